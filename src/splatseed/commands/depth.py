@@ -40,7 +40,6 @@ from splatseed.io.dense import (
 from splatseed.io.photograph import warnings_but_lens
 from splatseed.io.staging import check_output
 from splatseed.literal import quoted, visible
-from splatseed.monocular import DepthReport, estimate_depths
 from splatseed.requirements import require
 from splatseed.runtime.torch_device import DeviceName
 from splatseed.scene import Scene
@@ -48,8 +47,8 @@ from splatseed.seeding.diagnostics import is_distorted
 from splatseed.train.schedule import FULL_RUN
 
 if TYPE_CHECKING:  # kernels and PyTorch load with their use
+    from splatseed.depth.monocular import DepthNetwork, DepthReport
     from splatseed.depth.stereo import StereoMap
-    from splatseed.monocular.network import DepthNetwork
 
 NAMES_SHOWN = 5
 MAX_SIZE = 1600
@@ -151,7 +150,7 @@ def _run_network(options: Options) -> None:
         scene = load_scene(options.scene, require_points=False)
         clock("load network", 0.0)
         require("torch", "transformers")
-        from splatseed.monocular.network import load_network  # noqa: PLC0415  (imports PyTorch)
+        from splatseed.depth.monocular import estimate_depths, load_network  # noqa: PLC0415  (imports PyTorch)
 
         network = load_network(str(options.model), kind=options.depth_kind, device=options.device)
         meaning = network.meaning
@@ -171,15 +170,15 @@ def _run_network(options: Options) -> None:
 def _summarise_network(
     options: Options, scene: Scene, network: DepthNetwork, report: DepthReport
 ) -> None:
-    small, large = (f"{width} x {height}" for width, height in report.sizes)
-    each = report.seconds / report.num_images
+    ordered, num = sorted(report.sizes.values(), key=math.prod), len(report.sizes)
+    small, large = (f"{width} x {height}" for width, height in (ordered[0], ordered[-1]))
     rows = [
         ("network", str(options.model)),
         ("run by", network.device),
         ("predicts", f"{network.meaning.kind} ({network.meaning.reason})"),
-        ("maps", f"{report.num_images:,} of {large if small == large else f'{small} to {large}'}"),
-        ("seconds", f"{report.seconds:.1f}, {each:.2f} per image"),
-        ("output", str(report.path)),
+        ("maps", f"{num:,} of {large if small == large else f'{small} to {large}'}"),
+        ("seconds", f"{report.seconds:.1f}, {report.seconds / num:.2f} per image"),
+        ("output", str(options.output)),
     ]
     print_pairs("splatseed depth", rows)
     for warning in scene.warnings:
@@ -187,9 +186,9 @@ def _summarise_network(
     if report.flat:
         flat = _some(report.flat)
         print_note(f"the network predicted no depth (a constant map, or none) for: {flat}")
-    known = report.num_images * math.prod(report.sizes[0])
+    known = num * math.prod(ordered[0])
     most = Planned.of(scene, None, FULL_RUN).most_seeds
-    print_pairs("next", after_network(options.scene, scene, report.path, known, most))
+    print_pairs("next", after_network(options.scene, scene, options.output, known, most))
 
 
 def _some(names: Sequence[str]) -> str:

@@ -225,7 +225,7 @@ def _load_view(
     if min(width, height) < min_side:
         raise _too_small(path, min_side, data_factor, (width, height))
     camera = image.camera
-    scale = _file_from_camera(path, file_size, (camera.width, camera.height)) / data_factor
+    scale = file_from_camera(path, file_size, (camera.width, camera.height)) / data_factor
     K = np.diag([*scale, 1.0]) @ camera.K
     if not image.intrinsics.has_distortion:
         return View(image.name, photograph, K, width, height, camera.cam_from_world)
@@ -246,7 +246,7 @@ def _too_small(
     )
 
 
-def _file_from_camera(
+def file_from_camera(
     path: Path, file_size: tuple[int, int], camera_size: tuple[int, int]
 ) -> Float64[np.ndarray, " 2"]:
     """How many pixels of the file a pixel of the camera record is, along x and y."""

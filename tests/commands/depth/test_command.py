@@ -35,7 +35,7 @@ def test_a_network_of_transformers(room, model, tmp_path, splatseed):
 
 
 def test_a_blind_network_is_told_of(room, tmp_path, splatseed, monkeypatch):
-    from splatseed.monocular.network import DepthNetwork
+    from splatseed.depth.monocular import DepthNetwork
 
     predict = DepthNetwork.__call__
     monkeypatch.setattr(DepthNetwork, "__call__", lambda *a: 0 * predict(*a))

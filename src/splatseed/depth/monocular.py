@@ -1,11 +1,9 @@
-"""Depth networks in Hugging Face's format, run by transformers and PyTorch.
+"""Depth maps by a network in Hugging Face's format, run by transformers and PyTorch.
 
-Notation: a *prediction* is float32 [H, W], one value for each pixel of a photograph. A network sees
-a photograph within a *frame*: pixels [height, width] of the frame's [full_height, full_width], from
-(top, left) on; the rest is padding that the network asked for. Promise: nothing is downloaded and
-no code from a model's folder is run; a network whose weights are not all in its file is refused
-rather than run with random ones; transformers' logs stay silent; the meaning of a network's values
-is stated with the evidence for it, or the user is asked.
+Promise: nothing is downloaded and no code from a model's folder is run; a network whose weights are
+not all in its file is refused rather than run with random ones; the meaning of its values is stated
+with the evidence for it, or the user is asked. Every photograph is read to its last byte before the
+network runs on the first, and the folder of maps appears whole or not at all.
 """
 
 from __future__ import annotations
@@ -13,9 +11,9 @@ from __future__ import annotations
 import math
 import re
 import sys
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+import time
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,20 +21,26 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float, Float32, UInt8
+from PIL import Image as PilImage
 from torch import Tensor
 from torch.nn.functional import interpolate, pad
 
+from splatseed import errors
 from splatseed.depthmap import DepthKind
-from splatseed.errors import (
-    MissingDependencyError,
-    ParameterError,
-    SceneFormatError,
-    SceneNotFoundError,
-    SplatseedError,
+from splatseed.io.depth_maps import depth_folder
+from splatseed.io.photograph import (
+    check_photograph,
+    decode_photograph,
+    photograph_bytes,
+    photograph_folder,
 )
+from splatseed.io.staging import check_output
 from splatseed.literal import quoted
+from splatseed.progress import Progress, silent
 from splatseed.requirements import require
 from splatseed.runtime.torch_device import DeviceName, pick_torch_device
+from splatseed.scene import Scene
+from splatseed.views.view import file_from_camera
 
 _EXAMPLE = "depth-anything/Depth-Anything-V2-Small-hf"
 _ID = re.compile(r"\w[\w.-]*/\w[\w.-]*")
@@ -53,29 +57,96 @@ _METRIC = {
 }
 """Model types that always predict metres, and their common names."""
 
+Size = tuple[int, int]
+"""Width and height in pixels."""
+_Window = tuple[Sequence[int], slice, slice]
+"""What the network sees, as rows and columns, and those of them that hold the photograph."""
 
-@dataclass(frozen=True)
-class Meaning:
-    """What a network's values are.
 
-    Args:
-        kind: As in ``DepthMap``.
-        reason: The evidence, in a few words.
-    """
+class Meaning(NamedTuple):
+    """What a network's values are, and the evidence in a few words."""
 
     kind: DepthKind
     reason: str
 
 
-class _Frame(NamedTuple):
-    """Where the photograph lies within what the network sees."""
+class DepthReport(NamedTuple):
+    """The result of prediction."""
 
-    full_height: int
-    full_width: int
-    top: int
-    left: int
-    height: int
-    width: int
+    sizes: Mapping[str, Size]
+    """Of each map, by its image's name."""
+    flat: tuple[str, ...]
+    """Images whose map is constant or has no finite value: the network failed there."""
+    seconds: float
+    """Wall time of the predictions."""
+
+
+def estimate_depths(
+    scene: Scene,
+    network: DepthNetwork,
+    output: Path,
+    *,
+    max_size: int = 1600,
+    overwrite: bool = False,
+    provenance: Mapping[str, object] | None = None,
+    progress: Progress = silent,
+) -> DepthReport:
+    """Predict a depth map for every image of a scene; ``splatseed.io.find_depths`` reads them.
+
+    Args:
+        scene: A scene with photographs.
+        network: The network.
+        output: The folder to write, with one float32 ``.npy`` per image.
+        max_size: A photograph whose longer side has more pixels is reduced to this before the
+            network sees it, and its map has that size.
+        overwrite: Whether an earlier folder of maps may be replaced.
+        provenance: How the maps were made, for ``splatseed.json``.
+        progress: Called with the stage and the fraction done.
+
+    Raises:
+        ParameterError: ``max_size`` is out of its range.
+        SceneNotFoundError: The scene has no images, or a photograph is missing.
+        SceneFormatError: A photograph cannot be decoded, or differs from its camera in aspect
+            ratio.
+        OutputError: The folder cannot be written.
+    """
+    if max_size < 1:
+        raise errors.ParameterError("--max-size of 1 or more", found=f"{max_size}", fix="Raise it.")
+    folder = photograph_folder(scene)
+    protect = (folder,) if scene.source is None else scene.source.inputs
+    check_output(output, kind="depth", overwrite=overwrite, protect=protect)
+    sizes = _sizes(scene, folder, max_size, progress)
+    start, flat = time.perf_counter(), []
+    with depth_folder(
+        output, network.meaning.kind, overwrite=overwrite, protect=protect, provenance=provenance
+    ) as writer:
+        progress("predict depth", 0.0)
+        for done, (name, size) in enumerate(sizes.items(), 1):
+            path = folder / name
+            picture = decode_photograph(path, photograph_bytes(path))
+            if picture.size != size:
+                picture = picture.resize(size, PilImage.Resampling.BICUBIC)
+            values = network(np.array(picture))
+            finite = np.isfinite(values)
+            writer.write(name, np.where(finite, values, np.float32(np.nan)))
+            if not finite.any() or np.ptp(values[finite]) == 0:
+                flat.append(name)
+            progress("predict depth", done / len(sizes))
+    return DepthReport(sizes, tuple(flat), time.perf_counter() - start)
+
+
+def _sizes(scene: Scene, folder: Path, max_size: int, progress: Progress) -> dict[str, Size]:
+    """The size at which the network sees each photograph, by name, in order of names."""
+    lenses = dict(sorted((image.name, image.intrinsics) for image in scene.images))
+    sizes = {}
+    with ThreadPoolExecutor() as pool:  # Pillow decodes outside the GIL
+        checked = pool.map(lambda name: check_photograph(folder / name), lenses)
+        for (name, lens), (width, height) in zip(lenses.items(), checked, strict=True):
+            file_from_camera(folder / name, (width, height), (lens.width, lens.height))
+            factor = min(max_size / max(width, height), 1.0)
+            sizes[name] = max(round(width * factor), 1), max(round(height * factor), 1)
+            progress("check images", len(sizes) / len(lenses))
+    return sizes
 
 
 class DepthNetwork:
@@ -92,9 +163,8 @@ class DepthNetwork:
         self, processor: Any, network: Any, meaning: Meaning, device: torch.device
     ) -> None:
         self.meaning = meaning
-        self._processor = processor
+        self._processor, self._device = processor, device
         self._network = network.eval().to(device)
-        self._device = device
 
     @property
     def device(self) -> str:
@@ -115,7 +185,7 @@ class DepthNetwork:
             SceneFormatError: The network does not run on such an image.
         """
         size = image.shape[:2]
-        values, frame = self._prepare(image)
+        values, window = self._prepare(image)
         try:
             outputs = self._network(pixel_values=values.to(self._device))
         except (RuntimeError, ValueError) as error:
@@ -125,41 +195,47 @@ class DepthNetwork:
             depth = made["predicted_depth"].float()
         else:
             depth = outputs.predicted_depth[:, None].float()
-            if frame is not None:
-                rows = slice(frame.top, frame.top + frame.height)
-                columns = slice(frame.left, frame.left + frame.width)
-                depth = _scaled(depth, (frame.full_height, frame.full_width))[:, :, rows, columns]
+            if window is not None:
+                seen, rows, columns = window
+                depth = _scaled(depth, seen)[:, :, rows, columns]
             depth = _scaled(depth, size)[0, 0]
         return np.asarray(depth.cpu().numpy())
 
     def _prepare(
         self, image: UInt8[np.ndarray, "H W 3"]
-    ) -> tuple[Float[Tensor, "1 3 h w"], _Frame | None]:
+    ) -> tuple[Float[Tensor, "1 3 h w"], _Window | None]:
         """The network's input, and where the photograph lies in it; None: it fills it."""
-        processor, height, width = self._processor, *image.shape[:2]
-        divisor = getattr(processor, "size_divisor", None)
+        processor = self._processor
+        given = {"images": [image], "return_tensors": "pt", "input_data_format": "channels_last"}
         pads = bool(getattr(processor, "do_pad", False))
+        divisor = getattr(processor, "size_divisor", None)
         if pads and divisor:  # done here: the processor does not report how much
-            return _padded(self._process(image, do_pad=False), divisor)
-        values = self._process(image)
-        if pads and self._network.config.model_type == "zoedepth":
-            top, left = (int(math.sqrt(side / 2) * _ZOE_MARGIN) for side in (height, width))
-            return values, _Frame(height + 2 * top, width + 2 * left, top, left, height, width)
-        return values, None
+            values = torch.as_tensor(processor(**given, do_pad=False)["pixel_values"])
+            height, width = values.shape[2:]
+            down, right = -height % divisor, -width % divisor
+            top, left = down // 2, right // 2
+            values = pad(values, (left, right - left, top, down - top))
+            return values, _window(height + down, width + right, top, left, height, width)
+        values = torch.as_tensor(processor(**given)["pixel_values"])
+        if not (pads and self._network.config.model_type == "zoedepth"):
+            return values, None
+        height, width = image.shape[:2]
+        top, left = (int(math.sqrt(side / 2) * _ZOE_MARGIN) for side in (height, width))
+        return values, _window(height + 2 * top, width + 2 * left, top, left, height, width)
 
-    def _process(
-        self, image: UInt8[np.ndarray, "H W 3"], **options: bool
-    ) -> Float[Tensor, "1 3 h w"]:
-        made = self._processor(
-            images=[image], return_tensors="pt", input_data_format="channels_last", **options
-        )
-        return torch.as_tensor(made["pixel_values"])
+
+def _window(rows: int, columns: int, top: int, left: int, height: int, width: int) -> _Window:
+    return (rows, columns), slice(top, top + height), slice(left, left + width)
+
+
+def _scaled(depth: Float[Tensor, "1 1 h w"], size: Sequence[int]) -> Float[Tensor, "1 1 H W"]:
+    return interpolate(depth, size=tuple(size), mode="bilinear", align_corners=False)
 
 
 def load_network(
     model: str, *, kind: DepthKind | None = None, device: DeviceName = "auto"
 ) -> DepthNetwork:
-    """Load a depth network that is on this machine.
+    """Load a depth network that is on this machine; transformers keeps silent from then on.
 
     Args:
         model: A folder with ``config.json``, ``preprocessor_config.json`` and weights, or the id of
@@ -175,16 +251,16 @@ def load_network(
         ParameterError: There is no such device, or nothing says what it predicts.
     """
     require("transformers")
+    from transformers.utils import logging  # noqa: PLC0415  (seconds to import)
+
     where = pick_torch_device(device, "--device")
     path = Path(model)
-    if path.is_dir() and not (path / "config.json").is_file():
-        raise _misfit(model, "no config.json in it")
-    if path.is_file():
-        raise _misfit(model, "a file")
-    with _silent():
-        meaning = _meaning_of(_read_config(model).to_dict(), model, kind)
-        processor, network = _load(model)
-    return DepthNetwork(processor, network, meaning, where)
+    if path.is_file() or (path.is_dir() and not (path / "config.json").is_file()):
+        raise _misfit(model, "a file" if path.is_file() else "no config.json in it")
+    logging.set_verbosity(logging.CRITICAL)
+    logging.disable_progress_bar()
+    meaning = _meaning_of(_read_config(model).to_dict(), model, kind)
+    return DepthNetwork(*_load(model), meaning, where)
 
 
 def _meaning_of(config: Mapping[str, Any], name: str, given: DepthKind | None) -> Meaning:
@@ -202,7 +278,7 @@ def _meaning_of(config: Mapping[str, Any], name: str, given: DepthKind | None) -
         if (config.get("backbone_config") or {}).get("model_type") == "dinov2":
             return Meaning("z", "DPT on DINOv2 predicts metres")
         return Meaning("inverse", "DPT of MiDaS predicts inverse depth")
-    raise ParameterError(
+    raise errors.ParameterError(
         f"--depth-kind, to say what {name} predicts",
         found=f"a network of type {model_type!r}, which does not say",
         fix="Pass --depth-kind inverse for networks that predict disparity (MiDaS, Depth Anything"
@@ -219,7 +295,7 @@ def _read_config(model: str) -> Any:
     except Exception as error:  # transformers raises errors of many libraries
         if Path(model).is_dir():
             raise _misfit(model, _one_line(error)) from error
-        raise SceneNotFoundError(
+        raise errors.SceneNotFoundError(
             f"the depth network {model} on this machine",
             found="neither a folder of that name nor a copy in Hugging Face's cache",
             fix="splatseed downloads nothing by itself. "
@@ -248,7 +324,7 @@ def _load(model: str) -> tuple[Any, Any]:
     except Exception as error:  # transformers raises errors of many libraries
         if "torchvision" in str(error).lower() and find_spec("torchvision") is None:
             pip = f"{quoted(sys.executable or 'python')} -m pip install torchvision"
-            raise MissingDependencyError(
+            raise errors.MissingDependencyError(
                 f"torchvision, which the image processor of {model} needs",
                 found="none",
                 fix=f"Install it for your version of PyTorch: {pip}.",
@@ -261,25 +337,25 @@ def _load(model: str) -> tuple[Any, Any]:
     return processor, network
 
 
-def _failed(error: Exception, values: Float[Tensor, "1 3 h w"]) -> SplatseedError:
+def _failed(error: Exception, values: Float[Tensor, "1 3 h w"]) -> errors.SplatseedError:
     """The error for a network that failed."""
     height, width = values.shape[2:]
     # PyTorch's memory errors on the CPU contain "allocate".
     if isinstance(error, torch.cuda.OutOfMemoryError) or "allocate" in str(error):
-        return ParameterError(
+        return errors.ParameterError(
             f"enough memory for an image of {width} x {height}",
             found=_one_line(error).partition(". ")[0],
             fix="Pass a smaller --max-size, or another --device.",
         )
-    return SceneFormatError(
+    return errors.SceneFormatError(
         f"a network that takes images of {width} x {height} pixels",
         found=_one_line(error),
         fix="Its preprocessor_config.json may belong to another network.",
     )
 
 
-def _misfit(model: str, found: str) -> SceneFormatError:
-    return SceneFormatError(
+def _misfit(model: str, found: str) -> errors.SceneFormatError:
+    return errors.SceneFormatError(
         f"{model} to be a depth network that transformers loads: a folder of config.json,"
         " preprocessor_config.json and weights",
         found=found,
@@ -296,34 +372,3 @@ def _one_line(error: Exception) -> str:
     """The first line of another library's error."""
     lines = str(error).strip().splitlines()
     return f"{type(error).__name__}: {lines[0].rstrip('.')}" if lines else type(error).__name__
-
-
-@contextmanager
-def _silent() -> Iterator[None]:
-    """Keep transformers' warnings and progress bars from the terminal."""
-    from transformers.utils import logging  # noqa: PLC0415  (loads with its use)
-
-    level, bars = logging.get_verbosity(), logging.is_progress_bar_enabled()
-    logging.set_verbosity(logging.CRITICAL)
-    logging.disable_progress_bar()
-    try:
-        yield
-    finally:
-        logging.set_verbosity(level)
-        if bars:
-            logging.enable_progress_bar()
-
-
-def _padded(
-    values: Float[Tensor, "1 3 h w"], divisor: int
-) -> tuple[Float[Tensor, "1 3 H W"], _Frame]:
-    """Zero-padded on both sides to multiples of ``divisor``."""
-    height, width = values.shape[2:]
-    down, right = (-side % divisor for side in (height, width))
-    top, left = down // 2, right // 2
-    frame = _Frame(height + down, width + right, top, left, height, width)
-    return pad(values, (left, right - left, top, down - top)), frame
-
-
-def _scaled(depth: Float[Tensor, "1 1 h w"], size: Sequence[int]) -> Float[Tensor, "1 1 H W"]:
-    return interpolate(depth, size=tuple(size), mode="bilinear", align_corners=False)

@@ -1,0 +1,364 @@
+"""Networks in transformers' format: what they predict, where; what is written, and refused."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import shutil
+import socket
+import subprocess
+import sys
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from PIL import Image as PilImage
+
+pytest.importorskip("torch", reason="networks of transformers need PyTorch")
+pytest.importorskip("transformers", reason="needs splatseed[depth]")
+
+import torch
+import transformers
+from safetensors.torch import load_file, save_file
+
+from splatseed.depth.monocular import DepthNetwork, Meaning, estimate_depths, load_network
+from splatseed.errors import (
+    InputError,
+    MissingDependencyError,
+    OutputError,
+    ParameterError,
+    SceneFormatError,
+    SceneNotFoundError,
+)
+from splatseed.io import find_depths, load_scene
+
+from ..networks import SAVED, save_network
+
+KINDS = {
+    "depth_anything": "inverse",
+    "depth_anything_metric": "z",
+    "dpt": "inverse",
+    "dpt_on_dinov2": "z",
+    "glpn": "z",
+    "zoedepth": "z",
+}
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory):
+    """The folder of a network by its name. Not to be written to."""
+    folder = tmp_path_factory.mktemp("networks")
+    return {name: save_network(name, folder / name) for name in SAVED}
+
+
+@pytest.fixture
+def photographs(rng):
+    """Three of noise, 90 x 60."""
+    return [rng.integers(0, 256, (60, 90, 3), dtype=np.uint8) for _ in range(3)]
+
+
+@pytest.fixture
+def ramp():
+    """A photograph, 118 x 77, that is u + v with (u, v) the pixel's centre."""
+    v, u = np.mgrid[:77, :118] + 0.5
+    return np.repeat((u + v)[..., None], 3, axis=2).astype(np.uint8)
+
+
+def processor_of(path):
+    return transformers.AutoImageProcessor.from_pretrained(path, backend="pil")
+
+
+@pytest.mark.parametrize("name", SAVED)
+def test_what_a_network_predicts_is_read_from_its_config(name, saved):
+    assert load_network(str(saved[name]), device="cpu").meaning.kind == KINDS[name]
+
+
+def test_the_user_says_where_the_config_does_not(saved, tmp_path):
+    assert load_network(str(saved["dpt"]), kind="ray", device="cpu").meaning.kind == "ray"
+    folder = shutil.copytree(saved["depth_anything"], tmp_path / "copy")
+    config = json.loads((folder / "config.json").read_text())
+    config["model_type"] = "prompt_depth_anything"
+    (folder / "config.json").write_text(json.dumps(config))
+    with pytest.raises(ParameterError, match="--depth-kind"):
+        load_network(str(folder), device="cpu")
+
+
+@pytest.mark.parametrize("name", ["depth_anything", "depth_anything_metric", "dpt", "glpn"])
+def test_predictions_are_those_of_transformers_and_silent(name, saved, photographs, capfd):
+    network = transformers.AutoModelForDepthEstimation.from_pretrained(saved[name])
+    with torch.no_grad():
+        outputs = network(**processor_of(saved[name])(photographs, return_tensors="pt"))
+    capfd.readouterr()
+    ours = load_network(str(saved[name]), device="cpu")
+    for photograph, expected in zip(photographs, outputs.predicted_depth, strict=True):
+        depth = ours(photograph)
+        wanted = torch.nn.functional.interpolate(expected[None, None], (60, 90), mode="bilinear")
+        assert depth.dtype == np.float32
+        np.testing.assert_allclose(depth, wanted[0, 0], atol=1e-5)
+        assert np.ptp(depth) > 0.01  # not an empty comparison
+    assert capfd.readouterr() == ("", "")
+
+
+class _SeesItself(torch.nn.Module):
+    """Predicts the first channel of its input, so that a map shows where its pixels lie."""
+
+    def __init__(self, path):
+        super().__init__()
+        self.config, processor = transformers.AutoConfig.from_pretrained(path), processor_of(path)
+        normalises = processor.do_normalize
+        self.mean = processor.image_mean[0] if normalises else 0.0
+        self.std = processor.image_std[0] if normalises else 1.0
+
+    def forward(self, pixel_values):
+        self.seen = pixel_values
+        return SimpleNamespace(predicted_depth=(pixel_values[:, 0] * self.std + self.mean) * 255)
+
+
+@pytest.mark.parametrize("name", SAVED)
+def test_a_map_lies_on_its_photograph(name, saved, ramp):
+    """Padding is taken off and centres stay in place, to a third of a pixel along either axis.
+
+    ZoeDepth's processor resizes corners onto corners, which moves its own input by half a pixel.
+    """
+    processor, network = processor_of(saved[name]), _SeesItself(saved[name])
+    depth = DepthNetwork(processor, network, Meaning("z", "made"), CPU)(ramp)
+    assert depth.shape == ramp.shape[:2]
+    off = np.abs(depth - ramp[..., 0])[8:-8, 8:-8].mean()
+    assert off < (1.2 if name == "zoedepth" else 0.3)
+    # And padding is what the processor itself would add.
+    torch.testing.assert_close(network.seen, processor([ramp], return_tensors="pt")["pixel_values"])
+
+
+def test_depth_pro_leaves_its_maps_to_its_processor():
+    """Its scale depends on the field of view that it predicts, as its own post-processing knows."""
+
+    class Processor:
+        def __call__(self, images, **_):
+            return {"pixel_values": np.zeros((len(images), 3, 4, 4), np.float32)}
+
+        def post_process_depth_estimation(self, outputs, target_sizes):
+            sizes = zip(outputs.field_of_view, target_sizes, strict=True)
+            return [{"predicted_depth": torch.full(size, float(fov))} for fov, size in sizes]
+
+    class Network(torch.nn.Module):
+        def forward(self, pixel_values):
+            fov = torch.tensor([40])
+            return SimpleNamespace(predicted_depth=pixel_values[:, 0], field_of_view=fov)
+
+    depth = DepthNetwork(Processor(), Network(), Meaning("z", "made"), CPU)(
+        np.zeros((6, 9, 3), "B")
+    )
+    np.testing.assert_array_equal(depth, np.full((6, 9), 40))
+
+
+@pytest.mark.parametrize(
+    ("file", "content"),
+    [
+        ("config.json", b"{"),
+        ("config.json", None),
+        ("config.json", b'{"model_type": "bert"}'),
+        ("config.json", b'{"model_type": "unheard"}'),
+        ("model.safetensors", None),
+        ("model.safetensors", b"0123456789"),
+        ("preprocessor_config.json", None),
+        ("preprocessor_config.json", b"[1"),
+    ],
+)
+def test_a_damaged_folder_is_one_error(file, content, saved, tmp_path):
+    folder = shutil.copytree(saved["depth_anything"], tmp_path / "copy")
+    with pytest.raises(SceneFormatError, match="a file"):
+        load_network(str(folder / file))
+    (folder / file).unlink()
+    if content is not None:
+        (folder / file).write_bytes(content)
+    with pytest.raises(SceneFormatError, match=str(folder)) as caught:
+        load_network(str(folder), device="cpu")
+    assert "\n" not in str(caught.value)
+
+
+def test_weights_must_be_there_but_for_those_that_dpt_never_uses(saved, tmp_path, photographs):
+    """Which the files that Intel published omit."""
+    unused = "neck.fusion_stage.layers.0.residual_layer1."
+    for name, omitted in (("depth_anything", "head."), ("dpt", unused)):
+        folder = shutil.copytree(saved[name], tmp_path / name)
+        weights = load_file(folder / "model.safetensors")
+        kept = {key: value for key, value in weights.items() if not key.startswith(omitted)}
+        assert len(kept) < len(weights)
+        save_file(kept, folder / "model.safetensors")
+    with pytest.raises(SceneFormatError, match=r"head\.conv1\.bias"):
+        load_network(str(tmp_path / "depth_anything"), device="cpu")
+    ours, whole = (load_network(str(f), device="cpu") for f in (tmp_path / "dpt", saved["dpt"]))
+    np.testing.assert_allclose(ours(photographs[0]), whole(photographs[0]), atol=1e-5)
+
+
+@pytest.mark.parametrize("model", ["nobody/Depth-Nothing-hf", "nothing", "a/b/c", "../x"])
+def test_a_network_that_is_not_here_is_never_looked_for_elsewhere(model, monkeypatch, tmp_path):
+    def refuse(*_, **__):
+        raise AssertionError("a connection was tried")
+
+    for name in ("connect", "connect_ex"):
+        monkeypatch.setattr(socket.socket, name, refuse)
+    monkeypatch.setattr(socket, "getaddrinfo", refuse)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SceneNotFoundError) as caught:
+        load_network(model)
+    name = model if model.startswith("nobody") else "depth-anything/Depth-Anything-V2-Small-hf"
+    assert f"hf download {name} --local-dir {name.partition('/')[2]} " in str(caught.value)
+
+
+def test_an_id_is_found_in_the_cache(saved, tmp_path):
+    """In a process of its own: where the cache is, is settled as Hugging Face's package loads."""
+    entry = tmp_path / "hub" / "models--me--tiny"
+    shutil.copytree(saved["dpt"], entry / "snapshots" / ("0" * 40))
+    (entry / "refs").mkdir()
+    (entry / "refs" / "main").write_text("0" * 40)
+    code = "from splatseed.depth.monocular import load_network as load"
+    code += "; print(load('me/tiny').meaning.kind)"
+    environment = {**os.environ, "HF_HOME": str(tmp_path), "HF_HUB_CACHE": str(tmp_path / "hub")}
+    run = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, check=True, text=True, env=environment
+    )
+    assert run.stdout.strip() == "inverse"
+
+
+@pytest.mark.skipif(
+    importlib.util.find_spec("torchvision") is not None, reason="torchvision is here"
+)
+def test_a_processor_that_needs_torchvision_says_so(saved, tmp_path):
+    folder = shutil.copytree(saved["depth_anything"], tmp_path / "copy")
+    (folder / "config.json").write_text('{"model_type": "depth_pro"}')
+    processor = {"image_processor_type": "DepthProImageProcessor"}
+    (folder / "preprocessor_config.json").write_text(json.dumps(processor))
+    with pytest.raises(MissingDependencyError, match="pip install torchvision"):
+        load_network(str(folder), device="cpu")
+
+
+@pytest.mark.parametrize(
+    ("error", "raised"),
+    [
+        (torch.cuda.OutOfMemoryError("CUDA out of memory."), ParameterError),
+        (RuntimeError("DefaultCPUAllocator: can't allocate memory"), ParameterError),
+        (RuntimeError("sizes of tensors must match"), SceneFormatError),
+    ],
+)
+def test_a_network_that_fails_is_one_error(error, raised, saved, ramp, monkeypatch):
+    def fail(*_, **__):
+        raise error
+
+    monkeypatch.setattr(_SeesItself, "forward", fail)
+    network = _SeesItself(saved["dpt"])
+    with pytest.raises(raised):
+        DepthNetwork(processor_of(saved["dpt"]), network, Meaning("z", "made"), CPU)(ramp)
+
+
+# A scene's photographs through a network ----------------------------------------------------------
+
+
+class Brightness:
+    """A network that takes bright for near, and remembers what it was asked."""
+
+    meaning = Meaning("inverse", "made")
+
+    def __init__(self, fails=lambda num, values: values):  # noqa: ARG005  (takes a call's number)
+        self.asked, self.fails = [], fails
+
+    def __call__(self, image):
+        self.asked.append(image.shape[:2])
+        return self.fails(len(self.asked), image.mean(axis=2).astype(np.float32) + 1)
+
+
+@pytest.fixture
+def own(exact, tmp_path):
+    """A copy of the room that a test may spoil."""
+    return load_scene(shutil.copytree(exact.source.image_dir.parent, tmp_path / "own"))
+
+
+def test_every_image_gets_a_map_that_the_reader_finds(own, tmp_path):
+    network, stages = Brightness(), []
+    first, second, *rest = own.images
+    folder = own.source.image_dir
+    for image, name in ((first, "left/a.png"), (second, "right/a.png")):
+        (folder / name).parent.mkdir()
+        shutil.move(folder / image.name, folder / name)
+    with PilImage.open(folder / rest[0].name) as picture:
+        smaller = picture.resize((40, 30))
+    smaller.save(folder / rest[0].name)
+    renamed = (replace(first, name="left/a.png"), replace(second, name="right/a.png"), *rest[:3])
+    scene = own.replace(images=renamed)
+    report = estimate_depths(
+        scene, network, tmp_path / "maps", max_size=80, progress=lambda *each: stages.append(each)
+    )
+    sizes = {image.name: (80, 60) for image in renamed} | {rest[0].name: (40, 30)}
+    assert (report.sizes, report.flat) == (sizes, ())
+    assert set(network.asked) == {(60, 80), (30, 40)}
+    depths = find_depths(scene, tmp_path / "maps")
+    assert set(depths) == set(sizes)
+    for image in scene.images:
+        depth_map = depths.read(image.name)
+        assert (depth_map.kind, depth_map.camera(image.camera).width) == (
+            "inverse",
+            sizes[image.name][0],
+        )
+        with PilImage.open(folder / image.name) as picture:
+            shown = picture.convert("RGB").resize(sizes[image.name], PilImage.Resampling.BICUBIC)
+        np.testing.assert_allclose(depth_map.values, np.asarray(shown).mean(axis=2) + 1, rtol=1e-6)
+    assert ("check images", 1.0) in stages
+    assert stages[-1] == ("predict depth", 1.0)
+
+
+def test_a_network_that_fails_on_an_image_is_told_of(exact, tmp_path):
+    network = Brightness(
+        lambda num, v: np.full_like(v, {1: 7.0, 4: np.inf}[num]) if num in (1, 4) else v
+    )
+    report = estimate_depths(exact, network, tmp_path / "maps")
+    names = sorted(image.name for image in exact.images)
+    assert report.flat == (names[0], names[3])
+    assert np.isnan(find_depths(exact, tmp_path / "maps").read(names[3]).values).all()
+
+
+@pytest.mark.parametrize("damage", ["cut short", "missing", "of another shape", "text"])
+def test_a_bad_photograph_stops_before_the_network_is_run(damage, own, tmp_path):
+    network = Brightness()
+    path = own.source.image_dir / max(image.name for image in own.images)
+    if damage == "cut short":
+        path.write_bytes(path.read_bytes()[:-100])
+    elif damage == "of another shape":
+        PilImage.new("RGB", (60, 80)).save(path)
+    elif damage == "text":
+        path.write_text("not an image")
+    else:
+        path.unlink()
+    with pytest.raises((SceneFormatError, SceneNotFoundError), match=path.name):
+        estimate_depths(own, network, tmp_path / "maps")
+    assert not network.asked
+    assert not (tmp_path / "maps").exists()
+
+
+def test_a_failure_on_the_way_leaves_nothing(exact, tmp_path):
+    def broken(num, values):
+        if num == 3:
+            raise ParameterError("memory", found="none", fix="Buy some.")
+        return values
+
+    with pytest.raises(ParameterError):
+        estimate_depths(exact, Brightness(broken), tmp_path / "out" / "maps")
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_cannot_be_done_is_refused(exact, tmp_path):
+    folder, network = exact.source.image_dir.parent, Brightness()
+    nowhere = exact.replace(source=replace(exact.source, image_dir=None))
+    for scene, output, max_size, error in (
+        (exact, folder, 80, OutputError),
+        (exact, folder / "images" / "maps", 80, OutputError),
+        (exact, tmp_path / "maps", -5, ParameterError),
+        (exact.replace(images=()), tmp_path / "maps", 80, SceneNotFoundError),
+        (nowhere, tmp_path / "maps", 80, SceneNotFoundError),
+    ):
+        with pytest.raises(InputError) as caught:
+            estimate_depths(scene, network, output, max_size=max_size)
+        assert type(caught.value) is error
+    assert not network.asked
