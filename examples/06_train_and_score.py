@@ -15,7 +15,7 @@ from pathlib import Path
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before PyTorch: see docs/training.md
 
 import splatseed as ss
-from splatseed.evaluate import evaluate_views
+from splatseed.splat.evaluate import evaluate_views
 from splatseed.synthetic import make_capture, write_capture
 from splatseed.train import RunOptions, TrainSettings, prepare_run
 

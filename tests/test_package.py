@@ -48,8 +48,6 @@ ORDER = (
     "sfm",
     "render",
     "splat",
-    "export",
-    "evaluate",
     "train",
     "view",
     "bench",
@@ -340,13 +338,13 @@ def test_dependencies_are_those_that_are_imported():
         needed = imported - set(sys.stdlib_module_names) - {"splatseed", "pycolmap"}
         needed -= {"fused_ssim"} if path.name == "trainer.py" else set()  # taken where it is there
         part = path.relative_to(SOURCE).parts[0]
-        trains = part in {"render", "splat", "evaluate.py", "train", "view", "bench", "commands"}
+        trains = part in {"render", "splat", "train", "view", "bench", "commands"}
         # It loads torch, and gsplat's kernels, for those rooms.
         trains = trains or path.name == "torch_device.py"
         allowed = base | more if trains else base
         allowed = base | names["depth"] if path.name == "monocular.py" else allowed
         allowed = base | names["cluster"] if path.name.startswith("ray_") else allowed
-        if part in {"export", "view", "commands", "sfm"}:
+        if part in {"splat", "view", "commands", "sfm"}:
             allowed = allowed | names["view"]
         if path.parent.name == "clouds":
             allowed = allowed | names["scan"]

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from splatseed import load_scene
-from splatseed.evaluate import evaluate_views
+from splatseed.splat.evaluate import evaluate_views
 from splatseed.train import TrainSettings, prepare_run
 from splatseed.train.device import pick_device
 

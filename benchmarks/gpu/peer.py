@@ -19,7 +19,7 @@ from benchmarks.training.peer_stand_ins import Capture, load_peer
 from torch import Tensor
 
 from splatseed import load_scene
-from splatseed.evaluate import evaluate_views
+from splatseed.splat.evaluate import evaluate_views
 from splatseed.splat.metrics import l1_and_ssim_by_convolution
 from splatseed.train import TrainSettings
 from splatseed.train.device import peak_gpu_bytes, pick_device

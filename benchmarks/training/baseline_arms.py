@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from splatseed import load_scene
-from splatseed.evaluate import evaluate_views
+from splatseed.splat.evaluate import evaluate_views
 from splatseed.train import TrainSettings, prepare_run
 from splatseed.train.schedule import LEARNING_RATES, Schedule
 

@@ -43,10 +43,10 @@ from matplotlib.patches import Rectangle
 
 import splatseed as ss
 from splatseed.errors import SplatseedError
-from splatseed.evaluate import EvalResult, evaluate_views
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
 from splatseed.seeding.poses import random_start
+from splatseed.splat.evaluate import EvalResult, evaluate_views
 from splatseed.train import TrainSettings, prepare_run
 from splatseed.train.run import TrainingRun
 from splatseed.train.settings import Seeding, StrategyName

@@ -22,9 +22,9 @@ from torch import Tensor
 
 from splatseed import Scene, load_scene
 from splatseed.errors import SceneFormatError
-from splatseed.evaluate import Render, evaluate_views
 from splatseed.render import mcmc_on_cpu
 from splatseed.runtime.memory import keep_freed_memory
+from splatseed.splat.evaluate import Render, evaluate_views
 from splatseed.train import TrainSettings, prepare_run
 from splatseed.train.device import Capacity
 from splatseed.train.schedule import FULL_RUN

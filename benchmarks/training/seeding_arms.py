@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 
 import splatseed as ss
-from splatseed.evaluate import evaluate_views
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene, Split
 from splatseed.seeding.poses import random_start
 from splatseed.sfm import refined
+from splatseed.splat.evaluate import evaluate_views
 from splatseed.train import TrainSettings, prepare_run
 from splatseed.train.seeds import SEEDS_SHARE
 from splatseed.upsample import configure

@@ -32,7 +32,7 @@ from splatseed.bench.study import studies
 from splatseed.cli import main
 from splatseed.errors import OutputError, SceneFormatError, SceneNotFoundError
 from splatseed.io import load_scene
-from splatseed.splat.pictures import beside_photograph, write_picture
+from splatseed.splat.rendering import write_render
 from splatseed.synthetic import make_capture, write_capture
 
 from .browser import CHROMIUM, chromium
@@ -267,7 +267,7 @@ def with_capture(bench, capture, **changes):
         for name in ("view0.png", "view1.png"):
             noise = 40 * rng.standard_normal(truth.shape)
             render = np.clip(truth + noise, 0, 255).astype(np.float32) / 255
-            write_picture(folder / name, beside_photograph(truth, render))
+            write_render(folder / name, truth, render)
     return write_bench(bench, finished)
 
 

@@ -10,11 +10,11 @@ import pytest
 torch = pytest.importorskip("torch", reason="evaluation needs PyTorch")
 pytest.importorskip("gsplat", reason="training needs gsplat's strategies")
 
-from splatseed.evaluate import evaluate_views
 from splatseed.io import load_scene
 from splatseed.io.ply import write_ply
+from splatseed.splat.evaluate import evaluate_views
+from splatseed.splat.formats import write_model
 from splatseed.splat.gaussians import initial_gaussians
-from splatseed.splat.ply import write_gaussians
 from splatseed.train.run import prepare_run
 from splatseed.train.settings import TrainSettings
 
@@ -33,7 +33,7 @@ def run_folder(room, tmp_path_factory):
 @pytest.fixture
 def model(room, tmp_path):
     path = tmp_path / "model.ply"
-    write_gaussians(path, initial_gaussians(load_scene(room).points))
+    write_model(path, initial_gaussians(load_scene(room).points))
     return path
 
 
@@ -80,7 +80,7 @@ def test_what_cannot_be_scored_is_refused(model, room, run_folder, splatseed, tm
     write_ply(tmp_path / "seeds.ply", load_scene(room).points)
     gaussians = initial_gaussians(load_scene(room).points)
     gaussians.means[3] = np.nan
-    write_gaussians(tmp_path / "nan.ply", gaussians)
+    write_model(tmp_path / "nan.ply", gaussians)
     (tmp_path / "folder").mkdir()
     for name in ("nothing", "folder", "seeds.ply", "nan.ply"):
         _says(splatseed("evaluate", tmp_path / name, "--scene", room), tmp_path / name)

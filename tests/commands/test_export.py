@@ -8,9 +8,8 @@ import json
 import numpy as np
 import pytest
 
-from splatseed.export import read_model
+from splatseed.splat.formats import read_model, write_model
 from splatseed.splat.gaussians import Gaussians
-from splatseed.splat.ply import write_gaussians
 
 
 @pytest.fixture
@@ -26,7 +25,7 @@ def model(rng, tmp_path):
         "shN": 0.1 * rng.normal(size=(400, 15, 3)),
     }
     path = tmp_path / "model.ply"
-    write_gaussians(path, Gaussians(**{k: a.astype(np.float32) for k, a in arrays.items()}))
+    write_model(path, Gaussians(**{k: a.astype(np.float32) for k, a in arrays.items()}))
     return path
 
 

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from splatseed.pointcloud import PointCloud
-from splatseed.splat.appearance import EVEN, OWN, SH_C1, fit_harmonics
-from splatseed.splat.gaussians import SH_C0, initial_gaussians
+from splatseed.splat.gaussians import EVEN, OWN, SH_C0, SH_C1, fit_harmonics, initial_gaussians
 from splatseed.views.view import View
 
 SIDE = 64

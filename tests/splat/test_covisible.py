@@ -11,9 +11,9 @@ pytest.importorskip("torch", reason="scoring needs PyTorch")
 
 import torch
 
-from splatseed.evaluate import evaluate_views
 from splatseed.io import load_scene
 from splatseed.splat.covisible import find_covisible, pixel_masks, read_covisible
+from splatseed.splat.evaluate import evaluate_views
 from splatseed.synthetic import make_capture, write_capture
 from splatseed.views.view import View, poses_of
 

@@ -12,6 +12,7 @@ from splatseed.camera import rotation_from_quat
 from splatseed.errors import PointCloudError, SceneFormatError
 from splatseed.io.ply import read_ply, write_ply
 from splatseed.pointcloud import PointCloud
+from splatseed.splat.formats import read_model, write_model
 from splatseed.splat.gaussians import (
     SH_C0,
     Gaussians,
@@ -20,7 +21,6 @@ from splatseed.splat.gaussians import (
     stray_views,
     training_frame,
 )
-from splatseed.splat.ply import read_gaussians, write_gaussians
 from splatseed.views.view import load_split
 
 
@@ -47,13 +47,13 @@ def _assert_equal(a, b):
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_ply_round_trip_is_exact(tmp_path, rng, degree):
     gaussians = _random(rng, 17, degree)
-    write_gaussians(tmp_path / "g.ply", gaussians)
-    _assert_equal(gaussians, read_gaussians(tmp_path / "g.ply"))
+    write_model(tmp_path / "g.ply", gaussians)
+    _assert_equal(gaussians, read_model(tmp_path / "g.ply"))
 
 
 def test_ply_has_the_layout_of_3dgs(tmp_path, rng):
     gaussians = _random(rng, 2)
-    write_gaussians(tmp_path / "g.ply", gaussians)
+    write_model(tmp_path / "g.ply", gaussians)
     header, body = (tmp_path / "g.ply").read_bytes().split(b"end_header\n")
     names = [line.split()[-1].decode() for line in header.splitlines() if b"property" in line]
     assert names == (
@@ -70,21 +70,21 @@ def test_ply_that_holds_no_gaussians_is_refused(tmp_path, rng):
     path = tmp_path / "g.ply"
     write_ply(path, PointCloud(rng.random((4, 3)), np.zeros((4, 3), np.uint8)))
     with pytest.raises(SceneFormatError, match="trained Gaussians"):
-        read_gaussians(path)
-    write_gaussians(path, _random(rng, 9))
+        read_model(path)
+    write_model(path, _random(rng, 9))
     path.write_bytes(path.read_bytes()[:-40])
     with pytest.raises(SceneFormatError):
-        read_gaussians(path)
+        read_model(path)
     broken = _random(rng, 9)
     broken.means[3, 1] = np.nan
-    write_gaussians(path, broken)
-    with pytest.raises(SceneFormatError, match="vertex 3"):
-        read_gaussians(path)
+    write_model(path, broken)
+    with pytest.raises(SceneFormatError, match="Gaussian 3"):
+        read_model(path)
 
 
 def test_a_written_cloud_shows_the_seeds_colours(tmp_path, rng):
     seeds = PointCloud(rng.random((50, 3)), rng.integers(0, 256, (50, 3), np.uint8))
-    write_gaussians(tmp_path / "g.ply", initial_gaussians(seeds))
+    write_model(tmp_path / "g.ply", initial_gaussians(seeds))
     assert np.array_equal(read_ply(tmp_path / "g.ply").rgb, seeds.rgb)
 
 

@@ -12,12 +12,12 @@ pytest.importorskip("torch")
 
 from splatseed.camera import quat_from_rotation, rotation_from_quat
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
-from splatseed.evaluate import evaluate_model, load_model
 from splatseed.io import load_scene, write_scene
 from splatseed.io.cleaning import recentred
 from splatseed.similarity import Similarity, fit_similarity, similarity_of
+from splatseed.splat.evaluate import evaluate_model, load_model
+from splatseed.splat.formats import write_model
 from splatseed.splat.gaussians import Gaussians, initial_gaussians
-from splatseed.splat.ply import write_gaussians
 from splatseed.splat.world import check_world, find_transform
 
 
@@ -34,7 +34,7 @@ def gaussians(room):
 @pytest.fixture(scope="module")
 def psnr(room, gaussians, tmp_path_factory):
     path = tmp_path_factory.mktemp("world") / "model.ply"
-    write_gaussians(path, gaussians)
+    write_model(path, gaussians)
     return evaluate_model(load_model(path, room)).psnr
 
 
@@ -57,7 +57,7 @@ def other(rng):
 
 def test_what_gsplats_examples_write_is_refused_and_scored_right(room, gaussians, psnr, tmp_path):
     path = tmp_path / "model.ply"
-    write_gaussians(path, moved(gaussians, find_transform("gsplat", load_scene(room))))
+    write_model(path, moved(gaussians, find_transform("gsplat", load_scene(room))))
     with pytest.raises(SceneFormatError, match=r"another frame.*fit with --transform gsplat"):
         load_model(path, room)
     assert evaluate_model(load_model(path, room, transform="gsplat")).psnr == pytest.approx(
@@ -72,7 +72,7 @@ def test_what_gsplats_examples_write_is_refused_and_scored_right(room, gaussians
 def test_a_file_tells_the_transform(kind, room, gaussians, psnr, other, tmp_path):
     path = tmp_path / "point_cloud/iteration_7/point_cloud.ply"
     path.parent.mkdir(parents=True)
-    write_gaussians(path, moved(gaussians, other))
+    write_model(path, moved(gaussians, other))
     rows = other.matrix.tolist()
     unscaled = np.column_stack([other.rotation, other.translation / other.scale]).tolist()
     cameras = [
@@ -131,7 +131,7 @@ def test_what_gives_no_transform_is_refused(room, tmp_path):
 
 
 def test_a_wrong_transform_is_refused_too(room, gaussians, tmp_path):
-    write_gaussians(tmp_path / "model.ply", gaussians)
+    write_model(tmp_path / "model.ply", gaussians)
     with pytest.raises(SceneFormatError, match="They fit with --transform none"):
         load_model(tmp_path / "model.ply", room, transform="gsplat")
 
@@ -151,7 +151,7 @@ def test_a_model_that_lies_a_little_apart_is_scored_with_a_doubt(room, gaussians
     assert not check_world(tmp_path / "model.ply", scene, gaussians)
     gap = np.median(np.linalg.norm(np.diff(gaussians.means, axis=0), axis=1))
     beside = dataclasses.replace(gaussians, means=gaussians.means + np.float32([0, 0, 0.4 * gap]))
-    write_gaussians(tmp_path / "model.ply", beside)
+    write_model(tmp_path / "model.ply", beside)
     model = load_model(tmp_path / "model.ply", room)
     assert "times as far from the nearest Gaussian" in model.doubt
     assert not load_model(tmp_path / "model.ply", room, transform="none").doubt

@@ -15,9 +15,9 @@ import torch
 from PIL import Image as PilImage
 
 from splatseed.errors import OutputError, ParameterError, PointCloudError, SceneFormatError
-from splatseed.evaluate import evaluate_views
 from splatseed.scene import Split
-from splatseed.splat.ply import read_gaussians
+from splatseed.splat.evaluate import evaluate_views
+from splatseed.splat.formats import read_model
 from splatseed.train import device, run as run_module, trainer
 from splatseed.train.parameters import add_to_mean, gaussians_of, length_units
 from splatseed.train.run import RunOptions, prepare_run
@@ -206,7 +206,7 @@ def test_results_are_whole_and_in_the_scenes_world(begin, room):
     assert [test.step for test in result.curve] == list(range(1, 21))
     last, end = result.curve[-1], result.scores
     assert (last.psnr, last.ssim) == pytest.approx((end.psnr, end.ssim), abs=1e-4)
-    assert len(read_gaussians(folder.gaussians)) == result.scores.num_gaussians
+    assert len(read_model(folder.gaussians)) == result.scores.num_gaussians
     assert json.loads(folder.config.read_text())["data_factor"] == 2
     rows = list(csv.DictReader(folder.curve_csv.open()))
     assert int(rows[-1]["step"]) == 20
@@ -293,11 +293,11 @@ def test_a_disk_that_is_full_among_the_results_costs_nothing(begin, monkeypatch)
     assert seen == [True]
     whole = _bytes(run)
 
-    def disk_full(path, _picture):
+    def disk_full(path, *_):
         raise OutputError(f"{path}", found="No space left on device", fix="Free some.")
 
     with monkeypatch.context() as patch:
-        patch.setattr(run_module, "write_picture", disk_full)
+        patch.setattr(run_module, "write_render", disk_full)
         with pytest.raises(OutputError, match=r"No space left.*as of step 30 is kept.*--resume"):
             run.finish(evaluate_views)
     assert not run.folder.metrics.exists()

@@ -10,8 +10,8 @@ import pytest
 pytest.importorskip("torch", reason="rendering needs PyTorch")
 
 from splatseed.io import load_scene
+from splatseed.splat.formats import write_model
 from splatseed.splat.gaussians import initial_gaussians
-from splatseed.splat.ply import write_gaussians
 from splatseed.train.settings import TrainSettings
 
 
@@ -30,5 +30,5 @@ def run_folder(room, tmp_path_factory):
     for name in ("config.json", "splatseed.json"):
         (folder / name).write_text(json.dumps(config))
     gaussians = initial_gaussians(load_scene(room).points, opacity=0.9)
-    write_gaussians(folder / "point_cloud.ply", gaussians)
+    write_model(folder / "point_cloud.ply", gaussians)
     return folder

@@ -12,8 +12,8 @@ torch = pytest.importorskip("torch", reason="training needs PyTorch")
 pytest.importorskip("gsplat", reason="training needs gsplat's strategies")
 pytest.importorskip("viser", reason="the viewer needs viser (extra view)")
 
-from splatseed.evaluate import evaluate_views
 from splatseed.io import load_scene
+from splatseed.splat.evaluate import evaluate_views
 from splatseed.train.run import prepare_run
 from splatseed.train.settings import TrainSettings
 from splatseed.view.pictures import canvas_view, fitted_fov, stage_pose

@@ -232,13 +232,13 @@ def _scorer(spec: RunSpec, bench: Path, lpips: Any, progress: Progress) -> Calla
     These are computed once per scene; it is opened anew for that, so that an arm's depth maps make
     no difference.
     """
-    from splatseed.evaluate import evaluate_views  # noqa: PLC0415  (PyTorch)
     from splatseed.splat.covisible import (  # noqa: PLC0415  (PyTorch)
         find_covisible,
         pixel_masks,
         read_covisible,
         write_covisible,
     )
+    from splatseed.splat.evaluate import evaluate_views  # noqa: PLC0415  (PyTorch)
 
     every = spec.training.test_every
 

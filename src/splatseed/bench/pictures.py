@@ -1,8 +1,8 @@
 """Pictures of a report: each method's seeds from one camera, and test views of the best variant.
 
 Notation: runs keep a few test views as pictures, with photograph, render and error map in a row
-(see ``splatseed.splat.pictures``); descriptors are kept in ``BENCH/descriptors.json``, pictures of
-seeds in ``BENCH/figures`` under names that tell what they depend on. Promise: seeds are made
+(see ``splat.rendering``); descriptors are kept in ``BENCH/descriptors.json``, pictures of seeds in
+``BENCH/figures`` under names that tell what they depend on. Promise: seeds are made
 exactly as in the runs, and only if the scene's files are unchanged; a scene is opened only for what
 is not kept; if it is gone, only its pictures are missing. Both renders of a view are of the same
 repeat; the best variant is chosen by mean gain on the scene, not by the view that is shown.
@@ -36,7 +36,6 @@ from splatseed.io.files import read_file, read_text
 from splatseed.io.photograph import decode_photograph, photograph_bytes
 from splatseed.io.staging import write_json
 from splatseed.progress import Progress, silent
-from splatseed.splat.pictures import GAP
 from splatseed.train.settings import StrategyName
 from splatseed.view.clouds import preview_methods
 
@@ -212,6 +211,8 @@ def _pictures(base: Path, own: Path, best: str) -> tuple[dict[str, bytes], float
 
 def _apart(path: Path) -> UInt8[np.ndarray, "3 H W 3"]:
     """Photograph, render and error map of a picture that has them in a row."""
+    from splatseed.splat.rendering import GAP  # noqa: PLC0415  (imports PyTorch)
+
     pixels = np.asarray(decode_photograph(path, photograph_bytes(path)))
     width = (pixels.shape[1] - 2 * GAP) // 3
     return np.stack([pixels[:, i * (width + GAP) :][:, :width] for i in range(3)])

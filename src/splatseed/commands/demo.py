@@ -417,10 +417,9 @@ def _seed_poses_alone(folder: Path, clock: StageClock) -> list[_Arm]:
 
 def _train_arm(arm: _Arm, settings: TrainSettings, clock: StageClock) -> _Trained:
     """Train from an arm's seeds, and score."""
-    from splatseed.evaluate import evaluate_views  # noqa: PLC0415  (imports PyTorch)
-    from splatseed.splat.pictures import FULL_ERROR, error_map  # noqa: PLC0415  (likewise)
+    from splatseed.splat.evaluate import evaluate_views  # noqa: PLC0415  (imports PyTorch)
+    from splatseed.splat.rendering import FULL_ERROR, as_bytes, error_map  # noqa: PLC0415  (likewise)
     from splatseed.train.run import RunOptions, prepare_run  # noqa: PLC0415  (likewise)
-    from splatseed.view.models import as_bytes  # noqa: PLC0415  (likewise)
     from splatseed.view.page import Tile  # noqa: PLC0415  (likewise)
 
     stage = f"train {arm.label}"

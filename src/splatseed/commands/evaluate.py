@@ -134,8 +134,8 @@ def _evaluate(
     options: Options, task: _Task, lpips: Lpips | None, reason: str, clock: StageClock
 ) -> tuple[EvalResult, str]:
     """Score the test views, write what was asked for, and say why it may be another's scene."""
-    from splatseed.evaluate import evaluate_model, load_model, write_renders  # noqa: PLC0415  (PyTorch)
     from splatseed.splat.covisible import find_covisible, pixel_masks  # noqa: PLC0415  (kernels)
+    from splatseed.splat.evaluate import evaluate_model, load_model, write_renders  # noqa: PLC0415  (PyTorch)
     from splatseed.train.device import pick_device  # noqa: PLC0415  (PyTorch)
 
     clock("read", 0.0)

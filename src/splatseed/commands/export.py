@@ -12,17 +12,16 @@ from splatseed.commands.models import config_of, model_file
 from splatseed.commands.options import parse_options
 from splatseed.console import print_note, print_pairs, stage_display
 from splatseed.errors import OutputError
-from splatseed.export import (
+from splatseed.io.staging import check_parents
+from splatseed.literal import quoted
+from splatseed.splat.formats import (
     FORMATS,
-    check_opacity,
     format_of_name,
     keep_gaussians,
     parse_crop,
     read_model,
     write_model,
 )
-from splatseed.io.staging import check_parents
-from splatseed.literal import quoted
 from splatseed.train.folder import RunFolder
 from splatseed.train.settings import TrainSettings
 
@@ -54,7 +53,6 @@ def run(arguments: list[str]) -> None:
     options = parse_options(Options, "export", arguments)
     name = format_of_name(options.output)
     crop = None if options.crop is None else parse_crop(options.crop)
-    check_opacity(options.min_opacity)
     path = model_file(options.model)
     _check_output(options, path)
     with stage_display() as clock:

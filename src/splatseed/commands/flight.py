@@ -71,9 +71,10 @@ def run(arguments: list[str]) -> None:
     _check(options)
     require("torch", "imageio_ffmpeg")
     # These import PyTorch.
+    from splatseed.splat.rendering import ModelRenderer  # noqa: PLC0415  (likewise)
     from splatseed.train.device import pick_device  # noqa: PLC0415  (loads with its use)
     from splatseed.view.flights import flight_frames, write_video  # noqa: PLC0415  (likewise)
-    from splatseed.view.models import ModelRenderer, stage_frame  # noqa: PLC0415  (likewise)
+    from splatseed.view.models import stage_frame  # noqa: PLC0415  (likewise)
 
     with stage_display() as clock:
         clock("read", 0.0)

@@ -388,7 +388,7 @@ def _line(training: TrainingRun, steps_per_second: float | None) -> str:
 
 
 def _finish(training: TrainingRun, clock: StageClock) -> TrainingResult:
-    from splatseed.evaluate import evaluate_views  # noqa: PLC0415  (imports PyTorch)
+    from splatseed.splat.evaluate import evaluate_views  # noqa: PLC0415  (imports PyTorch)
 
     return training.finish(
         lambda render, views: evaluate_views(render, views, progress=clock), clock

@@ -13,11 +13,11 @@ import tyro
 
 from splatseed.commands.options import parse_options
 from splatseed.console import OUT, print_note, print_pairs, stage_display
-from splatseed.export import SUFFIXES
 from splatseed.io.load import check_there, is_scene
 from splatseed.literal import counted, visible
 from splatseed.requirements import require
 from splatseed.runtime.interruption import Termination, exit_code
+from splatseed.splat.formats import SUFFIXES
 from splatseed.train.folder import RunFolder
 from splatseed.train.settings import Backend
 

@@ -2,13 +2,15 @@
 
 Notation: N Gaussians; ``means`` [N, 3], ``scales`` [N, 3] as logarithms, ``quats`` [N, 4] wxyz of
 any length, ``opacities`` [N] as logits, ``sh0`` [N, 1, 3], ``shN`` [N, 15, 3]: gsplat's names and
-conventions. In the training frame the cameras' centroid is at 0 and the farthest camera at distance
-1, ``x_train = scale (x_world - origin)``; a *stray* camera is so far from all others that its pose
-must be wrong. Promise: arrays here are NumPy, so that a .ply can be read and written without
-PyTorch; equal seeds give equal Gaussians. The frame depends on the training cameras only, so that
-runs from different seeds are compared in one frame, and strays do not affect it; there is no
-rotation, so quaternions and spherical harmonics stay the same; single precision suffices for
-distant origins.
+conventions. Seen along the unit direction d from a camera, a Gaussian has the colour c(d) = 1/2 +
+sum_k y_k(d) h_k with the real spherical harmonics y, up to degree 1 in 3DGS's order and signs y =
+(C0, -C1 d_y, C1 d_z, -C1 d_x). In the training frame the cameras' centroid is at 0 and the farthest
+camera at distance 1, ``x_train = scale (x_world - origin)``; a *stray* camera is so far from all
+others that its pose must be wrong. Promise: arrays here are NumPy, so that a .ply can be read and
+written without PyTorch; equal seeds and views give equal Gaussians, whatever the number of threads.
+The frame depends on the training cameras only, so that runs from different seeds are compared in
+one frame, and strays do not affect it; there is no rotation, so quaternions and spherical harmonics
+stay the same; single precision suffices for distant origins.
 """
 
 from __future__ import annotations
@@ -18,7 +20,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Float64
+from jaxtyping import Bool, Float, Float32, Float64, Int64
+from numpy.lib.stride_tricks import sliding_window_view
 
 from splatseed.errors import PointCloudError
 from splatseed.pointcloud import PointCloud
@@ -26,13 +29,24 @@ from splatseed.views.view import View
 
 SH_C0 = 0.28209479177387814
 """The spherical harmonic of degree 0, 1 / (2 sqrt(pi)); colour = 0.5 + SH_C0 * sh0."""
+SH_C1 = 0.4886025119029199
+"""Constant of degree 1, sqrt(3 / (4 pi))."""
+OWN = 0.3
+"""Weight of a seed's own colour, in photographs."""
+EVEN = 1.0
+"""Weight of the prior against view dependence, in photographs: few views do not determine it."""
+CELL = 4.0
+"""Side in pixels of the cells within which seeds occlude each other."""
+MOST_PROJECTIONS = 50_000_000
+"""Limit on seeds times views: beyond it, an even subset of the views is used."""
+LEAST_VIEWS = 16
+"""But never fewer views than this."""
 NEIGHBORS = 3
 """Neighbours whose mean square distance is a Gaussian's first size, as in 3DGS."""
 GAP = 10.0
 """Largest initial scale, relative to the median: beyond it a point is isolated."""
 COINCIDENT = 1e-2
 """Smallest initial scale, relative to the median: coincident points would stay invisible."""
-MIN_POINTS = 2
 SCENE_SCALE = 1.1
 """Scene size for the strategies and the learning rate of positions: the cameras' extent plus a
 tenth, as in 3DGS."""
@@ -68,6 +82,10 @@ class Gaussians:
         """The parameters by name, in the order above."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
+    def select(self, index: Bool[np.ndarray, " N"] | Int64[np.ndarray, " M"]) -> Gaussians:
+        """Some of the Gaussians, by index or mask."""
+        return Gaussians(**{name: array[index] for name, array in self.arrays().items()})
+
 
 def initial_gaussians(
     seeds: PointCloud,
@@ -96,7 +114,10 @@ def initial_gaussians(
         PointCloudError: Fewer than two distinct finite points.
     """
     count, rest = len(seeds), (sh_degree + 1) ** 2 - 1
-    sizes = _first_sizes(seeds) * scale_factor
+    sizes = neighbor_distances(seeds.xyz)
+    if seeds.sizes is not None:
+        sizes = np.where(np.isnan(seeds.sizes), sizes, seeds.sizes.astype(np.float64))
+    sizes = sizes * scale_factor
     if largest is not None:
         sizes = np.minimum(sizes, largest)
     scales = np.repeat(np.log(sizes)[:, None], 3, axis=1)
@@ -122,20 +143,10 @@ def initial_gaussians(
     )
 
 
-def _first_sizes(seeds: PointCloud) -> Float64[np.ndarray, " N"]:
-    """Each seed's own size if known, else the size of the gap around it."""
-    gaps = neighbor_distances(seeds.xyz)
-    if seeds.sizes is None:
-        return gaps
-    return np.where(np.isnan(seeds.sizes), gaps, seeds.sizes.astype(np.float64))
-
-
 def _quats_to(normals: Float32[np.ndarray, "M 3"]) -> Float64[np.ndarray, "M 4"]:
-    """Unit wxyz quaternions of the shortest rotations of the z axis onto normals or opposites.
-
-    The rotation from z to n is (1 + n_z, z x n), normalised; a disc has no front, so the n with
-    n_z >= 0 is used, for which that never vanishes.
-    """
+    """Unit wxyz quaternions of the shortest rotations of the z axis onto normals or opposites."""
+    # From z to n it is (1 + n_z, z x n), normalised; a disc has no front: that never vanishes for
+    # the n with n_z >= 0.
     front = normals.astype(np.float64) * np.where(normals[:, 2:] < 0, -1.0, 1.0)
     x, y, z = (front / np.linalg.norm(front, axis=1, keepdims=True)).T
     quats = np.stack([1.0 + z, -y, x, np.zeros_like(z)], axis=1)
@@ -143,32 +154,85 @@ def _quats_to(normals: Float32[np.ndarray, "M 3"]) -> Float64[np.ndarray, "M 4"]
 
 
 def neighbor_distances(xyz: Float[np.ndarray, "N 3"]) -> Float64[np.ndarray, " N"]:
-    """Root mean square distance to the 3 nearest others, bounded relative to the median, [N].
+    """Root mean square distance to the 3 nearest others as in 3DGS, bounded relative to the median.
 
     Raises:
         PointCloudError: Fewer than two distinct finite points.
     """
-    squares = _squared_distances(xyz)
-    median = np.sqrt(np.median(squares[squares > 0])) if (squares > 0).any() else 0.0
-    if not median > 0:
+    from scipy.spatial import cKDTree  # noqa: PLC0415  (slow to import)
+
+    squares = np.zeros(len(xyz))
+    if len(xyz) > 1:
+        # An unbalanced tree is built several times faster and queried as fast.
+        tree = cKDTree(xyz, balanced_tree=False, compact_nodes=False)
+        distances, _ = tree.query(xyz, k=min(NEIGHBORS, len(xyz) - 1) + 1, workers=-1)
+        squares = (distances[:, 1:] ** 2).mean(axis=1)
+    if not (squares > 0).any():
         raise PointCloudError(
-            f"at least {MIN_POINTS} distinct finite points to start from",
+            "at least 2 distinct finite points to start from",
             found=f"{len(xyz)} points in one place",
             fix="Check that the scene was read correctly (splatseed info SCENE).",
         )
-    # Root mean square of the distances, as in 3DGS.
+    median = np.sqrt(np.median(squares[squares > 0]))
     return np.asarray(np.clip(np.sqrt(squares), COINCIDENT * median, GAP * median))
 
 
-def _squared_distances(xyz: Float[np.ndarray, "N 3"]) -> Float64[np.ndarray, " N"]:
-    if len(xyz) < MIN_POINTS:
-        return np.zeros(len(xyz))
-    # An unbalanced tree is built several times faster and queried as fast.
-    from scipy.spatial import cKDTree  # noqa: PLC0415  (slow to import)
+def fit_harmonics(seeds: PointCloud, views: Sequence[View]) -> Float32[np.ndarray, "N 4 3"]:
+    """Coefficients h of each seed: ridge regression over the views that see it.
 
-    tree = cKDTree(xyz, balanced_tree=False, compact_nodes=False)
-    distances, _ = tree.query(xyz, k=min(NEIGHBORS, len(xyz) - 1) + 1, workers=-1)
-    return np.asarray((distances[:, 1:] ** 2).mean(axis=1))
+    With the colours p_v seen by V views along directions d_v, and the seed's own colour p, it
+    solves min over h of sum_v |1/2 + y(d_v) h - p_v|^2 + OWN |1/2 + C0 h_0 - p|^2 + EVEN |C1
+    h_1..3|^2, a ridge regression of four unknowns per colour channel. A seed that no view sees
+    keeps its colour.
+
+    Args:
+        seeds: N points and their colours.
+        views: Photographs with their cameras, in the points' frame.
+    """
+    xyz = np.ascontiguousarray(seeds.xyz, np.float32)
+    # Normal equations; OWN and EVEN make them regular even for a seed that no view sees.
+    normal = np.tile(np.diag([OWN * SH_C0**2, *[EVEN * SH_C1**2] * 3]), (len(xyz), 1, 1))
+    right = np.zeros((len(xyz), 4, 3))
+    right[:, 0] = OWN * SH_C0 * (seeds.rgb / 255.0 - 0.5)
+    most = max(LEAST_VIEWS, MOST_PROJECTIONS // max(1, len(xyz)))
+    asked = np.linspace(0, len(views) - 1, min(most, len(views))).round().astype(int)
+    for view in [views[i] for i in np.unique(asked)]:
+        index, column, row = _shown(xyz, view)
+        sight = xyz[index].astype(np.float64) - _centers([view])[0]
+        d = sight / np.maximum(np.linalg.norm(sight, axis=1, keepdims=True), 1e-12)
+        ones = np.full(len(d), SH_C0)
+        basis = np.stack([ones, -SH_C1 * d[:, 1], SH_C1 * d[:, 2], -SH_C1 * d[:, 0]], axis=1)
+        # Mean colours of the 3 x 3 pixels around; border pixels are repeated.
+        framed = np.pad(view.photograph, ((1, 1), (1, 1), (0, 0)), "edge")
+        around = sliding_window_view(framed, (3, 3), axis=(0, 1))[row, column]
+        colors = around.sum(axis=(2, 3)) / (9 * 255.0) - 0.5
+        normal[index] += basis[:, :, None] * basis[:, None, :]
+        right[index] += basis[:, :, None] * colors[:, None, :]
+    return np.linalg.solve(normal, right).astype(np.float32)
+
+
+def _shown(
+    xyz: Float32[np.ndarray, "N 3"], view: View
+) -> tuple[Int64[np.ndarray, " M"], Int64[np.ndarray, " M"], Int64[np.ndarray, " M"]]:
+    """Seeds in the photograph that none in the same or a neighbouring cell occludes.
+
+    Their indices, columns and rows.
+    """
+    from splatseed.seeding.coverage import NEARER, cell_depths, grid_of  # noqa: PLC0415  (kernels)
+
+    # Pixels times depth, and depth, in written-out sums: BLAS's order varies with threads.
+    matrix, columns = view.K @ view.cam_from_world[:3], xyz.T.astype(np.float64)
+    x, y, depth = (m[0] * columns[0] + m[1] * columns[1] + m[2] * columns[2] + m[3] for m in matrix)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        column, row = x / depth, y / depth
+    inside = (depth > 0) & (column >= 0) & (column < view.width) & (row >= 0) & (row < view.height)
+    index = np.flatnonzero(inside)
+    column, row = column[index].astype(np.int64), row[index].astype(np.int64)
+    (rows, cols), depths = grid_of(view, CELL), cell_depths(view, xyz, CELL)
+    nearest = depths[row * rows // view.height, column * cols // view.width]
+    # A tenth behind the cell's depth still counts as its surface.
+    seen = (depth[index] <= nearest * (1 + NEARER)) & np.isfinite(nearest)
+    return index[seen], column[seen], row[seen]
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,7 +305,6 @@ def stray_note(name: str) -> str:
 
 
 def _centers(views: Sequence[View]) -> Float64[np.ndarray, "V 3"]:
-    """The cameras' positions in the world."""
     return np.array([-view.cam_from_world[:3, :3].T @ view.cam_from_world[:3, 3] for view in views])
 
 
@@ -250,9 +313,8 @@ def _is_stray(centers: Float64[np.ndarray, "V 3"]) -> Bool[np.ndarray, " V"]:
     if len(centers) < MIN_CAMERAS:
         return np.zeros(len(centers), bool)
     distances = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
-    # The nearest nine tenths of the cameras can be no strays.
+    # The nearest nine tenths of the cameras can be no strays: the distance of their farthest.
     usual = max(1, len(centers) - max(1, round(STRAY_SHARE * len(centers))))
-    # The farthest of those that cannot be strays.
     reach = np.partition(distances, usual - 1)[usual - 1]
     rounding = 1e-9 * float(np.abs(np.median(centers, axis=0)).max())
     return np.asarray((distances > STRAY_DISTANCE * reach) & (reach > rounding))

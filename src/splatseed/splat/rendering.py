@@ -1,29 +1,40 @@
 """Rendering Gaussians from a view, and the photographs that renders are compared with.
 
 Notation: gsplat's parameter dict as tensors: ``means``, ``scales`` (logarithms), ``quats``,
-``opacities`` (logits), ``sh0``, ``shN``. Promise: one rasteriser call serves training and scoring
-on CPU and CUDA alike; a view's camera is copied to a GPU once, and no step waits for its
-photograph. As bytes all photographs mostly fit on a GPU, and each is copied once; otherwise each
-step sends its own from pinned memory, which the GPU fetches while it works on the step before.
+``opacities`` (logits), ``sh0``, ``shN``; the error of a pixel is the mean over the channels of
+|render - photograph|, 0 to 1. Promise: one rasteriser serves training, scoring and viewing on CPU
+and CUDA alike; a view's camera is copied to a GPU once, and no step waits for its photograph. As
+bytes all photographs mostly fit on a GPU, and each is copied once; otherwise each step sends its
+own from pinned memory, which the GPU fetches while it works on the step before.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Float32, UInt8
 from torch import Tensor
 
+from splatseed.io.staging import atomic_file
 from splatseed.render import rasterization
 from splatseed.runtime.torch_device import free_bytes
+from splatseed.splat.gaussians import Gaussians, TrainingFrame
 from splatseed.views.view import View
 
 SHARE = 0.25
 """Most of a GPU's free memory that photographs may take."""
+LEAST_ALPHA = 0.05
+"""Alpha below which a pixel has no depth."""
+FULL_ERROR = 0.25
+"""The error that is drawn brightest, in all pictures, so that they can be compared."""
+GAP = 4
+"""White columns between the pictures of a row."""
 
 
 class CameraTensors(NamedTuple):
@@ -60,8 +71,9 @@ def render_view(
         view: The view whose camera is used.
         sh_degree: Degree of spherical harmonics in use; coefficients beyond it are ignored.
     """
-    images, info = _rasterize(params, view, _harmonics(params, sh_degree), sh_degree)
-    return images, info
+    # Unused coefficients would cost copies and optimiser steps for nothing.
+    colors = params["sh0"] if sh_degree == 0 else (params["sh0"], params["shN"])
+    return _rasterize(params, view, colors, sh_degree)
 
 
 def render_features(
@@ -97,11 +109,66 @@ def _rasterize(
     return images.squeeze(0), info  # unlike indexing, its backward allocates no image of zeros
 
 
-def _harmonics(
-    params: Mapping[str, Tensor] | torch.nn.ParameterDict, sh_degree: int
-) -> Tensor | tuple[Tensor, Tensor]:
-    """The coefficients in use; unused ones would cost copies and optimiser steps for nothing."""
-    return params["sh0"] if sh_degree == 0 else (params["sh0"], params["shN"])
+class ModelRenderer:
+    """Renders Gaussians of the world, without gradients.
+
+    Args:
+        gaussians: In world coordinates.
+        frame: The frame to render in: near planes and single precision work there.
+        device: Where to render; the CPU when left out.
+    """
+
+    def __init__(
+        self, gaussians: Gaussians, frame: TrainingFrame, device: torch.device | None = None
+    ) -> None:
+        self.frame = frame
+        self.count = len(gaussians)
+        self._degree = math.isqrt(1 + gaussians.shN.shape[1]) - 1
+        tensors = {name: torch.tensor(a, device=device) for name, a in gaussians.arrays().items()}
+        self._means = torch.tensor(frame.points_from_world(gaussians.means), device=device)
+        self._shapes: dict[str, Any] = {
+            "quats": tensors["quats"],
+            "scales": torch.exp(tensors["scales"] + math.log(frame.scale)),
+            "opacities": torch.sigmoid(tensors["opacities"]),
+        }
+        colors = (tensors["sh0"], tensors["shN"]) if self._degree else tensors["sh0"]
+        if isinstance(colors, tuple) and self._means.is_cuda:
+            # gsplat takes them joined, our own rasteriser in two: joined once, not for every frame.
+            colors = torch.cat(colors, dim=1)
+        self._colors = colors
+
+    def image(self, view: View) -> Float[Tensor, "H W 3"]:
+        """The render of a view of the world, about 0 to 1; the background is black."""
+        return self._images(view, "RGB")[0]
+
+    def color(self, view: View) -> Float32[np.ndarray, "H W 3"]:
+        """Likewise, clamped to [0, 1]."""
+        return np.asarray(self.image(view).clamp_(0, 1).cpu().numpy())
+
+    def depth(self, view: View) -> Float32[np.ndarray, "H W"]:
+        """Expected planar depth in world units; 0 where there is none."""
+        images, alphas = self._images(view, "ED")
+        depth = torch.where(alphas > LEAST_ALPHA, images, 0)[..., 0] / self.frame.scale
+        return np.asarray(depth.cpu().numpy())
+
+    @torch.no_grad()
+    def _images(self, view: View, mode: Literal["RGB", "ED"]) -> tuple[Tensor, Tensor]:
+        camera = camera_of(self.frame.view(view), self._means.device)
+        images, alphas, _ = rasterization(
+            means=self._means,
+            **self._shapes,
+            colors=self._colors,
+            sh_degree=self._degree,
+            viewmats=camera.viewmats,
+            Ks=camera.Ks,
+            width=view.width,
+            height=view.height,
+            render_mode=mode,
+        )
+        return images[0], alphas[0]
+
+
+# Photographs --------------------------------------------------------------------------------------
 
 
 class Photographs:
@@ -136,9 +203,56 @@ def photograph_of(view: View, device: torch.device) -> Float[Tensor, "H W 3"]:
 
 
 def _pixels_of(view: View, device: torch.device) -> UInt8[Tensor, "H W 3"]:
-    """The view's photograph in bytes."""
     # A copy: PyTorch warns on stderr about read-only arrays, which a view's may be.
     pixels = torch.tensor(view.photograph)
     if device.type == "cuda":  # from pinned memory a GPU fetches it while it works on earlier steps
         pixels = pixels.pin_memory()
     return pixels.to(device, non_blocking=True)
+
+
+# Pictures -----------------------------------------------------------------------------------------
+
+
+def error_map(
+    photograph: UInt8[np.ndarray, "H W 3"], render: Float32[np.ndarray, "H W 3"]
+) -> UInt8[np.ndarray, "H W 3"]:
+    """The error of each pixel as a colour: black is none, ``FULL_ERROR`` or more the brightest.
+
+    Args:
+        photograph: The view as captured.
+        render: What the Gaussians look like, 0 to 1; clamped.
+    """
+    from matplotlib import colormaps  # noqa: PLC0415  (slow to import)
+
+    error = np.abs(np.clip(render, 0.0, 1.0) - photograph / np.float32(255)).mean(axis=2)
+    colors = colormaps["inferno"](np.minimum(error / FULL_ERROR, 1.0), bytes=True)
+    return np.asarray(colors[..., :3], np.uint8)
+
+
+def as_bytes(image: Float32[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
+    """Colours in [0, 1] as 8-bit integers; others are clamped."""
+    return np.asarray(np.rint(np.clip(image, 0, 1) * 255), np.uint8)
+
+
+def write_render(
+    path: Path,
+    photograph: UInt8[np.ndarray, "H W 3"],
+    render: Float[Tensor, "H W 3"] | Float32[np.ndarray, "H W 3"],
+) -> None:
+    """Write a PNG of photograph, render and error map in a row.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    from PIL import Image  # noqa: PLC0415  (slow to import)
+
+    pixels = render.cpu().numpy() if isinstance(render, Tensor) else render
+    gap = np.full((len(photograph), GAP, 3), 255, np.uint8)
+    row = [photograph, gap, as_bytes(pixels), gap, error_map(photograph, pixels)]
+    with atomic_file(path) as partial:
+        Image.fromarray(np.concatenate(row, axis=1)).save(partial)
+
+
+def picture_name(image_name: str) -> str:
+    """The file name of an image's picture; folders in the name become part of it."""
+    return Path(image_name).with_suffix("").as_posix().replace("/", "_") + ".png"

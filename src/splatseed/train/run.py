@@ -23,9 +23,9 @@ from splatseed.progress import Progress, silent
 from splatseed.requirements import require
 from splatseed.scene import Scene
 from splatseed.scores import CurvePoint, EvalResult, TrainingResult
+from splatseed.splat.formats import write_model
 from splatseed.splat.gaussians import TrainingFrame, stray_note, stray_views, training_frame
-from splatseed.splat.pictures import beside_photograph, picture_name, write_picture
-from splatseed.splat.ply import write_gaussians
+from splatseed.splat.rendering import picture_name, write_render
 from splatseed.splat.ssim import WINDOW
 from splatseed.train.depths import known_depths
 from splatseed.train.device import (
@@ -299,7 +299,7 @@ class TrainingRun:
             world = self._frame.gaussians_to_world(gaussians_of(self.state.params))
             scores = replace(scores, num_gaussians=len(world), model_bytes=world.num_bytes)
             result = self._result(scores)
-            write_gaussians(self.folder.gaussians, world)
+            write_model(self.folder.gaussians, world)
             write_curve_csv(self.folder.curve_csv, self.state.records)
             write_curve_png(self.folder.curve_png, self.state.records)
             self._write_renders(progress)
@@ -356,6 +356,5 @@ class TrainingRun:
         names = [picture_name(view.name) for view in views]
         self.folder.claim([self.folder.renders / name for name in names])
         for i, (view, name) in enumerate(zip(views, names, strict=True)):
-            picture = beside_photograph(view.photograph, self.trainer.render(view).cpu().numpy())
-            write_picture(self.folder.renders / name, picture)
+            write_render(self.folder.renders / name, view.photograph, self.trainer.render(view))
             progress("write", (i + 1) / len(views))

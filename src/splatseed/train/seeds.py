@@ -24,7 +24,13 @@ from splatseed.io.seeds import saw_all_photographs, was_upsampled
 from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.progress import Progress
 from splatseed.scene import Scene
-from splatseed.splat.gaussians import Gaussians, initial_gaussians, stray_views, training_frame
+from splatseed.splat.gaussians import (
+    Gaussians,
+    fit_harmonics,
+    initial_gaussians,
+    stray_views,
+    training_frame,
+)
 from splatseed.train.depths import stereo_size
 from splatseed.train.settings import AS_3DGS, TrainSettings
 from splatseed.views.view import View
@@ -193,8 +199,6 @@ def first_gaussians(
     lengths, schedule = near_depths(seeds.xyz, views), settings.schedule
     harmonics = None
     if settings.seed_colors:
-        from splatseed.splat.appearance import fit_harmonics  # noqa: PLC0415  (kernels load with use)
-
         harmonics = fit_harmonics(seeds, views)
     gaussians = initial_gaussians(
         seeds,

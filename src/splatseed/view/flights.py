@@ -27,10 +27,9 @@ from splatseed.progress import Progress, silent
 from splatseed.requirements import require
 from splatseed.similarity import Similarity
 from splatseed.splat.gaussians import Gaussians, stray_views
+from splatseed.splat.rendering import ModelRenderer, as_bytes
 from splatseed.view.models import (
     CORE,
-    ModelRenderer,
-    as_bytes,
     depth_colors,
     depth_range,
     pinhole_view,

@@ -9,22 +9,18 @@ scene if the run or the user names it; no gradients are computed, and renders ar
 from __future__ import annotations
 
 import dataclasses
-import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
 
 import numpy as np
-import torch
 from jaxtyping import Float32, Float64, UInt8
 from PIL import Image as PillowImage, ImageDraw
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
-from splatseed.export import detect_format, read_model
 from splatseed.io import load_scene
 from splatseed.io.files import read_bytes
-from splatseed.render.rasterize import rasterization
 from splatseed.scene import Scene
+from splatseed.splat.formats import detect_format, read_model
 from splatseed.splat.gaussians import Gaussians, TrainingFrame, training_frame
 from splatseed.train.folder import RunFolder
 from splatseed.view.page import font, latin, map_colors
@@ -34,8 +30,6 @@ MODEL_SUFFIXES = (".spz", ".splat", ".sog", ".ksplat", ".glb")
 _HEADER = 1 << 16
 CORE = 0.6
 """Share of the points, nearest to their median, that the stage is fitted to without cameras."""
-LEAST_ALPHA = 0.05
-"""Alpha below which a pixel has no depth."""
 LINE, WHITE = 2, 255
 """Width and colour of the border between two pictures."""
 
@@ -184,67 +178,6 @@ def with_size(view: View, width: int, height: int) -> View:
     K = np.diag([scale, scale, 1.0]) @ view.K
     K[0, 2] += (width - scale * view.width) / 2
     return dataclasses.replace(view, K=K, width=width, height=height)
-
-
-class ModelRenderer:
-    """Renders Gaussians given in world coordinates.
-
-    Args:
-        gaussians: In world coordinates.
-        frame: The stage to render on.
-        device: Where to render; the CPU when left out.
-    """
-
-    def __init__(
-        self, gaussians: Gaussians, frame: TrainingFrame, device: torch.device | None = None
-    ) -> None:
-        self.frame = frame
-        self.count = len(gaussians)
-        self._degree = math.isqrt(1 + gaussians.shN.shape[1]) - 1
-        tensors = {name: torch.tensor(a, device=device) for name, a in gaussians.arrays().items()}
-        self._means = torch.tensor(frame.points_from_world(gaussians.means), device=device)
-        self._shapes: dict[str, Any] = {
-            "quats": tensors["quats"],
-            "scales": torch.exp(tensors["scales"] + math.log(frame.scale)),
-            "opacities": torch.sigmoid(tensors["opacities"]),
-        }
-        colors = (tensors["sh0"], tensors["shN"]) if self._degree else tensors["sh0"]
-        if isinstance(colors, tuple) and self._means.is_cuda:
-            # gsplat takes them joined, our own rasteriser in two: joined once, not for every frame.
-            colors = torch.cat(colors, dim=1)
-        self._colors = colors
-
-    @torch.no_grad()
-    def color(self, view: View) -> Float32[np.ndarray, "H W 3"]:
-        """The rendered view, in [0, 1]; the background is black."""
-        return np.asarray(self._images(view, "RGB")[0].clamp_(0, 1).cpu().numpy())
-
-    @torch.no_grad()
-    def depth(self, view: View) -> Float32[np.ndarray, "H W"]:
-        """Expected planar depth in world units; 0 where there is none."""
-        images, alphas = self._images(view, "ED")
-        depth = torch.where(alphas > LEAST_ALPHA, images, 0)[..., 0] / self.frame.scale
-        return np.asarray(depth.cpu().numpy())
-
-    def _images(self, view: View, mode: Literal["RGB", "ED"]) -> tuple[torch.Tensor, torch.Tensor]:
-        posed, device = self.frame.view(view), self._means.device
-        images, alphas, _ = rasterization(
-            means=self._means,
-            **self._shapes,
-            colors=self._colors,
-            sh_degree=self._degree,
-            viewmats=torch.tensor(posed.cam_from_world[None], dtype=torch.float32, device=device),
-            Ks=torch.tensor(posed.K[None], dtype=torch.float32, device=device),
-            width=posed.width,
-            height=posed.height,
-            render_mode=mode,
-        )
-        return images[0], alphas[0]
-
-
-def as_bytes(image: Float32[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
-    """Colours in [0, 1] as 8-bit integers."""
-    return np.asarray(np.rint(np.clip(image, 0, 1) * 255), np.uint8)
 
 
 def depth_range(depth: Float32[np.ndarray, "*S"]) -> tuple[float, float]:

@@ -27,13 +27,11 @@ from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene
 from splatseed.seeding.coverage import covered_cells
 from splatseed.splat.gaussians import Gaussians, TrainingFrame
-from splatseed.splat.pictures import error_map
+from splatseed.splat.rendering import ModelRenderer, as_bytes, error_map
 from splatseed.upsample.registry import origin_name
 from splatseed.view.clouds import cell_picture
 from splatseed.view.models import (
-    ModelRenderer,
     Shown,
-    as_bytes,
     depth_colors,
     depth_range,
     pinhole_view,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from splatseed.io import load_scene
-from splatseed.splat.ply import read_gaussians
+from splatseed.splat.formats import read_model
 
 
 def test_the_first_gaussians_stand_where_the_seeds_are(room, tmp_path, splatseed):
@@ -15,7 +15,7 @@ def test_the_first_gaussians_stand_where_the_seeds_are(room, tmp_path, splatseed
     )
     assert run.code == 0, run.err
     assert str(start) in run.out + run.err
-    gaussians, seeds = read_gaussians(start), load_scene(out).points
+    gaussians, seeds = read_model(start), load_scene(out).points
     assert len(gaussians) == len(seeds)
     extent = np.ptp(seeds.xyz, axis=0).max()
     np.testing.assert_allclose(gaussians.means, seeds.xyz, atol=1e-6 * extent)

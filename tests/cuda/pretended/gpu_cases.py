@@ -26,7 +26,7 @@ import pytest
 import torch
 
 from splatseed.errors import MissingDependencyError, PointCloudError
-from splatseed.evaluate import evaluate_views
+from splatseed.splat.evaluate import evaluate_views
 from splatseed.splat.metrics import l1_and_ssim_by_convolution, ssim_of_all
 from splatseed.io import load_scene
 from splatseed.runtime import torch_device

@@ -25,7 +25,7 @@ from splatseed.seeding.photographs import (
     read_views,
 )
 from splatseed.seeding.upsampling import CELL
-from splatseed.splat.ply import write_gaussians
+from splatseed.splat.formats import write_model
 from splatseed.train.seeds import gaussians_of_scene
 from splatseed.train.settings import TrainSettings
 from splatseed.upsample import Profile, Upsampler, configure
@@ -141,7 +141,7 @@ def write_start(path: Path, scene: Scene, method: Upsampler, progress: Progress)
     images = photographed(scene, getattr(method, "hold_out", 0))
     views = read_views(scene, images, MAX_SIZE, progress)
     settings = TrainSettings(strategy="grow", seed_colors=True)
-    write_gaussians(path, gaussians_of_scene(scene.points, views, settings))
+    write_model(path, gaussians_of_scene(scene.points, views, settings))
 
 
 def write_previews(

@@ -1,8 +1,5 @@
 """Scores of Gaussians: how close renders come to photographs that were not used for training.
 
-``evaluate_views`` scores any function from a view to an image; ``load_model`` and
-``evaluate_model`` a file of Gaussians in the world of its scene, whoever trained it.
-
 Notation: a render and a photograph are [H, W, 3], sRGB values 0..1, not linearised. Promise:
 renders are clamped to [0, 1] and not rounded to 8 bits; each view is scored at its own size; SSIM
 has an 11 x 11 Gaussian window (sigma 1.5) and images mirrored at their edges, which is what
@@ -14,12 +11,11 @@ for a distant world; the background is black. Needs PyTorch (``pip install ".[tr
 from __future__ import annotations
 
 import dataclasses
-import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -32,15 +28,14 @@ import torch
 from torch import Tensor
 
 from splatseed.errors import ParameterError, SceneNotFoundError
-from splatseed.export import read_model
 from splatseed.io import load_scene
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 from splatseed.scores import NOT_ASKED, EvalResult, ViewScore
-from splatseed.splat.gaussians import Gaussians, TrainingFrame, training_frame
+from splatseed.splat.formats import read_model
+from splatseed.splat.gaussians import Gaussians, training_frame
 from splatseed.splat.metrics import Lpips, psnr, ssim_of_all
-from splatseed.splat.pictures import beside_photograph, picture_name, write_picture
-from splatseed.splat.rendering import photograph_of, render_view
+from splatseed.splat.rendering import ModelRenderer, photograph_of, picture_name, write_render
 from splatseed.splat.ssim import WINDOW
 from splatseed.splat.world import NO_TRANSFORM, check_world, find_transform, view_in
 from splatseed.views.view import View, load_views, poses_of
@@ -106,7 +101,19 @@ def _score(
     start = _now()
     image = render(view)
     seconds = _now() - start
-    _check(image, view)
+    expected = (view.height, view.width, 3)
+    if tuple(image.shape) != expected:
+        raise ParameterError(
+            f"a render of {view.name} of shape {list(expected)}",
+            found=f"{list(image.shape)}",
+            fix="Render views at their own width and height.",
+        )
+    if not bool(torch.isfinite(image).all()):
+        raise ParameterError(
+            f"a render of {view.name} of finite values",
+            found="NaN or infinity",
+            fix="The model has values that are not finite: train it again.",
+        )
     image, photograph = image.clamp(0.0, 1.0), photograph_of(view, image.device)
     score = ViewScore(
         view.name,
@@ -130,22 +137,6 @@ def _now() -> float:
     if torch.cuda.is_available():
         torch.cuda.synchronize()
     return time.perf_counter()
-
-
-def _check(image: Tensor, view: View) -> None:
-    expected = (view.height, view.width, 3)
-    if tuple(image.shape) != expected:
-        raise ParameterError(
-            f"a render of {view.name} of shape {list(expected)}",
-            found=f"{list(image.shape)}",
-            fix="Render views at their own width and height.",
-        )
-    if not bool(torch.isfinite(image).all()):
-        raise ParameterError(
-            f"a render of {view.name} of finite values",
-            found="NaN or infinity",
-            fix="The model has values that are not finite: train it again.",
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,7 +172,7 @@ def load_model(
     """Read Gaussians that any trainer wrote, and the test views of their scene.
 
     Args:
-        path: A file of Gaussians in any format that ``export.read_model`` reads.
+        path: A file of Gaussians in any format that ``read_model`` reads.
         scene_path: The scene.
         data_factor: The factor by which photographs are downsampled.
         test_every: Every n-th image, sorted by name, is a test view.
@@ -217,59 +208,20 @@ def load_model(
     world = None if transform is None else find_transform(transform, scene)
     doubt = "" if transform == NO_TRANSFORM else check_world(path, scene, gaussians, world)
     frame = training_frame([view_in(world, view) for view in poses_of(train)])
-    render = gaussian_renderer(gaussians, frame, device)
-    return TrainedModel(gaussians, views, lambda view: render(view_in(world, view)), scene, doubt)
+    image = ModelRenderer(gaussians, frame, device).image
+    return TrainedModel(gaussians, views, lambda view: image(view_in(world, view)), scene, doubt)
 
 
-def evaluate_model(
-    model: TrainedModel,
-    *,
-    lpips: Lpips | None = None,
-    lpips_reason: str = NOT_ASKED,
-    covisible: Covisible | None = None,
-    progress: Progress = silent,
-) -> EvalResult:
-    """Score a model on its test views, and count its Gaussians; see ``evaluate_views``.
+def evaluate_model(model: TrainedModel, **options: Any) -> EvalResult:
+    """Score a model on its test views, and count its Gaussians; options as of ``evaluate_views``.
 
     Raises:
         ParameterError: A render is not finite.
     """
-    result = evaluate_views(
-        model.render,
-        model.views,
-        lpips=lpips,
-        lpips_reason=lpips_reason,
-        covisible=covisible,
-        progress=progress,
-    )
+    result = evaluate_views(model.render, model.views, **options)
     return dataclasses.replace(
         result, num_gaussians=len(model.gaussians), model_bytes=model.gaussians.num_bytes
     )
-
-
-def gaussian_renderer(
-    gaussians: Gaussians, frame: TrainingFrame, device: torch.device | None = None
-) -> Render:
-    """A function that renders views in the world, without gradients.
-
-    Args:
-        gaussians: In world coordinates.
-        frame: The frame to render in.
-        device: Where to render; the CPU when left out.
-    """
-    in_frame = dataclasses.replace(
-        gaussians,
-        means=frame.points_from_world(gaussians.means),
-        scales=gaussians.scales + np.float32(math.log(frame.scale)),
-    )
-    tensors = {k: torch.tensor(array, device=device) for k, array in in_frame.arrays().items()}
-    sh_degree = math.isqrt(1 + gaussians.shN.shape[1]) - 1
-
-    @torch.no_grad()
-    def render(view: View) -> Float[Tensor, "H W 3"]:
-        return render_view(tensors, frame.view(view), sh_degree)[0]
-
-    return render
 
 
 def write_renders(model: TrainedModel, folder: Path, progress: Progress = silent) -> None:
@@ -279,6 +231,5 @@ def write_renders(model: TrainedModel, folder: Path, progress: Progress = silent
         OutputError: A file cannot be written.
     """
     for done, view in enumerate(model.views):
-        picture = beside_photograph(view.photograph, model.render(view).cpu().numpy())
-        write_picture(folder / picture_name(view.name), picture)
+        write_render(folder / picture_name(view.name), view.photograph, model.render(view))
         progress("write", (done + 1) / len(model.views))

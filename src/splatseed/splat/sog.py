@@ -20,17 +20,9 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt8
 
 from splatseed.errors import SceneFormatError
-from splatseed.export.packing import (
-    SH_COUNTS,
-    from_smallest_three,
-    morton_order,
-    opacity_bytes,
-    opacity_logits,
-    rounded_bytes,
-    smallest_three,
-)
 from splatseed.io.files import guarded, read_bytes
 from splatseed.progress import Progress, silent
+from splatseed.splat import packed
 from splatseed.splat.gaussians import Gaussians
 
 CONVERTER = "npx @playcanvas/splat-transform"
@@ -40,8 +32,8 @@ _VERSION = 2
 _META = "meta.json"
 _PER_ROW = 64
 """Palette entries per row of the centroid picture."""
-_MOST_LEVELS, _LEAST_LEVELS = 16, 10
-"""The palette grows with the number of Gaussians, from 2^10 to 2^16 entries at most."""
+_MOST_LEVELS = 16
+"""The palette grows with the number of Gaussians, to 2^16 entries at most."""
 _MOST_BYTES = 2**31
 _MOST_META = 1 << 24
 """Larger parts of an archive are refused unread; meta.json takes some kilobytes."""
@@ -56,18 +48,25 @@ _STAMP = (1980, 1, 1, 0, 0, 0)
 """The timestamp of each picture in the zip, fixed so that equal Gaussians give equal bytes."""
 
 
-def encode(gaussians: Gaussians, progress: Progress = silent) -> bytes:
+def encode(gaussians: Gaussians, progress: Progress = silent) -> list[bytes]:
     """The bytes of a file with the Gaussians, in Z-curve order."""
-    order = morton_order(gaussians.means)
-    low, high, positions = _encoded_positions(gaussians.means[order])
-    largest, three = smallest_three(gaussians.quats[order])
+    from PIL import Image  # noqa: PLC0415  (slow to import)
+
+    order = packed.morton_order(gaussians.means)
+    # sign(p) log(1 + |p|): finer steps near the middle of the scene
+    means = gaussians.means[order].astype(np.float64)
+    curved = np.sign(means) * np.log1p(np.abs(means))
+    low, high = curved.min(axis=0), curved.max(axis=0)
+    positions = np.rint((curved - low) / np.where(high > low, high - low, 1) * 65535)
+    positions = positions.astype(np.int64)
+    largest, three = packed.smallest_three(gaussians.quats[order])
     # The three smaller components in RGB, 252 + the index of the largest in A.
     quats = np.column_stack(
-        [rounded_bytes(three * np.sqrt(0.5) * 255 + 127.5), _QUAT_MARK + largest]
+        [packed.rounded_bytes(three * np.sqrt(0.5) * 255 + 127.5), _QUAT_MARK + largest]
     )
     scales, sh0 = codebook(gaussians.scales), codebook(gaussians.sh0)
     colors = codes(gaussians.sh0[order, 0], sh0)
-    opacity = opacity_bytes(gaussians.opacities[order])
+    opacity = packed.opacity_bytes(gaussians.opacities[order])
     pictures = {
         "means_l.webp": _grid(positions & 255),  # 16 bits: low bytes, then high ones
         "means_u.webp": _grid(positions >> 8),
@@ -75,11 +74,12 @@ def encode(gaussians: Gaussians, progress: Progress = silent) -> bytes:
         "scales.webp": _grid(codes(gaussians.scales[order], scales)),
         "sh0.webp": _grid(np.column_stack([colors, opacity])),
     }
+    files = ["means_l.webp", "means_u.webp"]
     meta: dict[str, Any] = {
         "version": _VERSION,
         "asset": {"generator": "splatseed"},
         "count": len(order),
-        "means": {"mins": low, "maxs": high, "files": ["means_l.webp", "means_u.webp"]},
+        "means": {"mins": low.tolist(), "maxs": high.tolist(), "files": files},
         "scales": {"codebook": scales.tolist(), "files": ["scales.webp"]},
         "quats": {"files": ["quats.webp"]},
         "sh0": {"codebook": sh0.tolist(), "files": ["sh0.webp"]},
@@ -87,87 +87,73 @@ def encode(gaussians: Gaussians, progress: Progress = silent) -> bytes:
     if gaussians.shN.shape[1] and len(order) > 1:
         meta["shN"], more = _encoded_harmonics(gaussians.shN[order], progress)
         pictures.update(more)
-    return _zipped(meta, pictures)
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
+        archive.writestr(zipfile.ZipInfo(_META, _STAMP), json.dumps(meta))
+        for name, pixels in pictures.items():
+            picture = io.BytesIO()
+            # exact keeps colours where alpha is 0, which opacities and quaternions need.
+            Image.fromarray(pixels).save(picture, "WEBP", lossless=True, exact=True, quality=75)
+            archive.writestr(zipfile.ZipInfo(name, _STAMP), picture.getvalue())
+    return [file.getvalue()]
 
 
 def decode(path: Path) -> Gaussians:
-    """The Gaussians in a file, or in the unpacked folder that a ``meta.json`` lies in.
-
-    Raises:
-        SceneNotFoundError: There is no such file, or a picture beside its ``meta.json`` is missing.
-        SceneFormatError: It is damaged, or of another version.
-    """
-    with guarded(path, "a whole SOG"):
-        return _decoded(path, _opened(path))
-
-
-def _decoded(path: Path, content: Callable[[str], bytes]) -> Gaussians:
-    meta = json.loads(content(_META))
-    if "means" not in meta:  # of every version; a run's metrics.json has none
-        raise ValueError("JSON that describes no Gaussians")
-    if meta.get("version") != _VERSION:
-        raise SceneFormatError(
-            f"{path} to be a SOG of version {_VERSION}",
-            found=f"version {meta.get('version', 1)}",
-            fix=f"Convert it: {CONVERTER} IN OUT.sog.",
-        )
-    count = int(meta["count"])
-    if count < 1:
-        raise ValueError(f"{count} Gaussians")
-
+    """The Gaussians in a file, or in the unpacked folder that a ``meta.json`` lies in."""
     from PIL import Image  # noqa: PLC0415  (slow to import)
 
-    def pixels(part: str, which: int = 0, least: int = count) -> UInt8[np.ndarray, "P 4"]:
-        name = meta[part]["files"][which]
-        with Image.open(io.BytesIO(content(name))) as picture:
-            rows = np.asarray(picture.convert("RGBA")).reshape(-1, 4)
-        if len(rows) < least:
-            raise ValueError(f"{len(rows):,} pixels in {name}, of {least:,}")
-        return rows[:least]
+    with guarded(path, "a whole SOG"):
+        content = _opened(path)
+        meta = json.loads(content(_META))
+        if "means" not in meta:  # of every version; a run's metrics.json has none
+            raise ValueError("JSON that describes no Gaussians")
+        if meta.get("version") != _VERSION:
+            raise SceneFormatError(
+                f"{path} to be a SOG of version {_VERSION}",
+                found=f"version {meta.get('version', 1)}",
+                fix=f"Convert it: {CONVERTER} IN OUT.sog.",
+            )
+        count = int(meta["count"])
+        if count < 1:
+            raise ValueError(f"{count} Gaussians")
 
-    low, high = (pixels("means", i)[:, :3].astype(np.uint16) for i in (0, 1))
-    quats, sh0 = pixels("quats"), pixels("sh0")
-    centers = {part: np.array(meta[part]["codebook"], np.float32) for part in ("scales", "sh0")}
-    return Gaussians(
-        means=_decoded_positions(low | high << 8, meta["means"]),
-        scales=centers["scales"][pixels("scales")[:, :3]],
-        quats=from_smallest_three(
-            np.clip(quats[:, 3].astype(np.int64) - _QUAT_MARK, 0, 3),
-            ((quats[:, :3] / 255 - 0.5) * np.sqrt(2)).astype(np.float32),
-        ),
-        opacities=opacity_logits(sh0[:, 3]),
-        sh0=centers["sh0"][sh0[:, None, :3]],
-        shN=_decoded_harmonics(meta["shN"], pixels, count)
-        if "shN" in meta
-        else np.zeros((count, 0, 3), np.float32),
-    )
+        def pixels(part: str, which: int = 0, least: int = count) -> UInt8[np.ndarray, "P 4"]:
+            name = meta[part]["files"][which]
+            with Image.open(io.BytesIO(content(name))) as picture:
+                rows = np.asarray(picture.convert("RGBA")).reshape(-1, 4)
+            if len(rows) < least:
+                raise ValueError(f"{len(rows):,} pixels in {name}, of {least:,}")
+            return rows[:least]
 
-
-def _encoded_positions(
-    means: Float32[np.ndarray, "N 3"],
-) -> tuple[list[float], list[float], Int64[np.ndarray, "N 3"]]:
-    # sign(p) log(1 + |p|): finer steps near the middle of the scene
-    curved = np.sign(means) * np.log1p(np.abs(means.astype(np.float64)))
-    low, high = curved.min(axis=0), curved.max(axis=0)
-    extent = np.where(high > low, high - low, 1)
-    return low.tolist(), high.tolist(), np.rint((curved - low) / extent * 65535).astype(np.int64)
-
-
-def _decoded_positions(
-    values: np.ndarray, meta: dict[str, list[float]]
-) -> Float32[np.ndarray, "N 3"]:
-    low, high = (np.array(meta[end], np.float64) for end in ("mins", "maxs"))
-    curved = low + values / 65535 * (high - low)
-    return np.asarray(np.sign(curved) * np.expm1(np.abs(curved)), np.float32)
+        low, high = (pixels("means", i)[:, :3].astype(np.uint16) for i in (0, 1))
+        least, most = (np.array(meta["means"][end], np.float64) for end in ("mins", "maxs"))
+        curved = least + (low | high << 8) / 65535 * (most - least)
+        quats, sh0 = pixels("quats"), pixels("sh0")
+        centers = {part: np.array(meta[part]["codebook"], np.float32) for part in ("scales", "sh0")}
+        shN = np.zeros((count, 0, 3), np.float32)
+        if "shN" in meta:
+            rest, entries = packed.SH_COUNTS[int(meta["shN"]["bands"])], int(meta["shN"]["count"])
+            book = np.array(meta["shN"]["codebook"], np.float32)
+            table = book[pixels("shN", 0, entries * rest)[:, :3].reshape(entries, rest, 3)]
+            shN = table[pixels("shN", 1)[:, :2].astype(np.int64) @ np.array([1, 256])]
+        return Gaussians(
+            means=np.asarray(np.sign(curved) * np.expm1(np.abs(curved)), np.float32),
+            scales=centers["scales"][pixels("scales")[:, :3]],
+            quats=packed.from_smallest_three(
+                np.clip(quats[:, 3].astype(np.int64) - _QUAT_MARK, 0, 3),
+                ((quats[:, :3] / 255 - 0.5) * np.sqrt(2)).astype(np.float32),
+            ),
+            opacities=packed.opacity_logits(sh0[:, 3]),
+            sh0=centers["sh0"][sh0[:, None, :3]],
+            shN=shN,
+        )
 
 
 def _encoded_harmonics(
     shN: Float32[np.ndarray, "N K 3"], progress: Progress
 ) -> tuple[dict[str, Any], dict[str, UInt8[np.ndarray, "H W 4"]]]:
     count, rest, _ = shN.shape
-    levels = int(np.clip(np.log2(count), 0, _MOST_LEVELS))
-    if count >= 2**_LEAST_LEVELS:  # as in PlayCanvas's writer: 1024 for each 1024 Gaussians
-        levels = int(np.clip(np.log2(count), _LEAST_LEVELS, _MOST_LEVELS))
+    levels = min(int(np.log2(count)), _MOST_LEVELS)
     entries, labels = palette(shN.reshape(count, -1), levels, progress)
     centers = codebook(entries)
     table = codes(entries, centers).reshape(len(entries), rest, 3)
@@ -178,7 +164,7 @@ def _encoded_harmonics(
     low_high = np.column_stack([labels & 255, labels >> 8, np.zeros(count, np.int64)])
     meta = {
         "count": len(entries),
-        "bands": SH_COUNTS.index(rest),
+        "bands": packed.SH_COUNTS.index(rest),
         "codebook": centers.tolist(),
         "files": ["shN_centroids.webp", "shN_labels.webp"],
     }
@@ -189,16 +175,6 @@ def _encoded_harmonics(
     return meta, pictures
 
 
-def _decoded_harmonics(
-    meta: dict[str, Any], pixels: Callable[..., UInt8[np.ndarray, "P 4"]], count: int
-) -> Float32[np.ndarray, "N K 3"]:
-    rest, entries = SH_COUNTS[int(meta["bands"])], int(meta["count"])
-    centers = np.array(meta["codebook"], np.float32)
-    table = centers[pixels("shN", 0, entries * rest)[:, :3].reshape(entries, rest, 3)]
-    labels = pixels("shN", 1)[:, :2].astype(np.int64) @ np.array([1, 256])
-    return np.asarray(table[labels].reshape(count, rest, 3))
-
-
 def _grid(values: np.ndarray) -> UInt8[np.ndarray, "H W 4"]:
     """One pixel per row of 3 or 4 bytes, in a near-square picture; sides are multiples of 4."""
     width = 4 * int(np.ceil(np.sqrt(len(values)) / 4))
@@ -207,20 +183,6 @@ def _grid(values: np.ndarray) -> UInt8[np.ndarray, "H W 4"]:
     pixels[:, 3] = 255
     pixels[: len(values), : values.shape[1]] = values
     return pixels.reshape(height, width, 4)
-
-
-def _zipped(meta: dict[str, Any], pictures: dict[str, UInt8[np.ndarray, "H W 4"]]) -> bytes:
-    from PIL import Image  # noqa: PLC0415  (slow to import)
-
-    file = io.BytesIO()
-    with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
-        archive.writestr(zipfile.ZipInfo(_META, _STAMP), json.dumps(meta))
-        for name, pixels in pictures.items():
-            picture = io.BytesIO()
-            # exact keeps colours where alpha is 0, which opacities and quaternions need.
-            Image.fromarray(pixels).save(picture, "WEBP", lossless=True, exact=True, quality=75)
-            archive.writestr(zipfile.ZipInfo(name, _STAMP), picture.getvalue())
-    return file.getvalue()
 
 
 def _opened(path: Path) -> Callable[[str], bytes]:
@@ -238,15 +200,10 @@ def _opened(path: Path) -> Callable[[str], bytes]:
 
 
 def codebook(values: Float32[np.ndarray, "..."]) -> Float64[np.ndarray, " 256"]:
-    """The 256 numbers, ascending, that quantise values with small square error (1D Lloyd).
-
-    Args:
-        values: At least one, finite.
-    """
+    """The 256 numbers, ascending, that quantise values with small square error (1D Lloyd)."""
     ordered = np.sort(values.reshape(-1).astype(np.float64))
     sums = np.concatenate([[0.0], np.cumsum(ordered)])
-    # Half of the codes start evenly spaced, half at even ranks: both the tails and the middle get
-    # some.
+    # Half of the codes start evenly spaced, half at even ranks, for the tails and the middle.
     ranks = np.quantile(ordered, (np.arange(_CODES // 2) + 0.5) / (_CODES // 2))
     centers = np.sort(np.concatenate([ranks, np.linspace(ordered[0], ordered[-1], _CODES // 2)]))
     for _ in range(_LLOYD_STEPS):
@@ -268,17 +225,10 @@ def codes(
 def palette(
     vectors: Float32[np.ndarray, "N D"], levels: int, progress: Progress = silent
 ) -> tuple[Float32[np.ndarray, "K D"], Int64[np.ndarray, " N"]]:
-    """2^levels vectors that stand for N: groups are halved repeatedly where they vary most.
-
-    Args:
-        vectors: Finite; N is at least 2^levels.
-        levels: How often to halve.
-        progress: Called with the stage and the fraction done.
-    """
+    """2^levels vectors that stand for N >= 2^levels: groups are halved where they vary most."""
     count = 2**levels
     size = -(-len(vectors) // count)
-    # Groups keep one size, so that a level is a few array operations; to fill up, the first are
-    # repeated.
+    # Groups keep one size, so that a level is a few array operations; the first fill them up.
     order = np.resize(np.arange(len(vectors)), size * count)[None]
     for level in range(levels):
         progress("encode", level / levels)

@@ -17,7 +17,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError, SplatseedError
-from splatseed.export import (
+from splatseed.splat.formats import (
     FORMATS,
     format_of_name,
     keep_gaussians,
@@ -25,9 +25,9 @@ from splatseed.export import (
     read_model,
     write_model,
 )
-from splatseed.export.packing import from_smallest_three, smallest_three
-from splatseed.export.sog import _MOST_META, codebook, codes, palette
 from splatseed.splat.gaussians import Gaussians
+from splatseed.splat.packed import from_smallest_three, smallest_three
+from splatseed.splat.sog import _MOST_META, codebook, codes, palette
 
 SUFFIXES = [each.suffix for each in FORMATS.values()]
 PACKED = [suffix for suffix in SUFFIXES if suffix != ".ply"]

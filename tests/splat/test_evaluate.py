@@ -14,18 +14,18 @@ from PIL import Image
 torch = pytest.importorskip("torch", reason="evaluation needs PyTorch")
 
 from splatseed.errors import ParameterError, SceneNotFoundError
-from splatseed.evaluate import (
+from splatseed.io import load_scene
+from splatseed.scores import EvalResult, ViewScore
+from splatseed.splat.evaluate import (
     evaluate_model,
     evaluate_views,
-    gaussian_renderer,
     load_model,
     write_renders,
 )
-from splatseed.io import load_scene
-from splatseed.scores import EvalResult, ViewScore
+from splatseed.splat.formats import write_model
 from splatseed.splat.gaussians import initial_gaussians, training_frame
 from splatseed.splat.metrics import Lpips
-from splatseed.splat.ply import write_gaussians
+from splatseed.splat.rendering import ModelRenderer
 from splatseed.views.view import View, poses_of
 
 
@@ -116,7 +116,7 @@ def model_path(room, tmp_path_factory):
     gaussians = initial_gaussians(load_scene(room).points, opacity=0.9)
     gaussians.shN[:, :3] = np.random.default_rng(0).normal(0, 0.1, (len(gaussians), 3, 3))
     path = tmp_path_factory.mktemp("model") / "seeds.ply"
-    write_gaussians(path, gaussians)
+    write_model(path, gaussians)
     return path
 
 
@@ -134,7 +134,7 @@ def test_a_model_looks_the_same_in_whatever_frame_it_is_rendered(room, model_pat
     model = load_model(model_path, room)
     frame = training_frame(poses_of(load_scene(room).split()[0]))
     other = dataclasses.replace(frame, origin=frame.origin + 0.5, scale=3 * frame.scale)
-    moved = gaussian_renderer(model.gaussians, other)
+    moved = ModelRenderer(model.gaussians, other).image
     for view in model.views:
         # The near plane is closer there: nothing of the room lies that near.
         torch.testing.assert_close(moved(view), model.render(view), atol=2e-3, rtol=0)

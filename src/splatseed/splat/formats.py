@@ -1,0 +1,301 @@
+"""Files of trained Gaussians: 3DGS's .ply and the packed formats; and choosing which to keep.
+
+Notation: a .ply has one vertex per Gaussian, float32 x, y, z, nx, ny, nz (zero), f_dc_0..2,
+f_rest_* (all of red, then green, then blue), opacity (logit), scale_0..2 (logarithms), rot_0..3
+(wxyz). Promise: a file's content decides its format when it is read, its name when it is written; a
+file appears whole or not at all; positions read are finite. A .ply is read back bit for bit, and
+its properties are found by name; packed formats lose fine detail, and the Gaussians' order.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64
+from numpy.lib.recfunctions import structured_to_unstructured
+
+from splatseed.errors import ParameterError, SceneFormatError
+from splatseed.io.files import COPY_AGAIN, ByteReader, read_bytes
+from splatseed.io.ply import EXPORT_PLY_AGAIN, Element, parse_header
+from splatseed.io.staging import atomic_file
+from splatseed.literal import beginning, did_you_mean
+from splatseed.progress import Progress, silent
+from splatseed.splat import packed, sog
+from splatseed.splat.gaussians import Gaussians
+
+_HEADER = 1 << 20
+_COLUMNS = {
+    "means": ("x", "y", "z"),
+    "normals": ("nx", "ny", "nz"),
+    "sh0": ("f_dc_0", "f_dc_1", "f_dc_2"),
+    "shN": (),
+    "opacities": ("opacity",),
+    "scales": ("scale_0", "scale_1", "scale_2"),
+    "quats": ("rot_0", "rot_1", "rot_2", "rot_3"),
+}
+"""The properties of a .ply in the order in which 3DGS writes them, but for f_rest_*."""
+_ELSEWHERE = {
+    ".ksplat": "GaussianSplats3D's own tool (util/create-ksplat.js) makes one from a .ply",
+    ".glb": f"{sog.CONVERTER} MODEL.ply OUT.glb makes one from a .ply",
+    ".gltf": f"{sog.CONVERTER} MODEL.ply OUT.glb makes a .glb from a .ply",
+    ".usdz": "NVIDIA's converter (PyPI: usd-convert-gsplat) makes one from a .ply",
+}
+"""Formats that splatseed does not write, and the tools that do."""
+
+
+def _encode_ply(gaussians: Gaussians) -> list[bytes | memoryview]:
+    count, rest = len(gaussians), 3 * gaussians.shN.shape[1]
+    columns = _columns(rest)
+    arrays = {
+        **gaussians.arrays(),
+        "normals": np.zeros((count, 3), np.float32),
+        "shN": gaussians.shN.transpose(0, 2, 1),
+    }
+    tables = [arrays[name].reshape(count, len(each)) for name, each in columns.items()]
+    names = [name for each in columns.values() for name in each]
+    properties = "".join(f"property float {name}\n" for name in names)
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {count}\n{properties}"
+    table = np.concatenate(tables, axis=1, dtype="<f4")
+    return [f"{header}end_header\n".encode("ascii"), table.data]
+
+
+def _decode_ply(path: Path) -> Gaussians:
+    reader = ByteReader(path, EXPORT_PLY_AGAIN)
+    header = parse_header(path, reader.data)
+    vertex = header.elements[0] if header.elements else Element("none", 0, ())
+    names = {prop.name for prop in vertex.properties}
+    rest = sum(name.startswith("f_rest_") for name in names)
+    columns = _columns(rest)
+    del columns["normals"]
+    missing = [name for each in columns.values() for name in each if name not in names]
+    found = ""
+    if missing or not header.byte_order or vertex.has_lists:
+        found = f"no {', '.join(missing[:5])}" if missing else "an ascii file, or lists"
+    elif rest not in {3 * each for each in packed.SH_COUNTS} or not vertex.num_rows:
+        found = f"{rest} f_rest properties and {vertex.num_rows} vertices"
+    if found:
+        raise SceneFormatError(
+            f"{path} to hold trained Gaussians in 3DGS's layout, binary",
+            found=found,
+            fix="Name the point_cloud.ply of a training run, not the seeds or a mesh.",
+        )
+    reader.offset, reader.record = header.size, "element vertex"
+    rows = reader.array(header.dtype(vertex), vertex.num_rows)
+    arrays = {
+        name: np.array(structured_to_unstructured(rows[list(each)]), np.float32, order="C")
+        for name, each in columns.items()
+        if each
+    }
+    arrays["opacities"] = arrays["opacities"][:, 0]
+    arrays["sh0"] = arrays["sh0"][:, None]
+    planes = arrays.get("shN", np.zeros((len(rows), 0))).reshape(len(rows), 3, rest // 3)
+    return Gaussians(
+        **{**arrays, "shN": np.array(planes.transpose(0, 2, 1), np.float32, order="C")}
+    )
+
+
+def _columns(rest: int) -> dict[str, tuple[str, ...]]:
+    return {**_COLUMNS, "shN": tuple(f"f_rest_{i}" for i in range(rest))}
+
+
+class Format(NamedTuple):
+    """A format that can be read and written.
+
+    Args:
+        suffix: The end of its file names.
+        about: What it preserves, and who reads it.
+        encode: The bytes of a file, in parts.
+        decode: The Gaussians in a file; raises ``SceneFormatError``.
+    """
+
+    suffix: str
+    about: str
+    encode: Callable[[Gaussians], Iterable[bytes | memoryview]]
+    decode: Callable[[Path], Gaussians]
+
+
+FORMATS = {
+    "compressed-ply": Format(
+        ".compressed.ply",
+        "all but fine detail; PlayCanvas, SuperSplat",
+        packed.encode_compressed_ply,
+        packed.decode_compressed_ply,
+    ),
+    "ply": Format(
+        ".ply", "everything, as 3DGS writes it; every tool reads it", _encode_ply, _decode_ply
+    ),
+    "splat": Format(
+        ".splat",
+        "no view-dependent colour; web viewers",
+        packed.encode_splat,
+        packed.decode_splat,
+    ),
+    "spz": Format(
+        ".spz",
+        "all but fine detail; Niantic, three.js viewers, glTF tools",
+        packed.encode_spz,
+        packed.decode_spz,
+    ),
+    "sog": Format(".sog", "all but fine detail; PlayCanvas, SuperSplat", sog.encode, sog.decode),
+}
+"""The formats by name; of two suffixes that a file name ends in, the longer comes first."""
+SUFFIXES = {each.suffix: name for name, each in FORMATS.items()}
+"""The formats' names by file name suffix."""
+
+
+def read_model(path: Path) -> Gaussians:
+    """Read trained Gaussians: .ply, compressed .ply, .splat, .spz, .sog (or its meta.json).
+
+    Raises:
+        SceneNotFoundError: There is no such file.
+        SceneFormatError: It holds no Gaussians in a known format, or is damaged.
+        MissingDependencyError: It is an .spz of version 4, which needs zstandard.
+    """
+    gaussians = FORMATS[detect_format(path, read_bytes(path))].decode(path)
+    # Only of positions: some trainers write opacity +inf for opaque Gaussians.
+    bad = ~np.isfinite(gaussians.means).all(axis=1)
+    if bad.any():
+        raise SceneFormatError(
+            f"{path} to have finite positions",
+            found=f"{np.count_nonzero(bad)} that are not, the first in Gaussian {np.argmax(bad)}",
+            fix="Train or export it again, or remove those Gaussians.",
+        )
+    return gaussians
+
+
+def write_model(path: Path, gaussians: Gaussians, progress: Progress = silent) -> None:
+    """Write Gaussians in the format that the file name asks for, replacing a file at ``path``.
+
+    Args:
+        path: The file.
+        gaussians: At least one, with finite positions.
+        progress: Called with the stage and the fraction done.
+
+    Raises:
+        ParameterError: The suffix belongs to no format written here.
+        OutputError: The file cannot be written.
+    """
+    name = format_of_name(path)
+    progress("encode", 0.0)
+    parts = sog.encode(gaussians, progress) if name == "sog" else FORMATS[name].encode(gaussians)
+    progress("encode", 1.0)
+    with atomic_file(path) as partial, partial.open("wb") as file:
+        file.writelines(parts)
+
+
+def format_of_name(path: Path) -> str:
+    """The format that a file name asks for.
+
+    Raises:
+        ParameterError: The suffix belongs to no format written here.
+    """
+    for suffix, name in SUFFIXES.items():
+        if path.name.lower().endswith(suffix):
+            return name
+    suffix, other = path.suffix or "none", _ELSEWHERE.get(path.suffix.lower())
+    raise ParameterError(
+        f"a file name that ends in one of {', '.join(SUFFIXES)}",
+        found=suffix,
+        fix=f"Export a .ply: {other}." if other else f"{did_you_mean(suffix, SUFFIXES)}Choose one.",
+    )
+
+
+def detect_format(path: Path, data: bytes) -> str:
+    """The format of a file's content.
+
+    Args:
+        path: The file, for errors and for the format without a signature.
+        data: Its bytes.
+
+    Raises:
+        SceneFormatError: The format cannot be read.
+    """
+    suffix = path.suffix.lower()
+    if data.startswith(b"ply") and data[3:4] in (b"\n", b"\r", b" ", b"\t"):
+        return "compressed-ply" if b"packed_position" in data[:_HEADER] else "ply"
+    if packed.SPZ_MAGIC in (data[:4], _begin_of_gzipped(data)):
+        return "spz"
+    if data.startswith(b"PK\x03\x04") or (data[:1] == b"{" and suffix == ".json"):
+        return "sog"
+    found, fix = beginning(data), "Name a file of trained Gaussians."
+    if suffix == ".splat":
+        size = packed.RECORD.itemsize
+        if data and len(data) % size == 0:
+            return "splat"
+        found = f"{len(data):,} bytes, not a multiple of the {size} of a .splat's Gaussian"
+        fix = COPY_AGAIN
+    elif data.startswith(b"glTF"):
+        found, fix = "a binary glTF", "Export a .ply where it came from: splatseed reads no glTF."
+    elif suffix == ".ksplat":
+        found, fix = "a .ksplat", f"Convert it: {sog.CONVERTER} IN.ksplat OUT.ply."
+    expected = f"{path} to hold trained Gaussians ({', '.join(SUFFIXES)})"
+    raise SceneFormatError(expected, found=found, fix=fix)
+
+
+def _begin_of_gzipped(data: bytes) -> bytes:
+    try:
+        return zlib.decompressobj(wbits=31).decompress(data[:4096], 4)
+    except zlib.error:
+        return b""
+
+
+def parse_crop(text: str) -> Float64[np.ndarray, "2 3"]:
+    """The corners of the box given by six comma-separated numbers: minimum x, y, z, then maximum.
+
+    Raises:
+        ParameterError: There are not six, or they make no box.
+
+    Example:
+        >>> parse_crop("-1,-1,-1,1,1,2").tolist()
+        [[-1.0, -1.0, -1.0], [1.0, 1.0, 2.0]]
+    """
+    try:
+        low, high = np.array([float(word) for word in text.split(",")]).reshape(2, 3)
+    except ValueError:
+        low = high = np.zeros(3)
+    if not (low < high).all():
+        raise ParameterError(
+            "--crop x0,y0,z0,x1,y1,z1, the minimum and maximum corners of a box",
+            found=repr(text),
+            fix="splatseed info SCENE prints the bounding box of the points.",
+        )
+    return np.stack([low, high])
+
+
+def keep_gaussians(
+    gaussians: Gaussians,
+    crop: Float64[np.ndarray, "2 3"] | None = None,
+    min_opacity: float = 0.0,
+) -> Gaussians:
+    """The Gaussians whose centres lie in a box and that are opaque enough, in their order.
+
+    Args:
+        gaussians: The model's.
+        crop: Minimum and maximum corner of the box, in the model's world; no limit when left out.
+        min_opacity: Lowest opacity kept, 0 to 1.
+
+    Raises:
+        ParameterError: The opacity is out of range, or no Gaussian is left.
+    """
+    if not 0 <= min_opacity < 1:
+        raise ParameterError(
+            "--min-opacity of 0 or more, less than 1", found=f"{min_opacity}", fix="Try 0.05."
+        )
+    keep = np.ones(len(gaussians), bool)
+    if min_opacity:
+        keep &= gaussians.opacities >= np.log(min_opacity / (1 - min_opacity))
+    if crop is not None:
+        keep &= ((gaussians.means >= crop[0]) & (gaussians.means <= crop[1])).all(axis=1)
+    if not keep.any():
+        ends = (end(gaussians.means, axis=0) for end in (np.min, np.max))
+        low, high = (" ".join(f"{value:.4g}" for value in end) for end in ends)
+        raise ParameterError(
+            "--crop and --min-opacity to leave some Gaussians",
+            found=f"none of {len(gaussians):,}, whose centres lie from {low} to {high}",
+            fix="Choose a larger box or a smaller opacity.",
+        )
+    return gaussians if keep.all() else gaussians.select(keep)

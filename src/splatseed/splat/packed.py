@@ -1,0 +1,396 @@
+"""Packed formats: .splat, PlayCanvas's compressed PLY, Niantic's .spz, and what they share.
+
+Notation: quaternions are wxyz; a rotation's *largest* component, made positive, is dropped, because
+the other *three*, each within 1/sqrt(2) of 0, determine it; [N] Gaussians. A record of a .splat is
+float32 x, y, z and scales (standard deviations), then bytes: red, green, blue, opacity, and the
+rotation wxyz as 128 q + 128; the file has no header and no view-dependent colour. A *chunk* of a
+compressed PLY is 256 Gaussians with the bounds of their positions, log-scales and colours, to which
+their values, 16 bytes per Gaussian, are relative; a byte per further colour coefficient follows.
+An .spz holds one attribute after another, gzipped (versions 1 to 3) or in zstd (4); its axes are
+right, up, back, ours right, down, front: y and z change sign; f are its *fractional bits*.
+
+Source: antimatter15/splat; the format's description in PlayCanvas's splat-transform and engine;
+nianticlabs/spz (load-spz.cc, splat-types.h).
+"""
+
+from __future__ import annotations
+
+import gzip
+import struct
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32, Int64, UInt8, UInt32
+from numpy.lib.recfunctions import structured_to_unstructured
+
+from splatseed.io.files import COPY_AGAIN, ByteReader, guarded, read_bytes
+from splatseed.io.ply import parse_header
+from splatseed.requirements import require
+from splatseed.runtime.memory import check_memory
+from splatseed.splat.gaussians import SH_C0, Gaussians
+
+SH_COUNTS = (0, 3, 8, 15)
+"""Coefficients beyond the first, by the degree of the spherical harmonics."""
+RECORD = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
+"""A Gaussian of a .splat."""
+
+_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+"""The components that remain, by the index of the largest."""
+_MORTON_BITS = 16
+_CHUNK = 256
+_BOUNDS = [
+    [f"{end}_{name}" for name in names]
+    for names in (("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b"))
+    for end in ("min", "max")
+]
+_PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+_MOST_LOG_SCALE = 20.0
+_SH_RANGE = 8.0
+_VECTOR_BITS = ((21, 11), (11, 10), (0, 11))
+"""Shift and number of bits of each part of a packed number; likewise the following."""
+_THREE_BITS = ((20, 10), (10, 10), (0, 10))
+_COLOR_BITS = ((24, 8), (16, 8), (8, 8))
+
+SPZ_MAGIC = b"NGSP"
+_SPZ_HEADER = struct.Struct("<4sIIBBBB")
+_SPZ_VERSION = 3
+"""The version that is written: the latest that every reader accepts."""
+_MOST_FRACTIONAL_BITS = 20
+_SPZ_MOST = 2**23 - 1
+"""Largest position in units of 2^-f: 24 bits with a sign."""
+_NINE_BITS = 511
+_SPZ_COLOR = 0.15 * 255
+"""Bytes per unit of the first coefficient: the format's scale."""
+_AXES = np.array([1, -1, -1], np.float32)
+_SH_AXES = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
+"""Signs of the spherical harmonics of degrees 1 to 3 when y and z are flipped."""
+_SPZ_STEP = 4
+"""Further coefficients are rounded to this many 128ths, so that gzip saves more. Niantic's writer
+takes 8 for the first degree and 16 for the others: files are a quarter smaller, but coefficients of
+a short run vanish, and with them up to 2.8 dB (docs/formats.md)."""
+
+# What formats share -------------------------------------------------------------------------------
+
+
+def smallest_three(
+    quats: Float32[np.ndarray, "N 4"],
+) -> tuple[Int64[np.ndarray, " N"], Float32[np.ndarray, "N 3"]]:
+    """The index of the largest component, and the other three in order; see the module."""
+    unit = _unit_quats(quats)
+    largest = np.argmax(np.abs(unit), axis=1)
+    rows = np.arange(len(unit))
+    unit *= np.where(unit[rows, largest] < 0, -1, 1).astype(np.float32)[:, None]
+    return largest, unit[rows[:, None], _OTHERS[largest]]
+
+
+def from_smallest_three(
+    largest: Int64[np.ndarray, " N"], three: Float32[np.ndarray, "N 3"]
+) -> Float32[np.ndarray, "N 4"]:
+    """The unit quaternions that ``smallest_three`` encoded."""
+    rows = np.arange(len(three))
+    quats = np.empty((len(three), 4), np.float32)
+    quats[rows[:, None], _OTHERS[largest]] = three
+    # A unit quaternion: the fourth square is 1 minus the other three.
+    quats[rows, largest] = np.sqrt(np.maximum(1 - (three**2).sum(axis=1), 0))
+    return quats
+
+
+def opacity_bytes(logits: Float32[np.ndarray, " N"]) -> UInt8[np.ndarray, " N"]:
+    """Opacities in [0, 1] in steps of 1/255."""
+    with np.errstate(over="ignore"):
+        return np.rint(255 / (1 + np.exp(-logits.astype(np.float64)))).astype(np.uint8)
+
+
+def opacity_logits(values: UInt8[np.ndarray, " N"]) -> Float32[np.ndarray, " N"]:
+    """Logits of opacities in steps of 1/255; 0 and 1 move a quarter step inward to stay finite."""
+    opacity = np.clip(values / 255, 0.25 / 255, 1 - 0.25 / 255)
+    return np.log(opacity / (1 - opacity)).astype(np.float32)
+
+
+def rounded_bytes(values: np.ndarray) -> UInt8[np.ndarray, "..."]:
+    """Values from 0 to 255 as bytes; others are clipped."""
+    return np.asarray(np.clip(np.rint(values), 0, 255), np.uint8)
+
+
+def morton_order(xyz: Float32[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:
+    """The order of points along a Z curve through their bounding box."""
+    low, high = xyz.min(axis=0), xyz.max(axis=0)
+    extent = np.where(high > low, high - low, 1).astype(np.float64)
+    cells = ((xyz - low) / extent * (2**_MORTON_BITS - 1)).astype(np.uint64)
+    code = np.zeros(len(xyz), np.uint64)
+    for bit in range(_MORTON_BITS):
+        for axis in range(3):
+            digit = (cells[:, axis] >> np.uint64(bit)) & np.uint64(1)
+            code |= digit << np.uint64(3 * bit + axis)
+    return np.argsort(code, kind="stable")
+
+
+def _unit_quats(quats: Float32[np.ndarray, "N 4"]) -> Float32[np.ndarray, "N 4"]:
+    """Quaternions of length 1; zeros become the identity."""
+    norms = np.linalg.norm(quats, axis=1, keepdims=True)
+    known = np.isfinite(norms) & (norms > 0)
+    unit = np.divide(quats, norms, out=np.zeros_like(quats), where=known)
+    unit[~known[:, 0]] = (1, 0, 0, 0)
+    return np.asarray(unit)
+
+
+# .splat -------------------------------------------------------------------------------------------
+
+
+def encode_splat(gaussians: Gaussians) -> list[bytes]:
+    """A .splat: by size times opacity, so that a viewer can draw the most important ones first."""
+    log_opacity = -np.logaddexp(0, -gaussians.opacities.astype(np.float64))
+    size = gaussians.scales.astype(np.float64).sum(axis=1) + log_opacity
+    order = np.argsort(-size, kind="stable")
+    rows = np.empty(len(order), RECORD)
+    rows["mean"] = gaussians.means[order]
+    with np.errstate(over="ignore"):
+        rows["scale"] = np.exp(gaussians.scales[order])
+    color = 0.5 + SH_C0 * gaussians.sh0[order, 0]
+    rows["rgba"][:, :3] = np.rint(np.clip(color, 0, 1) * 255)
+    rows["rgba"][:, 3] = opacity_bytes(gaussians.opacities[order])
+    rows["quat"] = rounded_bytes(_unit_quats(gaussians.quats[order]) * 128 + 128)
+    return [rows.tobytes()]
+
+
+def decode_splat(path: Path) -> Gaussians:
+    """The Gaussians in a .splat: a whole number of records, with scales of 0 or more."""
+    reader = ByteReader(path)
+    reader.record = "Gaussians"
+    rows = reader.array(RECORD, len(reader.data) // RECORD.itemsize)
+    reader.finish()
+    good = np.isfinite(rows["scale"]).all(axis=1) & (rows["scale"] >= 0).all(axis=1)
+    if not len(rows) or not good.all():
+        raise reader.error("scales of 0 or more", f"others in {np.count_nonzero(~good)} Gaussians")
+    least = np.finfo(np.float32).tiny
+    return Gaussians(
+        means=np.ascontiguousarray(rows["mean"], np.float32),
+        scales=np.log(np.maximum(rows["scale"], least)).astype(np.float32),
+        quats=_unit_quats((rows["quat"].astype(np.float32) - 128) / 128),
+        opacities=opacity_logits(rows["rgba"][:, 3]),
+        sh0=((rows["rgba"][:, None, :3] / 255 - 0.5) / SH_C0).astype(np.float32),
+        shN=np.zeros((len(rows), 0, 3), np.float32),
+    )
+
+
+# Compressed PLY -----------------------------------------------------------------------------------
+
+
+def encode_compressed_ply(gaussians: Gaussians) -> list[bytes]:
+    """A compressed PLY, in Z-curve order."""
+    order = morton_order(gaussians.means)
+    count, rest = len(order), 3 * gaussians.shN.shape[1]
+    scales = np.clip(gaussians.scales[order], -_MOST_LOG_SCALE, _MOST_LOG_SCALE)
+    colors = gaussians.sh0[order, 0] * np.float32(SH_C0) + np.float32(0.5)
+    chunk, starts = np.arange(count) // _CHUNK, np.arange(0, count, _CHUNK)
+    tables, units = [], []
+    for values in (gaussians.means[order], scales, colors):
+        # The bounds of each chunk, and each value as a fraction between them.
+        low = np.minimum.reduceat(values, starts, axis=0)
+        high = np.maximum.reduceat(values, starts, axis=0)
+        extent = np.where(high > low, high - low, 1)
+        tables += [low, high]
+        units.append((values - low[chunk]) / extent[chunk])
+    largest, three = smallest_three(gaussians.quats[order])
+    packed = np.empty((count, 4), "<u4")
+    packed[:, 0] = _pack(units[0], _VECTOR_BITS)
+    # 2 bits for the index of the largest component, 10 for each other one.
+    turn = _pack(three * np.float32(np.sqrt(0.5)) + np.float32(0.5), _THREE_BITS)
+    packed[:, 1] = (largest.astype(np.uint32) << 30) | turn
+    packed[:, 2] = _pack(units[1], _VECTOR_BITS)
+    packed[:, 3] = _pack(units[2], _COLOR_BITS) | opacity_bytes(gaussians.opacities[order])
+    coefficients = gaussians.shN[order].transpose(0, 2, 1).reshape(count, rest)
+    # A coefficient c in [-4, 4] is the byte (c / 8 + 1/2) 256.
+    sh = np.clip((coefficients / _SH_RANGE + 0.5) * 256, 0, 255).astype(np.uint8)
+    lines = ["ply", "format binary_little_endian 1.0", f"element chunk {len(starts)}"]
+    lines += [f"property float {name}" for names in _BOUNDS for name in names]
+    lines += [f"element vertex {count}", *(f"property uint {name}" for name in _PACKED)]
+    if rest:
+        lines += [f"element sh {count}", *(f"property uchar f_rest_{i}" for i in range(rest))]
+    header = ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")
+    return [header, np.hstack(tables).astype("<f4").tobytes(), packed.tobytes(), sh.tobytes()]
+
+
+def decode_compressed_ply(path: Path) -> Gaussians:
+    """The Gaussians in a compressed PLY."""
+    reader = ByteReader(path)
+    header = parse_header(path, reader.data)
+    reader.offset = header.size
+    tables: dict[str, np.ndarray[Any, Any]] = {}
+    with guarded(path, "a whole compressed PLY"):
+        for element in header.elements:
+            reader.record = f"element {element.name}"
+            tables[element.name] = reader.array(header.dtype(element), element.num_rows)
+        vertices, chunks = tables["vertex"], tables["chunk"]
+        if not len(vertices) or len(chunks) != -(-len(vertices) // _CHUNK):
+            raise ValueError(f"{len(chunks)} chunks for {len(vertices)} Gaussians")
+        if any(vertices.dtype[name] != np.dtype("<u4") for name in _PACKED):
+            raise ValueError("packed properties of another type than uint")
+        position, turn, scale, color = (vertices[name] for name in _PACKED)
+        chunk = np.arange(len(vertices)) // _CHUNK
+
+        def within(units: Float32[np.ndarray, "N 3"], kind: int) -> Float32[np.ndarray, "N 3"]:
+            ends = (chunks[names] for names in _BOUNDS[2 * kind : 2 * kind + 2])
+            low, high = (structured_to_unstructured(end)[chunk] for end in ends)
+            return np.asarray(low + units * (high - low), np.float32)
+
+        colors = _unpack(color, _COLOR_BITS)
+        # Files from before 2024 have no colour bounds at all.
+        if {*_BOUNDS[4], *_BOUNDS[5]} & set(chunks.dtype.names or ()):
+            colors = within(colors, 2)
+        three = (_unpack(turn, _THREE_BITS) - np.float32(0.5)) * np.float32(np.sqrt(2))
+        return Gaussians(
+            means=within(_unpack(position, _VECTOR_BITS), 0),
+            scales=within(_unpack(scale, _VECTOR_BITS), 1),
+            quats=from_smallest_three((turn >> 30).astype(np.int64), three),
+            opacities=opacity_logits((color & 255).astype(np.uint8)),
+            sh0=((colors - np.float32(0.5)) / np.float32(SH_C0))[:, None],
+            shN=_coefficients(tables.get("sh", vertices), len(vertices)),
+        )
+
+
+def _pack(
+    units: Float32[np.ndarray, "N 3"], layout: tuple[tuple[int, int], ...]
+) -> UInt32[np.ndarray, " N"]:
+    """Values in [0, 1] quantised to the given numbers of bits, shifted into one integer."""
+    packed = np.zeros(len(units), np.uint32)
+    for i, (shift, bits) in enumerate(layout):
+        most = 2**bits - 1
+        packed |= np.rint(np.clip(units[:, i], 0, 1) * most).astype(np.uint32) << np.uint32(shift)
+    return packed
+
+
+def _unpack(
+    packed: UInt32[np.ndarray, " N"], layout: tuple[tuple[int, int], ...]
+) -> Float32[np.ndarray, "N 3"]:
+    columns = [((packed >> shift) & (2**bits - 1)) / (2**bits - 1) for shift, bits in layout]
+    return np.stack(columns, axis=1).astype(np.float32)
+
+
+def _coefficients(table: np.ndarray[Any, Any], count: int) -> Float32[np.ndarray, "N K 3"]:
+    """Colour coefficients beyond the first; the file stores all of red, then green, then blue."""
+    rest = sum(name.startswith("f_rest_") for name in table.dtype.names or ())
+    if not rest:
+        return np.zeros((count, 0, 3), np.float32)
+    if len(table) != count or rest not in {3 * each for each in SH_COUNTS}:
+        raise ValueError(f"{len(table)} rows of {rest} f_rest for {count} Gaussians")
+    values = structured_to_unstructured(table[[f"f_rest_{i}" for i in range(rest)]])
+    centers = (values.astype(np.float32) + np.float32(0.5)) / 256
+    centers = np.where(values == 0, 0, np.where(values == 255, 1, centers)).astype(np.float32)
+    rows = ((centers - np.float32(0.5)) * np.float32(_SH_RANGE)).reshape(count, 3, -1)
+    return np.ascontiguousarray(rows.transpose(0, 2, 1))
+
+
+# .spz ---------------------------------------------------------------------------------------------
+
+
+def encode_spz(gaussians: Gaussians) -> list[bytes]:
+    """An .spz, in Z-curve order, of degree 3 at most."""
+    order = morton_order(gaussians.means)
+    rest = gaussians.shN.shape[1]
+    farthest = float(np.abs(gaussians.means).max())
+    bits = np.floor(np.log2(_SPZ_MOST / max(farthest, 1e-9)))
+    bits = int(np.clip(bits, 0, _MOST_FRACTIONAL_BITS))
+    # A position in units of 2^-f; a coefficient c beyond the first as 128 c + 128.
+    fixed = np.rint(gaussians.means[order] * _AXES * np.float64(2**bits)).astype("<i4")
+    sh = np.rint(gaussians.shN[order] * _SH_AXES[:rest, None] * 128 + 128)
+    # From the highest bits: the index of the largest of xyzw, then signs and sizes of the others.
+    quats = gaussians.quats[order] * np.append(np.float32(1), _AXES)
+    largest, three = smallest_three(np.roll(quats, -1, axis=1))
+    turn = largest.astype(np.uint32)
+    for i in range(3):
+        size = np.rint(np.abs(three[:, i]) * np.float32(_NINE_BITS * np.sqrt(2)))
+        part = np.minimum(size, _NINE_BITS).astype(np.uint32)
+        turn = (turn << 10) | ((three[:, i] < 0).astype(np.uint32) << 9) | part
+    parts = [
+        fixed.view(np.uint8).reshape(-1, 4)[:, :3],  # 24 bits a component
+        opacity_bytes(gaussians.opacities[order]),
+        rounded_bytes(gaussians.sh0[order, 0] * _SPZ_COLOR + 127.5),  # 255 (0.15 c + 1/2)
+        rounded_bytes((gaussians.scales[order] + 10) * 16),  # of log-scales
+        turn.astype("<u4"),
+        rounded_bytes(np.floor((sh + _SPZ_STEP // 2) / _SPZ_STEP) * _SPZ_STEP),
+    ]
+    degree = SH_COUNTS.index(rest)
+    header = _SPZ_HEADER.pack(SPZ_MAGIC, _SPZ_VERSION, len(order), degree, bits, 0, 0)
+    body = b"".join(np.ascontiguousarray(part).tobytes() for part in parts)
+    return [gzip.compress(header + body, 6, mtime=0)]
+
+
+def decode_spz(path: Path) -> Gaussians:
+    """The Gaussians in an .spz.
+
+    Raises:
+        MissingDependencyError: It is of version 4, and zstandard is absent.
+    """
+    data = read_bytes(path)
+    with guarded(path, "a whole .spz"):
+        stream = zlib.decompressobj(wbits=31)
+        in_zstd = data.startswith(SPZ_MAGIC)
+        header = data if in_zstd else stream.decompress(data, _SPZ_HEADER.size)
+        _, version, count, degree, bits, _, _ = _SPZ_HEADER.unpack_from(header)
+        if not 1 <= version <= 4:
+            raise ValueError(f"version {version}; versions 1 to 4 are known")
+        if degree >= len(SH_COUNTS) or count == 0 or bits > 24:
+            raise ValueError(f"{count} Gaussians of degree {degree}, {bits} fractional bits")
+        rest = SH_COUNTS[degree]
+        # Position, opacity, colour, scale, rotation, harmonics: bytes per Gaussian.
+        sizes = [6 if version == 1 else 9, 1, 3, 3, 3 if version < 3 else 4, 3 * rest]
+        check_memory(count, sum(sizes), "Gaussians", fix=COPY_AGAIN)
+        wanted = count * sum(sizes)
+        if in_zstd:
+            body = _zstd_body(data, count, [size for size in sizes if size])
+        else:  # up to the size in the header: no zip bomb is unpacked
+            body = stream.decompress(stream.unconsumed_tail, wanted)
+        complete = in_zstd or stream.eof or stream.decompress(stream.unconsumed_tail, 1)
+        if len(body) != wanted or not complete:
+            raise ValueError(f"a stream that ends after {len(body):,} of {wanted:,} bytes")
+        parts = np.split(np.frombuffer(body, np.uint8), count * np.cumsum(sizes)[:-1])
+        position, opacity, color, scale, turn, sh = (part.reshape(count, -1) for part in parts)
+        harmonics = (sh.reshape(count, rest, 3).astype(np.float32) - 128) / 128
+        return Gaussians(
+            means=_positions(position, bits) * _AXES,
+            scales=(scale / 16 - 10).astype(np.float32),
+            quats=_quats(turn) * np.append(np.float32(1), _AXES),
+            opacities=opacity_logits(opacity[:, 0]),
+            sh0=((color - 127.5) / _SPZ_COLOR).astype(np.float32)[:, None],
+            shN=np.asarray(harmonics * _SH_AXES[:rest, None], np.float32),
+        )
+
+
+def _zstd_body(data: bytes, count: int, sizes: list[int]) -> bytes:
+    """The attributes of version 4, whose header ends in the offset of a table of their streams."""
+    require("zstandard")
+    import zstandard  # noqa: PLC0415  (of the extra view)
+
+    (table,) = struct.unpack_from("<I", data, _SPZ_HEADER.size)
+    at, body = table + 16 * len(sizes), b""
+    for i, size in enumerate(sizes):
+        length, _ = struct.unpack_from("<QQ", data, table + 16 * i)
+        body += zstandard.ZstdDecompressor().decompress(
+            data[at : at + length], max_output_size=count * size
+        )
+        at += length
+    return body
+
+
+def _positions(raw: UInt8[np.ndarray, "N B"], bits: int) -> Float32[np.ndarray, "N 3"]:
+    if raw.shape[1] == 6:  # half floats
+        return np.ascontiguousarray(raw).view("<f2").astype(np.float32)
+    digits = raw.reshape(-1, 3, 3).astype(np.int32)
+    fixed: Int64[np.ndarray, "N 3"] = digits[..., 0] | digits[..., 1] << 8 | digits[..., 2] << 16
+    fixed = np.where(fixed > _SPZ_MOST, fixed - 2**24, fixed)
+    return (fixed / 2.0**bits).astype(np.float32)
+
+
+def _quats(raw: UInt8[np.ndarray, "N B"]) -> Float32[np.ndarray, "N 4"]:
+    if raw.shape[1] == 3:  # a byte for each of x, y, z; w >= 0 follows
+        xyz = raw / np.float32(127.5) - 1
+        w = np.sqrt(np.maximum(1 - (xyz**2).sum(axis=1, keepdims=True), 0))
+        return np.hstack([w, xyz]).astype(np.float32)
+    packed = np.ascontiguousarray(raw).view("<u4")[:, 0]
+    fields = np.stack([(packed >> shift) & 1023 for shift in (20, 10, 0)], axis=1)
+    size = (fields & _NINE_BITS) / np.float32(_NINE_BITS * np.sqrt(2))
+    three = np.where(fields >> 9, -size, size).astype(np.float32)
+    return np.roll(from_smallest_three((packed >> 30).astype(np.int64), three), 1, axis=1)
