@@ -84,7 +84,7 @@ def test_a_failed_build_is_one_sentence(machine, tmp_path):
     _stand_in(tmp_path, fails=True)
     out, err = _start(machine).communicate()
     assert not err
-    assert "nvcc fatal : no such thing (nvcc 12.8)" in out
+    assert "nvcc fatal : no such thing" in out
     assert "--backend cpu" in out
 
 

@@ -11,7 +11,7 @@ import pytest
 pytest.importorskip("ray", reason="Ray is an extra: pip install -e '.[cluster]'")
 
 from splatseed.errors import ParameterError
-from splatseed.runtime.ray_tasks import RayTasks, Share, ray_cluster
+from splatseed.runtime.ray_tasks import RayTasks, ray_cluster
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1:{}", "ray://127.0.0.1:{}", "127.0.0.1:{}0000"])
@@ -52,7 +52,7 @@ def test_workers_import_nothing_of_the_working_directory(tmp_path, monkeypatch):
         return callable(splatseed.upsample)
 
     with ray_cluster(None):
-        tasks = RayTasks(Share(1), 1)
+        tasks = RayTasks(1, jobs=1)
         assert [each.value for each in tasks.run(task, [()])] == [True]
         assert not mark.exists()
         monkeypatch.syspath_prepend(tmp_path / "unknown")

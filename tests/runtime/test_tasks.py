@@ -17,8 +17,7 @@ import pytest
 import splatseed
 from splatseed.errors import OutputError, ParameterError, TaskLostError
 from splatseed.progress import silent
-from splatseed.runtime.tasks import Child, HereTasks, ProcessTasks
-from splatseed.runtime.threads import slot_environment
+from splatseed.runtime.tasks import Child, HereTasks, ProcessTasks, slot_environment
 
 POSIX = pytest.mark.skipif(os.name != "posix", reason="needs signals")
 

@@ -11,7 +11,7 @@ import pytest
 pytest.importorskip("ray", reason="Ray is an extra: pip install -e '.[cluster]'")
 
 from splatseed.errors import OutputError
-from splatseed.runtime.ray_tasks import RayTasks, Share, ray_cluster
+from splatseed.runtime.ray_tasks import RayTasks, ray_cluster
 from splatseed.upsample import configure, upsample
 
 
@@ -28,7 +28,7 @@ class DyingTasks(RayTasks):
     """A cluster of which one worker is killed."""
 
     def __init__(self, flag):
-        super().__init__(Share(1), 1)
+        super().__init__(1, jobs=1)
         self.flag = flag
 
     def run(self, function, calls, report=None):
@@ -51,7 +51,7 @@ def test_a_cluster_gives_the_same_bytes_though_a_worker_is_killed(
     with ray_cluster(None):
         xyz, _ = tiles(sheet, "linear", configure("linear"), most=250, tasks=DyingTasks(flag))
         with pytest.raises(OutputError, match="expected a manifest; found none"):
-            RayTasks(Share(1), 1).run_all(raiser(), [()], "stage", lambda *_: None)
+            RayTasks(1, jobs=1).run_all(raiser(), [()], "stage", lambda *_: None)
     assert flag.exists()
     expected = upsample(sheet.select(sheet.distinct), "linear", ratio=3)
     np.testing.assert_array_equal(xyz, expected.xyz)

@@ -12,8 +12,7 @@ from hypothesis import given, settings, strategies as st
 from hypothesis.extra import numpy as arrays
 
 from splatseed.pointcloud import PointCloud
-from splatseed.runtime.tasks import ProcessTasks
-from splatseed.runtime.threads import slot_environment
+from splatseed.runtime.tasks import ProcessTasks, slot_environment
 from splatseed.scene import Scene, Tracks
 from splatseed.tiles import making
 from splatseed.tiles.cutting import Cuts

@@ -58,8 +58,7 @@ from splatseed.progress import Progress
 from splatseed.requirements import require
 from splatseed.runtime.interruption import exit_code
 from splatseed.runtime.memory import check_memory
-from splatseed.runtime.tasks import ProcessTasks, Tasks
-from splatseed.runtime.threads import cores, slot_environment
+from splatseed.runtime.tasks import ProcessTasks, Tasks, cores, slot_environment
 from splatseed.train.settings import BYTES_EACH, Backend, StrategyName
 from splatseed.upsample import Profile
 
@@ -318,18 +317,10 @@ def open_machine(options: Options, backend: Backend) -> Iterator[Machine]:
         return
     from splatseed.runtime.ray_tasks import RayTasks, ray_cluster  # noqa: PLC0415  (an extra)
 
-    with ray_cluster(options.address) as cluster:
-        on_gpu = backend == "cuda" or (backend == "auto" and cluster.has_gpus)
-        share = cluster.share(None, gpu=on_gpu)
-        fitting = cluster.capacity(share)
-        yield Machine(
-            "Ray",
-            "cuda" if on_gpu else "cpu",
-            min(options.jobs or fitting, fitting),
-            share.threads,
-            RayTasks(share, options.jobs),
-            away=True,
-        )
+    with ray_cluster(options.address):
+        tasks = RayTasks(gpu=None if backend == "auto" else backend == "cuda", jobs=options.jobs)
+        on_gpu: Backend = "cuda" if tasks.gpu else "cpu"
+        yield Machine("Ray", on_gpu, tasks.jobs, tasks.threads, tasks, away=True)
 
 
 def _local_machine(jobs: int | None, backend: Backend) -> Machine:

@@ -12,19 +12,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
-
 
 class Termination(KeyboardInterrupt):
     """SIGTERM, as schedulers send it: cleanup runs as after Ctrl-C."""
 
 
 class Interruption:
-    """Whether the user asked to stop.
-
-    Attributes:
-        last: The last signal that asked the process to stop, whichever block received it.
-    """
+    """Whether the user asked to stop (``requested``); ``last`` is the last signal of any block."""
 
     last = signal.SIGINT
 
@@ -40,11 +34,7 @@ class Interruption:
 
 
 def exit_code(stop: KeyboardInterrupt | None = None) -> int:
-    """The exit code, by shell convention, of a process that stopped because it was asked to.
-
-    Args:
-        stop: What was raised, if the signal was not only noted.
-    """
+    """A shell's exit code of a process that was asked to stop, by what was raised if anything."""
     return 128 + (signal.SIGTERM if isinstance(stop, Termination) else Interruption.last)
 
 
@@ -55,7 +45,7 @@ def interruption() -> Iterator[Interruption]:
     if threading.current_thread() is not threading.main_thread():
         yield flag
         return
-    before = {number: signal.signal(number, flag) for number in SIGNALS}
+    before = {each: signal.signal(each, flag) for each in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield flag
     finally:

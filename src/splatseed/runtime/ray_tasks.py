@@ -13,14 +13,13 @@ import sys
 from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import chdir, contextmanager, suppress
-from dataclasses import dataclass
 from typing import Any
 
 from splatseed.errors import ParameterError, TaskLostError
+from splatseed.progress import thread_limit
 from splatseed.requirements import require
 from splatseed.runtime.interruption import interruption
 from splatseed.runtime.tasks import Function, Report, Result, Tasks
-from splatseed.runtime.threads import few_threads
 
 LOSSES = 3
 """How often a task is restarted whose node or worker was lost."""
@@ -37,66 +36,8 @@ MOST_THREADS = 8
 """Default threads of a task: with more, they wait for each other."""
 
 
-@dataclass(frozen=True)
-class Share:
-    """The resources of each task on a node.
-
-    Args:
-        threads: CPUs.
-        gpus: GPUs, 0 or 1.
-    """
-
-    threads: int
-    gpus: int = 0
-
-
-class Cluster:
-    """The current resources of the cluster that this process is connected to."""
-
-    @property
-    def has_gpus(self) -> bool:
-        """Whether any node has a GPU."""
-        return any(gpus >= 1 for _, gpus in self._nodes())
-
-    def share(self, threads: int | None, *, gpu: bool) -> Share:
-        """The resources of each task, such that every node with CPUs (and GPUs) can execute one.
-
-        Args:
-            threads: CPUs, if the user says so.
-            gpu: Whether tasks need a GPU.
-
-        Raises:
-            ParameterError: No node has enough.
-        """
-        nodes = [(cpus, gpus) for cpus, gpus in self._nodes() if cpus >= 1 and gpus >= gpu]
-        fitting = min((int(cpus // max(gpus, 1)) for cpus, gpus in nodes), default=1)
-        share = Share(threads or max(1, min(fitting, MOST_THREADS)), int(gpu))
-        if not self.capacity(share):
-            what = f"{share.threads} CPUs" + (" and a GPU" if gpu else "")
-            raise ParameterError(
-                f"a node of the cluster with {what}",
-                found=f"{len(nodes)} nodes, none with so much",
-                fix="Pass fewer --threads, or add nodes.",
-            )
-        return share
-
-    def capacity(self, share: Share) -> int:
-        """How many tasks fit at a time."""
-        return sum(
-            min(int(cpus // share.threads), int(gpus) if share.gpus else int(cpus))
-            for cpus, gpus in self._nodes()
-        )
-
-    def _nodes(self) -> list[tuple[float, float]]:
-        """CPUs and GPUs of each node."""
-        import ray  # noqa: PLC0415  (an extra, and slow to import)
-
-        resources = [node["Resources"] for node in ray.nodes() if node["Alive"]]
-        return [(each.get("CPU", 0.0), each.get("GPU", 0.0)) for each in resources]
-
-
 @contextmanager
-def ray_cluster(address: str | None) -> Iterator[Cluster]:
+def ray_cluster(address: str | None) -> Iterator[None]:
     """Connect to a cluster while the block runs.
 
     Args:
@@ -110,25 +51,22 @@ def ray_cluster(address: str | None) -> Iterator[Cluster]:
     require("ray")
     # Otherwise Ray reports usage on each start; clusters that others started keep their settings.
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    options: dict[str, Any] = {"address": address or "local"}
     if address:
         _check_answers(address)
         os.environ.setdefault("RAY_NUM_REDIS_GET_RETRIES", str(ATTEMPTS))  # Ray's name is older
+    else:
+        options["include_dashboard"] = False
     import ray  # noqa: PLC0415  (an extra, and slow to import)
 
-    options: dict[str, Any] = {} if address else {"include_dashboard": False}
     try:
         # Workers import from the directory that Ray is started in, before all else.
         with chdir(sys.prefix):
-            ray.init(
-                address=address or "local",
-                log_to_driver=False,
-                logging_level=logging.ERROR,
-                **options,
-            )
+            ray.init(log_to_driver=False, logging_level=logging.ERROR, **options)
     except (ConnectionError, RuntimeError, ValueError) as error:
         raise _no_cluster(address, " ".join(str(error).split())) from None
     try:
-        yield Cluster()
+        yield
     finally:
         ray.shutdown()
 
@@ -161,13 +99,43 @@ class RayTasks(Tasks):
     """Tasks on the cluster that this process is connected to.
 
     Args:
-        share: The resources of each.
+        threads: CPUs of each; left out, as many as let every node work on one for each of its GPUs.
+        gpu: Whether each needs a GPU; None for yes if any node has one.
         jobs: Most tasks at a time; as many as fit, when left out.
+
+    Attributes:
+        threads: CPUs of each.
+        gpu: Whether each has a GPU.
+
+    Raises:
+        ParameterError: No node has enough.
     """
 
-    def __init__(self, share: Share, jobs: int | None = None) -> None:
-        self._share, self._jobs = share, jobs
-        self.words = f"Ray, {self._most()} tasks at a time"
+    def __init__(
+        self, threads: int | None = None, *, gpu: bool | None = False, jobs: int | None = None
+    ) -> None:
+        nodes = _nodes()
+        self.gpu = any(gpus >= 1 for _, gpus in nodes) if gpu is None else gpu
+        fitting = [cpus // max(gpus, 1) for cpus, gpus in nodes if cpus >= 1 and gpus >= self.gpu]
+        self.threads = threads or max(1, min(int(min(fitting, default=1)), MOST_THREADS))
+        self._jobs = jobs
+        if not self._fitting():
+            raise ParameterError(
+                f"a node of the cluster with {self.threads} CPUs{' and a GPU' * self.gpu}",
+                found=f"{len(fitting)} nodes, none with so much",
+                fix="Pass fewer --threads, or add nodes.",
+            )
+        self.words = f"Ray, {self.jobs} tasks at a time"
+
+    @property
+    def jobs(self) -> int:
+        """Tasks at a time, on the nodes that are there now."""
+        fitting = max(self._fitting(), 1)
+        return min(self._jobs or fitting, fitting)
+
+    def _fitting(self) -> int:
+        most = [(cpus // self.threads, gpus if self.gpu else cpus) for cpus, gpus in _nodes()]
+        return sum(int(min(each)) for each in most)
 
     def run(
         self, function: Function, calls: Sequence[tuple[Any, ...]], report: Report | None = None
@@ -175,16 +143,16 @@ class RayTasks(Tasks):
         """See ``Tasks``; the function is given no ``progress``."""
         import ray  # noqa: PLC0415  (an extra, and slow to import)
 
-        share = self._share
-        options = {"num_cpus": share.threads, "num_gpus": share.gpus, "max_retries": LOSSES}
-        task = ray.remote(**options)(_limited)
+        task = ray.remote(num_cpus=self.threads, num_gpus=int(self.gpu), max_retries=LOSSES)(
+            _limited
+        )
         waiting, running = deque(range(len(calls))), dict[Any, int]()
         with interruption() as stop:
             try:
                 while (waiting or running) and not stop.requested:
-                    while waiting and len(running) < self._most():  # nodes may have come or gone
+                    while waiting and len(running) < self.jobs:  # nodes may have come or gone
                         index = waiting.popleft()
-                        running[task.remote(share.threads, function, calls[index])] = index
+                        running[task.remote(self.threads, function, calls[index])] = index
                         if report is not None:
                             report(index, "start", 0.0)
                     for each in ray.wait(list(running), timeout=POLL_SECONDS)[0]:
@@ -198,14 +166,27 @@ class RayTasks(Tasks):
         if stop.requested:
             raise KeyboardInterrupt
 
-    def _most(self) -> int:
-        return self._jobs or max(Cluster().capacity(self._share), 1)
+
+def _nodes() -> list[tuple[float, float]]:
+    """CPUs and GPUs of each node."""
+    import ray  # noqa: PLC0415  (an extra, and slow to import)
+
+    resources = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+    return [(each.get("CPU", 0.0), each.get("GPU", 0.0)) for each in resources]
 
 
 def _limited(threads: int, function: Function, call: tuple[Any, ...]) -> Any:
-    """A task with its share of a node."""
-    with few_threads(threads):
+    """A task, whose kernels and ``in_threads`` use its share of a node, in a worker's process."""
+    import numba  # noqa: PLC0415  (slow to import)
+
+    before = numba.get_num_threads()
+    numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]  # absent from Numba's stubs
+    limit = thread_limit.set(threads)
+    try:
         return function(*call)
+    finally:
+        thread_limit.reset(limit)
+        numba.set_num_threads(before)
 
 
 def _result(index: int, reference: Any) -> Result:
@@ -215,9 +196,14 @@ def _result(index: int, reference: Any) -> Result:
         return Result(index, ray.get(reference))
     except ray.exceptions.RayTaskError as error:
         told = str(error.cause)
-        if isinstance(error.cause, ray.exceptions.RaySystemError) or UNIMPORTED in told:
-            return Result(index, error=not_installed(told))
-        return Result(index, error=error.cause)
+        if not isinstance(error.cause, ray.exceptions.RaySystemError) and UNIMPORTED not in told:
+            return Result(index, error=error.cause)
+        missing = ParameterError(
+            "splatseed on every node of the cluster, in the Python that ray start ran in",
+            found=next(filter(None, map(str.strip, reversed(told.splitlines()))), "no reason"),
+            fix="Install the same version of splatseed there, and run the same command again.",
+        )
+        return Result(index, error=missing)
     except ray.exceptions.RayError as error:
         lost = TaskLostError(
             "a node that lives until its work is done",
@@ -225,13 +211,3 @@ def _result(index: int, reference: Any) -> Result:
             fix="Check the cluster's memory and disks, and run the same command to go on.",
         )
         return Result(index, error=lost)
-
-
-def not_installed(told: str) -> ParameterError:
-    """What a worker's traceback means, if the worker could not import what it is to call."""
-    reason = next(filter(None, map(str.strip, reversed(told.splitlines()))), "no reason")
-    return ParameterError(
-        "splatseed on every node of the cluster, in the Python that ray start ran in",
-        found=reason,
-        fix="Install the same version of splatseed there, and run the same command again.",
-    )

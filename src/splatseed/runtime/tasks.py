@@ -20,14 +20,14 @@ import threading
 import time
 import traceback
 from abc import ABC, abstractmethod
-from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from typing import IO, Any, TypeAlias, cast
 
 from splatseed.errors import SplatseedError, TaskLostError
-from splatseed.progress import Progress, thread_limit
+from splatseed.progress import Progress, silent, thread_limit
 from splatseed.runtime.interruption import interruption
 
 Function: TypeAlias = Callable[..., Any]
@@ -35,10 +35,31 @@ Report: TypeAlias = Callable[[int, str, float], None]
 """Takes a task's index, its stage, and the fraction of it that is done."""
 
 _PROGRAM = "from splatseed.runtime.tasks import serve; serve()"
-_TRIES = 2
 _POLL_SECONDS = 0.2
 _REPORT_SECONDS = 0.5
 _LAST_WORDS = 40
+
+
+def cores() -> int:
+    """How many cores this process may use."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # not on Windows and macOS
+        return os.cpu_count() or 1
+
+
+def slot_environment(threads: int, gpu: str = "") -> dict[str, str]:
+    """The variables that tell a process its share of the machine; results do not depend on it.
+
+    Args:
+        threads: Its threads.
+        gpu: Its GPU, as in ``CUDA_VISIBLE_DEVICES``; empty to leave the choice to PyTorch.
+    """
+    libraries = ("NUMBA", "OMP", "MKL", "OPENBLAS")
+    environment = {f"{library}_NUM_THREADS": str(threads) for library in libraries}
+    # Idle threads of one pool would take the cores from the other: see splatseed.cli.
+    environment["OMP_WAIT_POLICY"] = os.environ.get("OMP_WAIT_POLICY", "passive")
+    return {**environment, "CUDA_VISIBLE_DEVICES": gpu} if gpu else environment
 
 
 @dataclass(frozen=True)
@@ -116,7 +137,7 @@ class HereTasks(Tasks):
 
 
 class ProcessTasks(Tasks):
-    """Tasks in processes of this machine.
+    """Tasks in processes of this machine, each of which a thread of this one waits for.
 
     Args:
         environments: Variables of each process, such as ``slot_environment`` gives.
@@ -132,96 +153,75 @@ class ProcessTasks(Tasks):
         self, function: Function, calls: Sequence[tuple[Any, ...]], report: Report | None = None
     ) -> Iterator[Result]:
         """See ``Tasks``."""
-        slots = _Slots(function, calls, report, fresh=self._fresh)
-        threads = [
-            threading.Thread(target=slots.work, args=(environment,), daemon=True)
-            for environment in self._environments[: len(calls)]
-        ]
+        slots, died = _Slots(self._environments, fresh=self._fresh), set[int]()
+
+        def work(index: int) -> Any:
+            return slots.call(function, calls[index], _progress_of(index, report))
+
+        pool = ThreadPoolExecutor(len(self._environments))
         with interruption() as stop:
             try:
-                for thread in threads:
-                    thread.start()
-                while any(thread.is_alive() for thread in threads) or not slots.ended.empty():
-                    if stop.requested:
+                futures = {pool.submit(work, index): index for index in range(len(calls))}
+                while futures:
+                    done = wait(futures, _POLL_SECONDS, FIRST_COMPLETED).done
+                    if stop.requested and not slots.stopped:
+                        pool.shutdown(wait=False, cancel_futures=True)
+                        futures = {each: futures[each] for each in futures if not each.cancelled()}
                         slots.stop(signal.SIGTERM)
-                    with suppress(queue.Empty):
-                        yield slots.ended.get(timeout=_POLL_SECONDS)
+                    for future in done & futures.keys():
+                        index, error = futures.pop(future), future.exception()
+                        lost = isinstance(error, TaskLostError)
+                        if lost and index not in died and not slots.stopped:
+                            died.add(index)
+                            futures[pool.submit(work, index)] = index
+                        elif not (lost and slots.stopped):
+                            value = None if error else future.result()
+                            yield Result(index, value, cast("Exception | None", error))
             finally:
+                pool.shutdown(wait=False, cancel_futures=True)
                 slots.stop(signal.SIGKILL if os.name == "posix" else signal.SIGTERM)
-                for thread in threads:
-                    thread.join()
+                pool.shutdown()
+                slots.close()
         if stop.requested:
             raise KeyboardInterrupt
 
 
 class _Slots:
-    """What the threads share that wait for the processes of ``ProcessTasks``."""
+    """The processes of ``ProcessTasks``, one for each environment, each begun when it is needed."""
 
-    def __init__(
-        self,
-        function: Function,
-        calls: Sequence[tuple[Any, ...]],
-        report: Report | None,
-        *,
-        fresh: bool,
-    ) -> None:
-        self._function, self._calls, self._report, self._fresh = function, calls, report, fresh
-        self._waiting = deque(range(len(calls)))
-        self._deaths: Counter[int] = Counter()
-        self._children: set[Child] = set()
-        self._lock = threading.Lock()
-        self._sent: int | None = None
-        self.ended: queue.SimpleQueue[Result] = queue.SimpleQueue()
+    def __init__(self, environments: Sequence[Mapping[str, str]], *, fresh: bool) -> None:
+        self._free: queue.SimpleQueue[tuple[Mapping[str, str], Child | None]] = queue.SimpleQueue()
+        for environment in environments:
+            self._free.put((environment, None))
+        self._fresh, self._children, self.stopped = fresh, set[Child](), False
 
-    def work(self, environment: Mapping[str, str]) -> None:
-        """Have tasks done, in one process after another, until none is left."""
-        while self._waiting and self._sent is None:
-            try:
+    def call(self, function: Function, arguments: tuple[Any, ...], told: dict[str, Any]) -> Any:
+        """Call a function in a free process."""
+        environment, child = self._free.get()
+        try:
+            if child is None:
                 child = Child(environment, tempfile.TemporaryFile())  # noqa: SIM115  (the child's)
-            except OSError as error:
-                while (index := self._next()) is not None:
-                    self.ended.put(Result(index, error=error))
-                return
-            with self._lock:
                 self._children.add(child)
-            try:
-                self._employ(child)
-            finally:
-                with self._lock:
-                    self._children.remove(child)
+            if self.stopped:  # meanwhile
+                child.process.kill()
+            return child.call(function, *arguments, **told)
+        finally:
+            if child is not None and (self._fresh or child.process.poll() is not None):
+                self._children.discard(child)
                 child.close()
-
-    def _employ(self, child: Child) -> None:
-        """Give a process tasks until none is left, it dies, or the next wants a fresh one."""
-        while (index := self._next()) is not None:
-            try:
-                told = _progress_of(index, self._report)
-                value = child.call(self._function, *self._calls[index], **told)
-                self.ended.put(Result(index, value))
-            except TaskLostError as error:
-                self._deaths[index] += 1
-                if self._deaths[index] < _TRIES:
-                    self._waiting.append(index)
-                elif self._sent is None:
-                    self.ended.put(Result(index, error=error))
-                return
-            except Exception as error:  # noqa: BLE001  (the caller's to judge)
-                self.ended.put(Result(index, error=error))
-            if self._fresh:
-                return
+                child = None
+            self._free.put((environment, child))
 
     def stop(self, number: int) -> None:
-        """Begin no more tasks, and send the children a signal, once."""
-        with self._lock:
-            if self._sent != number:
-                self._sent = number
-                for child in self._children:
-                    child.process.send_signal(number)
+        """Send all processes a signal; those that begin later are killed."""
+        self.stopped = True
+        for child in list(self._children):
+            child.process.send_signal(number)
 
-    def _next(self) -> int | None:
-        with suppress(IndexError):
-            return None if self._sent is not None else self._waiting.popleft()
-        return None
+    def close(self) -> None:
+        """End all processes; no thread may wait for any."""
+        for child in self._children:
+            child.close()
 
 
 class Child:
@@ -260,7 +260,7 @@ class Child:
             pickle.dump(pickle.dumps((function, arguments, reports)), commands)
             commands.flush()
 
-    def wait(self, progress: Progress | None = None) -> Any:
+    def wait(self, progress: Progress = silent) -> Any:
         """What the function returns, or raises.
 
         Args:
@@ -269,22 +269,20 @@ class Child:
         Raises:
             TaskLostError: The process died.
         """
-        while True:
-            try:
-                kind, *content = pickle.load(cast("IO[bytes]", self.process.stdout))  # noqa: S301  (our child)
-            except (EOFError, pickle.UnpicklingError):
-                raise self._death() from None
-            if kind == "done":
-                return content[0]
-            if kind == "failed":
-                raise content[0]
-            if progress is not None:
-                progress(*content)
+        replies = cast("IO[bytes]", self.process.stdout)
+        try:
+            while (reply := pickle.load(replies))[0] == "told":  # noqa: S301  (our child)
+                progress(*reply[1:])
+        except (EOFError, pickle.UnpicklingError):
+            raise self._death() from None
+        if reply[0] == "failed":
+            raise reply[1]
+        return reply[1]
 
     def call(self, function: Function, *arguments: object, progress: Progress | None = None) -> Any:
         """``start`` and ``wait``."""
         self.start(function, *arguments, reports=progress is not None)
-        return self.wait(progress)
+        return self.wait(progress or silent)
 
     def close(self) -> None:
         """End the process, whatever it is doing."""
@@ -318,17 +316,24 @@ def serve() -> None:
         thread_limit.set(int(os.environ["NUMBA_NUM_THREADS"]))
     commands: queue.SimpleQueue[bytes] = queue.SimpleQueue()
     threading.Thread(target=_listen, args=(commands,), daemon=True).start()
+    last = ("", 0.0)
 
     def reply(*message: object) -> None:
         replies.write(pickle.dumps(message))
         replies.flush()
 
+    def progress(stage: str, fraction: float) -> None:
+        nonlocal last
+        if stage != last[0] or fraction >= 1.0 or time.monotonic() - last[1] > _REPORT_SECONDS:
+            last = (stage, time.monotonic())
+            reply("told", stage, float(fraction))
+
     try:
         while True:
             function, arguments, reports = pickle.loads(commands.get())  # noqa: S301  (our parent)
-            told = {"progress": _seldom(lambda *each: reply("told", *each))} if reports else {}
+            last = ("", 0.0)
             try:
-                reply("done", function(*arguments, **told))
+                reply("done", function(*arguments, **({"progress": progress} if reports else {})))
             except Exception as error:  # noqa: BLE001  (the parent's to judge)
                 if not isinstance(error, SplatseedError):
                     error.add_note(traceback.format_exc())
@@ -345,19 +350,6 @@ def _listen(commands: queue.SimpleQueue[bytes]) -> None:
         while True:
             commands.put(pickle.load(sys.stdin.buffer))  # noqa: S301  (our parent)
     os._exit(1)
-
-
-def _seldom(progress: Progress) -> Progress:
-    """Progress that is passed on a few times per second."""
-    last = ("", 0.0)
-
-    def report(stage: str, fraction: float) -> None:
-        nonlocal last
-        if stage != last[0] or fraction >= 1.0 or time.monotonic() - last[1] > _REPORT_SECONDS:
-            last = (stage, time.monotonic())
-            progress(stage, float(fraction))
-
-    return report
 
 
 def _progress_of(index: int, report: Report | None) -> dict[str, Progress]:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import io
 import os
 import shutil
-import subprocess
 import sys
 import sysconfig
 from contextlib import redirect_stdout
@@ -85,74 +84,37 @@ def load_kernels(option: str, progress: Progress = silent) -> None:
         MissingDependencyError: gsplat is absent, or has no compiled kernels and they cannot be
             built here.
     """
-    if _are_loaded():
+    if getattr(sys.modules.get(BACKEND), "_C", None) is not None:
         return
     require("gsplat")
-    _find_tools()
-    missing = [] if find_spec("gsplat.csrc") else _missing_tools()  # csrc: they came compiled
-    if missing:
-        raise _cannot_build(f"no {', no '.join(missing)}", option)
-    root = _build_root()
-    root.mkdir(parents=True, exist_ok=True)
-    with FileLock(root / "gsplat_cuda.splatseed.lock"):
-        if not any(root.rglob("gsplat_cuda.so")):
+    from torch.utils import cpp_extension  # noqa: PLC0415  (slow to import, for builds only)
+
+    # Ninja, which gsplat brings, is off the path of a venv's command called without activation.
+    os.environ["PATH"] = f"{os.environ.get('PATH', '')}{os.pathsep}{sysconfig.get_path('scripts')}"
+    home = cpp_extension.CUDA_HOME or os.environ.get("CUDA_HOME")
+    compiler = os.environ.get("CXX", "cl" if os.name == "nt" else "g++")
+    tools = {
+        "nvcc": (home and shutil.which("nvcc", path=Path(home, "bin"))) or shutil.which("nvcc"),
+        compiler: shutil.which(compiler),
+        "ninja": shutil.which("ninja"),
+    }
+    missing = [f"no {name}" for name, path in tools.items() if path is None]
+    if missing and not find_spec("gsplat.csrc"):  # csrc: they came compiled
+        raise _cannot_build(", ".join(missing), option)
+    root = os.environ.get("TORCH_EXTENSIONS_DIR") or cpp_extension.get_default_build_root()
+    Path(root).mkdir(parents=True, exist_ok=True)
+    with FileLock(Path(root, "gsplat_cuda.splatseed.lock")):
+        if not any(Path(root).rglob("gsplat_cuda.so")):
             progress(BUILDING, 0.0)
         try:
             with redirect_stdout(io.StringIO()):  # gsplat's own line belongs to no output of ours
-                import_module(BACKEND)
+                loaded = getattr(import_module(BACKEND), "_C", None)
         except (ImportError, OSError, RuntimeError) as error:
             lines = [line for line in str(error).splitlines() if "error" in line.lower()]
             told = (lines or [type(error).__name__])[0].strip()[:200]
-            raise _cannot_build(f"{told} (nvcc {_nvcc_release()})", option) from error
-    if not _are_loaded():
+            raise _cannot_build(f"{told} ({tools['nvcc']})", option) from error
+    if loaded is None:
         raise _cannot_build("kernels that gsplat could not load", option)
-
-
-def _are_loaded() -> bool:
-    return getattr(sys.modules.get(BACKEND), "_C", None) is not None
-
-
-def _find_tools() -> None:
-    """Let programs of this environment be found, ninja above all, which gsplat brings.
-
-    They are not on the path of a venv's command that is called without activating the venv.
-    """
-    here = sysconfig.get_path("scripts")
-    if here not in os.environ.get("PATH", "").split(os.pathsep):
-        os.environ["PATH"] = os.pathsep.join([os.environ.get("PATH", ""), here])
-
-
-def _missing_tools() -> list[str]:
-    """What a build needs and does not find."""
-    compiler = os.environ.get("CXX", "cl" if os.name == "nt" else "g++")
-    tools = {"nvcc": _nvcc(), compiler: shutil.which(compiler), "ninja": shutil.which("ninja")}
-    return [name for name, path in tools.items() if path is None]
-
-
-def _nvcc() -> str | None:
-    """Where gsplat finds nvcc: in CUDA's folder, else on the path."""
-    from torch.utils import cpp_extension  # noqa: PLC0415  (slow to import, for builds only)
-
-    home = cpp_extension.CUDA_HOME or os.environ.get("CUDA_HOME")
-    beside = Path(home, "bin", "nvcc.exe" if os.name == "nt" else "nvcc") if home else None
-    return str(beside) if beside and beside.is_file() else shutil.which("nvcc")
-
-
-def _nvcc_release() -> str:
-    """The release of the toolkit, such as 12.8; ``?`` if nvcc does not say."""
-    command = [_nvcc() or "nvcc", "--version"]
-    try:
-        said = subprocess.run(command, capture_output=True, text=True, check=True)  # noqa: S603  (as found)
-    except (OSError, subprocess.CalledProcessError):
-        return "?"
-    return said.stdout.partition("release ")[2].partition(",")[0] or "?"
-
-
-def _build_root() -> Path:
-    """The folder in which PyTorch builds extensions."""
-    from torch.utils import cpp_extension  # noqa: PLC0415  (slow to import, for builds only)
-
-    return Path(os.environ.get("TORCH_EXTENSIONS_DIR") or cpp_extension.get_default_build_root())
 
 
 def _cannot_build(found: str, option: str) -> MissingDependencyError:

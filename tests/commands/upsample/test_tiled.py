@@ -10,7 +10,7 @@ import pytest
 
 from splatseed.io.ply import read_ply, write_ply
 from splatseed.pointcloud import PointCloud
-from splatseed.runtime import tasks, threads
+from splatseed.runtime import tasks
 from splatseed.runtime.memory import bytes_of
 from splatseed.tiles import work
 
@@ -58,7 +58,7 @@ def test_large_clouds_are_shared_among_processes(cloud, tmp_path, splatseed, mon
             self.words, self.processes = f"{len(environments)} processes", 1 + len(environments)
 
     monkeypatch.setattr(tasks, "ProcessTasks", Processes)
-    monkeypatch.setattr(threads, "cores", lambda: 2)
+    monkeypatch.setattr(tasks, "cores", lambda: 2)
     monkeypatch.setattr(work, "MOST", 30)  # a large cloud has at least 8 tiles of this size
     words = ("upsample", npz(cloud), "--method", "linear", "--ratio", 3)
     for given, told in (

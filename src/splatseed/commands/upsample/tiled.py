@@ -258,16 +258,15 @@ def _tasks(options: Options, choose: Callable[..., int]) -> Iterator[Tasks]:
     """Where tiles are worked on, while the block runs."""
     from splatseed.runtime import tasks  # noqa: PLC0415  (processes)
     from splatseed.runtime.ray_tasks import RayTasks, ray_cluster  # noqa: PLC0415  (an extra)
-    from splatseed.runtime.threads import cores, slot_environment  # noqa: PLC0415  (loads with its use)
 
     tiling = options.tiling
     if tiling.executor == "ray":
-        with ray_cluster(tiling.address) as cluster:
-            yield RayTasks(cluster.share(1, gpu=False), tiling.jobs)
+        with ray_cluster(tiling.address):
+            yield RayTasks(1, jobs=tiling.jobs)
         return
-    jobs = tiling.jobs or (1 if tiling.tile_points is not None else choose(cores=cores()))
+    jobs = tiling.jobs or (1 if tiling.tile_points is not None else choose(cores=tasks.cores()))
     if jobs > 1:
-        yield tasks.ProcessTasks([slot_environment(max(1, cores() // jobs))] * jobs)
+        yield tasks.ProcessTasks([tasks.slot_environment(max(1, tasks.cores() // jobs))] * jobs)
     else:
         yield tasks.HereTasks()
 
