@@ -16,7 +16,7 @@ FACTS = (1234, 5.5, 0.61, {"features": 1.0})
 
 @pytest.fixture
 def called(monkeypatch, tmp_path):
-    """What the two reconstructions were called with, in place of running them."""
+    """What the reconstruction was called with, in place of running it."""
     calls = {}
     changes = [
         Refinement(True, 0.162, 0.162),
@@ -24,16 +24,11 @@ def called(monkeypatch, tmp_path):
     ]
 
     def reconstruct(*args, **kwargs):
-        calls["reconstruct"] = (args, kwargs)
-        return SfmReport(tmp_path / "out", 13, 20, LOST, *FACTS)
-
-    def triangulate(*args, **kwargs):
-        calls["triangulate"] = (args, kwargs)
-        change = changes.pop() if kwargs["refine_poses"] else None
-        return SfmReport(tmp_path / "out", 13, 13, (), *FACTS, change)
+        calls.update(args=args, **kwargs)
+        change = changes.pop() if kwargs.get("refine_poses") else None
+        return SfmReport(tmp_path / "out", 13, 20, LOST, *FACTS, change)
 
     monkeypatch.setattr(sfm, "reconstruct", reconstruct)
-    monkeypatch.setattr(sfm, "triangulate", triangulate)
     return calls
 
 
@@ -41,10 +36,10 @@ def test_words_reach_the_reconstruction_and_its_report_the_user(called, tmp_path
     words = ["--matcher", "sequential", "--threads", 2, "--overwrite", "--seed", 3]
     run = splatseed("sfm", tmp_path, "-o", tmp_path / "out", "--no-shared-camera", *words)
     assert (run.code, run.err) == (0, "")
-    args, kwargs = called["reconstruct"]
-    assert args == (tmp_path, tmp_path / "out", Settings("sequential", seed=3, threads=2))
-    assert not kwargs["shared_camera"]
-    assert kwargs["overwrite"]
+    settings = Settings("sequential", seed=3, threads=2)
+    assert called["args"] == (tmp_path, tmp_path / "out", settings)
+    assert not called["shared_camera"]
+    assert called["overwrite"]
     for text in ("13 of 20", "1,234", "mean 5.50 images", "mean 0.610 px", "and 2 more"):
         assert text in run.out
     assert f"splatseed upsample {tmp_path / 'out'} " in run.out
@@ -52,7 +47,7 @@ def test_words_reach_the_reconstruction_and_its_report_the_user(called, tmp_path
 
 def test_the_photographs_are_counted_by_folder_first(called, tmp_path, splatseed, capsys):
     splatseed("sfm", tmp_path, "-o", tmp_path / "out")
-    tell = called["reconstruct"][1]["on_photos"]
+    tell = called["on_photos"]
     tell(["a.png", "b.png"], {})
     tell(["scene/images/a.png", "run/render.png", "scene/images/b.png"], {"of grey": ["run/d.png"]})
     told = capsys.readouterr()
@@ -66,9 +61,8 @@ def test_the_photographs_are_counted_by_folder_first(called, tmp_path, splatseed
 def test_known_poses_are_triangulated_and_refined_when_asked(called, room, tmp_path, splatseed):
     words = ("sfm", room / "images", "--poses-from", room, "-o", tmp_path / "out")
     assert splatseed(*words).code == 0
-    (_, poses, *_), _ = called["triangulate"]
-    assert len(poses.images) == 12
-    assert "reconstruct" not in called
+    assert len(called["poses_from"].images) == 12
+    assert "camera_model" not in called
     moved = splatseed(*words, "--refine-poses").out
     for text in ("9.440 px", "0.160 px", "0.04 units", "0.113", "1.24 degrees", "3.66"):
         assert text in moved

@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter
 
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.io.files import is_video
-from splatseed.sfm.video import choose, pick_frames, shift
+from splatseed.sfm.photos import choose_frames, pick_frames, shift
 from splatseed.view.flights import write_video
 
 HEIGHT, WIDTH = 120, 160
@@ -52,12 +52,12 @@ def test_the_sharpest_of_each_stretch_is_taken():
     way = np.concatenate([np.zeros(50), np.linspace(0, 1, 101)[1:]])
     sharpness = np.ones(150)
     sharpness[[20, 77, 130]] = 2
-    taken = choose(sharpness, way, 4)
+    taken = choose_frames(sharpness, way, 4)
     assert len(taken) == 4
     assert {20, 77, 130} <= set(taken.tolist())
     assert np.all(np.diff(taken) > 0)
-    assert len(choose(sharpness, np.zeros(150), 10)) == 1
-    assert len(choose(np.ones(0), np.zeros(0), 10)) == 0
+    assert len(choose_frames(sharpness, np.zeros(150), 10)) == 1
+    assert len(choose_frames(np.ones(0), np.zeros(0), 10)) == 0
 
 
 def test_frames_are_sharp_spread_and_not_of_standing_still(video, tmp_path):

@@ -26,16 +26,8 @@ from splatseed.io.files import is_video
 from splatseed.io.staging import check_output
 from splatseed.literal import counted, quoted, visible
 from splatseed.runtime.torch_device import DeviceName
-from splatseed.sfm import (
-    MatcherName,
-    Refinement,
-    Settings,
-    SfmReport,
-    reconstruct,
-    triangulate,
-)
-from splatseed.sfm.photos import name_some
-from splatseed.sfm.video import pick_frames
+from splatseed.sfm import MatcherName, Refinement, Settings, SfmReport, reconstruct
+from splatseed.sfm.photos import name_some, pick_frames
 
 
 @dataclass(frozen=True)
@@ -136,20 +128,26 @@ def _from_photographs(options: Options, images: Path, clock: StageClock) -> SfmR
     video = images != options.images
     matcher = options.matcher or ("sequential" if video else "exhaustive")
     settings = Settings(matcher, options.device, seed=options.seed, threads=options.threads)
-    common: dict[str, Any] = {
-        "overwrite": options.overwrite,
-        "on_progress": clock,
-        "on_photos": None if video else partial(_tell_photographs, images),
-    }
     if options.poses_from is None:
-        clock.expect("features", "matching", "mapping", "undistortion")
-        common |= {"camera_model": options.camera_model, "shared_camera": options.shared_camera}
-        return reconstruct(images, options.output, settings, **common)
-    refinement = ["refinement"] if options.refine_poses else []
-    clock.expect("features", "matching", *refinement, "triangulation", "undistortion")
-    poses = load_scene(options.poses_from, require_points=False)
-    common["refine_poses"] = options.refine_poses
-    return triangulate(images, poses, options.output, settings, **common)
+        stages = ["mapping"]
+        how: dict[str, Any] = {
+            "camera_model": options.camera_model,
+            "shared_camera": options.shared_camera,
+        }
+    else:
+        stages = [*(["refinement"] if options.refine_poses else []), "triangulation"]
+        poses = load_scene(options.poses_from, require_points=False)
+        how = {"poses_from": poses, "refine_poses": options.refine_poses}
+    clock.expect("features", "matching", *stages, "undistortion")
+    return reconstruct(
+        images,
+        options.output,
+        settings,
+        overwrite=options.overwrite,
+        on_progress=clock,
+        on_photos=None if video else partial(_tell_photographs, images),
+        **how,
+    )
 
 
 def _tell_photographs(

@@ -46,7 +46,8 @@ def photograph_folder(scene: Scene) -> Path:
         raise SceneNotFoundError(
             "a scene with photographs",
             found="no images" if folder else "no folder of images",
-            fix="Name a scene with cameras, and put its photographs into a folder named images.",
+            fix="Name a scene with cameras (in a COLMAP model, images.bin has them), and put its "
+            "photographs into a folder named images.",
         )
     return folder
 

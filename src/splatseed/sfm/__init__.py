@@ -1,24 +1,20 @@
 """Structure-from-Motion: photographs to a scene folder, by pycolmap.
 
-``reconstruct`` finds poses, lenses and points; ``triangulate`` finds points for poses that are
-already known (an RGB-D capture, a simulator, another tool's calibration) and can refine those poses
-where a phone or SLAM made them; ``undistort`` removes lens distortion from a scene. All write the
-folder that every 3DGS trainer reads: undistorted ``images/`` and ``sparse/0/*.bin`` with PINHOLE
-cameras.
+``reconstruct`` finds poses, lenses and points, or points alone for poses that are already known (an
+RGB-D capture, a simulator, another tool's calibration), and can refine those where a phone or SLAM
+made them; ``undistort`` removes lens distortion from a scene. Both write the folder that every 3DGS
+trainer reads: undistorted ``images/`` and ``sparse/0/*.bin`` with PINHOLE cameras.
 
 Promise: the output appears whole or not at all, and every failure is one of ``splatseed.errors``.
-pycolmap is an optional dependency (``pip install "pycolmap>=4.0"``), imported when it is needed.
-
-Reproducibility: with one version of pycolmap on the CPU of one machine, features and verified
-matches are the same for the same images, options and seed. Mapping with several threads sums in
-varying order, and bundle adjustment can amplify that: 20 photographs gave 4095 points or 4047. With
-``threads=1`` the files are the same byte for byte. A GPU guarantees nothing.
+With one version of pycolmap on the CPU of one machine, features and verified matches are the same
+for the same images, options and seed. Mapping with several threads sums in varying order, and
+bundle adjustment can amplify that: 20 photographs gave 4095 points or 4047. With ``threads=1`` the
+files are the same byte for byte. A GPU guarantees nothing.
 """
 
-from splatseed.sfm.features import MatcherName, Settings
-from splatseed.sfm.pipeline import reconstruct, refined, triangulate, undistort, with_refined
+from splatseed.sfm.colmap import MatcherName, Settings
+from splatseed.sfm.pipeline import SfmReport, reconstruct, refined, undistort, with_refined
 from splatseed.sfm.refinement import Refinement
-from splatseed.sfm.worker import SfmReport
 
 __all__ = [
     "MatcherName",
@@ -27,7 +23,6 @@ __all__ = [
     "SfmReport",
     "reconstruct",
     "refined",
-    "triangulate",
     "undistort",
     "with_refined",
 ]

@@ -1,23 +1,39 @@
-"""Photographs: which images a folder holds, whether they can be read, and which have a pose.
+"""Photographs: those of a folder, checked, those that have a pose, and the best frames of a video.
 
-Promise: every ``Photo`` returned was decoded to its last byte. pycolmap itself accepts a truncated
-JPEG as a picture with a grey lower half, and skips files that it cannot read.
+Every photograph is decoded to its last byte: pycolmap accepts a truncated JPEG as a picture with a
+grey lower half, and skips files that it cannot read. From a video come sharp frames, spaced by how
+far the picture moves, so that a camera that stands still gives one frame, not hundreds.
+
+Notation: a video's *way* up to a frame is how far the picture has moved by then, in picture widths:
+the sum, over the frames so far, of the median shift of blocks from one frame to the next, by phase
+correlation (Kuglin and Hines 1975). A frame's *sharpness* is the variance of its Laplacian.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import logging
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import Literal, NamedTuple
 
+import numpy as np
+from jaxtyping import Float32, Float64, Int64, UInt8
 from PIL import Image as PilImage
+from scipy.ndimage import laplace
 
-from splatseed.errors import SceneFormatError, SceneNotFoundError
-from splatseed.io.files import VIDEO_SUFFIXES, open_file
+from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
+from splatseed.io.files import VIDEO_SUFFIXES
+from splatseed.io.photograph import check_photograph, open_photograph, photograph_bytes
 from splatseed.io.staging import read_manifest
-from splatseed.literal import describe_error, quoted
+from splatseed.literal import quoted
+from splatseed.progress import Progress, silent
+from splatseed.requirements import require
 from splatseed.scene import Image, Scene
+
+Size = tuple[int, int]
+"""Width and height in pixels as stored, before any EXIF rotation."""
 
 _SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
 _FOREIGN_SUFFIXES = frozenset(
@@ -29,30 +45,25 @@ _FOREIGN = "of a format that is not read"
 _DEPTH_MODES = ("I", "F")  # Pillow's names for 16- and 32-bit grey
 _SHOWN = 8
 
-
-@dataclass(frozen=True)
-class Photo:
-    """An image file.
-
-    Args:
-        name: Path relative to the images folder, with forward slashes.
-        width: Width in pixels as stored, before any EXIF rotation.
-        height: Height in pixels as stored.
-    """
-
-    name: str
-    width: int
-    height: int
+_LOOK_WIDTH = 256
+"""Width in pixels at which frames are analysed."""
+_BLOCK = 64
+"""Side of the blocks whose shifts are measured, in pixels at that width."""
+_LEAST_STEP = 0.02
+"""Least distance, in widths, that the picture moves between chosen frames."""
+_LEAST_FRAMES = 3
+"""Fewer photographs make no scene."""
 
 
-def find_photos(image_dir: Path) -> tuple[tuple[Photo, ...], Mapping[str, Sequence[str]]]:
+def find_photos(image_dir: Path) -> tuple[dict[str, Size], dict[str, list[str]]]:
     """The photographs below ``image_dir``, at least two.
 
     Hidden files are left out, and so are 16-bit and floating-point grey images: those are the
     depth maps of an RGB-D capture. Formats such as HEIC and cameras' raw ones are not read.
 
     Returns:
-        The photographs, sorted by name, and the names of other images by what they are.
+        The photographs' sizes by their names (paths relative to the folder), in order of names; and
+        the names of other images by what they are.
 
     Raises:
         SceneNotFoundError: The folder is missing or holds fewer than two photographs.
@@ -66,10 +77,9 @@ def find_photos(image_dir: Path) -> tuple[tuple[Photo, ...], Mapping[str, Sequen
         for suffixes in (_SUFFIXES, _FOREIGN_SUFFIXES)
     )
     with ThreadPoolExecutor() as pool:  # Pillow decodes outside the GIL
-        read = pool.map(lambda name: _read_photo(image_dir, name), names)
-        by_name = dict(zip(names, read, strict=True))
-    photos = tuple(photo for photo in by_name.values() if photo is not None)
-    grey = [name for name, photo in by_name.items() if photo is None]
+        sizes = dict(zip(names, pool.map(lambda n: _size(image_dir / n), names), strict=True))
+    photos = {name: size for name, size in sizes.items() if size is not None}
+    grey = [name for name, size in sizes.items() if size is None]
     left_out = {what: them for what, them in ((_GREY, grey), (_FOREIGN, foreign)) if them}
     if len(photos) < 2:
         found = [f"{len(them)} {what} ({name_some(them)})" for what, them in left_out.items()]
@@ -85,47 +95,6 @@ def find_photos(image_dir: Path) -> tuple[tuple[Photo, ...], Mapping[str, Sequen
     return photos, left_out
 
 
-def match_poses(
-    photos: Sequence[Photo], scene: Scene, image_dir: Path
-) -> tuple[tuple[Photo, Image], ...]:
-    """The photographs that ``scene`` has a pose for, with that pose.
-
-    Raises:
-        SceneNotFoundError: Fewer than two names are in both.
-        SceneFormatError: A photograph has another size than its camera.
-    """
-    posed = {image.name: image for image in scene.images}
-    pairs = tuple(
-        (photo, replace(posed[photo.name], observations=None))  # not needed by the worker
-        for photo in photos
-        if photo.name in posed
-    )
-    if len(pairs) < 2:
-        raise SceneNotFoundError(
-            f"two or more images of {image_dir} among the {len(posed)} posed images "
-            f"({name_some(sorted(posed)[:3])}, ...)",
-            found=f"{len(pairs)} of {len(photos)} ({name_some([p.name for p in photos[:3]])}, ...)",
-            fix="Names must be equal, relative to the images folder, suffix included.",
-        )
-    for photo, image in pairs:
-        lens = image.intrinsics
-        if (photo.width, photo.height) != (lens.width, lens.height):
-            raise SceneFormatError(
-                f"{image_dir / photo.name} to have the size of its camera {lens.camera_id}, "
-                f"{lens.width}x{lens.height}",
-                found=f"{photo.width}x{photo.height}",
-                fix="Give the images that the poses were made for, at the same scale.",
-            )
-    return pairs
-
-
-def name_some(names: Sequence[str]) -> str:
-    """The first few of ``names``, and how many more there are."""
-    shown = ", ".join(names[:_SHOWN])
-    more = len(names) - _SHOWN
-    return f"{shown} and {more} more" if more > 0 else shown
-
-
 def _check_folder(image_dir: Path) -> None:
     if not image_dir.is_dir():
         raise SceneNotFoundError(
@@ -136,28 +105,172 @@ def _check_folder(image_dir: Path) -> None:
         )
     if (kind := read_manifest(image_dir).get("command")) is not None:
         images = image_dir / "images"
-        fix = f"Name its photographs: {quoted(images)}."
         raise SceneNotFoundError(
             f"a folder of photographs at {image_dir}",
             found=f"what splatseed {kind} wrote, with pictures of its own",
-            fix=fix if images.is_dir() else "Name the folder that the photographs are in.",
+            fix=f"Name its photographs: {quoted(images)}."
+            if images.is_dir()
+            else "Name the folder that the photographs are in.",
         )
 
 
-def _read_photo(image_dir: Path, name: str) -> Photo | None:
-    """The photograph, decoded and found whole; None for a depth map."""
-    path = image_dir / name
-    try:
-        with open_file(path) as file, PilImage.open(file) as image:
-            if image.mode.startswith(_DEPTH_MODES):
-                return None
-            width, height = image.size
-            image.draft("L", (1, 1))  # an eighth of the JPEG's size: checks all bytes, cheaply
-            image.load()
-    except (OSError, SyntaxError, ValueError, PilImage.DecompressionBombError) as error:
+def _size(path: Path) -> Size | None:
+    """The size of a photograph, decoded and found whole; None for a depth map."""
+    with open_photograph(path, photograph_bytes(path)) as image:
+        grey = image.mode.startswith(_DEPTH_MODES)
+    return None if grey else check_photograph(path)
+
+
+def match_poses(photos: Mapping[str, Size], scene: Scene, image_dir: Path) -> tuple[Image, ...]:
+    """The images of ``scene`` that are among the photographs, in their order.
+
+    Raises:
+        SceneNotFoundError: Fewer than two names are in both.
+        SceneFormatError: A photograph has another size than its camera.
+    """
+    posed = {image.name: image for image in scene.images}
+    # Observations are not needed where they go, in another process.
+    images = tuple(replace(posed[name], observations=None) for name in photos if name in posed)
+    if len(images) < 2:
+        raise SceneNotFoundError(
+            f"two or more images of {image_dir} among the {len(posed)} posed images "
+            f"({name_some(sorted(posed)[:3])}, ...)",
+            found=f"{len(images)} of {len(photos)} ({name_some(list(photos)[:3])}, ...)",
+            fix="Names must be equal, relative to the images folder, suffix included.",
+        )
+    for image in images:
+        lens, (width, height) = image.intrinsics, photos[image.name]
+        if (width, height) != (lens.width, lens.height):
+            raise SceneFormatError(
+                f"{image_dir / image.name} to have the size of its camera {lens.camera_id}, "
+                f"{lens.width}x{lens.height}",
+                found=f"{width}x{height}",
+                fix="Give the images that the poses were made for, at the same scale.",
+            )
+    return images
+
+
+def name_some(names: Sequence[str]) -> str:
+    """The first few of ``names``, and how many more there are."""
+    shown = ", ".join(names[:_SHOWN])
+    more = len(names) - _SHOWN
+    return f"{shown} and {more} more" if more > 0 else shown
+
+
+class PickedFrames(NamedTuple):
+    """Which frames of a video were chosen."""
+
+    numbers: tuple[int, ...]
+    """Their numbers, from 0."""
+    total: int
+    """How many frames the video has."""
+    way: float
+    """How far the picture moves in total, in widths."""
+
+
+def pick_frames(
+    video: Path, folder: Path, most: int = 150, progress: Progress = silent
+) -> PickedFrames:
+    """Write the best frames of a video as JPEGs; equal videos give equal frames.
+
+    Args:
+        video: The file.
+        folder: An existing folder for the frames.
+        most: The most frames to choose.
+        progress: Called with the stage and the fraction done.
+
+    Raises:
+        MissingDependencyError: imageio-ffmpeg is absent.
+        SceneNotFoundError: There is no such file.
+        SceneFormatError: It cannot be read, or the picture hardly moves.
+        ParameterError: ``most`` is too small.
+    """
+    if most < _LEAST_FRAMES:
+        expected = f"--frames of {_LEAST_FRAMES} or more"
+        raise ParameterError(expected, found=f"{most}", fix="Try 150.")
+    if not video.is_file():
+        raise SceneNotFoundError(f"a video {video}", found="none", fix="Check the path.")
+    sharpness, steps = [], []
+    before: Float32[np.ndarray, "H W"] | None = None
+    for frame, part in _frames(video, ["-vf", f"scale={_LOOK_WIDTH}:-2"], "gray"):
+        grey = frame[..., 0].astype(np.float32)
+        sharpness.append(float(laplace(grey).var()))
+        steps.append(0.0 if before is None else shift(before, grey) / _LOOK_WIDTH)
+        before = grey
+        progress("look at video", part)
+    way = np.cumsum(steps)
+    numbers = choose_frames(np.array(sharpness), way, most).tolist()
+    if len(numbers) < _LEAST_FRAMES:
         raise SceneFormatError(
-            f"{path} to be a readable image",
-            found=describe_error(error),
-            fix="Export it again, or take it out of the folder.",
-        ) from error
-    return Photo(name, width, height)
+            f"{video} to move, for photographs from several places",
+            found=f"{len(way)} frames whose picture moves by {way[-1] if len(way) else 0:.1%} of "
+            "its width",
+            fix="Film while you walk around the scene.",
+        )
+    for number, (pixels, part) in enumerate(_frames(video, [], "rgb24")):
+        if number in numbers:
+            path = folder / f"{video.stem}_{number:06}.jpg"
+            PilImage.fromarray(pixels).save(path, quality=95, subsampling=0)
+        progress("take frames", part)
+    return PickedFrames(tuple(numbers), len(way), float(way[-1]))
+
+
+def choose_frames(
+    sharpness: Float64[np.ndarray, " F"], way: Float64[np.ndarray, " F"], most: int
+) -> Int64[np.ndarray, " P"]:
+    """The sharpest frame in each of at most ``most`` equal stretches of the (ascending) way."""
+    if not len(way):
+        return np.empty(0, np.int64)
+    step = max(way[-1] / most, _LEAST_STEP)
+    stretch = np.minimum((way / step).astype(np.int64), max(int(way[-1] / step) - 1, 0))
+    order = np.lexsort((-sharpness, stretch))
+    return np.sort(order[np.unique(stretch[order], return_index=True)[1]])
+
+
+def shift(before: Float32[np.ndarray, "H W"], now: Float32[np.ndarray, "H W"]) -> float:
+    """How far the picture moved: the median over blocks of the length of their shifts, px."""
+    window = np.hanning(_BLOCK)[:, None] * np.hanning(_BLOCK)
+    spectra = []
+    for grey in (before, now):
+        rows, columns = (max(1, side // _BLOCK) for side in grey.shape)
+        padded = np.pad(grey, [(0, max(0, _BLOCK - side)) for side in grey.shape])
+        cut = padded[: _BLOCK * rows, : _BLOCK * columns].reshape(rows, _BLOCK, columns, _BLOCK)
+        blocks = cut.swapaxes(1, 2).reshape(-1, _BLOCK, _BLOCK)
+        spectra.append(np.fft.rfft2((blocks - blocks.mean(axis=(1, 2), keepdims=True)) * window))
+    # Phase correlation: the inverse transform of the normalised cross spectrum peaks at the shift.
+    cross = spectra[0] * np.conj(spectra[1])
+    peaks = np.fft.irfft2(cross / np.maximum(np.abs(cross), 1e-6), s=(_BLOCK, _BLOCK))
+    at = np.argmax(peaks.reshape(len(peaks), -1), axis=1)
+    # Shifts of more than half a block are negative ones.
+    dy, dx = ((each + _BLOCK // 2) % _BLOCK - _BLOCK // 2 for each in np.divmod(at, _BLOCK))
+    return float(np.median(np.hypot(dx, dy)))
+
+
+def _frames(
+    video: Path, parameters: list[str], pixels: Literal["gray", "rgb24"]
+) -> Iterator[tuple[UInt8[np.ndarray, "H W C"], float]]:
+    """Frames of a video, with the fraction of it read so far."""
+    require("imageio_ffmpeg")
+    import imageio_ffmpeg  # noqa: PLC0415  (of the extras sfm and view)
+
+    channels = 1 if pixels == "gray" else 3
+    # It warns about every video that is read at another size than its own.
+    logging.getLogger("imageio_ffmpeg").setLevel(logging.ERROR)
+    try:
+        reader = imageio_ffmpeg.read_frames(
+            str(video), pix_fmt=pixels, bits_per_pixel=8 * channels,
+            output_params=["-fps_mode", "passthrough", *parameters],
+        )  # fmt: skip
+        facts = dict(next(reader))
+        total = max(1.0, float(facts.get("duration") or 0) * float(facts.get("fps") or 0))
+        width, height = facts["size"]
+        for i, raw in enumerate(reader):
+            frame = np.frombuffer(raw, np.uint8).reshape(height, width, channels)
+            yield frame, min(1.0, (i + 1) / total)
+    except (OSError, RuntimeError, StopIteration, IndexError, ValueError) as error:
+        said = " ".join(str(error).split())
+        raise SceneFormatError(
+            f"{video} to be a video that ffmpeg reads",
+            found=said[-120:] or type(error).__name__,
+            fix="Convert it to .mp4 (H.264), or pass a folder of photographs.",
+        ) from None

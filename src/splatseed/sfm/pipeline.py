@@ -1,40 +1,80 @@
-"""Scenes by Structure-from-Motion: ``reconstruct``, ``triangulate``, ``undistort``, ``refined``.
+"""Scenes by Structure-from-Motion: ``reconstruct``, ``undistort``, ``refined``.
 
-Here the input is checked and the output staged; the work is done by ``worker`` in another process.
+Here the input is checked and the output staged; pycolmap works in a process of its own. A failure
+deep in COLMAP (a full disk under SQLite, a broken image codec) aborts the process it happens in,
+and only a kill stops some of its loops: so an abort becomes a ``ReconstructionError``, and an
+interrupt a kill.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict, replace
+from contextlib import closing, contextmanager
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path, PurePosixPath
 from shutil import rmtree
 from tempfile import TemporaryDirectory
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 from splatseed.camera import CAMERA_MODELS
-from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.errors import (
+    ReconstructionError,
+    SceneFormatError,
+    SceneNotFoundError,
+    TaskLostError,
+)
 from splatseed.io import load_scene, write_scene
 from splatseed.io.layouts import write_split
+from splatseed.io.photograph import photograph_folder
 from splatseed.io.seeds import carry_seeds
 from splatseed.io.staging import MANIFEST, output_folder, write_json
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent
-from splatseed.scene import Scene
-from splatseed.sfm.features import Settings, check_choice, check_installed
-from splatseed.sfm.photos import find_photos, match_poses
-from splatseed.sfm.worker import (
-    SfmReport,
-    reconstruct_job,
-    run_job,
-    triangulate_job,
-    undistort_job,
-)
+from splatseed.requirements import require
+from splatseed.runtime.tasks import Child
+from splatseed.scene import Image, Scene
+from splatseed.sfm import colmap
+from splatseed.sfm.colmap import Run, Settings
+from splatseed.sfm.photos import Size, find_photos, match_poses
+from splatseed.sfm.refinement import Refinement, refine
 
 OnPhotos: TypeAlias = Callable[[Sequence[str], Mapping[str, Sequence[str]]], None]
 _DEFAULT = Settings()
+_REASON = re.compile(r"what\(\):\s*(.*)|^[EF]\d{8}\s.*?\]\s*(.*)", re.MULTILINE)
+
+
+@dataclass(frozen=True)
+class SfmReport:
+    """The outcome of ``reconstruct`` or ``undistort``.
+
+    Args:
+        path: The scene folder that was written.
+        registered: Images with a pose in the scene.
+        total: Images that were given.
+        unregistered: Names of the images without a pose, sorted; they are not in the scene.
+        num_points: Points in the scene.
+        mean_track_length: Observations per point.
+        mean_reprojection_error: Mean over points of their mean reprojection error, px of the
+            scene's (undistorted) images.
+        seconds: Wall time of each stage, in the order in which they ran.
+        refinement: What refinement changed; None where it was not asked for.
+    """
+
+    path: Path
+    registered: int
+    total: int
+    unregistered: tuple[str, ...]
+    num_points: int
+    mean_track_length: float
+    mean_reprojection_error: float
+    seconds: Mapping[str, float]
+    refinement: Refinement | None = None
+
+
+Job: TypeAlias = Callable[..., SfmReport]
+"""Takes a run, the folder to make the scene in, and arguments of its own."""
 
 
 def reconstruct(
@@ -44,105 +84,87 @@ def reconstruct(
     *,
     camera_model: str = "OPENCV",
     shared_camera: bool = True,
+    poses_from: Scene | None = None,
+    refine_poses: bool = False,
     overwrite: bool = False,
     on_progress: Progress = silent,
     on_photos: OnPhotos | None = None,
 ) -> SfmReport:
-    """Make a scene from photographs alone: features, matching, mapping, undistortion.
+    """Make a scene from photographs: features, matching, mapping or triangulation, undistortion.
+
+    Where poses are known, they and intrinsics stay exactly as given, and only points are estimated.
+    With ``refine_poses`` the poses move to where the photographs' matches agree, in the given world
+    frame and scale, and intrinsics stay. Photographs and poses are paired by name. Images without a
+    pose are left out, as are poses without an image. A scene that says which images test keeps its
+    lists.
 
     Args:
         image_dir: The photographs, also in subfolders.
         output: The scene folder to write. Its images are those that got a pose, undistorted, at the
             photographs' size.
         settings: How features are detected and matched.
-        camera_model: COLMAP's model of the lens in the photographs.
-        shared_camera: One lens for all photographs of a size, or one for each photograph.
+        camera_model: COLMAP's model of the lens in the photographs, where poses are not known.
+        shared_camera: One lens for all photographs of a size, or one for each photograph; likewise.
+        poses_from: A scene whose ``images`` give poses and intrinsics; its points are not used.
+        refine_poses: Refine these poses, if they are off by a few degrees or per cent of the
+            cameras' extent, as those of phones and SLAM are. They stay exactly as given where
+            refinement would lower the mean reprojection error by less than 0.1 px.
         overwrite: Replace ``output`` if it exists.
         on_progress: Called with the stage and the fraction done.
         on_photos: Called before work begins with the photographs' names, and with those of other
             images, by what they are.
 
-    Returns:
-        What was found, and how long it took.
-
     Raises:
-        InputError: Images missing or unreadable, an option out of range, output not writable.
-        ReconstructionError: No model came out, or fewer than half of the images got a pose.
+        InputError: Images missing, unreadable or of another size than their known camera; fewer
+            than two with a known pose; an option out of range; output not writable.
+        ReconstructionError: No model came out, or fewer than half of the images got a pose; no
+            point could be triangulated at known poses, or ``refine`` refused them.
         MissingDependencyError: pycolmap is absent or cannot use the device.
     """
-    check_choice("camera_model", camera_model, tuple(CAMERA_MODELS))
-    check_installed()
+    colmap.check_choice("camera_model", camera_model, tuple(CAMERA_MODELS))
+    require("pycolmap")
     images = Path(image_dir).absolute()
     photos, left_out = find_photos(images)
+    poses = None if poses_from is None else match_poses(photos, poses_from, images)
     with _staged(images, Path(output), "sfm", overwrite=overwrite) as staging:
         if on_photos is not None:
-            on_photos([photo.name for photo in photos], left_out)
-        report = run_job(
-            *(reconstruct_job, images, staging, settings, photos, camera_model, shared_camera),
-            on_progress=on_progress,
-        )
-        report = replace(report, path=Path(output))
-        _write_manifest(staging, "reconstruct", settings, report)
-    return report
+            on_photos(list(photos), left_out)
+        how = (images, staging, settings, on_progress, _reconstruct)
+        report = _call(*how, photos, camera_model, shared_camera, poses, refine_poses)
+        if poses_from is not None:
+            write_split(poses_from, staging)
+        manifest = {
+            "job": "reconstruct" if poses is None else "triangulate",
+            "version": version("splatseed"),
+            "settings": asdict(settings),
+            "report": {key: value for key, value in asdict(report).items() if key != "path"},
+        }
+        write_json(staging / MANIFEST, manifest)
+    return replace(report, path=Path(output))
 
 
-def triangulate(
-    image_dir: Path | str,
-    poses_from: Scene,
-    output: Path | str,
-    settings: Settings = _DEFAULT,
-    *,
-    refine_poses: bool = False,
-    overwrite: bool = False,
-    on_progress: Progress = silent,
-    on_photos: OnPhotos | None = None,
+def _reconstruct(
+    run: Run,
+    staging: Path,
+    photos: Mapping[str, Size],
+    camera_model: str,
+    shared_camera: bool,
+    poses: Sequence[Image] | None,
+    refine_poses: bool,
 ) -> SfmReport:
-    """Make a scene from photographs whose poses are known: features, matching, triangulation.
-
-    Poses and intrinsics stay exactly as given; only points are estimated. With ``refine_poses``
-    the poses move to where the photographs' matches agree, in the given world frame and scale, and
-    intrinsics stay. Photographs and poses are paired by name. Images without a pose are left out,
-    as are poses without an image. A scene that says which images test keeps its lists.
-
-    Args:
-        image_dir: The photographs, also in subfolders.
-        poses_from: A scene whose ``images`` give poses and intrinsics; its points are not used.
-        output: The scene folder to write.
-        settings: How features are detected and matched.
-        refine_poses: Refine poses that are off by a few degrees or per cent of the cameras' extent,
-            as those of phones and SLAM are. Poses stay exactly as given where refinement would
-            lower the mean reprojection error by less than 0.1 px.
-        overwrite: As in ``reconstruct``.
-        on_progress: As in ``reconstruct``.
-        on_photos: As in ``reconstruct``.
-
-    Returns:
-        What was found, and how long it took.
-
-    Raises:
-        InputError: Images missing, unreadable or of another size than their camera; fewer than
-            two with a pose; output not writable.
-        ReconstructionError: No point could be triangulated, or refinement drifted: it fits fewer
-            photographs or observations than the given poses do, or a camera turned by more than 10
-            degrees or moved by more than half of the cameras' root mean square distance from their
-            middle.
-        MissingDependencyError: pycolmap is absent or cannot use the device.
-    """
-    check_installed()
-    images = Path(image_dir).absolute()
-    photos, left_out = find_photos(images)
-    pairs = match_poses(photos, poses_from, images)
-    with _staged(images, Path(output), "sfm", overwrite=overwrite) as staging:
-        if on_photos is not None:
-            on_photos([photo.name for photo in photos], left_out)
-        report = run_job(
-            *(triangulate_job, images, staging, settings, photos, pairs, refine_poses),
-            on_progress=on_progress,
+    refinement = None
+    if poses is None:
+        colmap.match_photographs(
+            run, colmap.guessed_model(run, photos, camera_model, shared=shared_camera)
         )
-        report = replace(report, path=Path(output))
-        write_split(poses_from, staging)
-        _write_manifest(staging, "triangulate", settings, report)
-    return report
+        model_dir = colmap.map_images(run, list(photos))
+    else:
+        colmap.match_photographs(run, colmap.posed_model(run.pycolmap, poses))
+        if refine_poses:
+            poses, refinement = refine(run, poses)
+        model_dir = colmap.triangulate_points(run, poses)
+    colmap.export_scene(run, model_dir, staging)
+    return replace(_report(run, staging, list(photos)), refinement=refinement)
 
 
 def undistort(
@@ -163,9 +185,6 @@ def undistort(
         overwrite: Whether an earlier output of this function may be replaced.
         on_progress: Called with the stage and the fraction done.
 
-    Returns:
-        What the new scene holds.
-
     Raises:
         SceneNotFoundError: The scene has no photographs, or one is missing.
         SceneFormatError: The name of one leads out of their folder.
@@ -173,19 +192,21 @@ def undistort(
         ReconstructionError: pycolmap failed.
         MissingDependencyError: pycolmap is absent.
     """
-    check_installed()
+    require("pycolmap")
     images = _all_photographs(scene)
     with _staged(images, Path(output), "undistort", overwrite=overwrite) as staging:
         work = staging / ".work" / "distorted"
         distorted = write_scene(scene, work, format="colmap", require_points=False).path
-        names = sorted(image.name for image in scene.images)
-        report = run_job(
-            *(undistort_job, images, staging, _DEFAULT, distorted / "sparse" / "0", names),
-            on_progress=on_progress,
-        )
+        names, how = sorted(image.name for image in scene.images), (images, staging, _DEFAULT)
+        report = _call(*how, on_progress, _undistort, distorted / "sparse" / "0", names)
         carry_seeds(scene, distorted, staging)
         write_split(scene, staging)
     return replace(report, path=Path(output))
+
+
+def _undistort(run: Run, staging: Path, model_dir: Path, names: Sequence[str]) -> SfmReport:
+    colmap.export_scene(run, model_dir, staging, distinct=False)
+    return _report(run, staging, names)
 
 
 def refined(scene: Scene, seed: int, progress: Progress = silent) -> tuple[Scene, str]:
@@ -214,8 +235,9 @@ def refined(scene: Scene, seed: int, progress: Progress = silent) -> tuple[Scene
             fix="Put them beside the model in a folder named images, or leave it out.",
         )
     with TemporaryDirectory(prefix="splatseed-refine-") as name:
-        report = triangulate(
-            *(folder, scene, Path(name) / "scene", Settings(seed=seed)),
+        report = reconstruct(
+            *(folder, Path(name) / "scene", Settings(seed=seed)),
+            poses_from=scene,
             refine_poses=True,
             on_progress=progress,
         )
@@ -253,49 +275,74 @@ def with_refined(scene: Scene, found: Scene) -> Scene:
 def _staged(images: Path, output: Path, kind: str, *, overwrite: bool) -> Iterator[Path]:
     """The folder to make the scene in, with ``.work`` for scratch files, on the output's disk."""
     with output_folder(output, kind=kind, overwrite=overwrite, protect=(images,)) as staging:
-        work = staging / ".work"
-        work.mkdir()
+        (staging / ".work").mkdir()
         yield staging.absolute()
-        rmtree(work)
+        rmtree(staging / ".work")
 
 
-def _write_manifest(staging: Path, job: str, settings: Settings, report: SfmReport) -> None:
-    """Say how the scene was made."""
-    manifest = {
-        "job": job,
-        "version": version("splatseed"),
-        "settings": asdict(settings),
-        "report": {key: value for key, value in asdict(report).items() if key != "path"},
-    }
-    write_json(staging / MANIFEST, manifest)
+def _call(
+    images: Path, staging: Path, settings: Settings, progress: Progress, job: Job, *arguments: Any
+) -> SfmReport:
+    """Do a job, with arguments of its own, in a child process."""
+    log = staging / ".work" / "log.txt"
+    call = (_work, images, staging, settings, job, arguments)
+    with closing(Child(log=log.open("w+b"))) as child:
+        try:
+            report: SfmReport = child.call(*call, progress=progress)
+        except TaskLostError as error:
+            reasons, found = _REASON.findall(log.read_text("utf-8", "replace")), error.found
+            if reasons:
+                found = f"{found.partition(':')[0]}: {''.join(reasons[-1])}"
+            fix = "Check disk space and memory."
+            raise ReconstructionError("pycolmap to finish", found=found, fix=fix) from error
+    return report
+
+
+def _work(
+    images: Path,
+    staging: Path,
+    settings: Settings,
+    job: Job,
+    arguments: Sequence[Any],
+    progress: Progress,
+) -> SfmReport:
+    pycolmap = colmap.require_pycolmap(settings.device)
+    pycolmap.logging.logtostderr = True  # alone: it would leave files in the temporary folder
+    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.ERROR)
+    return job(Run(pycolmap, settings, images, staging / ".work", progress), staging, *arguments)
+
+
+def _report(run: Run, staging: Path, names: Sequence[str]) -> SfmReport:
+    """The contents of the scene, read back from its files."""
+    model = run.pycolmap.Reconstruction(staging / "sparse" / "0")
+    registered = {image.name for image in model.images.values() if image.has_pose}
+    return SfmReport(
+        path=staging,
+        registered=len(registered),
+        total=len(names),
+        unregistered=tuple(name for name in names if name not in registered),
+        num_points=model.num_points3D(),
+        mean_track_length=float(model.compute_mean_track_length()),
+        mean_reprojection_error=float(model.compute_mean_reprojection_error()),
+        seconds=dict(run.seconds),
+    )
 
 
 def _all_photographs(scene: Scene) -> Path:
     """The folder of a scene's photographs, all of which are there."""
-    if not scene.images:
-        raise SceneNotFoundError(
-            "a scene with the poses of its photographs",
-            found="none",
-            fix="Copy the whole model, images.bin too, or make one: splatseed sfm IMAGES -o SCENE.",
-        )
-    names = [image.name for image in scene.images]
-    for name in names:  # pycolmap writes to the output's folder joined with each
+    folder = photograph_folder(scene)
+    for name in (image.name for image in scene.images):
         path = PurePosixPath(name.replace("\\", "/"))
-        if path.is_absolute() or ".." in path.parts:
+        if path.is_absolute() or ".." in path.parts:  # pycolmap writes to a folder joined with it
             raise SceneFormatError(
                 "photographs whose names stay inside their folder, as copies get the same names",
                 found=repr(name),
                 fix="Move it into the folder and rename it in the model.",
             )
-    folder = scene.source.image_dir if scene.source else None
-    there = "no folder of images"
-    if folder is not None:
-        missing = next((name for name in names if not (folder / name).is_file()), None)
-        if missing is None:
-            return folder.absolute()
-        there = f"{missing} missing in {folder}"
-    raise SceneNotFoundError(
-        "a scene with all of its photographs",
-        found=there,
-        fix="Put them beside the model in a folder named images.",
-    )
+        if not (folder / name).is_file():
+            raise SceneNotFoundError(
+                "a scene with all of its photographs",
+                found=f"{name} missing in {folder}",
+                fix="Put it there, or drop it from the model.",
+            )
+    return folder.absolute()

@@ -24,8 +24,7 @@ from jaxtyping import Bool, Float64
 from splatseed.camera import quat_from_rotation
 from splatseed.errors import ReconstructionError
 from splatseed.scene import Image
-from splatseed.sfm.features import Run
-from splatseed.sfm.mapping import posed_model, rigid
+from splatseed.sfm.colmap import Run, posed_model, rigid
 from splatseed.sfm.photos import name_some
 
 COARSE = (6.0, 2.0)
@@ -53,11 +52,6 @@ MAX_TURN = 10.0
 """A camera that turned by more, in degrees, has drifted: devices err by a degree or two."""
 MAX_SHIFT = 0.5
 """Likewise one that moved by more, of the cameras' spread."""
-FIX = (
-    "Check that the poses belong to these images, in the same order and convention; take out the "
-    "images named; or leave refine_poses out, which keeps the poses."
-)
-"""What to do about poses that cannot be refined."""
 _ALIGN_ROUNDS = 5  # of fitting the similarity and the noise in turn
 _ALIGN_NOISE = 1e-9  # of the spread, and in radians: equal poses have none
 _TYPICAL = 1.54  # median length of a 3-vector of standard normal numbers
@@ -73,10 +67,10 @@ class Refinement:
         error_before: Mean over points of their mean reprojection error at the given poses, px of
             the photographs, for the observations that fit refined poses.
         error_after: The same at the scene's poses.
-        median_shift: Median over the cameras of how far each moved, scene units.
-        largest_shift: The largest, scene units.
-        median_turn: Median over the cameras of the angle by which each turned, degrees.
-        largest_turn: The largest, degrees.
+        median_shift: Over the cameras, how far each moved, scene units.
+        largest_shift: Likewise.
+        median_turn: Over the cameras, the angle by which each turned, degrees.
+        largest_turn: Likewise.
     """
 
     kept: bool
@@ -88,14 +82,8 @@ class Refinement:
     largest_turn: float = 0.0
 
 
-@dataclass(frozen=True, eq=False)
-class Poses:
-    """Poses of N cameras.
-
-    Args:
-        rotations: cam_from_world, float64 [N, 3, 3].
-        centers: In the world, scene units, float64 [N, 3].
-    """
+class Poses(NamedTuple):
+    """Poses of N cameras: rotations of cam_from_world, and centres in the world, scene units."""
 
     rotations: Float64[np.ndarray, "N 3 3"]
     centers: Float64[np.ndarray, "N 3"]
@@ -104,28 +92,26 @@ class Poses:
 def poses_of(images: Sequence[Image]) -> Poses:
     """The poses of ``images``, in their order."""
     cameras = [image.camera for image in images]
-    return Poses(
-        np.array([camera.cam_from_world[:3, :3] for camera in cameras]),
-        np.array([camera.center for camera in cameras]),
-    )
+    rotations = np.array([camera.cam_from_world[:3, :3] for camera in cameras])
+    return Poses(rotations, np.array([camera.center for camera in cameras]))
 
 
 def with_poses(images: Sequence[Image], poses: Poses) -> list[Image]:
     """The ``images`` with other poses."""
     return [
         replace(image, quat=quat_from_rotation(rotation), translation=-rotation @ center)
-        for image, rotation, center in zip(images, poses.rotations, poses.centers, strict=True)
+        for image, rotation, center in zip(images, *poses, strict=True)
     ]
 
 
 def turns(a: Poses, b: Poses) -> Float64[np.ndarray, " N"]:
-    """Angle between ``a`` and ``b`` of each camera in degrees, float64 [N]."""
+    """Angle between ``a`` and ``b`` of each camera in degrees."""
     vectors = _turn_vectors(a.rotations, b.rotations)
     return np.asarray(np.degrees(np.linalg.norm(vectors, axis=1)))
 
 
 def shifts(a: Poses, b: Poses) -> Float64[np.ndarray, " N"]:
-    """Distance between ``a`` and ``b`` of each camera in scene units, float64 [N]."""
+    """Distance between ``a`` and ``b`` of each camera in scene units."""
     return np.asarray(np.linalg.norm(a.centers - b.centers, axis=1))
 
 
@@ -146,11 +132,20 @@ def align(moved: Poses, given: Poses) -> Poses:
         given: The same cameras' poses in the wanted frame, not all in one place.
     """
     from scipy.optimize import least_squares  # noqa: PLC0415  (slow to import)
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415  (slow to import)
 
-    size = spread(given)
+    size, middle = spread(given), given.centers.mean(axis=0)
+    mean = Rotation.from_matrix(given.rotations.transpose(0, 2, 1) @ moved.rotations).mean()
+    centered = moved.centers - moved.centers.mean(axis=0)
+
+    def after(x: Float64[np.ndarray, " 7"]) -> Poses:
+        """``moved`` by a turn, a shift and the logarithm of a scale; at 0 by the mean rotation."""
+        turn = (Rotation.from_rotvec(x[:3]) * mean).as_matrix().T
+        centers = np.exp(x[6]) * (centered @ turn) + (middle + x[3:6] * size)
+        return Poses(moved.rotations @ turn, centers)
 
     def residuals(x: Float64[np.ndarray, " 7"], noise: tuple[float, float]) -> Any:
-        new = _moved_by(x, moved, given, size)
+        new = after(x)
         shift = (new.centers - given.centers) / (size * noise[0])
         return np.stack([shift, _turn_vectors(new.rotations, given.rotations) / noise[1]])
 
@@ -159,21 +154,7 @@ def align(moved: Poses, given: Poses) -> Poses:
         x = least_squares(lambda x: residuals(x, noise).ravel(), x, loss="soft_l1").x  # noqa: B023
         lengths = np.median(np.linalg.norm(residuals(x, (1.0, 1.0)), axis=2), axis=1) / _TYPICAL
         noise = (max(float(lengths[0]), _ALIGN_NOISE), max(float(lengths[1]), _ALIGN_NOISE))
-    return _moved_by(x, moved, given, size)
-
-
-def _moved_by(x: Float64[np.ndarray, " 7"], moved: Poses, given: Poses, size: float) -> Poses:
-    """``moved`` after the similarity ``x``: a turn, a shift and the logarithm of a scale.
-
-    At zero it brings the mean rotation and the middle of the cameras to ``given``'s.
-    """
-    from scipy.spatial.transform import Rotation  # noqa: PLC0415  (slow to import)
-
-    mean = Rotation.from_matrix(given.rotations.transpose(0, 2, 1) @ moved.rotations).mean()
-    new_from_old = (Rotation.from_rotvec(x[:3]) * mean).as_matrix()
-    centered = (moved.centers - moved.centers.mean(axis=0)) @ new_from_old.T
-    middle = given.centers.mean(axis=0) + x[3:6] * size
-    return Poses(moved.rotations @ new_from_old.T, np.exp(x[6]) * centered + middle)
+    return after(x)
 
 
 def _turn_vectors(
@@ -184,19 +165,15 @@ def _turn_vectors(
     return np.asarray(Rotation.from_matrix(a @ b.transpose(0, 2, 1)).as_rotvec())
 
 
-def refine(
-    run: Run, cameras: Sequence[Any], images: Sequence[Any], given: Sequence[Image]
-) -> tuple[list[Image], Refinement]:
+def refine(run: Run, given: Sequence[Image]) -> tuple[list[Image], Refinement]:
     """Move the given poses to where the photographs' matches agree.
 
-    Cameras that see fewer than 10 points stay where they are. Where the mean reprojection error
-    would fall by less than 0.1 px, all stay exactly where they are.
+    Cameras that see fewer than 10 points stay where they are; all do, exactly, where the mean
+    reprojection error would fall by less than 0.1 px.
 
     Args:
-        run: The run, with verified matches.
-        cameras: The cameras of the database.
-        images: The images of the database.
-        given: Their poses, in the same order.
+        run: The run, with verified matches of ``posed_model(given)``.
+        given: The images at their given poses.
 
     Raises:
         ReconstructionError: Fewer than half of the photographs see points, or the poses drifted:
@@ -204,34 +181,50 @@ def refine(
             degrees or moved by more than half of the cameras' root mean square distance from their
             middle.
     """
-    solver = _Solver(run, cameras, images, given)
-    solution = run.stage("refinement", solver.solve, lambda: solver.rounds, MAX_ROUNDS)
-    names = [image.name for image in given]
-    seeing = solution.after.seeing
-    if not _enough(seeing):
-        blind = [name for name, sees in zip(names, seeing, strict=True) if not sees]
-        raise ReconstructionError(
+    solver = _Solver(run, given)
+    poses, strict, after, before = run.stage(
+        "refinement", solver.solve, lambda: solver.rounds, MAX_ROUNDS
+    )
+    names = np.array([image.name for image in given])
+    if not _enough(after.seeing):
+        raise _refused(
             f"at least half of the {len(names)} posed images to see {LEAST_POINTS} points or more, "
             "so that their poses can be refined",
-            found=f"{seeing.sum()}; too few in {name_some(blind)}",
-            fix=FIX,
+            f"{after.seeing.sum()}; too few in {name_some(names[~after.seeing].tolist())}",
         )
-    before, after = solution.before.error, solution.after.error
-    if before - after < GAIN:
-        return list(given), Refinement(True, before, before)
+    if before.error - after.error < GAIN:
+        return list(given), Refinement(True, before.error, before.error)
+    lost = names[strict.seeing & ~after.seeing].tolist()
+    if (
+        after.seeing.sum() < strict.seeing.sum()
+        or after.observations < LEAST_KEPT * strict.observations
+    ):
+        raise _refused(
+            f"refined poses to fit the {strict.seeing.sum()} images and {strict.observations:,} "
+            "observations that the given poses fit",
+            f"{after.seeing.sum()} (lost: {name_some(lost) or 'none'}) and {after.observations:,}",
+        )
     old = poses_of(given)
-    shift, turn = shifts(solution.poses, old), turns(solution.poses, old)
-    _check_fit(solution, names)
-    _check_drift(shift, turn, MAX_SHIFT * spread(old), names)
-    return with_poses(given, solution.poses), Refinement(
-        kept=False,
-        error_before=before,
-        error_after=after,
-        median_shift=float(np.median(shift)),
-        largest_shift=float(shift.max()),
-        median_turn=float(np.median(turn)),
-        largest_turn=float(turn.max()),
+    shift, turn, limit = shifts(poses, old), turns(poses, old), MAX_SHIFT * spread(old)
+    drifted = np.flatnonzero((turn > MAX_TURN) | (shift > limit))
+    if len(drifted):
+        worst = int(drifted[np.argmax(turn[drifted] / MAX_TURN + shift[drifted] / limit)])
+        raise _refused(
+            f"refinement to turn no camera by more than {MAX_TURN:g} degrees nor move it by more "
+            f"than {limit:.3g} scene units, half of the cameras' spread",
+            f"{turn[worst]:.1f} degrees and {shift[worst]:.3g} units in {names[worst]}, and "
+            f"{len(drifted)} of {len(names)} such images: {name_some(names[drifted].tolist())}",
+        )
+    moves = [float(each) for of in (shift, turn) for each in (np.median(of), of.max())]
+    return with_poses(given, poses), Refinement(False, before.error, after.error, *moves)
+
+
+def _refused(expected: str, found: str) -> ReconstructionError:
+    fix = (
+        "Check that the poses belong to these images, in the same order and convention; take out "
+        "the images named; or leave refine_poses out, which keeps the poses."
     )
+    return ReconstructionError(expected, found=found, fix=fix)
 
 
 class _Fit(NamedTuple):
@@ -244,89 +237,39 @@ class _Fit(NamedTuple):
     """Mean over the points of their mean reprojection error, px; infinite without points."""
 
 
-class _Solution(NamedTuple):
-    """What the rounds came to."""
-
-    poses: Poses
-    """In the given frame."""
-    strict: _Fit
-    """The fit of what can be triangulated at the given poses."""
-    after: _Fit
-    """The fit at ``poses``."""
-    before: _Fit
-    """The fit of the same observations at the given poses."""
-
-
 def _enough(seeing: Bool[np.ndarray, " N"]) -> bool:
     """Whether half of the photographs take part."""
     return bool(2 * seeing.sum() >= len(seeing) and seeing.sum() >= 2)
 
 
-def _check_fit(solution: _Solution, names: Sequence[str]) -> None:
-    """Refuse poses that fit fewer photographs or observations than the given ones."""
-    strict, after = solution.strict, solution.after
-    if after.seeing.sum() < strict.seeing.sum():
-        gone = strict.seeing & ~after.seeing
-        lost = [name for name, each in zip(names, gone, strict=True) if each]
-        raise ReconstructionError(
-            f"refined poses to fit the {strict.seeing.sum()} images that the given poses fit",
-            found=f"{after.seeing.sum()}, without {name_some(lost)}",
-            fix=FIX,
-        )
-    if after.observations < LEAST_KEPT * strict.observations:
-        raise ReconstructionError(
-            f"refined poses to fit the {strict.observations:,} observations that the given fit",
-            found=f"{after.observations:,}",
-            fix=FIX,
-        )
-
-
-def _check_drift(
-    shift: Float64[np.ndarray, " N"],
-    turn: Float64[np.ndarray, " N"],
-    limit: float,
-    names: Sequence[str],
-) -> None:
-    """Refuse poses that are too far from the given ones."""
-    drifted = np.flatnonzero((turn > MAX_TURN) | (shift > limit))
-    if len(drifted):
-        worst = int(drifted[np.argmax(turn[drifted] / MAX_TURN + shift[drifted] / limit)])
-        raise ReconstructionError(
-            f"refinement to turn no camera by more than {MAX_TURN:g} degrees nor move it by more "
-            f"than {limit:.3g} scene units, half of the cameras' spread",
-            found=f"{turn[worst]:.1f} degrees and {shift[worst]:.3g} units in {names[worst]}, and "
-            f"{len(drifted)} of {len(names)} such images: "
-            f"{name_some([names[i] for i in drifted.tolist()])}",
-            fix=FIX,
-        )
-
-
 class _Solver:
     """Rounds of triangulation and bundle adjustment; arguments as ``refine`` has them."""
 
-    def __init__(
-        self, run: Run, cameras: Sequence[Any], images: Sequence[Any], given: Sequence[Image]
-    ) -> None:
+    def __init__(self, run: Run, images: Sequence[Image]) -> None:
         self.rounds = 0
-        self._settings = run.settings
-        self._database = run.database
-        self._pycolmap = run.pycolmap
-        self._ids = [image.image_id for image in images]
-        self._given = poses_of(given)
-        self._images = given
-        self._focal = float(np.median([camera.mean_focal_length() for camera in cameras]))
-        self._model = posed_model(self._pycolmap, cameras, images, given)
+        self._run, self._pycolmap = run, run.pycolmap
+        self._images, self._given = images, poses_of(images)
+        self._model = posed_model(run.pycolmap, images)
+        self._ids = range(1, len(images) + 1)
+        lenses = self._model.cameras.values()
+        self._focal = float(np.median([lens.mean_focal_length() for lens in lenses]))
 
-    def solve(self) -> _Solution:
-        """Refine until the poses rest."""
+    def solve(self) -> tuple[Poses, _Fit, _Fit, _Fit]:
+        """Refine until the poses rest.
+
+        Returns the poses in the given frame, the fit of what can be triangulated at the given
+        poses, the fit at the new ones, and that of the same observations at the given ones.
+        """
         pycolmap, size = self._pycolmap, spread(self._given)
-        with pycolmap.Database.open(self._database) as database:
+        with pycolmap.Database.open(self._run.database) as database:
             cache = pycolmap.DatabaseCache.create(database, pycolmap.DatabaseCacheOptions())
         mapper = pycolmap.IncrementalMapper(cache)
         mapper.begin_reconstruction(self._model)
         strict = self._round(mapper, FINE[-1], None)
         noise, poses = FIRST_NOISE * size, self._given
-        for pixels in self._limits():
+        coarse = [self._focal * math.tan(math.radians(degrees)) for degrees in COARSE]
+        limits = [*(max(pixels, FINE[0]) for pixels in coarse), *FINE]
+        for pixels in limits + [FINE[-1]] * (MAX_ROUNDS - len(limits)):
             fit = self._round(mapper, pixels, noise)
             if not _enough(fit.seeing):
                 break
@@ -342,49 +285,45 @@ class _Solver:
             self._model.image(image_id).frame.rig_from_world = rigid(pycolmap, image)
         self._adjust(FINE[-1], None)
         mapper.observation_manager.filter_observations_with_negative_depth()
-        return _Solution(poses, strict, after, self._fit())
-
-    def _limits(self) -> list[float]:
-        """How far an observation may miss its point in each round, px."""
-        coarse = [self._focal * math.tan(math.radians(degrees)) for degrees in COARSE]
-        limits = [max(pixels, FINE[0]) for pixels in coarse] + list(FINE)
-        return limits + [FINE[-1]] * (MAX_ROUNDS - len(limits))
+        return poses, strict, after, self._fit()
 
     def _round(self, mapper: Any, pixels: float, noise: float | None) -> _Fit:
         """Triangulate, adjust, and drop what misses its point by more than ``pixels``."""
-        self._triangulate(mapper, pixels)
+        options = self._pycolmap.IncrementalTriangulatorOptions(
+            merge_max_reproj_error=pixels,
+            complete_max_reproj_error=pixels,
+            max_extra_param=math.inf,  # a known lens is trusted
+            random_seed=self._run.settings.seed,
+        )
+        degrees = math.degrees(math.atan(pixels / self._focal))
+        for name in ("create_max_angle_error", "continue_max_angle_error", "re_max_angle_error"):
+            setattr(options, name, max(degrees, getattr(options, name)))
+        for image_id in self._ids:
+            mapper.triangulate_image(options, image_id)
+        mapper.complete_and_merge_tracks(options)
+        mapper.retriangulate(options)
         self._adjust(pixels, noise)
         least = self._pycolmap.IncrementalMapperOptions().filter_min_tri_angle
         mapper.observation_manager.filter_all_points3D(pixels, least)
         return self._fit()
 
-    def _triangulate(self, mapper: Any, pixels: float) -> None:
-        options = self._pycolmap.IncrementalTriangulatorOptions()
-        degrees = math.degrees(math.atan(pixels / self._focal))
-        for name in ("create_max_angle_error", "continue_max_angle_error", "re_max_angle_error"):
-            setattr(options, name, max(degrees, getattr(options, name)))
-        options.merge_max_reproj_error = options.complete_max_reproj_error = pixels
-        options.max_extra_param = math.inf  # a known lens is trusted
-        options.random_seed = self._settings.seed
-        for image_id in self._ids:
-            mapper.triangulate_image(options, image_id)
-        mapper.complete_and_merge_tracks(options)
-        mapper.retriangulate(options)
-
     def _adjust(self, pixels: float, noise: float | None) -> None:
         """Adjust points, and poses too if the ``noise`` of given positions is told."""
         if self._model.num_points3D() == 0:
             return
-        pycolmap = self._pycolmap
-        options = pycolmap.BundleAdjustmentOptions()
-        options.refine_focal_length = options.refine_extra_params = False
-        options.refine_sensor_from_rig = options.print_summary = False
-        options.refine_rig_from_world = noise is not None
-        options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-        options.ceres.loss_function_scale = pixels / 4
+        pycolmap, settings = self._pycolmap, self._run.settings
+        cauchy = pycolmap.LossFunctionType.CAUCHY
+        options = pycolmap.BundleAdjustmentOptions(
+            refine_focal_length=False,
+            refine_extra_params=False,
+            refine_sensor_from_rig=False,
+            refine_rig_from_world=noise is not None,
+            print_summary=False,
+        )
+        options.ceres.loss_function_type, options.ceres.loss_function_scale = cauchy, pixels / 4
         options.ceres.solver_options.function_tolerance = 1e-6
         options.ceres.solver_options.max_num_iterations = MAX_ITERATIONS
-        options.ceres.solver_options.num_threads = self._settings.threads
+        options.ceres.solver_options.num_threads = settings.threads
         config = pycolmap.BundleAdjustmentConfig()
         for image_id in self._ids:
             config.add_image(image_id)
@@ -393,33 +332,33 @@ class _Solver:
         if noise is None:
             pycolmap.create_default_bundle_adjuster(options, config, self._model).solve()
             return
-        of_priors = pycolmap.PosePriorBundleAdjustmentOptions()
-        of_priors.ceres.prior_position_loss_function_type = pycolmap.LossFunctionType.CAUCHY
-        of_priors.alignment_ransac.random_seed = self._settings.seed
-        centers = zip(self._ids, self._given.centers, strict=True)
-        priors = [self._prior(image_id, center, noise) for image_id, center in centers]
+        of_priors = pycolmap.PosePriorBundleAdjustmentOptions(
+            ceres={"prior_position_loss_function_type": cauchy},
+            alignment_ransac={"random_seed": settings.seed},
+        )
+        priors = [
+            pycolmap.PosePrior(
+                pose_prior_id=image_id,
+                corr_data_id=self._model.image(image_id).data_id,
+                position=center,
+                position_covariance=noise**2 * np.eye(3),
+                coordinate_system=pycolmap.PosePriorCoordinateSystem.CARTESIAN,
+            )
+            for image_id, center in zip(self._ids, self._given.centers, strict=True)
+        ]
         pycolmap.create_pose_prior_bundle_adjuster(
             options, of_priors, config, priors, self._model
         ).solve()
 
-    def _prior(self, image_id: int, center: Float64[np.ndarray, " 3"], noise: float) -> Any:
-        prior = self._pycolmap.PosePrior(pose_prior_id=image_id)
-        prior.corr_data_id = self._model.image(image_id).data_id
-        prior.position = center
-        prior.position_covariance = noise**2 * np.eye(3)
-        prior.coordinate_system = self._pycolmap.PosePriorCoordinateSystem.CARTESIAN
-        return prior
-
     def _aligned(self, seeing: Bool[np.ndarray, " N"]) -> Poses:
         """The model's poses in the given frame; given ones where a photograph sees no point."""
         matrices = [self._model.image(i).cam_from_world().matrix() for i in self._ids]
-        found = Poses(
-            np.array([matrix[:, :3] for matrix in matrices])[seeing],
-            np.array([-matrix[:, :3].T @ matrix[:, 3] for matrix in matrices])[seeing],
-        )
+        found = np.array([matrix[:, :3] for matrix in matrices])
+        found_centers = np.array([-matrix[:, :3].T @ matrix[:, 3] for matrix in matrices])
         rotations, centers = self._given.rotations.copy(), self._given.centers.copy()
-        aligned = align(found, Poses(rotations[seeing], centers[seeing]))
-        rotations[seeing], centers[seeing] = aligned.rotations, aligned.centers
+        rotations[seeing], centers[seeing] = align(
+            Poses(found[seeing], found_centers[seeing]), Poses(rotations[seeing], centers[seeing])
+        )
         return Poses(rotations, centers)
 
     def _fit(self) -> _Fit:

@@ -24,14 +24,14 @@ def refining(room, monkeypatch):
     """Stands in for pycolmap: poses and points are the room's. Its list tells the calls."""
     truth, calls = load_scene(room), []
 
-    def triangulate(folder, scene, output, settings, **how):
+    def reconstruct(folder, output, settings, **how):
         assert how["refine_poses"]
         calls.append(folder)
         write_scene(truth, output)
         change = Refinement(False, 9.0, 0.5, 0.1, 0.2, 0.1, 0.2)
         return SfmReport(output, 12, 12, (), len(truth.points), 3.0, 0.5, {}, change)
 
-    monkeypatch.setattr("splatseed.sfm.pipeline.triangulate", triangulate)
+    monkeypatch.setattr("splatseed.sfm.pipeline.reconstruct", reconstruct)
     return calls
 
 

@@ -1,0 +1,429 @@
+"""One run of pycolmap: its settings, features and matches, mapping, triangulation, and the export.
+
+The database is written before any feature is detected, images with their cameras, so that ids are
+ours: camera i has rig i, image i has frame i, counted from 1. pycolmap then only adds to it.
+Progress is read from the database through pycolmap too: Python's sqlite3 is another copy of SQLite,
+and two copies in one process drop each other's file locks and corrupt the file.
+
+Notation: a ``model`` is a ``pycolmap.Reconstruction``. Promise: a ``Settings`` that exists is
+valid, and pycolmap is imported only by ``require_pycolmap``.
+"""
+
+from __future__ import annotations
+
+import importlib
+import math
+import struct
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, TypeAlias, TypeVar, get_args
+
+import numpy as np
+from PIL import Image as PilImage
+
+from splatseed.errors import (
+    MissingDependencyError,
+    OutputError,
+    ParameterError,
+    ReconstructionError,
+    SceneFormatError,
+)
+from splatseed.progress import Progress
+from splatseed.requirements import install_command
+from splatseed.runtime.torch_device import DeviceName
+from splatseed.scene import Image
+from splatseed.sfm.photos import Size, name_some
+
+MatcherName: TypeAlias = Literal["exhaustive", "sequential"]
+T = TypeVar("T")
+
+_OLDEST = 4  # the first to pose an image and its rig in one call
+_LARGEST = 2**31 - 1  # pycolmap takes a 32-bit int
+_BLOCK_IMAGES = 16  # matches are committed, and progress is visible, per block of 16 x 16 pairs
+_POLL_SECONDS = 0.1
+_ORIENTATION, _UPRIGHT = 0x0112, 1
+_SHORT = 3  # the type of such tags
+_HEAD_BYTES = 1 << 17  # the EXIF segment, at most 64 KiB, comes first or after a small one
+_MORE_PHOTOGRAPHS = (
+    "Take more overlapping photographs, take out those of other places, or try the exhaustive "
+    "matcher or a simpler camera_model such as SIMPLE_RADIAL."
+)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How features are detected and matched, and how the scene is solved.
+
+    Args:
+        matcher: ``exhaustive`` compares every pair of images; ``sequential`` each with its
+            successors in the order of names, for a video.
+        device: Where features are detected and matched; all else runs on the CPU.
+        max_image_size: Longer sides are reduced to this many pixels for feature detection.
+        seed: Seed of RANSAC and of the order of bundle adjustment.
+        threads: Worker threads; -1 = all cores.
+
+    Raises:
+        ParameterError: A value is out of its range.
+    """
+
+    matcher: MatcherName = "exhaustive"
+    device: DeviceName = "auto"
+    max_image_size: int = 1600
+    seed: int = 0
+    threads: int = -1
+
+    def __post_init__(self) -> None:
+        check_choice("matcher", self.matcher, get_args(MatcherName))
+        check_choice("device", self.device, get_args(DeviceName))
+        for name, low in (("max_image_size", 1), ("seed", 0), ("threads", 1)):
+            value = getattr(self, name)
+            if not low <= value <= _LARGEST and (name, value) != ("threads", -1):
+                raise ParameterError(
+                    f"{name} from {low} to {_LARGEST}", found=f"{value}", fix="Choose another."
+                )
+
+
+def check_choice(name: str, value: str, choices: Sequence[str]) -> None:
+    """Raise ParameterError unless ``value`` is one of ``choices``."""
+    if value not in choices:
+        raise ParameterError(
+            f"{name} to be one of {', '.join(choices)}", found=repr(value), fix="Choose another."
+        )
+
+
+def require_pycolmap(device: DeviceName = "auto") -> Any:
+    """Import pycolmap.
+
+    Raises:
+        MissingDependencyError: It does not load, is too old, or cannot use ``device``.
+    """
+    # pycolmap's wheel exports its own zlib. A system libz loaded after it binds to that and
+    # corrupts the heap at the first compression (PNG, gzip); loaded before it, it does not.
+    importlib.import_module("zlib")
+    fix = f"Install it (extra sfm): {install_command('pycolmap', upgrade=True)}."
+    try:
+        pycolmap = importlib.import_module("pycolmap")
+    except (ImportError, RuntimeError) as error:  # RuntimeError: its C++ part does not load
+        found = str(error).strip()
+        raise MissingDependencyError("pycolmap to load", found=found, fix=fix) from error
+    found = f"pycolmap {pycolmap.__version__}"
+    if int(pycolmap.__version__.split(".")[0]) < _OLDEST:
+        raise MissingDependencyError(f"pycolmap {_OLDEST} or newer", found=found, fix=fix)
+    if device == "cuda" and not pycolmap.has_cuda:
+        raise MissingDependencyError(
+            "a pycolmap that can use CUDA, as device='cuda' asks",
+            found=f"{found} built for the CPU",
+            fix="Use device='auto' or 'cpu', or install a CUDA build of pycolmap.",
+        )
+    return pycolmap
+
+
+@dataclass(frozen=True)
+class Run:
+    """What the stages of one run share; ``work`` is a scratch folder that is removed at the end."""
+
+    pycolmap: Any
+    settings: Settings
+    image_dir: Path
+    work: Path
+    on_progress: Progress
+    seconds: dict[str, float] = field(default_factory=dict)
+    """Wall time of the stages so far."""
+
+    @property
+    def database(self) -> Path:
+        """The feature database."""
+        return self.work / "database.db"
+
+    def stage(self, name: str, work: Callable[[], T], count: Callable[[], int], total: int) -> T:
+        """What ``work`` returns, a blocking call of pycolmap, which releases the GIL.
+
+        Meanwhile ``count`` says ten times a second how many of ``total`` items are done.
+
+        Raises:
+            ReconstructionError: pycolmap failed.
+        """
+
+        def seeded() -> T:
+            self.pycolmap.set_random_seed(self.settings.seed)  # of this thread
+            return work()
+
+        started = time.perf_counter()
+        with ThreadPoolExecutor(1) as pool:
+            future = pool.submit(seeded)
+            self.on_progress(name, 0.0)
+            while not wait([future], _POLL_SECONDS).done:
+                self.on_progress(name, min(count() / max(total, 1), 1.0))
+        self.on_progress(name, 1.0)
+        self.seconds[name] = time.perf_counter() - started
+        try:
+            return future.result()
+        except Exception as error:  # pycolmap throws whatever C++ type its libraries throw
+            raise ReconstructionError(
+                f"pycolmap to finish {name}",
+                found=f"{type(error).__name__}: {error}",
+                fix="Check the disk space and the images.",
+            ) from error
+
+
+def guessed_model(run: Run, photos: Mapping[str, Size], camera_model: str, *, shared: bool) -> Any:
+    """A model without poses, with cameras of EXIF's or a default focal length.
+
+    With ``shared``, photographs of one size have one camera.
+    """
+    pycolmap, model = run.pycolmap, run.pycolmap.Reconstruction()
+    options = pycolmap.ImageReaderOptions(camera_model=camera_model)
+    ids: dict[Any, int] = {}
+    for number, (name, size) in enumerate(photos.items(), 1):
+        camera_id = ids.setdefault(size if shared else name, len(ids) + 1)
+        if not model.exists_camera(camera_id):
+            camera = pycolmap.infer_camera_from_image(run.image_dir / name, options)
+            camera.camera_id = camera_id
+            model.add_camera_with_trivial_rig(camera)
+        image = pycolmap.Image(name=name, image_id=number, camera_id=camera_id)
+        model.add_image_with_trivial_frame(image)
+    return model
+
+
+def posed_model(pycolmap: Any, poses: Sequence[Image]) -> Any:
+    """A model with the poses and cameras of images, exactly as given; image i is the i-th."""
+    model, ids = pycolmap.Reconstruction(), dict[int, int]()
+    for number, posed in enumerate(poses, 1):
+        lens = posed.intrinsics
+        camera_id = ids.setdefault(lens.camera_id, len(ids) + 1)
+        if not model.exists_camera(camera_id):
+            camera = pycolmap.Camera(
+                camera_id=camera_id,
+                model=lens.model,
+                width=lens.width,
+                height=lens.height,
+                params=list(lens.params),
+                has_prior_focal_length=True,  # matches are verified with the true focal length
+            )
+            model.add_camera_with_trivial_rig(camera)
+        image = pycolmap.Image(name=posed.name, image_id=number, camera_id=camera_id)
+        model.add_image_with_trivial_frame(image, rigid(pycolmap, posed))
+    return model
+
+
+def rigid(pycolmap: Any, image: Image) -> Any:
+    """The pose of ``image``, cam_from_world, as a ``pycolmap.Rigid3d``."""
+    rotation = pycolmap.Rotation3d(np.roll(image.quat, -1))  # wxyz to xyzw
+    return pycolmap.Rigid3d(rotation, image.translation)
+
+
+def match_photographs(run: Run, model: Any) -> None:
+    """Create the database of a model's images, with their features and verified matches.
+
+    Raises:
+        SceneFormatError: pycolmap could not use one of the photographs.
+    """
+    pycolmap, settings = run.pycolmap, run.settings
+    device = getattr(pycolmap.Device, settings.device)
+    names = {image_id: image.name for image_id, image in sorted(model.images.items())}
+    with pycolmap.Database.open(run.database) as database:
+        for camera_id, camera in sorted(model.cameras.items()):
+            database.write_camera(camera, use_camera_id=True)
+            database.write_rig(model.rig(camera_id), use_rig_id=True)
+        for image_id in names:
+            database.write_frame(model.frame(image_id), use_frame_id=True)
+            database.write_image(model.image(image_id), use_image_id=True)
+        extraction = pycolmap.FeatureExtractionOptions(
+            max_image_size=settings.max_image_size, num_threads=settings.threads
+        )
+        run.stage(
+            "features",
+            lambda: pycolmap.extract_features(
+                *(run.database, run.image_dir, list(names.values())),
+                extraction_options=extraction,
+                device=device,
+            ),
+            lambda: sum(map(database.exists_keypoints, names)),
+            len(names),
+        )
+        skipped = [name for i, name in names.items() if not database.exists_keypoints(i)]
+        if skipped:
+            raise SceneFormatError(
+                f"pycolmap to read all images of {run.image_dir}",
+                found=f"{len(skipped)} that it skipped: {name_some(skipped)}",
+                fix="Export them again as 8-bit JPEG or PNG, or take them out of the folder.",
+            )
+        if settings.matcher == "exhaustive":
+            match, generator = pycolmap.match_exhaustive, pycolmap.ExhaustivePairGenerator
+            pairing = pycolmap.ExhaustivePairingOptions(block_size=_BLOCK_IMAGES)
+        else:
+            match, generator = pycolmap.match_sequential, pycolmap.SequentialPairGenerator
+            pairing = pycolmap.SequentialPairingOptions()
+        run.stage(
+            "matching",
+            lambda: match(
+                run.database,
+                matching_options=pycolmap.FeatureMatchingOptions(num_threads=settings.threads),
+                pairing_options=pairing,
+                verification_options=pycolmap.TwoViewGeometryOptions(
+                    ransac={"random_seed": settings.seed}
+                ),
+                device=device,
+            ),
+            database.num_matched_image_pairs,
+            len(set(generator(pairing, database).all_pairs())),
+        )
+
+
+def _options(run: Run) -> Any:
+    return run.pycolmap.IncrementalPipelineOptions(
+        num_threads=run.settings.threads, random_seed=run.settings.seed
+    )
+
+
+def map_images(run: Run, names: Sequence[str]) -> Path:
+    """Solve for poses, lenses and points; the folder of the model with the most images.
+
+    Raises:
+        ReconstructionError: No model was found, or it has fewer than half of the photographs.
+    """
+    models_dir = run.work / "models"
+    models_dir.mkdir()
+    registered: list[None] = []  # of the model being built; mapping may begin several
+
+    def restart() -> None:
+        registered[:] = [None, None]
+
+    models = run.stage(
+        "mapping",
+        lambda: run.pycolmap.incremental_mapping(
+            run.database,
+            run.image_dir,
+            models_dir,
+            _options(run),
+            initial_image_pair_callback=restart,
+            next_image_callback=lambda: registered.append(None),
+        ),
+        lambda: len(registered),
+        len(names),
+    )
+    if not models:
+        raise ReconstructionError(
+            f"a model of the {len(names)} images in {run.image_dir}",
+            found="no two images that match well enough to begin one",
+            fix=_MORE_PHOTOGRAPHS,
+        )
+    best = max(models, key=lambda i: (models[i].num_reg_images(), models[i].num_points3D()))
+    found = {image.name for image in models[best].images.values() if image.has_pose}
+    if 2 * len(found) < len(names):
+        raise ReconstructionError(
+            f"at least half of the {len(names)} images in {run.image_dir} to register",
+            found=f"{len(found)} in the largest of {len(models)} models; "
+            f"without a pose: {name_some([name for name in names if name not in found])}",
+            fix=_MORE_PHOTOGRAPHS,
+        )
+    return models_dir / str(best)
+
+
+def triangulate_points(run: Run, poses: Sequence[Image]) -> Path:
+    """Triangulate points with cameras and poses held fixed; the folder of the model.
+
+    Raises:
+        ReconstructionError: Not a single point was found.
+    """
+    model_dir = run.work / "model"
+    model_dir.mkdir()
+    options = _options(run)
+    options.max_extra_param = math.inf  # a known lens is trusted: Kinects have a k3 above 1
+    posed = posed_model(run.pycolmap, poses)
+    model = run.stage(
+        "triangulation",
+        lambda: run.pycolmap.triangulate_points(
+            posed, run.database, run.image_dir, model_dir, options=options
+        ),
+        posed.num_points3D,
+        0,
+    )
+    if model.num_points3D() == 0:
+        raise ReconstructionError(
+            f"points from the {len(poses)} posed images in {run.image_dir}",
+            found="none on which two matching rays meet",
+            fix="Check that the poses belong to these images, in the same order and convention; "
+            "a capture without sideways motion has no depth to triangulate.",
+        )
+    return model_dir
+
+
+def export_scene(run: Run, model_dir: Path, staging: Path, *, distinct: bool = True) -> None:
+    """Write a model's photographs and points to ``staging`` with distortion removed.
+
+    Images whose camera is PINHOLE already are copied byte for byte, except that an EXIF orientation
+    is cleared. The points' reprojection errors are in pixels of the undistorted images. With
+    ``distinct``, points that COLMAP put exactly where another is are left out.
+
+    Raises:
+        OutputError: Not all images could be written.
+    """
+    pycolmap, dense = run.pycolmap, run.work / "dense"
+    num_images = pycolmap.Reconstruction(model_dir).num_reg_images()
+
+    def num_written() -> int:
+        return sum(path.is_file() for path in (dense / "images").rglob("*"))
+
+    run.stage(
+        "undistortion",
+        lambda: pycolmap.undistort_images(
+            dense, model_dir, run.image_dir, num_threads=run.settings.threads
+        ),
+        num_written,
+        num_images,
+    )
+    if num_written() != num_images:  # pycolmap only logs an image that it could not write
+        raise OutputError(
+            f"{num_images} undistorted images to be written",
+            found=f"{num_written()}",
+            fix="Free some space on the output's disk, or choose another.",
+        )
+    (staging / "sparse").mkdir()
+    (dense / "sparse").rename(staging / "sparse" / "0")
+    (dense / "images").rename(staging / "images")
+    clear_orientation(staging / "images")
+    model = pycolmap.Reconstruction(staging / "sparse" / "0")
+    if distinct:
+        drop_repeats(model)
+    model.update_point_3d_errors()
+    model.write(staging / "sparse" / "0")
+
+
+def drop_repeats(model: Any) -> None:
+    """Of a model's points at one float32 position, keep that with the longest track."""
+    points = model.points3D
+    longest_first = sorted(points, key=lambda i: (-points[i].track.length(), i))
+    xyz = np.array([points[i].xyz for i in longest_first], np.float32).reshape(-1, 3)
+    kept = np.unique(xyz + np.float32(0), axis=0, return_index=True)[1]  # -0.0 equals 0.0
+    for repeat in sorted(set(longest_first) - {longest_first[k] for k in kept}):
+        model.delete_point3D(repeat)
+
+
+def clear_orientation(folder: Path) -> None:
+    """Mark every JPEG below ``folder`` as upright in its stored orientation.
+
+    COLMAP reads pixels as they are stored and keeps EXIF's orientation in what it writes; a trainer
+    whose image reader obeys that tag (as OpenCV's does) would see the photograph rotated relative
+    to its camera. The two bytes of the tag change and nothing else.
+    """
+    for path in folder.rglob("*"):
+        if path.suffix.lower() not in {".jpg", ".jpeg"}:
+            continue
+        with PilImage.open(path) as image:
+            turned = image.getexif().get(_ORIENTATION, _UPRIGHT)
+        if turned not in range(_UPRIGHT + 1, 9):  # as stored, or no orientation
+            continue
+        content = path.read_bytes()
+        # EXIF's entry of a tag (TIFF 6.0): tag, type, count and value, in one of two byte orders.
+        for order in ("<HHIH", ">HHIH"):
+            entry = struct.pack(order, _ORIENTATION, _SHORT, 1, turned)
+            at = content.find(entry, 0, _HEAD_BYTES)
+            if at >= 0:
+                upright = struct.pack(order, _ORIENTATION, _SHORT, 1, _UPRIGHT)
+                path.unlink()  # a copy of a read-only photograph is read-only
+                path.write_bytes(content[:at] + upright + content[at + len(upright) :])
+                break
