@@ -1,4 +1,4 @@
-"""The numbers of ``splatseed info`` against brute force on small clouds."""
+"""The numbers of ``splatseed info``, and scores, against brute force on small clouds."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from splatseed.camera import Intrinsics
+from splatseed.errors import PointCloudError
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene, Tracks
 from splatseed.seeding.diagnostics import (
@@ -13,9 +14,13 @@ from splatseed.seeding.diagnostics import (
     EmptyRegions,
     cloud_statistics,
     empty_regions,
+    far_share,
     find_problems,
+    measure,
+    spacing,
     track_statistics,
 )
+from splatseed.synthetic import SHAPES
 
 SHARES = [5, 25, 50, 75, 95]
 
@@ -27,7 +32,7 @@ def _scene(xyz, **parts):
 
 def _brute_spacing(xyz):
     """Mean distance of every distinct point to its 6 nearest, by all pairs."""
-    distinct = np.unique(xyz.astype(np.float64), axis=0)
+    distinct = np.unique(np.asarray(xyz, np.float64), axis=0)
     distances = np.linalg.norm(distinct[:, None] - distinct, axis=2)
     return np.sort(distances, axis=1)[:, 1:7].mean(axis=1)
 
@@ -36,13 +41,12 @@ def test_counts_spacing_and_bounds(rng):
     xyz = rng.normal(size=(200, 3)).astype(np.float32)
     xyz[10:15] = xyz[0]
     scene = _scene(np.concatenate([xyz, [[np.nan, 0, 0], [0, np.inf, 0]]]))
-    statistics = cloud_statistics(scene)
-    assert (statistics.num_points, statistics.non_finite, statistics.duplicates) == (202, 2, 5)
-    np.testing.assert_allclose(
-        statistics.spacing, np.percentile(_brute_spacing(xyz), SHARES), rtol=1e-6
-    )
-    np.testing.assert_array_equal(statistics.low, xyz.min(axis=0))
-    np.testing.assert_array_equal(statistics.high, xyz.max(axis=0))
+    found = cloud_statistics(scene)
+    assert (found.num_points, found.non_finite, found.duplicates) == (202, 2, 5)
+    expected = np.percentile(_brute_spacing(xyz), SHARES)
+    np.testing.assert_allclose(found.spacing, expected, rtol=1e-6)
+    np.testing.assert_array_equal(found.low, xyz.min(axis=0))
+    np.testing.assert_array_equal(found.high, xyz.max(axis=0))
 
 
 def test_a_point_far_from_a_cluster_is_isolated(rng):
@@ -55,16 +59,16 @@ def test_a_point_far_from_a_cluster_is_isolated(rng):
 
 @pytest.mark.parametrize("far", [1.0, 1e3, 5e6])
 def test_resolution_is_the_step_to_the_next_float32(far):
-    statistics = cloud_statistics(_scene([[0, 0, 0], [0, -far, 0]]))
     next_one = np.nextafter(np.float32(far), np.float32(np.inf))
-    assert statistics.resolution == float(next_one) - far
+    found = cloud_statistics(_scene([[0, 0, 0], [0, -far, 0]]))
+    assert found.resolution == float(next_one) - far
 
 
 @pytest.mark.parametrize("xyz", [np.zeros((0, 3)), np.full((3, 3), np.nan)])
 def test_clouds_of_nothing_have_no_measures(xyz):
-    statistics = cloud_statistics(_scene(xyz))
-    assert (statistics.num_points, statistics.non_finite) == (len(xyz), len(xyz))
-    assert np.isnan([*statistics.spacing, *statistics.low, *statistics.high]).all()
+    found = cloud_statistics(_scene(xyz))
+    assert (found.num_points, found.non_finite) == (len(xyz), len(xyz))
+    assert np.isnan([*found.spacing, *found.low, *found.high]).all()
 
 
 def test_tracks(rng):
@@ -72,21 +76,14 @@ def test_tracks(rng):
     errors[::5] = -1  # unknown
     offsets = np.concatenate([[0], np.cumsum(lengths)])
     seen = np.zeros(offsets[-1], np.uint32)
-    xyz = rng.random((40, 3))
-    statistics = track_statistics(
-        _scene(xyz, tracks=Tracks(np.arange(40), xyz, errors, offsets, seen, seen))
-    )
-    known = [error for error in errors if error >= 0]
-    assert statistics.mean_length == pytest.approx(sum(lengths) / 40)
-    assert statistics.mean_error == pytest.approx(sum(known) / len(known))
-    np.testing.assert_allclose(statistics.length, np.percentile(lengths, SHARES))
-    np.testing.assert_allclose(statistics.error, np.percentile(known, SHARES))
+    xyz, known = rng.random((40, 3)), errors[errors >= 0]
+    tracks = Tracks(np.arange(40), xyz, errors, offsets, seen, seen)
+    found = track_statistics(_scene(xyz, tracks=tracks))
+    assert found.mean_length == pytest.approx(lengths.mean())
+    assert found.mean_error == pytest.approx(known.mean())
+    np.testing.assert_allclose(found.length, np.percentile(lengths, SHARES))
+    np.testing.assert_allclose(found.error, np.percentile(known, SHARES))
     assert track_statistics(_scene(xyz)) is None
-
-
-def _image(name, size=(320, 200)):
-    intrinsics = Intrinsics(1, "PINHOLE", *size, (100.0, 100.0, size[0] / 2, size[1] / 2))
-    return Image(name, 1, intrinsics, np.array([1.0, 0, 0, 0]), np.zeros(3))
 
 
 def _brute_empty(xyz, size, cell):
@@ -96,15 +93,18 @@ def _brute_empty(xyz, size, cell):
         u, v = 100 * x / z + size[0] / 2, 100 * y / z + size[1] / 2
         if z > 0 and 0 <= u < size[0] and 0 <= v < size[1]:
             hit.add((int(u // cell), int(v // cell)))
-    columns, rows = -(-size[0] // cell), -(-size[1] // cell)
-    return 1 - len(hit) / (columns * rows)
+    return 1 - len(hit) / (-(-size[0] // cell) * -(-size[1] // cell))
 
 
 @pytest.mark.parametrize("size", [(320, 200), (200, 320)])
 def test_empty_regions(size, rng):
     xyz = rng.normal(size=(300, 3)).astype(np.float32)  # half of them behind the camera
-    turned = Image("b.png", 2, _image("", size).intrinsics, np.array([0.0, 1, 0, 0]), np.zeros(3))
-    regions = empty_regions(_scene(xyz, images=(_image("a.png", size), turned)))
+    lens = Intrinsics(1, "PINHOLE", *size, (100.0, 100.0, size[0] / 2, size[1] / 2))
+    images = tuple(
+        Image(name, 1, lens, np.array(quat), np.zeros(3))
+        for name, quat in (("a.png", [1.0, 0, 0, 0]), ("b.png", [0.0, 1, 0, 0]))
+    )
+    regions = empty_regions(_scene(xyz, images=images))
     shares = [_brute_empty(xyz, size, 10), _brute_empty(xyz * [1, -1, -1], size, 10)]
     assert regions.mean == pytest.approx(np.mean(shares))
     assert regions.worst == pytest.approx(max(shares))
@@ -123,8 +123,79 @@ def test_problems_are_told_and_the_readers_come_first(rng):
     first, *others = find_problems(scene, _statistics(1000, 100), EmptyRegions(0.8, 0.9, "a"))
     assert first == "The reader's."
     assert [text.split()[0] for text in others] == ["100", "80%"]
-    # Not only those with surfaces: linear and triangle reject isolated points too.
-    assert "methods that interpolate start nothing from them" in others[0]
     (repeats,) = find_problems(_scene(rng.random((5, 3))), _statistics(1000, 100, 200), None)
     assert repeats.startswith("100 points (12.5%)")  # of those that are left
     assert "no points" in find_problems(_scene([]), _statistics(0, 0), None)[0]
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e6])
+def test_spacing_is_the_mean_over_six_neighbours_in_any_unit(scale, rng):
+    xyz = rng.normal(size=(300, 3))
+    assert spacing(scale * xyz) == pytest.approx(scale * _brute_spacing(xyz).mean())
+
+
+def test_duplicates_and_nan_points_are_no_neighbours():
+    pair = np.array([[0.0, 0, 0], [1.0, 0, 0]])
+    assert spacing(np.concatenate([pair, pair, [[np.nan, 0, 0]]])) == 1.0
+
+
+def test_measure_on_a_plane_moved_off_by_half_a_spacing(rng):
+    plane = SHAPES["plane"]()
+    originals = plane.sample(2000, rng)
+    h = spacing(originals)
+    new = plane.sample(1000, rng) + 0.5 * h * plane.frame[2]
+    whole = np.concatenate([originals, new])
+    score = measure(new, whole, plane, plane.sample(4000, rng), h)
+    assert score.error == pytest.approx(0.5)
+    assert score.p95 == pytest.approx(0.5)
+    assert score.share_far == 0
+
+
+def test_more_points_cover_more_and_outliers_are_far(rng):
+    sphere = SHAPES["sphere"]()
+    originals, extra = sphere.sample(500, rng), sphere.sample(1500, rng)
+    samples = sphere.sample(5000, rng)
+    h = spacing(originals)
+    before = measure(originals, originals, sphere, samples, h)
+    after = measure(extra, np.concatenate([originals, extra]), sphere, samples, h)
+    assert after.coverage < 0.6 * before.coverage
+    assert before.share_far == after.share_far == 0
+    astray = np.concatenate([extra[:900], 3 * extra[900:1000]])
+    score = measure(astray, np.concatenate([originals, astray]), sphere, samples, h)
+    assert score.share_far == pytest.approx(0.1)
+
+
+def test_far_is_three_local_spacings_of_the_nearest_original():
+    near = np.stack(np.meshgrid(*[np.arange(4.0)] * 2, [0.0]), axis=-1).reshape(-1, 3)
+    far = 100 * near + [1000.0, 0, 0]
+    originals, up = np.concatenate([near, far]), np.array([0, 0, 1.0])
+    assert far_share(originals, near + 2.9 * up) == 0
+    assert far_share(originals, near + 9 * up) == 1
+    assert far_share(originals, far + 9 * up) == 0  # the same height over sparser points
+
+
+def test_far_share_of_odd_clouds():
+    one = np.zeros((1, 3))
+    assert far_share(one, np.empty((0, 3))) == 0
+    assert far_share(one, one) == 0
+    assert far_share(one, one + 1) == 1
+    assert far_share(one, np.array([[0.0, 0, 0], [np.nan, 0, 0]])) == 0.5
+    assert far_share(one, np.repeat([[0.0, 0, 0], [1.0, 0, 0]], 40_000, axis=0)) == (
+        pytest.approx(0.5, abs=0.02)  # a sample of them
+    )
+
+
+@pytest.mark.parametrize(
+    ("call", "says"),
+    [
+        *((lambda xyz=xyz: spacing(xyz), "two distinct finite points")
+          for xyz in (np.empty((0, 3)), np.ones((1, 3)), np.ones((9, 3)))),
+        *((lambda num=num, h=h: measure(
+            np.zeros((num, 3)), np.zeros((num, 3)), SHAPES["sphere"](), np.ones((3, 3)), h
+        ), "spacing above zero") for num, h in ((0, 1.0), (5, 0.0), (5, np.nan))),
+        (lambda: far_share(np.full((2, 3), np.nan), np.zeros((1, 3))), "finite original points"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_measured_is_refused(call, says):
+    with pytest.raises(PointCloudError, match=says):
+        call()

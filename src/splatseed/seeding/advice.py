@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from typing import Literal
 
 import numpy as np
 
@@ -25,13 +25,10 @@ from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
 from splatseed.upsample import Upsampler
 
-Layout: TypeAlias = Literal["facing one way", "around something", "through a place"]
 DEFAULT_METHOD, FALLBACK = "auto", "mls"
 """The default method, and its replacement for scenes without photographs."""
-AS_IT_IS = "sfm"
-"""The advice to leave the points as they are."""
-SEEDED = "seeded"
-"""The advice to train: splatseed has made the points already."""
+AS_IT_IS, SEEDED = "sfm", "seeded"
+"""The advice to leave the points as they are; and to train, as splatseed has made them already."""
 ROOM = 1.1
 """Least room at which new points are worth making. On validation views fox, with a room of 1.17,
 gained 0.41 dB (two seeds), and scenes with a room of 1.0 lost; nothing was measured between."""
@@ -39,42 +36,25 @@ SAME_WAY = 0.95
 """Least length of the mean viewing direction at which cameras face one way."""
 INWARD = 0.7
 """Least share of cameras that look towards the point nearest to all optical axes in an orbit."""
-PLACES_ITSELF = (
-    "Strategy grow puts new Gaussians at the depth that stereo finds; points that method auto "
-    "added before it gained 0.1 dB at most on some of the captures measured, and cost as much on "
-    "others."
-)
 
 
 @dataclass(frozen=True)
 class Measured:
-    """Measurements of a scene.
+    """Measurements of a scene."""
 
-    Args:
-        num_points: Distinct points.
-        pixels: Pixels of one photograph.
-        empty: Share of the photographs' cells in which no point is seen, 0 to 1; None if unknown.
-        layout: Layout of its cameras; None for fewer than three.
-        photographs: Whether they exist.
-        depth_maps: Whether each photograph has a depth map.
-    """
-
-    num_points: int
-    pixels: float
-    empty: float | None = None
-    layout: Layout | None = None
-    photographs: bool = True
-    depth_maps: bool = False
+    num_points: int  # distinct ones
+    pixels: float  # of one photograph
+    empty: float | None = None  # share of the photographs' cells without a point, if known
+    layout: str | None = None  # of its cameras; None for fewer than three
+    photographs: bool = True  # whether they exist
+    depth_maps: bool = False  # whether there are any
 
 
 @dataclass(frozen=True)
 class Advice:
-    """What to do, and why.
+    """What to do, a sentence for each reason, and the numbers on which it rests.
 
-    Args:
-        method: The method for new points, ``AS_IT_IS`` or ``SEEDED``.
-        reasons: A sentence each.
-        measured: The numbers on which it rests.
+    ``method`` is the method for new points, ``AS_IT_IS`` or ``SEEDED``.
     """
 
     method: str
@@ -84,19 +64,12 @@ class Advice:
     @property
     def sentence(self) -> str:
         """What to do, in a few words."""
-        if self.method == SEEDED:
-            return "train it"
-        if self.method == AS_IT_IS:
-            return "leave the points as they are"
-        return f"add points by method {self.method}"
+        told = {SEEDED: "train it", AS_IT_IS: "leave the points as they are"}
+        return told.get(self.method, f"add points by method {self.method}")
 
 
 def advice_for(
-    scene: Scene,
-    most_seeds: int,
-    *,
-    strategy: str = "default",
-    empty: float | None = None,
+    scene: Scene, most_seeds: int, *, strategy: str = "default", empty: float | None = None
 ) -> Advice:
     """What to do with a scene's points before training; no photograph is opened.
 
@@ -130,14 +103,7 @@ def method_for(
 def advise(
     measured: Measured, most_seeds: int, *, strategy: str = "default", room: float = ROOM
 ) -> Advice:
-    """The rule behind ``advice_for``.
-
-    Args:
-        measured: Measurements of the scene.
-        most_seeds: Most seeds with which training can begin under its budget.
-        strategy: The strategy of that training.
-        room: Least room at which new points are worth making; scoring fits it.
-    """
+    """The rule behind ``advice_for``, which scoring calls with other values of ``room``."""
 
     def said(method: str, *reasons: str) -> Advice:
         return Advice(method, reasons, measured)
@@ -153,12 +119,19 @@ def advise(
     share = measured.num_points / measured.pixels if measured.pixels else 0.0
     share_said = f"{share:.2f}" if share >= 0.01 or not share else f"{share:.1g}"
     per_pixel = f"{measured.num_points:,} points, {share_said} per pixel"
-    if has < room or strategy == "grow":
+    if has < room:
         full = (
             f"Training begins with {most_seeds:,} at most, so there is no room for more: adding "
             "some cost up to 0.4 dB where that was measured."
         )
-        return said(AS_IT_IS, f"It has {per_pixel}.", full if has < room else PLACES_ITSELF)
+        return said(AS_IT_IS, f"It has {per_pixel}.", full)
+    if strategy == "grow":
+        places_itself = (
+            "Strategy grow puts new Gaussians at the depth that stereo finds; points that method "
+            "auto added before it gained 0.1 dB at most on some of the captures measured, and cost "
+            "as much on others."
+        )
+        return said(AS_IT_IS, f"It has {per_pixel}.", places_itself)
     reasons = [f"It has {per_pixel}, and room for {has:.1f} times as many seeds."]
     if measured.depth_maps:
         return said("depth", *reasons, "Its depth maps say where the surfaces are.")
@@ -182,7 +155,9 @@ def measure(scene: Scene, empty: float | None = None) -> Measured:
     )
 
 
-def camera_layout(scene: Scene) -> Layout | None:
+def camera_layout(
+    scene: Scene,
+) -> Literal["facing one way", "around something", "through a place"] | None:
     """The layout of a scene's cameras; None for fewer than three."""
     if len(scene.images) < 3:
         return None

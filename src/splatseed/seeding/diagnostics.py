@@ -2,9 +2,9 @@
 
 Notation: the spacing of a point is its mean distance to its 6 nearest others, in scene units; h is
 a cloud's: the mean over its points. Scores are in units of h of the *originals*, so that scenes of
-any size compare. Track lengths count images, reprojection errors are in px. Promise: exact
-duplicates and non-finite points do not count as neighbours; nothing is random unless a ``rng`` is
-passed; no photograph is opened.
+any size compare. Track lengths count images, reprojection errors are in px. Five numbers are the
+percentiles 5, 25, 50, 75, 95. Promise: exact duplicates and non-finite points do not count as
+neighbours; nothing is random; no photograph is opened.
 """
 
 from __future__ import annotations
@@ -25,86 +25,61 @@ from splatseed.scene import NO_POINT, Image, Scene
 
 NEIGHBORS = 6
 """Neighbours whose mean distance is the spacing: those of a point in a hexagonal pattern."""
-FAR_SPACINGS = 3.0
-"""A new point is far from the originals beyond this many spacings of the nearest one."""
-PERCENTILES = (5, 25, 50, 75, 95)
+FAR_SPACINGS, FAR_SAMPLE = 3.0, 50_000
+"""A new point is far from the originals beyond this many spacings of the nearest one; and of how
+many new points that is asked, at most."""
 EMPTY_CELLS = 32
 """Empty regions are counted on a grid with this many cells along an image's longer side."""
-MANY_ISOLATED = 0.02
-"""Share of isolated points that is worth a warning."""
-MANY_EMPTY = 0.5
-"""Share of the images' area without points that is worth a warning."""
+MANY_ISOLATED, MANY_EMPTY = 0.02, 0.5
+"""Shares of isolated points, and of the images' area without points, that are worth a warning."""
+
+Five = tuple[float, ...]
 
 
 @dataclass(frozen=True)
 class CloudStatistics:
-    """Statistics of the points alone.
-
-    Args:
-        num_points: All points.
-        non_finite: Points with a coordinate that is NaN or infinite.
-        duplicates: Finite points at exactly the position of an earlier one.
-        isolated: Points whose spacing is over 3 times that of their surroundings.
-        spacing: Percentiles 5, 25, 50, 75, 95 of the spacing, scene units; NaN for fewer than 2.
-        low: Least coordinates of the bounding box, [3].
-        high: Greatest coordinates, [3].
-        resolution: Step of float32 at the greatest coordinate, scene units.
-    """
+    """Statistics of the points alone; lengths are in scene units, NaN without finite points."""
 
     num_points: int
-    non_finite: int
-    duplicates: int
-    isolated: int
-    spacing: tuple[float, ...]
-    low: tuple[float, ...]
+    non_finite: int  # points with a coordinate that is NaN or infinite
+    duplicates: int  # finite points at exactly the position of an earlier one
+    isolated: int  # points whose spacing is over 3 times that of their surroundings
+    spacing: Five
+    low: tuple[float, ...]  # corner of the bounding box
     high: tuple[float, ...]
-    resolution: float
+    resolution: float  # step of float32 at the greatest coordinate
 
 
 @dataclass(frozen=True)
 class TrackStatistics:
-    """Statistics of the tracks: mean, and percentiles 5, 25, 50, 75, 95."""
+    """Statistics of the tracks."""
 
     mean_length: float
-    length: tuple[float, ...]
+    length: Five
     mean_error: float
-    error: tuple[float, ...]
+    error: Five
 
 
 @dataclass(frozen=True)
 class EmptyRegions:
-    """How much of the images no point projects into.
+    """How much of the images no point projects into."""
 
-    Args:
-        mean: Mean share of empty cells over the images.
-        worst: Share in the emptiest image.
-        worst_name: Its name.
-    """
-
-    mean: float
-    worst: float
+    mean: float  # share of empty cells
+    worst: float  # that of the emptiest image
     worst_name: str
 
 
 def cloud_statistics(scene: Scene, progress: Progress = silent) -> CloudStatistics:
-    """Count, measure and check the points of a scene; an empty cloud has NaN bounds."""
+    """Count, measure and check the points of a scene."""
     from splatseed.upsample.neighbors import prepare, sound_bases  # noqa: PLC0415  (SciPy)
 
-    xyz = scene.points.xyz
+    xyz, left = scene.points.xyz, scene.left_out
     finite = xyz[scene.points.finite].astype(np.float64)
-    nothing = (np.nan,) * 3
-    left = scene.left_out
-    total = len(xyz) + sum(left)
+    num, bad = len(xyz) + sum(left), len(xyz) - len(finite) + left.non_finite
     if len(finite) == 0:
+        nothing = (np.nan,) * 3
         return CloudStatistics(
-            total,
-            total - left.duplicates,
-            left.duplicates,
-            0,
-            (np.nan,) * len(PERCENTILES),
-            nothing,
-            nothing,
-            np.nan,
+            num, bad, left.duplicates, 0, (np.nan,) * 5, nothing, nothing, np.nan
         )
     cloud = prepare(scene.points.replace(source=np.zeros(len(xyz), np.uint8)), progress=progress)
     # Only originals start new points; alone they are spaced otherwise than among added ones.
@@ -114,30 +89,22 @@ def cloud_statistics(scene: Scene, progress: Progress = silent) -> CloudStatisti
     isolated = 0
     if len(originals) > 1:
         isolated = int((sound_bases(originals, originals.neighbors(16)) == 0).sum())
-    greatest = np.abs(finite).max().astype(np.float32)
     return CloudStatistics(
-        num_points=total,
-        non_finite=len(xyz) - len(finite) + left.non_finite,
-        duplicates=len(finite) - len(cloud) + left.duplicates,
-        isolated=isolated,
-        spacing=_percentiles(spacing),
-        low=tuple(finite.min(axis=0).tolist()),
-        high=tuple(finite.max(axis=0).tolist()),
-        resolution=float(np.spacing(greatest)),
-    )
+        num, bad, len(finite) - len(cloud) + left.duplicates, isolated, _five(spacing),
+        tuple(finite.min(axis=0).tolist()), tuple(finite.max(axis=0).tolist()),
+        float(np.spacing(np.abs(finite).max().astype(np.float32))),
+    )  # fmt: skip
 
 
 def track_statistics(scene: Scene) -> TrackStatistics | None:
     """Track lengths and reprojection errors; None for a scene without tracks."""
-    if scene.tracks is None or not _has_tracks(scene):
+    if scene.tracks is None or not np.any(scene.tracks.lengths):
         return None
     lengths, errors = scene.tracks.lengths, scene.tracks.errors
     known = errors[errors >= 0]
     if len(known) == 0:
         known = np.array([np.nan])
-    return TrackStatistics(
-        float(lengths.mean()), _percentiles(lengths), float(known.mean()), _percentiles(known)
-    )
+    return TrackStatistics(float(lengths.mean()), _five(lengths), float(known.mean()), _five(known))
 
 
 def empty_regions(scene: Scene, progress: Progress = silent) -> EmptyRegions | None:
@@ -169,40 +136,27 @@ def find_problems(
             "outliers or a sparse background; methods that interpolate start nothing from them"
         )
     if cloud.num_points == 0:
-        problems.append(_without_points(scene))
+        problems.append(
+            "there are no points yet: splatseed upsample makes some from the photographs, by "
+            "comparing them (method auto), splatseed sfm --poses-from triangulates some"
+            if scene.has_photographs
+            else "there are no points to upsample"
+        )
     elif regions is not None and regions.mean > MANY_EMPTY:
         problems.append(
             f"{regions.mean:.0%} of the images' area has no point: upsampling fills between "
             "points, but only photographs or depth maps can fill a bare wall"
         )
-    if cloud.num_points and (astray := _features_astray(scene)):
-        problems.append(
-            f"{astray:,} features of the photographs name points, but no point has a track: the "
-            "points were put in later, and a trainer that reads features takes wrong ones for them;"
-            " what splatseed upsample writes of this scene is free of that"
-        )
+    if cloud.num_points and track_statistics(scene) is None:
+        seen = (image.observations for image in scene.images)
+        astray = sum(int(np.count_nonzero(each.point_ids != NO_POINT)) for each in seen if each)
+        if astray:
+            problems.append(
+                f"{astray:,} features of the photographs name points, but no point has a track: "
+                "the points were put in later, and a trainer that reads features takes wrong ones "
+                "for them; what splatseed upsample writes of this scene is free of that"
+            )
     return tuple(problems)
-
-
-def _has_tracks(scene: Scene) -> bool:
-    return scene.tracks is not None and bool(np.any(scene.tracks.lengths))
-
-
-def _features_astray(scene: Scene) -> int:
-    """How many features name a point, in a scene whose points know of no feature."""
-    if _has_tracks(scene):
-        return 0
-    seen = (image.observations for image in scene.images)
-    return sum(int(np.count_nonzero(each.point_ids != NO_POINT)) for each in seen if each)
-
-
-def _without_points(scene: Scene) -> str:
-    if not scene.has_photographs:
-        return "there are no points to upsample"
-    return (
-        "there are no points yet: splatseed upsample makes some from the photographs, by comparing "
-        "them (method auto), splatseed sfm --poses-from triangulates some"
-    )
 
 
 def _empty_share(image: Image, xyz: Float64[np.ndarray, "3 N"]) -> float:
@@ -223,11 +177,8 @@ def _empty_share(image: Image, xyz: Float64[np.ndarray, "3 N"]) -> float:
     return 1.0 - np.count_nonzero(seen) / seen.size
 
 
-def _percentiles(values: np.ndarray) -> tuple[float, ...]:
-    return tuple(np.percentile(values, PERCENTILES).tolist())
-
-
-# Trainable? --------------------------------------------------------------------------------------
+def _five(values: np.ndarray) -> Five:
+    return tuple(np.percentile(values, (5, 25, 50, 75, 95)).tolist())
 
 
 def untrainable(scene: Scene) -> str:
@@ -253,9 +204,6 @@ def untrainable(scene: Scene) -> str:
 def is_distorted(scene: Scene) -> bool:
     """Whether any of the images' cameras has lens distortion."""
     return any(image.intrinsics.has_distortion for image in scene.images)
-
-
-# Accuracy ----------------------------------------------------------------------------------------
 
 
 class _Measurable(Protocol):
@@ -312,7 +260,7 @@ def measure(
     errors = surfaces.distance(new_xyz) / h if len(new_xyz) else np.array([np.nan])
     coverage = cKDTree(all_xyz).query(surface_samples)[0].mean() / h
     originals = all_xyz[: len(all_xyz) - len(new_xyz)]
-    share = far_share(originals, new_xyz) if len(originals) and len(new_xyz) else 0.0
+    share = far_share(originals, new_xyz) if len(originals) else 0.0
     median, p95 = (float(value) for value in np.percentile(errors, [50, 95]))
     return GeometryScore(float(errors.mean()), median, p95, float(coverage), share)
 
@@ -323,8 +271,8 @@ def spacing(xyz: Float[np.ndarray, "N 3"]) -> float:
     Raises:
         PointCloudError: Fewer than two distinct finite points.
     """
-    finite = _finite(xyz)
-    h = float(local_spacing(finite).mean()) if len(finite) else 0.0
+    finite = xyz[np.isfinite(xyz).all(axis=1)]
+    h = float(_spacing(cKDTree(finite), finite).mean()) if len(finite) else 0.0
     if not h > 0:
         raise PointCloudError(
             "at least two distinct finite points to take a spacing of",
@@ -334,71 +282,40 @@ def spacing(xyz: Float[np.ndarray, "N 3"]) -> float:
     return h
 
 
-def local_spacing(
-    xyz: Float[np.ndarray, "N 3"],
-    at: Float[np.ndarray, "M 3"] | None = None,
-    tree: cKDTree | None = None,
-) -> Float64[np.ndarray, " M"]:
-    """Mean distance to the 6 nearest others, in scene units, [M]; 0 if there are no others.
-
-    Args:
-        xyz: The cloud, finite, [N, 3].
-        at: The points of the cloud to evaluate, [M, 3]; all when left out.
-        tree: A tree of the cloud, if one exists already.
-    """
-    tree = cKDTree(xyz) if tree is None else tree
-    distances, _ = tree.query(xyz if at is None else at, k=NEIGHBORS + 1)
+def _spacing(tree: cKDTree, xyz: Float[np.ndarray, "M 3"]) -> Float64[np.ndarray, " M"]:
+    """The spacing of some of a tree's points, [M]; 0 if there are no others."""
+    distances, _ = tree.query(xyz, k=NEIGHBORS + 1)
     # The point itself and exact duplicates have distance 0, missing neighbours inf.
     counts = (distances > 0) & np.isfinite(distances)
     total = np.where(counts, distances, 0.0).sum(axis=1)
     return np.asarray(total / np.maximum(counts.sum(axis=1), 1))
 
 
-def far_share(
-    originals_xyz: Float[np.ndarray, "N 3"],
-    new_xyz: Float[np.ndarray, "M 3"],
-    max_sample: int = 50_000,
-    rng: np.random.Generator | None = None,
-) -> float:
+def far_share(originals_xyz: Float[np.ndarray, "N 3"], new_xyz: Float[np.ndarray, "M 3"]) -> float:
     """Share 0..1 of new points farther than 3 h from any original, h local to the nearest one.
 
     Args:
         originals_xyz: The originals, [N, 3].
-        new_xyz: The new points, [M, 3]; a non-finite one counts as far.
-        max_sample: If there are more new points, a sample of this size is judged.
-        rng: Draws the sample; evenly spaced points are taken when left out.
+        new_xyz: The new points, [M, 3], of which a sample is judged; a non-finite one counts as
+            far.
 
     Raises:
         PointCloudError: There are new points but no finite original.
     """
     if len(new_xyz) == 0:
         return 0.0
-    originals = _finite(originals_xyz)
+    originals = originals_xyz[np.isfinite(originals_xyz).all(axis=1)]
     if len(originals) == 0:
         raise PointCloudError(
             "finite original points to compare the new ones with",
             found=f"none among {len(originals_xyz)}",
             fix="Check that the cloud was read correctly.",
         )
-    sample = _sample(new_xyz, max_sample, rng)
-    finite = _finite(sample)
+    sample = new_xyz
+    if len(sample) > FAR_SAMPLE:
+        sample = sample[np.random.default_rng(0).choice(len(sample), FAR_SAMPLE, replace=False)]
     # An unbalanced tree is built several times faster, and only few queries follow.
     tree = cKDTree(originals, balanced_tree=False, compact_nodes=False)
-    to_original, nearest = tree.query(finite)
-    h = local_spacing(originals, originals[nearest], tree)
-    near = np.count_nonzero(to_original <= FAR_SPACINGS * h)
-    return float(1.0 - near / len(sample))
-
-
-def _finite(xyz: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "K 3"]:
-    return np.asarray(xyz[np.isfinite(xyz).all(axis=1)])
-
-
-def _sample(
-    xyz: Float[np.ndarray, "N 3"], limit: int, rng: np.random.Generator | None
-) -> Float[np.ndarray, "K 3"]:
-    if len(xyz) <= limit:
-        return xyz
-    if rng is None:
-        return xyz[np.linspace(0, len(xyz) - 1, limit).astype(np.int64)]
-    return xyz[rng.choice(len(xyz), limit, replace=False)]
+    to_original, nearest = tree.query(sample[np.isfinite(sample).all(axis=1)])
+    h = _spacing(tree, originals[nearest])
+    return float(1.0 - np.count_nonzero(to_original <= FAR_SPACINGS * h) / len(sample))

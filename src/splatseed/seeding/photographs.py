@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from splatseed.depth.stereo.settings import MOST_GRID, TOO_FEW
+from splatseed.depth.stereo.settings import MOST_GRID, TOO_FEW, StereoSettings
 from splatseed.errors import PointCloudError, SceneNotFoundError
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress
@@ -23,10 +23,10 @@ from splatseed.scene import Image, Scene
 from splatseed.upsample import as_cloud
 from splatseed.upsample.method import NewPoints, Traits, check_fields, require
 from splatseed.upsample.registry import source_code
+from splatseed.views.view import View, data_factor, load_views
 
 if TYPE_CHECKING:
     from splatseed.depth.stereo.maps import StereoMap, StereoResult
-    from splatseed.views.view import View
 
 MAX_SIZE = 800
 """Longer side in pixels at which photographs are used."""
@@ -47,8 +47,6 @@ class PhotographMethod:
     def __post_init__(self) -> None:
         check_fields(self)
         require(self.max_size >= 64, f"{self.name}.max_size of at least 64", self.max_size)
-        held = self.hold_out
-        require(held >= 0 and held != 1, f"{self.name}.hold_out of 0 or 2 and more", held)
         for field, most in (("spacing", 256), ("cell", 256), ("grid", MOST_GRID)):
             value = getattr(self, field, 1)
             require(1 <= value <= most, f"{self.name}.{field} from 1 to {most}", value)
@@ -78,7 +76,8 @@ class Stereo(PhotographMethod):
         """
         images = photographed(scene, self.hold_out)
         views = read_views(scene, images, self.max_size, progress)
-        stereo = self._compare(scene, images, views, np.random.default_rng(seed), progress, only)
+        rng = np.random.default_rng(seed)
+        stereo = compare(scene, images, views, self.grid, rng, progress, only)
         return tuple(stereo.map(i) for i in only)
 
     def __call__(
@@ -110,7 +109,7 @@ class Stereo(PhotographMethod):
             warnings = (error.warning,) if error and error.warning else ()
         views = read_views(scene, images, self.max_size, progress)
         start = time.perf_counter()
-        stereo = self._compare(scene, images, views, rng, progress)
+        stereo = compare(scene, images, views, self.grid, rng, progress)
         seeds = fuse(stereo, self.spacing, progress)
         found = _found(scene, stereo, time.perf_counter() - start)
         source = np.full(len(seeds), source_code("stereo"), np.uint8)
@@ -119,22 +118,6 @@ class Stereo(PhotographMethod):
             seeds.confidence, source,
         )  # fmt: skip
         return new, stereo
-
-    def _compare(
-        self,
-        scene: Scene,
-        images: Sequence[Image],
-        views: Sequence[View],
-        rng: np.random.Generator,
-        progress: Progress,
-        only: Sequence[int] | None = None,
-    ) -> StereoResult:
-        """Compare the photographs, or what some of them need."""
-        from splatseed.depth.stereo.depths import find_stereo, known_visibility  # noqa: PLC0415  (loads Numba)
-        from splatseed.depth.stereo.settings import StereoSettings  # noqa: PLC0415  (loads with its use)
-
-        settings, seed = StereoSettings(grid=self.grid), int(rng.integers(1 << 32))
-        return find_stereo(views, images, known_visibility(scene), settings, seed, progress, only)
 
 
 @dataclass(frozen=True)
@@ -162,7 +145,7 @@ class Cover(PhotographMethod):
                 fix="Choose --method auto, which compares the photographs first.",
             )
         views = read_views(scene, photographed(scene, self.hold_out), self.max_size, progress)
-        return cover_cloud(views, originals, self.cell, rng, progress)
+        return _cover(views, originals, self.cell, rng, progress)
 
 
 @dataclass(frozen=True)
@@ -180,7 +163,7 @@ class Auto(Stereo):
         """The same, and a seed in each part that is then still empty."""
         seeds, stereo = super().seeds_and_stereo(scene, rng, progress)
         known = PointCloud.concatenate(scene.points.originals, PointCloud(seeds.xyz, seeds.rgb))
-        gaps = cover_cloud(stereo.views, known, self.cell, rng, progress)
+        gaps = _cover(stereo.views, known, self.cell, rng, progress)
         arrays = {
             name: np.concatenate([getattr(seeds, name), getattr(gaps, name)])
             for name in NewPoints._fields
@@ -240,28 +223,42 @@ def read_views(
     scene: Scene, images: Sequence[Image], max_size: int, progress: Progress
 ) -> tuple[View, ...]:
     """The photographs of some images, undistorted, at most ``max_size`` pixels a side."""
-    from splatseed.views.view import data_factor, load_views  # noqa: PLC0415  (loads with use)
-
     factor = data_factor(images, max_size)
     return load_views(scene, images, data_factor=factor, undistort=True, progress=progress)
 
 
-def cover_cloud(
+def compare(
+    scene: Scene,
+    images: Sequence[Image],
+    views: Sequence[View],
+    grid: int,
+    rng: np.random.Generator,
+    progress: Progress,
+    only: Sequence[int] | None = None,
+) -> StereoResult:
+    """Stereo of the photographs, or what ``only`` some need; depths are ``grid`` pixels apart."""
+    from splatseed.depth.stereo.depths import find_stereo, known_visibility  # noqa: PLC0415  (loads Numba)
+
+    settings, seed = StereoSettings(grid=grid), int(rng.integers(1 << 32))
+    return find_stereo(views, images, known_visibility(scene), settings, seed, progress, only)
+
+
+def with_cover(
+    views: Sequence[View], points: PointCloud, cell: int, seed: int, progress: Progress
+) -> PointCloud:
+    """The points, plus a seed in each cell (its side in pixels) of the views that they leave."""
+    code = source_code("cover")
+    new = _cover(views, points, cell, np.random.default_rng([seed, code]), progress)
+    return PointCloud.concatenate(points, as_cloud(new, len(new.xyz), code))
+
+
+def _cover(
     views: Sequence[View],
     cloud: PointCloud,
     cell: int,
     rng: np.random.Generator,
     progress: Progress,
 ) -> NewPoints:
-    """A seed for every cell of every view that no point of a cloud falls in.
-
-    Args:
-        views: The photographs.
-        cloud: The points.
-        cell: Side of a cell in pixels of the views.
-        rng: Draws the order of the views.
-        progress: Called with the stage and the fraction done.
-    """
     from splatseed.seeding.cover import cover  # noqa: PLC0415  (kernels load with use)
 
     xyz, masks = cloud.xyz[cloud.finite], [view.mask for view in views]
@@ -269,15 +266,6 @@ def cover_cloud(
     normals = np.full((len(seeds.xyz), 3), np.nan, np.float32)
     source = np.full(len(seeds.xyz), source_code("cover"), np.uint8)
     return NewPoints(seeds.xyz, seeds.rgb, (), normals, seeds.size, seeds.confidence, source)
-
-
-def with_cover(
-    views: Sequence[View], points: PointCloud, cell: int, seed: int, progress: Progress
-) -> PointCloud:
-    """The points, plus a seed in each cell of the views that they leave empty."""
-    code = source_code("cover")
-    new = cover_cloud(views, points, cell, np.random.default_rng([seed, code]), progress)
-    return PointCloud.concatenate(points, as_cloud(new, len(new.xyz), code))
 
 
 def _found(scene: Scene, stereo: StereoResult, seconds: float) -> tuple[str, ...]:

@@ -37,15 +37,14 @@ from splatseed.views.pairs import choose_by_pose
 from splatseed.views.view import View, data_factor, load_views, poses_of
 
 Gray = Float64[np.ndarray, "H W"]
+Pixel = Float64[np.ndarray, " 2"]
 
 CORNERS_SIDE = 400
 """Longer side of the photographs that are compared, in pixels."""
 CORNERS_LOOKS, CORNERS_PARTNERS = 5, 2
 """Photographs looked at, and those that each is compared with."""
-CORNERS = 100
-"""Corners of a photograph, at most."""
-APART = 9
-"""Pixels between corners, at least."""
+CORNERS, APART = 100, 9
+"""Corners of a photograph, at most; and pixels between them, at least."""
 HALF = 5
 """A patch is 2 HALF + 1 pixels wide."""
 REACH = 24
@@ -67,17 +66,11 @@ at 0.55, a tenth of a degree of noise, fern keeps 0.6 of its depths (benchmarks/
 
 @dataclass(frozen=True)
 class PoseError:
-    """By how much photographs miss each other.
+    """By how much photographs miss each other."""
 
-    Args:
-        px: Median over pairs, in pixels of the photographs as they are stored.
-        degrees: The turn of a camera that moves its picture as far.
-        exact: Whether it is half a pixel at most, at the size at which stereo compares photographs.
-    """
-
-    px: float
-    degrees: float
-    exact: bool
+    px: float  # median over pairs, in pixels of the photographs as they are stored
+    degrees: float  # the turn of a camera that moves its picture as far
+    exact: bool  # whether it is half a pixel at most, at the size at which stereo compares
 
     def __str__(self) -> str:
         return f"{self.px:.2g} px ({self.degrees:.2g} degrees)"
@@ -96,10 +89,10 @@ class PoseError:
 def pose_error(
     scene: Scene, images: Sequence[Image], progress: Progress = silent
 ) -> PoseError | None:
-    """Measure how exact the poses of photographs are, in a few seconds.
+    """Measure how exact the poses of photographs are, in a few seconds; points are not used.
 
     Args:
-        scene: A scene with photographs, whose points are not used.
+        scene: A scene with photographs.
         images: The images whose photographs are compared; two at least.
         progress: Called with the stage and the fraction done.
 
@@ -111,12 +104,10 @@ def pose_error(
     """
     poses = np.array([image.camera.cam_from_world for image in images])
     partners = choose_by_pose(poses, CORNERS_PARTNERS)
-    looked = np.unique(np.linspace(0, len(images) - 1, CORNERS_LOOKS).round().astype(np.int64))
-    factor = data_factor(images, CORNERS_SIDE)
+    factor, looked = data_factor(images, CORNERS_SIDE), _spread(len(images), CORNERS_LOOKS)
     misses, pairs = [], 0
-    for number, i in enumerate(looked.tolist()):
-        others = [j for j in partners[i].tolist() if j >= 0]
-        some = [images[k] for k in (i, *others)]
+    for number, i in enumerate(looked):
+        some = [images[i], *(images[j] for j in partners[i].tolist() if j >= 0)]
         view, *rest = load_views(scene, some, data_factor=factor, undistort=True)
         pairs += len(rest)
         for other in rest:
@@ -134,12 +125,17 @@ def pose_error(
     return PoseError(px * factor, degrees, exact)
 
 
+def _spread(total: int, most: int) -> list[int]:
+    """At most so many of the numbers below ``total``, evenly spaced."""
+    return sorted(set(np.linspace(0, total - 1, most).round().astype(int).tolist()))
+
+
 def _misses(view: View, other: View) -> Float64[np.ndarray, " M"]:
     """How far beside their epipolar lines the corners of a view are found, in pixels."""
     j_from_i = other.cam_from_world @ np.linalg.inv(view.cam_from_world)
     margin = int(FARTHEST * view.width) + REACH + 2 * HALF
     image = _gray(view)
-    turned = _turned(_gray(other), other.K, j_from_i[:3, :3], view, margin)
+    turned = _turned(_gray(other), other.K @ j_from_i[:3, :3] @ np.linalg.inv(view.K), view, margin)
     # c: the step in i's axes, as R d + w t = R (d + w R' t).
     step = view.K @ (j_from_i[:3, :3].T @ j_from_i[:3, 3])
     found = []
@@ -147,11 +143,9 @@ def _misses(view: View, other: View) -> Float64[np.ndarray, " M"]:
         # d/dw of K (K^-1 p + w c), at w = 0: where a far point begins to move.
         along = step[:2] - step[2] * p
         length = np.linalg.norm(along)
-        if length < 1e-9 * max(1.0, abs(step[2])):
-            continue
-        miss = _miss(image, turned, p, along / length, margin, FARTHEST * view.width)
-        if miss is not None:
-            found.append(miss)
+        if length >= 1e-9 * max(1.0, abs(step[2])):
+            miss = _miss(image, turned, p, along / length, margin, FARTHEST * view.width)
+            found += [] if miss is None else [miss]
     return np.array(found)
 
 
@@ -159,19 +153,19 @@ def _gray(view: View) -> Gray:
     return np.asarray(view.photograph.mean(axis=2))
 
 
-def _turned(
-    image: Gray, K: Float64[np.ndarray, "3 3"], R: Float64[np.ndarray, "3 3"], view: View,
-    margin: int,
-) -> Gray:  # fmt: skip
+def _turned(image: Gray, turn: Float64[np.ndarray, "3 3"], view: View, margin: int) -> Gray:
     """A photograph in the view's orientation, with a margin; NaN where it shows nothing."""
     rows, columns = view.height + 2 * margin, view.width + 2 * margin
     v, u = np.indices((rows, columns)) - margin + 0.5
-    rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ (K @ R @ np.linalg.inv(view.K)).T
+    rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ turn.T
     with np.errstate(divide="ignore", invalid="ignore"):
         x, y = rays[..., 0] / rays[..., 2], rays[..., 1] / rays[..., 2]
-    behind = rays[..., 2] <= 0
-    places = np.where(behind, -1.0, [y - 0.5, x - 0.5])
-    return np.asarray(map_coordinates(image, places, order=1, cval=np.nan))
+    return _values(image, *np.where(rays[..., 2] <= 0, -1.0, [x - 0.5, y - 0.5]))
+
+
+def _values(image: Gray, x: np.ndarray, y: np.ndarray) -> Gray:
+    """Bilinear values at places, the centre of the first pixel at 0; NaN outside."""
+    return np.asarray(map_coordinates(image, [y, x], order=1, cval=np.nan))
 
 
 def _corners(image: Gray, mask: Bool[np.ndarray, "H W"] | None) -> Float64[np.ndarray, "N 2"]:
@@ -192,17 +186,15 @@ def _corners(image: Gray, mask: Bool[np.ndarray, "H W"] | None) -> Float64[np.nd
 
 
 def _miss(
-    image: Gray, turned: Gray, p: Float64[np.ndarray, " 2"], along: Float64[np.ndarray, " 2"],
-    margin: int, farthest: float,
-) -> float | None:  # fmt: skip
+    image: Gray, turned: Gray, p: Pixel, along: Pixel, margin: int, farthest: float
+) -> float | None:
     """How far beside its line a corner is found; None unless one place is clearly best."""
-    patch = _sample(image, p, along, (-HALF, HALF), (-HALF, HALF))
+    patch = _sample(image, p, along, (-HALF, HALF), HALF)
     if not np.isfinite(patch).all():  # beyond the picture's border
         return None
     # A little backwards, too: with wrong poses a far point may seem to be behind infinity.
-    start, stop = -HALF - REACH, HALF + int(farthest)
-    band = _sample(turned, p + margin, along, (start, stop), (-HALF - REACH, HALF + REACH))
-    scores = _correlation(patch, band)
+    length = -HALF - REACH, HALF + int(farthest)
+    scores = _correlation(patch, _sample(turned, p + margin, along, length, HALF + REACH))
     at = np.unravel_index(np.argmax(scores), scores.shape)
     best, (column, row) = scores[at], at
     rest = scores.copy()
@@ -216,16 +208,12 @@ def _miss(
     return float(row - REACH + (0.5 * (after - before) / bend if bend > 0 else 0.0))
 
 
-def _sample(
-    image: Gray, p: Float64[np.ndarray, " 2"], along: Float64[np.ndarray, " 2"],
-    length: tuple[int, int], width: tuple[int, int],
-) -> Gray:  # fmt: skip
-    """Values on a grid along a line through p and across it; NaN outside."""
+def _sample(image: Gray, p: Pixel, along: Pixel, length: tuple[int, int], width: int) -> Gray:
+    """Values on a grid along a line through p, and to both sides of it; NaN outside."""
     a = np.arange(length[0], length[1] + 1)[:, None]
-    b = np.arange(width[0], width[1] + 1)[None]
+    b = np.arange(-width, width + 1)[None]
     x = p[0] - 0.5 + a * along[0] - b * along[1]
-    y = p[1] - 0.5 + a * along[1] + b * along[0]
-    return np.asarray(map_coordinates(image, [y, x], order=1, cval=np.nan))
+    return _values(image, x, p[1] - 0.5 + a * along[1] + b * along[0])
 
 
 def _correlation(patch: Gray, band: Gray) -> Gray:
@@ -246,10 +234,9 @@ def _correlation(patch: Gray, band: Gray) -> Gray:
 
 Poses = Float64[np.ndarray, "V 4 4"]
 
-SIDE, GRID, SWEEPS = 200, 4, 6
-"""Size of the photographs, pixels between depths, and iterations of a look."""
-TOLERANCE, MAX_COST = 0.03, 0.4
-PARTNERS = 5
+SIDE, PARTNERS = 200, 5
+"""Size of the photographs of a look, and views that each is compared with."""
+SETTINGS = StereoSettings(grid=4, sweeps=6, tolerance=0.03, max_cost=0.4)
 LOOKS = 3
 """Photographs looked at, while what is seen decides nothing."""
 ENOUGH = 0.3
@@ -303,6 +290,8 @@ def check_poses(scene: Scene, images: Sequence[Image], progress: Progress = sile
     """
     poses = np.array([image.camera.cam_from_world for image in images])
     _check_places(poses)
+    assert scene.source is not None  # noqa: S101  (it has photographs)
+    agreeing = f"photographs that agree at the poses of {scene.source.root}"
     shares: list[float] = []
     for number in range(LOOKS):
         progress("check poses", number / LOOKS)
@@ -312,18 +301,33 @@ def check_poses(scene: Scene, images: Sequence[Image], progress: Progress = sile
         turned = {how: _look(scene, images, turn(poses), number) for how, turn in TURNS.items()}
         best = max(turned, key=lambda how: turned[how])
         if turned[best] >= max(CLEARLY * shares[-1], LEAST):
-            assert scene.source is not None  # noqa: S101  (its photographs were read)
             found = f"a depth that others confirm at {shares[-1]:.1%} of their pixels"
             raise SceneFormatError(
-                f"photographs that agree at the poses of {scene.source.root}",
+                agreeing,
                 found=f"{found}, and at {turned[best]:.0%} once {best}",
                 fix=f"Write the poses so: {WRITTEN[scene.source.format]}.",
             )
         if shares[-1] > max(CLEARLY * turned[best], NIL):
             break
     else:
-        if np.mean(shares) <= NIL:
-            raise _apart_error(scene, images, float(np.mean(shares)))
+        if (share := float(np.mean(shares))) <= NIL:
+            new = f"splatseed sfm {quoted(scene.source.image_dir or 'IMAGES')} -o SCENE"
+            if not _any_overlap(poses_of(images)):
+                raise SceneFormatError(
+                    f"photographs that show the same places, at the poses of {scene.source.root}",
+                    found=f"no two of {len(images)} whose pictures overlap at any depth",
+                    fix=f"Take more photographs in between, or find the poses anew: {new}.",
+                )
+            error = pose_error(scene, images)
+            off = error is not None and not error.exact
+            missed = f"; they miss each other by about {error}" if off else ""
+            check = "Check that poses and names of the images belong together"
+            check = "Mend the poses with --refine-poses" if off else check
+            raise SceneFormatError(
+                agreeing,
+                found=f"a depth that others confirm at {share:.1%} of their pixels{missed}",
+                fix=f"{check}, or find poses anew: {new}.",
+            )
     progress("check poses", 1.0)
     return max(shares)
 
@@ -355,38 +359,15 @@ def _look(scene: Scene, images: Sequence[Image], poses: Poses, number: int) -> f
     read = load_views(scene, some, data_factor=data_factor(some, SIDE), undistort=True)
     views = [replace(view, cam_from_world=poses[i]) for view, i in zip(read, chosen, strict=True)]
     sources = choose_by_pose(poses[chosen], PARTNERS)
-    settings = StereoSettings(grid=GRID, sweeps=SWEEPS, tolerance=TOLERANCE, max_cost=MAX_COST)
     hints = [any_depth(views, i, others) for i, others in enumerate(sources)]
-    stereo = match_views(views, hints, sources, settings, 0, silent)
+    stereo = match_views(views, hints, sources, SETTINGS, 0, silent)
     return float(np.mean([stereo.kept(i).mean() for i in range(len(views))]))
-
-
-def _apart_error(scene: Scene, images: Sequence[Image], share: float) -> SceneFormatError:
-    """The error for photographs that agree nowhere, and why they may not."""
-    assert scene.source is not None  # noqa: S101  (its photographs were read)
-    new = f"splatseed sfm {quoted(scene.source.image_dir or 'IMAGES')} -o SCENE"
-    if not _any_overlap(poses_of(images)):
-        return SceneFormatError(
-            f"photographs that show the same places, at the poses of {scene.source.root}",
-            found=f"no two of {len(images)} whose pictures overlap at any depth",
-            fix=f"Take more photographs in between, or find the poses anew: {new}.",
-        )
-    error = pose_error(scene, images)
-    off = error is not None and not error.exact
-    missed = f"; they miss each other by about {error}" if off else ""
-    check = "Check that poses and names of the images belong together"
-    return SceneFormatError(
-        f"photographs that agree at the poses of {scene.source.root}",
-        found=f"a depth that others confirm at {share:.1%} of their pixels{missed}",
-        fix=f"{'Mend the poses with --refine-poses' if off else check}, or find poses anew: {new}.",
-    )
 
 
 def _any_overlap(views: Sequence[View]) -> bool:
     """Whether a point at some depth before one view falls into another's picture."""
     uv = (np.indices((4, 5)).reshape(2, -1).T[:, ::-1] + 0.5) / [5, 4]
-    looked = np.unique(np.linspace(0, len(views) - 1, MOST_SEEN).round().astype(np.int64))
-    for i in looked:
+    for i in _spread(len(views), MOST_SEEN):
         for j in range(len(views)):
             first, other = views[i].camera, views[j].camera
             gap = float(np.linalg.norm(first.center - other.center))
@@ -413,19 +394,14 @@ def random_start(
             splatfacto, 50,000 that reach 5 times as far as their coordinates.
     """
     centers = np.stack([image.camera.center for image in scene.images])
-    middle = centers.mean(axis=0)
-    if trainer == "nerfstudio":
-        return _in_cube(middle, 5.0 * np.abs(centers - middle).max(), 50_000, rng)
-    # Its world is centred at the median, over cameras, of the point on the optical axis that is
-    # nearest to the origin. It is turned, too, which a median of coordinates feels a little.
-    axes = np.stack([image.camera.cam_from_world[2, :3] for image in scene.images])
-    nearest = centers - (centers * axes).sum(axis=1, keepdims=True) * axes
-    reach = np.linalg.norm(centers - middle, axis=1).max()
-    return _in_cube(np.median(nearest, axis=0), 3.0 * 1.1 * reach, 100_000, rng)
-
-
-def _in_cube(
-    middle: Float64[np.ndarray, " 3"], half: float, num: int, rng: np.random.Generator
-) -> PointCloud:
+    middle, num = centers.mean(axis=0), 50_000
+    half = 5.0 * np.abs(centers - middle).max()
+    if trainer == "gsplat":
+        # Its world is centred at the median, over cameras, of the point on the optical axis that is
+        # nearest to the origin. It is turned, too, which a median of coordinates feels a little.
+        axes = np.stack([image.camera.cam_from_world[2, :3] for image in scene.images])
+        nearest = centers - (centers * axes).sum(axis=1, keepdims=True) * axes
+        half = 3.0 * 1.1 * np.linalg.norm(centers - middle, axis=1).max()
+        middle, num = np.median(nearest, axis=0), 100_000
     xyz = middle + half * rng.uniform(-1.0, 1.0, (num, 3))
     return PointCloud(xyz.astype(np.float32), rng.integers(0, 256, (num, 3), dtype=np.uint8))

@@ -36,18 +36,13 @@ MOST = 10**12
 """More points than any trainer holds."""
 CELL = 8
 """Side in pixels of the cells by which coverage is measured."""
-
 INTERPOLATING = ("linear", "triangle", "spline", "mls", "voronoi", "random")
-"""Methods that interpolate between points; ``verify`` checks their points against the
-photographs."""
-
+"""Methods whose points ``verify`` checks against the photographs."""
 FILLING = ("auto", "cover", "stereo")
 """Methods that look where there are points already."""
 COVER, CLOUD = source_code("cover"), source_code("cloud")
-MOST_COVER = 0.1
-"""Largest part of a budget for cover's guesses; their cells grow until they fit."""
-COARSER = 1.25
-"""Growth factor of the cells."""
+MOST_COVER, COARSER = 0.1, 1.25
+"""Largest part of a budget for cover's guesses, whose cells grow by a factor until they fit."""
 
 Note = Callable[[str], None]
 
@@ -128,7 +123,7 @@ def upsample(
     if first is not None:
         cloud = PointCloud.concatenate(first, cloud.select(cloud.source != ORIGINAL))
     if verify:
-        cloud = add_verified(whole, cloud, progress=progress, note=note)
+        cloud = _add_verified(whole, cloud, progress, note)
     if cover is not None:
         cloud = add_cover(whole, cloud, cell=cover, seed=seed, progress=progress)
     if most is not None:
@@ -145,18 +140,7 @@ def upsample_with_stereo(
     progress: Progress = silent,
     note: Note = lambda _: None,
 ) -> tuple[PointCloud, StereoResult | None]:
-    """``upsample`` with seed 0, and what comparing the photographs found on the way.
-
-    Args:
-        scene: A scene with photographs.
-        method: Method ``auto`` or ``stereo``.
-        budget: Most points in all.
-        progress: Called with the stage and the fraction done.
-        note: Called with what was left out, one sentence each.
-
-    Returns:
-        The points, and stereo's result; None where the originals fill the budget.
-    """
+    """``upsample`` with seed 0, and its stereo; None where the originals fill the budget."""
     full = _full_already(scene, budget, 0, progress, note)
     if full is not None:
         return full, None
@@ -222,25 +206,12 @@ def add_cover(
     return with_cover(views, points, cell, seed, progress)
 
 
-def add_verified(
-    scene: Scene, cloud: PointCloud, *, progress: Progress = silent, note: Note = lambda _: None
-) -> PointCloud:
-    """A cloud with its interpolated points checked against the photographs: moved, kept or dropped.
-
-    Args:
-        scene: The scene with the photographs.
-        cloud: The points; those of ``INTERPOLATING`` methods are checked, the others stay.
-        progress: Called with the stage and the fraction done.
-        note: Called with how many met which fate, one sentence each.
-
-    Raises:
-        SceneNotFoundError: There are no photographs.
-    """
+def _add_verified(scene: Scene, cloud: PointCloud, progress: Progress, note: Note) -> PointCloud:
+    """A cloud with its interpolated points checked against the photographs; others stay."""
     from splatseed.seeding.verify import verify  # noqa: PLC0415  (kernels load with use)
     from splatseed.views.visibility import find_visibility  # noqa: PLC0415  (loads with its use)
 
-    codes = [source_code(name) for name in INTERPOLATING]
-    guessed = np.isin(cloud.source, codes)
+    guessed = np.isin(cloud.source, [source_code(name) for name in INTERPOLATING])
     if not guessed.any():
         note("There are no interpolated points to verify.")
         return cloud
@@ -256,12 +227,9 @@ def add_verified(
 
 
 def share_covered(scene: Scene, cloud: PointCloud, cell: int = CELL) -> float:
-    """The fraction of the photographs' cells that hold a point, at the size that methods use.
+    """The fraction of the photographs' cells, so many pixels wide, that hold a point.
 
-    Args:
-        scene: Provides the images; their files need not exist.
-        cloud: The points.
-        cell: Side of a cell in pixels.
+    The photographs count at the size that methods use; their files need not exist.
     """
     from splatseed.seeding.coverage import covered_share  # noqa: PLC0415  (kernels load with use)
 
@@ -269,14 +237,10 @@ def share_covered(scene: Scene, cloud: PointCloud, cell: int = CELL) -> float:
 
 
 def points_within(scene: Scene, budget: int | str) -> int:
-    """The number of points that a budget allows a scene.
-
-    Args:
-        scene: The scene whose photographs define rho.
-        budget: A number, or a string such as "0.25rho".
+    """The number of points that a budget allows a scene, whose photographs define rho.
 
     Raises:
-        ParameterError: It is neither, or below one point.
+        ParameterError: As for ``parse_budget``.
     """
     from splatseed.seeding.budget import median_pixels  # noqa: PLC0415  (loads Numba)
 

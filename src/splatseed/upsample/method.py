@@ -113,6 +113,8 @@ def check_fields(method: Any) -> None:
     for field in dataclasses.fields(method):
         value, hint = getattr(method, field.name), hints[field.name]
         require(_fits(value, hint), f"{label}.{field.name} as {_describe(hint)}", value)
+    held = getattr(method, "hold_out", 0)
+    require(held == 0 or held >= 2, f"{label}.hold_out of 0 or 2 and more", held)
 
 
 def _fits(value: object, hint: Any) -> bool:

@@ -21,7 +21,7 @@ from splatseed.scene import Scene
 from splatseed.similarity import Similarity
 
 if TYPE_CHECKING:
-    from splatseed.seeding.alignment.align import CloudAlignment
+    from splatseed.seeding.clouds.align import CloudAlignment
     from splatseed.seeding.clouds.method import Cloud
     from splatseed.seeding.clouds.voxels import MemoryPlan
 
@@ -182,7 +182,7 @@ def load_clouds(
     check_precision(scene)
     alignment = None
     if options.align:
-        from splatseed.seeding.alignment.align import align  # noqa: PLC0415  (loads Numba)
+        from splatseed.seeding.clouds.align import align  # noqa: PLC0415  (loads Numba)
 
         alignment = align(scene, options.files, progress)
         transform = alignment.scene_from_cloud

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, cast, get_args
 
-import numpy as np
 import tyro
 
 from splatseed.commands.options import check_least, parse_options
@@ -335,7 +334,7 @@ def _check(scene: Scene, seeds: PointCloud, method: Upsampler) -> dict[str, floa
     checks = {}
     new = seeds.xyz[seeds.source != ORIGINAL]
     if len(scene.points) and not chooses_number(method):
-        checks["far"] = far_share(scene.points.xyz, new, rng=np.random.default_rng(0))
+        checks["far"] = far_share(scene.points.xyz, new)
     if scene.images:
         checks["before"] = share_covered(scene, scene.points)
         checks["after"] = share_covered(scene, seeds)

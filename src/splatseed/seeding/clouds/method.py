@@ -1,7 +1,7 @@
 """The method ``cloud``: seeds from scans and dense clouds, as many as the photographs resolve.
 
 Points stream into voxels (``voxels``); of these, those stay that a photograph sees and nothing
-contradicts (``evidence``, ``judging``): no ray of Structure-from-Motion or stereo passes through
+contradicts (``judging``): no ray of Structure-from-Motion or stereo passes through
 them, the photographs that see them agree on a colour, and they do not float alone. A budget thins
 them afterwards, as those of every method.
 Promise: memory does not grow with the clouds; a cloud that is nowhere near the cameras, or does not
@@ -11,18 +11,19 @@ fit the scene's own points, is refused with the reason.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from jaxtyping import Float64
 
+from splatseed.depth.stereo.settings import StereoSettings
 from splatseed.errors import ParameterError, PointCloudError
 from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
-from splatseed.seeding.photographs import MAX_SIZE, photographed, read_views
-from splatseed.seeding.upsampling import frames_of
+from splatseed.seeding.photographs import MAX_SIZE, compare, photographed, read_views
+from splatseed.seeding.upsampling import CELL, frames_of
 from splatseed.similarity import Similarity
 from splatseed.upsample.method import NewPoints, Traits, check_fields, require
 from splatseed.upsample.registry import source_code
@@ -42,7 +43,6 @@ UNKNOWN = 0.5
 """Confidence of a point that fewer than two photographs see."""
 CORNER = 0.5
 """Below this share of the photographs' cells, a note says how little the cloud covers."""
-CELL = 8
 GRID = 1e5
 """Coordinates from here on, in metres, are those of a national grid."""
 
@@ -66,8 +66,6 @@ class Cloud:
     def __post_init__(self) -> None:
         check_fields(self)
         require(0.25 <= self.pixels <= 64, "cloud.pixels from 0.25 to 64", self.pixels)
-        held = self.hold_out
-        require(held != 1 and held >= 0, "cloud.hold_out of 0 or 2 and more", held)
 
     def of(
         self, *files: Path | str, transform: Similarity | None = None, memory: int | None = None
@@ -79,9 +77,8 @@ class Cloud:
             transform: From their frame to the scene's; the same frame when None.
             memory: Most bytes of memory; voxels grow where they do not fit. 4 GB when None.
         """
-        known = {field.name: getattr(self, field.name) for field in fields(Cloud)}
         paths = tuple(map(str, files))
-        return GivenClouds(**known, files=paths, transform=transform, memory=memory)
+        return GivenClouds(**vars(self), files=paths, transform=transform, memory=memory)
 
     def __call__(
         self,
@@ -144,22 +141,17 @@ class GivenClouds(Cloud):
             PointCloudError: No point is in view, or the cloud does not fit the scene.
             ParameterError: The scene has no cameras, or the memory is not enough.
         """
-        from splatseed.seeding.clouds.voxels import stream  # noqa: PLC0415  (loads Numba)
-
-        capacity, paths = self.plan(scene).capacity, [Path(each) for each in self.files]
-        streamed = stream(paths, self.transform, frames_of(scene), self.pixels, capacity, progress)
-        _check_in_view(streamed, scene)
-        return self._choose(scene, streamed, rng, progress)
-
-    def _choose(
-        self, scene: Scene, streamed: Streamed, rng: np.random.Generator, progress: Progress
-    ) -> NewPoints:
-        """The points that stay, their colours, and notes."""
         from splatseed.seeding.clouds.judging import judge  # noqa: PLC0415  (loads Numba)
+        from splatseed.seeding.clouds.voxels import stream  # noqa: PLC0415  (loads Numba)
         from splatseed.seeding.coverage import covered_share  # noqa: PLC0415  (loads Numba)
         from splatseed.views.visibility import find_visibility  # noqa: PLC0415  (loads with its use)
 
-        voxels, images, views = streamed.voxels, scene.images, frames_of(scene)
+        capacity, frames = self.plan(scene).capacity, frames_of(scene)
+        paths = [Path(each) for each in self.files]
+        streamed = stream(paths, self.transform, frames, self.pixels, capacity, progress)
+        voxels, images, views = streamed.voxels, scene.images, frames
+        if not len(voxels):
+            raise _out_of_view(streamed, scene)
         if scene.has_photographs:
             images = photographed(scene, self.hold_out)
             views = read_views(scene, images, MAX_SIZE, progress)
@@ -173,22 +165,21 @@ class GivenClouds(Cloud):
             views, seen, voxels, own if colored else None, progress, clean=self.clean, rays=rays
         )
         xyz, evidence = voxels.xyz[judged.kept], judged.evidence
-        rgb = evidence.rgb if own is None else own[judged.kept]
-        if scene.has_photographs and (self.recolor or not colored):
-            rgb = evidence.rgb
-        gone = [f"{count:,} {reason}" for reason, count in judged.reasons.items() if count]
-        gone = [f"{judged.hidden:,} are hidden in every photograph", *gone]
+        pictured = scene.has_photographs and (self.recolor or not colored)
+        rgb = evidence.rgb if own is None or pictured else own[judged.kept]
+        gone = [f"{judged.hidden:,} are hidden in every photograph"]
+        gone += [f"{count:,} {reason}" for reason, count in judged.reasons.items() if count]
         kept = f"Kept {len(judged.kept):,} of {len(voxels):,} merged points: {', '.join(gone)}."
-        notes = (*_read_notes(streamed), *_check_fit(judged), kept)
+        notes = [*_read_notes(streamed), *_check_fit(judged), kept]
         if scene.has_photographs and not colored:
             lacks = "no colours" if own is None else "intensity only"
-            notes = (*notes, f"The cloud has {lacks}: colours are those of the photographs.")
-        share = covered_share(frames_of(scene), xyz, CELL, silent)
+            notes.append(f"The cloud has {lacks}: colours are those of the photographs.")
+        share = covered_share(frames, xyz, CELL, silent)
         if share < CORNER:
             hint = ": --method auto beside --cloud seeds the rest" if self.alone else ""
-            notes = (*notes, f"The cloud covers {share:.0%} of the photographs{hint}.")
+            notes.append(f"The cloud covers {share:.0%} of the photographs{hint}.")
         return NewPoints(
-            xyz, rgb, notes,
+            xyz, rgb, tuple(notes),
             confidence=np.nan_to_num(evidence.agreement, nan=UNKNOWN),
             source=np.full(len(xyz), source_code("cloud"), np.uint8),
         )  # fmt: skip
@@ -208,37 +199,32 @@ def _free_rays(
     certain = seen if scene.tracks is not None else [np.empty((0, 3))] * len(views)
     if not scene.has_photographs or len(views) < 2:
         return free_rays(views, certain) if scene.tracks is not None else None
-    from splatseed.depth.stereo.depths import find_stereo, known_visibility  # noqa: PLC0415  (loads Numba)
-    from splatseed.depth.stereo.settings import StereoSettings  # noqa: PLC0415  (loads with its use)
-
-    seed, visibility = int(rng.integers(1 << 32)), known_visibility(scene)
-    stereo = find_stereo(views, images, visibility, StereoSettings(), seed, progress)
+    stereo = compare(scene, images, views, StereoSettings.grid, rng, progress)
     maps = [stereo.map(i).depth for i in range(len(views))]
     return free_rays(views, certain, [np.nan_to_num(depth, nan=np.inf) for depth in maps])
 
 
-def _check_in_view(streamed: Streamed, scene: Scene) -> None:
-    """Refuse clouds of which no point falls in any photograph."""
-    if len(streamed.voxels):
-        return
+def _out_of_view(streamed: Streamed, scene: Scene) -> PointCloudError:
+    """The error for clouds of which no point falls in any photograph."""
     centers = np.array([image.camera.center for image in scene.images])
+    low, high = streamed.low, streamed.high
     fix = "They are in different frames: find the transform with --align, or give it with "
     fix += "--transform FILE."
-    if max(np.abs(streamed.low).max(), np.abs(streamed.high).max()) > GRID:
+    if max(np.abs(low).max(), np.abs(high).max()) > GRID:
         fix += " --recenter would move both alike: it is for a scene in the cloud's own grid."
-    raise PointCloudError(
+    return PointCloudError(
         "points of the cloud in view of the scene's cameras, which stand "
         f"{_span(centers.min(axis=0), centers.max(axis=0))}",
-        found=f"none of {streamed.voxels.total:,}, which lie {_span(streamed.low, streamed.high)}",
+        found=f"none of {streamed.voxels.total:,}, which lie {_span(low, high)}",
         fix=fix,
     )
 
 
-def _span(low: Float64[np.ndarray, " 3"], high: Float64[np.ndarray, " 3"]) -> str:
+def _span(*corners: Float64[np.ndarray, " 3"]) -> str:
     """From corner to corner, without an exponent where digits matter."""
     first, last = (
         ", ".join(f"{x:.0f}" if GRID <= abs(x) < 1e12 else f"{x:.6g}" for x in each)
-        for each in (low, high)
+        for each in corners
     )
     return f"from ({first}) to ({last})"
 
@@ -259,7 +245,7 @@ def _check_fit(judged: Judged) -> tuple[str, ...]:
     return (f"The cloud fits: {share} lie at its depth, within 3%{doubt}.",)
 
 
-def _read_notes(streamed: Streamed) -> tuple[str, ...]:
+def _read_notes(streamed: Streamed) -> list[str]:
     voxels = streamed.voxels
     outside = f"{voxels.unseen:,} of them outside of every photograph"
     told = [f"{voxels.total + streamed.bad:,} points were read, {outside}."]
@@ -271,4 +257,4 @@ def _read_notes(streamed: Streamed) -> tuple[str, ...]:
             f"The cloud was merged at {2**voxels.coarser} times the spacing asked for, to stay "
             "within the memory: pass more --memory."
         )
-    return tuple(told)
+    return told

@@ -4,7 +4,7 @@ Notation: the *footprint* of a point is the side of a pixel at its depth, least 
 whose frames it falls. Its voxel has level L and side 2^(L + s), where 2^L is the greatest power of
 two within the footprint, and s, at first 0, counts how often all voxels were made coarser. A voxel
 holds the mean position and colour of its points, and their number. An even *sample* has voxels of
-one side; its coordinates are relative to ``offset``, the file's first point.
+one side; its coordinates are relative to the file's first point.
 Promise: the result depends on the points and their order, not on how they were cut into chunks nor
 on the threads. Coordinates are float64 until they are in the scene's frame, so that those of
 national grids lose nothing; memory holds one chunk and the voxels. Points that fall in no frame are
@@ -20,7 +20,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int16, Int32, UInt8, UInt64
-from scipy.spatial import cKDTree
 
 from splatseed.errors import ParameterError, PointCloudError
 from splatseed.io.clouds import CloudChunk, CloudFile, open_cloud
@@ -257,7 +256,6 @@ PER_PIXEL = 8
 """Bytes for each pixel of the photographs: the pixel, grey as well, and what stereo knows of it."""
 SAMPLE, LEAST_SAMPLE = 1 << 18, 1000
 """Most and fewest voxels of an even sample."""
-NEIGHBORS = 12
 TEXT_ROW = 40
 """Bytes of a line of text, to tell how far reading is where the number of lines is not known."""
 
@@ -267,30 +265,16 @@ class Streamed(NamedTuple):
 
     voxels: Voxels
     files: tuple[CloudFile, ...]
-    bad: int
-    """Points that are not finite."""
-    low: Float64[np.ndarray, " 3"]
-    """Least coordinates of the others in the scene's frame."""
+    bad: int  # points that are not finite
+    low: Float64[np.ndarray, " 3"]  # least coordinates of the others in the scene's frame
     high: Float64[np.ndarray, " 3"]
 
 
 class MemoryPlan(NamedTuple):
     """What seeds from a cloud will take."""
 
-    capacity: int
-    """Most voxels."""
-    memory: int
-    """Most bytes."""
-
-
-class CloudSample(NamedTuple):
-    """An even sample of some clouds in one frame."""
-
-    offset: Float64[np.ndarray, " 3"]
-    """What was subtracted."""
-    xyz: Float64[np.ndarray, "N 3"]
-    rgb: UInt8[np.ndarray, "N 3"] | None
-    """Colours; None if a cloud has none."""
+    capacity: int  # most voxels
+    memory: int  # most bytes
 
 
 def plan_memory(most: int | None, views: Sequence[View]) -> MemoryPlan:
@@ -338,15 +322,12 @@ def stream(
     low, high, bad = np.full(3, np.inf), np.full(3, -np.inf), 0
     for file in files:
         before = voxels.total
-        for done, chunk in _read(file, progress, "read"):
-            finite = chunk.finite
-            bad += len(chunk) - int(np.count_nonzero(finite))
-            good = chunk if finite.all() else chunk.select(finite)
-            xyz = good.xyz if scene_from_cloud is None else scene_from_cloud.points(good.xyz)
+        for chunk, left_out in _finite_chunks(file, "read", progress):
+            bad += left_out
+            xyz = chunk.xyz if scene_from_cloud is None else scene_from_cloud.points(chunk.xyz)
             if len(xyz):
                 low, high = np.minimum(low, xyz.min(axis=0)), np.maximum(high, xyz.max(axis=0))
-                voxels.add(xyz, good.rgb if painted else None)
-            progress(f"read {file.path.name}", done)
+                voxels.add(xyz, chunk.rgb if painted else None)
         if voxels.total == before:
             raise PointCloudError(
                 f"points with finite coordinates in {file.path}",
@@ -356,18 +337,26 @@ def stream(
     return Streamed(voxels, files, bad, low, high)
 
 
-def _read(file: CloudFile, progress: Progress, stage: str) -> Iterator[tuple[float, CloudChunk]]:
-    """The chunks of a file, each with the share that is then read."""
-    progress(f"{stage} {file.path.name}", 0.0)
+def _finite_chunks(
+    file: CloudFile, stage: str, progress: Progress
+) -> Iterator[tuple[CloudChunk, int]]:
+    """The finite points of a file, chunk by chunk, and how many others each had."""
+    stage = f"{stage} {file.path.name}"
+    progress(stage, 0.0)
     expected = file.count or max(file.path.stat().st_size // TEXT_ROW, 1)
     given = 0
     for chunk in file.chunks(CHUNK):
         given += len(chunk)
-        yield min(given / expected, 1.0), chunk
+        finite = chunk.finite
+        good = chunk if finite.all() else chunk.select(finite)
+        yield good, len(chunk) - len(good)
+        progress(stage, min(given / expected, 1.0))
 
 
-def sample_cloud(paths: Sequence[Path], progress: Progress) -> CloudSample:
-    """Read clouds of one frame, keeping an even sample.
+def sample_cloud(
+    paths: Sequence[Path], progress: Progress
+) -> tuple[Float64[np.ndarray, " 3"], Float64[np.ndarray, "N 3"], UInt8[np.ndarray, "N 3"] | None]:
+    """An even sample of clouds of one frame: what was subtracted, positions, and colours if known.
 
     Raises:
         SceneNotFoundError: A file is missing.
@@ -376,29 +365,16 @@ def sample_cloud(paths: Sequence[Path], progress: Progress) -> CloudSample:
     """
     files = [open_cloud(path) for path in paths]
     painted = all(file.has_color for file in files)
-    voxels, offset = Voxels(SAMPLE), None
+    voxels, offset = Voxels(SAMPLE), np.zeros(3)
     for file in files:
-        for done, chunk in _read(file, progress, "look at"):
-            finite = chunk.select(chunk.finite)
-            if len(finite):
-                offset = finite.xyz[0].copy() if offset is None else offset
-                voxels.add(finite.xyz - offset, finite.rgb if painted else None)
-            progress(f"look at {file.path.name}", done)
-    if offset is None or len(voxels) < LEAST_SAMPLE:
+        for chunk, _ in _finite_chunks(file, "look at", progress):
+            if len(chunk):
+                offset = offset if len(voxels) else chunk.xyz[0].copy()
+                voxels.add(chunk.xyz - offset, chunk.rgb if painted else None)
+    if len(voxels) < LEAST_SAMPLE:
         raise PointCloudError(
             f"at least {LEAST_SAMPLE:,} points apart, to align a cloud by",
             found=f"{len(voxels):,}",
             fix="Give the transform with --transform FILE.",
         )
-    return CloudSample(offset, voxels.xyz.astype(np.float64), voxels.rgb if painted else None)
-
-
-def normals_of(xyz: Float64[np.ndarray, "N 3"], tree: cKDTree) -> Float64[np.ndarray, "N 3"]:
-    """Unit normals of either sign: the last principal axis of a point and its 11 neighbours."""
-    normals = np.empty_like(xyz)
-    for start in range(0, len(xyz), CHUNK // 16):
-        part = slice(start, start + CHUNK // 16)
-        idx = tree.query(xyz[part], min(NEIGHBORS, len(xyz)))[1]
-        near = xyz[idx] - xyz[idx].mean(axis=1, keepdims=True)
-        normals[part] = np.linalg.eigh(np.einsum("nki,nkj->nij", near, near))[1][:, :, 0]
-    return normals
+    return offset, voxels.xyz.astype(np.float64), voxels.rgb if painted else None

@@ -43,11 +43,6 @@ class Depth(Settings):
         require(0 < self.tolerance < 1, "depth.tolerance between 0 and 1", self.tolerance)
         color = self.color_tolerance
         require(color is None or 0 < color <= 1, "depth.color_tolerance above 0, 1 at most", color)
-        require(
-            self.hold_out != 1 and self.hold_out >= 0,
-            "depth.hold_out of 0 or 2 and more",
-            self.hold_out,
-        )
 
     @property
     def traits(self) -> Traits:

@@ -1,0 +1,141 @@
+"""Alignment: made clouds, shifted, scaled and turned by what is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+from scipy.spatial.transform import Rotation
+
+from splatseed.errors import PointCloudError
+from splatseed.pointcloud import PointCloud
+from splatseed.scene import Scene
+from splatseed.seeding.clouds import align as module
+from splatseed.seeding.clouds.align import align, find_starts, spread_rotations, to_unit_size
+from splatseed.similarity import Similarity
+
+MOVE = Similarity(0.37, spread_rotations(500)[321], np.array([5.6e5, 5.9e6, -80.0]))
+QUICK = (
+    (60, 150, 10, 0.25, 0.04, 0.04, 0.75),
+    (6, 600, 15, 0.1, 0.02, 0.02, 0.75),
+    (3, 1500, 40, 0.04, 0.005, 0.01, 0.75),
+)
+"""Fewer tries than for real clouds, as tests must be quick."""
+
+
+def place(rng, num):
+    """A room without symmetry: floor, three walls, a table, a ball."""
+    sheets = [
+        ((0, 0, 0), (6, 0, 0), (0, 4, 0)),
+        ((0, 0, 0), (6, 0, 0), (0, 0, 2.5)),
+        ((0, 0, 0), (0, 4, 0), (0, 0, 2.5)),
+        ((6, 1, 0), (0, 3, 0), (0, 0, 1.2)),
+        ((1, 1, 0.8), (1.7, 0.3, 0), (-0.2, 0.9, 0)),
+        ((1, 1, 0), (1.7, 0.3, 0), (0, 0, 0.8)),
+    ]
+    parts = []
+    for corner, first, second in sheets:
+        area = np.linalg.norm(np.cross(first, second))
+        u, v = rng.random((2, int(num * area / 64), 1))
+        parts.append(np.array(corner) + u * np.array(first) + v * np.array(second))
+    ball = rng.normal(size=(num // 20, 3))
+    parts.append((4.5, 2.8, 0.6) + 0.6 * ball / np.linalg.norm(ball, axis=1, keepdims=True))
+    return np.concatenate(parts)
+
+
+def shades(xyz):
+    grey = 128 + 90 * np.sin(3 * xyz[:, 0]) * np.cos(2 * xyz[:, 1] + xyz[:, 2])
+    return np.repeat(grey.astype(np.uint8)[:, None], 3, axis=1)
+
+
+@pytest.fixture(scope="module")
+def made():
+    """Noisy points of the room, a tenth of them wrong, and many exact ones."""
+    rng = np.random.default_rng(11)
+    marks = place(rng, 1500)
+    marks += 0.005 * rng.standard_t(3, marks.shape)
+    marks[::10] += rng.normal(size=marks[::10].shape)
+    return marks, place(rng, 40_000)
+
+
+def aligned(folder, marks, xyz, **arrays):
+    np.savez(folder / "cloud.npz", xyz=xyz, **arrays)
+    return align(Scene(PointCloud(marks, shades(marks))), [folder / "cloud.npz"])
+
+
+@pytest.mark.slow
+def test_a_cloud_that_is_shifted_scaled_and_turned(made, tmp_path):
+    marks, dense = made
+    found = aligned(tmp_path, marks, MOVE.points(dense), rgb=shades(dense))
+    back = found.scene_from_cloud.points(MOVE.points(dense))
+    assert np.linalg.norm(back - dense, axis=1).max() < 0.005  # metres
+    turn = found.scene_from_cloud.rotation @ MOVE.rotation
+    assert np.degrees(np.arccos(min(1.0, (np.trace(turn) - 1) / 2))) < 0.1
+    assert found.share > 0.5
+    assert found.likeness > 0.5
+    assert found.error < 0.003 * found.extent
+    np.testing.assert_allclose(
+        np.array(found.report["matrix"])[:3] @ np.append(MOVE.translation, 1.0),
+        found.scene_from_cloud.points(MOVE.translation[None])[0],
+        atol=1e-6,
+    )
+
+
+def box(num, rng):
+    xyz = rng.uniform(-1, 1, (num, 3)) * (3, 2, 1)
+    axis = rng.integers(0, 3, num)
+    xyz[np.arange(num), axis] = np.sign(xyz[np.arange(num), axis]) * np.array([3, 2, 1])[axis]
+    return xyz
+
+
+@pytest.mark.parametrize(
+    ("case", "says"),
+    [
+        ("another place", "one alignment of the cloud that is sure"),
+        ("a box that looks alike from several sides", "several that fit"),
+        ("few points of a cloud", "at least 1,000 points apart"),
+        ("few points of a scene", "at least 200 points of the scene's own"),
+    ],
+)
+def test_what_is_not_sure_is_refused(case, says, made, rng, tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "ROTATIONS", 150)
+    monkeypatch.setattr(module, "BEST", 2)
+    monkeypatch.setattr(module, "ROUNDS", QUICK)
+    marks, dense = made
+    if case == "another place":
+        blobs = [(2, 0, 1) * rng.normal(size=(4000, 3)) + rng.normal(size=3) * 3 for _ in range(6)]
+        dense = np.concatenate(blobs)
+    elif "box" in case:
+        marks, dense = box(2000, rng), box(30000, rng)
+    elif "cloud" in case:
+        dense = dense[:500]
+    else:
+        marks = marks[:50]
+    with pytest.raises(PointCloudError, match=says):
+        aligned(tmp_path, marks, dense)
+
+
+def degrees_between(first, second):
+    cosines = (np.einsum("nij,ij->n", first, second) - 1) / 2
+    return np.degrees(np.arccos(np.clip(cosines, -1, 1)))
+
+
+def test_orientations_between_those_spread_are_tried(made):
+    marks, dense = made
+    spread = spread_rotations(module.ROTATIONS)
+    some = Rotation.random(1000, random_state=0).as_matrix()
+    farthest = max(some, key=lambda each: degrees_between(spread, each).min())
+    assert degrees_between(spread, farthest).min() > 13
+    turned = dense @ farthest.T
+    starts = find_starts(to_unit_size(turned).points(turned), to_unit_size(marks).points(marks), 5)
+    found = np.array([start.rotation for start in starts])
+    assert degrees_between(found, farthest).min() < 8
+
+
+@settings(max_examples=30, deadline=None)
+@given(num=st.integers(1, 400))
+def test_spread_rotations_are_rotations(num):
+    R = spread_rotations(num)
+    expected = np.broadcast_to(np.eye(3), R.shape)
+    np.testing.assert_allclose(R @ R.swapaxes(1, 2), expected, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.det(R), 1.0)
