@@ -19,7 +19,7 @@ import pytest
 import splatseed
 from splatseed.cli import VERBS
 from splatseed.errors import MissingDependencyError
-from splatseed.requirements import _EXTRA, INSTALL, install_command, require
+from splatseed.requirements import EXTRAS, install_command, require
 
 ROOT = Path(__file__).parents[1]
 SOURCE = Path(splatseed.__file__).parent
@@ -90,9 +90,10 @@ def test_what_errors_tell_to_install_is_what_the_package_asks_for():
         extra: {each.partition(";")[0] for each in packages}
         for extra, packages in project["optional-dependencies"].items()
     }
-    assert set(_EXTRA) == set(INSTALL)
-    assert all(wanted in extras[_EXTRA[name]] for name, wanted in INSTALL.items())
-    assert all(wanted.startswith(name.replace("_", "-")) for name, wanted in INSTALL.items())
+    assert {extra: set(wanted) for extra, wanted in EXTRAS.items()} == {
+        e: extras[e] for e in EXTRAS
+    }
+    assert extras.keys() == {*EXTRAS, "dev"}
 
 
 def test_what_to_install_is_for_this_python_and_for_the_whole_extra(monkeypatch, tmp_path):

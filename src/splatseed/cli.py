@@ -10,7 +10,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
 from importlib.metadata import version
-from types import FrameType
 from typing import NoReturn
 
 from rich.table import Table
@@ -61,10 +60,8 @@ def main(arguments: list[str] | None = None) -> None:
         sys.exit(1)
     except OSError as error:
         where = f" at {error.filename}" if error.filename else ""
-        _fail(
-            "expected to read the input and write the output; found"
-            f" {error.strerror or type(error).__name__}{where}. Check the disk and the path."
-        )
+        found = f"{error.strerror or type(error).__name__}{where}"
+        _fail(f"expected to read the input and write the output; found {found}. Check the disk.")
     except KeyboardInterrupt as stop:
         kept = " ".join(getattr(stop, "__notes__", ()))
         told = f". {kept}" if kept else "; nothing was left half-written"
@@ -82,11 +79,14 @@ def _act(words: list[str]) -> None:
     elif verb in {"-V", "--version"}:
         OUT.print(f"splatseed {version('splatseed')}")
     elif verb.partition("=")[0] == COMPLETION:
-        from splatseed.commands.options import print_completion  # noqa: PLC0415  (loads tyro)
+        import tyro  # noqa: PLC0415  (takes a while to load)
+
+        from splatseed.commands.options import CONFIG  # noqa: PLC0415  (likewise)
 
         modules = {verb: import_module(f"splatseed.commands.{verb}") for verb in VERBS}
         verbs = {verb: module.Options for verb, module in modules.items()}
-        print_completion(verbs | {"upsample": modules["upsample"].full_options()}, words)
+        verbs["upsample"] = modules["upsample"].full_options()
+        tyro.extras.subcommand_cli_from_dict(verbs, prog="splatseed", args=words, config=CONFIG)
     else:
         meant = did_you_mean(verb, [*VERBS, "--help", "--version", COMPLETION])
         _fail(
@@ -97,22 +97,19 @@ def _act(words: list[str]) -> None:
 
 @contextmanager
 def _termination_raised() -> Iterator[None]:
-    """Have SIGTERM raise an exception, so that half-written files are removed.
-
-    The previous handler is restored afterwards.
-    """
+    """Have SIGTERM raise an exception while the block runs, so that half-written files go."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.signal(signal.SIGTERM, _terminate)
+
+    def terminate(*_: object) -> NoReturn:
+        raise Termination
+
+    before = signal.signal(signal.SIGTERM, terminate)
     try:
         yield
     finally:
         signal.signal(signal.SIGTERM, before)
-
-
-def _terminate(number: int, frame: FrameType | None) -> None:  # noqa: ARG001  (signal's)
-    raise Termination
 
 
 def _fail(message: str) -> NoReturn:

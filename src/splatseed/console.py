@@ -8,19 +8,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import Any
 
+from rich import progress as rich_progress
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    Progress as Bar,
-    Task,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
@@ -49,11 +41,9 @@ TOLD_AFTER = 3.0
 """Compilations shorter than this many seconds are not logged."""
 
 
-class _Bars(BarColumn):
-    """Bars that stand still until their stage begins; Rich's would pulse."""
-
-    def render(self, task: Task) -> ProgressBar:
-        """The bar of a stage."""
+class _Bars(rich_progress.BarColumn):
+    def render(self, task: rich_progress.Task) -> ProgressBar:
+        """A stage's bar, which stands still until it begins; Rich's would pulse."""
         bar = super().render(task)
         bar.pulse = False
         return bar
@@ -63,12 +53,11 @@ class StageClock:
     """A ``Progress`` that times the stages and, within ``stage_display``, shows them."""
 
     def __init__(self) -> None:
-        self._bar: Bar | None = None
-        self._tasks: dict[str, TaskID] = {}
+        self._bar: rich_progress.Progress | None = None
+        self._tasks: dict[str, rich_progress.TaskID] = {}
         self._started: list[tuple[str, float]] = []
         self._compiling = 0
         self._before = COMPILE
-        self._announced = False
         self._told = 0.0
 
     def __call__(self, stage: str, fraction: float) -> None:
@@ -82,10 +71,9 @@ class StageClock:
 
     def expect(self, *stages: str) -> None:
         """Show stages that are still to come, so that the user sees what is left."""
-        if self._bar is not None:
-            for stage in stages:
-                if stage not in self._tasks:
-                    self._tasks[stage] = self._bar.add_task(stage, total=1.0, start=False)
+        for stage in stages:
+            if self._bar is not None and stage not in self._tasks:
+                self._tasks[stage] = self._bar.add_task(stage, total=1.0, start=False)
 
     def seconds(self) -> dict[str, float]:
         """Wall time of each stage so far, in order of first appearance."""
@@ -97,45 +85,32 @@ class StageClock:
             total[stage] = total.get(stage, 0.0) + end - start
         return total
 
-    def begin_compilation(self) -> None:
-        """Count time as compilation and show it; compilations can nest."""
-        self._compiling += 1
-        if self._compiling == 1:
+    def compilation(self, begins: bool) -> None:
+        """Count time as compilation, and show it, until each that began has ended."""
+        self._compiling += 1 if begins else -1
+        if self._compiling != int(begins):  # within another
+            return
+        if begins:
             self._before = self._started[-1][0] if self._started else COMPILE
-            self._started.append((COMPILE, time.perf_counter()))
-            if self._bar is not None and COMPILE not in self._tasks:
-                note = f"{COMPILE} (first use only, then cached)"
-                self._tasks[COMPILE] = self._bar.add_task(note, total=None)
-
-    def end_compilation(self) -> None:
-        """Return to the stage that compilation interrupted."""
-        self._compiling -= 1
-        if self._compiling == 0:
-            self._started.append((self._before, time.perf_counter()))
-            if self._bar is not None and COMPILE in self._tasks:
-                self._bar.remove_task(self._tasks.pop(COMPILE))
-            if self._bar is None and not self._announced and self._compiled() > TOLD_AFTER:
-                self._announced = True
-                ERR.print(f"{COMPILE}, needed on first use ...")
-
-    def tell_compilation(self) -> None:
-        """Report on stderr how long compilation took since the last report, if it was long."""
-        since = self._compiled() - self._told
-        if since > TOLD_AFTER:
-            self._told += since
-            ERR.print(f"{COMPILE} took {since:.0f} s; cached for the next run")
-
-    def _compiled(self) -> float:
-        return self.seconds().get(COMPILE, 0.0)
+        self._started.append((COMPILE if begins else self._before, time.perf_counter()))
+        if self._bar is not None and begins:
+            note = f"{COMPILE} (first use only, then cached)"
+            self._tasks[COMPILE] = self._bar.add_task(note, total=None)
+        elif self._bar is not None and COMPILE in self._tasks:
+            self._bar.remove_task(self._tasks.pop(COMPILE))
 
     @contextmanager
-    def shown_on(self, bar: Bar) -> Iterator[None]:
-        """Show the stages on ``bar`` while the block runs."""
+    def _shown(self, bar: rich_progress.Progress | None) -> Iterator[None]:
+        """Show the stages while the block runs; then tell how long compilation took, if long."""
         self._bar, self._tasks = bar, {}
         try:
             yield
         finally:
             self._bar = None
+        since = self.seconds().get(COMPILE, 0.0) - self._told
+        if since > TOLD_AFTER:
+            self._told += since
+            ERR.print(f"{COMPILE} took {since:.0f} s; cached for the next run")
 
 
 @contextmanager
@@ -149,32 +124,23 @@ def stage_display(
         remaining: Whether to show the time left too, for stages that take minutes.
     """
     clock = StageClock() if clock is None else clock
-    if not ERR.is_terminal:
-        with _compilation_shown(clock):
-            yield clock
-        clock.tell_compilation()
-        return
-    left = (TextColumn("left", markup=False), TimeRemainingColumn()) if remaining else ()
-    named = TextColumn("{task.description}", markup=False)
-    columns = (named, _Bars(), TimeElapsedColumn(), *left)
-    with (
-        Bar(*columns, console=ERR, transient=True) as bar,
-        clock.shown_on(bar),
-        _compilation_shown(clock),
-    ):
+    named, left = (
+        rich_progress.TextColumn(text, markup=False) for text in ("{task.description}", "left")
+    )
+    columns = [named, _Bars(), rich_progress.TimeElapsedColumn()]
+    columns += [left, rich_progress.TimeRemainingColumn()] if remaining else []
+    drawn = rich_progress.Progress(*columns, console=ERR, transient=True)
+    bar = drawn if ERR.is_terminal else None
+    with clock._shown(bar), bar or nullcontext(), watched(clock.compilation):  # noqa: SLF001  (ours)
         yield clock
-    clock.tell_compilation()
-
-
-def _compilation_shown(clock: StageClock) -> AbstractContextManager[None]:
-    """Tell the clock about compilations, which make a first run slow."""
-    return watched(lambda begins: clock.begin_compilation() if begins else clock.end_compilation())
 
 
 def print_pairs(title: str, rows: Sequence[tuple[str, str]]) -> None:
     """Print names and their values, or commands, unwrapped so that they can be copied."""
     _print_title(title)
-    _print_columns(rows)
+    width = max((len(label) for label, _ in rows), default=0)
+    for label, value in rows:
+        OUT.print(f"  {label:<{width}}  {visible(value)}", soft_wrap=True)
 
 
 def print_note(note: str) -> None:
@@ -197,9 +163,3 @@ def print_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]
 
 def _print_title(title: str) -> None:
     OUT.print(f"\n{visible(title)}", style="bold", soft_wrap=True)
-
-
-def _print_columns(rows: Sequence[tuple[str, str]]) -> None:
-    width = max((len(label) for label, _ in rows), default=0)
-    for label, value in rows:
-        OUT.print(f"  {label:<{width}}  {visible(value)}", soft_wrap=True)

@@ -1,19 +1,11 @@
-"""The errors that splatseed raises on purpose.
+"""The errors that splatseed raises on purpose; anything else that escapes is a bug of ours.
 
 Each says what was expected, what was found and how to mend it, in one line a user can act on::
 
     SplatseedError
-    ├── InputError                 the user's data or options; the command line exits with code 2
-    │   ├── SceneNotFoundError     no scene, model, image or file where one was named
-    │   ├── SceneFormatError       a file is there but is not what its format promises
-    │   ├── PointCloudError        arrays of the wrong shape or type, too few usable points
-    │   ├── ParameterError         an option or a method's parameter out of its range
-    │   └── OutputError            the output cannot or must not be written
-    ├── ReconstructionError        Structure-from-Motion ran and did not succeed
-    ├── MissingDependencyError     an optional package is needed and absent
-    └── TaskLostError              a task was lost with its process or node too often
-
-Anything else that escapes is a bug of ours.
+    ├── InputError    the user's data or options
+    │   └── SceneNotFoundError, SceneFormatError, PointCloudError, ParameterError, OutputError
+    └── ReconstructionError, MissingDependencyError, TaskLostError
 """
 
 from __future__ import annotations

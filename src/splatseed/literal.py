@@ -29,11 +29,7 @@ SAID = {
 
 
 def visible(text: object, keep: str = "") -> str:
-    r"""Text with every control character written as an escape.
-
-    Args:
-        text: A name, or a sentence that holds some.
-        keep: Characters that stay as they are, such as a newline.
+    r"""Text with every control character but those to ``keep`` written as an escape.
 
     Example:
         >>> print(visible("a\x1b[31mb"), visible("写真 1"))
@@ -102,26 +98,12 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
 
 
 def counted(number: int, noun: str) -> str:
-    """A number and what it counts.
-
-    Args:
-        number: How many there are.
-        noun: One of them, in a word whose plural ends in s.
-
-    Example:
-        >>> print(counted(1, "test view"), counted(2300, "point"), sep=", ")
-        1 test view, 2,300 points
-    """
+    """A number and what it counts: "1 test view", "2,300 points"."""
     return f"{number:,} {noun}{'' if number == 1 else 's'}"
 
 
 def agreeing(number: int, one: str, more: str) -> str:
-    """The verb that agrees with a number of things.
-
-    Example:
-        >>> agreeing(1, "is", "are")
-        'is'
-    """
+    """The word that agrees with a number of things: ``one`` or ``more``."""
     return one if number == 1 else more
 
 
@@ -135,10 +117,8 @@ def _escape(character: str) -> str:
 
 def _ansi_c(character: str) -> str:
     r"""A character within $'...', which bash, zsh and POSIX of 2024 know."""
-    if character in "\\'":
-        return f"\\{character}"
     if _shows(character):
-        return character
+        return f"\\{character}" if character in "\\'" else character
     if character in "\n\t\r":
         return _escape(character)
     return "".join(f"\\x{byte:02x}" for byte in os.fsencode(character))

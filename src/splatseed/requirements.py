@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from importlib.util import find_spec
 from pathlib import Path
@@ -10,45 +11,18 @@ from shlex import quote
 from splatseed.errors import MissingDependencyError
 from splatseed.literal import quoted
 
-INSTALL = {
-    "torch": "torch>=2.4",
-    "gsplat": "gsplat>=1.5.3,<1.6",
-    "torchmetrics": "torchmetrics>=1.4",
-    "pandas": "pandas>=2.2",
-    "pycolmap": "pycolmap>=4.0",
-    "tensorboard": "tensorboard>=2.14",
-    "transformers": "transformers>=5.18",
-    "OpenEXR": "OpenEXR>=3.3",
-    "ray": "ray>=2.40",
-    "imageio_ffmpeg": "imageio-ffmpeg>=0.6",
-    "viser": "viser>=1.1",
-    "zstandard": "zstandard>=0.22",
-    "laspy": "laspy>=2.5",
-    "lazrs": "lazrs>=0.6",
-    "pye57": "pye57>=0.4.13",
+EXTRAS = {
+    "train": ("torch>=2.4", "gsplat>=1.5.3,<1.6", "torchmetrics>=1.4", "pandas>=2.2"),
+    "depth": ("torch>=2.4", "transformers>=5.18"),
+    "view": ("viser>=1.1", "zstandard>=0.22", "imageio-ffmpeg>=0.6"),
+    "scan": ("laspy>=2.5", "lazrs>=0.6", "pye57>=0.4.13"),
+    "sfm": ("pycolmap>=4.0", "imageio-ffmpeg>=0.6"),
+    "cluster": ("ray>=2.40",),
+    "exr": ("OpenEXR>=3.3",),
+    "tensorboard": ("tensorboard>=2.14",),
 }
 """What to ask pip for, as in pyproject.toml: splatseed's extras can only be installed from its
-folder."""
-_TRAIN = ("torch", "gsplat", "torchmetrics", "pandas")
-_EXTRA = {
-    **dict.fromkeys(_TRAIN, "train"),
-    "transformers": "depth",
-    **dict.fromkeys(("viser", "zstandard", "imageio_ffmpeg"), "view"),
-    **dict.fromkeys(("laspy", "lazrs", "pye57"), "scan"),
-    "pycolmap": "sfm",
-    "ray": "cluster",
-    "OpenEXR": "exr",
-    "tensorboard": "tensorboard",
-}
-"""The extra that a package is for, first of all, by the names in pyproject.toml."""
-_TOGETHER = {
-    "torch": _TRAIN,
-    "gsplat": _TRAIN,
-    "transformers": ("torch", "transformers"),
-    "viser": ("viser", "imageio_ffmpeg", "zstandard"),
-    "pycolmap": ("pycolmap", "imageio_ffmpeg"),
-}
-"""The packages of an extra by the one that is needed first, so that one command installs all."""
+folder. A package's own extra is the first that has it."""
 _TESTED = Path(__file__).parents[2] / "constraints.txt"
 """The versions that were tested; there only if splatseed runs from its own folder."""
 
@@ -56,15 +30,12 @@ _TESTED = Path(__file__).parents[2] / "constraints.txt"
 def require(*packages: str) -> None:
     """Check that packages are installed, without importing them.
 
-    Args:
-        packages: Their names.
-
     Raises:
         MissingDependencyError: One is absent.
     """
     missing = [package for package in packages if find_spec(package) is None]
     if missing:
-        extras = " and ".join(dict.fromkeys(_EXTRA[each] for each in missing))
+        extras = " and ".join(dict.fromkeys(map(_extra_of, missing)))
         what = "it" if len(missing) == 1 else "them"
         advice = f"Install {what} (extra {extras}): {install_command(*missing)}."
         if "torch" in missing:
@@ -77,18 +48,25 @@ def require(*packages: str) -> None:
 
 
 def install_command(*packages: str, upgrade: bool = False) -> str:
-    """The command that installs packages, and what else their extra needs, for this Python.
+    """The command that installs packages, and what else their extra lacks, for this Python.
 
     Args:
-        packages: Names that ``INSTALL`` has.
+        packages: Names of modules that ``EXTRAS`` has.
         upgrade: Replace an older version.
     """
-    wanted = dict.fromkeys(packages)
-    for package in packages:
-        others = _TOGETHER.get(package, ())
-        wanted.update(dict.fromkeys(each for each in others if find_spec(each) is None))
+    wanted: dict[str, None] = {}
+    for each in packages:
+        first, *others = sorted(EXTRAS[_extra_of(each)], key=lambda need: _module(need) != each)
+        wanted |= dict.fromkeys([first, *(o for o in others if find_spec(_module(o)) is None)])
     options = ["--upgrade"] if upgrade else []
-    if _TESTED.is_file():
-        options += ["-c", quoted(_TESTED)]
-    words = ["install", *options, *(quote(INSTALL[w]) for w in wanted)]
+    options += ["-c", quoted(_TESTED)] if _TESTED.is_file() else []
+    words = ["install", *options, *map(quote, wanted)]
     return f"{quoted(sys.executable or 'python')} -m pip {' '.join(words)}"
+
+
+def _module(requirement: str) -> str:
+    return re.split("[<>=]", requirement)[0].replace("-", "_")
+
+
+def _extra_of(package: str) -> str:
+    return next(extra for extra, needs in EXTRAS.items() if package in map(_module, needs))

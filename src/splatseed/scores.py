@@ -7,9 +7,8 @@ per-image values; what was not measured is None, with the reason beside it.
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Self
 
@@ -97,16 +96,15 @@ class EvalResult:
             "per_image": [_finite(asdict(score)) for score in self.per_image],
         }
 
-    def to_json(self) -> str:
-        """The result as JSON text."""
-        return json.dumps(self.to_dict(), indent=2, allow_nan=False) + "\n"
-
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
         """The inverse of ``to_dict``; means are recomputed, and unknown keys ignored."""
-        views = ({**each, "psnr": _or_infinite(each["psnr"])} for each in values["per_image"])
+        views = [
+            ViewScore(**{**each, "psnr": math.inf if each["psnr"] is None else each["psnr"]})
+            for each in values["per_image"]
+        ]
         own = {each.name: values[each.name] for each in fields(cls) if each.name in values}
-        return cls(**{**own, "per_image": tuple(ViewScore(**view) for view in views)})
+        return cls(**{**own, "per_image": tuple(views)})
 
 
 @dataclass(frozen=True)
@@ -156,11 +154,7 @@ class TrainingResult:
         return {**self.scores.to_dict(), **others, **held, "tests": tests}
 
 
-def _or_infinite(psnr: float | None) -> float:
-    return math.inf if psnr is None else psnr
-
-
-def _mean(values: Iterable[float] | Sequence[float]) -> float:
+def _mean(values: Iterable[float]) -> float:
     listed = list(values)
     return math.fsum(listed) / len(listed) if all(map(math.isfinite, listed)) else sum(listed)
 

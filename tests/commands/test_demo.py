@@ -14,7 +14,6 @@ from splatseed.commands import demo
 from splatseed.errors import MissingDependencyError
 from splatseed.io import load_scene
 from splatseed.runtime.compilation import tell
-from splatseed.scores import CurvePoint, TrainingResult
 from splatseed.upsample import METHODS
 
 
@@ -61,25 +60,6 @@ def test_the_demo_leaves_a_scene_scores_pictures_and_runs(tmp_path, splatseed):
     assert f"{metrics['auto']['psnr']:.2f}" in again.out
     refused = splatseed("demo", "--views", 6, "-o", out)
     assert (refused.code, "--overwrite" in refused.err) == (2, True)
-
-
-@pytest.mark.parametrize(
-    "words", [["--views", 2], ["--train-steps", -1], ["--training", "only"]], ids=str
-)
-def test_a_demo_that_cannot_be_leaves_nothing(words, tmp_path, splatseed):
-    run = splatseed("demo", "-o", tmp_path / "demo", *words)
-    assert (run.code, run.err.count("\n")) == (2, 1)
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize(("seconds", "psnr"), [(2.4, None), (2.5, 20.0), (9.9, 22.0)])
-def test_psnr_after_some_seconds_counts_those_of_the_seeds(seconds, psnr):
-    tests = ((10, 0.5, 20.0), (20, 1.0, 22.0), (30, 1.5, 25.0))  # the last is of the mean
-    curve = tuple(CurvePoint(*test, 100) for test in tests)
-    result = TrainingResult(None, curve, steps=30, train_seconds=1.5, num_seeds=100)
-    each = demo._Trained(demo._Arm("auto", None, None, seconds=2.0), result, ())
-    assert each.psnr_after(seconds) == psnr
-    assert each.seconds == 3.5
 
 
 def test_without_pytorch_the_demo_says_what_to_install(splatseed, tmp_path, monkeypatch):

@@ -96,7 +96,7 @@ def test_what_cannot_be_scored_is_refused(truth):
 def test_json_is_valid_also_for_a_perfect_render():
     scores = (ViewScore("a", math.inf, 1.0, 0.0, 0.1), ViewScore("b", 30.0, 0.9, 0.2, 0.3))
     result = EvalResult(scores, lpips_net="vgg", lpips_reason="")
-    content = json.loads(result.to_json())
+    content = json.loads(json.dumps(result.to_dict(), allow_nan=False))
     assert content["psnr"] is None
     assert content["per_image"][0]["psnr"] is None
     assert content["per_image"][1]["psnr"] == 30.0

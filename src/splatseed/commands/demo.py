@@ -1,11 +1,9 @@
 """``splatseed demo``: the whole workflow on a synthetic capture with known surfaces.
 
-It photographs a synthetic room, finds points as Structure-from-Motion would, writes them as a
-COLMAP scene, reads that back, upsamples it and shows the result. Then it does so by every method,
-and measures how far the new points lie from the true surfaces and how well they cover them. Then,
-if PyTorch and gsplat are installed, it trains briefly and compares: from poses alone, where a
-trainer starts at random, and from the points as they are and upsampled. A second process compiles
-kernels ahead of the first, which waits for a kernel that is being compiled.
+It photographs a synthetic room, finds points as Structure-from-Motion would, upsamples them by
+every method, and measures how far the new points lie from the true surfaces and how well they cover
+them. Then, if PyTorch and gsplat are installed, it trains briefly and compares: from poses alone,
+and from the points as they are and upsampled. A second process compiles kernels ahead of the first.
 
 Promise: the default method's picture comes first, when its folder is already in place; later files
 are added one by one, each whole. Runs differ only in their seeds, and have the same number of
@@ -25,20 +23,14 @@ from dataclasses import astuple, dataclass
 from importlib import invalidate_caches
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 import numpy as np
 import tyro
 
-from splatseed.commands.options import parse_options
-from splatseed.console import (
-    StageClock,
-    print_note,
-    print_pairs,
-    print_table,
-    stage_display,
-)
-from splatseed.errors import MissingDependencyError, OutputError, ParameterError
+from splatseed.commands.options import parse_options, refuse
+from splatseed.console import StageClock, print_note, print_pairs, print_table, stage_display
+from splatseed.errors import MissingDependencyError
 from splatseed.io import find_depths, load_scene, write_scene
 from splatseed.io.staging import add_files, atomic_file, output_folder, read_manifest
 from splatseed.literal import quoted
@@ -52,7 +44,6 @@ from splatseed.upsample import METHODS, chooses_number, configure, methods_for, 
 if TYPE_CHECKING:  # they load Numba, or PyTorch, which may be absent
     from splatseed.scores import TrainingResult
     from splatseed.seeding.diagnostics import GeometryScore
-    from splatseed.synthetic import Capture
     from splatseed.train.settings import TrainSettings
     from splatseed.view.page import Tile
 
@@ -76,6 +67,14 @@ SMALL = {"num_views": 8, "width": 96, "height": 72}
 """The capture on which it does."""
 POLL = 0.5
 """Seconds between its checks whether PyTorch has been installed."""
+EXPLANATION = [
+    ("poses alone", "the first two rows know no points: trainers then start at random"),
+    ("fixed", "3DGS's densification, and the most Gaussians"),
+    ("seconds", "of training and making the seeds; the last column is during training,"),
+    ("", "before the mean that a run ends with is taken"),
+    ("limits", "a synthetic room, one run each, no error bars; strategy grow, which"),
+    ("", "splatseed train takes for short runs, gains more, and needs seeds less"),
+]
 
 
 @dataclass(frozen=True)
@@ -98,35 +97,29 @@ class Options:
 def run(arguments: list[str]) -> None:
     """Run the verb with these arguments."""
     options = parse_options(Options, "demo", arguments)
-    if options.train_steps < 0:
-        raise ParameterError(
-            "--train-steps of 0 or more", found=f"{options.train_steps}", fix="Pass 0 not to train."
-        )
-    if options.training == "only" and read_manifest(options.output).get("command") != "demo":
-        raise OutputError(
-            f"a demo at {options.output}", found="none", fix="Make it first: splatseed demo."
-        )
+    out, later, only = options.output, options.training == "later", options.training == "only"
+    none = only and read_manifest(out).get("command") != "demo"
+    refuse(
+        (options.train_steps < 0, "--train-steps of 0 or more", options.train_steps,
+         "Pass 0 not to train."),
+        (none, f"a demo at {out}", "none", "Make it first: splatseed demo."),
+    )  # fmt: skip
     parts = [each for each in AHEAD if options.train_steps or each != TRAINING]
-    with compiled_ahead([TRAINING] if options.training == "only" else parts) as finish:
-        if options.training != "only":
+    with compiled_ahead([TRAINING] if only else parts) as finish:
+        if not only:
             _make_points(options)
-        if options.training == "later":
+        if later:
             with stage_display() as clock:
-                clock.begin_compilation()
+                clock.compilation(True)
                 finish()
-                clock.end_compilation()
+                clock.compilation(False)
             return
         trained = _train(options) if options.train_steps else False
-    scene, seeded = (options.output / name for name in ("scene", f"scene_{SHOWN}"))
-    another = f"splatseed upsample {quoted(scene)} --method spline --ratio 16 -o OUT"
-    commands = [
-        ("another method", another),
-        ("a longer run", f"splatseed train {quoted(seeded)} --max-steps 3000 -o RUN"),
-    ]
-    if trained:
-        run_folder = options.output / f"run_{SHOWN}"
-        commands.append(("the scores again", f"splatseed evaluate {quoted(run_folder)}"))
-    print_pairs("next", commands)
+    another = f"splatseed upsample {quoted(out / 'scene')} --method spline --ratio 16 -o OUT"
+    longer = f"splatseed train {quoted(out / f'scene_{SHOWN}')} --max-steps 3000 -o RUN"
+    score = ("the scores again", f"splatseed evaluate {quoted(out / f'run_{SHOWN}')}")
+    commands = [("another method", another), ("a longer run", longer)]
+    print_pairs("next", [*commands, *([score] if trained else [])])
 
 
 def _upsample_by(name: str, scene: Scene, ratio: float = RATIO) -> PointCloud:
@@ -219,12 +212,9 @@ def _has_pytorch() -> bool:
 
 def _make_points(options: Options) -> None:
     """The capture, its points by every method, their errors, and pictures."""
+    from splatseed.seeding.diagnostics import measure, spacing  # noqa: PLC0415  (SciPy)
     from splatseed.synthetic import make_capture, write_capture  # noqa: PLC0415  (loads Numba)
-    from splatseed.view.clouds import (  # noqa: PLC0415  (likewise)
-        preview_errors,
-        preview_methods,
-        preview_pair,
-    )
+    from splatseed.view import clouds as pictures  # noqa: PLC0415  (likewise)
     from splatseed.views.visibility import choose_camera  # noqa: PLC0415  (loads with its use)
 
     clock, out = StageClock(), options.output
@@ -247,7 +237,7 @@ def _make_points(options: Options) -> None:
             provenance={"method": SHOWN, "seconds": clock.seconds()["upsample"]},
         )
         clock("pictures", 0.0)
-        preview_pair(scene, clouds[SHOWN], folder / PICTURES[0], title=SHOWN)
+        pictures.preview_pair(scene, clouds[SHOWN], folder / PICTURES[0], title=SHOWN)
     seconds = sum(clock.seconds().values())
     print_note(f"the first picture is ready after {seconds:.0f} s: {out / PICTURES[0]}")
 
@@ -261,17 +251,22 @@ def _make_points(options: Options) -> None:
                 clouds[name] = _upsample_by(name, scene)
         clouds = {name: clouds[name] for name in methods}
         clock("measure", 0.0)
-        scores, errors = _measured(capture, scene, clouds)
+        xyz, surfaces = scene.points.xyz, capture.surfaces
+        h, samples = spacing(xyz), capture.sample_visible(SAMPLES, np.random.default_rng(0))
+        new = {name: cloud.select(slice(len(xyz), None)) for name, cloud in clouds.items()}
+        scores = {"originals": measure(xyz, xyz, surfaces, samples, h)}
+        for name, cloud in clouds.items():
+            scores[name] = measure(new[name].xyz, cloud.xyz, surfaces, samples, h)
         with atomic_file(out / TABLE) as path, path.open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)  # in units of the originals' spacing
             writer.writerow(["method", "error_h", "median_h", "p95_h", "coverage_h", "share_far"])
             for name, score in scores.items():
                 writer.writerow([name, *(f"{x:.4f}" for x in astuple(score))])
         clock("pictures", 0.0)
-        preview_methods(scene, clouds, out / PICTURES[1])
+        pictures.preview_methods(scene, clouds, out / PICTURES[1])
         clock("pictures", 0.6)
-        new = {name: c.select(slice(len(scene.points), None)) for name, c in clouds.items()}
-        preview_errors(new, errors, choose_camera(scene), out / PICTURES[2])
+        errors = {name: surfaces.distance(cloud.xyz) / h for name, cloud in new.items()}
+        pictures.preview_errors(new, errors, choose_camera(scene), out / PICTURES[2])
         clock("pictures", 1.0)
     _summarise(options, scene, scores, clock.seconds())
 
@@ -279,24 +274,6 @@ def _make_points(options: Options) -> None:
 def _load(folder: Path) -> Scene:
     scene = load_scene(folder / "scene")
     return scene.replace(depths=find_depths(scene, folder / "scene"))
-
-
-def _measured(
-    capture: Capture, scene: Scene, clouds: Mapping[str, PointCloud]
-) -> tuple[dict[str, GeometryScore], dict[str, np.ndarray]]:
-    """Scores of the originals alone and of each method's new points, and the latter's errors."""
-    from splatseed.seeding.diagnostics import measure, spacing  # noqa: PLC0415  (SciPy)
-
-    originals = scene.points.xyz
-    h = spacing(originals)
-    samples = capture.sample_visible(SAMPLES, np.random.default_rng(0))
-    scores = {"originals": measure(originals, originals, capture.surfaces, samples, h)}
-    errors = {}
-    for name, cloud in clouds.items():
-        new = cloud.xyz[len(originals) :]
-        scores[name] = measure(new, cloud.xyz, capture.surfaces, samples, h)
-        errors[name] = capture.surfaces.distance(new) / h
-    return scores, errors
 
 
 def _summarise(
@@ -313,10 +290,9 @@ def _summarise(
         [(name, *numbers[name], f"{s.share_far:.2%}") for name, s in scores.items()],
     )
     error = "mean distance of new points to the true surfaces; its median and 95th percentile"
-    coverage = "mean distance of the surfaces that cameras see to the nearest point"
     rows = [
         ("error", error),
-        ("coverage", coverage),
+        ("coverage", "mean distance of the surfaces that cameras see to the nearest point"),
         ("far", "share of new points over 3 spacings from any original"),
         ("seconds", ", ".join(f"{stage} {time:.1f}" for stage, time in seconds.items())),
         ("scene", f"{options.output / 'scene'} (COLMAP, with images and depths)"),
@@ -328,38 +304,13 @@ def _summarise(
 # Training -----------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _Arm:
+class _Arm(NamedTuple):
     """A run: its seeds' name, the folders of its scene and of itself, and its seeds' seconds."""
 
     label: str
     scene: Path
     output: Path
     seconds: float = 0.0
-
-
-@dataclass(frozen=True)
-class _Trained:
-    """A finished run, with its render of the view that is shown, and that view's error map."""
-
-    arm: _Arm
-    result: TrainingResult
-    tiles: tuple[Tile, ...]
-    """The photograph, the render, the errors."""
-
-    @property
-    def seconds(self) -> float:
-        """Seconds of making the seeds and training from them."""
-        return self.arm.seconds + self.result.train_seconds
-
-    def psnr_after(self, seconds: float) -> float | None:
-        """The last test PSNR, in dB, within ``seconds`` in all; None before the first.
-
-        The curve's end is of the mean that a run ends with, which one in training has not yet.
-        """
-        during = self.result.curve[:-1]
-        known = [test.psnr for test in during if self.arm.seconds + test.seconds <= seconds]
-        return known[-1] if known else None
 
 
 def _train(options: Options) -> bool:
@@ -373,25 +324,25 @@ def _train(options: Options) -> bool:
     from splatseed.view.page import write_grid  # noqa: PLC0415  (likewise)
 
     folder = options.output
-    runs = [f"run_{name}" for name in ("sfm", SHOWN)]
-    alone = [f"{kind}_{name}" for name in POSES_ALONE.values() for kind in ("scene", "run")]
-    add_files(folder, [*runs, *alone, TRAINED_PICTURE])
+    names = ["sfm", SHOWN, *POSES_ALONE.values()]
+    alone = [f"scene_{name}" for name in POSES_ALONE.values()]
+    add_files(folder, [*(f"run_{name}" for name in names), *alone, TRAINED_PICTURE])
     seeded = read_manifest(folder / f"scene_{SHOWN}")
     arms = [
-        _Arm("SfM seeds", folder / "scene", folder / runs[0]),
-        _Arm(SHOWN, folder / f"scene_{SHOWN}", folder / runs[1], seeded["seconds"]),
+        _Arm("SfM seeds", folder / "scene", folder / "run_sfm"),
+        _Arm(SHOWN, folder / f"scene_{SHOWN}", folder / f"run_{SHOWN}", seeded["seconds"]),
     ]
     settings = TrainSettings(
         strategy="default", cap_max=seeded["num_points"], max_steps=options.train_steps, seed=SEED
     )
     with stage_display() as clock:
         arms = [*_seed_poses_alone(folder, clock), *arms]
-        trained = [_train_arm(arm, settings, clock) for arm in arms]
-        photographs, renders, errors = zip(*(each.tiles for each in trained), strict=True)
+        results, shown = zip(*(_train_arm(arm, settings, clock) for arm in arms), strict=True)
+        photographs, renders, errors = zip(*shown, strict=True)
         blank = photographs[0]._replace(label="", picture=np.full_like(photographs[0].picture, 255))
         tiles = [photographs[0], *renders, blank, *errors]
         write_grid(tiles, folder / TRAINED_PICTURE, columns=1 + len(arms))
-    _summarise_training(options, trained)
+    _summarise_training(options, arms, results)
     return True
 
 
@@ -402,30 +353,29 @@ def _seed_poses_alone(folder: Path, clock: StageClock) -> list[_Arm]:
     scene = load_scene(folder / "scene").replace(points=PointCloud.empty(), tracks=None)
     arms: list[_Arm] = []
     for label, name in POSES_ALONE.items():
-        before = sum(clock.seconds().values())
         clock("seed poses alone", len(arms) / len(POSES_ALONE))
+        begun = time.perf_counter()
         if name == "random":
             points = random_start(scene, np.random.default_rng(SEED))
         else:
             points = _upsample_by(SHOWN, scene)
-        seconds = sum(clock.seconds().values()) - before
-        path = folder / f"scene_{name}"
+        seconds, path = time.perf_counter() - begun, folder / f"scene_{name}"
         write_scene(scene.replace(points=points), path, provenance={"method": label})
         arms.append(_Arm(label, path, folder / f"run_{name}", seconds))
     return arms
 
 
-def _train_arm(arm: _Arm, settings: TrainSettings, clock: StageClock) -> _Trained:
-    """Train from an arm's seeds, and score."""
+def _train_arm(
+    arm: _Arm, settings: TrainSettings, clock: StageClock
+) -> tuple[TrainingResult, tuple[Tile, ...]]:
+    """Train from an arm's seeds, and score; also a test view's photograph, render and errors."""
     from splatseed.splat.evaluate import evaluate_views  # noqa: PLC0415  (imports PyTorch)
     from splatseed.splat.rendering import FULL_ERROR, as_bytes, error_map  # noqa: PLC0415  (likewise)
     from splatseed.train.run import RunOptions, prepare_run  # noqa: PLC0415  (likewise)
     from splatseed.view.page import Tile  # noqa: PLC0415  (likewise)
 
-    stage = f"train {arm.label}"
-    run = prepare_run(
-        load_scene(arm.scene), arm.output, settings, RunOptions(overwrite=True), progress=clock
-    )
+    stage, how = f"train {arm.label}", RunOptions(overwrite=True)
+    run = prepare_run(load_scene(arm.scene), arm.output, settings, how, progress=clock)
     clock(stage, 0.0)
     if not run.train(lambda step: clock(stage, step / settings.max_steps)):
         raise KeyboardInterrupt
@@ -433,51 +383,32 @@ def _train_arm(arm: _Arm, settings: TrainSettings, clock: StageClock) -> _Traine
     shown = run.trainer.test_views[len(run.trainer.test_views) // 2]
     render = np.asarray(run.trainer.render(shown).cpu().numpy(), np.float32)
     score = f"{arm.label}: {result.scores.psnr:.2f} dB over all test views"
-    return _Trained(
-        arm,
-        result,
-        (
-            Tile("photograph, not trained on", shown.photograph),
-            Tile(score, as_bytes(render)),
-            Tile(
-                f"error: black 0, bright {FULL_ERROR:g} or more",
-                error_map(shown.photograph, render),
-            ),
-        ),
+    error = f"error: black 0, bright {FULL_ERROR:g} or more"
+    return result, (
+        Tile("photograph, not trained on", shown.photograph),
+        Tile(score, as_bytes(render)),
+        Tile(error, error_map(shown.photograph, render)),
     )
 
 
-def _summarise_training(options: Options, trained: Sequence[_Trained]) -> None:
+def _summarise_training(
+    options: Options, arms: Sequence[_Arm], results: Sequence[TrainingResult]
+) -> None:
     """The runs side by side, and what they do and do not show."""
-    least = min(each.seconds for each in trained)
+    runs = list(zip(arms, results, strict=True))
+    least = min(arm.seconds + result.train_seconds for arm, result in runs)
     rows = []
-    for each in trained:
-        scores, then = each.result.scores, each.psnr_after(least)
-        rows.append(
-            (
-                each.arm.label,
-                f"{scores.num_gaussians:,}",
-                f"{each.seconds:.1f}",
-                f"{scores.psnr:.2f}",
-                f"{scores.ssim:.4f}",
-                "not begun" if then is None else f"{then:.2f}",
-            )
-        )
+    for arm, result in runs:
+        # The curve's end is of the mean that a run ends with, which one in training has not yet.
+        during = [t.psnr for t in result.curve[:-1] if arm.seconds + t.seconds <= least]
+        scores, seconds = result.scores, arm.seconds + result.train_seconds
+        then = f"{during[-1]:.2f}" if during else "not begun"
+        quality = f"{scores.psnr:.2f}", f"{scores.ssim:.4f}"
+        rows.append((arm.label, f"{scores.num_gaussians:,}", f"{seconds:.1f}", *quality, then))
     print_table(
-        f"{options.train_steps:,} training steps, "
-        f"{len(trained[0].result.scores.per_image)} test views",
+        f"{options.train_steps:,} training steps, {len(results[0].scores.per_image)} test views",
         ("seeds", "Gaussians", "seconds", "PSNR, dB", "SSIM", f"dB after {least:.0f} s"),
         rows,
     )
-    print_pairs(
-        "what this shows",
-        [
-            ("poses alone", "the first two rows know no points: trainers then start at random"),
-            ("fixed", "3DGS's densification, and the most Gaussians"),
-            ("seconds", "of training and making the seeds; the last column is during training,"),
-            ("", "before the mean that a run ends with is taken"),
-            ("limits", "a synthetic room, one run each, no error bars; strategy grow, which"),
-            ("", "splatseed train takes for short runs, gains more, and needs seeds less"),
-            ("pictures", str(options.output / TRAINED_PICTURE)),
-        ],
-    )
+    picture = ("pictures", str(options.output / TRAINED_PICTURE))
+    print_pairs("what this shows", [*EXPLANATION, picture])

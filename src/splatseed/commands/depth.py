@@ -18,25 +18,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import tyro
 
-from splatseed.commands.next_steps import Planned, after_network, after_stereo, look
-from splatseed.commands.options import check_least, parse_options
-from splatseed.console import (
-    OUT,
-    StageClock,
-    print_note,
-    print_pairs,
-    stage_display,
-)
+from splatseed.commands.next_steps import after_depth, look
+from splatseed.commands.options import check_least, parse_options, refuse
+from splatseed.console import OUT, print_note, print_pairs, stage_display
 from splatseed.depth.stereo.settings import LEAST_SIZE, MOST_GRID
 from splatseed.depthmap import DepthKind
-from splatseed.errors import ParameterError
-from splatseed.io import load_scene
-from splatseed.io.dense import (
-    DenseReport,
-    check_dense_scene,
-    write_dense_maps,
-    write_dense_workspace,
-)
+from splatseed.io import dense, load_scene
 from splatseed.io.photograph import warnings_but_lens
 from splatseed.io.staging import check_output
 from splatseed.literal import quoted, visible
@@ -44,10 +31,8 @@ from splatseed.requirements import require
 from splatseed.runtime.torch_device import DeviceName
 from splatseed.scene import Scene
 from splatseed.seeding.diagnostics import is_distorted
-from splatseed.train.schedule import FULL_RUN
 
-if TYPE_CHECKING:  # kernels and PyTorch load with their use
-    from splatseed.depth.monocular import DepthNetwork, DepthReport
+if TYPE_CHECKING:  # kernels load with their use
     from splatseed.depth.stereo import StereoMap
 
 NAMES_SHOWN = 5
@@ -101,35 +86,24 @@ class Options:
 def run(arguments: list[str]) -> None:
     """Run the verb with these arguments."""
     options = parse_options(Options, "depth", arguments)
-    _check(options)
+    check_least(options, 1, "grid")
+    check_least(options, LEAST_SIZE if options.stereo else 1, "max_size")
+    foreign = OF_NETWORK if options.stereo else OF_STEREO
+    idle = [name for name in foreign if getattr(options, name) != getattr(Options, name)]
+    refuse(
+        (options.stereo == (options.model is not None),
+         "either --model or --stereo", "both" if options.stereo else "neither",
+         "Name a network with --model, or match the photographs themselves with --stereo."),
+        ((options.grid or 1) > MOST_GRID, f"--grid from 1 to {MOST_GRID}", options.grid, "Try 4."),
+        (idle, "options of " + ("--stereo" if options.stereo else "--model"),
+         ", ".join(f"--{name.replace('_', '-')}" for name in idle),
+         "Leave them out" + ("." if options.stereo else ", or add --stereo.")),
+    )  # fmt: skip
     check_output(options.output, kind="depth", overwrite=options.overwrite, protect=[options.scene])
     if options.stereo:
         _run_stereo(options)
     else:
         _run_network(options)
-
-
-def _check(options: Options) -> None:
-    """Check that the options name one source of depth, and none that belongs to the other."""
-    if options.stereo == (options.model is not None):
-        raise ParameterError(
-            "either --model or --stereo",
-            found="both" if options.stereo else "neither",
-            fix="Name a network with --model, or match the photographs themselves with --stereo.",
-        )
-    check_least(options, 1, "grid")
-    check_least(options, LEAST_SIZE if options.stereo else 1, "max_size")
-    if (options.grid or 1) > MOST_GRID:
-        found = f"{options.grid}"
-        raise ParameterError(f"--grid from 1 to {MOST_GRID}", found=found, fix="Try 4.")
-    foreign = OF_NETWORK if options.stereo else OF_STEREO
-    idle = [name for name in foreign if getattr(options, name) != getattr(Options, name)]
-    if idle:
-        raise ParameterError(
-            "options of " + ("--stereo" if options.stereo else "--model"),
-            found=", ".join(f"--{name.replace('_', '-')}" for name in idle),
-            fix="Leave them out" + ("." if options.stereo else ", or add --stereo."),
-        )
 
 
 def _provenance(options: Options) -> dict[str, object]:
@@ -153,30 +127,20 @@ def _run_network(options: Options) -> None:
         from splatseed.depth.monocular import estimate_depths, load_network  # noqa: PLC0415  (imports PyTorch)
 
         network = load_network(str(options.model), kind=options.depth_kind, device=options.device)
-        meaning = network.meaning
-        said = {"kind": meaning.kind, "kind_because": meaning.reason, "device": network.device}
+        kind, reason = network.meaning.kind, network.meaning.reason
+        said = {"kind": kind, "kind_because": reason, "device": network.device}
         report = estimate_depths(
-            scene,
-            network,
-            options.output,
-            max_size=max_size,
-            overwrite=options.overwrite,
-            provenance={**_provenance(options), **said},
-            progress=clock,
-        )
-    _summarise_network(options, scene, network, report)
-
-
-def _summarise_network(
-    options: Options, scene: Scene, network: DepthNetwork, report: DepthReport
-) -> None:
+            scene, network, options.output, max_size=max_size, overwrite=options.overwrite,
+            provenance={**_provenance(options), **said}, progress=clock,
+        )  # fmt: skip
     ordered, num = sorted(report.sizes.values(), key=math.prod), len(report.sizes)
     small, large = (f"{width} x {height}" for width, height in (ordered[0], ordered[-1]))
+    size = large if small == large else f"{small} to {large}"
     rows = [
         ("network", str(options.model)),
         ("run by", network.device),
-        ("predicts", f"{network.meaning.kind} ({network.meaning.reason})"),
-        ("maps", f"{num:,} of {large if small == large else f'{small} to {large}'}"),
+        ("predicts", f"{kind} ({reason})"),
+        ("maps", f"{num:,} of {size}"),
         ("seconds", f"{report.seconds:.1f}, {report.seconds / num:.2f} per image"),
         ("output", str(options.output)),
     ]
@@ -187,8 +151,7 @@ def _summarise_network(
         flat = _some(report.flat)
         print_note(f"the network predicted no depth (a constant map, or none) for: {flat}")
     known = num * math.prod(ordered[0])
-    most = Planned.of(scene, None, FULL_RUN).most_seeds
-    print_pairs("next", after_network(options.scene, scene, options.output, known, most))
+    print_pairs("next", after_depth(options.scene, scene, options.output, known, aligned=False))
 
 
 def _some(names: Sequence[str]) -> str:
@@ -204,47 +167,39 @@ def _run_stereo(options: Options) -> None:
         clock("read", 0.0)
         scene = load_scene(options.scene, require_points=False)
         if options.colmap:
-            check_dense_scene(scene, undistorts=True)
+            dense.check_dense_scene(scene, undistorts=True)
         given = {name: getattr(options, name) for name in ("max_size", "grid")}
         given = {name: value for name, value in given.items() if value is not None}
         maps = stereo_depths(scene, progress=clock, **given)
-        report = _write(scene, maps, options, clock)
+        how: dict[str, Any] = {"overwrite": options.overwrite, "progress": clock}
+        write = dense.write_dense_maps
+        if options.colmap:
+            from splatseed.views.undistortion import undistort  # noqa: PLC0415  (Numba)
+
+            write, how["undistort"] = dense.write_dense_workspace, undistort
+        report = write(scene, maps, options.output, provenance=_provenance(options), **how)
         if options.preview:
             from splatseed.view.maps import preview_maps  # noqa: PLC0415  (Pillow)
 
             clock("preview", 0.0)
             preview_maps(scene, maps, options.output / PICTURE)
-    _summarise_stereo(options, scene, maps, report, time.perf_counter() - start)
-
-
-def _write(
-    scene: Scene, maps: Sequence[StereoMap], options: Options, clock: StageClock
-) -> DenseReport:
-    how: dict[str, Any] = {
-        "overwrite": options.overwrite,
-        "provenance": _provenance(options),
-        "progress": clock,
-    }
-    if not options.colmap:
-        return write_dense_maps(scene, maps, options.output, **how)
-    from splatseed.views.undistortion import undistort  # noqa: PLC0415  (Numba)
-
-    return write_dense_workspace(scene, maps, options.output, undistort=undistort, **how)
+    seconds = time.perf_counter() - start
+    _summarise_stereo(options, scene, maps, report, seconds)
 
 
 def _summarise_stereo(
     options: Options,
     scene: Scene,
     maps: Sequence[StereoMap],
-    report: DenseReport,
+    report: dense.DenseReport,
     seconds: float,
 ) -> None:
-    ordered = sorted((each.depth.shape for each in maps), key=math.prod)
+    path, ordered = report.path, sorted((each.depth.shape for each in maps), key=math.prod)
     ends = dict.fromkeys((ordered[0], ordered[-1]))
     sizes = " to ".join(f"{width} x {height}" for height, width in ends)
     OUT.print(
         f"{report.num_maps:,} depth maps of {sizes}: {report.share_known:.0%} of their "
-        f"pixels confirmed by other views, in {seconds:.1f} s, written to {visible(report.path)}",
+        f"pixels confirmed by other views, in {seconds:.1f} s, written to {visible(path)}",
         soft_wrap=True,
     )
     if options.preview:
@@ -258,20 +213,11 @@ def _summarise_stereo(
             "the cameras have lens distortion, and these maps belong to the undistorted "
             "photographs: --colmap writes both, as a scene to continue with"
         )
-    confirmed = sum(np.count_nonzero(np.isfinite(each.depth)) for each in maps)
-    print_pairs("next", _after_stereo(options, scene, report.path, int(confirmed)))
-
-
-def _after_stereo(
-    options: Options, scene: Scene, written: Path, confirmed: int
-) -> list[tuple[str, str]]:
-    if not options.colmap:
-        most = Planned.of(scene, None, FULL_RUN).most_seeds
-        return after_stereo(options.scene, scene, written, confirmed, most)
-    fused = quoted(written / "fused.ply")
-    fuse = (
-        f"colmap stereo_fusion --workspace_path {quoted(written)} --output_path {fused}"
-        f" --StereoFusion.min_num_pixels {MIN_PIXELS}"
-    )
-    # The workspace is itself a scene, without distortion.
-    return [look(written, written), ("fuse", fuse)]
+    if options.colmap:
+        fuse = f"--workspace_path {quoted(path)} --output_path {quoted(path / 'fused.ply')}"
+        fuse = f"colmap stereo_fusion {fuse} --StereoFusion.min_num_pixels {MIN_PIXELS}"
+        # The workspace is itself a scene, without distortion.
+        print_pairs("next", [look(path, path), ("fuse", fuse)])
+        return
+    confirmed = int(sum(np.count_nonzero(np.isfinite(each.depth)) for each in maps))
+    print_pairs("next", after_depth(options.scene, scene, path, confirmed, aligned=True))

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from splatseed.commands.models import config_of, model_file
-from splatseed.commands.options import parse_options
+from splatseed.commands.models import check_free, config_of, model_file
+from splatseed.commands.options import parse_options, refuse
 from splatseed.console import StageClock, print_note, print_pairs, print_table, stage_display
-from splatseed.errors import MissingDependencyError, ParameterError, SceneNotFoundError
-from splatseed.io.staging import check_output, check_parents, output_folder, write_json
+from splatseed.errors import MissingDependencyError, SceneNotFoundError
+from splatseed.io.staging import check_output, output_folder, write_json
 from splatseed.literal import counted
 from splatseed.requirements import require
 from splatseed.train.settings import Backend, TrainSettings
@@ -20,7 +21,9 @@ from splatseed.views.view import user_cache_dir
 
 if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
     from splatseed.scores import EvalResult, ViewScore
-    from splatseed.splat.metrics import Lpips
+
+LEAST = {"data_factor": 1, "test_every": 2}
+"""Numbers that a run's config gives where no option does, and their least values."""
 
 
 @dataclass(frozen=True)
@@ -56,138 +59,86 @@ class Options:
     """Replace existing files and folders."""
 
 
-class _Task(NamedTuple):
-    """What to score, and against what."""
-
-    gaussians: Path
-    scene: Path
-    data_factor: int
-    test_every: int
-
-
 def run(arguments: list[str]) -> None:
     """Run the verb with these arguments."""
     options = parse_options(Options, "evaluate", arguments)
     require("torch")
-    task = _task(options)
-    _check_outputs(options, task)
-    lpips, reason = _lpips(options)
-    with stage_display() as clock:
-        result, doubt = _evaluate(options, task, lpips, reason, clock)
-    _summarise(options, task, result)
-    if doubt:
-        print_note(doubt)
-
-
-def _task(options: Options) -> _Task:
-    """The files and settings; a run's config fills in what the options leave open."""
     gaussians, config = model_file(options.model), config_of(options.model)
     scene = options.scene or config.get("scene")
-    if not isinstance(scene, str | Path):
-        raise ParameterError(
-            f"--scene, as {options.model} does not name its scene",
-            found="none",
-            fix="Pass --scene SCENE: the scene that it was trained on.",
-        )
-    numbers = []
-    for name, least in (("data_factor", 1), ("test_every", 2)):
-        given = getattr(options, name)
-        value = config.get(name, getattr(TrainSettings, name)) if given is None else given
-        if not isinstance(value, int) or value < least:
-            raise ParameterError(
-                f"--{name.replace('_', '-')} of {least} or more",
-                found=f"{value}",
-                fix="See splatseed evaluate --help.",
-            )
-        numbers.append(value)
-    return _Task(gaussians, Path(scene), *numbers)
-
-
-def _check_outputs(options: Options, task: _Task) -> None:
-    """Refuse what cannot be written before any work is done."""
-    protect = [task.scene, options.model]
+    numbers: dict[str, Any] = {
+        name: config.get(name, getattr(TrainSettings, name)) if given is None else given
+        for name in LEAST
+        for given in [getattr(options, name)]
+    }
+    refuse(
+        (not isinstance(scene, str | Path), f"--scene, as {options.model} does not name its scene",
+         "none", "Pass --scene SCENE: the scene that it was trained on."),
+        *((not isinstance(numbers[name], int) or numbers[name] < least,
+           f"--{name.replace('_', '-')} of {least} or more", numbers[name],
+           "See splatseed evaluate --help.") for name, least in LEAST.items()),
+    )  # fmt: skip
+    scene = Path(str(scene))
     if options.renders is not None:
-        check_output(options.renders, kind="evaluate", overwrite=options.overwrite, protect=protect)
+        check_output(
+            options.renders, kind="evaluate", overwrite=options.overwrite,
+            protect=[scene, options.model],
+        )  # fmt: skip
     if options.output is not None:
-        check_parents(options.output)
-        if options.output.exists() and not options.overwrite:
-            raise ParameterError(
-                f"no file at {options.output}",
-                found="one",
-                fix="Pass --overwrite to replace it, or choose another name.",
-            )
-
-
-def _lpips(options: Options) -> tuple[Lpips | None, str]:
-    """The metric, or why there is none; weights that the user names must exist."""
-    from splatseed.splat.metrics import load_lpips  # noqa: PLC0415  (imports PyTorch)
-
-    try:
-        return load_lpips(weights=options.lpips_weights), ""
-    except (MissingDependencyError, SceneNotFoundError) as error:
-        if options.lpips_weights is not None:
-            raise
-        return None, str(error)
-
-
-def _evaluate(
-    options: Options, task: _Task, lpips: Lpips | None, reason: str, clock: StageClock
-) -> tuple[EvalResult, str]:
-    """Score the test views, write what was asked for, and say why it may be another's scene."""
-    from splatseed.splat.covisible import find_covisible, pixel_masks  # noqa: PLC0415  (kernels)
-    from splatseed.splat.evaluate import evaluate_model, load_model, write_renders  # noqa: PLC0415  (PyTorch)
-    from splatseed.train.device import pick_device  # noqa: PLC0415  (PyTorch)
-
-    clock("read", 0.0)
-    model = load_model(
-        task.gaussians,
-        task.scene,
-        data_factor=task.data_factor,
-        test_every=task.test_every,
-        transform=options.transform,
-        device=pick_device(options.backend, clock),
-        cache_dir=user_cache_dir(),
-        progress=clock,
-    )
-    grids = find_covisible(model.scene, task.test_every, clock)
-    result = evaluate_model(
-        model,
-        lpips=lpips,
-        lpips_reason=reason,
-        covisible=pixel_masks(grids, model.views),
-        progress=clock,
-    )
-    if options.renders is not None:
-        with output_folder(options.renders, kind="evaluate", overwrite=options.overwrite) as folder:
-            write_renders(model, folder, clock)
-    if options.output is not None:
-        named = {"model": options.model, "scene": task.scene}
-        numbers = {"data_factor": task.data_factor, "test_every": task.test_every}
-        write_json(options.output, {**named, **numbers, **result.to_dict()})
-    return result, model.doubt
-
-
-def _summarise(options: Options, task: _Task, result: EvalResult) -> None:
+        check_free(options.output, overwrite=options.overwrite)
+    with stage_display() as clock:
+        result, doubt = _evaluate(options, gaussians, scene, numbers, clock)
     rows = [
         (score.name, *_numbers(score), f"{1e3 * score.seconds:.1f}") for score in result.per_image
     ]
     print_table(
-        f"{counted(len(rows), 'test view')} of {task.scene}",
+        f"{counted(len(rows), 'test view')} of {scene}",
         ("image", "PSNR, dB", "co-visible, dB", "of pixels", "SSIM", "LPIPS", "render, ms"),
         [*rows, ("mean", *_numbers(result), f"{1e3 * result.render_seconds:.1f}")],
     )
-    written = [("scores", options.output), ("renders", options.renders)]
-    print_pairs(
-        str(options.model),
-        [
-            ("Gaussians", f"{result.num_gaussians:,}"),
-            ("size", f"{(result.model_bytes or 0) / 1e6:.1f} MB of parameters"),
-            ("data factor", f"{task.data_factor}"),
-            *((label, str(path)) for label, path in written if path is not None),
-        ],
-    )
+    facts = [
+        ("Gaussians", f"{result.num_gaussians:,}"),
+        ("size", f"{(result.model_bytes or 0) / 1e6:.1f} MB of parameters"),
+        ("data factor", f"{numbers['data_factor']}"),
+    ]
+    written = (("scores", options.output), ("renders", options.renders))
+    facts += [(label, str(path)) for label, path in written if path is not None]
+    print_pairs(str(options.model), facts)
     if result.lpips is None:
         print_note(f"LPIPS was not computed: {result.lpips_reason}")
+    if doubt:
+        print_note(doubt)
+
+
+def _evaluate(
+    options: Options, gaussians: Path, scene: Path, numbers: Mapping[str, int], clock: StageClock
+) -> tuple[EvalResult, str]:
+    """Score the test views, write what was asked for, and say why it may be another's scene."""
+    from splatseed.splat.covisible import find_covisible, pixel_masks  # noqa: PLC0415  (kernels)
+    from splatseed.splat.evaluate import evaluate_model, load_model, write_renders  # noqa: PLC0415  (PyTorch)
+    from splatseed.splat.metrics import load_lpips  # noqa: PLC0415  (PyTorch)
+    from splatseed.train.device import pick_device  # noqa: PLC0415  (PyTorch)
+
+    clock("read", 0.0)
+    lpips, reason = None, ""
+    try:
+        lpips = load_lpips(weights=options.lpips_weights)
+    except (MissingDependencyError, SceneNotFoundError) as error:
+        if options.lpips_weights is not None:
+            raise
+        reason = str(error)
+    model = load_model(
+        gaussians, scene, **numbers, transform=options.transform,
+        device=pick_device(options.backend, clock), cache_dir=user_cache_dir(), progress=clock,
+    )  # fmt: skip
+    seen = pixel_masks(find_covisible(model.scene, numbers["test_every"], clock), model.views)
+    result = evaluate_model(model, lpips=lpips, lpips_reason=reason, covisible=seen, progress=clock)
+    if options.renders is not None:
+        with output_folder(options.renders, kind="evaluate", overwrite=options.overwrite) as folder:
+            write_renders(model, folder, clock)
+    if options.output is not None:
+        named = {"model": options.model, "scene": scene}
+        write_json(options.output, {**named, **numbers, **result.to_dict()})
+    return result, model.doubt
 
 
 def _numbers(scores: EvalResult | ViewScore) -> tuple[str, ...]:

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import tyro
 
-from splatseed.commands.models import config_of, model_file
-from splatseed.commands.options import parse_options
+from splatseed.commands.models import check_free, config_of, model_file
+from splatseed.commands.options import parse_options, refuse
 from splatseed.console import print_note, print_pairs, stage_display
-from splatseed.errors import OutputError
-from splatseed.io.staging import check_parents
 from splatseed.literal import quoted
 from splatseed.splat.formats import (
     FORMATS,
@@ -24,9 +22,6 @@ from splatseed.splat.formats import (
 )
 from splatseed.train.folder import RunFolder
 from splatseed.train.settings import TrainSettings
-
-if TYPE_CHECKING:
-    from splatseed.splat.gaussians import Gaussians
 
 
 @dataclass(frozen=True)
@@ -53,42 +48,25 @@ def run(arguments: list[str]) -> None:
     options = parse_options(Options, "export", arguments)
     name = format_of_name(options.output)
     crop = None if options.crop is None else parse_crop(options.crop)
-    path = model_file(options.model)
-    _check_output(options, path)
+    path, target = model_file(options.model), options.output
+    check_free(target, overwrite=options.overwrite)
+    refuse(
+        (target.exists() and target.samefile(path), f"another file than {target}", "the model's",
+         "Choose another name."),
+        (RunFolder(target.resolve().parent).is_run, f"a file outside training runs, not {target}",
+         "the folder of a run", "Choose a place beside the run."),
+    )  # fmt: skip
     with stage_display() as clock:
         clock("read", 0.0)
         gaussians = read_model(path)
         kept = keep_gaussians(gaussians, crop, options.min_opacity)
-        write_model(options.output, kept, clock)
-    _summarise(options, name, path, gaussians, kept)
-
-
-def _check_output(options: Options, source: Path) -> None:
-    """Refuse what must not be replaced before any work is done."""
-    target = options.output
-    check_parents(target)
-    if target.exists() and (not options.overwrite or target.samefile(source)):
-        fix = "Choose another name."
-        if not options.overwrite:
-            fix = "Pass --overwrite to replace it, or choose another name."
-        raise OutputError(f"no file at {target}", found="one", fix=fix)
-    if RunFolder(target.resolve().parent).is_run:
-        raise OutputError(
-            f"a file outside training runs, not {target}",
-            found="the folder of a run",
-            fix="Choose a place beside the run.",
-        )
-
-
-def _summarise(
-    options: Options, name: str, path: Path, gaussians: Gaussians, kept: Gaussians
-) -> None:
-    before, after = path.stat().st_size, options.output.stat().st_size
+        write_model(target, kept, clock)
+    before, after = path.stat().st_size, target.stat().st_size
     rows = [
         ("Gaussians", f"{len(kept):,} of {len(gaussians):,}"),
         ("format", f"{name}: {FORMATS[name].about}"),
         ("size", f"{after / 1e6:.2f} MB, of {before / 1e6:.2f} MB read"),
-        ("output", str(options.output)),
+        ("output", str(target)),
     ]
     print_pairs("splatseed export", rows)
     if name == "splat" and gaussians.shN.size:

@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from splatseed.commands.models import model_file
-from splatseed.commands.options import parse_options
+from splatseed.commands.models import check_free, model_file
+from splatseed.commands.options import parse_options, refuse
 from splatseed.console import print_note, print_pairs, stage_display
-from splatseed.errors import OutputError, ParameterError
-from splatseed.io.staging import check_parents
+from splatseed.errors import ParameterError
 from splatseed.pointcloud import PointCloud
 from splatseed.requirements import require
 from splatseed.scene import Scene
@@ -68,7 +67,19 @@ class Options:
 def run(arguments: list[str]) -> None:
     """Run the verb with these arguments."""
     options = parse_options(Options, "flight", arguments)
-    _check(options)
+    suffix = options.output.suffix
+    refuse(
+        (suffix.lower() not in VIDEO_SUFFIXES, f"the name of a video: {', '.join(VIDEO_SUFFIXES)}",
+         suffix or "no suffix", "Name it flight.mp4."),
+        (options.path in (None, ORBIT) and options.transform is not None,
+         "--path with --transform", "none", "Leave it out."),
+        (not 1 <= options.seconds * FPS <= MOST_FRAMES,
+         f"--seconds from {1 / FPS:.2g} to {MOST_FRAMES / FPS:.0f}", f"{options.seconds:g}",
+         "Try 10."),
+    )  # fmt: skip
+    check_free(options.output, overwrite=options.overwrite)
+    for each in filter(None, (options.model, options.compare)):
+        model_file(each)
     require("torch", "imageio_ffmpeg")
     # These import PyTorch.
     from splatseed.splat.rendering import ModelRenderer  # noqa: PLC0415  (likewise)
@@ -98,51 +109,22 @@ def run(arguments: list[str]) -> None:
         print_note("No cameras are known, so the video circles; --scene SCENE names the scene's.")
 
 
-def _check(options: Options) -> None:
-    """Check what can be checked before any work starts."""
-    suffix = options.output.suffix
-    if suffix.lower() not in VIDEO_SUFFIXES:
-        raise ParameterError(
-            f"the name of a video: {', '.join(VIDEO_SUFFIXES)}",
-            found=suffix or "no suffix",
-            fix="Name it flight.mp4.",
-        )
-    check_parents(options.output)
-    if options.output.exists() and not options.overwrite:
-        fix = "Pass --overwrite to replace it, or choose another name."
-        raise OutputError(f"no file at {options.output}", found="one", fix=fix)
-    if options.path in (None, ORBIT) and options.transform is not None:
-        raise ParameterError("--path with --transform", found="none", fix="Leave it out.")
-    if not 1 <= options.seconds * FPS <= MOST_FRAMES:
-        raise ParameterError(
-            f"--seconds from {1 / FPS:.2g} to {MOST_FRAMES / FPS:.0f}",
-            found=f"{options.seconds:g}",
-            fix="Try 10.",
-        )
-    for each in (options.model, options.compare):
-        if each is not None:
-            model_file(each)
-
-
 def _opened(options: Options) -> list[Shown]:
     """The model, and the one that is compared with it, which the same cameras see."""
     from splatseed.view.models import open_shown, share_a_world  # noqa: PLC0415  (imports PyTorch)
 
     paths = [path for path in (options.model, options.compare) if path is not None]
     models = [open_shown(path, options.scene) for path in paths]
+    look = "Train it first (splatseed train), or look at it with splatseed view."
     for path, shown in zip(paths, models, strict=True):
-        if shown.gaussians is None:
-            raise ParameterError(
-                f"{path} to be a trained model",
-                found="a scene or points",
-                fix="Train it first (splatseed train), or look at it with splatseed view.",
-            )
-    if not share_a_world(models[0], models[-1]):
-        raise ParameterError(
-            f"a model of the same scene as {options.model}, for --compare",
-            found=f"{options.compare}, whose scene has no photograph with a pose of that scene",
-            fix="Compare runs of one scene; if these are, name it with --scene.",
-        )
+        bare = shown.gaussians is None
+        refuse((bare, f"{path} to be a trained model", "a scene or points", look))
+    refuse(
+        (not share_a_world(models[0], models[-1]),
+         f"a model of the same scene as {options.model}, for --compare",
+         f"{options.compare}, whose scene has no photograph with a pose of that scene",
+         "Compare runs of one scene; if these are, name it with --scene."),
+    )  # fmt: skip
     return models
 
 
@@ -167,22 +149,17 @@ def _size(options: Options, shown: Shown) -> tuple[int, int]:
 def _path(options: Options, shown: Shown, size: tuple[int, int]) -> tuple[list[View], float]:
     """The cameras, one per frame, and the frame rate."""
     from splatseed.splat.world import NO_TRANSFORM, find_transform  # noqa: PLC0415  (imports PyTorch)
-    from splatseed.view.flights import (  # noqa: PLC0415  (likewise)
-        check_path,
-        orbit,
-        path_of_file,
-        smooth_path,
-    )
+    from splatseed.view import flights  # noqa: PLC0415  (likewise)
 
     cameras, frames = shown.train_views, max(1, round(options.seconds * FPS))
-    if options.path is not None and options.path != ORBIT:
-        world = None
-        if options.transform is not None:
-            world = find_transform(options.transform, shown.scene or Scene(PointCloud.empty()))
-        views, fps = path_of_file(options.path, size, world)
-        if options.transform != NO_TRANSFORM:
-            check_path(options.path, views, shown.model, cameras)
-        return views, fps or FPS
-    if options.path == ORBIT or len(cameras) < 2:
-        return orbit(cameras, shown.model, frames, size), FPS
-    return smooth_path(cameras, frames, size), FPS
+    if options.path == ORBIT or (options.path is None and len(cameras) < 2):
+        return flights.orbit(cameras, shown.model, frames, size), FPS
+    if options.path is None:
+        return flights.smooth_path(cameras, frames, size), FPS
+    world = None
+    if options.transform is not None:
+        world = find_transform(options.transform, shown.scene or Scene(PointCloud.empty()))
+    views, fps = flights.path_of_file(options.path, size, world)
+    if options.transform != NO_TRANSFORM:
+        flights.check_path(options.path, views, shown.model, cameras)
+    return views, fps or FPS

@@ -7,67 +7,42 @@ is null; keys are only ever added.
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import tyro
 
-from splatseed.commands.next_steps import (
-    Planned,
-    advice_commands,
-    advice_rows,
-    number_for,
-    use,
-)
-from splatseed.commands.options import parse_options
-from splatseed.console import (
-    OUT,
-    StageClock,
-    print_note,
-    print_pairs,
-    print_table,
-    stage_display,
-)
-from splatseed.depthmap import DepthKind
-from splatseed.errors import ParameterError, SplatseedError
+from splatseed.commands import next_steps
+from splatseed.commands.next_steps import Commands, Planned
+from splatseed.commands.options import parse_options, refuse
+from splatseed.console import OUT, StageClock, print_note, print_pairs, print_table, stage_display
+from splatseed.depthmap import DepthKind, DepthMaps
+from splatseed.errors import SplatseedError
 from splatseed.io import find_depths, load_scene
 from splatseed.io.seeds import was_upsampled
 from splatseed.io.staging import check_parents
 from splatseed.literal import quoted, visible
 from splatseed.progress import Progress
 from splatseed.scene import Scene
-from splatseed.seeding.advice import advice_for
-from splatseed.seeding.diagnostics import (
-    EMPTY_CELLS,
-    CloudStatistics,
-    EmptyRegions,
-    TrackStatistics,
-    cloud_statistics,
-    empty_regions,
-    find_problems,
-    is_distorted,
-    track_statistics,
-    untrainable,
-)
+from splatseed.seeding import diagnostics
+from splatseed.seeding.advice import Advice, advice_for
 from splatseed.seeding.photographs import has_points, photographed
 from splatseed.train.schedule import FULL_RUN
 
 if TYPE_CHECKING:  # Numba, which takes a while to load, comes with it
     from splatseed.depth.alignment import Alignment
-    from splatseed.seeding.poses import PoseError
 
 KINDS_SHOWN = 3
 """Kinds of cameras listed; collections of photographs from the web have one per photograph."""
 IMAGES_SHOWN = 12
 """Images whose depth is listed."""
-REFINE = "--refine-poses"
-"""What problems of poses name that it can mend."""
 
 
 @dataclass(frozen=True)
@@ -96,92 +71,75 @@ class Options:
     """Print one JSON object instead, for scripts."""
 
 
-@dataclass(frozen=True)
-class _Poses:
-    """What the photographs tell of their poses.
-
-    Args:
-        agreement: Share of the pixels looked at whose depth others confirm.
-        error: By how much the photographs miss each other; None if that could not be told.
-        problem: Why they cannot be compared, or should not be as they are; empty if they can.
-    """
-
-    agreement: float
-    error: PoseError | None
-    problem: str
-
-    @property
-    def refine(self) -> bool:
-        """Whether they should be refined first."""
-        return REFINE in self.problem
-
-
 def run(arguments: list[str]) -> None:
     """Run the verb with these arguments."""
     options = parse_options(Options, "info", arguments)
     with stage_display() as clock:
         clock("read", 0.0)
         scene = _read(options)
-        cloud = cloud_statistics(scene, clock)
-        tracks = track_statistics(scene)
-        regions = empty_regions(scene, clock)
+        cloud = diagnostics.cloud_statistics(scene, clock)
+        tracks = diagnostics.track_statistics(scene)
+        regions = diagnostics.empty_regions(scene, clock)
         # An empty part is reason to upsample, which was done.
-        problems = find_problems(scene, cloud, None if was_upsampled(scene) else regions)
-        alignments = _alignments(options, scene, clock)
-        known = _known_depths(options, scene, clock)
+        empty = None if was_upsampled(scene) else regions
+        problems = [*diagnostics.find_problems(scene, cloud, empty)]
+        alignments = None if options.depth is None else _alignments(options, scene, clock)
+        known = _known_depths(scene.depths, clock) if options.depth and scene.depths else 0
         poses = _look_at_poses(scene, clock)
-        doubts = [poses.problem] if poses and poses.problem else []
-        problems = (*problems, *_unfit_maps(scene, alignments or {}), *doubts)
+    doubt = poses["problem"] if poses else ""
+    problems += [*_unfit_maps(scene, alignments or {}), *([doubt] if doubt else [])]
     if options.json:
-        _print_json(scene, cloud, tracks, regions, poses, alignments, problems)
+        facts = {
+            "points": cloud, "tracks": tracks, "empty": regions, "poses": poses,
+            "depth": alignments, "problems": problems,
+        }  # fmt: skip
+        facts = _plain({**_facts_of(scene), **facts})
+        print(json.dumps(facts, indent=2, allow_nan=False), file=OUT.file)
         return
-    rows = [*_source_rows(scene), *_cloud_rows(cloud), *_track_rows(tracks), *_region_rows(regions)]
-    rows += _pose_rows(poses)
     usable = scene
     if alignments and len(scene.points) and all(each.rejected for each in alignments.values()):
         usable = scene.replace(depths=None)  # nothing follows from maps that cannot be used
-    rows += _advice_rows(options, usable, regions)
+    planned = Planned.of(usable, options.budget, options.max_steps)
+    share = None if regions is None else regions.mean
+    advice = advice_for(usable, planned.most_seeds, strategy=planned.strategy, empty=share)
+    rows = [*_source_rows(scene), *_cloud_rows(cloud), *_track_rows(tracks)]
+    rows += _photograph_rows(regions, poses)
+    rows += _advice_rows(advice, planned) if len(scene.points) else []
     print_pairs(str(options.scene), rows)
     if alignments is not None:
         _print_depth(str(options.depth or "depth"), scene, alignments)
-    OUT.print("\nproblems" if problems else "\nno problems found", style="bold" if problems else "")
-    for problem in problems:
-        OUT.print(f"  - {problem}", soft_wrap=True)
+    _print_list("problems" if problems else "no problems found", problems)
     if options.picture is not None:
         print_pairs("picture", [("of depth", str(options.picture))])
     if len(scene.points) or scene.images:
-        if missing := untrainable(scene):
+        if missing := diagnostics.untrainable(scene):
             print_note(missing)
-        print_pairs("next", _next_commands(options, usable, known, poses))
+        print_pairs("next", _next(options, usable, advice, planned, known, doubt))
 
 
 def _read(options: Options) -> Scene:
     """The scene, with the depth maps that the user names, else with its own."""
+    about = options.depth_kind, options.depth_scale, options.picture
+    refuse(
+        (options.depth is None and any(each is not None for each in about),
+         "--depth DIR, which --depth-kind, --depth-scale and --picture refer to", "none",
+         "Name the folder."),
+    )  # fmt: skip
     if options.picture is not None:
-        if options.picture.suffix.lower() != ".png":
-            raise ParameterError(
-                "a file that ends in .png, for --picture",
-                found=visible(options.picture.name),
-                fix=f"Try {quoted(options.picture.with_suffix('.png'))}.",
-            )
+        name = options.picture.name
+        fix = f"Try {quoted(f'{options.picture.stem}.png')}."
+        wrong = options.picture.suffix.lower() != ".png"
+        refuse((wrong, "a file that ends in .png, for --picture", visible(name), fix))
         check_parents(options.picture)
     scene = load_scene(options.scene, require_points=False)
-    if options.depth is not None:
-        maps = find_depths(scene, options.depth, kind=options.depth_kind, scale=options.depth_scale)
-        return scene.replace(depths=maps)
-    if options.depth_kind is not None or options.depth_scale is not None or options.picture:
-        raise ParameterError(
-            "--depth DIR, which --depth-kind, --depth-scale and --picture refer to",
-            found="none",
-            fix="Name the folder.",
-        )
-    return scene
-
-
-def _alignments(options: Options, scene: Scene, clock: StageClock) -> dict[str, Alignment] | None:
-    """How each map fits the SfM points, drawn if requested; None if no maps were named."""
     if options.depth is None:
-        return None
+        return scene
+    maps = find_depths(scene, options.depth, kind=options.depth_kind, scale=options.depth_scale)
+    return scene.replace(depths=maps)
+
+
+def _alignments(options: Options, scene: Scene, clock: StageClock) -> dict[str, Alignment]:
+    """How each map fits the SfM points, drawn if requested."""
     from splatseed.depth.alignment import align  # noqa: PLC0415  (loads Numba)
 
     alignments = align(scene, progress=clock)
@@ -193,22 +151,17 @@ def _alignments(options: Options, scene: Scene, clock: StageClock) -> dict[str, 
     return alignments
 
 
-def _look_at_poses(scene: Scene, progress: Progress) -> _Poses | None:
-    """Compare a few photographs of a scene without points; None with points or without any."""
-    if has_points(scene) or not scene.has_photographs:
-        return None
-    from splatseed.seeding.poses import check_poses, pose_error  # noqa: PLC0415  (loads Numba)
-
-    try:
-        images = photographed(scene)
-        agreement = check_poses(scene, images, progress)
-    except SplatseedError as refused:
-        return _Poses(0.0, None, f"The photographs cannot be compared: {refused}")
-    error = pose_error(scene, images, progress)
-    return _Poses(agreement, error, error.warning if error else "")
+def _known_depths(depths: DepthMaps, clock: StageClock) -> int:
+    """How many pixels have a depth, of all maps."""
+    known = 0
+    for i, name in enumerate(depths):
+        known += int(np.count_nonzero(np.isfinite(depths.read(name).values)))
+        clock("count depths", (i + 1) / len(depths))
+    return known
 
 
 def _unfit_maps(scene: Scene, alignments: Mapping[str, Alignment]) -> list[str]:
+    """What is wrong with the maps, in a sentence, if anything is."""
     if alignments and not len(scene.points):
         unit = "only maps in the scene's unit can be used, with --depth.no-align"
         return [f"there are no points to align the depth maps with: {unit}"]
@@ -217,56 +170,81 @@ def _unfit_maps(scene: Scene, alignments: Mapping[str, Alignment]) -> list[str]:
     return [f"{maps} cannot be aligned with the points, and are left out"] if unfit else []
 
 
-def _next_commands(
-    options: Options, scene: Scene, known: int, poses: _Poses | None
-) -> list[tuple[str, str]]:
+def _look_at_poses(scene: Scene, progress: Progress) -> dict[str, Any] | None:
+    """Compare a few photographs of a scene without points; None with points or without any.
+
+    Gives the share of the pixels looked at whose depth others confirm (``agreement``), by how much
+    the photographs miss each other (``error``), and why they should not be used as they are.
+    """
+    if has_points(scene) or not scene.has_photographs:
+        return None
+    from splatseed.seeding.poses import check_poses, pose_error  # noqa: PLC0415  (loads Numba)
+
+    try:
+        images = photographed(scene)
+        agreement = check_poses(scene, images, progress)
+    except SplatseedError as refused:
+        problem = f"The photographs cannot be compared: {refused}"
+        return {"agreement": 0.0, "error": None, "problem": problem}
+    error = pose_error(scene, images, progress)
+    return {"agreement": agreement, "error": error, "problem": error.warning if error else ""}
+
+
+def _next(
+    options: Options, scene: Scene, advice: Advice, planned: Planned, known: int, problem: str
+) -> Commands:
     """What to do next with the scene, or what there is to choose from."""
-    if scene.depths is not None and options.depth and len(scene.points) and not is_distorted(scene):
-        planned = Planned.of(scene, options.budget, options.max_steps)
-        number = number_for(len(scene.points), known, planned.most_seeds)
-        how = f"{_reading(options)}{number}"
-        return [("", use(options.scene, options.depth, how)[1])]
-    advised, refine = [], poses is not None and poses.refine
-    if len(scene.points) or (
-        (poses is None or poses.refine or not poses.problem) and scene.has_photographs
-    ):
-        planned = Planned.of(scene, options.budget, options.max_steps)
-        advice = advice_for(scene, planned.most_seeds, strategy=planned.strategy)
-        advised = advice_commands(options.scene, scene, advice, planned, refine=refine)
-    if len(scene.points):
+    any_points, refine = len(scene.points) > 0, "--refine-poses" in problem
+    lifted = ""
+    if options.depth is not None and scene.depths and not diagnostics.is_distorted(scene):
+        how = "" if options.depth_kind is None else f"--depth-kind {options.depth_kind} "
+        how += "" if options.depth_scale is None else f"--depth-scale {options.depth_scale:g} "
+        how += "" if any_points else "--depth.no-align "
+        how += next_steps.number_for(len(scene.points), known, planned.most_seeds)
+        lifted = next_steps.use(options.scene, options.depth, how)
+    if any_points and lifted:
+        return [("", lifted)]
+    advised: Commands = []
+    if any_points or (scene.has_photographs and (refine or not problem)):
+        advised = next_steps.advice_commands(options.scene, scene, advice, planned, refine=refine)
+    if any_points:
         return advised
-    images = scene.source.image_dir if scene.source else None
-    photographs = "IMAGES" if images is None else quoted(images)
-    points = f"splatseed sfm {photographs} --poses-from {quoted(options.scene)} -o OUT"
+    points = next_steps.triangulate_command(options.scene, scene, "OUT")
     points = f"{points} --refine-poses" if refine else points
-    maps = _from_maps(options, scene, known)
+    maps = [("or from the maps", lifted)] if lifted and known else []
     return [*advised, *maps, ("or points" if advised or maps else "points", points)]
 
 
-def _from_maps(options: Options, scene: Scene, known: int) -> list[tuple[str, str]]:
-    """The command for seeds from metric maps of a scene without points."""
-    if not known or options.depth is None or is_distorted(scene):
-        return []
-    most = Planned.of(scene, options.budget, options.max_steps).most_seeds
-    how = f"{_reading(options)}--depth.no-align {number_for(0, known, most)}"
-    return [("or from the maps", use(options.scene, options.depth, how)[1])]
+def _facts_of(scene: Scene) -> dict[str, Any]:
+    """Where a scene comes from and what it holds, for ``--json``."""
+    train, test = scene.split()
+    return {
+        "format": scene.source.format if scene.source else None,
+        "root": str(scene.source.root) if scene.source else None,
+        "images": len(scene.images),
+        "train_images": len(train),
+        "test_images": len(test),
+        "photographs": scene.has_photographs,
+        "cameras": [
+            {"id": c.camera_id, "model": c.model, "width": c.width, "height": c.height}
+            for c in scene.intrinsics
+        ],
+        "depth_maps": 0 if scene.depths is None else len(scene.depths),
+    }
 
 
-def _reading(options: Options) -> str:
-    """The options that say how the maps are to be read."""
-    kind = "" if options.depth_kind is None else f"--depth-kind {options.depth_kind} "
-    return kind if options.depth_scale is None else f"{kind}--depth-scale {options.depth_scale:g} "
-
-
-def _known_depths(options: Options, scene: Scene, clock: StageClock) -> int:
-    """How many pixels have a depth, of all maps that the user named."""
-    if options.depth is None or scene.depths is None:
-        return 0
-    known = 0
-    for i, name in enumerate(scene.depths):
-        known += int(np.count_nonzero(np.isfinite(scene.depths.read(name).values)))
-        clock("count depths", (i + 1) / len(scene.depths))
-    return known
+def _plain(value: Any) -> Any:
+    """A value as JSON takes it: a dataclass as a table, a number that is not finite as null."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        value = dataclasses.asdict(value)
+    if isinstance(value, Mapping):
+        return {str(key): _plain(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(each) for each in value]
+    if isinstance(value, float) or hasattr(value, "item"):
+        number = float(value)
+        return number if math.isfinite(number) else None
+    return value
 
 
 def _source_rows(scene: Scene) -> list[tuple[str, str]]:
@@ -286,7 +264,7 @@ def _source_rows(scene: Scene) -> list[tuple[str, str]]:
     ]
 
 
-def _cloud_rows(cloud: CloudStatistics) -> list[tuple[str, str]]:
+def _cloud_rows(cloud: diagnostics.CloudStatistics) -> list[tuple[str, str]]:
     rows = [("points", f"{cloud.num_points:,}"), ("not finite", f"{cloud.non_finite:,}")]
     if cloud.num_points == cloud.non_finite:  # nothing to measure
         return rows if cloud.num_points else [("points", "none")]
@@ -302,125 +280,95 @@ def _cloud_rows(cloud: CloudStatistics) -> list[tuple[str, str]]:
     ]
 
 
-def _track_rows(tracks: TrackStatistics | None) -> list[tuple[str, str]]:
+def _track_rows(tracks: diagnostics.TrackStatistics | None) -> list[tuple[str, str]]:
     if tracks is None:
         return [("tracks", "none")]
-    unknown = math.isnan(tracks.mean_error)
-    error = "unknown" if unknown else _spread_of(tracks.mean_error, tracks.error, ".3f")
+
+    def told(mean: float, percentiles: tuple[float, ...], style: str) -> str:
+        spread = " ".join(f"{x:{style}}" for x in percentiles)
+        return "unknown" if math.isnan(mean) else f"mean {mean:{style}}, 5/25/50/75/95% {spread}"
+
     return [
-        ("track length, images", _spread_of(tracks.mean_length, tracks.length, ".3g")),
-        ("reprojection error, px", error),
+        ("track length, images", told(tracks.mean_length, tracks.length, ".3g")),
+        ("reprojection error, px", told(tracks.mean_error, tracks.error, ".3f")),
     ]
 
 
-def _spread_of(mean: float, percentiles: tuple[float, ...], style: str) -> str:
-    spread = " ".join(f"{x:{style}}" for x in percentiles)
-    return f"mean {mean:{style}}, 5/25/50/75/95% {spread}"
-
-
-def _pose_rows(poses: _Poses | None) -> list[tuple[str, str]]:
-    if poses is None or (poses.error is None and poses.problem):
-        return []
-    miss = "cannot be told" if poses.error is None else f"{poses.error}"
-    agree = f"at {poses.agreement:.0%} of the pixels looked at"
-    return [("photographs agree", agree), ("they miss by", miss)]
-
-
-def _advice_rows(
-    options: Options, scene: Scene, regions: EmptyRegions | None
+def _photograph_rows(
+    regions: diagnostics.EmptyRegions | None, poses: Mapping[str, Any] | None
 ) -> list[tuple[str, str]]:
-    """What to do before training, and why; photographs are not looked at for it."""
-    if not len(scene.points):
-        return []
-    planned = Planned.of(scene, options.budget, options.max_steps)
-    empty = None if regions is None else regions.mean
-    said = advice_for(scene, planned.most_seeds, strategy=planned.strategy, empty=empty)
-    return advice_rows(said, planned)
+    rows = []
+    if regions is not None:
+        worst = f"{regions.worst:.0%} in {regions.worst_name}"
+        grid = f"(of cells, {diagnostics.EMPTY_CELLS} along the longer side)"
+        rows.append(("image area without points", f"{regions.mean:.0%} on average, {worst} {grid}"))
+    if poses and (poses["error"] is not None or not poses["problem"]):
+        agreed = f"at {poses['agreement']:.0%} of the pixels looked at"
+        miss = "cannot be told" if poses["error"] is None else f"{poses['error']}"
+        rows += [("photographs agree", agreed), ("they miss by", miss)]
+    return rows
 
 
-def _region_rows(regions: EmptyRegions | None) -> list[tuple[str, str]]:
-    if regions is None:
-        return []
-    worst = f"{regions.worst:.0%} in {regions.worst_name}"
-    grid = f"(of cells, {EMPTY_CELLS} along the longer side)"
-    return [("image area without points", f"{regions.mean:.0%} on average, {worst} {grid}")]
-
-
-def _print_json(
-    scene: Scene,
-    cloud: CloudStatistics,
-    tracks: TrackStatistics | None,
-    regions: EmptyRegions | None,
-    poses: _Poses | None,
-    alignments: Mapping[str, Alignment] | None,
-    problems: Sequence[str],
-) -> None:
-    """Print the facts that ``info`` shows."""
-    train, test = scene.split()
-    source = scene.source
-    facts = {
-        "format": source.format if source else None,
-        "root": str(source.root) if source else None,
-        "images": len(scene.images),
-        "train_images": len(train),
-        "test_images": len(test),
-        "photographs": scene.has_photographs,
-        "cameras": [
-            {"id": c.camera_id, "model": c.model, "width": c.width, "height": c.height}
-            for c in scene.intrinsics
-        ],
-        "depth_maps": 0 if scene.depths is None else len(scene.depths),
-        "points": asdict(cloud),
-        "tracks": None if tracks is None else asdict(tracks),
-        "empty": None if regions is None else asdict(regions),
-        "poses": None if poses is None else asdict(poses),
-        "depth": None if alignments is None else {k: asdict(a) for k, a in alignments.items()},
-        "problems": list(problems),
-    }
-    print(json.dumps(_finite(facts), indent=2, allow_nan=False), file=OUT.file)
-
-
-def _finite(value: Any) -> Any:
-    """The value, with null for numbers that are not finite."""
-    if isinstance(value, Mapping):
-        return {str(key): _finite(each) for key, each in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(each) for each in value]
-    if isinstance(value, float) or hasattr(value, "item"):
-        number = float(value)
-        return number if math.isfinite(number) else None
-    return value
+def _advice_rows(advice: Advice, planned: Planned) -> list[tuple[str, str]]:
+    """What to do, why, and for which training."""
+    plan = f"{planned.budget:,} Gaussians at most, {planned.max_steps:,} steps, strategy"
+    rows = [("planned", f"{plan} {planned.strategy}"), ("advice", advice.sentence)]
+    if advice.measured.layout:
+        rows.insert(0, ("cameras stand", advice.measured.layout))
+    return rows + [("" if i else "why", reason) for i, reason in enumerate(advice.reasons)]
 
 
 def _print_depth(title: str, scene: Scene, alignments: Mapping[str, Alignment]) -> None:
     """Print a summary of the depth maps and a table of images, the worst first."""
     maps = f"{len(alignments):,} of {len(scene.images):,} images"
-    kind: DepthKind = "z"
+    columns = {"scale": ".4g", "residual": ".2%"}
     known = [image.name for image in scene.images if image.name in alignments]
     if known and scene.depths is not None:
         first = scene.depths.read(known[0])
-        kind = first.kind
-        maps = f"{maps}, the first {first.width} x {first.height}, kind {kind}"
+        maps = f"{maps}, the first {first.width} x {first.height}, kind {first.kind}"
+        if first.kind == "inverse":
+            columns = {"scale": ".4g", "shift": ".4g", "residual": ".2%"}
     if not len(scene.points):  # nothing to compare with
         print_pairs(title, [("maps", maps)])
         return
     used = [each for each in alignments.values() if each.rejected is None]
-    counts = _spread((each.num_points for each in alignments.values()), ".0f")
     rows = [("maps", maps), ("left out", f"{len(alignments) - len(used):,}")]
+    counts = _spread((each.num_points for each in alignments.values()), ".0f")
     rows.append(("SfM points per image", counts))
-    if used:
-        rows.append(("scale", _spread((each.scale for each in used), ".4g")))
-        if kind == "inverse":
-            rows.append(("shift", _spread((each.shift for each in used), ".4g")))
-        rows.append(("residual", _spread((each.residual for each in used), ".2%")))
+    for name, style in columns.items() if used else ():
+        rows.append((name, _spread((getattr(each, name) for each in used), style)))
     print_pairs(title, rows)
-    ordered = sorted(alignments, key=lambda name: _badness(name, alignments[name]))
-    listed = ordered[:IMAGES_SHOWN]
-    header = ["image", "points", "scale", *(["shift"] if kind == "inverse" else []), "residual"]
-    some = "" if len(listed) == len(ordered) else f", the {len(listed)} worst; --json has all"
-    table = [_row(name, alignments[name], len(header)) for name in listed]
-    print_table(f"depth against SfM points{some}", header, table)
-    _print_rejections(alignments, listed)
+
+    def badness(item: tuple[str, Alignment]) -> tuple[bool, float, str]:
+        residual = np.nan_to_num(item[1].residual, nan=np.inf)
+        return item[1].rejected is None, -float(residual), item[0]
+
+    def cell(each: Alignment, name: str) -> str:
+        value = getattr(each, name)
+        unknown = math.isnan(value) or (name == "shift" and math.isnan(each.scale))
+        return "-" if unknown else f"{value:{columns[name]}}"
+
+    listed = sorted(alignments.items(), key=badness)[:IMAGES_SHOWN]
+    some = "" if len(listed) == len(alignments) else f", the {len(listed)} worst; --json has all"
+    print_table(
+        f"depth against SfM points{some}",
+        ["image", "points", *columns],
+        [
+            [name, f"{each.num_points:,}", *(cell(each, column) for column in columns)]
+            for name, each in listed
+        ],
+    )
+    reasons = [f"{name}: {each.rejected}" for name, each in listed if each.rejected is not None]
+    if more := len(alignments) - len(used) - len(reasons):
+        reasons.append(f"and {more:,} more")
+    if reasons:
+        _print_list("left out", reasons)
+
+
+def _print_list(title: str, sentences: Sequence[str]) -> None:
+    OUT.print(f"\n{title}", style="bold" if sentences else "")
+    for sentence in sentences:
+        OUT.print(f"  - {sentence}", soft_wrap=True)
 
 
 def _spread(values: Iterable[float], style: str) -> str:
@@ -429,31 +377,3 @@ def _spread(values: Iterable[float], style: str) -> str:
         return "unknown"
     low, median, high = np.percentile(known, [5, 50, 95])
     return f"median {median:{style}}, 5/95% {low:{style}} {high:{style}}"
-
-
-def _badness(name: str, alignment: Alignment) -> tuple[bool, float, str]:
-    """Sort key: images left out first, then the largest residuals."""
-    residual = -math.inf if math.isnan(alignment.residual) else -alignment.residual
-    return alignment.rejected is None, residual, name
-
-
-def _row(name: str, alignment: Alignment, columns: int) -> list[str]:
-    numbers = [_number(alignment.scale, ".4g")]
-    if columns == 5:
-        numbers.append(_number(alignment.shift, ".4g") if numbers != ["-"] else "-")
-    return [name, f"{alignment.num_points:,}", *numbers, _number(alignment.residual, ".2%")]
-
-
-def _number(value: float, style: str) -> str:
-    return "-" if math.isnan(value) else f"{value:{style}}"
-
-
-def _print_rejections(alignments: Mapping[str, Alignment], listed: Sequence[str]) -> None:
-    rejected = [(name, alignments[name].rejected) for name in listed]
-    sentences = [f"{name}: {reason}" for name, reason in rejected if reason is not None]
-    if not sentences:
-        return
-    OUT.print("\nleft out", style="bold")
-    more = sum(a.rejected is not None for a in alignments.values()) - len(sentences)
-    for sentence in [*sentences, *([f"and {more:,} more"] if more else [])]:
-        OUT.print(f"  - {sentence}", soft_wrap=True)

@@ -1,4 +1,4 @@
-"""A trained model as a user names it: a run folder, or a file."""
+"""A trained model as a user names it, a run folder or a file, and where its files may go."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from splatseed.errors import SceneNotFoundError
+from splatseed.errors import OutputError, SceneNotFoundError
 from splatseed.io.files import odd_kind
 from splatseed.io.load import is_scene
+from splatseed.io.staging import check_parents
 from splatseed.literal import quoted
 from splatseed.train.folder import RunFolder
 
@@ -36,6 +37,18 @@ def model_file(path: Path) -> Path:
         found=found,
         fix=fix,
     )
+
+
+def check_free(path: Path, *, overwrite: bool) -> None:
+    """Refuse a file that may not be written, before any work is done.
+
+    Raises:
+        OutputError: It is there and may not be replaced, or its folder cannot be made.
+    """
+    check_parents(path)
+    if path.exists() and not overwrite:
+        fix = "Pass --overwrite to replace it, or choose another name."
+        raise OutputError(f"no file at {path}", found="one", fix=fix)
 
 
 def config_of(path: Path) -> Mapping[str, Any]:

@@ -11,11 +11,7 @@ from splatseed.console import print_note, print_pairs
 from splatseed.lens import undistort_command, undistorted
 from splatseed.literal import quoted
 from splatseed.scene import Scene, SceneFormat
-from splatseed.seeding.advice import (
-    AS_IT_IS,
-    SEEDED,
-    Advice,
-)
+from splatseed.seeding.advice import AS_IT_IS, SEEDED, Advice
 from splatseed.seeding.diagnostics import is_distorted, untrainable
 from splatseed.train.schedule import FULL_RUN
 from splatseed.train.seeds import most_seeds
@@ -30,6 +26,8 @@ PINHOLE_ONLY = frozenset({"splatseed", "graphdeco", "OpenSplat", "LichtFeld"})
 """Trainers that do not deal with lens distortion themselves, as far as we know."""
 COMMON_LENSES = frozenset({"SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"})
 """The distortion that the others know."""
+
+Commands = list[tuple[str, str]]
 
 
 @dataclass(frozen=True)
@@ -49,11 +47,11 @@ class Planned:
     max_steps: int
     strategy: str
     most_seeds: int
-    flags: str = ""
-    tuning: str = ""
+    flags: str
+    tuning: str
 
     @classmethod
-    def of(cls, scene: Scene, budget: str | None, max_steps: int) -> Planned:
+    def of(cls, scene: Scene, budget: str | None = None, max_steps: int = FULL_RUN) -> Planned:
         """A scene's plan, from the options.
 
         Raises:
@@ -61,36 +59,24 @@ class Planned:
         """
         sizes = [image.intrinsics.width * image.intrinsics.height for image in scene.images]
         pixels = round(float(np.median(sizes))) if sizes else BUDGET
-        number = max(2, min(BUDGET, pixels))
+        number, flags, tuning = max(2, min(BUDGET, pixels)), "", ""
         if budget is not None:
             from splatseed.seeding.upsampling import points_within  # noqa: PLC0415  (loads Numba)
 
             number = max(2, points_within(scene, budget))
+            # A trial's photographs are smaller, and so is its number of Gaussians.
+            flags, tuning = f"--budget {number} ", f" --budget {number / pixels:.3g}rho"
+        if max_steps != FULL_RUN:
+            flags, tuning = f"{flags}--max-steps {max_steps} ", f"{tuning} --max-steps {max_steps}"
         settings = TrainSettings(strategy="auto", max_steps=max_steps, cap_max=number)
-        flags = "" if budget is None else f"--budget {number} "
-        flags += "" if max_steps == FULL_RUN else f"--max-steps {max_steps} "
-        # A trial's photographs are smaller, and so is its number of Gaussians.
-        tuning = "" if budget is None else f" --budget {number / pixels:.3g}rho"
-        tuning += "" if max_steps == FULL_RUN else f" --max-steps {max_steps}"
         most = most_seeds(settings, number)
         return cls(number, max_steps, settings.densification, most, flags, tuning)
 
 
-def advice_rows(advice: Advice, planned: Planned) -> list[tuple[str, str]]:
-    """The advice as a table's rows: what, why, and for which training."""
-    layout = [("cameras stand", stand)] if (stand := advice.measured.layout) else []
-    why = [("why" if i == 0 else "", reason) for i, reason in enumerate(advice.reasons)]
-    plan = (
-        f"{planned.budget:,} Gaussians at most, {planned.max_steps:,} steps, strategy "
-        f"{planned.strategy}"
-    )
-    return [*layout, ("planned", plan), ("advice", advice.sentence), *why]
-
-
 def advice_commands(
-    path: Path, scene: Scene, advice: Advice, planned: Planned, *, refine: bool = False
-) -> list[tuple[str, str]]:
-    """The commands that follow the advice, each of which works on this scene.
+    path: Path, scene: Scene, advice: Advice, planned: Planned, *, refine: bool
+) -> Commands:
+    """The commands that follow the advice for a scene.
 
     Args:
         path: Where the scene lies.
@@ -99,7 +85,8 @@ def advice_commands(
         planned: How it will be trained.
         refine: Whether its poses should be refined.
     """
-    trains, first = not untrainable(scene), []
+    trains = not untrainable(scene)
+    first: Commands = []
     if trains and is_distorted(scene):
         first, path = [("undistort", undistort_command(path))], undistorted(path)
     source = quoted(path)
@@ -116,47 +103,38 @@ def advice_commands(
         train = f"splatseed train OUT {training}"
     if not trains:
         return first or [("look", f"splatseed view {source}")]
-    tune = ("or ask by experiment", f"splatseed tune {source} --minutes 30{planned.tuning}")
-    tunes = advice.method in (AS_IT_IS, "auto") and len(scene.points)
-    return [*first, ("train", train), *([tune] if tunes else [])]
+    if advice.method in (AS_IT_IS, "auto") and len(scene.points):
+        tune = f"splatseed tune {source} --minutes 30{planned.tuning}"
+        return [*first, ("train", train), ("or ask by experiment", tune)]
+    return [*first, ("train", train)]
 
 
-def after_stereo(
-    path: Path, scene: Scene, maps: Path, confirmed: int, most: int
-) -> list[tuple[str, str]]:
-    """What to do with stereo's maps, which need no alignment.
+def after_depth(path: Path, scene: Scene, maps: Path, known: int, *, aligned: bool) -> Commands:
+    """What to do with depth maps that were made of a scene's photographs.
 
     Args:
         path: Where the scene lies.
         scene: The scene.
         maps: The folder of the maps.
-        confirmed: Number of pixels with a depth, of all maps.
-        most: Most seeds with which training can begin.
+        known: Number of pixels with a depth, of all maps.
+        aligned: Whether they are in the scene's unit, as stereo's are and a network's are not.
     """
+    looking, number = (
+        look(path, maps),
+        number_for(len(scene.points), known, Planned.of(scene).most_seeds),
+    )
     if is_distorted(scene):  # seeds are lifted along the rays of a pinhole camera
-        return [look(path, maps)]
-    number = number_for(len(scene.points), confirmed, most)
-    aligned = "" if len(scene.points) else "--depth.no-align "
-    return [look(path, maps), use(path, maps, aligned + number)]
-
-
-def after_network(
-    path: Path, scene: Scene, maps: Path, known: int, most: int
-) -> list[tuple[str, str]]:
-    """What to do with a network's maps, which must be aligned to points; arguments as above."""
-    if is_distorted(scene):
-        return [look(path, maps), ("for seeds, begin with", undistort_command(path))]
-    if len(scene.points):
-        return [look(path, maps), use(path, maps, number_for(len(scene.points), known, most))]
-    photographs = scene.source.image_dir if scene.source else None
-    images = "IMAGES" if photographs is None else quoted(photographs)
-    made = Path("SCENE")
-    points = f"splatseed sfm {images} --poses-from {quoted(path)} -o {made}"
-    return [look(path, maps), ("points to align to", points), use(made, maps, f"--ratio {RATIO}")]
+        begin = ("for seeds, begin with", undistort_command(path))
+        return [looking] if aligned else [looking, begin]
+    if len(scene.points) or aligned:
+        how = number if len(scene.points) else f"--depth.no-align {number}"
+        return [looking, ("use", use(path, maps, how))]
+    points = ("points to align to", triangulate_command(path, scene, "SCENE"))
+    return [looking, points, ("use", use(Path("SCENE"), maps, f"--ratio {RATIO}"))]
 
 
 def look(path: Path, maps: Path) -> tuple[str, str]:
-    """The command that shows the maps."""
+    """The command that shows depth maps."""
     info = f"splatseed info {quoted(path)} --depth {quoted(maps)} --picture depth.png"
     return "look", info
 
@@ -175,10 +153,17 @@ def number_for(points: int, known: int, most: int) -> str:
     return f"--ratio {RATIO}" if 0 < RATIO * points <= number else f"--num-points {number}"
 
 
-def use(path: Path, maps: Path, how: str) -> tuple[str, str]:
-    """The command that makes seeds of the maps."""
+def use(path: Path, maps: Path, how: str) -> str:
+    """The command that makes seeds of depth maps."""
     seeds = f"splatseed upsample {quoted(path)} --method depth --depth {quoted(maps)}"
-    return "use", f"{seeds} {how} -o OUT"
+    return f"{seeds} {how} -o OUT"
+
+
+def triangulate_command(path: Path, scene: Scene, output: str) -> str:
+    """The command that finds points for a scene's poses."""
+    photographs = scene.source.image_dir if scene.source else None
+    images = "IMAGES" if photographs is None else quoted(photographs)
+    return f"splatseed sfm {images} --poses-from {quoted(path)} -o {output}"
 
 
 def tell_training(read_from: Path, scene: Scene, output: Path, layout: SceneFormat) -> None:
@@ -195,28 +180,24 @@ def tell_training(read_from: Path, scene: Scene, output: Path, layout: SceneForm
     if missing := untrainable(scene):
         print_note(missing)
         return
-    if not is_distorted(scene):
-        print_pairs("train it with", training_commands(output, layout))
-        return
     lenses = {image.intrinsics.model for image in scene.images if image.intrinsics.has_distortion}
     known = lenses <= COMMON_LENSES
     if known:
-        print_pairs("train it with", training_commands(output, layout, distorted=True))
-    print_note(
-        f"{'The other trainers' if known else 'Trainers'} need photographs without lens "
-        f"distortion: begin with {undistort_command(read_from)}, and upsample that scene."
-    )
+        print_pairs("train it with", training_commands(output, layout, distorted=bool(lenses)))
+    if lenses:
+        print_note(
+            f"{'The other trainers' if known else 'Trainers'} need photographs without lens "
+            f"distortion: begin with {undistort_command(read_from)}, and upsample that scene."
+        )
 
 
-def training_commands(
-    path: Path, written_format: SceneFormat, *, distorted: bool = False
-) -> list[tuple[str, str]]:
+def training_commands(path: Path, layout: SceneFormat, *, distorted: bool = False) -> Commands:
     """(trainer, command) for every trainer that reads the scene at ``path`` unchanged.
 
     Args:
         path: The scene folder that was written.
-        written_format: "colmap" or "transforms": gsplat's examples and graphdeco's code read only
-            the former, and LichtFeld Studio is made for it.
+        layout: "colmap" or "transforms": gsplat's examples and graphdeco's code read only the
+            former, and LichtFeld Studio is made for it.
         distorted: Whether cameras have lens distortion, with which only some trainers deal.
 
     Example:
@@ -228,13 +209,13 @@ def training_commands(
     scene = quoted(full)
     result = [quoted(f"{full}-{name}") for name in ("gsplat", "graphdeco", "lichtfeld")]
     gsplat = f"--data_dir {scene} --data_factor 1 --result_dir {result[0]}"
-    colmap = written_format != "transforms"
-    layout = " colmap --colmap-path sparse/0 --downscale-factor 1" if colmap else ""
+    colmap = layout != "transforms"
+    folder = " colmap --colmap-path sparse/0 --downscale-factor 1" if colmap else ""
     commands = {
         "splatseed": f"splatseed train {quoted(path)} -o {quoted(f'{path}-run')}",
         "gsplat": f"python examples/simple_trainer.py default {gsplat}",
         "graphdeco": f"python train.py -s {scene} -m {result[1]} --eval",
-        "nerfstudio": f"ns-train splatfacto --data {scene}{layout}",
+        "nerfstudio": f"ns-train splatfacto --data {scene}{folder}",
         "Brush": f"brush {scene} --with-viewer",
         "OpenSplat": f"./opensplat {scene} -n 30000",
         "LichtFeld": f"./build/LichtFeld-Studio -d {scene} -o {result[2]}",

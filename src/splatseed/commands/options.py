@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, TypeVar
 
 import tyro
@@ -18,13 +18,7 @@ CONFIG = (tyro.conf.DisallowNone, tyro.conf.FlagCreatePairsOff)
 def parse_options(
     kind: type[Options], verb: str, arguments: Sequence[str], default: Options | None = None
 ) -> Options:
-    """The options in ``arguments``.
-
-    Args:
-        kind: The dataclass that holds them.
-        verb: The verb they belong to.
-        arguments: The words after the verb.
-        default: Values of options that are not given; the dataclass's own defaults if left out.
+    """The options in ``arguments``, the words after the verb; ``default`` gives the others.
 
     Raises:
         SystemExit: With code 2 after telling what is wrong with an option; 0 after the help.
@@ -36,34 +30,27 @@ def parse_options(
     return options
 
 
-def print_completion(verbs: Mapping[str, type[Any]], arguments: Sequence[str]) -> None:
-    """Print a shell's script that completes verbs and options.
+def refuse(*faults: tuple[object, str, object, str]) -> None:
+    """Refuse the first of several faults that there is.
 
     Args:
-        verbs: The options of each verb.
-        arguments: ``--tyro-print-completion SHELL``, or to write it, what else tyro takes.
+        faults: Of each, whether it is there; what was expected, what was found, and what to do.
+
+    Raises:
+        ParameterError: One is there.
     """
-    tyro.extras.subcommand_cli_from_dict(
-        dict(verbs), prog="splatseed", args=list(arguments), config=CONFIG
-    )
+    for there, expected, found, fix in faults:
+        if there:
+            raise ParameterError(expected, found=str(found), fix=fix)
 
 
 def check_least(options: object, least: float, *names: str) -> None:
-    """Refuse numbers that are too small; None, for an option that is not given, is none.
-
-    Args:
-        options: The parsed options.
-        least: The least value.
-        names: The fields to check.
+    """Refuse fields of parsed options below ``least``; None, for one not given, is none.
 
     Raises:
         ParameterError: One is smaller, or no number.
     """
     for name in names:
-        value = getattr(options, name)
-        if value is not None and not value >= least:
-            raise ParameterError(
-                f"--{name.replace('_', '-')} of {least:g} or more",
-                found=f"{value}",
-                fix="Leave it out for the default.",
-            )
+        value, option = getattr(options, name), f"--{name.replace('_', '-')}"
+        wrong = value is not None and not value >= least
+        refuse((wrong, f"{option} of {least:g} or more", value, "Leave it out for the default."))

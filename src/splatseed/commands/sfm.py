@@ -12,21 +12,14 @@ from typing import Annotated, Any
 
 import tyro
 
-from splatseed.commands.options import parse_options
-from splatseed.console import (
-    ERR,
-    StageClock,
-    print_note,
-    print_pairs,
-    stage_display,
-)
-from splatseed.errors import ParameterError
+from splatseed.commands.options import parse_options, refuse
+from splatseed.console import ERR, StageClock, print_note, print_pairs, stage_display
 from splatseed.io import load_scene
 from splatseed.io.files import is_video
 from splatseed.io.staging import check_output
 from splatseed.literal import counted, quoted, visible
 from splatseed.runtime.torch_device import DeviceName
-from splatseed.sfm import MatcherName, Refinement, Settings, SfmReport, reconstruct
+from splatseed.sfm import MatcherName, Settings, SfmReport, reconstruct
 from splatseed.sfm.photos import name_some, pick_frames
 
 
@@ -64,51 +57,28 @@ class Options:
 def run(arguments: list[str]) -> None:
     """Run the verb with these arguments."""
     options = parse_options(Options, "sfm", arguments)
-    video = is_video(options.images)
-    _check(options, video=video)
-    with stage_display(remaining=True) as clock:
-        clock("prepare", 0.0)
-        make = _from_video if video else _from_photographs
-        report = make(options, options.images, clock)
-    _summarise(options, report)
-
-
-def _check(options: Options, *, video: bool) -> None:
-    """Refuse options that would have no effect.
-
-    Raises:
-        ParameterError: There is one.
-    """
-    known, poses = options.poses_from is not None, "the folder of photographs with poses"
+    video, known = is_video(options.images), options.poses_from is not None
+    poses = "the folder of photographs with poses"
     lens = [
         f"--{name.replace('_', '-')}"
         for name in ("camera_model", "shared_camera")
         if getattr(options, name) != getattr(Options, name)
     ]
-    for wrong, expected, found, fix in (
-        (options.frames < 1, "--frames of 1 or more", f"{options.frames}", "Try 150."),
-        (
-            options.frames != Options.frames and not video,
-            "a video with --frames",
-            f"the folder {visible(options.images)}",
-            "Leave --frames out.",
-        ),
-        (
-            options.refine_poses and not known,
-            "--poses-from with --refine-poses",
-            "none",
-            "Name a scene with the poses, or leave --refine-poses out to have all poses found.",
-        ),
-        (
-            known and bool(lens),
-            "the lens from --poses-from, without options of its own",
-            ", ".join(lens),
-            "Leave them out.",
-        ),
+    refuse(
+        (options.frames < 1, "--frames of 1 or more", options.frames, "Try 150."),
+        (options.frames != Options.frames and not video, "a video with --frames",
+         f"the folder {visible(options.images)}", "Leave --frames out."),
+        (options.refine_poses and not known, "--poses-from with --refine-poses", "none",
+         "Name a scene with the poses, or leave --refine-poses out to have all poses found."),
+        (known and lens, "the lens from --poses-from, without options of its own",
+         ", ".join(lens), "Leave them out."),
         (known and video, f"{poses} with --poses-from", "a video", f"Name {poses}."),
-    ):
-        if wrong:
-            raise ParameterError(expected, found=found, fix=fix)
+    )  # fmt: skip
+    with stage_display(remaining=True) as clock:
+        clock("prepare", 0.0)
+        make = _from_video if video else _from_photographs
+        report = make(options, options.images, clock)
+    _summarise(options, report)
 
 
 def _from_video(options: Options, video: Path, clock: StageClock) -> SfmReport:
@@ -163,33 +133,27 @@ def _tell_photographs(
 
 
 def _summarise(options: Options, report: SfmReport) -> None:
-    seconds = ", ".join(f"{stage} {time:.1f}" for stage, time in report.seconds.items())
     rows = [
         ("images with a pose", f"{report.registered} of {report.total}"),
         ("points", f"{report.num_points:,}"),
         ("track length", f"mean {report.mean_track_length:.2f} images"),
         ("reprojection error", f"mean {report.mean_reprojection_error:.3f} px"),
-        *_rows_of(report.refinement),
-        ("seconds", seconds),
+    ]
+    if (change := report.refinement) is not None:
+        before, after = f"{change.error_before:.3f} px", f"{change.error_after:.3f} px"
+        shift, turn = f"median {change.median_shift:.3g}", f"median {change.median_turn:.2f}"
+        kept = f"kept as given, at {before}: refined, they gain less than 0.1 px"
+        changed = [
+            ("at the given poses", f"mean {before}, refined {after}"),
+            ("cameras moved", f"{shift} units, largest {change.largest_shift:.3g}"),
+            ("cameras turned", f"{turn} degrees, largest {change.largest_turn:.2f}"),
+        ]
+        rows += [("poses", kept)] if change.kept else changed
+    rows += [
+        ("seconds", ", ".join(f"{stage} {time:.1f}" for stage, time in report.seconds.items())),
         ("output", str(report.path)),
     ]
     print_pairs("splatseed sfm", rows)
     if report.unregistered:
         print_note(f"without a pose: {name_some(report.unregistered)}")
-    command = f"splatseed upsample {quoted(options.output)} -o OUT --preview"
-    print_pairs("next", [("", command)])
-
-
-def _rows_of(change: Refinement | None) -> list[tuple[str, str]]:
-    """Rows on the poses, if they were to be refined."""
-    if change is None:
-        return []
-    before, after = f"{change.error_before:.3f} px", f"{change.error_after:.3f} px"
-    if change.kept:
-        return [("poses", f"kept as given, at {before}: refined, they gain less than 0.1 px")]
-    shift, turn = change.median_shift, change.median_turn
-    return [
-        ("at the given poses", f"mean {before}, refined {after}"),
-        ("cameras moved", f"median {shift:.3g} units, largest {change.largest_shift:.3g}"),
-        ("cameras turned", f"median {turn:.2f} degrees, largest {change.largest_turn:.2f}"),
-    ]
+    print_pairs("next", [("", f"splatseed upsample {quoted(options.output)} -o OUT --preview")])

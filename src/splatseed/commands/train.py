@@ -9,43 +9,22 @@ import tomllib
 from argparse import ArgumentParser
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, is_dataclass, replace
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import (
-    TYPE_CHECKING,
-    Annotated,
-    Any,
-    Literal,
-    TypeVar,
-    get_args,
-    get_origin,
-    get_type_hints,
-)
+from typing import TYPE_CHECKING, Annotated, Any, get_args, get_type_hints
 
 import tyro
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress as Bar,
-    ProgressColumn,
-    TextColumn,
-    TimeRemainingColumn,
-)
+from rich import progress as rich_progress
 from rich.table import Column
 
-from splatseed.commands.options import parse_options
-from splatseed.console import (
-    ERR,
-    OUT,
-    StageClock,
-    print_note,
-    print_pairs,
-    stage_display,
-)
+from splatseed.commands.options import parse_options, refuse
+from splatseed.console import ERR, OUT, print_note, print_pairs, stage_display
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.io import load_scene
 from splatseed.io.files import read_text
 from splatseed.literal import did_you_mean, quoted, visible
+from splatseed.progress import Progress
 from splatseed.requirements import require
 from splatseed.runtime.interruption import exit_code
 from splatseed.scene import Scene
@@ -62,13 +41,12 @@ from splatseed.train.settings import (
     StrategyName,
     TrainSettings,
 )
+from splatseed.upsample.method import fits
 from splatseed.views.view import poses_of, user_cache_dir
 
 if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
     from splatseed.train.run import TrainingRun
     from splatseed.view.server import TrainingViewer
-
-Settings = TypeVar("Settings")
 
 BAR_WIDTH = 12
 DEFAULT = TrainSettings()
@@ -135,21 +113,42 @@ def parse(arguments: list[str]) -> Options:
     parser = ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--config", type=Path)
     path = parser.parse_known_args(arguments)[0].config
-    default = None
-    if path is not None:
-        given = _read_config(path)
-        default = _filled(Options(scene=tyro.MISSING, output=tyro.MISSING), given, path)
-        for unknown in given:
+    return parse_options(Options, "train", arguments, None if path is None else _in_file(path))
+
+
+def _in_file(path: Path) -> Options:
+    """The options in a .toml or in a run's config.json."""
+    kinds = {"training": TrainSettings, "reading": Reading, "": Options}
+    fields = {
+        name: (group, hint)
+        for group, kind in kinds.items()
+        for name, hint in get_type_hints(kind).items()
+        if name not in kinds
+    }
+    given: dict[str, dict[str, Any]] = {group: {} for group in kinds}
+    for name, value in _read_config(path).items():
+        if name not in fields:
             raise SceneFormatError(
                 f"options of splatseed train in {path}",
-                found=repr(unknown),
-                fix=f"{did_you_mean(unknown, _names(Options))}Run splatseed train --help.",
+                found=repr(name),
+                fix=f"{did_you_mean(name, fields)}Run splatseed train --help.",
             )
-    return parse_options(Options, "train", arguments, default)
+        group, hint = fields[name]
+        named = Path in (hint, *get_args(hint)) and isinstance(value, str)
+        given[group][name] = Path(value) if named else value
+        if not fits(given[group][name], hint):
+            raise SceneFormatError(
+                f"a value for {name} in {path} that the option takes",
+                found=repr(value)[:80],
+                fix="Run splatseed train --help.",
+            )
+    paths: dict[str, Any] = {"scene": tyro.MISSING, "output": tyro.MISSING}
+    training, reading = replace(BEST_SETTINGS, **given["training"]), Reading(**given["reading"])
+    return Options(**{**paths, **given[""]}, training=training, reading=reading)
 
 
 def _read_config(path: Path) -> dict[str, Any]:
-    """The options in a .toml or in a run's config.json, without what a run notes besides."""
+    """What a file says, without what a run notes besides its options."""
     try:
         text = read_text(path)
         content = json.loads(text) if path.suffix.lower() == ".json" else tomllib.loads(text)
@@ -168,51 +167,19 @@ def _read_config(path: Path) -> dict[str, Any]:
     return {k: v for k, v in content.items() if k not in RUN_NOTES and v is not None}
 
 
-def _filled(options: Settings, given: dict[str, Any], path: Path) -> Settings:
-    """A dataclass with the values given for its fields and for theirs, which are taken out."""
-    changes: dict[str, Any] = {}
-    for name, hint in get_type_hints(type(options)).items():
-        if is_dataclass(hint):
-            changes[name] = _filled(getattr(options, name), given, path)
-        elif name in given:
-            changes[name] = _checked(name, given.pop(name), hint, path)
-    return replace(options, **changes)  # type: ignore[type-var]  # it is a dataclass
-
-
-def _names(kind: type[Any]) -> list[str]:
-    """The fields of a dataclass and of those among them that are dataclasses."""
-    hints = get_type_hints(kind)
-    inner = [each for each in hints.values() if isinstance(each, type) and is_dataclass(each)]
-    return [*hints, *(name for each in inner for name in _names(each))]
-
-
-def _checked(name: str, value: object, hint: Any, path: Path) -> Any:
-    """A value, if it is of a kind that the type hint names."""
-    for kind in [hint] if get_origin(hint) is Literal else get_args(hint) or [hint]:
-        if kind is Path and isinstance(value, str):
-            return Path(value)
-        if value in get_args(kind) if get_origin(kind) is Literal else type(value) is kind:
-            return value
-    raise SceneFormatError(
-        f"a value for {name} in {path} that the option takes",
-        found=repr(value)[:80],
-        fix="Run splatseed train --help.",
-    )
-
-
 def run(arguments: list[str]) -> None:
     """Run the verb with these arguments."""
     options = parse(arguments)
     settings = options.settings
-    require("torch", "gsplat")
-    if options.view:
-        require("viser")
+    require("torch", "gsplat", *(["viser"] if options.view else []))
     notes: list[str] = []
     if options.resume and not RunFolder(options.output).is_run:
         notes.append(f"There is no run to resume in {options.output}: a new one begins.")
     with stage_display() as clock:
         training = _prepare(options, settings, notes.append, clock)
-    _announce(options, training, notes)
+    for note in notes:
+        print_note(note)
+    _announce(options, training)
     with _watched(options, training) as viewer, _training_bar(training) as show:
 
         def on_step(step: int) -> None:
@@ -222,15 +189,19 @@ def run(arguments: list[str]) -> None:
 
         done = training.train(on_step)
     if not done and not (viewer and viewer.kept):
-        _say_how_to_go_on(options, training)
+        again = f"{quoted(options.scene)} -o {quoted(options.output)} --resume"
+        saved = f"interrupted after step {training.state.step:,}; saved. Continue with:"
+        ERR.print(f"\n{saved}\n  splatseed train {again}", soft_wrap=True)
         sys.exit(exit_code())
+    from splatseed.splat.evaluate import evaluate_views  # noqa: PLC0415  (imports PyTorch)
+
     with stage_display(clock):
-        result = _finish(training, clock)
+        result = training.finish(partial(evaluate_views, progress=clock), clock)
     _summarise(options, result)
 
 
 def _prepare(
-    options: Options, settings: TrainSettings, note: Callable[[str], None], clock: StageClock
+    options: Options, settings: TrainSettings, note: Callable[[str], None], clock: Progress
 ) -> TrainingRun:
     from splatseed.train.run import RunOptions, prepare_run  # noqa: PLC0415  (imports PyTorch)
 
@@ -256,16 +227,15 @@ def _prepare(
 
 def _sized(options: Options, settings: TrainSettings, scene: Scene) -> TrainSettings:
     """The settings, with the factor that --long-side amounts to in this scene."""
-    if options.long_side is None:
+    side = options.long_side
+    if side is None:
         return settings
-    if settings.data_factor != 1:
-        raise ParameterError("--long-side or --data-factor", found="both", fix="Leave one out.")
-    if options.long_side < 1:
-        raise ParameterError(
-            "--long-side of 1 or more", found=f"{options.long_side}", fix="Try 800."
-        )
-    sizes = [max(im.intrinsics.width, im.intrinsics.height) for im in scene.images]
-    return replace(settings, data_factor=max(1, -(-max(sizes, default=1) // options.long_side)))
+    refuse(
+        (settings.data_factor != 1, "--long-side or --data-factor", "both", "Leave one out."),
+        (side < 1, "--long-side of 1 or more", side, "Try 800."),
+    )
+    sizes = [max(image.intrinsics.width, image.intrinsics.height) for image in scene.images]
+    return replace(settings, data_factor=max(1, -(-max(sizes, default=1) // side)))
 
 
 def _within_budget(
@@ -279,42 +249,32 @@ def _within_budget(
 
     views = poses_of(scene.images, settings.data_factor)
     pixels = median_pixels(views) if views else 0
-    if options.budget is not None:
-        cap = parse_budget(options.budget, pixels)
-        if cap < LEAST_GAUSSIANS:
-            raise ParameterError(
-                f"--budget of {LEAST_GAUSSIANS} Gaussians or more",
-                found=f"{options.budget}",
-                fix="Try 0.25rho.",
-            )
+    if options.budget is None:
+        cap = max(2, min(BUDGET, round(pixels)))
+        each = "one for each pixel of a photograph; --budget sets another"
+        note(f"At most {cap:,} Gaussians, {each}.")
         return replace(settings, cap_max=cap)
-    cap = max(2, min(BUDGET, round(pixels)))
-    note(f"At most {cap:,} Gaussians, one for each pixel of a photograph; --budget sets another.")
+    cap = parse_budget(options.budget, pixels)
+    least = f"--budget of {LEAST_GAUSSIANS} Gaussians or more"
+    refuse((cap < LEAST_GAUSSIANS, least, options.budget, "Try 0.25rho."))
     return replace(settings, cap_max=cap)
 
 
-def _announce(options: Options, training: TrainingRun, notes: list[str]) -> None:
+def _announce(options: Options, training: TrainingRun) -> None:
     """Print what will be done."""
-    for note in notes:
-        print_note(note)
     settings, views = training.settings, training.trainer.train_views
     for name in settings.idle:
         print_note(f"{name} has no effect with strategy {settings.densification}.")
+    chosen = settings.strategy == BEST
+    strategy = f"{settings.densification} ({BEST})" if chosen else settings.strategy
     OUT.print(
         f"{visible(options.scene)} ({len(views)} training and {len(training.trainer.test_views)} "
         f"test views of {views[0].width} x {views[0].height}, "
-        f"{len(training.state.params['means']):,} Gaussians)\n  -> {_strategy(settings)}, "
+        f"{len(training.state.params['means']):,} Gaussians)\n  -> strategy {strategy}, "
         f"{settings.max_steps:,} steps, seed {settings.seed}, on {training.device}\n  -> "
         f"{visible(options.output)}",
         soft_wrap=True,
     )
-
-
-def _strategy(settings: TrainSettings) -> str:
-    """The strategy's name, and what ``auto`` chose."""
-    if settings.strategy == BEST:
-        return f"strategy {settings.densification} ({BEST})"
-    return f"strategy {settings.strategy}"
 
 
 @contextmanager
@@ -347,7 +307,8 @@ def _training_bar(training: TrainingRun) -> Iterator[Callable[[int], None]]:
     if not ERR.is_terminal:
         yield lambda _: None
         return
-    with Bar(*bar_columns(), console=ERR, transient=True, expand=True) as bar:
+    columns = bar_columns()
+    with rich_progress.Progress(*columns, console=ERR, transient=True, expand=True) as bar:
         first, total = training.state.step, training.settings.max_steps
         task = bar.add_task("", total=total, completed=first)
 
@@ -357,18 +318,15 @@ def _training_bar(training: TrainingRun) -> Iterator[Callable[[int], None]]:
         yield show
 
 
-def bar_columns() -> tuple[ProgressColumn, ...]:
+def bar_columns() -> tuple[rich_progress.ProgressColumn, ...]:
     """Steps and remaining time in full; the rest of the line is cut off where it ends."""
-
-    def whole() -> Column:
-        return Column(no_wrap=True, overflow="ignore")
-
+    whole = Column(no_wrap=True, overflow="ignore")
     rest = Column(ratio=1, no_wrap=True, overflow="ellipsis")
     return (
-        BarColumn(BAR_WIDTH, table_column=whole()),
-        MofNCompleteColumn(table_column=whole()),
-        TimeRemainingColumn(table_column=whole()),
-        TextColumn("{task.description}", markup=False, table_column=rest),
+        rich_progress.BarColumn(BAR_WIDTH, table_column=whole),
+        rich_progress.MofNCompleteColumn(table_column=whole),
+        rich_progress.TimeRemainingColumn(table_column=whole),
+        rich_progress.TextColumn("{task.description}", markup=False, table_column=rest),
     )
 
 
@@ -387,51 +345,30 @@ def _line(training: TrainingRun, steps_per_second: float | None) -> str:
     )
 
 
-def _finish(training: TrainingRun, clock: StageClock) -> TrainingResult:
-    from splatseed.splat.evaluate import evaluate_views  # noqa: PLC0415  (imports PyTorch)
-
-    return training.finish(
-        lambda render, views: evaluate_views(render, views, progress=clock), clock
-    )
-
-
-def _say_how_to_go_on(options: Options, training: TrainingRun) -> None:
-    scene, output = quoted(options.scene), quoted(options.output)
-    ERR.print(
-        f"\ninterrupted after step {training.state.step:,}; saved. Continue with:\n"
-        f"  splatseed train {scene} -o {output} --resume",
-        soft_wrap=True,
-    )
-
-
 def _summarise(options: Options, result: TrainingResult) -> None:
     """Print the final table and the commands to run next."""
-    scores, seconds = result.scores, result.train_seconds
+    scores, seconds, output = result.scores, result.train_seconds, options.output
     psnr = f"{scores.psnr:.2f} dB" if math.isfinite(scores.psnr) else "infinite"
-    print_pairs(
-        "splatseed train",
-        [
-            ("test PSNR", psnr),
-            ("test SSIM", f"{scores.ssim:.4f}"),
-            ("Gaussians", f"{scores.num_gaussians:,} from {result.num_seeds:,} seeds"),
-            ("training", f"{seconds:.1f} s, {1e3 * seconds / result.steps:.1f} ms per step"),
-            ("Gaussians in", str(options.output / "point_cloud.ply")),
-            ("pictures", f"{options.output / 'renders'}, {options.output / 'curve.png'}"),
-        ],
-    )
+    rows = [
+        ("test PSNR", psnr),
+        ("test SSIM", f"{scores.ssim:.4f}"),
+        ("Gaussians", f"{scores.num_gaussians:,} from {result.num_seeds:,} seeds"),
+        ("training", f"{seconds:.1f} s, {1e3 * seconds / result.steps:.1f} ms per step"),
+        ("Gaussians in", str(output / "point_cloud.ply")),
+        ("pictures", f"{output / 'renders'}, {output / 'curve.png'}"),
+    ]
+    print_pairs("splatseed train", rows)
     if held := result.held_by_memory_at:
         print_note(
             f"memory held the run at {held:,} Gaussians; results may differ on another machine. "
             f"Pass --budget {held} for the same result everywhere."
         )
-    print_pairs("next", _next_commands(options.output))
+    print_pairs("next", _next_commands(output))
 
 
 def _next_commands(output: Path) -> list[tuple[str, str]]:
     """What to do with a finished run; LPIPS only where its weights are."""
     from splatseed.splat.metrics import lpips_is_here  # noqa: PLC0415  (imports PyTorch)
 
-    commands = [("look at it", f"splatseed view {quoted(output)}")]
-    if lpips_is_here():
-        commands.append(("score again, with LPIPS", f"splatseed evaluate {quoted(output)}"))
-    return commands
+    score = ("score again, with LPIPS", f"splatseed evaluate {quoted(output)}")
+    return [("look at it", f"splatseed view {quoted(output)}"), *[score] * lpips_is_here()]

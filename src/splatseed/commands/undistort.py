@@ -34,27 +34,17 @@ class Options:
 def run(arguments: list[str]) -> None:
     """Run the verb with these arguments."""
     options = parse_options(Options, "undistort", arguments)
-    check_output(
-        options.output, kind="undistort", overwrite=options.overwrite, protect=[options.scene]
-    )
+    output, overwrite = options.output, options.overwrite
+    check_output(output, kind="undistort", overwrite=overwrite, protect=[options.scene])
     with stage_display() as clock:
         clock("read", 0.0)
         scene = load_scene(options.scene, require_points=False)
-        undistorted = undistort(
-            scene,
-            options.output,
-            overwrite=options.overwrite,
-            on_progress=clock,
-        )
-    rows = [
-        ("images", f"{undistorted.registered:,}"),
-        ("points", f"{undistorted.num_points:,}"),
-        ("output", str(options.output)),
-    ]
-    print_pairs("splatseed undistort", rows)
+        report = undistort(scene, output, overwrite=overwrite, on_progress=clock)
+    counts = [("images", f"{report.registered:,}"), ("points", f"{report.num_points:,}")]
+    print_pairs("splatseed undistort", [*counts, ("output", str(output))])
     for warning in warnings_but_lens(scene):
         print_note(warning)
     if not is_distorted(scene):
         print_note("No camera had distortion: the photographs are copies.")
     verb, made = ("train", "RUN") if was_upsampled(scene) else ("upsample", "OUT")
-    print_pairs("next", [("", f"splatseed {verb} {quoted(options.output)} -o {made}")])
+    print_pairs("next", [("", f"splatseed {verb} {quoted(output)} -o {made}")])

@@ -86,8 +86,7 @@ def _opened(options: Options) -> tuple[list[Shown], int | None]:
 
     paths = _within(options.what)
     beside = None if options.compare is None else len(paths)
-    if options.compare is not None:
-        paths += _within(options.compare)
+    paths += [] if options.compare is None else _within(options.compare)
     names = [path.name for path in paths]
     opened = []
     for path in paths:
@@ -120,25 +119,19 @@ def _is_shown(path: Path) -> bool:
 def _announce(options: Options, port: int, opened: list[Shown], beside: int | None) -> None:
     """Say where to look; flushed, because whoever started us may be waiting for it."""
     host = "localhost" if options.host in LOCAL | {"0.0.0.0"} else options.host  # noqa: S104  (compared, not bound)
-    url = f"http://{host}:{port}"
-    rows = [(shown.name, _contents(shown)) for shown in opened]
+    rows = []
+    for shown in opened:
+        parts = [] if shown.gaussians is None else [counted(len(shown.gaussians), "Gaussian")]
+        if shown.scene is not None:
+            parts.append(counted(len(shown.scene.points), "point"))
+            parts.append(counted(len(shown.scene.images), "image"))
+        rows.append((shown.name, ", ".join(parts)))
     if beside is not None:
         rows.append(("side by side", f"{opened[0].name} left, {opened[beside].name} right"))
     print_pairs("splatseed view", rows)
-    commands = [("open in a browser", url)]
+    commands = [("open in a browser", f"http://{host}:{port}")]
     if options.host in LOCAL:
-        commands.append(
-            ("from elsewhere, first", f"ssh -L {port}:localhost:{port} {socket.gethostname()}")
-        )
+        tunnel = f"ssh -L {port}:localhost:{port} {socket.gethostname()}"
+        commands.append(("from elsewhere, first", tunnel))
     print_pairs("next", [*commands, ("stop", "Ctrl-C")])
     OUT.file.flush()
-
-
-def _contents(shown: Shown) -> str:
-    parts = []
-    if shown.gaussians is not None:
-        parts.append(counted(len(shown.gaussians), "Gaussian"))
-    if shown.scene is not None:
-        parts += [counted(len(shown.scene.points), "point")]
-        parts += [counted(len(shown.scene.images), "image")]
-    return ", ".join(parts)

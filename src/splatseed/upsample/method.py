@@ -112,17 +112,17 @@ def check_fields(method: Any) -> None:
     label = getattr(method, "name", type(method).__name__.lower())
     for field in dataclasses.fields(method):
         value, hint = getattr(method, field.name), hints[field.name]
-        require(_fits(value, hint), f"{label}.{field.name} as {_describe(hint)}", value)
+        require(fits(value, hint), f"{label}.{field.name} as {_describe(hint)}", value)
     held = getattr(method, "hold_out", 0)
     require(held == 0 or held >= 2, f"{label}.hold_out of 0 or 2 and more", held)
 
 
-def _fits(value: object, hint: Any) -> bool:
+def fits(value: object, hint: Any) -> bool:
     """Whether a value has a type: a plain one, a choice of literals, or a union of these."""
     if get_origin(hint) is Literal:
         return isinstance(value, str) and value in get_args(hint)
     if get_origin(hint) in {Union, types.UnionType}:
-        return any(_fits(value, choice) for choice in get_args(hint))
+        return any(fits(value, choice) for choice in get_args(hint))
     if isinstance(value, (bool, np.bool_)):
         return hint is bool
     if hint is float:

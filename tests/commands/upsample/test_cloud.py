@@ -142,17 +142,17 @@ def test_what_is_wrong_with_a_scan_is_one_line(splatseed, room, xyz, tmp_path, k
     assert not list(tmp_path.glob("out*"))
 
 
-def test_the_files_of_an_alignment_are_listed(splatseed, room, tmp_path, monkeypatch):
+def test_the_files_of_an_alignment_are_listed(splatseed, room, scan, tmp_path, monkeypatch):
     found = SimpleNamespace(
         report={}, residuals=np.zeros(1), extent=1.0, sample=None, rgb=None, marks=None, sentence=""
     )
     monkeypatch.setattr(
-        "splatseed.commands.upsample.command.load_clouds",
-        lambda *given: LoadedCloud(given[1], given[2], found),
+        "splatseed.commands.upsample.command.load_cloud",
+        lambda _, scene, method, __: LoadedCloud(scene, method.of(scan), alignment=found),
     )
     monkeypatch.setattr("splatseed.view.clouds.preview_alignment", lambda *given: given[-1].touch())
     out = tmp_path / "out"
-    run = splatseed("upsample", room, "--method", "linear", "--ratio", 1.1, "-o", out)
+    run = splatseed("upsample", room, "--cloud", scan, "-o", out)
     assert run.code == 0, run.err
     for name in ("alignment.json", "preview_alignment.png"):
         assert (out / name).is_file()

@@ -83,10 +83,10 @@ def test_the_default_looks_at_the_photographs(room, tmp_path, splatseed):
 def test_the_plan_has_the_number_and_what_was_changed(
     words, said, room, tmp_path, splatseed, monkeypatch
 ):
-    def leave(*_):
+    def leave(*_, **__):
         raise SystemExit(0)
 
-    monkeypatch.setattr("splatseed.commands.upsample.command._make", leave)  # only the plan
+    monkeypatch.setattr("splatseed.commands.upsample.command.upsample", leave)  # only the plan
     run = splatseed("upsample", room, "-o", tmp_path / "out", *words)
     assert said in " ".join(run.out.split())
     assert "as the photographs need" not in run.out

@@ -4,66 +4,46 @@ from __future__ import annotations
 
 import dataclasses
 from argparse import ArgumentParser
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, cast, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import tyro
 
-from splatseed.commands.options import check_least, parse_options
-from splatseed.commands.upsample.cloud import CLOUD, CloudOptions, load_clouds, with_cloud_defaults
-from splatseed.commands.upsample.output import (
-    PICTURES,
-    check_start,
-    found_how,
-    method_words,
-    number_words,
-    parameters_of,
-    summarise,
-    write_previews,
-    write_start,
-)
+from splatseed.commands.options import check_least, parse_options, refuse
+from splatseed.commands.upsample import output
+from splatseed.commands.upsample.cloud import load_cloud
 from splatseed.commands.upsample.tiled import Tiling, find_source, run_tiled
-from splatseed.console import (
-    OUT,
-    StageClock,
-    print_note,
-    stage_display,
-)
+from splatseed.console import OUT, print_note, stage_display
 from splatseed.depthmap import DepthKind
-from splatseed.errors import ParameterError
-from splatseed.io import WriteReport, find_depths, load_originals, write_scene
+from splatseed.io import find_depths, load_originals, write_scene
 from splatseed.io.clouds import open_cloud
 from splatseed.io.depth_search import with_own_depths
-from splatseed.io.staging import check_output
+from splatseed.io.staging import check_output, check_parents
 from splatseed.literal import counted, quoted, visible
-from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.runtime.memory import bytes_of
 from splatseed.scene import Scene
+from splatseed.seeding import photographs
 from splatseed.seeding.advice import DEFAULT_METHOD, method_for
-from splatseed.seeding.diagnostics import far_share
-from splatseed.seeding.photographs import photographed
-from splatseed.seeding.upsampling import points_within, share_covered, upsample
+from splatseed.seeding.upsampling import points_within, upsample
 from splatseed.upsample import (
     METHODS,
     Profile,
     Upsampler,
-    chooses_number,
     configure,
     number_of_new,
     planned_size,
     traits_of,
 )
 
-if TYPE_CHECKING:
-    from splatseed.seeding.clouds.method import Cloud, GivenClouds
-
-
 FILES = (".ply", ".las", ".laz", ".e57", ".pcd", ".xyz", ".pts", ".npz", ".bin", ".txt")
 """Suffixes by which somebody means a file of points."""
 COVERING = ("auto", "cover")
 """Methods that leave no gaps for --cover."""
+CLOUD = "cloud"
+WITH_CLOUD = (CLOUD, "auto", "stereo", "cover", "depth")
+"""Methods that --cloud can be combined with."""
 
 
 @dataclass(frozen=True)
@@ -150,33 +130,23 @@ class Options:
         """The options about memory and who works."""
         return Tiling(self.memory_bytes, self.jobs, self.executor, self.address, self.tile_points)
 
-    @property
-    def cloud_options(self) -> CloudOptions:
-        """The options about clouds."""
-        return CloudOptions(
-            self.cloud_files, self.cloud_transform, self.align, self.recenter, self.memory_bytes
-        )
-
 
 def parse(arguments: list[str]) -> tuple[Options, dict[str, Upsampler]]:
     """The options, and every method with its parameters, from the words of the command line."""
-    profile = _profile_of(arguments)
+    parser = ArgumentParser(add_help=False, allow_abbrev=False)
+    for option in ("--profile", "--method"):
+        parser.add_argument(option)
+    named = parser.parse_known_args(arguments)[0]
+    # The profile sets the defaults of the methods' options, so it is parsed before them.
+    profile: Profile = named.profile if named.profile in get_args(Profile) else "default"
     names: Collection[str] = METHODS
     if {"-h", "--help"} & set(arguments):  # all methods' options would be too much to read
-        names = [name for name in METHODS if {name, f"--method={name}"} & set(arguments)]
+        names = {named.method} & set(METHODS)
     methods = {name: configure(name, profile) for name in names}
     options: Any = parse_options(_with_methods(methods), "upsample", arguments)
-    return with_cloud_defaults(options, arguments), {
-        name: getattr(options, name) for name in METHODS
-    }
-
-
-def _profile_of(arguments: Sequence[str]) -> Profile:
-    """The profile, which sets the defaults of the methods' options; parsed before all others."""
-    parser = ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument("--profile")
-    named = parser.parse_known_args(arguments)[0].profile
-    return named if named in get_args(Profile) else "default"
+    if options.cloud_files and named.method is None:
+        options = replace(options, method=CLOUD)
+    return options, {name: getattr(options, name) for name in METHODS}
 
 
 def full_options() -> type[Options]:
@@ -202,222 +172,179 @@ def _with_methods(methods: Mapping[str, Upsampler]) -> type[Options]:
 def run(arguments: list[str]) -> None:
     """Run the verb with these arguments."""
     options, methods = parse(arguments)
-    _check_options(options)
+    _check(options)
     planned_size(1, options.ratio, None if options.ratio is None else options.num_points)
-    given = (options.scene, options.depth_maps, options.cloud_transform, *options.cloud_files)
-    inputs = [path for path in given if path is not None]
-    check_output(options.output, kind="upsample", overwrite=options.overwrite, protect=inputs)
+    inputs = (options.scene, options.depth_maps, options.cloud_transform, *options.cloud_files)
+    protect = [path for path in inputs if path is not None]
+    check_output(options.output, kind="upsample", overwrite=options.overwrite, protect=protect)
     if options.gaussians is not None:
-        check_start(options.gaussians, options.output, overwrite=options.overwrite)
+        check_parents(options.gaussians)
     for file in options.cloud_files:
         open_cloud(file)  # reads headers only: what is wrong is told before work begins
     source = find_source(options, methods)
     if source is not None:
         run_tiled(options, methods, source, _provenance)
-        return
-    _run_in_memory(options, methods)
+    else:
+        _run_in_memory(options, methods)
 
 
-def _check_options(options: Options) -> None:
-    """Refuse options out of their range, and those that another makes pointless.
-
-    Raises:
-        ParameterError: There is such an option.
-    """
+def _check(options: Options) -> None:
+    """Refuse options out of their range, and those that another makes pointless."""
     check_least(options, 1, "num_points", "jobs", "tile_points")
     check_least(options, 0, "seed")
-    if options.output.suffix.lower() in FILES and not options.output.is_dir():
-        raise ParameterError(
-            "a folder after -o, as a whole scene is written",
-            found=f"{options.output}, the name of a file",
-            fix=f"Pass -o {quoted(options.output.with_suffix(''))}: the points lie there as a .ply "
-            "too.",
-        )
-    if options.address is not None and options.executor != "ray":
-        raise ParameterError("--executor ray with --address", found="local", fix="Add it.")
-    if options.cover_cell is None:
-        return
-    if options.cover_cell < 1:
-        found = f"{options.cover_cell}"
-        raise ParameterError("--cover of 1 or more", found=found, fix="Try --cover 8.")
-    if options.method in COVERING:
-        raise ParameterError(
-            f"--{options.method}.cell for method {options.method}, which covers by itself",
-            found=f"--cover {options.cover_cell}",
-            fix=f"Say --{options.method}.cell {options.cover_cell} instead.",
-        )
+    method, cell, folder = options.method, options.cover_cell, options.output
+    maps = options.depth_kind is not None or options.depth_scale is not None
+    moved = options.cloud_transform is not None
+    framed = moved or options.align or options.recenter or method == CLOUD
+    refuse(
+        (folder.suffix.lower() in FILES and not folder.is_dir(),
+         "a folder after -o, as a whole scene is written", f"{folder}, the name of a file",
+         f"Pass -o {quoted(folder.parent / folder.stem)}: the points lie there as a .ply too."),
+        (options.address is not None and options.executor != "ray",
+         "--executor ray with --address", "local", "Add it."),
+        (cell is not None and cell < 1, "--cover of 1 or more", cell, "Try --cover 8."),
+        (cell is not None and method in COVERING,
+         f"--{method}.cell for method {method}, which covers by itself", f"--cover {cell}",
+         f"Say --{method}.cell {cell} instead."),
+        (maps and options.depth_maps is None,
+         "--depth DIR, which --depth-kind and --depth-scale refer to", "none", "Name the folder."),
+        (framed and not options.cloud_files, "--cloud FILE", "none", "Name the scan."),
+        (options.cloud_files and method not in WITH_CLOUD,
+         f"--method {', '.join(WITH_CLOUD[:-1])} or {WITH_CLOUD[-1]} with --cloud", method,
+         "Leave --method out for the cloud's points alone: interpolating needs no scan."),
+        (options.recenter and options.format == "transforms",
+         "--format colmap with --recenter", "transforms", "Leave --format out."),
+        (options.align and moved, "--align or --transform", "both", "Leave one of them out."),
+    )  # fmt: skip
+    if (start := options.gaussians) is not None:
+        inside = folder.resolve() in (start.resolve(), *start.resolve().parents)
+        refuse(
+            (start.suffix.lower() != ".ply", "--gaussians FILE.ply", start, "Name a .ply file."),
+            (inside, "a file outside the scene that is written, for the initial Gaussians",
+             f"{start} in {folder}, where some trainers read any .ply as points",
+             "Name a file beside the folder."),
+            (start.exists() and not options.overwrite, f"no file at {start}", "one",
+             "Choose another name, or pass --overwrite."),
+        )  # fmt: skip
 
 
-def _run_in_memory(options: Options, methods: dict[str, Upsampler]) -> None:
+def _run_in_memory(options: Options, methods: dict[str, Any]) -> None:
     """Upsample a scene that fits into memory whole."""
     notes: list[str] = []
     with stage_display() as clock:
         clock("read", 0.0)
         scene = _read(options, methods[options.method])
         if options.gaussians is not None:
-            photographed(scene, without="leave out --gaussians")  # views bound their sizes
+            photographs.photographed(scene, without="leave out --gaussians")  # they bound sizes
         if options.refine_poses:
             from splatseed.sfm import refined  # noqa: PLC0415  (loads with its use)
 
             clock.expect("features", "matching", "refinement", "triangulation", "undistortion")
             scene, told = refined(scene, options.seed, clock)
             notes.append(told)
-        options = _settle(options, scene, notes)
-        plain = cast("Cloud", methods[CLOUD])
-        brought = load_clouds(options.cloud_options, scene, plain, clock)
-        scene, methods = brought.scene, {**methods, CLOUD: brought.method}
-        notes += brought.notes
-        method = methods[options.method]
-        total = _planned(options, method, len(scene.points))
+        if options.method == DEFAULT_METHOD:  # which needs photographs
+            options = replace(options, method=str(method_for(scene, note=notes.append)))
+        cloud, extra_method = None, None
+        if options.cloud_files:
+            cloud = load_cloud(options, scene, methods[CLOUD], clock)
+            scene, methods = cloud.scene, {**methods, CLOUD: cloud.method}
+            notes += cloud.notes
+            if options.method != CLOUD:
+                extra_method = replace(cloud.method, alone=False)
+        method, count = methods[options.method], len(scene.points)
+        new = number_of_new(method, options.method, count, options.ratio, options.num_points)
+        total = None if new is None else count + new
         most = None if options.budget is None else points_within(scene, options.budget)
-    given = {"--verify": options.verify, "--cover": options.cover_cell is not None}
-    changed_by = [option for option, is_given in given.items() if is_given]
-    number = number_words(total, most, changed_by)
-    _announce(options, scene, method, number, _idle(options, methods), brought.takes)
+    asked = {"--verify": options.verify, "--cover": options.cover_cell is not None}
+    number = output.number_words(total, most, [name for name, given in asked.items() if given])
+    _announce(options, scene, methods, number, "" if cloud is None else cloud.takes)
     with stage_display(clock):
-        extra_method = None
-        if options.cloud_files and options.method != CLOUD:
-            extra_method = dataclasses.replace(cast("GivenClouds", methods[CLOUD]), alone=False)
-        seeds = _make(options, scene, method, extra_method, total, clock, notes)
+        seeds = upsample(
+            scene, method, num_points=total, budget=options.budget, cover=options.cover_cell,
+            verify=options.verify, extra_method=extra_method, seed=options.seed, progress=clock,
+            note=notes.append,
+        )  # fmt: skip
         clock("check", 0.0)
-        checks = _check(scene, seeds, method)
+        findings = output.findings(scene, seeds, method)
         clock("write", 0.0)
-        report = _write(options, scene.replace(points=seeds), method)
-        brought.write(options.output)
+        seeded = scene.replace(points=seeds)
+        layout = "colmap" if options.recenter else options.format
+        report = write_scene(
+            seeded, options.output, format=layout, overwrite=options.overwrite,
+            copy_images=options.copy_images, provenance=_provenance(options, method),
+        )  # fmt: skip
+        if cloud is not None:
+            cloud.write(options.output)
         if options.gaussians is not None:
-            write_start(options.gaussians, scene.replace(points=seeds), method, clock)
+            output.write_start(options.gaussians, seeded, method, clock)
             notes.append(f"The initial Gaussians are in {visible(options.gaussians)}.")
         if options.preview:
-            write_previews(
-                scene, seeds, options.method, method, options.seed, options.output, clock
-            )
+            output.write_previews(options, scene, seeds, method, clock)
         seconds = clock.seconds()
-    files = {"alignment": brought.aligned, "pictures": PICTURES}
-    summarise(options.scene, scene, seeds, report, seconds, checks, options.output, files)
+    output.summarise(options, scene, seeds, report, seconds, findings)
     for sentence in notes:
         print_note(sentence)
-
-
-def _settle(options: Options, scene: Scene, notes: list[str]) -> Options:
-    """The options with the method that will be used: the default needs photographs."""
-    if options.method != DEFAULT_METHOD:
-        return options
-    method = method_for(scene, options.method, notes.append)
-    return dataclasses.replace(options, method=str(method))
-
-
-def _planned(options: Options, method: Upsampler, count: int) -> int | None:
-    """Points in all; None if the photographs determine the number."""
-    new = number_of_new(method, options.method, count, options.ratio, options.num_points)
-    return None if new is None else count + new
-
-
-def _make(
-    options: Options,
-    scene: Scene,
-    method: Upsampler,
-    extra_method: Upsampler | None,
-    total: int | None,
-    clock: StageClock,
-    notes: list[str],
-) -> PointCloud:
-    """The originals and the new points."""
-    return upsample(
-        scene, method, num_points=total, budget=options.budget, cover=options.cover_cell,
-        verify=options.verify, extra_method=extra_method, seed=options.seed, progress=clock,
-        note=notes.append,
-    )  # fmt: skip
-
-
-def _check(scene: Scene, seeds: PointCloud, method: Upsampler) -> dict[str, float]:
-    """How far off the points are, or how much of the photographs they cover."""
-    checks = {}
-    new = seeds.xyz[seeds.source != ORIGINAL]
-    if len(scene.points) and not chooses_number(method):
-        checks["far"] = far_share(scene.points.xyz, new)
-    if scene.images:
-        checks["before"] = share_covered(scene, scene.points)
-        checks["after"] = share_covered(scene, seeds)
-    return checks
 
 
 def _read(options: Options, method: Upsampler) -> Scene:
     """The scene's originals, and its depth maps if their folder is named."""
     scene = load_originals(options.scene, require_points="points" in traits_of(method).needs)
-    if options.method == "depth" and options.depth_maps is None:
-        scene = with_own_depths(scene)
     if options.depth_maps is not None:
-        maps = find_depths(
-            scene, options.depth_maps, kind=options.depth_kind, scale=options.depth_scale
-        )
-        return scene.replace(depths=maps)
-    if options.depth_kind is not None or options.depth_scale is not None:
-        raise ParameterError(
-            "--depth DIR, which --depth-kind and --depth-scale refer to",
-            found="none",
-            fix="Name the folder.",
-        )
-    return scene
+        kind, scale = options.depth_kind, options.depth_scale
+        return scene.replace(depths=find_depths(scene, options.depth_maps, kind=kind, scale=scale))
+    return with_own_depths(scene) if options.method == "depth" else scene
 
 
 def _announce(
-    options: Options,
-    scene: Scene,
-    method: Upsampler,
-    number: str,
-    idle: Sequence[str],
-    takes: str,
+    options: Options, scene: Scene, methods: Mapping[str, Upsampler], number: str, takes: str
 ) -> None:
     """Print what will be done, what a cloud takes, and which flags have no effect."""
     for warning in scene.warnings:
         print_note(warning)
-    for name in idle:
-        print_note(f"The flags of {name} have no effect with --method {options.method}.")
-    if options.profile == "paper" and configure(options.method, "paper") == configure(
-        options.method
-    ):
-        print_note(f"Profile paper changes nothing for method {options.method}.")
+    name, method = options.method, methods[options.method]
+    for other, given in methods.items():
+        changed = given != configure(other, options.profile) and not (
+            other == CLOUD and options.cloud_files
+        )
+        if other != name and (changed or (other == "depth" and options.depth_maps is not None)):
+            print_note(f"The flags of {other} have no effect with --method {name}.")
+    if options.profile == "paper" and configure(name, "paper") == configure(name):
+        print_note(f"Profile paper changes nothing for method {name}.")
+    how = ""
+    if isinstance(method, photographs.Stereo) and not photographs.begins_from_points(scene):
+        points = "too few" if photographs.has_points(scene) else "no"
+        where = "" if scene.depths is None else ", around its depth maps"
+        how = f": {points} points, so depth is found by comparing photographs{where}"
     kind = scene.source.format if scene.source else "memory"
-    how = found_how(scene, method)
     size = f"{counted(len(scene.images), 'image')}, {counted(len(scene.points), 'point')}"
     OUT.print(
         f"{visible(options.scene)} ({kind}, {size})\n"
-        f"  -> {method_words(options.method, method, options.profile)}{how}\n  "
+        f"  -> {output.method_words(name, method, options.profile)}{how}\n  "
         f"-> {visible(options.output)} ({number}, seed {options.seed}){takes}",
         soft_wrap=True,
     )
 
 
-def _idle(options: Options, methods: dict[str, Upsampler]) -> list[str]:
-    """Methods whose flags were changed although they are not used."""
-    plain = {name: configure(name, options.profile) for name in methods}
-    changed = {name for name in methods if methods[name] != plain[name]}
-    if options.depth_maps is not None:
-        changed.add("depth")
-    changed -= {CLOUD} if options.cloud_files else set()
-    return [name for name in methods if name in changed - {options.method}]
-
-
-def _write(options: Options, scene: Scene, method: Upsampler) -> WriteReport:
-    return write_scene(
-        scene,
-        options.output,
-        format=options.format,
-        overwrite=options.overwrite,
-        copy_images=options.copy_images,
-        provenance=_provenance(options, method),
-    )
-
-
 def _provenance(options: Options, method: Upsampler) -> dict[str, object]:
     """How the output was made, for ``splatseed.json``."""
+
+    def full(path: Path | None) -> str | None:
+        return None if path is None else str(path.resolve())
+
+    cloud = {
+        "files": [full(path) for path in options.cloud_files],
+        "transform": full(options.cloud_transform),
+        "align": options.align,
+        "recenter": options.recenter,
+        "memory": options.memory_bytes,
+    }
     return {
         "command": "upsample",
         "method": options.method,
         "profile": options.profile,
-        "parameters": parameters_of(method),
-        "cloud": options.cloud_options.provenance if options.cloud_files else None,
-        "depth": None if options.depth_maps is None else str(options.depth_maps.resolve()),
+        "parameters": output.parameters_of(method),
+        "cloud": cloud if options.cloud_files else None,
+        "depth": full(options.depth_maps),
         "ratio": options.ratio,
         "num_points_asked": options.num_points,
         "budget": options.budget,

@@ -5,31 +5,28 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from splatseed.commands.next_steps import tell_training
+from splatseed.commands.upsample.cloud import ALIGNMENT
 from splatseed.console import StageClock, print_note, print_pairs
-from splatseed.errors import OutputError, ParameterError
 from splatseed.io import WriteReport
-from splatseed.io.staging import check_parents
-from splatseed.pointcloud import PointCloud
+from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
-from splatseed.seeding.photographs import (
-    MAX_SIZE,
-    Stereo,
-    begins_from_points,
-    has_points,
-    photographed,
-    read_views,
-)
-from splatseed.seeding.upsampling import CELL
+from splatseed.seeding.diagnostics import far_share
+from splatseed.seeding.photographs import MAX_SIZE, Stereo, photographed, read_views
+from splatseed.seeding.upsampling import CELL, share_covered
 from splatseed.splat.formats import write_model
 from splatseed.train.seeds import gaussians_of_scene
 from splatseed.train.settings import TrainSettings
-from splatseed.upsample import Profile, Upsampler, configure
+from splatseed.upsample import Profile, Upsampler, chooses_number, configure
 from splatseed.upsample.registry import origin_name
+
+if TYPE_CHECKING:
+    from splatseed.commands.upsample.command import Options
 
 PAIR, ORIGINS, CELLS, MAPS = PICTURES = (
     "preview.png",
@@ -57,10 +54,9 @@ def method_words(name: str, method: Upsampler, profile: Profile) -> str:
         'mls (profile paper, k=12)'
     """
     plain = parameters_of(configure(name, profile))
-    changed = [f"{k}={v}" for k, v in parameters_of(method).items() if v != plain[k]]
     words = [] if profile == "default" else [f"profile {profile}"]
-    told = ", ".join([*words, *changed])
-    return f"{name} ({told})" if told else name
+    words += [f"{k}={v}" for k, v in parameters_of(method).items() if v != plain[k]]
+    return f"{name} ({', '.join(words)})" if words else name
 
 
 def number_words(total: int | None, most: int | None, changed_by: Sequence[str] = ()) -> str:
@@ -83,60 +79,10 @@ def number_words(total: int | None, most: int | None, changed_by: Sequence[str] 
     return f"{total:,} points{before}"
 
 
-def found_how(scene: Scene, method: Upsampler) -> str:
-    """How a method that compares photographs finds depth without enough points; else empty.
-
-    Args:
-        scene: The scene.
-        method: The method that makes its points.
-    """
-    if not isinstance(method, Stereo) or begins_from_points(scene):
-        return ""
-    points = "too few" if has_points(scene) else "no"
-    where = "" if scene.depths is None else ", around its depth maps"
-    return f": {points} points, so depth is found by comparing photographs{where}"
-
-
-def check_start(path: Path, output: Path, *, overwrite: bool) -> None:
-    """Refuse an unusable name for the initial Gaussians before any work is done.
-
-    Args:
-        path: The .ply.
-        output: The scene folder that is written beside it.
-        overwrite: Whether an existing file may be replaced.
-
-    Raises:
-        ParameterError: It is not named .ply.
-        OutputError: It is taken, or lies in the output folder.
-    """
-    if path.suffix.lower() != ".ply":
-        raise ParameterError("--gaussians FILE.ply", found=str(path), fix="Name a .ply file.")
-    check_parents(path)
-    target, folder = path.resolve(), output.resolve()
-    if folder == target or folder in target.parents:
-        raise OutputError(
-            "a file outside the scene that is written, for the initial Gaussians",
-            found=f"{path} in {output}, where some trainers read any .ply as points",
-            fix="Name a file beside the folder.",
-        )
-    if path.exists() and not overwrite:
-        raise OutputError(
-            f"no file at {path}", found="one", fix="Choose another name, or pass --overwrite."
-        )
-
-
 def write_start(path: Path, scene: Scene, method: Upsampler, progress: Progress) -> None:
     """Write the Gaussians that training from a scene's points would start with.
 
-    Args:
-        path: The .ply.
-        scene: The scene with the seeds as its points; the Gaussians are in its world.
-        method: The method that made them; photographs that it held out are not used.
-        progress: Told how far it is.
-
-    Raises:
-        SceneNotFoundError: The scene has no photographs, which bound the size of a Gaussian.
-        OutputError: The file cannot be written.
+    Photographs that the method held out are not used.
     """
     images = photographed(scene, getattr(method, "hold_out", 0))
     views = read_views(scene, images, MAX_SIZE, progress)
@@ -145,59 +91,34 @@ def write_start(path: Path, scene: Scene, method: Upsampler, progress: Progress)
 
 
 def write_previews(
-    scene: Scene,
-    seeds: PointCloud,
-    name: str,
-    method: Upsampler,
-    seed: int,
-    folder: Path,
-    clock: StageClock,
+    options: Options, scene: Scene, seeds: PointCloud, method: Upsampler, clock: StageClock
 ) -> None:
-    """Draw before and after; with photographs also origins, covered cells and stereo's maps.
+    """Draw before and after; with photographs also origins, covered cells and stereo's maps."""
+    from splatseed.seeding.coverage import covered_cells  # noqa: PLC0415  (kernels load with use)
+    from splatseed.view import clouds, maps  # noqa: PLC0415  (Pillow)
 
-    Args:
-        scene: The scene, with the originals that were used.
-        seeds: The points that were written.
-        name: The name of the method that made them.
-        method: That method.
-        seed: The seed that was used.
-        folder: Where the pictures go.
-        clock: Told the stages.
-    """
-    from splatseed.view.clouds import preview_origins, preview_pair  # noqa: PLC0415  (Pillow)
-    from splatseed.view.maps import preview_maps  # noqa: PLC0415  (Pillow)
-
+    folder = options.output
     clock("preview", 0.0)
-    preview_pair(scene, seeds, folder / PAIR, title=name)
+    clouds.preview_pair(scene, seeds, folder / PAIR, title=options.method)
     if scene.has_photographs:
         clock("preview", 0.4)
-        preview_origins(scene, seeds, folder / ORIGINS)
+        clouds.preview_origins(scene, seeds, folder / ORIGINS)
         clock("preview", 0.6)
-        _draw_cells(scene, seeds, folder / CELLS)
+        images = photographed(scene)
+        views = read_views(scene, [images[i] for i in _some_of(images)], MAX_SIZE, silent)
+        both = [cloud.xyz[cloud.finite] for cloud in (scene.points, seeds)]
+        cells = zip(views, *(covered_cells(views, xyz, CELL) for xyz in both), strict=True)
+        shown = [
+            clouds.CoveredView(v.name, v.photograph, CELL, before, after)
+            for v, before, after in cells
+        ]
+        clouds.preview_cells(shown, folder / CELLS)
     if isinstance(method, Stereo):
-        shown = _some_of(photographed(scene, method.hold_out))
         # Recomputed for the few that are shown: keeping all maps would take as much memory as the
         # views.
-        maps = method.maps(scene, shown, seed, clock)
-        clock("preview", 0.9)
-        preview_maps(scene, maps, folder / MAPS)
+        some = _some_of(photographed(scene, method.hold_out))
+        maps.preview_maps(scene, method.maps(scene, some, options.seed, clock), folder / MAPS)
     clock("preview", 1.0)
-
-
-def _draw_cells(scene: Scene, seeds: PointCloud, path: Path) -> None:
-    """Which cells of some photographs hold a point, before and after."""
-    from splatseed.seeding.coverage import covered_cells  # noqa: PLC0415  (kernels load with use)
-    from splatseed.view.clouds import CoveredView, preview_cells  # noqa: PLC0415  (Pillow)
-
-    images = photographed(scene)
-    views = read_views(scene, [images[i] for i in _some_of(images)], MAX_SIZE, silent)
-    clouds = [cloud.xyz[cloud.finite] for cloud in (scene.points, seeds)]
-    before, after = (covered_cells(views, xyz, CELL) for xyz in clouds)
-    shown = [
-        CoveredView(view.name, view.photograph, CELL, old, new)
-        for view, old, new in zip(views, before, after, strict=True)
-    ]
-    preview_cells(shown, path)
 
 
 def _some_of(images: Sequence[Image]) -> list[int]:
@@ -206,45 +127,60 @@ def _some_of(images: Sequence[Image]) -> list[int]:
     return [int(place) for place in np.unique(places.round())]
 
 
+def findings(scene: Scene, seeds: PointCloud, method: Upsampler) -> list[tuple[str, str]]:
+    """Rows on how far off the points are, and how much of the photographs they cover."""
+    rows = []
+    if len(scene.points) and not chooses_number(method):
+        new = seeds.xyz[seeds.source != ORIGINAL]
+        far = far_share(scene.points.xyz, new)
+        rows.append(("far from any original", f"{far:.2%} of the new points, over 3 spacings"))
+    if scene.images:
+        before, after = share_covered(scene, scene.points), share_covered(scene, seeds)
+        share = f"{after:.1%} of the 8 x 8 pixel cells of the photographs have a point"
+        rows.append(("covered", f"{share}; {before:.1%} before"))
+    return rows
+
+
 def summarise(
-    read_from: Path,
+    options: Options,
     scene: Scene,
     seeds: PointCloud,
     report: WriteReport,
     seconds: Mapping[str, float],
-    checks: Mapping[str, float],
-    output: Path,
-    files: Mapping[str, Sequence[str]],
+    found: Sequence[tuple[str, str]],
 ) -> None:
     """Print the final table and the commands to run next.
 
     Args:
-        read_from: Where the scene was read.
+        options: The options.
         scene: The scene as it was read.
         seeds: The points that were to be written.
         report: The report of writing.
         seconds: Seconds by stage.
-        checks: ``far``, the share of new points far from any original; ``before`` and ``after``,
-            the share of the photographs that the points cover.
-        output: The scene folder.
-        files: Names of further files in it, by label; those that are not there are left out.
+        found: What ``findings`` gave.
     """
+    output = options.output
     written = seeds if len(seeds) == report.num_points else seeds.select(seeds.distinct)
+    codes, counts = np.unique(written.source, return_counts=True)
+    origins = zip(counts, map(origin_name, codes.tolist()), strict=True)
+    made = ", ".join(f"{count:,} {name}" for count, name in origins)
     rows = [
         ("points in", f"{len(scene.points):,}"),
-        ("points out", f"{report.num_points:,} ({_origins(written)})"),
-        *_findings(checks),
+        ("points out", f"{report.num_points:,} ({made})"),
+        *([("left out", left_out)] if (left_out := _left_out(scene, report)) else []),
+        *found,
         ("seconds", ", ".join(f"{stage} {time:.2f}" for stage, time in seconds.items())),
         ("output", str(output)),
     ]
-    if linked := _linked(output, report):
-        where = ", ".join(map(str, linked))
-        rows.append(("images", f"linked, not copied: {where}; --copy-images to move OUT elsewhere"))
-    if left_out := _left_out(scene, report):
-        rows.insert(2, ("left out", left_out))
-    for label, names in files.items():
-        there = [output / name for name in names if (output / name).is_file()]
-        rows += [("" if i else label, str(path)) for i, path in enumerate(there)]
+    links = [Path(name) for name in report.files if (output / name).is_symlink()]
+    photographs = [link for link in links if link.parts[0] == "images"] or links
+    there = [(output / link).resolve() for link in photographs]
+    if linked := sorted({str(path if path.is_dir() else path.parent) for path in there}):
+        moving = "--copy-images to move OUT elsewhere"
+        rows.append(("images", f"linked, not copied: {', '.join(linked)}; {moving}"))
+    for label, names in (("alignment", ALIGNMENT), ("pictures", PICTURES)):
+        paths = [output / name for name in names if (output / name).is_file()]
+        rows += [("" if i else label, str(path)) for i, path in enumerate(paths)]
     print_pairs("splatseed upsample", rows)
     for note in report.notes:
         print_note(note)
@@ -253,15 +189,7 @@ def summarise(
             "The commands of gsplat's examples, graphdeco's code and LichtFeld are for COLMAP's "
             "layout: --format colmap."
         )
-    tell_training(read_from, scene, output, report.layout)
-
-
-def _linked(output: Path, report: WriteReport) -> list[Path]:
-    """Where photographs lie that the output only links."""
-    links = [Path(name) for name in report.files if (output / name).is_symlink()]
-    photographs = [link for link in links if link.parts[0] == "images"] or links
-    there = [(output / link).resolve() for link in photographs]
-    return sorted({path if path.is_dir() else path.parent for path in there})
+    tell_training(options.scene, scene, output, report.layout)
 
 
 def _left_out(scene: Scene, report: WriteReport) -> str:
@@ -274,23 +202,3 @@ def _left_out(scene: Scene, report: WriteReport) -> str:
     if thinned > 0:
         parts += [f"{thinned:,} originals, for the budget, where they crowd"]
     return ", ".join(parts)
-
-
-def _origins(seeds: PointCloud) -> str:
-    """How many points have which origin."""
-    codes, counts = np.unique(seeds.source, return_counts=True)
-    return ", ".join(
-        f"{count:,} {origin_name(int(code))}" for code, count in zip(codes, counts, strict=True)
-    )
-
-
-def _findings(checks: Mapping[str, float]) -> list[tuple[str, str]]:
-    rows = []
-    if "far" in checks:
-        rows.append(
-            ("far from any original", f"{checks['far']:.2%} of the new points, over 3 spacings")
-        )
-    if "after" in checks:
-        share = f"{checks['after']:.1%} of the 8 x 8 pixel cells of the photographs have a point"
-        rows.append(("covered", f"{share}; {checks['before']:.1%} before"))
-    return rows
