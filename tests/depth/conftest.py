@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from splatseed.depth.alignment import ray_length
 from splatseed.depthmap import DepthMap
 from splatseed.io import load_scene
 from splatseed.synthetic import make_capture, write_capture
@@ -24,22 +25,24 @@ def capture():
 
 
 @pytest.fixture(scope="session")
-def exact(capture, tmp_path_factory):
-    """Its scene, read from disk, with the exact planar depth of every image in memory."""
-    folder = write_capture(capture, tmp_path_factory.mktemp("depth") / "room")
-    return load_scene(folder).replace(depths=maps_of(capture))
+def make_maps(capture):
+    """Makes maps of the room: ``make_maps(kind, change)``, which takes planar depth and the image's
+    number, and gives planar depth, or the inverse."""
 
+    def make(kind="z", change=lambda z, _: z):
+        maps = MemoryMaps()
+        for i, (image, depth) in enumerate(zip(capture.scene.images, capture.depths, strict=True)):
+            z = change(np.where(depth > 0, depth, np.nan).astype(np.float64), i)
+            if kind == "ray":
+                z = z * ray_length(image.camera, np.arange(160), np.arange(120)[:, None])
+            maps[image.name] = DepthMap(z.astype(np.float32), kind)
+        return maps
 
-def maps_of(capture, kind="z", change=lambda z, _: z):
-    """The capture's exact depth, as maps of a kind, changed image by image."""
-    maps = MemoryMaps()
-    for i, (image, depth) in enumerate(zip(capture.scene.images, capture.depths, strict=True)):
-        z = np.where(depth > 0, depth, np.nan).astype(np.float64)
-        maps[image.name] = DepthMap(change(z, i).astype(np.float32), kind)
-    return maps
+    return make
 
 
 @pytest.fixture(scope="session")
-def make_maps(capture):
-    """Makes maps of the room: ``make_maps(kind, change)``."""
-    return lambda kind="z", change=lambda z, _: z: maps_of(capture, kind, change)
+def exact(capture, make_maps, tmp_path_factory):
+    """Its scene, read from disk, with the exact planar depth of every image in memory."""
+    folder = write_capture(capture, tmp_path_factory.mktemp("depth") / "room")
+    return load_scene(folder).replace(depths=make_maps())

@@ -1,15 +1,29 @@
-"""Lifted points against surfaces that are known, against the text, and against the settings."""
+"""Lifted points against surfaces that are known, the text and the settings; what is refused."""
 
 from __future__ import annotations
 
+import dataclasses
 import os
+import shutil
 
+import numba
 import numpy as np
 import pytest
+from hypothesis import given, settings, strategies as st
+from PIL import Image as PilImage
 
 import splatseed as ss
-from splatseed.depth import lifting, views
-from splatseed.depth.alignment import PlanarDepth, lift_pixels, ray_length
+from splatseed.camera import Intrinsics
+from splatseed.depth import lifting
+from splatseed.depth.alignment import PlanarDepth, lift_pixels
+from splatseed.depth.lifting import Cubes, thin
+from splatseed.errors import (
+    InputError,
+    ParameterError,
+    PointCloudError,
+    SceneFormatError,
+    SceneNotFoundError,
+)
 
 FLOAT32 = 3e-6  # metres, in a room of 5
 
@@ -24,24 +38,10 @@ def lifted(scene, num, profile="default", **changes):
     return seeds.select(slice(len(scene.points), None))
 
 
-def along_rays(scene, make_maps):
-    """The same depth as distances along the rays."""
-
-    def change(z, i):
-        camera = scene.images[i].camera
-        columns, rows = np.arange(camera.width), np.arange(camera.height)[:, None]
-        return z * ray_length(camera, columns, rows)
-
-    return scene.replace(depths=make_maps("ray", change))
-
-
 @pytest.mark.parametrize("kind", ["z", "ray", "inverse"])
 def test_lifted_points_lie_on_the_surfaces(kind, exact, capture, make_maps):
-    scene = exact
-    if kind == "ray":
-        scene = along_rays(exact, make_maps)
-    if kind == "inverse":
-        scene = exact.replace(depths=make_maps("inverse", lambda z, _: 1 / z))
+    change = (lambda z, _: 1 / z) if kind == "inverse" else (lambda z, _: z)
+    scene = exact.replace(depths=make_maps(kind, change))
     new = lifted(scene, 5000, align=False)
     assert capture.surfaces.distance(new.xyz.astype(np.float64)).max() < FLOAT32
     aligned = lifted(scene, 5000)  # SfM points are off by millimetres
@@ -55,7 +55,7 @@ def test_equation_9_is_a_loop_over_pixels(exact, rng):
     scale = 1.7
     for unit_ray in (False, True):
         planar = PlanarDepth.of(depth, camera, scale, 0.0, unit_ray=unit_ray)
-        lifted = lift_pixels(pixel, planar.at(pixel), camera, np.empty((50, 3), np.float32))
+        lifted = lift_pixels(pixel, planar.at(pixel), camera)
         for number, point in zip(pixel.tolist(), lifted, strict=True):
             v, u = number // 160 + 0.5, number % 160 + 0.5
             ray = camera.cam_from_world[:3, :3].T @ np.linalg.inv(camera.K) @ [u, v, 1.0]
@@ -89,11 +89,15 @@ def test_the_paper_takes_as_many_from_the_middle_of_every_image(exact):
 
 @pytest.mark.parametrize("profile", ["default", "paper"])
 def test_bytes_follow_from_the_seed_whatever_the_threads(profile, exact, monkeypatch):
-    results = []
-    for cores in (1, 2, 7):
-        monkeypatch.setattr(os, "cpu_count", lambda cores=cores: cores)
-        new = lifted(exact, 3000, profile, seed=3)
-        results.append(new.xyz.tobytes() + new.rgb.tobytes())
+    results, available = [], numba.get_num_threads()
+    try:
+        for cores in (1, 7):
+            numba.set_num_threads(min(cores, available))
+            monkeypatch.setattr(os, "cpu_count", lambda cores=cores: cores)
+            new = lifted(exact, 3000, profile, seed=3)
+            results.append(new.xyz.tobytes() + new.rgb.tobytes())
+    finally:
+        numba.set_num_threads(available)
     assert len(set(results)) == 1
     assert lifted(exact, 3000, profile, seed=4).xyz.tobytes() not in results[0]
 
@@ -113,14 +117,13 @@ def test_held_out_images_are_not_even_read(exact):
 
 def test_a_second_reading_comes_when_the_first_was_not_enough(exact, make_maps, monkeypatch):
     """Each map is off by its own tenth, unaligned: hardly a candidate is confirmed."""
-    reads = []
-    plain = views.Reader.read
+    reads, plain = [], lifting.read_view
 
-    def counted(self, image, num, rng):
-        reads.append(num)
-        return plain(self, image, num, rng)
+    def counted(*args):
+        reads.append(args[-2])
+        return plain(*args)
 
-    monkeypatch.setattr(views.Reader, "read", counted)
+    monkeypatch.setattr(lifting, "read_view", counted)
     scale = 1 + 0.06 * np.sin(np.arange(12) * 2.0)
     scene = exact.replace(depths=make_maps("z", lambda z, i: z * scale[i]))
     notes = []
@@ -137,7 +140,7 @@ def test_every_pixel_can_be_had_but_no_more(exact):
     new = lifted(scene, pixels, **options)
     assert len(np.unique(new.xyz, axis=0)) == pixels
     for profile, change in (("default", options), ("paper", {"region": 1.0})):
-        with pytest.raises(ss.errors.PointCloudError, match=rf"give {pixels + 1:,}.*{pixels:,}"):
+        with pytest.raises(PointCloudError, match=rf"give {pixels + 1:,}.*{pixels:,}"):
             lifted(scene, pixels + 1, profile, **change)
 
 
@@ -146,7 +149,115 @@ def test_without_points_metric_depth_will_do(exact, capture):
     seeds = ss.upsample(empty, "depth", num_points=1500, align=False)
     assert len(seeds) == 1500
     assert capture.surfaces.distance(seeds.xyz.astype(np.float64)).max() < FLOAT32
-    with pytest.raises(ss.errors.ParameterError, match="num_points of 1 or more"):
+    with pytest.raises(ParameterError, match="num_points of 1 or more"):
         ss.upsample(empty, "depth", ratio=4, align=False)
-    with pytest.raises(ss.errors.PointCloudError, match="at least one original"):
+    with pytest.raises(PointCloudError, match="at least one original"):
         ss.upsample(empty, "depth", num_points=1500)
+
+
+def test_infinities_zeros_and_negatives_are_never_lifted(exact, make_maps):
+    def change(z, i):
+        z[::3] = (np.inf, 0.0, -1.0)[i % 3]
+        return z
+
+    for profile in ("default", "paper"):
+        scene = exact.replace(depths=make_maps("z", change))
+        seeds = ss.upsample(scene, "depth", ratio=2, profile=profile)
+        assert seeds.finite.all()
+        assert np.abs(seeds.xyz).max() < 10
+
+
+# What is refused ----------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def own(exact, tmp_path):
+    """The scene with a folder of photographs that a test may spoil."""
+    folder = shutil.copytree(exact.source.image_dir, tmp_path / "images")
+    return exact.replace(source=dataclasses.replace(exact.source, image_dir=folder))
+
+
+def test_what_cannot_be_lifted_is_refused(own, make_maps):
+    photograph = own.source.image_dir / "view_004.png"
+    focal, _, cx, cy = own.images[0].intrinsics.params
+
+    def with_bend(k):
+        lens = Intrinsics(1, "SIMPLE_RADIAL", 160, 120, (focal, cx, cy, k))
+        return own.replace(
+            images=tuple(dataclasses.replace(image, intrinsics=lens) for image in own.images)
+        )
+
+    large = own.replace(depths=make_maps("z", lambda z, _: 1000 * z))
+    for scene, write, error, said in (
+        (own.points, None, SceneNotFoundError, "--depth DIR"),
+        (own.replace(depths=None), None, SceneNotFoundError, "--depth DIR"),
+        (own.replace(depths={}), None, SceneNotFoundError, "--depth DIR"),
+        (own.replace(images=()), None, SceneNotFoundError, "--depth DIR"),
+        (own.replace(source=None), None, SceneNotFoundError, "photographs"),
+        (with_bend(0.1), None, SceneFormatError, "SIMPLE_RADIAL for view_000"),
+        (own, photograph.unlink, SceneNotFoundError, "view_004.png"),
+        (own, lambda: photograph.write_bytes(b"no image"), SceneFormatError, "view_004.png"),
+        (own, lambda: resized(photograph, (120, 160)), SceneFormatError, "120 x 160"),
+        (large, lambda: resized(photograph, (320, 240)), SceneFormatError, "--depth-scale"),
+    ):
+        if write is not None:
+            write()
+        with pytest.raises(InputError) as caught:
+            ss.upsample(scene, "depth", ratio=2, align=scene is not large)
+        assert type(caught.value) is error
+        assert said in str(caught.value)
+    assert ss.upsample(
+        with_bend(0.0), "depth", ratio=2
+    ).finite.all()  # nor is another size any harm
+    aligned, plain = (ss.upsample(scene, "depth", ratio=2) for scene in (large, own))
+    assert np.median(np.linalg.norm(aligned.xyz - plain.xyz, axis=1)) < 0.01
+
+
+def resized(path, size):
+    path.unlink()
+    with PilImage.open(path.with_name("view_003.png")) as picture:
+        picture.resize(size).save(path)
+
+
+# Spreading: one point a cube ----------------------------------------------------------------------
+
+
+def sheet(rng, num):
+    """Points on a bent sheet 2 wide, dense on its left."""
+    u, v = rng.random((2, num)) ** [[2], [1]] * 2
+    return np.stack([u, v, 0.2 * np.sin(3 * u)], axis=1).astype(np.float32)
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(0.003, 3.0))
+@settings(max_examples=30, deadline=None)
+def test_cubes_are_those_of_a_dictionary(seed, side):
+    rng = np.random.default_rng(seed)
+    xyz, originals = sheet(rng, 400), rng.normal(size=(60, 3)).astype(np.float32)
+    footprint = rng.integers(0, 5, 400).astype(np.float32)  # ties, which the first wins
+    low = xyz.min(axis=0).astype(np.float64)
+    there = {tuple(np.floor((p - low) / side)) for p in originals.astype(np.float64)}
+    best = {}
+    for k, point in enumerate(xyz.astype(np.float64)):
+        cube = tuple(np.floor((point - low) / side))
+        if cube not in there and (cube not in best or footprint[k] < footprint[best[cube]]):
+            best[cube] = k
+    cubes = Cubes(xyz, footprint, np.ones(400, bool), originals)
+    assert np.flatnonzero(cubes.take(side)).tolist() == sorted(best.values())
+    assert cubes.count(side) == len(best)
+
+
+@pytest.mark.parametrize("num", [1, 7, 500, 4000, 5000])
+def test_exactly_so_many_come_out(num, rng):
+    xyz, every = sheet(rng, 5000), np.ones(5000, bool)
+    taken = thin(xyz, every.astype(np.float32), every, xyz[:0], num, rng)
+    assert np.count_nonzero(taken) == num
+
+
+def test_many_candidates_are_estimated_from_some(rng):
+    xyz, every = rng.random((100_000, 3)).astype(np.float32), np.ones(100_000, bool)
+    cubes = Cubes(xyz, every.astype(np.float32), every, xyz[:0])
+    for side in (0.5, 0.02, 0.001):
+        exact = np.count_nonzero(cubes.take(side))
+        assert cubes.count(side) == pytest.approx(exact, rel=0.05, abs=40)
+    taken = thin(xyz, cubes.footprint, every, xyz[:0], 20_000, rng)
+    assert np.count_nonzero(taken) == 20_000

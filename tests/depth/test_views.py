@@ -1,17 +1,15 @@
-"""What other views say of a point, which of them are asked, and how their maps are made to
-agree."""
+"""Which pixels are drawn of a map; what other views say of a point, and how maps come to agree."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from splatseed.camera import Camera
-from splatseed.depth.alignment import Alignment, PlanarDepth
+from splatseed.depth.alignment import Alignment, Settings
 from splatseed.depth.comparison import choose_neighbors, find_support, synchronize_scales
-from splatseed.depth.settings import Settings
-from splatseed.depth.views import DepthView, Reduced
-from splatseed.depthmap import DepthMap
+from splatseed.depth.views import DepthView, Reduced, sample_pixels
 from splatseed.progress import silent
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
@@ -79,9 +77,9 @@ THROUGH = [0, 0, 0, 1, 0, 0]
 def test_a_view_confirms_hides_or_looks_through(unit):
     camera = camera_at(0.05 * unit)
     other = reduced(camera, wall(camera, 2.0 * unit))
-    support = find_support(POINTS * np.float32(unit), other, [other], Settings())
-    np.testing.assert_array_equal(support.agreeing, CONFIRMED)
-    np.testing.assert_array_equal(support.seen_through, THROUGH)
+    agreeing, seen_through = find_support(POINTS * np.float32(unit), other, [other], Settings())
+    np.testing.assert_array_equal(agreeing, CONFIRMED)
+    np.testing.assert_array_equal(seen_through, THROUGH)
 
 
 def test_a_view_of_another_color_confirms_nothing():
@@ -89,22 +87,22 @@ def test_a_view_of_another_color_confirms_nothing():
     own = reduced(camera, wall(camera))
     for change, agrees in ((30, 1), (60, 0)):
         other = reduced(camera, wall(camera), GRAY + np.uint8(change))
-        support = find_support(POINTS[:1], own, [other], Settings())
-        assert (support.agreeing[0], support.seen_through[0]) == (agrees, False)
-        assert find_support(POINTS[:1], own, [other], Settings(color_tolerance=None)).agreeing[0]
+        (agreeing,), (seen_through,) = find_support(POINTS[:1], own, [other], Settings())
+        assert (agreeing, seen_through) == (agrees, False)
+        assert find_support(POINTS[:1], own, [other], Settings(color_tolerance=None))[0][0]
 
 
 def test_what_a_view_does_not_know_says_nothing():
     camera = camera_at(0.0)
     nothing = np.full((HEIGHT, WIDTH), np.nan, np.float32)
-    support = find_support(POINTS, reduced(camera, nothing), [reduced(camera, nothing)], Settings())
-    assert not support.agreeing.any()
-    assert not support.seen_through.any()
+    own = reduced(camera, nothing)
+    assert not np.any(find_support(POINTS, own, [own], Settings()))
     half = wall(camera)
     half[:, ::2] = np.nan  # beside the unknown, known pixels may confirm but not look through
-    support = find_support(POINTS, reduced(camera, half), [reduced(camera, half)], Settings())
-    np.testing.assert_array_equal(support.agreeing, CONFIRMED)
-    assert not support.seen_through.any()
+    own = reduced(camera, half)
+    agreeing, seen_through = find_support(POINTS, own, [own], Settings())
+    np.testing.assert_array_equal(agreeing, CONFIRMED)
+    assert not seen_through.any()
 
 
 def test_neighbors_see_the_same_from_another_side():
@@ -143,17 +141,84 @@ def test_maps_are_scaled_to_agree():
     assert abs(left.mean()) < 0.02
 
 
-def test_planar_depth_knows_every_kind():
-    camera = camera_at(0.0)
-    z = wall(camera, 3.0) + np.linspace(0, 1, WIDTH, dtype=np.float32)
-    column, row = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
-    length = np.sqrt(((column - 32) / FOCAL) ** 2 + ((row - 24) / FOCAL) ** 2 + 1)
-    kinds = {"z": (z / 2, 0.0), "ray": (z * length / 2, 0.0), "inverse": ((1 / z - 0.1) / 2, 0.1)}
-    for kind, (values, shift) in kinds.items():
-        depth = DepthMap(values.astype(np.float32), kind)
-        planar = PlanarDepth.of(depth, camera, 2.0, shift, unit_ray=False)
-        np.testing.assert_allclose(planar.whole(), z, rtol=2e-6)
-        np.testing.assert_allclose(planar.every(1, 3) * planar.scale, z[1::3, 1::3], rtol=2e-6)
-        np.testing.assert_allclose(planar.at(np.array([0, 70])), [z[0, 0], z[1, 6]], rtol=2e-6)
-    behind = DepthMap(np.full((HEIGHT, WIDTH), -1.0, np.float32), "inverse")
-    assert np.isnan(PlanarDepth.of(behind, camera, 1.0, 0.5, unit_ray=False).whole()).all()
+# Pixels ------------------------------------------------------------------------------------------
+
+SHAPE = (60, 80)
+NOWHERE = np.empty((0, 2))
+PLAIN = Settings(placement="uniform", edge_tolerance=None)
+
+
+def slanted(rng, holes=0.2):
+    """A slanted plane, 1 / depth linear in the image, with holes."""
+    row, column = np.indices(SHAPE)
+    values = (1.0 / (0.5 + 0.004 * column - 0.003 * row)).astype(np.float32)
+    values[rng.random(SHAPE) < holes] = np.nan
+    return values
+
+
+@pytest.mark.parametrize("placement", ["uniform", "empty"])
+@pytest.mark.parametrize("num", [1, 100, 3000, 10_000])
+def test_pixels_are_known_and_distinct(placement, num, rng):
+    values = slanted(rng)
+    points = rng.uniform(0, SHAPE[::-1], (40, 2))
+    settings = Settings(placement=placement)
+    pixel, edge = sample_pixels(values, num, points, settings, rng)
+    known = int((values > 0).sum())
+    assert min(num, known) <= len(pixel) <= max(1.2 * num + 2, known)
+    assert len(np.unique(pixel)) == len(pixel) == len(edge)
+    assert (values.ravel()[pixel] > 0).all()
+
+
+@pytest.mark.parametrize("region", [0.5, 0.2])
+def test_the_region_is_that_share_of_each_dimension(region, rng):
+    values = slanted(rng, holes=0.0)
+    settings = Settings(placement="uniform", edge_tolerance=None, region=region)
+    pixel = sample_pixels(values, 10_000, NOWHERE, settings, rng)[0]
+    row, column = np.divmod(pixel, SHAPE[1])
+    assert len(pixel) == round(region * SHAPE[0]) * round(region * SHAPE[1])
+    assert np.ptp(row) + 1 == round(region * SHAPE[0])
+    assert row.min() + row.max() == SHAPE[0] - 1
+    assert column.min() + column.max() == SHAPE[1] - 1
+
+
+def test_pixels_go_where_points_are_far(rng):
+    values = slanted(rng, holes=0.0)
+    points = np.stack([rng.uniform(0, 40, 500), rng.uniform(0, 60, 500)], axis=1)  # the left half
+    mean = {}
+    for placement in ("uniform", "empty"):
+        settings = Settings(placement=placement, edge_tolerance=None)
+        pixel = sample_pixels(values, 400, points, settings, rng)[0]
+        row, column = np.divmod(pixel, SHAPE[1])
+        mean[placement] = cKDTree(points).query(np.stack([column, row], axis=1))[0].mean()
+        if placement == "empty":
+            assert 0 < (column < 40).mean() < 0.35
+    assert mean["empty"] > 1.25 * mean["uniform"]
+
+
+@pytest.mark.parametrize("radius", [1, 3])
+def test_pixels_keep_off_the_jumps_of_depth(radius, rng):
+    values = slanted(rng, holes=0.0)
+    values[:, 40:] *= 1.1
+    values[30:, :20] *= 0.9
+    settings = Settings(placement="uniform", edge_radius=radius)
+    pixel, edge = sample_pixels(values, 1500, NOWHERE, settings, rng)
+    row, column = np.divmod(pixel, SHAPE[1])
+    assert not edge.any()
+    assert not ((column >= 40 - radius) & (column < 40 + radius)).any()
+    assert not ((row >= 30 + radius) & (column >= 20 - radius) & (column < 20 + radius)).any()
+    assert not ((column < 20 - radius) & (row >= 30 - radius) & (row < 30 + radius)).any()
+    plain = np.divmod(sample_pixels(values, 1500, NOWHERE, PLAIN, rng)[0], SHAPE[1])[1]
+    assert ((plain >= 40 - radius) & (plain < 40 + radius)).any()
+
+
+def test_what_is_mostly_unknown_around_comes_last(rng):
+    values = slanted(rng, holes=0.0)
+    values[:, 40:] = np.nan
+    values[::6, 43:79:6] = 2.0  # sparse, as a lidar's
+    settings = Settings(placement="uniform")
+    known = int((values > 0).sum())
+    some, _ = sample_pixels(values, known // 2, NOWHERE, settings, rng)
+    assert (some % 80 < 40).all()
+    every, edge = sample_pixels(values, known, NOWHERE, settings, rng)
+    assert len(every) == known
+    assert edge[every % 80 > 40].all()

@@ -19,13 +19,14 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int, Int64
 
 from splatseed.camera import Camera
-from splatseed.depthmap import DepthKind, DepthMap
+from splatseed.depthmap import DepthMap
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.progress import Progress, in_threads, silent
-from splatseed.runtime.jit import inline
 from splatseed.scene import Image, Scene
 from splatseed.views.visibility import SeenPoints, camera_points, find_visibility
 
+Fit = Literal["robust", "least-squares"]
+"""Medians and reweighting, or the paper's equation 7."""
 PAIRS = 256
 """Pairs of points whose lines are tried; nothing is random, as they follow the R2 sequence."""
 GOLDEN = np.array([0.7548776662466927, 0.5698402909980532])
@@ -36,14 +37,67 @@ STEPS = 20
 """Most steps of reweighting."""
 SIGMA_OF_MEDIAN = 1.4826
 """Standard deviation of a normal variable over the median of its absolute value."""
+GOOD_RESIDUAL = 0.01
+"""An image that fits this well is never an outlier, however well the others fit."""
+MAX_RESIDUAL = 0.25
+"""An image whose median error exceeds this is not aligned at all."""
+NO_DEPTH = "the map has no depth at any pixel"
+UNIT_POINTS = 20
+UNIT_SLACK = 1.25
+"""A map in scene units is refused if at least this many SfM points show it off by this factor."""
 
 Values = Float64[np.ndarray, " M"]
 
 
-@inline
-def median(values):  # type: ignore[no-untyped-def]  # Numba's types
-    """NumPy's median for float64 without NaN, without its overhead on a thousand values."""
-    return np.median(values)
+@dataclass(frozen=True)
+class Settings:
+    """The choices of depth-guided lifting; the defaults avoid the traps of the paper's text."""
+
+    align: bool = True
+    """Fit the scale (for inverse depth, and shift) of each map to the SfM points."""
+    fit: Literal["robust", "least-squares"] = "robust"
+    """How to fit: medians and reweighting, or the paper's equation 7 (paper: least-squares)."""
+    min_points: int = 20
+    """Fewest SfM points that an image must see, else it is left out (paper: 1)."""
+    max_residual_ratio: float | None = 3.0
+    """Leave out images that fit this many times worse than the median one (paper: none)."""
+    synchronize_scales: bool = True
+    """Then scale the maps, each by one factor, to agree with each other (paper: no)."""
+    unit_ray: bool = False
+    """Take z for the distance along the ray, as equation 9 says; this bends walls (paper: yes)."""
+    region: float = 1.0
+    """Central fraction of the width and of the height that pixels are drawn from (paper: 0.5)."""
+    placement: Literal["empty", "uniform"] = "empty"
+    """Draw pixels by their distance to the nearest SfM point, or uniformly (paper: uniform)."""
+    edge_tolerance: float | None = 0.03
+    """Avoid pixels near discontinuities larger than this fraction of depth (paper: none)."""
+    edge_radius: int = 3
+    """Radius of the discontinuity test, in pixels of the map."""
+    min_agreeing: int = 2
+    """Other views whose depth and colour must confirm a point; 0 = none (paper: 0)."""
+    see_through: bool = False
+    """Keep points that another view looks through (paper: yes)."""
+    num_neighbors: int = 12
+    """Most other views that are compared with a point."""
+    tolerance: float = 0.02
+    """Relative difference up to which two depths agree."""
+    color_tolerance: float | None = 0.15
+    """Mean colour difference, 0 to 1, up to which two views agree; none = not compared."""
+    spread: bool = True
+    """Spread points as evenly as their number allows, whatever image they come from (paper:
+    no)."""
+    hold_out: int = 0
+    """Leave out every n-th image by name, as trainers do for testing (8); 0 = use all."""
+
+    @property
+    def synchronizes(self) -> bool:
+        """Whether maps are scaled to agree with each other; maps in scene units are left alone."""
+        return self.align and self.synchronize_scales
+
+    @property
+    def compares_views(self) -> bool:
+        """Whether points are compared with other views at all."""
+        return self.min_agreeing > 0 or not self.see_through
 
 
 def least_squares_scale(value: Values, z: Values) -> float:
@@ -53,7 +107,7 @@ def least_squares_scale(value: Values, z: Values) -> float:
 
 def median_scale(value: Values, z: Values) -> float:
     """The median of z / value: up to half of the points may be wrong."""
-    return float(median(z / value))
+    return float(np.median(z / value))
 
 
 def least_squares_line(value: Values, z: Values) -> tuple[float, float]:
@@ -121,9 +175,8 @@ def map_camera(depth: DepthMap, image: Image) -> Camera:
     try:
         return depth.camera(image.camera)
     except SceneFormatError as error:
-        raise SceneFormatError(
-            f"for {image.name} {error.expected}", found=error.found, fix=error.fix
-        ) from None
+        expected = f"for {image.name} {error.expected}"
+        raise SceneFormatError(expected, found=error.found, fix=error.fix) from None
 
 
 def ray_length(
@@ -137,10 +190,7 @@ def ray_length(
 
 @dataclass(frozen=True, eq=False)
 class PlanarDepth:
-    """A map whose planar depth is computed only where needed.
-
-    Most maps need only one factor, and multiplying a whole map takes longer than everything done
-    with the few pixels that are lifted.
+    """A map whose planar depth is computed only at the few pixels that need it.
 
     Args:
         values: float32 [H, W]; NaN, or not above 0, where depth is unknown.
@@ -158,14 +208,9 @@ class PlanarDepth:
     def of(
         cls, depth: DepthMap, camera: Camera, scale: float, shift: float, *, unit_ray: bool
     ) -> PlanarDepth:
-        """A map with its alignment.
+        """A map by its ``Alignment``'s scale and shift.
 
-        Args:
-            depth: The map.
-            camera: The image's camera in pixels of the map.
-            scale: As in ``Alignment``.
-            shift: Likewise.
-            unit_ray: Whether to take planar depth as distance along the ray: equation 9's letter.
+        With ``unit_ray``, planar depth is taken for distance along the ray: equation 9's letter.
         """
         if depth.kind != "inverse":
             return cls(depth.values, scale, depth.kind == "ray" or unit_ray, camera)
@@ -188,7 +233,7 @@ class PlanarDepth:
         return self.every(0, 1) * np.float64(self.scale)
 
     def at(self, pixel: Int64[np.ndarray, " C"]) -> Float32[np.ndarray, " C"]:
-        """Planar depth in scene units of pixels numbered row * W + column, [C]."""
+        """Planar depth in scene units of pixels numbered row * W + column."""
         z = self.values.ravel()[pixel] * self.scale
         if self.along_ray:
             row, column = np.divmod(pixel, self.camera.width)
@@ -200,44 +245,21 @@ def lift_pixels(
     pixel: Int64[np.ndarray, " C"],
     z: Float32[np.ndarray, " C"],
     camera: Camera,
-    out: Float32[np.ndarray, "C 3"],
     factor: float = 1.0,
 ) -> Float32[np.ndarray, "C 3"]:
-    """Write the world positions of pixels (row * W + column) into ``out`` [C, 3], and return it.
+    """The world positions of pixels (row * W + column) at depth ``factor * z``.
 
     Equation 9: P = c + z v, where v is the ray through the pixel's centre, with unit z in camera
-    axes; the text's P = c + s d v / |v| is the same with z = s d / |v|. ``factor`` multiplies
-    depth.
+    axes; the text's P = c + s d v / |v| is the same with z = s d / |v|.
     """
-    world_from_pixel = camera.cam_from_world[:3, :3].T @ np.linalg.inv(camera.K)
-    _lift(pixel, z, camera.width, world_from_pixel, camera.center, factor, out)
-    return out
-
-
-@inline
-def _lift(pixel, depth, width, m, center, factor, xyz):  # type: ignore[no-untyped-def]  # Numba's types
-    """P = c + z M (u, v, 1), in float64."""
-    for k in range(len(pixel)):
-        u, v = pixel[k] % width + 0.5, pixel[k] // width + 0.5
-        z = factor * np.float64(depth[k])
-        for axis in range(3):
-            xyz[k, axis] = center[axis] + z * (m[axis, 0] * u + m[axis, 1] * v + m[axis, 2])
-
-
-Fit = Literal["robust", "least-squares"]
-"""Medians and reweighting, or the paper's equation 7."""
-
-GOOD_RESIDUAL = 0.01
-"""An image that fits this well is never an outlier, however well the others fit."""
-
-MAX_RESIDUAL = 0.25
-"""An image whose median error exceeds this is not aligned at all."""
-
-
-NO_DEPTH = "the map has no depth at any pixel"
-UNIT_POINTS = 20
-UNIT_SLACK = 1.25
-"""A map in scene units is refused if at least this many SfM points show it off by this factor."""
+    m = camera.cam_from_world[:3, :3].T @ np.linalg.inv(camera.K)
+    row, column = np.divmod(pixel, camera.width)
+    z = factor * z.astype(np.float64)
+    xyz = np.empty((len(pixel), 3), np.float32)
+    for axis in range(3):
+        ray = m[axis, 0] * (column + 0.5) + m[axis, 1] * (row + 0.5) + m[axis, 2]
+        xyz[:, axis] = camera.center[axis] + z * ray
+    return xyz
 
 
 @dataclass(frozen=True)
@@ -293,26 +315,24 @@ def align(
         )
     depths, visibility = scene.depths, find_visibility(scene)
     images = [image for image in scene.images if image.name in depths]
-    alignments: list[Alignment | None] = [None] * len(images)
+    found: dict[str, Alignment] = {}
 
     def work(start: int, stop: int) -> None:
-        for i in range(start, stop):
-            depth = depths.read(images[i].name)
-            camera = map_camera(depth, images[i])
-            points = camera_points(camera, visibility.of(images[i]))
-            alignments[i] = align_map(depth, camera, points, fit, min_points)
+        for image in images[start:stop]:
+            depth = depths.read(image.name)
+            camera = map_camera(depth, image)
+            points = camera_points(camera, visibility.of(image))
+            found[image.name] = align_map(depth, camera, points, fit, min_points)
 
     in_threads(work, len(images), 1, "align depth", progress)
-    found = zip(images, alignments, strict=True)
-    aligned = {image.name: alignment for image, alignment in found if alignment is not None}
-    return reject_outliers(aligned, max_residual_ratio)
+    return reject_outliers({image.name: found[image.name] for image in images}, max_residual_ratio)
 
 
 def align_map(
     depth: DepthMap, camera: Camera, points: SeenPoints, fit: Fit, min_points: int
 ) -> Alignment:
     """Align one map, whose camera is in its own pixels, with the SfM points that its image sees."""
-    value, z = values_at(depth, camera, points)
+    value, z = _values_at(depth, camera, points)
     known = depth.values[np.isfinite(depth.values)]
     refused = None
     if not known.size:
@@ -323,20 +343,27 @@ def align_map(
         refused = "the map has one value everywhere: its estimation failed on this image"
     if refused is not None:
         return Alignment(np.nan, 0.0, len(value), np.nan, refused)
-    scale, shift = _fit(depth.kind, value, z, fit)
-    residual = _residual(depth.kind, value, z, scale, shift)
-    return Alignment(scale, shift, len(value), residual, _misfit(depth.kind, scale, residual))
+    if depth.kind == "inverse":
+        scale, shift = (robust_line if fit == "robust" else least_squares_line)(value, z)
+    else:
+        scale, shift = (median_scale if fit == "robust" else least_squares_scale)(value, z), 0.0
+    residual = _residual(depth, value, z, scale, shift)
+    if depth.kind == "inverse" and not scale > 0:
+        refused = "values rise with depth, so they are not its inverse"
+    elif not residual <= MAX_RESIDUAL:
+        refused = f"depth is off by {residual:.0%} at half of the SfM points"
+    return Alignment(scale, shift, len(value), residual, refused)
 
 
 def trust_units(depth: DepthMap, camera: Camera, points: SeenPoints) -> Alignment:
     """Take a map as being in scene units, checked against the SfM points if there are any."""
-    value, z = values_at(depth, camera, points)
+    value, z = _values_at(depth, camera, points)
     plain = Alignment(1.0, 0.0, len(value), np.nan)
     if not np.isfinite(depth.values).any():
         return replace(plain, rejected=NO_DEPTH)
     if len(value) < UNIT_POINTS:
         return plain
-    plain = replace(plain, residual=_residual(depth.kind, value, z, 1.0, 0.0))
+    plain = replace(plain, residual=_residual(depth, value, z, 1.0, 0.0))
     with np.errstate(divide="ignore"):
         ratio = float(np.median((1.0 / value if depth.kind == "inverse" else value) / z))
     # Depth in millimetres, or of another scene, is off by far more.
@@ -345,10 +372,8 @@ def trust_units(depth: DepthMap, camera: Camera, points: SeenPoints) -> Alignmen
     return replace(plain, rejected=f"its depth is {ratio:.3g} times that of the SfM points")
 
 
-def values_at(
-    depth: DepthMap, camera: Camera, points: SeenPoints
-) -> tuple[Float64[np.ndarray, " K"], Float64[np.ndarray, " K"]]:
-    """The map's values at the points, and the points' planar depths: [K] each, K <= M see depth.
+def _values_at(depth: DepthMap, camera: Camera, points: SeenPoints) -> tuple[Values, Values]:
+    """The map's values at the points that see depth, and these points' planar depths.
 
     A point takes the value of the pixel it falls into. Distances along the ray are turned into
     planar depth by the ray through that pixel's centre.
@@ -359,6 +384,16 @@ def values_at(
         value /= ray_length(camera, column, row)
     known = np.isfinite(value) & ((value > 0) | (depth.kind == "inverse"))
     return value[known], points.z[known]
+
+
+def _residual(depth: DepthMap, value: Values, z: Values, scale: float, shift: float) -> float:
+    """Median relative error of depth; infinite at a point that would lie behind the camera."""
+    aligned = scale * value + shift
+    if depth.kind == "inverse":
+        # Where 1 / z would not be positive there is no depth.
+        aligned = 1.0 / np.where(aligned > 0, aligned, np.nan)
+    error = np.abs(aligned / z - 1.0)
+    return float(np.median(np.where(np.isfinite(error), error, np.inf)))
 
 
 def reject_outliers(
@@ -377,29 +412,3 @@ def reject_outliers(
         else a
         for name, a in alignments.items()
     }
-
-
-def _fit(kind: DepthKind, value: Values, z: Values, fit: Fit) -> tuple[float, float]:
-    """Scale and shift for the kind of map."""
-    if kind == "inverse":
-        return (robust_line if fit == "robust" else least_squares_line)(value, z)
-    return (median_scale if fit == "robust" else least_squares_scale)(value, z), 0.0
-
-
-def _residual(kind: DepthKind, value: Values, z: Values, scale: float, shift: float) -> float:
-    """Median relative error of depth; infinite at a point that would lie behind the camera."""
-    aligned = scale * value + shift
-    if kind == "inverse":
-        # Where 1 / z would not be positive there is no depth.
-        aligned = 1.0 / np.where(aligned > 0, aligned, np.nan)
-    error = np.abs(aligned / z - 1.0)
-    return float(median(np.where(np.isfinite(error), error, np.inf)))
-
-
-def _misfit(kind: DepthKind, scale: float, residual: float) -> str | None:
-    """Why a fit is not valid: the wrong kind of map, or a map of another scene."""
-    if kind == "inverse" and not scale > 0:
-        return "values rise with depth, so they are not its inverse"
-    if not residual <= MAX_RESIDUAL:
-        return f"depth is off by {residual:.0%} at half of the SfM points"
-    return None

@@ -22,15 +22,13 @@ follows. Only reduced copies are read, so no file is opened again.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import spsolve
 
-from splatseed.depth.alignment import SIGMA_OF_MEDIAN
-from splatseed.depth.settings import Settings
+from splatseed.depth.alignment import SIGMA_OF_MEDIAN, Settings
 from splatseed.depth.views import DepthView, Reduced
 from splatseed.progress import Progress, in_threads
 from splatseed.runtime.jit import inline, kernel, parallel_range
@@ -70,9 +68,8 @@ def choose_neighbors(
     # V^2 S projections for the shortlist.
     per_view = int(np.clip(WORK // len(usable) ** 2, MIN_SAMPLES, SAMPLES))
     samples = np.full((len(usable), per_view, 3), np.inf, np.float32)  # seen by nobody
-    for i, k in enumerate(usable.tolist()):
-        own = views[k].samples(per_view)
-        samples[i, : len(own)] = own
+    for own, k in zip(samples, usable.tolist(), strict=True):
+        own[: len(views[k])] = views[k].samples(per_view)
     grids = [copy for k in usable.tolist() if (copy := views[k].reduced) is not None]
     matrices = np.stack([grid.grid_from_world for grid in grids])
     sizes = np.array([grid.z.shape for grid in grids])
@@ -88,18 +85,13 @@ def choose_neighbors(
             for row, j in zip(covers, listed.tolist(), strict=True):
                 _weigh(samples[i], matrices[j], sizes[j], centers[i], centers[j], row)
                 _keep_seen(samples[i], matrices[j], grids[j].z, grids[j].factor, row)
-            best = _cover(covers, num)
+            best = np.full(num, -1)
+            _choose(covers, best)
+            best = best[best >= 0]
             chosen[usable[i], : len(best)] = usable[listed[best]]
 
     in_threads(work, len(usable), PIECE, "choose neighbours", progress)
     return chosen
-
-
-def _cover(covers: Float64[np.ndarray, "J S"], num: int) -> Int64[np.ndarray, " K"]:
-    """Up to ``num`` of the rows, each chosen for what the rows before it cover least."""
-    out = np.full(num, -1)
-    _choose(covers, out)
-    return out[out >= 0]
 
 
 @kernel
@@ -296,19 +288,14 @@ ALWAYS = 8
 SAYS_NOTHING, CONFIRMS, LOOKS_THROUGH = range(3)
 
 
-class Support(NamedTuple):
-    """The verdict of other views on a view's candidates."""
-
-    agreeing: UInt8[np.ndarray, " C"]
-    """How many confirm each, counted up to the number required."""
-    seen_through: Bool[np.ndarray, " C"]
-    """Whether some view looks through each."""
-
-
 def find_support(
     xyz: Float32[np.ndarray, "C 3"], own: Reduced, others: Sequence[Reduced], settings: Settings
-) -> Support:
-    """Compare the candidates of a view, whose reduced copy is ``own``, with other views."""
+) -> tuple[UInt8[np.ndarray, " C"], Bool[np.ndarray, " C"]]:
+    """Compare the candidates of a view, whose reduced copy is ``own``, with other views.
+
+    Returns how many views confirm each, counted up to the number required, and whether some view
+    looks through each.
+    """
     agreeing = np.zeros(len(xyz), np.uint8)
     seen_through = np.zeros(len(xyz), np.bool_)
     # The sum over three channels of 8 bits.
@@ -321,7 +308,7 @@ def find_support(
             settings.tolerance, limit, settings.min_agreeing, rank >= ALWAYS, agreeing,
             seen_through,
         )  # fmt: skip
-    return Support(agreeing, seen_through)
+    return agreeing, seen_through
 
 
 @inline

@@ -1,32 +1,42 @@
 """Depth-guided lifting, from the images of a scene to new points.
 
-Notation: every image gives *candidates*; a candidate is *sound* if enough views confirm it, none
-looks through it, and no depth discontinuity is near. Promise: exactly the number asked for, or one
-error that says how many are possible. Sound candidates come first, then those that too few views
-confirm, then those near discontinuities; none that a view looks through is used, unless that is
-allowed. A note says how many of the less certain ones were needed.
+Notation: every image gives *candidates*, C in all; a candidate is *sound* (``tier`` 0) if enough
+views confirm it, none looks through it, and no depth discontinuity is near. To spread points, space
+is cut into cubes of one *side*; the key of a cube is its position, three numbers of 21 bits,
+scrambled so that all its bits are as good as random.
+Promise: exactly the number asked for, or one error that says how many are possible. Sound
+candidates come first, then those that too few views confirm, then those near discontinuities; none
+that a view looks through is used, unless that is allowed. A note says how many of the less certain
+ones were needed. Within one tier, points are spread evenly in space, or every image gives the same
+number as far as it can. Each cube gives at most one candidate, the one with the finest footprint,
+and none if an original lies in it; the side is the largest that gives the number, to about a
+fiftieth; the result does not depend on threads.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float32, Float64, UInt8
+from jaxtyping import Bool, Float32, Float64, Int64, UInt8, UInt64
 
-from splatseed.depth.alignment import reject_outliers
-from splatseed.depth.candidates import NEAR_EDGE, UNCONFIRMED, choose, gather
-from splatseed.depth.settings import Settings
-from splatseed.depth.views import DepthView, Reader
-from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.depth.alignment import Settings, lift_pixels, reject_outliers
+from splatseed.depth.comparison import choose_neighbors, find_support, synchronize_scales
+from splatseed.depth.views import DepthView, read_view
+from splatseed.errors import PointCloudError, SceneFormatError, SceneNotFoundError
 from splatseed.literal import agreeing
 from splatseed.progress import Progress, in_threads, silent
+from splatseed.runtime.hashing import scramble
+from splatseed.runtime.jit import kernel, parallel_range
 from splatseed.scene import Image, Scene
-from splatseed.views.visibility import find_visibility
+from splatseed.views.visibility import Visibility, find_visibility
 
+SOUND, UNCONFIRMED, NEAR_EDGE, DISTRUSTED = range(4)
+"""Tiers, in the order in which they are used up; the last is never used."""
 OVERSAMPLING = 1.4
 """Candidates per new point, when views are compared or points spread."""
 MAX_OVERSAMPLING = 16.0
@@ -36,15 +46,33 @@ SURPLUS = 1.25
 """Candidates are overdrawn by this factor, to save another round."""
 NAMED = 3
 """Most images that a note names."""
+PIECE = 4
+"""Views per task of a thread."""
+PARTS = 32
+"""Parts of the hash range, by a key's top 5 bits."""
+SAMPLED = 2
+"""Parts whose cubes are counted to find the side; all of them if there are few candidates."""
+FEW = 1 << 16
+STEPS = 24
+"""Most trials of a side."""
+LEAST_POWER = 0.2
+"""Least exponent e assumed in: number of cubes ~ (1 / side)^e; bounds the length of a step."""
+SLACK = 0.02
+"""Surplus of cubes that is accepted: it is then dropped at random."""
+BITS = 21
+"""Bits of a cube's position along one axis: three fit into 64."""
+OUTSIDE = 2.0**20 + 2
+"""Positions beyond every cube of a candidate, as no side is below ``FINEST``."""
+FINEST = 2.0**-20
+"""The smallest side, as a fraction of the candidates' extent: positions fit into the bits."""
 
 
 class Lifted(NamedTuple):
     """New points, and notes for the user."""
 
     xyz: Float32[np.ndarray, "M 3"]
-    """World positions, float32 [M, 3], image after image."""
+    """World positions, image after image."""
     rgb: UInt8[np.ndarray, "M 3"]
-    """Colours, uint8 [M, 3]."""
     notes: tuple[str, ...]
     """What was left out or replaced, one sentence each."""
 
@@ -73,30 +101,39 @@ def lift(
         PointCloudError: The maps cannot give so many points.
     """
     scene, center = _centered(scene)
-    images = _images_with_maps(scene, settings.hold_out)
-    reader = _reader(scene, settings)
+    used = scene.split(settings.hold_out)[0] if settings.hold_out else scene.images
+    images = [image for image in used if scene.depths is not None and image.name in scene.depths]
+    notes = _check_images(scene, len(images), len(used))
     factor = OVERSAMPLING if settings.compares_views or settings.spread else SURPLUS
-    views = _read_all(reader, images, factor * num, rng, progress)
-    notes = _missing_notes(scene, len(images), settings.hold_out)
+    read = partial(_read_all, scene, find_visibility(scene), settings, rng, progress)
+    views = read(images, factor * num)
     images, views, more = _leave_out(images, views, settings.max_residual_ratio)
-    candidates = gather(views, settings, progress)
+    candidates = _gather(views, settings, progress)
     while (
-        candidates.num_sound < num
+        (sound := int(np.count_nonzero(candidates.tier == SOUND))) < num
         and factor < MAX_OVERSAMPLING
         and not all(v.exhausted for v in views)
     ):
         # In proportion to what was sound, so that one more round mostly suffices.
-        growth = SURPLUS * num / max(candidates.num_sound, 1)
+        growth = SURPLUS * num / max(sound, 1)
         factor = min(factor * min(growth, MAX_GROWTH), MAX_OVERSAMPLING)
-        views = _read_all(reader, images, factor * num, rng, progress)
-        candidates = gather(views, settings, progress)
+        views = read(images, factor * num)
+        candidates = _gather(views, settings, progress)
+    progress("choose points", 0.0)
     points = scene.points.originals
-    originals = np.asarray(points.xyz[points.finite])
-    chosen = choose(candidates, originals, num, settings, rng, progress)
-    notes = (*notes, *more, *_relaxed_notes(candidates.tier[chosen], settings))
+    chosen = _choose(candidates, np.asarray(points.xyz[points.finite]), num, settings, rng)
+    progress("choose points", 1.0)
+    tier = candidates.tier[chosen]
+    if unconfirmed := np.count_nonzero(tier == UNCONFIRMED):
+        more.append(
+            f"{unconfirmed:,} of {num:,} new points are confirmed by fewer than "
+            f"{settings.min_agreeing} other views: no others were left."
+        )
+    if edge := np.count_nonzero(tier == NEAR_EDGE):
+        more.append(f"{edge:,} of {num:,} new points lie near depth discontinuities.")
     xyz = candidates.xyz[chosen]
     np.add(xyz, center, out=xyz, casting="same_kind")  # in float64, then rounded
-    return Lifted(xyz, candidates.rgb[chosen], notes)
+    return Lifted(xyz, candidates.rgb[chosen], (*notes, *more))
 
 
 def _centered(scene: Scene) -> tuple[Scene, Float64[np.ndarray, " 3"]]:
@@ -112,62 +149,58 @@ def _centered(scene: Scene) -> tuple[Scene, Float64[np.ndarray, " 3"]]:
         replace(image, translation=image.translation + image.camera.cam_from_world[:3, :3] @ center)
         for image in scene.images
     )
-    xyz = (scene.points.xyz - center).astype(np.float32)
-    points = scene.points.replace(xyz=xyz)
+    points = scene.points.replace(xyz=(scene.points.xyz - center).astype(np.float32))
     return scene.replace(points=points, images=images, tracks=scene.tracks), center
 
 
-def _images_with_maps(scene: Scene, hold_out: int) -> list[Image]:
-    """The images to lift from, in the order of the scene."""
-    depths = scene.depths
-    used = {image.name for image in (scene.split(hold_out)[0] if hold_out else scene.images)}
-    images = [
-        im for im in scene.images if im.name in used and depths is not None and im.name in depths
-    ]
-    if not images:
+def _check_images(scene: Scene, num: int, expected: int) -> list[str]:
+    """Refuse a scene without maps or photographs; a note says how many images lack a map."""
+    if not num:
         raise SceneNotFoundError(
             "a scene with depth maps of its images",
             found=f"{len(scene.images)} images, and maps of none of them",
             fix="Name the folder with the maps: --depth DIR.",
         )
-    return images
-
-
-def _reader(scene: Scene, settings: Settings) -> Reader:
-    folder = scene.source.image_dir if scene.source else None
-    if folder is None or scene.depths is None:
+    if scene.source is None or scene.source.image_dir is None:
         raise SceneNotFoundError(
             "a folder with the scene's photographs, from which points take their colours",
             found="none",
             fix="Put them beside the model in a folder named images.",
         )
-    return Reader(folder, scene.depths, find_visibility(scene), settings)
+    lacking = expected - num
+    what = agreeing(lacking, "has no depth map and gives", "have no depth map and give")
+    return [f"{lacking} of {expected} images {what} no points."] if lacking else []
 
 
 def _read_all(
-    reader: Reader,
-    images: Sequence[Image],
-    num: float,
+    scene: Scene,
+    visibility: Visibility,
+    settings: Settings,
     rng: np.random.Generator,
     progress: Progress,
+    images: Sequence[Image],
+    num: float,
 ) -> list[DepthView]:
     """The views of all images, which share the number of candidates equally."""
+    folder, depths = scene.source.image_dir if scene.source else None, scene.depths
+    assert folder is not None and depths is not None  # noqa: S101, PT018  (checked before)
     per_image = math.ceil(num / len(images))
     # One seed per image, drawn in order, so that threads do not matter.
     seeds = rng.integers(0, 1 << 63, len(images))
-    views: list[DepthView | None] = [None] * len(images)
+    views: list[DepthView] = [None] * len(images)  # type: ignore[list-item]  # filled in below
 
     def work(start: int, stop: int) -> None:
         for i in range(start, stop):
-            views[i] = reader.read(images[i], per_image, np.random.default_rng(seeds[i]))
+            own = np.random.default_rng(seeds[i])
+            views[i] = read_view(images[i], folder, depths, visibility, settings, per_image, own)
 
     in_threads(work, len(images), 1, "read images", progress)
-    return [view for view in views if view is not None]
+    return views
 
 
 def _leave_out(
     images: Sequence[Image], views: Sequence[DepthView], max_ratio: float | None
-) -> tuple[list[Image], list[DepthView], tuple[str, ...]]:
+) -> tuple[list[Image], list[DepthView], list[str]]:
     """The images and views whose maps are aligned, and notes on the others."""
     alignments = reject_outliers(
         {image.name: view.alignment for image, view in zip(images, views, strict=True)}, max_ratio
@@ -182,32 +215,203 @@ def _leave_out(
             "--depth-scale.",
         )
     if not reasons:
-        return list(images), list(views), ()
+        return list(images), list(views), []
     named = "; ".join(f"{name}: {reason}" for name, reason in list(reasons.items())[:NAMED])
     more = ", ..." if len(reasons) > NAMED else ""
     note = f"{len(reasons)} of {len(images)} depth maps are left out ({named}{more})."
     kept = [i for i, image in enumerate(images) if image.name not in reasons]
-    return [images[i] for i in kept], [views[i] for i in kept], (note,)
+    return [images[i] for i in kept], [views[i] for i in kept], [note]
 
 
-def _missing_notes(scene: Scene, num_used: int, hold_out: int) -> tuple[str, ...]:
-    expected = len(scene.split(hold_out)[0] if hold_out else scene.images)
-    if num_used >= expected:
-        return ()
-    lacking = expected - num_used
-    what = agreeing(lacking, "has no depth map and gives", "have no depth map and give")
-    return (f"{lacking} of {expected} images {what} no points.",)
+class _Candidates(NamedTuple):
+    """Points that could be added, view after view."""
+
+    xyz: Float32[np.ndarray, "C 3"]
+    rgb: UInt8[np.ndarray, "C 3"]
+    footprint: Float32[np.ndarray, " C"]
+    """Size of a pixel at their depth, scene units."""
+    tier: UInt8[np.ndarray, " C"]
+    view_idx: Int64[np.ndarray, " C"]
 
 
-def _relaxed_notes(tier: UInt8[np.ndarray, " M"], settings: Settings) -> tuple[str, ...]:
-    """A sentence for each requirement that was relaxed."""
-    unconfirmed, edge = (int(np.count_nonzero(tier == t)) for t in (UNCONFIRMED, NEAR_EDGE))
-    notes = []
-    if unconfirmed:
-        notes.append(
-            f"{unconfirmed:,} of {len(tier):,} new points are confirmed by fewer than "
-            f"{settings.min_agreeing} other views: no others were left."
+def _gather(views: Sequence[DepthView], settings: Settings, progress: Progress) -> _Candidates:
+    """Lift the views' candidates, and compare them with other views if the settings say so."""
+    counts = np.array([len(view) for view in views])
+    neighbors = choose_neighbors(views, settings.num_neighbors, progress)
+    factors = np.ones(len(views))
+    if settings.synchronizes:
+        factors = synchronize_scales(views, neighbors, progress)
+    copies = [
+        view.reduced and replace(view.reduced, factor=view.reduced.factor * factor)
+        for view, factor in zip(views, factors.tolist(), strict=True)
+    ]
+    stop_of = np.cumsum(counts)
+    candidates = _Candidates(
+        np.empty((stop_of[-1], 3), np.float32),
+        np.concatenate([view.rgb for view in views]),
+        np.empty(stop_of[-1], np.float32),
+        np.empty(stop_of[-1], np.uint8),
+        np.repeat(np.arange(len(views)), counts),
+    )
+
+    def work(first: int, last: int) -> None:
+        for i in range(first, last):
+            view, own, factor = views[i], copies[i], float(factors[i])
+            xyz, _, footprint, tier, _ = (
+                each[stop_of[i] - counts[i] : stop_of[i]] for each in candidates
+            )
+            xyz[:] = lift_pixels(view.pixel, view.z, view.camera, factor)
+            # A pixel at depth z is z / focal wide.
+            np.multiply(view.z, factor / view.camera.K[0, 0], out=footprint)
+            tier[:] = SOUND
+            seen_through: Bool[np.ndarray, " C"] | None = None
+            if settings.compares_views and own is not None:
+                asked = [copy for j in neighbors[i] if j >= 0 and (copy := copies[j]) is not None]
+                confirming, seen_through = find_support(xyz, own, asked, settings)
+                tier[confirming < settings.min_agreeing] = UNCONFIRMED
+            tier[view.edge] = NEAR_EDGE  # the worst tier counts
+            if seen_through is not None and not settings.see_through:
+                tier[seen_through] = DISTRUSTED
+
+    in_threads(work, len(views), PIECE, "compare views", progress)
+    return candidates
+
+
+def _choose(
+    candidates: _Candidates,
+    originals: Float32[np.ndarray, "N 3"],
+    num: int,
+    settings: Settings,
+    rng: np.random.Generator,
+) -> Int64[np.ndarray, " num"]:
+    """Exactly ``num`` candidates, ascending indices, beside originals that exist already."""
+    usable = int(np.count_nonzero(candidates.tier < DISTRUSTED))
+    if usable < num:
+        larger = " or a larger --depth.region" if settings.region < 1 else ""
+        raise PointCloudError(
+            f"depth maps that can give {num:,} points",
+            found=f"{usable:,} that no other view looks through" if usable else "none",
+            fix=f"Ask for fewer, or allow more with --depth.see-through{larger}.",
         )
-    if edge:
-        notes.append(f"{edge:,} of {len(tier):,} new points lie near depth discontinuities.")
-    return tuple(notes)
+    taken = np.zeros(len(candidates.tier), bool)
+    for tier in range(DISTRUSTED):
+        members, missing = candidates.tier == tier, num - int(np.count_nonzero(taken))
+        if missing >= np.count_nonzero(members):
+            taken |= members
+        elif settings.spread:
+            there = np.concatenate([originals, candidates.xyz[taken]])
+            xyz, footprint = candidates.xyz, candidates.footprint
+            return np.flatnonzero(taken | thin(xyz, footprint, members, there, missing, rng))
+        else:
+            which = np.flatnonzero(members)
+            taken[which[_even_shares(candidates.view_idx[which], missing, rng)]] = True
+            break
+    return np.flatnonzero(taken)
+
+
+def _even_shares(
+    view_idx: Int64[np.ndarray, " C"], num: int, rng: np.random.Generator
+) -> Int64[np.ndarray, " num"]:
+    """``num`` of C indices, as many from every view as it and the others have."""
+    order = rng.permutation(len(view_idx))
+    order = order[np.argsort(view_idx[order], kind="stable")]
+    counts = np.bincount(view_idx)
+    place = np.arange(len(order)) - np.repeat(np.cumsum(counts) - counts, counts)
+    # The first of every view, then the second of every view, and so on.
+    return np.asarray(order[np.argsort(place, kind="stable")[:num]])
+
+
+def thin(
+    xyz: Float32[np.ndarray, "C 3"],
+    footprint: Float32[np.ndarray, " C"],
+    eligible: Bool[np.ndarray, " C"],
+    originals: Float32[np.ndarray, "N 3"],
+    num: int,
+    rng: np.random.Generator,
+) -> Bool[np.ndarray, " C"]:
+    """Mark ``num`` of the eligible candidates, one per cube, the finest; none beside an original.
+
+    ``rng`` draws which of a small surplus are dropped, and fills up where candidates coincide.
+    """
+    cubes = Cubes(xyz, footprint, eligible, originals)
+    side = _largest_side(cubes, num)
+    taken = cubes.take(side)
+    if np.count_nonzero(taken) < num:  # the estimate was a little too large
+        taken = cubes.take(side * (1.0 - 2 * SLACK))
+    surplus = np.count_nonzero(taken) - num
+    if surplus > 0:
+        taken[rng.choice(np.flatnonzero(taken), surplus, replace=False, shuffle=False)] = False
+    else:
+        rest = np.flatnonzero(eligible & ~taken)
+        taken[rng.choice(rest, -surplus, replace=False, shuffle=False)] = True
+    return taken
+
+
+def _largest_side(cubes: Cubes, num: int) -> float:
+    """The largest side at which about ``num`` cubes hold a candidate."""
+    extent = float(np.ptp(cubes.xyz.astype(np.float64), axis=0).max()) or 1.0
+    least, most = FINEST * extent, extent
+    side, power = extent / math.sqrt(num), 2.0  # points on surfaces; fewer when saturated
+    known: tuple[float, float] | None = None
+    for _ in range(STEPS):
+        count = max(cubes.count(side), 1.0)
+        if num <= count <= num * (1.0 + SLACK):
+            return side
+        least, most = (side, most) if count > num else (least, side)
+        if known is not None and count != known[1]:
+            power = math.log(count / known[1]) / math.log(known[0] / side)
+        known = side, count
+        # Secant step in log side: count ~ side^-power, aimed at the middle of the slack.
+        guess = side * (count / (num * (1.0 + 0.5 * SLACK))) ** (1.0 / max(power, LEAST_POWER))
+        # A step out of the bracket is replaced by bisection, in log side.
+        side = guess if least < guess < most else math.sqrt(least * most)
+    return least
+
+
+@dataclass(frozen=True, eq=False)
+class Cubes:
+    """Candidates and originals, sorted into cubes of any side; arguments as ``thin`` has them."""
+
+    xyz: Float32[np.ndarray, "C 3"]
+    footprint: Float32[np.ndarray, " C"]
+    eligible: Bool[np.ndarray, " C"]
+    originals: Float32[np.ndarray, "N 3"]
+
+    def count(self, side: float) -> float:
+        """Estimate how many cubes hold a candidate and no original."""
+        parts = PARTS if len(self.xyz) < FEW else SAMPLED
+        keys, blocked = self._keys(side)
+        some = keys[self.eligible & (keys >> np.uint64(59) < parts)]
+        return len(np.setdiff1d(some, blocked)) * (PARTS / parts)
+
+    def take(self, side: float) -> Bool[np.ndarray, " C"]:
+        """Mark the candidate that each cube gives: the finest, of equals the first."""
+        keys, blocked = self._keys(side)
+        candidates = np.flatnonzero(self.eligible & ~np.isin(keys, blocked))
+        order = candidates[np.lexsort((self.footprint[candidates], keys[candidates]))]
+        taken = np.zeros(len(keys), np.bool_)
+        taken[order[np.unique(keys[order], return_index=True)[1]]] = True
+        return taken
+
+    def _keys(self, side: float) -> list[UInt64[np.ndarray, " C"]]:
+        """The keys of the candidates' cubes, and of the originals'."""
+        low = self.xyz.min(axis=0).astype(np.float64)
+        keys = [np.empty(len(points), np.uint64) for points in (self.xyz, self.originals)]
+        _find_cubes(self.xyz, low, side, keys[0])
+        _find_cubes(self.originals, low, side, keys[1])
+        return keys
+
+
+@kernel
+def _find_cubes(xyz, low, side, out):  # type: ignore[no-untyped-def]  # Numba's types
+    """The key of each point's cube.
+
+    Points outside the candidates' box get keys that no other cube has.
+    """
+    for k in parallel_range(len(xyz)):
+        key = np.uint64(0)
+        for axis in range(3):
+            place = np.floor((np.float64(xyz[k, axis]) - low[axis]) / side)
+            inside = min(max(place, -1.0), OUTSIDE)
+            key = (key << np.uint64(BITS)) | np.uint64(inside + 1.0)
+        out[k] = scramble(key)

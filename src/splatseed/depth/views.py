@@ -12,9 +12,9 @@ candidates depend on the image, the seed and the settings only, not on threads o
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
@@ -23,18 +23,17 @@ from splatseed.camera import Camera
 from splatseed.depth.alignment import (
     Alignment,
     PlanarDepth,
+    Settings,
     align_map,
     lift_pixels,
     map_camera,
     trust_units,
 )
-from splatseed.depth.settings import Settings
-from splatseed.depthmap import ASPECT_SLACK, DepthMaps
-from splatseed.errors import SceneFormatError
+from splatseed.depthmap import DepthMaps
 from splatseed.io.photograph import decode_photograph, photograph_bytes
 from splatseed.runtime.jit import inline
 from splatseed.scene import Image
-from splatseed.views.view import check_lens
+from splatseed.views.view import check_lens, file_from_camera
 from splatseed.views.visibility import Visibility, camera_points
 
 if TYPE_CHECKING:
@@ -42,6 +41,18 @@ if TYPE_CHECKING:
 
 GRID = 256
 """Longer side of a reduced copy: at most 7 bytes x 256 x 256 per image are kept."""
+CELLS = 64
+"""Most cells along the longer side of a map."""
+ROUNDS = 4
+"""Most rounds of drawing, each for what the last has left missing."""
+DIAGONAL = 2.0**0.5
+"""Length of a diagonal step, in cells."""
+LEAST_DISTANCE = 0.5
+"""Distance, in cells, given to a cell that has points itself: it stays open to new ones."""
+SURPLUS = 1.15
+"""Overdraw factor: some pixels will be unknown or near a discontinuity."""
+LEAST_SHARE = 0.05
+"""Fraction of the drawn pixels that is assumed usable."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,91 +109,63 @@ class DepthView:
         num = min(num, len(self))
         # Pixels come roughly row by row, so even numbers are spread over the image.
         which = ((np.arange(num) + 0.5) * (len(self) / num)).astype(np.int64)
-        out = np.empty((num, 3), np.float32)
-        return lift_pixels(self.pixel[which], self.z[which], self.camera, out, factor)
+        return lift_pixels(self.pixel[which], self.z[which], self.camera, factor)
 
 
-@dataclass(frozen=True, eq=False)
-class Reader:
-    """Turns images into views.
+def read_view(
+    image: Image,
+    folder: Path,
+    depths: DepthMaps,
+    visibility: Visibility,
+    settings: Settings,
+    num: int,
+    rng: np.random.Generator,
+) -> DepthView:
+    """Read an image and its map, and draw ``num`` candidates, or a few more.
 
     Args:
-        folder: The folder of the photographs.
+        image: The image.
+        folder: That of the photographs.
         depths: The depth maps.
         visibility: The SfM points that each image sees.
         settings: The method's choices.
+        num: How many candidates.
+        rng: The source of this image's random numbers.
+
+    Raises:
+        SceneNotFoundError: A file is gone.
+        SceneFormatError: A file is damaged, has the wrong aspect ratio, or the lens distorts.
     """
-
-    folder: Path
-    depths: DepthMaps
-    visibility: Visibility
-    settings: Settings
-
-    def read(self, image: Image, num: int, rng: np.random.Generator) -> DepthView:
-        """Read an image and its map, and draw ``num`` candidates, or a few more.
-
-        Raises:
-            SceneNotFoundError: A file is gone.
-            SceneFormatError: A file is damaged, has the wrong aspect ratio, or the lens distorts.
-        """
-        check_lens(image, reason="along whose rays pixels are lifted")
-        view, coarse, unit = self._read_map(image, num, rng)  # its map is freed by now
-        if view.alignment.rejected is not None:
-            return view
-        path, camera = self.folder / image.name, view.camera
-        photograph = decode_photograph(path, photograph_bytes(path))
-        _check_shape(path, photograph, camera)
-        rgb = np.empty((len(view), 3), np.uint8)
-        _take_colors(np.asarray(photograph), view.pixel, camera.width, camera.height, rgb)
-        reduced = None if coarse is None else _reduce(camera, coarse, unit, photograph)
-        return replace(view, rgb=rgb, exhausted=len(view) < num, reduced=reduced)
-
-    def _read_map(
-        self, image: Image, num: int, rng: np.random.Generator
-    ) -> tuple[DepthView, Float32[np.ndarray, "h w"] | None, float]:
-        """What is taken from a map: the view without colours, a coarse copy, and its unit."""
-        depth, settings = self.depths.read(image.name), self.settings
-        camera = map_camera(depth, image)
-        points = camera_points(camera, self.visibility.of(image))
-        if settings.align:
-            alignment = align_map(depth, camera, points, settings.fit, settings.min_points)
-        else:
-            alignment = trust_units(depth, camera, points)
-        no_rgb = np.empty((0, 3), np.uint8)
-        if alignment.rejected is not None:
-            none, no_z = np.empty(0, np.int64), np.empty(0, np.float32)
-            return DepthView(alignment, camera, none, no_z, no_rgb, none > 0, True, None), None, 1.0
-        planar = PlanarDepth.of(
-            depth, camera, alignment.scale, alignment.shift, unit_ray=settings.unit_ray
-        )
-        pixel, edge = sample_pixels(planar.values, num, points.uv, settings, rng)
-        view = DepthView(alignment, camera, pixel, planar.at(pixel), no_rgb, edge, False, None)
-        if not (settings.compares_views or settings.synchronizes):
-            return view, None, 1.0
+    check_lens(image, reason="along whose rays pixels are lifted")
+    depth = depths.read(image.name)
+    camera = map_camera(depth, image)
+    points = camera_points(camera, visibility.of(image))
+    if settings.align:
+        alignment = align_map(depth, camera, points, settings.fit, settings.min_points)
+    else:
+        alignment = trust_units(depth, camera, points)
+    if alignment.rejected is not None:
+        none, no_rgb = np.empty(0, np.int64), np.empty((0, 3), np.uint8)
+        no_z = np.empty(0, np.float32)
+        return DepthView(alignment, camera, none, no_z, no_rgb, none > 0, True, None)
+    scale, shift = alignment.scale, alignment.shift
+    planar = PlanarDepth.of(depth, camera, scale, shift, unit_ray=settings.unit_ray)
+    pixel, edge = sample_pixels(planar.values, num, points.uv, settings, rng)
+    z, unit, coarse = planar.at(pixel), planar.scale, None
+    if settings.compares_views or settings.synchronizes:
         # The whole step at which the longer side keeps at most GRID pixels.
-        factor = -(-max(planar.values.shape) // GRID)
-        return view, planar.every(factor // 2, factor), planar.scale
-
-
-def _check_shape(path: Path, photograph: PilImage.Image, camera: Camera) -> None:
-    stretch = photograph.width / camera.width / (photograph.height / camera.height)
-    if abs(stretch - 1) > ASPECT_SLACK:
-        raise SceneFormatError(
-            f"{path} to have the aspect ratio of camera and map, {camera.width} x {camera.height}",
-            found=f"{photograph.width} x {photograph.height}",
-            fix="Use the images that the model was made from, or a resized copy of them.",
-        )
-
-
-@inline
-def _take_colors(photograph, pixel, width, height, out):  # type: ignore[no-untyped-def]  # Numba's types
-    """The photograph's pixels at the centres of the map's pixels."""
-    rows, columns = photograph.shape[0], photograph.shape[1]
-    for k in range(len(pixel)):
-        row = int((pixel[k] // width + 0.5) * rows / height)
-        column = int((pixel[k] % width + 0.5) * columns / width)
-        for channel in range(3):
-            out[k, channel] = photograph[row, column, channel]
+        step = -(-max(planar.values.shape) // GRID)
+        coarse = planar.every(step // 2, step)
+    del depth, planar  # before the photograph needs memory
+    path = folder / image.name
+    photograph = decode_photograph(path, photograph_bytes(path))
+    file_from_camera(path, photograph.size, (camera.width, camera.height))
+    row, column = (each + 0.5 for each in np.divmod(pixel, camera.width))
+    row = (row * photograph.height / camera.height).astype(np.int64)
+    column = (column * photograph.width / camera.width).astype(np.int64)
+    rgb = np.asarray(photograph)[row, column]
+    reduced = None if coarse is None else _reduce(camera, coarse, unit, photograph)
+    return DepthView(alignment, camera, pixel, z, rgb, edge, len(pixel) < num, reduced)
 
 
 def _reduce(
@@ -206,43 +189,29 @@ def _reduce(
     )
 
 
-CELLS = 64
-"""Most cells along the longer side of a map."""
-
-ROUNDS = 4
-"""Most rounds of drawing, each for what the last has left missing."""
-DIAGONAL = 2.0**0.5
-"""Length of a diagonal step, in cells."""
-LEAST_DISTANCE = 0.5
-"""Distance, in cells, given to a cell that has points itself: it stays open to new ones."""
-
-SURPLUS = 1.15
-"""Overdraw factor: some pixels will be unknown or near a discontinuity."""
-LEAST_SHARE = 0.05
-"""Fraction of the drawn pixels that is assumed usable."""
-
-
-class Drawn(NamedTuple):
-    """Pixels drawn from one map."""
-
-    pixel: Int64[np.ndarray, " C"]
-    """Their numbers."""
-    edge: Bool[np.ndarray, " C"]
-    """Which lie near a depth discontinuity: taken only when nothing else is left."""
-
-
 def sample_pixels(
     values: Float32[np.ndarray, "H W"],
     num: int,
     points: Float64[np.ndarray, "M 2"],
     settings: Settings,
     rng: np.random.Generator,
-) -> Drawn:
+) -> tuple[Int64[np.ndarray, " C"], Bool[np.ndarray, " C"]]:
     """Draw ``num`` distinct pixels with depth, or a few more; fewer if the map has fewer.
 
-    ``values`` are positive where known, else NaN; ``points`` are where SfM points lie, in pixels.
+    Args:
+        values: Positive where known, else NaN.
+        num: How many.
+        points: Where SfM points lie, in pixels.
+        settings: The method's choices.
+        rng: The source of random numbers.
+
+    Returns:
+        Their numbers, and which lie near a discontinuity: those are taken when nothing else is
+        left.
     """
-    box = _region(values.shape, settings.region)
+    # The central share of each dimension.
+    top, left = (round(0.5 * (1.0 - settings.region) * size) for size in values.shape)
+    box = (top, left, values.shape[0] - top, values.shape[1] - left)
     step = -(-max(values.shape) // CELLS)
     weight = _cell_weights(values.shape, step, points, settings)
     cumulative = np.cumsum(weight, dtype=np.float64)
@@ -256,8 +225,12 @@ def sample_pixels(
         if missing <= 0:
             break
         # The share of usable pixels so far tells how many to try.
-        will_do = max(len(pixel) / tried, LEAST_SHARE) if tried else 1.0
-        picks = _picks(int(SURPLUS * missing / will_do) + 1, settings.placement, rng)
+        usable = max(len(pixel) / tried, LEAST_SHARE) if tried else 1.0
+        picks = rng.random(int(SURPLUS * missing / usable) + 1)
+        if settings.placement == "uniform":
+            picks.sort()
+        else:  # stratified: one in each part
+            picks = (np.arange(len(picks)) + picks) / len(picks)
         # Inverse of the cumulative weight: a cell is drawn in proportion to its weight.
         picks *= cumulative[-1]
         jitter = rng.random((len(picks), 2), dtype=np.float32)
@@ -265,15 +238,19 @@ def sample_pixels(
         drawn = _draw(values, cumulative, weight.shape[1], step, box, picks, jitter, *edges, part)
         pixel = part[:drawn] if not tried else np.unique(np.concatenate([pixel, part[:drawn]]))
         tried += len(picks)
-    if len(pixel) < num:
-        return _with_rest(values, pixel, num, box, edges, rng)
-    return Drawn(pixel, np.zeros(len(pixel), np.bool_))
-
-
-def _region(shape: tuple[int, int], share: float) -> tuple[int, int, int, int]:
-    """Top, left, bottom and right of the central share of each dimension, in pixels."""
-    top, left = (round(0.5 * (1.0 - share) * size) for size in shape)
-    return top, left, shape[0] - top, shape[1] - left
+    edge = np.zeros(len(pixel), np.bool_)
+    if len(pixel) >= num:
+        return pixel, edge
+    # As many others as are missing, whatever their weight, edges last.
+    free = np.zeros(values.shape, bool)
+    inner = np.s_[box[0] : box[2], box[1] : box[3]]
+    free[inner] = (values[inner] > 0) & (values[inner] < np.inf)
+    free.ravel()[pixel] = False
+    rest = rng.permutation(np.flatnonzero(free))
+    near = np.empty(len(rest), np.bool_)
+    _mark_edges(values, rest, *edges, near)
+    chosen = np.argsort(near, kind="stable")[: num - len(pixel)]
+    return np.concatenate([pixel, rest[chosen]]), np.concatenate([edge, near[chosen]])
 
 
 def _cell_weights(
@@ -292,35 +269,6 @@ def _cell_weights(
     distance[row, column] = 0.0
     _spread_distance(distance)
     return np.asarray(np.sqrt(np.maximum(distance, LEAST_DISTANCE)))
-
-
-def _picks(num: int, placement: str, rng: np.random.Generator) -> Float64[np.ndarray, " num"]:
-    """Ascending numbers in [0, 1): independent, or stratified with one in each ``num``-th."""
-    if placement == "uniform":
-        return np.sort(rng.random(num))
-    return (np.arange(num) + rng.random(num)) / num
-
-
-def _with_rest(
-    values: Float32[np.ndarray, "H W"],
-    pixel: Int64[np.ndarray, " C"],
-    num: int,
-    box: tuple[int, int, int, int],
-    edges: tuple[int, float],
-    rng: np.random.Generator,
-) -> Drawn:
-    """The drawn pixels and as many others as are missing, whatever their weight, edges last."""
-    top, left, bottom, right = box
-    free = np.zeros(values.shape, bool)
-    inner = values[top:bottom, left:right]
-    free[top:bottom, left:right] = (inner > 0) & (inner < np.inf)
-    free.ravel()[pixel] = False
-    rest = rng.permutation(np.flatnonzero(free))
-    edge = np.empty(len(rest), np.bool_)
-    _mark_edges(values, rest, *edges, edge)
-    chosen = np.argsort(edge, kind="stable")[: num - len(pixel)]
-    edge = np.concatenate([np.zeros(len(pixel), np.bool_), edge[chosen]])
-    return Drawn(np.concatenate([pixel, rest[chosen]]), edge)
 
 
 @inline

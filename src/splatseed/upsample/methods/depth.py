@@ -13,7 +13,7 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from splatseed.depth.settings import Settings
+from splatseed.depth.alignment import Settings
 from splatseed.progress import Progress
 from splatseed.scene import Scene
 from splatseed.upsample.method import NewPoints, Traits, check_fields, require
