@@ -17,8 +17,7 @@ from benchmarks.common.clouds import find_scenes
 
 import splatseed as ss
 from splatseed.depth.stereo.depths import find_stereo
-from splatseed.depth.stereo.maps import StereoResult
-from splatseed.depth.stereo.settings import StereoSettings
+from splatseed.depth.stereo.maps import StereoResult, StereoSettings
 from splatseed.views.view import data_factor, load_views
 from splatseed.views.visibility import Visibility, find_visibility
 

@@ -22,7 +22,7 @@ from benchmarks.stereo.truth import MADE_STEP, Score, first, load, reached, rela
 from jaxtyping import Float, Int, UInt8
 
 from splatseed.depth.stereo.depths import known_visibility
-from splatseed.depth.stereo.settings import StereoSettings
+from splatseed.depth.stereo.maps import StereoSettings
 from splatseed.scene import Scene
 from splatseed.views.pairs import choose_sources
 from splatseed.views.view import View, data_factor, load_views

@@ -19,10 +19,9 @@ from benchmarks.stereo.peer import costs_of_planes
 
 import splatseed as ss
 from splatseed.depth.stereo.cost import make_quads
-from splatseed.depth.stereo.depths import find_stereo
-from splatseed.depth.stereo.fusion import fuse
+from splatseed.depth.stereo.depths import find_stereo, fuse
+from splatseed.depth.stereo.maps import StereoSettings
 from splatseed.depth.stereo.patchmatch import QuadImages, begin, sweep
-from splatseed.depth.stereo.settings import StereoSettings
 from splatseed.pointcloud import PointCloud
 from splatseed.synthetic import make_capture, write_capture
 from splatseed.synthetic.texture import value_noise

@@ -21,7 +21,7 @@ import tyro
 from splatseed.commands.next_steps import after_depth, look
 from splatseed.commands.options import check_least, parse_options, refuse
 from splatseed.console import OUT, print_note, print_pairs, stage_display
-from splatseed.depth.stereo.settings import LEAST_SIZE, MOST_GRID
+from splatseed.depth.stereo.maps import LEAST_SIZE, MOST_GRID
 from splatseed.depthmap import DepthKind
 from splatseed.io import dense, load_scene
 from splatseed.io.photograph import warnings_but_lens

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from splatseed.depth.stereo.settings import MOST_GRID, TOO_FEW, StereoSettings
+from splatseed.depth.stereo.maps import MOST_GRID, TOO_FEW, StereoSettings
 from splatseed.errors import PointCloudError, SceneNotFoundError
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress
@@ -97,7 +97,7 @@ class Stereo(PhotographMethod):
 
         Without points, the scene's poses are checked first.
         """
-        from splatseed.depth.stereo.fusion import fuse  # noqa: PLC0415  (kernels load with use)
+        from splatseed.depth.stereo.depths import fuse  # noqa: PLC0415  (kernels load with use)
 
         images = photographed(scene, self.hold_out)
         warnings: tuple[str, ...] = ()

@@ -26,8 +26,8 @@ from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter, sobe
 from scipy.signal import correlate
 
 from splatseed.depth.stereo.depths import any_depth
+from splatseed.depth.stereo.maps import StereoSettings
 from splatseed.depth.stereo.matching import match_views
-from splatseed.depth.stereo.settings import StereoSettings
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.literal import quoted
 from splatseed.pointcloud import PointCloud

@@ -18,8 +18,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32
 
-from splatseed.depth.stereo.maps import StereoResult, stereo_depths
-from splatseed.depth.stereo.settings import StereoSettings
+from splatseed.depth.stereo.maps import StereoResult, StereoSettings, stereo_depths
 from splatseed.io.files import ARCHIVE_FAILURES
 from splatseed.io.staging import atomic_file
 from splatseed.progress import Progress, silent

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from splatseed.depth.stereo.depths import StereoResult, find_stereo
-from splatseed.depth.stereo.settings import StereoSettings
+from splatseed.depth.stereo.maps import StereoSettings
 from splatseed.scene import Scene
 from splatseed.synthetic.surfaces import Union
 from splatseed.views.view import load_views

@@ -11,7 +11,7 @@ import pytest
 
 from splatseed.depth.stereo import depths as without_points, stereo_depths
 from splatseed.depth.stereo.depths import find_stereo
-from splatseed.depth.stereo.settings import StereoSettings
+from splatseed.depth.stereo.maps import StereoSettings
 from splatseed.errors import ParameterError, SceneNotFoundError
 from splatseed.pointcloud import PointCloud
 from splatseed.views.view import load_views

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from splatseed.depth.stereo.fusion import SAME, fuse
+from splatseed.depth.stereo.depths import SAME, fuse
 
 CELL = 6.0
 

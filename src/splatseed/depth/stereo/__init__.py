@@ -3,7 +3,6 @@
 Promise: NumPy and Numba only; importing this package loads neither Numba nor SciPy.
 """
 
-from splatseed.depth.stereo.maps import StereoMap, stereo_depths
-from splatseed.depth.stereo.settings import StereoSettings
+from splatseed.depth.stereo.maps import StereoMap, StereoSettings, stereo_depths
 
 __all__ = ["StereoMap", "StereoSettings", "stereo_depths"]

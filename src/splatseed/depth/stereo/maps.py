@@ -1,4 +1,4 @@
-"""Stereo's maps: depth and normals at the pixels of each photograph of a scene.
+"""Stereo's choices and its maps: depth and normals at the pixels of each photograph of a scene.
 
 Notation: V views of W x H pixels; a map has one pixel per block of g x g pixels, and ``camera`` is
 the photograph's, scaled to the map's pixels, with the centre of the first at (0.5, 0.5). Promise: a
@@ -15,11 +15,61 @@ import numpy as np
 from jaxtyping import Float32, Int64, UInt8
 
 from splatseed.camera import Camera
-from splatseed.depth.stereo.settings import StereoSettings
-from splatseed.errors import SceneNotFoundError
+from splatseed.errors import ParameterError, SceneNotFoundError
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 from splatseed.views.view import View
+
+TOO_FEW = 30
+"""Points that are not worth being searched around, and vouch for no pose."""
+LEAST_SIZE = 32
+MOST_GRID = 32
+MOST_SOURCES = 8
+"""Bits of the byte that records which views agree."""
+
+
+@dataclass(frozen=True)
+class StereoSettings:
+    """The choices of stereo: depth from photographs alone."""
+
+    max_size: int = 800
+    """Photographs are downsampled by a whole factor to at most this many pixels a side."""
+    grid: int = 4
+    """Pixels between depths, along a row and a column."""
+    sweeps: int = 4
+    """PatchMatch iterations: each propagates and refines all planes."""
+    num_sources: int = 5
+    """Views in which a plane is compared."""
+    num_witnesses: int = 8
+    """Views that may confirm a depth."""
+    min_agreeing: int = 2
+    """How many of these views must confirm it."""
+    tolerance: float = 0.01
+    """Relative difference at which two depths agree."""
+    max_cost: float = 0.5
+    """Pixels of higher cost (one minus correlation, 0 to 2) are left out."""
+
+    def __post_init__(self) -> None:
+        for name, good, expected in (
+            ("max_size", self.max_size >= LEAST_SIZE, f"at least {LEAST_SIZE}"),
+            ("grid", 1 <= self.grid <= MOST_GRID, f"1 to {MOST_GRID}"),
+            ("sweeps", self.sweeps >= 1, "at least 1"),
+            ("num_sources", 1 <= self.num_sources <= MOST_SOURCES, f"1 to {MOST_SOURCES}"),
+            ("num_witnesses", 1 <= self.num_witnesses <= MOST_SOURCES, f"1 to {MOST_SOURCES}"),
+            (
+                "min_agreeing",
+                1 <= self.min_agreeing <= self.num_witnesses,
+                f"1 to {self.num_witnesses}",
+            ),
+            ("tolerance", 0 < self.tolerance < 1, "more than 0 and less than 1"),
+            ("max_cost", 0 < self.max_cost <= 2, "more than 0, 2 at most"),
+        ):
+            if not good:
+                raise ParameterError(
+                    f"stereo.{name} of {expected}",
+                    found=repr(getattr(self, name)),
+                    fix="Choose such a value.",
+                )
 
 
 @dataclass(frozen=True, eq=False)

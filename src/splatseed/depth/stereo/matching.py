@@ -23,9 +23,8 @@ from jaxtyping import Bool, Float32, Float64, Int32, Int64, UInt8
 from scipy.spatial import cKDTree
 
 from splatseed.depth.stereo.cost import grey_image, make_quads
-from splatseed.depth.stereo.maps import StereoResult
+from splatseed.depth.stereo.maps import StereoResult, StereoSettings
 from splatseed.depth.stereo.patchmatch import QuadImages, begin, sweep
-from splatseed.depth.stereo.settings import StereoSettings
 from splatseed.progress import Progress, in_threads
 from splatseed.runtime.jit import inline
 from splatseed.runtime.memory import check_memory

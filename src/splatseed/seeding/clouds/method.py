@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 from jaxtyping import Float64
 
-from splatseed.depth.stereo.settings import StereoSettings
+from splatseed.depth.stereo.maps import StereoSettings
 from splatseed.errors import ParameterError, PointCloudError
 from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
