@@ -351,14 +351,13 @@ def test_a_failure_on_the_way_leaves_nothing(exact, tmp_path):
 def test_what_cannot_be_done_is_refused(exact, tmp_path):
     folder, network = exact.source.image_dir.parent, Brightness()
     nowhere = exact.replace(source=replace(exact.source, image_dir=None))
-    for scene, output, max_size, error in (
-        (exact, folder, 80, OutputError),
-        (exact, folder / "images" / "maps", 80, OutputError),
-        (exact, tmp_path / "maps", -5, ParameterError),
-        (exact.replace(images=()), tmp_path / "maps", 80, SceneNotFoundError),
-        (nowhere, tmp_path / "maps", 80, SceneNotFoundError),
+    for scene, output, error in (
+        (exact, folder, OutputError),
+        (exact, folder / "images" / "maps", OutputError),
+        (exact.replace(images=()), tmp_path / "maps", SceneNotFoundError),
+        (nowhere, tmp_path / "maps", SceneNotFoundError),
     ):
         with pytest.raises(InputError) as caught:
-            estimate_depths(scene, network, output, max_size=max_size)
+            estimate_depths(scene, network, output)
         assert type(caught.value) is error
     assert not network.asked

@@ -194,35 +194,23 @@ def synchronize_scales(
     """The factor by which to multiply the depth of each view, [V]."""
     residuals = np.array([view.alignment.residual for view in views])
     sigma = np.maximum(np.where(np.isfinite(residuals), residuals, OTHER_SURFACE), LEAST_RESIDUAL)
-    g = np.zeros(len(views))
+    neighbors, g = neighbors[:, :PAIRS], np.zeros(len(views))
     for _ in range(ROUNDS):  # again from where the first solution leaves the maps
-        g = _solve_scales(_compare_all(views, neighbors, g, progress), g, sigma)
+        # Rows i, j, a, sigma of every pair that overlaps, with the maps multiplied by exp(g).
+        pairs = np.full((*neighbors.shape, 4), np.nan)
+
+        def work(start: int, stop: int, g=g, pairs=pairs) -> None:  # type: ignore[no-untyped-def]
+            for i in range(start, stop):
+                samples = views[i].samples(PAIR_SAMPLES, float(np.exp(g[i])))
+                for row, j in zip(pairs[i], neighbors[i].tolist(), strict=True):
+                    other = views[j].reduced if j >= 0 else None
+                    if other is not None:
+                        row[:2], factor = (i, j), other.factor * np.exp(g[j])
+                        _compare_pair(samples, other.z, factor, other.grid_from_world, row[2:])
+
+        in_threads(work, len(views), PIECE, "synchronize scales", progress)
+        g = _solve_scales(pairs[np.isfinite(pairs).all(axis=2)], g, sigma)
     return np.asarray(np.exp(g))
-
-
-def _compare_all(
-    views: Sequence[DepthView],
-    neighbors: Int64[np.ndarray, "V num"],
-    g: Float64[np.ndarray, " V"],
-    progress: Progress,
-) -> Float64[np.ndarray, "P 4"]:
-    """Rows i, j, a, sigma of every pair that overlaps, with the maps multiplied by exp(g)."""
-    neighbors = neighbors[:, :PAIRS]
-    pairs = np.full((*neighbors.shape, 4), np.nan)
-
-    def work(start: int, stop: int) -> None:
-        for i in range(start, stop):
-            samples = views[i].samples(PAIR_SAMPLES, float(np.exp(g[i])))
-            for k, j in enumerate(neighbors[i].tolist()):
-                other = views[j].reduced if j >= 0 else None
-                if other is not None:
-                    pairs[i, k, :2] = i, j
-                    factor = other.factor * np.exp(g[j])
-                    _compare_pair(samples, other.z, factor, other.grid_from_world, pairs[i, k, 2:])
-
-    in_threads(work, len(views), PIECE, "synchronize scales", progress)
-    rows = pairs.reshape(-1, 4)
-    return np.asarray(rows[np.isfinite(rows).all(axis=1)])
 
 
 def _solve_scales(

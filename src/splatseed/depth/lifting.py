@@ -18,7 +18,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -28,12 +27,13 @@ from splatseed.depth.alignment import Settings, lift_pixels, reject_outliers
 from splatseed.depth.comparison import choose_neighbors, find_support, synchronize_scales
 from splatseed.depth.views import DepthView, read_view
 from splatseed.errors import PointCloudError, SceneFormatError, SceneNotFoundError
+from splatseed.io.photograph import photograph_folder
 from splatseed.literal import agreeing
 from splatseed.progress import Progress, in_threads, silent
 from splatseed.runtime.hashing import scramble
 from splatseed.runtime.jit import kernel, parallel_range
 from splatseed.scene import Image, Scene
-from splatseed.views.visibility import Visibility, find_visibility
+from splatseed.views.visibility import find_visibility
 
 SOUND, UNCONFIRMED, NEAR_EDGE, DISTRUSTED = range(4)
 """Tiers, in the order in which they are used up; the last is never used."""
@@ -67,23 +67,13 @@ FINEST = 2.0**-20
 """The smallest side, as a fraction of the candidates' extent: positions fit into the bits."""
 
 
-class Lifted(NamedTuple):
-    """New points, and notes for the user."""
-
-    xyz: Float32[np.ndarray, "M 3"]
-    """World positions, image after image."""
-    rgb: UInt8[np.ndarray, "M 3"]
-    notes: tuple[str, ...]
-    """What was left out or replaced, one sentence each."""
-
-
 def lift(
     scene: Scene,
     num: int,
     settings: Settings,
     rng: np.random.Generator,
     progress: Progress = silent,
-) -> Lifted:
+) -> tuple[Float32[np.ndarray, "M 3"], UInt8[np.ndarray, "M 3"], tuple[str, ...]]:
     """Lift ``num`` pixels of a scene's images into its world.
 
     Each image and its map are read once, and again only if too few of the candidates are sound.
@@ -95,19 +85,47 @@ def lift(
         rng: The source of all random numbers.
         progress: Called with the stage and the fraction done.
 
+    Returns:
+        World positions and colours, image after image, and what was left out or replaced, one
+        sentence each.
+
     Raises:
         SceneNotFoundError: There are no maps or no photographs, or a file is gone.
         SceneFormatError: A file is damaged or does not fit, or no map can be aligned.
         PointCloudError: The maps cannot give so many points.
     """
     scene, center = _centered(scene)
+    depths, visibility = scene.depths, find_visibility(scene)
     used = scene.split(settings.hold_out)[0] if settings.hold_out else scene.images
-    images = [image for image in used if scene.depths is not None and image.name in scene.depths]
-    notes = _check_images(scene, len(images), len(used))
+    images = [image for image in used if depths is not None and image.name in depths]
+    if depths is None or not images:
+        raise SceneNotFoundError(
+            "a scene with depth maps of its images",
+            found=f"{len(scene.images)} images, and maps of none of them",
+            fix="Name the folder with the maps: --depth DIR.",
+        )
+    folder, notes = photograph_folder(scene), []
+    if lacking := len(used) - len(images):
+        what = agreeing(lacking, "has no depth map and gives", "have no depth map and give")
+        notes.append(f"{lacking} of {len(used)} images {what} no points.")
+
+    def read_all(num: float) -> list[DepthView]:
+        """The views of all images, which share the number of candidates equally."""
+        views: dict[int, DepthView] = {}
+        # One seed per image, drawn in order, so that threads do not matter.
+        seeds = rng.integers(0, 1 << 63, len(images))
+
+        def work(start: int, stop: int) -> None:
+            for i in range(start, stop):
+                own, share = np.random.default_rng(seeds[i]), math.ceil(num / len(images))
+                views[i] = read_view(images[i], folder, depths, visibility, settings, share, own)
+
+        in_threads(work, len(images), 1, "read images", progress)
+        return [views[i] for i in range(len(images))]
+
     factor = OVERSAMPLING if settings.compares_views or settings.spread else SURPLUS
-    read = partial(_read_all, scene, find_visibility(scene), settings, rng, progress)
-    views = read(images, factor * num)
-    images, views, more = _leave_out(images, views, settings.max_residual_ratio)
+    views = read_all(factor * num)
+    images, views = _leave_out(images, views, settings.max_residual_ratio, notes)
     candidates = _gather(views, settings, progress)
     while (
         (sound := int(np.count_nonzero(candidates.tier == SOUND))) < num
@@ -117,7 +135,7 @@ def lift(
         # In proportion to what was sound, so that one more round mostly suffices.
         growth = SURPLUS * num / max(sound, 1)
         factor = min(factor * min(growth, MAX_GROWTH), MAX_OVERSAMPLING)
-        views = read(images, factor * num)
+        views = read_all(factor * num)
         candidates = _gather(views, settings, progress)
     progress("choose points", 0.0)
     points = scene.points.originals
@@ -125,15 +143,15 @@ def lift(
     progress("choose points", 1.0)
     tier = candidates.tier[chosen]
     if unconfirmed := np.count_nonzero(tier == UNCONFIRMED):
-        more.append(
+        notes.append(
             f"{unconfirmed:,} of {num:,} new points are confirmed by fewer than "
             f"{settings.min_agreeing} other views: no others were left."
         )
     if edge := np.count_nonzero(tier == NEAR_EDGE):
-        more.append(f"{edge:,} of {num:,} new points lie near depth discontinuities.")
+        notes.append(f"{edge:,} of {num:,} new points lie near depth discontinuities.")
     xyz = candidates.xyz[chosen]
     np.add(xyz, center, out=xyz, casting="same_kind")  # in float64, then rounded
-    return Lifted(xyz, candidates.rgb[chosen], (*notes, *more))
+    return xyz, candidates.rgb[chosen], tuple(notes)
 
 
 def _centered(scene: Scene) -> tuple[Scene, Float64[np.ndarray, " 3"]]:
@@ -153,55 +171,10 @@ def _centered(scene: Scene) -> tuple[Scene, Float64[np.ndarray, " 3"]]:
     return scene.replace(points=points, images=images, tracks=scene.tracks), center
 
 
-def _check_images(scene: Scene, num: int, expected: int) -> list[str]:
-    """Refuse a scene without maps or photographs; a note says how many images lack a map."""
-    if not num:
-        raise SceneNotFoundError(
-            "a scene with depth maps of its images",
-            found=f"{len(scene.images)} images, and maps of none of them",
-            fix="Name the folder with the maps: --depth DIR.",
-        )
-    if scene.source is None or scene.source.image_dir is None:
-        raise SceneNotFoundError(
-            "a folder with the scene's photographs, from which points take their colours",
-            found="none",
-            fix="Put them beside the model in a folder named images.",
-        )
-    lacking = expected - num
-    what = agreeing(lacking, "has no depth map and gives", "have no depth map and give")
-    return [f"{lacking} of {expected} images {what} no points."] if lacking else []
-
-
-def _read_all(
-    scene: Scene,
-    visibility: Visibility,
-    settings: Settings,
-    rng: np.random.Generator,
-    progress: Progress,
-    images: Sequence[Image],
-    num: float,
-) -> list[DepthView]:
-    """The views of all images, which share the number of candidates equally."""
-    folder, depths = scene.source.image_dir if scene.source else None, scene.depths
-    assert folder is not None and depths is not None  # noqa: S101, PT018  (checked before)
-    per_image = math.ceil(num / len(images))
-    # One seed per image, drawn in order, so that threads do not matter.
-    seeds = rng.integers(0, 1 << 63, len(images))
-    views: list[DepthView] = [None] * len(images)  # type: ignore[list-item]  # filled in below
-
-    def work(start: int, stop: int) -> None:
-        for i in range(start, stop):
-            own = np.random.default_rng(seeds[i])
-            views[i] = read_view(images[i], folder, depths, visibility, settings, per_image, own)
-
-    in_threads(work, len(images), 1, "read images", progress)
-    return views
-
-
 def _leave_out(
-    images: Sequence[Image], views: Sequence[DepthView], max_ratio: float | None
-) -> tuple[list[Image], list[DepthView], list[str]]:
-    """The images and views whose maps are aligned, and notes on the others."""
+    images: list[Image], views: list[DepthView], max_ratio: float | None, notes: list[str]
+) -> tuple[list[Image], list[DepthView]]:
+    """The images and views whose maps are aligned; a note is added on the others."""
     alignments = reject_outliers(
         {image.name: view.alignment for image, view in zip(images, views, strict=True)}, max_ratio
     )
@@ -214,13 +187,12 @@ def _leave_out(
             fix="Look at them with splatseed info SCENE --depth DIR; check --depth-kind and "
             "--depth-scale.",
         )
-    if not reasons:
-        return list(images), list(views), []
-    named = "; ".join(f"{name}: {reason}" for name, reason in list(reasons.items())[:NAMED])
-    more = ", ..." if len(reasons) > NAMED else ""
-    note = f"{len(reasons)} of {len(images)} depth maps are left out ({named}{more})."
+    if reasons:
+        named = "; ".join(f"{name}: {reason}" for name, reason in list(reasons.items())[:NAMED])
+        more = ", ..." if len(reasons) > NAMED else ""
+        notes.append(f"{len(reasons)} of {len(images)} depth maps are left out ({named}{more}).")
     kept = [i for i, image in enumerate(images) if image.name not in reasons]
-    return [images[i] for i in kept], [views[i] for i in kept], [note]
+    return [images[i] for i in kept], [views[i] for i in kept]
 
 
 class _Candidates(NamedTuple):
@@ -242,7 +214,7 @@ def _gather(views: Sequence[DepthView], settings: Settings, progress: Progress) 
     if settings.synchronizes:
         factors = synchronize_scales(views, neighbors, progress)
     copies = [
-        view.reduced and replace(view.reduced, factor=view.reduced.factor * factor)
+        view.reduced and view.reduced._replace(factor=view.reduced.factor * factor)
         for view, factor in zip(views, factors.tolist(), strict=True)
     ]
     stop_of = np.cumsum(counts)

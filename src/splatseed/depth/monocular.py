@@ -27,14 +27,8 @@ from torch.nn.functional import interpolate, pad
 
 from splatseed import errors
 from splatseed.depthmap import DepthKind
+from splatseed.io import photograph
 from splatseed.io.depth_maps import depth_folder
-from splatseed.io.photograph import (
-    check_photograph,
-    decode_photograph,
-    photograph_bytes,
-    photograph_folder,
-)
-from splatseed.io.staging import check_output
 from splatseed.literal import quoted
 from splatseed.progress import Progress, silent
 from splatseed.requirements import require
@@ -59,8 +53,8 @@ _METRIC = {
 
 Size = tuple[int, int]
 """Width and height in pixels."""
-_Window = tuple[Sequence[int], slice, slice]
-"""What the network sees, as rows and columns, and those of them that hold the photograph."""
+_Frame = tuple[tuple[int, int], tuple[int, int, int, int]]
+"""Rows and columns of what a network sees; top, left, height and width of the photograph there."""
 
 
 class Meaning(NamedTuple):
@@ -104,26 +98,22 @@ def estimate_depths(
         progress: Called with the stage and the fraction done.
 
     Raises:
-        ParameterError: ``max_size`` is out of its range.
         SceneNotFoundError: The scene has no images, or a photograph is missing.
         SceneFormatError: A photograph cannot be decoded, or differs from its camera in aspect
             ratio.
         OutputError: The folder cannot be written.
     """
-    if max_size < 1:
-        raise errors.ParameterError("--max-size of 1 or more", found=f"{max_size}", fix="Raise it.")
-    folder = photograph_folder(scene)
+    folder, kind, flat = photograph.photograph_folder(scene), network.meaning.kind, []
     protect = (folder,) if scene.source is None else scene.source.inputs
-    check_output(output, kind="depth", overwrite=overwrite, protect=protect)
-    sizes = _sizes(scene, folder, max_size, progress)
-    start, flat = time.perf_counter(), []
     with depth_folder(
-        output, network.meaning.kind, overwrite=overwrite, protect=protect, provenance=provenance
+        output, kind, overwrite=overwrite, protect=protect, provenance=provenance
     ) as writer:
+        sizes = _sizes(scene, folder, max_size, progress)
+        start = time.perf_counter()
         progress("predict depth", 0.0)
         for done, (name, size) in enumerate(sizes.items(), 1):
             path = folder / name
-            picture = decode_photograph(path, photograph_bytes(path))
+            picture = photograph.decode_photograph(path, photograph.photograph_bytes(path))
             if picture.size != size:
                 picture = picture.resize(size, PilImage.Resampling.BICUBIC)
             values = network(np.array(picture))
@@ -140,7 +130,7 @@ def _sizes(scene: Scene, folder: Path, max_size: int, progress: Progress) -> dic
     lenses = dict(sorted((image.name, image.intrinsics) for image in scene.images))
     sizes = {}
     with ThreadPoolExecutor() as pool:  # Pillow decodes outside the GIL
-        checked = pool.map(lambda name: check_photograph(folder / name), lenses)
+        checked = pool.map(lambda name: photograph.check_photograph(folder / name), lenses)
         for (name, lens), (width, height) in zip(lenses.items(), checked, strict=True):
             file_from_camera(folder / name, (width, height), (lens.width, lens.height))
             factor = min(max_size / max(width, height), 1.0)
@@ -185,7 +175,7 @@ class DepthNetwork:
             SceneFormatError: The network does not run on such an image.
         """
         size = image.shape[:2]
-        values, window = self._prepare(image)
+        values, frame = self._prepare(image)
         try:
             outputs = self._network(pixel_values=values.to(self._device))
         except (RuntimeError, ValueError) as error:
@@ -195,15 +185,15 @@ class DepthNetwork:
             depth = made["predicted_depth"].float()
         else:
             depth = outputs.predicted_depth[:, None].float()
-            if window is not None:
-                seen, rows, columns = window
-                depth = _scaled(depth, seen)[:, :, rows, columns]
+            if frame is not None:
+                seen, (top, left, height, width) = frame
+                depth = _scaled(depth, seen)[..., top : top + height, left : left + width]
             depth = _scaled(depth, size)[0, 0]
         return np.asarray(depth.cpu().numpy())
 
     def _prepare(
         self, image: UInt8[np.ndarray, "H W 3"]
-    ) -> tuple[Float[Tensor, "1 3 h w"], _Window | None]:
+    ) -> tuple[Float[Tensor, "1 3 h w"], _Frame | None]:
         """The network's input, and where the photograph lies in it; None: it fills it."""
         processor = self._processor
         given = {"images": [image], "return_tensors": "pt", "input_data_format": "channels_last"}
@@ -215,17 +205,13 @@ class DepthNetwork:
             down, right = -height % divisor, -width % divisor
             top, left = down // 2, right // 2
             values = pad(values, (left, right - left, top, down - top))
-            return values, _window(height + down, width + right, top, left, height, width)
+            return values, ((height + down, width + right), (top, left, height, width))
         values = torch.as_tensor(processor(**given)["pixel_values"])
         if not (pads and self._network.config.model_type == "zoedepth"):
             return values, None
         height, width = image.shape[:2]
         top, left = (int(math.sqrt(side / 2) * _ZOE_MARGIN) for side in (height, width))
-        return values, _window(height + 2 * top, width + 2 * left, top, left, height, width)
-
-
-def _window(rows: int, columns: int, top: int, left: int, height: int, width: int) -> _Window:
-    return (rows, columns), slice(top, top + height), slice(left, left + width)
+        return values, ((height + 2 * top, width + 2 * left), (top, left, height, width))
 
 
 def _scaled(depth: Float[Tensor, "1 1 h w"], size: Sequence[int]) -> Float[Tensor, "1 1 H W"]:

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
@@ -55,50 +55,30 @@ LEAST_SHARE = 0.05
 """Fraction of the drawn pixels that is assumed usable."""
 
 
-@dataclass(frozen=True, eq=False)
-class Reduced:
-    """An image's depth and colours on a coarse grid.
+class Reduced(NamedTuple):
+    """An image's depth and colours on a coarse grid."""
 
-    Args:
-        z: Planar depth at the grid's points, float32 [h, w]; NaN where unknown.
-        factor: Scene units per unit of ``z``.
-        grid_from_world: World to (column z, row z, z) of the grid, whose points are at whole
-            numbers, float64 [3, 4].
-        rgb: The photograph, smoothed and smaller, uint8 [p, q, 3].
-        rgb_from_grid: Factor and offset from columns of the grid to those of ``rgb``, then of rows,
-            float64 [2, 2].
-    """
-
-    z: Float32[np.ndarray, "h w"]
-    factor: float
+    z: Float32[np.ndarray, "h w"]  # planar depth at the grid's points; NaN where unknown
+    factor: float  # scene units per unit of z
     grid_from_world: Float64[np.ndarray, "3 4"]
-    rgb: UInt8[np.ndarray, "p q 3"]
+    """World to (column z, row z, z) of the grid, whose points are at whole numbers."""
+    rgb: UInt8[np.ndarray, "p q 3"]  # the photograph, smoothed and smaller
     rgb_from_grid: Float64[np.ndarray, "2 2"]
+    """Factor and offset from columns of the grid to those of ``rgb``, then of rows."""
 
 
 @dataclass(frozen=True, eq=False)
 class DepthView:
-    """What remains of an image; if its map is rejected, only the alignment.
-
-    Args:
-        alignment: The map's alignment.
-        camera: The camera, in pixels of the map.
-        pixel: Candidates, by their numbers row * W + column, int64 [C], roughly row by row.
-        z: Their planar depth in scene units, float32 [C].
-        rgb: Their colours, uint8 [C, 3].
-        edge: Which lie near a depth discontinuity, bool [C].
-        exhausted: Whether the map has no more pixels to give.
-        reduced: The coarse copy; None if views are not compared.
-    """
+    """What remains of an image, with C candidates; if its map is rejected, only the alignment."""
 
     alignment: Alignment
-    camera: Camera
-    pixel: Int64[np.ndarray, " C"]
-    z: Float32[np.ndarray, " C"]
+    camera: Camera  # in pixels of the map
+    pixel: Int64[np.ndarray, " C"]  # numbers row * W + column, roughly row by row
+    z: Float32[np.ndarray, " C"]  # planar depth in scene units
     rgb: UInt8[np.ndarray, "C 3"]
-    edge: Bool[np.ndarray, " C"]
-    exhausted: bool
-    reduced: Reduced | None
+    edge: Bool[np.ndarray, " C"]  # which lie near a depth discontinuity
+    exhausted: bool  # the map has no more pixels to give
+    reduced: Reduced | None  # none where views are not compared
 
     def __len__(self) -> int:
         """The number of candidates."""
@@ -121,16 +101,7 @@ def read_view(
     num: int,
     rng: np.random.Generator,
 ) -> DepthView:
-    """Read an image and its map, and draw ``num`` candidates, or a few more.
-
-    Args:
-        image: The image.
-        folder: That of the photographs.
-        depths: The depth maps.
-        visibility: The SfM points that each image sees.
-        settings: The method's choices.
-        num: How many candidates.
-        rng: The source of this image's random numbers.
+    """Read an image from the photographs' folder and its map, and draw about ``num`` candidates.
 
     Raises:
         SceneNotFoundError: A file is gone.
@@ -198,16 +169,8 @@ def sample_pixels(
 ) -> tuple[Int64[np.ndarray, " C"], Bool[np.ndarray, " C"]]:
     """Draw ``num`` distinct pixels with depth, or a few more; fewer if the map has fewer.
 
-    Args:
-        values: Positive where known, else NaN.
-        num: How many.
-        points: Where SfM points lie, in pixels.
-        settings: The method's choices.
-        rng: The source of random numbers.
-
-    Returns:
-        Their numbers, and which lie near a discontinuity: those are taken when nothing else is
-        left.
+    ``values`` are positive where known, else NaN; ``points`` are where SfM points lie, in pixels.
+    Returns the pixels' numbers, and which lie near a discontinuity: those are drawn last.
     """
     # The central share of each dimension.
     top, left = (round(0.5 * (1.0 - settings.region) * size) for size in values.shape)

@@ -24,13 +24,7 @@ from typing import Any, Literal, TypeAlias, TypeVar, get_args
 import numpy as np
 from PIL import Image as PilImage
 
-from splatseed.errors import (
-    MissingDependencyError,
-    OutputError,
-    ParameterError,
-    ReconstructionError,
-    SceneFormatError,
-)
+from splatseed import errors
 from splatseed.progress import Progress
 from splatseed.requirements import install_command
 from splatseed.runtime.torch_device import DeviceName
@@ -81,7 +75,7 @@ class Settings:
         for name, low in (("max_image_size", 1), ("seed", 0), ("threads", 1)):
             value = getattr(self, name)
             if not low <= value <= _LARGEST and (name, value) != ("threads", -1):
-                raise ParameterError(
+                raise errors.ParameterError(
                     f"{name} from {low} to {_LARGEST}", found=f"{value}", fix="Choose another."
                 )
 
@@ -89,7 +83,7 @@ class Settings:
 def check_choice(name: str, value: str, choices: Sequence[str]) -> None:
     """Raise ParameterError unless ``value`` is one of ``choices``."""
     if value not in choices:
-        raise ParameterError(
+        raise errors.ParameterError(
             f"{name} to be one of {', '.join(choices)}", found=repr(value), fix="Choose another."
         )
 
@@ -108,12 +102,12 @@ def require_pycolmap(device: DeviceName = "auto") -> Any:
         pycolmap = importlib.import_module("pycolmap")
     except (ImportError, RuntimeError) as error:  # RuntimeError: its C++ part does not load
         found = str(error).strip()
-        raise MissingDependencyError("pycolmap to load", found=found, fix=fix) from error
+        raise errors.MissingDependencyError("pycolmap to load", found=found, fix=fix) from error
     found = f"pycolmap {pycolmap.__version__}"
     if int(pycolmap.__version__.split(".")[0]) < _OLDEST:
-        raise MissingDependencyError(f"pycolmap {_OLDEST} or newer", found=found, fix=fix)
+        raise errors.MissingDependencyError(f"pycolmap {_OLDEST} or newer", found=found, fix=fix)
     if device == "cuda" and not pycolmap.has_cuda:
-        raise MissingDependencyError(
+        raise errors.MissingDependencyError(
             "a pycolmap that can use CUDA, as device='cuda' asks",
             found=f"{found} built for the CPU",
             fix="Use device='auto' or 'cpu', or install a CUDA build of pycolmap.",
@@ -123,15 +117,14 @@ def require_pycolmap(device: DeviceName = "auto") -> Any:
 
 @dataclass(frozen=True)
 class Run:
-    """What the stages of one run share; ``work`` is a scratch folder that is removed at the end."""
+    """What the stages of one run share."""
 
     pycolmap: Any
     settings: Settings
     image_dir: Path
-    work: Path
+    work: Path  # a scratch folder, removed at the end
     on_progress: Progress
-    seconds: dict[str, float] = field(default_factory=dict)
-    """Wall time of the stages so far."""
+    seconds: dict[str, float] = field(default_factory=dict)  # wall time of the stages so far
 
     @property
     def database(self) -> Path:
@@ -162,7 +155,7 @@ class Run:
         try:
             return future.result()
         except Exception as error:  # pycolmap throws whatever C++ type its libraries throw
-            raise ReconstructionError(
+            raise errors.ReconstructionError(
                 f"pycolmap to finish {name}",
                 found=f"{type(error).__name__}: {error}",
                 fix="Check the disk space and the images.",
@@ -246,7 +239,7 @@ def match_photographs(run: Run, model: Any) -> None:
         )
         skipped = [name for i, name in names.items() if not database.exists_keypoints(i)]
         if skipped:
-            raise SceneFormatError(
+            raise errors.SceneFormatError(
                 f"pycolmap to read all images of {run.image_dir}",
                 found=f"{len(skipped)} that it skipped: {name_some(skipped)}",
                 fix="Export them again as 8-bit JPEG or PNG, or take them out of the folder.",
@@ -306,7 +299,7 @@ def map_images(run: Run, names: Sequence[str]) -> Path:
         len(names),
     )
     if not models:
-        raise ReconstructionError(
+        raise errors.ReconstructionError(
             f"a model of the {len(names)} images in {run.image_dir}",
             found="no two images that match well enough to begin one",
             fix=_MORE_PHOTOGRAPHS,
@@ -314,7 +307,7 @@ def map_images(run: Run, names: Sequence[str]) -> Path:
     best = max(models, key=lambda i: (models[i].num_reg_images(), models[i].num_points3D()))
     found = {image.name for image in models[best].images.values() if image.has_pose}
     if 2 * len(found) < len(names):
-        raise ReconstructionError(
+        raise errors.ReconstructionError(
             f"at least half of the {len(names)} images in {run.image_dir} to register",
             found=f"{len(found)} in the largest of {len(models)} models; "
             f"without a pose: {name_some([name for name in names if name not in found])}",
@@ -343,7 +336,7 @@ def triangulate_points(run: Run, poses: Sequence[Image]) -> Path:
         0,
     )
     if model.num_points3D() == 0:
-        raise ReconstructionError(
+        raise errors.ReconstructionError(
             f"points from the {len(poses)} posed images in {run.image_dir}",
             found="none on which two matching rays meet",
             fix="Check that the poses belong to these images, in the same order and convention; "
@@ -377,7 +370,7 @@ def export_scene(run: Run, model_dir: Path, staging: Path, *, distinct: bool = T
         num_images,
     )
     if num_written() != num_images:  # pycolmap only logs an image that it could not write
-        raise OutputError(
+        raise errors.OutputError(
             f"{num_images} undistorted images to be written",
             found=f"{num_written()}",
             fix="Free some space on the output's disk, or choose another.",

@@ -69,7 +69,19 @@ def find_photos(image_dir: Path) -> tuple[dict[str, Size], dict[str, list[str]]]
         SceneNotFoundError: The folder is missing or holds fewer than two photographs.
         SceneFormatError: An image cannot be decoded.
     """
-    _check_folder(image_dir)
+    if not image_dir.is_dir():
+        raise SceneNotFoundError(
+            f"a folder of photographs or a video at {image_dir}",
+            found="a file that is neither" if image_dir.exists() else "nothing",
+            fix="Name the folder that holds the photographs, or a video "
+            f"({', '.join(sorted(VIDEO_SUFFIXES))}).",
+        )
+    if (kind := read_manifest(image_dir).get("command")) is not None:
+        raise SceneNotFoundError(
+            f"a folder of photographs at {image_dir}",
+            found=f"what splatseed {kind} wrote, with pictures of its own",
+            fix=f"Name the folder of its photographs, such as {quoted(image_dir / 'images')}.",
+        )
     relative = [path.relative_to(image_dir) for path in image_dir.rglob("*") if path.is_file()]
     files = [path for path in relative if not any(part.startswith(".") for part in path.parts)]
     names, foreign = (
@@ -93,25 +105,6 @@ def find_photos(image_dir: Path) -> tuple[dict[str, Size], dict[str, list[str]]]
             else "Name the folder that holds the photographs of a scene.",
         )
     return photos, left_out
-
-
-def _check_folder(image_dir: Path) -> None:
-    if not image_dir.is_dir():
-        raise SceneNotFoundError(
-            f"a folder of photographs or a video at {image_dir}",
-            found="a file that is neither" if image_dir.exists() else "nothing",
-            fix="Name the folder that holds the photographs, or a video "
-            f"({', '.join(sorted(VIDEO_SUFFIXES))}).",
-        )
-    if (kind := read_manifest(image_dir).get("command")) is not None:
-        images = image_dir / "images"
-        raise SceneNotFoundError(
-            f"a folder of photographs at {image_dir}",
-            found=f"what splatseed {kind} wrote, with pictures of its own",
-            fix=f"Name its photographs: {quoted(images)}."
-            if images.is_dir()
-            else "Name the folder that the photographs are in.",
-        )
 
 
 def _size(path: Path) -> Size | None:

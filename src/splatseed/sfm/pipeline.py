@@ -18,13 +18,8 @@ from shutil import rmtree
 from tempfile import TemporaryDirectory
 from typing import Any, TypeAlias
 
+from splatseed import errors
 from splatseed.camera import CAMERA_MODELS
-from splatseed.errors import (
-    ReconstructionError,
-    SceneFormatError,
-    SceneNotFoundError,
-    TaskLostError,
-)
 from splatseed.io import load_scene, write_scene
 from splatseed.io.layouts import write_split
 from splatseed.io.photograph import photograph_folder
@@ -229,7 +224,7 @@ def refined(scene: Scene, seed: int, progress: Progress = silent) -> tuple[Scene
     """
     folder = scene.source.image_dir if scene.source else None
     if folder is None:
-        raise SceneNotFoundError(
+        raise errors.SceneNotFoundError(
             "photographs, at whose features --refine-poses looks",
             found="no folder with images",
             fix="Put them beside the model in a folder named images, or leave it out.",
@@ -289,12 +284,12 @@ def _call(
     with closing(Child(log=log.open("w+b"))) as child:
         try:
             report: SfmReport = child.call(*call, progress=progress)
-        except TaskLostError as error:
+        except errors.TaskLostError as error:
             reasons, found = _REASON.findall(log.read_text("utf-8", "replace")), error.found
             if reasons:
                 found = f"{found.partition(':')[0]}: {''.join(reasons[-1])}"
             fix = "Check disk space and memory."
-            raise ReconstructionError("pycolmap to finish", found=found, fix=fix) from error
+            raise errors.ReconstructionError("pycolmap to finish", found=found, fix=fix) from error
     return report
 
 
@@ -334,13 +329,13 @@ def _all_photographs(scene: Scene) -> Path:
     for name in (image.name for image in scene.images):
         path = PurePosixPath(name.replace("\\", "/"))
         if path.is_absolute() or ".." in path.parts:  # pycolmap writes to a folder joined with it
-            raise SceneFormatError(
+            raise errors.SceneFormatError(
                 "photographs whose names stay inside their folder, as copies get the same names",
                 found=repr(name),
                 fix="Move it into the folder and rename it in the model.",
             )
         if not (folder / name).is_file():
-            raise SceneNotFoundError(
+            raise errors.SceneNotFoundError(
                 "a scene with all of its photographs",
                 found=f"{name} missing in {folder}",
                 fix="Put it there, or drop it from the model.",

@@ -68,13 +68,7 @@ def enough_points(visibility: Visibility, images: Sequence[Image]) -> bool:
 
 
 def coarse_stereo(views: Sequence[View], seed: int, progress: Progress) -> Visibility:
-    """Points that small copies of photographs confirm.
-
-    Args:
-        views: The photographs, two at least.
-        seed: The same seed gives the same points.
-        progress: Called with the stage and the fraction done.
-    """
+    """Points that small copies of photographs, two at least, confirm."""
     small = [_small(view) for view in views]
     # A few views, compared with neighbours chosen by pose, show which depths occur.
     spread = _spread_of_depth(small, seed, progress)

@@ -44,17 +44,11 @@ RIDGE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Hints:
-    """What is known about the depth in a view before stereo.
+    """What is known about the depth in a view before stereo."""
 
-    Args:
-        uv: Pixels of points that it sees, float64 [M, 2].
-        w: Their inverse depths, float64 [M].
-        bounds: Smallest and largest inverse depth that is searched, float32 [2].
-    """
-
-    uv: Float64[np.ndarray, "M 2"]
-    w: Float64[np.ndarray, " M"]
-    bounds: Float32[np.ndarray, " 2"]
+    uv: Float64[np.ndarray, "M 2"]  # pixels of points that it sees
+    w: Float64[np.ndarray, " M"]  # their inverse depths
+    bounds: Float32[np.ndarray, " 2"]  # smallest and largest inverse depth that is searched
 
 
 def hints_from(uv: Float64[np.ndarray, "M 2"], w: Float64[np.ndarray, " M"]) -> Hints:
@@ -67,14 +61,7 @@ def hints_from(uv: Float64[np.ndarray, "M 2"], w: Float64[np.ndarray, " M"]) -> 
 def first_planes(
     hints: Hints, shape: tuple[int, int], grid: int, rng: np.random.Generator
 ) -> Float32[np.ndarray, "K 3 h w"]:
-    """The planes to try first at each grid point.
-
-    Args:
-        hints: The view's hints.
-        shape: Rows and columns of the grid, neither 0.
-        grid: Pixels between grid points.
-        rng: For guesses where too few points are seen.
-    """
+    """The planes to try first at each grid point, random where too few points are seen."""
     rows, columns = shape
     w = hints.w
     if len(w) < FITTED:
@@ -113,18 +100,8 @@ def confirm(  # type: ignore[no-untyped-def]  # Numba\'s types
 ):
     """Set a bit where another view's map agrees with a view's.
 
-    Args:
-        planes: The view's planes, float32 [3, h, w].
-        costs: The view's costs, float32 [h, w].
-        max_cost: Planes of higher cost neither ask nor answer.
-        grid: Pixels between grid points.
-        j_from_i: Maps pixels of the view times depth, and 1, to the other's times its depth; [3,
-            4].
-        other_planes: The other view's planes, float32 [3, p, q].
-        other_costs: The other view's costs, float32 [p, q].
-        tolerance: Relative difference of depth.
-        bit: The bit to set, uint8.
-        out: The bits of each grid point, uint8 [h, w].
+    ``planes`` [3, h, w] and ``costs`` [h, w] are float32, ``out`` uint8 [h, w]; planes above
+    ``max_cost`` neither ask nor answer; ``j_from_i`` [3, 4] is ``other_from_view``'s.
     """
     height, width = costs.shape
     m = j_from_i
