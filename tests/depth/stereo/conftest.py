@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
 import pytest
 
 from splatseed.depth.stereo.depths import StereoResult, find_stereo
@@ -47,16 +46,3 @@ def plane(tmp_path_factory) -> Planted:
 @pytest.fixture(scope="session")
 def ball(tmp_path_factory) -> Planted:
     return plant(tmp_path_factory.mktemp("ball"), ball_before_wall())
-
-
-@pytest.fixture
-def rough(rng: np.random.Generator):
-    """Makes grey images of noise, a few pixels wide, so that interpolation has something to do."""
-
-    def make(height: int, width: int) -> np.ndarray:
-        image = rng.uniform(0, 255, (height, width))
-        for axis in (0, 1):
-            image = (np.roll(image, 1, axis) + 2 * image + np.roll(image, -1, axis)) / 4
-        return image.astype(np.uint8)
-
-    return make

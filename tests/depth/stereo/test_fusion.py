@@ -15,48 +15,39 @@ def seeds(ball):
     return fuse(ball.stereo, CELL)
 
 
-def cells_of(view, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where world points fall in a view, in cells, and their inverse depths."""
-    uv, z = view.camera.project(xyz)
-    return np.floor(uv / CELL).astype(int), 1.0 / z
-
-
-def test_seeds_lie_on_the_surface_and_know_its_normals(seeds, ball):
+def test_seeds_lie_on_the_surface_and_know_its_normals_best_first(seeds, ball):
     xyz = seeds.xyz.astype(np.float64)
     assert np.quantile(ball.surfaces.distance(xyz), 0.9) < 0.04
     cosine = np.abs((ball.surfaces.normals(xyz) * seeds.normals).sum(axis=1))
     assert np.degrees(np.arccos(np.median(cosine))) < 12
     np.testing.assert_allclose(np.linalg.norm(seeds.normals, axis=1), 1.0, atol=1e-5)
+    assert (np.diff(seeds.view_idx) >= 0).all()
+    for i in np.unique(seeds.view_idx):
+        assert (np.diff(seeds.confidence[seeds.view_idx == i]) <= 0).all()
+    assert ((seeds.confidence > 0) & (seeds.confidence <= 1)).all()
 
 
 def test_a_cell_of_a_view_has_one_seed_at_a_depth(seeds, ball):
     """Asked of the view that each comes from, where it certainly counts."""
     for i, view in enumerate(ball.stereo.views):
-        mine = np.flatnonzero(seeds.view_idx == i)
-        cells, w = cells_of(view, seeds.xyz[mine].astype(float))
+        uv, z = view.camera.project(seeds.xyz[seeds.view_idx == i].astype(float))
+        cells = np.floor(uv / CELL).astype(int)
         for cell in np.unique(cells, axis=0):
-            here = np.sort(w[(cells == cell).all(axis=1)])
+            here = np.sort(1.0 / z[(cells == cell).all(axis=1)])
             assert (np.diff(here) / here[:-1] > SAME / (1 + SAME) - 1e-4).all()
 
 
 def test_every_kept_pixel_has_a_seed_near_it(seeds, ball):
-    """What was not taken was left out for a seed of its cell, in its own view or a confirming
-    one."""
+    """What was left out has a seed in its cell, in its own view or a confirming one."""
     stereo, xyz = ball.stereo, seeds.xyz.astype(float)
-    for i in range(len(stereo.views)):
+    for i, view in enumerate(stereo.views):
         stereo_map = stereo.map(i)
         row, column = np.nonzero(stereo.kept(i))
-        points = stereo_map.camera.unproject(
-            np.stack([column, row], axis=1) + 0.5, stereo_map.depth[row, column]
-        )
+        depth = stereo_map.depth[row, column]
+        points = stereo_map.camera.unproject(np.stack([column, row], axis=1) + 0.5, depth)
         gap = np.linalg.norm(points[:, None] - xyz, axis=2).min(axis=1)
         # A cell's diagonal across the line of sight, and as much along it.
-        assert (
-            np.quantile(
-                gap / (CELL * stereo_map.depth[row, column] / stereo.views[i].K[0, 0]), 0.99
-            )
-            < 3
-        )
+        assert np.quantile(gap / (CELL * depth / view.K[0, 0]), 0.99) < 3
 
 
 def test_larger_cells_give_fewer_seeds_and_never_finer_than_the_maps(seeds, ball):
@@ -64,10 +55,3 @@ def test_larger_cells_give_fewer_seeds_and_never_finer_than_the_maps(seeds, ball
     finest = fuse(ball.stereo, 2.0)
     np.testing.assert_array_equal(fuse(ball.stereo, 0.1).xyz, finest.xyz)
     assert len(finest) > len(seeds)
-
-
-def test_best_first_within_a_view(seeds):
-    for i in np.unique(seeds.view_idx):
-        assert (np.diff(seeds.confidence[seeds.view_idx == i]) <= 0).all()
-    assert (np.diff(seeds.view_idx) >= 0).all()
-    assert ((seeds.confidence > 0) & (seeds.confidence <= 1)).all()
