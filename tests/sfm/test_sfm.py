@@ -24,7 +24,6 @@ from splatseed.errors import (
     SceneNotFoundError,
 )
 from splatseed.io import load_scene
-from splatseed.io.rgbd import load_rgbd
 from splatseed.pointcloud import PointCloud
 from splatseed.runtime import tasks
 from splatseed.scene import Scene, Split
@@ -310,23 +309,3 @@ def test_of_points_at_one_place_the_longest_track_stays(room_path):
     assert model.exists_point3D(long)
     seen = {p.point3D_id for image in model.images.values() for p in image.points2D}
     assert short not in seen
-
-
-def test_triangulated_points_lie_on_a_real_depth_map(scenes, tmp_path):
-    room = load_rgbd(scenes / "replica" / "room0")
-    results = scenes / "replica" / "room0" / "results"
-    chosen = room.images[::6]
-    (tmp_path / "photos").mkdir()
-    for image in chosen:
-        shutil.copy(results / image.name, tmp_path / "photos")
-    settings, known = Settings(max_image_size=800), room.replace(images=chosen)
-    report = reconstruct(tmp_path / "photos", tmp_path / "scene", settings, poses_from=known)
-    model = pycolmap.Reconstruction(report.path / "sparse" / "0")
-    uv, depth = chosen[0].camera.project(np.array([p.xyz for p in model.points3D.values()]))
-    with PilImage.open(results / "depth000000.png") as image:
-        measured = np.asarray(image) / 6553.5
-    inside = (uv > 0).all(axis=1) & (uv < [1200, 680]).all(axis=1)
-    column, row = uv[inside].astype(int).T
-    error = np.abs(measured[row, column] - depth[inside])
-    assert len(error) > 100
-    assert np.median(error) < 0.02  # metres
