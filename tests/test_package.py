@@ -42,7 +42,6 @@ ORDER = (
     "views",
     "depth",
     "upsample",
-    "tiles",
     "seeding",
     "synthetic",
     "sfm",
@@ -155,7 +154,9 @@ def test_rooms_of_a_part_import_each_other_in_no_circle(part):
 
 @pytest.mark.parametrize("part", ["views", "depth", "upsample", "seeding"])
 def test_what_makes_seeds_needs_little(part):
-    more = {"views": {"PIL"}, "depth": {"PIL", "llvmlite"}}.get(part, set())
+    more = {"views": {"PIL"}, "depth": {"PIL", "llvmlite"}, "upsample": {"filelock"}}.get(
+        part, set()
+    )
     allowed = {"splatseed", *more, *LIGHT}
     for path in _files(part):
         tops = {name.split(".")[0] for name in _imports(path)}

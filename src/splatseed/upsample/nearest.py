@@ -2,7 +2,7 @@
 
 Such a method has two steps with the draw of the bases between them: ``weigh`` says how likely each
 row is a base, ``place`` makes the points. Promise: both look at a row and the neighbours it is
-given only, so that they give the same for a cloud in tiles (``splatseed.tiles``) as for the whole.
+given only, so that they give the same for a cloud in tiles (``upsample.tiles``) as for the whole.
 
 Colours: c = sum_j w_j c_j / sum_j w_j over the base point and its neighbours, with
 w_j = 1 / max(|p - p_j|, 0.01 h), h the base point's spacing, in linear arithmetic on the 8-bit

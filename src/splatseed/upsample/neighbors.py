@@ -9,7 +9,7 @@ Promise: random draws are assigned by rank, not by row, and equal distances are 
 also where the k-th of them is as far as the next, so that results follow from the points alone: any
 tree over the same points, and any division of them among several trees, gives the same. A cloud
 that is one tile of a larger one has *halo* rows after its own: points of other tiles that are
-neighbours of its own, but no bases (``splatseed.tiles``).
+neighbours of its own, but no bases (``upsample.tiles``).
 """
 
 from __future__ import annotations

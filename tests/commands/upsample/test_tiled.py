@@ -12,7 +12,7 @@ from splatseed.io.ply import read_ply, write_ply
 from splatseed.pointcloud import PointCloud
 from splatseed.runtime import tasks
 from splatseed.runtime.memory import bytes_of
-from splatseed.tiles import work
+from splatseed.upsample.tiles import making, work
 
 
 def files(folder):
@@ -40,13 +40,13 @@ def test_a_bare_cloud_in_tiles_gives_the_files_of_memory(cloud, tmp_path, splats
     assert splatseed(*words, "-o", tmp_path / "whole").code == 0
     run = splatseed(*words, "-o", tmp_path / "out", "--tile-points", 120)
     assert (run.code, run.err) == (0, "")
-    assert "in about 3 tiles of at most 120 points, at most " in run.out
+    assert "in about 4 tiles of at most 120 points, at most " in run.out
     assert "900 (300 original, 600 linear)" in run.out
     assert "1 not finite, 1 duplicate" in run.out
     assert files(tmp_path / "out") == files(tmp_path / "whole")
     told = json.loads((tmp_path / "out" / "splatseed.json").read_text())
     assert (told["num_points"], told["num_original"]) == (900, 300)
-    assert (told["tiles"], told["source"]) == (3, str(cloud))
+    assert (told["tiles"], told["source"]) == (4, str(cloud))
     assert not (tmp_path / "out.tiles").exists()
 
 
@@ -187,7 +187,7 @@ def test_interrupted_it_says_what_is_kept_and_goes_on(cloud, tmp_path, splatseed
 
     words = ("upsample", cloud, "--method", "linear", "-o", tmp_path / "out", "--tile-points", 120)
     with monkeypatch.context() as context:
-        context.setattr("splatseed.tiles.making.place", interrupted)
+        context.setattr(making, "place", interrupted)
         run = splatseed(*words)
     assert run.code != 0
     told = f"Finished tiles are kept in {tmp_path / 'out.tiles'}; the same command goes on"

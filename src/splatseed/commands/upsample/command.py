@@ -14,7 +14,7 @@ import tyro
 from splatseed.commands.options import check_least, parse_options, refuse
 from splatseed.commands.upsample import output
 from splatseed.commands.upsample.cloud import load_cloud
-from splatseed.commands.upsample.tiled import Tiling, find_source, run_tiled
+from splatseed.commands.upsample.tiled import find_source, run_tiled
 from splatseed.console import OUT, print_note, stage_display
 from splatseed.depthmap import DepthKind
 from splatseed.io import find_depths, load_originals, write_scene
@@ -124,11 +124,6 @@ class Options:
     def memory_bytes(self) -> int | None:
         """Most bytes of memory, if the user says so."""
         return None if self.memory is None else bytes_of(self.memory)
-
-    @property
-    def tiling(self) -> Tiling:
-        """The options about memory and who works."""
-        return Tiling(self.memory_bytes, self.jobs, self.executor, self.address, self.tile_points)
 
 
 def parse(arguments: list[str]) -> tuple[Options, dict[str, Upsampler]]:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from splatseed.commands.next_steps import tell_training
 from splatseed.commands.upsample.output import method_words
@@ -36,8 +36,7 @@ from splatseed.upsample.registry import source_code
 
 if TYPE_CHECKING:
     from splatseed.commands.upsample.command import Options
-    from splatseed.runtime.tasks import Tasks
-    from splatseed.tiles import Source, Tiled
+    from splatseed.upsample.tiles import Source, Tiled
 
 CLOUDS = (".las", ".laz", ".e57", ".pcd", ".xyz", ".csv", ".asc", ".pts", ".npz", ".glb")
 """Files of points that only ``open_cloud`` reads."""
@@ -60,39 +59,14 @@ NOT_IN_TILES = {
 """Options that need all points in memory, by field."""
 
 
-@dataclass(frozen=True)
-class Tiling:
-    """Memory and executor options.
-
-    Args:
-        memory: Most bytes of memory, if the user says so.
-        jobs: Tiles at a time; None for as many as cores and memory allow, on a cluster as fit.
-        executor: Where tiles run.
-        address: The cluster's address.
-        tile_points: Most points in a tile, if the user says so.
-    """
-
-    memory: int | None
-    jobs: int | None
-    executor: Literal["local", "ray"]
-    address: str | None
-    tile_points: int | None
-
-    @property
-    def asked(self) -> tuple[str, ...]:
-        """The options that ask for tiles, whatever the memory."""
-        asks = {
-            "--executor": self.executor == "ray",
-            "--jobs": (self.jobs or 1) > 1,
-            "--tile-points": self.tile_points is not None,
-        }
-        return tuple(name for name, asked in asks.items() if asked)
-
-    @property
-    def bound(self) -> int | None:
-        """The memory that may be used; None if neither user nor system says."""
-        known = [each for each in (self.memory, free_memory()) if each is not None]
-        return min(known, default=None)
+def asks_for_tiles(options: Options) -> tuple[str, ...]:
+    """The options that ask for tiles, whatever the memory."""
+    asks = {
+        "--executor": options.executor == "ray",
+        "--jobs": (options.jobs or 1) > 1,
+        "--tile-points": options.tile_points is not None,
+    }
+    return tuple(name for name, asked in asks.items() if asked)
 
 
 def find_source(options: Options, methods: Mapping[str, Upsampler]) -> Source | None:
@@ -103,24 +77,31 @@ def find_source(options: Options, methods: Mapping[str, Upsampler]) -> Source | 
         SceneFormatError: It is not what its name says.
         OutputError: It has attributes that tiles do not.
     """
-    tiling, path = options.tiling, options.scene
-    if not tiling.asked and (options.cloud_files or (path.is_dir() and tiling.memory is None)):
+    asked, path, method = asks_for_tiles(options), options.scene, methods[options.method]
+    if not asked and (options.cloud_files or (path.is_dir() and options.memory is None)):
         return None
-    from splatseed.tiles import FileSource, SceneSource  # noqa: PLC0415  (Numba)
+    from splatseed.upsample.tiles import file_source, scene_source  # noqa: PLC0415  (Numba)
+
+    def is_large(count: int) -> bool:
+        bound = _bound(options)
+        return bound is not None and _needed(options, method, count) > bound
 
     if path.is_file() and path.suffix.lower() in CLOUDS and find_model(path.parent) is None:
-        return FileSource(open_cloud(path))
-    method = methods[options.method]
+        return file_source(open_cloud(path))
     if path.is_file() and path.suffix.lower() == ".ply":
-        file = FileSource(open_cloud(path))
-        return file if tiling.asked or _is_large(options, method, file.count or 0) else None
-    if not tiling.asked and tiling.memory is None:  # a file that holds no cloud alone
+        file = file_source(open_cloud(path))
+        return file if asked or is_large(file.count or 0) else None
+    if not asked and options.memory is None:  # a file that holds no cloud alone
         return None
-    _check_model(path, tiling.bound)
+    _check_model(path, _bound(options))
     scene = load_originals(path)
-    if tiling.asked or _is_large(options, method, len(scene.points)):
-        return SceneSource(scene)
-    return None
+    return scene_source(scene) if asked or is_large(len(scene.points)) else None
+
+
+def _bound(options: Options) -> int | None:
+    """The memory that may be used; None if neither user nor system says."""
+    known = (options.memory_bytes, free_memory())
+    return min((each for each in known if each is not None), default=None)
 
 
 def _check_model(path: Path, bound: int | None) -> None:
@@ -131,23 +112,18 @@ def _check_model(path: Path, bound: int | None) -> None:
     """
     places = (path / "sparse" / "0", path / "sparse", path, path / "0")
     model = find_model(*places) if path.is_dir() else None
-    names = [f"{each}{end}" for each in ("images", "points3D") for end in (".bin", ".txt")]
-    files = [] if model is None else [model / name for name in names]
-    needed = PROCESS + round(READ * sum(each.stat().st_size for each in files if each.is_file()))
-    if model is None or bound is None or needed <= bound:
+    if model is None or bound is None:
         return
-    raise ParameterError(
-        f"at least {words_of(needed, up=True)} of memory for the points and tracks of {path}, which"
-        " are read whole",
-        found=words_of(bound),
-        fix=f"Pass {option_of(needed)}; or name a file of its points alone, such as points3D.ply.",
-    )
-
-
-def _is_large(options: Options, method: Upsampler, count: int) -> bool:
-    """Whether the whole cloud takes more memory than it may."""
-    bound = options.tiling.bound
-    return bound is not None and _needed(options, method, count) > bound
+    files = [model / f"{each}{end}" for each in ("images", "points3D") for end in (".bin", ".txt")]
+    needed = PROCESS + round(READ * sum(each.stat().st_size for each in files if each.is_file()))
+    if needed > bound:
+        raise ParameterError(
+            f"at least {words_of(needed, up=True)} of memory for the points and tracks of {path}, "
+            "which are read whole",
+            found=words_of(bound),
+            fix=f"Pass {option_of(needed)}; or name a file of its points alone, such as "
+            "points3D.ply.",
+        )
 
 
 def _needed(options: Options, method: Upsampler, count: int) -> int:
@@ -178,59 +154,65 @@ def run_tiled(
             enough for tiles.
         OutputError: The disk is too small, or an earlier run's folder belongs to another command.
     """
-    from splatseed import tiles  # noqa: PLC0415  (Numba)
+    from splatseed.runtime import tasks  # noqa: PLC0415  (processes)
+    from splatseed.runtime.ray_tasks import RayTasks, ray_cluster  # noqa: PLC0415  (an extra)
+    from splatseed.upsample import tiles  # noqa: PLC0415  (Numba)
 
-    scene = source.scene if isinstance(source, tiles.SceneSource) else None
     if options.method == DEFAULT_METHOD:
-        options = replace(
-            options, method=str(method_for(scene or PointCloud.empty(), note=print_note))
-        )
+        chosen = method_for(source.scene or PointCloud.empty(), note=print_note)
+        options = replace(options, method=str(chosen))
     method = methods[options.method]
-    _check_tileable(options, method, scene, source.count)
+    _check_tileable(options, method, source)
     request = tiles.Request(options.method, method, options.ratio, options.num_points, options.seed)
-    points = "unknown" if source.count is None else f"{source.count:,}"
-    path, clock, tiling = tiles.work_path(options.output), StageClock(), options.tiling
-    count, new = source.count, None
+    path, clock, count, new = tiles.work_path(options.output), StageClock(), source.count, None
     if count is not None:
         new = planned_size(count, options.ratio, options.num_points) - count
-    memory = tiling.bound or MEMORY
-    choose = partial(tiles.choose_jobs, method, count, new, memory, held=source.held)
-    with _tasks(options, choose) as tasks:
-        if tiling.executor == "ray" and tiling.memory is not None:
-            memory = tiling.memory  # of each task, wherever it runs
-        plan = tiles.plan_tiles(
-            method, count, new, memory, processes=tasks.processes,
-            tile_points=tiling.tile_points, held=source.held,
-        )  # fmt: skip
-        tiles.check_disk(path, plan.disk)
+    memory, jobs, cores = _bound(options) or MEMORY, options.jobs, tasks.cores()
+    if jobs is None and options.tile_points is not None:
+        jobs = 1
+    away = options.executor == "ray"
+    if away:  # the memory is that of each task, wherever it runs
+        memory, jobs = options.memory_bytes or memory, 1
+    plan = tiles.plan_tiles(
+        method, count, new, memory, jobs=jobs, cores=cores,
+        tile_points=options.tile_points, held=source.held,
+    )  # fmt: skip
+    tiles.check_disk(path, plan.disk)
+    with ray_cluster(options.address) if away else nullcontext():
+        workers: tasks.Tasks = tasks.HereTasks()
+        if away:
+            workers = RayTasks(1, jobs=options.jobs)
+        elif plan.jobs > 1:
+            share = tasks.slot_environment(max(1, cores // plan.jobs))
+            workers = tasks.ProcessTasks([share] * plan.jobs)
         with _kept(path), tiles.open_work(path, request.job(source)) as resumed:
+            points = "unknown" if count is None else f"{count:,}"
             OUT.print(
                 f"{visible(options.scene)} ({points} points)\n"
                 f"  -> {method_words(options.method, method, options.profile)}, in {plan.words}\n"
-                f"  -> {visible(options.output)} (seed {options.seed}, {tasks.words})",
+                f"  -> {visible(options.output)} (seed {options.seed}, {workers.words})",
                 soft_wrap=True,
             )
             if resumed:
                 done = counted(len(list((path / "made").glob("*[0-9]"))), "tile")
                 print_note(f"Going on with the work in {visible(path)}: {done} done.")
             with stage_display(clock, remaining=True):
-                tiled = tiles.make_tiled(path, source, request, plan, tasks, clock)
+                tiled = tiles.make_tiled(path, source, request, plan, workers, clock)
                 report = _write(options, source, tiled, clock, provenance(options, method))
     shutil.rmtree(path)
     _summarise(options, tiled, report, clock.seconds())
 
 
-def _check_tileable(
-    options: Options, method: Upsampler, scene: Scene | None, count: int | None
-) -> None:
+def _check_tileable(options: Options, method: Upsampler, source: Source) -> None:
     """Refuse what needs all points in memory, before any work."""
-    from splatseed.tiles import check_tileable  # noqa: PLC0415  (Numba)
+    from splatseed.upsample.tiles import check_tileable  # noqa: PLC0415  (Numba)
 
     in_memory = "leave out --memory, --jobs, --executor and --tile-points to work in memory"
-    if scene is None and (options.scene.suffix.lower() in CLOUDS or _looks(method)):
+    scene, looks = source.scene, traits_of(method).needs - {"points"}
+    if scene is None and (options.scene.suffix.lower() in CLOUDS or looks):
         in_memory = "bring the scan to its photographs with splatseed upsample SCENE --cloud SCAN"
-    elif not options.tiling.asked and options.tiling.memory is None:
-        needed = words_of(_needed(options, method, count or 0), up=True)
+    elif not asks_for_tiles(options) and options.memory is None:
+        needed = words_of(_needed(options, method, source.count or 0), up=True)
         in_memory = f"use a machine with {needed} of free memory"
     if given := [flag for name, flag in NOT_IN_TILES.items() if getattr(options, name)]:
         raise ParameterError(
@@ -248,29 +230,6 @@ def _check_tileable(
     check_tileable(options.method, method, in_memory)
 
 
-def _looks(method: Upsampler) -> bool:
-    """Whether a method needs more than points."""
-    return bool(traits_of(method).needs - {"points"})
-
-
-@contextmanager
-def _tasks(options: Options, choose: Callable[..., int]) -> Iterator[Tasks]:
-    """Where tiles are worked on, while the block runs."""
-    from splatseed.runtime import tasks  # noqa: PLC0415  (processes)
-    from splatseed.runtime.ray_tasks import RayTasks, ray_cluster  # noqa: PLC0415  (an extra)
-
-    tiling = options.tiling
-    if tiling.executor == "ray":
-        with ray_cluster(tiling.address):
-            yield RayTasks(1, jobs=tiling.jobs)
-        return
-    jobs = tiling.jobs or (1 if tiling.tile_points is not None else choose(cores=tasks.cores()))
-    if jobs > 1:
-        yield tasks.ProcessTasks([tasks.slot_environment(max(1, tasks.cores() // jobs))] * jobs)
-    else:
-        yield tasks.HereTasks()
-
-
 def _write(
     options: Options,
     source: Source,
@@ -279,24 +238,16 @@ def _write(
     provenance: Mapping[str, object],
 ) -> WriteReport:
     """Write the scene, its points a piece at a time."""
-    from splatseed.tiles import FileSource, SceneSource  # noqa: PLC0415  (Numba)
-
     about: dict[str, Any] = {**provenance, "tiles": tiled.tiles, "origin": tiled.origin}
-    repeated = tiled.num_repeated
+    repeated, new = tiled.num_repeated, partial(tiled.new_distinct, progress)
     num_new, code = tiled.num_new - repeated, source_code(options.method)
-    if isinstance(source, SceneSource):
-        scene = source.scene
+    scene, stream = source.scene, PointStream(0, num_new, code, new, (), (0, repeated))
+    if scene is None:
+        assert source.path is not None  # noqa: S101  (a cloud is one or the other)
+        scene, about["source"] = Scene(PointCloud.empty()), str(source.path)
         stream = PointStream(
-            0, num_new, code, lambda: tiled.new_distinct(progress), (), (0, repeated)
-        )
-    else:
-        assert isinstance(source, FileSource)  # noqa: S101  (the two there are)
-        file = source.cloud.path
-        scene, about["source"] = Scene(PointCloud.empty()), str(file)
-        stream = PointStream(
-            tiled.num_original, num_new, code,
-            lambda: chain(tiled.originals(progress), tiled.new_distinct(progress)),
-            (file,), (tiled.non_finite, tiled.repeats + repeated),
+            tiled.num_original, num_new, code, lambda: chain(tiled.originals(progress), new()),
+            (source.path,), (tiled.non_finite, tiled.repeats + repeated),
         )  # fmt: skip
     return write_scene(
         scene, options.output, format=options.format, overwrite=options.overwrite,
@@ -310,17 +261,16 @@ def _summarise(
     """Print the final table."""
     new = report.num_points - tiled.num_original
     made = f"{tiled.num_original:,} original, {new:,} {options.method}"
-    out = f"{report.dropped_nonfinite:,} not finite, {report.dropped_duplicates:,} duplicate"
     rows = [
         ("points in", f"{tiled.num_original:,}"),
         ("points out", f"{report.num_points:,} ({made})"),
-        ("left out", out),
         ("tiles", f"{tiled.tiles:,}"),
         ("seconds", ", ".join(f"{stage} {time:.2f}" for stage, time in seconds.items())),
         ("output", str(options.output)),
     ]
-    if not report.dropped_nonfinite + report.dropped_duplicates:
-        rows.remove(("left out", out))
+    if report.dropped_nonfinite + report.dropped_duplicates:
+        out = f"{report.dropped_nonfinite:,} not finite, {report.dropped_duplicates:,} duplicate"
+        rows.insert(2, ("left out", out))
     print_pairs("splatseed upsample", rows)
     if any(tiled.origin):
         away = ", ".join(f"{each:,.0f}" for each in tiled.origin)

@@ -6,22 +6,21 @@ bases in file order, makes the new points of each tile, and gives all points in 
 same bytes as in memory, whatever the size of the tiles and wherever they are worked on.
 """
 
-from splatseed.tiles.cutting import FileSource, SceneSource, Source
-from splatseed.tiles.making import Request, Tiled, check_tileable, make_tiled
-from splatseed.tiles.work import TilePlan, check_disk, choose_jobs, open_work, plan_tiles, work_path
+from splatseed.upsample.tiles.cutting import Source, file_source, scene_source
+from splatseed.upsample.tiles.making import Request, Tiled, check_tileable, make_tiled
+from splatseed.upsample.tiles.work import TilePlan, check_disk, open_work, plan_tiles, work_path
 
 __all__ = [
-    "FileSource",
     "Request",
-    "SceneSource",
     "Source",
     "TilePlan",
     "Tiled",
     "check_disk",
     "check_tileable",
-    "choose_jobs",
+    "file_source",
     "make_tiled",
     "open_work",
     "plan_tiles",
+    "scene_source",
     "work_path",
 ]

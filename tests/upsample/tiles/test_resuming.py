@@ -15,9 +15,9 @@ import pytest
 
 from splatseed.errors import OutputError, ParameterError, PointCloudError
 from splatseed.pointcloud import PointCloud
-from splatseed.tiles import check_disk, check_tileable, choose_jobs, making, plan_tiles
-from splatseed.tiles.cutting import origin_of
 from splatseed.upsample import configure, upsample
+from splatseed.upsample.tiles import check_disk, check_tileable, making, plan_tiles
+from splatseed.upsample.tiles.cutting import origin_of
 
 LINEAR = configure("linear")
 
@@ -69,9 +69,9 @@ import os, signal, sys
 from pathlib import Path
 import numpy as np
 from splatseed.pointcloud import PointCloud
-from splatseed.tiles import making
+from splatseed.upsample.tiles import making
 from splatseed.upsample import configure
-from tests.tiles.conftest import Tiles
+from tests.upsample.tiles.conftest import Tiles
 
 real = np.save
 def save(path, *values, **options):
@@ -90,7 +90,7 @@ Tiles(Path(sys.argv[2]))(
 def test_sigkill_in_the_middle_of_a_tile_loses_that_tile(sheet, tiles):
     kept = tiles.path.with_name("sheet.npz")
     np.savez(kept, xyz=sheet.xyz, rgb=sheet.rgb)
-    root = Path(__file__).parents[2]
+    root = Path(__file__).parents[3]
     paths = os.pathsep.join([str(root), str(root / "src")])
     words = [sys.executable, "-c", KILLED, str(kept), str(tiles.path)]
     done = subprocess.run(words, env={**os.environ, "PYTHONPATH": paths}, check=False)
@@ -166,7 +166,7 @@ def test_too_little_memory_names_what_is_needed(tmp_path):
     assert plan.tiles >= 10**8 / plan.tile_points
     bound = 1 << 30
     plain = plan_tiles(LINEAR, 10**7, 10**7, bound)
-    for more in ({"held": bound // 2}, {"processes": 2}):
+    for more in ({"held": bound // 2}, {"jobs": 2}):
         plan = plan_tiles(LINEAR, 10**7, 10**7, bound, **more)
         assert plan.tile_points < plain.tile_points
         assert plan.memory <= bound
@@ -208,9 +208,9 @@ def test_the_memory_for_repeats_is_that_of_a_tile(tiles, tmp_path, monkeypatch):
 )
 def test_processes_are_as_many_as_are_worth_it(name, count, memory, cores, jobs):
     method, num_new = configure(name), 3 * count
-    assert choose_jobs(method, count, num_new, memory, cores=cores) == jobs
+    plan = plan_tiles(method, count, num_new, memory, jobs=None, cores=cores)
+    assert plan.jobs == jobs
     if jobs > 1:
-        plan = plan_tiles(method, count, num_new, memory, processes=1 + jobs)
         assert plan.tile_points == plan_tiles(method, count, num_new, memory).tile_points
         assert plan.memory <= memory
 

@@ -9,7 +9,7 @@ from splatseed.pointcloud import PointCloud
 from splatseed.progress import silent
 from splatseed.runtime.tasks import HereTasks
 from splatseed.scene import Scene
-from splatseed.tiles import Request, SceneSource, TilePlan, make_tiled, open_work
+from splatseed.upsample.tiles import Request, TilePlan, make_tiled, open_work, scene_source
 
 
 class Tiles:
@@ -21,11 +21,11 @@ class Tiles:
     def __call__(self, cloud, name, method, *, most=60, ratio=3, seed=0, at_once=97, tasks=None):
         """Positions and colours of all points."""
         scene = cloud if isinstance(cloud, Scene) else Scene(cloud)
-        source, request = SceneSource(scene), Request(name, method, ratio, None, seed)
+        source, request = scene_source(scene), Request(name, method, ratio, None, seed)
         plan = TilePlan(most, at_once, None, None, 0)
         with open_work(self.path, request.job(source)) as self.resumed:
             self.tiled = make_tiled(self.path, source, request, plan, tasks or HereTasks(), silent)
-            pieces = list(self.tiled.all(silent))
+            pieces = [*self.tiled.originals(silent), *self.tiled.new(silent)]
         return tuple(np.concatenate(arrays) for arrays in zip(*pieces, strict=True))
 
 

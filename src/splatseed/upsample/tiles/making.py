@@ -25,21 +25,22 @@ from splatseed.io.staging import remove, staged
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, blocks, silent
 from splatseed.runtime.tasks import Tasks
-from splatseed.tiles.cutting import (
-    Points,
+from splatseed.upsample import neighbors
+from splatseed.upsample.method import Upsampler
+from splatseed.upsample.methods.bounding_box import BoundingBox, in_box
+from splatseed.upsample.nearest import NearestMethod
+from splatseed.upsample.tiles.cutting import (
     Rows,
     Source,
     TileStore,
+    append_by_tile,
     by_tile,
     read_rows,
     split,
     tile_name,
 )
-from splatseed.tiles.neighborhood import find_neighborhood
-from splatseed.tiles.work import TilePlan, facts_of, finish, load_arrays, save_arrays
-from splatseed.upsample import Upsampler, neighbors, planned_size
-from splatseed.upsample.methods.bounding_box import BoundingBox, in_box
-from splatseed.upsample.nearest import NearestMethod
+from splatseed.upsample.tiles.neighborhood import find_neighborhood
+from splatseed.upsample.tiles.work import TilePlan, facts_of, finish, load_arrays, save_arrays
 
 Piece: TypeAlias = tuple[Float32[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]
 """Positions and colours of some points."""
@@ -75,11 +76,10 @@ class Request:
 
     def job(self, source: Source) -> dict[str, object]:
         """All that determines the result, as JSON has it."""
-        parameters: dict[str, Any] = asdict(self.method)  # type: ignore[call-overload]  # a method is a dataclass
         return {
-            "input": source.fingerprint(),
+            "input": dict(source.fingerprint),
             "method": self.name,
-            "parameters": parameters,
+            "parameters": asdict(self.method),  # type: ignore[call-overload]  # a method is a dataclass
             "ratio": self.ratio,
             "num_points": self.num_points,
             "seed": self.seed,
@@ -151,23 +151,15 @@ class Tiled:
         if isinstance(self.request.method, BoundingBox):
             yield from self._in_box(progress)
             return
-        store = TileStore(self.work)
-        done = np.zeros(len(store), np.int64)
+        tiles = np.flatnonzero(TileStore(self.work).counts)
         for first, last in blocks(self.num_new, self.at_once, "write", progress):
             xyz = np.empty((last - first, 3), np.float32)
             rgb = np.empty((last - first, 3), np.uint8)
-            for tile in np.flatnonzero(store.counts):
+            for tile in tiles:
                 made = load_arrays(self.work / "made" / tile_name(tile))
-                start = made["start"]
-                # The base before the first that starts in the run may reach into it.
-                bases = slice(
-                    max(int(np.searchsorted(start, first)) - 1, 0), np.searchsorted(start, last)
-                )
-                number = _numbers(start[bases], made["count"][bases])
-                inside = number[(number >= first) & (number < last)] - first
-                part = slice(done[tile], done[tile] + len(inside))
-                xyz[inside], rgb[inside] = made["xyz"][part], made["rgb"][part]
-                done[tile] += len(inside)
+                part = slice(*np.searchsorted(made["number"], [first, last]))
+                places = made["number"][part] - first
+                xyz[places], rgb[places] = made["xyz"][part], made["rgb"][part]
             yield xyz, rgb
 
     def _in_box(self, progress: Progress) -> Iterator[Piece]:
@@ -197,14 +189,9 @@ class Tiled:
         for xyz, rgb in self.new(progress):
             kept = np.ones(len(xyz), bool)
             if self.num_repeated:
-                flags = np.fromfile(self.work / "repeated", np.uint8, len(xyz), offset=first)
-                kept = flags == 0
+                kept = ~np.fromfile(self.work / "repeated", bool, len(xyz), offset=first)
             first += len(xyz)
             yield xyz[kept], rgb[kept]
-
-    def all(self, progress: Progress) -> Iterator[Piece]:
-        """The originals, then the new points."""
-        return chain(self.originals(progress), self.new(progress))
 
 
 def make_tiled(
@@ -231,6 +218,8 @@ def make_tiled(
         PointCloudError: Too few distinct finite points for the method.
         OutputError: The disk is full.
     """
+    from splatseed.upsample import planned_size  # noqa: PLC0415  (the package that this is in)
+
     check_tileable(request.name, request.method)
     if facts_of(work, "read") is None:
         read_rows(work, source, plan.at_once, progress)
@@ -246,7 +235,7 @@ def make_tiled(
     num_new = planned_size(store.count, request.ratio, request.num_points) - store.count
     tiled = Tiled(
         work, store.count, num_new, facts["non_finite"], facts["repeats"],
-        tuple(Rows(work).origin.tolist()), len(store), plan.at_once, request,
+        tuple(Rows(work).origin.tolist()), len(store.counts), plan.at_once, request,
     )  # fmt: skip
     method = request.method
     if not num_new or not isinstance(method, NearestMethod):
@@ -270,7 +259,7 @@ def weigh(work: Path, method: NearestMethod, tile: str) -> None:
     """Find the neighbours of a tile's points, and how likely each is a base, as a task.
 
     Saved are ``weight`` float64 [n] by position; and for ``place`` the ``order`` of own points, the
-    places of neighbours ``idx`` int32 [n, k], the ring, and what the method has found.
+    places of neighbours ``idx`` int32 [n, k], the ``ring``, and what the method has found.
 
     Args:
         work: The folder, in which the rows are split.
@@ -279,33 +268,30 @@ def weigh(work: Path, method: NearestMethod, tile: str) -> None:
     """
     store = TileStore(work)
     k = min(method.num_queried, store.count - 1)
-    around = find_neighborhood(store, int(tile), k)
-    own = around.num_own
-    weight, known = method.weigh(*_prepared(store, around.points, own, around.idx), silent)
-    by_position = np.empty(own)
-    by_position[around.order] = weight
-    ring = around.points.select(np.arange(own, len(around.idx)))
+    points, order, idx = find_neighborhood(store, int(tile), k)
+    weight, known = method.weigh(*_prepared(store, points, len(order), idx), silent)
+    by_position = np.empty(len(order))
+    by_position[order] = weight
     save_arrays(
         work / "weighed" / tile,
         {
             "weight": by_position,
-            "order": around.order,
-            "idx": around.idx[:own, : method.num_neighbors],
-            **{f"ring_{name}": values for name, values in vars(ring).items()},
+            "order": order,
+            "idx": idx[: len(order), : method.num_neighbors],
+            "ring": points[len(order) : len(idx)],
             **{f"{KNOWN}{name}": values for name, values in known.items()},
         },
     )
 
 
 def _prepared(
-    store: TileStore, points: Points, num_own: int, idx: Int32[np.ndarray, "m k"]
+    store: TileStore, points: np.ndarray, num_own: int, idx: Int32[np.ndarray, "m k"]
 ) -> tuple[neighbors.PreparedCloud, neighbors.Neighbors]:
     """Points and their neighbours as the methods take them."""
-    cloud = neighbors.PreparedCloud(
-        points.xyz, points.rgb, points.row, points.trusted, store.center, None,
-        halo=len(points) - num_own,
-    )  # fmt: skip
-    return cloud, neighbors.Neighbors(idx, neighbors.distances_of(points.xyz, idx, store.least))
+    xyz, rgb, row, trusted = (points[name].copy() for name in ("xyz", "rgb", "row", "trusted"))
+    halo = len(points) - num_own
+    cloud = neighbors.PreparedCloud(xyz, rgb, row, trusted, store.center, None, halo=halo)
+    return cloud, neighbors.Neighbors(idx, neighbors.distances_of(cloud.xyz, idx, store.least))
 
 
 def _draw(work: Path, num_new: int, seed: int, progress: Progress) -> None:
@@ -322,9 +308,7 @@ def _draw(work: Path, num_new: int, seed: int, progress: Progress) -> None:
             drawn = np.empty(len(counts), DRAWN)
             drawn["start"], drawn["count"] = first + np.cumsum(counts) - counts, counts
             first += int(total)
-            for tile, places in by_tile(tiles):
-                with (folder / tile_name(tile)).open("ab") as file:
-                    drawn[places].tofile(file)
+            append_by_tile(folder, tiles, drawn)
     state: Any = rng.bit_generator.state
     assert not state["has_uint32"]  # noqa: S101  (drawing bases takes whole numbers)
     stream = {name: str(value) for name, value in state["state"].items()}  # of 128 bits
@@ -335,7 +319,7 @@ def _weights(
     store: TileStore, progress: Progress
 ) -> Iterator[tuple[Int32[np.ndarray, " b"], Float64[np.ndarray, " b"]]]:
     """The tiles and the weights of each block of points in file order."""
-    taken = np.zeros(len(store), np.int64)
+    taken = np.zeros(len(store.counts), np.int64)
     for tiles in _kept_tiles(Rows(store.work), neighbors.DRAW_BLOCK, progress):
         weight = np.empty(len(tiles))
         for tile, places in by_tile(tiles):
@@ -362,8 +346,8 @@ def _kept_tiles(rows: Rows, size: int, progress: Progress) -> Iterator[Int32[np.
 def place(work: Path, method: NearestMethod, tile: str) -> None:
     """Make the new points of a tile's bases, as a task; what weighing left is then removed.
 
-    Saved are ``start`` int64 [b] and ``count`` int32 [b] of the bases that make any, in file order,
-    and their points' ``xyz`` float32 [m, 3] and ``rgb`` uint8 [m, 3].
+    Saved are the new points' ``number`` int64 [m], ascending, ``xyz`` float32 [m, 3] and ``rgb``
+    uint8 [m, 3].
 
     Args:
         work: The folder, in which the bases are drawn.
@@ -376,37 +360,31 @@ def place(work: Path, method: NearestMethod, tile: str) -> None:
     store, drawn = TileStore(work), facts_of(work, "drawn") or {}
     weighed, bases = load_arrays(work / "weighed" / tile), np.fromfile(work / "drawn" / tile, DRAWN)
     order = weighed["order"]
-    ring = Points(*(np.array(weighed[f"ring_{name}"]) for name in ("xyz", "rgb", "row", "trusted")))
-    points = Points.joined(store.points(int(tile)).select(order), ring)
+    points = np.concatenate([store.points(int(tile))[order], weighed["ring"]])
     cloud, near = _prepared(store, points, len(order), np.array(weighed["idx"]))
     count = bases["count"].astype(np.int64)
-    makes = np.flatnonzero(count)
-    own = neighbors.Bases((np.cumsum(count) - count)[order], count[order], int(count.sum()))
-    number = _numbers(bases["start"][makes], count[makes])
-    draws = TileDraws(drawn["stream"], drawn["total"], number)
-    known = {
-        name.removeprefix(KNOWN): np.array(values)
-        for name, values in weighed.items()
-        if name.startswith(KNOWN)
-    }
-    new = method.place(cloud, near, known, own, draws, silent)
+    first = np.cumsum(count) - count
+    number = np.repeat(bases["start"] - first, count) + np.arange(count.sum())
+    new = method.place(
+        cloud,
+        near,
+        {
+            key.removeprefix(KNOWN): np.array(weighed[key])
+            for key in weighed
+            if key.startswith(KNOWN)
+        },
+        neighbors.Bases(first[order], count[order], len(number)),
+        TileDraws(drawn["stream"], drawn["total"], number),
+        silent,
+    )
     if not np.isfinite(new.xyz).all():
         raise PointCloudError(
             "finite new points",
             found="one that is not",
             fix="Report this with the cloud; float32 may be too small for its coordinates.",
         )
-    made = {"start": bases["start"][makes], "count": bases["count"][makes]}
-    save_arrays(work / "made" / tile, {**made, "xyz": new.xyz, "rgb": new.rgb})
+    save_arrays(work / "made" / tile, {"number": number, "xyz": new.xyz, "rgb": new.rgb})
     remove(work / "weighed" / tile)
-
-
-def _numbers(
-    start: Int64[np.ndarray, " b"], count: Int32[np.ndarray, " b"]
-) -> Int64[np.ndarray, " m"]:
-    """The numbers of all new points of some bases."""
-    wide = np.asarray(count, np.int64)
-    return np.repeat(start - np.cumsum(wide) + wide, wide) + np.arange(wide.sum())
 
 
 class TileDraws:
@@ -487,9 +465,7 @@ def _find_repeats(tiled: Tiled, most: int, progress: Progress) -> None:
             points = points[keep_first(points)]
             bits = (points["xyz"] + np.float32(0)).view(np.uint32)  # -0.0 equals 0.0
             mixed = bits.astype(np.uint64) @ HASH
-            for bucket, places in by_tile((mixed >> np.uint64(7)) % np.uint64(buckets)):
-                with (folder / tile_name(bucket)).open("ab") as file:
-                    points[places].tofile(file)
+            append_by_tile(folder, (mixed >> np.uint64(7)) % np.uint64(buckets), points)
         for bucket in range(buckets):
             if (path := folder / tile_name(bucket)).exists():
                 keep_first(np.fromfile(path, PLACED))

@@ -66,7 +66,7 @@ def open_work(path: Path, job: Mapping[str, object]) -> Iterator[bool]:
     with oserror_as_output_error(path):
         path.mkdir(parents=True, exist_ok=True)
         there = any(not each.name.startswith(".") for each in path.iterdir())
-    known = facts_of(path, "job")
+    known, asked = facts_of(path, "job"), json.loads(json.dumps(job))
     if there and known is None:
         raise OutputError(
             f"no folder, or one with tiles, at {path}",
@@ -77,8 +77,15 @@ def open_work(path: Path, job: Mapping[str, object]) -> Iterator[bool]:
         with FileLock(path / ".lock", timeout=0):
             if known is None:
                 finish(path, "job", job)
-            else:
-                _check_same(path, known, json.loads(json.dumps(job)))
+                known = asked
+            for name in sorted({*known, *asked}):
+                if known.get(name) != asked.get(name):
+                    old, new = (visible(json.dumps(e.get(name)))[:120] for e in (known, asked))
+                    raise OutputError(
+                        f"the same {name} as when {path} was begun ({old})",
+                        found=new,
+                        fix="Repeat the earlier command, or remove that folder to begin anew.",
+                    )
             yield there
     except Timeout:
         raise OutputError(
@@ -86,17 +93,6 @@ def open_work(path: Path, job: Mapping[str, object]) -> Iterator[bool]:
             found="another process at work there",
             fix="Wait for it to end, or stop it.",
         ) from None
-
-
-def _check_same(path: Path, there: Mapping[str, Any], asked: Mapping[str, Any]) -> None:
-    for name in sorted({*there, *asked}):
-        if there.get(name) != asked.get(name):
-            old, new = (visible(json.dumps(each.get(name)))[:120] for each in (there, asked))
-            raise OutputError(
-                f"the same {name} as when {path} was begun ({old})",
-                found=new,
-                fix="Repeat the earlier command to go on, or remove that folder to begin anew.",
-            )
 
 
 def finish(work: Path, step: str, facts: Mapping[str, object]) -> None:
@@ -149,6 +145,7 @@ class TilePlan:
         tiles: About how many tiles; None if the number of points is unknown.
         disk: Bytes on disk, the output included; None likewise.
         memory: Most bytes of memory.
+        jobs: Processes that work on tiles.
     """
 
     tile_points: int
@@ -156,18 +153,16 @@ class TilePlan:
     tiles: int | None
     disk: int | None
     memory: int
+    jobs: int = 1
 
     @property
     def words(self) -> str:
         """A sentence for the user."""
-        most = f"at most {words_of(self.memory)} of memory"
+        most = f"of at most {self.tile_points:,} points, at most {words_of(self.memory)} of memory"
         if self.tiles is None or self.disk is None:
-            return f"tiles of at most {self.tile_points:,} points, {most}"
+            return f"tiles {most}"
         tiles = "1 tile" if self.tiles == 1 else f"about {self.tiles:,} tiles"
-        return (
-            f"{tiles} of at most {self.tile_points:,} points, {most},"
-            f" {words_of(self.disk)} of disk while it works"
-        )
+        return f"{tiles} {most}, {words_of(self.disk)} of disk while it works"
 
 
 def plan_tiles(
@@ -176,7 +171,8 @@ def plan_tiles(
     num_new: int | None,
     memory: int,
     *,
-    processes: int = 1,
+    jobs: int | None = 1,
+    cores: int = 1,
     tile_points: int | None = None,
     held: int = 0,
 ) -> TilePlan:
@@ -187,14 +183,24 @@ def plan_tiles(
         count: Points of the cloud, if known.
         num_new: New points, if known.
         memory: Bytes that all processes may take together.
-        processes: How many there are.
+        jobs: Processes that work on tiles, beside the one that hands out unless it does so itself;
+            None for one a core, if each gets several full tiles.
+        cores: Most processes then.
         tile_points: Most points in a tile, if the user says so.
         held: Bytes that the source keeps in memory all the while.
 
     Raises:
         ParameterError: The memory is not enough.
     """
-    each, fixed = _costs(method, count, num_new, held)
+    near = method if isinstance(method, NearestMethod) else None
+    ratio = 4.0 if count is None or num_new is None else num_new / max(count, 1)
+    each = int(PER_POINT + PER_NEIGHBOR * (near.num_queried if near else 0) + PER_NEW * ratio)
+    fixed = held + (0 if near else 3 * (count or 0))  # method random holds all colours
+    if jobs is None:
+        fits = (memory - fixed) // (PROCESS + MOST * each) - 1
+        enough = cores if count is None else count // (WORTH * MOST)
+        jobs = max(1, min(cores, fits, enough)) if near else 1
+    processes = jobs + (jobs > 1)
     needed = processes * (PROCESS + LEAST * each) + fixed
     if memory < needed:
         raise ParameterError(
@@ -206,53 +212,18 @@ def plan_tiles(
     room = (memory - fixed) // processes - PROCESS
     most = min(tile_points or MOST, room // each)
     at_once = max(min(AT_ONCE, room // PER_ROW), LEAST)
-    disk = None if count is None else _disk(method, count, num_new or 0)
-    tiles = None if count is None else max(-(-count // most), 1)
     full = min(most, count or most) * each
     peak = processes * PROCESS + max(processes * full, at_once * PER_ROW) + fixed
-    return TilePlan(int(most), int(at_once), tiles, disk, min(int(peak), memory))
+    tiles, disk = None, None
+    if count is not None:
+        tiles = 1 << max(-(-count // most) - 1, 0).bit_length()  # cut in half again and again
+        disk = _disk(near.num_neighbors if near else 0, count, num_new or 0)
+    return TilePlan(int(most), int(at_once), tiles, disk, min(int(peak), memory), jobs)
 
 
-def choose_jobs(
-    method: object,
-    count: int | None,
-    num_new: int | None,
-    memory: int,
-    *,
-    cores: int,
-    held: int = 0,
-) -> int:
-    """How many processes are to work on tiles: one a core, if each gets several full tiles.
-
-    Args:
-        method: The method.
-        count: Points of the cloud, if known.
-        num_new: New points, if known.
-        memory: Bytes that all processes may take together.
-        cores: Most processes.
-        held: Bytes that the source keeps in memory all the while.
-    """
-    if not isinstance(method, NearestMethod):
-        return 1
-    each, fixed = _costs(method, count, num_new, held)
-    fits = (memory - fixed) // (PROCESS + MOST * each) - 1  # one is the process that hands out
-    enough = cores if count is None else count // (WORTH * MOST)
-    return max(1, min(cores, fits, enough))
-
-
-def _costs(method: object, count: int | None, num_new: int | None, held: int) -> tuple[int, int]:
-    """Bytes for each point of a tile, and for all tiles together."""
-    neighbors = method.num_queried if isinstance(method, NearestMethod) else 0
-    ratio = 4.0 if count is None or num_new is None else num_new / max(count, 1)
-    each = int(PER_POINT + PER_NEIGHBOR * neighbors + PER_NEW * ratio)
-    colors = 0 if isinstance(method, NearestMethod) else 3 * (count or 0)  # of method random
-    return each, held + colors
-
-
-def _disk(method: object, count: int, num_new: int) -> int:
+def _disk(neighbors: int, count: int, num_new: int) -> int:
     """Bytes at most on disk at a time: rows, tiles, what the draw needs, new points, output."""
-    neighbors = method.num_neighbors if isinstance(method, NearestMethod) else 0
-    made = num_new * 16 + count * 12
+    made = num_new * 24
     at_work = count * (31 + 24 + 16 + 12 + 32 + 4 * neighbors) + made
     for_repeats = count * (31 + 24 + 12 + 20) + num_new * 20 + made
     in_the_end = count * 31 + made + (count + num_new) * (27 + 43)

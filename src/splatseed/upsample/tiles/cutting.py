@@ -1,24 +1,25 @@
 """The cloud on disk: copied as it is, then sorted into tiles.
 
 Notation: a *row* is a point as the input has it, also one that is not finite or repeats another; a
-*tile* is a box of a kd-tree whose cuts a sample of the rows decides, with *walls* (which may be
-infinite) and the *bounds* of its points. ``rows`` holds all rows, ``tile_of_row`` int32 the tile of
-each, -1 where it drops out, and ``tiles/NNNNNN`` the points of a tile in file order. Promise: what
-is kept, its order and its centroid are those of the cloud in memory; coordinates keep the precision
-of the input; every point is in exactly one tile.
+*tile* is a box of a kd-tree of a sample of the rows, with *walls* (which may be infinite) and the
+*bounds* of its points. ``rows`` holds all rows, ``tile_of_row`` int32 the tile of each, -1 where it
+drops out, and ``tiles/NNNNNN`` the points of a tile in file order. Promise: what is kept, its order
+and its centroid are those of the cloud in memory; coordinates keep the precision of the input;
+every point is in exactly one tile.
 """
 
 from __future__ import annotations
 
 import hashlib
-from abc import ABC, abstractmethod
-from collections.abc import Iterator
+import sys
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int32, Int64, UInt8
+from jaxtyping import Bool, Float32, Float64, Int32, Int64
+from scipy.spatial import cKDTree
 
 from splatseed.errors import OutputError, ParameterError, PointCloudError
 from splatseed.io.clouds import CloudChunk, CloudFile
@@ -27,12 +28,14 @@ from splatseed.io.staging import staged
 from splatseed.pointcloud import FARTHEST, PointCloud
 from splatseed.progress import Progress, blocks
 from splatseed.scene import Scene
-from splatseed.tiles.work import facts_of, finish
 from splatseed.upsample.neighbors import least_distance, trusted_originals
+from splatseed.upsample.tiles.work import facts_of, finish
 
 ROW = np.dtype([("xyz", "<f8", 3), ("rgb", "u1", 3)])
-RECORD = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3), ("trusted", "u1"), ("row", "<i8")])
+RECORD = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3), ("trusted", "?"), ("row", "<i8")])
 """A point of a tile."""
+POINT = np.dtype([("xyz", "<f8", 3), ("rgb", "u1", 3), ("trusted", "?"), ("row", "<i8")])
+"""The same relative to the centroid: colour, whether it may be a base, and row."""
 GREY = 128
 """The colour of points without one."""
 SAMPLE = 1 << 20
@@ -44,97 +47,79 @@ MARGIN, SMALLER, TRIES = 0.85, 0.7, 8
 factor to it after each try that fails, and the tries."""
 
 
-class Source(ABC):
+@dataclass(frozen=True, eq=False)
+class Source:
     """Points that may be too many for memory, in the order of the cloud in memory.
 
-    Attributes:
-        count: How many there are; None if only reading tells.
-        trusted: Which of them may be bases; None if all may.
-        held: Bytes that it keeps in memory.
-    """
-
-    count: int | None
-    held: int = 0
-    trusted: Bool[np.ndarray, " n"] | None = None
-
-    @abstractmethod
-    def chunks(self, size: int) -> Iterator[CloudChunk]:
-        """The points in order, at most ``size`` at a time."""
-
-    @abstractmethod
-    def fingerprint(self) -> dict[str, object]:
-        """What tells one input from another, as JSON has it."""
-
-
-@dataclass
-class FileSource(Source):
-    """A file of points; those that splatseed added to it before are left out.
-
     Args:
-        cloud: The file.
+        chunks: Gives them in order, at most so many at a time.
+        count: How many there are; None if only reading tells.
+        fingerprint: What tells one input from another, as JSON has it.
+        path: The file that they are in, if it holds nothing else.
+        scene: The scene whose originals they are, otherwise.
+        trusted: Which of them may be bases; None if all may.
+        held: Bytes that they keep in memory.
     """
 
-    cloud: CloudFile
+    chunks: Callable[[int], Iterator[CloudChunk]]
+    count: int | None
+    fingerprint: Mapping[str, object]
+    path: Path | None = None
+    scene: Scene | None = None
+    trusted: Bool[np.ndarray, " n"] | None = None
+    held: int = 0
 
-    def __post_init__(self) -> None:
-        self.count = self.cloud.count
-        if self.count is not None:
-            self.count = number_of_originals(self.cloud.path.parent, self.count)
 
-    def chunks(self, size: int) -> Iterator[CloudChunk]:
-        """See ``Source``."""
-        left = self.count if self.count is not None else np.iinfo(np.int64).max
-        for chunk in self.cloud.chunks(size):
+def file_source(cloud: CloudFile) -> Source:
+    """The points of a file, told by its name, size and time of change.
+
+    Those that splatseed added to it before are left out.
+    """
+    path, count = cloud.path.resolve(), cloud.count
+    if count is not None:
+        count = number_of_originals(cloud.path.parent, count)
+
+    def chunks(size: int) -> Iterator[CloudChunk]:
+        left = sys.maxsize if count is None else count
+        for chunk in cloud.chunks(size):
+            yield chunk.select(slice(0, left))
+            left -= len(chunk)
             if left <= 0:
                 return
-            yield chunk if len(chunk) <= left else chunk.select(slice(0, left))
-            left -= len(chunk)
 
-    def fingerprint(self) -> dict[str, object]:
-        """See ``Source``: the file's name, size and time of change."""
-        path = self.cloud.path.resolve()
-        known = path.stat()
-        return {"path": str(path), "bytes": known.st_size, "changed": known.st_mtime_ns}
+    known = path.stat()
+    told = {"path": str(path), "bytes": known.st_size, "changed": known.st_mtime_ns}
+    return Source(chunks, count, told, path=cloud.path)
 
 
-@dataclass
-class SceneSource(Source):
-    """The originals of a scene.
+def scene_source(scene: Scene) -> Source:
+    """The originals of a scene, told by a hash.
 
-    Args:
-        scene: The scene; its originals come first.
+    Raises:
+        OutputError: They have attributes that tiles do not.
     """
+    points, trusted = scene.points.originals, trusted_originals(scene)
+    if points.attributes:
+        raise OutputError(
+            "originals with positions and colours only, to be written a piece at a time",
+            found=f"{', '.join(points.attributes)} of them, in seeds.npz",
+            fix="Leave out --memory and --executor, or remove seeds.npz.",
+        )
 
-    scene: Scene
-
-    def __post_init__(self) -> None:
-        self.points = self.scene.points.originals
-        if self.points.attributes:
-            raise OutputError(
-                "originals with positions and colours only, to be written a piece at a time",
-                found=f"{', '.join(self.points.attributes)} of them, in seeds.npz",
-                fix="Leave out --memory and --executor, or remove seeds.npz.",
-            )
-        self.count = len(self.points)
-        self.trusted = trusted_originals(self.scene)
-        seen = (image.observations for image in self.scene.images)
-        parts = [self.scene.points, self.scene.tracks, *seen]
-        values = [each for part in parts if part is not None for each in vars(part).values()]
-        self.held = sum(each.nbytes for each in values if isinstance(each, np.ndarray))
-
-    def chunks(self, size: int) -> Iterator[CloudChunk]:
-        """See ``Source``."""
-        for first in range(0, len(self.points), size):
+    def chunks(size: int) -> Iterator[CloudChunk]:
+        for first in range(0, len(points), size):
             part = slice(first, first + size)
-            yield CloudChunk(self.points.xyz[part].astype(np.float64), self.points.rgb[part])
+            yield CloudChunk(points.xyz[part].astype(np.float64), points.rgb[part])
 
-    def fingerprint(self) -> dict[str, object]:
-        """See ``Source``: a hash of the points."""
-        digest = hashlib.blake2b(digest_size=16)
-        trusted = np.ones(1, bool) if self.trusted is None else self.trusted
-        for array in (self.points.xyz, self.points.rgb, trusted):
-            digest.update(np.ascontiguousarray(array).data)
-        return {"points": len(self.points), "digest": digest.hexdigest()}
+    digest = hashlib.blake2b(digest_size=16)
+    for array in (points.xyz, points.rgb, np.ones(1, bool) if trusted is None else trusted):
+        digest.update(np.ascontiguousarray(array).data)
+    parts = [scene.points, scene.tracks, *(image.observations for image in scene.images)]
+    values = [each for part in parts if part is not None for each in vars(part).values()]
+    return Source(
+        chunks, len(points), {"points": len(points), "digest": digest.hexdigest()}, scene=scene,
+        trusted=trusted, held=sum(each.nbytes for each in values if isinstance(each, np.ndarray)),
+    )  # fmt: skip
 
 
 def read_rows(work: Path, source: Source, at_once: int, progress: Progress) -> None:
@@ -166,21 +151,16 @@ def read_rows(work: Path, source: Source, at_once: int, progress: Progress) -> N
                 sample, share = sample[rng.random(len(sample)) < 0.5], share / 2
             progress("read", count / source.count if source.count else 0.0)
     origin = origin_of(low, high, exact=exact)
-    np.save(work / "sample.npy", without_origin(sample, origin))
+    np.save(work / "sample.npy", _without_origin(sample, origin))
     finish(work, "read", {"rows": count, "origin": origin.tolist()})
 
 
 def origin_of(
     low: Float64[np.ndarray, " 3"], high: Float64[np.ndarray, " 3"], *, exact: bool
 ) -> Float64[np.ndarray, " 3"]:
-    """The middle of the bounds in whole units where a cloud lies far off, as on a national grid.
+    """The middle of a cloud's bounds in whole units if it lies far off, as on a national grid.
 
-    Zero where float32 holds the coordinates as they are, or where the cloud is near zero.
-
-    Args:
-        low: Least coordinates.
-        high: Greatest coordinates.
-        exact: Whether float32 holds them all.
+    Zero where float32 holds all coordinates as they are (``exact``), or where it is near zero.
     """
     far = max(float(np.abs(low).max()), float(np.abs(high).max()))
     if exact or not np.isfinite(far) or far <= FAR_OFF * float((high - low).max()):
@@ -188,10 +168,7 @@ def origin_of(
     return np.asarray(np.round((low + high) / 2))
 
 
-def without_origin(
-    xyz: Float64[np.ndarray, "n 3"], origin: Float64[np.ndarray, " 3"]
-) -> Float32[np.ndarray, "n 3"]:
-    """Positions relative to the origin, as clouds hold them."""
+def _without_origin(xyz: np.ndarray, origin: np.ndarray) -> Float32[np.ndarray, "n 3"]:
     with np.errstate(over="ignore"):  # beyond float32 is infinite, to be seen and dropped
         return np.asarray((xyz - origin).astype(np.float32))
 
@@ -213,7 +190,7 @@ class Rows:
         """Rows, relative to the origin."""
         path = self._work / "rows"
         rows = np.fromfile(path, ROW, last - first, offset=ROW.itemsize * first)
-        return PointCloud(without_origin(rows["xyz"], self.origin), rows["rgb"].copy())
+        return PointCloud(_without_origin(rows["xyz"], self.origin), rows["rgb"].copy())
 
     def tiles(self, first: int, last: int) -> Int32[np.ndarray, " n"]:
         """The tiles of rows, -1 where one drops out."""
@@ -221,64 +198,41 @@ class Rows:
 
 
 class Cuts:
-    """A kd-tree that cuts a sample into parts of about the same size.
+    """A kd-tree of a sample whose leaves are tiles.
 
     Args:
         sample: Finite positions.
-        parts: How many tiles are wanted; there are fewer where points coincide.
+        most: Most of them in a tile, unless they coincide.
     """
 
-    def __init__(self, sample: Float32[np.ndarray, "s 3"], parts: int) -> None:
-        self.walls: list[Float32[np.ndarray, "2 3"]] = []
-        everywhere = np.array([[-np.inf] * 3, [np.inf] * 3], np.float32)
-        self._root = self._cut(sample, parts, everywhere)
+    def __init__(self, sample: Float32[np.ndarray, "s 3"], most: int) -> None:
+        self.walls: list[Float64[np.ndarray, "2 3"]] = []
+        self._root = cKDTree(sample, max(most, 1)).tree
+        self._number: dict[Any, int] = {}
+        self._visit(self._root, np.array([[-np.inf] * 3, [np.inf] * 3]))
 
-    def __len__(self) -> int:
-        """The number of tiles."""
-        return len(self.walls)
-
-    def _cut(self, sample: np.ndarray, parts: int, walls: np.ndarray) -> _Node:
-        cut = _place_of_cut(sample, parts // 2 / parts) if parts > 1 and len(sample) else None
-        if cut is None:
+    def _visit(self, node: Any, walls: np.ndarray) -> None:
+        if node.split_dim < 0:
+            self._number[node.start_idx] = len(self.walls)
             self.walls.append(walls)
-            return len(self.walls) - 1
-        axis, at = cut
-        below = sample[:, axis] < at
-        left = min(max(round(np.count_nonzero(below) / len(sample) * parts), 1), parts - 1)
-        inner = walls.copy(), walls.copy()
-        inner[0][1, axis] = inner[1][0, axis] = at
-        return (
-            axis, at, self._cut(sample[below], left, inner[0]),
-            self._cut(sample[~below], parts - left, inner[1]),
-        )  # fmt: skip
+            return
+        below, above = walls.copy(), walls.copy()
+        below[1, node.split_dim] = above[0, node.split_dim] = node.split
+        self._visit(node.lesser, below)
+        self._visit(node.greater, above)
 
     def tiles_of(self, xyz: Float32[np.ndarray, "n 3"]) -> Int32[np.ndarray, " n"]:
         """The tile of each point, int32 [n]."""
-        out = np.empty(len(xyz), np.int32)
-        left = [(self._root, np.arange(len(xyz)))]
+        wide = xyz.astype(np.float64)  # cuts can lie just behind a point, where float32 has none
+        out, left = np.empty(len(xyz), np.int32), [(self._root, np.arange(len(xyz)))]
         while left:
             node, which = left.pop()
-            if isinstance(node, int):
-                out[which] = node
+            if node.split_dim < 0:
+                out[which] = self._number[node.start_idx]
             else:
-                below = xyz[which, node[0]] < node[1]
-                left += [(node[2], which[below]), (node[3], which[~below])]
+                below = wide[which, node.split_dim] < node.split
+                left += [(node.lesser, which[below]), (node.greater, which[~below])]
         return out
-
-
-_Node = tuple[int, np.float32, "_Node", "_Node"] | int
-"""The axis and place of a cut and what is below and above it; or a tile's number."""
-
-
-def _place_of_cut(sample: np.ndarray, share: float) -> tuple[int, np.float32] | None:
-    """The axis and the place of a cut with about ``share`` of the sample below it, if any."""
-    axis = int(np.argmax(sample.max(axis=0).astype(np.float64) - sample.min(axis=0)))
-    values = sample[:, axis]
-    at = np.partition(values, int(share * len(values)))[int(share * len(values))]
-    if at > values.min():
-        return axis, at
-    above = values[values > at]  # else nothing would be below it
-    return (axis, above.min()) if len(above) else None
 
 
 def tile_name(tile: int | np.integer[Any]) -> str:
@@ -289,10 +243,15 @@ def tile_name(tile: int | np.integer[Any]) -> str:
 def by_tile(tiles: Int32[np.ndarray, " n"]) -> Iterator[tuple[int, Int64[np.ndarray, " m"]]]:
     """The tiles that occur in an array, each with its places there in order."""
     order = np.argsort(tiles, kind="stable")
-    counts = np.bincount(tiles)
-    ends = np.cumsum(counts)
-    for tile in np.flatnonzero(counts):
-        yield int(tile), order[ends[tile] - counts[tile] : ends[tile]]
+    names, first = np.unique(tiles[order], return_index=True)
+    yield from zip(names.tolist(), np.split(order, first[1:]), strict=False)  # one piece of none
+
+
+def append_by_tile(folder: Path, tiles: Int32[np.ndarray, " n"], records: np.ndarray) -> None:
+    """Write records to the ends of their tiles' files."""
+    for tile, places in by_tile(tiles):
+        with (folder / tile_name(tile)).open("ab") as file:
+            records[places].tofile(file)
 
 
 def split(
@@ -318,9 +277,10 @@ def split(
     """
     rows, sample = Rows(work), np.load(work / "sample.npy")
     sample = sample[np.isfinite(sample).all(axis=1)]
-    wanted = MARGIN * most if len(sample) < rows.count else float(most)
+    share = len(sample) / max(rows.count, 1)
+    wanted = share * most * (MARGIN if share < 1 else 1.0)
     for _ in range(TRIES):
-        cuts = Cuts(sample, int(np.ceil(rows.count / max(wanted, 1))))
+        cuts = Cuts(sample, int(wanted))
         counts, non_finite = _distribute(work, rows, cuts, trusted, at_once, progress)
         if non_finite == rows.count:
             raise PointCloudError(
@@ -360,7 +320,7 @@ def _distribute(
     progress: Progress,
 ) -> tuple[Int64[np.ndarray, " t"], int]:
     """Write each row to its tile's file; returns the points of each and how many are not finite."""
-    counts, non_finite = np.zeros(len(cuts), np.int64), 0
+    counts, non_finite = np.zeros(len(cuts.walls), np.int64), 0
     with (
         staged(work / "tiles", folder=True) as folder,
         staged(work / "tile_of_row", folder=False) as partial,
@@ -376,24 +336,16 @@ def _distribute(
             records["xyz"], records["rgb"] = cloud.xyz[kept], cloud.rgb[kept]
             records["row"] = first + kept
             records["trusted"] = True if trusted is None else trusted[first + kept]
-            for tile, places in by_tile(tiles[kept]):
-                with (folder / tile_name(tile)).open("ab") as each:
-                    records[places].tofile(each)
+            append_by_tile(folder, tiles[kept], records)
             non_finite += int(np.count_nonzero(~cloud.finite))
-            counts += np.bincount(tiles[kept], minlength=len(cuts))
+            counts += np.bincount(tiles[kept], minlength=len(counts))
     return counts, non_finite
 
 
 def _drop_repeats(
     work: Path, counts: Int64[np.ndarray, " t"], progress: Progress
 ) -> Float32[np.ndarray, "t 2 3"]:
-    """Drop what repeats a position of an earlier piece; returns the bounds of tiles.
-
-    Args:
-        work: The folder.
-        counts: Points of each tile, changed in place.
-        progress: Told the stage.
-    """
+    """Drop what repeats a position of an earlier piece, from ``counts``, too; returns bounds."""
     bounds = np.full((len(counts), 2, 3), np.nan, np.float32)
     for tile, _ in blocks(len(counts), 1, "tiles", progress):
         if not counts[tile]:
@@ -410,36 +362,6 @@ def _drop_repeats(
         counts[tile] = len(records)
         bounds[tile] = records["xyz"].min(axis=0), records["xyz"].max(axis=0)
     return bounds
-
-
-@dataclass(frozen=True, eq=False)
-class Points:
-    """Some points, in file order unless said otherwise.
-
-    Args:
-        xyz: Positions relative to the centroid, float64 [n, 3].
-        rgb: Colours, uint8 [n, 3].
-        row: Rows, int64 [n].
-        trusted: Which may be bases, bool [n].
-    """
-
-    xyz: Float64[np.ndarray, "n 3"]
-    rgb: UInt8[np.ndarray, "n 3"]
-    row: Int64[np.ndarray, " n"]
-    trusted: Bool[np.ndarray, " n"]
-
-    def __len__(self) -> int:
-        return len(self.xyz)
-
-    def select(self, which: np.ndarray) -> Points:
-        """The points at ``which``, in that order."""
-        return Points(*(values[which] for values in vars(self).values()))
-
-    @staticmethod
-    def joined(*parts: Points) -> Points:
-        """All points of the parts, one part after another."""
-        columns = zip(*(vars(part).values() for part in parts), strict=True)
-        return Points(*(np.concatenate(values) for values in columns))
 
 
 class TileStore:
@@ -467,20 +389,16 @@ class TileStore:
         self.bounds: Float64[np.ndarray, "t 2 3"] = np.array(facts["bounds"]) - self.center
         self.least = least_distance(float(np.nanmax(np.abs(self.bounds))))
 
-    def __len__(self) -> int:
-        """The number of tiles."""
-        return len(self.counts)
-
-    def points(self, tile: int, within: Float64[np.ndarray, "2 3"] | None = None) -> Points:
-        """The points of a tile that has some.
+    def points(self, tile: int, within: Float64[np.ndarray, "2 3"] | None = None) -> np.ndarray:
+        """The points of a tile that has some, ``POINT`` [n].
 
         Args:
             tile: Its number.
             within: Only those in this box, relative to the centroid; all when left out.
         """
-        records = np.fromfile(self.work / "tiles" / tile_name(tile), RECORD)
-        xyz = records["xyz"].astype(np.float64) - self.center
-        if within is not None:
-            inside = ((xyz >= within[0]) & (xyz <= within[1])).all(axis=1)
-            records, xyz = records[inside], xyz[inside]
-        return Points(xyz, records["rgb"].copy(), records["row"].copy(), records["trusted"] != 0)
+        points = np.fromfile(self.work / "tiles" / tile_name(tile), RECORD).astype(POINT)
+        points["xyz"] -= self.center
+        if within is None:
+            return points
+        inside = (points["xyz"] >= within[0]) & (points["xyz"] <= within[1])
+        return np.asarray(points[inside.all(axis=1)])
