@@ -58,7 +58,7 @@ def test_a_damaged_file_of_pytorchs(what, how, rng, tmp_path):
 
 def _load(what, path):
     if what == "weights":
-        return load_lpips("alex", path)
+        return load_lpips(path)
     settings = TrainSettings(strategy="none", backend="cpu")
     return load_checkpoint(path, make_strategy(settings, CPU), settings.schedule, CPU)
 

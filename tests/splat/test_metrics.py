@@ -1,9 +1,10 @@
-"""LPIPS is that of torchmetrics and of its authors, with weights that are on this machine."""
+"""The loss kernel and the metrics against torchmetrics, autograd and LPIPS's authors."""
 
 from __future__ import annotations
 
 import math
 
+import numba
 import numpy as np
 import pytest
 
@@ -11,98 +12,153 @@ torch = pytest.importorskip("torch", reason="scoring needs PyTorch")
 reference = pytest.importorskip("torchmetrics.functional.image.lpips")
 
 from torch import nn
+from torchmetrics.functional.image import structural_similarity_index_measure
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
-from splatseed.splat.metrics import LPIPS_FILES, load_lpips
+from splatseed.splat.metrics import LPIPS_FILE, l1_and_ssim_by_convolution, load_lpips, psnr
+from splatseed.splat.ssim import l1_and_ssim
+from splatseed.train.trainer import photometric_loss
 
-VGG = "64 64 M 128 128 M 256 256 256 M 512 512 512 M 512 512 512 M"
-"""Torchvision's configuration D."""
+# L1, SSIM, PSNR -----------------------------------------------------------------------------------
 
 
-def _torchvision_features(net):
-    """The network's convolutions as torchvision lists them, with random weights."""
-    if net == "alex":
-        layers = [
-            *(nn.Conv2d(3, 64, kernel_size=11, stride=4, padding=2), nn.ReLU()),
-            *(nn.MaxPool2d(3, 2), nn.Conv2d(64, 192, 5, padding=2), nn.ReLU()),
-            *(nn.MaxPool2d(3, 2), nn.Conv2d(192, 384, 3, padding=1), nn.ReLU()),
-            *(nn.Conv2d(384, 256, 3, padding=1), nn.ReLU()),
-            *(nn.Conv2d(256, 256, 3, padding=1), nn.ReLU(), nn.MaxPool2d(3, 2)),
-        ]
-    else:
-        layers, before = [], 3
-        for word in VGG.split():
-            if word == "M":
-                layers.append(nn.MaxPool2d(2, 2))
-            else:
-                layers += [nn.Conv2d(before, int(word), 3, padding=1), nn.ReLU()]
-                before = int(word)
-    generator = torch.Generator().manual_seed(0)
-    for layer in layers:
-        for weights in layer.parameters():
-            spread = math.sqrt(2 / weights[0].numel()) if weights.ndim > 1 else 0.1
-            weights.data.normal_(0, spread, generator=generator)
-    return nn.Sequential(*layers)
+def _pair(rng, height, width):
+    x = rng.random((height, width, 3), np.float32)
+    y = np.clip(x + rng.normal(0, 0.1, x.shape), 0, 1).astype(np.float32)
+    return x, y
+
+
+@pytest.mark.parametrize(("height", "width"), [(11, 11), (12, 40), (37, 23), (64, 50)])
+def test_ssim_is_torchmetrics_where_the_window_fits(rng, height, width):
+    x, y = _pair(rng, height, width)
+    pair = torch.from_numpy(x), torch.from_numpy(y)
+    expected = float(_torchmetrics_ssim(*pair))
+    assert l1_and_ssim(x, y, 0.8, 0.2)[1] == pytest.approx(expected, abs=2e-6)
+    l1, ours, _ = l1_and_ssim_by_convolution(*pair, 0.8, 0.2)
+    assert float(ours) == pytest.approx(expected, abs=2e-6)
+    assert float(l1) == pytest.approx(np.abs(x - y).mean(), rel=1e-6)
+
+
+def _torchmetrics_ssim(x, y):
+    """Mean SSIM where the window fits entirely, differentiable."""
+    images = (image.permute(2, 0, 1)[None] for image in (x, y))
+    _, full = structural_similarity_index_measure(*images, data_range=1.0, return_full_image=True)
+    return full[..., 5:-5, 5:-5].mean()
+
+
+def _by_convolution(render, photograph):
+    """The loss as on a GPU, its gradient from ``l1_and_ssim_by_convolution``."""
+    l1, ssim, gradient = l1_and_ssim_by_convolution(render, photograph, 0.8, 0.2)
+    value = 0.8 * l1 + 0.2 * (1 - ssim)
+    return value + ((render - render.detach()) * gradient).sum()
+
+
+@pytest.mark.parametrize("compute", [photometric_loss, _by_convolution])
+def test_gradient_is_autograds(rng, compute):
+    x, y = (torch.from_numpy(image) for image in _pair(rng, 40, 29))
+    ours, theirs = x.clone().requires_grad_(), x.double().requires_grad_()
+    loss = compute(ours, y)
+    expected = 0.8 * (theirs - y).abs().mean() + 0.2 * (1 - _torchmetrics_ssim(theirs, y.double()))
+    (3 * loss).backward()
+    (3 * expected).backward()
+    assert loss.item() == pytest.approx(expected.item(), rel=1e-5)
+    torch.testing.assert_close(ours.grad.double(), theirs.grad, rtol=1e-3, atol=1e-8)
+
+
+def test_equal_images_are_the_best_there_is(rng):
+    x, _ = _pair(rng, 20, 20)
+    l1, similarity, gradient = l1_and_ssim(x, x.copy(), 0.8, 0.2)
+    assert l1 == 0
+    assert similarity == pytest.approx(1.0, abs=1e-6)
+    assert np.abs(gradient).max() < 1e-6
+
+
+def test_bytes_do_not_depend_on_threads(rng):
+    x, y = _pair(rng, 50, 61)
+    before = numba.get_num_threads()
+    results = []
+    try:
+        for threads in (1, before):
+            numba.set_num_threads(threads)
+            results.append(l1_and_ssim(x, y, 0.8, 0.2))
+    finally:
+        numba.set_num_threads(before)
+    assert results[0][:2] == results[1][:2]
+    assert results[0][2].tobytes() == results[1][2].tobytes()
+
+
+def test_psnr_is_of_the_clamped_render():
+    truth = torch.zeros(11, 11, 3)
+    assert psnr(truth - 5.0, truth) == float("inf")
+    assert psnr(truth + 0.1, truth) == pytest.approx(20.0, abs=1e-4)
+
+
+# LPIPS --------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
-def networks(tmp_path_factory):
-    """A folder with the weights of both networks as PyTorch's cache has them, and the layers."""
-    folder = tmp_path_factory.mktemp("hub") / "checkpoints"
+def network(tmp_path_factory):
+    """A cache of PyTorch with random weights of VGG, and its layers as torchvision lists them."""
+    layers, before = [], 3
+    for word in [64, 64, "M", 128, 128, "M", *[256] * 3, "M", *[512] * 3, "M", *[512] * 3, "M"]:
+        if word == "M":
+            layers.append(nn.MaxPool2d(2, 2))
+        else:
+            layers += [nn.Conv2d(before, word, 3, padding=1), nn.ReLU()]
+            before = word
+    generator = torch.Generator().manual_seed(0)
+    for weights in (each for layer in layers for each in layer.parameters()):
+        spread = math.sqrt(2 / weights[0].numel()) if weights.ndim > 1 else 0.1
+        weights.data.normal_(0, spread, generator=generator)
+    features, folder = nn.Sequential(*layers), tmp_path_factory.mktemp("hub") / "checkpoints"
     folder.mkdir()
-    features = {net: _torchvision_features(net) for net in LPIPS_FILES}
-    for net, layers in features.items():
-        state = {f"features.{name}": value for name, value in layers.state_dict().items()}
-        torch.save({**state, "classifier.1.weight": torch.zeros(1)}, folder / LPIPS_FILES[net])
+    state = {f"features.{name}": value for name, value in features.state_dict().items()}
+    torch.save({**state, "classifier.1.weight": torch.zeros(1)}, folder / LPIPS_FILE)
     return folder, features
 
 
-@pytest.mark.parametrize("net", LPIPS_FILES)
-def test_lpips_is_that_of_torchmetrics(net, networks, rng, monkeypatch):
-    folder, features = networks
-    monkeypatch.setattr(reference, "_get_tv_model_features", lambda *_: features[net])
+def test_lpips_is_that_of_torchmetrics(network, rng, monkeypatch):
+    folder, features = network
+    monkeypatch.setattr(reference, "_get_tv_model_features", lambda *_: features)
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(folder.parent))
     image, photo = torch.from_numpy(rng.random((2, 48, 64, 3), np.float32))
-    theirs = reference._LPIPS(net=net)
+    theirs = reference._LPIPS(net="vgg")
     expected = theirs(*(i.permute(2, 0, 1)[None] for i in (image, photo)), normalize=True)
     before = torch.random.get_rng_state()
-    for weights in (None, folder, folder / LPIPS_FILES[net]):
-        lpips = load_lpips(net, weights)
+    for weights in (None, folder, folder / LPIPS_FILE):
+        lpips = load_lpips(weights)
         assert lpips(image, photo) == pytest.approx(float(expected), rel=1e-4)
     assert lpips(photo, photo) == 0.0
     assert torch.equal(before, torch.random.get_rng_state())  # training after it is the same
 
 
-@pytest.mark.parametrize(("net", "theirs"), [("alex", 0.1570625), ("vgg", 0.3332108)])
-def test_lpips_with_the_published_weights_is_that_of_its_authors(net, theirs):
-    """Numbers that the package ``lpips`` 0.1.4 gave for the same images."""
+def test_lpips_with_the_published_weights_is_that_of_its_authors():
+    """A number that the package ``lpips`` 0.1.4 gave for the same images."""
     try:
-        metric = load_lpips(net)
+        metric = load_lpips()
     except SceneNotFoundError as error:
         pytest.skip(f"no weights in PyTorch's cache: {error}")
     row, column = np.mgrid[:96, :128]
     truth = np.stack([2 * row, 2 * column % 256, (row // 8 + column // 8) % 2 * 255], axis=-1)
     render = np.roll(truth, 3, axis=1) // 2 + 60
     pair = [torch.from_numpy(image / np.float32(255)).float() for image in (truth, render)]
-    assert metric(*pair) == pytest.approx(theirs, abs=1e-6)
+    assert metric(*pair) == pytest.approx(0.3332108, abs=1e-6)
 
 
 def test_absent_weights_are_named_with_where_to_get_and_put_them(tmp_path, monkeypatch):
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
     with pytest.raises(SceneNotFoundError) as caught:
-        load_lpips("vgg")
-    for text in ("https://", LPIPS_FILES["vgg"], f"{tmp_path}/checkpoints", "--lpips-weights"):
+        load_lpips()
+    for text in ("https://", LPIPS_FILE, f"{tmp_path}/checkpoints", "--lpips-weights"):
         assert text in str(caught.value)
 
 
-@pytest.mark.parametrize("content", ["another network", "a list", b"", b"text", b"PK\x03\x04 cut"])
-def test_a_file_of_something_else_is_refused(content, networks, tmp_path):
+@pytest.mark.parametrize("content", [{}, [torch.zeros(1)], b"", b"text", b"PK\x03\x04 cut"])
+def test_a_file_of_something_else_is_refused(content, tmp_path):
     path = tmp_path / "weights.pth"
     if isinstance(content, bytes):
         path.write_bytes(content)
-    elif content == "a list":
-        torch.save([torch.zeros(1)], path)
     else:
-        path = networks[0] / LPIPS_FILES["alex"]
+        torch.save(content, path)
     with pytest.raises(SceneFormatError, match=path.name):
-        load_lpips("vgg", path)
+        load_lpips(path)

@@ -18,7 +18,7 @@ from splatseed.commands.train import Options, _next_commands
 from splatseed.io import load_scene
 from splatseed.io.ply import write_ply
 from splatseed.pointcloud import PointCloud
-from splatseed.splat.metrics import LPIPS_FILES
+from splatseed.splat.metrics import LPIPS_FILE
 from splatseed.train.folder import RunFolder
 from splatseed.train.record import make_config, resumed_settings
 from splatseed.train.seeds import usable_seeds
@@ -131,7 +131,7 @@ def test_lpips_is_offered_only_where_its_weights_are(tmp_path, monkeypatch):
     monkeypatch.setattr("torch.hub.get_dir", lambda: str(tmp_path))
     monkeypatch.setattr("splatseed.splat.metrics.require", lambda *_: None)
     assert _next_commands(Path("my run")) == [("look at it", "splatseed view 'my run'")]
-    weights = tmp_path / "checkpoints" / LPIPS_FILES["vgg"]
+    weights = tmp_path / "checkpoints" / LPIPS_FILE
     weights.parent.mkdir()
     weights.touch()
     assert _next_commands(Path("r"))[1] == ("score again, with LPIPS", "splatseed evaluate r")

@@ -1,12 +1,10 @@
 """Which pixels of the test views at least two training views see: where scores measure skill.
 
-What no training view shows can only be guessed, and the depth of what a single one shows is
-unknown: errors there are a matter of luck. Notation: frames are cut into the cells of
-``seeding.coverage``; the geometry is the depth of each cell: from the scene's own depth map if
-there is one, else the lower quartile of its points' depths; an empty cell has the median of the
-nearest cells. A training view sees a point if it projects into the view and lies no more than
-``NEARER`` behind the geometry there. Promise: the answer depends on the capture alone (cameras,
-points, depth maps), never on a render, so it is the same for everything that is scored on a scene.
+What fewer show can only be guessed. Frames are cut into the cells of ``seeding.coverage``. A cell's
+depth is that of the scene's own depth map, else the lower quartile of its points' depths, or the
+median of the nearest cells. A training view sees a point if it projects into the view and lies no
+more than ``NEARER`` behind the depth there. Promise: the answer depends on cameras, points and
+depth maps alone, never on a render, so it is the same for everything that is scored on a scene.
 """
 
 from __future__ import annotations
@@ -18,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64
+from jaxtyping import Bool, Float32
 
 from splatseed.depthmap import DepthMaps
 from splatseed.io.files import ARCHIVE_FAILURES
@@ -30,10 +28,9 @@ from splatseed.views.view import View, data_factor, poses_of
 
 _LEAST_VIEWS = 2
 """Training views that must see a pixel."""
-_CELLS = 100
-"""Along the longer side: 8 pixels of 800. The SfM points of a capture fill most of such cells."""
-_LEAST_CELL = 2.0
-"""Smallest side of a cell, in pixels."""
+_CELLS, _LEAST_CELL = 100, 2.0
+"""Cells along the longer side (the SfM points of a capture fill most of so many), and the smallest
+side of a cell, in pixels."""
 _MAX_SIZE = 800
 """Longer side in pixels of the frames that are divided into cells."""
 _NEAREST = 4
@@ -87,12 +84,7 @@ def find_covisible(
 
 
 def pixel_masks(grids: Grids, views: Sequence[View]) -> dict[str, Bool[np.ndarray, "H W"]]:
-    """The cells as masks of pixels, for views of any size that have cells.
-
-    Args:
-        grids: The result of ``find_covisible``.
-        views: The test views.
-    """
+    """The cells that ``find_covisible`` found as masks of the pixels of views of any size."""
     return {v.name: _resized(grids[v.name], v.height, v.width) for v in views if v.name in grids}
 
 
@@ -104,7 +96,6 @@ def _resized(values: np.ndarray[Any, Any], rows: int, cols: int) -> np.ndarray[A
 
 
 def _cell(view: View) -> float:
-    """Side of a view's cells in pixels."""
     return max(max(view.width, view.height) / _CELLS, _LEAST_CELL)
 
 
@@ -117,27 +108,22 @@ def _frames(images: Sequence[Image], maps: DepthMaps | None) -> Sequence[View]:
 def _depths(
     view: View, xyz: Float32[np.ndarray, "N 3"], maps: DepthMaps | None
 ) -> Float32[np.ndarray, "rows cols"]:
-    """Planar depth of each cell; infinite in all where nothing is known."""
-    rows, cols = grid_of(view, _cell(view))
-    if maps is None:
-        return _filled(cell_depths(view, xyz, _cell(view)))
-    values = _resized(maps.read(view.name).values, rows, cols)  # RGB-D captures have planar depth
-    return _filled(np.nan_to_num(values, nan=np.inf))
-
-
-def _filled(depths: Float32[np.ndarray, "rows cols"]) -> Float32[np.ndarray, "rows cols"]:
-    """The depths, with gaps filled from the nearest cells."""
+    """Planar depth of each cell, gaps filled; infinite in all where nothing is known."""
     from scipy.spatial import cKDTree  # noqa: PLC0415  (slow to import)
 
+    if maps is None:
+        depths = cell_depths(view, xyz, _cell(view))
+    else:  # RGB-D captures have planar depth
+        values = _resized(maps.read(view.name).values, *grid_of(view, _cell(view)))
+        depths = np.nan_to_num(values, nan=np.inf)
     known = np.isfinite(depths)
-    if not known.any() or known.all():
-        return depths
-    inverse = 1.0 / depths[known]
-    k = min(_NEAREST, len(inverse))
-    _, near = cKDTree(np.argwhere(known)).query(np.argwhere(~known), k=k)
-    filled = depths.copy()
-    filled[~known] = 1.0 / np.median(inverse[near.reshape(-1, k)], axis=1)
-    return filled
+    if known.any() and not known.all():
+        k = min(_NEAREST, np.count_nonzero(known))
+        _, near = cKDTree(np.argwhere(known)).query(np.argwhere(~known), k=k)
+        inverse = 1.0 / depths[known][near.reshape(-1, k)]
+        depths = depths.copy()
+        depths[~known] = 1.0 / np.median(inverse, axis=1)
+    return depths
 
 
 def _covisible(
@@ -152,23 +138,16 @@ def _covisible(
     grid_from_pixels = np.diag([cols / view.width, rows / view.height, 1.0])
     rays = np.linalg.inv(grid_from_pixels @ view.K) @ np.vstack([place, np.ones(rows * cols)])
     in_cam = np.vstack([rays * np.where(known, depths, -1.0).ravel(), np.ones(rows * cols)])
-    xyz1 = (np.linalg.inv(view.cam_from_world) @ in_cam).T
-    count = sum((_sees(other, grid, xyz1) for other, grid in seen), np.zeros(len(xyz1), np.int32))
-    return np.asarray((np.asarray(count).reshape(depths.shape) >= _LEAST_VIEWS) & known)
-
-
-def _sees(
-    view: View, known: Float32[np.ndarray, "rows cols"], xyz1: Float64[np.ndarray, "C 4"]
-) -> Bool[np.ndarray, " C"]:
-    """Which points a view sees."""
-    column, row, depth = grid_from_world(view, _cell(view)) @ xyz1.T
-    front = depth > 0
-    safe = np.where(front, depth, 1.0)
-    column, row = column / safe, row / safe
-    rows, cols = known.shape
-    inside = front & (column >= 0) & (column < cols) & (row >= 0) & (row < rows)
-    i, j = (np.where(inside, x, 0).astype(np.int64) for x in (row, column))
-    return np.asarray(inside & (known[i, j] >= (1.0 - NEARER) * depth))
+    xyz1 = np.linalg.inv(view.cam_from_world) @ in_cam
+    count = np.zeros(rows * cols, np.int32)
+    for other, farthest in seen:
+        column, row, depth = grid_from_world(other, _cell(other)) @ xyz1
+        front = depth > 0
+        j, i = np.floor([column, row] / np.where(front, depth, 1.0))
+        inside = front & (j >= 0) & (j < farthest.shape[1]) & (i >= 0) & (i < farthest.shape[0])
+        i, j = (np.where(inside, each, 0).astype(np.int64) for each in (i, j))
+        count += inside & (farthest[i, j] >= (1.0 - NEARER) * depth)
+    return np.asarray((count.reshape(depths.shape) >= _LEAST_VIEWS) & known)
 
 
 def write_covisible(path: Path, grids: Grids) -> None:

@@ -1,11 +1,9 @@
 """Scores of Gaussians: how close renders come to photographs that were not used for training.
 
-Notation: a render and a photograph are [H, W, 3], sRGB values 0..1, not linearised. Promise:
-renders are clamped to [0, 1] and not rounded to 8 bits; each view is scored at its own size; SSIM
-has an 11 x 11 Gaussian window (sigma 1.5) and images mirrored at their edges, which is what
-torchmetrics and so gsplat's trainer report. A model is rendered in the frame of the scene's
-training cameras, so that the near plane is the same as in training and single precision suffices
-for a distant world; the background is black. Needs PyTorch (``pip install ".[train]"``).
+Promise: values are sRGB 0..1, not linearised, renders clamped and not rounded to 8 bits; each view
+is scored at its own size; SSIM has an 11 x 11 Gaussian window (sigma 1.5) and images mirrored at
+their edges, as torchmetrics' and so gsplat's trainer's. A model is rendered in the frame of the
+scene's training cameras, as in training. Needs PyTorch (``pip install ".[train]"``).
 """
 
 from __future__ import annotations
@@ -34,7 +32,7 @@ from splatseed.scene import Scene
 from splatseed.scores import NOT_ASKED, EvalResult, ViewScore
 from splatseed.splat.formats import read_model
 from splatseed.splat.gaussians import Gaussians, training_frame
-from splatseed.splat.metrics import Lpips, psnr, ssim_of_all
+from splatseed.splat.metrics import LPIPS_NET, Lpips, psnr, ssim_of_all
 from splatseed.splat.rendering import ModelRenderer, photograph_of, picture_name, write_render
 from splatseed.splat.ssim import WINDOW
 from splatseed.splat.world import NO_TRANSFORM, check_world, find_transform, view_in
@@ -64,8 +62,7 @@ def evaluate_views(
         views: The views; at least one.
         lpips: The LPIPS metric; LPIPS is not measured when left out.
         lpips_reason: Why it is left out, for the reader of the result.
-        covisible: The pixels over which PSNR is also computed, for the views it contains; see
-            ``splat.covisible``.
+        covisible: The pixels over which PSNR is also computed, for the views it contains.
         progress: Called with the stage and the fraction done.
 
     Raises:
@@ -90,7 +87,7 @@ def evaluate_views(
         progress("score", len(scores) / len(views))
     return EvalResult(
         tuple(scores),
-        lpips_net=lpips.net if lpips else None,
+        lpips_net=LPIPS_NET if lpips else None,
         lpips_reason="" if lpips else lpips_reason,
     )
 
@@ -101,18 +98,12 @@ def _score(
     start = _now()
     image = render(view)
     seconds = _now() - start
-    expected = (view.height, view.width, 3)
-    if tuple(image.shape) != expected:
+    shape = [view.height, view.width, 3]
+    if list(image.shape) != shape or not bool(torch.isfinite(image).all()):
         raise ParameterError(
-            f"a render of {view.name} of shape {list(expected)}",
-            found=f"{list(image.shape)}",
-            fix="Render views at their own width and height.",
-        )
-    if not bool(torch.isfinite(image).all()):
-        raise ParameterError(
-            f"a render of {view.name} of finite values",
-            found="NaN or infinity",
-            fix="The model has values that are not finite: train it again.",
+            f"a render of {view.name} of shape {shape} and finite values",
+            found="NaN or infinity" if list(image.shape) == shape else f"{list(image.shape)}",
+            fix="Render views at their own width and height, of a model whose values are finite.",
         )
     image, photograph = image.clamp(0.0, 1.0), photograph_of(view, image.device)
     score = ViewScore(
@@ -141,14 +132,9 @@ def _now() -> float:
 
 @dataclass(frozen=True, eq=False)
 class TrainedModel:
-    """Gaussians and the views to score them on.
+    """Gaussians in the scene's world, its test views, and what renders a view of that world.
 
-    Args:
-        gaussians: The model, in the scene's world.
-        views: The scene's test views, in its world.
-        render: Renders the Gaussians from a view in the world.
-        scene: The scene.
-        doubt: Why the Gaussians may not be in its world after all; empty if they surely are.
+    ``doubt`` says why the Gaussians may not be in that world after all; empty if they surely are.
     """
 
     gaussians: Gaussians
@@ -172,20 +158,20 @@ def load_model(
     """Read Gaussians that any trainer wrote, and the test views of their scene.
 
     Args:
-        path: A file of Gaussians in any format that ``read_model`` reads.
+        path: A file that ``read_model`` reads.
         scene_path: The scene.
         data_factor: The factor by which photographs are downsampled.
         test_every: Every n-th image, sorted by name, is a test view.
-        transform: From the scene's world to the model's, if they differ: a file, or a word, as for
-            ``find_transform``. When left out, the model must be in the scene's own world.
+        transform: From the scene's world to the model's, as for ``find_transform``; when left out,
+            they must be the same.
         device: Where to render; the CPU when left out.
         cache_dir: Where smaller photographs are cached; nowhere when left out.
         progress: Called with the stage and the fraction done.
 
     Raises:
         SceneNotFoundError: The model, the scene or its images are missing.
-        SceneFormatError: One of them is not what its format promises, or the model's Gaussians are
-            not where the scene's points are.
+        SceneFormatError: One of them is damaged, or the Gaussians are not where the scene's points
+            are.
         ParameterError: The transform cannot be computed.
     """
     gaussians = read_model(path)

@@ -1,16 +1,16 @@
 """Files of trained Gaussians: 3DGS's .ply and the packed formats; and choosing which to keep.
 
-Notation: a .ply has one vertex per Gaussian, float32 x, y, z, nx, ny, nz (zero), f_dc_0..2,
-f_rest_* (all of red, then green, then blue), opacity (logit), scale_0..2 (logarithms), rot_0..3
-(wxyz). Promise: a file's content decides its format when it is read, its name when it is written; a
-file appears whole or not at all; positions read are finite. A .ply is read back bit for bit, and
-its properties are found by name; packed formats lose fine detail, and the Gaussians' order.
+A .ply has one vertex per Gaussian, all float32; of f_rest_* all of red comes first, then green,
+then blue. Promise: a file's content decides its format when it is read, its name when it is
+written; a file appears whole or not at all; positions read are finite. A .ply is read back bit for
+bit, its properties found by name; packed formats lose fine detail, and the Gaussians' order.
 """
 
 from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -44,20 +44,16 @@ _ELSEWHERE = {
     ".gltf": f"{sog.CONVERTER} MODEL.ply OUT.glb makes a .glb from a .ply",
     ".usdz": "NVIDIA's converter (PyPI: usd-convert-gsplat) makes one from a .ply",
 }
-"""Formats that splatseed does not write, and the tools that do."""
+"""Formats that are neither read nor written here, and the tools that write them."""
 
 
 def _encode_ply(gaussians: Gaussians) -> list[bytes | memoryview]:
     count, rest = len(gaussians), 3 * gaussians.shN.shape[1]
     columns = _columns(rest)
-    arrays = {
-        **gaussians.arrays(),
-        "normals": np.zeros((count, 3), np.float32),
-        "shN": gaussians.shN.transpose(0, 2, 1),
-    }
+    arrays = {**gaussians.arrays(), "normals": np.zeros((count, 3), np.float32)}
+    arrays["shN"] = gaussians.shN.transpose(0, 2, 1)
     tables = [arrays[name].reshape(count, len(each)) for name, each in columns.items()]
-    names = [name for each in columns.values() for name in each]
-    properties = "".join(f"property float {name}\n" for name in names)
+    properties = "".join(f"property float {p}\n" for each in columns.values() for p in each)
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex {count}\n{properties}"
     table = np.concatenate(tables, axis=1, dtype="<f4")
     return [f"{header}end_header\n".encode("ascii"), table.data]
@@ -69,13 +65,12 @@ def _decode_ply(path: Path) -> Gaussians:
     vertex = header.elements[0] if header.elements else Element("none", 0, ())
     names = {prop.name for prop in vertex.properties}
     rest = sum(name.startswith("f_rest_") for name in names)
-    columns = _columns(rest)
-    del columns["normals"]
+    columns = {name: each for name, each in _columns(rest).items() if name != "normals"}
     missing = [name for each in columns.values() for name in each if name not in names]
-    found = ""
-    if missing or not header.byte_order or vertex.has_lists:
-        found = f"no {', '.join(missing[:5])}" if missing else "an ascii file, or lists"
-    elif rest not in {3 * each for each in packed.SH_COUNTS} or not vertex.num_rows:
+    found = f"no {', '.join(missing[:5])}" if missing else ""
+    if not found and (not header.byte_order or vertex.has_lists):
+        found = "an ascii file, or lists"
+    elif not found and (rest not in {3 * k for k in packed.SH_COUNTS} or not vertex.num_rows):
         found = f"{rest} f_rest properties and {vertex.num_rows} vertices"
     if found:
         raise SceneFormatError(
@@ -90,12 +85,10 @@ def _decode_ply(path: Path) -> Gaussians:
         for name, each in columns.items()
         if each
     }
-    arrays["opacities"] = arrays["opacities"][:, 0]
-    arrays["sh0"] = arrays["sh0"][:, None]
+    arrays["opacities"], arrays["sh0"] = arrays["opacities"][:, 0], arrays["sh0"][:, None]
     planes = arrays.get("shN", np.zeros((len(rows), 0))).reshape(len(rows), 3, rest // 3)
-    return Gaussians(
-        **{**arrays, "shN": np.array(planes.transpose(0, 2, 1), np.float32, order="C")}
-    )
+    arrays["shN"] = np.array(planes.transpose(0, 2, 1), np.float32, order="C")
+    return Gaussians(**arrays)
 
 
 def _columns(rest: int) -> dict[str, tuple[str, ...]]:
@@ -103,14 +96,7 @@ def _columns(rest: int) -> dict[str, tuple[str, ...]]:
 
 
 class Format(NamedTuple):
-    """A format that can be read and written.
-
-    Args:
-        suffix: The end of its file names.
-        about: What it preserves, and who reads it.
-        encode: The bytes of a file, in parts.
-        decode: The Gaussians in a file; raises ``SceneFormatError``.
-    """
+    """A format: its files' suffix, what it preserves and who reads it, and its two functions."""
 
     suffix: str
     about: str
@@ -129,10 +115,7 @@ FORMATS = {
         ".ply", "everything, as 3DGS writes it; every tool reads it", _encode_ply, _decode_ply
     ),
     "splat": Format(
-        ".splat",
-        "no view-dependent colour; web viewers",
-        packed.encode_splat,
-        packed.decode_splat,
+        ".splat", "no view-dependent colour; web viewers", packed.encode_splat, packed.decode_splat
     ),
     "spz": Format(
         ".spz",
@@ -205,11 +188,7 @@ def format_of_name(path: Path) -> str:
 
 
 def detect_format(path: Path, data: bytes) -> str:
-    """The format of a file's content.
-
-    Args:
-        path: The file, for errors and for the format without a signature.
-        data: Its bytes.
+    """The format of a file's content; of one without a signature, its name decides.
 
     Raises:
         SceneFormatError: The format cannot be read.
@@ -217,7 +196,10 @@ def detect_format(path: Path, data: bytes) -> str:
     suffix = path.suffix.lower()
     if data.startswith(b"ply") and data[3:4] in (b"\n", b"\r", b" ", b"\t"):
         return "compressed-ply" if b"packed_position" in data[:_HEADER] else "ply"
-    if packed.SPZ_MAGIC in (data[:4], _begin_of_gzipped(data)):
+    begin = data
+    with suppress(zlib.error):
+        begin = zlib.decompressobj(wbits=31).decompress(data[:4096], 4)
+    if begin.startswith(packed.SPZ_MAGIC):
         return "spz"
     if data.startswith(b"PK\x03\x04") or (data[:1] == b"{" and suffix == ".json"):
         return "sog"
@@ -228,19 +210,11 @@ def detect_format(path: Path, data: bytes) -> str:
             return "splat"
         found = f"{len(data):,} bytes, not a multiple of the {size} of a .splat's Gaussian"
         fix = COPY_AGAIN
-    elif data.startswith(b"glTF"):
-        found, fix = "a binary glTF", "Export a .ply where it came from: splatseed reads no glTF."
-    elif suffix == ".ksplat":
-        found, fix = "a .ksplat", f"Convert it: {sog.CONVERTER} IN.ksplat OUT.ply."
+    elif suffix in _ELSEWHERE:
+        found = f"a {suffix}"
+        fix = f"Export a .ply where it came from, or try {sog.CONVERTER} IN{suffix} OUT.ply."
     expected = f"{path} to hold trained Gaussians ({', '.join(SUFFIXES)})"
     raise SceneFormatError(expected, found=found, fix=fix)
-
-
-def _begin_of_gzipped(data: bytes) -> bytes:
-    try:
-        return zlib.decompressobj(wbits=31).decompress(data[:4096], 4)
-    except zlib.error:
-        return b""
 
 
 def parse_crop(text: str) -> Float64[np.ndarray, "2 3"]:
@@ -267,9 +241,7 @@ def parse_crop(text: str) -> Float64[np.ndarray, "2 3"]:
 
 
 def keep_gaussians(
-    gaussians: Gaussians,
-    crop: Float64[np.ndarray, "2 3"] | None = None,
-    min_opacity: float = 0.0,
+    gaussians: Gaussians, crop: Float64[np.ndarray, "2 3"] | None = None, min_opacity: float = 0.0
 ) -> Gaussians:
     """The Gaussians whose centres lie in a box and that are opaque enough, in their order.
 

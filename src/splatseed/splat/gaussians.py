@@ -2,15 +2,11 @@
 
 Notation: N Gaussians; ``means`` [N, 3], ``scales`` [N, 3] as logarithms, ``quats`` [N, 4] wxyz of
 any length, ``opacities`` [N] as logits, ``sh0`` [N, 1, 3], ``shN`` [N, 15, 3]: gsplat's names and
-conventions. Seen along the unit direction d from a camera, a Gaussian has the colour c(d) = 1/2 +
-sum_k y_k(d) h_k with the real spherical harmonics y, up to degree 1 in 3DGS's order and signs y =
-(C0, -C1 d_y, C1 d_z, -C1 d_x). In the training frame the cameras' centroid is at 0 and the farthest
-camera at distance 1, ``x_train = scale (x_world - origin)``; a *stray* camera is so far from all
-others that its pose must be wrong. Promise: arrays here are NumPy, so that a .ply can be read and
-written without PyTorch; equal seeds and views give equal Gaussians, whatever the number of threads.
-The frame depends on the training cameras only, so that runs from different seeds are compared in
-one frame, and strays do not affect it; there is no rotation, so quaternions and spherical harmonics
-stay the same; single precision suffices for distant origins.
+conventions. In the training frame the cameras' centroid is at 0 and the farthest camera at distance
+1, ``x_train = scale (x_world - origin)``; a *stray* camera is so far from all others that its pose
+must be wrong. Promise: no PyTorch; equal seeds and views give equal Gaussians, whatever the number
+of threads. The frame depends on the training cameras alone, without the strays, so that runs from
+different seeds are compared in one frame; single precision suffices there for distant origins.
 """
 
 from __future__ import annotations
@@ -31,32 +27,26 @@ SH_C0 = 0.28209479177387814
 """The spherical harmonic of degree 0, 1 / (2 sqrt(pi)); colour = 0.5 + SH_C0 * sh0."""
 SH_C1 = 0.4886025119029199
 """Constant of degree 1, sqrt(3 / (4 pi))."""
-OWN = 0.3
-"""Weight of a seed's own colour, in photographs."""
-EVEN = 1.0
-"""Weight of the prior against view dependence, in photographs: few views do not determine it."""
-CELL = 4.0
-"""Side in pixels of the cells within which seeds occlude each other."""
-MOST_PROJECTIONS = 50_000_000
-"""Limit on seeds times views: beyond it, an even subset of the views is used."""
-LEAST_VIEWS = 16
-"""But never fewer views than this."""
-NEIGHBORS = 3
-"""Neighbours whose mean square distance is a Gaussian's first size, as in 3DGS."""
-GAP = 10.0
-"""Largest initial scale, relative to the median: beyond it a point is isolated."""
-COINCIDENT = 1e-2
-"""Smallest initial scale, relative to the median: coincident points would stay invisible."""
 SCENE_SCALE = 1.1
 """Scene size for the strategies and the learning rate of positions: the cameras' extent plus a
 tenth, as in 3DGS."""
-STRAY_SHARE = 0.1
-"""At most this share of the cameras, but always one, can be strays."""
-STRAY_DISTANCE = 10.0
-"""A stray is this many times farther from the cameras' median than the farthest camera that cannot
-be one."""
-MIN_CAMERAS = 5
-"""With fewer cameras, none can be called a stray."""
+NEIGHBORS = 3
+"""Neighbours whose mean square distance is a Gaussian's first size, as in 3DGS."""
+COINCIDENT, GAP = 1e-2, 10.0
+"""Bounds of a first size, relative to the median: beyond the second a point is isolated, and below
+the first it would stay invisible."""
+OWN, EVEN = 0.3, 1.0
+"""Weights, in photographs, of a seed's own colour, and of the prior against view dependence, which
+few views do not determine."""
+CELL = 4.0
+"""Side in pixels of the cells within which seeds occlude each other."""
+LEAST_VIEWS, MOST_PROJECTIONS = 16, 50_000_000
+"""An even subset of the views, but never fewer than the first, is used beyond as many seeds times
+views as the second."""
+MIN_CAMERAS, STRAY_SHARE, STRAY_DISTANCE = 5, 0.1, 10.0
+"""Among fewer cameras than the first, none is a stray; among more, at most this share of them, but
+always one, can be. A stray is this many times farther from the cameras' median than the farthest
+camera that cannot be one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,10 +170,11 @@ def neighbor_distances(xyz: Float[np.ndarray, "N 3"]) -> Float64[np.ndarray, " N
 def fit_harmonics(seeds: PointCloud, views: Sequence[View]) -> Float32[np.ndarray, "N 4 3"]:
     """Coefficients h of each seed: ridge regression over the views that see it.
 
-    With the colours p_v seen by V views along directions d_v, and the seed's own colour p, it
-    solves min over h of sum_v |1/2 + y(d_v) h - p_v|^2 + OWN |1/2 + C0 h_0 - p|^2 + EVEN |C1
-    h_1..3|^2, a ridge regression of four unknowns per colour channel. A seed that no view sees
-    keeps its colour.
+    Along the unit direction d from a camera, the colour is 1/2 + sum_k y_k(d) h_k with the real
+    spherical harmonics up to degree 1 in 3DGS's order and signs, y = (C0, -C1 d_y, C1 d_z, -C1
+    d_x). With the colours p_v seen along d_v, and the seed's own colour p, h is the least of
+    sum_v |1/2 + y(d_v) h - p_v|^2 + OWN |1/2 + C0 h_0 - p|^2 + EVEN |C1 h_1..3|^2 in each colour
+    channel. A seed that no view sees keeps its colour.
 
     Args:
         seeds: N points and their colours.
@@ -211,13 +202,8 @@ def fit_harmonics(seeds: PointCloud, views: Sequence[View]) -> Float32[np.ndarra
     return np.linalg.solve(normal, right).astype(np.float32)
 
 
-def _shown(
-    xyz: Float32[np.ndarray, "N 3"], view: View
-) -> tuple[Int64[np.ndarray, " M"], Int64[np.ndarray, " M"], Int64[np.ndarray, " M"]]:
-    """Seeds in the photograph that none in the same or a neighbouring cell occludes.
-
-    Their indices, columns and rows.
-    """
+def _shown(xyz: Float32[np.ndarray, "N 3"], view: View) -> Int64[np.ndarray, "3 M"]:
+    """Index, column and row of the seeds that none in the same or a neighbouring cell occludes."""
     from splatseed.seeding.coverage import NEARER, cell_depths, grid_of  # noqa: PLC0415  (kernels)
 
     # Pixels times depth, and depth, in written-out sums: BLAS's order varies with threads.
@@ -232,7 +218,7 @@ def _shown(
     nearest = depths[row * rows // view.height, column * cols // view.width]
     # A tenth behind the cell's depth still counts as its surface.
     seen = (depth[index] <= nearest * (1 + NEARER)) & np.isfinite(nearest)
-    return index[seen], column[seen], row[seen]
+    return np.stack([index, column, row])[:, seen]
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,16 +246,23 @@ class TrainingFrame:
         sizes = np.clip(cloud.sizes.astype(np.float64) * self.scale, limits.tiny, limits.max)
         return moved.replace(sizes=sizes)
 
+    def gaussians_from_world(self, gaussians: Gaussians) -> Gaussians:
+        """Gaussians of the world in the training frame."""
+        return dataclasses.replace(
+            gaussians,
+            means=self.points_from_world(gaussians.means),
+            scales=gaussians.scales + np.float32(np.log(self.scale)),  # logarithms
+        )
+
     def points_to_world(self, xyz: Float[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
         """Points of the training frame in the world."""
         return np.asarray(xyz.astype(np.float64) / self.scale + self.origin)
 
     def gaussians_to_world(self, gaussians: Gaussians) -> Gaussians:
-        """Gaussians of the training frame in the world (float32 there: see the promise)."""
+        """Gaussians of the training frame in the world, float32 there; harmonics do not turn."""
         return dataclasses.replace(
             gaussians,
             means=self.points_to_world(gaussians.means).astype(np.float32),
-            # Scales are logarithms: division becomes subtraction.
             scales=gaussians.scales - np.float32(np.log(self.scale)),
         )
 
@@ -288,13 +281,12 @@ def training_frame(views: Sequence[View]) -> TrainingFrame:
     near = centers[~_is_stray(centers)]
     origin = near.mean(axis=0)
     extent = float(np.linalg.norm(near - origin, axis=1).max())
-    # Rounding leaves a little extent even if all cameras are in one place.
-    rounding = 1e-9 * float(np.abs(near).max())
+    rounding = 1e-9 * float(np.abs(near).max())  # of which the extent of one place may be
     return TrainingFrame(origin, 1.0 / extent if extent > rounding else 1.0)
 
 
 def stray_views(views: Sequence[View]) -> tuple[str, ...]:
-    """Names of the views whose cameras are strays: see ``STRAY_DISTANCE``."""
+    """Names of the views whose cameras are strays."""
     strays = _is_stray(_centers(views))
     return tuple(view.name for view, stray in zip(views, strays, strict=True) if stray)
 

@@ -1,47 +1,35 @@
-"""Metrics of two images in PyTorch: PSNR, SSIM and LPIPS.
+"""Metrics of two images [H, W, 3], values about 0..1, in PyTorch: PSNR, SSIM and LPIPS.
 
-Notation: images are [H, W, 3], values about 0..1. LPIPS is the distance of two images in the
-features of a network trained on ImageNet: f_l is the output of the l-th of 5 stages at each place,
-scaled to unit length over its channels; w_l >= 0 are weights of the channels learnt from human
-judgements, and
-
-    d(x, y) = sum_l mean_places sum_c w_lc (f_lc(x) - f_lc(y))^2     (Zhang et al. 2018, eq. 1)
-
-Promise: on a GPU only what returns a Python number waits for it. SSIM is computed in full float32:
-cuDNN's default rounds the inputs of convolutions to ten bits (TF32), and E[x^2] - E[x]^2 then
-cancels. LPIPS is version 0.1, with the weights that torchvision publishes and the w_l that
-torchmetrics ships. torchmetrics' own class builds its network by torchvision, which is tied to one
-version of PyTorch and not needed here: the network is a dozen lines. Nothing is downloaded.
+LPIPS, version 0.1, is the distance of two images in the features of a network: f_l is the output of
+its l-th of 5 stages, scaled to unit length over its channels; w_l >= 0 are learnt from human
+judgements, and d(x, y) = sum_l mean_places sum_c w_lc (f_lc(x) - f_lc(y))^2 (Zhang et al. 2018, eq.
+1). The networks' weights are torchvision's, the w_l torchmetrics'; torchmetrics makes the networks
+by torchvision, which is tied to one version of PyTorch, so that they are made here. Nothing is
+downloaded. Promise: on a GPU only what returns a Python number waits for it.
 """
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn.functional import conv2d, conv_transpose2d, pad
 
-from splatseed.errors import MissingDependencyError, SceneFormatError, SceneNotFoundError
-from splatseed.io.files import odd_kind
+from splatseed.errors import MissingDependencyError, SceneNotFoundError
+from splatseed.io.files import guarded, odd_kind
 from splatseed.requirements import require
 from splatseed.splat.ssim import C1, C2, WINDOW, l1_and_ssim, window_weights
 
-LpipsNet = Literal["vgg", "alex"]
-LPIPS_FILES: Mapping[LpipsNet, str] = {
-    "vgg": "vgg16-397923af.pth",
-    "alex": "alexnet-owt-7be5be79.pth",
-}
-"""The names that PyTorch gives the files of weights."""
-GIVE_PATH = "pass its path with --lpips-weights"
+LPIPS_NET, LPIPS_FILE = "vgg", "vgg16-397923af.pth"
+"""The network of LPIPS, which papers on 3DGS report, and PyTorch's name for the file of weights."""
 _URL = "https://download.pytorch.org/models/"
-_TAPS = {"vgg": (3, 8, 15, 22, 29), "alex": (1, 4, 7, 9, 11)}
+_TAPS = (3, 8, 15, 22, 29)
 """The layers whose output is compared."""
 # Each channel of an image in [-1, 1] becomes (value - SHIFT) / SCALE, as in the metric's code.
 _SHIFT = (-0.030, -0.088, -0.188)
@@ -56,12 +44,9 @@ def psnr(
     photograph: Float[Tensor, "H W 3"],
     mask: Bool[Tensor, "H W"] | None = None,
 ) -> float:
-    """Peak signal-to-noise ratio in dB of a render clamped to [0, 1].
+    """Peak signal-to-noise ratio in dB of a render clamped to [0, 1], over the pixels of a mask.
 
-    Args:
-        render: x.
-        photograph: y.
-        mask: The pixels that count; all when left out. NaN if there are none.
+    NaN if there are none.
     """
     error = (render.clamp(0, 1) - photograph).square()
     error = error if mask is None else error[mask]
@@ -77,18 +62,13 @@ def l1_and_ssim_by_convolution(
 ) -> tuple[Float[Tensor, ""], Float[Tensor, ""], Float[Tensor, "H W 3"]]:
     """``splat.ssim.l1_and_ssim`` on any device, by convolutions; its header has the equations.
 
-    Args:
-        render: x, values about 0..1; at least 11 pixels a side.
-        photograph: y, likewise.
-        l1_weight: Weight of the mean absolute difference.
-        ssim_weight: Weight of 1 - SSIM.
-
     Returns:
         Mean |x - y|, mean SSIM where the window fits entirely, and
-        d(l1_weight L1 + ssim_weight (1 - SSIM)) / dx.
+        d(l1_weight L1 + ssim_weight (1 - SSIM)) / dx, with the render x and the photograph y.
     """
     x, y = render.permute(2, 0, 1), photograph.permute(2, 0, 1)
     c1, c2 = float(C1), float(C2)
+    # cuDNN's TF32 would round inputs to ten bits, and E[x^2] - E[x]^2 cancel.
     with torch.backends.cudnn.flags(enabled=True, allow_tf32=False):
         planes = torch.stack([x, y, x * y, torch.addcmul(y * y, x, x)])
         mean_x, mean_y, e_xy, e_2 = _blur(planes)
@@ -117,19 +97,15 @@ def l1_and_ssim_by_convolution(
 def _blur(planes: Float[Tensor, "P 3 H W"]) -> Float[Tensor, "P 3 H-10 W-10"]:
     """Windowed means where the window fits entirely."""
     across, down = _window(planes.device)
-    columns = conv2d(planes.flatten(0, 1).unsqueeze(1), down)
-    return conv2d(columns, across).view(
-        *planes.shape[:2], *(n - WINDOW + 1 for n in planes.shape[2:])
-    )
+    blurred = conv2d(conv2d(planes.flatten(0, 1).unsqueeze(1), down), across)
+    return blurred.view(*planes.shape[:2], *blurred.shape[2:])
 
 
 def _spread(maps: Float[Tensor, "P 3 h w"]) -> Float[Tensor, "P 3 h+10 w+10"]:
     """The transpose of ``_blur``."""
     across, down = _window(maps.device)
-    rows = conv_transpose2d(maps.flatten(0, 1).unsqueeze(1), across)
-    return conv_transpose2d(rows, down).view(
-        *maps.shape[:2], *(n + WINDOW - 1 for n in maps.shape[2:])
-    )
+    spread = conv_transpose2d(conv_transpose2d(maps.flatten(0, 1).unsqueeze(1), across), down)
+    return spread.view(*maps.shape[:2], *spread.shape[2:])
 
 
 @lru_cache
@@ -152,117 +128,82 @@ def ssim_of_all(render: Float[Tensor, "H W 3"], photograph: Float[Tensor, "H W 3
     return float(l1_and_ssim(x.contiguous().numpy(), y.contiguous().numpy(), 0.0, 1.0)[1])
 
 
+@dataclass(frozen=True, eq=False)
 class Lpips:
     """LPIPS with its weights, ready to compare images.
 
     Args:
-        net: The network's name.
-        features: Its convolutions, in torchvision's order.
+        features: The network's convolutions, in torchvision's order.
         heads: w_l of each stage, [1, C_l, 1, 1].
     """
 
-    def __init__(self, net: LpipsNet, features: nn.Sequential, heads: Sequence[Tensor]) -> None:
-        self.net = net
-        self._features = features
-        self._heads = list(heads)
+    features: nn.Sequential
+    heads: list[Tensor]
 
     @torch.no_grad()
     def __call__(self, render: Float[Tensor, "H W 3"], photograph: Float[Tensor, "H W 3"]) -> float:
         """The distance of two images of values 0..1; 0 where they are equal."""
         pair = torch.stack([render, photograph]).permute(0, 3, 1, 2)
         shift, scale = (pair.new_tensor(values).view(1, 3, 1, 1) for values in (_SHIFT, _SCALE))
-        x, total = (2 * pair - 1 - shift) / scale, 0.0
-        heads = iter(self._heads)
-        for i, layer in enumerate(self._features.to(render.device)):
+        x, total, heads = (2 * pair - 1 - shift) / scale, 0.0, iter(self.heads)
+        for i, layer in enumerate(self.features.to(render.device)):
             x = layer(x)
-            if i in _TAPS[self.net]:
+            if i in _TAPS:
                 unit = x / torch.sqrt(_EPSILON + x.square().sum(dim=1, keepdim=True))
                 head = next(heads).to(render.device)
                 total += float((head * (unit[:1] - unit[1:]).square()).sum(dim=1).mean())
         return total
 
 
-def load_lpips(net: LpipsNet = "vgg", weights: Path | None = None) -> Lpips:
-    """LPIPS with weights that are on this machine.
-
-    Args:
-        net: The network; papers on 3DGS report vgg.
-        weights: The file of its weights, or the folder that it lies in; PyTorch's own cache when
-            left out.
+def load_lpips(weights: Path | None = None) -> Lpips:
+    """LPIPS with VGG's weights, a file or the folder it lies in, by default in PyTorch's cache.
 
     Raises:
         MissingDependencyError: torchmetrics, which brings the w_l, is absent.
         SceneNotFoundError: There are no weights; says what to fetch, and where to put it.
         SceneFormatError: The file does not hold this network's weights.
     """
-    require("torchmetrics")
-    path = _weights_path(net, weights)
+    path, layers, before = _weights_path(weights), list[nn.Module](), 3
     with torch.device("meta"):  # no random weights first: they would change PyTorch's generator
-        features = nn.Sequential(*(_vgg16() if net == "vgg" else _alexnet()))
-    package = find_spec("torchmetrics")
-    try:
-        state, prefix = _read(path), "features."
-        own = {k.removeprefix(prefix): v.float() for k, v in state.items() if k.startswith(prefix)}
+        for channels, count in ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3)):
+            for _ in range(count):
+                layers += [nn.Conv2d(before, channels, 3, padding=1), nn.ReLU(inplace=True)]
+                before = channels
+            layers.append(nn.MaxPool2d(2))
+    features = nn.Sequential(*layers)
+    with guarded(path, f"the weights of {LPIPS_NET} for LPIPS", fix="Download the file again."):
+        named = [(name.partition("."), value) for name, value in _read(path).items()]
+        own = {name: value.float() for (part, _, name), value in named if part == "features"}
         features.load_state_dict(own, assign=True)
-    except Exception as error:  # noqa: BLE001  (PyTorch raises anything for a foreign file)
-        raise SceneFormatError(
-            f"{path} to hold the weights of {net} for LPIPS",
-            found=" ".join(f"{type(error).__name__}: {error}".split())[:200],
-            fix="Download the file again.",
-        ) from None
-    assert package is not None  # noqa: S101  (required above)
-    package_dir = Path(package.origin or "").parent
-    heads = _read(package_dir / "functional" / "image" / "lpips_models" / f"{net}.pth")
-    return Lpips(net, features, [heads[f"lin{i}.model.1.weight"] for i in range(len(_TAPS[net]))])
+    package = find_spec("torchmetrics")  # importing it takes a second
+    folder = Path(str(package.origin)).parent / "functional" / "image" / "lpips_models"  # type: ignore[union-attr]  # required above
+    heads = _read(folder / f"{LPIPS_NET}.pth")
+    return Lpips(features, [heads[f"lin{i}.model.1.weight"] for i in range(len(_TAPS))])
 
 
-def lpips_is_here(net: LpipsNet = "vgg") -> bool:
+def lpips_is_here() -> bool:
     """Whether all that ``load_lpips`` needs is on this machine; no file is opened."""
     try:
-        require("torchmetrics")
-        _weights_path(net, None)
+        return _weights_path(None).is_file()
     except (MissingDependencyError, SceneNotFoundError):
         return False
-    return True
 
 
-def _vgg16() -> list[nn.Module]:
-    """Layers of configuration D (Simonyan and Zisserman 2015, table 1), as torchvision's."""
-    layers: list[nn.Module] = []
-    before = 3
-    for channels, count in ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3)):
-        for _ in range(count):
-            layers += [nn.Conv2d(before, channels, 3, padding=1), nn.ReLU(inplace=True)]
-            before = channels
-        layers.append(nn.MaxPool2d(2))
-    return layers
-
-
-def _alexnet() -> list[nn.Module]:
-    """Layers of the one-column network (Krizhevsky 2014), as torchvision's."""
-    first = [nn.Conv2d(3, 64, 11, 4, 2), nn.ReLU(inplace=True), nn.MaxPool2d(3, 2)]
-    second = [nn.Conv2d(64, 192, 5, padding=2), nn.ReLU(inplace=True), nn.MaxPool2d(3, 2)]
-    layers: list[nn.Module] = [*first, *second]
-    for before, after in ((192, 384), (384, 256), (256, 256)):
-        layers += [nn.Conv2d(before, after, 3, padding=1), nn.ReLU(inplace=True)]
-    return layers
-
-
-def _weights_path(net: LpipsNet, given: Path | None) -> Path:
-    """The file of weights, which exists."""
+def _weights_path(given: Path | None) -> Path:
+    require("torchmetrics")
     folder = Path(torch.hub.get_dir()) / "checkpoints" if given is None else given
-    path = folder if folder.is_file() else folder / LPIPS_FILES[net]
+    path = folder if folder.is_file() else folder / LPIPS_FILE
     if not path.is_file():
-        place = f"{folder}, or {GIVE_PATH}" if given is None else f"a folder; {GIVE_PATH}"
+        place = f"{folder}, or a folder" if given is None else "a folder"
         raise SceneNotFoundError(
             f"the weights for LPIPS, {path.name}",
             found="none" if given is None else f"{odd_kind(given) or 'no such file'} at {given}",
-            fix=f"Download {_URL}{path.name} and put it into {place}.",
+            fix=f"Download {_URL}{path.name}, put it into {place}; pass its path with "
+            "--lpips-weights.",
         )
     return path
 
 
 def _read(path: Path) -> dict[str, Tensor]:
-    """The tensors in a file by name; no code in it is run."""
     with warnings.catch_warnings(action="ignore"):  # about what a foreign file might be
         return dict(torch.load(path, map_location="cpu", weights_only=True))

@@ -1,16 +1,12 @@
 """Packed formats: .splat, PlayCanvas's compressed PLY, Niantic's .spz, and what they share.
 
 Notation: quaternions are wxyz; a rotation's *largest* component, made positive, is dropped, because
-the other *three*, each within 1/sqrt(2) of 0, determine it; [N] Gaussians. A record of a .splat is
-float32 x, y, z and scales (standard deviations), then bytes: red, green, blue, opacity, and the
-rotation wxyz as 128 q + 128; the file has no header and no view-dependent colour. A *chunk* of a
-compressed PLY is 256 Gaussians with the bounds of their positions, log-scales and colours, to which
-their values, 16 bytes per Gaussian, are relative; a byte per further colour coefficient follows.
-An .spz holds one attribute after another, gzipped (versions 1 to 3) or in zstd (4); its axes are
-right, up, back, ours right, down, front: y and z change sign; f are its *fractional bits*.
-
-Source: antimatter15/splat; the format's description in PlayCanvas's splat-transform and engine;
-nianticlabs/spz (load-spz.cc, splat-types.h).
+the other *three*, each within 1/sqrt(2) of 0, determine it. A .splat has no header and no
+view-dependent colour. A *chunk* of a compressed PLY is 256 Gaussians with the bounds of their
+positions, log-scales and colours, to which their values, 16 bytes per Gaussian, are relative. An
+.spz holds one attribute after another, gzipped (versions 1 to 3) or in zstd (4); its axes are
+right, up, back, ours right, down, front: y and z change sign. Source: antimatter15/splat;
+PlayCanvas's splat-transform and engine; nianticlabs/spz (load-spz.cc, splat-types.h).
 """
 
 from __future__ import annotations
@@ -34,37 +30,35 @@ from splatseed.splat.gaussians import SH_C0, Gaussians
 SH_COUNTS = (0, 3, 8, 15)
 """Coefficients beyond the first, by the degree of the spherical harmonics."""
 RECORD = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
-"""A Gaussian of a .splat."""
+"""A Gaussian of a .splat: scales are standard deviations, the rotation is 128 q + 128."""
+SPZ_MAGIC = b"NGSP"
 
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 """The components that remain, by the index of the largest."""
 _MORTON_BITS = 16
-_CHUNK = 256
+_CHUNK, _MOST_LOG_SCALE, _SH_RANGE = 256, 20.0, 8.0
 _BOUNDS = [
     [f"{end}_{name}" for name in names]
     for names in (("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b"))
     for end in ("min", "max")
 ]
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
-_MOST_LOG_SCALE = 20.0
-_SH_RANGE = 8.0
-_VECTOR_BITS = ((21, 11), (11, 10), (0, 11))
-"""Shift and number of bits of each part of a packed number; likewise the following."""
-_THREE_BITS = ((20, 10), (10, 10), (0, 10))
-_COLOR_BITS = ((24, 8), (16, 8), (8, 8))
+_Layout = tuple[tuple[int, int], ...]
+"""Shift and number of bits of each part of a packed number."""
+_VECTOR_BITS: _Layout = ((21, 11), (11, 10), (0, 11))
+_THREE_BITS: _Layout = ((20, 10), (10, 10), (0, 10))
+_COLOR_BITS: _Layout = ((24, 8), (16, 8), (8, 8))
 
-SPZ_MAGIC = b"NGSP"
 _SPZ_HEADER = struct.Struct("<4sIIBBBB")
-_SPZ_VERSION = 3
-"""The version that is written: the latest that every reader accepts."""
-_MOST_FRACTIONAL_BITS = 20
-_SPZ_MOST = 2**23 - 1
-"""Largest position in units of 2^-f: 24 bits with a sign."""
-_NINE_BITS = 511
+_SPZ_VERSION = 3  # the latest that every reader accepts
+_SPZ_MOST, _SPZ_FRACTION = 2**23 - 1, 20
+"""Largest position in units of 2^-f, 24 bits with a sign; largest f."""
+_SPZ_NINE_BITS = np.float32(511 * np.sqrt(2))
 _SPZ_COLOR = 0.15 * 255
 """Bytes per unit of the first coefficient: the format's scale."""
-_AXES = np.array([1, -1, -1], np.float32)
-_SH_AXES = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
+_SPZ_AXES = np.array([1, -1, -1], np.float32)
+_SPZ_QUAT = np.array([1, 1, -1, -1], np.float32)
+_SPZ_SH = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
 """Signs of the spherical harmonics of degrees 1 to 3 when y and z are flipped."""
 _SPZ_STEP = 4
 """Further coefficients are rounded to this many 128ths, so that gzip saves more. Niantic's writer
@@ -140,7 +134,7 @@ def _unit_quats(quats: Float32[np.ndarray, "N 4"]) -> Float32[np.ndarray, "N 4"]
 
 
 def encode_splat(gaussians: Gaussians) -> list[bytes]:
-    """A .splat: by size times opacity, so that a viewer can draw the most important ones first."""
+    """By size times opacity, so that a viewer can draw the most important ones first."""
     log_opacity = -np.logaddexp(0, -gaussians.opacities.astype(np.float64))
     size = gaussians.scales.astype(np.float64).sum(axis=1) + log_opacity
     order = np.argsort(-size, kind="stable")
@@ -156,7 +150,7 @@ def encode_splat(gaussians: Gaussians) -> list[bytes]:
 
 
 def decode_splat(path: Path) -> Gaussians:
-    """The Gaussians in a .splat: a whole number of records, with scales of 0 or more."""
+    """A whole number of records, with scales of 0 or more."""
     reader = ByteReader(path)
     reader.record = "Gaussians"
     rows = reader.array(RECORD, len(reader.data) // RECORD.itemsize)
@@ -179,7 +173,7 @@ def decode_splat(path: Path) -> Gaussians:
 
 
 def encode_compressed_ply(gaussians: Gaussians) -> list[bytes]:
-    """A compressed PLY, in Z-curve order."""
+    """In Z-curve order."""
     order = morton_order(gaussians.means)
     count, rest = len(order), 3 * gaussians.shN.shape[1]
     scales = np.clip(gaussians.scales[order], -_MOST_LOG_SCALE, _MOST_LOG_SCALE)
@@ -214,7 +208,7 @@ def encode_compressed_ply(gaussians: Gaussians) -> list[bytes]:
 
 
 def decode_compressed_ply(path: Path) -> Gaussians:
-    """The Gaussians in a compressed PLY."""
+    """Chunks, vertices, and coefficients if there are some."""
     reader = ByteReader(path)
     header = parse_header(path, reader.data)
     reader.offset = header.size
@@ -251,9 +245,7 @@ def decode_compressed_ply(path: Path) -> Gaussians:
         )
 
 
-def _pack(
-    units: Float32[np.ndarray, "N 3"], layout: tuple[tuple[int, int], ...]
-) -> UInt32[np.ndarray, " N"]:
+def _pack(units: Float32[np.ndarray, "N 3"], layout: _Layout) -> UInt32[np.ndarray, " N"]:
     """Values in [0, 1] quantised to the given numbers of bits, shifted into one integer."""
     packed = np.zeros(len(units), np.uint32)
     for i, (shift, bits) in enumerate(layout):
@@ -262,9 +254,7 @@ def _pack(
     return packed
 
 
-def _unpack(
-    packed: UInt32[np.ndarray, " N"], layout: tuple[tuple[int, int], ...]
-) -> Float32[np.ndarray, "N 3"]:
+def _unpack(packed: UInt32[np.ndarray, " N"], layout: _Layout) -> Float32[np.ndarray, "N 3"]:
     columns = [((packed >> shift) & (2**bits - 1)) / (2**bits - 1) for shift, bits in layout]
     return np.stack(columns, axis=1).astype(np.float32)
 
@@ -287,22 +277,20 @@ def _coefficients(table: np.ndarray[Any, Any], count: int) -> Float32[np.ndarray
 
 
 def encode_spz(gaussians: Gaussians) -> list[bytes]:
-    """An .spz, in Z-curve order, of degree 3 at most."""
+    """In Z-curve order, of degree 3 at most."""
     order = morton_order(gaussians.means)
     rest = gaussians.shN.shape[1]
     farthest = float(np.abs(gaussians.means).max())
-    bits = np.floor(np.log2(_SPZ_MOST / max(farthest, 1e-9)))
-    bits = int(np.clip(bits, 0, _MOST_FRACTIONAL_BITS))
+    bits = int(np.clip(np.log2(_SPZ_MOST / max(farthest, 1e-9)), 0, _SPZ_FRACTION))
     # A position in units of 2^-f; a coefficient c beyond the first as 128 c + 128.
-    fixed = np.rint(gaussians.means[order] * _AXES * np.float64(2**bits)).astype("<i4")
-    sh = np.rint(gaussians.shN[order] * _SH_AXES[:rest, None] * 128 + 128)
+    fixed = np.rint(gaussians.means[order] * _SPZ_AXES * np.float64(2**bits)).astype("<i4")
+    sh = np.rint(gaussians.shN[order] * _SPZ_SH[:rest, None] * 128 + 128)
     # From the highest bits: the index of the largest of xyzw, then signs and sizes of the others.
-    quats = gaussians.quats[order] * np.append(np.float32(1), _AXES)
+    quats = gaussians.quats[order] * _SPZ_QUAT
     largest, three = smallest_three(np.roll(quats, -1, axis=1))
     turn = largest.astype(np.uint32)
     for i in range(3):
-        size = np.rint(np.abs(three[:, i]) * np.float32(_NINE_BITS * np.sqrt(2)))
-        part = np.minimum(size, _NINE_BITS).astype(np.uint32)
+        part = np.minimum(np.rint(np.abs(three[:, i]) * _SPZ_NINE_BITS), 511).astype(np.uint32)
         turn = (turn << 10) | ((three[:, i] < 0).astype(np.uint32) << 9) | part
     parts = [
         fixed.view(np.uint8).reshape(-1, 4)[:, :3],  # 24 bits a component
@@ -319,11 +307,7 @@ def encode_spz(gaussians: Gaussians) -> list[bytes]:
 
 
 def decode_spz(path: Path) -> Gaussians:
-    """The Gaussians in an .spz.
-
-    Raises:
-        MissingDependencyError: It is of version 4, and zstandard is absent.
-    """
+    """Of any version; 4 needs zstandard."""
     data = read_bytes(path)
     with guarded(path, "a whole .spz"):
         stream = zlib.decompressobj(wbits=31)
@@ -350,12 +334,12 @@ def decode_spz(path: Path) -> Gaussians:
         position, opacity, color, scale, turn, sh = (part.reshape(count, -1) for part in parts)
         harmonics = (sh.reshape(count, rest, 3).astype(np.float32) - 128) / 128
         return Gaussians(
-            means=_positions(position, bits) * _AXES,
+            means=_positions(position, bits) * _SPZ_AXES,
             scales=(scale / 16 - 10).astype(np.float32),
-            quats=_quats(turn) * np.append(np.float32(1), _AXES),
+            quats=_quats(turn) * _SPZ_QUAT,
             opacities=opacity_logits(opacity[:, 0]),
             sh0=((color - 127.5) / _SPZ_COLOR).astype(np.float32)[:, None],
-            shN=np.asarray(harmonics * _SH_AXES[:rest, None], np.float32),
+            shN=np.asarray(harmonics * _SPZ_SH[:rest, None], np.float32),
         )
 
 
@@ -391,6 +375,6 @@ def _quats(raw: UInt8[np.ndarray, "N B"]) -> Float32[np.ndarray, "N 4"]:
         return np.hstack([w, xyz]).astype(np.float32)
     packed = np.ascontiguousarray(raw).view("<u4")[:, 0]
     fields = np.stack([(packed >> shift) & 1023 for shift in (20, 10, 0)], axis=1)
-    size = (fields & _NINE_BITS) / np.float32(_NINE_BITS * np.sqrt(2))
+    size = (fields & 511) / _SPZ_NINE_BITS
     three = np.where(fields >> 9, -size, size).astype(np.float32)
     return np.roll(from_smallest_three((packed >> 30).astype(np.int64), three), 1, axis=1)

@@ -1,11 +1,8 @@
 """Rendering Gaussians from a view, and the photographs that renders are compared with.
 
 Notation: gsplat's parameter dict as tensors: ``means``, ``scales`` (logarithms), ``quats``,
-``opacities`` (logits), ``sh0``, ``shN``; the error of a pixel is the mean over the channels of
-|render - photograph|, 0 to 1. Promise: one rasteriser serves training, scoring and viewing on CPU
-and CUDA alike; a view's camera is copied to a GPU once, and no step waits for its photograph. As
-bytes all photographs mostly fit on a GPU, and each is copied once; otherwise each step sends its
-own from pinned memory, which the GPU fetches while it works on the step before.
+``opacities`` (logits), ``sh0``, ``shN``. Promise: one rasteriser serves training, scoring and
+viewing on CPU and CUDA alike; no step waits for what is copied to a GPU.
 """
 
 from __future__ import annotations
@@ -38,14 +35,11 @@ GAP = 4
 
 
 class CameraTensors(NamedTuple):
-    """A view's camera on a device."""
+    """A view's camera on a device: as the rasteriser takes it, and its pose in float64."""
 
     viewmats: Float[Tensor, "1 4 4"]
-    """cam_from_world, as the rasteriser takes it, float32."""
     Ks: Float[Tensor, "1 3 3"]
-    """Pinhole matrix, likewise."""
     cam_from_world: Float[Tensor, "4 4"]
-    """In full, float64."""
 
 
 _CAMERAS: WeakKeyDictionary[View, dict[torch.device, CameraTensors]] = WeakKeyDictionary()
@@ -71,9 +65,8 @@ def render_view(
         view: The view whose camera is used.
         sh_degree: Degree of spherical harmonics in use; coefficients beyond it are ignored.
     """
-    # Unused coefficients would cost copies and optimiser steps for nothing.
-    colors = params["sh0"] if sh_degree == 0 else (params["sh0"], params["shN"])
-    return _rasterize(params, view, colors, sh_degree)
+    images, _, info = _rasterize(params, view, sh_degree)
+    return images, info
 
 
 def render_features(
@@ -82,18 +75,25 @@ def render_features(
     features: Float[Tensor, "N D"],
 ) -> Float[Tensor, "H W D"]:
     """The Gaussians rendered with arbitrary features in place of colours."""
-    return _rasterize(params, view, features, None)[0]
+    return _rasterize(params, view, features)[0]
 
 
 def _rasterize(
     params: Mapping[str, Tensor] | torch.nn.ParameterDict,
     view: View,
-    colors: Tensor | tuple[Tensor, Tensor],
-    sh_degree: int | None,
-) -> tuple[Float[Tensor, "H W D"], dict[str, Any]]:
+    shown: Tensor | int,
+    mode: Literal["RGB", "ED"] = "RGB",
+) -> tuple[Float[Tensor, "H W D"], Float[Tensor, "H W 1"], dict[str, Any]]:
+    """Render features, or harmonics up to a degree: image, alphas, ``info``."""
+    colors: Tensor | tuple[Tensor, Tensor]
+    if isinstance(shown, Tensor):
+        colors, degree = shown, None
+    else:  # unused coefficients would cost copies and optimiser steps for nothing
+        colors = (params["sh0"], params["shN"]) if shown else params["sh0"]
+        degree = shown
     means = params["means"]
     camera = camera_of(view, means.device)
-    images, _, info = rasterization(
+    images, alphas, info = rasterization(
         means=means,
         quats=params["quats"],
         scales=torch.exp(params["scales"]),
@@ -103,10 +103,12 @@ def _rasterize(
         Ks=camera.Ks,
         width=view.width,
         height=view.height,
-        sh_degree=sh_degree,
+        sh_degree=degree,
         packed=False,
+        render_mode=mode,
     )
-    return images.squeeze(0), info  # unlike indexing, its backward allocates no image of zeros
+    # Unlike indexing, squeeze's backward allocates no image of zeros.
+    return images.squeeze(0), alphas.squeeze(0), info
 
 
 class ModelRenderer:
@@ -121,21 +123,9 @@ class ModelRenderer:
     def __init__(
         self, gaussians: Gaussians, frame: TrainingFrame, device: torch.device | None = None
     ) -> None:
-        self.frame = frame
-        self.count = len(gaussians)
-        self._degree = math.isqrt(1 + gaussians.shN.shape[1]) - 1
-        tensors = {name: torch.tensor(a, device=device) for name, a in gaussians.arrays().items()}
-        self._means = torch.tensor(frame.points_from_world(gaussians.means), device=device)
-        self._shapes: dict[str, Any] = {
-            "quats": tensors["quats"],
-            "scales": torch.exp(tensors["scales"] + math.log(frame.scale)),
-            "opacities": torch.sigmoid(tensors["opacities"]),
-        }
-        colors = (tensors["sh0"], tensors["shN"]) if self._degree else tensors["sh0"]
-        if isinstance(colors, tuple) and self._means.is_cuda:
-            # gsplat takes them joined, our own rasteriser in two: joined once, not for every frame.
-            colors = torch.cat(colors, dim=1)
-        self._colors = colors
+        self.frame, self.count = frame, len(gaussians)
+        arrays = frame.gaussians_from_world(gaussians).arrays()
+        self._params = {name: torch.tensor(array, device=device) for name, array in arrays.items()}
 
     def image(self, view: View) -> Float[Tensor, "H W 3"]:
         """The render of a view of the world, about 0 to 1; the background is black."""
@@ -147,36 +137,23 @@ class ModelRenderer:
 
     def depth(self, view: View) -> Float32[np.ndarray, "H W"]:
         """Expected planar depth in world units; 0 where there is none."""
-        images, alphas = self._images(view, "ED")
-        depth = torch.where(alphas > LEAST_ALPHA, images, 0)[..., 0] / self.frame.scale
+        image, alphas = self._images(view, "ED")
+        depth = torch.where(alphas > LEAST_ALPHA, image, 0)[..., 0] / self.frame.scale
         return np.asarray(depth.cpu().numpy())
 
     @torch.no_grad()
     def _images(self, view: View, mode: Literal["RGB", "ED"]) -> tuple[Tensor, Tensor]:
-        camera = camera_of(self.frame.view(view), self._means.device)
-        images, alphas, _ = rasterization(
-            means=self._means,
-            **self._shapes,
-            colors=self._colors,
-            sh_degree=self._degree,
-            viewmats=camera.viewmats,
-            Ks=camera.Ks,
-            width=view.width,
-            height=view.height,
-            render_mode=mode,
-        )
-        return images[0], alphas[0]
+        degree = math.isqrt(1 + self._params["shN"].shape[1]) - 1
+        return _rasterize(self._params, self.frame.view(view), degree, mode)[:2]
 
 
 # Photographs --------------------------------------------------------------------------------------
 
 
 class Photographs:
-    """Photographs of views on a device.
+    """Photographs of views on a device, where the Gaussians are.
 
-    Args:
-        views: The views to learn from.
-        device: Where the Gaussians are.
+    As bytes all mostly fit on a GPU, and each is copied once; otherwise each step sends its own.
     """
 
     def __init__(self, views: Sequence[View], device: torch.device) -> None:
@@ -193,16 +170,16 @@ class Photographs:
         if self._held is None:
             return photograph_of(view, self._device)
         if view not in self._held:
-            self._held[view] = _pixels_of(view, self._device)
+            self._held[view] = _bytes_of(view, self._device)
         return self._held[view].to(torch.float32).div_(255.0)
 
 
 def photograph_of(view: View, device: torch.device) -> Float[Tensor, "H W 3"]:
     """The view's photograph as float32 from 0 to 1."""
-    return _pixels_of(view, device).to(torch.float32).div_(255.0)
+    return _bytes_of(view, device).to(torch.float32).div_(255.0)
 
 
-def _pixels_of(view: View, device: torch.device) -> UInt8[Tensor, "H W 3"]:
+def _bytes_of(view: View, device: torch.device) -> UInt8[Tensor, "H W 3"]:
     # A copy: PyTorch warns on stderr about read-only arrays, which a view's may be.
     pixels = torch.tensor(view.photograph)
     if device.type == "cuda":  # from pinned memory a GPU fetches it while it works on earlier steps
@@ -218,9 +195,7 @@ def error_map(
 ) -> UInt8[np.ndarray, "H W 3"]:
     """The error of each pixel as a colour: black is none, ``FULL_ERROR`` or more the brightest.
 
-    Args:
-        photograph: The view as captured.
-        render: What the Gaussians look like, 0 to 1; clamped.
+    It is the mean over the channels of |render - photograph|, 0 to 1; the render is clamped.
     """
     from matplotlib import colormaps  # noqa: PLC0415  (slow to import)
 

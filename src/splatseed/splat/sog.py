@@ -1,10 +1,8 @@
 """PlayCanvas's SOG, version 2: a .zip of lossless WebP pictures and ``meta.json``.
 
-Notation: each picture has one pixel per Gaussian; a *codebook* is 256 numbers that bytes stand for,
-a *palette* K vectors of coefficients that Gaussians share, and a *label* says which of them stands
-for each. Nothing is random: equal Gaussians give equal bytes.
-
-Source: the format's specification by PlayCanvas.
+Each picture has one pixel per Gaussian; a *codebook* is 256 numbers that bytes stand for, a
+*palette* K vectors of coefficients that Gaussians share, and a *label* says which stands for each.
+Equal Gaussians give equal bytes. Source: the format's specification by PlayCanvas.
 """
 
 from __future__ import annotations
@@ -34,16 +32,14 @@ _PER_ROW = 64
 """Palette entries per row of the centroid picture."""
 _MOST_LEVELS = 16
 """The palette grows with the number of Gaussians, to 2^16 entries at most."""
-_MOST_BYTES = 2**31
-_MOST_META = 1 << 24
-"""Larger parts of an archive are refused unread; meta.json takes some kilobytes."""
+_MOST_BYTES, _MOST_META = 1 << 31, 1 << 24
+"""Larger pictures of an archive, and a larger meta.json, are refused unread."""
 _QUAT_MARK = 252
 """Alpha of a rotation whose largest component is the first; SOG's marker."""
 _CODES = 256
-_LLOYD_STEPS = 20
-"""Alternations of assigning values to codes and moving codes to the means."""
-_POWER_STEPS = 3
-"""Steps of power iteration: a rough principal direction is enough to halve a group."""
+_LLOYD_STEPS, _POWER_STEPS = 20, 3
+"""Alternations of assigning values to codes and moving codes to the means; steps of power
+iteration, as a rough principal direction is enough to halve a group."""
 _STAMP = (1980, 1, 1, 0, 0, 0)
 """The timestamp of each picture in the zip, fixed so that equal Gaussians give equal bytes."""
 
@@ -84,9 +80,23 @@ def encode(gaussians: Gaussians, progress: Progress = silent) -> list[bytes]:
         "quats": {"files": ["quats.webp"]},
         "sh0": {"codebook": sh0.tolist(), "files": ["sh0.webp"]},
     }
-    if gaussians.shN.shape[1] and len(order) > 1:
-        meta["shN"], more = _encoded_harmonics(gaussians.shN[order], progress)
-        pictures.update(more)
+    count, rest, _ = gaussians.shN.shape
+    if rest and count > 1:
+        levels = min(int(np.log2(count)), _MOST_LEVELS)
+        entries, labels = palette(gaussians.shN[order].reshape(count, -1), levels, progress)
+        book = codebook(entries)
+        # Entries are bytes of a third codebook, 64 entries per row.
+        table = np.full((-(-len(entries) // _PER_ROW) * _PER_ROW, rest, 4), 255, np.uint8)
+        table[: len(entries), :, :3] = codes(entries, book).reshape(-1, rest, 3)
+        pictures["shN_centroids.webp"] = table.reshape(-1, _PER_ROW * rest, 4)
+        blank = np.zeros(count, np.int64)
+        pictures["shN_labels.webp"] = _grid(np.column_stack([labels & 255, labels >> 8, blank]))
+        meta["shN"] = {
+            "count": len(entries),
+            "bands": packed.SH_COUNTS.index(rest),
+            "codebook": book.tolist(),
+            "files": ["shN_centroids.webp", "shN_labels.webp"],
+        }
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
         archive.writestr(zipfile.ZipInfo(_META, _STAMP), json.dumps(meta))
@@ -147,32 +157,6 @@ def decode(path: Path) -> Gaussians:
             sh0=centers["sh0"][sh0[:, None, :3]],
             shN=shN,
         )
-
-
-def _encoded_harmonics(
-    shN: Float32[np.ndarray, "N K 3"], progress: Progress
-) -> tuple[dict[str, Any], dict[str, UInt8[np.ndarray, "H W 4"]]]:
-    count, rest, _ = shN.shape
-    levels = min(int(np.log2(count)), _MOST_LEVELS)
-    entries, labels = palette(shN.reshape(count, -1), levels, progress)
-    centers = codebook(entries)
-    table = codes(entries, centers).reshape(len(entries), rest, 3)
-    # Entries are bytes of a third codebook, 64 entries per row.
-    rows = -(-len(entries) // _PER_ROW)
-    picture = np.full((rows * _PER_ROW, rest, 4), 255, np.uint8)
-    picture[: len(table), :, :3] = table
-    low_high = np.column_stack([labels & 255, labels >> 8, np.zeros(count, np.int64)])
-    meta = {
-        "count": len(entries),
-        "bands": packed.SH_COUNTS.index(rest),
-        "codebook": centers.tolist(),
-        "files": ["shN_centroids.webp", "shN_labels.webp"],
-    }
-    pictures = {
-        "shN_centroids.webp": picture.reshape(rows, _PER_ROW * rest, 4),
-        "shN_labels.webp": _grid(low_high),
-    }
-    return meta, pictures
 
 
 def _grid(values: np.ndarray) -> UInt8[np.ndarray, "H W 4"]:

@@ -1,18 +1,16 @@
 """The world of a trained model, which need not be its scene's.
 
-Notation: ``model_from_scene`` takes the scene's world to that of the Gaussians. Some trainers
-normalise the world before training, and write Gaussians in that world; rendered from the scene's
-cameras these give wrong pictures, and wrong scores without a warning. *Apart* is the median
-distance from the scene's points to the nearest Gaussian, in units of the median distance between
-neighbouring Gaussians: in the right world about 1 (0.1 to 1.3 for seeds and trained models of five
-scenes), in a wrong one 4 to 700. Promise: Gaussians that lie apart from the scene's points are
-refused; if a transform is named then, it is accepted.
+Some trainers normalise the world before training, and write Gaussians in that world; rendered from
+the scene's cameras these give wrong pictures, and wrong scores without a warning. *Apart* is the
+median distance from the scene's points to the nearest Gaussian, in units of the median distance
+between neighbouring Gaussians: in the right world about 1 (0.1 to 1.3 for seeds and trained models
+of five scenes), in a wrong one 4 to 700.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -30,14 +28,11 @@ from splatseed.views.view import View
 
 GSPLAT, NO_TRANSFORM = "gsplat", "none"
 """Words that name a transform: that of gsplat's examples, and none, without any check."""
-APART = 8.0
-"""Gaussians farther apart than this are in another world."""
-DOUBTFUL, CLOSER = 1.5, 3.0
-"""They are beyond the first, too, if another world is closer by the second as a factor."""
-SAMPLES = 3000
-"""Number of points and Gaussians used to measure distances."""
-LEAST = 20
-"""Fewest points and Gaussians that can be compared."""
+APART, DOUBTFUL, CLOSER = 8.0, 1.5, 3.0
+"""Gaussians farther apart than the first are in another world; beyond the second, too, if another
+world is closer by the third as a factor."""
+LEAST, SAMPLES = 20, 3000
+"""Fewest and most points and Gaussians whose distances are measured."""
 VISIBLE = -2.2
 """Logit of the least opacity that counts, a tenth."""
 FILES = (NERFSTUDIO, "cameras.json")
@@ -65,22 +60,22 @@ def find_transform(word: str, scene: Scene) -> Similarity | None:
         return None
     if word == GSPLAT:
         return _of_gsplat(scene)
-    return _of_file(Path(word), scene)
+    path = Path(word)
+    content = read_json(path, "a transform in JSON", fix=_FIX)
+    if isinstance(content, list) and content and isinstance(content[0], dict):
+        return _of_cameras(path, content, scene)
+    return similarity_in(path, content, scene, _FIX)  # a matrix, or nerfstudio's
 
 
 def check_world(
     path: Path, scene: Scene, gaussians: Gaussians, given: Similarity | None = None
 ) -> str:
-    """Refuse a model that is not in the assumed world.
+    """Refuse a model, read from a path, that is not in the world of the scene's points.
 
-    Args:
-        path: The model's file.
-        scene: The scene with its points; without points nothing can be checked.
-        gaussians: The model.
-        given: The transform that the user named.
+    With ``given``, the transform that the user named, it must be in that world.
 
     Returns:
-        Why it is doubtful that it is, in a sentence; empty if it is not.
+        Why it is doubtful that it is, in a sentence; empty if it is not, or without points.
 
     Raises:
         SceneFormatError: It is in another world.
@@ -88,22 +83,20 @@ def check_world(
     apart = _measure(scene, gaussians)
     if apart is None or (ratio := apart(given)) <= DOUBTFUL:
         return ""
-    ratios = [(word, apart(world)) for word, world in _candidates(path, scene)]
-    closest = min(each for _, each in ratios)
-    if ratio <= APART and ratio <= closest * CLOSER:
+    ratios = {word: apart(world) for word, world in _candidates(path, scene).items()}
+    if ratio <= APART and ratio <= min(ratios.values()) * CLOSER:
         return (
             f"Points of the scene are {ratio:.1f} times as far from the nearest Gaussian as "
             "Gaussians from each other: look at the renders before you trust the scores."
         )
-    closer = (word for word, each in ratios if each < ratio / CLOSER and each <= DOUBTFUL)
-    word = next(closer, None)
     fix = (
-        f"They fit with --transform {word}, unless it is a model of another scene."
-        if word
-        else "No known transform fits: probably it is a model of another scene. Else name the "
+        "No known transform fits: probably it is a model of another scene. Else name the "
         "transform that its trainer applied with --transform FILE; "
         f"to score it as it is, pass --transform {NO_TRANSFORM}."
     )
+    fitting = [w for w, each in ratios.items() if each < ratio / CLOSER and each <= DOUBTFUL]
+    if fitting:
+        fix = f"They fit with --transform {fitting[0]}, unless it is a model of another scene."
     raise SceneFormatError(
         f"the Gaussians of {path} in the world of the scene, where its points are",
         found=f"points {ratio:.0f} times as far from the nearest Gaussian as Gaussians from each "
@@ -119,8 +112,7 @@ def _measure(scene: Scene, gaussians: Gaussians) -> Callable[[Similarity | None]
     rng = np.random.default_rng(0)
     points = scene.points.references
     xyz = rng.permutation(points.xyz[points.finite].astype(np.float64))[:SAMPLES]
-    means = gaussians.means[gaussians.opacities.reshape(-1) > VISIBLE].astype(np.float64)
-    means = means[np.isfinite(means).all(axis=1)]
+    means = gaussians.means[gaussians.opacities > VISIBLE].astype(np.float64)
     if len(xyz) < LEAST or len(means) < LEAST:
         return None
     tree = KDTree(means)
@@ -134,27 +126,17 @@ def _measure(scene: Scene, gaussians: Gaussians) -> Callable[[Similarity | None]
     return apart
 
 
-def _candidates(path: Path, scene: Scene) -> Iterator[tuple[str, Similarity | None]]:
-    """Transforms that the model's trainer may have applied, as words for --transform."""
-    yield NO_TRANSFORM, None
-    for folder in path.resolve().parents[:4]:
-        for name in FILES:
-            if (folder / name).is_file():
-                with suppress(SceneFormatError):
-                    yield str(folder / name), _of_file(folder / name, scene)
-    with suppress(ParameterError):
-        yield GSPLAT, _of_gsplat(scene)
+def _candidates(path: Path, scene: Scene) -> dict[str, Similarity | None]:
+    """Transforms that the model's trainer may have applied, by the words for --transform."""
+    found: dict[str, Similarity | None] = {NO_TRANSFORM: None}
+    files = [folder / name for folder in path.resolve().parents[:4] for name in FILES]
+    for word in (*(str(file) for file in files if file.is_file()), GSPLAT):
+        with suppress(SceneFormatError, ParameterError):
+            found[word] = find_transform(word, scene)
+    return found
 
 
-def _of_file(path: Path, scene: Scene) -> Similarity:
-    """A transform from a file: a matrix, nerfstudio's ``transform`` and ``scale``, or cameras."""
-    content = read_json(path, "a transform in JSON", fix=_FIX)
-    if isinstance(content, list) and content and isinstance(content[0], dict):
-        return _of_cameras(path, content, scene)
-    return similarity_in(path, content, scene, _FIX)
-
-
-def _of_cameras(path: Path, cameras: Sequence[Any], scene: Scene) -> Similarity:
+def _of_cameras(path: Path, cameras: list[Any], scene: Scene) -> Similarity:
     """The similarity that takes the scene's cameras to those of graphdeco's ``cameras.json``."""
     known = {PurePosixPath(image.name).stem: image.camera.center for image in scene.images}
     try:
@@ -186,11 +168,15 @@ def _of_gsplat(scene: Scene) -> Similarity:
             found=f"{len(xyz)} points, {len(scene.images)} cameras",
             fix="Name a file with the transform.",
         )
-    world_from_cam = np.stack([image.camera.world_from_cam for image in scene.images])
-    first = _upright(world_from_cam)
-    second = _principal(first @ np.vstack([xyz.T, np.ones(len(xyz))]))
-    matrix = second @ np.vstack([first, np.eye(4)[3:]])
-    z = matrix[2] @ np.vstack([xyz.T, np.ones(len(xyz))])
+    first = _upright(np.stack([image.camera.world_from_cam for image in scene.images]))
+    xyz1 = np.vstack([xyz.T, np.ones(len(xyz))])
+    upright = first @ xyz1
+    # The median to 0, the axis of least spread to z.
+    center = np.median(upright, axis=1)
+    axes = np.linalg.eigh(np.cov(upright - center[:, None]))[1][:, ::-1].T.copy()
+    axes[0] *= np.sign(np.linalg.det(axes))
+    matrix = np.column_stack([axes, -axes @ center]) @ np.vstack([first, np.eye(4)[3:]])
+    z = matrix[2] @ xyz1
     if np.median(z) > z.mean():
         matrix = np.diag([1.0, -1.0, -1.0]) @ matrix
     world = similarity_of(matrix)
@@ -202,14 +188,11 @@ def _upright(world_from_cam: Float64[np.ndarray, "V 4 4"]) -> Float64[np.ndarray
     """Mean up direction to -y, the point that cameras look at to 0, median camera distance to 1."""
     up = -world_from_cam[:, :3, 1].mean(axis=0)
     up /= np.linalg.norm(up)
-    goal = np.array([0.0, -1.0, 0.0])
-    cross = np.cross(up, goal)
     # Rodrigues: the rotation that takes one unit vector to another
-    skew = np.cross(np.eye(3), cross)
-    if up @ goal > -1:
-        rotation = np.eye(3) + skew + skew @ skew / (1 + up @ goal)
-    else:
-        rotation = np.diag([-1.0, 1.0, 1.0])
+    skew = np.cross(np.eye(3), np.cross(up, [0.0, -1.0, 0.0]))
+    rotation = np.diag([-1.0, 1.0, 1.0])
+    if up[1] < 1:
+        rotation = np.eye(3) + skew + skew @ skew / (1 - up[1])
     forward = world_from_cam[:, :3, 2] @ rotation.T
     centers = world_from_cam[:, :3, 3] @ rotation.T
     # The point of each camera's axis that is nearest to the origin.
@@ -217,13 +200,3 @@ def _upright(world_from_cam: Float64[np.ndarray, "V 4 4"]) -> Float64[np.ndarray
     shift = -np.median(nearest, axis=0)
     scale = 1.0 / np.median(np.linalg.norm(centers + shift, axis=1))
     return np.asarray(scale * np.column_stack([rotation, shift]))
-
-
-def _principal(xyz: Float64[np.ndarray, "3 N"]) -> Float64[np.ndarray, "3 4"]:
-    """The median to 0, the axis of least spread to z."""
-    center = np.median(xyz, axis=1)
-    _, vectors = np.linalg.eigh(np.cov(xyz - center[:, None]))
-    vectors = vectors[:, ::-1].copy()
-    if np.linalg.det(vectors) < 0:
-        vectors[:, 0] *= -1
-    return np.column_stack([vectors.T, -vectors.T @ center])
