@@ -88,7 +88,8 @@ class Page:
                   deviceScaleFactor=1, mobile=phone)  # fmt: skip
         scheme = [{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}]
         self.call("Emulation.setEmulatedMedia", features=scheme)
-        self.call("Page.navigate", url=Path(path).resolve().as_uri())
+        url = path if str(path).startswith("http") else Path(path).resolve().as_uri()
+        self.call("Page.navigate", url=url)
         while not self._events:
             self._next()
 
@@ -98,9 +99,11 @@ class Page:
         assert "exceptionDetails" not in reply, reply
         return reply["result"].get("value")
 
-    def drag(self, x, y):
-        """Press, move and release the mouse."""
-        for kind, buttons in (("mousePressed", 1), ("mouseMoved", 1), ("mouseReleased", 0)):
+    def drag(self, x, y, to_x=None):
+        """Move the mouse to a place, press it, move on and release."""
+        for kind, buttons in (("mouseMoved", 0), ("mousePressed", 1), ("mouseMoved", 1),
+                              ("mouseReleased", 0)):  # fmt: skip
+            x = to_x if buttons and kind == "mouseMoved" and to_x is not None else x
             self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left",
                       buttons=buttons, clickCount=1)  # fmt: skip
 

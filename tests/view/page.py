@@ -22,37 +22,24 @@ FLAGS = (
 
 
 @contextmanager
-def served_page(folder, url, width=800, height=600):
+def served_page(folder, url):
     """A page of a browser, at an address."""
     before, browser.FLAGS = browser.FLAGS, FLAGS
     try:
         with browser.chromium(folder) as page:
-            go(page, url, width, height)
+            go(page, url)
             yield page
     finally:
         browser.FLAGS = before
 
 
-def go(page, url, width=800, height=600):
-    page.requests.clear()
-    page._events.clear()
-    page.call(
-        "Emulation.setDeviceMetricsOverride",
-        width=width,
-        height=height,
-        deviceScaleFactor=1,
-        mobile=False,
-    )
-    page.call("Page.navigate", url=url)
-    while not page._events:
-        page._next()
+def go(page, url):
+    page.open(url, 800, 600)
 
 
-def screenshot(page, path=None):
+def screenshot(page):
     """What the page shows, [H, W, 3]."""
     data = base64.b64decode(page.call("Page.captureScreenshot")["data"])
-    if path is not None:
-        path.write_bytes(data)
     return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
 
 

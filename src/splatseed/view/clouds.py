@@ -2,7 +2,7 @@
 
 Notation: cell (i, j) of a ``covered`` grid [rows, columns] starts at pixel (``cell i``, ``cell j``)
 and has ``cell`` px a side; the last row and column may reach beyond the photograph. Promise: files
-appear whole or not at all; cells are coloured exactly, without bleeding into each other.
+appear whole or not at all, else ``OutputError`` is raised; cells are coloured exactly.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float64, UInt8
+from PIL import Image as PillowImage, ImageDraw
 
 from splatseed.camera import Camera
 from splatseed.pointcloud import PointCloud
@@ -20,26 +21,27 @@ from splatseed.scene import Scene
 from splatseed.upsample.registry import origin_name
 from splatseed.view.page import (
     GRID_SIDE,
+    INK,
+    PAPER,
+    STRIP_HEIGHT,
     Tile,
     color_bar,
     fitted,
-    legend,
+    font,
     map_colors,
     photograph_at,
     resized,
     write_grid,
 )
-from splatseed.view.points import origin_colors, origin_picture, picture_size, render_points
+from splatseed.view.points import origin_colors, picture_size, points_over, render_points
 from splatseed.views.visibility import choose_camera, choose_image
 
 PAIR_SIDE = 800
 GREY = 150
 NEAR, FAR = np.array([0, 114, 178]), np.array([213, 94, 0])
 """Colours of points on an aligned cloud and of those off it."""
-EMPTY = np.array([214.0, 20.0, 190.0])
-"""Colour of cells without a seed: magenta, the rarest colour in photographs."""
-BLEND = 0.6
-"""Opacity of that colour."""
+EMPTY, BLEND = np.array([214.0, 20.0, 190.0]), 0.6
+"""Colour of cells without a seed, magenta, the rarest in photographs, and its opacity."""
 DIM = 0.75
 """Factor on the brightness of the photograph under cells."""
 
@@ -74,7 +76,6 @@ def preview_pair(
         title: Describes the upsampled points, such as ``"mls, 8x"``.
 
     Raises:
-        OutputError: The file cannot be written.
         PointCloudError: The scene has no finite points.
     """
     clouds = {"original": scene.points, title: upsampled}
@@ -82,25 +83,14 @@ def preview_pair(
 
 
 def preview_methods(scene: Scene, clouds: Mapping[str, PointCloud], path: Path | str) -> Path:
-    """Write a grid: the photograph if there is one, the scene's points, and each cloud.
-
-    Args:
-        scene: The scene as read.
-        clouds: Upsampled points by label, drawn in this order.
-        path: The PNG to write.
+    """Write a grid: the photograph if there is one, the scene's points, and clouds by label.
 
     Raises:
-        OutputError: The file cannot be written.
         PointCloudError: The scene has no finite points.
     """
     clouds = {"original": scene.points, **clouds}
-    return write_grid(
-        [
-            *_photograph(scene, GRID_SIDE, "photograph"),
-            *_cloud_tiles(clouds, choose_camera(scene), GRID_SIDE),
-        ],
-        path,
-    )
+    tiles = _photograph(scene, GRID_SIDE, "photograph")
+    return write_grid([*tiles, *_cloud_tiles(clouds, choose_camera(scene), GRID_SIDE)], path)
 
 
 def preview_errors(
@@ -117,10 +107,6 @@ def preview_errors(
             1 on points have the last colour.
         camera: The camera to look from.
         path: The PNG to write.
-
-    Raises:
-        OutputError: The file cannot be written.
-        PointCloudError: Distances and points differ in number.
     """
     colored = {
         f"{label}   {len(cloud):,} points: mean error {distances[label].mean():.2f} spacings": (
@@ -135,30 +121,28 @@ def preview_errors(
 def preview_origins(scene: Scene, points: PointCloud, path: Path | str) -> Path:
     """Write a page: the seeds in their own colours, and by origin over the photograph.
 
-    Args:
-        scene: The scene as read; one of its cameras is chosen.
-        points: The seeds.
-        path: The PNG to write.
-
     Raises:
-        OutputError: The file cannot be written.
         PointCloudError: The scene has no finite points.
     """
     camera = choose_camera(scene)
     scale = PAIR_SIDE / max(camera.width, camera.height)
     size = picture_size(camera, scale)
     photograph = photograph_at(scene, choose_image(scene), size)
+    colored = points.replace(rgb=origin_colors(points.source))
     tiles = [
         Tile(f"{len(points):,} seeds", render_points(points, camera, scale=scale)),
-        Tile("by origin", origin_picture(points, camera, photograph, scale=scale)),
+        Tile("by origin", points_over(colored, camera, photograph, scale=scale)),
     ]
+    # Below them, the name of each origin after a dot of its colour.
+    strip = PillowImage.new("RGB", (2 * size[0], STRIP_HEIGHT), PAPER)
+    draw, letters, x = ImageDraw.Draw(strip), font(18), 8.0
     codes, counts = np.unique(points.source, return_counts=True)
-    colors = origin_colors(codes.astype(np.uint8)).tolist()
-    entries = [
-        (f"{origin_name(code)} {count:,}", tuple(color))
-        for code, count, color in zip(codes.tolist(), counts.tolist(), colors, strict=True)
-    ]
-    return write_grid(tiles, path, columns=2, footer=legend(entries, 2 * size[0]))
+    for code, count, color in zip(codes, counts, origin_colors(codes).tolist(), strict=True):
+        words = f"{origin_name(int(code))} {count:,}"
+        draw.ellipse((x, 14, x + 16, 30), fill=tuple(color))
+        draw.text((x + 24, 22), words, fill=INK, font=letters, anchor="lm")
+        x += 24 + letters.getlength(words) + 28
+    return write_grid(tiles, path, columns=2, footer=np.asarray(strip))
 
 
 def preview_alignment(
@@ -178,9 +162,6 @@ def preview_alignment(
         marks: The scene's points that it was aligned with.
         share: For each, 0 on the cloud to 1 where it does not count.
         path: The PNG to write.
-
-    Raises:
-        OutputError: The file cannot be written.
     """
     blend = np.clip(share, 0, 1)[:, None]
     shades = np.rint((1 - blend) * NEAR + blend * FAR).astype(np.uint8)
@@ -196,24 +177,15 @@ def preview_alignment(
 
 
 def preview_cells(views: Sequence[CoveredView], path: Path | str) -> Path:
-    """Write a page: for each view, the cells covered by the originals, and by all seeds.
-
-    Args:
-        views: At least one.
-        path: The PNG to write.
-
-    Raises:
-        OutputError: The file cannot be written.
-    """
+    """Write a page: for each view, the cells covered by the originals, and by all seeds."""
     tiles = []
     for view in views:
-        labels = (
-            f"{view.name[-28:]}: {view.before.mean():.1%} covered",
-            (f"with new points: {view.after.mean():.1%}"),
-        )
-        for label, covered in zip(labels, (view.before, view.after), strict=True):
+        size = fitted(view.photograph.shape[1], view.photograph.shape[0])
+        for label, covered in (
+            (f"{view.name[-28:]}: {view.before.mean():.1%} covered", view.before),
+            (f"with new points: {view.after.mean():.1%}", view.after),
+        ):
             picture = cell_picture(view.photograph, covered, view.cell)
-            size = fitted(picture.shape[1], picture.shape[0])
             tiles.append(Tile(label, resized(picture, size)))
     return write_grid(tiles, path, columns=2 if len(views) == 1 else 4)
 
@@ -221,15 +193,9 @@ def preview_cells(views: Sequence[CoveredView], path: Path | str) -> Path:
 def cell_picture(
     photograph: UInt8[np.ndarray, "H W 3"], covered: Bool[np.ndarray, "rows columns"], cell: int
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """The dimmed photograph, with cells without a seed in magenta.
-
-    Args:
-        photograph: The photograph at the size at which cells were counted.
-        covered: Whether each cell holds a seed.
-        cell: Side of a cell in pixels.
-    """
+    """The dimmed photograph, as large as where cells were counted, with empty ones in magenta."""
     height, width = photograph.shape[:2]
-    empty = ~np.repeat(np.repeat(covered, cell, axis=0), cell, axis=1)[:height, :width, None]
+    empty = ~np.kron(covered, np.ones((cell, cell), bool))[:height, :width, None]
     dimmed = DIM * photograph.astype(np.float64)
     grey = dimmed.mean(axis=2, keepdims=True)
     picture = np.where(empty, (1 - BLEND) * grey + BLEND * EMPTY, dimmed)

@@ -13,29 +13,23 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float64, UInt8
+from scipy.interpolate import interp1d
 from scipy.ndimage import gaussian_filter1d
 
-from splatseed.errors import OutputError, ParameterError, SceneFormatError, SceneNotFoundError
-from splatseed.io.files import read_bytes
+from splatseed.errors import OutputError, ParameterError, SceneFormatError
+from splatseed.io.files import guarded, read_bytes
 from splatseed.io.staging import atomic_file
-from splatseed.literal import counted, describe_error
+from splatseed.literal import counted
 from splatseed.progress import Progress, silent
 from splatseed.requirements import require
 from splatseed.similarity import Similarity
 from splatseed.splat.gaussians import Gaussians, stray_views
 from splatseed.splat.rendering import ModelRenderer, as_bytes
-from splatseed.view.models import (
-    CORE,
-    depth_colors,
-    depth_range,
-    pinhole_view,
-    split_picture,
-    with_size,
-)
+from splatseed.view.models import CORE, pinhole_view, split_picture
+from splatseed.view.page import depth_picture, nearness, usual_range
 from splatseed.views.view import View
 from splatseed.views.visibility import look_at
 
@@ -47,10 +41,9 @@ DETOUR = 2.0
 """Names give no order if following them takes this many times the way by nearest neighbours."""
 MOST_FRAMES = 100_000
 MADE_UP_SIZE = (960, 720)
-LOOKS, LOOKED_AT = 60, 5000
-"""Views and Gaussians sampled to decide whether a path misses the model."""
-LEAST_SEEN = 0.002
-"""A view that sees a smaller share of the Gaussians misses them; more than half must not."""
+LOOKS, LOOKED_AT, LEAST_SEEN = 60, 5000, 0.002
+"""Views and Gaussians sampled to decide whether a path misses the model: one that sees a smaller
+share of the Gaussians does, and more than half must not."""
 FAR_AWAY = 10.0
 """A path is far away beyond this many times the cameras' extent."""
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -58,6 +51,8 @@ DEPTH_SAMPLES = 7
 """How many frames of a path are rendered to find its depth range."""
 QUALITY = 8
 """imageio-ffmpeg's quality, 0 to 10."""
+
+Point = Float64[np.ndarray, " 3"]
 
 # Paths --------------------------------------------------------------------------------------------
 
@@ -75,7 +70,7 @@ def smooth_path(views: Sequence[View], frames: int, size: tuple[int, int]) -> li
     """
     strays = stray_views(views)
     stops = _in_order([view for view in views if view.name not in strays])
-    poses = np.array([_pose_vector(view) for view in stops])
+    poses = _poses(stops)
     reach = np.linalg.norm(poses[:, :3] - poses[:, :3].mean(axis=0), axis=1).max() if stops else 0
     if len(stops) < 2 or not reach > 0:
         raise ParameterError(
@@ -85,15 +80,14 @@ def smooth_path(views: Sequence[View], frames: int, size: tuple[int, int]) -> li
         )
     # Turning by one radian counts as moving by the extent of the cameras.
     steps = np.linalg.norm(np.diff(poses * np.r_[np.ones(3) / reach, np.ones(6)], axis=0), axis=1)
-    places = np.linspace(0, 1, FINE * frames + 1)
-    fine = _interpolated(poses, steps, places)
+    fine = _resampled(poses, steps, FINE * frames + 1)
     # Then at even speed: by the distance covered, not by the stops passed.
-    fine = gaussian_filter1d(fine, SMOOTHING * len(places), axis=0, mode="nearest")
+    fine = gaussian_filter1d(fine, SMOOTHING * len(fine), axis=0, mode="nearest")
     moved = np.linalg.norm(np.diff(fine[:, :3], axis=0), axis=1)
-    even = _interpolated(fine, moved + 1e-9 * reach, np.linspace(0, 1, frames))
-    lens = with_size(_median_camera(views), *size)
+    lens = _lens(views, size)
     return [
-        _posed(lens, i, pose[:3], pose[:3] + pose[3:6], pose[6:]) for i, pose in enumerate(even)
+        _posed(lens, i, pose[:3], pose[:3] + pose[3:6], pose[6:])
+        for i, pose in enumerate(_resampled(fine, moved + 1e-9 * reach, frames))
     ]
 
 
@@ -109,15 +103,14 @@ def orbit(
         size: Their width and height.
     """
     if len(views) > 1:
-        centers = _centers(views)
-        up = -np.mean([view.cam_from_world[1, :3] for view in views], axis=0)
-        focus, lens = focus_of(views), _median_camera(views)
+        centers, _, ups = np.split(_poses(views), 3, axis=1)
+        up, focus, lens = ups.mean(axis=0), focus_of(views), _lens(views, size)
     else:
         focus = np.median(gaussians.means.astype(np.float64), axis=0)
         reach = np.quantile(np.linalg.norm(gaussians.means - focus, axis=1), CORE)
         up = np.array([0.0, -1.0, 0.0])  # as in the world of most captures
         centers = (focus + reach * np.array([2.0, -0.7, 0.0]))[None]
-        lens = pinhole_view(MADE_UP_SIZE, 2 * np.arctan(0.5), np.eye(4))
+        lens = _lens([pinhole_view(MADE_UP_SIZE, 2 * np.arctan(0.5), np.eye(4))], size)
     up = up / np.linalg.norm(up)
     offsets = centers - focus
     # Distances from the focus along up, and around it.
@@ -125,7 +118,7 @@ def orbit(
     radius = np.median(np.linalg.norm(offsets - heights[:, None] * up, axis=1))
     first = np.cross(up, [1.0, 0, 0] if abs(up[0]) < 0.9 else [0, 1.0, 0])
     first /= np.linalg.norm(first)
-    side, lens = np.cross(up, first), with_size(lens, *size)
+    side = np.cross(up, first)
     eyes = [
         focus + np.median(heights) * up + radius * (np.cos(angle) * first + np.sin(angle) * side)
         for angle in 2 * np.pi * np.arange(frames) / frames
@@ -135,8 +128,7 @@ def orbit(
 
 def focus_of(views: Sequence[View]) -> Float64[np.ndarray, " 3"]:
     """The point nearest to all cameras' axes; a point ahead of them if these are parallel."""
-    centers = _centers(views)
-    axes = np.array([view.cam_from_world[2, :3] for view in views])
+    centers, axes, _ = np.split(_poses(views), 3, axis=1)
     # Distance of x to axis i: |A_i (x - c_i)| with A_i = I - a_i a_i'; sum A_i x = sum A_i c_i
     across = np.eye(3) - axes[:, :, None] * axes[:, None]
     middle, spread = centers.mean(axis=0), np.linalg.norm(centers - centers.mean(axis=0), axis=1)
@@ -163,40 +155,24 @@ def path_of_file(
         SceneNotFoundError: There is no such file.
         SceneFormatError: It is not a camera path.
     """
-    try:
-        content = json.loads(read_bytes(path))
-        views = [_view_of_frame(frame, size, i) for i, frame in enumerate(content["camera_path"])]
-        fps = float(content["fps"]) if content.get("fps") else None
-        found = "" if 0 < len(views) <= MOST_FRAMES else counted(len(views), "camera")
-    except SceneNotFoundError:
-        raise
-    except (AttributeError, KeyError, TypeError, ValueError, RecursionError) as error:
-        found = describe_error(error)
-    if found:
-        raise SceneFormatError(
-            f"{path} to be a camera path as nerfstudio's viewer writes it: "
-            "camera_path, with camera_to_world and fov",
-            found=found[:120],
-            fix="Export the path again.",
-        )
-    if world is not None:
-        back = world.inverse
-        views = [
-            dataclasses.replace(view, cam_from_world=back.camera(view.cam_from_world))
-            for view in views
-        ]
-    return views, fps
-
-
-def _view_of_frame(frame: dict[str, Any], size: tuple[int, int], i: int) -> View:
-    world_from_gl = np.array(frame["camera_to_world"], np.float64).reshape(4, 4)
-    fov = np.radians(float(frame.get("fov", 50)))
-    rotation = world_from_gl[:3, :3]
-    if not np.isfinite(world_from_gl).all() or not 0 < fov < np.pi:
-        raise ValueError(f"camera {i} with a field of view of {frame.get('fov')}")
-    if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3:
-        raise ValueError(f"camera {i}, whose matrix is no rotation")
-    return pinhole_view(size, fov, np.linalg.inv(world_from_gl @ OPENCV_FROM_OPENGL))
+    with guarded(
+        path,
+        "a camera path as nerfstudio's viewer writes it: camera_path, with camera_to_world and fov",
+        fix="Export the path again.",
+    ):
+        content, views = json.loads(read_bytes(path)), []
+        for i, frame in enumerate(content["camera_path"]):
+            world_from_gl = np.array(frame["camera_to_world"], np.float64).reshape(4, 4)
+            fov, rotation = np.radians(float(frame.get("fov", 50))), world_from_gl[:3, :3]
+            if not np.isfinite(world_from_gl).all() or not 0 < fov < np.pi:
+                raise ValueError(f"camera {i} with a field of view of {frame.get('fov')}")
+            if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3:
+                raise ValueError(f"camera {i}, whose matrix is no rotation")
+            pose = np.linalg.inv(world_from_gl @ OPENCV_FROM_OPENGL)
+            views.append(pinhole_view(size, fov, world.inverse.camera(pose) if world else pose))
+        if not 0 < len(views) <= MOST_FRAMES:
+            raise ValueError(counted(len(views), "camera"))
+        return views, float(content["fps"]) if content.get("fps") else None
 
 
 def check_path(
@@ -217,8 +193,8 @@ def check_path(
     xyz = gaussians.means[:: max(1, len(gaussians) // LOOKED_AT)].astype(np.float64)
     lost = np.mean([_share_seen(view, xyz) < LEAST_SEEN for view in some]) > 0.5
     if len(cameras) > 1:
-        middle = np.median(_centers(cameras), axis=0)
-        reach, away = (np.linalg.norm(_centers(v) - middle, axis=1) for v in (cameras, some))
+        middle = np.median(_poses(cameras)[:, :3], axis=0)
+        reach, away = (np.linalg.norm(_poses(v)[:, :3] - middle, axis=1) for v in (cameras, some))
         lost = lost or np.median(away) > FAR_AWAY * reach.max() > 0
     if lost:
         raise SceneFormatError(
@@ -242,7 +218,7 @@ def _in_order(views: Sequence[View]) -> list[View]:
     by_name = sorted(views, key=lambda view: view.name)
     if len(views) < 3:
         return by_name
-    centers = _centers(by_name)
+    centers = _poses(by_name)[:, :3]
     gaps = np.linalg.norm(centers[:, None] - centers[None], axis=2)
     np.fill_diagonal(gaps, np.inf)
     tour, left = [0], set(range(1, len(views)))
@@ -254,41 +230,33 @@ def _in_order(views: Sequence[View]) -> list[View]:
     return [by_name[i] for i in tour] if named > DETOUR * walked else by_name
 
 
-def _pose_vector(view: View) -> Float64[np.ndarray, " 9"]:
-    """Centre, forward and up: quantities that can be averaged."""
-    rotation, translation = view.cam_from_world[:3, :3], view.cam_from_world[:3, 3]
-    return np.concatenate([-rotation.T @ translation, rotation[2], -rotation[1]])
+def _poses(views: Sequence[View]) -> Float64[np.ndarray, "V 9"]:
+    """Centres, forward and up axes: quantities that can be averaged."""
+    poses = np.array([view.cam_from_world for view in views]).reshape(-1, 4, 4)
+    centers = -np.einsum("vij,vi->vj", poses[:, :3, :3], poses[:, :3, 3])
+    return np.hstack([centers, poses[:, 2, :3], -poses[:, 1, :3]])
 
 
-def _centers(views: Sequence[View]) -> Float64[np.ndarray, "N 3"]:
-    return np.array([_pose_vector(view)[:3] for view in views])
-
-
-def _posed(
-    lens: View,
-    i: int,
-    eye: Float64[np.ndarray, " 3"],
-    target: Float64[np.ndarray, " 3"],
-    up: Float64[np.ndarray, " 3"],
-) -> View:
+def _posed(lens: View, i: int, eye: Point, target: Point, up: Point) -> View:
     return dataclasses.replace(lens, name=f"{i}", cam_from_world=look_at(eye, target, up))
 
 
-def _interpolated(
-    poses: Float64[np.ndarray, "N 9"],
-    steps: Float64[np.ndarray, " N-1"],
-    at: Float64[np.ndarray, " M"],
+def _resampled(
+    poses: Float64[np.ndarray, "N 9"], steps: Float64[np.ndarray, " N-1"], count: int
 ) -> Float64[np.ndarray, "M 9"]:
-    """Poses at fractions in [0, 1] of a path whose segments have these lengths."""
+    """Poses at even distances along a path whose segments have these lengths."""
     way = np.concatenate([[0.0], np.cumsum(steps)])
-    place = at * way[-1]
-    return np.stack([np.interp(place, way, column) for column in poses.T], axis=1)
+    return np.asarray(interp1d(way, poses, axis=0)(np.linspace(0, 1, count) * way[-1]))
 
 
-def _median_camera(views: Sequence[View]) -> View:
-    """A camera with the median lens."""
-    focals = [view.K[1, 1] / view.height for view in views]
-    return views[int(np.argsort(focals)[len(focals) // 2])]
+def _lens(views: Sequence[View], size: tuple[int, int]) -> View:
+    """A camera with the median vertical field of view, and another picture size."""
+    view = sorted(views, key=lambda view: view.K[1, 1] / view.height)[len(views) // 2]
+    width, height = size
+    scale = height / view.height
+    K = np.diag([scale, scale, 1.0]) @ view.K
+    K[0, 2] += (width - scale * view.width) / 2
+    return dataclasses.replace(view, K=K, width=width, height=height)
 
 
 # Frames and videos --------------------------------------------------------------------------------
@@ -311,13 +279,12 @@ def flight_frames(
         depth: Show depth, not colour.
         progress: Called with the stage and the fraction done.
     """
-    limits = (0.0, 1.0)
     if depth:
         some = path[:: max(1, len(path) // DEPTH_SAMPLES)]
-        limits = depth_range(np.stack([renderers[0].depth(view) for view in some]))
+        limits = usual_range(nearness(np.stack([renderers[0].depth(view) for view in some])))
     for i, view in enumerate(path):
         pictures = [
-            depth_colors(each.depth(view), limits) if depth else as_bytes(each.color(view))
+            depth_picture(each.depth(view), limits) if depth else as_bytes(each.color(view))
             for each in renderers
         ]
         yield pictures[0] if len(pictures) == 1 else split_picture(pictures[0], pictures[1], *names)

@@ -2,8 +2,8 @@
 
 Notation: a map is H x W values in the pixels of its own camera; depth is planar z in scene units,
 normals are unit vectors in the camera's axes (x right, y down, z forward). A row of a page is one
-image. Promise: near is yellow, far is violet, unknown is grey, on a logarithmic scale; pictures
-show the map's pixels unchanged.
+image. Promise: pictures show the map's pixels unchanged; ``OutputError`` if a page cannot be
+written.
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Float64, UInt8
-from PIL import Image as PillowImage, ImageDraw
 
-from splatseed.camera import Camera
 from splatseed.depth.alignment import Alignment, PlanarDepth, map_camera
 from splatseed.depth.stereo import StereoMap
+from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene
 from splatseed.view.page import (
     UNKNOWN,
     Tile,
     color_bar,
+    depth_picture,
     fitted,
     map_colors,
     photograph_or_blank,
@@ -30,6 +30,7 @@ from splatseed.view.page import (
     usual_range,
     write_grid,
 )
+from splatseed.view.points import points_over
 from splatseed.views.visibility import find_visibility
 
 SIDE, CHECK_SIDE = 440, 480
@@ -38,8 +39,6 @@ LABEL, CHECK_LABEL = 40, 46
 """Characters of a label that fit above it."""
 LIMIT = 0.1
 """Relative errors of depth from this value on have the last colour."""
-RADIUS = 2.5
-"""Of an SfM point, in pixels."""
 
 
 def preview_maps(
@@ -52,9 +51,6 @@ def preview_maps(
         maps: At least one.
         path: The PNG to write.
         most: The most rows.
-
-    Raises:
-        OutputError: The file cannot be written.
     """
     by_name = {image.name: image for image in scene.images}
     places = np.linspace(0, len(maps) - 1, min(most, len(maps)))
@@ -67,12 +63,7 @@ def preview_maps(
 
 
 def map_tiles(maps: StereoMap, photograph: UInt8[np.ndarray, "H W 3"]) -> list[Tile]:
-    """Photograph, depth, normals and confidence of a view: four tiles of the photograph's size.
-
-    Args:
-        maps: The maps.
-        photograph: Their photograph, of any size.
-    """
+    """Photograph, depth, normals and confidence of a view: four tiles of the photograph's size."""
     known = np.isfinite(maps.depth)
     low, high = usual_range(maps.depth)
     confidence = np.where(known, maps.confidence, np.nan)
@@ -89,16 +80,6 @@ def map_tiles(maps: StereoMap, photograph: UInt8[np.ndarray, "H W 3"]) -> list[T
     ]
 
 
-def depth_picture(depth: Float[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W 3"]:
-    """Depth in colours: near is yellow, far is violet, on a logarithmic scale."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return _nearness_picture(-np.log(depth))
-
-
-def _nearness_picture(nearness: Float[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W 3"]:
-    return map_colors(nearness, *usual_range(nearness))
-
-
 def normal_picture(normal: Float[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
     """Normals in colours: red to the right, green upward, blue toward the camera."""
     known = np.isfinite(normal).all(axis=2, keepdims=True)
@@ -109,9 +90,6 @@ def normal_picture(normal: Float[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W
 
 def _shortened(label: str, length: int) -> str:
     return label if len(label) <= length else f"...{label[3 - length :]}"
-
-
-# Depth against SfM points -------------------------------------------------------------------------
 
 
 def preview_depth(scene: Scene, alignments: Mapping[str, Alignment], path: Path) -> Path:
@@ -125,9 +103,6 @@ def preview_depth(scene: Scene, alignments: Mapping[str, Alignment], path: Path)
         scene: A scene with depth maps.
         alignments: The alignments of its images, by name; at least one.
         path: The PNG to write.
-
-    Raises:
-        OutputError: The file cannot be written.
     """
     by_name, visibility = {image.name: image for image in scene.images}, find_visibility(scene)
     used = sorted(
@@ -138,11 +113,9 @@ def preview_depth(scene: Scene, alignments: Mapping[str, Alignment], path: Path)
     if used:  # a later word replaces an earlier one where there are few images
         words = {used[0]: "best", used[-1]: "worst", used[len(used) // 2]: "typical"}
     left_out = [name for name, a in alignments.items() if a.rejected is not None]
-    chosen = sorted(words, key=used.index) + left_out[:1]
     tiles: list[Tile] = []
-    for name in chosen:
-        image = by_name[name]
-        label = f"{name}, {words.get(name, 'left out')}"
+    for name in sorted(words, key=used.index) + left_out[:1]:
+        image, label = by_name[name], f"{name}, {words.get(name, 'left out')}"
         tiles += _checked(scene, image, alignments[name], visibility.of(image), label)
     return write_grid(tiles, path, columns=3, footer=color_bar("0", f"off by {LIMIT:.0%} or more"))
 
@@ -156,48 +129,28 @@ def _checked(
     assert scene.depths is not None  # noqa: S101  (there are alignments of them)
     depth = scene.depths.read(image.name)
     camera = map_camera(depth, image)
-    aligned = np.isfinite(alignment.scale)
-    z: Float64[np.ndarray, "H W"] | None = None
+    aligned, points = np.isfinite(alignment.scale), PointCloud.empty()
     if depth.kind == "inverse" and not aligned:
-        seen, words = _nearness_picture(depth.values), "depth, not aligned"
+        seen, words = map_colors(depth.values, *usual_range(depth.values)), "depth, not aligned"
     else:
         scale, shift = (alignment.scale, alignment.shift) if aligned else (1.0, 0.0)
         z = PlanarDepth.of(depth, camera, scale, shift, unit_ray=False).whole()
         low, high = usual_range(z)
         seen = depth_picture(z)
         words = f"depth {low:.3g} to {high:.3g}" + ("" if aligned else ", not aligned")
-    points, count = _points(photograph, z if aligned else None, camera, xyz)
-    told = f"{count:,} SfM points, residual {alignment.residual:.2%}"
+        uv, true = camera.project(xyz)
+        inside = (true > 0) & ((uv >= 0) & (uv < [camera.width, camera.height])).all(axis=1)
+        column, row = uv[inside].astype(np.int64).T
+        error = np.abs(z[row, column] / true[inside] - 1.0)
+        known = np.isfinite(error) & aligned
+        colors = map_colors(error[known] / LIMIT, 0.0, 1.0, "plasma")
+        points = PointCloud(xyz[inside][known], colors)
+    told = f"{len(points):,} SfM points, residual {alignment.residual:.2%}"
     if np.isnan(alignment.residual):
         told = alignment.rejected or "no SfM points see depth"
+    scale = size[0] / camera.width
     return [
         Tile(_shortened(label, CHECK_LABEL), photograph),
         Tile(words, resized(seen, size, smooth=False)),
-        Tile(_shortened(told, CHECK_LABEL), points),
+        Tile(_shortened(told, CHECK_LABEL), points_over(points, camera, photograph, scale=scale)),
     ]
-
-
-def _points(
-    photograph: UInt8[np.ndarray, "H W 3"],
-    z_map: Float64[np.ndarray, "H W"] | None,
-    camera: Camera,
-    xyz: Float64[np.ndarray, "M 3"],
-) -> tuple[UInt8[np.ndarray, "H W 3"], int]:
-    """The SfM points that see depth on the faded photograph, the largest errors on top."""
-    grey = np.repeat(photograph.mean(axis=2, keepdims=True), 3, axis=2)
-    canvas = PillowImage.fromarray(np.uint8((grey + 255) / 2))
-    if z_map is None:
-        return np.array(canvas), 0
-    uv, z = camera.project(xyz)
-    inside = (z > 0) & ((uv >= 0) & (uv < [camera.width, camera.height])).all(axis=1)
-    uv, z = uv[inside], z[inside]
-    column, row = uv.astype(np.int64).T
-    error = np.abs(z_map[row, column] / z - 1.0)
-    known = np.isfinite(error)
-    uv, error = uv[known], error[known]
-    uv = uv * [canvas.width / camera.width, canvas.height / camera.height]
-    draw, order = ImageDraw.Draw(canvas), np.argsort(error, kind="stable")
-    colors = map_colors(error[order] / LIMIT, 0.0, 1.0, "plasma").tolist()
-    for (u, v), color in zip(uv[order], colors, strict=True):
-        draw.ellipse((u - RADIUS, v - RADIUS, u + RADIUS, v + RADIUS), fill=tuple(color))
-    return np.array(canvas), len(error)

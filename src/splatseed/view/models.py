@@ -1,19 +1,18 @@
-"""What a user names to look at: a scene, a run, or a file of Gaussians; and renders of the latter.
+"""What a user names to look at: a scene, a run, or a file of Gaussians; and its stage.
 
 Notation: the *stage* is the world moved and scaled so that near planes and single precision work:
-the training frame if the scene is known, else one fitted to what is shown; depth is planar z in
-world units, 0 where there is none. Promise: a file's content decides what it is; a model knows its
-scene if the run or the user names it; no gradients are computed, and renders are not cached.
+the training frame if the scene is known, else one fitted to what is shown. Promise: a file's
+content decides what it is; a model knows its scene if the run or the user names it.
 """
 
 from __future__ import annotations
 
-import dataclasses
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Float64, UInt8
+from jaxtyping import Float64, UInt8
 from PIL import Image as PillowImage, ImageDraw
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
@@ -23,15 +22,15 @@ from splatseed.scene import Scene
 from splatseed.splat.formats import detect_format, read_model
 from splatseed.splat.gaussians import Gaussians, TrainingFrame, training_frame
 from splatseed.train.folder import RunFolder
-from splatseed.view.page import font, latin, map_colors
+from splatseed.view.page import font, latin
 from splatseed.views.view import View, poses_of
 
 MODEL_SUFFIXES = (".spz", ".splat", ".sog", ".ksplat", ".glb")
 _HEADER = 1 << 16
 CORE = 0.6
 """Share of the points, nearest to their median, that the stage is fitted to without cameras."""
-LINE, WHITE = 2, 255
-"""Width and colour of the border between two pictures."""
+LINE = 2
+"""Width of the border between two pictures."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,37 +76,28 @@ def open_shown(path: Path, scene_path: Path | None = None) -> Shown:
         SceneNotFoundError: ``path``, or the scene that the user names, does not exist.
         SceneFormatError: It is damaged, or cannot be shown.
     """
+
+    def scene_at(place: Path | None) -> Scene | None:
+        return None if place is None else load_scene(place, require_points=False)
+
     folder = RunFolder(path)
-    if path.is_dir() and folder.is_run:
-        return _open_run(folder, scene_path)
-    if path.is_file() and _is_model(path):
-        scene = None if scene_path is None else load_scene(scene_path, require_points=False)
-        return Shown(path.name, scene, read_model(path))
-    return Shown(path.name, load_scene(path, require_points=False))
-
-
-def _open_run(folder: RunFolder, scene_path: Path | None) -> Shown:
+    if not path.is_dir() or not folder.is_run:
+        if path.is_file() and _is_model(path):
+            return Shown(path.name, scene_at(scene_path), read_model(path))
+        return Shown(path.name, scene_at(path))
     if not folder.gaussians.is_file():
         raise SceneNotFoundError(
             f"{folder.path} to be a finished run of splatseed train",
             found="a run that has not finished",
             fix=f"Continue it: splatseed train SCENE -o {folder.path} --resume.",
         )
-    config, scene = folder.read_config(), None
-    named = scene_path or folder.scene_of(config)
-    if named is not None:
-        try:
-            scene = load_scene(Path(named), require_points=False)
-        except (SceneNotFoundError, SceneFormatError):
-            if scene_path is not None:
-                raise
-    return Shown(
-        folder.path.name,
-        scene,
-        read_model(folder.gaussians),
-        int(config.get("data_factor", 1)),
-        int(config.get("test_every", 8)),
-    )
+    config, scene = folder.read_config(), scene_at(scene_path)
+    named = folder.scene_of(config)
+    if scene is None and named is not None:
+        with suppress(SceneNotFoundError, SceneFormatError):  # it is gone
+            scene = scene_at(Path(named))
+    factor, every = (int(config.get(*each)) for each in (("data_factor", 1), ("test_every", 8)))
+    return Shown(folder.path.name, scene, read_model(folder.gaussians), factor, every)
 
 
 def _is_model(path: Path) -> bool:
@@ -172,33 +162,6 @@ def pinhole_view(
     return View("", np.empty((0, 0, 3), np.uint8), K, width, height, cam_from_world)
 
 
-def with_size(view: View, width: int, height: int) -> View:
-    """A camera with another picture size and the same vertical field of view."""
-    scale = height / view.height
-    K = np.diag([scale, scale, 1.0]) @ view.K
-    K[0, 2] += (width - scale * view.width) / 2
-    return dataclasses.replace(view, K=K, width=width, height=height)
-
-
-def depth_range(depth: Float32[np.ndarray, "*S"]) -> tuple[float, float]:
-    """Near and far: the 2nd and 98th percentiles of what is known, in world units."""
-    seen = depth[depth > 0]
-    if not seen.size:
-        return 0.0, 1.0
-    near, far = (float(value) for value in np.percentile(seen, [2, 98]))
-    return near, max(far, near * 1.001)
-
-
-def depth_colors(
-    depth: Float32[np.ndarray, "H W"], limits: tuple[float, float]
-) -> UInt8[np.ndarray, "H W 3"]:
-    """Depth as colours, spaced evenly in 1 / depth; near is bright, and black means no depth."""
-    near, far = (1 / max(limit, 1e-12) for limit in limits)
-    with np.errstate(divide="ignore"):
-        colors = map_colors(1 / depth, far, near, "turbo")
-    return np.where(depth[..., None] > 0, colors, 0).astype(np.uint8)
-
-
 def split_picture(
     left: UInt8[np.ndarray, "H W 3"],
     right: UInt8[np.ndarray, "H W 3"],
@@ -208,31 +171,20 @@ def split_picture(
     at: float = 0.5,
 ) -> UInt8[np.ndarray, "H W 3"]:
     """The left of one picture and the right of another, labelled, with a white line between."""
-    column = round(at * left.shape[1])
-    named = (
-        _labelled(left, left_name, 0)[:, :column],
-        _labelled(right, right_name, column)[:, column:],
-    )
-    picture = np.concatenate(named, axis=1)
-    picture[:, max(column - LINE // 2, 0) : column + LINE // 2] = WHITE
-    return picture
-
-
-def _labelled(
-    picture: UInt8[np.ndarray, "H W 3"], name: str, column: int
-) -> UInt8[np.ndarray, "H W 3"]:
-    """A picture with a name at its lower edge, starting at a given column."""
-    if not name:
-        return picture
-    size = max(10, min(picture.shape[0] // 28, 28))
-    image = PillowImage.fromarray(picture)
-    ImageDraw.Draw(image).text(
-        (column + size // 2, picture.shape[0] - size // 2),
-        latin(name),
-        fill="white",
-        font=font(size),
-        anchor="ld",
-        stroke_width=2,
-        stroke_fill="black",
-    )
-    return np.array(image)
+    column, size = round(at * left.shape[1]), max(10, min(len(left) // 28, 28))
+    pictures = []
+    for picture, name, start in ((left, left_name, 0), (right, right_name, column)):
+        image = PillowImage.fromarray(picture)
+        ImageDraw.Draw(image).text(
+            (start + size // 2, len(picture) - size // 2),
+            latin(name),
+            fill="white",
+            font=font(size),
+            anchor="ld",
+            stroke_width=2,
+            stroke_fill="black",
+        )
+        pictures.append(np.array(image))
+    joined = np.concatenate([pictures[0][:, :column], pictures[1][:, column:]], axis=1)
+    joined[:, max(column - LINE // 2, 0) : column + LINE // 2] = 255
+    return joined

@@ -25,10 +25,9 @@ GRID_SIDE = 600
 LABEL_SIZES = (20, 11)
 """Usual and smallest size of letters."""
 GAP, LABEL_HEIGHT, STRIP_HEIGHT = 12, 34, 44
-PAPER, INK = (255, 255, 255), (20, 20, 20)
+PAPER, INK, UNKNOWN = (255, 255, 255), (20, 20, 20), (150, 150, 150)
 BLANK = (230, 230, 230)
 """Stands in for a photograph."""
-UNKNOWN = (150, 150, 150)
 RANGE = (2, 98)
 """Percentiles of a map's values between which its colours vary."""
 
@@ -81,12 +80,14 @@ def write_grid(
     foot = 0 if footer is None else len(footer)
     page_height = rows * (height + LABEL_HEIGHT) + GAP + foot
     page = PillowImage.new("RGB", (columns * (width + GAP) + GAP, page_height), PAPER)
-    draw = ImageDraw.Draw(page)
+    draw, (usual, least) = ImageDraw.Draw(page), LABEL_SIZES
     for i, (label, picture) in enumerate(tiles):
         x = GAP + (i % columns) * (width + GAP)
         y = (i // columns) * (height + LABEL_HEIGHT)
         words = latin(label)
-        letters = _letters(words, width)
+        # Letters are smaller, but legible, where a label would be wider than its tile.
+        size = int(usual * width / max(font(usual).getlength(words), 1.0))
+        letters = font(max(min(usual, size), least))
         draw.text((x, y + LABEL_HEIGHT / 2), words, fill=INK, font=letters, anchor="lm")
         left, top = (width - picture.shape[1]) // 2, (height - len(picture)) // 2
         page.paste(PillowImage.fromarray(picture), (x + left, y + LABEL_HEIGHT + top))
@@ -95,13 +96,6 @@ def write_grid(
     with atomic_file(Path(path)) as partial:
         page.save(partial, format="PNG")
     return Path(path)
-
-
-def _letters(label: str, width: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    """The largest font, down to a legible size, in which a label is no wider than its tile."""
-    size, least = LABEL_SIZES
-    needed = font(size).getlength(label)
-    return font(max(min(size, int(size * width / max(needed, 1.0))), least))
 
 
 def resized(
@@ -133,10 +127,27 @@ def map_colors(
 def usual_range(values: Float[np.ndarray, "*S"]) -> tuple[float, float]:
     """The range of the finite values without their extremes; 0 to 0 if there are none."""
     finite = values[np.isfinite(values)]
-    if not finite.size:
-        return 0.0, 0.0
-    low, high = np.percentile(finite, RANGE)
+    low, high = np.percentile(finite, RANGE) if finite.size else (0.0, 0.0)
     return float(low), float(high)
+
+
+def nearness(depth: Float[np.ndarray, "*S"]) -> Float[np.ndarray, "*S"]:
+    """What colours of depth are spaced evenly in, -log(depth); not finite where none is known."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(-np.log(depth))
+
+
+def depth_picture(
+    depth: Float[np.ndarray, "H W"], limits: tuple[float, float] | None = None
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Depth in colours: near is yellow, far is violet, 0 and NaN are grey.
+
+    Args:
+        depth: Planar depth.
+        limits: Of its ``nearness``; by default ``usual_range``.
+    """
+    near = nearness(depth)
+    return map_colors(near, *(limits or usual_range(near)))
 
 
 def color_bar(low: str, high: str, colormap: str = "plasma") -> UInt8[np.ndarray, "H W 3"]:
@@ -150,19 +161,6 @@ def color_bar(low: str, high: str, colormap: str = "plasma") -> UInt8[np.ndarray
     return np.asarray(bar)
 
 
-def legend(
-    entries: Sequence[tuple[str, tuple[int, ...]]], width: int
-) -> UInt8[np.ndarray, "H W 3"]:
-    """A strip of words, each after a dot of its colour."""
-    strip = PillowImage.new("RGB", (width, STRIP_HEIGHT), PAPER)
-    draw, letters, x = ImageDraw.Draw(strip), font(18), 8.0
-    for words, color in entries:
-        draw.ellipse((x, 14, x + 16, 30), fill=color)
-        draw.text((x + 24, 22), words, fill=INK, font=letters, anchor="lm")
-        x += 24 + letters.getlength(words) + 28
-    return np.asarray(strip)
-
-
 # Photographs --------------------------------------------------------------------------------------
 
 
@@ -173,9 +171,8 @@ def photograph_at(
     folder = scene.source.image_dir if scene.source else None
     if folder is None or image is None:
         return None
-    path = folder / image.name
     try:
-        picture = decode_photograph(path, photograph_bytes(path))
+        picture = decode_photograph(folder / image.name, photograph_bytes(folder / image.name))
     except (SceneNotFoundError, SceneFormatError):
         return None
     return np.array(picture.resize(size, PillowImage.Resampling.LANCZOS))

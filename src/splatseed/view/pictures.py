@@ -4,8 +4,7 @@ Notation: an *entry* is one of the things the user opened; the *canvas* is the b
 camera of the scene's world; *at* is the image whose camera the canvas stands at, or None; the
 *stage* is the viewer's world (``stage_frame``), so that a browser's single precision suffices.
 Promise: pictures are drawn one at a time, however many browsers are connected, because PyTorch's
-and Numba's threads are shared; a picture that cannot be drawn is None, with a reason; each browser
-gets its own points and cameras, so that the switches of one do not affect another.
+and Numba's threads are shared; each browser gets its own points and cameras.
 """
 
 from __future__ import annotations
@@ -30,17 +29,13 @@ from splatseed.splat.gaussians import Gaussians, TrainingFrame
 from splatseed.splat.rendering import ModelRenderer, as_bytes, error_map
 from splatseed.upsample.registry import origin_name
 from splatseed.view.clouds import cell_picture
-from splatseed.view.models import (
-    Shown,
-    depth_colors,
-    depth_range,
-    pinhole_view,
-)
-from splatseed.view.page import BLANK, photograph_at
+from splatseed.view.models import Shown, pinhole_view
+from splatseed.view.page import BLANK, depth_picture, photograph_at
 from splatseed.view.points import origin_colors, render_points
 from splatseed.views.view import View, poses_of
 
-Drawn = tuple[UInt8[np.ndarray, "H W 3"] | None, str]
+Picture = UInt8[np.ndarray, "H W 3"]
+Drawn = tuple[Picture | None, str]
 """A picture, or None and the reason why there is none."""
 MOST_MOVING = 250_000
 """Gaussians rendered while a camera moves, on the CPU: projecting a million takes longer there than
@@ -48,6 +43,7 @@ all pixels. A GPU, which projects millions in milliseconds, renders all."""
 CELL = 8
 """Side in pixels of the cells that are tested for seeds."""
 PHOTOGRAPH_SIDE, CELLS_SIDE = 1600, 800
+AT_A_CAMERA = {"photograph", "error", "depth map", "uncovered cells"}
 GO = "Click a camera to stand where a photograph was taken."
 MOST_CAMERAS = 400
 """Most cameras that are drawn; of more, an even subset."""
@@ -93,12 +89,7 @@ def stage_pose(
 
 
 def fitted_fov(camera: Camera, aspect: float) -> float:
-    """The vertical field of view, radians, at which a canvas shows everything the camera saw.
-
-    Args:
-        camera: Its principal point is assumed to be central.
-        aspect: Width of the canvas over its height.
-    """
+    """The vertical field of view, radians, at which a canvas shows all that a camera saw."""
     by_height = camera.height / camera.K[1, 1]
     by_width = camera.width / camera.K[0, 0] / aspect
     return float(2 * np.arctan(max(by_height, by_width) / 2))
@@ -107,14 +98,7 @@ def fitted_fov(camera: Camera, aspect: float) -> float:
 def laid_onto(
     canvas: View, picture: UInt8[np.ndarray, "h w 3"], camera: Camera, *, smooth: bool = True
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """A camera's picture as seen on a canvas with the same pose; black outside the picture.
-
-    Args:
-        canvas: The view to draw.
-        picture: What the camera saw, at any size.
-        camera: The intrinsics of the picture.
-        smooth: Interpolate between pixels.
-    """
+    """A camera's picture, of any size, on a canvas with the same pose; black outside it."""
     height, width = picture.shape[:2]
     K = np.diag([width / camera.width, height / camera.height, 1.0]) @ camera.K
     picture_from_canvas = K @ np.linalg.inv(canvas.K)
@@ -143,24 +127,25 @@ class Entry:
     def __init__(
         self, shown: Shown, frame: TrainingFrame, device: torch.device | None = None
     ) -> None:
-        self.shown = shown
-        self.name = shown.name
-        self.frame = frame
-        self._device = device
-        self._painters: dict[str, Callable[[View, Image | None], Drawn]] = {}
-        scene = shown.scene
+        self.shown, self.name, self.frame, self._device = shown, shown.name, frame, device
+        scene, painters = shown.scene, dict[str, Callable[[View, Any], Picture | str]]()
         if self.has_model:
-            self._painters = {"Gaussians": self._gaussians, "depth": self._depth}
+            painters["Gaussians"] = lambda canvas, _: as_bytes(self.renderer.color(canvas))
+            painters["depth"] = lambda canvas, _: depth_picture(self.renderer.depth(canvas))
         if scene is not None and scene.has_photographs:
-            self._painters["photograph"] = self._photograph
+            painters["photograph"] = self._photograph
             if self.has_model:
-                self._painters["error"] = self._error
+                painters["error"] = self._error
         if scene is not None and scene.depths is not None:
-            self._painters["depth map"] = self._depth_map
+            painters["depth map"] = self._depth_map
         if scene is not None and len(scene.points):
-            self._painters |= {"points": self._points, "origins": self._origins}
+            points = scene.points
+            colored = points.replace(rgb=origin_colors(points.source))
+            painters["points"] = lambda canvas, _: render_points(points, canvas.camera)
+            painters["origins"] = lambda canvas, _: render_points(colored, canvas.camera)
             if scene.images:
-                self._painters["uncovered cells"] = self._uncovered
+                painters["uncovered cells"] = self._uncovered
+        self._painters = painters
 
     @cached_property
     def renderer(self) -> ModelRenderer:
@@ -187,13 +172,16 @@ class Entry:
 
     def draw(self, kind: str, canvas: View, at: Image | None, *, quick: bool = False) -> Drawn:
         """A picture as large as the canvas; a quick one may skip the least visible Gaussians."""
+        if at is None and kind in AT_A_CAMERA:
+            return None, GO
         with _DRAWING:
             try:
                 if quick and kind == "Gaussians":
                     return as_bytes(self.quick_renderer.color(canvas)), ""
-                return self._painters[kind](canvas, at)
+                drawn = self._painters[kind](canvas, at)
             except SplatseedError as error:
                 return None, str(error)
+        return (None, drawn) if isinstance(drawn, str) else (drawn, "")
 
     def warm_up(self) -> None:
         """Compile the kernels that renders need, so that no browser waits for them."""
@@ -201,59 +189,33 @@ class Entry:
             for quick in (True, False):
                 self.draw("Gaussians", pinhole_view((32, 24), 0.7, np.eye(4)), None, quick=quick)
 
-    def _gaussians(self, canvas: View, at: Image | None) -> Drawn:
-        del at
-        return as_bytes(self.renderer.color(canvas)), ""
-
-    def _depth(self, canvas: View, at: Image | None) -> Drawn:
-        del at
-        depth = self.renderer.depth(canvas)
-        return depth_colors(depth, depth_range(depth)), ""
-
-    def _points(self, canvas: View, at: Image | None) -> Drawn:
-        del at
-        camera = Camera(canvas.K, canvas.width, canvas.height, canvas.cam_from_world)
-        return render_points(self._scene.points, camera), ""
-
-    def _origins(self, canvas: View, at: Image | None) -> Drawn:
-        del at
-        points = self._scene.points
-        camera = Camera(canvas.K, canvas.width, canvas.height, canvas.cam_from_world)
-        return render_points(points.replace(rgb=origin_colors(points.source)), camera), ""
-
-    def _photograph(self, canvas: View, at: Image | None) -> Drawn:
-        if at is None:
-            return None, GO
+    def _photograph(self, canvas: View, at: Image) -> Picture | str:
         photograph = _photograph_of(self._scene, at, PHOTOGRAPH_SIDE)
         if photograph is None:
-            return None, f"The photograph {at.name} cannot be read."
-        return laid_onto(canvas, photograph, at.camera), ""
+            return f"The photograph {at.name} cannot be read."
+        return laid_onto(canvas, photograph, at.camera)
 
-    def _error(self, canvas: View, at: Image | None) -> Drawn:
-        photograph, why = self._photograph(canvas, at)
-        if photograph is None or at is None:
-            return None, why
+    def _error(self, canvas: View, at: Image) -> Picture | str:
+        photograph = self._photograph(canvas, at)
+        if isinstance(photograph, str):
+            return photograph
         white = np.full((2, 2, 3), 255, np.uint8)
         inside = laid_onto(canvas, white, at.camera, smooth=False) > 0
-        return np.where(inside, error_map(photograph, self.renderer.color(canvas)), 0), ""
+        return np.where(inside, error_map(photograph, self.renderer.color(canvas)), 0)
 
-    def _depth_map(self, canvas: View, at: Image | None) -> Drawn:
+    def _depth_map(self, canvas: View, at: Image) -> Picture | str:
         maps = self._scene.depths
-        if at is None or maps is None or at.name not in maps:
-            return None, GO if at is None else f"{at.name} has no depth map."
-        depth = np.nan_to_num(maps.read(at.name).values, nan=0.0, posinf=0.0)
-        picture = depth_colors(depth, depth_range(depth))
-        return laid_onto(canvas, picture, at.camera, smooth=False), ""
+        if maps is None or at.name not in maps:
+            return f"{at.name} has no depth map."
+        picture = depth_picture(maps.read(at.name).values)
+        return laid_onto(canvas, picture, at.camera, smooth=False)
 
-    def _uncovered(self, canvas: View, at: Image | None) -> Drawn:
-        if at is None:
-            return None, GO
-        view = _sized(at, CELLS_SIDE)
-        photograph = _photograph_of(self._scene, at, CELLS_SIDE)
+    def _uncovered(self, canvas: View, at: Image) -> Picture | str:
+        view, photograph = _sized(at, CELLS_SIDE), _photograph_of(self._scene, at, CELLS_SIDE)
         if photograph is None:
             photograph = np.full((view.height, view.width, 3), BLANK, np.uint8)
         (covered,) = covered_cells([view], self._scene.points.xyz, CELL)
-        return laid_onto(canvas, cell_picture(photograph, covered, CELL), at.camera), ""
+        return laid_onto(canvas, cell_picture(photograph, covered, CELL), at.camera)
 
     @property
     def _scene(self) -> Scene:
@@ -266,7 +228,7 @@ def _most_seen(gaussians: Gaussians, count: int) -> Gaussians:
     wide = np.sort(gaussians.scales.astype(np.float64), axis=1)[:, 1:].sum(axis=1)
     weight = wide - np.logaddexp(0, -gaussians.opacities.astype(np.float64))
     keep = np.sort(np.argpartition(-weight, count)[:count])
-    return Gaussians(**{name: array[keep] for name, array in gaussians.arrays().items()})
+    return gaussians.select(keep)
 
 
 def _sized(image: Image, side: int) -> View:
@@ -286,14 +248,9 @@ def _photograph_of(scene: Scene, image: Image, side: int) -> UInt8[np.ndarray, "
 
 @dataclass(frozen=True, eq=False)
 class StageCloud:
-    """Points of one origin, on the stage.
+    """Points of one origin on the stage, photographed and own colours, and how many there are.
 
-    Args:
-        name: The origin's name.
-        xyz: Positions on the stage, [N, 3].
-        rgb: Photographed colours.
-        color: The origin's colour.
-        count: How many the scene has; ``xyz`` may hold only some of them.
+    ``xyz`` may hold only some of them.
     """
 
     name: str
@@ -329,13 +286,9 @@ def point_size(
 def add_cameras(
     gui_scene: Any, shown: Shown, frame: TrainingFrame, fly: Callable[[Image], None]
 ) -> list[tuple[Image, Any]]:
-    """Add a frustum for each camera to a browser's scene; a click on one flies there.
+    """Add a frustum for each camera of the images, test views in another colour.
 
-    Args:
-        gui_scene: The browser's scene.
-        shown: Its scene has images; test views get another colour.
-        frame: The stage.
-        fly: Called with the image whose camera was clicked.
+    A click on one calls ``fly`` with its image.
     """
     assert shown.scene is not None  # noqa: S101  (see above)
     tested = {image.name for image in shown.scene.split(shown.test_every)[1]}

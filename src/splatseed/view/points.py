@@ -9,9 +9,6 @@ mixed in one cloud have colours that the colour-blind can tell apart (Okabe and 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from types import MappingProxyType
-
 import numpy as np
 from jaxtyping import UInt8
 from PIL import Image as PillowImage
@@ -24,29 +21,25 @@ from splatseed.view.page import PAPER, resized
 
 DISCS_PER_SIDE = 340
 """A disc at the median depth is the picture's longer side divided by this: 2.4 px at 800."""
-
 SMOOTHING = 2
 """Pictures are drawn this much larger and averaged down, so that discs are round."""
-
 ORIGIN_POINT_SIZE = 3.0
 PALE = 0.7
 """How far a photograph behind points is bleached."""
-COLORS: Mapping[int, tuple[int, int, int]] = MappingProxyType(
-    {
-        ORIGINAL: (0, 0, 0),
-        SOURCE_CODES["linear"]: (230, 159, 0),
-        SOURCE_CODES["triangle"]: (190, 170, 0),
-        SOURCE_CODES["spline"]: (204, 121, 167),
-        SOURCE_CODES["mls"]: (0, 158, 115),
-        SOURCE_CODES["voronoi"]: (118, 42, 131),
-        SOURCE_CODES["depth"]: (86, 180, 233),
-        SOURCE_CODES["random"]: (128, 128, 128),
-        SOURCE_CODES["stereo"]: (0, 114, 178),
-        SOURCE_CODES["cover"]: (213, 94, 0),
-        SOURCE_CODES["cloud"]: (240, 228, 66),
-        GENERATED: (140, 86, 75),
-    }
-)
+COLORS: dict[int, tuple[int, int, int]] = {
+    ORIGINAL: (0, 0, 0),
+    SOURCE_CODES["linear"]: (230, 159, 0),
+    SOURCE_CODES["triangle"]: (190, 170, 0),
+    SOURCE_CODES["spline"]: (204, 121, 167),
+    SOURCE_CODES["mls"]: (0, 158, 115),
+    SOURCE_CODES["voronoi"]: (118, 42, 131),
+    SOURCE_CODES["depth"]: (86, 180, 233),
+    SOURCE_CODES["random"]: (128, 128, 128),
+    SOURCE_CODES["stereo"]: (0, 114, 178),
+    SOURCE_CODES["cover"]: (213, 94, 0),
+    SOURCE_CODES["cloud"]: (240, 228, 66),
+    GENERATED: (140, 86, 75),
+}
 """The colour of each origin; others have that of ``GENERATED``."""
 
 
@@ -121,34 +114,25 @@ def origin_colors(source: UInt8[np.ndarray, " N"]) -> UInt8[np.ndarray, "N 3"]:
     return np.asarray(table[source])
 
 
-def origin_picture(
+def points_over(
     points: PointCloud,
     camera: Camera,
     photograph: UInt8[np.ndarray, "h w 3"] | None = None,
     *,
+    point_size: float = ORIGIN_POINT_SIZE,
     scale: float = 1.0,
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """The points in the colours of their origins, over the bleached photograph.
+    """The points over the photograph, of any size, grey and pale so that their colours stand out.
 
-    Args:
-        points: Seeds, world coordinates.
-        camera: The camera to look from.
-        photograph: Its photograph, of any size; white when left out.
-        scale: Size of the picture relative to the camera's.
+    Other arguments as of ``render_points``; without a photograph it is white.
     """
     background: tuple[int, int, int] | UInt8[np.ndarray, "H W 3"] = PAPER
-    if photograph is not None:  # grey and pale, so that every colour of an origin stands out
+    if photograph is not None:
         grey = np.asarray(PillowImage.fromarray(photograph).convert("L"))
         shown = resized(grey, picture_size(camera, scale)).astype(np.float64)
         pale = np.round(PALE * 255 + (1 - PALE) * shown).astype(np.uint8)
         background = np.repeat(pale[..., None], 3, axis=2)
-    return render_points(
-        points.replace(rgb=origin_colors(points.source)),
-        camera,
-        point_size=ORIGIN_POINT_SIZE,
-        background=background,
-        scale=scale,
-    )
+    return render_points(points, camera, point_size=point_size, background=background, scale=scale)
 
 
 @inline

@@ -2,7 +2,7 @@
 
 Promise: of the network, only the host and port to listen on are used; a taken port is an error, and
 no other port is tried. In training, the training thread itself draws, between two steps, so nothing
-changes under a render; the training steps are the same as without a viewer; time spent on browsers
+changes under a render, and training steps are the same as without a viewer; time spent on browsers
 does not count as training.
 """
 
@@ -18,6 +18,7 @@ import warnings
 from collections.abc import Callable
 from concurrent.futures import CancelledError, Future
 from contextlib import redirect_stdout
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -36,7 +37,6 @@ from splatseed.views.visibility import choose_camera, choose_image
 if TYPE_CHECKING:
     from splatseed.train.run import TrainingRun
 
-MOST_PORT = 65535
 STEP_BACK = 0.6
 """How far behind the first camera a browser begins, on the stage, so that it sees that camera."""
 REFRESH_SECONDS = 2.0
@@ -48,30 +48,20 @@ ENDED = "The training has ended: look at the run with splatseed view."
 
 
 def free_port(host: str, port: int) -> int:
-    """A port that can be listened on: the one asked for, or any free port for 0.
-
-    Args:
-        host: The address to listen on.
-        port: The port.
+    """A port of a host that can be listened on: the one asked for, or any free port for 0.
 
     Raises:
         ParameterError: The port is taken or out of range, or the host is not this machine's.
     """
-    if not 0 <= port <= MOST_PORT:
-        raise ParameterError(
-            f"--port from 0 to {MOST_PORT}",
-            found=f"{port}",
-            fix="Pass another (0: any free one).",
-        )
     try:
         with socket.socket() as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind((host, port))
             return int(probe.getsockname()[1])
-    except OSError as error:
+    except (OSError, OverflowError) as error:  # the latter beyond 65535
         raise ParameterError(
             f"to listen on --host {host}, --port {port}",
-            found=error.strerror or str(error),
+            found=getattr(error, "strerror", None) or str(error),
             fix="Pass another --port (0: any free one); --host 127.0.0.1 is this machine alone.",
         ) from None
 
@@ -101,9 +91,7 @@ class Viewer:
         # A browser may disconnect at any moment: no warning that it missed the rest.
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
         with redirect_stdout(io.StringIO()):  # viser prints its own address
-            self.server: Any = viser.ViserServer(
-                host=host, port=port, label="splatseed", verbose=False
-            )
+            self.server: Any = viser.ViserServer(host, port, label="splatseed", verbose=False)
         self.server.gui.configure_theme(
             show_logo=False, show_share_button=False, control_width="large"
         )
@@ -124,12 +112,12 @@ class Viewer:
         with self._lock:
             return list(self._sessions.values())
 
-    def greet(self, session: Session) -> None:
+    def greet(self, gui: Any, session: Session) -> None:
         """Called for each new browser; subclasses add controls here."""
 
     def _welcome(self, client: Any) -> None:
         session = Session(client, self.entries, self._beside)
-        self.greet(session)
+        self.greet(client.gui, session)
         with self._lock:
             self._sessions[client.client_id] = session
 
@@ -163,28 +151,19 @@ class Viewer:
         start.fov = fov
 
 
-class _LiveRenderer:
-    """Renders the Gaussians as they are now."""
-
-    def __init__(self, run: TrainingRun, entry: Entry) -> None:
-        self._run, self._entry = run, entry
-
-    def color(self, view: View) -> Float32[np.ndarray, "H W 3"]:
-        """A view of the world, in [0, 1]."""
-        image = self._run.trainer.render(self._entry.frame.view(view))
-        return np.asarray(image.clamp(0, 1).cpu().numpy())
-
-
 class _LiveEntry(Entry):
     """A run's scene and its current Gaussians, drawn by the thread that calls ``serve``."""
 
     def __init__(self, shown: Shown, run: TrainingRun) -> None:
         super().__init__(shown, stage_frame(shown))
-        self.renderer = _LiveRenderer(run, self)  # type: ignore[assignment]  # has what Entry calls
-        self._asked: queue.SimpleQueue[tuple[Future[Drawn], Callable[[], Drawn]]] = (
-            queue.SimpleQueue()
-        )
-        self._painters.pop("depth", None)
+
+        def color(view: View) -> Float32[np.ndarray, "H W 3"]:
+            image = run.trainer.render(self.frame.view(view))
+            return np.asarray(image.clamp(0, 1).cpu().numpy())
+
+        self.renderer = SimpleNamespace(color=color)  # type: ignore[assignment]  # as Entry calls it
+        self._asked = queue.SimpleQueue[tuple[Future[Drawn], Callable[[], Drawn]]]()
+        del self._painters["depth"]
         self._open = True
 
     @property
@@ -225,15 +204,7 @@ class _LiveEntry(Entry):
 
 
 class TrainingViewer(Viewer):
-    """Serves a run while it trains.
-
-    Args:
-        run: The run.
-        scene: Its scene.
-        name: What to call it.
-        host: The address to listen at.
-        port: The port that ``free_port`` returned.
-    """
+    """Serves a run of a scene while it trains, under a name; else as ``Viewer``."""
 
     def __init__(self, run: TrainingRun, scene: Scene, name: str, host: str, port: int) -> None:
         settings = run.settings
@@ -241,25 +212,24 @@ class TrainingViewer(Viewer):
         self._run = run
         self._live = _LiveEntry(shown, run)
         self._paused, self.kept = False, False
-        self._panels: dict[int, tuple[Session, Any, Any]] = {}
+        self._panels: list[tuple[Session, Any, Any]] = []
         self._next = 0.0
         super().__init__([self._live], host, port)
 
-    def greet(self, session: Session) -> None:
+    def greet(self, gui: Any, session: Session) -> None:
         """Add the run's progress, a pause and a stop button."""
-        gui = session.gui
         with gui.add_folder("Training", order=-1.0):
             numbers = gui.add_markdown(self._numbers())
             pause = gui.add_checkbox("Pause", self._paused)
             stop = gui.add_button("Stop and keep")
         pause.on_update(lambda _: self.pause(on=pause.value))
         stop.on_click(lambda _: self.stop_and_keep())
-        self._panels[id(session)] = (session, numbers, pause)
+        self._panels.append((session, numbers, pause))
 
     def pause(self, *, on: bool) -> None:
         """Pause after the current step, or resume."""
         self._paused = on
-        for _, _, box in list(self._panels.values()):
+        for _, _, box in self._panels:
             if box.value != on:
                 box.value = on
 
@@ -276,7 +246,8 @@ class TrainingViewer(Viewer):
         watch.stop()
         self._refresh()
         self._live.serve()
-        while self._paused and not self.kept and not self._interrupted():
+        handler = signal.getsignal(signal.SIGINT)
+        while self._paused and not self.kept and not getattr(handler, "requested", False):
             self._live.serve(PAUSED_POLL)
         watch.start()
         if self.kept:
@@ -287,22 +258,15 @@ class TrainingViewer(Viewer):
         self._live.close()
         self.stop()
 
-    @staticmethod
-    def _interrupted() -> bool:
-        handler = signal.getsignal(signal.SIGINT)
-        return bool(getattr(handler, "requested", False))
-
     def _refresh(self) -> None:
         """Update the numbers and ask for new pictures, now and then."""
         if time.monotonic() < self._next:
             return
         looking = self.sessions
-        for key, (session, numbers, _) in list(self._panels.items()):
-            if session in looking:
-                numbers.content = self._numbers()
-                session.refresh()
-            else:
-                del self._panels[key]
+        self._panels = [panel for panel in self._panels if panel[0] in looking]
+        for session, numbers, _ in self._panels:
+            numbers.content = self._numbers()
+            session.refresh()
         self._next = time.monotonic() + REFRESH_SECONDS
 
     def _numbers(self) -> str:

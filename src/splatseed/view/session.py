@@ -34,10 +34,8 @@ from splatseed.view.pictures import (
 )
 from splatseed.views.view import View
 
-MOVING_SECONDS = 0.12
-"""Seconds a frame may take while the camera moves."""
-STILL_AFTER = 0.2
-"""Seconds without movement after which the full picture is drawn."""
+MOVING_SECONDS, STILL_AFTER = 0.12, 0.2
+"""Seconds a frame may take while the camera moves, and without movement until the full picture."""
 LEAST_SCALE, FIRST_SCALE = 0.12, 0.3
 """Coarsest scale of a frame, and the scale before any frame has been timed."""
 CLOSE_SECONDS = 2.0
@@ -72,8 +70,7 @@ class FrameLoop:
 
     def __init__(self, draw: Callable[[float], int]) -> None:
         self._draw = draw
-        self._changed = threading.Event()
-        self._closed = False
+        self._changed, self._closed = threading.Event(), False
         self._pixel_seconds: float | None = None
         self._full_pixels = 1.0
         self.frames = 0
@@ -96,31 +93,25 @@ class FrameLoop:
             if self._closed:
                 return
             self._changed.clear()
-            scale = self._scale()
-            self._frame(scale)
+            scale = FIRST_SCALE
+            if self._pixel_seconds is not None:  # at which a frame just meets its time
+                affordable = MOVING_SECONDS / self._pixel_seconds / self._full_pixels
+                scale = float(np.clip(np.sqrt(affordable), LEAST_SCALE, 1.0))
+            began = time.perf_counter()
+            pixels = self._frame(scale)
+            if pixels:  # a full frame teaches nothing: it draws Gaussians that a coarse one skips
+                took = (time.perf_counter() - began) / pixels
+                before = took if self._pixel_seconds is None else self._pixel_seconds
+                self._pixel_seconds = MEMORY * took + (1 - MEMORY) * before
             if scale < 1 and not self._changed.wait(STILL_AFTER):
-                self._frame(1.0, learn=False)
+                self._frame(1.0)
 
-    def _scale(self) -> float:
-        """The scale at which a frame just meets its time budget."""
-        if self._pixel_seconds is None:
-            return FIRST_SCALE
-        affordable = MOVING_SECONDS / self._pixel_seconds / self._full_pixels
-        # Pixels go with the square of the scale.
-        return float(np.clip(np.sqrt(affordable), LEAST_SCALE, 1.0))
-
-    def _frame(self, scale: float, *, learn: bool = True) -> None:
-        began = time.perf_counter()
+    def _frame(self, scale: float) -> int:
         pixels = self._draw(scale)
-        if not pixels:
-            return
-        self.frames += 1
-        self._full_pixels = pixels / scale**2
-        if not learn:  # a full frame draws all Gaussians, a coarse one only the most visible
-            return
-        took = (time.perf_counter() - began) / pixels
-        before = took if self._pixel_seconds is None else self._pixel_seconds
-        self._pixel_seconds = MEMORY * took + (1 - MEMORY) * before
+        if pixels:
+            self.frames += 1
+            self._full_pixels = pixels / scale**2
+        return pixels
 
 
 class Session:
@@ -133,8 +124,7 @@ class Session:
     """
 
     def __init__(self, client: Any, entries: list[Entry], beside: Entry | None = None) -> None:
-        self._beside = beside
-        self._client = client
+        self._beside, self._client = beside, client
         self._entries = {entry.name: entry for entry in entries}
         self._goal: Image | None = None
         self._picture: np.ndarray | None = None
@@ -143,8 +133,8 @@ class Session:
         self._closed = False
         self._loop = FrameLoop(self._draw)
         self._build()
-        client.camera.on_update(lambda _: self._loop.change())
-        self._loop.change()
+        client.camera.on_update(lambda _: self.refresh())
+        self.refresh()
         self._fill_stage()
 
     def close(self) -> None:
@@ -152,13 +142,8 @@ class Session:
         self._closed = True
         self._loop.close()
 
-    @property
-    def gui(self) -> Any:
-        """The browser's controls, for callers that add their own."""
-        return self._client.gui
-
     def refresh(self) -> None:
-        """What is shown has changed."""
+        """The camera moved, or what is shown has changed."""
         self._loop.change()
 
     # Controls -----------------------------------------------------------------------------------
@@ -171,10 +156,10 @@ class Session:
         self._kind = gui.add_dropdown(
             "Picture", kinds, initial_value=kinds[1 if first.has_model else 0]
         )
-        pairs = [(entry, kind) for entry in self._entries.values() for kind in entry.kinds]
         self._seconds = {
             f"{entry.name}: {kind}" if len(names) > 1 else kind: (entry, kind)
-            for entry, kind in pairs
+            for entry in self._entries.values()
+            for kind in entry.kinds
         }
         second = NO_SECOND
         if self._beside is not None and self._beside.has_model:
@@ -197,12 +182,14 @@ class Session:
         with gui.add_folder("Cameras"):
             self._cameras_on = gui.add_checkbox("Show cameras", not first.has_model)
             self._go = gui.add_dropdown("Fly to", ("-",))
-        for each in (self._kind, self._second, self._split):
-            each.on_update(lambda _: self._changed())
-        for each in (self._points_on, self._by_origin, self._size, self._cameras_on):
-            each.on_update(lambda _: self._restyle())
-        self._what.on_update(lambda _: self._switched())
-        self._go.on_update(lambda _: self._go_to(self._go.value))
+        for boxes, changed in (
+            ((self._kind, self._second, self._split), self._changed),
+            ((self._points_on, self._by_origin, self._size, self._cameras_on), self._restyle),
+            ((self._what,), self._switched),
+            ((self._go,), self._go_to),
+        ):
+            for box in boxes:
+                box.on_update(lambda _, changed=changed: changed())
         shot.on_click(lambda _: self._screenshot())
 
     @property
@@ -210,14 +197,14 @@ class Session:
         return self._entries[self._what.value]
 
     def _switched(self) -> None:
-        """Another entry was chosen: replace pictures, points and cameras by its own."""
+        """Another entry was chosen: its pictures, points and cameras come."""
         kinds = (NOTHING, *self._entry.kinds)
         self._kind.options = kinds
         if self._kind.value not in kinds:
             self._kind.value = kinds[-1] if not self._entry.has_model else kinds[1]
         self._goal = None
         self._fill_stage()
-        self._loop.change()
+        self.refresh()
 
     def _changed(self) -> None:
         self._split.visible = self._second.value != NO_SECOND
@@ -265,8 +252,14 @@ class Session:
 
     def _fill_in(self) -> None:
         """Send what can wait: photographs, and as many more points as the browser draws quickly."""
-        self._add_thumbnails()
-        scene, nodes = self._entry.shown.scene, self._nodes
+        scene, nodes, cameras = self._entry.shown.scene, self._nodes, self._cameras
+        for image, handle in cameras:
+            if self._closed or scene is None or cameras is not self._cameras:
+                return
+            size = fitted(image.camera.width, image.camera.height, THUMBNAIL)
+            thumbnail = photograph_at(scene, image, size)
+            if thumbnail is not None:
+                handle.image = thumbnail
         if scene is None or len(scene.points) <= FIRST_POINTS:
             return
         try:
@@ -303,8 +296,13 @@ class Session:
                 colors = np.broadcast_to(np.array(cloud.color, np.uint8), cloud.rgb.shape)
             if not np.array_equal(node.colors[:1], colors[:1]) or self._by_origin.value:
                 node.colors = colors
+        rows = []
+        for cloud in (self._clouds[name] for name in self._nodes):
+            dot = f'<span style="color:rgb{cloud.color};font-size:1.4em">&#9679;</span>'
+            shown = "" if len(cloud.xyz) == cloud.count else f" ({len(cloud.xyz):,} shown)"
+            rows.append(f"<div>{dot} {cloud.name}: {cloud.count:,}{shown}</div>")
+        self._legend.content = f'<div id="legend" style="padding:0 1em">{"".join(rows)}</div>'
         self._show_cameras()
-        self._legend.content = self._legend_html()
 
     def _show_cameras(self) -> None:
         """Hide the camera at which the browser stands: its photograph would block the view."""
@@ -313,33 +311,12 @@ class Session:
             if handle.visible != (wanted := on and image is not at):
                 handle.visible = wanted
 
-    def _legend_html(self) -> str:
-        rows = []
-        for name in self._nodes:
-            cloud = self._clouds[name]
-            rgb = ",".join(map(str, cloud.color))
-            dot = f'<span style="color:rgb({rgb});font-size:1.4em">&#9679;</span>'
-            shown = "" if len(cloud.xyz) == cloud.count else f" ({len(cloud.xyz):,} shown)"
-            rows.append(f"<div>{dot} {name}: {cloud.count:,}{shown}</div>")
-        return f'<div id="legend" style="padding:0 1em">{"".join(rows)}</div>'
-
-    def _add_thumbnails(self) -> None:
-        scene, cameras = self._entry.shown.scene, list(self._cameras)
-        for image, handle in cameras:
-            if self._closed or scene is None or cameras != self._cameras:
-                return
-            camera = image.camera
-            size = fitted(camera.width, camera.height, THUMBNAIL)
-            thumbnail = photograph_at(scene, image, size)
-            if thumbnail is not None:
-                handle.image = thumbnail
-
     # The camera ---------------------------------------------------------------------------------
 
-    def _go_to(self, name: str) -> None:
-        image = next((image for image, _ in self._cameras if image.name == name), None)
-        if image is not None:
-            self._fly(image)
+    def _go_to(self) -> None:
+        for image, _ in self._cameras:
+            if image.name == self._go.value:
+                self._fly(image)
 
     def _fly(self, image: Image) -> None:
         """Move to where an image was taken, in half a second."""
@@ -380,27 +357,26 @@ class Session:
         try:
             return self._drawn(scale)
         except Exception as error:  # noqa: BLE001  (the thread must live on)
-            if self._closed:  # the browser has disconnected meanwhile
-                return 0
-            _LOG.exception("a picture could not be drawn")
-            self._say(f"{type(error).__name__}: {error}")
+            if not self._closed:  # the browser is still there
+                _LOG.exception("a picture could not be drawn")
+                self._say(f"{type(error).__name__}: {error}")
         return 0
 
     def _drawn(self, scale: float) -> int:
         kind, second = self._kind.value, self._seconds.get(self._second.value)
         self._show_cameras()
-        if kind == NOTHING and second is None:
+        asked = [(self._entry, kind)] if kind != NOTHING else []
+        asked += [second] if second is not None else []
+        if not asked:
             self._show(None, 0)
             self._say("")
             return 0
         canvas, at = self._canvas(scale), self.at
-        drawn: list[Drawn] = [(None, "")]
-        if kind != NOTHING:
-            drawn = [self._entry.draw(kind, canvas, at, quick=scale < 1)]
-        if second is not None:
-            drawn.append(second[0].draw(second[1], canvas, at, quick=scale < 1))
+        drawn = [entry.draw(kind, canvas, at, quick=scale < 1) for entry, kind in asked]
         self._say(" ".join(dict.fromkeys(why for _, why in drawn if why)))
-        picture = self._joined(drawn, canvas, named=scale == 1)
+        picture = drawn[0][0]
+        if second is not None:
+            picture = self._joined([(None, ""), *drawn][-2:], canvas, named=scale == 1)
         self._show(picture, JPEG_STILL if scale == 1 else JPEG_MOVING)
         return canvas.width * canvas.height
 
@@ -411,16 +387,14 @@ class Session:
         size = (max(8, round(scale * width)), max(8, round(scale * height)))
         return canvas_view(camera.wxyz, camera.position, camera.fov, size, self._entry.frame)
 
-    def _joined(self, drawn: list[Drawn], canvas: View, *, named: bool) -> np.ndarray | None:
+    def _joined(self, drawn: list[Drawn], canvas: View, *, named: bool) -> np.ndarray:
         white = np.full((canvas.height, canvas.width, 3), 255, np.uint8)
-        pictures = [white if picture is None else picture for picture, _ in drawn]
-        if len(pictures) == 1:
-            return drawn[0][0]
+        left, right = (white if picture is None else picture for picture, _ in drawn)
         names = (self._kind.value, self._second.value)
         if len(self._entries) > 1:
             names = (f"{self._entry.name}: {names[0]}", names[1])
         names = names if named else ("", "")  # letters would be huge in a coarse picture
-        return split_picture(pictures[0], pictures[1], *names, at=float(self._split.value))
+        return split_picture(left, right, *names, at=float(self._split.value))
 
     def _show(self, picture: np.ndarray | None, quality: int) -> None:
         self._picture = picture

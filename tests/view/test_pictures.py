@@ -1,4 +1,4 @@
-"""Drawn points are where, in front of and as many as they should be; pages show what they say."""
+"""Points are drawn where, in front of and as many as they should be; pages show what they say."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from hypothesis.extra import numpy as hnp
 from PIL import Image as PillowImage
 
 from splatseed.camera import Camera, Intrinsics
+from splatseed.depth.stereo import StereoMap
 from splatseed.errors import OutputError
 from splatseed.io import load_scene
 from splatseed.pointcloud import PointCloud
@@ -23,12 +24,13 @@ from splatseed.view.clouds import (
     preview_origins,
     preview_pair,
 )
-from splatseed.view.page import Tile, write_grid
-from splatseed.view.points import COLORS, origin_colors, origin_picture, render_points
+from splatseed.view.maps import map_tiles, normal_picture, preview_maps
+from splatseed.view.page import UNKNOWN, Tile, depth_picture, write_grid
+from splatseed.view.points import COLORS, origin_colors, points_over, render_points
 
 K = np.array([[50.0, 0, 20], [0, 50.0, 15], [0, 0, 1]])
 CAMERA = Camera(K, 40, 30, np.eye(4))
-RED, GREEN = [255, 0, 0], [0, 255, 0]
+RED, GREEN, PHOTOGRAPH = [255, 0, 0], [0, 255, 0], [10, 200, 30]
 
 
 def _cloud(xyz, rgb):
@@ -38,6 +40,12 @@ def _cloud(xyz, rgb):
 def _at(column, row, depth):
     """The world point in the middle of a pixel."""
     return CAMERA.unproject(np.array([[column + 0.5, row + 0.5]]), np.array([depth]))[0]
+
+
+def _read(path):
+    with PillowImage.open(path) as file:
+        assert file.format == "PNG"
+        return np.asarray(file.convert("RGB")).astype(int)
 
 
 # Points -------------------------------------------------------------------------------------------
@@ -51,27 +59,10 @@ def test_a_point_in_the_middle_of_a_pixel_colours_that_pixel_alone():
         assert (picture[22, 7] != 255).any()
 
 
-@pytest.mark.parametrize("swap", [False, True])
-def test_the_nearer_point_hides_the_farther(swap):
-    xyz, rgb = [_at(20, 15, 5.0), _at(20, 15, 2.0)], [RED, GREEN]
-    cloud = _cloud(xyz[::-1] if swap else xyz, rgb[::-1] if swap else rgb)
-    assert render_points(cloud, CAMERA, point_size=2)[15, 20].tolist() == GREEN
-
-
 def test_points_behind_beside_and_nowhere_are_left_out():
     xyz = [[0, 0, -2.0], [0, 0, 0], [900.0, 0, 1], [np.nan, 0, 2], [0, np.inf, 2], [0, -1e30, 1]]
     for cloud in (_cloud(xyz, [RED] * 6), _cloud([], [])):
         assert (render_points(cloud, CAMERA, background=(9, 8, 7)) == [9, 8, 7]).all()
-
-
-def test_near_points_are_larger_up_to_a_limit():
-    def ink(depth):
-        others = [_at(2, 2, 4.0), _at(37, 2, 4.0), _at(2, 27, 4.0)]
-        cloud = _cloud([*others, _at(20, 15, depth)], [RED] * 3 + [GREEN])
-        picture = render_points(cloud, CAMERA, point_size=4).astype(int)
-        return (picture[..., 0] < 128).sum()
-
-    assert ink(4.0) < ink(2.5) < ink(1.0) == ink(0.3)
 
 
 def test_scale_changes_the_size_and_keeps_the_place():
@@ -83,6 +74,7 @@ def test_scale_changes_the_size_and_keeps_the_place():
 
 
 def test_drawing_matches_a_loop_over_points(rng):
+    """The nearer hides the farther, and is larger, up to a limit."""
     xyz = CAMERA.unproject(rng.uniform([-2, -2], [42, 32], (200, 2)), rng.uniform(1, 9, 200))
     rgb = rng.integers(0, 255, (200, 3))
     size = 5.0
@@ -98,7 +90,7 @@ def test_drawing_matches_a_loop_over_points(rng):
     np.testing.assert_allclose(picture, expected, atol=0.51)
 
 
-# Origins ------------------------------------------------------------------------------------------
+# Pages of clouds ----------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -109,22 +101,30 @@ def seeds():
     return PointCloud(xyz, np.full((3, 3), 90, np.uint8), source)
 
 
+@pytest.fixture
+def scene(tmp_path, rng):
+    folder = tmp_path / "images"
+    folder.mkdir()
+    PillowImage.new("RGB", (40, 30), tuple(PHOTOGRAPH)).save(folder / "a.png")
+    intrinsics = Intrinsics(1, "PINHOLE", 40, 30, (50.0, 50.0, 20.0, 15.0))
+    image = Image("a.png", 1, intrinsics, np.array([1.0, 0, 0, 0]), np.zeros(3))
+    xyz = CAMERA.unproject(rng.uniform([0, 0], [40, 30], (150, 2)), rng.uniform(2, 4, 150))
+    points = _cloud(xyz, np.full((150, 3), 60))
+    source = SceneSource("colmap", tmp_path, tmp_path / "points3D.bin", image_dir=folder)
+    return Scene(points, (image,), (intrinsics,), source=source)
+
+
 def test_every_origin_has_a_colour_of_its_own(seeds):
     codes = np.array([0, *SOURCE_CODES.values(), 255], np.uint8)
     assert len(np.unique(origin_colors(codes), axis=0)) == len(codes)
     assert origin_colors(np.array([77], np.uint8)).tolist() == [list(COLORS[255])]
-    picture = origin_picture(seeds, CAMERA)
-    for (row, column), code in zip([(5, 5), (15, 20), (25, 35)], (0, 8, 9), strict=True):
-        assert picture[row, column].tolist() == list(COLORS[code])
-    assert picture[15, 5].tolist() == [255, 255, 255]
-
-
-def test_the_photograph_behind_is_grey_and_pale(seeds):
     photograph = np.zeros((60, 80, 3), np.uint8)
     photograph[:, :40] = [250, 10, 10]
-    picture = origin_picture(seeds, CAMERA, photograph, scale=2.0).astype(int)
-    assert picture.shape == (60, 80, 3)
-    left, right = picture[50, 5], picture[10, 70]
+    colored = seeds.replace(rgb=origin_colors(seeds.source))
+    picture = points_over(colored, CAMERA, photograph, scale=2.0).astype(int)
+    for (row, column), code in zip([(11, 11), (31, 41), (51, 71)], (0, 8, 9), strict=True):
+        assert picture[row, column].tolist() == list(COLORS[code])
+    left, right = picture[50, 5], picture[10, 70]  # the photograph behind is grey and pale
     assert len(set(left)) == len(set(right)) == 1
     assert 170 < right[0] < left[0] < 255
 
@@ -140,32 +140,9 @@ def test_a_page_of_origins_has_both_pictures_and_names_what_is_there(seeds, tmp_
         assert (dot > 100) == (code in {0, 8, 9})
 
 
-# Pages --------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def scene(tmp_path, rng):
-    folder = tmp_path / "images"
-    folder.mkdir()
-    PillowImage.new("RGB", (40, 30), (10, 200, 30)).save(folder / "a.png")
-    intrinsics = Intrinsics(1, "PINHOLE", 40, 30, (50.0, 50.0, 20.0, 15.0))
-    image = Image("a.png", 1, intrinsics, np.array([1.0, 0, 0, 0]), np.zeros(3))
-    xyz = CAMERA.unproject(rng.uniform([0, 0], [40, 30], (150, 2)), rng.uniform(2, 4, 150))
-    points = _cloud(xyz, np.full((150, 3), 60))
-    source = SceneSource("colmap", tmp_path, tmp_path / "points3D.bin", image_dir=folder)
-    return Scene(points, (image,), (intrinsics,), source=source)
-
-
-def _read(path):
-    with PillowImage.open(path) as file:
-        assert file.format == "PNG"
-        return np.asarray(file.convert("RGB")).astype(int)
-
-
 def test_a_pair_shows_both_clouds(scene, tmp_path):
-    dense = PointCloud.concatenate(
-        scene.points, scene.points.replace(xyz=scene.points.xyz + np.float32(0.03))
-    )
+    moved = scene.points.replace(xyz=scene.points.xyz + np.float32(0.03))
+    dense = PointCloud.concatenate(scene.points, moved)
     path = preview_pair(scene, dense, tmp_path / "out" / "pair.png", title="twice")
     picture = _read(path)
     left, right = np.array_split(picture[60:], 2, axis=1)
@@ -182,11 +159,11 @@ def test_a_pair_shows_both_clouds(scene, tmp_path):
 def test_the_grid_starts_with_the_photograph_where_there_is_one(scene, tmp_path):
     clouds = {"one": scene.points, "two": scene.points}
     with_photo = _read(preview_methods(scene, clouds, tmp_path / "with.png"))
-    green = (with_photo == [10, 200, 30]).all(axis=2)
+    green = (with_photo == PHOTOGRAPH).all(axis=2)
     assert green.sum() == 600 * 450
     assert not green[:, 615:].any()
     bare = _read(preview_methods(scene.replace(source=None), clouds, tmp_path / "without.png"))
-    assert not (bare == [10, 200, 30]).all(axis=2).any()
+    assert not (bare == PHOTOGRAPH).all(axis=2).any()
 
 
 def test_errors_are_coloured_by_distance(scene, tmp_path):
@@ -207,7 +184,7 @@ def test_errors_are_coloured_by_distance(scene, tmp_path):
 def test_a_pixel_is_dimmed_or_tinted_as_its_cell_is(data, height, width, cell):
     covered = data.draw(hnp.arrays(bool, (-(-height // cell), -(-width // cell))))
     picture = cell_picture(np.full((height, width, 3), 200, np.uint8), covered, cell).astype(int)
-    seeded = np.kron(covered, np.ones((cell, cell), bool))[:height, :width]
+    seeded = covered.repeat(cell, axis=0).repeat(cell, axis=1)[:height, :width]
     assert (picture[seeded] == 150).all()
     assert (picture[~seeded][:, [0, 2]] > picture[~seeded][:, [1]] + 50).all()
 
@@ -235,3 +212,52 @@ def test_real_scenes_fill_a_good_part_of_the_picture(scenes, tmp_path, name):
     left, right = np.array_split(picture[40:] < 200, 2, axis=1)
     assert left.mean() > 0.01
     assert right.mean() == pytest.approx(left.mean(), rel=0.05)
+
+
+# Maps ---------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def maps():
+    """A slope that comes nearer to the right; its left half is not known."""
+    depth = np.tile(np.linspace(8.0, 2.0, 40, dtype=np.float32), (30, 1))
+    normal = np.tile(np.array([0, 0, -1], np.float32), (30, 40, 1))
+    depth[:, :20] = normal[:, :20] = np.nan
+    return StereoMap("a.png", CAMERA, depth, normal, np.nan_to_num(depth / 8), (), np.empty(0))
+
+
+def test_unknown_is_grey_and_near_is_brighter_than_far(maps):
+    picture = depth_picture(maps.depth).astype(int)
+    unknown = np.isnan(maps.depth)
+    assert (picture[unknown] == UNKNOWN).all()
+    assert not (picture[~unknown] == UNKNOWN).all(axis=1).any()
+    brightness = picture[0, 20:].sum(axis=1)
+    assert (np.diff(brightness) >= 0).all()
+    assert brightness[-1] > brightness[0] + 200
+    for value in (np.nan, 3.0, np.inf, 0.0, -1.0):
+        assert depth_picture(np.full((3, 4), value)).shape == (3, 4, 3)
+
+
+def test_normals_have_the_colours_of_their_axes():
+    normal = np.array([[[0, 0, -1], [1, 0, 0], [0, -1, 0], [np.nan, 0, 0]]])
+    picture = normal_picture(normal)[0].tolist()  # toward the camera, right, up
+    assert picture == [[128, 128, 255], [255, 128, 128], [128, 255, 128], list(UNKNOWN)]
+
+
+def test_a_row_has_four_pictures_of_the_photographs_size(maps):
+    photograph = np.full((90, 120, 3), 40, np.uint8)
+    tiles = map_tiles(maps, photograph)
+    assert [tile.picture.shape for tile in tiles] == [photograph.shape] * 4
+    assert tiles[0].picture is photograph
+    assert "50% known" in tiles[1].label
+    for tile in tiles[1:]:  # no pixel is a blend of known and unknown
+        assert (tile.picture[:, :60] == UNKNOWN).all()
+    maps.depth[:] = np.nan
+    assert "0% known" in map_tiles(maps, photograph)[1].label
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_a_page_shows_some_of_the_maps_beside_their_photographs(maps, scene, tmp_path, there):
+    shown = scene if there else scene.replace(source=None)
+    picture = _read(preview_maps(shown, [maps] * 5, tmp_path / "out.png", most=2))
+    assert (picture == PHOTOGRAPH).all(axis=2).sum() == (2 * 440 * 330 if there else 0)
