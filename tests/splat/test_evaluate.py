@@ -10,21 +10,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-# An import below imports PyTorch, so that it has to come after the question whether it is there.
 torch = pytest.importorskip("torch", reason="evaluation needs PyTorch")
 
 from splatseed.errors import ParameterError, SceneNotFoundError
 from splatseed.io import load_scene
 from splatseed.scores import EvalResult, ViewScore
-from splatseed.splat.evaluate import (
-    evaluate_model,
-    evaluate_views,
-    load_model,
-    write_renders,
-)
+from splatseed.splat.evaluate import evaluate_model, evaluate_views, load_model, write_renders
 from splatseed.splat.formats import write_model
 from splatseed.splat.gaussians import initial_gaussians, training_frame
-from splatseed.splat.metrics import Lpips
 from splatseed.splat.rendering import ModelRenderer
 from splatseed.views.view import View, poses_of
 
@@ -34,25 +27,17 @@ def truth(rng):
     return rng.integers(0, 256, (48, 64, 3), dtype=np.uint8)
 
 
-@pytest.fixture
-def noisy(rng, truth):
-    noise = rng.normal(0, 0.1, truth.shape).astype(np.float32)
-    return torch.from_numpy(truth / np.float32(255) + noise)
-
-
 def _view(image, name="a.png"):
     height, width = image.shape[:2]
     return View(name, image, np.eye(3), width, height, np.eye(4))
 
 
-def test_scores_are_those_of_torchmetrics_on_clamped_renders(truth, noisy):
+def test_scores_are_those_of_torchmetrics_on_clamped_renders(rng, truth):
     functional = pytest.importorskip("torchmetrics.functional.image")
+    photo = torch.from_numpy(truth / np.float32(255))
+    noisy = photo + torch.from_numpy(rng.normal(0, 0.1, truth.shape).astype(np.float32))
     result = evaluate_views(lambda _: noisy, [_view(truth)])
-
-    def planes(image):
-        return image.clamp(0, 1).permute(2, 0, 1)[None]
-
-    x, y = planes(noisy), planes(torch.from_numpy(truth / np.float32(255)))
+    x, y = (image.clamp(0, 1).permute(2, 0, 1)[None] for image in (noisy, photo))
     psnr = functional.peak_signal_noise_ratio(x, y, data_range=1.0)
     ssim = functional.structural_similarity_index_measure(x, y, sigma=1.5, data_range=1.0)
     assert result.psnr == pytest.approx(float(psnr), abs=1e-3)
@@ -69,20 +54,20 @@ def test_the_mean_psnr_is_that_of_the_images_not_of_the_mean_error():
     assert [s.name for s in result.per_image] == ["a.png", "b.png"]
 
 
-def test_values_beyond_the_range_are_clamped():
-    white = _view(np.full((16, 16, 3), 255, np.uint8))
-    assert evaluate_views(lambda _: torch.full((16, 16, 3), 7.0), [white]).psnr == math.inf
-
-
-def test_lpips_is_in_the_result_or_why_not(truth, noisy):
-    without = evaluate_views(lambda _: noisy, [_view(truth)], lpips_reason="no weights").to_dict()
-    assert (without["lpips"], without["lpips_reason"]) == (None, "no weights")
-    metric = Lpips.__new__(Lpips)
-    metric.net = "alex"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Lpips, "__call__", lambda *_: 0.25)
-        result = evaluate_views(lambda _: noisy, [_view(truth)] * 2, lpips=metric)
-    assert (result.lpips, result.lpips_net, result.lpips_reason) == (0.25, "alex", "")
+def test_scores_over_a_mask_and_lpips_are_in_the_result_where_asked_for():
+    view = _view(np.full((16, 16, 3), 100, np.uint8))
+    image = torch.full((16, 16, 3), 100 / 255)
+    image[:8] += 0.1
+    mask = np.zeros((16, 16), bool)
+    mask[4:] = True  # a third of it is wrong by 0.1
+    metric = {"lpips": lambda *_: 0.25, "covisible": {"a.png": mask}}
+    result = evaluate_views(lambda _: image, [view], **metric)
+    assert (result.lpips, result.lpips_net, result.lpips_reason) == (0.25, "vgg", "")
+    assert result.covisible_share == 0.75
+    assert result.covisible_psnr == pytest.approx(-10 * np.log10(0.01 / 3), abs=1e-3)
+    plain = evaluate_views(lambda _: image, [view], lpips_reason="no weights").to_dict()
+    assert (plain["lpips"], plain["lpips_reason"]) == (None, "no weights")
+    assert (plain["covisible_psnr"], plain["covisible_share"]) == (None, None)
 
 
 def test_what_cannot_be_scored_is_refused(truth):
@@ -97,61 +82,48 @@ def test_json_is_valid_also_for_a_perfect_render():
     scores = (ViewScore("a", math.inf, 1.0, 0.0, 0.1), ViewScore("b", 30.0, 0.9, 0.2, 0.3))
     result = EvalResult(scores, lpips_net="vgg", lpips_reason="")
     content = json.loads(json.dumps(result.to_dict(), allow_nan=False))
-    assert content["psnr"] is None
-    assert content["per_image"][0]["psnr"] is None
+    assert content["psnr"] is content["per_image"][0]["psnr"] is None
     assert content["per_image"][1]["psnr"] == 30.0
-    assert content["ssim"] == pytest.approx(0.95)
-    assert content["lpips"] == pytest.approx(0.1)
-    assert content["render_seconds"] == pytest.approx(0.2)
+    for name, mean in (("ssim", 0.95), ("lpips", 0.1), ("render_seconds", 0.2)):
+        assert content[name] == pytest.approx(mean)
 
 
 @pytest.fixture(scope="module")
-def room(larger_room_path):
-    return larger_room_path
-
-
-@pytest.fixture(scope="module")
-def model_path(room, tmp_path_factory):
+def model_path(larger_room_path, tmp_path_factory):
     """The seeds themselves as Gaussians of the world, with some colour by direction."""
-    gaussians = initial_gaussians(load_scene(room).points, opacity=0.9)
+    gaussians = initial_gaussians(load_scene(larger_room_path).points, opacity=0.9)
     gaussians.shN[:, :3] = np.random.default_rng(0).normal(0, 0.1, (len(gaussians), 3, 3))
     path = tmp_path_factory.mktemp("model") / "seeds.ply"
     write_model(path, gaussians)
     return path
 
 
-def test_a_ply_of_the_world_is_scored_on_the_test_views(room, model_path):
-    model = load_model(model_path, room)
+def test_a_ply_of_the_world_is_scored_on_the_test_views(larger_room_path, model_path):
+    model, scene = load_model(model_path, larger_room_path), load_scene(larger_room_path)
     result = evaluate_model(model)
-    assert [s.name for s in result.per_image] == [i.name for i in load_scene(room).split()[1]]
-    assert result.num_gaussians == len(load_scene(room).points)
+    assert [s.name for s in result.per_image] == [i.name for i in scene.split()[1]]
+    assert result.num_gaussians == len(scene.points)
     assert result.model_bytes == result.num_gaussians * 59 * 4
     black = evaluate_views(lambda v: torch.zeros(v.height, v.width, 3), model.views)
     assert result.psnr > black.psnr + 1
-
-
-def test_a_model_looks_the_same_in_whatever_frame_it_is_rendered(room, model_path):
-    model = load_model(model_path, room)
-    frame = training_frame(poses_of(load_scene(room).split()[0]))
+    # It looks the same in whatever frame it is rendered; nothing lies at the nearer near plane.
+    frame = training_frame(poses_of(scene.split()[0]))
     other = dataclasses.replace(frame, origin=frame.origin + 0.5, scale=3 * frame.scale)
-    moved = ModelRenderer(model.gaussians, other).image
+    moved = ModelRenderer(model.gaussians, other)
     for view in model.views:
-        # The near plane is closer there: nothing of the room lies that near.
-        torch.testing.assert_close(moved(view), model.render(view), atol=2e-3, rtol=0)
+        torch.testing.assert_close(moved.image(view), model.render(view), atol=2e-3, rtol=0)
 
 
-def test_pictures_show_the_photograph_the_render_and_the_error(room, model_path, tmp_path):
-    model = load_model(model_path, room, data_factor=2)
+def test_pictures_show_the_photograph_the_render_and_the_error(
+    larger_room_path, model_path, tmp_path
+):
+    model = load_model(model_path, larger_room_path, data_factor=2)
     write_renders(model, tmp_path)
     for view in model.views:
         assert (view.width, view.height) == (60, 45)
         with Image.open(tmp_path / view.name) as file:
             pixels = np.asarray(file)
-        assert pixels.shape[0] == view.height
-        assert pixels.shape[1] > 3 * view.width
-        np.testing.assert_array_equal(pixels[:, : view.width], view.photograph)
-
-
-def test_a_bare_cloud_is_no_scene_to_score_on(room, model_path):
+        assert pixels.shape == (45, 3 * 60 + 8, 3)
+        np.testing.assert_array_equal(pixels[:, :60], view.photograph)
     with pytest.raises(SceneNotFoundError, match="to have images"):
-        load_model(model_path, room / "sparse/0/points3D.ply")
+        load_model(model_path, larger_room_path / "sparse/0/points3D.ply")

@@ -51,21 +51,25 @@ def _canvas(viewer, image):
 
 def test_renders_come_between_steps_and_change_nothing(watched, room, tmp_path):
     run, viewer, scene = watched
-    pictures = []
+    canvas, pictures = _canvas(viewer, scene.images[0]), []
 
     def look():
         while len(pictures) < 5:
-            picture, _ = viewer._live.draw("Gaussians", _canvas(viewer, scene.images[0]), None)
-            pictures.append(picture)
+            pictures.append(viewer._live.draw("Gaussians", canvas, None))
 
     thread = threading.Thread(target=look)
     thread.start()
     assert run.train(viewer.on_step)
     viewer._live.close()
     thread.join(30)
-    drawn = [picture for picture in pictures if picture is not None]
+    drawn = [picture for picture, _ in pictures if picture is not None]
     assert drawn
     assert all(picture.std() > 5 for picture in drawn)
+    picture, why = viewer._live.draw("Gaussians", canvas, None)  # who looks after the end is told
+    assert (picture, "ended" in why) == (None, True)
+    numbers = viewer._numbers()
+    for told in (f"step {STEPS}", f"{len(run.state.params['means']):,} Gaussians", "test views"):
+        assert told in numbers
     alone = prepare_run(load_scene(room), tmp_path / "alone", run.settings)
     assert alone.train()
     for name, value in alone.state.params.items():
@@ -102,20 +106,3 @@ def test_a_pause_holds_and_a_stop_keeps(watched):
     assert run.finish(evaluate_views).steps == run.state.step
     assert run.folder.gaussians.is_file()
     assert not run.folder.checkpoint.exists()
-
-
-def test_who_looks_after_the_end_is_told(watched):
-    _, viewer, scene = watched
-    viewer._live.close()
-    picture, why = viewer._live.draw("Gaussians", _canvas(viewer, scene.images[0]), None)
-    assert picture is None
-    assert "ended" in why
-
-
-def test_numbers_are_those_of_the_run(watched):
-    run, viewer, _ = watched
-    assert run.train()
-    numbers = viewer._numbers()
-    assert f"step {STEPS}" in numbers
-    assert f"{len(run.state.params['means']):,} Gaussians" in numbers
-    assert "test views" in numbers

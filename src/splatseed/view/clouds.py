@@ -47,14 +47,9 @@ DIM = 0.75
 
 
 class CoveredView(NamedTuple):
-    """Which cells of one view are covered.
+    """A view's name and photograph, and which of its cells held a seed before and after.
 
-    Args:
-        name: The image's name.
-        photograph: Its pixels, uint8 [H, W, 3].
-        cell: Side of a cell in pixels.
-        before: Whether each cell holds an original, bool [rows, columns].
-        after: Whether it holds a seed.
+    ``cell`` is the side of one in pixels of the photograph.
     """
 
     name: str
@@ -67,13 +62,7 @@ class CoveredView(NamedTuple):
 def preview_pair(
     scene: Scene, upsampled: PointCloud, path: Path | str, *, title: str = "upsampled"
 ) -> Path:
-    """Write a picture of the scene's points beside the upsampled ones, from one camera.
-
-    Args:
-        scene: The scene as read.
-        upsampled: The points made from it.
-        path: The PNG to write.
-        title: Describes the upsampled points, such as ``"mls, 8x"``.
+    """Write a picture of the scene's points beside the upsampled ones, described by a title.
 
     Raises:
         PointCloudError: The scene has no finite points.
@@ -99,14 +88,9 @@ def preview_errors(
     camera: Camera,
     path: Path | str,
 ) -> Path:
-    """Write a grid of clouds whose points are coloured by their distance to the true surface.
+    """Write a grid of clouds by label, their points coloured by their distance to the true surface.
 
-    Args:
-        clouds: Points by label; usually only the new ones.
-        distances: For each label the distance of every point, in spacings h of the originals; from
-            1 on points have the last colour.
-        camera: The camera to look from.
-        path: The PNG to write.
+    Distances are in spacings h of the originals; from 1 on points have the last colour.
     """
     colored = {
         f"{label}   {len(cloud):,} points: mean error {distances[label].mean():.2f} spacings": (

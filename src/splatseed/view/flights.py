@@ -58,12 +58,7 @@ Point = Float64[np.ndarray, " 3"]
 
 
 def smooth_path(views: Sequence[View], frames: int, size: tuple[int, int]) -> list[View]:
-    """A path past all cameras, at even speed.
-
-    Args:
-        views: The cameras, in the order in which the photographs may have been taken.
-        frames: How many views to return.
-        size: Their width and height.
+    """A path of so many frames past all cameras, at even speed.
 
     Raises:
         ParameterError: There are fewer than two cameras, or all are in one place.
@@ -94,14 +89,7 @@ def smooth_path(views: Sequence[View], frames: int, size: tuple[int, int]) -> li
 def orbit(
     views: Sequence[View], gaussians: Gaussians, frames: int, size: tuple[int, int]
 ) -> list[View]:
-    """Circle what the cameras look at, at their distance and height; without cameras, the model.
-
-    Args:
-        views: The cameras, or none.
-        gaussians: The model.
-        frames: How many views to return.
-        size: Their width and height.
-    """
+    """Circle what the cameras look at, at their distance and height; without cameras, the model."""
     if len(views) > 1:
         centers, _, ups = np.split(_poses(views), 3, axis=1)
         up, focus, lens = ups.mean(axis=0), focus_of(views), _lens(views, size)
@@ -178,20 +166,19 @@ def path_of_file(
 def check_path(
     path: Path, views: Sequence[View], gaussians: Gaussians, cameras: Sequence[View]
 ) -> None:
-    """Refuse a path that leads through another world: far from all cameras, or past the model.
-
-    Args:
-        path: Its file.
-        views: Its cameras.
-        gaussians: The model.
-        cameras: The cameras that the model was trained from, or none.
+    """Refuse a path, of a file, that leads far from all training cameras, or past the model.
 
     Raises:
         SceneFormatError: Most of the views see next to nothing, or are out of reach.
     """
     some = [views[i] for i in np.linspace(0, len(views) - 1, min(len(views), LOOKS)).astype(int)]
     xyz = gaussians.means[:: max(1, len(gaussians) // LOOKED_AT)].astype(np.float64)
-    lost = np.mean([_share_seen(view, xyz) < LEAST_SEEN for view in some]) > 0.5
+    seen = []
+    for view in some:
+        u, v, depth = view.K @ (xyz @ view.cam_from_world[:3, :3].T + view.cam_from_world[:3, 3]).T
+        inside = (u >= 0) & (u < view.width * depth) & (v >= 0) & (v < view.height * depth)
+        seen.append(inside.mean())
+    lost = np.mean(np.array(seen) < LEAST_SEEN) > 0.5
     if len(cameras) > 1:
         middle = np.median(_poses(cameras)[:, :3], axis=0)
         reach, away = (np.linalg.norm(_poses(v)[:, :3] - middle, axis=1) for v in (cameras, some))
@@ -203,14 +190,6 @@ def check_path(
             fix="nerfstudio's paths are in a world of its own: name the dataparser_transforms.json "
             "of its run with --transform; to follow the path as it is, pass --transform none.",
         )
-
-
-def _share_seen(view: View, xyz: Float64[np.ndarray, "N 3"]) -> float:
-    """The share of the points that the view sees."""
-    cam = xyz @ view.cam_from_world[:3, :3].T + view.cam_from_world[:3, 3]
-    u, v, depth = view.K @ cam.T
-    inside = (u >= 0) & (u < view.width * depth) & (v >= 0) & (v < view.height * depth)
-    return float(inside.mean())
 
 
 def _in_order(views: Sequence[View]) -> list[View]:
@@ -270,15 +249,7 @@ def flight_frames(
     depth: bool = False,
     progress: Progress = silent,
 ) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
-    """The frames of a path: of one model, or of two side by side.
-
-    Args:
-        renderers: One model, or two.
-        names: The models' names, shown when there are two.
-        path: The cameras.
-        depth: Show depth, not colour.
-        progress: Called with the stage and the fraction done.
-    """
+    """The frames of a path: of one model, or of two side by side with their names."""
     if depth:
         some = path[:: max(1, len(path) // DEPTH_SAMPLES)]
         limits = usual_range(nearness(np.stack([renderers[0].depth(view) for view in some])))
@@ -292,13 +263,7 @@ def flight_frames(
 
 
 def even_size(width: int, height: int, most: int | None = None) -> tuple[int, int]:
-    """The nearest size that H.264 allows, both sides even.
-
-    Args:
-        width: Pixels.
-        height: Pixels.
-        most: Limit of the longer side; unlimited when left out.
-    """
+    """The nearest size that H.264 allows, both sides even, the longer one at most ``most``."""
     scale = min(1.0, most / max(width, height)) if most else 1.0
     width, height = (max(2, 2 * round(scale * side / 2)) for side in (width, height))
     return width, height

@@ -44,13 +44,9 @@ LIMIT = 0.1
 def preview_maps(
     scene: Scene, maps: Sequence[StereoMap], path: Path | str, *, most: int = 4
 ) -> Path:
-    """Write a page with a row of ``map_tiles`` for a few maps, evenly chosen.
+    """Write a page with a row of ``map_tiles`` for at most so many of the maps, evenly chosen.
 
-    Args:
-        scene: The scene of the photographs; grey stands in for one that cannot be read.
-        maps: At least one.
-        path: The PNG to write.
-        most: The most rows.
+    Grey stands in for a photograph that cannot be read.
     """
     by_name = {image.name: image for image in scene.images}
     places = np.linspace(0, len(maps) - 1, min(most, len(maps)))
@@ -97,12 +93,7 @@ def preview_depth(scene: Scene, alignments: Mapping[str, Alignment], path: Path)
 
     A row shows an image's photograph, its depth, and its SfM points on the photograph, coloured by
     |depth of the map / depth of the point - 1|. The rows are the best and the worst aligned image,
-    a typical one, and one that was left out, if there are such.
-
-    Args:
-        scene: A scene with depth maps.
-        alignments: The alignments of its images, by name; at least one.
-        path: The PNG to write.
+    a typical one, and one that was left out, if there are such. Alignments are by name.
     """
     by_name, visibility = {image.name: image for image in scene.images}, find_visibility(scene)
     used = sorted(

@@ -64,15 +64,7 @@ def canvas_view(
     size: tuple[int, int],
     frame: TrainingFrame,
 ) -> View:
-    """A browser's camera in the scene's world.
-
-    Args:
-        wxyz: Rotation stage_from_cam.
-        position: The camera's centre on the stage.
-        fov: Vertical field of view, radians.
-        size: Width and height of the picture to draw.
-        frame: From the scene's world to the stage.
-    """
+    """A browser's camera in the scene's world: its pose is on the stage, its fov vertical."""
     cam_from_world = np.eye(4)
     cam_from_world[:3, :3] = rotation_from_quat(np.asarray(wxyz, np.float64)).T
     center = np.asarray(position, np.float64) / frame.scale + frame.origin
@@ -116,13 +108,7 @@ def laid_onto(
 
 
 class Entry:
-    """Something the user opened, and the pictures that can be made of it.
-
-    Args:
-        shown: The scene, model or both.
-        frame: The stage, on which models are rendered.
-        device: Where to render; the CPU when left out.
-    """
+    """Something the user opened, and the pictures that can be made of it on its stage."""
 
     def __init__(
         self, shown: Shown, frame: TrainingFrame, device: torch.device | None = None

@@ -67,13 +67,9 @@ def free_port(host: str, port: int) -> int:
 
 
 class Viewer:
-    """Serves what was opened.
+    """Serves what was opened on a port that ``free_port`` returned.
 
-    Args:
-        entries: What to show; the first decides where browsers begin.
-        host: The address to listen on.
-        port: The port that ``free_port`` returned.
-        beside: The entry that a browser begins with beside the first.
+    Browsers begin where the first entry shows most, with ``beside`` beside it.
 
     Raises:
         MissingDependencyError: viser is absent.
@@ -135,16 +131,13 @@ class Viewer:
             camera = choose_camera(scene) if image is None else image.camera
             cameras = [each.camera for each in scene.images] or [camera]
             up = -np.mean([each.cam_from_world[1, :3] for each in cameras], axis=0)
-            fov = fitted_fov(camera, 1.5)
-            _, position = stage_pose(camera, frame)
-            ahead = camera.world_from_cam[:3, 2]
-            if not entry.has_model:  # its cameras are shown too
-                position = position - STEP_BACK * ahead
+            fov, (_, position) = fitted_fov(camera, 1.5), stage_pose(camera, frame)
+            step = 0.0 if entry.has_model else STEP_BACK  # its cameras are shown too
+            position = position - step * camera.world_from_cam[:3, 2]
         else:
-            (view,) = orbit([], entry.shown.model, 1, (600, 400))
-            pose = view.cam_from_world
-            up, ahead, fov = np.array([0.0, -1.0, 0.0]), pose[2, :3], 0.9
-            position = (-pose[:3, :3].T @ pose[:3, 3] - frame.origin) * frame.scale
+            camera = orbit([], entry.shown.model, 1, (600, 400))[0].camera
+            up, fov, (_, position) = np.array([0.0, -1.0, 0.0]), 0.9, stage_pose(camera, frame)
+        ahead = camera.world_from_cam[:3, 2]
         self.server.scene.set_up_direction(tuple(up / np.linalg.norm(up)))
         start = self.server.initial_camera
         start.position, start.look_at = tuple(position), tuple(position + ahead)

@@ -62,11 +62,7 @@ _LOG = logging.getLogger(__name__)
 
 
 class FrameLoop:
-    """Draws a frame after each call of ``change``.
-
-    Args:
-        draw: Draws and sends a picture at a scale; returns the number of pixels drawn, 0 for none.
-    """
+    """Draws a frame after each call of ``change``: ``draw`` returns its pixels, 0 for none."""
 
     def __init__(self, draw: Callable[[float], int]) -> None:
         self._draw = draw
@@ -115,12 +111,9 @@ class FrameLoop:
 
 
 class Session:
-    """A browser's view of the entries.
+    """A browser's view of what was opened; viser's ``client`` is its handle.
 
-    Args:
-        client: viser's handle of the browser.
-        entries: What was opened; at least one.
-        beside: The entry whose model is shown beside that of the first, from the beginning.
+    The model of ``beside`` is shown beside that of the first entry, from the beginning.
     """
 
     def __init__(self, client: Any, entries: list[Entry], beside: Entry | None = None) -> None:
@@ -208,7 +201,7 @@ class Session:
 
     def _changed(self) -> None:
         self._split.visible = self._second.value != NO_SECOND
-        self._loop.change()
+        self.refresh()
 
     # The stage ----------------------------------------------------------------------------------
 
@@ -337,7 +330,7 @@ class Session:
                 camera.position = (1 - ease) * origin + ease * position
                 camera.fov = (1 - ease) * first + ease * fov
             time.sleep(FLIGHT_SECONDS / FLIGHT_STEPS)
-        self._loop.change()
+        self.refresh()
 
     @property
     def at(self) -> Image | None:
@@ -367,18 +360,16 @@ class Session:
         self._show_cameras()
         asked = [(self._entry, kind)] if kind != NOTHING else []
         asked += [second] if second is not None else []
-        if not asked:
-            self._show(None, 0)
-            self._say("")
-            return 0
         canvas, at = self._canvas(scale), self.at
         drawn = [entry.draw(kind, canvas, at, quick=scale < 1) for entry, kind in asked]
         self._say(" ".join(dict.fromkeys(why for _, why in drawn if why)))
-        picture = drawn[0][0]
+        picture = drawn[0][0] if drawn else None
         if second is not None:
             picture = self._joined([(None, ""), *drawn][-2:], canvas, named=scale == 1)
-        self._show(picture, JPEG_STILL if scale == 1 else JPEG_MOVING)
-        return canvas.width * canvas.height
+        self._picture, quality = picture, JPEG_STILL if scale == 1 else JPEG_MOVING
+        self._client.scene.set_background_image(picture, format="jpeg", jpeg_quality=quality)
+        self._client.flush()
+        return canvas.width * canvas.height if drawn else 0
 
     def _canvas(self, scale: float) -> View:
         camera = self._client.camera
@@ -395,12 +386,6 @@ class Session:
             names = (f"{self._entry.name}: {names[0]}", names[1])
         names = names if named else ("", "")  # letters would be huge in a coarse picture
         return split_picture(left, right, *names, at=float(self._split.value))
-
-    def _show(self, picture: np.ndarray | None, quality: int) -> None:
-        self._picture = picture
-        scene = self._client.scene
-        scene.set_background_image(picture, format="jpeg", jpeg_quality=quality or None)
-        self._client.flush()
 
     def _say(self, text: str) -> None:
         shown = visible(text)
