@@ -65,14 +65,6 @@ def test_points_behind_beside_and_nowhere_are_left_out():
         assert (render_points(cloud, CAMERA, background=(9, 8, 7)) == [9, 8, 7]).all()
 
 
-def test_scale_changes_the_size_and_keeps_the_place():
-    picture = render_points(_cloud(_at(10, 20, 2.0), RED), CAMERA, point_size=2, scale=2.5)
-    assert picture.shape == (75, 100, 3)
-    row, column = np.argwhere((picture != 255).any(axis=2)).mean(axis=0) + 0.5
-    assert row == pytest.approx(20.5 * 2.5, abs=0.5)
-    assert column == pytest.approx(10.5 * 2.5, abs=0.5)
-
-
 def test_drawing_matches_a_loop_over_points(rng):
     """The nearer hides the farther, and is larger, up to a limit."""
     xyz = CAMERA.unproject(rng.uniform([-2, -2], [42, 32], (200, 2)), rng.uniform(1, 9, 200))

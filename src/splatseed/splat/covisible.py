@@ -45,13 +45,7 @@ def find_covisible(
 ) -> dict[str, Bool[np.ndarray, "rows cols"]]:
     """The cells of each test view that at least two training views see, by the view's name.
 
-    Args:
-        scene: Provides cameras, points and depth maps.
-        test_every: Every ``test_every``-th image, sorted by name, is a test view.
-        progress: Called with the stage and the fraction done.
-
-    Returns:
-        Nothing if the scene has neither points nor depth maps.
+    Every ``test_every``-th image is a test view; none if there are neither points nor depth maps.
 
     Raises:
         SceneFormatError: A depth map is damaged.

@@ -106,20 +106,17 @@ def _score(
             fix="Render views at their own width and height, of a model whose values are finite.",
         )
     image, photograph = image.clamp(0.0, 1.0), photograph_of(view, image.device)
-    score = ViewScore(
+    within = None
+    if seen is not None and seen.any():
+        within = psnr(image, photograph, torch.from_numpy(seen).to(image.device))
+    return ViewScore(
         view.name,
         psnr=psnr(image, photograph),
         ssim=ssim_of_all(image, photograph),
         lpips=None if lpips is None else lpips(image, photograph),
         seconds=seconds,
-    )
-    if seen is None:
-        return score
-    within = psnr(image, photograph, torch.from_numpy(seen).to(image.device))
-    return dataclasses.replace(
-        score,
-        covisible_psnr=within if seen.any() else None,
-        covisible_share=float(seen.mean()),
+        covisible_psnr=within,
+        covisible_share=None if seen is None else float(seen.mean()),
     )
 
 
@@ -166,7 +163,7 @@ def load_model(
             they must be the same.
         device: Where to render; the CPU when left out.
         cache_dir: Where smaller photographs are cached; nowhere when left out.
-        progress: Called with the stage and the fraction done.
+        progress: Told how far it is.
 
     Raises:
         SceneNotFoundError: The model, the scene or its images are missing.

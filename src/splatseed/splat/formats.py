@@ -151,12 +151,7 @@ def read_model(path: Path) -> Gaussians:
 
 
 def write_model(path: Path, gaussians: Gaussians, progress: Progress = silent) -> None:
-    """Write Gaussians in the format that the file name asks for, replacing a file at ``path``.
-
-    Args:
-        path: The file.
-        gaussians: At least one, with finite positions.
-        progress: Called with the stage and the fraction done.
+    """Write at least one Gaussian, at finite positions, in the format that the file name asks for.
 
     Raises:
         ParameterError: The suffix belongs to no format written here.

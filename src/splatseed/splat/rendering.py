@@ -58,12 +58,9 @@ def camera_of(view: View, device: torch.device) -> CameraTensors:
 def render_view(
     params: Mapping[str, Tensor] | torch.nn.ParameterDict, view: View, sh_degree: int
 ) -> tuple[Float[Tensor, "H W 3"], dict[str, Any]]:
-    """The render of a view, and the rasteriser's ``info``.
+    """The render of a view, in the frame of its camera, and the rasteriser's ``info``.
 
-    Args:
-        params: The parameter dict, in the frame of the view's camera.
-        view: The view whose camera is used.
-        sh_degree: Degree of spherical harmonics in use; coefficients beyond it are ignored.
+    Coefficients of harmonics beyond ``sh_degree`` are ignored.
     """
     images, _, info = _rasterize(params, view, sh_degree)
     return images, info
@@ -112,12 +109,9 @@ def _rasterize(
 
 
 class ModelRenderer:
-    """Renders Gaussians of the world, without gradients.
+    """Renders Gaussians of the world, without gradients, on a device, by default the CPU.
 
-    Args:
-        gaussians: In world coordinates.
-        frame: The frame to render in: near planes and single precision work there.
-        device: Where to render; the CPU when left out.
+    In ``frame`` near planes and single precision work.
     """
 
     def __init__(

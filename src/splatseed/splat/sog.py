@@ -230,7 +230,7 @@ def palette(
 def _spread(
     vectors: Float32[np.ndarray, "N D"], order: Int64[np.ndarray, "G M"]
 ) -> Float32[np.ndarray, "G M"]:
-    """Where each vector lies along the principal direction of its group (power iteration)."""
+    """Where each vector lies along the principal direction of its group."""
     along = np.empty(order.shape, np.float32)
     step = max(1, 2**20 // order.shape[1])
     for first in range(0, len(order), step):

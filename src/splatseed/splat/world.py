@@ -16,7 +16,6 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
 
 from splatseed.errors import ParameterError, SceneFormatError
 from splatseed.io.files import read_json
@@ -156,11 +155,7 @@ def _of_cameras(path: Path, cameras: list[Any], scene: Scene) -> Similarity:
 
 
 def _of_gsplat(scene: Scene) -> Similarity:
-    """How gsplat's examples (1.5, examples/datasets/normalize.py) normalise a COLMAP scene.
-
-    Cameras are turned upright, moved and scaled; then points are rotated onto their principal axes,
-    and flipped if more of them lie above the mean than below.
-    """
+    """How gsplat's examples (1.5, examples/datasets/normalize.py) normalise a COLMAP scene."""
     xyz = scene.points.xyz[scene.points.finite].astype(np.float64)
     if len(xyz) < 3 or not scene.images:
         raise ParameterError(
@@ -168,10 +163,25 @@ def _of_gsplat(scene: Scene) -> Similarity:
             found=f"{len(xyz)} points, {len(scene.images)} cameras",
             fix="Name a file with the transform.",
         )
-    first = _upright(np.stack([image.camera.world_from_cam for image in scene.images]))
+    world_from_cam = np.stack([image.camera.world_from_cam for image in scene.images])
+    # Mean up direction to -y, by Rodrigues' rotation that takes one unit vector to another.
+    up = -world_from_cam[:, :3, 1].mean(axis=0)
+    up /= np.linalg.norm(up)
+    skew = np.cross(np.eye(3), np.cross(up, [0.0, -1.0, 0.0]))
+    rotation = np.diag([-1.0, 1.0, 1.0])
+    if up[1] < 1:
+        rotation = np.eye(3) + skew + skew @ skew / (1 - up[1])
+    # The point that cameras look at to 0, of each axis the nearest to the origin; median camera
+    # distance to 1.
+    forward = world_from_cam[:, :3, 2] @ rotation.T
+    centers = world_from_cam[:, :3, 3] @ rotation.T
+    nearest = centers - (forward * centers).sum(axis=1, keepdims=True) * forward
+    shift = -np.median(nearest, axis=0)
+    scale = 1.0 / np.median(np.linalg.norm(centers + shift, axis=1))
+    first = scale * np.column_stack([rotation, shift])
     xyz1 = np.vstack([xyz.T, np.ones(len(xyz))])
     upright = first @ xyz1
-    # The median to 0, the axis of least spread to z.
+    # The median of the points to 0, the axis of their least spread to z, most of them below.
     center = np.median(upright, axis=1)
     axes = np.linalg.eigh(np.cov(upright - center[:, None]))[1][:, ::-1].T.copy()
     axes[0] *= np.sign(np.linalg.det(axes))
@@ -182,21 +192,3 @@ def _of_gsplat(scene: Scene) -> Similarity:
     world = similarity_of(matrix)
     assert world is not None  # noqa: S101  (rotations and one scale)
     return world
-
-
-def _upright(world_from_cam: Float64[np.ndarray, "V 4 4"]) -> Float64[np.ndarray, "3 4"]:
-    """Mean up direction to -y, the point that cameras look at to 0, median camera distance to 1."""
-    up = -world_from_cam[:, :3, 1].mean(axis=0)
-    up /= np.linalg.norm(up)
-    # Rodrigues: the rotation that takes one unit vector to another
-    skew = np.cross(np.eye(3), np.cross(up, [0.0, -1.0, 0.0]))
-    rotation = np.diag([-1.0, 1.0, 1.0])
-    if up[1] < 1:
-        rotation = np.eye(3) + skew + skew @ skew / (1 - up[1])
-    forward = world_from_cam[:, :3, 2] @ rotation.T
-    centers = world_from_cam[:, :3, 3] @ rotation.T
-    # The point of each camera's axis that is nearest to the origin.
-    nearest = centers - (forward * centers).sum(axis=1, keepdims=True) * forward
-    shift = -np.median(nearest, axis=0)
-    scale = 1.0 / np.median(np.linalg.norm(centers + shift, axis=1))
-    return np.asarray(scale * np.column_stack([rotation, shift]))
