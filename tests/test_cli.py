@@ -92,14 +92,14 @@ SLOW_WRITER = """
 import signal, sys, time
 from pathlib import Path
 from splatseed.cli import main
-from splatseed.io.colmap import binary as colmap_binary
+from splatseed.io import colmap
 
 def write(path, points, tracks=None):
     Path(path).write_bytes(b"half")
     print("writing", flush=True)
     time.sleep(60)
 
-colmap_binary.write_points3d = write
+colmap.write_points3d = write
 # A suite that runs in the background of a shell has Ctrl-C ignored, and its children inherit it.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 main()

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from splatseed.commands import info
-from splatseed.io import load_scene
-from splatseed.io.colmap import binary as colmap_binary
+from splatseed.io import colmap, load_scene
 from splatseed.io.ply import write_ply
 from splatseed.pointcloud import PointCloud
 
@@ -226,7 +225,7 @@ def _fail_halfway(monkeypatch, error):
         Path(path).write_bytes(b"half")
         raise error
 
-    monkeypatch.setattr(colmap_binary, "write_points3d", write)
+    monkeypatch.setattr(colmap, "write_points3d", write)
 
 
 def test_memory_that_ran_out_is_said_so_whatever_the_error_says(splatseed, monkeypatch):

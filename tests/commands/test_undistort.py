@@ -14,7 +14,7 @@ pytest.importorskip("pycolmap", reason="needs pycolmap")
 from splatseed.camera import Intrinsics
 from splatseed.errors import SceneFormatError
 from splatseed.io import load_scene, write_scene
-from splatseed.io.colmap.binary import write_images
+from splatseed.io.colmap import write_images
 from splatseed.io.seeds import saw_all_photographs, was_upsampled
 from splatseed.views.view import check_lens, load_views
 

@@ -15,7 +15,7 @@ from hypothesis.extra import numpy as hnp
 from PIL import Image as PilImage
 
 from splatseed.camera import CAMERA_MODELS, Intrinsics
-from splatseed.io.colmap import binary as colmap_binary
+from splatseed.io import colmap
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Observations, Tracks
 
@@ -132,9 +132,9 @@ def scene_dir(tmp_path, model) -> Path:
     """The model as a scene folder with its photographs."""
     root = tmp_path / "scene"
     (root / "sparse" / "0").mkdir(parents=True)
-    colmap_binary.write_cameras(root / "sparse/0/cameras.bin", model.intrinsics)
-    colmap_binary.write_images(root / "sparse/0/images.bin", model.images)
-    colmap_binary.write_points3d(root / "sparse/0/points3D.bin", model.points, model.tracks)
+    colmap.write_cameras(root / "sparse/0/cameras.bin", model.intrinsics)
+    colmap.write_images(root / "sparse/0/images.bin", model.images)
+    colmap.write_points3d(root / "sparse/0/points3D.bin", model.points, model.tracks)
     for image in model.images:
         path = root / "images" / image.name
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -24,12 +24,12 @@ from splatseed.errors import (
 from splatseed.io import find_depths, load_scene
 from splatseed.io.dense import (
     depth_along,
+    scaled_K,
     write_consistency_graph,
     write_dense_maps,
     write_dense_workspace,
     write_map,
 )
-from splatseed.io.dense_model import scaled_K
 from splatseed.io.depth_files import read_stored
 from splatseed.io.ply import read_ply
 from splatseed.synthetic import make_capture, write_capture

@@ -13,7 +13,7 @@ from PIL import Image as PilImage
 
 from splatseed.camera import Intrinsics
 from splatseed.errors import SplatseedError
-from splatseed.io.colmap import binary as colmap_binary, text as colmap_text
+from splatseed.io import colmap
 from splatseed.io.depth_files import read_stored
 from splatseed.io.depth_maps import read_capture_scale, read_description
 from splatseed.io.ply import read_ply, write_ply
@@ -23,12 +23,12 @@ from .fuzzing import assert_only_our_errors
 
 CAMERAS = (Intrinsics(7, "PINHOLE", 64, 48, (50.0, 50.0, 32.0, 24.0)),)
 READERS: dict[str, Callable[[Path], object]] = {
-    "cameras.bin": colmap_binary.read_cameras,
-    "images.bin": lambda path: colmap_binary.read_images(path, CAMERAS),
-    "points3D.bin": colmap_binary.read_points3d,
-    "cameras.txt": colmap_text.read_cameras,
-    "images.txt": lambda path: colmap_text.read_images(path, CAMERAS),
-    "points3D.txt": colmap_text.read_points3d,
+    "cameras.bin": colmap.read_cameras,
+    "images.bin": lambda path: colmap.read_images(path, CAMERAS),
+    "points3D.bin": colmap.read_points3d,
+    "cameras.txt": colmap.read_cameras,
+    "images.txt": lambda path: colmap.read_images(path, CAMERAS),
+    "points3D.txt": colmap.read_points3d,
     "little.ply": read_ply,
     "big.ply": read_ply,
     "ascii.ply": read_ply,
@@ -80,12 +80,12 @@ def valid(tmp_path_factory) -> dict[str, bytes]:
     )
     (folder / "images.txt").write_text(image)
     (folder / "points3D.txt").write_text("9 1 2 3 4 5 6 .5 3 1\n12 1 nan 3 4 5 6 -1\n")
-    points, tracks = colmap_text.read_points3d(folder / "points3D.txt")
-    cameras = colmap_text.read_cameras(folder / "cameras.txt")
-    images = colmap_text.read_images(folder / "images.txt", CAMERAS)
-    colmap_binary.write_cameras(folder / "cameras.bin", cameras)
-    colmap_binary.write_images(folder / "images.bin", images)
-    colmap_binary.write_points3d(folder / "points3D.bin", points, tracks)
+    points, tracks = colmap.read_points3d(folder / "points3D.txt")
+    cameras = colmap.read_cameras(folder / "cameras.txt")
+    images = colmap.read_images(folder / "images.txt", CAMERAS)
+    colmap.write_cameras(folder / "cameras.bin", cameras)
+    colmap.write_images(folder / "images.bin", images)
+    colmap.write_points3d(folder / "points3D.bin", points, tracks)
     write_ply(folder / "little.ply", points)
     rows = [(1, 2, 3, 200, 3, 4)] * 2
     faces = b"\x03" + np.array([0, 1, 1], ">i4").tobytes()

@@ -19,8 +19,7 @@ import splatseed
 from splatseed.bench.plan_file import read_plan
 from splatseed.commands.train import parse
 from splatseed.errors import OutputError, SceneFormatError, SceneNotFoundError
-from splatseed.io import files, load_originals, load_scene, write_scene
-from splatseed.io.colmap import binary as colmap_binary
+from splatseed.io import colmap, files, load_originals, load_scene, write_scene
 from splatseed.io.depth_files import read_stored
 from splatseed.io.files import open_file, read_file
 from splatseed.io.photograph import photograph_bytes
@@ -126,7 +125,7 @@ def test_a_file_larger_than_the_memory_is_not_read(tmp_path, monkeypatch):
 
 def _rename(scene_dir, model, name):
     images = [dataclasses.replace(model.images[0], name=name), *model.images[1:]]
-    colmap_binary.write_images(scene_dir / "sparse/0/images.bin", images)
+    colmap.write_images(scene_dir / "sparse/0/images.bin", images)
 
 
 @pytest.mark.parametrize("name", ["../../x.jpg", "/dev/zero", "/etc/hostname"])

@@ -13,8 +13,7 @@ import pytest
 from PIL import Image as PilImage
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
-from splatseed.io import load_scene
-from splatseed.io.colmap import binary as colmap_binary
+from splatseed.io import colmap, load_scene
 from splatseed.io.ply import write_ply
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import LeftOut
@@ -23,7 +22,7 @@ from splatseed.scene import LeftOut
 def rewrite_points(scene_dir, xyz):
     rgb = np.zeros((len(xyz), 3), np.uint8)
     path = scene_dir / "sparse/0/points3D.bin"
-    colmap_binary.write_points3d(path, PointCloud(np.asarray(xyz, np.float64), rgb), None)
+    colmap.write_points3d(path, PointCloud(np.asarray(xyz, np.float64), rgb), None)
 
 
 def warnings_of(path):
@@ -208,7 +207,7 @@ def test_images_without_their_own_folder_are_found_in_the_root(scene_dir, model)
 
 def test_system_errors_become_ours(scene_dir, model):
     images = [replace(im, name=f"{i}{'n' * 5000}") for i, im in enumerate(model.images)]
-    colmap_binary.write_images(scene_dir / "sparse/0/images.bin", images)
+    colmap.write_images(scene_dir / "sparse/0/images.bin", images)
     with pytest.raises(SceneFormatError, match="too long"):
         load_scene(scene_dir)
 

@@ -2,35 +2,16 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 
 from splatseed.depth.alignment import align_map
 from splatseed.depthmap import DepthMap
-from splatseed.errors import SceneFormatError
 from splatseed.io.cleaning import clean_scene, cloud_warnings
-from splatseed.io.colmap import binary as colmap_binary
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
 from splatseed.upsample import upsample
 from splatseed.views.visibility import camera_points
-
-
-@pytest.mark.parametrize("focal", [0.0, -500.0])
-def test_a_focal_length_of_0_or_below(focal, model, tmp_path):
-    camera = dataclasses.replace(model.intrinsics[0], params=(500.0, focal, 320.0, 240.0))
-    colmap_binary.write_cameras(tmp_path / "cameras.bin", (camera,))
-    with pytest.raises(SceneFormatError, match=rf"focal length above 0 .*found 500, {focal:g}"):
-        colmap_binary.read_cameras(tmp_path / "cameras.bin")
-
-
-def test_one_image_name_twice(model, tmp_path):
-    images = (*model.images[:3], dataclasses.replace(model.images[3], name=model.images[1].name))
-    colmap_binary.write_images(tmp_path / "images.bin", images)
-    with pytest.raises(SceneFormatError, match=r"name once .*image001\.jpg a second time"):
-        colmap_binary.read_images(tmp_path / "images.bin", model.intrinsics)
 
 
 def test_a_depth_map_of_one_value(model):

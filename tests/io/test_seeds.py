@@ -11,8 +11,7 @@ from hypothesis.extra import numpy as hnp
 
 from splatseed import load_scene, upsample, write_scene
 from splatseed.errors import SceneNotFoundError
-from splatseed.io import load_originals
-from splatseed.io.colmap import binary as colmap_binary
+from splatseed.io import colmap, load_originals
 from splatseed.io.seeds import SEEDS, _read_seeds, saw_all_photographs, was_upsampled, write_seeds
 from splatseed.pointcloud import ATTRIBUTES, GENERATED, PointCloud
 from splatseed.progress import silent
@@ -104,11 +103,11 @@ def test_a_file_of_other_points_is_left_aside_and_told_of(scene, tmp_path):
     seeds = scene.points.replace(sizes=np.ones(len(scene.points)))
     out = write_scene(scene.replace(points=seeds), tmp_path / "out").path
     model = out / "sparse/0/points3D.bin"
-    points, tracks = colmap_binary.read_points3d(model)
-    colmap_binary.write_points3d(model, points.replace(rgb=255 - points.rgb), tracks)
+    points, tracks = colmap.read_points3d(model)
+    colmap.write_points3d(model, points.replace(rgb=255 - points.rgb), tracks)
     assert load_scene(out).points.sizes is not None  # another colour, the same place
     other = points.select(slice(None, None, -1))
-    colmap_binary.write_points3d(model, other, None)
+    colmap.write_points3d(model, other, None)
     again = load_scene(out)
     assert again.points.sizes is None
     assert [w for w in again.warnings if SEEDS in w and "other points" in w]

@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 
 from splatseed.errors import OutputError, PointCloudError
-from splatseed.io import layouts, load_scene, write_scene
-from splatseed.io.colmap import binary as colmap_binary
+from splatseed.io import colmap, load_scene, write, write_scene
 from splatseed.io.ply import read_ply, write_ply
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Observations, Scene
@@ -36,7 +35,7 @@ def check_consistent(folder, scene, num_points):
     reconstruction = pycolmap.Reconstruction(str(folder / "sparse/0"))
     assert sorted(reconstruction.points3D) == list(range(1, num_points + 1))
     assert len(reconstruction.images) == len(scene.images)
-    points, tracks = colmap_binary.read_points3d(folder / "sparse/0/points3D.bin")
+    points, tracks = colmap.read_points3d(folder / "sparse/0/points3D.bin")
     images = load_scene(folder).images
     observed = {im.image_id: im.observations.point_ids for im in images}
     owner = np.repeat(tracks.point_ids, tracks.lengths)
@@ -98,7 +97,7 @@ def test_unusable_points_are_dropped_with_their_observations(scene_dir, tmp_path
     xyz[2], xyz[5], xyz[7] = np.nan, xyz[1], np.inf
     broken = replace(model.tracks, xyz=xyz)
     points = PointCloud(xyz, model.points.rgb)
-    colmap_binary.write_points3d(scene_dir / "sparse/0/points3D.bin", points, broken)
+    colmap.write_points3d(scene_dir / "sparse/0/points3D.bin", points, broken)
     scene = more_points(load_scene(scene_dir), rng, 3)
     again = PointCloud.concatenate(scene.points, scene.points.select(np.array([7, 0])))
     report = write_scene(scene.replace(points=again), tmp_path / "out")
@@ -258,7 +257,7 @@ def test_an_interrupted_or_full_disk_leaves_nothing(
         path.write_bytes(b"half")
         raise failure
 
-    monkeypatch.setattr(layouts, function, fail)
+    monkeypatch.setattr(write, function, fail)
     form = "transforms" if function == "write_json" else "colmap"
     expected = OutputError if isinstance(failure, OSError) else KeyboardInterrupt
     scene = load_scene(scene_dir)

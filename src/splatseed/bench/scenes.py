@@ -23,8 +23,8 @@ from splatseed.depthmap import DepthMaps
 from splatseed.errors import SceneNotFoundError
 from splatseed.io import find_depths, load_originals
 from splatseed.io.clouds import open_cloud
-from splatseed.io.depth_search import search_depths
 from splatseed.io.files import open_file
+from splatseed.io.load import search_depths
 from splatseed.io.photograph import open_photograph, photograph_bytes
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene

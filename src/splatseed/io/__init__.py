@@ -8,8 +8,7 @@ this package loads neither Numba nor SciPy.
 
 from splatseed.io.cleaning import clean_scene
 from splatseed.io.depth_maps import DepthFiles, DepthWriter, depth_folder
-from splatseed.io.depth_search import find_depths
-from splatseed.io.load import load_originals, load_scene
+from splatseed.io.load import find_depths, load_originals, load_scene
 from splatseed.io.write import WriteReport, write_scene
 
 __all__ = [

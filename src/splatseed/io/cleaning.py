@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from splatseed.errors import ParameterError
-from splatseed.io.colmap.model import without_points
+from splatseed.io.model import without_points
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import LeftOut, Scene
 

@@ -1,18 +1,19 @@
-"""Clouds from elsewhere: what every reader offers, and what readers share.
+"""Clouds from elsewhere: what every reader offers, and tables of rows and of lines.
 
-Notation: a *row* is one point of a file; a *column* is a function from a column's name to its
-values in some rows; *full* is the value that means 255: 1, 255 or 65535. Formats with 16-bit
-colours are filled with 8-bit values by many writers, so the values decide, not the type.
-Promise: a file is never held in memory whole where its format permits reading in parts; ranges of
-colours are found in a sample before the first chunk, so that chunks of any size give the same
-points; colours beyond the range are clipped, and what is not a number becomes mid grey.
+Notation: a *row* is one point of a file; a *block* is some rows as values by the names of columns;
+*full* is the value that means 255: 1, 255 or 65535. Formats with 16-bit colours are filled with
+8-bit values by many writers, so the values decide, not the type. Promise: a file is never held in
+memory whole where its format permits reading in parts; ranges of colours are found in a sample
+before the first chunk, so that chunks of any size give the same points; colours beyond the range
+are clipped, and what is not a number becomes mid grey.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
@@ -24,20 +25,20 @@ from splatseed.io.files import COPY_AGAIN, open_file
 
 CHUNK = 1 << 20
 """Rows read at once unless the caller says otherwise: 50 to 100 MB while they are read."""
-Colors: TypeAlias = Literal["rgb", "intensity", "none"]
-"""Where the colours of a file's chunks come from."""
-Column: TypeAlias = Callable[[str], Any]
+Block: TypeAlias = Mapping[str, Any] | np.ndarray
 XYZ = ("x", "y", "z")
-RGB_NAMES = (
-    ("red", "green", "blue"),
-    ("diffuse_red", "diffuse_green", "diffuse_blue"),
-    ("r", "g", "b"),
-)
+RGB = ("red", "green", "blue")
+PACKED = "packed rgb"
+"""The column of colours in four bytes: blue, green, red, and one that is not used."""
 SAMPLES, SAMPLE_ROWS, SAMPLE_BYTES = 16, 4096, 1 << 16
 """Places in a file that are looked at to find ranges, and rows, or bytes of text, at each."""
 
 _SH_NAMES = ("f_dc_0", "f_dc_1", "f_dc_2")
 _SH0 = 0.28209479177387814  # 1 / (2 sqrt(pi)); colour = 0.5 + SH0 * f_dc in 3DGS
+_RGB_NAMES = (
+    *((PACKED,), RGB, ("diffuse_red", "diffuse_green", "diffuse_blue")),
+    *(("r", "g", "b"), _SH_NAMES),
+)
 _INTENSITY_NAMES = (
     *("intensity", "scalar_intensity", "scalar_Intensity", "Intensity"),
     *("reflectance", "scalar_Reflectance"),
@@ -45,7 +46,7 @@ _INTENSITY_NAMES = (
 _GREY = 128
 _DARK, _BRIGHT = 1.0, 99.0
 """Percentiles of intensity that become black and white: single mirrors outshine a whole scan."""
-_BLOCK = 1 << 22
+_TEXT_BYTES = 1 << 22
 """Bytes of text read at once."""
 
 
@@ -77,6 +78,13 @@ class CloudChunk:
 class CloudFile(ABC):
     """A file of points, opened but not read.
 
+    A reader of a format gives ``_blocks`` and ``_sample``.
+
+    Args:
+        path: The file.
+        names: Its columns; those that hold positions and colours are recognised.
+        count: See below.
+
     Attributes:
         path: The file.
         count: Rows that its header promises; None where only reading tells. ``chunks`` may give
@@ -85,105 +93,88 @@ class CloudFile(ABC):
             are what the file claims, and are not checked.
         colors: Where the colours come from.
         warnings: What is odd about the file, one sentence each.
+        used: The columns that are read.
     """
 
-    path: Path
-    count: int | None = None
     bounds: Float64[np.ndarray, "2 3"] | None = None
-    colors: Colors = "none"
     warnings: tuple[str, ...] = ()
+
+    def __init__(self, path: Path, names: Iterable[str], count: int | None = None) -> None:
+        self.path, self.count = path, count
+        there = set(names)
+        self._rgb = next((each for each in _RGB_NAMES if set(each) <= there), ())
+        intensity = next((each for each in _INTENSITY_NAMES if each in there), None)
+        self._intensity = None if self._rgb else intensity
+        self.used = (*XYZ, *self._rgb, *([self._intensity] if self._intensity else []))
+        self._range: tuple[float, float] | None = None
+
+    @abstractmethod
+    def _blocks(self, size: int) -> Iterator[Block]:
+        """The columns that are used, at most ``size`` rows at a time, in file order."""
+
+    @abstractmethod
+    def _sample(self) -> Block:
+        """The same of rows from places spread over the file."""
+
+    @property
+    def colors(self) -> Literal["rgb", "intensity", "none"]:
+        """Where colours come from."""
+        return "rgb" if self._rgb else "intensity" if self._intensity else "none"
 
     @property
     def has_color(self) -> bool:
         """Whether its points have colours, rather than intensity or nothing."""
         return self.colors == "rgb"
 
-    @abstractmethod
     def chunks(self, size: int = CHUNK) -> Iterator[CloudChunk]:
         """The rows in file order, at most ``size`` at a time; no chunk is empty.
 
         Raises:
             SceneFormatError: The file ends early, or a row makes no sense.
         """
+        if self.colors != "none" and self._range is None:
+            self._range = self._range_of(self._sample())
+        for block in self._blocks(size):
+            if len(block["x"]):
+                yield self._chunk(block, self._range)
+
+    def whole(self) -> CloudChunk:
+        """All rows at once, with ranges found in all of them; intensity is not used."""
+        blocks = list(self._blocks(max(self.count or 0, 1)))  # one, or none of no rows
+        if not blocks:
+            return CloudChunk(np.empty((0, 3)))
+        return self._chunk(blocks[0], self._range_of(blocks[0]) if self.has_color else None)
+
+    def _range_of(self, sample: Block) -> tuple[float, float]:
+        """The values that become black and white."""
+        if self._rgb:
+            return 0.0, full_value(_columns(sample, self._rgb))
+        known = np.asarray(sample[str(self._intensity)], np.float64)
+        known = known[np.isfinite(known)]
+        low, high = np.percentile(known, (_DARK, _BRIGHT)) if known.size else (0.0, 1.0)
+        return float(low), float(high) if high > low else float(low) + 1.0
+
+    def _chunk(self, block: Block, between: tuple[float, float] | None) -> CloudChunk:
+        with np.errstate(invalid="ignore", over="ignore"):  # damaged ones may not be finite
+            xyz = np.stack([np.asarray(block[name], np.float64) for name in XYZ], axis=1)
+        if between is None:
+            return CloudChunk(xyz)
+        low, high = between
+        if self._intensity:
+            values = np.asarray(block[self._intensity], np.float64)
+            grey = color_bytes((values - low) / (high - low), 1.0)
+            return CloudChunk(xyz, np.repeat(grey[:, None], 3, axis=1))
+        values = _columns(block, self._rgb)
+        if self._rgb == _SH_NAMES:
+            return CloudChunk(xyz, color_bytes(0.5 + _SH0 * values.astype(np.float64), 1.0))
+        return CloudChunk(xyz, color_bytes(values, high))
 
 
-def check_size(path: Path, needed: int) -> None:
-    """Check that a file has at least ``needed`` bytes.
-
-    Raises:
-        SceneFormatError: It is shorter.
-    """
-    size = path.stat().st_size
-    if size < needed:
-        raise SceneFormatError(
-            f"{path} to have {needed:,} bytes, as its header promises",
-            found=f"{size:,}: the file is cut short",
-            fix=COPY_AGAIN,
-        )
-
-
-@dataclass(frozen=True)
-class Columns:
-    """Which columns of a table hold colours.
-
-    Args:
-        rgb: Names of the three colour columns; empty for none.
-        intensity: Name of the intensity column; None for none, or where there are colours.
-    """
-
-    rgb: tuple[str, ...] = ()
-    intensity: str | None = None
-
-    @classmethod
-    def among(cls, names: Sequence[str]) -> Columns:
-        """The columns that a table with these names has."""
-        rgb = next((each for each in (*RGB_NAMES, _SH_NAMES) if set(each) <= set(names)), ())
-        intensity = next((each for each in _INTENSITY_NAMES if each in names), None)
-        return cls(rgb, None if rgb else intensity)
-
-    @property
-    def colors(self) -> Colors:
-        """Where colours come from."""
-        return "rgb" if self.rgb else "intensity" if self.intensity else "none"
-
-
-class Painter:
-    """Turns columns into colours, with ranges found in a sample.
-
-    Args:
-        columns: Which columns to use.
-        sample: Gives some rows; called if there are colours.
-    """
-
-    def __init__(self, columns: Columns, sample: Callable[[], Column]) -> None:
-        self._columns = columns
-        column = sample() if columns.colors != "none" else None
-        if columns.rgb and column:
-            self._full = full_value(np.stack([column(name) for name in columns.rgb], axis=1))
-        elif columns.intensity and column:
-            known = np.asarray(column(columns.intensity), np.float64)
-            known = known[np.isfinite(known)]
-            low, high = np.percentile(known, (_DARK, _BRIGHT)) if known.size else (0.0, 1.0)
-            self._low, self._high = float(low), float(max(high, low))
-            self._high += self._high == self._low
-
-    def paint(self, column: Column) -> UInt8[np.ndarray, "n 3"] | None:
-        """The colours of some rows; None without any."""
-        if self._columns.rgb == _SH_NAMES:
-            sh0 = np.stack([column(name) for name in _SH_NAMES], axis=1).astype(np.float64)
-            return color_bytes(0.5 + _SH0 * sh0, 1.0)
-        if self._columns.rgb:
-            values = np.stack([column(name) for name in self._columns.rgb], axis=1)
-            return color_bytes(values, self._full)
-        if self._columns.intensity:
-            values = np.asarray(column(self._columns.intensity), np.float64)
-            grey = color_bytes((values - self._low) / (self._high - self._low), 1.0)
-            return np.repeat(grey[:, None], 3, axis=1)
-        return None
-
-    def chunk(self, column: Column) -> CloudChunk:
-        """Some rows with their colours."""
-        return CloudChunk(positions(column), self.paint(column))
+def _columns(block: Block, names: Sequence[str]) -> np.ndarray:
+    """The columns of colours, side by side."""
+    if names == (PACKED,):
+        return np.ascontiguousarray(block[PACKED]).view(np.uint8).reshape(-1, 4)[:, 2::-1]
+    return np.stack([np.asarray(block[name]) for name in names], axis=1)
 
 
 def full_value(sample: Shaped[np.ndarray, "..."]) -> float:
@@ -204,10 +195,15 @@ def color_bytes(values: Shaped[np.ndarray, "..."], full: float) -> UInt8[np.ndar
     return np.asarray(np.clip(np.rint(known), 0, 255).astype(np.uint8))
 
 
-def positions(column: Column, names: Sequence[str] = XYZ) -> Float64[np.ndarray, "n 3"]:
-    """The positions of some rows; damaged ones may not be finite."""
-    with np.errstate(invalid="ignore", over="ignore"):
-        return np.stack([np.asarray(column(name), np.float64) for name in names], axis=1)
+def check_size(path: Path, needed: int) -> None:
+    """Raise a ``SceneFormatError`` for a file of fewer bytes than are needed."""
+    size = path.stat().st_size
+    if size < needed:
+        raise SceneFormatError(
+            f"{path} to have {needed:,} bytes, as its header promises",
+            found=f"{size:,}: the file is cut short",
+            fix=COPY_AGAIN,
+        )
 
 
 def sample_starts(count: int) -> list[int]:
@@ -216,8 +212,7 @@ def sample_starts(count: int) -> list[int]:
     return sorted({last * i // (SAMPLES - 1) for i in range(SAMPLES)}) if count else []
 
 
-@dataclass(frozen=True)
-class RowTable:
+class RowCloud(CloudFile):
     """Binary rows of one length within a file, read by offset.
 
     Args:
@@ -230,29 +225,25 @@ class RowTable:
         SceneFormatError: The file is shorter than that.
     """
 
-    path: Path
-    dtype: np.dtype[Any]
-    offset: int
-    count: int
+    def __init__(self, path: Path, dtype: np.dtype[Any], offset: int, count: int) -> None:
+        super().__init__(path, dtype.names or (), count)
+        check_size(path, offset + count * dtype.itemsize)
+        self.num_rows, self._dtype, self._offset = count, dtype, offset
 
-    def __post_init__(self) -> None:
-        check_size(self.path, self.offset + self.count * self.dtype.itemsize)
+    def _blocks(self, size: int) -> Iterator[np.ndarray]:
+        for start in range(0, self.num_rows, size):
+            yield self.rows(start, size)
 
-    def columns(self, size: int) -> Iterator[Column]:
-        """The rows, at most ``size`` at a time."""
-        for start in range(0, self.count, size):
-            yield self._rows(start, size).__getitem__
+    def _sample(self) -> np.ndarray:
+        parts = [self.rows(start, SAMPLE_ROWS) for start in sample_starts(self.num_rows)]
+        return np.concatenate([np.empty(0, self._dtype), *parts])
 
-    def sample(self) -> Column:
-        """Rows from places spread over the file."""
-        parts = [self._rows(start, SAMPLE_ROWS) for start in sample_starts(self.count)]
-        return np.concatenate([np.empty(0, self.dtype), *parts]).__getitem__
-
-    def _rows(self, start: int, size: int) -> np.ndarray:
-        wanted = min(size, self.count - start)
+    def rows(self, start: int, size: int) -> np.ndarray:
+        """Some rows, fewer at the end."""
+        wanted = min(size, self.num_rows - start)
         with open_file(self.path) as file:
-            file.seek(self.offset + start * self.dtype.itemsize)
-            return np.frombuffer(file.read(wanted * self.dtype.itemsize), self.dtype, wanted)
+            file.seek(self._offset + start * self._dtype.itemsize)
+            return np.frombuffer(file.read(wanted * self._dtype.itemsize), self._dtype, wanted)
 
 
 @dataclass(frozen=True)
@@ -276,8 +267,7 @@ class Dialect:
         )
 
 
-@dataclass(frozen=True)
-class TextTable:
+class LineCloud(CloudFile):
     """Lines of numbers within a file: XYZ, CSV, ascii PLY and PCD, read in blocks of lines.
 
     Empty lines and lines that begin with # are skipped.
@@ -285,51 +275,40 @@ class TextTable:
     Args:
         path: The file.
         names: The names of all columns.
-        used: Those that are read.
         offset: Where the first line begins, in bytes.
         count: How many lines it must have; as many as there are when None.
         dialect: How numbers are written.
-        integers: Columns that hold integers.
+        types: The types of columns that are no floats; ``PACKED`` needs its own.
     """
 
-    path: Path
-    names: Sequence[str]
-    used: Sequence[str]
-    offset: int = 0
-    count: int | None = None
-    dialect: Dialect = Dialect()
-    integers: frozenset[str] = frozenset()
+    def __init__(
+        self,
+        path: Path,
+        names: Sequence[str],
+        offset: int = 0,
+        count: int | None = None,
+        *,
+        dialect: Dialect | None = None,
+        types: Mapping[str, np.dtype[Any]] | None = None,
+    ) -> None:
+        super().__init__(path, names, count)
+        self._places = [names.index(name) for name in self.used]
+        self._offset, self._dialect, self._types = offset, dialect or Dialect(), types or {}
 
-    def columns(self, size: int) -> Iterator[Column]:
-        """The rows, at most ``size`` at a time.
-
-        Raises:
-            SceneFormatError: A word is no number, or lines are missing.
-        """
-        given, held = 0, list[str]()
-        limit = self.count
-        for block in self._blocks():
-            held += block
-            while len(held) >= size and given != limit:
-                lines = held[: size if limit is None else min(size, limit - given)]
-                held = held[len(lines) :]
-                yield self._column(lines, given)
-                given += len(lines)
-            if given == limit:
-                return
-        lines = held if limit is None else held[: limit - given]
-        if limit is not None and given + len(lines) < limit:
+    def _blocks(self, size: int) -> Iterator[Block]:
+        given, lines = 0, islice(chain.from_iterable(self._lines()), self.count)
+        while rows := list(islice(lines, size)):
+            yield self._block(rows, given)
+            given += len(rows)
+        if self.count is not None and given < self.count:
             raise SceneFormatError(
-                f"{limit:,} points in {self.path}, as its header promises",
-                found=f"{given + len(lines):,}: the file is cut short",
+                f"{self.count:,} points in {self.path}, as its header promises",
+                found=f"{given:,}: the file is cut short",
                 fix=COPY_AGAIN,
             )
-        if lines:
-            yield self._column(lines, given)
 
-    def sample(self) -> Column:
-        """Rows from places spread over the file."""
-        first, last = self.offset, self.path.stat().st_size - SAMPLE_BYTES
+    def _sample(self) -> Block:
+        first, last = self._offset, self.path.stat().st_size - SAMPLE_BYTES
         places = {max(first, first + (last - first) * i // (SAMPLES - 1)) for i in range(SAMPLES)}
         lines: list[str] = []
         with open_file(self.path) as file:
@@ -337,42 +316,42 @@ class TextTable:
                 file.seek(place)
                 block = file.read(SAMPLE_BYTES).decode("latin-1").split("\n")
                 lines += _numbers(block[place > first : -1] or block[:1])
-        return self._column(lines[: self.count], 0)
+        return self._block(lines[: self.count], 0)
 
-    def _column(self, lines: Sequence[str], given: int) -> Column:
-        places = [self.names.index(name) for name in self.used]
-        table = np.empty((0, len(places)))
+    def _block(self, lines: Sequence[str], given: int) -> Block:
+        """The columns of some lines, which follow ``given`` others."""
+        table = np.empty((0, len(self._places)))
         try:
-            table = self.dialect.parse(lines, places) if lines else table
+            table = self._dialect.parse(lines, self._places) if lines else table
         except ValueError:
-            raise self._error(lines, places, given) from None
+            raise self._error(lines, given) from None
+        block: dict[str, np.ndarray] = dict(zip(self.used, table.T, strict=True))
+        with np.errstate(invalid="ignore", over="ignore"):
+            for name in block.keys() & self._types.keys():
+                kind = self._types[name]
+                values = block[name] if kind.kind == "f" else block[name].astype(np.int64)
+                block[name] = values.astype(kind)
+        return block
 
-        def column(name: str) -> np.ndarray:
-            values = table[:, self.used.index(name)]
-            with np.errstate(invalid="ignore"):
-                return values.astype(np.int64) if name in self.integers else values
-
-        return column
-
-    def _error(self, lines: Sequence[str], places: list[int], given: int) -> SceneFormatError:
-        """Which of some lines, after ``given`` others, is at fault."""
+    def _error(self, lines: Sequence[str], given: int) -> SceneFormatError:
+        """Which of some lines is at fault."""
         for row, line in enumerate(lines, start=given + 1):
             try:
-                self.dialect.parse([line], places)
+                self._dialect.parse([line], self._places)
             except ValueError:
                 return SceneFormatError(
-                    f"{max(places) + 1} numbers in row {row:,} of {self.path}",
+                    f"{max(self._places) + 1} numbers in row {row:,} of {self.path}",
                     found=repr(line[:80]),
                     fix="Remove the line, or export the cloud again.",
                 )
         return SceneFormatError(f"numbers in {self.path}", found="others", fix=COPY_AGAIN)
 
-    def _blocks(self) -> Iterator[list[str]]:
+    def _lines(self) -> Iterator[list[str]]:
         """The lines of numbers, a block at a time."""
         rest = b""
         with open_file(self.path) as file:
-            file.seek(self.offset)
-            while data := file.read(_BLOCK):
+            file.seek(self._offset)
+            while data := file.read(_TEXT_BYTES):
                 whole, end, rest = (rest + data).rpartition(b"\n")
                 if end:
                     yield _numbers(whole.decode("latin-1").split("\n"))

@@ -6,44 +6,59 @@ COLMAP's image_undistorter lays them out, for its ``stereo_fusion``; COLMAP plac
 row) of a map at (column, row) of its camera, whereas everyone else, its own sparse model included,
 has (column + 0.5, row + 0.5). Files of floats (mvs/mat.h) and consistency graphs
 (mvs/consistency_graph.h), little-endian, begin with the text ``W&H&C&``; a map follows with C x H x
-W float32, one channel after another, a graph with int32: column, row, n and n image indices for
-each pixel that has any. In a plain folder the image ``a/b.jpg`` has ``a/b.jpg.npy``, its planar
-depth, and ``a/b.jpg.stereo.npz`` with the rest.
+W float32, one channel after another, a graph with int32: column, row, n and n image indices (places
+in the model, ascending by id) for each pixel that has any. In a plain folder the image ``a/b.jpg``
+has ``a/b.jpg.npy``, its planar depth, and ``a/b.jpg.stereo.npz`` with the rest.
 
 Promise: depths are those along COLMAP's rays, so fused points lie where the scene has them,
 whatever the size of the maps; a pixel is moved along the plane given by its normal and never mixed
-with its neighbours, so that no depth between two surfaces is invented; a folder appears whole or
-not at all.
+with its neighbours, so that no depth between two surfaces is invented. Photographs are linked,
+copied, or undistorted under their names and file types. The model's points are the originals with
+their tracks; without tracks, points from the maps stand in, because COLMAP learns only from tracks
+which images overlap. A folder appears whole or not at all.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from operator import length_hint
 from pathlib import Path
-from typing import Protocol
+from typing import Any, TypeAlias
 
 import numpy as np
-from jaxtyping import Float32, Float64, UInt8
+from jaxtyping import Bool, Float32, Float64, UInt8
 
-from splatseed.camera import Camera
-from splatseed.errors import ParameterError
-from splatseed.io.dense_model import (
-    OverlapPoints,
-    Size,
-    SparseModel,
-    Undistort,
-    bring_photographs,
-    check_image,
-    photograph_model,
-    scaled_K,
-)
+from splatseed.camera import Camera, Intrinsics
+from splatseed.errors import OutputError, ParameterError, SceneFormatError
+from splatseed.io import colmap
+from splatseed.io.cleaning import clean_scene
 from splatseed.io.depth_maps import depth_folder, safe_parts
-from splatseed.io.photograph import photograph_folder
+from splatseed.io.model import renumber
+from splatseed.io.photograph import (
+    decode_photograph,
+    open_photograph,
+    photograph_bytes,
+    photograph_folder,
+)
 from splatseed.io.staging import MANIFEST, output_folder, write_json
-from splatseed.progress import Progress, silent
-from splatseed.scene import Image, Scene
+from splatseed.io.write import bring, image_folders
+from splatseed.lens import rays_through
+from splatseed.pointcloud import PointCloud
+from splatseed.progress import Progress, in_threads, silent
+from splatseed.scene import Image, Observations, Scene, Tracks
+
+DenseMap: TypeAlias = Any
+"""A ``splatseed.depth.stereo.StereoMap``: name, camera, depth, normal, confidence, sources and
+agreeing of one image."""
+Size = tuple[int, int]
+"""Width and height in pixels."""
+Undistort: TypeAlias = Callable[
+    [UInt8[np.ndarray, "H W 3"], Intrinsics, Float64[np.ndarray, "3 3"]],
+    tuple[UInt8[np.ndarray, "H W 3"], Bool[np.ndarray, "H W"]],
+]
+"""``splatseed.views.undistortion.undistort`` or an equivalent: takes pixels, lens and matrix, and
+returns pixels and which of them are known."""
 
 _MAX_SOURCES = 8
 """``agreeing`` has one bit per source."""
@@ -52,38 +67,10 @@ _MAX_CHANGE = 1.25
 _SAME_POSE = 1e-6
 _KINDS = ("photometric", "geometric")
 """COLMAP's two passes; stereo_fusion reads the second unless told otherwise."""
-
-
-class DenseMap(Protocol):
-    """Depth, normals and confidence of one image; ``splatseed.depth.stereo.StereoMap`` is one."""
-
-    @property
-    def name(self) -> str:
-        """The image's name."""
-
-    @property
-    def camera(self) -> Camera:
-        """The camera, in pixels of this map."""
-
-    @property
-    def depth(self) -> Float32[np.ndarray, "H W"]:
-        """Planar z-depth in scene units; NaN where unknown."""
-
-    @property
-    def normal(self) -> Float32[np.ndarray, "H W 3"]:
-        """Unit normals in camera axes, facing the camera; NaN where unknown."""
-
-    @property
-    def confidence(self) -> Float32[np.ndarray, "H W"]:
-        """Confidence, 0 to 1; 0 where depth is NaN."""
-
-    @property
-    def sources(self) -> tuple[str, ...]:
-        """Names of the views that it was compared with."""
-
-    @property
-    def agreeing(self) -> UInt8[np.ndarray, "H W"]:
-        """Bit k is set where source k confirms the pixel."""
+_ASPECT_SLACK = 0.02
+_PER_MAP = 200
+"""Points of a map: enough to tell which views overlap much and which little."""
+_GREY = 128
 
 
 @dataclass(frozen=True)
@@ -108,17 +95,6 @@ class DenseReport:
     def share_known(self) -> float:
         """The share of pixels with a depth, 0 to 1."""
         return self.num_known / max(self.num_pixels, 1)
-
-    def with_map(self, dense: DenseMap) -> DenseReport:
-        """The report after one more map."""
-        known = int(np.count_nonzero(np.isfinite(dense.depth)))
-        return DenseReport(
-            self.path,
-            self.num_maps + 1,
-            self.num_pixels + dense.depth.size,
-            self.num_known + known,
-            self.empty if known else tuple(sorted((*self.empty, dense.name))),
-        )
 
 
 def write_dense_maps(
@@ -147,14 +123,13 @@ def write_dense_maps(
         ParameterError: There is no map, or one does not belong to the scene.
         OutputError: The folder is taken or cannot be written.
     """
-    images = {image.name: image for image in scene.images}
-    report, total = DenseReport(Path(path)), length_hint(maps, len(images)) or 1
+    path, images = Path(path), {image.name: image for image in scene.images}
     protect = scene.source.inputs if scene.source else ()
     with depth_folder(
-        Path(path), "z", overwrite=overwrite, protect=protect, provenance=provenance
+        path, "z", overwrite=overwrite, protect=protect, provenance=provenance
     ) as writer:
-        for dense in maps:
-            _check_map(dense, images)
+
+        def write(dense: DenseMap) -> None:
             height, width = dense.depth.shape
             K = scaled_K(images[dense.name].camera, width, height)  # as readers scale it
             writer.write(dense.name, depth_along(dense, K, 0.5))
@@ -168,10 +143,8 @@ def write_dense_maps(
                     sources=np.array(dense.sources, np.str_),
                     K=np.asarray(dense.camera.K, np.float64),
                 )
-            report = report.with_map(dense)
-            progress("write maps", min(report.num_maps / total, 1.0))
-        _check_any(report)
-    return report
+
+        return _write_each(maps, images, write, path, progress)
 
 
 def write_dense_workspace(
@@ -192,7 +165,7 @@ def write_dense_workspace(
 
     Args:
         scene: A scene with photographs.
-        maps: Maps of some of its images, in any order and of any size; taken one by one.
+        maps: As for ``write_dense_maps``.
         path: The folder to make.
         overwrite: Whether an earlier output of splatseed may be replaced.
         copy_images: Copy the photographs instead of linking them.
@@ -213,35 +186,41 @@ def write_dense_workspace(
             its camera in aspect ratio.
         OutputError: The folder is taken or cannot be written, or an image's name leads out of it.
     """
-    model = photograph_model(scene, check_dense_scene(scene, undistorts=undistort is not None))
-    report, overlap = DenseReport(Path(path)), OverlapPoints()
-    total = length_hint(maps, len(scene.images)) or 1
+    path, sizes = Path(path), check_dense_scene(scene, undistorts=undistort is not None)
+    cameras, images = _photograph_model(scene, sizes)
+    idxs = {name: idx for idx, name in enumerate(images)}
     inputs = scene.source.inputs if scene.source else ()
-    with output_folder(Path(path), kind="depth", overwrite=overwrite, protect=inputs) as folder:
-        bring_photographs(scene, folder, undistort, progress, copy=copy_images)
+    with output_folder(path, kind="depth", overwrite=overwrite, protect=inputs) as folder:
+        _bring_photographs(scene, folder, undistort, progress, copy=copy_images)
         stereo = folder / "stereo"
         for name in ("depth_maps", "normal_maps", "consistency_graphs"):
             (stereo / name).mkdir(parents=True)
         sources: dict[str, tuple[str, ...]] = {}
-        progress("write maps", 0.0)
-        for dense in maps:
-            if dense.name in sources:
-                raise ParameterError(
-                    "one depth map per image", found=f"two for {dense.name}", fix="Leave one out."
-                )
+        overlap: list[tuple[np.ndarray, list[list[int]]]] = []
+
+        def write(dense: DenseMap) -> None:
             sources[dense.name] = dense.sources
-            _write_stereo(stereo, model, dense)
-            report = report.with_map(dense)
-            overlap.add(dense.camera, dense.depth, (dense.name, *dense.sources), dense.agreeing)
-            progress("write maps", min(report.num_maps / total, 1.0))
-        _check_any(report)
+            views = [idxs[name] for name in (dense.name, *dense.sources)]
+            _write_stereo(stereo, images[dense.name].camera, dense, views[1:])
+            overlap.append(_overlap_points(dense, views))
+
+        progress("write maps", 0.0)
+        report = _write_each(maps, images, write, path, progress)
         # Which images to match with which, and which to fuse, in the model's order.
-        names = [name for name in model.by_name if name in sources]
+        names = [name for name in images if name in sources]
         matches = [f"{name}\n{_matches(sources[name])}\n" for name in names]
         (stereo / "patch-match.cfg").write_text("".join(matches), encoding="utf-8")
-        fused = "".join(f"{name}\n" for name in names)
-        (stereo / "fusion.cfg").write_text(fused, encoding="utf-8")
-        model.write(folder / "sparse", overlap)
+        (stereo / "fusion.cfg").write_text("".join(f"{n}\n" for n in names), encoding="utf-8")
+        # The finite, distinct points with tracks; added points have none.
+        points = scene.points.select(slice(0, len(scene.tracks or ())))
+        originals = clean_scene(replace(scene, points=points, images=tuple(images.values())))
+        points, (tracks, featured, _) = originals.points, renumber(originals)
+        if tracks is None or not len(tracks.image_ids):
+            points, tracks, featured = _overlap_model(overlap, tuple(images.values()))
+        (folder / "sparse").mkdir()
+        colmap.write_cameras(folder / "sparse/cameras.bin", cameras)
+        colmap.write_images(folder / "sparse/images.bin", featured)
+        colmap.write_points3d(folder / "sparse/points3D.bin", points, tracks)
         write_json(folder / MANIFEST, dict(provenance or {}))
     return report
 
@@ -263,7 +242,101 @@ def check_dense_scene(scene: Scene, *, undistorts: bool = False) -> dict[str, Si
         OutputError: An image's name leads out of its folder.
     """
     folder = photograph_folder(scene)
-    return {image.name: check_image(image, folder, undistorts=undistorts) for image in scene.images}
+    return {image.name: _size_of(image, folder, undistorts=undistorts) for image in scene.images}
+
+
+def _size_of(image: Image, folder: Path, *, undistorts: bool) -> Size:
+    from PIL import Image as PilImage  # noqa: PLC0415  (slow to import)
+
+    lens = image.intrinsics
+    if lens.has_distortion and not undistorts:
+        raise SceneFormatError(
+            "cameras without lens distortion (PINHOLE), as COLMAP's dense tools need them",
+            found=f"{lens.model} for {image.name}",
+            fix="Undistort the scene first: splatseed undistort SCENE -o OUT.",
+        )
+    kind = PilImage.registered_extensions().get(Path(image.name).suffix.lower())
+    if lens.has_distortion and kind not in PilImage.SAVE:
+        raise SceneFormatError(
+            "photographs that can be written again once they are undistorted (.jpg, .png, .tif)",
+            found=image.name,
+            fix="Export them as one of these, or undistort the scene first.",
+        )
+    if "/".join(safe_parts(image.name)) != image.name or "\n" in image.name:
+        expected = "image names that stay inside their folder"
+        raise OutputError(expected, found=repr(image.name), fix="Rename the image.")
+    path = folder / image.name
+    size = open_photograph(path, photograph_bytes(path)).size
+    if abs(size[0] / size[1] / (lens.width / lens.height) - 1) > _ASPECT_SLACK:
+        raise SceneFormatError(
+            f"{path} to have the shape of its camera, {lens.width} x {lens.height}",
+            found=f"{size[0]} x {size[1]}",
+            fix="Use the images that the model was made from, or a resized copy of them.",
+        )
+    return size
+
+
+def _write_each(
+    maps: Iterable[DenseMap],
+    images: Mapping[str, Image],
+    write: Callable[[DenseMap], None],
+    path: Path,
+    progress: Progress,
+) -> DenseReport:
+    """Check and write the maps one by one."""
+    report, total = DenseReport(path), length_hint(maps, len(images)) or 1
+    seen = set[str]()
+    for dense in maps:
+        _check_map(dense, images)
+        if dense.name in seen:
+            raise ParameterError(
+                "one depth map per image", found=f"two for {dense.name}", fix="Leave one out."
+            )
+        seen.add(dense.name)
+        write(dense)
+        known = int(np.count_nonzero(np.isfinite(dense.depth)))
+        report = DenseReport(
+            path,
+            len(seen),
+            report.num_pixels + dense.depth.size,
+            report.num_known + known,
+            report.empty if known else tuple(sorted((*report.empty, dense.name))),
+        )
+        progress("write maps", min(len(seen) / total, 1.0))
+    if not seen:
+        raise ParameterError("at least one depth map", found="none", fix="Make some first.")
+    return report
+
+
+def _check_map(dense: DenseMap, images: Mapping[str, Image]) -> None:
+    """Check that a map belongs to an image of the scene, and that its arrays match."""
+    unknown = [name for name in (dense.name, *dense.sources) if name not in images]
+    size = (dense.camera.height, dense.camera.width)
+    arrays = (dense.depth, dense.normal[..., 0], dense.confidence, dense.agreeing)
+    wrong = [each.shape for each in arrays if each.shape != size]
+    if unknown:
+        expected, found = "images of the scene", ", ".join(unknown[:3])
+    elif len(dense.sources) > _MAX_SOURCES:
+        expected, found = f"at most {_MAX_SOURCES} sources", f"{len(dense.sources)}"
+    elif wrong:
+        expected, found = f"arrays of its camera's size, {size}", f"{wrong[0]}"
+    else:
+        pose = images[dense.name].camera.cam_from_world
+        tolerance = _SAME_POSE * max(1.0, float(np.abs(pose).max()))
+        if np.allclose(dense.camera.cam_from_world, pose, atol=tolerance):
+            return
+        expected, found = "the pose of its image", "another"
+    raise ParameterError(
+        f"the map of {dense.name} to have {expected}",
+        found=found,
+        fix="Make the maps from this scene.",
+    )
+
+
+def scaled_K(camera: Camera, width: int, height: int) -> Float64[np.ndarray, "3 3"]:  # noqa: N802  (K is the field's name)
+    """The pinhole matrix of a camera whose image is resized to ``width`` x ``height``, [3, 3]."""
+    scaled: np.ndarray = np.diag([width / camera.width, height / camera.height, 1.0]) @ camera.K
+    return scaled
 
 
 def depth_along(
@@ -296,51 +369,19 @@ def _toward_plane(
     return np.asarray(np.einsum("hwc,hwc->hw", dense.normal.astype(np.float64), rays))
 
 
-def _check_any(report: DenseReport) -> None:
-    if not report.num_maps:
-        raise ParameterError("at least one depth map", found="none", fix="Make some first.")
-
-
-def _check_map(dense: DenseMap, images: Mapping[str, Image]) -> None:
-    """Check that a map belongs to an image of the scene, and that its arrays match."""
-    unknown = [name for name in (dense.name, *dense.sources) if name not in images]
-    size = (dense.camera.height, dense.camera.width)
-    arrays = (dense.depth, dense.normal[..., 0], dense.confidence, dense.agreeing)
-    wrong = [each.shape for each in arrays if each.shape != size]
-    if unknown:
-        expected, found = "images of the scene", ", ".join(unknown[:3])
-    elif len(dense.sources) > _MAX_SOURCES:
-        expected, found = f"at most {_MAX_SOURCES} sources", f"{len(dense.sources)}"
-    elif wrong:
-        expected, found = f"arrays of its camera's size, {size}", f"{wrong[0]}"
-    else:
-        pose = images[dense.name].camera.cam_from_world
-        tolerance = _SAME_POSE * max(1.0, float(np.abs(pose).max()))
-        if np.allclose(dense.camera.cam_from_world, pose, atol=tolerance):
-            return
-        expected, found = "the pose of its image", "another"
-    raise ParameterError(
-        f"the map of {dense.name} to have {expected}",
-        found=found,
-        fix="Make the maps from this scene.",
-    )
-
-
-def _write_stereo(folder: Path, model: SparseModel, dense: DenseMap) -> None:
+def _write_stereo(folder: Path, camera: Camera, dense: DenseMap, sources: Sequence[int]) -> None:
     """Write one map into the folder ``stereo``."""
-    _check_map(dense, model.by_name)
     height, width = dense.depth.shape
-    K = scaled_K(model.by_name[dense.name].camera, width, height)  # as COLMAP scales it
+    K = scaled_K(camera, width, height)  # as COLMAP scales it
     depth = depth_along(dense, K, 0.0)
     unknown = ~np.isfinite(depth)
     normal = np.where(unknown[..., None], np.float32(0), dense.normal)
     agreeing = np.where(unknown, np.uint8(0), dense.agreeing)
-    idxs = [model.image_idxs[name] for name in dense.sources]
     for kind in _KINDS:
         file = f"{dense.name}.{kind}.bin"
         write_map(folder / "depth_maps" / file, depth)
         write_map(folder / "normal_maps" / file, normal)
-        write_consistency_graph(folder / "consistency_graphs" / file, agreeing, idxs)
+        write_consistency_graph(folder / "consistency_graphs" / file, agreeing, sources)
     centred = folder / "depth_maps" / f"{dense.name}.npy"
     np.save(centred, depth_along(dense, K, 0.5), allow_pickle=False)
 
@@ -353,11 +394,7 @@ def _matches(sources: tuple[str, ...]) -> str:
 
 
 def write_map(path: Path, values: Float32[np.ndarray, "H W *C"]) -> None:
-    """Write a depth map [H, W] or a normal map [H, W, 3]; NaN becomes 0, COLMAP's "unknown".
-
-    Args:
-        path: A file that does not exist yet.
-        values: The map, top row first.
+    """Write a new file of a depth map [H, W] or a normal map [H, W, 3]; NaN becomes 0, "unknown".
 
     Raises:
         OSError: It exists, or cannot be written.
@@ -371,10 +408,10 @@ def write_map(path: Path, values: Float32[np.ndarray, "H W *C"]) -> None:
 def write_consistency_graph(
     path: Path, agreeing: UInt8[np.ndarray, "H W"], image_idxs: Sequence[int]
 ) -> None:
-    """Write which images confirm each pixel, row by row.
+    """Write a new file of which images confirm each pixel, row by row.
 
     Args:
-        path: A file that does not exist yet.
+        path: The file.
         agreeing: Bit k is set where ``image_idxs[k]`` confirms the pixel.
         image_idxs: Positions of the sources in the model's list of images, from 0.
 
@@ -383,17 +420,13 @@ def write_consistency_graph(
     """
     bits = (agreeing[..., None] >> np.arange(len(image_idxs), dtype=np.uint8)) & 1
     rows, columns = np.nonzero(bits.any(axis=-1))
-    bits = bits[rows, columns].astype(bool)
-    counts = bits.sum(axis=1)
-    starts = np.cumsum(counts + 3) - (counts + 3)
-    records = np.empty(int((counts + 3).sum()), "<i4")
-    for place, values in enumerate((columns, rows, counts)):
-        records[starts + place] = values
-    pixel, source = np.nonzero(bits)
-    nth = np.arange(len(pixel)) - np.repeat(np.cumsum(counts) - counts, counts)
-    records[starts[pixel] + 3 + nth] = np.array(image_idxs, np.int32)[source]
+    confirming = bits[rows, columns].astype(bool)  # [pixels, sources]
+    counts = confirming.sum(axis=1)
+    idxs = np.broadcast_to(np.array(image_idxs, np.int64), confirming.shape)
+    records = np.column_stack([columns, rows, counts, idxs])
+    written = np.column_stack([np.ones((len(rows), 3), bool), confirming])
     height, width = agreeing.shape
-    _write(path, (width, height, 1), records.tobytes())
+    _write(path, (width, height, 1), records[written].astype("<i4").tobytes())
 
 
 def _write(path: Path, size: tuple[int, int, int], body: bytes) -> None:
@@ -401,3 +434,104 @@ def _write(path: Path, size: tuple[int, int, int], body: bytes) -> None:
     with path.open("xb") as file:
         file.write("".join(f"{each}&" for each in size).encode("ascii"))
         file.write(body)
+
+
+def _bring_photographs(
+    scene: Scene, folder: Path, undistort: Undistort | None, progress: Progress, *, copy: bool
+) -> None:
+    """Fill ``images`` in a folder with the photographs of a scene that was checked."""
+    bent = [image for image in scene.images if image.intrinsics.has_distortion]
+    source = scene.source.image_dir if scene.source else None
+    if undistort is None or not bent or source is None:
+        folders = image_folders(scene)
+        wanted = {n: p for n, p in folders.items() if n == "images" or n.startswith("images/")}
+        bring(wanted, folder, copy=copy)
+        return
+    straight = [image.name for image in scene.images if not image.intrinsics.has_distortion]
+    bring({f"images/{name}": source / name for name in straight}, folder, copy=copy)
+
+    def work(start: int, stop: int) -> None:
+        from PIL import Image as PilImage  # noqa: PLC0415  (slow to import)
+
+        for image in bent[start:stop]:
+            path, target = source / image.name, folder / "images" / image.name
+            pixels = np.asarray(decode_photograph(path, photograph_bytes(path)))
+            height, width = pixels.shape[:2]
+            K = scaled_K(image.camera, width, height)
+            straight = PilImage.fromarray(undistort(pixels, image.intrinsics, K)[0])
+            target.parent.mkdir(parents=True, exist_ok=True)
+            jpeg = PilImage.registered_extensions()[target.suffix.lower()] == "JPEG"
+            # The pixels of a JPEG come from one already.
+            options: dict[str, Any] = {"quality": 95, "subsampling": 0} if jpeg else {}
+            straight.save(target, **options)
+
+    in_threads(work, len(bent), 1, "undistort", progress)
+
+
+def _photograph_model(
+    scene: Scene, sizes: Mapping[str, Size]
+) -> tuple[tuple[Intrinsics, ...], dict[str, Image]]:
+    """The pinhole cameras and the images of a scene, in pixels of the photographs as on disk.
+
+    A camera record may be larger than its photographs (a folder of reduced copies); COLMAP samples
+    colours at the record's pixels, so the two must agree. There is a record for each camera and
+    size of photograph; images are by name, ascending by id.
+    """
+    cameras: dict[tuple[int, Size], Intrinsics] = {}
+    images = {}
+    for image in sorted(scene.images, key=lambda image: image.image_id):
+        lens, size, seen = image.intrinsics, sizes[image.name], image.observations
+        (fx, _, cx), (_, fy, cy), _ = scaled_K(image.camera, *size).tolist()
+        pinhole = Intrinsics(len(cameras) + 1, "PINHOLE", *size, (fx, fy, cx, cy))
+        record = cameras.setdefault((lens.camera_id, size), pinhole)
+        if seen is not None:
+            uv = seen.xy
+            if lens.has_distortion:  # a feature that no ray of the lens reaches stays
+                straight = rays_through(lens, uv) * lens.K[[0, 1], [0, 1]] + lens.K[:2, 2]
+                uv = np.where(np.isnan(straight), uv, straight)
+            scale = np.array([record.width / lens.width, record.height / lens.height])
+            seen = Observations(uv * scale, seen.point_ids)
+        images[image.name] = replace(image, intrinsics=record, observations=seen)
+    return tuple(cameras.values()), images
+
+
+def _overlap_points(dense: DenseMap, views: Sequence[int]) -> tuple[np.ndarray, list[list[int]]]:
+    """Points [n, 3] evenly over a map's pixels that a source confirms, and the views of each."""
+    rows, columns = np.nonzero(np.isfinite(dense.depth) & (dense.agreeing > 0))
+    chosen = np.linspace(0, len(rows) - 1, min(_PER_MAP, len(rows))).astype(np.intp)
+    rows, columns = rows[chosen], columns[chosen]
+    xyz = dense.camera.unproject(
+        np.stack([columns, rows], axis=1) + 0.5, dense.depth[rows, columns]
+    )
+    seen = [
+        [views[0], *(view for k, view in enumerate(views[1:]) if bits >> k & 1)]
+        for bits in dense.agreeing[rows, columns].tolist()
+    ]
+    return xyz, seen
+
+
+def _overlap_model(
+    overlap: Sequence[tuple[np.ndarray, list[list[int]]]], images: Sequence[Image]
+) -> tuple[PointCloud, Tracks, tuple[Image, ...]]:
+    """Points of the maps with tracks, and the images with features where they see them."""
+    xyz = np.concatenate([np.empty((0, 3)), *(xyz for xyz, _ in overlap)])
+    views = [seen for _, each in overlap for seen in each]
+    lengths = np.array([len(seen) for seen in views], np.int64)
+    image_idx = np.array([idx for seen in views for idx in seen], np.int64)
+    point_idx = np.repeat(np.arange(len(xyz)), lengths)
+    places, featured = np.empty(len(image_idx), np.uint32), []
+    for idx, image in enumerate(images):
+        mine = np.flatnonzero(image_idx == idx)
+        places[mine], seen = np.arange(len(mine)), point_idx[mine]
+        uv = np.nan_to_num(image.camera.project(xyz[seen])[0])  # perhaps behind it: a wrong map
+        featured.append(replace(image, observations=Observations(uv, seen + 1)))
+    tracks = Tracks(
+        point_ids=np.arange(1, len(xyz) + 1),
+        xyz=xyz,
+        errors=np.full(len(xyz), colmap.UNKNOWN_ERROR),
+        offsets=np.concatenate([[0], np.cumsum(lengths)]),
+        image_ids=np.array([i.image_id for i in images], np.uint32)[image_idx],
+        point2d_idx=places,
+    )
+    cloud = PointCloud(xyz.astype(np.float32), np.full(xyz.shape, _GREY, np.uint8))
+    return cloud, tracks, tuple(featured)

@@ -41,12 +41,7 @@ _EXR_CHANNELS = ("Z", "depth", "Depth", "D", "Y", "V", "R")
 
 
 class StoredDepth(NamedTuple):
-    """A map as stored in its file.
-
-    Args:
-        values: Real numbers [H, W].
-        kind: What the values are, if the file says so; else None.
-    """
+    """Real numbers [H, W] as stored in a file, and what they are if the file says so."""
 
     values: np.ndarray
     kind: DepthKind | None = None
@@ -67,58 +62,83 @@ def read_stored(path: Path) -> StoredDepth:
         SceneFormatError: It is damaged, or no map of real numbers.
         MissingDependencyError: It is an OpenEXR file, and that package is absent.
     """
-    data = read_bytes(path)
+    data, kind = read_bytes(path), None
     with guarded(path, "a depth map"):
-        stored = _READERS[path.suffix.lower()](path, data)
-        check_stored(stored.values.shape, stored.values.dtype)
-        return stored
+        suffix = path.suffix.lower()
+        if suffix == ".npz":
+            values, kind = _read_npz(data)
+        else:
+            values = _READERS[suffix](path, data)
+        if suffix in {".npy", ".npz"} and values.ndim == 3:  # [1, H, W] or [H, W, 1]
+            short = next((axis for axis in (0, 2) if values.shape[axis] == 1), None)
+            values = values if short is None else values.squeeze(short)
+        check_stored(values.shape, values.dtype)
+        return StoredDepth(values, kind)
 
 
 def check_stored(shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
-    """Check that an array can be a depth map: not empty, not absurd, real numbers.
-
-    Raises:
-        ValueError: It cannot.
-    """
+    """Raise a ``ValueError`` unless an array can be a depth map: not empty, real numbers."""
     if len(shape) != 2 or not 0 < math.prod(shape) <= _MAX_PIXELS or dtype.kind not in "uif":
         size = "x".join(map(str, shape)) or "one number"
         raise ValueError(f"{size} of {dtype}, not height x width real numbers")
 
 
-def _read_npy(_: Path, data: bytes) -> StoredDepth:
-    return StoredDepth(_as_map(_parse_npy(data)))
+def _read_npy(_: Path, data: bytes) -> np.ndarray:
+    stream = io.BytesIO(data)
+    shape, fortran, dtype = read_npy_header(stream)
+    count, start = math.prod(shape), stream.tell()
+    if dtype.hasobject or min(shape, default=0) < 0 or count * dtype.itemsize != len(data) - start:
+        raise ValueError(f"{len(data) - start} bytes for {shape} values of {dtype}")
+    array = np.frombuffer(data, dtype, count, start) if count else np.empty(0, dtype)
+    return array.reshape(shape, order="F" if fortran else "C")
 
 
-def _read_npz(_: Path, data: bytes) -> StoredDepth:
+def _read_npz(data: bytes) -> StoredDepth:
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
+
+        def member(name: str) -> np.ndarray:
+            info = archive.getinfo(f"{name}.npy")
+            packed, size = info.compress_size, info.file_size
+            if size > min(max(_SMALL, _MOST_INFLATED * packed), 8 * _MAX_PIXELS):
+                raise ValueError(f"{packed:,} bytes that would become {size:,}")
+            return _read_npy(Path(), archive.read(info))
+
         names = {n.removesuffix(".npy") for n in archive.namelist() if n.endswith(".npy")}
-        kind = str(_member(archive, "kind").reshape(-1)[0]) if "kind" in names else None
+        kind: Any = str(member("kind").reshape(-1)[0]) if "kind" in names else None
         if kind is not None and kind not in KINDS:
             raise ValueError(f"kind {kind!r}, not one of {', '.join(KINDS)}")
         arrays = sorted(names - {"kind"})
         wanted = [key for key in _NPZ_KEYS if key in arrays] or arrays
         if not wanted or (wanted[0] not in _NPZ_KEYS and len(arrays) > 1):
             raise ValueError(f"arrays {', '.join(arrays[:5])}: not one, and none named depth")
-        return StoredDepth(_as_map(_member(archive, wanted[0])), kind)
+        return StoredDepth(member(wanted[0]), kind)
 
 
-def _read_pfm(_: Path, data: bytes) -> StoredDepth:
+def _read_pfm(_: Path, data: bytes) -> np.ndarray:
     header = _PFM_HEADER.match(data)
     scale = float(header[3]) if header else 0.0
     if header is None or not (math.isfinite(scale) and scale):
         raise ValueError(f"no one-channel float map (Pf), but {beginning(data)}")
-    shape = (int(header[2]), int(header[1]))
-    return StoredDepth(_body(data, header.end(), shape, "<f4" if scale < 0 else ">f4")[::-1])
+    return _body(data, header, "<f4" if scale < 0 else ">f4")[::-1]
 
 
-def _read_colmap(_: Path, data: bytes) -> StoredDepth:
+def _read_colmap(_: Path, data: bytes) -> np.ndarray:
     header = _BIN_HEADER.match(data)
     if header is None:
         raise ValueError(f"no depth map of COLMAP's (W&H&1&), but {beginning(data)}")
-    return StoredDepth(_body(data, header.end(), (int(header[2]), int(header[1])), "<f4"))
+    return _body(data, header, "<f4")
 
 
-def _read_picture(_: Path, data: bytes) -> StoredDepth:
+def _body(data: bytes, header: re.Match[bytes], dtype: str) -> np.ndarray:
+    """The values that follow a header with width and height, a view of the file's bytes."""
+    shape, body = (int(header[2]), int(header[1])), memoryview(data)[header.end() :]
+    check_stored(shape, np.dtype(dtype))
+    if len(body) != math.prod(shape) * np.dtype(dtype).itemsize:
+        raise ValueError(f"{len(body)} bytes for {shape[1]} x {shape[0]} values")
+    return np.frombuffer(body, dtype).reshape(shape)
+
+
+def _read_picture(_: Path, data: bytes) -> np.ndarray:
     from PIL import Image as PilImage  # noqa: PLC0415  (slow to import)
 
     with PilImage.open(io.BytesIO(data), formats=("PNG", "TIFF")) as picture:
@@ -127,10 +147,10 @@ def _read_picture(_: Path, data: bytes) -> StoredDepth:
         values = np.asarray(picture)
         if picture.format == "PNG" and values.dtype == np.int32:
             values = values.astype(np.uint16)  # how some versions of Pillow open 16 bits
-    return StoredDepth(values)
+    return values
 
 
-def _read_exr(path: Path, _: bytes) -> StoredDepth:
+def _read_exr(path: Path, _: bytes) -> np.ndarray:
     require("OpenEXR")
     openexr = importlib.import_module("OpenEXR")
     with openexr.File(str(path), header_only=True) as file:
@@ -147,47 +167,11 @@ def _read_exr(path: Path, _: bytes) -> StoredDepth:
     found = next((word for word in _EXR_CHANNELS if word in by_word), None)
     if found is None and len(channels) != 1:
         raise ValueError(f"channels {', '.join(channels)}, none of {', '.join(_EXR_CHANNELS)}")
-    return StoredDepth(by_word[found] if found else next(iter(channels.values())))
+    return by_word[found] if found else next(iter(channels.values()))
 
 
-def _body(data: bytes, start: int, shape: tuple[int, int], dtype: str) -> np.ndarray:
-    """The values that follow a header, a view of the file's bytes."""
-    check_stored(shape, np.dtype(dtype))
-    promised = math.prod(shape) * np.dtype(dtype).itemsize
-    if len(data) - start != promised:
-        raise ValueError(f"{len(data) - start} bytes for {shape[1]} x {shape[0]} values")
-    return np.frombuffer(data, dtype, math.prod(shape), start).reshape(shape)
-
-
-def _parse_npy(data: bytes) -> np.ndarray:
-    """The array of a ``.npy`` file's bytes."""
-    stream = io.BytesIO(data)
-    shape, fortran, dtype = read_npy_header(stream)
-    count, start = math.prod(shape), stream.tell()
-    if dtype.hasobject or min(shape, default=0) < 0 or count * dtype.itemsize != len(data) - start:
-        raise ValueError(f"{len(data) - start} bytes for {shape} values of {dtype}")
-    array = np.frombuffer(data, dtype, count, start) if count else np.empty(0, dtype)
-    return array.reshape(shape, order="F" if fortran else "C")
-
-
-def _as_map(array: np.ndarray) -> np.ndarray:
-    """The map without an axis of length 1 before [1, H, W] or after [H, W, 1]."""
-    if array.ndim == 3 and 1 in (array.shape[0], array.shape[2]):
-        return np.asarray(array[0] if array.shape[0] == 1 else array[..., 0])
-    return array
-
-
-def _member(archive: zipfile.ZipFile, name: str) -> np.ndarray:
-    """An array in an archive, refused if it claims to be absurdly larger than stored."""
-    info = archive.getinfo(f"{name}.npy")
-    if info.file_size > min(max(_SMALL, _MOST_INFLATED * info.compress_size), 8 * _MAX_PIXELS):
-        raise ValueError(f"{info.compress_size:,} bytes that would become {info.file_size:,}")
-    return _parse_npy(archive.read(info))
-
-
-_READERS: dict[str, Callable[[Path, bytes], StoredDepth]] = {
+_READERS: dict[str, Callable[[Path, bytes], np.ndarray]] = {
     ".npy": _read_npy,
-    ".npz": _read_npz,
     ".exr": _read_exr,
     ".pfm": _read_pfm,
     ".bin": _read_colmap,
@@ -195,6 +179,6 @@ _READERS: dict[str, Callable[[Path, bytes], StoredDepth]] = {
     ".tif": _read_picture,
     ".png": _read_picture,
 }
-SUFFIXES = tuple(_READERS)
+SUFFIXES = (".npy", ".npz", *[suffix for suffix in _READERS if suffix != ".npy"])
 """Suffixes of readable files. PNG comes last: beside a file of exact numbers it is their
 picture."""

@@ -14,11 +14,12 @@ files; a written folder appears whole or not at all, with one float32 ``.npy`` p
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path, PurePosixPath
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float32
@@ -50,10 +51,9 @@ _CAPTURED = re.compile(r"depth(\d+)", re.IGNORECASE)
 
 @dataclass(frozen=True, eq=False)
 class Undistortion:
-    """Moves the values of a map to where undistorted photographs have them.
+    """Moves the values of a planar map to where undistorted photographs have them.
 
-    Planar depth belongs to the ray and not to the pixel, so values are moved, never changed; a
-    pixel takes the nearest value, so that no depth between two surfaces is invented.
+    Values are moved, never changed or mixed, so that no depth between two surfaces is invented.
 
     Args:
         lens: The camera that took the maps, in one of COLMAP's models.
@@ -64,14 +64,9 @@ class Undistortion:
     cameras: Mapping[str, Intrinsics]
 
     def apply(self, name: str, values: Float32[np.ndarray, "H W"]) -> Float32[np.ndarray, "h w"]:
-        """The map in the pixels of one photograph, at that photograph's size.
+        """A map taken with the lens, or a resized copy, in the pixels and size of one photograph.
 
-        Args:
-            name: The photograph.
-            values: A map that was taken with the lens, of its size or a resized copy.
-
-        Returns:
-            The values, NaN where the lens did not look.
+        NaN stands where the lens did not look.
         """
         camera = self.cameras[name]
         height, width = values.shape
@@ -154,8 +149,16 @@ def match_by_name(scene: Scene, root: Path) -> DepthFiles | None:
         SceneFormatError: Two images share a map, or the folder's description is damaged.
     """
     for folder in (root / name for name in _FOLDERS):
-        if folder.is_dir() and (paths := _match(scene, folder)):
-            return DepthFiles(paths, *_describe(folder, next(iter(paths.values()))))
+        if not folder.is_dir() or not (paths := _match(scene, folder)):
+            continue
+        if (folder / DESCRIPTION).is_file():
+            return DepthFiles(paths, *read_description(folder / DESCRIPTION))
+        example, scale = next(iter(paths.values())), None
+        if _CAPTURED.fullmatch(example.stem) and example.suffix.lower() == ".png":
+            near = (each / CAMERA_FILE for each in (folder, *folder.resolve().parents[:2]))
+            camera_file = next((path for path in near if path.is_file()), None)
+            scale = read_capture_scale(camera_file) if camera_file else None
+        return DepthFiles(paths, scale=scale)
     return None
 
 
@@ -166,64 +169,42 @@ def _match(scene: Scene, folder: Path) -> dict[str, Path]:
     dropped.
     """
     parts = {image.name: safe_parts(image.name) for image in scene.images}
-    listing = _Listing(folder, _image_files(scene))
+    taken, true_folder = set[Path](), cache(Path.resolve)
+    if scene.source and (image_dir := scene.source.image_dir):
+        photographs = (image_dir / image.name for image in scene.images)  # perhaps in this folder
+        taken = {true_folder(path.parent) / path.name for path in photographs}
+    listing = cache(lambda parents: _listing(folder.joinpath(*parents), taken))
     for drop in range(max(map(len, parts.values()), default=0)):
-        maps = {name: listing.map_of(each[drop:]) for name, each in sorted(parts.items())}
-        present = {name: path for name, path in maps.items() if path is not None}
         owners: dict[Path, str] = {}
-        for name, path in present.items():
-            if (other := owners.setdefault(path, name)) != name:
-                raise SceneFormatError(
-                    "a depth map of its own for each image",
-                    found=f"{path} for {other} and for {name}",
-                    fix=f"Name maps in full, with subfolders: {name}.npy or {name}.png.",
-                )
-        if present:
-            return present
+        for name, each in sorted(parts.items()):
+            if each[drop:]:
+                files = listing(each[drop:-1])
+                keys = (stem + suffix for stem in _stems(each[-1]) for suffix in SUFFIXES)
+                path = next((files[key] for key in keys if key in files), None)
+                if path and (other := owners.setdefault(path, name)) != name:
+                    raise SceneFormatError(
+                        "a depth map of its own for each image",
+                        found=f"{path} for {other} and for {name}",
+                        fix=f"Name maps in full, with subfolders: {name}.npy or {name}.png.",
+                    )
+        if owners:
+            return {name: path for path, name in owners.items()}
     return {}
 
 
-def _image_files(scene: Scene) -> frozenset[Path]:
-    """The photographs themselves, which are not depth maps even if they lie in the same folder."""
-    folder = scene.source.image_dir if scene.source else None
-    if folder is None:
-        return frozenset()
-    paths = [folder / image.name for image in scene.images]
-    resolved = {parent: parent.resolve() for parent in {path.parent for path in paths}}
-    return frozenset(resolved[path.parent] / path.name for path in paths)
-
-
-class _Listing:
-    """The depth maps of a folder; each subfolder is listed once, on demand."""
-
-    def __init__(self, root: Path, taken: frozenset[Path]) -> None:
-        self._root = root
-        self._taken = taken
-        self._folders: dict[tuple[str, ...], dict[str, Path]] = {}
-
-    def map_of(self, parts: tuple[str, ...]) -> Path | None:
-        """The map of the image with these folders and this file name."""
-        if not parts:
-            return None
-        if parts[:-1] not in self._folders:
-            self._folders[parts[:-1]] = self._list(self._root.joinpath(*parts[:-1]))
-        files = self._folders[parts[:-1]]
-        keys = (stem + suffix for stem in _stems(parts[-1]) for suffix in SUFFIXES)
-        return next((files[key] for key in keys if key in files), None)
-
-    def _list(self, folder: Path) -> dict[str, Path]:
-        """The files of a subfolder by name, suffixes in lower case, numbers also unpadded."""
-        files: dict[str, Path] = {}
-        if not folder.is_dir():
-            return files
-        resolved = folder.resolve()
-        for path in sorted(folder.iterdir(), reverse=True):  # .png before .PNG
-            if path.suffix.lower() in SUFFIXES and resolved / path.name not in self._taken:
-                files.setdefault(path.stem + path.suffix.lower(), path)
-        for key, path in list(files.items()):
-            if number := _CAPTURED.match(key):
-                files.setdefault(f"depth{int(number[1])}{key[number.end() :]}", path)
+def _listing(folder: Path, taken: Collection[Path]) -> dict[str, Path]:
+    """The maps of a folder by name, suffixes in lower case, numbers also unpadded."""
+    files: dict[str, Path] = {}
+    if not folder.is_dir():
         return files
+    true_folder = folder.resolve()
+    for path in sorted(folder.iterdir(), reverse=True):  # .png before .PNG
+        if path.suffix.lower() in SUFFIXES and true_folder / path.name not in taken:
+            files.setdefault(path.stem + path.suffix.lower(), path)
+    for key, path in list(files.items()):
+        if number := _CAPTURED.match(key):
+            files.setdefault(f"depth{int(number[1])}{key[number.end() :]}", path)
+    return files
 
 
 def _stems(file_name: str) -> Iterator[str]:
@@ -237,31 +218,8 @@ def _stems(file_name: str) -> Iterator[str]:
         yield f"{stem.removesuffix('.color')}.depth"
 
 
-class DepthDescription(NamedTuple):
-    """What a folder says about its maps.
-
-    Args:
-        kind: What the values are; None: not said.
-        scale: Stored units per scene unit; None: not said.
-    """
-
-    kind: DepthKind | None = None
-    scale: float | None = None
-
-
-def _describe(folder: Path, example: Path) -> DepthDescription:
-    """What the folder says about its maps: ``depths.json``, or the camera file of a capture."""
-    if (folder / DESCRIPTION).is_file():
-        return read_description(folder / DESCRIPTION)
-    if _CAPTURED.fullmatch(example.stem) and example.suffix.lower() == ".png":
-        for parent in (folder, *folder.resolve().parents[:2]):
-            if (parent / CAMERA_FILE).is_file():
-                return DepthDescription(scale=read_capture_scale(parent / CAMERA_FILE))
-    return DepthDescription()
-
-
-def read_description(path: Path) -> DepthDescription:
-    """Read a ``depths.json``.
+def read_description(path: Path) -> tuple[DepthKind | None, float | None]:
+    """Kind and scale that a ``depths.json`` gives; None for what it does not say.
 
     Raises:
         SceneNotFoundError: There is no such file.
@@ -275,7 +233,7 @@ def read_description(path: Path) -> DepthDescription:
             found=repr(kind)[:80],
             fix="Correct it, or leave it out for planar z.",
         )
-    return DepthDescription(kind, _scale_in(path, content))
+    return kind, _scale_in(path, content)
 
 
 def read_capture_scale(path: Path) -> float | None:
@@ -330,11 +288,7 @@ def write_description(folder: Path, kind: DepthKind, scale: float = 1.0, **more:
 
 @dataclass(frozen=True)
 class DepthWriter:
-    """Writes the maps of a folder in the making.
-
-    Args:
-        folder: Where to.
-    """
+    """Writes the maps of a folder in the making."""
 
     folder: Path
 

@@ -32,25 +32,20 @@ from splatseed.runtime.memory import free_memory
 
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".mts", ".3gp"})
 COPY_AGAIN = "Copy the file again, or export it again."
-ARRAY_FAILURES = (
-    *(ValueError, TypeError, KeyError, IndexError, OverflowError, MemoryError, SyntaxError),
-    *(EOFError, RecursionError),
-    tokenize.TokenError,  # of headers that look like Python 2's
-)
-"""What NumPy raises for a damaged ``.npy``: it parses the header as Python."""
 ARCHIVE_FAILURES = (
-    *ARRAY_FAILURES,
-    *(OSError, zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error),
+    *(ValueError, TypeError, KeyError, IndexError, OverflowError, MemoryError, SyntaxError),
+    *(EOFError, RecursionError, OSError, zipfile.BadZipFile, zlib.error, lzma.LZMAError),
+    struct.error,
+    tokenize.TokenError,  # of headers that look like Python 2's: NumPy parses them as Python
     RuntimeError,  # encrypted, or compressed in a way that zipfile does not know
 )
-"""What a damaged ``.zip`` or ``.npz`` can raise besides."""
+"""What a damaged ``.npy``, ``.npz`` or ``.zip`` can raise."""
 
-_KINDS = (
-    (stat.S_ISDIR, errno.EISDIR, "a folder"),
-    (stat.S_ISFIFO, errno.EINVAL, "a pipe, not a file"),
-    (stat.S_ISSOCK, errno.EINVAL, "a socket, not a file"),
-    (lambda _: True, errno.EINVAL, "a device, not a file"),
-)
+_KINDS = {
+    stat.S_IFDIR: "a folder",
+    stat.S_IFIFO: "a pipe, not a file",
+    stat.S_IFSOCK: "a socket, not a file",
+}
 _WAIT_NOT = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
 _COUNT = struct.Struct("<Q")
 
@@ -74,11 +69,10 @@ def other_spelling(path: Path) -> str | None:
 def odd_kind(path: Path) -> str:
     """What a path is that is neither a regular file nor a folder; empty if it is, or is nothing."""
     try:
-        status = path.stat()
+        mode = path.stat().st_mode
     except OSError as error:
         return "a link that leads back to itself" if error.errno == errno.ELOOP else ""
-    known = stat.S_ISREG(status.st_mode) or stat.S_ISDIR(status.st_mode)
-    return "" if known else _kind(status)[1]
+    return "" if stat.S_ISREG(mode) or stat.S_ISDIR(mode) else _kind(mode)
 
 
 def open_file(path: Path) -> BinaryIO:
@@ -109,11 +103,7 @@ def read_file(path: Path) -> bytes:
 
 
 def check_room(path: Path, size: int) -> None:
-    """Refuse a file whose content takes more bytes than are free.
-
-    Raises:
-        OSError: It does.
-    """
+    """Raise an ``OSError`` for a file whose content takes more bytes than are free."""
     free = free_memory()
     if free is not None and size > free:
         told = f"{size / 1e9:,.1f} GB, more than the {free / 1e9:,.1f} GB of free memory"
@@ -206,18 +196,11 @@ def read_json(path: Path, expected: str = "JSON", *, fix: str = COPY_AGAIN) -> A
         SceneNotFoundError: There is no such file.
         SceneFormatError: It is no JSON.
     """
-    try:
-        return json.loads(read_bytes(path))
-    except json.JSONDecodeError as error:
-        rest = error.doc[error.pos :].strip().splitlines()
-        there = repr(rest[0][:40]) if rest else "its end"
-        found = f"{there} at line {error.lineno}, column {error.colno}"
-        found = found if error.doc.strip() else "an empty file"
-    except UnicodeDecodeError:
-        found = "bytes that are no text"
-    except (ValueError, RecursionError) as error:
-        found = str(error)
-    raise SceneFormatError(f"{path} to be {expected}", found=found, fix=fix)
+    data = read_bytes(path)
+    with guarded(path, expected, fix=fix):
+        if not data.strip():
+            raise ValueError("an empty file")
+        return json.loads(data)
 
 
 class ByteReader:
@@ -249,12 +232,18 @@ class ByteReader:
         """Bytes not read yet."""
         return len(self.data) - self.offset
 
+    @property
+    def where(self) -> str:
+        """The current place, for errors."""
+        return f"{self.path}, {self.record}, byte {self.offset}"
+
     def unpack(self, layout: struct.Struct) -> tuple[Any, ...]:
         """The values of a fixed layout."""
-        self._require(layout.size)
-        values = layout.unpack_from(self.data, self.offset)
-        self.offset += layout.size
-        return values
+        return layout.unpack(self._take(layout.size))
+
+    def array(self, dtype: np.dtype[Any], count: int) -> np.ndarray:
+        """The next ``count`` items, a read-only view of the file's bytes."""
+        return np.frombuffer(self._take(count * dtype.itemsize), dtype)
 
     def count(self, least_bytes: int, what: str) -> int:
         """A u64 count of items that take at least ``least_bytes`` each, checked to fit."""
@@ -264,12 +253,13 @@ class ByteReader:
             raise self.error(f"at most {room} {what} in the bytes that follow", f"{count} promised")
         return int(count)
 
-    def array(self, dtype: np.dtype[Any], count: int) -> np.ndarray:
-        """The next ``count`` items, a read-only view of the file's bytes."""
-        self._require(count * dtype.itemsize)
-        items = np.frombuffer(self.data, dtype, count, self.offset)
-        self.offset += count * dtype.itemsize
-        return items
+    def records(self, least_bytes: int, what: str) -> Iterator[str]:
+        """The place of each of as many records as a count promises, which end the file."""
+        count = self.count(least_bytes, what)
+        for idx in range(count):
+            self.record = f"record {idx + 1} of {count}"
+            yield self.where
+        self.finish()
 
     def text(self) -> str:
         """A NUL-terminated UTF-8 string."""
@@ -290,25 +280,21 @@ class ByteReader:
             self.record = "end"
             raise self.error("the end of the file", f"{self.remaining} more bytes")
 
-    @property
-    def where(self) -> str:
-        """The current place, for errors."""
-        return f"{self.path}, {self.record}, byte {self.offset}"
-
     def error(self, expected: str, found: str) -> SceneFormatError:
         """An error at the current place."""
         return SceneFormatError(f"{expected} in {self.where}", found=found, fix=self.fix)
 
-    def _require(self, size: int) -> None:
+    def _take(self, size: int) -> memoryview:
         if size > self.remaining:
             raise self.error(f"{size} more bytes", f"{self.remaining} before the end of the file")
+        self.offset += size
+        return memoryview(self.data)[self.offset - size : self.offset]
 
 
 def _check(path: Path, status: os.stat_result) -> None:
     if not stat.S_ISREG(status.st_mode):
-        raise OSError(*_kind(status), str(path))
+        raise OSError(errno.EINVAL, _kind(status.st_mode), str(path))
 
 
-def _kind(status: os.stat_result) -> tuple[int, str]:
-    """The error and the name of what is no regular file."""
-    return next((number, kind) for is_, number, kind in _KINDS if is_(status.st_mode))
+def _kind(mode: int) -> str:
+    return _KINDS.get(stat.S_IFMT(mode), "a device, not a file")

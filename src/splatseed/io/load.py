@@ -1,4 +1,4 @@
-"""Reading a scene in any format.
+"""Reading a scene in any format, and finding its depth maps: by time in a capture, else by name.
 
 Notation: a *model* is a folder with COLMAP's cameras, images and points3D, each as ``.bin`` or
 ``.txt``. Promise: one function recognises what a path holds and reads it; what is odd but usable
@@ -7,17 +7,22 @@ becomes a sentence in ``Scene.warnings``, anything else raises one error.
 
 from __future__ import annotations
 
-import json
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
-from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.depthmap import DepthKind
+from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.io.cleaning import clean_scene, cloud_warnings
-from splatseed.io.colmap.scene import find_model, read_colmap_scene, scene_root
-from splatseed.io.files import is_video, odd_kind, read_text
+from splatseed.io.depth_files import KINDS, SUFFIXES
+from splatseed.io.depth_maps import DepthFiles, match_by_name
+from splatseed.io.files import is_video, odd_kind
+from splatseed.io.model import find_model, read_colmap_scene, scene_root
 from splatseed.io.nerfstudio import is_blender, read_blender, read_transforms_scene
 from splatseed.io.ply import read_ply, refuse_model
-from splatseed.io.rgbd import is_tum, load_rgbd, load_tum
+from splatseed.io.rgbd import find_tum_depths, is_tum, load_rgbd, load_tum
 from splatseed.io.seeds import recall_seeds
 from splatseed.io.split import follow_lists
 from splatseed.io.staging import MANIFEST, read_manifest
@@ -112,29 +117,33 @@ def check_there(path: Path) -> None:
 
 def is_scene(folder: Path) -> bool:
     """Whether a folder looks like a scene, by the names in it."""
-    models = (folder / "sparse/0", folder / "sparse", folder, folder / "colmap/sparse/0")
-    if find_model(*models) is not None or is_tum(folder) or is_blender(folder):
-        return True
-    return any((folder / name).is_file() for name in (_TRANSFORMS, "traj.txt"))
+    return _reader(folder) is not None
+
+
+def _reader(folder: Path) -> Callable[[], Scene] | None:
+    """What reads the scene of a folder, by the names in it."""
+    model = find_model(*(folder / each for each in ("sparse/0", "sparse", "", "0")))
+    if model is not None:
+        return partial(read_colmap_scene, model)
+    if (folder / _TRANSFORMS).is_file():
+        return partial(read_transforms_scene, folder / _TRANSFORMS)
+    if is_blender(folder):
+        return partial(read_blender, folder)
+    if (nested := find_model(folder / "colmap/sparse/0")) is not None:
+        return partial(read_colmap_scene, nested)
+    if (folder / "traj.txt").is_file():
+        return partial(load_rgbd, folder)
+    return partial(load_tum, folder) if is_tum(folder) else None
 
 
 def _read(path: Path) -> Scene:
     if path.is_file():
         return _read_file(path)
     check_there(path)
-    first = find_model(path / "sparse" / "0", path / "sparse", path, path / "0")
-    if first is not None:
-        return read_colmap_scene(first)
-    if (path / _TRANSFORMS).is_file():
-        return read_transforms_scene(path / _TRANSFORMS)
-    if is_blender(path):
-        return read_blender(path)
-    nested = find_model(path / "colmap" / "sparse" / "0")
-    if nested is not None:
-        return read_colmap_scene(nested)
-    if not (path / "traj.txt").is_file() and not is_tum(path):
+    reader = _reader(path)
+    if reader is None:
         raise _no_scene(path)
-    return load_rgbd(path) if (path / "traj.txt").is_file() else load_tum(path)
+    return reader()
 
 
 def _read_file(path: Path) -> Scene:
@@ -190,22 +199,15 @@ def _no_scene(path: Path) -> SceneNotFoundError:
         fix = f"Name the scene's folder: {above}"
     else:
         fix += " For photographs alone, run: splatseed sfm IMAGES -o SCENE."
-    return SceneNotFoundError(
-        f"sparse/0, sparse, colmap/sparse/0, {_TRANSFORMS}, traj.txt or groundtruth.txt in {path}",
-        found=inside,
-        fix=fix,
-    )
+    expected = f"sparse/0, sparse, colmap/sparse/0, {_TRANSFORMS}, traj.txt or groundtruth.txt"
+    return SceneNotFoundError(f"{expected} in {path}", found=inside, fix=fix)
 
 
 def _is_run(path: Path) -> SceneNotFoundError:
-    try:
-        scene = json.loads(read_text(path / "config.json"))["scene"]
-    except (OSError, ValueError, TypeError, KeyError):
-        scene = None
-    run, named = quoted(path), isinstance(scene, str)
+    run = quoted(path)
     return SceneNotFoundError(
         f"a scene at {path}",
-        found="a run of splatseed train" + (f" on the scene {scene}" if named else ""),
+        found="a run of splatseed train",
         fix=f"Look at it: splatseed view {run}. Score it: splatseed evaluate {run}.",
     )
 
@@ -214,3 +216,76 @@ def _some(names: Sequence[str]) -> str:
     """The first five names, and how many more there are."""
     more = f" and {len(names) - 5:,} more" if len(names) > 5 else ""
     return ", ".join(names[:5]) + more
+
+
+def find_depths(
+    scene: Scene, path: Path, *, kind: DepthKind | None = None, scale: float | None = None
+) -> DepthFiles:
+    """The depth maps in a folder that belong to images of a scene.
+
+    Args:
+        scene: The scene.
+        path: The folder: maps named like the images, with subfolders, or a COLMAP dense workspace,
+            an RGB-D capture in NICE-SLAM's or TUM's layout, or the output of ``splatseed depth``.
+        kind: What the values are; None: what the folder or file itself says, else planar z.
+        scale: Stored units per scene unit; None: what the folder itself says, else 1000 for
+            integers and 1 for floats.
+
+    Returns:
+        The maps, read one by one on demand. An image without a map is not among them.
+
+    Raises:
+        ParameterError: The kind is unknown, or the scale is not a positive number.
+        SceneNotFoundError: There is no such folder, or no image has a map in it.
+        SceneFormatError: Two images share a map, or the folder's description is damaged.
+    """
+    if kind is not None and kind not in KINDS:
+        raise ParameterError(
+            f"a kind of depth: {', '.join(KINDS)}", found=repr(kind), fix="Choose one of them."
+        )
+    if scale is not None and not (math.isfinite(scale) and scale > 0):
+        raise ParameterError(
+            "a scale of depth above 0", found=f"{scale}", fix="Give stored units per scene unit."
+        )
+    root = Path(path)
+    if not root.is_dir():
+        raise SceneNotFoundError(
+            f"a folder of depth maps at {root}",
+            found="a file" if root.exists() else "nothing",
+            fix="Name the folder that the maps lie in.",
+        )
+    maps = search_depths(scene, root)
+    if maps is None:
+        name = scene.images[0].name if scene.images else ""
+        raise SceneNotFoundError(
+            f"depth maps of the scene's images in {root}"
+            + (f", such as {name}{SUFFIXES[0]} or {Path(name).stem}.png" if name else ""),
+            found="none" if name else "a scene without images",
+            fix="Name maps as their images are, with subfolders and another suffix.",
+        )
+    return replace(maps, kind=kind or maps.kind, scale=scale or maps.scale)
+
+
+def with_own_depths(scene: Scene) -> Scene:
+    """The scene with the depth maps that lie in its own folder, if it has none and there are some.
+
+    Raises:
+        SceneFormatError: Two images share a map, or the folder's description is damaged.
+    """
+    if scene.depths is not None or scene.source is None:
+        return scene
+    return scene.replace(depths=search_depths(scene, scene.source.root))
+
+
+def search_depths(scene: Scene, root: Path) -> DepthFiles | None:
+    """As ``find_depths``, but None where no image has a map.
+
+    Raises:
+        SceneFormatError: Two images share a map, or the folder's description is damaged.
+    """
+    if is_tum(root) and (maps := find_tum_depths(scene, root)) is not None:
+        return maps
+    if (maps := match_by_name(scene, root)) is not None:
+        return maps
+    capture = root.resolve().parent  # perhaps the folder of depth images was named
+    return find_tum_depths(scene, capture) if is_tum(capture) else None

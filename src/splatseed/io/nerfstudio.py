@@ -27,14 +27,13 @@ from jaxtyping import Float64
 
 from splatseed.camera import Intrinsics, quat_from_rotation
 from splatseed.errors import SceneFormatError
-from splatseed.io.colmap.model import MAX_ID, make_intrinsics
-from splatseed.io.colmap.scene import (
-    empty_cloud,
+from splatseed.io.colmap import MAX_ID, make_intrinsics
+from splatseed.io.files import guarded, odd_kind, open_file, read_json
+from splatseed.io.model import (
     find_model,
     read_model_cameras,
     read_model_points,
 )
-from splatseed.io.files import guarded, odd_kind, open_file, read_json
 from splatseed.io.photograph import image_warnings, lens_warnings
 from splatseed.io.ply import read_ply
 from splatseed.pointcloud import PointCloud
@@ -337,7 +336,7 @@ def _find_points(transforms: Transforms) -> tuple[PointCloud, Path, list[str]]:
         return read_ply(ply), ply, notes
     model_dir = find_model(root / "colmap/sparse/0", root / "sparse/0", root / "sparse")
     if model_dir is None:
-        return empty_cloud(), root / _POINT_FILES[0], notes
+        return PointCloud.empty(), root / _POINT_FILES[0], notes
     points, tracks, points_path = read_model_points(model_dir)
     _, model_images = read_model_cameras(model_dir)
     transform, doubts = _transform_of_model(transforms, model_dir, model_images)

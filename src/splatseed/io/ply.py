@@ -11,7 +11,7 @@ Files with lists in their vertices, or another element before them, are refused:
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,17 +19,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from splatseed.errors import SceneFormatError
-from splatseed.io.cloud_file import (
-    CHUNK,
-    XYZ,
-    CloudChunk,
-    CloudFile,
-    Columns,
-    Painter,
-    RowTable,
-    TextTable,
-    positions,
-)
+from splatseed.io.cloud_file import RGB, XYZ, CloudFile, LineCloud, RowCloud
 from splatseed.io.files import check_room, open_file, readable
 from splatseed.literal import beginning
 from splatseed.pointcloud import PointCloud
@@ -38,16 +28,16 @@ EXPORT_PLY_AGAIN = "Copy the file again, or export it again as a binary little-e
 
 _TYPES = {
     "char": "i1",
-    "int8": "i1",
     "uchar": "u1",
-    "uint8": "u1",
     "short": "i2",
-    "int16": "i2",
     "ushort": "u2",
-    "uint16": "u2",
     "int": "i4",
-    "int32": "i4",
     "uint": "u4",
+    "int8": "i1",
+    "uint8": "u1",
+    "int16": "i2",
+    "uint16": "u2",
+    "int32": "i4",
     "uint32": "u4",
     "float": "f4",
     "float32": "f4",
@@ -59,8 +49,7 @@ _END = re.compile(rb"^end_header[ \t]*(\r?\n|\Z)", re.MULTILINE)
 _MAX_HEADER = 1 << 20  # a longer search would only crawl through a body
 _GREY = 128
 _DROP_IN = np.dtype(
-    [(name, "<f4") for name in (*XYZ, "nx", "ny", "nz")]
-    + [(name, "u1") for name in ("red", "green", "blue")]
+    [(name, "<f4") for name in (*XYZ, "nx", "ny", "nz")] + [(name, "u1") for name in RGB]
 )
 _MODELS = {
     ".spz": "Gaussians compressed by Niantic's spz",
@@ -165,49 +154,29 @@ def _property(name: str, kind: list[str]) -> Property | None:
     return None
 
 
-class PlyCloud(CloudFile):
-    """A PLY file of points, of any size.
+def open_ply(path: Path) -> CloudFile:
+    """Open a PLY file of points, of any size.
 
     Raises:
         SceneFormatError: It is not a PLY, has no vertices with x, y, z, or is cut short.
     """
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        with open_file(path) as file:
-            header = parse_header(path, file.read(_MAX_HEADER))
-        vertex = _vertex_of(path, header)
-        names = [each.name for each in vertex.properties]
-        self._columns = Columns.among(names)
-        self.count, self.colors = vertex.num_rows, self._columns.colors
-        self._table: RowTable | TextTable
-        if header.byte_order:
-            self._table = RowTable(path, header.dtype(vertex), header.size, self.count)
-        else:
-            intensity = self._columns.intensity
-            used = (*XYZ, *self._columns.rgb, *([intensity] if intensity else []))
-            whole = frozenset(each.name for each in vertex.properties if each.dtype[0] in "iu")
-            self._table = TextTable(
-                path, names, used, header.size, self.count, integers=whole - {*XYZ}
-            )
-        self._painter: Painter | None = None
-
-    def chunks(self, size: int = CHUNK) -> Iterator[CloudChunk]:
-        """See ``CloudFile.chunks``."""
-        if self._painter is None:
-            self._painter = Painter(self._columns, self._table.sample)
-        yield from map(self._painter.chunk, self._table.columns(size))
-
-    def whole(self) -> PointCloud:
-        """All points; grey without colours."""
-        count = self.count or 0
-        column = next(self._table.columns(max(count, 1)), np.empty(0, _DROP_IN).__getitem__)
-        with np.errstate(over="ignore"):  # beyond float32 is infinite, to be seen and dropped
-            xyz = positions(column).astype(np.float32)
-        rgb = None
-        if count and self._columns.rgb:
-            rgb = Painter(self._columns, lambda: column).paint(column)
-        return PointCloud(xyz, np.full((count, 3), _GREY, np.uint8) if rgb is None else rgb)
+    with open_file(path) as file:
+        header = parse_header(path, file.read(_MAX_HEADER))
+    for each in header.elements:
+        refuse_packed(path, [prop.name for prop in each.properties])
+    vertex = header.elements[0] if header.elements else Element("no element", 0, ())
+    names = [each.name for each in vertex.properties]
+    if vertex.name != "vertex" or not set(XYZ) <= set(names) or vertex.has_lists:
+        raise SceneFormatError(
+            f"{path} to begin with vertices that have x, y, z and no lists",
+            found=f"{vertex.name} with {', '.join(names)[:200] or 'no properties'}",
+            fix=EXPORT_PLY_AGAIN,
+        )
+    dtype = header.dtype(vertex)
+    if header.byte_order:
+        return RowCloud(path, dtype, header.size, vertex.num_rows)
+    whole = {n: np.dtype(np.int64) for n in names if dtype[n].kind in "iu" and n not in XYZ}
+    return LineCloud(path, names, header.size, vertex.num_rows, types=whole)
 
 
 def read_ply(path: Path) -> PointCloud:
@@ -222,9 +191,12 @@ def read_ply(path: Path) -> PointCloud:
             than the free memory, or has no vertices with x, y, z.
     """
     with readable(path):
-        cloud = PlyCloud(path)
+        cloud = open_ply(path)
         check_room(path, path.stat().st_size)
-        return cloud.whole()
+        whole = cloud.whole()
+    with np.errstate(over="ignore"):  # beyond float32 is infinite, to be seen and dropped
+        xyz = whole.xyz.astype(np.float32)
+    return PointCloud(xyz, np.full(xyz.shape, _GREY, np.uint8) if whole.rgb is None else whole.rgb)
 
 
 def write_ply(path: Path, points: PointCloud) -> None:
@@ -253,28 +225,20 @@ def ply_header(count: int) -> bytes:
 def ply_rows(xyz: Float32[np.ndarray, "n 3"], rgb: UInt8[np.ndarray, "n 3"]) -> memoryview:
     """The body of such a PLY: some of its points."""
     rows = np.zeros(len(xyz), _DROP_IN)
-    for i, (axis, channel) in enumerate(zip(XYZ, ("red", "green", "blue"), strict=True)):
+    for i, (axis, channel) in enumerate(zip(XYZ, RGB, strict=True)):
         rows[axis], rows[channel] = xyz[:, i], rgb[:, i]
     return rows.view(np.uint8).data
 
 
 def refuse_model(path: Path) -> None:
-    """Refuse a file whose name is that of a format of trained Gaussians.
-
-    Raises:
-        SceneFormatError: It is one.
-    """
+    """Raise a ``SceneFormatError`` for a file named as a format of trained Gaussians is."""
     kind = _MODELS.get(path.suffix.lower())
     if kind is not None and path.is_file():
         raise _is_model(path, kind)
 
 
 def refuse_packed(path: Path, properties: Collection[str]) -> None:
-    """Refuse a PLY whose properties are those of packed Gaussians.
-
-    Raises:
-        SceneFormatError: They are.
-    """
+    """Raise a ``SceneFormatError`` for a PLY whose properties are those of packed Gaussians."""
     if "packed_position" in properties:
         raise _is_model(path, "Gaussians compressed as PlayCanvas's .compressed.ply")
 
@@ -285,18 +249,4 @@ def _is_model(path: Path, kind: str) -> SceneFormatError:
         found=f"{kind}: a trained model",
         fix="Score it with splatseed evaluate MODEL --scene SCENE, look at it with splatseed view "
         "MODEL; a .ply of it, by splatseed export MODEL -o OUT.ply, is read as points too.",
-    )
-
-
-def _vertex_of(path: Path, header: Header) -> Element:
-    for each in header.elements:
-        refuse_packed(path, [prop.name for prop in each.properties])
-    first = header.elements[0] if header.elements else Element("no element", 0, ())
-    names = [each.name for each in first.properties]
-    if first.name == "vertex" and set(XYZ) <= set(names) and not first.has_lists:
-        return first
-    raise SceneFormatError(
-        f"{path} to begin with vertices that have x, y, z and no lists",
-        found=f"{first.name} with {', '.join(names)[:200] or 'no properties'}",
-        fix=EXPORT_PLY_AGAIN,
     )

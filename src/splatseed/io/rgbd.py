@@ -28,7 +28,6 @@ from jaxtyping import Bool, Float64, Int64
 
 from splatseed.camera import Intrinsics, quat_from_rotation, rotation_from_quat
 from splatseed.errors import SceneFormatError, SceneNotFoundError
-from splatseed.io.colmap.scene import empty_cloud
 from splatseed.io.depth_maps import (
     CAMERA_FILE,
     DepthFiles,
@@ -40,6 +39,7 @@ from splatseed.io.depth_maps import (
 from splatseed.io.files import guarded, open_file, read_bytes, read_json
 from splatseed.io.photograph import lens_warnings
 from splatseed.literal import agreeing, counted
+from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene, SceneSource
 
 _FRAME = re.compile(r"frame(\d+)\.(?:jpe?g|png)", re.IGNORECASE)
@@ -112,7 +112,7 @@ def load_rgbd(path: Path) -> Scene:
         images.append(Image(frames[i].name, i + 1, intrinsics, quat, translation))
     lost = [frames[i].name for i in np.flatnonzero(~tracked)]
     scene = Scene(
-        points=empty_cloud(),
+        points=PointCloud.empty(),
         images=tuple(images),
         intrinsics=(intrinsics,),
         source=SceneSource("rgbd", root, track, image_dir=folder),
@@ -171,7 +171,7 @@ def load_tum(path: Path) -> Scene:
     lost = [names[i] for i in np.flatnonzero(~near)]
     missing = [names[i] for i in np.flatnonzero(near & ~present)]
     scene = Scene(
-        empty_cloud(),
+        PointCloud.empty(),
         tuple(images),
         (intrinsics,),
         source=SceneSource("rgbd", root, root / "groundtruth.txt", image_dir=root / folder),

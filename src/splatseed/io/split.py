@@ -62,18 +62,6 @@ def follow_lists(scene: Scene) -> Scene:
     return scene.replace(warnings=tuple(warnings))
 
 
-def split_fields(scene: Scene) -> dict[str, list[str]]:
-    """The fields of a new ``transforms.json`` that tell nerfstudio the split; none without one."""
-    if scene.listed is None:
-        return {}
-    train, test = scene.split()
-    parts = {"train": train, "test": test, "val": test}
-    return {
-        f"{part}_filenames": [f"images/{image.name}" for image in images]
-        for part, images in parts.items()
-    }
-
-
 def _lists(scene: Scene) -> Iterator[_Lists]:
     """All lists that a scene has, in order of precedence."""
     source = scene.source

@@ -21,10 +21,10 @@ from typing import Any, TypeAlias
 from splatseed import errors
 from splatseed.camera import CAMERA_MODELS
 from splatseed.io import load_scene, write_scene
-from splatseed.io.layouts import write_split
 from splatseed.io.photograph import photograph_folder
 from splatseed.io.seeds import carry_seeds
 from splatseed.io.staging import MANIFEST, output_folder, write_json
+from splatseed.io.write import write_split
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.requirements import require

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image as PilImage
 
 from splatseed.io import load_scene, write_scene
-from splatseed.io.colmap.binary import write_points3d
+from splatseed.io.colmap import write_points3d
 from splatseed.io.ply import write_ply
 from splatseed.pointcloud import PointCloud
 

@@ -19,7 +19,7 @@ from splatseed.console import OUT, print_note, stage_display
 from splatseed.depthmap import DepthKind
 from splatseed.io import find_depths, load_originals, write_scene
 from splatseed.io.clouds import open_cloud
-from splatseed.io.depth_search import with_own_depths
+from splatseed.io.load import with_own_depths
 from splatseed.io.staging import check_output, check_parents
 from splatseed.literal import counted, quoted, visible
 from splatseed.runtime.memory import bytes_of

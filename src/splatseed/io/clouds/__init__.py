@@ -19,11 +19,11 @@ from splatseed.io.ply import refuse_model
 __all__ = ["CloudChunk", "CloudFile", "open_cloud"]
 
 _READERS = {
-    **dict.fromkeys((".las", ".laz"), "splatseed.io.clouds.las:LasCloud"),
-    ".e57": "splatseed.io.clouds.e57:E57Cloud",
-    ".ply": "splatseed.io.ply:PlyCloud",
-    ".pcd": "splatseed.io.clouds.pcd:PcdCloud",
-    **dict.fromkeys((".xyz", ".txt", ".csv", ".asc", ".pts"), "splatseed.io.clouds.text:TextCloud"),
+    **dict.fromkeys((".las", ".laz"), "splatseed.io.clouds.scans:LasCloud"),
+    ".e57": "splatseed.io.clouds.scans:E57Cloud",
+    ".ply": "splatseed.io.ply:open_ply",
+    ".pcd": "splatseed.io.clouds.pcd:open_pcd",
+    **dict.fromkeys((".xyz", ".txt", ".csv", ".asc", ".pts"), "splatseed.io.clouds.text:open_text"),
     ".npz": "splatseed.io.clouds.networks:NpzCloud",
     ".glb": "splatseed.io.clouds.networks:GlbCloud",
 }

@@ -24,14 +24,7 @@ from jaxtyping import Float64
 
 from splatseed.camera import rotation_from_quat
 from splatseed.errors import SceneFormatError
-from splatseed.io.cloud_file import (
-    CHUNK,
-    CloudChunk,
-    CloudFile,
-    RowTable,
-    color_bytes,
-    full_value,
-)
+from splatseed.io.cloud_file import RGB, XYZ, Block, CloudFile, RowCloud, color_bytes
 from splatseed.io.files import guarded, open_file, read_npy_header
 from splatseed.runtime.memory import check_memory
 
@@ -74,7 +67,6 @@ class NpzCloud(CloudFile):
     """
 
     def __init__(self, path: Path) -> None:
-        self.path = path
         members = _members(path)
         points = next((members[name] for name in POSITIONS if name in members), None)
         if points is None or points.shape[-1:] != (3,) or points.dtype.kind not in "fiu":
@@ -84,25 +76,25 @@ class NpzCloud(CloudFile):
                 found=found[:200] or "no arrays",
                 fix="Save the points under one of these names.",
             )
-        self._points, self.count = points, points.size // 3
+        count = points.size // 3
 
         def beside(names: tuple[str, ...], size: int) -> _Member | None:
             there = (members[name] for name in names if name in members)
             return next((m for m in there if m.size == size and m.dtype.kind in "bfiu"), None)
 
-        self._mask, self._confidence = beside(MASKS, self.count), beside(CONFIDENCES, self.count)
-        self._color = beside(COLORS, 3 * self.count)
+        self._points, self._color = points, beside(COLORS, 3 * count)
+        self._mask, self._confidence = beside(MASKS, count), beside(CONFIDENCES, count)
         shape = self._color.shape if self._color else ()
         self._planar = shape[-1:] != (3,) and shape[-3:-2] == (3,)
-        if self._color and (not (self._planar or shape[-1:] == (3,)) or shape == ()):
+        if not self._planar and shape[-1:] != (3,):
             self._color = None
-        self._full = 255.0
-        if self._color:
-            self.colors = "rgb"
-            self._full = full_value(next(_parts(path, self._color, 1 << 20), np.empty(0)))
+        super().__init__(path, (*XYZ, *RGB) if self._color else XYZ, count)
 
-    def chunks(self, size: int = CHUNK) -> Iterator[CloudChunk]:
-        """See ``CloudFile.chunks``."""
+    def _sample(self) -> Block:
+        values: Any = self._color and next(_parts(self.path, self._color, 1 << 20), np.empty(0))
+        return dict.fromkeys(RGB, values)
+
+    def _blocks(self, size: int) -> Iterator[Block]:
         streams = {"xyz": _parts(self.path, self._points, 3 * size)}
         if self._color:
             streams["rgb"] = self._painted(self._color, size)
@@ -112,22 +104,24 @@ class NpzCloud(CloudFile):
             streams["confidence"] = _parts(self.path, self._confidence, size)
         for values in zip(*streams.values(), strict=True):
             parts = dict(zip(streams, values, strict=True))
-            chunk = CloudChunk(parts["xyz"].reshape(-1, 3).astype(np.float64), parts.get("rgb"))
-            valid = np.ones(len(chunk), bool)
+            table = parts["xyz"].reshape(-1, 3)
+            valid = np.ones(len(table), bool)
             if "mask" in parts:
                 valid &= parts["mask"] != 0
             if "confidence" in parts:
                 valid &= parts["confidence"] >= LEAST
-            if len(chunk := chunk if valid.all() else chunk.select(valid)):
-                yield chunk
+            block = dict(zip(XYZ, table[valid].T, strict=True))
+            if "rgb" in parts:
+                block |= zip(RGB, parts["rgb"][valid].T, strict=True)
+            yield block
 
     def _painted(self, color: _Member, size: int) -> Iterator[np.ndarray]:
-        """Colours, ``size`` points at a time."""
+        """Colours [n, 3], ``size`` points at a time."""
         pixels = int(np.prod(color.shape[-2:])) if self._planar else size
-        held = np.empty((0, 3), np.uint8)
+        held = np.empty((0, 3), color.dtype)
         for part in _parts(self.path, color, 3 * pixels):
             rgb = part.reshape(3, -1).T if self._planar else part.reshape(-1, 3)
-            held = np.concatenate([held, color_bytes(rgb, self._full)])
+            held = np.concatenate([held, rgb])
             while len(held) >= size:
                 yield held[:size]
                 held = held[size:]
@@ -173,8 +167,8 @@ class _Part(NamedTuple):
 
     mode: int
     matrix: Float64[np.ndarray, "4 4"]
-    position: RowTable
-    color: RowTable | None
+    position: RowCloud
+    color: RowCloud | None
 
 
 class GlbCloud(CloudFile):
@@ -185,7 +179,6 @@ class GlbCloud(CloudFile):
     """
 
     def __init__(self, path: Path) -> None:
-        self.path = path
         with guarded(path, _WHOLE_GLB), open_file(path) as file:
             magic, version, _, length, kind = struct.unpack("<4sIIII", file.read(20))
             if (magic, version, kind) != _GLTF or length > path.stat().st_size:
@@ -196,27 +189,30 @@ class GlbCloud(CloudFile):
             self._parts = drawn or parts
             if not self._parts:
                 raise ValueError("no vertices")
-        self.count = sum(part.position.count for part in self._parts)
-        self.colors = "rgb" if all(part.color for part in self._parts) else "none"
+        colored = all(part.color for part in self._parts)
+        count = sum(part.position.num_rows for part in self._parts)
+        super().__init__(path, (*XYZ, *RGB) if colored else XYZ, count)
         if drawn and len(drawn) < len(parts):
             self.warnings = ("It holds points and meshes: the meshes are left out.",)
 
-    def chunks(self, size: int = CHUNK) -> Iterator[CloudChunk]:
-        """See ``CloudFile.chunks``."""
+    def _sample(self) -> Block:
+        return dict.fromkeys(RGB, np.empty(0, np.uint8))  # blocks have bytes
+
+    def _blocks(self, size: int) -> Iterator[Block]:
         with guarded(self.path, _WHOLE_GLB):
             for part in self._parts:
-                colors = part.color.columns(size) if part.color and self.has_color else None
-                for column in part.position.columns(size):
+                for start in range(0, part.position.num_rows, size):
                     with np.errstate(invalid="ignore", over="ignore"):
-                        xyz = column("values").astype(np.float64)
+                        xyz = part.position.rows(start, size)["values"].astype(np.float64)
                         xyz = xyz @ part.matrix[:3, :3].T + part.matrix[:3, 3]
-                    rgb = None
-                    if colors is not None:
-                        values = next(colors)("values")[:, :3]
+                    block = dict(zip(XYZ, xyz.T, strict=True))
+                    if part.color and self.has_color:
+                        values = part.color.rows(start, size)["values"][:, :3]
                         # Integers are normalised to their range, as glTF has them.
                         is_float = values.dtype.kind == "f"
-                        rgb = color_bytes(values, 1 if is_float else np.iinfo(values.dtype).max)
-                    yield CloudChunk(xyz, rgb)
+                        full = 1 if is_float else np.iinfo(values.dtype).max
+                        block |= zip(RGB, color_bytes(values, full).T, strict=True)
+                    yield block
 
 
 def _primitives(path: Path, content: Mapping[str, Any], body: int) -> Iterator[_Part]:
@@ -231,7 +227,7 @@ def _primitives(path: Path, content: Mapping[str, Any], body: int) -> Iterator[_
                 if name in {"POSITION", "COLOR_0"}
             }
             mode, color = int(primitive.get("mode", _TRIANGLES)), tables.get("COLOR_0")
-            if color and color.count != tables["POSITION"].count:
+            if color and color.num_rows != tables["POSITION"].num_rows:
                 raise ValueError("not a colour for each vertex")
             yield _Part(mode, matrix, tables["POSITION"], color)
 
@@ -267,7 +263,7 @@ def _matrix(node: Mapping[str, Any]) -> Float64[np.ndarray, "4 4"]:
     return matrix
 
 
-def _table(path: Path, content: Mapping[str, Any], index: int, body: int) -> RowTable:
+def _table(path: Path, content: Mapping[str, Any], index: int, body: int) -> RowCloud:
     """The rows of an accessor, which may lie between those of others."""
     accessor = content["accessors"][index]
     view = content["bufferViews"][accessor["bufferView"]]
@@ -276,11 +272,6 @@ def _table(path: Path, content: Mapping[str, Any], index: int, body: int) -> Row
     item = np.dtype((_TYPES[accessor["componentType"]], (_WIDTHS[accessor["type"]],)))
     stride, at = int(view.get("byteStride", 0)) or item.itemsize, int(accessor.get("byteOffset", 0))
     within = at % stride if stride > item.itemsize else 0
-    layout: Any = {
-        "names": ["values"],
-        "formats": [item],
-        "offsets": [within],
-        "itemsize": stride,
-    }
+    layout: Any = {"names": ["values"], "formats": [item], "offsets": [within], "itemsize": stride}
     start = body + int(view.get("byteOffset", 0)) + at - within
-    return RowTable(path, np.dtype(layout), start, int(accessor["count"]))
+    return RowCloud(path, np.dtype(layout), start, int(accessor["count"]))

@@ -8,121 +8,58 @@ whole and needs two more packages.)
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import UInt8
 
-from splatseed.errors import SceneFormatError
-from splatseed.io.cloud_file import (
-    CHUNK,
-    XYZ,
-    CloudChunk,
-    CloudFile,
-    Column,
-    Columns,
-    Painter,
-    RowTable,
-    TextTable,
-    positions,
-)
-from splatseed.io.files import COPY_AGAIN, guarded, open_file
+from splatseed.io.cloud_file import PACKED, XYZ, Block, CloudFile, LineCloud, RowCloud
+from splatseed.io.files import guarded, open_file
 from splatseed.runtime.jit import inline
 from splatseed.runtime.memory import check_memory
 
 _HEADER_BYTES = 1 << 16
 _KINDS = {"F": "f", "I": "i", "U": "u"}
-_PACKED = ("rgb", "rgba")
 
 
-@dataclass(frozen=True)
-class _Header:
-    """The layout of a row, the number of rows, the kind of the body, and where it begins."""
-
-    dtype: np.dtype[Any]
-    rows: int
-    body: str
-    offset: int
-
-
-@dataclass(frozen=True)
-class _UnpackedTable:
-    """The columns of a compressed body, which holds them one after another."""
-
-    data: dict[str, np.ndarray]
-    count: int
-
-    def columns(self, size: int) -> Iterator[Column]:
-        """The rows, at most ``size`` at a time."""
-        for start in range(0, self.count, size):
-            yield lambda name, at=start: self.data[name][at : at + size]  # type: ignore[misc]  # bound at once
-
-    def sample(self) -> Column:
-        """All rows."""
-        return self.data.__getitem__
-
-
-class PcdCloud(CloudFile):
-    """A PCD file.
+def open_pcd(path: Path) -> CloudFile:
+    """Open a PCD file.
 
     Raises:
         SceneFormatError: It is not a PCD, has no x, y, z, or is cut short.
     """
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        with guarded(path, "a PCD: FIELDS, SIZE, TYPE, POINTS, DATA"), open_file(path) as file:
-            header = _parse_header(file.read(_HEADER_BYTES))
-        dtype, self.count = header.dtype, header.rows
-        names = list(dtype.names or ())
-        self._packed = next((name for name in _PACKED if name in names), None)
-        columns = Columns() if self._packed else Columns.among(names)
-        self.colors = "rgb" if self._packed else columns.colors
-        optional = (self._packed, columns.intensity)
-        used = (*XYZ, *columns.rgb, *(name for name in optional if name))
-        wrong = [name for name in used if name not in names or dtype[name].shape]
-        if wrong:
-            raise SceneFormatError(
-                f"fields {', '.join(used)} of one value (COUNT 1) in {path}",
-                found=f"none, or another COUNT, of {wrong[0]}",
-                fix=COPY_AGAIN,
-            )
-        self._is_float = self._packed is not None and dtype[self._packed].kind == "f"
-        self._table: RowTable | TextTable | _UnpackedTable
-        if header.body == "ascii":
-            shapes = {name: int(np.prod(dtype[name].shape, dtype=int)) for name in names}
-            spread = [
-                name if i == 0 else f"{name} {i}" for name in names for i in range(shapes[name])
-            ]
-            self._table = TextTable(path, spread, used, header.offset, self.count)
-        elif header.body == "binary":
-            self._table = RowTable(path, dtype, header.offset, self.count)
-        else:
-            self._table = _decompressed(path, header)
-        self._painter = Painter(columns, self._table.sample)
-
-    def chunks(self, size: int = CHUNK) -> Iterator[CloudChunk]:
-        """See ``CloudFile.chunks``."""
-        for column in self._table.columns(size):
-            if self._packed is None:
-                yield self._painter.chunk(column)
-            else:
-                yield CloudChunk(positions(column), self._unpacked(column(self._packed)))
-
-    def _unpacked(self, values: np.ndarray) -> UInt8[np.ndarray, "n 3"]:
-        """Colours from 32 bits 0xAARRGGBB, which may be declared as a float."""
-        if self._is_float:
-            bits = np.ascontiguousarray(values, np.float32).view(np.uint32)
-        else:
-            bits = np.asarray(values).astype(np.int64).astype(np.uint32)
-        return np.stack([(bits >> shift) & 255 for shift in (16, 8, 0)], axis=1).astype(np.uint8)
+    with guarded(path, "a PCD: FIELDS, SIZE, TYPE, POINTS, DATA"), open_file(path) as file:
+        dtype, rows, body, offset = _parse_header(file.read(_HEADER_BYTES))
+    if body == "binary":
+        return RowCloud(path, dtype, offset, rows)
+    if body == "binary_compressed":
+        return _ColumnCloud(path, _decompressed(path, dtype, rows, offset), rows)
+    fields = [(name, int(np.prod(dtype[name].shape, dtype=int))) for name in dtype.names or ()]
+    names = [name if i == 0 else f"{name} {i}" for name, count in fields for i in range(count)]
+    types = {PACKED: dtype[PACKED]} if PACKED in names else {}
+    return LineCloud(path, names, offset, rows, types=types)
 
 
-def _parse_header(data: bytes) -> _Header:
+class _ColumnCloud(CloudFile):
+    """Columns in memory."""
+
+    def __init__(self, path: Path, columns: dict[str, np.ndarray], count: int) -> None:
+        super().__init__(path, columns, count)
+        self._columns, self._num_rows = columns, count
+
+    def _blocks(self, size: int) -> Iterator[Block]:
+        for start in range(0, self._num_rows, size):
+            yield {name: self._columns[name][start : start + size] for name in self.used}
+
+    def _sample(self) -> Block:
+        return self._columns
+
+
+def _parse_header(data: bytes) -> tuple[np.dtype[Any], int, str, int]:
+    """The layout of a row, the number of rows, the kind of the body, and where it begins."""
     known: dict[str, list[str]] = {}
     at = 0
     while "DATA" not in known and (end := data.find(b"\n", at)) >= 0:
@@ -132,26 +69,35 @@ def _parse_header(data: bytes) -> _Header:
         at = end + 1
     names, sizes, kinds = known["FIELDS"], known["SIZE"], known["TYPE"]
     counts = [int(each) for each in known.get("COUNT", ["1"] * len(names))]
-    fields: list[Any] = [
-        (f"pad {i}" if name == "_" else name, f"<{_KINDS[kind]}{int(size)}", *shape)
-        for i, (name, kind, size, count) in enumerate(zip(names, kinds, sizes, counts, strict=True))
-        if (shape := ((count,),) if count != 1 else ()) is not None
-    ]
-    size = int(known["WIDTH"][0]) * int(known["HEIGHT"][0]) if "POINTS" not in known else 0
-    rows = int(known["POINTS"][0]) if "POINTS" in known else size
+    packed = next((name for name in ("rgb", "rgba") if name in names), None)
+    fields: list[Any] = []
+    for i, (name, kind, size, count) in enumerate(zip(names, kinds, sizes, counts, strict=True)):
+        known_as = f"pad {i}" if name == "_" else PACKED if (name, size) == (packed, "4") else name
+        several = () if count == 1 else ((count,),)
+        fields.append(
+            (f"{known_as}[]" if several else known_as, f"<{_KINDS[kind]}{int(size)}", *several)
+        )
+    if missing := set(XYZ) - {name for name, *_ in fields}:
+        raise ValueError(f"no fields {', '.join(sorted(missing))} of one value (COUNT 1)")
+    rows = math.prod(
+        int(known[key][0]) for key in (["POINTS"] if "POINTS" in known else ["WIDTH", "HEIGHT"])
+    )
     (body,) = (word.lower() for word in known["DATA"])
     if body not in {"ascii", "binary", "binary_compressed"} or rows < 0:
         raise ValueError(f"{rows} points, DATA {body}")
-    return _Header(np.dtype(fields), rows, body, at)
+    return np.dtype(fields), rows, body, at
 
 
-def _decompressed(path: Path, header: _Header) -> _UnpackedTable:
-    needed = header.rows * header.dtype.itemsize
+def _decompressed(
+    path: Path, dtype: np.dtype[Any], rows: int, offset: int
+) -> dict[str, np.ndarray]:
+    """The columns of a compressed body, which holds them one after another."""
+    needed = rows * dtype.itemsize
     fix = "Save the cloud as a binary PCD or PLY, which is read in parts."
     # It is in memory packed and unpacked.
     check_memory(2 * needed, 1, "bytes of a compressed PCD", fix=fix)
     with guarded(path, "a PCD compressed by LZF"), open_file(path) as file:
-        file.seek(header.offset)
+        file.seek(offset)
         size, promised = struct.unpack("<II", file.read(8))
         packed = file.read(min(size, path.stat().st_size))
         if len(packed) < size or promised != needed:
@@ -161,13 +107,12 @@ def _decompressed(path: Path, header: _Header) -> _UnpackedTable:
         if not decode(np.frombuffer(packed, np.uint8), data):
             raise ValueError("bytes that are not")
     columns, at = {}, 0
-    for name in header.dtype.names or ():
-        kind = header.dtype[name]
-        stop = at + header.rows * kind.itemsize
-        values = data[at:stop].view(kind.base)
-        columns[name] = values.reshape(header.rows, -1)[:, 0] if kind.shape else values
+    for name in dtype.names or ():
+        stop = at + rows * dtype[name].itemsize
+        if not dtype[name].shape:
+            columns[name] = data[at:stop].view(dtype[name])
         at = stop
-    return _UnpackedTable(columns, header.rows)
+    return columns
 
 
 @inline

@@ -17,18 +17,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from splatseed.errors import SceneFormatError
-from splatseed.io.cloud_file import (
-    CHUNK,
-    RGB_NAMES,
-    SAMPLE_BYTES,
-    XYZ,
-    CloudChunk,
-    CloudFile,
-    Columns,
-    Dialect,
-    Painter,
-    TextTable,
-)
+from splatseed.io.cloud_file import RGB, SAMPLE_BYTES, XYZ, CloudFile, Dialect, LineCloud
 from splatseed.io.files import open_file
 
 _NAMES = {
@@ -49,45 +38,41 @@ _NAMES = {
 _MARKS = re.compile(r"^(//|#|%|;)+\s*")
 _UNIT = 1e-2
 """By how much the length of a triple may differ from 1 for it to count as a normal."""
-_RGB = RGB_NAMES[0]
 
 
-class TextCloud(CloudFile):
-    """A text file of points.
+def open_text(path: Path) -> CloudFile:
+    """Open a text file of points.
 
     Raises:
         SceneFormatError: Its lines hold no three numbers.
     """
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        with open_file(path) as file:
-            head = file.read(SAMPLE_BYTES).decode("latin-1")
-        lines = head.split("\n")[: None if len(head) < SAMPLE_BYTES else -1]
-        first, dialect = _first_line(path, lines)
-        rows = [line.strip() for line in lines[first:] if line.strip()]
-        num = len(_words(rows[0], dialect))
-        try:  # rows of another length than the first are left to the reader
-            even = [row for row in rows if len(_words(row, dialect)) == num]
-            sample = dialect.parse(even, range(num))
-        except ValueError as error:
-            raise SceneFormatError(
-                f"numbers in every row of {path}", found=str(error)[:120], fix="Export it again."
-            ) from None
-        names = _named(lines[:first], dialect, num)
-        if names is None:
-            names = _guessed(sample, path.suffix.lower() == ".pts")
-            self.warnings = (_describe_guess(path, names),)
-        columns = Columns.among(names)
-        self.colors = columns.colors
-        used = (*XYZ, *columns.rgb, *([columns.intensity] if columns.intensity else []))
-        offset = sum(len(line) + 1 for line in lines[:first])  # latin-1: a byte per character
-        self._table = TextTable(path, names, used, offset, dialect=dialect)
-        self._painter = Painter(columns, self._table.sample)
-
-    def chunks(self, size: int = CHUNK) -> Iterator[CloudChunk]:
-        """See ``CloudFile.chunks``."""
-        yield from map(self._painter.chunk, self._table.columns(size))
+    with open_file(path) as file:
+        head = file.read(SAMPLE_BYTES).decode("latin-1")
+    lines = head.split("\n")[: None if len(head) < SAMPLE_BYTES else -1]
+    first, dialect = _first_line(path, lines)
+    rows = [line.strip() for line in lines[first:] if line.strip()]
+    num = len(_words(rows[0], dialect))
+    try:  # rows of another length than the first are left to the reader
+        even = [row for row in rows if len(_words(row, dialect)) == num]
+        sample = dialect.parse(even, range(num))
+    except ValueError as error:
+        raise SceneFormatError(
+            f"numbers in every row of {path}", found=str(error)[:120], fix="Export it again."
+        ) from None
+    named = _named(lines[:first], dialect, num)
+    names = named or _guessed(sample, path.suffix.lower() == ".pts")
+    offset = sum(len(line) + 1 for line in lines[:first])  # latin-1: a byte per character
+    cloud = LineCloud(path, names, offset, dialect=dialect)
+    if named is None:
+        what = "none as colours"
+        if cloud.colors == "rgb":
+            at = names.index(RGB[0]) + 1
+            what = f"{at} to {at + 2} as red, green, blue"
+        elif cloud.colors == "intensity":
+            what = "4 as intensity"
+        taken = f"columns 1 to 3 of {path.name} are taken as x, y, z, {what}"
+        cloud.warnings = (f"It has no line of names: {taken}.",)
+    return cloud
 
 
 def _first_line(path: Path, lines: Sequence[str]) -> tuple[int, Dialect]:
@@ -147,7 +132,7 @@ def _guessed(sample: Float64[np.ndarray, "N C"], is_pts: bool) -> list[str]:
     starts = range(4, 5) if is_pts and count == 7 else range(3, count - 2)
     start = next((i for i in starts if _like_colors(sample[:, i : i + 3])), None)
     if start is not None:
-        names[start : start + 3] = _RGB
+        names[start : start + 3] = RGB
     elif count == 4:
         names[3] = "intensity"
     return names
@@ -160,13 +145,3 @@ def _like_colors(values: Float64[np.ndarray, "N 3"]) -> bool:
     if known.max() <= 1.0 and (known != np.rint(known)).any():
         return bool((np.abs(np.linalg.norm(known, axis=1) - 1.0) > _UNIT).mean() > 0.5)
     return bool(known.max() <= 65535 and (known == np.rint(known)).all())
-
-
-def _describe_guess(path: Path, names: Sequence[str]) -> str:
-    what = "none as colours"
-    if _RGB[0] in names:
-        at = names.index(_RGB[0]) + 1
-        what = f"{at} to {at + 2} as red, green, blue"
-    elif "intensity" in names:
-        what = "4 as intensity"
-    return f"It has no line of names: columns 1 to 3 of {path.name} are taken as x, y, z, {what}."

@@ -1,0 +1,252 @@
+"""Scans of surveyors: LAS and LAZ by laspy with lazrs, E57 by pye57 (libE57Format).
+
+LAS: coordinates are float64 as the file's scale and offset have them; points that it marks as
+withheld are left out; colours that are all 0 are none, and then intensity that varies is used.
+E57: the points of all scans come one scan after another, in the common frame that the scans' poses
+lead to; Cartesian and spherical coordinates are read; points marked invalid are left out. Promise:
+files are read in parts, never whole; a LAZ file that ends early is an error, not a shorter cloud;
+what it says of its chunks is checked before lazrs, which would end the process, allocates for it.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from splatseed.io.cloud_file import (
+    RGB,
+    SAMPLE_ROWS,
+    SAMPLES,
+    XYZ,
+    Block,
+    CloudFile,
+    check_size,
+    sample_starts,
+)
+from splatseed.io.files import guarded
+from splatseed.requirements import require
+
+_WHERE_POINTS, _RECORD = 96, 54
+"""Where a header has the offset of the points, followed by the number of variable length records;
+bytes of each of these, at least."""
+_MOST_BYTES = 1 << 30
+"""Of a chunk of points, unpacked; writers use 50,000 points, of 20 to some 100 bytes."""
+_CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
+_SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
+_E57_COLORS = {"colorRed": "red", "colorGreen": "green", "colorBlue": "blue"}
+_INVALID = ("cartesianInvalidState", "sphericalInvalidState")
+
+
+class LasCloud(CloudFile):
+    """A LAS or LAZ file.
+
+    Raises:
+        MissingDependencyError: laspy or lazrs is not installed.
+        SceneFormatError: It is not LAS, or cut short.
+    """
+
+    def __init__(self, path: Path) -> None:
+        require("laspy", "lazrs")
+        with _opened_las(path) as file:
+            self._num_rows = int(file.header.point_count)
+            bounds = np.array([file.header.mins, file.header.maxs], np.float64)
+            names = set(file.header.point_format.dimension_names)
+            there = [name for name in (*RGB, "intensity") if name in names]
+            parts = {name: [np.empty(0, np.uint16)] for name in there}
+            for start in sample_starts(self._num_rows):
+                file.seek(start)
+                points = file.read_points(SAMPLE_ROWS)
+                for name in there:
+                    parts[name].append(np.asarray(points[name], np.uint16))
+        self._known = {name: np.concatenate(each) for name, each in parts.items()}
+        self._marks_withheld = "withheld" in names
+        unused = set[str]()
+        if self._num_rows and not any(self._known[name].any() for name in set(RGB) & names):
+            unused |= set(RGB)
+        if not len(self._known.get("intensity", ())) or not np.ptp(self._known["intensity"]):
+            unused.add("intensity")
+        super().__init__(path, names - unused, self._num_rows)
+        self.bounds = bounds
+
+    def _sample(self) -> Block:
+        return self._known
+
+    def _blocks(self, size: int) -> Iterator[Block]:
+        given = 0
+        with _opened_las(self.path) as file:
+            while given < self._num_rows:
+                points = file.read_points(size)
+                if not len(points):
+                    raise ValueError(f"{given:,} of {self._num_rows:,} points")
+                given += len(points)
+                kept = np.ones(len(points), bool)
+                if self._marks_withheld:
+                    kept = ~np.asarray(points["withheld"], bool)
+                yield {name: np.asarray(points[name])[kept] for name in self.used}
+
+
+@contextmanager
+def _opened_las(path: Path) -> Iterator[Any]:
+    """A laspy reader; what it raises becomes one of our errors."""
+    import laspy  # noqa: PLC0415  (an optional package)
+
+    with guarded(path, "a complete LAS or LAZ file"):
+        # laspy makes room for all that a header promises in front of the points, whatever the
+        # file's size. Source: LAS 1.4 R15, tables 3 and 7.
+        size = path.stat().st_size
+        with path.open("rb") as file:
+            file.seek(_WHERE_POINTS)
+            start, number = struct.unpack("<II", file.read(8))
+        if start > size or number * _RECORD > size:
+            raise ValueError(f"{number:,} records and points from byte {start:,} in {size:,} bytes")
+        with laspy.open(path, read_evlrs=False) as reader:
+            header = reader.header
+            if header.are_points_compressed:
+                _check_chunks(path, header)
+            else:
+                bodies = header.point_count * header.point_format.size
+                check_size(path, header.offset_to_point_data + bodies)
+            yield reader
+
+
+def _check_chunks(path: Path, header: Any) -> None:
+    """Refuse a LAZ file whose description or table of chunks cannot be true.
+
+    Source: the LAZ specification (rapidlasso), "LASzip VLR" and "Chunk table".
+    """
+    import lazrs  # noqa: PLC0415  (an optional package)
+
+    if not header.point_count:
+        return  # there need not be a table
+    size, bytes_each = path.stat().st_size, header.point_format.size
+    vlr = lazrs.LazVlr(header.vlrs[header.vlrs.index("LasZipVlr")].record_data)
+    if vlr.item_size() != bytes_each:
+        raise ValueError(f"points of {vlr.item_size():,} bytes, not {bytes_each:,}")
+    with path.open("rb") as file:
+        number = _number_of_chunks(file, header.offset_to_point_data)
+        # A chunk begins with a point as it is.
+        if number * bytes_each > size:
+            raise ValueError(f"{number:,} chunks in {size:,} bytes")
+        file.seek(header.offset_to_point_data)
+        chunks = np.array(lazrs.read_chunk_table(file, vlr), np.float64).reshape(number, 2)
+    points, packed = chunks.sum(axis=0)
+    most = chunks[:, 0].max() * bytes_each
+    if packed > size or points < header.point_count or most > _MOST_BYTES:
+        found = f"chunks of {points:,.0f} points in {packed:,.0f} bytes"
+        raise ValueError(f"{found}, for {header.point_count:,} points in {size:,} bytes")
+
+
+def _number_of_chunks(file: IO[bytes], start: int) -> int:
+    """The number that stands before the table of chunks."""
+    file.seek(start)
+    (offset,) = struct.unpack("<q", file.read(8))
+    if offset <= start:  # written in one go: the offset follows the table
+        file.seek(-8, os.SEEK_END)
+        (offset,) = struct.unpack("<q", file.read(8))
+    file.seek(offset)
+    _, number = struct.unpack("<II", file.read(8))
+    return int(number)
+
+
+class E57Cloud(CloudFile):
+    """An E57 file.
+
+    Raises:
+        MissingDependencyError: pye57 is not installed.
+        SceneFormatError: It is not E57, damaged, or holds no points.
+    """
+
+    def __init__(self, path: Path) -> None:
+        require("pye57")
+        with _opened_e57(path) as (_, headers):
+            if not headers:
+                raise ValueError("no scans")
+            for header in headers:
+                _place_fields(header)
+            shared = set.intersection(*(set(header.point_fields) for header in headers))
+            count = sum(int(header.point_count) for header in headers)
+        super().__init__(path, (_E57_COLORS.get(name, name) for name in (*XYZ, *shared)), count)
+
+    def _sample(self) -> Block:
+        """The beginning of each scan."""
+        with _opened_e57(self.path) as (image, headers):
+            heads = [
+                next(_read_scan(image, header, SAMPLES * SAMPLE_ROWS), None) for header in headers
+            ]
+        there = [head for head in heads if head]
+        return {
+            name: np.concatenate([np.empty(0), *(head[name] for head in there)])
+            for name in self.used
+        }
+
+    def _blocks(self, size: int) -> Iterator[Block]:
+        with _opened_e57(self.path) as (image, headers):
+            for header in headers:
+                yield from _read_scan(image, header, size)
+
+
+@contextmanager
+def _opened_e57(path: Path) -> Iterator[tuple[Any, list[Any]]]:
+    """An open file and the headers of its scans; failures become one of our errors."""
+    from pye57 import ScanHeader, libe57  # noqa: PLC0415  (an optional package)
+
+    with guarded(path, "a complete E57 file"):
+        image = libe57.ImageFile(str(path), "r")  # pye57.E57 removes files that it fails to open
+        try:
+            scans = image.root()["data3D"]
+            yield image, [ScanHeader(scans[i]) for i in range(len(scans))]
+        finally:
+            image.close()
+
+
+def _place_fields(header: Any) -> tuple[str, ...]:
+    known = set(header.point_fields)
+    place = next((each for each in (_CARTESIAN, _SPHERICAL) if set(each) <= known), None)
+    if place is None:
+        raise ValueError(f"neither cartesian nor spherical coordinates: {sorted(known)}")
+    return place
+
+
+def _read_scan(image: Any, header: Any, size: int) -> Iterator[dict[str, np.ndarray]]:
+    """The valid points of a scan in the file's common frame, at most ``size`` at a time."""
+    from pye57 import libe57  # noqa: PLC0415  (an optional package)
+
+    place, count = _place_fields(header), int(header.point_count)
+    optional = (*_E57_COLORS, "intensity", *_INVALID)
+    fields = (*place, *(name for name in optional if name in header.point_fields))
+    room = min(size, max(count, 1))
+    # Colours may be bytes, 16-bit or 0 to 1: the values tell.
+    arrays: dict[str, np.ndarray] = {
+        name: np.empty(room, np.int8 if name in _INVALID else np.float64) for name in fields
+    }
+    buffers = libe57.VectorSourceDestBuffer()
+    for name, array in arrays.items():
+        buffers.append(libe57.SourceDestBuffer(image, name, array, room, True, True))
+    reader = header.points.reader(buffers)
+    given = 0
+    while number := reader.read():
+        given += number
+        valid = np.ones(number, bool)
+        for name in _INVALID:
+            if name in arrays:
+                valid &= arrays[name][:number] == 0
+        data = {name: array[:number][valid] for name, array in arrays.items()}
+        xyz = np.stack([data[name] for name in place], axis=1)
+        if place == _SPHERICAL:
+            distance, azimuth, elevation = xyz.T
+            flat, height = distance * np.cos(elevation), distance * np.sin(elevation)
+            xyz = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), height], axis=1)
+        if header.has_pose():
+            xyz = xyz @ np.asarray(header.rotation_matrix, np.float64).T
+            xyz = xyz + np.asarray(header.translation, np.float64)
+        named = {_E57_COLORS.get(name, name): values for name, values in data.items()}
+        yield named | dict(zip(XYZ, xyz.T, strict=True))
+    reader.close()
+    if given < count:
+        raise ValueError(f"{given:,} of {count:,} points of a scan")

@@ -1,0 +1,467 @@
+"""COLMAP's files: cameras, images and points3D, binary (read and written) and as text (read).
+
+Notation: ``_id`` comes from the file; ``where`` is the place that an error names, "file, record" or
+"file, line". In points3D, N records hold T observations in all; of a binary one, ``starts`` [N + 1]
+are the records' byte offsets, ended by the end of the last. Layouts as COLMAP's documentation of
+its output format gives them, little-endian. Promise: a binary file that was read is written back
+byte for byte; both forms of a model give the same, to the last bit; each record becomes one of our
+types with its values checked, or raises one error that names the place. Writers write straight to
+``path`` and let ``OSError`` pass: their caller stages the output.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from array import array
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+from jaxtyping import Float32, Int64, UInt8
+
+from splatseed.camera import CAMERA_MODELS, Intrinsics
+from splatseed.errors import OutputError, PointCloudError, SceneFormatError
+from splatseed.io.files import COPY_AGAIN, ByteReader, read_bytes
+from splatseed.pointcloud import PointCloud
+from splatseed.scene import NO_POINT, Image, Observations, Tracks
+
+MAX_ID = 2**32 - 1
+"""Camera ids, image ids and feature indices are 32-bit in COLMAP's binary form."""
+UNKNOWN_ERROR = -1.0
+"""COLMAP's reprojection error of a point that has none yet."""
+
+_MAX_SIZE = 2**31 - 1
+_NORM_RANGE = (1e-100, 1e100)  # inside it the square of a quaternion's norm is a normal float
+_COUNT = struct.Struct("<Q")
+_CAMERA = struct.Struct("<IiQQ")  # camera id, model id, width, height; then the parameters
+_POSE = struct.Struct("<I7dI")  # image id, wxyz quaternion, translation, camera id; then the name
+_FEATURE = np.dtype([("xy", "<f8", 2), ("point_id", "<u8")])
+_POINT = np.dtype(
+    [("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("length", "<u8")]
+)
+_OBSERVATION = np.dtype([("image_id", "<u4"), ("point2d_idx", "<u4")])
+# A record of points3D.bin is a head of 51 bytes, whose last field is the track's length L, then L
+# observations of 8 bytes; nothing is aligned.
+_HEAD_BYTES, _PAIR_BYTES = _POINT.itemsize, _OBSERVATION.itemsize
+_LENGTH_AT = 43  # of the track length within a head
+_POINTS_AT_ONCE = 1 << 18  # bounds the writer's memory to some tens of megabytes
+_Points: TypeAlias = tuple[UInt8[np.ndarray, "N 3"], Tracks, Callable[[int], str]]
+"""Colours, all else, and the place of point i in the file."""
+
+
+def read_cameras(path: Path) -> tuple[Intrinsics, ...]:
+    """The camera records of a ``cameras.bin`` or ``cameras.txt``, in file order.
+
+    Raises:
+        SceneNotFoundError: There is no such file.
+        SceneFormatError: It is unreadable or malformed, or a camera model is unknown.
+    """
+    cameras: dict[int, Intrinsics] = {}
+    for where, camera_id, *record in (_text_cameras if _is_text(path) else _binary_cameras)(path):
+        _require(camera_id not in cameras, "each camera id once", where, f"{camera_id} again")
+        cameras[camera_id] = make_intrinsics(where, camera_id, *record)
+    return tuple(cameras.values())
+
+
+def make_intrinsics(
+    where: str, camera_id: int, model: str, width: int, height: int, params: Sequence[float]
+) -> Intrinsics:
+    """A checked camera record.
+
+    Raises:
+        SceneFormatError: Its id, size or parameters are impossible, or its model unknown.
+    """
+    _require(0 <= camera_id <= MAX_ID, f"a camera id from 0 to {MAX_ID}", where, camera_id)
+    fits = 0 < width <= _MAX_SIZE and 0 < height <= _MAX_SIZE
+    _require(fits, "a camera with a size in pixels", where, f"{width} x {height}")
+    _require(all(map(math.isfinite, params)), "finite camera parameters", where, tuple(params))
+    try:
+        camera = Intrinsics(camera_id, model, width, height, tuple(params))
+    except SceneFormatError as error:
+        expected = f"{error.expected} in {where}"
+        raise SceneFormatError(expected, found=error.found, fix=error.fix) from None
+    lengths = camera.params[: CAMERA_MODELS[model].num_focal]
+    found = ", ".join(f"{each:g}" for each in lengths)
+    _require(min(lengths) > 0, "a focal length above 0", where, found)
+    return camera
+
+
+def read_images(path: Path, intrinsics: Sequence[Intrinsics]) -> tuple[Image, ...]:
+    """The image records of an ``images.bin`` or ``images.txt``, in file order, with their features.
+
+    Args:
+        path: The file.
+        intrinsics: The camera records that the images refer to.
+
+    Raises:
+        SceneNotFoundError: There is no such file.
+        SceneFormatError: It is unreadable or malformed, a pose is not finite, an id or a name
+            occurs twice, or an image names a camera that is not there.
+    """
+    cameras = {camera.camera_id: camera for camera in intrinsics}
+    images: dict[int, Image] = {}
+    names: set[str] = set()
+    for record in (_text_images if _is_text(path) else _binary_images)(path):
+        where, image_id, pose, camera_id, name, observations = record
+        _require(0 <= image_id <= MAX_ID, f"an image id from 0 to {MAX_ID}", where, image_id)
+        _require(image_id not in images, "each image id once", where, f"{image_id} again")
+        _require(bool(name), "an image name", where, "an empty one")
+        _require(name not in names, "each image name once", where, f"{name} again")
+        of = f"of image {name!r}"
+        _require(all(map(math.isfinite, pose)), f"a finite pose {of}", where, tuple(pose))
+        norm = math.hypot(*pose[:4])
+        is_rotation = _NORM_RANGE[0] < norm < _NORM_RANGE[1]
+        _require(is_rotation, f"a rotation quaternion {of}", where, tuple(pose[:4]))
+        known = f"one of the {len(cameras)} camera records as that {of}"
+        _require(camera_id in cameras, known, where, f"camera id {camera_id}")
+        ids = observations.point_ids
+        in_range = bool((ids >= NO_POINT).all())
+        _require(in_range, f"point ids from -1 (none) to 2^63 - 1 {of}", where, "another")
+        quat, translation = np.array(pose[:4], np.float64), np.array(pose[4:], np.float64)
+        names.add(name)
+        images[image_id] = Image(
+            name, image_id, cameras[camera_id], quat, translation, observations
+        )
+    return tuple(images.values())
+
+
+def read_points3d(path: Path) -> tuple[PointCloud, Tracks]:
+    """The points of a ``points3D.bin`` or ``points3D.txt`` in file order, and their tracks.
+
+    Coordinates may be NaN or infinite, and those beyond float32 become infinite in the cloud, where
+    they can be seen and dropped; nothing is repaired here.
+
+    Raises:
+        SceneNotFoundError: There is no such file.
+        SceneFormatError: It is unreadable or malformed, or a point id occurs twice or exceeds
+            2^63 - 1.
+    """
+    rgb, tracks, place = (_text_points if _is_text(path) else _binary_points)(path)
+    ids = tracks.point_ids
+    if (ids < 0).any():
+        where = f"{path}, {place(int((ids < 0).argmax()))}"
+        raise _bad(f"a point id from 0 to {2**63 - 1}", where, "one outside")
+    if not (ids[1:] > ids[:-1]).all():  # the usual order needs no sort
+        order = np.argsort(ids, kind="stable")
+        again = order[1:][ids[order[1:]] == ids[order[:-1]]]
+        if len(again):
+            i = int(again.min())
+            raise _bad("each point id once", f"{path}, {place(i)}", f"{ids[i]} a second time")
+    with np.errstate(over="ignore"):
+        return PointCloud(tracks.xyz.astype(np.float32), rgb), tracks
+
+
+# The binary form
+
+
+def _binary_cameras(path: Path) -> Iterator[tuple[Any, ...]]:
+    reader = ByteReader(path)
+    for where in reader.records(_CAMERA.size + 3 * 8, "cameras"):
+        camera_id, model_id, *size = reader.unpack(_CAMERA)
+        model = next((m for m in CAMERA_MODELS.values() if m.model_id == model_id), None)
+        if model is None:
+            raise reader.error("the id of a COLMAP camera model", str(model_id))
+        params = reader.unpack(struct.Struct(f"<{model.num_params}d"))
+        yield where, camera_id, model.name, *size, params
+
+
+def _binary_images(path: Path) -> Iterator[tuple[Any, ...]]:
+    reader = ByteReader(path)
+    for where in reader.records(_POSE.size + 1 + 8, "images"):
+        image_id, *pose, camera_id = reader.unpack(_POSE)
+        name = reader.text()
+        features = reader.array(_FEATURE, reader.count(_FEATURE.itemsize, "features"))
+        ids = features["point_id"].astype(np.int64)  # COLMAP's "none", 2^64 - 1, becomes -1
+        observations = Observations(features["xy"].astype(np.float64), ids)
+        yield where, image_id, pose, camera_id, name, observations
+
+
+def _binary_points(path: Path) -> _Points:
+    reader = ByteReader(path)
+    count = reader.count(_HEAD_BYTES, "points")
+    starts = _scan_records(reader.data, reader.offset, count)
+    complete = len(starts) - 1
+    reader.offset = int(starts[complete])
+    if complete < count:
+        reader.record = f"record {complete + 1} of {count}"
+        raise reader.error("a whole point record", f"{reader.remaining} bytes to the file's end")
+    reader.finish()
+    buffer = np.frombuffer(reader.data, np.uint8)
+    points = _anywhere(buffer, _HEAD_BYTES)[starts[:-1]].view(_POINT)
+    observations = _anywhere(buffer, _PAIR_BYTES)[_pair_offsets(starts)].view(_OBSERVATION)
+    tracks = Tracks(
+        point_ids=points["id"].astype(np.int64),
+        xyz=points["xyz"].astype(np.float64),
+        errors=points["error"].astype(np.float64),
+        offsets=(starts - starts[0] - _HEAD_BYTES * np.arange(len(starts))) // _PAIR_BYTES,
+        image_ids=observations["image_id"].astype(np.uint32),
+        point2d_idx=observations["point2d_idx"].astype(np.uint32),
+    )
+    return points["rgb"].copy(), tracks, lambda i: f"record {i + 1}"
+
+
+def _scan_records(data: bytes, first: int, count: int) -> Int64[np.ndarray, " K+1"]:
+    """The offsets of ``count`` records that begin at ``first``, then the end of the last.
+
+    They are fewer if the data ends within one: then the last offset is where that begins.
+    """
+    at, last = first, len(data) - _HEAD_BYTES
+    starts = [at]
+    length_at = _COUNT.unpack_from
+    for _ in range(count):  # a record's place is known only from the one before it
+        if at > last:
+            break
+        at += _HEAD_BYTES + _PAIR_BYTES * length_at(data, at + _LENGTH_AT)[0]
+        if at > len(data):
+            break
+        starts.append(at)
+    return np.array(starts, np.int64)
+
+
+def _anywhere(buffer: UInt8[np.ndarray, " B"], size: int) -> np.ndarray:
+    """The ``size`` bytes from each byte of a buffer on, as one element: a view."""
+    return np.ndarray(max(len(buffer) - size + 1, 0), f"V{size}", buffer, strides=(1,))
+
+
+def _pair_offsets(starts: Int64[np.ndarray, " N+1"]) -> Int64[np.ndarray, " T"]:
+    """Where each observation stands."""
+    lengths = (np.diff(starts) - _HEAD_BYTES) // _PAIR_BYTES
+    before = np.cumsum(lengths) - lengths
+    offsets = np.repeat(starts[:-1] + _HEAD_BYTES - _PAIR_BYTES * before, lengths)
+    offsets += _PAIR_BYTES * np.arange(len(offsets))
+    return offsets
+
+
+def write_cameras(path: Path, intrinsics: Sequence[Intrinsics]) -> None:
+    """Write a ``cameras.bin``.
+
+    Raises:
+        OutputError: A value does not fit its field.
+        OSError: The file cannot be written.
+    """
+    with path.open("wb") as file:
+        file.write(_COUNT.pack(len(intrinsics)))
+        for camera in intrinsics:
+            where = f"camera {camera.camera_id}"
+            head = (CAMERA_MODELS[camera.model].model_id, camera.width, camera.height)
+            file.write(_pack(_CAMERA, where, camera.camera_id, *head))
+            file.write(np.array(camera.params, "<f8").tobytes())
+
+
+def write_images(path: Path, images: Sequence[Image]) -> None:
+    """Write an ``images.bin``; images without observations get zero features.
+
+    Raises:
+        OutputError: A name holds a zero byte or is not Unicode, or a value does not fit its field.
+        OSError: The file cannot be written.
+    """
+    with path.open("wb") as file:
+        file.write(_COUNT.pack(len(images)))
+        for image in images:
+            pose = (*image.quat.tolist(), *image.translation.tolist())
+            values = (image.image_id, *pose, image.intrinsics.camera_id)
+            file.write(_pack(_POSE, f"image {image.name!r}", *values))
+            name = image.name.encode("utf-8", errors="replace")
+            if b"\0" in name or name.decode("utf-8") != image.name:
+                expected = "image names in UTF-8 without a zero byte"
+                raise OutputError(expected, found=f"{image.name!r}", fix="Rename the image.")
+            features = np.empty(len(image.observations or ()), _FEATURE)
+            if image.observations is not None:
+                features["xy"] = image.observations.xy
+                features["point_id"] = image.observations.point_ids.astype(np.uint64)
+            file.write(name + b"\0" + _COUNT.pack(len(features)) + features.tobytes())
+
+
+def _pack(layout: struct.Struct, where: str, *values: float) -> bytes:
+    try:
+        return layout.pack(*values)
+    except struct.error as error:
+        raise OutputError(
+            f"values of {where} that COLMAP's binary form can hold",
+            found=f"{values} ({error})",
+            fix="Ids and sizes are non-negative, ids below 2^32.",
+        ) from None
+
+
+def write_points3d(path: Path, points: PointCloud, tracks: Tracks | None) -> None:
+    """Write a ``points3D.bin``.
+
+    Args:
+        path: The file.
+        points: The cloud.
+        tracks: Ids, float64 positions, errors and tracks of the first ``len(tracks)`` points. The
+            others get the ids that follow the largest, error -1 (COLMAP's "unknown") and no track.
+            Without it all points do, with ids from 1.
+
+    Raises:
+        PointCloudError: There are more tracks than points.
+        OSError: The file cannot be written.
+    """
+    check_tracks(points, tracks)
+    known = len(tracks) if tracks is not None else 0
+    heads = np.zeros(len(points), _POINT)
+    heads["xyz"], heads["rgb"], heads["error"] = points.xyz, points.rgb, UNKNOWN_ERROR
+    first_new = 1
+    if tracks is not None and known:
+        first_new = int(tracks.point_ids.max()) + 1
+        heads["id"][:known], heads["xyz"][:known] = tracks.point_ids, tracks.xyz
+        heads["error"][:known], heads["length"][:known] = tracks.errors, tracks.lengths
+    heads["id"][known:] = np.arange(first_new, first_new + len(points) - known)
+    with path.open("wb") as file:
+        file.write(_COUNT.pack(len(points)))
+        for start in range(0, known, _POINTS_AT_ONCE):
+            part = slice(start, min(start + _POINTS_AT_ONCE, known))
+            file.write(_joined_records(heads[part], tracks, part).data)
+        file.write(heads[known:].view(np.uint8).data)  # a record without a track is its head
+
+
+def set_point_count(path: Path, count: int) -> None:
+    """Change the number of points that a ``points3D.bin`` promises, before more are appended.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
+    with path.open("r+b") as file:
+        file.write(_COUNT.pack(count))
+
+
+def point_rows(
+    first_id: int, xyz: Float32[np.ndarray, "n 3"], rgb: UInt8[np.ndarray, "n 3"]
+) -> memoryview:
+    """Records of points without a track, as ``write_points3d`` writes them; ids from the first."""
+    heads = np.zeros(len(xyz), _POINT)
+    heads["id"] = np.arange(first_id, first_id + len(xyz))
+    heads["xyz"], heads["rgb"], heads["error"] = xyz, rgb, UNKNOWN_ERROR
+    return heads.view(np.uint8).data
+
+
+def _joined_records(heads: np.ndarray, tracks: Any, part: slice) -> UInt8[np.ndarray, " B"]:
+    """The bytes of the records of some points, which have tracks."""
+    first, last = tracks.offsets[part.start], tracks.offsets[part.stop]
+    observations = np.empty(last - first, _OBSERVATION)
+    observations["image_id"] = tracks.image_ids[first:last]
+    observations["point2d_idx"] = tracks.point2d_idx[first:last]
+    starts = (tracks.offsets[part.start : part.stop + 1] - first) * _PAIR_BYTES
+    starts += np.arange(len(starts)) * _HEAD_BYTES
+    buffer = np.empty(starts[-1], np.uint8)
+    _anywhere(buffer, _HEAD_BYTES)[starts[:-1]] = heads.view(f"V{_HEAD_BYTES}")
+    _anywhere(buffer, _PAIR_BYTES)[_pair_offsets(starts)] = observations.view(f"V{_PAIR_BYTES}")
+    return buffer
+
+
+def check_tracks(points: PointCloud, tracks: Tracks | None) -> None:
+    """Raise a ``PointCloudError`` if there are more tracks than points."""
+    if tracks is not None and len(tracks) > len(points):
+        raise PointCloudError(
+            "at most one track per point",
+            found=f"{len(tracks)} tracks for {len(points)} points",
+            fix="Replace the points by Scene.replace, which drops tracks that do not fit.",
+        )
+
+
+# The text form
+
+
+def _is_text(path: Path) -> bool:
+    return path.suffix == ".txt"
+
+
+def _text_cameras(path: Path) -> Iterator[tuple[Any, ...]]:
+    for where, line in _data_lines(path):
+        row = line.split()
+        with _parsed(where, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]", row):
+            record = (int(row[0]), row[1], int(row[2]), int(row[3]), tuple(map(float, row[4:])))
+        yield where, *record
+
+
+def _text_images(path: Path) -> Iterator[tuple[Any, ...]]:
+    """As ``_binary_images``; the line after an image's is always its features, and may be blank."""
+    lines = _lines(path)
+    for where, line in lines:
+        if not _is_data(line):
+            continue
+        row = line.strip().split(maxsplit=9)  # a name may hold spaces
+        with _parsed(where, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", row):
+            pose = tuple(map(float, row[1:8]))
+            image_id, camera_id, name = int(row[0]), int(row[8]), row[9]
+        # The last image of a file cut by an editor may lack its empty feature line.
+        below, features = next(lines, (where, ""))
+        fields = features.split()
+        with _parsed(below, "X Y POINT3D_ID triples", fields):
+            triples = np.array(fields, object).reshape(-1, 3)
+            xy, ids = triples[:, :2].astype(np.float64), triples[:, 2].astype(np.int64)
+        yield where, image_id, pose, camera_id, name, Observations(xy, ids)
+
+
+def _text_points(path: Path) -> _Points:
+    ids, lengths, pairs = array("q"), array("q", [0]), array("I")
+    xyz, errors, rgb = array("d"), array("d"), bytearray()
+    places = []
+    for where, line in _data_lines(path):
+        row = line.split()
+        with _parsed(where, "POINT3D_ID X Y Z R G B ERROR and IMAGE_ID POINT2D_IDX pairs", row):
+            if len(row) % 2:
+                raise IndexError
+            ids.append(int(row[0]))
+            xyz.extend((float(row[1]), float(row[2]), float(row[3])))
+            rgb += bytes((int(row[4]), int(row[5]), int(row[6])))  # from 0 to 255
+            errors.append(float(row[7]))
+            pairs.extend(map(int, row[8:]))
+        lengths.append((len(row) - 8) // 2)
+        places.append(where)
+    image_ids, point2d_idx = np.array(pairs, np.uint32).reshape(-1, 2).T.copy()
+    tracks = Tracks(
+        point_ids=np.array(ids, np.int64),
+        xyz=np.array(xyz, np.float64).reshape(-1, 3),
+        errors=np.array(errors, np.float64),
+        offsets=np.cumsum(lengths, dtype=np.int64),
+        image_ids=image_ids,
+        point2d_idx=point2d_idx,
+    )
+    colors = np.frombuffer(bytes(rgb), np.uint8).reshape(-1, 3)
+    return colors, tracks, lambda i: places[i].rpartition(", ")[2]
+
+
+@contextmanager
+def _parsed(where: str, layout: str, row: Sequence[str]) -> Iterator[None]:
+    """Turn what a block raises over the words of a line into an error that shows the line."""
+    try:
+        yield
+    except (ValueError, IndexError, OverflowError):
+        fields = " ".join(row)
+        line = repr(fields if len(fields) <= 80 else f"{fields[:77]}...") if row else "an empty one"
+        raise _bad(layout, where, line) from None
+
+
+def _lines(path: Path) -> Iterator[tuple[str, str]]:
+    """The lines of a UTF-8 file with their places, its byte order mark left out."""
+    raw = read_bytes(path)
+    try:
+        text = raw.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        number = raw.count(b"\n", 0, error.start) + 1
+        found = repr(raw[error.start : error.end])
+        raise _bad("UTF-8 text", f"{path}, line {number}", found) from None
+    for number, line in enumerate(text.split("\n"), start=1):
+        yield f"{path}, line {number}", line
+
+
+def _data_lines(path: Path) -> Iterator[tuple[str, str]]:
+    return (each for each in _lines(path) if _is_data(each[1]))
+
+
+def _is_data(line: str) -> bool:
+    stripped = line.lstrip()
+    return bool(stripped) and not stripped.startswith("#")
+
+
+def _require(holds: bool, expected: str, where: str, found: object) -> None:
+    if not holds:
+        raise _bad(expected, where, str(found))
+
+
+def _bad(expected: str, where: str, found: str) -> SceneFormatError:
+    return SceneFormatError(f"{expected} in {where}", found=found, fix=COPY_AGAIN)

@@ -1,1 +1,0 @@
-"""COLMAP models: both forms of their files, and the scenes they hold."""

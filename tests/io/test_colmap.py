@@ -1,0 +1,330 @@
+"""COLMAP's files in both forms: read, written back byte for byte, judged by pycolmap, and one error
+with the place for whatever is malformed."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+
+from splatseed.camera import Intrinsics
+from splatseed.errors import OutputError, PointCloudError, SceneFormatError, SceneNotFoundError
+from splatseed.io import colmap, files
+from splatseed.pointcloud import PointCloud
+
+REAL_MODELS = [
+    f"{scene}/sparse/0" for scene in ("fern", "fox", "treehill", "bonsai", "mipnerf360_sfm/stump")
+]
+CAMERAS = (Intrinsics(1, "PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0)),)
+READERS = {
+    "cameras": colmap.read_cameras,
+    "images": lambda path: colmap.read_images(path, CAMERAS),
+    "points": colmap.read_points3d,
+}
+
+
+def written(folder, model):
+    colmap.write_cameras(folder / "cameras.bin", model.intrinsics)
+    colmap.write_images(folder / "images.bin", model.images)
+    colmap.write_points3d(folder / "points3D.bin", model.points, model.tracks)
+    return folder
+
+
+def read(folder, suffix="bin"):
+    cameras = colmap.read_cameras(folder / f"cameras.{suffix}")
+    images = colmap.read_images(folder / f"images.{suffix}", cameras)
+    return cameras, images, *colmap.read_points3d(folder / f"points3D.{suffix}")
+
+
+@pytest.mark.parametrize("model_dir", REAL_MODELS)
+def test_real_models_are_written_back_byte_for_byte(scenes, model_dir, tmp_path):
+    source = scenes / model_dir
+    cameras = colmap.read_cameras(source / "cameras.bin")
+    colmap.write_cameras(tmp_path / "cameras.bin", cameras)
+    points, tracks = colmap.read_points3d(source / "points3D.bin")
+    colmap.write_points3d(tmp_path / "points3D.bin", points, tracks)
+    if (source / "images.bin").exists():
+        images = colmap.read_images(source / "images.bin", cameras)
+        colmap.write_images(tmp_path / "images.bin", images)
+    for path in tmp_path.iterdir():
+        assert path.read_bytes() == (source / path.name).read_bytes(), path.name
+
+
+@settings(max_examples=60, deadline=None)
+@given(data=st.data())
+def test_models_survive_a_round_trip(
+    models, assert_same_images, assert_same_points, tmp_path_factory, data
+):
+    model = data.draw(models)
+    cameras, images, *points = read(written(tmp_path_factory.getbasetemp(), model))
+    assert cameras == model.intrinsics
+    assert_same_images(images, model.images)
+    assert_same_points(points, (model.points, model.tracks))
+
+
+def test_new_points_follow_the_tracked_ones(model, rng, tmp_path, monkeypatch):
+    monkeypatch.setattr(colmap, "_POINTS_AT_ONCE", 4)  # several writes with tracks
+    path = tmp_path / "points3D.bin"
+    new = PointCloud(rng.normal(size=(3, 3)), np.full((3, 3), 9, np.uint8))
+    points = PointCloud.concatenate(model.points, new)
+    colmap.write_points3d(path, points, model.tracks)
+    back, tracks = colmap.read_points3d(path)
+    np.testing.assert_array_equal(back.xyz, points.xyz)
+    np.testing.assert_array_equal(back.rgb, points.rgb)
+    assert tracks.point_ids.tolist() == [*model.tracks.point_ids, 31, 32, 33]
+    assert tracks.errors.tolist() == [*model.tracks.errors, -1.0, -1.0, -1.0]
+    assert tracks.lengths.tolist() == [4] * 10 + [0] * 3
+    np.testing.assert_array_equal(tracks.xyz[:10], model.tracks.xyz)
+    np.testing.assert_array_equal(tracks.image_ids, model.tracks.image_ids)
+    colmap.write_points3d(path, points, None)
+    _, tracks = colmap.read_points3d(path)
+    assert tracks.point_ids.tolist() == list(range(1, 14))
+    assert (set(tracks.errors), tracks.lengths.any()) == ({-1.0}, False)
+    with pytest.raises(PointCloudError, match="10 tracks for 4 points"):
+        colmap.write_points3d(path, points.select(slice(4)), model.tracks)
+
+
+@pytest.mark.parametrize(("name", "data"), [("a.bin", bytes(8)), ("a.txt", b"# nothing\n")])
+def test_empty_models_are_models(tmp_path, name, data):
+    path = tmp_path / name
+    path.write_bytes(data)
+    assert colmap.read_cameras(path) == colmap.read_images(path, ()) == ()
+    points, tracks = colmap.read_points3d(path)
+    assert len(points) == len(tracks) == 0
+    assert (tracks.offsets.tolist(), tracks.image_ids.dtype) == ([0], np.uint32)
+
+
+@pytest.mark.parametrize(
+    ("name", "data"),
+    [
+        ("a.bin", struct.pack("<QQ3d3BdQ", 1, 5, np.nan, np.inf, 1e300, 1, 2, 3, np.nan, 0)),
+        ("a.txt", b"5 nan inf 1e300 1 2 3 nan"),
+    ],
+)
+def test_non_finite_points_pass(tmp_path, name, data):
+    (tmp_path / name).write_bytes(data)
+    points, tracks = colmap.read_points3d(tmp_path / name)
+    np.testing.assert_array_equal(points.xyz, [[np.nan, np.inf, np.inf]])
+    np.testing.assert_array_equal(tracks.xyz, [[np.nan, np.inf, 1e300]])
+
+
+CAMERA = struct.pack("<QIiQQ4d", 1, 1, 1, 640, 480, 500, 500, 320, 240)
+IMAGE = struct.pack("<QI7dI", 1, 1, 1, 0, 0, 0, 0, 0, 0, 1) + b"a.jpg\0" + struct.pack("<Q", 0)
+POINT = struct.pack("<Q3d3BdQ2I", 1, 0, 0, 0, 1, 2, 3, 0.5, 1, 1, 0)  # without the file's count
+TWO, MANY = struct.pack("<Q", 2), struct.pack("<Q", 2**60)
+
+
+def patched(data, at, layout, value):
+    """The bytes with one field changed."""
+    return data[:at] + struct.pack(layout, value) + data[at + struct.calcsize(layout) :]
+
+
+def points_of(*records):
+    return struct.pack("<Q", len(records)) + b"".join(records)
+
+
+def point(point_id=1, track_length=0):
+    return struct.pack("<Q3d3BdQ", point_id, 0, 0, 0, 1, 2, 3, 0.5, track_length)
+
+
+@pytest.mark.parametrize(
+    ("what", "data", "where"),
+    [
+        ("cameras", b"", "byte 0"),
+        ("cameras", CAMERA[:40], "byte 8"),
+        ("cameras", CAMERA[:-1], "record 1"),
+        ("cameras", CAMERA + b"\0", "end"),
+        ("cameras", MANY + CAMERA[8:], "at most 1 cameras"),
+        ("cameras", TWO + 2 * CAMERA[8:], "record 2"),
+        ("cameras", patched(CAMERA, 12, "<i", 99), "record 1"),
+        ("cameras", patched(CAMERA, 16, "<Q", 0), "record 1"),
+        ("cameras", patched(CAMERA, 16, "<Q", 2**63), "record 1"),
+        ("cameras", patched(CAMERA, 32, "<d", np.nan), "record 1"),
+        ("cameras", patched(CAMERA, 32, "<d", 0.0), "focal length above 0 .*record 1"),
+        ("cameras", patched(CAMERA, 40, "<d", -500.0), "focal length above 0 .*record 1"),
+        ("images", IMAGE[:50], "at most 0 images"),
+        ("images", IMAGE + b"rest", "end"),
+        ("images", MANY + IMAGE[8:], "at most 1 images"),
+        ("images", TWO + 2 * IMAGE[8:], "image id once .*record 2"),
+        ("images", TWO + IMAGE[8:] + patched(IMAGE, 8, "<I", 3)[8:], "name once .*record 2"),
+        ("images", patched(IMAGE, 12, "<d", np.nan), "record 1"),
+        ("images", patched(IMAGE, 44, "<d", np.inf), "record 1"),
+        ("images", patched(IMAGE, 12, "<d", 0.0), "quaternion .*record 1"),
+        ("images", patched(IMAGE, 68, "<I", 8), "camera id 8"),
+        ("images", IMAGE[:72] + b"\xff.jpg\0" + IMAGE[-8:], "record 1"),
+        ("images", IMAGE[:72] + b"no end" + 20 * b"x", "record 1"),
+        ("images", IMAGE[:72] + b"\0" + IMAGE[-8:], "an image name .*record 1"),
+        ("images", IMAGE[:-8] + MANY, "at most 0 features"),
+        ("images", IMAGE[:-8] + struct.pack("<QddQ", 1, 0, 0, 2**63), "record 1"),
+        ("points", b"\1\0\0", "byte 0"),
+        ("points", points_of(point())[:-1], "at most 0 points"),
+        ("points", points_of(point(track_length=1)), "record 1 of 1, byte 8"),
+        ("points", points_of(point(), POINT)[:-1], "record 2 of 2, byte 59; found 58 bytes"),
+        ("points", points_of(POINT) + b"\0", "end"),
+        ("points", MANY + POINT, "at most 1 points"),
+        ("points", struct.pack("<Q", 2**64 - 1) + POINT, "at most 1 points"),
+        *(("points", points_of(point(track_length=2**n)), "record 1") for n in (60, 63)),
+        ("points", points_of(point(4), point(5), point(4)), "record 3; found 4"),
+        ("points", points_of(point(4), point(2**63)), "record 2"),
+    ],
+)
+def test_malformed_binary_records_are_named(tmp_path, little_memory, what, data, where):
+    (tmp_path / "a.bin").write_bytes(data)
+    with little_memory(), pytest.raises(SceneFormatError, match=where) as caught:
+        READERS[what](tmp_path / "a.bin")
+    assert "a.bin" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("what", "text", "where"),
+    [
+        ("cameras", "\n1 PINHOLE 640", "line 2; found '1 PINHOLE 640'"),
+        ("cameras", "1 PINHOLE 640 x 1 2 3 4", "line 1"),
+        ("cameras", "1 LENS 640 480 1 2 3 4", "line 1; found 'LENS'"),
+        ("cameras", "1 PINHOLE 640 480 1 2 3", "line 1; found 3"),
+        ("cameras", "1 PINHOLE 640 480 1 2 3 nan", "line 1"),
+        ("cameras", "1 PINHOLE -640 480 1 2 3 4", "line 1"),
+        ("cameras", "-1 PINHOLE 640 480 1 2 3 4", "line 1"),
+        ("cameras", "1 PINHOLE 6 4 1 2 3 4\n# c\n1 PINHOLE 6 4 1 2 3 4", "line 3"),
+        ("cameras", b"# one\n# caf\xe9\n", "line 2"),
+        ("images", "# c\n1 1 0 0 0 0 0 0 1\n\n", "line 2"),
+        ("images", "1 1 0 0 0 0 0 x 1 a.jpg\n\n", "line 1"),
+        ("images", "1 1 0 0 0 0 0 0 1.0 a.jpg\n\n", "line 1"),
+        ("images", "1 nan 0 0 0 0 0 0 1 a.jpg\n\n", "line 1"),
+        ("images", "1 0 0 0 0 0 0 0 1 a.jpg\n\n", "line 1"),
+        ("images", "1 1 0 0 0 0 0 0 5 a.jpg\n\n", "line 1; found camera id 5"),
+        ("images", "4294967296 1 0 0 0 0 0 0 1 a.jpg\n\n", "line 1"),
+        ("images", "1 1 0 0 0 0 0 0 1 a.jpg\n1 2\n", "line 2; found '1 2'"),
+        ("images", "1 1 0 0 0 0 0 0 1 a.jpg\n1 2 x\n", "line 2"),
+        ("images", "1 1 0 0 0 0 0 0 1 a.jpg\n1 2 9223372036854775808\n", "line 2"),
+        ("images", "1 1 0 0 0 0 0 0 1 a.jpg\n1 2 -2\n", "line 1"),
+        ("images", "1 1 0 0 0 0 0 0 1 a\n2 1 0 0 0 0 0 0 1 b\n", "line 2"),
+        ("images", "1 1 0 0 0 0 0 0 1 a\n\n1 1 0 0 0 0 0 0 1 b\n", "line 3; found 1"),
+        ("points", "# c\n\n1 0 0 0 1 2 3", "line 3; found '1 0 0 0 1 2 3'"),
+        ("points", "1 0 0 0 1 2 3 .5 4", "line 1"),
+        ("points", "1 0 0 0 1 2 3 .5\n2 0 x 0 1 2 3 .5", "line 2"),
+        ("points", "1 0 0 0 1 2 3 .5\n2 0 0 0 1 2 256 .5", "line 2"),
+        ("points", "1 0 0 0 1 2 3 .5 4 5\n2 0 0 0 1 2 3 .5 4 -1", "line 2"),
+        ("points", "1 0 0 0 1 2 3 .5\n9223372036854775808 0 0 0 1 2 3 .5", "line 2"),
+        ("points", "-1 0 0 0 1 2 3 .5", "line 1"),
+        ("points", "7 0 0 0 1 2 3 .5\n# c\n7 0 0 0 1 2 3 .5", "line 3; found 7"),
+    ],
+)
+def test_malformed_lines_are_named(tmp_path, what, text, where):
+    (tmp_path / "a.txt").write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(SceneFormatError, match=rf"a\.txt, {where}"):
+        READERS[what](tmp_path / "a.txt")
+
+
+@pytest.mark.parametrize("what", READERS)
+def test_unreadable_files_are_our_errors(what, tmp_path, monkeypatch):
+    (tmp_path / "a.bin").touch()
+    for path in (tmp_path / "absent.bin", tmp_path / "a.bin" / "below_a_file.bin"):
+        with pytest.raises(SceneNotFoundError):
+            READERS[what](path)
+    with pytest.raises(SceneFormatError, match="readable"):
+        READERS[what](tmp_path)
+
+    def deny(_):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(files, "read_file", deny)
+    with pytest.raises(SceneFormatError, match="Permission denied"):
+        READERS[what](tmp_path / "a.bin")
+
+
+@pytest.mark.parametrize("change", [{"name": "a\0b"}, {"name": "\udcff"}, {"image_id": -1}])
+def test_images_that_the_form_cannot_hold_are_refused(model, change, tmp_path):
+    with pytest.raises(OutputError):
+        colmap.write_images(tmp_path / "images.bin", [replace(model.images[0], **change)])
+
+
+def test_text_may_have_comments_blank_lines_any_line_ends_and_names_with_spaces(tmp_path):
+    text = "\ufeff# a comment\r\n\r\n  1 PINHOLE 640 480 500 5e2 320.0 240\r\n# the end"
+    (tmp_path / "cameras.txt").write_text(text, "utf-8", newline="")
+    assert colmap.read_cameras(tmp_path / "cameras.txt") == CAMERAS
+    lines = ["# images", *(f"{i} 1 0 0 0 0 0 0 1 my photos/{i}  b.jpg \n" for i in (1, 2))]
+    lines[2] += "1 2 -1 3 4 9\n3 1 0 0 0 0 0 0 1 c.jpg"  # whose line of features is missing
+    (tmp_path / "images.txt").write_text("\n".join(lines))
+    images = colmap.read_images(tmp_path / "images.txt", CAMERAS)
+    assert [image.name for image in images] == [
+        "my photos/1  b.jpg",
+        "my photos/2  b.jpg",
+        "c.jpg",
+    ]
+    assert [len(image.observations) for image in images] == [0, 2, 0]
+    assert images[1].observations.xy.tolist() == [[1, 2], [3, 4]]
+    assert images[1].observations.point_ids.tolist() == [-1, 9]
+
+
+# COLMAP itself is the judge of what its formats say.
+
+
+def assert_agree(reconstruction, cameras, images, points, tracks):
+    assert set(reconstruction.cameras) == {camera.camera_id for camera in cameras}
+    for camera in cameras:
+        theirs = reconstruction.cameras[camera.camera_id]
+        size = (theirs.model.name, theirs.width, theirs.height)
+        assert size == (camera.model, camera.width, camera.height)
+        assert tuple(theirs.params) == camera.params
+    assert set(reconstruction.images) == {image.image_id for image in images}
+    for image in images:
+        theirs = reconstruction.images[image.image_id]
+        assert (theirs.name, theirs.camera_id) == (image.name, image.intrinsics.camera_id)
+        np.testing.assert_allclose(
+            theirs.cam_from_world().matrix(), image.camera.cam_from_world[:3], atol=1e-12
+        )
+        ids = [p.point3D_id if p.has_point3D() else -1 for p in theirs.points2D]
+        assert ids == image.observations.point_ids.tolist()
+        np.testing.assert_array_equal([p.xy for p in theirs.points2D], image.observations.xy)
+    assert set(reconstruction.points3D) == set(tracks.point_ids.tolist())
+    for i, point_id in enumerate(tracks.point_ids.tolist()):
+        theirs = reconstruction.points3D[point_id]
+        np.testing.assert_array_equal(theirs.xyz, tracks.xyz[i])
+        np.testing.assert_array_equal(theirs.color, points.rgb[i])
+        assert theirs.error == tracks.errors[i]
+        observed = slice(*tracks.offsets[i : i + 2])
+        elements = [(e.image_id, e.point2D_idx) for e in theirs.track.elements]
+        ours = zip(tracks.image_ids[observed], tracks.point2d_idx[observed], strict=True)
+        assert elements == [(int(a), int(b)) for a, b in ours]
+
+
+def test_pycolmap_reads_what_we_write_and_we_what_it_writes(model, tmp_path):
+    pycolmap = pytest.importorskip("pycolmap")
+    reconstruction = pycolmap.Reconstruction(written(tmp_path, model))
+    assert_agree(reconstruction, *model)
+    (tmp_path / "theirs").mkdir()
+    reconstruction.write_binary(tmp_path / "theirs")
+    reconstruction.write_text(tmp_path / "theirs")
+    for suffix in ("bin", "txt"):
+        assert_agree(reconstruction, *read(tmp_path / "theirs", suffix))
+
+
+def test_pycolmap_takes_points_without_tracks_and_images_without_features(model, tmp_path):
+    pycolmap = pytest.importorskip("pycolmap")
+    grown = PointCloud.concatenate(model.points, model.points)
+    reconstruction = pycolmap.Reconstruction(written(tmp_path, model._replace(points=grown)))
+    new = [p for p in reconstruction.points3D.values() if not p.track.length()]
+    assert (len(reconstruction.points3D), len(new)) == (20, 10)
+    assert {p.error for p in new} == {pycolmap.Point3D().error}
+    images = tuple(replace(image, observations=None) for image in model.images)
+    written(tmp_path, model._replace(images=images))
+    colmap.write_points3d(tmp_path / "points3D.bin", model.points, None)
+    theirs = pycolmap.Reconstruction(tmp_path).images
+    assert {image.name for image in theirs.values()} == {image.name for image in images}
+    assert [len(image.observations) for image in read(tmp_path)[1]] == [0] * 4
+
+
+def test_both_forms_of_a_real_model_agree(scenes, tmp_path, assert_same_images, assert_same_points):
+    pycolmap = pytest.importorskip("pycolmap")
+    reconstruction = pycolmap.Reconstruction(scenes / "fern" / "sparse" / "0")
+    reconstruction.write_binary(tmp_path)
+    reconstruction.write_text(tmp_path)
+    cameras, images, *points = read(tmp_path)
+    text_cameras, text_images, *text_points = read(tmp_path, "txt")
+    assert text_cameras == cameras
+    assert_same_images(text_images, images)
+    assert_same_points(text_points, points)
