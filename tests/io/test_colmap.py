@@ -65,8 +65,7 @@ def test_models_survive_a_round_trip(
     assert_same_points(points, (model.points, model.tracks))
 
 
-def test_new_points_follow_the_tracked_ones(model, rng, tmp_path, monkeypatch):
-    monkeypatch.setattr(colmap, "_POINTS_AT_ONCE", 4)  # several writes with tracks
+def test_new_points_follow_the_tracked_ones(model, rng, tmp_path):
     path = tmp_path / "points3D.bin"
     new = PointCloud(rng.normal(size=(3, 3)), np.full((3, 3), 9, np.uint8))
     points = PointCloud.concatenate(model.points, new)

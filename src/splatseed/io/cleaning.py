@@ -1,21 +1,23 @@
-"""Points that training can use: distinct, finite, and near enough to 0 for single precision.
+"""Points that training can use: distinct, finite, near 0, and numbered as COLMAP's files want them.
 
-Notation: a duplicate has the float32 position of an earlier point. Promise: counts of what was left
-out are exact, and a clean scene is returned unchanged; scenes in national grids are moved around 0
-in double precision, nothing is turned or scaled.
+A duplicate has the float32 position of an earlier point. Scenes in national grids are moved around
+0 in double precision; nothing is turned or scaled. A *feature* is one observation slot of an image;
+all features of all images in a row are numbered by *slot*. A track element (image id, feature
+index) and a feature's point id state the same fact twice.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, Int64
 
 from splatseed.errors import ParameterError
-from splatseed.io.model import without_points
+from splatseed.io.colmap import check_tracks
 from splatseed.pointcloud import PointCloud
-from splatseed.scene import LeftOut, Scene
+from splatseed.scene import NO_POINT, Image, LeftOut, Observations, Scene, Tracks
 
 _FAR_OUT = 1e4
 """Times the inner half of the points: the sky of outdoor scenes is at some hundred times."""
@@ -29,75 +31,135 @@ def clean_scene(scene: Scene) -> Scene:
 
     ``left_out`` counts the others, and ``warnings`` report them.
     """
-    points = scene.points
+    points, known = scene.points, scene.left_out
     keep = points.distinct
     if keep.all():
         return scene
     num_finite = int(np.count_nonzero(points.finite))
-    left = LeftOut(len(points) - num_finite, num_finite - int(np.count_nonzero(keep)))
-    known = scene.left_out
+    non_finite, duplicates = len(points) - num_finite, num_finite - int(np.count_nonzero(keep))
+    notes = []
+    if non_finite:
+        what, were = ("point is", "was") if non_finite == 1 else ("points are", "were")
+        which = "beyond 1e15" if np.isfinite(points.xyz).all() else "not finite"
+        notes.append(f"{non_finite:,} {what} {which} and {were} left out.")
+    if duplicates:
+        what, were = ("point repeats", "was") if duplicates == 1 else ("points repeat", "were")
+        notes.append(f"{duplicates:,} {what} the position of another and {were} left out.")
     return replace(
         without_points(scene, keep),
-        warnings=(*scene.warnings, *_left_out_notes(points, left)),
-        left_out=LeftOut(known.non_finite + left.non_finite, known.duplicates + left.duplicates),
+        warnings=(*scene.warnings, *notes),
+        left_out=LeftOut(known.non_finite + non_finite, known.duplicates + duplicates),
     )
 
 
-def _left_out_notes(points: PointCloud, left: LeftOut) -> list[str]:
-    notes = []
-    if left.non_finite:
-        what, were = ("point is", "was") if left.non_finite == 1 else ("points are", "were")
-        which = "beyond 1e15" if np.isfinite(points.xyz).all() else "not finite"
-        notes.append(f"{left.non_finite:,} {what} {which} and {were} left out.")
-    if left.duplicates:
-        what, were = ("point repeats", "was") if left.duplicates == 1 else ("points repeat", "were")
-        notes.append(f"{left.duplicates:,} {what} the position of another and {were} left out.")
-    return notes
+def without_points(scene: Scene, keep: Bool[np.ndarray, " N"]) -> Scene:
+    """The scene with some points removed; their features then belong to no point."""
+    points, tracks = scene.points.select(keep), scene.tracks
+    if tracks is None:
+        return replace(scene, points=points)
+    check_tracks(scene.points, tracks)
+    keep = keep[: len(tracks)]
+    ids = _feature_ids(scene.images)
+    ids[np.isin(ids, tracks.point_ids[~keep])] = NO_POINT
+    images = _with_point_ids(scene.images, ids)
+    return replace(scene, points=points, tracks=tracks.select(keep), images=images)
+
+
+def renumber(scene: Scene) -> tuple[Tracks | None, tuple[Image, ...], int]:
+    """Number the points 1, 2, ... in their order; tracks belong to the first of them.
+
+    Returns:
+        The tracks, None if there are none; the images, with the features' point ids renewed; and
+        how many references between points and features were removed because one side did not
+        confirm them.
+    """
+    old_ids, tracks = _feature_ids(scene.images), scene.tracks
+    new_ids = np.full(len(old_ids), NO_POINT, np.int64)
+    if tracks is None:
+        images = _with_point_ids(scene.images, new_ids)
+        return None, images, int(np.count_nonzero(old_ids != NO_POINT))
+    check_tracks(scene.points, tracks)
+    point_idx = np.repeat(np.arange(len(tracks)), tracks.lengths)
+    slots = _slots(scene.images, tracks)
+    agreed = slots >= 0
+    agreed[agreed] = old_ids[slots[agreed]] == tracks.point_ids[point_idx[agreed]]
+    new_ids[slots[agreed]] = point_idx[agreed] + 1
+    unconfirmed = (old_ids != NO_POINT) & (new_ids == NO_POINT)
+    lengths = np.bincount(point_idx[agreed], minlength=len(tracks))
+    kept = replace(
+        tracks,
+        point_ids=np.arange(1, len(tracks) + 1, dtype=np.int64),
+        offsets=np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64),
+        image_ids=tracks.image_ids[agreed],
+        point2d_idx=tracks.point2d_idx[agreed],
+    )
+    num_broken = int(np.count_nonzero(~agreed) + np.count_nonzero(unconfirmed))
+    return kept, _with_point_ids(scene.images, new_ids), num_broken
+
+
+def _feature_ids(images: Sequence[Image]) -> Int64[np.ndarray, " S"]:
+    """The point id of every slot."""
+    ids = [im.observations.point_ids for im in images if im.observations is not None]
+    return np.concatenate([np.empty(0, np.int64), *ids])
+
+
+def _feature_counts(images: Sequence[Image]) -> Int64[np.ndarray, " I"]:
+    return np.array([len(im.observations or ()) for im in images], np.int64)
+
+
+def _slots(images: Sequence[Image], tracks: Tracks) -> Int64[np.ndarray, " T"]:
+    """The slot of every track element; -1 where there is no such image or feature."""
+    if not images:
+        return np.full(len(tracks.image_ids), -1, np.int64)
+    counts = _feature_counts(images)
+    firsts = np.cumsum(counts) - counts
+    image_ids = np.array([image.image_id for image in images], np.int64)
+    order = np.argsort(image_ids)
+    place = np.searchsorted(image_ids[order], tracks.image_ids).clip(max=len(images) - 1)
+    image_idx = order[place]
+    feature_idx = tracks.point2d_idx.astype(np.int64)
+    exists = (image_ids[image_idx] == tracks.image_ids) & (feature_idx < counts[image_idx])
+    return np.where(exists, firsts[image_idx] + feature_idx, -1)
+
+
+def _with_point_ids(
+    images: Sequence[Image], point_ids: Int64[np.ndarray, " S"]
+) -> tuple[Image, ...]:
+    """The images with the point ids of their slots."""
+    pieces = np.split(point_ids, np.cumsum(_feature_counts(images))[:-1])
+    return tuple(
+        image
+        if image.observations is None
+        else replace(image, observations=Observations(image.observations.xy, piece))
+        for image, piece in zip(images, pieces, strict=False)  # no image still makes one piece
+    )
 
 
 def cloud_warnings(points: PointCloud) -> tuple[str, ...]:
     """A sentence on each problem of the cloud as a whole."""
     warnings = []
-    far, distance = _far_points(points)
-    if far.any():
-        what = "point lies" if far.sum() == 1 else "points lie"
+    xyz = points.xyz[points.finite]
+    if len(xyz) < 2:
+        return ()
+    low, middle, high = np.percentile(xyz.astype(np.float64), (25, 50, 75), axis=0)
+    distance = np.abs(xyz - middle).max(axis=1)
+    far = distance > _FAR_OUT * float((high - low).max())
+    if far.any() and far.mean() <= _FEW and (high > low).any():
+        what, them = ("point lies", "it") if far.sum() == 1 else ("points lie", "them")
         warnings.append(
-            f"{far.sum():,} {what} up to {distance:.3g} from the middle of the others, more than"
-            f" {_FAR_OUT:,.0f} times their extent: probably a reconstruction error; remove"
-            f" {'it' if far.sum() == 1 else 'them'}."
+            f"{far.sum():,} {what} up to {distance.max():.3g} from the middle of the others, more"
+            f" than {_FAR_OUT:,.0f} times their extent: probably a reconstruction error; remove"
+            f" {them}."
         )
-    if _is_too_far_out(points.select(~far)):
+        xyz = xyz[~far]
+        low, high = np.percentile(xyz, (25, 75), axis=0)
+    step = float(np.spacing(np.abs(xyz).max()))
+    if step > _RESOLUTION * float((high - low).max()) > 0:
         warnings.append(
             "The coordinates are so large beside the scene's extent that float32 cannot resolve"
             " it; recentre the scene (subtract an offset from points and cameras) first."
         )
     return tuple(warnings)
-
-
-def _far_points(points: PointCloud) -> tuple[Bool[np.ndarray, " N"], float]:
-    """Which few points are out of all proportion to the others, and how far the farthest is."""
-    far = np.zeros(len(points), bool)
-    finite = points.finite
-    xyz = points.xyz[finite].astype(np.float64)
-    if len(xyz) < 2:
-        return far, 0.0
-    low, middle, high = np.percentile(xyz, (25, 50, 75), axis=0)
-    distance = np.abs(xyz - middle).max(axis=1)
-    beyond = distance > _FAR_OUT * float((high - low).max())
-    if (high <= low).all() or beyond.mean() > _FEW:
-        return far, 0.0
-    far[finite] = beyond
-    return far, float(distance.max())
-
-
-def _is_too_far_out(points: PointCloud) -> bool:
-    xyz = points.xyz[points.finite]
-    if len(xyz) < 2:
-        return False
-    low, high = np.percentile(xyz, (25, 75), axis=0)
-    extent = float((high.astype(np.float64) - low).max())
-    step = float(np.spacing(np.abs(xyz).max()))
-    return step > _RESOLUTION * extent > 0
 
 
 def offset_of(scene: Scene) -> Float64[np.ndarray, " 3"]:
@@ -107,10 +169,7 @@ def offset_of(scene: Scene) -> Float64[np.ndarray, " 3"]:
 
 
 def recentred(scene: Scene, offset: Float64[np.ndarray, " 3"]) -> Scene:
-    """A scene moved by ``-offset``.
-
-    Files beside the model that hold positions no longer belong to it.
-    """
+    """A scene moved by ``-offset``; files beside the model no longer belong to it."""
     images = tuple(
         replace(image, translation=image.translation + image.camera.cam_from_world[:3, :3] @ offset)
         for image in scene.images
@@ -125,11 +184,7 @@ def recentred(scene: Scene, offset: Float64[np.ndarray, " 3"]) -> Scene:
 
 
 def check_precision(scene: Scene) -> None:
-    """Refuse a scene whose coordinates single precision cannot hold.
-
-    Raises:
-        ParameterError: It is far from 0.
-    """
+    """Raise a ``ParameterError`` for a scene too far from 0 for single precision."""
     if not scene.images:
         return
     centers = np.array([image.camera.center for image in scene.images])

@@ -1,17 +1,16 @@
 """Clouds from elsewhere: what every reader offers, and tables of rows and of lines.
 
-Notation: a *row* is one point of a file; a *block* is some rows as values by the names of columns;
-*full* is the value that means 255: 1, 255 or 65535. Formats with 16-bit colours are filled with
-8-bit values by many writers, so the values decide, not the type. Promise: a file is never held in
-memory whole where its format permits reading in parts; ranges of colours are found in a sample
-before the first chunk, so that chunks of any size give the same points; colours beyond the range
-are clipped, and what is not a number becomes mid grey.
+A *block* is some rows (points) as values by the names of columns; *full* is the value that means
+255: 1, 255 or 65535. Many writers fill 16-bit colours with 8-bit values, so the values decide, not
+the type; they are looked at in a sample before the first chunk, so that chunks of any size give the
+same points. Colours beyond the range are clipped, and what is not a number becomes mid grey.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain, islice
 from pathlib import Path
@@ -76,27 +75,17 @@ class CloudChunk:
 
 
 class CloudFile(ABC):
-    """A file of points, opened but not read.
-
-    A reader of a format gives ``_blocks`` and ``_sample``.
-
-    Args:
-        path: The file.
-        names: Its columns; those that hold positions and colours are recognised.
-        count: See below.
+    """A file of points, opened but not read; readers of formats give ``_blocks`` and ``_sample``.
 
     Attributes:
         path: The file.
         count: Rows that its header promises; None where only reading tells. ``chunks`` may give
             fewer, as rows that the file itself marks as invalid are left out.
-        bounds: Least and greatest coordinates, float64 [2, 3], where the header states them; they
-            are what the file claims, and are not checked.
         colors: Where the colours come from.
         warnings: What is odd about the file, one sentence each.
-        used: The columns that are read.
+        used: The columns that are read, of those that are named: positions and colours.
     """
 
-    bounds: Float64[np.ndarray, "2 3"] | None = None
     warnings: tuple[str, ...] = ()
 
     def __init__(self, path: Path, names: Iterable[str], count: int | None = None) -> None:
@@ -213,17 +202,7 @@ def sample_starts(count: int) -> list[int]:
 
 
 class RowCloud(CloudFile):
-    """Binary rows of one length within a file, read by offset.
-
-    Args:
-        path: The file.
-        dtype: The layout of a row.
-        offset: Where the first begins, in bytes.
-        count: How many there are.
-
-    Raises:
-        SceneFormatError: The file is shorter than that.
-    """
+    """Binary rows of one length within a file, read by offset."""
 
     def __init__(self, path: Path, dtype: np.dtype[Any], offset: int, count: int) -> None:
         super().__init__(path, dtype.names or (), count)
@@ -248,12 +227,7 @@ class RowCloud(CloudFile):
 
 @dataclass(frozen=True)
 class Dialect:
-    """How numbers are written in a line.
-
-    Args:
-        delimiter: What stands between them; None for spaces and tabs.
-        decimal_comma: Whether 1,5 is one and a half.
-    """
+    """How numbers are written in a line: what stands between them (None: spaces or tabs)."""
 
     delimiter: str | None = None
     decimal_comma: bool = False
@@ -268,18 +242,7 @@ class Dialect:
 
 
 class LineCloud(CloudFile):
-    """Lines of numbers within a file: XYZ, CSV, ascii PLY and PCD, read in blocks of lines.
-
-    Empty lines and lines that begin with # are skipped.
-
-    Args:
-        path: The file.
-        names: The names of all columns.
-        offset: Where the first line begins, in bytes.
-        count: How many lines it must have; as many as there are when None.
-        dialect: How numbers are written.
-        types: The types of columns that are no floats; ``PACKED`` needs its own.
-    """
+    """Lines of numbers within a file: XYZ, CSV, ascii PLY and PCD, read in blocks of lines."""
 
     def __init__(
         self,
@@ -324,7 +287,12 @@ class LineCloud(CloudFile):
         try:
             table = self._dialect.parse(lines, self._places) if lines else table
         except ValueError:
-            raise self._error(lines, given) from None
+            wrong = next((i for i, line in enumerate(lines) if not self._parses(line)), 0)
+            raise SceneFormatError(
+                f"{max(self._places) + 1} numbers in row {given + wrong + 1:,} of {self.path}",
+                found=repr(lines[wrong][:80]),
+                fix="Remove the line, or export the cloud again.",
+            ) from None
         block: dict[str, np.ndarray] = dict(zip(self.used, table.T, strict=True))
         with np.errstate(invalid="ignore", over="ignore"):
             for name in block.keys() & self._types.keys():
@@ -333,18 +301,10 @@ class LineCloud(CloudFile):
                 block[name] = values.astype(kind)
         return block
 
-    def _error(self, lines: Sequence[str], given: int) -> SceneFormatError:
-        """Which of some lines is at fault."""
-        for row, line in enumerate(lines, start=given + 1):
-            try:
-                self._dialect.parse([line], self._places)
-            except ValueError:
-                return SceneFormatError(
-                    f"{max(self._places) + 1} numbers in row {row:,} of {self.path}",
-                    found=repr(line[:80]),
-                    fix="Remove the line, or export the cloud again.",
-                )
-        return SceneFormatError(f"numbers in {self.path}", found="others", fix=COPY_AGAIN)
+    def _parses(self, line: str) -> bool:
+        with suppress(ValueError):
+            return bool(self._dialect.parse([line], self._places).size)
+        return False
 
     def _lines(self) -> Iterator[list[str]]:
         """The lines of numbers, a block at a time."""

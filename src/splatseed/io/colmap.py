@@ -1,12 +1,10 @@
 """COLMAP's files: cameras, images and points3D, binary (read and written) and as text (read).
 
-Notation: ``_id`` comes from the file; ``where`` is the place that an error names, "file, record" or
-"file, line". In points3D, N records hold T observations in all; of a binary one, ``starts`` [N + 1]
-are the records' byte offsets, ended by the end of the last. Layouts as COLMAP's documentation of
-its output format gives them, little-endian. Promise: a binary file that was read is written back
-byte for byte; both forms of a model give the same, to the last bit; each record becomes one of our
-types with its values checked, or raises one error that names the place. Writers write straight to
-``path`` and let ``OSError`` pass: their caller stages the output.
+Notation: ``where`` is the place that an error names, "file, record" or "file, line"; of N binary
+points, ``starts`` [N + 1] are the records' byte offsets, ended by the end of the last. Layouts as
+COLMAP's documentation of its output format gives them, little-endian. Promise: a binary file that
+was read is written back byte for byte; both forms of a model give the same, to the last bit; a
+malformed file is one error, which names the place. Writers let ``OSError`` pass.
 """
 
 from __future__ import annotations
@@ -20,20 +18,30 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
-from jaxtyping import Float32, Int64, UInt8
+from jaxtyping import Float32, Float64, Int64, UInt8
 
-from splatseed.camera import CAMERA_MODELS, Intrinsics
-from splatseed.errors import OutputError, PointCloudError, SceneFormatError
-from splatseed.io.files import COPY_AGAIN, ByteReader, read_bytes
+from splatseed.camera import CAMERA_MODELS, Intrinsics, quat_from_rotation
+from splatseed.errors import (
+    OutputError,
+    PointCloudError,
+    SceneFormatError,
+    SceneNotFoundError,
+)
+from splatseed.io.files import COPY_AGAIN, ByteReader, numbered_lines
+from splatseed.io.photograph import image_warnings, lens_warnings
+from splatseed.io.ply import read_ply
 from splatseed.pointcloud import PointCloud
-from splatseed.scene import NO_POINT, Image, Observations, Tracks
+from splatseed.scene import NO_POINT, Image, Observations, Scene, SceneSource, Tracks
 
 MAX_ID = 2**32 - 1
 """Camera ids, image ids and feature indices are 32-bit in COLMAP's binary form."""
 UNKNOWN_ERROR = -1.0
 """COLMAP's reprojection error of a point that has none yet."""
 
+_MODEL_FILES = ("cameras", "images", "points3D")
+_IMAGE_DIRS = ("images", "images_2", "images_4", "images_8", "image", "input")
 _MAX_SIZE = 2**31 - 1
+_RIGID_TOLERANCE = 1e-3  # of rotation @ rotation.T against the identity
 _NORM_RANGE = (1e-100, 1e100)  # inside it the square of a quaternion's norm is a normal float
 _COUNT = struct.Struct("<Q")
 _CAMERA = struct.Struct("<IiQQ")  # camera id, model id, width, height; then the parameters
@@ -47,18 +55,12 @@ _OBSERVATION = np.dtype([("image_id", "<u4"), ("point2d_idx", "<u4")])
 # observations of 8 bytes; nothing is aligned.
 _HEAD_BYTES, _PAIR_BYTES = _POINT.itemsize, _OBSERVATION.itemsize
 _LENGTH_AT = 43  # of the track length within a head
-_POINTS_AT_ONCE = 1 << 18  # bounds the writer's memory to some tens of megabytes
 _Points: TypeAlias = tuple[UInt8[np.ndarray, "N 3"], Tracks, Callable[[int], str]]
 """Colours, all else, and the place of point i in the file."""
 
 
 def read_cameras(path: Path) -> tuple[Intrinsics, ...]:
-    """The camera records of a ``cameras.bin`` or ``cameras.txt``, in file order.
-
-    Raises:
-        SceneNotFoundError: There is no such file.
-        SceneFormatError: It is unreadable or malformed, or a camera model is unknown.
-    """
+    """The camera records of a ``cameras.bin`` or ``cameras.txt``, in file order."""
     cameras: dict[int, Intrinsics] = {}
     for where, camera_id, *record in (_text_cameras if _is_text(path) else _binary_cameras)(path):
         _require(camera_id not in cameras, "each camera id once", where, f"{camera_id} again")
@@ -69,11 +71,7 @@ def read_cameras(path: Path) -> tuple[Intrinsics, ...]:
 def make_intrinsics(
     where: str, camera_id: int, model: str, width: int, height: int, params: Sequence[float]
 ) -> Intrinsics:
-    """A checked camera record.
-
-    Raises:
-        SceneFormatError: Its id, size or parameters are impossible, or its model unknown.
-    """
+    """A checked camera record."""
     _require(0 <= camera_id <= MAX_ID, f"a camera id from 0 to {MAX_ID}", where, camera_id)
     fits = 0 < width <= _MAX_SIZE and 0 < height <= _MAX_SIZE
     _require(fits, "a camera with a size in pixels", where, f"{width} x {height}")
@@ -90,17 +88,7 @@ def make_intrinsics(
 
 
 def read_images(path: Path, intrinsics: Sequence[Intrinsics]) -> tuple[Image, ...]:
-    """The image records of an ``images.bin`` or ``images.txt``, in file order, with their features.
-
-    Args:
-        path: The file.
-        intrinsics: The camera records that the images refer to.
-
-    Raises:
-        SceneNotFoundError: There is no such file.
-        SceneFormatError: It is unreadable or malformed, a pose is not finite, an id or a name
-            occurs twice, or an image names a camera that is not there.
-    """
+    """The image records of an ``images.bin`` or ``images.txt``, in file order."""
     cameras = {camera.camera_id: camera for camera in intrinsics}
     images: dict[int, Image] = {}
     names: set[str] = set()
@@ -131,13 +119,7 @@ def read_images(path: Path, intrinsics: Sequence[Intrinsics]) -> tuple[Image, ..
 def read_points3d(path: Path) -> tuple[PointCloud, Tracks]:
     """The points of a ``points3D.bin`` or ``points3D.txt`` in file order, and their tracks.
 
-    Coordinates may be NaN or infinite, and those beyond float32 become infinite in the cloud, where
-    they can be seen and dropped; nothing is repaired here.
-
-    Raises:
-        SceneNotFoundError: There is no such file.
-        SceneFormatError: It is unreadable or malformed, or a point id occurs twice or exceeds
-            2^63 - 1.
+    Nothing is repaired; what is beyond float32 is infinite in the cloud, to be seen and dropped.
     """
     rgb, tracks, place = (_text_points if _is_text(path) else _binary_points)(path)
     ids = tracks.point_ids
@@ -152,6 +134,24 @@ def read_points3d(path: Path) -> tuple[PointCloud, Tracks]:
             raise _bad("each point id once", f"{path}, {place(i)}", f"{ids[i]} a second time")
     with np.errstate(over="ignore"):
         return PointCloud(tracks.xyz.astype(np.float32), rgb), tracks
+
+
+def rigid_pose(
+    where: str, world_from_cam: Float64[np.ndarray, "R 4"]
+) -> tuple[Float64[np.ndarray, " 4"], Float64[np.ndarray, " 3"]]:
+    """Quaternion and translation of ``cam_from_world``; a fourth row must be 0, 0, 0, 1."""
+    rotation = world_from_cam[:3, :3].T
+    with np.errstate(over="ignore", invalid="ignore"):  # huge numbers are not rigid either
+        off = np.abs(rotation @ rotation.T - np.eye(3)).max()
+        proper = np.linalg.det(rotation) > 0
+    affine = np.allclose(world_from_cam[3:], [[0, 0, 0, 1]], atol=_RIGID_TOLERANCE)
+    if not (off <= _RIGID_TOLERANCE and proper and affine):
+        raise SceneFormatError(
+            f"a rotation and a translation as world_from_cam in {where}",
+            found="a scaled, sheared or mirrored one",
+            fix="Remove the scale from the poses (and from the points).",
+        )
+    return quat_from_rotation(rotation), -rotation @ world_from_cam[:3, 3]
 
 
 # The binary form
@@ -204,10 +204,7 @@ def _binary_points(path: Path) -> _Points:
 
 
 def _scan_records(data: bytes, first: int, count: int) -> Int64[np.ndarray, " K+1"]:
-    """The offsets of ``count`` records that begin at ``first``, then the end of the last.
-
-    They are fewer if the data ends within one: then the last offset is where that begins.
-    """
+    """The offsets of ``count`` records that begin at ``first``, then the end of the last."""
     at, last = first, len(data) - _HEAD_BYTES
     starts = [at]
     length_at = _COUNT.unpack_from
@@ -236,12 +233,7 @@ def _pair_offsets(starts: Int64[np.ndarray, " N+1"]) -> Int64[np.ndarray, " T"]:
 
 
 def write_cameras(path: Path, intrinsics: Sequence[Intrinsics]) -> None:
-    """Write a ``cameras.bin``.
-
-    Raises:
-        OutputError: A value does not fit its field.
-        OSError: The file cannot be written.
-    """
+    """Write a ``cameras.bin``."""
     with path.open("wb") as file:
         file.write(_COUNT.pack(len(intrinsics)))
         for camera in intrinsics:
@@ -252,12 +244,7 @@ def write_cameras(path: Path, intrinsics: Sequence[Intrinsics]) -> None:
 
 
 def write_images(path: Path, images: Sequence[Image]) -> None:
-    """Write an ``images.bin``; images without observations get zero features.
-
-    Raises:
-        OutputError: A name holds a zero byte or is not Unicode, or a value does not fit its field.
-        OSError: The file cannot be written.
-    """
+    """Write an ``images.bin``; images without observations get zero features."""
     with path.open("wb") as file:
         file.write(_COUNT.pack(len(images)))
         for image in images:
@@ -287,18 +274,9 @@ def _pack(layout: struct.Struct, where: str, *values: float) -> bytes:
 
 
 def write_points3d(path: Path, points: PointCloud, tracks: Tracks | None) -> None:
-    """Write a ``points3D.bin``.
+    """Write a ``points3D.bin``; tracks belong to the first points.
 
-    Args:
-        path: The file.
-        points: The cloud.
-        tracks: Ids, float64 positions, errors and tracks of the first ``len(tracks)`` points. The
-            others get the ids that follow the largest, error -1 (COLMAP's "unknown") and no track.
-            Without it all points do, with ids from 1.
-
-    Raises:
-        PointCloudError: There are more tracks than points.
-        OSError: The file cannot be written.
+    The others get the ids that follow the largest, error -1 (COLMAP's "unknown") and no track.
     """
     check_tracks(points, tracks)
     known = len(tracks) if tracks is not None else 0
@@ -312,18 +290,13 @@ def write_points3d(path: Path, points: PointCloud, tracks: Tracks | None) -> Non
     heads["id"][known:] = np.arange(first_new, first_new + len(points) - known)
     with path.open("wb") as file:
         file.write(_COUNT.pack(len(points)))
-        for start in range(0, known, _POINTS_AT_ONCE):
-            part = slice(start, min(start + _POINTS_AT_ONCE, known))
-            file.write(_joined_records(heads[part], tracks, part).data)
+        if tracks is not None:
+            file.write(_joined_records(heads[:known], tracks).data)
         file.write(heads[known:].view(np.uint8).data)  # a record without a track is its head
 
 
 def set_point_count(path: Path, count: int) -> None:
-    """Change the number of points that a ``points3D.bin`` promises, before more are appended.
-
-    Raises:
-        OSError: The file cannot be written.
-    """
+    """Change the number of points that a ``points3D.bin`` promises, before more are appended."""
     with path.open("r+b") as file:
         file.write(_COUNT.pack(count))
 
@@ -338,14 +311,11 @@ def point_rows(
     return heads.view(np.uint8).data
 
 
-def _joined_records(heads: np.ndarray, tracks: Any, part: slice) -> UInt8[np.ndarray, " B"]:
-    """The bytes of the records of some points, which have tracks."""
-    first, last = tracks.offsets[part.start], tracks.offsets[part.stop]
-    observations = np.empty(last - first, _OBSERVATION)
-    observations["image_id"] = tracks.image_ids[first:last]
-    observations["point2d_idx"] = tracks.point2d_idx[first:last]
-    starts = (tracks.offsets[part.start : part.stop + 1] - first) * _PAIR_BYTES
-    starts += np.arange(len(starts)) * _HEAD_BYTES
+def _joined_records(heads: np.ndarray, tracks: Tracks) -> UInt8[np.ndarray, " B"]:
+    """The bytes of the records of points that have tracks."""
+    observations = np.empty(len(tracks.image_ids), _OBSERVATION)
+    observations["image_id"], observations["point2d_idx"] = tracks.image_ids, tracks.point2d_idx
+    starts = tracks.offsets * _PAIR_BYTES + np.arange(len(heads) + 1) * _HEAD_BYTES
     buffer = np.empty(starts[-1], np.uint8)
     _anywhere(buffer, _HEAD_BYTES)[starts[:-1]] = heads.view(f"V{_HEAD_BYTES}")
     _anywhere(buffer, _PAIR_BYTES)[_pair_offsets(starts)] = observations.view(f"V{_PAIR_BYTES}")
@@ -379,7 +349,7 @@ def _text_cameras(path: Path) -> Iterator[tuple[Any, ...]]:
 
 def _text_images(path: Path) -> Iterator[tuple[Any, ...]]:
     """As ``_binary_images``; the line after an image's is always its features, and may be blank."""
-    lines = _lines(path)
+    lines = numbered_lines(path)
     for where, line in lines:
         if not _is_data(line):
             continue
@@ -436,21 +406,8 @@ def _parsed(where: str, layout: str, row: Sequence[str]) -> Iterator[None]:
         raise _bad(layout, where, line) from None
 
 
-def _lines(path: Path) -> Iterator[tuple[str, str]]:
-    """The lines of a UTF-8 file with their places, its byte order mark left out."""
-    raw = read_bytes(path)
-    try:
-        text = raw.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        number = raw.count(b"\n", 0, error.start) + 1
-        found = repr(raw[error.start : error.end])
-        raise _bad("UTF-8 text", f"{path}, line {number}", found) from None
-    for number, line in enumerate(text.split("\n"), start=1):
-        yield f"{path}, line {number}", line
-
-
 def _data_lines(path: Path) -> Iterator[tuple[str, str]]:
-    return (each for each in _lines(path) if _is_data(each[1]))
+    return (each for each in numbered_lines(path) if _is_data(each[1]))
 
 
 def _is_data(line: str) -> bool:
@@ -465,3 +422,80 @@ def _require(holds: bool, expected: str, where: str, found: object) -> None:
 
 def _bad(expected: str, where: str, found: str) -> SceneFormatError:
     return SceneFormatError(f"{expected} in {where}", found=found, fix=COPY_AGAIN)
+
+
+# A model: a folder with cameras, images and points3D, each as .bin, else .txt
+
+
+def find_model(*folders: Path) -> Path | None:
+    """The first of the given folders that holds a model."""
+    holding = (f for f in folders if any(_model_file(f, name) for name in _MODEL_FILES))
+    return next(holding, None)
+
+
+def _model_file(model_dir: Path, name: str) -> Path | None:
+    suffixes = (".bin", ".txt", ".ply") if name == "points3D" else (".bin", ".txt")
+    candidates = (model_dir / f"{name}{suffix}" for suffix in suffixes)
+    return next((path for path in candidates if path.is_file()), None)
+
+
+def scene_root(model_dir: Path) -> Path:
+    """The scene's folder: the model's without ``sparse/0`` or ``sparse``, or ``colmap`` above."""
+    parts = model_dir.absolute().parts
+    levels = 1 if parts[-1] == "sparse" else 2 if parts[-2:-1] == ("sparse",) else 0
+    if not levels:
+        return model_dir
+    levels += parts[-levels - 1] == "colmap"
+    named = model_dir if len(model_dir.parts) >= levels else model_dir.absolute()
+    return named.parents[levels - 1]
+
+
+def read_colmap_scene(model_dir: Path) -> Scene:
+    """The scene of a model: its images, its points, and warnings for the user."""
+    root = scene_root(model_dir)
+    intrinsics, images = read_model_cameras(model_dir)
+    points, tracks, points_path = read_model_points(model_dir)
+    # The first known folder that holds the first image, else the first that exists.
+    folders = [root / name for name in _IMAGE_DIRS if (root / name).is_dir()]
+    first = images[0].name if images else ""
+    holding = (folder for folder in (*folders, root) if first and (folder / first).is_file())
+    image_dir = next(holding, folders[0] if folders else None)
+    warnings = [*image_warnings(images, image_dir, root), *lens_warnings(images)]
+    if model_dir.name == "0" and find_model(model_dir.with_name("1")):
+        warnings.append(f"{model_dir.parent} has several models; this is {model_dir.name}.")
+    if (root / "transforms.json").is_file():
+        warnings.append(f"{root / 'transforms.json'} is there too; name it to read it instead.")
+    if not images and (tracks is not None or intrinsics or image_dir is not None):
+        tracks, path = None, _model_file(model_dir, "images")  # tracks name images
+        why = f"{path} lists no images" if path else f"{model_dir} has no images.bin or images.txt"
+        warnings.append(
+            f"{why}, so no photograph has a pose: copy the whole model, or make one with splatseed"
+            " sfm IMAGES -o SCENE. Points can be interpolated, but nothing can be trained."
+        )
+    source = SceneSource("colmap", root, points_path, model_dir, image_dir)
+    return Scene(points, images, intrinsics, tracks, source, tuple(warnings))
+
+
+def read_model_cameras(
+    model_dir: Path,
+) -> tuple[tuple[Intrinsics, ...], tuple[Image, ...]]:
+    """The camera and the image records of a model."""
+    cameras_path, images_path = _model_file(model_dir, "cameras"), _model_file(model_dir, "images")
+    if cameras_path is None and images_path is not None:
+        raise SceneNotFoundError(
+            f"cameras.bin or cameras.txt beside {images_path}",
+            found="neither",
+            fix="Copy the whole model.",
+        )
+    intrinsics = read_cameras(cameras_path) if cameras_path else ()
+    return intrinsics, read_images(images_path, intrinsics) if images_path else ()
+
+
+def read_model_points(model_dir: Path) -> tuple[PointCloud, Tracks | None, Path]:
+    """The points of a model, ``points3D.ply`` if need be, their tracks if any, and their file."""
+    path = _model_file(model_dir, "points3D")
+    if path is None:
+        return PointCloud.empty(), None, model_dir / "points3D.bin"
+    if path.suffix == ".ply":
+        return read_ply(path), None, path
+    return *read_points3d(path), path

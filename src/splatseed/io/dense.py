@@ -1,21 +1,13 @@
 """Writing stereo's depth and normal maps: a COLMAP dense workspace, or a plain folder.
 
-Notation: ``K`` [3, 3] maps rays r = (x, y, 1) to pixels; a map's own pixel (column, row) has its
-centre at (column + 0.5, row + 0.5). A workspace has ``images/``, ``sparse/`` and ``stereo/`` as
-COLMAP's image_undistorter lays them out, for its ``stereo_fusion``; COLMAP places pixel (column,
-row) of a map at (column, row) of its camera, whereas everyone else, its own sparse model included,
-has (column + 0.5, row + 0.5). Files of floats (mvs/mat.h) and consistency graphs
-(mvs/consistency_graph.h), little-endian, begin with the text ``W&H&C&``; a map follows with C x H x
-W float32, one channel after another, a graph with int32: column, row, n and n image indices (places
-in the model, ascending by id) for each pixel that has any. In a plain folder the image ``a/b.jpg``
-has ``a/b.jpg.npy``, its planar depth, and ``a/b.jpg.stereo.npz`` with the rest.
-
-Promise: depths are those along COLMAP's rays, so fused points lie where the scene has them,
-whatever the size of the maps; a pixel is moved along the plane given by its normal and never mixed
-with its neighbours, so that no depth between two surfaces is invented. Photographs are linked,
-copied, or undistorted under their names and file types. The model's points are the originals with
-their tracks; without tracks, points from the maps stand in, because COLMAP learns only from tracks
-which images overlap. A folder appears whole or not at all.
+A workspace has ``images/``, ``sparse/`` and ``stereo/`` as COLMAP's image_undistorter lays them
+out, for its ``stereo_fusion``. COLMAP places pixel (column, row) of a map at (column, row) of its
+camera, whereas everyone else, its own sparse model included, has (column + 0.5, row + 0.5). Maps
+(mvs/mat.h) and consistency graphs (mvs/consistency_graph.h), little-endian, begin with the text
+``W&H&C&``; a map follows with C x H x W float32, a graph with int32: column, row, n and n image
+indices (places in the model, ascending by id) for each pixel that has any. Promise: depths are
+those along COLMAP's rays, so fused points lie where the scene has them, whatever the size of the
+maps; a pixel is moved along the plane given by its normal and never mixed with its neighbours.
 """
 
 from __future__ import annotations
@@ -32,9 +24,8 @@ from jaxtyping import Bool, Float32, Float64, UInt8
 from splatseed.camera import Camera, Intrinsics
 from splatseed.errors import OutputError, ParameterError, SceneFormatError
 from splatseed.io import colmap
-from splatseed.io.cleaning import clean_scene
+from splatseed.io.cleaning import clean_scene, renumber
 from splatseed.io.depth_maps import depth_folder, safe_parts
-from splatseed.io.model import renumber
 from splatseed.io.photograph import (
     decode_photograph,
     open_photograph,
@@ -108,6 +99,9 @@ def write_dense_maps(
 ) -> DenseReport:
     """Write a folder of depth maps of kind "z"; ``splatseed.io.find_depths`` reads them.
 
+    Beside the planar depth of the image ``a/b.jpg``, ``a/b.jpg.npy``, the rest is in
+    ``a/b.jpg.stereo.npz``.
+
     Args:
         scene: The scene of the maps.
         maps: The maps of some of its images, in any order and of any size; consumed one by one.
@@ -115,9 +109,6 @@ def write_dense_maps(
         overwrite: Whether an earlier output of splatseed may be replaced.
         provenance: How the maps came about, for ``splatseed.json``.
         progress: Called with the stage and the fraction done.
-
-    Returns:
-        What was written.
 
     Raises:
         ParameterError: There is no map, or one does not belong to the scene.
@@ -165,26 +156,18 @@ def write_dense_workspace(
 
     Args:
         scene: A scene with photographs.
-        maps: As for ``write_dense_maps``.
+        maps: As for ``write_dense_maps``, whose errors are raised here, too.
         path: The folder to make.
         overwrite: Whether an earlier output of splatseed may be replaced.
         copy_images: Copy the photographs instead of linking them.
-        undistort: Removes lens distortion from a photograph, such as
-            ``splatseed.views.undistortion.undistort``. The workspace then holds the undistorted
-            photographs and pinhole cameras of the same matrix, which the maps belong to. Without
-            it, distorted cameras are refused.
+        undistort: Removes lens distortion from a photograph; the workspace then holds the
+            undistorted photographs and pinhole cameras of the same matrix, which the maps belong
+            to. Without it, distorted cameras are refused.
         provenance: How the maps came about, for ``splatseed.json``.
         progress: Called with the stage and the fraction done.
 
-    Returns:
-        What was written.
-
     Raises:
-        ParameterError: There is no map, or one does not belong to the scene.
-        SceneNotFoundError: The scene has no photographs, or one is missing.
-        SceneFormatError: A camera has distortion that is not removed, or a photograph differs from
-            its camera in aspect ratio.
-        OutputError: The folder is taken or cannot be written, or an image's name leads out of it.
+        InputError: What ``check_dense_scene`` refuses.
     """
     path, sizes = Path(path), check_dense_scene(scene, undistorts=undistort is not None)
     cameras, images = _photograph_model(scene, sizes)
@@ -226,19 +209,12 @@ def write_dense_workspace(
 
 
 def check_dense_scene(scene: Scene, *, undistorts: bool = False) -> dict[str, Size]:
-    """Check that a scene can become a dense workspace, before any work is done.
-
-    Args:
-        scene: The scene.
-        undistorts: Whether distortion will be removed.
-
-    Returns:
-        Width and height of each photograph, by its name.
+    """Width and height of each photograph, by name, of a scene that can become a workspace.
 
     Raises:
         SceneNotFoundError: It has no photographs, or one is missing.
-        SceneFormatError: A camera has distortion that stays, or a photograph differs from it in
-            aspect ratio.
+        SceneFormatError: A camera has distortion that stays (not ``undistorts``), or a photograph
+            differs from it in aspect ratio.
         OutputError: An image's name leads out of its folder.
     """
     folder = photograph_folder(scene)
@@ -344,11 +320,7 @@ def depth_along(
 ) -> Float32[np.ndarray, "H W"]:
     """The depth of each pixel's plane along another ray nearby; NaN where unknown.
 
-    Args:
-        dense: The map.
-        K: Maps the other rays to their grid, [3, 3].
-        at: Pixel (column, row) gets the depth along the ray through (column + at, row + at) of that
-            grid. 0.5 is a pixel's centre; COLMAP's dense stereo uses 0.
+    Pixel (column, row) gets that along the ray through (column + at, row + at) of the grid of K.
     """
     own = _toward_plane(dense, dense.camera.K, 0.5)
     other = _toward_plane(dense, K, at)
@@ -394,11 +366,7 @@ def _matches(sources: tuple[str, ...]) -> str:
 
 
 def write_map(path: Path, values: Float32[np.ndarray, "H W *C"]) -> None:
-    """Write a new file of a depth map [H, W] or a normal map [H, W, 3]; NaN becomes 0, "unknown".
-
-    Raises:
-        OSError: It exists, or cannot be written.
-    """
+    """Write a new file of depths [H, W] or normals [H, W, 3]; NaN becomes 0, "unknown"."""
     height, width = values.shape[:2]
     planes = np.moveaxis(values.reshape(height, width, -1), -1, 0)
     known = np.nan_to_num(planes, nan=0.0).astype("<f4")
@@ -408,16 +376,7 @@ def write_map(path: Path, values: Float32[np.ndarray, "H W *C"]) -> None:
 def write_consistency_graph(
     path: Path, agreeing: UInt8[np.ndarray, "H W"], image_idxs: Sequence[int]
 ) -> None:
-    """Write a new file of which images confirm each pixel, row by row.
-
-    Args:
-        path: The file.
-        agreeing: Bit k is set where ``image_idxs[k]`` confirms the pixel.
-        image_idxs: Positions of the sources in the model's list of images, from 0.
-
-    Raises:
-        OSError: It exists, or cannot be written.
-    """
+    """Write a new file of which images confirm each pixel: bit k stands for ``image_idxs[k]``."""
     bits = (agreeing[..., None] >> np.arange(len(image_idxs), dtype=np.uint8)) & 1
     rows, columns = np.nonzero(bits.any(axis=-1))
     confirming = bits[rows, columns].astype(bool)  # [pixels, sources]
@@ -471,11 +430,10 @@ def _bring_photographs(
 def _photograph_model(
     scene: Scene, sizes: Mapping[str, Size]
 ) -> tuple[tuple[Intrinsics, ...], dict[str, Image]]:
-    """The pinhole cameras and the images of a scene, in pixels of the photographs as on disk.
+    """The pinhole cameras and the images, by id, in pixels of the photographs as on disk.
 
-    A camera record may be larger than its photographs (a folder of reduced copies); COLMAP samples
-    colours at the record's pixels, so the two must agree. There is a record for each camera and
-    size of photograph; images are by name, ascending by id.
+    A record may be larger than its photographs (a folder of reduced copies), and COLMAP samples
+    colours at the record's pixels: there is one for each camera and size of photograph.
     """
     cameras: dict[tuple[int, Size], Intrinsics] = {}
     images = {}

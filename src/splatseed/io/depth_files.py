@@ -1,9 +1,8 @@
 """Depth maps as files store them: NumPy's, ``.pfm``, COLMAP's ``.bin``, PNG, TIFF and OpenEXR.
 
-Notation: a stored map is H x W real numbers, top row first, still in the file's own units. Promise:
-a header is checked against the bytes that follow before anything is allocated for it, no pickle is
-loaded, only one-channel pictures count as depth, and every failure is a ``SceneFormatError`` that
-names the file.
+A stored map is H x W real numbers, top row first, still in the file's own units. Promise: a header
+is checked against the bytes that follow before anything is allocated for it, no pickle is loaded,
+and only one-channel pictures count as depth.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from typing import Any, NamedTuple, get_args
 import numpy as np
 
 from splatseed.depthmap import DepthKind
-from splatseed.io.files import guarded, read_bytes, read_npy_header
+from splatseed.io.files import guarded, read_bytes, read_npy
 from splatseed.literal import beginning
 from splatseed.requirements import require
 
@@ -56,11 +55,6 @@ def read_stored(path: Path) -> StoredDepth:
     the sign of the scale is the byte order, its size is not used). ``.bin``: COLMAP's ``W&H&1&``,
     then float32 rows (mvs/mat.h). PNG of 8 or 16 bits, TIFF of 8, 16 or 32 bits or floats.
     OpenEXR: the channel Z, else depth, D, Y, V or R, else the only one.
-
-    Raises:
-        SceneNotFoundError: There is no such file.
-        SceneFormatError: It is damaged, or no map of real numbers.
-        MissingDependencyError: It is an OpenEXR file, and that package is absent.
     """
     data, kind = read_bytes(path), None
     with guarded(path, "a depth map"):
@@ -83,16 +77,6 @@ def check_stored(shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
         raise ValueError(f"{size} of {dtype}, not height x width real numbers")
 
 
-def _read_npy(_: Path, data: bytes) -> np.ndarray:
-    stream = io.BytesIO(data)
-    shape, fortran, dtype = read_npy_header(stream)
-    count, start = math.prod(shape), stream.tell()
-    if dtype.hasobject or min(shape, default=0) < 0 or count * dtype.itemsize != len(data) - start:
-        raise ValueError(f"{len(data) - start} bytes for {shape} values of {dtype}")
-    array = np.frombuffer(data, dtype, count, start) if count else np.empty(0, dtype)
-    return array.reshape(shape, order="F" if fortran else "C")
-
-
 def _read_npz(data: bytes) -> StoredDepth:
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
 
@@ -101,7 +85,8 @@ def _read_npz(data: bytes) -> StoredDepth:
             packed, size = info.compress_size, info.file_size
             if size > min(max(_SMALL, _MOST_INFLATED * packed), 8 * _MAX_PIXELS):
                 raise ValueError(f"{packed:,} bytes that would become {size:,}")
-            return _read_npy(Path(), archive.read(info))
+            with archive.open(info) as file:
+                return read_npy(file, size)
 
         names = {n.removesuffix(".npy") for n in archive.namelist() if n.endswith(".npy")}
         kind: Any = str(member("kind").reshape(-1)[0]) if "kind" in names else None
@@ -171,7 +156,7 @@ def _read_exr(path: Path, _: bytes) -> np.ndarray:
 
 
 _READERS: dict[str, Callable[[Path, bytes], np.ndarray]] = {
-    ".npy": _read_npy,
+    ".npy": lambda _, data: read_npy(io.BytesIO(data), len(data)),
     ".exr": _read_exr,
     ".pfm": _read_pfm,
     ".bin": _read_colmap,

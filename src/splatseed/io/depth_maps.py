@@ -1,14 +1,11 @@
 """Folders of depth maps: which map belongs to which image, reading it on demand, writing a folder.
 
-Notation: ``scale`` is stored units per scene unit, by which a file's numbers are divided;
-``depths.json`` beside the maps holds ``{"kind": "z" | "ray" | "inverse", "scale": S}``, both
-optional. A *stem* is a map's path without suffix, relative to the folder. For the image ``a/b.jpg``
-the stems are tried in this order: ``a/b.jpg``, ``a/b.jpg.geometric`` and ``.photometric`` (COLMAP's
-dense stereo), ``a/b``, ``a/b_depth``, ``a/depthN`` for ``a/frameN.jpg`` (NICE-SLAM) and
-``a/X.depth`` for ``a/X.color.png`` (7-Scenes); for each, the suffixes in the order of ``SUFFIXES``.
-Promise: a map is float32 with NaN where unknown; nothing stays in memory, and reading is safe from
-several threads at once; matching depends on names only, never on the order in which a system lists
-files; a written folder appears whole or not at all, with one float32 ``.npy`` per image.
+``scale`` is stored units per scene unit, by which a file's numbers are divided. A *stem* is a map's
+path without suffix. For the image ``a/b.jpg`` the stems are tried in this order: ``a/b.jpg``,
+``a/b.jpg.geometric`` and ``.photometric`` (COLMAP's dense stereo), ``a/b``, ``a/b_depth``,
+``a/depthN`` for ``a/frameN.jpg`` (NICE-SLAM) and ``a/X.depth`` for ``a/X.color.png`` (7-Scenes);
+for each, the suffixes in the order of ``SUFFIXES``. Promise: a map is float32 with NaN where
+unknown; reading is safe from several threads; matching depends on names only.
 """
 
 from __future__ import annotations
@@ -51,23 +48,13 @@ _CAPTURED = re.compile(r"depth(\d+)", re.IGNORECASE)
 
 @dataclass(frozen=True, eq=False)
 class Undistortion:
-    """Moves the values of a planar map to where undistorted photographs have them.
-
-    Values are moved, never changed or mixed, so that no depth between two surfaces is invented.
-
-    Args:
-        lens: The camera that took the maps, in one of COLMAP's models.
-        cameras: The pinhole camera of each photograph, by its name, at the same place.
-    """
+    """Moves the values of a planar map to where undistorted photographs have them."""
 
     lens: Intrinsics
     cameras: Mapping[str, Intrinsics]
 
     def apply(self, name: str, values: Float32[np.ndarray, "H W"]) -> Float32[np.ndarray, "h w"]:
-        """A map taken with the lens, or a resized copy, in the pixels and size of one photograph.
-
-        NaN stands where the lens did not look.
-        """
+        """A map taken with the lens, or a resized copy, in the pixels of one photograph."""
         camera = self.cameras[name]
         height, width = values.shape
         column, row = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
@@ -143,11 +130,7 @@ class DepthFiles:
 
 
 def match_by_name(scene: Scene, root: Path) -> DepthFiles | None:
-    """The depth maps in a folder whose names match a scene's images; None if there are none.
-
-    Raises:
-        SceneFormatError: Two images share a map, or the folder's description is damaged.
-    """
+    """The depth maps in a folder whose names match a scene's images; None if there are none."""
     for folder in (root / name for name in _FOLDERS):
         if not folder.is_dir() or not (paths := _match(scene, folder)):
             continue
@@ -163,11 +146,7 @@ def match_by_name(scene: Scene, root: Path) -> DepthFiles | None:
 
 
 def _match(scene: Scene, folder: Path) -> dict[str, Path]:
-    """The map of each image in one folder.
-
-    Image names may begin with folders that map names lack: as many as needed to match any map are
-    dropped.
-    """
+    """The map of each image in one folder; folders that map names lack are dropped."""
     parts = {image.name: safe_parts(image.name) for image in scene.images}
     taken, true_folder = set[Path](), cache(Path.resolve)
     if scene.source and (image_dir := scene.source.image_dir):
@@ -219,50 +198,31 @@ def _stems(file_name: str) -> Iterator[str]:
 
 
 def read_description(path: Path) -> tuple[DepthKind | None, float | None]:
-    """Kind and scale that a ``depths.json`` gives; None for what it does not say.
-
-    Raises:
-        SceneNotFoundError: There is no such file.
-        SceneFormatError: It is no such description.
-    """
-    content = _read_object(path)
-    kind = content.get("kind")
-    if kind is not None and kind not in KINDS:
-        raise SceneFormatError(
-            f"kind in {path} to be {', '.join(KINDS)}",
-            found=repr(kind)[:80],
-            fix="Correct it, or leave it out for planar z.",
-        )
-    return kind, _scale_in(path, content)
+    """Kind and scale that a ``depths.json`` gives; None for what it does not say."""
+    content = read_json(path)
+    with guarded(path, "a description of depth maps", fix="Correct it, or leave it out."):
+        scale, kind = _scale_in(content), content.get("kind")
+        if kind not in (None, *KINDS):
+            raise ValueError(f"kind {kind!r}, not one of {', '.join(KINDS)}")
+        return kind, scale
 
 
 def read_capture_scale(path: Path) -> float | None:
-    """Stored units per metre that the ``cam_params.json`` of an RGB-D capture gives, if it does.
-
-    Raises:
-        SceneFormatError: It is no such file, or its scale is not a positive number.
-    """
-    camera = _read_object(path).get("camera")
-    return _scale_in(path, camera) if isinstance(camera, dict) else None
+    """Stored units per metre that the ``cam_params.json`` of an RGB-D capture gives, if it does."""
+    content = read_json(path)
+    with guarded(path, "the camera of a capture", fix="Correct it."):
+        camera = content.get("camera") if isinstance(content, dict) else content
+        return _scale_in({} if camera is None else camera)
 
 
-def _read_object(path: Path) -> dict[str, Any]:
-    content = read_json(path, "a JSON object")
-    if isinstance(content, dict):
-        return content
-    found = type(content).__name__
-    raise SceneFormatError(f"{path} to hold a JSON object", found=found, fix="Write it again.")
-
-
-def _scale_in(path: Path, content: Mapping[str, Any]) -> float | None:
+def _scale_in(content: Any) -> float | None:
+    if not isinstance(content, dict):
+        raise TypeError
     scale = content.get("scale")
-    if scale is None:
-        return None
-    if isinstance(scale, int | float) and not isinstance(scale, bool) and 0 < scale < 1e300:
-        return float(scale)
-    raise SceneFormatError(
-        f"scale in {path} to be a number above 0", found=repr(scale)[:80], fix="Correct it."
-    )
+    number = isinstance(scale, int | float) and not isinstance(scale, bool)
+    if scale is None or (number and 0 < scale < 1e300):
+        return scale and float(scale)
+    raise ValueError(f"scale {scale!r}, not a number above 0")
 
 
 def safe_parts(name: str) -> tuple[str, ...]:
@@ -279,9 +239,6 @@ def write_description(folder: Path, kind: DepthKind, scale: float = 1.0, **more:
         kind: What the values are.
         scale: Stored units per scene unit.
         more: How they were made; for people, never read back.
-
-    Raises:
-        OSError: It cannot be written.
     """
     write_json(folder / DESCRIPTION, {"kind": kind, "scale": scale, **more})
 
@@ -293,26 +250,15 @@ class DepthWriter:
     folder: Path
 
     def write(self, name: str, values: Float32[np.ndarray, "H W"]) -> None:
-        """Keep the map of one image; safe to call from several threads.
-
-        Args:
-            name: The image's name.
-            values: NaN where nothing is known.
-
-        Raises:
-            OutputError: Two image names become the same once parts that lead out are dropped.
-        """
+        """Keep the map of one image, NaN where nothing is known; safe from several threads."""
         path = self.folder.joinpath(*safe_parts(f"{name}.npy"))
         with guarded(path, "a depth map"):
             check_stored(values.shape, values.dtype)
+        if path.exists():
+            expected = "one depth map per image"
+            raise OutputError(expected, found=f"two for {name}", fix="Rename the image.")
         path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            with path.open("xb") as file:
-                np.save(file, np.ascontiguousarray(values, np.float32))
-        except FileExistsError:
-            raise OutputError(
-                "one depth map per image", found=f"two for {name}", fix="Rename the image."
-            ) from None
+        np.save(path, np.ascontiguousarray(values, np.float32))
 
 
 @contextmanager

@@ -3,8 +3,7 @@
 Promise: only regular files are opened, so that nothing blocks or reads forever (a pipe,
 ``/dev/zero``), and none larger than the free memory is read whole; a count in a file is checked
 against the bytes that are left before anything is allocated for it. ``open_file``, ``read_file``
-and ``read_text`` raise an ``OSError`` whose ``strerror`` says what was refused; all else raises one
-of our errors, which names the file.
+and ``read_text`` raise an ``OSError``; all else one of our errors, which names the file.
 """
 
 from __future__ import annotations
@@ -12,6 +11,7 @@ from __future__ import annotations
 import errno
 import json
 import lzma
+import math
 import os
 import stat
 import struct
@@ -76,11 +76,7 @@ def odd_kind(path: Path) -> str:
 
 
 def open_file(path: Path) -> BinaryIO:
-    """Open a regular file for reading.
-
-    Raises:
-        OSError: There is none, it cannot be opened, or is of another kind.
-    """
+    """Open a regular file for reading; an ``OSError`` for anything else."""
     _check(path, path.stat())  # opening alone can act on a device
     file = os.fdopen(os.open(path, os.O_RDONLY | _WAIT_NOT), "rb")
     try:
@@ -92,11 +88,7 @@ def open_file(path: Path) -> BinaryIO:
 
 
 def read_file(path: Path) -> bytes:
-    """The whole content of a regular file.
-
-    Raises:
-        OSError: As for ``open_file``, or it is larger than the free memory.
-    """
+    """The whole content of a regular file; an ``OSError`` also if it exceeds the free memory."""
     with open_file(path) as file:
         check_room(path, os.fstat(file.fileno()).st_size)
         return file.read()
@@ -111,12 +103,7 @@ def check_room(path: Path, size: int) -> None:
 
 
 def read_text(path: Path) -> str:
-    """The whole content of a regular file of UTF-8, such as JSON or TOML.
-
-    Raises:
-        OSError: See ``read_file``.
-        UnicodeDecodeError: It is something else.
-    """
+    """The whole content of a regular file of UTF-8, such as JSON or TOML, as ``read_file``."""
     return read_file(path).decode("utf-8")
 
 
@@ -133,7 +120,7 @@ def read_bytes(path: Path) -> bytes:
 
 @contextmanager
 def readable(path: Path) -> Iterator[None]:
-    """Turn an ``OSError`` from reading a file into one of our errors, as for ``read_bytes``."""
+    """Turn an ``OSError`` from reading a file into one of our errors, as ``read_bytes`` raises."""
     try:
         yield
     except (FileNotFoundError, NotADirectoryError):
@@ -148,15 +135,12 @@ def readable(path: Path) -> Iterator[None]:
 
 @contextmanager
 def guarded(path: Path, expected: str, *, fix: str = COPY_AGAIN) -> Iterator[None]:
-    """Turn whatever reading a bad file raises, in a package or here, into one of our errors.
+    """Turn whatever reading a bad file raises, in a package or here, into a ``SceneFormatError``.
 
     Args:
         path: The file.
         expected: What it should be.
         fix: What the error advises.
-
-    Raises:
-        SceneFormatError: The block failed, other than by one of our own errors.
     """
     try:
         yield
@@ -184,13 +168,35 @@ def read_npy_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[An
     return npy_format.read_array_header_2_0(file)
 
 
-def read_json(path: Path, expected: str = "JSON", *, fix: str = COPY_AGAIN) -> Any:
-    """The content of a JSON file.
+def read_npy(file: IO[bytes], most: float = np.inf) -> np.ndarray:
+    """The array of a ``.npy``; ``ValueError`` for one of objects or of more than ``most`` bytes."""
+    shape, turned, dtype = read_npy_header(file)
+    size = math.prod(shape) * dtype.itemsize
+    if dtype.hasobject or min(shape, default=0) < 0 or size > most:
+        raise ValueError(f"{shape} values of {dtype}")
+    data = file.read(size + 1)
+    if len(data) != size:
+        raise ValueError(f"{len(data)} bytes for {shape} values of {dtype}")
+    return np.frombuffer(data, dtype).reshape(shape, order="F" if turned else "C")
 
-    Args:
-        path: The file.
-        expected: What errors say that it should be.
-        fix: What errors advise.
+
+def numbered_lines(path: Path) -> Iterator[tuple[str, str]]:
+    """The lines of a UTF-8 file with their places, its byte order mark left out."""
+    raw = read_bytes(path)
+    try:
+        text = raw.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        number = raw.count(b"\n", 0, error.start) + 1
+        found = repr(raw[error.start : error.end])
+        raise SceneFormatError(
+            f"UTF-8 text in {path}, line {number}", found=found, fix=COPY_AGAIN
+        ) from None
+    for number, line in enumerate(text.split("\n"), start=1):
+        yield f"{path}, line {number}", line
+
+
+def read_json(path: Path, expected: str = "JSON", *, fix: str = COPY_AGAIN) -> Any:
+    """The content of a JSON file, which errors say should be what is ``expected``.
 
     Raises:
         SceneNotFoundError: There is no such file.
@@ -204,20 +210,14 @@ def read_json(path: Path, expected: str = "JSON", *, fix: str = COPY_AGAIN) -> A
 
 
 class ByteReader:
-    """Reads a little-endian binary file from front to back.
+    """Reads a little-endian binary file, whole in memory, from front to back.
 
-    Args:
-        path: The file; it is read whole.
-        fix: What errors advise.
+    What ends early, or cannot be, is a ``SceneFormatError`` that names file, record and byte.
 
     Attributes:
         data: Its bytes.
         offset: The next byte to read.
         record: What is being read, for errors ("header", "record 3").
-
-    Raises:
-        SceneNotFoundError: There is no such file.
-        SceneFormatError: It cannot be read; or, from any method, it ends early.
     """
 
     def __init__(self, path: Path, fix: str = COPY_AGAIN) -> None:

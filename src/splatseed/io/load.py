@@ -1,14 +1,12 @@
 """Reading a scene in any format, and finding its depth maps: by time in a capture, else by name.
 
-Notation: a *model* is a folder with COLMAP's cameras, images and points3D, each as ``.bin`` or
-``.txt``. Promise: one function recognises what a path holds and reads it; what is odd but usable
-becomes a sentence in ``Scene.warnings``, anything else raises one error.
+What is odd but usable becomes a sentence in ``Scene.warnings``, anything else one error.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -16,10 +14,10 @@ from pathlib import Path
 from splatseed.depthmap import DepthKind
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.io.cleaning import clean_scene, cloud_warnings
+from splatseed.io.colmap import find_model, read_colmap_scene, scene_root
 from splatseed.io.depth_files import KINDS, SUFFIXES
 from splatseed.io.depth_maps import DepthFiles, match_by_name
 from splatseed.io.files import is_video, odd_kind
-from splatseed.io.model import find_model, read_colmap_scene, scene_root
 from splatseed.io.nerfstudio import is_blender, read_blender, read_transforms_scene
 from splatseed.io.ply import read_ply, refuse_model
 from splatseed.io.rgbd import find_tum_depths, is_tum, load_rgbd, load_tum
@@ -105,11 +103,7 @@ def load_originals(path: str | Path, *, require_points: bool = True) -> Scene:
 
 
 def check_there(path: Path) -> None:
-    """Refuse the path of a scene at which there is neither a file nor a folder.
-
-    Raises:
-        SceneNotFoundError: There is none.
-    """
+    """Raise a ``SceneNotFoundError`` if there is neither a file nor a folder."""
     if not path.is_file() and not path.is_dir():
         found = odd_kind(path) or "no such file or folder"
         raise SceneNotFoundError(f"a scene at {path}", found=found, fix="Check the path.")
@@ -190,17 +184,20 @@ def _no_scene(path: Path) -> SceneNotFoundError:
         return _is_run(path)
     scenes = [each.name for each in sorted(path.iterdir()) if is_scene(each)]
     files = {each.name for suffix in ("*.json", "*.ply") for each in path.glob(suffix)}
-    near, above = sorted(files - {MANIFEST}), _scene_above(path)
-    inside = f"only {_some(near)}" if near else "none of them"
-    fix = "Name the scene's folder, or a .ply or .json file itself."
+    names = scenes or sorted(files - {MANIFEST})
+    more = f" and {len(names) - 5:,} more" if len(names) > 5 else ""
+    some = ", ".join(names[:5]) + more
+    found = f"scenes in it: {some}" if scenes else f"only {some}" if names else "none of them"
+    fix = (
+        "Name the scene's folder, or a .ply or .json file itself. For photographs alone, run:"
+        " splatseed sfm IMAGES -o SCENE."
+    )
     if scenes:
-        inside, fix = f"scenes in it: {_some(scenes)}", f"Name one of them: {path / scenes[0]}"
-    elif above is not None:
+        fix = f"Name one of them: {path / scenes[0]}"
+    elif (above := _scene_above(path)) is not None:
         fix = f"Name the scene's folder: {above}"
-    else:
-        fix += " For photographs alone, run: splatseed sfm IMAGES -o SCENE."
     expected = f"sparse/0, sparse, colmap/sparse/0, {_TRANSFORMS}, traj.txt or groundtruth.txt"
-    return SceneNotFoundError(f"{expected} in {path}", found=inside, fix=fix)
+    return SceneNotFoundError(f"{expected} in {path}", found=found, fix=fix)
 
 
 def _is_run(path: Path) -> SceneNotFoundError:
@@ -210,12 +207,6 @@ def _is_run(path: Path) -> SceneNotFoundError:
         found="a run of splatseed train",
         fix=f"Look at it: splatseed view {run}. Score it: splatseed evaluate {run}.",
     )
-
-
-def _some(names: Sequence[str]) -> str:
-    """The first five names, and how many more there are."""
-    more = f" and {len(names) - 5:,} more" if len(names) > 5 else ""
-    return ", ".join(names[:5]) + more
 
 
 def find_depths(
@@ -267,22 +258,14 @@ def find_depths(
 
 
 def with_own_depths(scene: Scene) -> Scene:
-    """The scene with the depth maps that lie in its own folder, if it has none and there are some.
-
-    Raises:
-        SceneFormatError: Two images share a map, or the folder's description is damaged.
-    """
+    """The scene with the depth maps in its own folder, if it has none and there are some."""
     if scene.depths is not None or scene.source is None:
         return scene
     return scene.replace(depths=search_depths(scene, scene.source.root))
 
 
 def search_depths(scene: Scene, root: Path) -> DepthFiles | None:
-    """As ``find_depths``, but None where no image has a map.
-
-    Raises:
-        SceneFormatError: Two images share a map, or the folder's description is damaged.
-    """
+    """As ``find_depths``, but None where no image has a map."""
     if is_tum(root) and (maps := find_tum_depths(scene, root)) is not None:
         return maps
     if (maps := match_by_name(scene, root)) is not None:

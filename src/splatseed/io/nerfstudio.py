@@ -1,53 +1,52 @@
-"""Scenes in ``transforms.json``, of nerfstudio, instant-ngp and Blender's data sets.
+"""Scenes in ``transforms.json``, of nerfstudio, instant-ngp and Blender's data sets; similarities.
 
 Notation: a *frame* is one posed image; its ``transform_matrix`` is ``world_from_cam`` in OpenGL
-axes (x right, y up, z back), ours in OpenCV's (x right, y down, z forward), so the y and z columns
-change sign. The *transforms' space* is the world of the file's poses; ``applied_transform`` [3, 4]
-takes the world of the Structure-from-Motion model there. Promise: images come in the file's order
-with names relative to ``image_dir``; what cannot be expressed raises an error that names the frame.
-Points come from the file that the JSON names, else from a PLY known to lie in that space, else from
-a COLMAP model whose cameras determine the map into that space: a known rotation of the axes, or a
-fitted similarity.
-
-Source: nerfstudio's "data conventions" page and instant-ngp's ``colmap2nerf`` output.
+axes (x right, y up, z back). The *transforms' space* is the world of the file's poses;
+``applied_transform`` [3, 4] takes the world of the Structure-from-Motion model there. Points come
+from the file that the JSON names, else from a PLY known to lie in that space, else from a COLMAP
+model whose cameras determine the map into that space. Source: nerfstudio's "data conventions" page
+and instant-ngp's ``colmap2nerf`` output.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
 
-from splatseed.camera import Intrinsics, quat_from_rotation
+from splatseed.camera import Intrinsics
 from splatseed.errors import SceneFormatError
-from splatseed.io.colmap import MAX_ID, make_intrinsics
-from splatseed.io.files import guarded, odd_kind, open_file, read_json
-from splatseed.io.model import (
+from splatseed.io.colmap import (
+    MAX_ID,
     find_model,
+    make_intrinsics,
     read_model_cameras,
     read_model_points,
+    rigid_pose,
 )
+from splatseed.io.files import guarded, odd_kind, open_file, read_bytes, read_json
 from splatseed.io.photograph import image_warnings, lens_warnings
 from splatseed.io.ply import read_ply
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene, SceneSource, Split
-from splatseed.similarity import fit_similarity
+from splatseed.similarity import Similarity, fit_similarity, similarity_of
 
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """Turns camera axes from OpenGL's to OpenCV's, and back."""
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG", ".JPEG")  # tried when a file_path has none
-_RIGID_TOLERANCE = 1e-3  # of rotation @ rotation.T against the identity
 _PERSPECTIVE = {"OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"}
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 _FIX = "Correct the file, or export the scene again."
+NERFSTUDIO = "dataparser_transforms.json"
+_MATRIX_KEYS = ("transform", "matrix", "transform_matrix", "transformation")
+_MATRIX_FIX = "Give 3 or 4 rows of 4 numbers, as text or JSON."
 _BLENDER = ("transforms_train.json", "transforms_test.json")
 _POINT_FILES = ("sparse_pc.ply", "points3d.ply", "points3D.ply", "pointcloud.ply")
 _LEGACY_TRANSFORM = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]])
@@ -59,49 +58,36 @@ _POSE_TOLERANCE = 1e-2  # of the cameras' extent, between transforms.json and it
 
 @dataclass(frozen=True, eq=False)
 class Transforms:
-    """A ``transforms.json``, read and checked.
-
-    Args:
-        path: The file.
-        json: Its content, unchanged.
-        images: The posed images, in the file's order; OpenCV axes, the transforms' space.
-        intrinsics: The distinct cameras of the frames, ids from 1.
-        image_dir: The folder that holds all images (``images`` as a rule); names are relative
-            to it.
-        applied_transform: float64 [3, 4], None if the file has none.
-        warnings: What could not be converted, one sentence each.
-    """
+    """A ``transforms.json``, read and checked; images in the file's order, in OpenCV axes."""
 
     path: Path
     json: Mapping[str, Any]
     images: tuple[Image, ...]
     intrinsics: tuple[Intrinsics, ...]
-    image_dir: Path
+    image_dir: Path  # names are relative to it
     applied_transform: Float64[np.ndarray, "3 4"] | None
     warnings: tuple[str, ...]
 
 
 def read_transforms_scene(path: Path) -> Scene:
-    """Read a ``transforms.json`` and the points that belong to it; the cloud may be empty.
-
-    Raises:
-        SceneNotFoundError: A file is missing.
-        SceneFormatError: A file is not what its format promises, or the COLMAP model beside the
-            JSON does not fit its poses.
-    """
+    """Read a ``transforms.json`` and the points that belong to it; the cloud may be empty."""
     transforms = read_transforms(path)
     points, points_path, notes = _find_points(transforms)
-    folder = transforms.image_dir
-    source = SceneSource(
-        "transforms", path.parent, points_path, image_dir=folder, transforms_path=path
+    images, folder = transforms.images, transforms.image_dir
+    return Scene(
+        points,
+        images,
+        transforms.intrinsics,
+        source=SceneSource(
+            "transforms", path.parent, points_path, image_dir=folder, transforms_path=path
+        ),
+        warnings=(
+            *transforms.warnings,
+            *notes,
+            *image_warnings(images, folder, path.parent),
+            *lens_warnings(images),
+        ),
     )
-    warnings = (
-        *transforms.warnings,
-        *notes,
-        *image_warnings(transforms.images, folder, path.parent),
-        *lens_warnings(transforms.images),
-    )
-    return Scene(points, transforms.images, transforms.intrinsics, source=source, warnings=warnings)
 
 
 def is_blender(folder: Path) -> bool:
@@ -110,89 +96,86 @@ def is_blender(folder: Path) -> bool:
 
 
 def read_blender(folder: Path) -> Scene:
-    """Read both files as one scene, and the points in their space; the cloud may be empty.
+    """Read both files as one scene, whose split is theirs, and the points in their space.
 
-    Images are named with their folders (``train/r_0.png``), and the split is that of the files.
-    Images that only ``transforms_val.json`` has are left out.
-
-    Raises:
-        SceneNotFoundError: A file is missing.
-        SceneFormatError: A file is not what its format promises.
+    Images are named with their folders (``train/r_0.png``); those of ``transforms_val.json`` are
+    left out.
     """
     parts = [read_transforms(folder / name) for name in _BLENDER]
     cameras: dict[tuple[object, ...], Intrinsics] = {}
-    named: list[list[Image]] = [[], []]
-    for part, images in zip(parts, named, strict=True):
+    images: list[Image] = []
+    for part in parts:
         for image in part.images:
             lens = image.intrinsics
             key = (lens.model, lens.width, lens.height, lens.params)
-            shared = cameras.setdefault(key, dataclasses.replace(lens, camera_id=len(cameras) + 1))
-            path, image_id = part.image_dir / image.name, sum(map(len, named)) + 1
-            within = folder.absolute() in path.parents
-            name = path.relative_to(folder.absolute()).as_posix() if within else str(path)
-            images.append(
-                dataclasses.replace(image, name=name, image_id=image_id, intrinsics=shared)
-            )
-    train, test = named
+            shared = cameras.setdefault(key, replace(lens, camera_id=len(cameras) + 1))
+            name = os.path.relpath(part.image_dir / image.name, folder.absolute())
+            name = PurePath(name).as_posix()
+            images.append(replace(image, name=name, image_id=len(images) + 1, intrinsics=shared))
     points, points_path, notes = _find_points(parts[0])
+    names = [image.name for image in images]
+    num_train = len(parts[0].images)
     return Scene(
         points,
-        (*train, *test),
+        tuple(images),
         tuple(cameras.values()),
         source=SceneSource("transforms", folder, points_path, image_dir=folder),
         warnings=(
             *dict.fromkeys((*parts[0].warnings, *parts[1].warnings, *notes)),
-            *image_warnings((*train, *test), folder, folder),
-            *lens_warnings((*train, *test)),
+            *image_warnings(images, folder, folder),
+            *lens_warnings(images),
         ),
         listed=Split(
-            frozenset(image.name for image in train),
-            frozenset(image.name for image in test),
+            frozenset(names[:num_train]),
+            frozenset(names[num_train:]),
             f"pair of {_BLENDER[0]} and {_BLENDER[1]}",
         ),
     )
 
 
 def read_transforms(path: Path) -> Transforms:
-    """Read the cameras of a ``transforms.json``; its points are read by ``load_scene``.
-
-    Raises:
-        SceneNotFoundError: There is no such file.
-        SceneFormatError: It is not JSON, has no frames, or a frame's file name, pose or camera is
-            missing or impossible.
-    """
+    """Read the cameras of a ``transforms.json``; its points are read by ``load_scene``."""
     meta = read_json(path, fix=_FIX)
     frames = meta.get("frames") if isinstance(meta, dict) else None
     if not isinstance(frames, list) or not frames or not all(isinstance(f, dict) for f in frames):
         found = "something else" if frames else "none"
         raise SceneFormatError(f"{path} to have a list of frames", found=found, fix=_FIX)
     files = [_image_file(path, i, frame) for i, frame in enumerate(frames)]
-    image_dir = _image_dir(path, files)
+    # The folder beside the file that holds all images, else the deepest one that does. Links are
+    # not followed, so that names are as in COLMAP.
+    image_dir = Path(os.path.commonpath([file.parent for file in files]))
+    root = Path(os.path.abspath(path)).parent  # noqa: PTH100
+    if root in image_dir.parents:
+        image_dir = root / image_dir.relative_to(root).parts[0]
     names = [file.relative_to(image_dir).as_posix() for file in files]
+    ids = [frame.get("colmap_im_id") for frame in frames]
+    if not all(isinstance(i, int) and 0 < i <= MAX_ID for i in ids) or len({*ids}) < len(ids):
+        ids = list(range(1, len(frames) + 1))
     cameras: dict[tuple[str, int, int, tuple[float, ...]], Intrinsics] = {}
     images: list[Image] = []
     seen: set[str] = set()
     odd = 0
-    for i, (frame, image_id) in enumerate(zip(frames, _image_ids(frames), strict=True)):
-        where = f"{path}, frame {i + 1} ({names[i]})"
-        if names[i] in seen:
+    for i, (name, frame) in enumerate(zip(names, frames, strict=True)):
+        where = f"{path}, frame {i + 1} ({name})"
+        if name in seen:
             expected = f"{where} to have an image of its own"
-            raise SceneFormatError(expected, found=f"{names[i]!r} again", fix=_FIX)
-        seen.add(names[i])
+            raise SceneFormatError(expected, found=f"{name!r} again", fix=_FIX)
+        seen.add(name)
         values = {**meta, **frame}
         key = _camera(where, values, files[i])
         if key not in cameras:
             cameras[key] = make_intrinsics(where, len(cameras) + 1, *key)
         odd += bool(values.get("k4")) and key[0] != "OPENCV_FISHEYE"
-        quat, translation = _pose(where, frame.get("transform_matrix"))
-        images.append(Image(names[i], image_id, cameras[key], quat, translation))
+        pose = _matrix(f"{where}, transform_matrix", frame.get("transform_matrix"))
+        quat, translation = rigid_pose(where, pose @ OPENCV_FROM_OPENGL)
+        images.append(Image(name, ids[i], cameras[key], quat, translation))
     applied = meta.get("applied_transform")
     if applied is not None:
         applied = _matrix(f"{path}, applied_transform", applied)
     note = f"k4 of {odd} frames is not used: COLMAP's perspective models have no such term."
-    warnings = (note,) if odd else ()
+    cameras_of = tuple(cameras.values())
     return Transforms(
-        path, meta, tuple(images), tuple(cameras.values()), image_dir, applied, warnings
+        path, meta, tuple(images), cameras_of, image_dir, applied, (note,) if odd else ()
     )
 
 
@@ -215,22 +198,6 @@ def _image_file(path: Path, idx: int, frame: Mapping[str, Any]) -> Path:
         return file
     candidates = (file.with_name(file.name + suffix) for suffix in _SUFFIXES)
     return next((candidate for candidate in candidates if candidate.is_file()), file)
-
-
-def _image_dir(path: Path, files: Sequence[Path]) -> Path:
-    """The folder beside the file that holds all images, else the deepest one that does."""
-    shared = Path(os.path.commonpath([file.parent for file in files]))
-    root = Path(os.path.abspath(path)).parent  # noqa: PTH100  (as the files: links not followed)
-    if root not in shared.parents:
-        return shared
-    return root / shared.relative_to(root).parts[0]  # images, so that names are as in COLMAP
-
-
-def _image_ids(frames: Sequence[Mapping[str, Any]]) -> list[int]:
-    """COLMAP's ids where every frame has one, else 1, 2, ..."""
-    ids = [frame.get("colmap_im_id") for frame in frames]
-    usable = [i for i in ids if isinstance(i, int) and 0 < i <= MAX_ID]
-    return usable if len(set(usable)) == len(frames) else list(range(1, len(frames) + 1))
 
 
 def _number(where: str, values: Mapping[str, Any], key: str, default: float | None = None) -> float:
@@ -310,20 +277,6 @@ def _matrix(where: str, value: Any) -> Float64[np.ndarray, "3 4"]:
     return matrix[:3]
 
 
-def _pose(where: str, value: Any) -> tuple[Float64[np.ndarray, " 4"], Float64[np.ndarray, " 3"]]:
-    """Quaternion and translation of ``cam_from_world`` in OpenCV axes."""
-    world_from_cam = _matrix(f"{where}, transform_matrix", value) @ OPENCV_FROM_OPENGL
-    rotation = world_from_cam[:, :3].T
-    off = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    if off > _RIGID_TOLERANCE or np.linalg.det(rotation) < 0:
-        raise SceneFormatError(
-            f"a rotation and translation as transform_matrix in {where}",
-            found="a scaled, sheared or mirrored one",
-            fix="Remove the scale from the poses (and from the points).",
-        )
-    return quat_from_rotation(rotation), -rotation @ world_from_cam[:, 3]
-
-
 def _find_points(transforms: Transforms) -> tuple[PointCloud, Path, list[str]]:
     """The cloud, the file it came from, and notes for the user."""
     root, notes = transforms.path.parent, []
@@ -354,26 +307,27 @@ def _transform_of_model(
         candidates = [transforms.applied_transform]
     elif model_dir.parts[-3:-2] != ("colmap",):  # not a folder that nerfstudio made
         candidates.reverse()
-    pairs = list(_common_centers(transforms.images, model_images))
+    named = {PurePath(image.name).name: image.camera.center for image in model_images}
+    here = {PurePath(image.name).name: image.camera.center for image in transforms.images}
+    pairs = [(center, named[name]) for name, center in here.items() if name in named]
     if not pairs:
         doubt = f"no image of {model_dir} is in {transforms.path.name}; its points may lie askew."
         return candidates[0], [doubt]
     centers, model_centers = (np.array(each) for each in zip(*pairs, strict=True))
     extent = max(float(np.ptp(centers, axis=0).max()), 1e-6 * float(np.abs(centers).max()))
-    for candidate in candidates:
-        off = np.abs(apply_transform(candidate, model_centers) - centers).max(axis=1)
-        if np.median(off) <= _POSE_TOLERANCE * extent:
-            return candidate, []
+    maps: list[tuple[np.ndarray, list[str]]] = [(each, []) for each in candidates]
     fitted = fit_similarity(model_centers, centers)
-    if fitted is not None:
-        apart = np.abs(fitted.points(model_centers) - centers).max(axis=1)
-        if len(centers) >= _FEWEST_FITTED and np.median(apart) <= _POSE_TOLERANCE * extent:
-            note = (
-                f"The poses of {transforms.path.name} are those of {model_dir} turned, moved and "
-                f"scaled by {fitted.scale:.3g}, as instant-ngp writes them; its points were "
-                "brought there."
-            )
-            return fitted.matrix, [note]
+    if fitted is not None and len(pairs) >= _FEWEST_FITTED:
+        note = (
+            f"The poses of {transforms.path.name} are those of {model_dir} turned, moved and "
+            f"scaled by {fitted.scale:.3g}, as instant-ngp writes them; its points were brought "
+            "there."
+        )
+        maps.append((fitted.matrix, [note]))
+    for matrix, notes in maps:
+        off = np.abs(apply_transform(matrix, model_centers) - centers).max(axis=1)
+        if np.median(off) <= _POSE_TOLERANCE * extent:
+            return matrix, notes
     raise SceneFormatError(
         f"the cameras of {model_dir} to be those of {transforms.path} after applied_transform",
         found=f"cameras {np.median(off):.3g} apart in a scene of extent {extent:.3g}",
@@ -381,12 +335,55 @@ def _transform_of_model(
     )
 
 
-def _common_centers(
-    images: Sequence[Image], model_images: Sequence[Image]
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """The camera centres, here and in the model, of the images that both have, by file name."""
-    named = {PurePath(image.name).name: image for image in model_images}
-    for image in images:
-        other = named.get(PurePath(image.name).name)
-        if other is not None:
-            yield image.camera.center, other.camera.center
+def read_cloud_transform(path: Path, scene: Scene) -> Similarity:
+    """The transform from a cloud's frame to the scene's; a ``SceneFormatError`` if it is none.
+
+    Nerfstudio's file leads from the scene to the world that it trains and exports in, so a cloud
+    from there goes the other way.
+    """
+    try:
+        rows = np.loadtxt(read_bytes(path).decode("utf-8").splitlines(), np.float64, ndmin=2)
+        return similarity_in(path, rows.tolist(), scene, _MATRIX_FIX)
+    except (UnicodeDecodeError, ValueError):
+        pass  # not plain numbers
+    content = read_json(path, "a transform, as text or JSON", fix=_MATRIX_FIX)
+    found = similarity_in(path, content, scene, _MATRIX_FIX)
+    return found.inverse if path.name == NERFSTUDIO else found
+
+
+def similarity_in(path: Path, content: Any, scene: Scene, fix: str) -> Similarity:
+    """The similarity that the content of a file is.
+
+    Args:
+        path: The file; nerfstudio's is recognised by its name.
+        content: Rows of a matrix, or a mapping with them and a scale.
+        scene: For nerfstudio's file, whose transform begins from COLMAP's own world: a scene read
+            from transforms.json is in that file's world, to which ``applied_transform`` leads.
+        fix: What errors advise.
+
+    Raises:
+        SceneFormatError: It is none.
+    """
+    scale, rows = 1.0, content
+    if isinstance(content, dict):
+        rows = next((content[key] for key in _MATRIX_KEYS if key in content), None)
+        scale = content.get("scale", 1.0)
+    try:
+        matrix = np.atleast_1d(np.array(rows, np.float64))
+        matrix = np.concatenate([matrix[:3] * float(scale), np.eye(4)[3:]])
+        transforms = scene.source.transforms_path if scene.source else None
+        if path.name == NERFSTUDIO and transforms is not None:
+            applied = read_json(transforms, fix=fix).get("applied_transform", np.eye(4)[:3])
+            applied = np.vstack([np.array(applied, np.float64)[:3], np.eye(4)[3:]])
+            matrix = matrix @ np.linalg.inv(applied)
+        world = similarity_of(matrix)
+    except (TypeError, ValueError):
+        world = None
+    if world is None:
+        raise SceneFormatError(
+            f"{path} to hold a similarity (rotation, shift and one scale; no shear, no mirror): 3 "
+            "or 4 rows of 4 numbers, by themselves or as transform, with a scale beside them",
+            found=repr(rows)[:80],
+            fix=fix,
+        )
+    return world

@@ -2,8 +2,7 @@
 
 Promise: pixels are as stored, before any EXIF rotation, because COLMAP counts them so; transparent
 ones are composited over black, the background of renders; 16-bit grey, and floats in [0, 1], are
-rounded to 8 bits, and 16-bit colours keep their upper 8 (Pillow's way); every failure names the
-file. Checks open only the headers of a few files, and return problems instead of raising them.
+rounded to 8 bits, and 16-bit colours keep their upper 8 (Pillow's way).
 """
 
 from __future__ import annotations
@@ -36,18 +35,13 @@ _MAX_OPENED = 32  # files whose size is compared
 
 
 def photograph_folder(scene: Scene) -> Path:
-    """The folder that a scene's photographs are in.
-
-    Raises:
-        SceneNotFoundError: The scene has no images, or no folder of them.
-    """
+    """The folder of a scene's photographs; a ``SceneNotFoundError`` without photographs."""
     folder = scene.source.image_dir if scene.source else None
     if folder is None or not scene.images:
         raise SceneNotFoundError(
             "a scene with photographs",
             found="no images" if folder else "no folder of images",
-            fix="Name a scene with cameras (in a COLMAP model, images.bin has them), and put its "
-            "photographs into a folder named images.",
+            fix="Name a scene with cameras, and put its photographs into a folder named images.",
         )
     return folder
 
@@ -62,25 +56,17 @@ def photograph_bytes(path: Path) -> bytes:
     try:
         return read_file(path)
     except FileNotFoundError:
-        near = other_spelling(path)
-        raise SceneNotFoundError(
-            f"the image {path}",
-            found=f"{near} in its place" if near else "no such file",
-            fix="Name it as the model does, to the letter."
-            if near
-            else "Put it there, or drop it from the model.",
-        ) from None
+        found, fix = "no such file", "Put it there, or drop it from the model."
+        if near := other_spelling(path):
+            found, fix = f"{near} in its place", "Name it as the model does, to the letter."
+        raise SceneNotFoundError(f"the image {path}", found=found, fix=fix) from None
     except OSError as error:
         found = error.strerror or type(error).__name__
         raise SceneFormatError(f"{path} to be an image", found=found, fix=_COPY_AGAIN) from None
 
 
 def open_photograph(path: Path, encoded: bytes) -> PilImage.Image:
-    """The photograph in a file's bytes; only its header is decoded yet.
-
-    Raises:
-        SceneFormatError: It is no image.
-    """
+    """The photograph in a file's bytes; only its header is decoded yet."""
     from PIL import Image as PilImage  # noqa: PLC0415  (slow to import)
 
     with guarded(path, "an image", fix=_COPY_AGAIN):
@@ -113,12 +99,7 @@ def decode_photograph(path: Path, encoded: bytes) -> PilImage.Image:
 
 
 def check_photograph(path: Path) -> tuple[int, int]:
-    """Read a photograph to its last byte, keep nothing, and return its width and height.
-
-    Raises:
-        SceneNotFoundError: There is no such file.
-        SceneFormatError: It is no image, or is cut short or damaged.
-    """
+    """Read a photograph to its last byte, keep nothing, and return its width and height."""
     photograph = open_photograph(path, photograph_bytes(path))
     size = photograph.size
     photograph.draft(None, (size[0] // _CHECK_SCALE, size[1] // _CHECK_SCALE))
@@ -150,49 +131,35 @@ def _eight_bits(path: Path, photograph: PilImage.Image) -> PilImage.Image:
 
 
 def image_warnings(images: Sequence[Image], image_dir: Path | None, root: Path) -> list[str]:
-    """What is wrong with the image files against their records; only a few headers are opened.
-
-    Args:
-        images: The images.
-        image_dir: The folder their names are relative to, if it exists.
-        root: The scene's folder.
-    """
+    """What is wrong with the image files against their records; only a few headers are opened."""
     if not images:
         return []
     if image_dir is None:
         return ["The images folder is missing; points can be made, but nothing can be trained."]
-    outside = [im.name for im in images if _leads_out(im.name, image_dir, root)]
+    count, warnings = len(images), []
     missing = {im.name: None for im in images if not (image_dir / im.name).is_file()}
-    warnings = []
     if missing:
         first, are = next(iter(missing)), agreeing(len(missing), "is", "are")
-        near = other_spelling(image_dir / first)
+        near, kind = other_spelling(image_dir / first), odd_kind(image_dir / first)
         hint = f"; {near} is there, but names must be equal to the letter" if near else ""
-        if kind := odd_kind(image_dir / first):
-            hint = f", which is {kind}"
+        hint = f", which is {kind}" if kind else hint
         warnings.append(
-            f"{len(missing)} of {len(images)} images {are} missing in {image_dir}, the first is "
+            f"{len(missing)} of {count} images {are} missing in {image_dir}, the first is "
             f"{first}{hint}."
         )
+    # Links, which somebody made on purpose, may lead anywhere: they are not followed.
+    around = os.path.abspath(root)  # noqa: PTH100
+    paths = {im.name: os.path.abspath(image_dir / im.name) for im in images}  # noqa: PTH100
+    outside = [n for n, path in paths.items() if os.path.commonpath([path, around]) != around]
     if outside:
         lie = agreeing(len(outside), "lies", "lie")
         warnings.append(
-            f"{len(outside)} of {len(images)} images {lie} outside of {root}, the first is "
-            f"{outside[0]}."
+            f"{len(outside)} of {count} images {lie} outside of {root}, the first is {outside[0]}."
         )
     present = [im for im in images if im.name not in missing]
     sample = present[:: -(-len(present) // _MAX_OPENED) or 1]  # evenly spaced, the first among them
     wrong = [text for im in sample if (text := _size_warning(im, image_dir))]
     return [*warnings, *wrong[:1]]
-
-
-def _leads_out(name: str, image_dir: Path, root: Path) -> bool:
-    """Whether an image's name leads out of its scene's folder.
-
-    Links, which somebody made on purpose, may lead anywhere.
-    """
-    path, around = (os.path.abspath(each) for each in (image_dir / name, root))  # noqa: PTH100  (without following links)
-    return os.path.commonpath([path, around]) != around
 
 
 def _size_warning(image: Image, image_dir: Path) -> str | None:
@@ -201,16 +168,14 @@ def _size_warning(image: Image, image_dir: Path) -> str | None:
     try:
         with open_file(image_dir / image.name) as file, PilImage.open(file) as picture:
             size = picture.size
-    except (FileNotFoundError, NotADirectoryError):
-        return None
     except (OSError, UnidentifiedImageError, PilImage.DecompressionBombError) as error:
         return f"{image.name} cannot be read: {describe_error(error)}."
-    expected = (image.intrinsics.width, image.intrinsics.height)
-    if size == expected:
+    lens = image.intrinsics
+    if size == (lens.width, lens.height):
         return None
     return (
-        f"{image.name} has {size[0]} x {size[1]} pixels, its camera {image.intrinsics.camera_id}"
-        f" {expected[0]} x {expected[1]}; some trainers rescale, others fail."
+        f"{image.name} has {size[0]} x {size[1]} pixels, its camera {lens.camera_id} {lens.width} x"
+        f" {lens.height}; some trainers rescale, others fail."
     )
 
 

@@ -1,17 +1,15 @@
 """PLY files: reading points of any writer, and the form of them that every 3DGS loader takes.
 
-Notation: an *element* is a table of rows; a *property* is a column, a scalar or a list with its
-length in front. Properties may stand in any order and beside any others. Colours are
-red/green/blue, diffuse_* or r/g/b: bytes, 16-bit integers, or floats from 0 to 1 or to 255; else
-the ``f_dc`` of trained Gaussians. Promise: ascii and both binary forms give the same cloud; counts
-are checked against the file before anything is allocated; what follows the vertices is not read.
-Files with lists in their vertices, or another element before them, are refused: nobody writes them.
+An *element* is a table of rows; a *property* is a column, a scalar or a list with its length in
+front. Files with lists in their vertices, or another element before them, are refused: nobody
+writes them. Counts are checked against the file before anything is allocated; what follows the
+vertices is not read.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -46,6 +44,7 @@ _TYPES = {
 }
 _BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _END = re.compile(rb"^end_header[ \t]*(\r?\n|\Z)", re.MULTILINE)
+_COUNT = re.compile("[0-9]{1,19}")
 _MAX_HEADER = 1 << 20  # a longer search would only crawl through a body
 _GREY = 128
 _DROP_IN = np.dtype(
@@ -59,25 +58,13 @@ _MODELS = {
 }
 
 
-class Property(NamedTuple):
-    """One column of an element: its name, NumPy's code of its type, and whether it is a list."""
-
-    name: str
-    dtype: str
-    is_list: bool
-
-
 class Element(NamedTuple):
-    """One table of a file."""
+    """One table of a file: NumPy's types of its columns by name, and whether one is of lists."""
 
     name: str
     num_rows: int
-    properties: tuple[Property, ...]
-
-    @property
-    def has_lists(self) -> bool:
-        """Whether its rows may differ in length."""
-        return any(each.is_list for each in self.properties)
+    types: Mapping[str, str]
+    has_lists: bool = False
 
 
 class Header(NamedTuple):
@@ -95,7 +82,7 @@ class Header(NamedTuple):
 
     def dtype(self, element: Element) -> np.dtype[Any]:
         """The layout of a row of scalars."""
-        return np.dtype([(each.name, self.byte_order + each.dtype) for each in element.properties])
+        return np.dtype([(name, self.byte_order + kind) for name, kind in element.types.items()])
 
 
 def parse_header(path: Path, data: bytes) -> Header:
@@ -104,9 +91,6 @@ def parse_header(path: Path, data: bytes) -> Header:
     Args:
         path: The file, for errors.
         data: Its bytes, or its first ones.
-
-    Raises:
-        SceneFormatError: It is not a PLY header, or one of its lines makes no sense.
     """
     end = _END.search(data, 0, _MAX_HEADER)
     if not re.match(rb"ply[ \t]*\r?\n", data) or end is None:
@@ -125,15 +109,15 @@ def parse_header(path: Path, data: bytes) -> Header:
             case ["format", form, "1.0"] if form in _BYTE_ORDERS and byte_order is None:
                 byte_order = _BYTE_ORDERS[form]
                 continue
-            case ["element", name, count] if re.fullmatch("[0-9]{1,19}", count) and (
-                byte_order is not None
-            ):
-                elements.append(Element(name, int(count), ()))
+            case ["element", name, count] if byte_order is not None and _COUNT.fullmatch(count):
+                elements.append(Element(name, int(count), {}))
                 continue
-            case ["property", *kind, name] if elements and (found := _property(name, kind)):
+            case ["property", *kind, of, name] if elements and of in _TYPES:
                 last = elements[-1]
-                if name not in {each.name for each in last.properties}:
-                    elements[-1] = last._replace(properties=(*last.properties, found))
+                lists = kind[:1] == ["list"] and _TYPES.get(kind[-1], "f")[0] in "iu"
+                if name not in last.types and (not kind or (lists and len(kind) == 2)):
+                    types = {**last.types, name: _TYPES[of]}
+                    elements[-1] = Element(*last[:2], types, last.has_lists or lists)
                     continue
         raise SceneFormatError(
             f"a format, an element or one of its properties in the header of {path}, line {number}",
@@ -145,27 +129,14 @@ def parse_header(path: Path, data: bytes) -> Header:
     return Header(byte_order, tuple(elements), end.end())
 
 
-def _property(name: str, kind: list[str]) -> Property | None:
-    match kind:
-        case ["list", length, of] if of in _TYPES and _TYPES.get(length, "f")[0] in "iu":
-            return Property(name, _TYPES[of], is_list=True)
-        case [of] if of in _TYPES:
-            return Property(name, _TYPES[of], is_list=False)
-    return None
-
-
 def open_ply(path: Path) -> CloudFile:
-    """Open a PLY file of points, of any size.
-
-    Raises:
-        SceneFormatError: It is not a PLY, has no vertices with x, y, z, or is cut short.
-    """
+    """Open a PLY file of points, of any size."""
     with open_file(path) as file:
         header = parse_header(path, file.read(_MAX_HEADER))
     for each in header.elements:
-        refuse_packed(path, [prop.name for prop in each.properties])
-    vertex = header.elements[0] if header.elements else Element("no element", 0, ())
-    names = [each.name for each in vertex.properties]
+        refuse_packed(path, each.types)
+    vertex = header.elements[0] if header.elements else Element("no element", 0, {})
+    names = list(vertex.types)
     if vertex.name != "vertex" or not set(XYZ) <= set(names) or vertex.has_lists:
         raise SceneFormatError(
             f"{path} to begin with vertices that have x, y, z and no lists",
@@ -180,15 +151,14 @@ def open_ply(path: Path) -> CloudFile:
 
 
 def read_ply(path: Path) -> PointCloud:
-    """The vertices of a PLY file as a cloud.
+    """The vertices of a PLY file as a cloud; nothing is repaired.
 
-    Coordinates may be NaN or infinite; nothing is repaired. Colours that are not a number are mid
-    grey, and so are all without colours.
+    Colours that are not a number are mid grey, and so are all without colours.
 
     Raises:
         SceneNotFoundError: There is no such file.
-        SceneFormatError: It is unreadable, malformed or shorter than its header promises, larger
-            than the free memory, or has no vertices with x, y, z.
+        SceneFormatError: It is malformed, shorter than its header promises or larger than the free
+            memory, or has no vertices with x, y, z.
     """
     with readable(path):
         cloud = open_ply(path)
@@ -200,13 +170,7 @@ def read_ply(path: Path) -> PointCloud:
 
 
 def write_ply(path: Path, points: PointCloud) -> None:
-    """Write the PLY that every 3DGS loader takes.
-
-    Binary little-endian; float32 x, y, z and zero normals, uchar red, green, blue; nothing else.
-
-    Raises:
-        OSError: The file cannot be written.
-    """
+    """Write binary float32 x, y, z and zero normals, uchar red, green, blue; nothing else."""
     with path.open("wb") as file:
         file.write(ply_header(len(points)))
         file.write(ply_rows(points.xyz, points.rgb))

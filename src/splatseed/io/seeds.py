@@ -1,34 +1,29 @@
 """Which points of a scene that splatseed wrote are originals, and what is known about the others.
 
-Point files have no field for a point's origin, but ``splatseed.json`` beside them says how many of
-the first points were in the input, and ``seeds.npz`` which method made each of the others. New
-points must never be taken for originals: upsampling an output again starts from its originals and
-replaces the points made from them.
-
-Notation of ``seeds.npz``: N points, in the order of the point files; ``source`` uint8 [N],
-``normals`` float16 [N, 3], ``sizes`` float32 [N] and ``confidence`` float16 [N], in the scene's
-world, each present if known for any point; ``digest`` is the fingerprint of the positions they
-belong to. Promise: equal clouds give equal bytes; a file that is damaged or belongs to other points
-is reported and not used; no pickle is loaded, and nothing is allocated on the word of a header.
+Point files have no field for a point's origin, but ``splatseed.json`` beside them counts the
+originals, which come first, and ``seeds.npz`` has, in the order of the point files, ``source``
+uint8 [N], ``normals`` float16 [N, 3], ``sizes`` float32 [N] and ``confidence`` float16 [N], each
+present if known for any point, and a ``digest`` of their positions. Promise: equal clouds give
+equal bytes; a file that is damaged or belongs to other points is reported and not used; no pickle
+is loaded, and nothing is allocated on the word of a header.
 """
 
 from __future__ import annotations
 
 import hashlib
-import io
+import math
 import shutil
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float32
-from numpy.lib import format as npy_format
 
 from splatseed.errors import PointCloudError
-from splatseed.io.files import ARCHIVE_FAILURES, read_npy_header
+from splatseed.io.files import ARCHIVE_FAILURES, read_npy
 from splatseed.io.staging import MANIFEST, read_manifest, write_json
 from splatseed.pointcloud import ATTRIBUTES, GENERATED, ORIGINAL, PointCloud
 from splatseed.scene import Scene
@@ -47,26 +42,18 @@ _STORED: dict[str, tuple[tuple[int, ...], np.dtype[Any]]] = {
 }
 """Shape of one point's value, and type in the file."""
 _DIGEST_BYTES = 16
-_RUN = 1 << 20
-"""Bytes that are compressed at once."""
-_MOST_HEADER = 4096
 
 
 class PositionDigest:
-    """The fingerprint of positions that come a piece at a time.
+    """The fingerprint of positions that come a piece at a time; -0.0 counts as 0.0."""
 
-    It is equal for both zeros and for any byte order.
-    """
-
-    def __init__(self, xyz: Float32[np.ndarray, "n 3"] | None = None) -> None:
+    def __init__(self, xyz: Float32[np.ndarray, "n 3"]) -> None:
         self._hash = hashlib.blake2b(digest_size=_DIGEST_BYTES)
-        if xyz is not None:
-            self.add(xyz)
+        self.add(xyz)
 
     def add(self, xyz: Float32[np.ndarray, "n 3"]) -> None:
         """Take the next positions."""
-        rows = np.ascontiguousarray(xyz + np.float32(0.0), "<f4")  # adding turns -0.0 into 0.0
-        self._hash.update(rows.tobytes())
+        self._hash.update(np.ascontiguousarray(xyz + np.float32(0.0), "<f4").tobytes())
 
     def bytes(self) -> bytes:
         """The fingerprint of all of them."""
@@ -74,48 +61,22 @@ class PositionDigest:
 
 
 def write_seeds(folder: Path, points: PointCloud) -> None:
-    """Write ``seeds.npz`` into an output, if it says more than the other files.
+    """Write ``seeds.npz`` into an output, if it says more than the other files."""
+    known = {n: values for n, values in points.attributes.items() if not np.isnan(values).all()}
+    write_origins(folder, PositionDigest(points.xyz).bytes(), points.source, known)
 
-    Args:
-        folder: The output.
-        points: The cloud, in the order of the point files.
 
-    Raises:
-        OSError: It cannot be written.
-    """
-    arrays: dict[str, np.ndarray] = {}
-    if not np.isin(points.source, (ORIGINAL, GENERATED)).all():
-        arrays["source"] = points.source
-    arrays |= {n: values for n, values in points.attributes.items() if not np.isnan(values).all()}
+def write_origins(
+    folder: Path, digest: bytes, source: np.ndarray, known: Mapping[str, np.ndarray] | None = None
+) -> None:
+    """The same of points that are not in memory: only their sources, uint8 [N], are."""
+    arrays = dict(known or {})
+    if not np.isin(source, (ORIGINAL, GENERATED)).all():
+        arrays = {"source": source, **arrays}
     if arrays:
         arrays = {name: values.astype(_STORED[name][1]) for name, values in arrays.items()}
-        digest = np.frombuffer(PositionDigest(points.xyz).bytes(), np.uint8)
-        np.savez_compressed(folder / SEEDS, digest=digest, **arrays)  # type: ignore[arg-type]  # savez takes arrays by name
-
-
-def write_origins(folder: Path, digest: bytes, runs: Sequence[tuple[int, int]]) -> None:
-    """Write ``seeds.npz`` for points of which only the origin is known, too many for memory.
-
-    Args:
-        folder: The output.
-        digest: The fingerprint of all positions.
-        runs: Codes and how many points in a row have each.
-
-    Raises:
-        OSError: It cannot be written.
-    """
-    if all(code in {ORIGINAL, GENERATED} for code, count in runs if count):
-        return  # as in write_seeds: the other files say as much
-    shape = (sum(count for _, count in runs),)
-    header = {"descr": "|u1", "fortran_order": False, "shape": shape}
-    with zipfile.ZipFile(folder / SEEDS, "w", zipfile.ZIP_DEFLATED) as archive:
-        with archive.open("digest.npy", "w", force_zip64=True) as member:
-            npy_format.write_array(member, np.frombuffer(digest, np.uint8))
-        with archive.open("source.npy", "w", force_zip64=True) as member:
-            npy_format.write_array_header_1_0(member, header)
-            for code, count in runs:
-                for first in range(0, count, _RUN):
-                    member.write(bytes([code]) * min(_RUN, count - first))
+        arrays = {"digest": np.frombuffer(digest, np.uint8), **arrays}
+        np.savez_compressed(folder / SEEDS, **arrays)  # type: ignore[arg-type]  # by name
 
 
 def recall_seeds(scene: Scene) -> Scene:
@@ -137,11 +98,9 @@ def recall_seeds(scene: Scene) -> Scene:
 
 
 def number_of_originals(root: Path, total: int) -> int:
-    """How many of the points of a file are originals, by the manifest beside it.
+    """How many points of a file in this folder, which has ``total``, are originals.
 
-    Args:
-        root: The file's folder.
-        total: Points of the file; all are originals unless a manifest for so many says otherwise.
+    All are, unless the manifest is for so many and says otherwise.
     """
     facts = read_manifest(root)
     originals = facts.get("num_original")
@@ -150,28 +109,21 @@ def number_of_originals(root: Path, total: int) -> int:
     return total
 
 
-def upsampling(scene: Scene) -> dict[str, Any] | None:
-    """What ``splatseed upsample`` wrote about the scene's points; None if it did not make them.
-
-    A scene that was undistorted since holds it, too.
-    """
-    if scene.source is None:
-        return None
-    facts = read_manifest(scene.source.root)
-    if facts.get("command") == "upsample":
-        return facts
-    carried = facts.get(UPSAMPLED)
+def _upsampling(scene: Scene) -> dict[str, Any] | None:
+    """What ``splatseed upsample`` wrote about the points, if it made them."""
+    facts = read_manifest(scene.source.root) if scene.source else {}
+    carried = facts if facts.get("command") == "upsample" else facts.get(UPSAMPLED)
     return carried if isinstance(carried, dict) else None
 
 
 def was_upsampled(scene: Scene) -> bool:
     """Whether ``splatseed upsample`` made or thinned these points."""
-    return upsampling(scene) is not None or scene.points.num_original < len(scene.points)
+    return _upsampling(scene) is not None or scene.points.num_original < len(scene.points)
 
 
 def saw_all_photographs(scene: Scene) -> bool:
     """Whether ``splatseed upsample`` made new points from photographs and held none out."""
-    facts = upsampling(scene) or {}
+    facts = _upsampling(scene) or {}
     try:
         return bool(facts["num_new"]) and facts["parameters"]["hold_out"] == 0
     except (TypeError, KeyError):
@@ -185,14 +137,11 @@ def carry_seeds(scene: Scene, written: Path, folder: Path) -> None:
         scene: The scene that is undistorted.
         written: What ``write_scene`` made of it.
         folder: The undistorted scene, with the same points in the same order.
-
-    Raises:
-        OSError: A file cannot be written.
     """
     if (written / SEEDS).is_file():
         shutil.copyfile(written / SEEDS, folder / SEEDS)
     counts = {key: read_manifest(written)[key] for key in ("num_points", "num_original")}
-    write_json(folder / MANIFEST, {**counts, UPSAMPLED: upsampling(scene)})
+    write_json(folder / MANIFEST, {**counts, UPSAMPLED: _upsampling(scene)})
 
 
 def _read_seeds(folder: Path, points: PointCloud) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
@@ -223,11 +172,8 @@ def _member(
     archive: zipfile.ZipFile, name: str, shape: tuple[int, ...], dtype: np.dtype[Any]
 ) -> np.ndarray:
     """An array that must have just this shape and type, else a ``ValueError`` or ``KeyError``."""
-    info = archive.getinfo(f"{name}.npy")
-    count = int(np.prod(shape, dtype=np.int64))
-    if info.file_size > count * dtype.itemsize + _MOST_HEADER:
+    with archive.open(f"{name}.npy") as file:
+        array = read_npy(file, math.prod(shape) * dtype.itemsize)
+    if (array.shape, array.dtype) != (shape, dtype):
         raise ValueError(name)
-    stream = io.BytesIO(archive.read(info))
-    if read_npy_header(stream) != (shape, False, dtype):
-        raise ValueError(name)
-    return np.frombuffer(stream.getvalue(), dtype, count, stream.tell()).reshape(shape)
+    return array

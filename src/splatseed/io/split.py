@@ -1,90 +1,67 @@
 """Which images train and which test, for scenes with files that say so.
 
-Notation: a *list* is a text file with one image name per line. Promise: the first of these that
-fits is used, and reported: ``train_filenames`` and ``test_filenames`` (else ``val_filenames``) of a
-transforms.json, as nerfstudio writes them; ``train_list.txt``, ``test_list.txt`` (else
-``validation_list.txt``) in the scene's folder, as nerfstudio's COLMAP reader has them; ``test.txt``
-in the model's folder (graphdeco); ``train.txt`` and ``test.txt`` in the scene's. A list whose names
-match no image is ignored, and reported too, as are single names that match none.
+Promise: the first of these that fits is used, and reported: ``train_filenames`` and
+``test_filenames`` (else ``val_filenames``) of a transforms.json, as nerfstudio writes them; text
+files with one image name per line, as nerfstudio's COLMAP reader, graphdeco (beside the model) and
+others have them. A list whose names match no image is ignored, and reported too, as are single
+names that match none.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
-from typing import Any, NamedTuple
 
 from splatseed.io.files import read_bytes
 from splatseed.literal import agreeing, counted
 from splatseed.scene import Scene, Split
 
 ROOT_LISTS = ("train_list.txt", "test_list.txt", "validation_list.txt", "train.txt", "test.txt")
-"""Lists in a scene's folder."""
+"""Lists in a scene's folder: for training, test and validation; for training and test."""
 MODEL_LISTS = ("test.txt",)
 """Lists beside a COLMAP model."""
-_PARTS = ("train", "test", "val")
 _SHOWN = 3
 """Names that a warning shows."""
 
 
-class _Lists(NamedTuple):
-    """Names for training, test and validation; empty where there is no list."""
-
-    origin: str
-    train: Sequence[str]
-    test: Sequence[str]
-    validation: Sequence[str] = ()
-
-
 def follow_lists(scene: Scene) -> Scene:
-    """The scene with the split of its lists, if it has some.
-
-    Raises:
-        SceneFormatError: A list cannot be read.
-    """
+    """The scene with the split of its lists, if it has some."""
     if scene.source is None or not scene.images or scene.listed is not None:
         return scene
     warnings = list(scene.warnings)
-    for lists in _lists(scene):
-        split, unknown = _split(scene, lists)
+    for origin, parts in _lists(scene):
+        split, unknown = _split(scene, origin, parts)
         if split is not None:
             if unknown:  # a slip, or lost by SfM
                 shown = ", ".join(unknown[:_SHOWN]) + (", ..." if len(unknown) > _SHOWN else "")
-                match = (
-                    f"{counted(len(unknown), 'name')} {agreeing(len(unknown), 'matches', 'match')}"
-                )
-                warnings.append(f"{lists.origin}: {match} no image ({shown}).")
+                match = agreeing(len(unknown), "matches", "match")
+                names = counted(len(unknown), "name")
+                warnings.append(f"{origin}: {names} {match} no image ({shown}).")
             return scene.replace(listed=split, warnings=tuple(warnings))
-        warnings.append(
-            f"{lists.origin} was ignored: it leaves no images to train on, or none to test."
-        )
+        warnings.append(f"{origin} was ignored: it leaves no images to train on, or none to test.")
     return scene.replace(warnings=tuple(warnings))
 
 
-def _lists(scene: Scene) -> Iterator[_Lists]:
-    """All lists that a scene has, in order of precedence."""
+def _lists(scene: Scene) -> Iterator[tuple[str, list[list[str]]]]:
+    """What each list is called, and its names for training, test and perhaps validation."""
     source = scene.source
     assert source is not None  # noqa: S101  (checked by the caller)
     if source.transforms_path is not None:
         fields = json.loads(read_bytes(source.transforms_path))
-        parts = [_names(fields, f"{part}_filenames") for part in _PARTS]
+        found = [fields.get(f"{part}_filenames") for part in ("train", "test", "val")]
+        parts = [[n for n in f if isinstance(n, str)] if isinstance(f, list) else [] for f in found]
         if any(parts):
-            yield _Lists("list of file names in transforms.json", *parts)
-    read = {name: _read(source.root / name) for name in ROOT_LISTS}
-    if any(read[name] for name in ROOT_LISTS[:3]):
-        there = " and ".join(name for name in ROOT_LISTS[:3] if read[name])
-        yield _Lists(there, *(read[name] for name in ROOT_LISTS[:3]))
-    if source.model_dir is not None and (names := _read(source.model_dir / MODEL_LISTS[0])):
-        yield _Lists(f"{MODEL_LISTS[0]} beside the model", (), names)
-    if any(read[name] for name in ROOT_LISTS[3:]):
-        there = " and ".join(name for name in ROOT_LISTS[3:] if read[name])
-        yield _Lists(there, read["train.txt"], read["test.txt"])
-
-
-def _names(fields: Mapping[str, Any], key: str) -> list[str]:
-    names = fields.get(key)
-    return [each for each in names if isinstance(each, str)] if isinstance(names, list) else []
+            yield "list of file names in transforms.json", parts
+    for folder, files, place in (
+        (source.root, ROOT_LISTS[:3], ""),
+        (source.model_dir, ("", *MODEL_LISTS), " beside the model"),
+        (source.root, ROOT_LISTS[3:], ""),
+    ):
+        parts = [_read(folder / name) if folder and name else [] for name in files]
+        if any(parts):
+            there = (name for name, part in zip(files, parts, strict=True) if part)
+            yield " and ".join(there) + place, parts
 
 
 def _read(path: Path) -> list[str]:
@@ -94,37 +71,34 @@ def _read(path: Path) -> list[str]:
     return [line.strip() for line in lines if line.strip()]
 
 
-def _split(scene: Scene, lists: _Lists) -> tuple[Split | None, list[str]]:
+def _split(scene: Scene, origin: str, parts: list[list[str]]) -> tuple[Split | None, list[str]]:
     """The split of the images, None if one part would be empty; and the names of no image."""
     names = [image.name for image in scene.images]
     folder = scene.source.image_dir if scene.source else None
     prefixes = ("", "images/", f"{folder.name}/" if folder else "")
-    known = [_known(names, each, prefixes) for each in lists[1:]]
-    train, test, validation = (frozenset(each.values()) for each in known)
-    used = (0, 1) if test or not validation else (0, 2)
-    unknown = [name for i in used for name in lists[1 + i] if name not in known[i]]
-    test = test or validation
-    if lists.train and not lists.test and not lists.validation:
+    if len(parts) > 2 and not _known(names, parts[1], prefixes):
+        parts = [parts[0], parts[2] or parts[1]]  # validation
+    known = [_known(names, each, prefixes) for each in parts[:2]]
+    train, test = (frozenset(each.values()) for each in known)
+    unknown = [name for i in (0, 1) for name in parts[i] if name not in known[i]]
+    if parts[0] and not parts[1]:
         test = frozenset(names) - train
-    if not lists.train:
+    if not parts[0]:
         train = frozenset(names) - test
     train -= test
-    return (Split(train, test, lists.origin) if train and test else None), unknown
+    return (Split(train, test, origin) if train and test else None), unknown
 
 
 def _known(names: Sequence[str], listed: Sequence[str], prefixes: Sequence[str]) -> dict[str, str]:
     """The images that are listed: by name as it is or within their folder, or by file or stem."""
     exact = {f"{prefix}{name}": name for prefix in reversed(prefixes) for name in names}
-    known = {each: exact[plain] for each in listed if (plain := _plain(each)) in exact}
+    plain = {each: each.replace("\\", "/").removeprefix("./") for each in listed}
+    known = {each: exact[name] for each, name in plain.items() if name in exact}
     for field in () if known else ("name", "stem"):
         parts = {getattr(PurePosixPath(name), field): name for name in names}
         if len(parts) == len(names):  # else a name would be ambiguous
-            wanted = {each: getattr(PurePosixPath(_plain(each)), field) for each in listed}
+            wanted = {each: getattr(PurePosixPath(name), field) for each, name in plain.items()}
             known = {each: parts[part] for each, part in wanted.items() if part in parts}
         if known:
             break
     return known
-
-
-def _plain(name: str) -> str:
-    return name.replace("\\", "/").removeprefix("./")

@@ -1,12 +1,11 @@
 """Output that appears whole or not at all, and replaces only what splatseed wrote.
 
-Notation: the *target* is what the user named; the *partial* is a hidden sibling
-``.NAME.partial-XXXX`` that is written first and renamed to the target at the end. A folder's
-*manifest*, ``splatseed.json``, says what wrote it, its *kind* (``command``), and lists its files;
-an entry that names a folder with a manifest of its own stands for that one's list. Promise:
-whatever interrupts writing, an earlier output stays unharmed, and the partial is removed, after a
-kill by the next process that writes the same target. A folder is replaced on request only, by its
-own kind, and only if its manifest lists everything in it.
+The *target* is what the user named; the *partial* is a hidden sibling ``.NAME.partial-XXXX`` that
+is written first and renamed to the target at the end, or removed, after a kill by the next process
+that writes the same target. A folder's *manifest*, ``splatseed.json``, says what wrote it, its
+*kind* (``command``), and lists its files; an entry that names a folder with a manifest of its own
+stands for that one's list. A folder is replaced on request only, by its own kind, and only if its
+manifest lists everything in it.
 """
 
 from __future__ import annotations
@@ -46,6 +45,9 @@ _NOBODYS = re.compile(
     r"|images_\d+_png/.*\.png)",  # gsplat's copies of the photographs
     re.IGNORECASE,
 )
+_FULL = {errno.ENOSPC, errno.EDQUOT}
+_TRY_AGAIN = "Check the disk and try again."
+_FORBIDDEN = {errno.EACCES, errno.EPERM, errno.EROFS}
 _LOG = logging.getLogger(__name__)
 
 
@@ -80,18 +82,10 @@ def output_folder(
 
 @contextmanager
 def atomic_file(path: Path) -> Iterator[Path]:
-    """A file to write to; it appears at ``path`` when the block ends without an error.
+    """The name of an empty partial file; it appears at ``path`` when the block ends without error.
 
-    Its name keeps the suffix. Missing parents are made, and an existing file is replaced.
-
-    Args:
-        path: Where the file should be.
-
-    Yields:
-        The name of the partial file, which is empty.
-
-    Raises:
-        OutputError: ``path`` is a folder or a device, or writing failed.
+    Its name keeps the suffix. Missing parents are made, and an existing file is replaced. An
+    ``OutputError``: ``path`` is a folder or a device, or writing failed.
     """
     target = _resolved(path)
     if os.path.lexists(target) and not target.is_file():  # a device would be replaced by a file
@@ -102,11 +96,7 @@ def atomic_file(path: Path) -> Iterator[Path]:
 
 
 def write_json(path: Path, content: Mapping[str, object]) -> None:
-    """Write readable JSON, whole or not at all; NumPy scalars become numbers, paths text.
-
-    Raises:
-        OutputError: It cannot be written.
-    """
+    """Write readable JSON as an ``atomic_file``; NumPy scalars become numbers, paths text."""
 
     def plain(value: object) -> object:
         return value.item() if isinstance(value, np.generic) else str(value)
@@ -117,17 +107,9 @@ def write_json(path: Path, content: Mapping[str, object]) -> None:
 
 @contextmanager
 def staged(target: Path, *, folder: bool) -> Iterator[Path]:
-    """A partial that replaces ``target``, whatever that is, when the block ends without an error.
+    """An empty partial, a folder or a file, that replaces ``target``, whatever that is, at the end.
 
-    Args:
-        target: Where it goes; its parents are made.
-        folder: Whether it is a folder.
-
-    Yields:
-        The partial, empty.
-
-    Raises:
-        OutputError: Writing failed.
+    Missing parents are made. If the block or the writing (an ``OutputError``) fails, all stays.
     """
     _remove_leftovers(target)
     token = secrets.token_hex(4)
@@ -152,22 +134,21 @@ def staged(target: Path, *, folder: bool) -> Iterator[Path]:
                     each.rmdir()
             raise
         finally:
-            if old.exists():
-                _discard(old, target)
+            if (old / MANIFEST).is_file() and (names := unlisted_files(old)):
+                # Somebody has put files there while we worked.
+                _LOG.warning("%s is complete; %s has what it held: %s.", target, old, names)
+            elif old.exists():
+                remove(old)
 
 
 def add_files(folder: Path, names: Iterable[str]) -> None:
-    """List more of an output's files, so that ``--overwrite`` may replace them.
+    """List more of an output's files in its manifest, so that ``--overwrite`` may replace them.
 
-    Args:
-        folder: An output with a manifest.
-        names: Paths inside it, with forward slashes, which need not exist yet. A folder without a
-            manifest stands for the files in it now.
-
-    Raises:
-        OutputError: The manifest cannot be written.
+    They are paths inside the folder, with forward slashes, which need not exist yet. A folder
+    without a manifest stands for the files in it now.
     """
-    manifest, listed = read_manifest(folder), _listed(folder)
+    manifest = read_manifest(folder)
+    listed = _listed(manifest)
     for name in names:
         plain = (folder / name).is_dir() and not (folder / name / MANIFEST).is_file()
         listed.update(_files(folder, prefix=f"{name}/") if plain else [name])
@@ -184,42 +165,30 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 
 
 def unlisted_files(folder: Path) -> list[str]:
-    """Files in ``folder`` that its manifest does not list.
-
-    Raises:
-        OSError: The folder cannot be read.
-    """
+    """Files in ``folder`` that its manifest does not list."""
 
     def is_copy(name: str) -> bool:  # nerfstudio's smaller photographs
         return bool(re.match("images_[248]/", name)) and (folder / f"images{name[8:]}").is_file()
 
-    names = _files(folder, {*_listed(folder), MANIFEST})
+    names = _files(folder, {*_listed(read_manifest(folder)), MANIFEST})
     return sorted(name for name in names if not (_NOBODYS.fullmatch(name) or is_copy(name)))
 
 
 def check_output(
     path: Path, *, kind: str, overwrite: bool = False, protect: Sequence[Path] = ()
 ) -> None:
-    """Refuse what ``output_folder`` would refuse, before any work is done; arguments as there.
-
-    Raises:
-        OutputError: ``path`` is taken or protected, or ``check_parents`` refuses it.
-    """
+    """Refuse what ``output_folder`` and ``check_parents`` refuse, before any work is done."""
     check_apart(path, protect)
     check_parents(path)
     _check_replaceable(_resolved(path), kind, overwrite=overwrite)
 
 
 def check_apart(path: Path, protect: Sequence[Path]) -> None:
-    """Refuse an output that is one of ``protect``, lies inside one, or contains one.
-
-    Raises:
-        OutputError: It is one of these.
-    """
-    target = _resolved(path)
-    for source in (*map(_resolved, protect), Path.cwd()):
+    """Raise an ``OutputError`` for an output that is, lies in or contains one of ``protect``."""
+    target, here = _resolved(path), Path.cwd()
+    for source in (*map(_resolved, protect), here):
         held = target == source or target in source.parents
-        if held or (source in target.parents and source != Path.cwd()):
+        if held or (source in target.parents and source != here):
             raise OutputError(
                 "an output folder apart from the input and the working directory",
                 found=f"{target}, which {'holds or is' if held else 'lies in'} {source}",
@@ -228,11 +197,7 @@ def check_apart(path: Path, protect: Sequence[Path]) -> None:
 
 
 def check_parents(path: Path) -> None:
-    """Refuse a place in which nothing can be made, or whose parent's parent is missing: a slip.
-
-    Raises:
-        OutputError: It is one of these.
-    """
+    """Raise an ``OutputError`` where nothing can be made, or a parent's parent is missing."""
     target = _resolved(path)
     if os.path.lexists(target):  # perhaps a run that goes on, in a write-protected folder
         return
@@ -254,22 +219,15 @@ def oserror_as_output_error(target: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        fix = "Check the disk and try again."
-        if error.errno in {errno.ENOSPC, errno.EDQUOT}:
-            fix = "Free some space, or choose another disk."
-        elif error.errno in {errno.EACCES, errno.EPERM, errno.EROFS}:
-            fix = "Choose a folder that you may write to."
+        fix = "Choose a folder that you may write to." if error.errno in _FORBIDDEN else _TRY_AGAIN
+        fix = "Free some space, or choose another disk." if error.errno in _FULL else fix
         where = f" at {error.filename}" if error.filename else ""
         found = f"{error.strerror or type(error).__name__}{where}"
         raise OutputError(f"{target} to be written", found=found, fix=fix) from error
 
 
 def remove(path: Path) -> None:
-    """Remove one of our own files or folders, if it is there, with read-only folders in it.
-
-    Raises:
-        OSError: It cannot be removed.
-    """
+    """Remove one of our own files or folders, if it is there, with read-only folders in it."""
     if path.is_symlink() or not path.is_dir():
         path.unlink(missing_ok=True)
         return
@@ -286,44 +244,30 @@ def _resolved(path: Path) -> Path:
 
 
 def _check_replaceable(target: Path, kind: str, *, overwrite: bool) -> None:
+    fix = "Choose another name, or move what is there elsewhere."
     with oserror_as_output_error(target):
         if not os.path.lexists(target) or (target.is_dir() and not any(target.iterdir())):
             return
-        found = "a file" if target.exists() else "a link that leads back to itself"
-        if target.is_dir():
-            found = _why_kept(target, kind)
-    fix = "Choose another name, or move what is there elsewhere."
-    if not found:
-        if overwrite:
+        manifest, ours = read_manifest(target), "files that splatseed did not write"
+        if not target.is_dir():
+            found = "a file" if target.exists() else "a link that leads back to itself"
+        elif manifest.get("command", kind) != kind:
+            found = f"what splatseed {manifest['command']} wrote, not {kind}"
+        elif "command" not in manifest or not isinstance(manifest.get("files"), list):
+            found = f"{ours} (no {MANIFEST} that lists them)"
+        elif names := unlisted_files(target):
+            more = f" and {len(names) - 3:,} more" if len(names) > 3 else ""
+            found = f"an earlier output with {ours}: {', '.join(names[:3])}{more}"
+        elif overwrite:
             return
-        found = "an earlier output"
-        fix = "Pass --overwrite (from Python, overwrite=True) to replace it, or choose another."
+        else:
+            found = "an earlier output"
+            fix = "Pass --overwrite (from Python, overwrite=True) to replace it, or choose another."
     raise OutputError(f"no folder, or an empty one, at {target}", found=found, fix=fix)
 
 
-def _why_kept(folder: Path, kind: str) -> str:
-    """Why a folder may not be replaced; empty if it may."""
-    manifest = read_manifest(folder)
-    if manifest.get("command", kind) != kind:
-        return f"what splatseed {manifest['command']} wrote, not {kind}"
-    if "command" not in manifest or not isinstance(manifest.get("files"), list):
-        return f"files that splatseed did not write (no {MANIFEST} that lists them)"
-    names = unlisted_files(folder)
-    more = f" and {len(names) - 3:,} more" if len(names) > 3 else ""
-    some = f"{', '.join(names[:3])}{more}"
-    return f"an earlier output with files that splatseed did not write: {some}" if names else ""
-
-
-def _discard(old: Path, target: Path) -> None:
-    """Remove an earlier output, unless somebody has put files there while we worked."""
-    if (old / MANIFEST).is_file() and (names := unlisted_files(old)):
-        _LOG.warning("%s is complete; the earlier one is kept as %s for %s.", target, old, names)
-        return
-    remove(old)
-
-
-def _listed(folder: Path) -> set[str]:
-    files = read_manifest(folder).get("files")
+def _listed(manifest: Mapping[str, Any]) -> set[str]:
+    files = manifest.get("files")
     return {name for name in files if isinstance(name, str)} if isinstance(files, list) else set()
 
 

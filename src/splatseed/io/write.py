@@ -1,14 +1,10 @@
 """Writing a scene that every 3D Gaussian Splatting trainer loads unchanged.
 
-Notation: *originals* are the points that were read, with their tracks; a *layout* is the set of
-files a trainer looks for: COLMAP's, or nerfstudio's ``transforms.json``; image folders map a path
-inside an output to the folder or file it stands for. Promise: the folder appears whole or not at
-all; its points are finite and distinct; all its point files, ``seeds.npz`` too, hold them in the
-scene's order; originals keep their float64 positions and tracks; point ids are 1..N. COLMAP's root
-holds no PLY, because Brush loads any it finds there. A ``transforms.json`` that was read keeps all
-its fields; a new one has those that nerfstudio's own conversion of a COLMAP model writes, which
-OpenSplat, Brush and LichtFeld Studio read too. Photographs are linked, or copied where links are
-not wanted or not possible. docs/formats.md says which trainer needs which file.
+A *layout* is the set of files a trainer looks for: COLMAP's, or nerfstudio's ``transforms.json``;
+image folders map a path inside an output to the folder or file it stands for. Promise: the folder
+appears whole or not at all; its points are finite and distinct, in the scene's order in all files;
+originals keep their float64 positions and tracks; point ids are 1..N. COLMAP's root holds no PLY,
+because Brush loads any it finds there. docs/formats.md says which trainer needs which file.
 """
 
 from __future__ import annotations
@@ -30,9 +26,9 @@ from jaxtyping import Float32, Float64, UInt8
 from splatseed.camera import CAMERA_MODELS, Intrinsics
 from splatseed.errors import OutputError, PointCloudError
 from splatseed.io import colmap
-from splatseed.io.cleaning import clean_scene
+from splatseed.io.cleaning import clean_scene, renumber
+from splatseed.io.colmap import read_model_cameras
 from splatseed.io.files import open_file
-from splatseed.io.model import read_model_cameras, renumber
 from splatseed.io.nerfstudio import (
     OPENCV_FROM_OPENGL,
     Transforms,
@@ -209,24 +205,14 @@ def _choose_layout(scene: Scene, wanted: str) -> Layout:
         return "transforms" if scene.source and scene.source.format == "transforms" else "colmap"
     if wanted == "colmap":
         return "colmap"
-    if wanted != "transforms":
-        raise OutputError(
-            "a format of auto, colmap or transforms", found=repr(wanted), fix="Choose one of them."
-        )
-    if not scene.images:
-        raise OutputError(
-            "a scene with images for transforms.json",
-            found="none",
-            fix="Write the COLMAP layout (--format colmap).",
-        )
-    return "transforms"
+    if wanted == "transforms" and scene.images:
+        return "transforms"
+    known = "a format of auto, colmap or transforms, which needs images"
+    raise OutputError(known, found=repr(wanted), fix="Write the COLMAP layout (--format colmap).")
 
 
 def _append_points(folder: Path, first: PointCloud, stream: PointStream) -> None:
-    """Append points to the point files of a scene that was written with the first ones alone.
-
-    The files are, byte for byte, those of the same points in memory.
-    """
+    """Append points to the point files of a scene that was written with the first ones alone."""
     total, digest = len(first) + len(stream), PositionDigest(first.xyz)
     transforms, model = folder / "sparse_pc.ply", folder / "sparse/0/points3D.bin"
     ply = transforms if transforms.exists() else model.with_suffix(".ply")
@@ -249,8 +235,9 @@ def _append_points(folder: Path, first: PointCloud, stream: PointStream) -> None
     if ply == transforms:
         shutil.copyfile(ply, folder / "pointcloud.ply")
     (folder / SEEDS).unlink(missing_ok=True)
-    runs = [(ORIGINAL, len(first) + stream.num_original), (stream.code, stream.num_new)]
-    write_origins(folder, digest.bytes(), runs)
+    runs = (len(first) + stream.num_original, stream.num_new)
+    source = np.repeat(np.array([ORIGINAL, stream.code], np.uint8), runs)
+    write_origins(folder, digest.bytes(), source)
 
 
 def _write_colmap(scene: Scene, folder: Path) -> tuple[list[str], dict[str, Path]]:
@@ -289,15 +276,7 @@ def _write_colmap(scene: Scene, folder: Path) -> tuple[list[str], dict[str, Path
 
 
 def write_split(scene: Scene, folder: Path) -> None:
-    """Write the lists of a scene's split beside a COLMAP model: its own, else nerfstudio's.
-
-    Args:
-        scene: The scene.
-        folder: The folder that holds ``sparse/0``.
-
-    Raises:
-        OSError: A list cannot be written.
-    """
+    """Write the lists of a scene's split beside a COLMAP model: its own, else nerfstudio's."""
     if scene.source is not None:
         _copy_files(scene.source.root, ROOT_LISTS, folder)
         if scene.source.model_dir is not None:
@@ -337,11 +316,7 @@ def _rigs(scene: Scene, model_dir: Path) -> tuple[list[str], list[str]]:
 
 
 def _write_transforms(scene: Scene, folder: Path) -> tuple[list[str], dict[str, Path]]:
-    """Write ``transforms.json`` and its PLY; returns notes and the image folders it names.
-
-    Raises:
-        OutputError: A camera model has no counterpart in nerfstudio.
-    """
+    """Write ``transforms.json`` and its PLY; returns notes and the image folders it names."""
     source, points = scene.source, scene.points
     if source is not None and source.transforms_path is not None:
         names = {image.name for image in scene.images}
@@ -422,10 +397,7 @@ def _camera_fields(camera: Intrinsics) -> dict[str, Any]:
 
 
 def _kept_json(transforms: Transforms, names: Collection[str]) -> dict[str, Any]:
-    """The file's content, with only the named images, for use in another folder.
-
-    Paths that lead out of the file's folder become absolute; everything else stays.
-    """
+    """The file's content, with only the named images, for use in another folder."""
     root, content = transforms.path.parent, transforms.json
 
     def portable(path: Any) -> Any:
@@ -454,11 +426,7 @@ def _kept_json(transforms: Transforms, names: Collection[str]) -> dict[str, Any]
 
 
 def image_folders(scene: Scene) -> dict[str, Path]:
-    """The source of ``images/`` and its siblings in a scene folder.
-
-    Images that lie in the scene's own root, between other files, are linked by their first folder
-    (or one by one).
-    """
+    """The source of ``images/`` and its siblings in a scene folder."""
     source = scene.source
     if source is None or not scene.images:
         return {}
@@ -484,14 +452,7 @@ def _siblings(root: Path) -> dict[str, Path]:
 
 
 def bring(folders: Mapping[str, Path], output: Path, *, copy: bool) -> list[str]:
-    """Link or copy image folders into ``output``; missing ones are left out.
-
-    Returns:
-        The paths inside ``output`` that were made.
-
-    Raises:
-        OSError: Neither worked.
-    """
+    """Link or copy image folders into ``output``; missing ones are left out."""
     present = {name: source for name, source in folders.items() if source.exists()}
     around = output.resolve().parent
     for name, source in present.items():

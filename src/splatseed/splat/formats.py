@@ -62,8 +62,8 @@ def _encode_ply(gaussians: Gaussians) -> list[bytes | memoryview]:
 def _decode_ply(path: Path) -> Gaussians:
     reader = ByteReader(path, EXPORT_PLY_AGAIN)
     header = parse_header(path, reader.data)
-    vertex = header.elements[0] if header.elements else Element("none", 0, ())
-    names = {prop.name for prop in vertex.properties}
+    vertex = header.elements[0] if header.elements else Element("none", 0, {})
+    names = set(vertex.types)
     rest = sum(name.startswith("f_rest_") for name in names)
     columns = {name: each for name, each in _columns(rest).items() if name != "normals"}
     missing = [name for each in columns.values() for name in each if name not in names]

@@ -19,7 +19,7 @@ import numpy as np
 
 from splatseed.errors import ParameterError, SceneFormatError
 from splatseed.io.files import read_json
-from splatseed.io.transform_file import NERFSTUDIO, similarity_in
+from splatseed.io.nerfstudio import NERFSTUDIO, similarity_in
 from splatseed.scene import Scene
 from splatseed.similarity import Similarity, fit_similarity, similarity_of
 from splatseed.splat.gaussians import Gaussians

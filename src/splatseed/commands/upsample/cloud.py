@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from splatseed.io.cleaning import check_precision, offset_of, recentred
+from splatseed.io.nerfstudio import read_cloud_transform
 from splatseed.io.staging import add_files, write_json
-from splatseed.io.transform_file import read_cloud_transform
 from splatseed.literal import visible
 from splatseed.progress import Progress
 from splatseed.runtime.memory import words_of

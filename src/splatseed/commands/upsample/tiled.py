@@ -23,7 +23,7 @@ from splatseed.console import (
 from splatseed.errors import OutputError, ParameterError, PointCloudError, SceneFormatError
 from splatseed.io import WriteReport, load_originals, load_scene, write_scene
 from splatseed.io.clouds import open_cloud
-from splatseed.io.model import find_model
+from splatseed.io.colmap import find_model
 from splatseed.io.write import PointStream
 from splatseed.literal import counted, visible
 from splatseed.pointcloud import PointCloud

@@ -1,21 +1,20 @@
 """Point maps that networks export: NPZ archives of DUSt3R, MASt3R, VGGT and their kin, and GLB.
 
 NPZ: positions are the first of ``POSITIONS`` that is there, of shape [..., 3]; colours the first of
-``COLORS`` with as many values, which may hold channels before rows and columns, as networks have
-images; ``MASKS`` say which points count, and of ``CONFIDENCES`` those below ``LEAST`` are left out.
-GLB (binary glTF): where some primitives are points, only those are read, as exporters draw cameras
-as triangles beside them; else the vertices of all meshes. Colours are ``COLOR_0``; nodes'
-transforms are applied. Promise: arrays are read in parts, whether compressed or not; pickled
-objects, and what glTF's extensions compress, are refused. (trimesh reads a GLB whole, and takes
-vertices that it cannot decompress for zeros.)
+``COLORS`` with as many values, which may hold channels before rows and columns; ``MASKS`` say which
+points count, and of ``CONFIDENCES`` those below ``LEAST`` are left out. GLB (binary glTF): where
+some primitives are points, only those are read, as exporters draw cameras as triangles beside them;
+else the vertices of all meshes. (trimesh reads a GLB whole, and takes vertices that it cannot
+decompress for zeros: here they are refused.)
 """
 
 from __future__ import annotations
 
 import json
+import math
 import struct
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,7 +24,7 @@ from jaxtyping import Float64
 from splatseed.camera import rotation_from_quat
 from splatseed.errors import SceneFormatError
 from splatseed.io.cloud_file import RGB, XYZ, Block, CloudFile, RowCloud, color_bytes
-from splatseed.io.files import guarded, open_file, read_npy_header
+from splatseed.io.files import guarded, open_file, read_npy, read_npy_header
 from splatseed.runtime.memory import check_memory
 
 POSITIONS = ("world_points", "pts3d", "points3d", "points", "xyz", "point_map", "pointmap")
@@ -35,7 +34,9 @@ CONFIDENCES = ("world_points_conf", "conf", "confs", "confidence")
 LEAST = 1.5
 """Least confidence that counts: these networks give 1 where they know nothing, and 3 to 30 on
 surfaces."""
-_STRAIGHTEN = "Save the array row by row: numpy.ascontiguousarray."
+_FEWER = "Save fewer views in one archive, or the points as a binary PLY, which is read in parts."
+_NONE = ((), False, np.dtype(object))
+_SAMPLED = 1 << 18
 _GLTF = (b"glTF", 2, 0x4E4F534A)
 """Magic, version, and the mark of the description."""
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -45,121 +46,68 @@ _WHOLE_NPZ = "an archive of NumPy arrays"
 _WHOLE_GLB = "a complete .glb file with vertices"
 
 
-class _Member(NamedTuple):
-    """An array of an archive; ``turned`` if stored column by column, and so read whole."""
-
-    name: str
-    shape: tuple[int, ...]
-    dtype: np.dtype[Any]
-    turned: bool
-
-    @property
-    def size(self) -> int:
-        """How many values it has."""
-        return int(np.prod(self.shape, dtype=np.int64))
-
-
 class NpzCloud(CloudFile):
-    """An .npz archive with an array of points.
-
-    Raises:
-        SceneFormatError: It is no archive, or has no array of points, or arrays do not fit.
-    """
+    """An .npz archive with an array of points; arrays are in memory whole while they are read."""
 
     def __init__(self, path: Path) -> None:
-        members = _members(path)
-        points = next((members[name] for name in POSITIONS if name in members), None)
-        if points is None or points.shape[-1:] != (3,) or points.dtype.kind not in "fiu":
-            found = ", ".join(f"{m.name} {list(m.shape)}" for m in members.values())
+        shapes: dict[str, tuple[int, ...]] = {}
+        with guarded(path, _WHOLE_NPZ), zipfile.ZipFile(path) as archive:
+            for name in archive.namelist():
+                with archive.open(name) as file:
+                    shape, _, dtype = read_npy_header(file) if name.endswith(".npy") else _NONE
+                if dtype.kind in "bfiu":
+                    shapes[name.removesuffix(".npy")] = shape
+        points = next((name for name in POSITIONS if name in shapes), "")
+        if shapes.get(points, ())[-1:] != (3,):
+            found = ", ".join(f"{name} {list(shape)}" for name, shape in shapes.items())
             raise SceneFormatError(
                 f"{path} to hold points: one of {', '.join(POSITIONS)}, of shape [..., 3]",
                 found=found[:200] or "no arrays",
                 fix="Save the points under one of these names.",
             )
-        count = points.size // 3
+        count = math.prod(shapes[points]) // 3
 
-        def beside(names: tuple[str, ...], size: int) -> _Member | None:
-            there = (members[name] for name in names if name in members)
-            return next((m for m in there if m.size == size and m.dtype.kind in "bfiu"), None)
+        def beside(names: Sequence[str], size: int) -> str | None:
+            return next((n for n in names if n in shapes and math.prod(shapes[n]) == size), None)
 
-        self._points, self._color = points, beside(COLORS, 3 * count)
-        self._mask, self._confidence = beside(MASKS, count), beside(CONFIDENCES, count)
-        shape = self._color.shape if self._color else ()
-        self._planar = shape[-1:] != (3,) and shape[-3:-2] == (3,)
-        if not self._planar and shape[-1:] != (3,):
-            self._color = None
-        super().__init__(path, (*XYZ, *RGB) if self._color else XYZ, count)
+        color = beside(COLORS, 3 * count)
+        if color and 3 not in (shapes[color][-1:] + shapes[color][-3:-2]):
+            color = None
+        self._names = (points, color, beside(MASKS, count), beside(CONFIDENCES, count))
+        super().__init__(path, (*XYZ, *RGB) if color else XYZ, count)
 
     def _sample(self) -> Block:
-        values: Any = self._color and next(_parts(self.path, self._color, 1 << 20), np.empty(0))
-        return dict.fromkeys(RGB, values)
+        color = self._array(self._names[1])
+        return dict.fromkeys(RGB, None if color is None else color[:_SAMPLED])
 
     def _blocks(self, size: int) -> Iterator[Block]:
-        streams = {"xyz": _parts(self.path, self._points, 3 * size)}
-        if self._color:
-            streams["rgb"] = self._painted(self._color, size)
-        if self._mask:
-            streams["mask"] = _parts(self.path, self._mask, size)
-        if self._confidence:
-            streams["confidence"] = _parts(self.path, self._confidence, size)
-        for values in zip(*streams.values(), strict=True):
-            parts = dict(zip(streams, values, strict=True))
-            table = parts["xyz"].reshape(-1, 3)
-            valid = np.ones(len(table), bool)
-            if "mask" in parts:
-                valid &= parts["mask"] != 0
-            if "confidence" in parts:
-                valid &= parts["confidence"] >= LEAST
-            block = dict(zip(XYZ, table[valid].T, strict=True))
-            if "rgb" in parts:
-                block |= zip(RGB, parts["rgb"][valid].T, strict=True)
+        points, color, mask, confidence = map(self._array, self._names)
+        assert points is not None  # noqa: S101  (its name is known)
+        for start in range(0, len(points), size):
+            part = slice(start, start + size)
+            valid = np.ones(len(points[part]), bool)
+            if mask is not None:
+                valid &= mask[part, 0] != 0
+            if confidence is not None:
+                valid &= confidence[part, 0] >= LEAST
+            block = dict(zip(XYZ, points[part][valid].T, strict=True))
+            if color is not None:
+                block |= zip(RGB, color[part][valid].T, strict=True)
             yield block
 
-    def _painted(self, color: _Member, size: int) -> Iterator[np.ndarray]:
-        """Colours [n, 3], ``size`` points at a time."""
-        pixels = int(np.prod(color.shape[-2:])) if self._planar else size
-        held = np.empty((0, 3), color.dtype)
-        for part in _parts(self.path, color, 3 * pixels):
-            rgb = part.reshape(3, -1).T if self._planar else part.reshape(-1, 3)
-            held = np.concatenate([held, rgb])
-            while len(held) >= size:
-                yield held[:size]
-                held = held[size:]
-        if len(held):
-            yield held
-
-
-def _members(path: Path) -> dict[str, _Member]:
-    """The arrays of an archive by name."""
-    members = {}
-    with guarded(path, _WHOLE_NPZ), zipfile.ZipFile(path) as archive:
-        for name in archive.namelist():
-            if name.endswith(".npy"):
-                with archive.open(name) as file:
-                    shape, fortran, dtype = read_npy_header(file)
-                if not dtype.hasobject:
-                    key = name.removesuffix(".npy")
-                    members[key] = _Member(key, shape, dtype, fortran and len(shape) > 1)
-    return members
-
-
-def _parts(path: Path, member: _Member, size: int) -> Iterator[np.ndarray]:
-    """The values of an array in order, flat, ``size`` at a time."""
-    left = member.size
-    if member.turned:
-        check_memory(2 * left * member.dtype.itemsize, 1, "bytes", fix=_STRAIGHTEN)
-        for values in _parts(path, member._replace(turned=False), max(left, 1)):
-            straight = values.reshape(member.shape, order="F").ravel()
-            yield from (straight[start : start + size] for start in range(0, left, size))
-        return
-    name = f"{member.name}.npy"
-    with guarded(path, _WHOLE_NPZ), zipfile.ZipFile(path) as archive, archive.open(name) as file:
-        read_npy_header(file)
-        while left:
-            count = min(size, left)
-            data = file.read(count * member.dtype.itemsize)
-            yield np.frombuffer(data, member.dtype, count)
-            left -= count
+    def _array(self, name: str | None) -> np.ndarray | None:
+        """The values of an array, a row a point."""
+        if name is None:
+            return None
+        with guarded(self.path, _WHOLE_NPZ), zipfile.ZipFile(self.path) as archive:
+            info = archive.getinfo(f"{name}.npy")
+            check_memory(2 * info.file_size, 1, "bytes of arrays", fix=_FEWER)
+            with archive.open(info) as file:
+                array = read_npy(file, info.file_size)
+            if name in COLORS and array.shape[-1] != 3:  # channels stand before rows and columns
+                array = np.moveaxis(array, -3, -1)
+            width = 3 if name in (*POSITIONS, *COLORS) else 1
+            return array.reshape(-1, width)
 
 
 class _Part(NamedTuple):
@@ -172,11 +120,7 @@ class _Part(NamedTuple):
 
 
 class GlbCloud(CloudFile):
-    """A .glb file.
-
-    Raises:
-        SceneFormatError: It is no binary glTF, has no vertices, or is cut short.
-    """
+    """A .glb file."""
 
     def __init__(self, path: Path) -> None:
         with guarded(path, _WHOLE_GLB), open_file(path) as file:

@@ -1,9 +1,8 @@
 """PCD, the format of the Point Cloud Library: ascii, binary and binary_compressed.
 
-Colours are ``rgb`` or ``rgba`` packed into 32 bits, or columns r, g, b; else intensity. Promise:
-binary rows are read by offset. A compressed body is one LZF block by its definition, which has to
-be in memory whole; its size is checked against the free memory first. (pypcd4 reads every body
-whole and needs two more packages.)
+Colours are ``rgb`` or ``rgba`` packed into 32 bits, or columns r, g, b; else intensity. A
+compressed body is one LZF block, which has to be in memory whole. (pypcd4 reads every body whole
+and needs two more packages.)
 """
 
 from __future__ import annotations
@@ -26,11 +25,7 @@ _KINDS = {"F": "f", "I": "i", "U": "u"}
 
 
 def open_pcd(path: Path) -> CloudFile:
-    """Open a PCD file.
-
-    Raises:
-        SceneFormatError: It is not a PCD, has no x, y, z, or is cut short.
-    """
+    """Open a PCD file."""
     with guarded(path, "a PCD: FIELDS, SIZE, TYPE, POINTS, DATA"), open_file(path) as file:
         dtype, rows, body, offset = _parse_header(file.read(_HEADER_BYTES))
     if body == "binary":

@@ -1,11 +1,10 @@
 """Scans of surveyors: LAS and LAZ by laspy with lazrs, E57 by pye57 (libE57Format).
 
-LAS: coordinates are float64 as the file's scale and offset have them; points that it marks as
-withheld are left out; colours that are all 0 are none, and then intensity that varies is used.
-E57: the points of all scans come one scan after another, in the common frame that the scans' poses
-lead to; Cartesian and spherical coordinates are read; points marked invalid are left out. Promise:
-files are read in parts, never whole; a LAZ file that ends early is an error, not a shorter cloud;
-what it says of its chunks is checked before lazrs, which would end the process, allocates for it.
+LAS: points that it marks as withheld are left out; colours that are all 0 are none, and then
+intensity that varies is used. E57: the points of all scans, in the frame that the scans' poses lead
+to; points marked invalid are left out. Promise: a LAZ file that ends early is an error, not a
+shorter cloud; what it says of its chunks is checked before lazrs, which would end the process,
+allocates for it.
 """
 
 from __future__ import annotations
@@ -37,25 +36,19 @@ _WHERE_POINTS, _RECORD = 96, 54
 bytes of each of these, at least."""
 _MOST_BYTES = 1 << 30
 """Of a chunk of points, unpacked; writers use 50,000 points, of 20 to some 100 bytes."""
-_CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 _SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
+_PLACES = (("cartesianX", "cartesianY", "cartesianZ"), _SPHERICAL)
 _E57_COLORS = {"colorRed": "red", "colorGreen": "green", "colorBlue": "blue"}
 _INVALID = ("cartesianInvalidState", "sphericalInvalidState")
 
 
 class LasCloud(CloudFile):
-    """A LAS or LAZ file.
-
-    Raises:
-        MissingDependencyError: laspy or lazrs is not installed.
-        SceneFormatError: It is not LAS, or cut short.
-    """
+    """A LAS or LAZ file."""
 
     def __init__(self, path: Path) -> None:
         require("laspy", "lazrs")
         with _opened_las(path) as file:
             self._num_rows = int(file.header.point_count)
-            bounds = np.array([file.header.mins, file.header.maxs], np.float64)
             names = set(file.header.point_format.dimension_names)
             there = [name for name in (*RGB, "intensity") if name in names]
             parts = {name: [np.empty(0, np.uint16)] for name in there}
@@ -72,7 +65,6 @@ class LasCloud(CloudFile):
         if not len(self._known.get("intensity", ())) or not np.ptp(self._known["intensity"]):
             unused.add("intensity")
         super().__init__(path, names - unused, self._num_rows)
-        self.bounds = bounds
 
     def _sample(self) -> Block:
         return self._known
@@ -155,20 +147,13 @@ def _number_of_chunks(file: IO[bytes], start: int) -> int:
 
 
 class E57Cloud(CloudFile):
-    """An E57 file.
-
-    Raises:
-        MissingDependencyError: pye57 is not installed.
-        SceneFormatError: It is not E57, damaged, or holds no points.
-    """
+    """An E57 file."""
 
     def __init__(self, path: Path) -> None:
         require("pye57")
         with _opened_e57(path) as (_, headers):
             if not headers:
                 raise ValueError("no scans")
-            for header in headers:
-                _place_fields(header)
             shared = set.intersection(*(set(header.point_fields) for header in headers))
             count = sum(int(header.point_count) for header in headers)
         super().__init__(path, (_E57_COLORS.get(name, name) for name in (*XYZ, *shared)), count)
@@ -176,14 +161,9 @@ class E57Cloud(CloudFile):
     def _sample(self) -> Block:
         """The beginning of each scan."""
         with _opened_e57(self.path) as (image, headers):
-            heads = [
-                next(_read_scan(image, header, SAMPLES * SAMPLE_ROWS), None) for header in headers
-            ]
-        there = [head for head in heads if head]
-        return {
-            name: np.concatenate([np.empty(0), *(head[name] for head in there)])
-            for name in self.used
-        }
+            heads = [next(_read_scan(image, h, SAMPLES * SAMPLE_ROWS), {}) for h in headers]
+        none = np.empty(0)
+        return {n: np.concatenate([none, *(h.get(n, none) for h in heads)]) for n in self.used}
 
     def _blocks(self, size: int) -> Iterator[Block]:
         with _opened_e57(self.path) as (image, headers):
@@ -205,20 +185,14 @@ def _opened_e57(path: Path) -> Iterator[tuple[Any, list[Any]]]:
             image.close()
 
 
-def _place_fields(header: Any) -> tuple[str, ...]:
-    known = set(header.point_fields)
-    place = next((each for each in (_CARTESIAN, _SPHERICAL) if set(each) <= known), None)
-    if place is None:
-        raise ValueError(f"neither cartesian nor spherical coordinates: {sorted(known)}")
-    return place
-
-
 def _read_scan(image: Any, header: Any, size: int) -> Iterator[dict[str, np.ndarray]]:
     """The valid points of a scan in the file's common frame, at most ``size`` at a time."""
     from pye57 import libe57  # noqa: PLC0415  (an optional package)
 
-    place, count = _place_fields(header), int(header.point_count)
-    optional = (*_E57_COLORS, "intensity", *_INVALID)
+    place = next((p for p in _PLACES if set(p) <= set(header.point_fields)), None)
+    if place is None:
+        raise ValueError(f"neither cartesian nor spherical coordinates: {header.point_fields}")
+    count, optional = int(header.point_count), (*_E57_COLORS, "intensity", *_INVALID)
     fields = (*place, *(name for name in optional if name in header.point_fields))
     room = min(size, max(count, 1))
     # Colours may be bytes, 16-bit or 0 to 1: the values tell.

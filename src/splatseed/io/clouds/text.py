@@ -3,8 +3,8 @@
 The delimiter, a decimal comma, and a line of names are recognised from the first lines. Without
 names, columns 1 to 3 are the position; of the others, three whole numbers from 0 to 65535 in a row,
 or three numbers from 0 to 1 that are not unit normals, are the colour, and the fourth of four is
-intensity. A PTS file begins with the number of its points and has intensity before colours.
-Promise: what was assumed about columns without names is told in ``warnings``.
+intensity; ``warnings`` tell it. A PTS file begins with the number of its points and has intensity
+before colours.
 """
 
 from __future__ import annotations
@@ -41,11 +41,7 @@ _UNIT = 1e-2
 
 
 def open_text(path: Path) -> CloudFile:
-    """Open a text file of points.
-
-    Raises:
-        SceneFormatError: Its lines hold no three numbers.
-    """
+    """Open a text file of points."""
     with open_file(path) as file:
         head = file.read(SAMPLE_BYTES).decode("latin-1")
     lines = head.split("\n")[: None if len(head) < SAMPLE_BYTES else -1]
