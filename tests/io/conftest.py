@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import tracemalloc
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -141,58 +138,6 @@ def scene_dir(tmp_path, model) -> Path:
         size = (image.intrinsics.width, image.intrinsics.height)
         PilImage.new("RGB", size, "teal").save(path)
     return root
-
-
-@pytest.fixture(scope="session")
-def assert_same_images() -> Callable[[tuple[Image, ...], tuple[Image, ...]], None]:
-    def check(actual, expected):
-        keys = [(im.name, im.image_id, im.intrinsics) for im in expected]
-        assert [(im.name, im.image_id, im.intrinsics) for im in actual] == keys
-        for a, b in zip(actual, expected, strict=True):
-            np.testing.assert_array_equal(a.quat, b.quat)
-            np.testing.assert_array_equal(a.translation, b.translation)
-            np.testing.assert_array_equal(a.observations.xy, b.observations.xy)
-            np.testing.assert_array_equal(a.observations.point_ids, b.observations.point_ids)
-            assert a.observations.point_ids.dtype == np.int64
-
-    return check
-
-
-@pytest.fixture(scope="session")
-def assert_same_points() -> Callable[..., None]:
-    def check(actual, expected):
-        (points, tracks), (expected_points, expected_tracks) = actual, expected
-        np.testing.assert_array_equal(points.xyz, expected_points.xyz)
-        np.testing.assert_array_equal(points.rgb, expected_points.rgb)
-        for name, dtype in (
-            ("point_ids", np.int64),
-            ("xyz", np.float64),
-            ("errors", np.float64),
-            ("offsets", np.int64),
-            ("image_ids", np.uint32),
-            ("point2d_idx", np.uint32),
-        ):
-            array = getattr(tracks, name)
-            assert array.dtype == dtype, name
-            np.testing.assert_array_equal(array, getattr(expected_tracks, name), err_msg=name)
-
-    return check
-
-
-@pytest.fixture(scope="session")
-def little_memory() -> Callable[[], AbstractContextManager[None]]:
-    """A context that fails if what runs in it allocates as a lying header would have it."""
-
-    @contextmanager
-    def guard(limit: int = 16 << 20) -> Iterator[None]:
-        tracemalloc.start()
-        try:
-            yield
-            assert tracemalloc.get_traced_memory()[1] < limit
-        finally:
-            tracemalloc.stop()
-
-    return guard
 
 
 @pytest.fixture(scope="module")

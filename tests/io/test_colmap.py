@@ -15,6 +15,8 @@ from splatseed.errors import OutputError, PointCloudError, SceneFormatError, Sce
 from splatseed.io import colmap, files
 from splatseed.pointcloud import PointCloud
 
+from .checks import assert_same_images, assert_same_points, little_memory
+
 REAL_MODELS = [
     f"{scene}/sparse/0" for scene in ("fern", "fox", "treehill", "bonsai", "mipnerf360_sfm/stump")
 ]
@@ -55,9 +57,7 @@ def test_real_models_are_written_back_byte_for_byte(scenes, model_dir, tmp_path)
 
 @settings(max_examples=60, deadline=None)
 @given(data=st.data())
-def test_models_survive_a_round_trip(
-    models, assert_same_images, assert_same_points, tmp_path_factory, data
-):
+def test_models_survive_a_round_trip(models, tmp_path_factory, data):
     model = data.draw(models)
     cameras, images, *points = read(written(tmp_path_factory.getbasetemp(), model))
     assert cameras == model.intrinsics
@@ -170,7 +170,7 @@ def point(point_id=1, track_length=0):
         ("points", points_of(point(4), point(2**63)), "record 2"),
     ],
 )
-def test_malformed_binary_records_are_named(tmp_path, little_memory, what, data, where):
+def test_malformed_binary_records_are_named(tmp_path, what, data, where):
     (tmp_path / "a.bin").write_bytes(data)
     with little_memory(), pytest.raises(SceneFormatError, match=where) as caught:
         READERS[what](tmp_path / "a.bin")
@@ -317,7 +317,7 @@ def test_pycolmap_takes_points_without_tracks_and_images_without_features(model,
     assert [len(image.observations) for image in read(tmp_path)[1]] == [0] * 4
 
 
-def test_both_forms_of_a_real_model_agree(scenes, tmp_path, assert_same_images, assert_same_points):
+def test_both_forms_of_a_real_model_agree(scenes, tmp_path):
     pycolmap = pytest.importorskip("pycolmap")
     reconstruction = pycolmap.Reconstruction(scenes / "fern" / "sparse" / "0")
     reconstruction.write_binary(tmp_path)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import struct
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +16,6 @@ from splatseed.depth.stereo import StereoMap
 from splatseed.errors import (
     InputError,
     OutputError,
-    ParameterError,
     SceneFormatError,
     SceneNotFoundError,
 )
@@ -30,7 +28,6 @@ from splatseed.io.dense import (
     write_dense_workspace,
     write_map,
 )
-from splatseed.io.depth_files import read_stored
 from splatseed.io.ply import read_ply
 from splatseed.synthetic import make_capture, write_capture
 from splatseed.views.undistortion import undistort
@@ -139,15 +136,11 @@ def test_pycolmap_fuses_it(capture, workspaces, tmp_path):
     options.min_num_pixels = 3
     fused = tmp_path / "fused.ply"
     pycolmap.stereo_fusion(fused, workspaces[4], options=options, output_type="ply")
-    _check_fused(fused, capture, 4)
-
-
-def _check_fused(path, capture, factor):
-    points = read_ply(path)
-    assert len(points) > 2000 / factor**2
+    points = read_ply(fused)
+    assert len(points) > 125
     away = np.abs(capture.surfaces.distance(points.xyz.astype(np.float64)))
     assert np.median(away) < 2 * ON_SURFACE  # 0.3 pixels without the move to COLMAP's rays
-    assert np.quantile(away, 0.95) < PIXEL / 2 * factor
+    assert np.quantile(away, 0.95) < PIXEL * 2
 
 
 @pytest.fixture(scope="module")
@@ -157,11 +150,13 @@ def bent_room(capture, tmp_path_factory):
 
 
 def test_distorted_photographs_come_without_their_distortion(bent_room, room, maps, tmp_path):
-    write_dense_workspace(bent_room, maps[4], tmp_path / "w", undistort=undistort)
+    mixed = bent_room.replace(images=(*bent_room.images[:6], *room.images[6:]))
+    write_dense_workspace(mixed, maps[4], tmp_path / "w", undistort=undistort)
     scene = load_scene(tmp_path / "w")
     assert {lens.model for lens in scene.intrinsics} == {"PINHOLE"}
-    assert not (tmp_path / "w/images").is_symlink()
-    for straight, lens, image in zip(room.images, bent_room.images, scene.images, strict=True):
+    links = [(tmp_path / "w/images" / image.name).is_symlink() for image in mixed.images]
+    assert links == [False] * 6 + [True] * 2
+    for straight, lens, image in zip(room.images, bent_room.images, scene.images[:6], strict=False):
         np.testing.assert_allclose(image.camera.K, straight.camera.K)
         np.testing.assert_allclose(image.observations.xy, straight.observations.xy, atol=1e-6)
         undistorted, bent, truth = (
@@ -172,33 +167,37 @@ def test_distorted_photographs_come_without_their_distortion(bent_room, room, ma
         np.testing.assert_array_equal(undistorted, expected)
         error, before = (np.abs(each.astype(int) - truth).mean() for each in (undistorted, bent))
         assert error < 0.8 * before  # two interpolations blur
-
-
-def test_of_mixed_photographs_only_distorted_ones_are_written(bent_room, room, maps, tmp_path):
-    mixed = bent_room.replace(images=(*bent_room.images[:2], *room.images[2:]))
-    write_dense_workspace(mixed, maps[4], tmp_path / "w", undistort=undistort)
-    links = [(tmp_path / "w/images" / image.name).is_symlink() for image in mixed.images]
-    assert links == [False, False, *[True] * 6]
     write_dense_workspace(mixed, maps[4], tmp_path / "w", undistort=undistort, overwrite=True)
 
 
-def test_cameras_are_those_of_reduced_photographs(capture, maps, tmp_path):
+def test_cameras_are_those_of_reduced_photographs_and_points_stand_in_for_tracks(
+    capture, maps, tmp_path
+):
     path = write_capture(capture, tmp_path / "room")
     for picture in (path / "images").iterdir():
         with PilImage.open(picture) as image:
             half = image.resize((48, 36))
         half.save(picture)
     scene = load_scene(path)
-    report = write_dense_workspace(scene, maps[4][:2], tmp_path / "w")
-    assert report.num_maps == 2
+    assert write_dense_workspace(scene, maps[4][:2], tmp_path / "w").num_maps == 2
     small = load_scene(tmp_path / "w")
     assert {(camera.width, camera.height) for camera in small.intrinsics} == {(48, 36)}
-    np.testing.assert_allclose(
-        small.images[0].observations.xy, scene.images[0].observations.xy * [48 / 97, 36 / 73]
-    )
+    expected = scene.images[0].observations.xy * [48 / 97, 36 / 73]
+    np.testing.assert_allclose(small.images[0].observations.xy, expected)
     xyz, _ = _fused_points(tmp_path / "w", small.images[0])
     assert np.median(np.abs(capture.surfaces.distance(xyz))) < ON_SURFACE
     assert (tmp_path / "w/stereo/fusion.cfg").read_text().count("\n") == 2
+    write_dense_workspace(scene.replace(tracks=None), maps[4][:2], tmp_path / "no tracks")
+    model = load_scene(tmp_path / "no tracks")
+    assert 200 <= len(model.points) <= 400
+    assert np.median(np.abs(capture.surfaces.distance(model.tracks.xyz))) < ON_SURFACE
+    for image in model.images:
+        ids = image.observations.point_ids
+        uv, _ = image.camera.project(model.tracks.xyz[ids - 1])
+        np.testing.assert_allclose(image.observations.xy, np.nan_to_num(uv), atol=1e-6)
+        mine = model.tracks.image_ids == image.image_id
+        owner = np.repeat(model.tracks.point_ids, model.tracks.lengths)[mine]
+        np.testing.assert_array_equal(ids[model.tracks.point2d_idx[mine]], owner)
 
 
 def test_a_plain_folder_and_the_rest_beside_it(maps, room, tmp_path):
@@ -220,39 +219,38 @@ def test_a_plain_folder_and_the_rest_beside_it(maps, room, tmp_path):
 
 @pytest.mark.parametrize("write", [write_dense_workspace, write_dense_maps])
 @pytest.mark.parametrize(
-    ("spoil", "said"),
+    ("changes", "said"),
     [
-        (lambda maps: maps[:0], "at least one depth map"),
-        (lambda maps: [maps[0], maps[0]], "one depth map per image"),
-        (lambda maps: [replace(maps[0], name="other.png")], "images of the scene"),
-        (lambda maps: [replace(maps[0], sources=("other.png",))], "images of the scene"),
-        (lambda maps: [replace(maps[0], sources=maps[0].sources * 3)], "at most 8 sources"),
-        (lambda maps: [replace(maps[0], depth=maps[0].depth[:-1])], "arrays of its camera's size"),
-        (lambda maps: [replace(maps[0], camera=_turned(maps[0].camera))], "the pose of its image"),
+        ([], "at least one depth map"),
+        ([{}, {}], "one depth map per image"),
+        ([{"name": "other.png"}], "images of the scene"),
+        ([{"sources": ("other.png",)}], "images of the scene"),
+        ([{"sources": ("view_001.png",) * 9}], "at most 8 sources"),
+        ([{"depth": np.ones((3, 3))}], "arrays of its camera's size"),
+        ([{"camera": None}], "the pose of its image"),
     ],
 )
-def test_maps_that_do_not_belong_are_refused(write, spoil, said, maps, room, tmp_path):
+def test_maps_that_do_not_belong_are_refused(write, changes, said, maps, room, tmp_path):
+    first = maps[4][0]
+    turned = replace(first.camera, cam_from_world=first.camera.cam_from_world[[1, 0, 2, 3]])
+    spoilt = [replace(first, **(c if c.get("camera", 1) else {"camera": turned})) for c in changes]
     with pytest.raises(InputError, match=said):
-        write(room, spoil(maps[4][:1]), tmp_path / "w")
+        write(room, iter(spoilt), tmp_path / "w")
     assert list(tmp_path.iterdir()) == []
 
 
-def _turned(camera):
-    return replace(camera, cam_from_world=camera.cam_from_world[[1, 0, 2, 3]])
-
-
 def test_scenes_that_cannot_be_fused_are_refused(maps, room, tmp_path):
-    def refused(error, said, scene):
+    lens = room.images[0].intrinsics
+    bent = replace(lens, model="SIMPLE_RADIAL", params=(100.0, 60.0, 45.0, 0.1))
+    for error, said, scene in (
+        (SceneFormatError, "distortion", _with_first(room, intrinsics=bent)),
+        (OutputError, "stay inside", _with_first(room, name="../view_000.png")),
+        (SceneNotFoundError, "gone.png", _with_first(room, name="gone.png")),
+        (SceneNotFoundError, "photographs", room.replace(source=None)),
+    ):
         with pytest.raises(error, match=said):
             write_dense_workspace(scene, maps[4][:1], tmp_path / "w")
         assert list(tmp_path.iterdir()) == []
-
-    first = room.images[0]
-    lens = replace(first.intrinsics, model="SIMPLE_RADIAL", params=(100.0, 60.0, 45.0, 0.1))
-    refused(SceneFormatError, "distortion", _with_first(room, intrinsics=lens))
-    refused(OutputError, "stay inside", _with_first(room, name="../view_000.png"))
-    refused(SceneNotFoundError, "gone.png", _with_first(room, name="gone.png"))
-    refused(SceneNotFoundError, "photographs", room.replace(source=None))
 
 
 def _with_first(scene, **changes):
@@ -276,52 +274,26 @@ def test_only_an_earlier_workspace_is_replaced(maps, room, tmp_path):
         write_dense_workspace(room, some, room.source.root / "dense")
 
 
-def test_a_failure_on_the_way_leaves_nothing(maps, room, tmp_path):
-    def breaking():
-        yield maps[4][0]
-        raise ParameterError("no more", found="less", fix="Stop.")
-
-    with pytest.raises(ParameterError):
-        write_dense_workspace(room, breaking(), tmp_path / "w")
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_depth_map_byte_by_byte(tmp_path):
-    values = np.array([[1.5, np.nan, 2.0], [0.25, 3.0, np.nan]], np.float32)
-    write_map(tmp_path / "sub" / "a.bin", values)
-    data = (tmp_path / "sub" / "a.bin").read_bytes()
-    assert data == b"3&2&1&" + struct.pack("<6f", 1.5, 0, 2, 0.25, 3, 0)
-    read = read_stored(tmp_path / "sub" / "a.bin").values
-    np.testing.assert_array_equal(read, np.nan_to_num(values))
-
-
-def test_a_graph_byte_by_byte(tmp_path):
-    agreeing = np.array([[0, 0b11], [0b10, 0]], np.uint8)
-    write_consistency_graph(tmp_path / "a.bin", agreeing, (7, 4))
-    data = (tmp_path / "a.bin").read_bytes()
-    assert data == b"2&2&1&" + struct.pack("<9i", 1, 0, 2, 7, 4, 0, 1, 1, 4)
-
-
-def _records(agreeing, image_idxs):
-    """Literally as COLMAP's patch match lists them."""
-    records = []
-    for row, column in np.ndindex(*agreeing.shape):
-        confirming = [idx for k, idx in enumerate(image_idxs) if agreeing[row, column] >> k & 1]
-        if confirming:
-            records += [column, row, len(confirming), *confirming]
-    return records
-
-
 @settings(max_examples=60, deadline=None)
 @given(
     agreeing=hnp.arrays(np.uint8, hnp.array_shapes(min_dims=2, max_dims=2, max_side=7)),
     image_idxs=st.lists(st.integers(0, 2**31 - 1), max_size=8),
 )
-def test_graphs_against_the_loop(tmp_path_factory, agreeing, image_idxs):
-    path = tmp_path_factory.mktemp("graph") / "a.bin"
-    write_consistency_graph(path, agreeing, image_idxs)
-    body = path.read_bytes().split(b"&", 3)[3]
-    assert np.frombuffer(body, "<i4").tolist() == _records(agreeing, image_idxs)
+def test_maps_and_graphs_against_the_loop(tmp_path_factory, agreeing, image_idxs):
+    """A graph is literally as COLMAP's patch match lists it."""
+    folder = tmp_path_factory.mktemp("graph")
+    write_consistency_graph(folder / "a.bin", agreeing, image_idxs)
+    records = []
+    for row, column in np.ndindex(*agreeing.shape):
+        confirming = [idx for k, idx in enumerate(image_idxs) if agreeing[row, column] >> k & 1]
+        if confirming:
+            records += [column, row, len(confirming), *confirming]
+    height, width = agreeing.shape
+    head = f"{width}&{height}&1&".encode()
+    assert (folder / "a.bin").read_bytes() == head + np.array(records, "<i4").tobytes()
+    depth = np.where(agreeing > 200, np.nan, agreeing).astype(np.float32)
+    write_map(folder / "sub/b.bin", depth)
+    assert (folder / "sub/b.bin").read_bytes() == head + np.nan_to_num(depth).tobytes()
 
 
 def planted(normal, distance, *, shape=(12, 16), fov=0.6):

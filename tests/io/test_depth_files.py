@@ -15,6 +15,8 @@ from splatseed import requirements
 from splatseed.errors import MissingDependencyError, SceneFormatError, SceneNotFoundError
 from splatseed.io.depth_files import SUFFIXES, read_stored
 
+from .checks import little_memory
+
 SHAPES = hnp.array_shapes(min_dims=2, max_dims=2, max_side=9)
 FLOATS = hnp.arrays(np.float32, SHAPES)
 ANY = st.sampled_from([np.uint8, np.uint16, np.int32, np.float16, np.float64, ">f4"]).flatmap(
@@ -36,6 +38,9 @@ def assert_read(path, expected):
 def test_npy(tmp_path, array, order):
     np.save(tmp_path / "a.npy", np.asarray(array, order=order))
     assert_read(tmp_path / "a.npy", array)
+    for longer in (array[None], *([array[..., None]] if len(array) > 1 else [])):
+        np.save(tmp_path / "a.npy", longer)
+        assert_read(tmp_path / "a.npy", array)
 
 
 @repeat
@@ -56,12 +61,6 @@ def test_npz_says_what_it_holds(tmp_path):
             read_stored(path)
 
 
-@pytest.mark.parametrize("shape", [(1, 4, 5), (4, 5, 1)])
-def test_axis_of_length_one_is_dropped(tmp_path, shape):
-    np.save(tmp_path / "a.npy", np.arange(20.0).reshape(shape))
-    assert_read(tmp_path / "a.npy", np.arange(20.0).reshape(4, 5))
-
-
 @pytest.mark.parametrize(
     "array",
     [
@@ -76,7 +75,7 @@ def test_arrays_that_are_no_map(tmp_path, array):
         read_stored(tmp_path / "a.npy")
 
 
-def test_npy_header_that_promises_too_much_takes_no_memory(tmp_path, little_memory):
+def test_npy_header_that_promises_too_much_takes_no_memory(tmp_path):
     stream = io.BytesIO()
     header = {"descr": "<f4", "fortran_order": False, "shape": (2**20, 2**20)}
     np.lib.format.write_array_header_1_0(stream, header)
@@ -84,7 +83,7 @@ def test_npy_header_that_promises_too_much_takes_no_memory(tmp_path, little_memo
     with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
         archive.write(tmp_path / "a.npy", "depth.npy")
     for name in ("a.npy", "a.npz"):
-        with little_memory(), pytest.raises(SceneFormatError, match="100 bytes"):
+        with little_memory(), pytest.raises(SceneFormatError, match="values of float32 in"):
             read_stored(tmp_path / name)
 
 
@@ -125,25 +124,17 @@ def test_wide_tiff(tmp_path, compression, array):
 @pytest.mark.parametrize(
     ("name", "data"),
     [
-        ("a.pfm", b""),
+        *(("a.pfm", b"Pf\n" + rest) for rest in (b"", b"0 1\n-1\n", b"999999999 999999999\n-1\n")),
+        *(("a.pfm", b"Pf\n2 1\n%s\n" % n + bytes(8)) for n in (b"0", b"1e999", b"+-e")),
+        *(("a.pfm", b"Pf\n2 1\n-1\n" + bytes(size)) for size in (7, 9)),
         ("a.pfm", b"PF\n2 1\n-1\n" + bytes(24)),
-        ("a.pfm", b"Pf\n2 1\n0\n" + bytes(8)),
-        ("a.pfm", b"Pf\n2 1\n1e999\n" + bytes(8)),
-        ("a.pfm", b"Pf\n2 1\n+-e\n" + bytes(8)),
-        ("a.pfm", b"Pf\n0 1\n-1\n"),
-        ("a.pfm", b"Pf\n2 1\n-1\n" + bytes(7)),
-        ("a.pfm", b"Pf\n2 1\n-1\n" + bytes(9)),
-        ("a.pfm", b"Pf\n999999999 999999999\n-1\n"),
-        ("a.bin", b""),
-        ("a.bin", b"2&1&" + bytes(8)),
+        *(
+            ("a.bin", b"2&1&%s" % rest)
+            for rest in (b"" + bytes(8), b"1&" + bytes(4), b"1&" + bytes(12))
+        ),
         ("a.bin", b"2&1&3&" + bytes(24)),  # a normal map
-        ("a.bin", b"0&1&1&"),
-        ("a.bin", b"2&1&1&" + bytes(4)),
-        ("a.bin", b"2&1&1&" + bytes(12)),
-        ("a.bin", b"100000&100000&1&" + bytes(12)),
-        ("a.png", b""),
-        ("a.tiff", b"no picture"),
-        ("a.npz", b"PK\x03\x04"),
+        *(("a.bin", data) for data in (b"", b"0&1&1&", b"100000&100000&1&" + bytes(12))),
+        *(("a.png", b""), ("a.tiff", b"no picture"), ("a.npz", b"PK\x03\x04")),
     ],
 )
 def test_bad_files_are_named(tmp_path, name, data):
@@ -158,6 +149,20 @@ def test_colour_pictures_are_no_depth(tmp_path, mode):
     PilImage.new(mode, (4, 3)).save(path)
     with pytest.raises(SceneFormatError, match=f"a picture of mode {mode}"):
         read_stored(path)
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_missing_files_and_packages(tmp_path, suffix, monkeypatch):
+    with pytest.raises(SceneNotFoundError, match="gone"):
+        read_stored(tmp_path / f"gone{suffix}")
+    (tmp_path / f"folder{suffix}").mkdir()
+    with pytest.raises(SceneFormatError, match="readable file"):
+        read_stored(tmp_path / f"folder{suffix}")
+    if suffix == ".exr":
+        monkeypatch.setattr(requirements, "find_spec", lambda _: None)
+        (tmp_path / "a.exr").touch()
+        with pytest.raises(MissingDependencyError, match=r"pip install .*'OpenEXR>=3.3'"):
+            read_stored(tmp_path / "a.exr")
 
 
 def write_exr(path, channels, **header):
@@ -190,19 +195,3 @@ def test_exr_that_holds_no_whole_depth(tmp_path, rng):
             path.write_bytes(data)
         with pytest.raises(SceneFormatError, match=r"a\.exr to be a depth map"):
             read_stored(path)
-
-
-def test_exr_without_its_package(tmp_path, monkeypatch):
-    monkeypatch.setattr(requirements, "find_spec", lambda _: None)
-    (tmp_path / "a.exr").touch()
-    with pytest.raises(MissingDependencyError, match=r"pip install .*'OpenEXR>=3.3'"):
-        read_stored(tmp_path / "a.exr")
-
-
-@pytest.mark.parametrize("suffix", SUFFIXES)
-def test_missing_file(tmp_path, suffix):
-    with pytest.raises(SceneNotFoundError, match="gone"):
-        read_stored(tmp_path / f"gone{suffix}")
-    (tmp_path / f"folder{suffix}").mkdir()
-    with pytest.raises(SceneFormatError, match="readable file"):
-        read_stored(tmp_path / f"folder{suffix}")

@@ -69,25 +69,14 @@ def test_every_format_beside_the_image(tmp_path, suffix):
     put(tmp_path / f"left/a{suffix}", 3)
     depths = find_depths(scene_of("left/a.jpg"), tmp_path, scale=2)
     read = depths.read("left/a.jpg")
-    assert isinstance(read, DepthMap)
-    assert read.kind == "z"
-    assert read.values.dtype == np.float32
+    assert (type(read), read.kind, read.values.dtype) == (DepthMap, "z", np.float32)
     np.testing.assert_array_equal(read.values, np.full((3, 4), 1.5))
 
 
 ORDER = [
-    "x/b.jpg.npy",
-    "x/b.jpg.npz",
-    "x/b.jpg.png",
-    "x/b.jpg.geometric.bin",
-    "x/b.jpg.photometric.bin",
-    "x/b.npy",
-    "x/b.exr",
-    "x/b.pfm",
-    "x/b.tiff",
-    "x/b.png",
-    "x/b_depth.npy",
-    "x/b_depth.png",
+    *("x/b.jpg.npy", "x/b.jpg.npz", "x/b.jpg.png", "x/b.jpg.geometric.bin"),
+    *("x/b.jpg.photometric.bin", "x/b.npy", "x/b.exr", "x/b.pfm", "x/b.tiff", "x/b.png"),
+    *("x/b_depth.npy", "x/b_depth.png"),
 ]
 
 
@@ -102,52 +91,47 @@ def test_the_first_of_several_candidates_is_taken(tmp_path):
         find_depths(scene, tmp_path)
 
 
-def test_images_without_a_map_are_not_there(tmp_path):
-    for name in ("c", "a", "stranger"):
-        put(tmp_path / f"{name}.npy")
-    depths = find_depths(scene_of("d.jpg", "c.jpg", "b.jpg", "a.jpg"), tmp_path)
-    assert list(depths) == ["a.jpg", "c.jpg"]
-    assert len(depths) == 2
-    assert "a.jpg" in depths
-    assert "b.jpg" not in depths
-    assert None not in depths
-    with pytest.raises(SceneNotFoundError, match=r"a depth map of b\.jpg"):
-        depths.read("b.jpg")
+@pytest.mark.parametrize(
+    ("files", "names", "found"),
+    [
+        (["c.npy", "a.npy", "stranger.npy"], ["d.jpg", "c.jpg", "a.jpg"], ["a.npy", "c.npy"]),
+        (["images/a_depth.png", "images/a.png"], ["a.png"], ["images/a_depth.png"]),
+        (["left/1.npy", "right/1.npy"], ["x/left/1.jpg", "x/right/1.jpg"], None),
+        (["frame-3.depth.png", "frame-3.color.png"], ["frame-3.color.png"], ["frame-3.depth.png"]),
+        (["1.npy", "left/1.npy"], ["left/1.jpg", "right/1.jpg"], ["left/1.npy"]),
+        (["1.npy"], ["left/1.jpg", "right/1.jpg"], SceneFormatError),
+        *((["a.npy", "x/y/other.npy"], [name], []) for name in ("../a.jpg", "/a.jpg")),
+    ],
+)
+def test_which_files_belong_to_which_images(tmp_path, files, names, found):
+    """Not photographs in their own folder, nor what lies out of it; folders may be missing."""
+    paths = [put(tmp_path / name) for name in files]
+    inside = tmp_path / {"images/a.png": "images", "x/y/other.npy": "x/y"}.get(files[-1], "")
+    scene = scene_of(*names, image_dir=inside)
+    if found == []:
+        with pytest.raises(SceneNotFoundError):
+            find_depths(scene, inside)
+    elif found is SceneFormatError:
+        with pytest.raises(SceneFormatError, match=r"1\.npy for left/1\.jpg and for right/1\.jpg"):
+            find_depths(scene, inside)
+    else:
+        depths = find_depths(scene, inside)
+        expected = paths if found is None else [tmp_path / name for name in found]
+        assert [depths.paths[name] for name in depths] == expected
+        assert len(depths) == len(expected)
 
 
-def test_photographs_are_not_their_own_depth(tmp_path):
-    put(tmp_path / "images/a.png")
-    put(tmp_path / "images/b.png")
-    put(tmp_path / "images/a_depth.png")
-    depths = find_depths(
-        scene_of("a.png", "b.png", image_dir=tmp_path / "images"), tmp_path / "images"
-    )
-    assert depths.paths == {"a.png": tmp_path / "images/a_depth.png"}
-
-
-def test_leading_folders_may_be_missing(tmp_path):
-    put(tmp_path / "left/1.npy")
-    put(tmp_path / "right/1.npy", 2)
-    depths = find_depths(scene_of("images/left/1.jpg", "images/right/1.jpg"), tmp_path)
-    assert depths.read("images/right/1.jpg").values[0, 0] == 2
-    assert len(depths) == 2
-
-
-def test_one_map_for_two_images_is_refused(tmp_path):
-    put(tmp_path / "1.npy")
-    with pytest.raises(SceneFormatError, match=r"1\.npy for left/1\.jpg and for right/1\.jpg"):
-        find_depths(scene_of("left/1.jpg", "right/1.jpg"), tmp_path)
-    put(tmp_path / "left/1.npy")
-    assert list(find_depths(scene_of("left/1.jpg", "right/1.jpg"), tmp_path)) == ["left/1.jpg"]
-
-
-@pytest.mark.parametrize("name", ["../a.jpg", "/a.jpg", "../../x/../a.jpg"])
-def test_names_do_not_lead_out_of_the_folder(tmp_path, name):
+def test_images_without_a_map_and_damaged_maps_are_named(tmp_path):
     put(tmp_path / "a.npy")
-    inside = tmp_path / "x" / "y"
-    put(inside / "other.npy")
-    with pytest.raises(SceneNotFoundError):
-        find_depths(scene_of(name), inside)
+    put(tmp_path / "b.npy").write_bytes(b"\x93NUMPY")
+    depths = find_depths(scene_of("a.jpg", "b.jpg", "c.jpg"), tmp_path)
+    assert [name in depths for name in ("a.jpg", "c.jpg", None)] == [True, False, False]
+    with pytest.raises(SceneFormatError, match=r"b\.npy"):
+        depths.read("b.jpg")
+    (tmp_path / "a.npy").unlink()
+    for name, told in (("a.jpg", r"a\.npy"), ("c.jpg", r"a depth map of c\.jpg")):
+        with pytest.raises(SceneNotFoundError, match=told):
+            depths.read(name)
 
 
 @pytest.mark.parametrize("folder", ["", "stereo", "stereo/depth_maps"])
@@ -178,13 +162,6 @@ def test_rgbd_capture_by_the_frames_numbers(tmp_path, name):
     )
 
 
-def test_7scenes_names(tmp_path):
-    put(tmp_path / "frame-000003.depth.png", 1500)
-    (tmp_path / "frame-000003.color.png").touch()
-    scene = scene_of("frame-000003.color.png", image_dir=tmp_path)
-    assert find_depths(scene, tmp_path).read("frame-000003.color.png").values[0, 0] == 1.5
-
-
 def test_description_beside_the_maps(tmp_path):
     put(tmp_path / "depths/a.png", 500)
     (tmp_path / "depths/depths.json").write_text('{"kind": "ray", "scale": 100}')
@@ -199,36 +176,21 @@ def test_description_beside_the_maps(tmp_path):
 @pytest.mark.parametrize(
     "content",
     [
-        b"",
-        b"\xff\xfe{}",
-        b"[1]",
-        b'{"kind": "metric"}',
-        b'{"kind": ["z"]}',
-        b'{"scale": 0}',
-        b'{"scale": -2}',
-        b'{"scale": NaN}',
-        b'{"scale": 1e999}',
-        b'{"scale": true}',
-        b'{"scale": "1"}',
+        *(b"", b"\xff\xfe{}", b"[1]", b"[" * 100_000, b'{"kind": "metric"}', b'{"kind": ["z"]}'),
+        *(b'{"scale": %s}' % n for n in (b"0", b"-2", b"NaN", b"1e999", b"true", b'"1"')),
         b'{"scale": 1' + b"0" * 400 + b"}",
-        b"[" * 100_000,
+        *({"scale": value} for value in (0.0, -1.0, np.nan, np.inf)),
+        {"kind": "metric"},
     ],
 )
-def test_bad_description(tmp_path, content):
+def test_bad_descriptions_and_options_are_named(tmp_path, content):
     put(tmp_path / "a.png")
-    (tmp_path / "depths.json").write_bytes(content)
-    with pytest.raises(SceneFormatError, match=r"depths\.json"):
-        find_depths(scene_of("a.jpg"), tmp_path)
-
-
-@pytest.mark.parametrize(
-    "options",
-    [{"scale": 0.0}, {"scale": -1.0}, {"scale": np.nan}, {"scale": np.inf}, {"kind": "metric"}],
-)
-def test_bad_options(tmp_path, options):
-    put(tmp_path / "a.npy")
-    with pytest.raises(ParameterError, match=r"scale|kind"):
-        find_depths(scene_of("a.jpg"), tmp_path, **options)
+    scene, options = scene_of("a.jpg"), content if isinstance(content, dict) else {}
+    if not options:
+        (tmp_path / "depths.json").write_bytes(content)
+    error, told = (ParameterError, "scale|kind") if options else (SceneFormatError, "depths.json")
+    with pytest.raises(error, match=told):
+        find_depths(scene, tmp_path, **options)
 
 
 def test_where_nothing_is_known(tmp_path):
@@ -255,17 +217,6 @@ def test_integers_count_millimetres_unless_told(tmp_path):
     np.testing.assert_array_equal(depths.read("a.jpg").values, [[np.nan, 1.5, np.nan]])
     np.testing.assert_allclose(depths.read("b.jpg").values, [[np.nan, 0.255, 0.1]])
     np.testing.assert_array_equal(depths.read("c.jpg").values, [[2]])
-
-
-def test_damage_is_told_when_the_map_is_read(tmp_path):
-    put(tmp_path / "a.npy")
-    put(tmp_path / "b.npy").write_bytes(b"\x93NUMPY")
-    depths = find_depths(scene_of("a.jpg", "b.jpg"), tmp_path)
-    with pytest.raises(SceneFormatError, match=r"b\.npy"):
-        depths.read("b.jpg")
-    (tmp_path / "a.npy").unlink()
-    with pytest.raises(SceneNotFoundError, match=r"a\.npy"):
-        depths.read("a.jpg")
 
 
 def test_many_threads_read_what_one_does(tmp_path, rng):
@@ -357,13 +308,9 @@ def test_a_name_out_of_the_folder_stays_inside(tmp_path):
         writer.write("../images/f.jpg", np.ones((2, 2), np.float32))
         with pytest.raises(OutputError, match="two for"):
             writer.write("/images/f.jpg", np.ones((2, 2), np.float32))
+        for shape in ((3,), (2, 2, 3), (0, 4)):
+            with pytest.raises(SceneFormatError):
+                writer.write("a.jpg", np.ones(shape, np.float32))
     assert [path.name for path in (tmp_path / "a").iterdir()] == ["out"]
-    assert list(find_depths(scene_of("../images/f.jpg"), tmp_path / "a" / "out")) == [
-        "../images/f.jpg"
-    ]
-
-
-@pytest.mark.parametrize("shape", [(3,), (2, 2, 3), (0, 4)])
-def test_only_maps_are_written(tmp_path, shape):
-    with depth_folder(tmp_path / "out", "z") as writer, pytest.raises(SceneFormatError):
-        writer.write("a.jpg", np.ones(shape, np.float32))
+    found = find_depths(scene_of("../images/f.jpg"), tmp_path / "a" / "out")
+    assert list(found) == ["../images/f.jpg"]

@@ -26,6 +26,8 @@ from splatseed.io.photograph import photograph_bytes
 from splatseed.io.staging import read_manifest
 from splatseed.seeding.diagnostics import untrainable
 
+from .checks import little_memory
+
 
 @pytest.fixture
 def odd(tmp_path):
@@ -128,17 +130,15 @@ def _rename(scene_dir, model, name):
     colmap.write_images(scene_dir / "sparse/0/images.bin", images)
 
 
-@pytest.mark.parametrize("name", ["../../x.jpg", "/dev/zero", "/etc/hostname"])
+@pytest.mark.parametrize(
+    "name", ["../../x.jpg", "/dev/zero", "/etc/hostname", "../images/left/image000.jpg"]
+)
 def test_a_name_that_leads_out_of_the_scene_is_told(scene_dir, model, name):
     _rename(scene_dir, model, name)
-    (told,) = [each for each in load_scene(scene_dir).warnings if "outside of" in each]
-    assert f"1 of {len(model.images)} images lies outside of {scene_dir}" in told
-    assert name in told
-
-
-def test_names_inside_are_not_told(scene_dir, model):
-    _rename(scene_dir, model, "../images/left/image000.jpg")
-    assert not [each for each in load_scene(scene_dir).warnings if "outside of" in each]
+    told = [each for each in load_scene(scene_dir).warnings if "outside of" in each]
+    inside = "left" in name
+    assert len(told) == (not inside)
+    assert inside or name in told[0]
 
 
 @pytest.mark.parametrize("target", ["/dev/zero", "../images"])
@@ -164,20 +164,12 @@ def _archive(path: Path, shape, name="depth"):
             file.write(bytes(4 * shape[1]))
 
 
-def test_an_archive_that_would_burst_is_refused_by_its_header(tmp_path, little_memory):
+def test_an_archive_that_would_burst_is_refused_by_its_header(tmp_path):
     _archive(tmp_path / "bomb.npz", (6000, 6000))
     assert (tmp_path / "bomb.npz").stat().st_size < 200_000
-    with (
-        little_memory(),
-        pytest.raises(SceneFormatError, match=r"bytes that would become 144,000,"),
-    ):
+    with little_memory(), pytest.raises(SceneFormatError, match=r"would become 144,000,"):
         read_stored(tmp_path / "bomb.npz")
-
-
-def test_a_map_of_one_value_and_other_arrays_are_fine(tmp_path, little_memory):
-    _archive(tmp_path / "flat.npz", (480, 640))
-    assert read_stored(tmp_path / "flat.npz").values.shape == (480, 640)
-    _archive(tmp_path / "more.npz", (48, 64))
+    _archive(tmp_path / "more.npz", (48, 64))  # of one value
     with zipfile.ZipFile(tmp_path / "more.npz", "a", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("normals.npy", bytes(1 << 25))  # never looked at
     with little_memory(1 << 20):

@@ -18,6 +18,8 @@ from splatseed.io.ply import write_ply
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import LeftOut
 
+from .checks import assert_same_points
+
 
 def rewrite_points(scene_dir, xyz):
     rgb = np.zeros((len(xyz), 3), np.uint8)
@@ -36,7 +38,7 @@ def test_import_stays_fast():
 
 
 @pytest.mark.parametrize("place", ["sparse/0", "sparse", "colmap/sparse/0", "."])
-def test_model_is_found_in_its_usual_places(scene_dir, model, place, assert_same_points):
+def test_model_is_found_in_its_usual_places(scene_dir, model, place):
     moved = scene_dir.with_name("moved")
     shutil.copytree(scene_dir / "sparse/0", moved / place)
     shutil.copytree(scene_dir / "images", moved / "images")
@@ -90,119 +92,93 @@ def test_sparse_goes_before_transforms_json_and_that_before_nerfstudios_colmap(s
     assert load_scene(scene_dir).source.format == "colmap"
 
 
-def test_model_of_points_alone_keeps_cameras_and_drops_tracks(scene_dir, model):
-    (scene_dir / "sparse/0/images.bin").unlink()
+def test_model_without_images_keeps_cameras_and_drops_tracks(scene_dir, model):
+    folder = scene_dir / "sparse/0"
+    (folder / "images.bin").write_bytes(bytes(8))
+    assert f"{folder / 'images.bin'} lists no images" in warnings_of(scene_dir)
+    (folder / "images.bin").unlink()
     scene = load_scene(scene_dir)
-    assert scene.images == ()
-    assert scene.intrinsics == model.intrinsics
-    assert scene.tracks is None
+    assert (scene.images, scene.tracks, scene.intrinsics) == ((), None, model.intrinsics)
     np.testing.assert_array_equal(scene.points.xyz, model.points.xyz)
-    said = " ".join(scene.warnings)
-    assert (
-        f"{scene_dir / 'sparse/0'} has no images.bin or images.txt, so no photograph has a pose"
-        in said
-    )
-
-
-def test_a_model_that_lists_no_images_says_which_file_does_not(scene_dir):
-    (scene_dir / "sparse/0/images.bin").write_bytes(bytes(8))
-    assert f"{scene_dir / 'sparse/0/images.bin'} lists no images" in warnings_of(scene_dir)
+    assert f"{folder} has no images.bin or images.txt" in " ".join(scene.warnings)
     shutil.rmtree(scene_dir / "images")
-    for name in ("images.bin", "cameras.bin", "points3D.bin"):
-        (scene_dir / "sparse/0" / name).unlink()
-    write_ply(
-        scene_dir / "sparse/0/points3D.ply", PointCloud(np.eye(3), np.zeros((3, 3), np.uint8))
-    )
+    write_ply(folder / "points3D.ply", model.points)
+    for name in ("cameras.bin", "points3D.bin"):
+        (folder / name).unlink()
     assert warnings_of(scene_dir) == ""  # a cloud for a trainer, which is to have no poses
-
-
-def test_bare_ply(tmp_path, model):
-    write_ply(tmp_path / "cloud.ply", model.points)
-    scene = load_scene(tmp_path / "cloud.ply")
-    assert scene.source.format == "ply"
-    assert scene.images == ()
+    scene = load_scene(folder / "points3D.ply")
+    assert (scene.source.format, scene.images) == ("ply", ())
     np.testing.assert_array_equal(scene.points.xyz, model.points.xyz)
 
 
-def test_missing_photographs_are_counted_and_the_first_is_named(scene_dir, model):
-    (scene_dir / "images" / model.images[1].name).unlink()
-    (scene_dir / "images" / model.images[3].name).unlink()
+@pytest.mark.parametrize(
+    ("other", "told"),
+    [
+        (str.upper, "names must be equal to the letter"),
+        (lambda name: f"{name}.jpeg", "1 of 4 images is missing"),
+        (None, "1 of 4 images is missing"),
+    ],
+)
+def test_missing_photographs_are_counted_and_the_first_is_named(other, told, scene_dir, model):
+    path = scene_dir / "images" / model.images[1].name
+    if other is None:
+        path.unlink()
+    else:
+        path.rename(path.with_name(other(path.stem) + path.suffix.upper()))
     text = warnings_of(scene_dir)
-    assert "2 of 4 images are missing" in text
-    assert model.images[1].name in text
+    assert f"the first is {model.images[1].name}" in text
+    assert told in text
     shutil.rmtree(scene_dir / "images")
     assert "images folder is missing" in warnings_of(scene_dir)
 
 
-@pytest.mark.parametrize("other", [str.upper, lambda name: f"{name}.jpeg"])
-def test_photographs_named_almost_as_their_images_are_told(other, scene_dir, model):
-    path = scene_dir / "images" / model.images[1].name
-    path.rename(path.with_name(other(path.stem) + path.suffix.upper()))
-    text = warnings_of(scene_dir)
-    assert f"the first is {model.images[1].name}" in text
-    near = other(path.stem) == path.stem.upper()
-    assert ("names must be equal to the letter" in text) == near
-
-
-def test_photographs_of_another_size_and_broken_ones_are_told(scene_dir, model):
+def test_photographs_of_another_size_broken_ones_and_those_in_the_root(scene_dir, model):
     path = scene_dir / "images" / model.images[0].name
     PilImage.new("RGB", (64, 48)).save(path)
     assert "64 x 48" in warnings_of(scene_dir)
     path.write_bytes(b"no picture")
     assert "cannot be read" in warnings_of(scene_dir)
+    (scene_dir / "images/left").rename(scene_dir / "left")
+    assert load_scene(scene_dir).source.image_dir == scene_dir
 
 
-def test_duplicates_and_nonfinite_points_are_left_out_and_counted(scene_dir):
+def test_points_that_cannot_be_used_are_left_out_or_told(scene_dir, rng):
     rewrite_points(scene_dir, [[0, 0, 0], [-0.0, 0, 0], [1, 2, 3], [np.nan, 0, 0], [np.inf, 0, 0]])
     scene = load_scene(scene_dir)
     assert (len(scene.points), scene.left_out) == (2, LeftOut(2, 1))
     text = " ".join(scene.warnings)
     assert "2 points are not finite" in text
     assert "1 point repeats" in text
-
-
-def test_coordinates_beyond_float32s_resolution_are_told(scene_dir, rng):
     room = rng.uniform(-5, 5, (100, 3))
-    rewrite_points(scene_dir, room + np.array([500_000, 5_000_000, 100]))
-    assert "recentre" in warnings_of(scene_dir)
-    rewrite_points(scene_dir, 1000 * room + np.array([5000, 0, 0]))
-    assert "recentre" not in warnings_of(scene_dir)
+    for xyz, told in (
+        (room + np.array([500_000, 5_000_000, 100]), "recentre"),
+        (1000 * room + np.array([5000, 0, 0]), None),
+        (np.concatenate([room, [[1e6] * 3]]), "1 point lies up to 1e+06 from the middle"),
+        (
+            np.concatenate([np.tile(room, (9, 1)) + 1e-3 * rng.random((900, 3)), [[300.0] * 3]]),
+            None,
+        ),
+    ):
+        rewrite_points(scene_dir, xyz)
+        text = warnings_of(scene_dir)
+        found = [
+            each
+            for each in ("recentre", "1 point lies up to 1e+06 from the middle")
+            if each in text
+        ]
+        assert found == ([told] if told else [])
 
 
-def test_scene_without_points_is_an_error_unless_allowed(scene_dir):
+def test_scene_without_points_is_an_error_unless_allowed(scene_dir, scenes):
     rewrite_points(scene_dir, np.empty((0, 3)))
     with pytest.raises(SceneNotFoundError, match="sfm IMAGES --poses-from"):
         load_scene(scene_dir)
     (scene_dir / "sparse/0/points3D.bin").unlink()
-    with pytest.raises(SceneNotFoundError, match="sfm IMAGES --poses-from"):
-        load_scene(scene_dir)
-    scene = load_scene(scene_dir, require_points=False)
-    assert len(scene.points) == 0
-    assert len(scene.images) == 4
-
-
-def test_rgbd_capture_gives_poses(scenes):
-    scene = load_scene(scenes / "replica/room0", require_points=False)
-    assert len(scene.images) == 20
-    with pytest.raises(SceneNotFoundError, match="--poses-from"):
-        load_scene(scenes / "replica/room0")
-
-
-def test_real_captures_have_what_their_info_says(scenes):
-    for name in ("fern", "fox", "treehill"):
-        scene = load_scene(scenes / name)
-        info = json.loads((scenes / name / "info.json").read_text())
-        assert len(scene.images) == info["reg"]
-        assert len(scene.points) + sum(scene.left_out) == info["pts"]
-        assert not any("missing" in text for text in scene.warnings)
-
-
-def test_images_without_their_own_folder_are_found_in_the_root(scene_dir, model):
-    for image in model.images:
-        target = scene_dir / image.name
-        target.parent.mkdir(exist_ok=True)
-        (scene_dir / "images" / image.name).rename(target)
-    assert load_scene(scene_dir).source.image_dir == scene_dir
+    for path, num_images in ((scene_dir, 4), (scenes / "replica/room0", 20)):
+        with pytest.raises(SceneNotFoundError, match="sfm IMAGES --poses-from"):
+            load_scene(path)
+        scene = load_scene(path, require_points=False)
+        assert (len(scene.points), len(scene.images)) == (0, num_images)
 
 
 def test_system_errors_become_ours(scene_dir, model):

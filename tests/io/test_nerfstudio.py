@@ -27,15 +27,7 @@ LEGACY = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]])
 
 def opengl_pose(image, applied):
     square = np.vstack([applied, [0, 0, 0, 1]])
-    return square @ image.camera.world_from_cam @ FLIP
-
-
-def nerfstudio_camera(meta, frame):
-    """The frame's camera by nerfstudio's conventions, in OpenCV axes."""
-    values = {**meta, **frame}
-    K = np.array([[values["fl_x"], 0, values["cx"]], [0, values["fl_y"], values["cy"]], [0, 0, 1]])
-    world_from_cam = np.array(frame["transform_matrix"]) @ FLIP
-    return Camera(K, values["w"], values["h"], np.linalg.inv(world_from_cam))
+    return (square @ image.camera.world_from_cam @ FLIP).tolist()
 
 
 def write_json(path, content):
@@ -48,35 +40,32 @@ def write_json(path, content):
 def content(model):
     """A valid file with all there can be."""
     frames = [
-        {"file_path": f"images/{im.name}", "transform_matrix": opengl_pose(im, APPLIED).tolist()}
+        {"file_path": f"images/{im.name}", "transform_matrix": opengl_pose(im, APPLIED)}
         for im in model.images
     ]
     lens = {"fl_x": 500.0, "fl_y": 510.0, "cx": 320.0, "cy": 240.0, "w": 640, "h": 480, "k1": 0.1}
     return {**lens, "applied_transform": APPLIED.tolist(), "frames": frames, "aabb_scale": 16}
 
 
-@pytest.fixture
-def in_front(scene_dir, rng):
-    """The scene with a cloud before its first camera."""
+def test_cloud_lands_on_the_same_pixels_through_nerfstudios_cameras(scene_dir, rng, tmp_path):
     scene = load_scene(scene_dir)
-    camera = scene.images[0].camera
-    uv = rng.uniform((0, 0), (camera.width, camera.height), (200, 2))
-    xyz = camera.unproject(uv, rng.uniform(2, 6, 200))
-    return scene.replace(points=PointCloud(xyz, np.zeros((200, 3), np.uint8)))
-
-
-def test_cloud_lands_on_the_same_pixels_through_nerfstudios_cameras(in_front, tmp_path):
-    write_scene(in_front, tmp_path / "out", format="transforms")
+    first = scene.images[0].camera
+    uv = rng.uniform((0, 0), (first.width, first.height), (200, 2))
+    xyz = first.unproject(uv, rng.uniform(2, 6, 200))
+    scene = scene.replace(points=PointCloud(xyz, np.zeros((200, 3), np.uint8)))
+    write_scene(scene, tmp_path / "out", format="transforms")
     meta = json.loads((tmp_path / "out/transforms.json").read_text())
     cloud = read_ply(tmp_path / "out" / meta["ply_file_path"])
-    assert len(cloud) == 200
-    for image, frame in zip(in_front.images, meta["frames"], strict=True):
-        expected_uv, expected_depth = image.camera.project(in_front.points.xyz)
-        uv, depth = nerfstudio_camera(meta, frame).project(cloud.xyz)
+    for image, frame in zip(scene.images, meta["frames"], strict=True):
+        expected_uv, expected_depth = image.camera.project(scene.points.xyz)
+        values = {**meta, **frame}
+        K = [[values["fl_x"], 0, values["cx"]], [0, values["fl_y"], values["cy"]], [0, 0, 1]]
+        cam_from_world = np.linalg.inv(np.array(frame["transform_matrix"]) @ FLIP)
+        theirs = Camera(np.array(K), values["w"], values["h"], cam_from_world)
+        uv, depth = theirs.project(cloud.xyz)
         np.testing.assert_allclose(depth, expected_depth, rtol=1e-5, atol=1e-5)
         seen = expected_depth > 0.1
         np.testing.assert_allclose(uv[seen], expected_uv[seen], atol=1e-2)
-    assert np.isfinite(expected_uv).any()
 
 
 def test_from_colmap_to_transforms_and_back_is_the_same_scene(scene_dir, tmp_path):
@@ -88,9 +77,8 @@ def test_from_colmap_to_transforms_and_back_is_the_same_scene(scene_dir, tmp_pat
     assert there.intrinsics[1].params == scene.intrinsics[1].params
     write_scene(there, tmp_path / "b", format="colmap")
     back = load_scene(tmp_path / "b")
-    assert [im.name for im in back.images] == [im.name for im in scene.images]
-    assert [im.image_id for im in back.images] == [im.image_id for im in scene.images]
     for ours, theirs in zip(back.images, scene.images, strict=True):
+        assert (ours.name, ours.image_id) == (theirs.name, theirs.image_id)
         uv, _ = ours.camera.project(back.points.xyz)
         expected, depth = theirs.camera.project(scene.points.xyz)
         np.testing.assert_allclose(uv[depth > 0.2], expected[depth > 0.2], rtol=1e-4, atol=1e-2)
@@ -115,11 +103,10 @@ def test_content_that_was_read_is_kept(content, scene_dir, tmp_path):
 
 
 def test_paths_out_of_the_folder_still_resolve(content, scene_dir, tmp_path):
-    folder = scene_dir / "poses"
     for frame in content["frames"]:
         frame["file_path"] = f"../{frame['file_path']}"
-    path = write_json(folder / "transforms.json", content)
-    write_ply(folder / "sparse_pc.ply", load_scene(scene_dir).points)
+    path = write_json(scene_dir / "poses/transforms.json", content)
+    write_ply(scene_dir / "poses/sparse_pc.ply", load_scene(scene_dir).points)
     write_scene(load_scene(path), tmp_path / "out")
     frames = json.loads((tmp_path / "out/transforms.json").read_text())["frames"]
     assert all((tmp_path / "out" / frame["file_path"]).is_file() for frame in frames)
@@ -132,9 +119,11 @@ def test_named_ply_is_taken_as_it_is_and_colmaps_points_are_brought_over(content
     loaded = load_scene(path)
     np.testing.assert_array_equal(loaded.points.xyz, expected)
     for ours, theirs in zip(loaded.images, scene.images, strict=True):
-        _, depth = ours.camera.project(loaded.points.xyz)
-        _, expected_depth = theirs.camera.project(scene.points.xyz)
-        np.testing.assert_allclose(depth, expected_depth, atol=1e-5)
+        depths = (
+            ours.camera.project(loaded.points.xyz)[1],
+            theirs.camera.project(scene.points.xyz)[1],
+        )
+        np.testing.assert_allclose(*depths, atol=1e-5)
     write_ply(scene_dir / "given.ply", scene.points)
     write_json(path, content | {"ply_file_path": "given.ply"})
     np.testing.assert_array_equal(load_scene(path).points.xyz, scene.points.xyz)
@@ -148,10 +137,9 @@ def test_named_ply_is_taken_as_it_is_and_colmaps_points_are_brought_over(content
 def test_cameras_tell_how_colmaps_points_are_brought_over(content, scene_dir, model, transform):
     del content["applied_transform"]
     for frame, image in zip(content["frames"], model.images, strict=True):
-        frame["transform_matrix"] = opengl_pose(image, transform).tolist()
+        frame["transform_matrix"] = opengl_pose(image, transform)
     points = load_scene(write_json(scene_dir / "transforms.json", content)).points
-    expected = model.tracks.xyz @ transform[:, :3].T
-    np.testing.assert_allclose(points.xyz, expected, rtol=1e-6)
+    np.testing.assert_allclose(points.xyz, model.tracks.xyz @ transform[:, :3].T, rtol=1e-6)
 
 
 def test_instant_ngps_recentred_poses_are_fitted(content, scene_dir, model, rng):
@@ -183,41 +171,29 @@ def test_colmap_points_of_another_world_are_refused(content, scene_dir, rng):
     assert any("askew" in text for text in load_scene(path).warnings)
 
 
-def test_instant_ngp_without_extension_size_or_focal_length(tmp_path):
-    (tmp_path / "images").mkdir()
-    PilImage.new("RGB", (64, 48)).save(tmp_path / "images/0001.png")
-    frame = {"file_path": "./images/0001", "transform_matrix": np.eye(4).tolist()}
-    path = write_json(tmp_path / "transforms.json", {"camera_angle_x": 1.2, "frames": [frame]})
-    scene = load_scene(path, require_points=False)
-    image = scene.images[0]
-    assert image.name == "0001.png"
-    assert scene.source.image_dir == tmp_path / "images"
-    focal_length = 32 / math.tan(0.6)
-    assert image.intrinsics == Intrinsics(
-        1, "PINHOLE", 64, 48, (focal_length, focal_length, 32.0, 24.0)
-    )
-    np.testing.assert_allclose(rotation_from_quat(image.quat), np.diag([1, -1, -1]), atol=1e-12)
+@pytest.mark.parametrize("folder", ["images/", ""])
+def test_instant_ngp_without_extension_size_or_focal_length(folder, tmp_path, model):
+    root = tmp_path / "scene"
+    (root / folder).mkdir(parents=True)
+    PilImage.new("RGB", (64, 48)).save(root / folder / "0001.png")
+    frame = {"file_path": f"./{folder}0001", "transform_matrix": np.eye(4).tolist()}
+    path = write_json(root / "transforms.json", {"camera_angle_x": 1.2, "frames": [frame]})
     with pytest.raises(SplatseedError, match="--poses-from"):
         load_scene(path)
-    (tmp_path / "images/0001.png").unlink()
-    with pytest.raises(SceneFormatError, match="w and h"):
-        load_scene(path, require_points=False)
-
-
-def test_images_beside_the_file_without_extension_are_linked(tmp_path, model):
-    folder = tmp_path / "scene"
-    folder.mkdir()
-    PilImage.new("RGB", (64, 48)).save(folder / "0001.png")
-    frame = {"file_path": "./0001", "transform_matrix": np.eye(4).tolist()}
-    path = write_json(folder / "transforms.json", {"camera_angle_x": 1.2, "frames": [frame]})
-    write_ply(folder / "sparse_pc.ply", model.points)
+    write_ply(root / "sparse_pc.ply", model.points)
     scene = load_scene(path)
-    assert scene.images[0].name == "0001.png"
+    (image,) = scene.images
+    assert (image.name, scene.source.image_dir) == ("0001.png", root / folder)
+    focal = 32 / math.tan(0.6)
+    assert image.intrinsics == Intrinsics(1, "PINHOLE", 64, 48, (focal, focal, 32.0, 24.0))
+    np.testing.assert_allclose(rotation_from_quat(image.quat), np.diag([1, -1, -1]), atol=1e-12)
     write_scene(scene, tmp_path / "a")
-    assert (tmp_path / "a/0001.png").is_file()
+    assert (tmp_path / f"a/{folder}0001.png").is_file()
     write_scene(scene, tmp_path / "b", format="colmap")
-    assert (tmp_path / "b/images/0001.png").is_file()
     assert [p.name for p in (tmp_path / "b/images").iterdir()] == ["0001.png"]
+    (root / folder / "0001.png").unlink()
+    with pytest.raises(SceneFormatError, match="w and h"):
+        load_scene(path)
 
 
 @pytest.mark.parametrize(
@@ -237,17 +213,13 @@ def test_lens_models(content, tmp_path, lens, name, terms):
     assert (camera.model, camera.params) == (name, (500.0, 510.0, 320.0, 240.0, *terms))
 
 
-def test_frames_may_have_cameras_of_their_own(content, tmp_path):
+def test_frames_may_have_cameras_of_their_own_and_unused_distortion_is_told(content, tmp_path):
     content["frames"][2] |= {"fl_x": 700.0, "w": 800, "k1": 0.0}
-    transforms = read_transforms(write_json(tmp_path / "t.json", content))
+    transforms = read_transforms(write_json(tmp_path / "t.json", content | {"k4": 0.1}))
     assert [im.intrinsics.camera_id for im in transforms.images] == [1, 1, 2, 1]
     camera = transforms.images[2].intrinsics
     assert (camera.model, camera.width, camera.params[:2]) == ("PINHOLE", 800, (700.0, 510.0))
-
-
-def test_unused_distortion_is_told(content, tmp_path):
-    path = write_json(tmp_path / "t.json", content | {"k4": 0.1})
-    assert any("k4 of 4 frames" in text for text in read_transforms(path).warnings)
+    assert any("k4 of 4 frames" in text for text in transforms.warnings)
 
 
 def test_lens_that_nerfstudio_has_not_is_refused(scene_dir, tmp_path):
@@ -282,15 +254,36 @@ def test_any_value_in_any_field_gives_our_errors_alone(content, tmp_path, data):
     assert all(np.isfinite(im.camera.cam_from_world).all() for im in transforms.images)
 
 
-COUNTS = {"train": 5, "val": 2, "test": 3}
+@pytest.mark.parametrize(
+    ("change", "frame"),
+    [
+        *(({"fl_x": value}, {}) for value in (None, -5, 0, float("nan"))),
+        *(({"w": 0}, {}), ({"frames": []}, {}), ({"camera_model": "EQUIRECTANGULAR"}, {})),
+        ({"applied_transform": [[1, 0], [0, 1]]}, {}),
+        *(
+            ({}, {"file_path": value}) for value in (None, "images/left/image000.jpg")
+        ),  # the first's
+        ({}, {"transform_matrix": None}),
+        ({}, {"transform_matrix": (2 * np.eye(4)).tolist()}),
+        ({}, {"transform_matrix": np.diag([1.0, 1, -1, 1]).tolist()}),
+        ({}, {"transform_matrix": np.full((4, 4), np.nan).tolist()}),
+        *((data, None) for data in (b"", b"{", b"[]", b"\xff\xfe{", b"[" * 100_000, b"3")),
+    ],
+)
+def test_malformed_files_and_frames_are_named(content, tmp_path, change, frame):
+    content["frames"][1] |= frame or {}
+    path = tmp_path / "t.json"
+    path.write_bytes(change if frame is None else json.dumps(content | change).encode())
+    with pytest.raises(SceneFormatError, match=r"t\.json, frame 2" if frame else r"t\.json"):
+        read_transforms(path)
 
 
-@pytest.fixture
-def lego(tmp_path, rng):
+@pytest.mark.parametrize("layout", ["auto", "colmap"])
+def test_blenders_files_are_one_scene_and_so_is_its_output(layout, tmp_path, rng):
     """As NeRF's data set has it: paths without suffix, one angle of view, names alike in each
     part."""
-    root = tmp_path / "lego"
-    for part, count in COUNTS.items():
+    root, counts = tmp_path / "lego", {"train": 5, "val": 2, "test": 3}
+    for part, count in counts.items():
         (root / part).mkdir(parents=True)
         frames = []
         for i in range(count):
@@ -298,74 +291,21 @@ def lego(tmp_path, rng):
             pose[:3, 3] = rng.normal(size=3)
             frames.append({"file_path": f"./{part}/r_{i}", "transform_matrix": pose.tolist()})
             PilImage.new("RGBA", (40, 30)).save(root / part / f"r_{i}.png")
-        content = {"camera_angle_x": 0.7, "frames": frames}
-        (root / f"transforms_{part}.json").write_text(json.dumps(content))
-    write_ply(
-        root / "points3d.ply", PointCloud(rng.normal(size=(9, 3)), np.zeros((9, 3), np.uint8))
-    )
-    return root
-
-
-@pytest.mark.parametrize(
-    ("change", "frame"),
-    [
-        ({"frames": []}, {}),
-        ({"fl_x": None}, {}),
-        ({"fl_x": -5}, {}),
-        ({"fl_x": 0}, {}),
-        ({"fl_x": float("nan")}, {}),
-        ({"w": 0}, {}),
-        ({"camera_model": "EQUIRECTANGULAR"}, {}),
-        ({"applied_transform": [[1, 0], [0, 1]]}, {}),
-        ({}, {"file_path": None}),
-        ({}, {"file_path": "images/left/image000.jpg"}),  # the first's
-        ({}, {"transform_matrix": None}),
-        ({}, {"transform_matrix": (2 * np.eye(4)).tolist()}),
-        ({}, {"transform_matrix": np.diag([1.0, 1, -1, 1]).tolist()}),
-        ({}, {"transform_matrix": np.full((4, 4), np.nan).tolist()}),
-    ],
-)
-def test_malformed_files_and_frames_are_named(content, tmp_path, change, frame):
-    content["frames"][1] |= frame
-    path = write_json(tmp_path / "t.json", content | change)
-    with pytest.raises(SceneFormatError, match=r"t\.json, frame 2" if frame else r"t\.json"):
-        read_transforms(path)
-
-
-@pytest.mark.parametrize("data", [b"", b"{", b"[]", b"\xff\xfe{", b"[" * 100_000, b"3"])
-def test_what_is_not_json_is_one_error(tmp_path, data):
-    (tmp_path / "t.json").write_bytes(data)
-    with pytest.raises(SceneFormatError, match=r"t\.json"):
-        read_transforms(tmp_path / "t.json")
-
-
-def _parts(scene):
-    return [[image.name for image in part] for part in scene.split(8)]
-
-
-def test_both_files_are_one_scene_with_their_split(lego):
-    scene = load_scene(lego)
-    wanted = [[f"{part}/r_{i}.png" for i in range(COUNTS[part])] for part in ("train", "test")]
-    assert _parts(scene) == wanted
-    assert len({image.image_id for image in scene.images}) == 8
-    assert len(scene.intrinsics) == 1
-    assert len(scene.points) == 9
-    assert scene.has_photographs
+        write_json(root / f"transforms_{part}.json", {"camera_angle_x": 0.7, "frames": frames})
+    points = PointCloud(rng.normal(size=(9, 3)), np.zeros((9, 3), np.uint8))
+    write_ply(root / "points3d.ply", points)
+    scene = load_scene(root)
+    again = load_scene(write_scene(scene, tmp_path / "out", format=layout).path)
+    wanted = [[f"{part}/r_{i}.png" for i in range(counts[part])] for part in ("train", "test")]
+    pixels = []
+    for each in (scene, again):
+        assert [[image.name for image in part] for part in each.split(8)] == wanted
+        assert len({image.image_id for image in each.images}) == 8
+        assert (len(each.intrinsics), len(each.points)) == (1, 9)
+        assert each.has_photographs
+        ordered = sorted(each.images, key=lambda image: image.name)
+        seen = [im.camera.project(each.points.xyz.astype(np.float64))[0] for im in ordered]
+        pixels.append(np.nan_to_num(np.stack(seen)))
+    np.testing.assert_allclose(*pixels, rtol=1e-3, atol=1e-2)
     assert not [each for each in scene.warnings if "missing" in each or "outside" in each]
     assert "transforms_train.json" in scene.listed.sentence
-
-
-@pytest.mark.parametrize("layout", ["auto", "colmap"])
-def test_an_output_has_the_same_split_and_cameras(layout, lego, tmp_path):
-    scene = load_scene(lego)
-    again = load_scene(write_scene(scene, tmp_path / "out", format=layout).path)
-    assert _parts(again) == _parts(scene)
-    assert again.has_photographs
-    pixels = {}
-    for each in (scene, again):
-        seen = [
-            im.camera.project(each.points.xyz.astype(np.float64))[0]
-            for im in sorted(each.images, key=lambda image: image.name)
-        ]
-        pixels[id(each)] = np.nan_to_num(np.stack(seen))
-    np.testing.assert_allclose(*pixels.values(), rtol=1e-3, atol=1e-2)

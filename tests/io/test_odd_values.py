@@ -7,7 +7,7 @@ import pytest
 
 from splatseed.depth.alignment import align_map
 from splatseed.depthmap import DepthMap
-from splatseed.io.cleaning import clean_scene, cloud_warnings
+from splatseed.io.cleaning import clean_scene
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
 from splatseed.upsample import upsample
@@ -29,16 +29,6 @@ def _cloud(rng, *far):
     xyz = rng.normal(size=(500, 3)).astype(np.float32)
     xyz[: len(far)] = np.reshape(far, (-1, 1))
     return PointCloud(xyz, np.zeros((500, 3), np.uint8))
-
-
-def test_one_point_far_out_is_not_the_coordinates_fault(rng):
-    (told,) = cloud_warnings(_cloud(rng, 1e6))
-    assert told.startswith("1 point lies up to 1e+06 from the middle of the others")
-    (told,) = cloud_warnings(_cloud(rng, 1e6, -2e6))
-    assert told.startswith("2 points lie up to 2e+06")
-    told = cloud_warnings(PointCloud(_cloud(rng).xyz + 1e6, np.zeros((500, 3), np.uint8)))
-    assert "recentre" in told[-1]
-    assert cloud_warnings(_cloud(rng, 300.0)) == ()
 
 
 @pytest.mark.parametrize("method", ["mls", "linear", "spline", "voronoi", "triangle"])

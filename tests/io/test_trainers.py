@@ -67,21 +67,15 @@ def images_of(folder):
     return records(folder / "images.bin", "<I7dI", tail)
 
 
-def test_graphdeco_ply_has_the_fields_it_reads(colmap_out):
-    lines, body = ply_parts(colmap_out / "sparse/0/points3D.ply")
-    names = [line.split()[2] for line in lines if line.startswith("property")]
-    assert {"x", "y", "z", "nx", "ny", "nz", "red", "green", "blue"} <= set(names)
-    rows = np.frombuffer(body, [(name, "u1" if len(name) > 2 else "<f4") for name in names])
-    normals = np.stack([rows["nx"], rows["ny"], rows["nz"]])
-    assert not normals.any()
-
-
-def test_graphdeco_ply_shadows_no_other_cloud(colmap_out):
+def test_graphdeco_reads_a_ply_of_all_points_without_normals(colmap_out):
     _, body = ply_parts(colmap_out / "sparse/0/points3D.ply")
     rows = np.frombuffer(body, [("xyz", "<f4", 3), ("normal", "<f4", 3), ("rgb", "u1", 3)])
+    assert not rows["normal"].any()
     heads = [head for head, _ in points_of(colmap_out / "sparse/0")[0]]
     np.testing.assert_array_equal(rows["xyz"], np.array([h[1:4] for h in heads], np.float32))
     np.testing.assert_array_equal(rows["rgb"], [h[4:7] for h in heads])
+    assert np.isfinite(rows["xyz"]).all()
+    assert len(np.unique(rows["xyz"], axis=0)) == len(rows) == 40
 
 
 def test_graphdeco_depth_scales_index_an_array_by_point_id(colmap_out):
@@ -113,12 +107,6 @@ def test_gsplat_and_pycolmap_open_it_with_unique_ids(colmap_out, scene):
     assert {im.name for im in reconstruction.images.values()} == {im.name for im in scene.images}
 
 
-def test_points_are_finite_and_apart(colmap_out):
-    xyz = np.array([head[1:4] for head, _ in points_of(colmap_out / "sparse/0")[0]], np.float32)
-    assert np.isfinite(xyz).all()
-    assert len(np.unique(xyz, axis=0)) == len(xyz) == 40
-
-
 def test_nerfstudio_ply_is_in_the_space_of_the_poses_with_byte_colours(nerfstudio_out, scene):
     meta = json.loads((nerfstudio_out / "transforms.json").read_text())
     lines, body = ply_parts(nerfstudio_out / meta["ply_file_path"])
@@ -135,11 +123,17 @@ def test_nerfstudio_ply_is_in_the_space_of_the_poses_with_byte_colours(nerfstudi
         assert {"fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "p1", "p2"} <= set(values)
 
 
-def test_brush_finds_no_ply_that_overrides_the_points(colmap_out, nerfstudio_out):
-    assert list(colmap_out.glob("*.ply")) == []
-    assert [p.name for p in colmap_out.rglob("*.ply")] == ["points3D.ply"]
-    clouds = {path.read_bytes() for path in nerfstudio_out.glob("*.ply")}
-    assert len(clouds) == 1  # whichever it takes
+def test_each_finds_one_format_and_one_cloud(colmap_out, nerfstudio_out):
+    """Brush loads any PLY in the root; OpenSplat takes one format; LichtFeld has its own name."""
+    assert not (colmap_out / "transforms.json").exists()
+    assert not (nerfstudio_out / "sparse").exists()
+    assert [path.parent.name for path in colmap_out.rglob("*.ply")] == ["0"]
+    names = {path.name: path.read_bytes() for path in nerfstudio_out.glob("*.ply")}
+    assert names.keys() == {"sparse_pc.ply", "pointcloud.ply"}
+    assert len(set(names.values())) == 1  # whichever it takes
+    meta = json.loads((nerfstudio_out / "transforms.json").read_text())
+    assert meta["camera_model"]  # OpenSplat throws without, even where frames have their own
+    assert meta["ply_file_path"] in names
 
 
 def test_opensplat_ply_has_contiguous_columns_and_nothing_else(colmap_out):
@@ -154,14 +148,6 @@ def test_opensplat_ply_has_contiguous_columns_and_nothing_else(colmap_out):
     assert len(body) == 40 * (6 * 4 + 3)
 
 
-def test_opensplat_reads_one_format_not_both(colmap_out, nerfstudio_out):
-    assert not (colmap_out / "transforms.json").exists()
-    assert not (nerfstudio_out / "sparse").exists()
-    meta = json.loads((nerfstudio_out / "transforms.json").read_text())
-    assert meta["camera_model"]  # it throws without, even where frames have their own
-    assert (nerfstudio_out / meta["ply_file_path"]).is_file()
-
-
 def test_lichtfeld_finds_no_trailing_bytes(colmap_out):
     folder = colmap_out / "sparse/0"
     assert points_of(folder)[1] == 0
@@ -171,8 +157,3 @@ def test_lichtfeld_finds_no_trailing_bytes(colmap_out):
         folder / "cameras.bin", "<IiQQ", lambda head, *_: 8 * num_params[head[1]]
     )
     assert (len(cameras), rest) == (2, 0)
-
-
-def test_lichtfeld_finds_its_sibling_ply(nerfstudio_out):
-    ply = (nerfstudio_out / "pointcloud.ply").read_bytes()
-    assert ply == (nerfstudio_out / "sparse_pc.ply").read_bytes()

@@ -173,7 +173,7 @@ def read_npy(file: IO[bytes], most: float = np.inf) -> np.ndarray:
     shape, turned, dtype = read_npy_header(file)
     size = math.prod(shape) * dtype.itemsize
     if dtype.hasobject or min(shape, default=0) < 0 or size > most:
-        raise ValueError(f"{shape} values of {dtype}")
+        raise ValueError(f"{shape} values of {dtype} in {most:,.0f} bytes")
     data = file.read(size + 1)
     if len(data) != size:
         raise ValueError(f"{len(data)} bytes for {shape} values of {dtype}")

@@ -1,13 +1,16 @@
-"""Clouds of every format, written by others, come back as they were written."""
+"""Clouds of every format, written by others, come back as they were written; damaged ones are
+refused in one sentence that names the file."""
 
 from __future__ import annotations
 
+import io
 import struct
 
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
+from splatseed.errors import MissingDependencyError, SceneFormatError, SceneNotFoundError
 from splatseed.io.clouds import open_cloud
 
 NUM = 257
@@ -30,9 +33,8 @@ def whole(path, size=100):
 def check(path, xyz, rgb, tolerance=1e-9):
     got_xyz, got_rgb = whole(path)
     np.testing.assert_allclose(got_xyz, xyz, atol=tolerance, rtol=0)
-    if rgb is None:
-        assert got_rgb is None
-    else:
+    assert (got_rgb is None) == (rgb is None)
+    if rgb is not None:
         np.testing.assert_array_equal(got_rgb, rgb)
 
 
@@ -49,19 +51,16 @@ def test_las_of_a_national_grid_in_8_and_16_bits(tmp_path, points, suffix, facto
     path = tmp_path / f"scan.{suffix}"
     las.write(path)
     check(path, xyz, rgb, 1e-6)
-    cloud = open_cloud(path)
-    assert (cloud.count, cloud.colors) == (NUM, "rgb")
-    np.testing.assert_allclose(cloud.bounds, [xyz.min(axis=0), xyz.max(axis=0)], atol=1e-6)
-
-
-def test_las_points_that_are_withheld_are_left_out(tmp_path, points):
-    laspy = pytest.importorskip("laspy")
-    las = laspy.LasData(laspy.LasHeader(point_format=3, version="1.2"))
-    las.x, las.y, las.z = points[0].T
+    assert (open_cloud(path).count, open_cloud(path).colors) == (NUM, "rgb")
+    las.red, las.green, las.blue, las.intensity = np.zeros((4, NUM), np.uint16)
+    las.intensity[:] = np.arange(NUM) * 9
     las.withheld = np.arange(NUM) % 2
-    path = tmp_path / "scan.las"
     las.write(path)
-    assert len(whole(path)[0]) == (NUM + 1) // 2
+    assert open_cloud(path).colors == "intensity"
+    kept, grey = whole(path)
+    assert len(kept) == (NUM + 1) // 2
+    assert grey[0].tolist() == [0, 0, 0]
+    assert grey[-1].tolist() == [255, 255, 255]
 
 
 def test_e57_scans_stand_where_their_poses_say(tmp_path, points):
@@ -87,64 +86,35 @@ def test_ply_and_glb_of_trimesh(tmp_path, points):
     for name, options in (("b.ply", {}), ("a.ply", {"encoding": "ascii"}), ("c.glb", {})):
         cloud.export(tmp_path / name, **options)
         check(tmp_path / name, xyz, rgb, 1e-6)
-
-
-def test_glb_leaves_out_the_cameras_drawn_beside_points(tmp_path, points):
-    trimesh = pytest.importorskip("trimesh")
-    scene = trimesh.Scene([trimesh.PointCloud(points[0], colors=points[1])])
-    scene.add_geometry(trimesh.creation.box())
+    scene = trimesh.Scene([cloud])
+    scene.add_geometry(trimesh.creation.box())  # as cameras are drawn
     shift = np.eye(4)
     shift[:3, 3] = 5
     scene.apply_transform(shift)
     scene.export(tmp_path / "scene.glb")
-    check(tmp_path / "scene.glb", points[0] + 5, points[1], 1e-5)
+    check(tmp_path / "scene.glb", xyz + 5, rgb, 1e-5)
     assert "meshes are left out" in open_cloud(tmp_path / "scene.glb").warnings[0]
 
 
-def test_ply_properties_in_any_order(tmp_path, points):
-    xyz, rgb = points
-    rows = np.zeros(NUM, [("blue", "u1"), ("z", ">f8"), ("x", ">f8"), ("nx", ">f4"),
-                          ("green", "u1"), ("y", ">f8"), ("red", "u1")])  # fmt: skip
-    for i, axis in enumerate("xyz"):
-        rows[axis] = xyz[:, i]
-    for i, name in enumerate(("red", "green", "blue")):
-        rows[name] = rgb[:, i]
-    kinds = {"u1": "uchar", "f8": "double", "f4": "float"}
-    named = ((name, rows.dtype[name].str[1:]) for name in rows.dtype.names)
-    lines = [f"property {kinds[kind]} {name}" for name, kind in named]
-    head = "\n".join(["ply", "format binary_big_endian 1.0", f"element vertex {NUM}", *lines])
-    (tmp_path / "a.ply").write_bytes(f"{head}\nend_header\n".encode() + rows.tobytes())
-    check(tmp_path / "a.ply", xyz, rgb)
-
-
-def pcd_header(kind, packed):
-    fields = "x y z rgb" if packed else "x y z"
-    count = 4 if packed else 3
+def pcd_header(kind):
     return (
-        f"# .PCD v0.7\nVERSION 0.7\nFIELDS {fields}\nSIZE{' 4' * count}\nTYPE{' F' * count}\n"
-        f"COUNT{' 1' * count}\nWIDTH {NUM}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {NUM}\n"
-        f"DATA {kind}\n"
+        "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\n"
+        f"WIDTH {NUM}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {NUM}\nDATA {kind}\n"
     ).encode()
-
-
-def literal_lzf(data):
-    """LZF without any references."""
-    return b"".join(
-        bytes([len(p) - 1]) + p for p in (data[i : i + 32] for i in range(0, len(data), 32))
-    )
 
 
 def test_pcd_binary_ascii_and_compressed(tmp_path, points):
     xyz, rgb = points[0].astype(np.float32), points[1]
     bits = (rgb.astype(np.uint32) << np.array([16, 8, 0], np.uint32)).sum(axis=1, dtype=np.uint32)
     table = np.column_stack([xyz, bits.view(np.float32)])
-    (tmp_path / "b.pcd").write_bytes(pcd_header("binary", True) + table.tobytes())
+    (tmp_path / "b.pcd").write_bytes(pcd_header("binary") + table.tobytes())
     text = "\n".join(" ".join(repr(float(v)) for v in row) for row in table)
-    (tmp_path / "a.pcd").write_bytes(pcd_header("ascii", True) + text.encode())
+    (tmp_path / "a.pcd").write_bytes(pcd_header("ascii") + text.encode())
     data = table.T.tobytes()
-    packed = literal_lzf(data)
+    parts = (data[i : i + 32] for i in range(0, len(data), 32))
+    packed = b"".join(bytes([len(p) - 1]) + p for p in parts)  # LZF without references
     sizes = struct.pack("<II", len(packed), len(data))
-    (tmp_path / "c.pcd").write_bytes(pcd_header("binary_compressed", True) + sizes + packed)
+    (tmp_path / "c.pcd").write_bytes(pcd_header("binary_compressed") + sizes + packed)
     for name in ("a", "b", "c"):
         check(tmp_path / f"{name}.pcd", xyz, rgb, 1e-6)
 
@@ -176,31 +146,22 @@ def test_lzf_references(block, expected):
         ("a.xyz", None, " ", True),
         ("a.asc", None, "\t", True),
         ("b.csv", "Easting;Northing;Height", ";", False),
+        ("c.csv", "x;y;z", ";", False),  # with decimal commas
+        ("a.pts", str(NUM), " ", True),  # intensity stands before colours
     ],
 )
 def test_text_of_several_writers(tmp_path, points, name, header, delimiter, colors):
     xyz, rgb = points
-    columns = np.column_stack([xyz, rgb]) if colors else xyz
+    table = np.column_stack([xyz, rgb]) if colors else xyz
     formats = ["%.3f"] * 3 + ["%d"] * (3 * colors)
+    if name == "a.pts":
+        table, formats = np.insert(table, 3, -900, axis=1), [*formats, "%d"]
     path = tmp_path / name
-    np.savetxt(path, columns, formats, delimiter, header=header or "", comments="")
+    np.savetxt(path, table, formats, delimiter, header=header or "", comments="")
+    if name == "c.csv":
+        path.write_text(path.read_text().replace(".", ","))
     check(path, xyz, rgb if colors else None)
-    assert bool(open_cloud(path).warnings) == (header is None)
-
-
-def test_decimal_commas(tmp_path, points):
-    path = tmp_path / "a.csv"
-    rows = [";".join(f"{value:.3f}".replace(".", ",") for value in row) for row in points[0]]
-    path.write_text("x;y;z\n" + "\n".join(rows))
-    check(path, points[0], None)
-
-
-def test_pts_has_its_count_first_and_intensity_before_colours(tmp_path, points):
-    xyz, rgb = points
-    path = tmp_path / "a.pts"
-    table = np.column_stack([xyz, np.full(NUM, -900), rgb])
-    np.savetxt(path, table, ["%.3f"] * 3 + ["%d"] * 4, header=str(NUM), comments="")
-    check(path, xyz, rgb)
+    assert bool(open_cloud(path).warnings) == (header is None or name == "a.pts")
 
 
 def test_normals_are_not_taken_for_colours(tmp_path, points):
@@ -217,16 +178,15 @@ def test_point_maps_of_networks(tmp_path, rng):
     confidence = np.full((2, 5, 7), 3.0)
     confidence[1, 2] = 1.0
     planar = np.moveaxis(rgb, -1, 1) / np.float32(255)
-    np.savez(tmp_path / "v.npz", world_points=xyz, images=planar, world_points_conf=confidence)
     kept = confidence.ravel() > 1
-    check(tmp_path / "v.npz", xyz.reshape(-1, 3)[kept], rgb.reshape(-1, 3)[kept], 1e-6)
+    expected = xyz.reshape(-1, 3)[kept], rgb.reshape(-1, 3)[kept], 1e-6
+    np.savez(tmp_path / "v.npz", world_points=xyz, images=planar, world_points_conf=confidence)
+    check(tmp_path / "v.npz", *expected)
     np.savez_compressed(tmp_path / "d.npz", pts3d=xyz, imgs=rgb / 255.0, mask=confidence > 1)
-    check(tmp_path / "d.npz", xyz.reshape(-1, 3)[kept], rgb.reshape(-1, 3)[kept], 1e-6)
-
-
-def test_an_array_stored_column_by_column(tmp_path, points):
-    np.savez(tmp_path / "f.npz", xyz=np.asfortranarray(points[0]), rgb=np.asfortranarray(points[1]))
-    check(tmp_path / "f.npz", *points)
+    check(tmp_path / "d.npz", *expected)
+    by_columns = {"xyz": np.asfortranarray(xyz), "rgb": np.asfortranarray(rgb)}
+    np.savez(tmp_path / "f.npz", **by_columns)
+    check(tmp_path / "f.npz", xyz.reshape(-1, 3), rgb.reshape(-1, 3), 1e-6)
 
 
 @settings(max_examples=20, deadline=None)
@@ -240,7 +200,67 @@ def test_chunks_of_any_size_hold_the_same(tmp_path_factory, size, name):
         elif name == "a.xyz":
             np.savetxt(path, xyz, "%.9g")
         else:
-            head = "ply\nformat binary_little_endian 1.0\nelement vertex 199\nproperty float x\n"
-            rest = "property float y\nproperty float z\nend_header\n"
-            path.write_bytes((head + rest).encode() + xyz.tobytes())
+            path.write_bytes(PLY.format("binary_little_endian", 199).encode() + xyz.tobytes())
     np.testing.assert_array_equal(whole(path, size)[0].astype(np.float32), xyz)
+
+
+def archive(**arrays):
+    file = io.BytesIO()
+    np.savez(file, **arrays)
+    return file.getvalue()
+
+
+PLY = (
+    "ply\nformat {} 1.0\nelement vertex {}\nproperty float x\nproperty float y\n"
+    "property float z\nend_header\n"
+)
+ROWS = "1 2 3\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "found"),
+    [
+        ("a.ply", PLY.format("binary_little_endian", 3).encode() + bytes(35), "cut short"),
+        ("a.ply", (PLY.format("ascii", 3) + ROWS).encode(), "found 1"),
+        ("a.e57", b"no scan" * 1000, ""),
+        ("a.xyz", (70000 * ROWS + "1 two 3").encode(), "row 70,001 of .*'1 two 3'"),
+        *(("a.txt", data, "") for data in (b"", b"hello\nworld\n", b"1 2\n3 4\n")),
+        ("a.npz", archive(depth=np.zeros((3, 4))), "depth"),
+        ("a.npz", archive(xyz=np.zeros((3, 3)))[:100], ""),
+        *(("a.glb", data, "") for data in (b"", b"glTF", b"glTF\2\0\0\0" + bytes(60))),
+        ("a.pcd", b"", ""),
+        ("a.pcd", pcd_header("binary"), "cut short"),
+        ("a.jpg", b"", ""),
+    ],
+)
+def test_bad_files_are_named(tmp_path, name, data, found):
+    if name == "a.e57":
+        pytest.importorskip("pye57")
+    path = tmp_path / name
+    path.write_bytes(data)
+    with pytest.raises(SceneFormatError, match=found or None) as caught:
+        whole(path)
+    assert name in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert path.exists()  # pye57 removes what it cannot open
+
+
+@pytest.mark.parametrize("keep", [0.2, 0.98])
+def test_laz_that_is_cut_short(tmp_path, rng, keep):
+    laspy = pytest.importorskip("laspy")
+    las = laspy.LasData(laspy.LasHeader(point_format=3, version="1.2"))
+    las.x, las.y, las.z = rng.normal(size=(3, 60000))
+    path = tmp_path / "scan.laz"
+    las.write(path)
+    path.write_bytes(path.read_bytes()[: int(keep * path.stat().st_size)])
+    with pytest.raises(SceneFormatError, match="complete LAS or LAZ file"):
+        whole(path, 1000)
+
+
+def test_a_missing_file_and_a_missing_package_are_named(tmp_path, monkeypatch):
+    with pytest.raises(SceneNotFoundError, match=r"none\.las"):
+        open_cloud(tmp_path / "none.las")
+    monkeypatch.setattr("splatseed.requirements.find_spec", lambda _: None)
+    (tmp_path / "a.laz").write_bytes(b"LASF")
+    with pytest.raises(MissingDependencyError, match=r"pip install .*'laspy"):
+        open_cloud(tmp_path / "a.laz")

@@ -1,0 +1,53 @@
+"""What several tests of the formats check."""
+
+from __future__ import annotations
+
+import tracemalloc
+from contextlib import contextmanager
+
+import numpy as np
+
+from splatseed.errors import SplatseedError
+
+
+@contextmanager
+def little_memory(limit=16 << 20):
+    """Fails if what runs in it allocates as a lying header would have it."""
+    tracemalloc.start()
+    try:
+        yield
+        assert tracemalloc.get_traced_memory()[1] < limit
+    finally:
+        tracemalloc.stop()
+
+
+def assert_only_our_errors(read, target, data, limit=16 << 20):
+    """Whatever bytes a file has, it is read or one of our own errors names it."""
+    target.write_bytes(data)
+    with little_memory(limit):
+        try:
+            read(target)
+        except SplatseedError as error:
+            assert str(target) in str(error)  # noqa: PT017  (no error is as good as ours)
+
+
+def assert_same_images(actual, expected):
+    keys = [(im.name, im.image_id, im.intrinsics) for im in expected]
+    assert [(im.name, im.image_id, im.intrinsics) for im in actual] == keys
+    for a, b in zip(actual, expected, strict=True):
+        np.testing.assert_array_equal(a.quat, b.quat)
+        np.testing.assert_array_equal(a.translation, b.translation)
+        np.testing.assert_array_equal(a.observations.xy, b.observations.xy)
+        np.testing.assert_array_equal(a.observations.point_ids, b.observations.point_ids)
+        assert a.observations.point_ids.dtype == np.int64
+
+
+def assert_same_points(actual, expected):
+    (points, tracks), (expected_points, expected_tracks) = actual, expected
+    np.testing.assert_array_equal(points.xyz, expected_points.xyz)
+    np.testing.assert_array_equal(points.rgb, expected_points.rgb)
+    types = {"image_ids": np.uint32, "point2d_idx": np.uint32, "point_ids": np.int64}
+    types |= {"offsets": np.int64, "xyz": np.float64, "errors": np.float64}
+    for name, dtype in types.items():
+        assert getattr(tracks, name).dtype == dtype, name
+        np.testing.assert_array_equal(getattr(tracks, name), getattr(expected_tracks, name))
