@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -99,22 +98,11 @@ def test_pixels_lie_on_the_surface_where_colmap_places_them(factor, capture, wor
         assert np.quantile(away, 0.95) < PIXEL * factor
         np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1, atol=1e-5)
         assert (np.einsum("ij,ij->i", normal, xyz - image.camera.center) < 0).all()
-
-
-@pytest.mark.parametrize("factor", [1, 4])
-def test_depth_at_pixel_centres_is_read_back(factor, capture, maps, workspaces):
-    scene = load_scene(workspaces[factor])
-    depths = find_depths(scene, workspaces[factor])
-    for truth in maps[factor][:3]:
-        image = next(image for image in scene.images if image.name == truth.name)
-        stored = depths.read(truth.name)
-        camera = stored.camera(image.camera)
+        stored = find_depths(scene, workspaces[factor]).read(image.name)  # at pixel centres
         rows, columns = np.nonzero(np.isfinite(stored.values))
         uv = np.stack([columns, rows], axis=1) + 0.5
-        xyz = camera.unproject(uv, stored.values[rows, columns])
+        xyz = stored.camera(image.camera).unproject(uv, stored.values[rows, columns])
         assert np.quantile(np.abs(capture.surfaces.distance(xyz)), FLAT) < ON_SURFACE
-        both = np.isfinite(stored.values) & np.isfinite(truth.depth)
-        np.testing.assert_allclose(stored.values[both], truth.depth[both], rtol=0.2)
 
 
 def test_graphs_name_images_by_their_place_in_the_model(maps, workspaces):
@@ -255,23 +243,6 @@ def test_scenes_that_cannot_be_fused_are_refused(maps, room, tmp_path):
 
 def _with_first(scene, **changes):
     return scene.replace(images=(replace(scene.images[0], **changes), *scene.images[1:]))
-
-
-def test_only_an_earlier_workspace_is_replaced(maps, room, tmp_path):
-    some = maps[4][:2]
-    path = tmp_path / "w"
-    write_dense_workspace(room, some, path, provenance={"command": "depth"})
-    assert json.loads((path / "splatseed.json").read_text())["command"] == "depth"
-    assert (path / "images").is_symlink()
-    with pytest.raises(OutputError, match="overwrite"):
-        write_dense_workspace(room, some, path)
-    write_dense_workspace(room, some, path, overwrite=True, copy_images=True)
-    assert not (path / "images").is_symlink()
-    (path / "fused.ply").write_text("COLMAP's, and the user's")
-    with pytest.raises(OutputError, match=r"fused\.ply"):
-        write_dense_workspace(room, some, path, overwrite=True)
-    with pytest.raises(OutputError, match="apart"):
-        write_dense_workspace(room, some, room.source.root / "dense")
 
 
 @settings(max_examples=60, deadline=None)

@@ -101,22 +101,6 @@ def scene_of_files(scene_dir):
     return scene.replace(images=scene.images[1:])
 
 
-@pytest.mark.parametrize("frame", ["../apart.jpg", "/dev/zero"])
-def test_an_image_outside_leaves_room_for_outputs_and_is_told(frame, scene_dir, tmp_path):
-    path = write_scene(load_scene(scene_dir), tmp_path / "json", format="transforms").path
-    (tmp_path / "apart.jpg").write_bytes((scene_dir / "images/left/image000.jpg").read_bytes())
-    content = json.loads((path / "transforms.json").read_text())
-    content["frames"][0]["file_path"] = frame
-    (path / "transforms.json").write_text(json.dumps(content))
-    scene = load_scene(path)
-    (told,) = [each for each in scene.warnings if "outside of" in each]
-    assert frame.rpartition("/")[2] in told
-    write_scene(scene, tmp_path / "out")
-    for taken in (path, path / "out"):
-        with pytest.raises(OutputError, match="an output folder apart from the input"):
-            write_scene(scene, taken)
-
-
 def test_a_file_larger_than_the_memory_is_not_read(tmp_path, monkeypatch):
     (tmp_path / "file").write_bytes(b"12345")
     assert read_file(tmp_path / "file") == b"12345"

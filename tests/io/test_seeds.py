@@ -11,7 +11,7 @@ from hypothesis.extra import numpy as hnp
 
 from splatseed import load_scene, upsample, write_scene
 from splatseed.errors import SceneNotFoundError
-from splatseed.io import colmap, load_originals
+from splatseed.io import load_originals
 from splatseed.io.seeds import SEEDS, _read_seeds, saw_all_photographs, was_upsampled, write_seeds
 from splatseed.pointcloud import ATTRIBUTES, GENERATED, PointCloud
 from splatseed.progress import silent
@@ -86,23 +86,14 @@ def test_a_scene_keeps_what_is_known_of_its_seeds(scene, tmp_path_factory, cloud
         assert all(np.isnan(values).all() for values in expected.attributes.values())
     assert_same(again.points, expected)
     assert (SEEDS in report.files) == (folder / "a" / SEEDS).exists()
+    first_new = len(scene.points)
+    assert again.tracks is None or len(again.tracks) == first_new
+    assert len(again.points.originals) == first_new + np.count_nonzero(
+        expected.source[first_new:] == 0
+    )
     write_scene(again, folder / "b", format=layout)
     if (folder / "a" / SEEDS).exists():
         assert (folder / "b" / SEEDS).read_bytes() == (folder / "a" / SEEDS).read_bytes()
-
-
-def test_a_file_of_other_points_is_left_aside_and_told_of(scene, tmp_path):
-    seeds = scene.points.replace(sizes=np.ones(len(scene.points)))
-    out = write_scene(scene.replace(points=seeds), tmp_path / "out").path
-    model = out / "sparse/0/points3D.bin"
-    points, tracks = colmap.read_points3d(model)
-    colmap.write_points3d(model, points.replace(rgb=255 - points.rgb), tracks)
-    assert load_scene(out).points.sizes is not None  # another colour, the same place
-    other = points.select(slice(None, None, -1))
-    colmap.write_points3d(model, other, None)
-    again = load_scene(out)
-    assert again.points.sizes is None
-    assert [w for w in again.warnings if SEEDS in w and "other points" in w]
 
 
 LYING = b"\x93NUMPY\x01\x00v\x00" + (
@@ -137,6 +128,9 @@ def test_damaged_files_are_left_aside_and_told_of(tmp_path, how):
     known, (told,) = _read_seeds(tmp_path, cloud.replace(sizes=None))
     assert known == {}
     assert f"{SEEDS} was ignored" in told
+    write_seeds(tmp_path, cloud)
+    assert "other points" in _read_seeds(tmp_path, PointCloud(2 * cloud.xyz, cloud.rgb))[1][0]
+    assert _read_seeds(tmp_path, PointCloud(cloud.xyz, 255 - cloud.rgb))[0].keys() == {"sizes"}
 
 
 @settings(deadline=None, max_examples=60)
@@ -151,21 +145,6 @@ def test_damage_anywhere_never_escapes(tmp_path_factory, data):
     (folder / SEEDS).write_bytes(content[: data.draw(st.integers(0, len(content)))])
     sizes = _read_seeds(folder, cloud.replace(sizes=None))[0].get("sizes")
     assert sizes is None or np.array_equal(sizes, np.ones(3))  # a checksum guards each array
-
-
-@pytest.mark.parametrize("layout", ["colmap", "transforms"])
-def test_an_output_knows_its_originals(scene, tmp_path, layout):
-    seeds = upsample(scene, "mls", ratio=4)
-    write_scene(scene.replace(points=seeds), tmp_path / "out", format=layout)
-    again = load_scene(tmp_path / "out")
-    n = len(scene.points)
-    assert np.array_equal(again.points.source, seeds.source)
-    assert not any("upsampling again" in warning for warning in again.warnings)
-    assert again.tracks is None or len(again.tracks) == n
-    more = upsample(again, "linear", ratio=2)
-    assert len(more) == 2 * n
-    write_scene(again.replace(points=more), tmp_path / "more")
-    assert len(load_scene(tmp_path / "more").points.originals) == n
 
 
 @pytest.mark.parametrize("known", [True, False])

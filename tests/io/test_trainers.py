@@ -88,25 +88,6 @@ def test_graphdeco_depth_scales_index_an_array_by_point_id(colmap_out):
         assert (features["id"] < len(table)).all()
 
 
-def test_gsplat_knows_every_image_of_every_track(colmap_out):
-    names = {head[0] for head, _ in images_of(colmap_out / "sparse/0")[0]}
-    tracks = [tail for _, tail in points_of(colmap_out / "sparse/0")[0]]
-    elements = np.frombuffer(b"".join(tracks), "<u4").reshape(-1, 2)
-    assert len(elements) == 40
-    assert set(elements[:, 0].tolist()) <= names
-
-
-def test_gsplat_and_pycolmap_open_it_with_unique_ids(colmap_out, scene):
-    pycolmap = pytest.importorskip("pycolmap")
-    reconstruction = pycolmap.Reconstruction(str(colmap_out / "sparse/0"))
-    assert sorted(reconstruction.points3D) == list(range(1, 41))
-    for point_id, point in reconstruction.points3D.items():
-        for element in point.track.elements:
-            feature = reconstruction.images[element.image_id].points2D[element.point2D_idx]
-            assert feature.point3D_id == point_id
-    assert {im.name for im in reconstruction.images.values()} == {im.name for im in scene.images}
-
-
 def test_nerfstudio_ply_is_in_the_space_of_the_poses_with_byte_colours(nerfstudio_out, scene):
     meta = json.loads((nerfstudio_out / "transforms.json").read_text())
     lines, body = ply_parts(nerfstudio_out / meta["ply_file_path"])

@@ -270,7 +270,7 @@ def depth_folder(
     protect: tuple[Path, ...] = (),
     provenance: Mapping[str, object] | None = None,
 ) -> Iterator[DepthWriter]:
-    """A folder of depth maps that appears at ``path`` when the block ends without an error.
+    """A folder of depth maps, to write to, that appears when the block ends without an error.
 
     Args:
         path: Where the maps should be.
@@ -278,9 +278,6 @@ def depth_folder(
         overwrite: Whether a folder that splatseed wrote may be replaced.
         protect: Inputs that the folder must lie apart from.
         provenance: How the maps were made, for ``splatseed.json``.
-
-    Yields:
-        The writer of the maps.
 
     Raises:
         OutputError: ``path`` is taken or protected, or writing failed.

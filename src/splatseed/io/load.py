@@ -47,9 +47,9 @@ def load_scene(path: str | Path, *, require_points: bool = True) -> Scene:
 
     Returns:
         The scene in the world frame of its files, cameras in OpenCV axes. Points are finite and
-        distinct: ``left_out`` counts the points of the files that are not, and ``warnings`` report
-        them. Points that splatseed added before have no tracks; their ``source`` and attributes
-        come from ``seeds.npz``, else ``source`` is 255 (``GENERATED``).
+        distinct: ``left_out`` counts the others. Points that splatseed added before have no tracks;
+        their ``source`` and attributes come from ``seeds.npz``, else ``source`` is 255
+        (``GENERATED``).
 
     Raises:
         SceneNotFoundError: There is no scene, or it has no points.
@@ -73,14 +73,7 @@ def load_scene(path: str | Path, *, require_points: bool = True) -> Scene:
 
 
 def load_originals(path: str | Path, *, require_points: bool = True) -> Scene:
-    """Read a scene without the points that splatseed added to it before.
-
-    Args:
-        path: As for ``load_scene``.
-        require_points: Whether a scene without originals is an error; else its cloud is empty.
-
-    Returns:
-        The scene with its originals alone, and a warning if it had other points.
+    """As ``load_scene``, without the points that splatseed added before, of which a warning tells.
 
     Raises:
         SceneNotFoundError: There is no scene, or it has no originals.
@@ -212,7 +205,7 @@ def _is_run(path: Path) -> SceneNotFoundError:
 def find_depths(
     scene: Scene, path: Path, *, kind: DepthKind | None = None, scale: float | None = None
 ) -> DepthFiles:
-    """The depth maps in a folder that belong to images of a scene.
+    """The depth maps in a folder that belong to images of a scene, read one by one on demand.
 
     Args:
         scene: The scene.
@@ -221,9 +214,6 @@ def find_depths(
         kind: What the values are; None: what the folder or file itself says, else planar z.
         scale: Stored units per scene unit; None: what the folder itself says, else 1000 for
             integers and 1 for floats.
-
-    Returns:
-        The maps, read one by one on demand. An image without a map is not among them.
 
     Raises:
         ParameterError: The kind is unknown, or the scale is not a positive number.

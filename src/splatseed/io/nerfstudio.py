@@ -380,10 +380,9 @@ def similarity_in(path: Path, content: Any, scene: Scene, fix: str) -> Similarit
     except (TypeError, ValueError):
         world = None
     if world is None:
-        raise SceneFormatError(
-            f"{path} to hold a similarity (rotation, shift and one scale; no shear, no mirror): 3 "
-            "or 4 rows of 4 numbers, by themselves or as transform, with a scale beside them",
-            found=repr(rows)[:80],
-            fix=fix,
+        expected = (
+            f"{path} to hold a similarity (rotation, shift and one scale; no shear, no mirror): 3"
+            " or 4 rows of 4 numbers, by themselves or as transform, with a scale beside them"
         )
+        raise SceneFormatError(expected, found=repr(rows)[:80], fix=fix)
     return world

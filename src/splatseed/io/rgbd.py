@@ -16,7 +16,7 @@ times belong together if the times are within 0.02 s, the benchmark's own tolera
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -93,22 +93,16 @@ def load_rgbd(root: Path) -> Scene:
         images.append(Image(frames[i].name, i + 1, intrinsics, quat, translation))
     lost = [frames[i].name for i in np.flatnonzero(~tracked)]
     warnings = _left_out("frame", "a finite pose", lost)
-    scene = _scene(root, track, folder, images, intrinsics, warnings)
+    scene = _scene(track, folder, images, intrinsics, warnings)
     return scene.replace(depths=match_by_name(scene, folder))
 
 
 def _scene(
-    root: Path,
-    track: Path,
-    folder: Path,
-    images: Sequence[Image],
-    intrinsics: Intrinsics,
-    warnings: Iterable[str],
+    track: Path, folder: Path, images: Sequence[Image], lens: Intrinsics, warnings: Sequence[str]
 ) -> Scene:
-    source = SceneSource("rgbd", root, track, image_dir=folder)
-    return Scene(
-        PointCloud.empty(), tuple(images), (intrinsics,), source=source, warnings=tuple(warnings)
-    )
+    source = SceneSource("rgbd", track.parent, track, image_dir=folder)
+    points = PointCloud.empty()
+    return Scene(points, tuple(images), (lens,), source=source, warnings=tuple(warnings))
 
 
 def is_tum(root: Path) -> bool:
@@ -152,7 +146,7 @@ def load_tum(root: Path) -> Scene:
         *_left_out("image", "a file", missing),
         *lens_warnings(images),
     )
-    scene = _scene(root, track, root / folder, images, intrinsics, warnings)
+    scene = _scene(track, root / folder, images, intrinsics, warnings)
     return scene.replace(depths=find_tum_depths(scene, root))
 
 

@@ -55,7 +55,7 @@ _LOG = logging.getLogger(__name__)
 def output_folder(
     path: Path, *, kind: str, overwrite: bool = False, protect: Sequence[Path] = ()
 ) -> Iterator[Path]:
-    """A folder to write into that appears at ``path`` when the block ends without an error.
+    """An empty folder to write into that appears at ``path`` when the block ends without an error.
 
     Missing parents are made. The manifest is completed at the end.
 
@@ -64,9 +64,6 @@ def output_folder(
         kind: What writes it: the verb of the command line, if any.
         overwrite: Whether an earlier output of this kind may be replaced.
         protect: Files and folders that are read: the output may not be, lie inside or contain any.
-
-    Yields:
-        The partial folder, empty.
 
     Raises:
         OutputError: ``path`` is taken or protected, or writing failed.
