@@ -88,8 +88,16 @@ def _fused_points(workspace, image):
 
 
 @pytest.mark.parametrize("factor", [1, 4])
-def test_pixels_lie_on_the_surface_where_colmap_places_them(factor, capture, workspaces):
+def test_pixels_lie_on_the_surface_where_colmap_places_them(factor, capture, maps, workspaces):
     scene = load_scene(workspaces[factor])
+    ids = [image.image_id for image in scene.images]
+    assert ids == sorted(ids)  # COLMAP 3 counts in file order, COLMAP 4 by id
+    truth = maps[factor][2]
+    graph = workspaces[factor] / f"stereo/consistency_graphs/{truth.name}.geometric.bin"
+    body = graph.read_bytes().split(b"&", 3)[3]
+    column, row, num, *rest = np.frombuffer(body, "<i4").tolist()
+    expected = [n for k, n in enumerate(truth.sources) if truth.agreeing[row, column] >> k & 1]
+    assert [scene.images[idx].name for idx in rest[:num]] == expected
     for image in scene.images[:3]:
         xyz, normal = _fused_points(workspaces[factor], image)
         assert len(xyz) > 0.8 * (97 // factor) * (73 // factor)
@@ -103,19 +111,6 @@ def test_pixels_lie_on_the_surface_where_colmap_places_them(factor, capture, wor
         uv = np.stack([columns, rows], axis=1) + 0.5
         xyz = stored.camera(image.camera).unproject(uv, stored.values[rows, columns])
         assert np.quantile(np.abs(capture.surfaces.distance(xyz)), FLAT) < ON_SURFACE
-
-
-def test_graphs_name_images_by_their_place_in_the_model(maps, workspaces):
-    truth = maps[4][2]
-    scene = load_scene(workspaces[4])
-    ids = [image.image_id for image in scene.images]
-    assert ids == sorted(ids)  # COLMAP 3 counts in file order, COLMAP 4 by id
-    path = workspaces[4] / f"stereo/consistency_graphs/{truth.name}.geometric.bin"
-    body = path.read_bytes().split(b"&", 3)[3]
-    column, row, num, *rest = np.frombuffer(body, "<i4").tolist()
-    bits = truth.agreeing[row, column]
-    expected = [name for k, name in enumerate(truth.sources) if bits >> k & 1]
-    assert [scene.images[idx].name for idx in rest[:num]] == expected
 
 
 def test_pycolmap_fuses_it(capture, workspaces, tmp_path):

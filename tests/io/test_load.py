@@ -119,18 +119,16 @@ def test_missing_photographs_are_counted_and_the_first_is_named(other, told, sce
     text = warnings_of(scene_dir)
     assert f"the first is {model.images[1].name}" in text
     assert told in text
-    shutil.rmtree(scene_dir / "images")
-    assert "images folder is missing" in warnings_of(scene_dir)
-
-
-def test_photographs_of_another_size_broken_ones_and_those_in_the_root(scene_dir, model):
-    path = scene_dir / "images" / model.images[0].name
-    PilImage.new("RGB", (64, 48)).save(path)
+    first = scene_dir / "images" / model.images[0].name
+    PilImage.new("RGB", (64, 48)).save(first)
     assert "64 x 48" in warnings_of(scene_dir)
-    path.write_bytes(b"no picture")
+    first.write_bytes(b"no picture")
     assert "cannot be read" in warnings_of(scene_dir)
     (scene_dir / "images/left").rename(scene_dir / "left")
     assert load_scene(scene_dir).source.image_dir == scene_dir
+    shutil.rmtree(scene_dir / "left")
+    (scene_dir / "images").rmdir()
+    assert "images folder is missing" in warnings_of(scene_dir)
 
 
 def test_points_that_cannot_be_used_are_left_out_or_told(scene_dir, rng):

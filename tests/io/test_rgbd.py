@@ -115,26 +115,12 @@ def test_images_without_pose_or_file_are_left_out_and_told(capture):
     (capture / "rgb" / f"{TIMES[1]:.6f}.png").unlink()
     scene = load_tum(capture)
     assert [image.name for image in scene.images] == [f"{TIMES[i]:.6f}.png" for i in (0, 2)]
+    rows = [(f"{t + 0.005:.6f}", f"depth/{t + 0.005:.6f}.png") for t in TIMES]
+    write_list(capture / "depth.txt", [rows[0], (TIMES[2] + 0.0205, rows[2][1])])
+    assert list(load_tum(capture).depths) == [f"{TIMES[0]:.6f}.png"]  # the other is too late
     without_pose, without_file = scene.warnings
     assert f"is left out, the first is rgb/{TIMES[3]:.6f}" in without_pose
     assert "1 image without a file is left out" in without_file
-
-
-def test_depth_too_late_is_none(capture):
-    rows = [(f"{t + 0.005:.6f}", f"depth/{t + 0.005:.6f}.png") for t in TIMES]
-    write_list(capture / "depth.txt", [rows[0], (TIMES[2] + 0.0205, rows[2][1])])
-    scene = load_tum(capture)
-    assert len(scene.images) == 4
-    assert list(scene.depths) == [f"{TIMES[0]:.6f}.png", f"{TIMES[3]:.6f}.png"]
-    for name in ("rgb.txt", "groundtruth.txt"):
-        kept = (capture / name).read_bytes()
-        (capture / name).write_text("# nothing\n")
-        with pytest.raises(SceneNotFoundError, match="with a pose"):
-            load_tum(capture)
-        (capture / name).unlink()
-        with pytest.raises(SceneNotFoundError, match=name):
-            load_tum(capture)
-        (capture / name).write_bytes(kept)
 
 
 DISTORTED = (

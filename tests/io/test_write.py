@@ -176,6 +176,12 @@ def test_scene_without_images_opens_and_says_what_to_do_with_it(scene_dir, tmp_p
     assert len(pycolmap.Reconstruction(str(tmp_path / "from_ply/sparse/0")).points3D) == 10
     with pytest.raises(OutputError, match="needs images"):
         write_scene(bare, tmp_path / "json", format="transforms")
+    with pytest.raises(OutputError, match="colmap or transforms"):
+        write_scene(bare, tmp_path / "json", format="obj")
+    nothing = model.points.replace(xyz=np.full((10, 3), np.nan))
+    with pytest.raises(PointCloudError, match="none of them finite"):
+        write_scene(Scene(nothing), tmp_path / "json")
+    assert not (tmp_path / "json").exists()
 
 
 def test_image_folders_are_linked(scene_dir, tmp_path, monkeypatch):
@@ -237,12 +243,3 @@ def test_an_interrupted_or_full_disk_leaves_nothing(
     with pytest.raises(expected):
         write_scene(scene, tmp_path / "deep/out", format=form)
     assert sorted(tmp_path.rglob("*")) == before
-
-
-def test_no_usable_point_or_unknown_format_is_one_error(tmp_path, model):
-    nothing = model.points.replace(xyz=np.full((10, 3), np.nan))
-    with pytest.raises(PointCloudError, match="none of them finite"):
-        write_scene(Scene(nothing), tmp_path / "out")
-    with pytest.raises(OutputError, match="colmap or transforms"):
-        write_scene(Scene(model.points), tmp_path / "out", format="obj")
-    assert not (tmp_path / "out").exists()

@@ -23,15 +23,9 @@ from jaxtyping import Bool, Float32, Float64, UInt8
 
 from splatseed.camera import Camera, Intrinsics
 from splatseed.errors import OutputError, ParameterError, SceneFormatError
-from splatseed.io import colmap
+from splatseed.io import colmap, photograph
 from splatseed.io.cleaning import clean_scene, renumber
 from splatseed.io.depth_maps import depth_folder, safe_parts
-from splatseed.io.photograph import (
-    decode_photograph,
-    open_photograph,
-    photograph_bytes,
-    photograph_folder,
-)
 from splatseed.io.staging import MANIFEST, output_folder, write_json
 from splatseed.io.write import bring, image_folders
 from splatseed.lens import rays_through
@@ -217,7 +211,7 @@ def check_dense_scene(scene: Scene, *, undistorts: bool = False) -> dict[str, Si
             differs from it in aspect ratio.
         OutputError: An image's name leads out of its folder.
     """
-    folder = photograph_folder(scene)
+    folder = photograph.photograph_folder(scene)
     return {image.name: _size_of(image, folder, undistorts=undistorts) for image in scene.images}
 
 
@@ -242,7 +236,7 @@ def _size_of(image: Image, folder: Path, *, undistorts: bool) -> Size:
         expected = "image names that stay inside their folder"
         raise OutputError(expected, found=repr(image.name), fix="Rename the image.")
     path = folder / image.name
-    size = open_photograph(path, photograph_bytes(path)).size
+    size = photograph.open_photograph(path, photograph.photograph_bytes(path)).size
     if abs(size[0] / size[1] / (lens.width / lens.height) - 1) > _ASPECT_SLACK:
         raise SceneFormatError(
             f"{path} to have the shape of its camera, {lens.width} x {lens.height}",
@@ -414,7 +408,9 @@ def _bring_photographs(
 
         for image in bent[start:stop]:
             path, target = source / image.name, folder / "images" / image.name
-            pixels = np.asarray(decode_photograph(path, photograph_bytes(path)))
+            pixels = np.asarray(
+                photograph.decode_photograph(path, photograph.photograph_bytes(path))
+            )
             height, width = pixels.shape[:2]
             K = scaled_K(image.camera, width, height)
             straight = PilImage.fromarray(undistort(pixels, image.intrinsics, K)[0])

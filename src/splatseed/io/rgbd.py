@@ -24,15 +24,8 @@ from jaxtyping import Bool, Float64, Int64
 
 from splatseed.camera import Intrinsics, rotation_from_quat
 from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.io import depth_maps
 from splatseed.io.colmap import rigid_pose
-from splatseed.io.depth_maps import (
-    CAMERA_FILE,
-    DepthFiles,
-    Undistortion,
-    match_by_name,
-    read_capture_scale,
-    safe_parts,
-)
 from splatseed.io.files import guarded, numbered_lines, open_file, read_json
 from splatseed.io.photograph import lens_warnings
 from splatseed.literal import agreeing, counted
@@ -80,7 +73,7 @@ def load_rgbd(root: Path) -> Scene:
     camera_file = _camera_file(root)
     if camera_file is None:
         raise SceneNotFoundError(
-            f"{CAMERA_FILE} in {root} or the folder above it",
+            f"{depth_maps.CAMERA_FILE} in {root} or the folder above it",
             found="neither",
             fix='Write {"camera": {"w": 9, "h": 9, "fx": 9, "fy": 9, "cx": 9, "cy": 9}}.',
         )
@@ -94,7 +87,7 @@ def load_rgbd(root: Path) -> Scene:
     lost = [frames[i].name for i in np.flatnonzero(~tracked)]
     warnings = _left_out("frame", "a finite pose", lost)
     scene = _scene(track, folder, images, intrinsics, warnings)
-    return scene.replace(depths=match_by_name(scene, folder))
+    return scene.replace(depths=depth_maps.match_by_name(scene, folder))
 
 
 def _scene(
@@ -150,7 +143,7 @@ def load_tum(root: Path) -> Scene:
     return scene.replace(depths=find_tum_depths(scene, root))
 
 
-def find_tum_depths(scene: Scene, root: Path) -> DepthFiles | None:
+def find_tum_depths(scene: Scene, root: Path) -> depth_maps.DepthFiles | None:
     """The maps nearest in time to the images of a scene that was made from a capture; or None.
 
     Images are known by the last part of their paths. Where the capture's lens is distorted and the
@@ -165,13 +158,13 @@ def find_tum_depths(scene: Scene, root: Path) -> DepthFiles | None:
     entries = {PurePosixPath(name).name: i for i, name in enumerate(names) if nearest[i] >= 0}
     paths, originals = dict[str, Path](), dict[str, Path]()
     for image in scene.images:
-        entry = entries.get(safe_parts(image.name)[-1])
+        entry = entries.get(depth_maps.safe_parts(image.name)[-1])
         if entry is not None and (path := root / depth_names[nearest[entry]]).is_file():
             paths[image.name], originals[image.name] = path, root / names[entry]
     if not paths:
         return None
     camera_file = _camera_file(root)
-    scale = read_capture_scale(camera_file) if camera_file else None
+    scale = depth_maps.read_capture_scale(camera_file) if camera_file else None
     posed = {image.name: image.intrinsics for image in scene.images if image.name in paths}
     lens = _tum_camera(root)[0]
     bent = not lens.is_pinhole and all(camera.is_pinhole for camera in posed.values())
@@ -180,8 +173,8 @@ def find_tum_depths(scene: Scene, root: Path) -> DepthFiles | None:
         name, original = next(iter(originals.items()))
         both = (folder / name, original)
         bent = not all(p.is_file() for p in both) or len({p.read_bytes() for p in both}) > 1
-    moved = Undistortion(lens, posed) if bent else None
-    return DepthFiles(paths, "z", scale or _DEPTH_SCALE, moved)
+    moved = depth_maps.Undistortion(lens, posed) if bent else None
+    return depth_maps.DepthFiles(paths, "z", scale or _DEPTH_SCALE, moved)
 
 
 def _tum_camera(root: Path) -> tuple[Intrinsics, tuple[str, ...]]:
@@ -207,7 +200,7 @@ def _tum_camera(root: Path) -> tuple[Intrinsics, tuple[str, ...]]:
 
 
 def _camera_file(root: Path) -> Path | None:
-    paths = (folder / CAMERA_FILE for folder in (root, root.resolve().parent))
+    paths = (folder / depth_maps.CAMERA_FILE for folder in (root, root.resolve().parent))
     return next((path for path in paths if path.is_file()), None)
 
 
@@ -236,7 +229,7 @@ def _check_image(path: Path, intrinsics: Intrinsics) -> None:
         raise SceneFormatError(
             f"{path} to have the size of the capture's camera, {expected[0]}x{expected[1]}",
             found=f"{size[0]}x{size[1]}",
-            fix=f"Write the camera of these images into {CAMERA_FILE}, scaled as they are.",
+            fix=f"Write these images' own camera into {depth_maps.CAMERA_FILE}.",
         )
 
 

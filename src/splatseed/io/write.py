@@ -25,16 +25,10 @@ from jaxtyping import Float32, Float64, UInt8
 
 from splatseed.camera import CAMERA_MODELS, Intrinsics
 from splatseed.errors import OutputError, PointCloudError
-from splatseed.io import colmap
+from splatseed.io import colmap, nerfstudio
 from splatseed.io.cleaning import clean_scene, renumber
 from splatseed.io.colmap import read_model_cameras
 from splatseed.io.files import open_file
-from splatseed.io.nerfstudio import (
-    OPENCV_FROM_OPENGL,
-    Transforms,
-    apply_transform,
-    read_transforms,
-)
 from splatseed.io.ply import ply_header, ply_rows, write_ply
 from splatseed.io.seeds import SEEDS, PositionDigest, write_origins, write_seeds
 from splatseed.io.split import MODEL_LISTS, ROOT_LISTS
@@ -57,12 +51,9 @@ _PATH_KEYS = ("file_path", "mask_path", "depth_file_path")
 _LIST_KEYS = ("train_filenames", "val_filenames", "test_filenames")
 _TERMS = {"OPENCV": ("k1", "k2", "p1", "p2"), "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4")}
 """Nerfstudio's distortion terms, in the order of COLMAP's parameters."""
-_NERFSTUDIO_MODELS = {
-    **dict.fromkeys(("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"), "OPENCV"),
-    **dict.fromkeys(
-        ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"), "OPENCV_FISHEYE"
-    ),
-}
+_PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
+_FISHEYE = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+_MODELS = dict.fromkeys(_PERSPECTIVE, "OPENCV") | dict.fromkeys(_FISHEYE, "OPENCV_FISHEYE")
 _SIBLINGS = tuple(
     f"{kind}{scale}" for kind in ("images", "masks", "depths") for scale in ("", "_2", "_4", "_8")
 )
@@ -320,7 +311,7 @@ def _write_transforms(scene: Scene, folder: Path) -> tuple[list[str], dict[str, 
     source, points = scene.source, scene.points
     if source is not None and source.transforms_path is not None:
         names = {image.name for image in scene.images}
-        content = _kept_json(read_transforms(source.transforms_path), names)
+        content = _kept_json(nerfstudio.read_transforms(source.transforms_path), names)
         found = (frame.get(key) for frame in content["frames"] for key in _PATH_KEYS)
         paths = [each for each in found if isinstance(each, str) and not Path(each).is_absolute()]
         if source.image_dir is not None and source.image_dir.resolve() == source.root.resolve():
@@ -332,7 +323,9 @@ def _write_transforms(scene: Scene, folder: Path) -> tuple[list[str], dict[str, 
         A = None if source and source.format == "transforms" else _NERFSTUDIO_FROM_COLMAP
         content, folders = _new_json(scene, A), image_folders(scene)
         if A is not None:
-            points = points.replace(xyz=apply_transform(A, points.xyz).astype(np.float32))
+            points = points.replace(
+                xyz=nerfstudio.apply_transform(A, points.xyz).astype(np.float32)
+            )
             if points.normals is not None:
                 points = points.replace(normals=points.normals @ A[:, :3].T)
     write_json(folder / "transforms.json", {**content, "ply_file_path": "sparse_pc.ply"})
@@ -353,7 +346,7 @@ def _new_json(scene: Scene, A: Float64[np.ndarray, "3 4"] | None) -> dict[str, A
         shared = {"camera_model": shared.get("camera_model", "OPENCV")}
     frames = []
     for image in scene.images:
-        pose = image.camera.world_from_cam @ OPENCV_FROM_OPENGL
+        pose = image.camera.world_from_cam @ nerfstudio.OPENCV_FROM_OPENGL
         if A is not None:
             pose[:3] = A @ pose
         frames.append(
@@ -375,7 +368,7 @@ def _new_json(scene: Scene, A: Float64[np.ndarray, "3 4"] | None) -> dict[str, A
 
 def _camera_fields(camera: Intrinsics) -> dict[str, Any]:
     """The fields of one camera record, under nerfstudio's names."""
-    model = _NERFSTUDIO_MODELS.get(camera.model)
+    model = _MODELS.get(camera.model)
     if model is None:
         raise OutputError(
             "cameras that transforms.json can express",
@@ -396,7 +389,7 @@ def _camera_fields(camera: Intrinsics) -> dict[str, Any]:
     }
 
 
-def _kept_json(transforms: Transforms, names: Collection[str]) -> dict[str, Any]:
+def _kept_json(transforms: nerfstudio.Transforms, names: Collection[str]) -> dict[str, Any]:
     """The file's content, with only the named images, for use in another folder."""
     root, content = transforms.path.parent, transforms.json
 

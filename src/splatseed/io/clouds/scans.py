@@ -18,16 +18,8 @@ from typing import IO, Any
 
 import numpy as np
 
-from splatseed.io.cloud_file import (
-    RGB,
-    SAMPLE_ROWS,
-    SAMPLES,
-    XYZ,
-    Block,
-    CloudFile,
-    check_size,
-    sample_starts,
-)
+from splatseed.io import cloud_file
+from splatseed.io.cloud_file import RGB, XYZ, Block, CloudFile
 from splatseed.io.files import guarded
 from splatseed.requirements import require
 
@@ -52,9 +44,9 @@ class LasCloud(CloudFile):
             names = set(file.header.point_format.dimension_names)
             there = [name for name in (*RGB, "intensity") if name in names]
             parts = {name: [np.empty(0, np.uint16)] for name in there}
-            for start in sample_starts(self._num_rows):
+            for start in cloud_file.sample_starts(self._num_rows):
                 file.seek(start)
-                points = file.read_points(SAMPLE_ROWS)
+                points = file.read_points(cloud_file.SAMPLE_ROWS)
                 for name in there:
                     parts[name].append(np.asarray(points[name], np.uint16))
         self._known = {name: np.concatenate(each) for name, each in parts.items()}
@@ -103,7 +95,7 @@ def _opened_las(path: Path) -> Iterator[Any]:
                 _check_chunks(path, header)
             else:
                 bodies = header.point_count * header.point_format.size
-                check_size(path, header.offset_to_point_data + bodies)
+                cloud_file.check_size(path, header.offset_to_point_data + bodies)
             yield reader
 
 
@@ -161,7 +153,10 @@ class E57Cloud(CloudFile):
     def _sample(self) -> Block:
         """The beginning of each scan."""
         with _opened_e57(self.path) as (image, headers):
-            heads = [next(_read_scan(image, h, SAMPLES * SAMPLE_ROWS), {}) for h in headers]
+            heads = [
+                next(_read_scan(image, h, cloud_file.SAMPLES * cloud_file.SAMPLE_ROWS), {})
+                for h in headers
+            ]
         none = np.empty(0)
         return {n: np.concatenate([none, *(h.get(n, none) for h in heads)]) for n in self.used}
 
