@@ -45,17 +45,9 @@ def reduced(camera, z, rgb=GRAY):
 def view(camera, z, rgb=GRAY, factor=1.0):
     """A view with every known pixel as a candidate, its map wrong by a factor."""
     z = (z * factor).astype(np.float32)
-    pixel = np.flatnonzero(z > 0)
-    return DepthView(
-        Alignment(1.0, 0.0, 100, 0.05),
-        camera,
-        pixel,
-        z.ravel()[pixel],
-        rgb.reshape(-1, 3)[pixel],
-        np.zeros(len(pixel), bool),
-        exhausted=False,
-        reduced=reduced(camera, z, rgb),
-    )
+    pixel, copy = np.flatnonzero(z > 0), reduced(camera, z, rgb)
+    drawn = (pixel, z.ravel()[pixel], rgb.reshape(-1, 3)[pixel], np.zeros(len(pixel), bool))
+    return DepthView(Alignment(1.0, 0.0, 100, 0.05), camera, *drawn, exhausted=False, reduced=copy)
 
 
 POINTS = np.array(

@@ -84,7 +84,7 @@ def test_true_poses_stay_exactly(room, refined):
     assert refinement.error_before == refinement.error_after < 0.25
 
 
-def test_poses_that_drift_are_refused_by_name(room, refined):
+def test_poses_that_drift_or_are_of_others_are_refused(room, refined):
     given = with_noise(room.images, 0.5, 0.5)
     camera = given[3].camera
     turned = Rotation.from_rotvec([0, np.radians(25), 0]).as_matrix()
@@ -94,9 +94,6 @@ def test_poses_that_drift_are_refused_by_name(room, refined):
     with pytest.raises(ReconstructionError) as caught:
         refined(given)
     assert "1 of 12 such images: view_003.png" in caught.value.found
-
-
-def test_poses_of_other_photographs_are_refused(room, refined):
     true = poses_of(room.images)
     for order in (np.zeros(12, int), np.random.default_rng(0).permutation(12)):
         others = Poses(true.rotations[order], true.centers[order])
@@ -123,21 +120,16 @@ def test_a_scene_has_the_refined_poses_and_one_without_matches_its_own(room, tmp
     assert list(report.seconds) == stages
 
 
-def test_cameras_on_a_line_are_aligned_by_their_rotations():
+@pytest.mark.parametrize("wrong", [False, True], ids=["on a line", "one wrong camera"])
+def test_rotations_count_and_a_wrong_camera_hardly(wrong):
     rng = np.random.default_rng(0)
     centers = np.linspace(0, 4, 9)[:, None] * [1.0, 2.0, 2.0]
+    if wrong:
+        centers = rng.standard_normal((9, 3))
     given = Poses(Rotation.random(9, rng).as_matrix(), centers)
     turn = Rotation.random(1, rng).as_matrix()[0]
     moved = Poses(given.rotations @ turn.T, 2.5 * centers @ turn.T + [3.0, -1.0, 8.0])
-    aligned = align(moved, given)
-    assert turns(aligned, given).max() < 1e-4
-    assert shifts(aligned, given).max() < 1e-5
-
-
-def test_one_wrong_camera_does_not_tilt_the_frame():
-    rng = np.random.default_rng(0)
-    given = Poses(Rotation.random(10, rng).as_matrix(), rng.standard_normal((10, 3)))
-    moved = Poses(given.rotations, given.centers.copy())
-    moved.centers[4] += [5.0, 0.0, 0.0]
-    rest = np.arange(10) != 4
-    assert shifts(align(moved, given), given)[rest].max() < 1e-3
+    moved.centers[4] += [12.0 * wrong, 0.0, 0.0]
+    aligned, rest = align(moved, given), np.arange(9) != 4
+    assert turns(aligned, given).max() < (1e-2 if wrong else 1e-4)
+    assert shifts(aligned, given)[rest].max() < (1e-3 if wrong else 1e-5)

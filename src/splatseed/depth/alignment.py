@@ -55,7 +55,7 @@ class Settings:
 
     align: bool = True
     """Fit the scale (for inverse depth, and shift) of each map to the SfM points."""
-    fit: Literal["robust", "least-squares"] = "robust"
+    fit: Fit = "robust"
     """How to fit: medians and reweighting, or the paper's equation 7 (paper: least-squares)."""
     min_points: int = 20
     """Fewest SfM points that an image must see, else it is left out (paper: 1)."""

@@ -176,7 +176,16 @@ def sample_pixels(
     top, left = (round(0.5 * (1.0 - settings.region) * size) for size in values.shape)
     box = (top, left, values.shape[0] - top, values.shape[1] - left)
     step = -(-max(values.shape) // CELLS)
-    weight = _cell_weights(values.shape, step, points, settings)
+    weight = np.ones([-(-size // step) for size in values.shape])
+    if settings.placement != "uniform" and len(points):
+        weight[:] = np.inf
+        column, row = (points // step).astype(np.int64).T
+        weight[row, column] = 0.0
+        _spread_distance(weight)
+        # The root of a cell's distance to the nearest one with an SfM point. The distance itself
+        # would leave too little for the surroundings of points: compared with held-out frames of
+        # two captures, the root leaves the smallest gaps.
+        weight = np.sqrt(np.maximum(weight, LEAST_DISTANCE))
     cumulative = np.cumsum(weight, dtype=np.float64)
     # Radius and tolerance of the discontinuity test; radius 0 passes all.
     edges = (0, np.inf)
@@ -214,24 +223,6 @@ def sample_pixels(
     _mark_edges(values, rest, *edges, near)
     chosen = np.argsort(near, kind="stable")[: num - len(pixel)]
     return np.concatenate([pixel, rest[chosen]]), np.concatenate([edge, near[chosen]])
-
-
-def _cell_weights(
-    shape: tuple[int, int], step: int, points: Float64[np.ndarray, "M 2"], settings: Settings
-) -> Float64[np.ndarray, "R C"]:
-    """Weight of every cell: the root of its distance to the nearest one with an SfM point, or 1.
-
-    The distance itself would leave too little for the surroundings of points: compared with
-    held-out frames of two captures, the root leaves the smallest gaps.
-    """
-    rows, columns = -(-shape[0] // step), -(-shape[1] // step)
-    if settings.placement == "uniform" or not len(points):
-        return np.ones((rows, columns))
-    distance = np.full((rows, columns), np.inf)
-    column, row = (points // step).astype(np.int64).T
-    distance[row, column] = 0.0
-    _spread_distance(distance)
-    return np.asarray(np.sqrt(np.maximum(distance, LEAST_DISTANCE)))
 
 
 @inline

@@ -280,11 +280,7 @@ def map_images(run: Run, names: Sequence[str]) -> Path:
     """
     models_dir = run.work / "models"
     models_dir.mkdir()
-    registered: list[None] = []  # of the model being built; mapping may begin several
-
-    def restart() -> None:
-        registered[:] = [None, None]
-
+    registered: list[None] = []  # but for those with which a model begins
     models = run.stage(
         "mapping",
         lambda: run.pycolmap.incremental_mapping(
@@ -292,7 +288,6 @@ def map_images(run: Run, names: Sequence[str]) -> Path:
             run.image_dir,
             models_dir,
             _options(run),
-            initial_image_pair_callback=restart,
             next_image_callback=lambda: registered.append(None),
         ),
         lambda: len(registered),

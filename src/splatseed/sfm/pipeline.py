@@ -222,13 +222,7 @@ def refined(scene: Scene, seed: int, progress: Progress = silent) -> tuple[Scene
         ReconstructionError: The poses drifted, or no point could be triangulated.
         MissingDependencyError: pycolmap is absent.
     """
-    folder = scene.source.image_dir if scene.source else None
-    if folder is None:
-        raise errors.SceneNotFoundError(
-            "photographs, at whose features --refine-poses looks",
-            found="no folder with images",
-            fix="Put them beside the model in a folder named images, or leave it out.",
-        )
+    folder = photograph_folder(scene)
     with TemporaryDirectory(prefix="splatseed-refine-") as name:
         report = reconstruct(
             *(folder, Path(name) / "scene", Settings(seed=seed)),
@@ -258,12 +252,10 @@ def with_refined(scene: Scene, found: Scene) -> Scene:
         found: Its points count as originals without tracks.
     """
     posed = {image.name: image for image in found.images}
-    images = []
-    for image in scene.images:
-        pose = posed.get(image.name, image)
-        images.append(replace(image, quat=pose.quat, translation=pose.translation))
+    pairs = [(image, posed.get(image.name, image)) for image in scene.images]
+    images = tuple(replace(i, quat=pose.quat, translation=pose.translation) for i, pose in pairs)
     points = PointCloud(found.points.xyz, found.points.rgb)
-    return scene.replace(images=tuple(images), points=points, tracks=None)
+    return scene.replace(images=images, points=points, tracks=None)
 
 
 @contextmanager

@@ -69,7 +69,7 @@ class Refinement:
         error_after: The same at the scene's poses.
         median_shift: Over the cameras, how far each moved, scene units.
         largest_shift: Likewise.
-        median_turn: Over the cameras, the angle by which each turned, degrees.
+        median_turn: Likewise, the angle by which each turned, degrees.
         largest_turn: Likewise.
     """
 
