@@ -358,18 +358,17 @@ def align_map(
 def trust_units(depth: DepthMap, camera: Camera, points: SeenPoints) -> Alignment:
     """Take a map as being in scene units, checked against the SfM points if there are any."""
     value, z = _values_at(depth, camera, points)
-    plain = Alignment(1.0, 0.0, len(value), np.nan)
+    residual, refused = np.nan, None
     if not np.isfinite(depth.values).any():
-        return replace(plain, rejected=NO_DEPTH)
-    if len(value) < UNIT_POINTS:
-        return plain
-    plain = replace(plain, residual=_residual(depth, value, z, 1.0, 0.0))
-    with np.errstate(divide="ignore"):
-        ratio = float(np.median((1.0 / value if depth.kind == "inverse" else value) / z))
-    # Depth in millimetres, or of another scene, is off by far more.
-    if 1.0 / UNIT_SLACK < ratio < UNIT_SLACK:
-        return plain
-    return replace(plain, rejected=f"its depth is {ratio:.3g} times that of the SfM points")
+        refused = NO_DEPTH
+    elif len(value) >= UNIT_POINTS:
+        residual = _residual(depth, value, z, 1.0, 0.0)
+        with np.errstate(divide="ignore"):
+            ratio = float(np.median((1.0 / value if depth.kind == "inverse" else value) / z))
+        # Depth in millimetres, or of another scene, is off by far more.
+        if not 1.0 / UNIT_SLACK < ratio < UNIT_SLACK:
+            refused = f"its depth is {ratio:.3g} times that of the SfM points"
+    return Alignment(1.0, 0.0, len(value), residual, refused)
 
 
 def _values_at(depth: DepthMap, camera: Camera, points: SeenPoints) -> tuple[Values, Values]:

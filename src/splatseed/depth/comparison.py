@@ -194,20 +194,21 @@ def synchronize_scales(
     """The factor by which to multiply the depth of each view, [V]."""
     residuals = np.array([view.alignment.residual for view in views])
     sigma = np.maximum(np.where(np.isfinite(residuals), residuals, OTHER_SURFACE), LEAST_RESIDUAL)
-    neighbors, g = neighbors[:, :PAIRS], np.zeros(len(views))
+    neighbors = neighbors[:, :PAIRS]
+    # Rows i, j, a, sigma of every pair that overlaps, with the maps multiplied by exp(g).
+    g, pairs = np.zeros(len(views)), np.empty((*neighbors.shape, 4))
+
+    def work(start: int, stop: int) -> None:
+        for i in range(start, stop):
+            samples = views[i].samples(PAIR_SAMPLES, float(np.exp(g[i])))
+            for row, j in zip(pairs[i], neighbors[i].tolist(), strict=True):
+                other = views[j].reduced if j >= 0 else None
+                if other is not None:
+                    row[:2], factor = (i, j), other.factor * np.exp(g[j])
+                    _compare_pair(samples, other.z, factor, other.grid_from_world, row[2:])
+
     for _ in range(ROUNDS):  # again from where the first solution leaves the maps
-        # Rows i, j, a, sigma of every pair that overlaps, with the maps multiplied by exp(g).
-        pairs = np.full((*neighbors.shape, 4), np.nan)
-
-        def work(start: int, stop: int, g=g, pairs=pairs) -> None:  # type: ignore[no-untyped-def]
-            for i in range(start, stop):
-                samples = views[i].samples(PAIR_SAMPLES, float(np.exp(g[i])))
-                for row, j in zip(pairs[i], neighbors[i].tolist(), strict=True):
-                    other = views[j].reduced if j >= 0 else None
-                    if other is not None:
-                        row[:2], factor = (i, j), other.factor * np.exp(g[j])
-                        _compare_pair(samples, other.z, factor, other.grid_from_world, row[2:])
-
+        pairs[:] = np.nan
         in_threads(work, len(views), PIECE, "synchronize scales", progress)
         g = _solve_scales(pairs[np.isfinite(pairs).all(axis=2)], g, sigma)
     return np.asarray(np.exp(g))

@@ -127,8 +127,8 @@ def estimate_depths(
 
 def _sizes(scene: Scene, folder: Path, max_size: int, progress: Progress) -> dict[str, Size]:
     """The size at which the network sees each photograph, by name, in order of names."""
-    lenses = dict(sorted((image.name, image.intrinsics) for image in scene.images))
-    sizes = {}
+    in_order = sorted(scene.images, key=lambda image: image.name)
+    lenses, sizes = {image.name: image.intrinsics for image in in_order}, {}
     with ThreadPoolExecutor() as pool:  # Pillow decodes outside the GIL
         checked = pool.map(lambda name: photograph.check_photograph(folder / name), lenses)
         for (name, lens), (width, height) in zip(lenses.items(), checked, strict=True):
@@ -274,10 +274,10 @@ def _meaning_of(config: Mapping[str, Any], name: str, given: DepthKind | None) -
 
 def _read_config(model: str) -> Any:
     """The configuration of a network for depth, from its folder or from Hugging Face's cache."""
-    from transformers import MODEL_FOR_DEPTH_ESTIMATION_MAPPING, AutoConfig  # noqa: PLC0415  (loads with its use)
+    import transformers  # noqa: PLC0415  (loads with its use)
 
     try:
-        config = AutoConfig.from_pretrained(model, **_LOCAL)
+        config = transformers.AutoConfig.from_pretrained(model, **_LOCAL)
     except Exception as error:  # transformers raises errors of many libraries
         if Path(model).is_dir():
             raise _misfit(model, _one_line(error)) from error
@@ -287,22 +287,19 @@ def _read_config(model: str) -> Any:
             fix="splatseed downloads nothing by itself. "
             + _fetch(model if _ID.fullmatch(model) else _EXAMPLE),
         ) from error
-    if type(config) not in MODEL_FOR_DEPTH_ESTIMATION_MAPPING:
+    if type(config) not in transformers.MODEL_FOR_DEPTH_ESTIMATION_MAPPING:
         raise _misfit(model, f"a network of type {config.model_type}, which is not for depth")
     return config
 
 
 def _load(model: str) -> tuple[Any, Any]:
     """The image processor and the network, from local files only, with all weights."""
-    from transformers import (  # noqa: PLC0415  (seconds to import)
-        AutoImageProcessor,
-        AutoModelForDepthEstimation,
-    )
+    import transformers  # noqa: PLC0415  (seconds to import)
 
     try:
         # Pillow's resizing, with or without torchvision: the same maps on every machine.
-        processor = AutoImageProcessor.from_pretrained(model, backend="pil", **_LOCAL)
-        network, loading = AutoModelForDepthEstimation.from_pretrained(
+        processor = transformers.AutoImageProcessor.from_pretrained(model, backend="pil", **_LOCAL)
+        network, loading = transformers.AutoModelForDepthEstimation.from_pretrained(
             model, dtype=torch.float32, output_loading_info=True, **_LOCAL
         )
     except MemoryError:

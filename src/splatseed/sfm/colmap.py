@@ -58,9 +58,6 @@ class Settings:
         max_image_size: Longer sides are reduced to this many pixels for feature detection.
         seed: Seed of RANSAC and of the order of bundle adjustment.
         threads: Worker threads; -1 = all cores.
-
-    Raises:
-        ParameterError: A value is out of its range.
     """
 
     matcher: MatcherName = "exhaustive"
