@@ -34,12 +34,10 @@ from splatseed.progress import Progress, in_threads
 from splatseed.runtime.jit import inline, kernel, parallel_range
 from splatseed.views.projection import cosine_between, place
 
-SAMPLES = 40
-"""Candidates of a view by which its neighbours are judged."""
-MIN_SAMPLES = 4
-"""But never fewer, however many views there are."""
+MIN_SAMPLES, SAMPLES = 4, 40
+"""Candidates of a view by which its neighbours are judged: the fewer, the more views there are."""
 WORK = 1 << 28
-"""Limit on projections: the more views, the fewer samples of each."""
+"""Limit on projections."""
 SHORTLIST = 2
 """Views on the shortlist, per neighbour chosen."""
 FULL = 0.03
@@ -182,10 +180,8 @@ HUBER = 1.345
 """Residuals beyond this many sigmas count linearly: 95% efficiency for normal errors."""
 ROUNDS = 2
 """Comparisons of all pairs: after the first, maps overlap better."""
-STEPS = 12
-"""Most reweightings of a solution."""
-CONVERGED = 1e-4
-"""Largest change of a log factor at which reweighting ends: 0.01% of depth."""
+STEPS, CONVERGED = 12, 1e-4
+"""Most reweightings of a solution, and the change of log factors at which they end: 0.01%."""
 
 
 def synchronize_scales(

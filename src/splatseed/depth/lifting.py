@@ -39,20 +39,17 @@ SOUND, UNCONFIRMED, NEAR_EDGE, DISTRUSTED = range(4)
 """Tiers, in the order in which they are used up; the last is never used."""
 OVERSAMPLING = 1.4
 """Candidates per new point, when views are compared or points spread."""
-MAX_OVERSAMPLING = 16.0
-"""Most candidates per new point; a round of reading multiplies them by up to ``MAX_GROWTH``."""
-MAX_GROWTH = 8.0
+MAX_OVERSAMPLING, MAX_GROWTH = 16.0, 8.0
+"""Most candidates per new point, and the most by which a round of reading multiplies them."""
 SURPLUS = 1.25
 """Candidates are overdrawn by this factor, to save another round."""
 NAMED = 3
 """Most images that a note names."""
 PIECE = 4
 """Views per task of a thread."""
-PARTS = 32
-"""Parts of the hash range, by a key's top 5 bits."""
-SAMPLED = 2
-"""Parts whose cubes are counted to find the side; all of them if there are few candidates."""
-FEW = 1 << 16
+PARTS, SAMPLED, FEW = 32, 2, 1 << 16
+"""Parts of the hash range, by a key's top 5 bits; those whose cubes are counted to find the side,
+unless there are few candidates."""
 STEPS = 24
 """Most trials of a side."""
 LEAST_POWER = 0.2
@@ -200,8 +197,7 @@ class _Candidates(NamedTuple):
 
     xyz: Float32[np.ndarray, "C 3"]
     rgb: UInt8[np.ndarray, "C 3"]
-    footprint: Float32[np.ndarray, " C"]
-    """Size of a pixel at their depth, scene units."""
+    footprint: Float32[np.ndarray, " C"]  # size of a pixel at their depth, scene units
     tier: UInt8[np.ndarray, " C"]
     view_idx: Int64[np.ndarray, " C"]
 

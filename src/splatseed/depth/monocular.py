@@ -67,12 +67,9 @@ class Meaning(NamedTuple):
 class DepthReport(NamedTuple):
     """The result of prediction."""
 
-    sizes: Mapping[str, Size]
-    """Of each map, by its image's name."""
-    flat: tuple[str, ...]
-    """Images whose map is constant or has no finite value: the network failed there."""
-    seconds: float
-    """Wall time of the predictions."""
+    sizes: Mapping[str, Size]  # of each map, by its image's name
+    flat: tuple[str, ...]  # images whose map is constant, or not finite: the network failed there
+    seconds: float  # wall time of the predictions
 
 
 def estimate_depths(

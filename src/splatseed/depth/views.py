@@ -60,11 +60,9 @@ class Reduced(NamedTuple):
 
     z: Float32[np.ndarray, "h w"]  # planar depth at the grid's points; NaN where unknown
     factor: float  # scene units per unit of z
-    grid_from_world: Float64[np.ndarray, "3 4"]
-    """World to (column z, row z, z) of the grid, whose points are at whole numbers."""
+    grid_from_world: Float64[np.ndarray, "3 4"]  # to (column z, row z, z), points at whole numbers
     rgb: UInt8[np.ndarray, "p q 3"]  # the photograph, smoothed and smaller
-    rgb_from_grid: Float64[np.ndarray, "2 2"]
-    """Factor and offset from columns of the grid to those of ``rgb``, then of rows."""
+    rgb_from_grid: Float64[np.ndarray, "2 2"]  # factor and offset of columns, then of rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,12 +99,7 @@ def read_view(
     num: int,
     rng: np.random.Generator,
 ) -> DepthView:
-    """Read an image from the photographs' folder and its map, and draw about ``num`` candidates.
-
-    Raises:
-        SceneNotFoundError: A file is gone.
-        SceneFormatError: A file is damaged, has the wrong aspect ratio, or the lens distorts.
-    """
+    """Read an image from the photographs' folder and its map, and draw about ``num`` candidates."""
     check_lens(image, reason="along whose rays pixels are lifted")
     depth = depths.read(image.name)
     camera = map_camera(depth, image)

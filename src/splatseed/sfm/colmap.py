@@ -38,8 +38,7 @@ _OLDEST = 4  # the first to pose an image and its rig in one call
 _LARGEST = 2**31 - 1  # pycolmap takes a 32-bit int
 _BLOCK_IMAGES = 16  # matches are committed, and progress is visible, per block of 16 x 16 pairs
 _POLL_SECONDS = 0.1
-_ORIENTATION, _UPRIGHT = 0x0112, 1
-_SHORT = 3  # the type of such tags
+_ORIENTATION, _SHORT, _UPRIGHT = 0x0112, 3, 1  # the tag, its type, the value that turns nothing
 _HEAD_BYTES = 1 << 17  # the EXIF segment, at most 64 KiB, comes first or after a small one
 _MORE_PHOTOGRAPHS = (
     "Take more overlapping photographs, take out those of other places, or try the exhaustive "
@@ -132,9 +131,6 @@ class Run:
         """What ``work`` returns, a blocking call of pycolmap, which releases the GIL.
 
         Meanwhile ``count`` says ten times a second how many of ``total`` items are done.
-
-        Raises:
-            ReconstructionError: pycolmap failed.
         """
 
         def seeded() -> T:
@@ -206,11 +202,7 @@ def rigid(pycolmap: Any, image: Image) -> Any:
 
 
 def match_photographs(run: Run, model: Any) -> None:
-    """Create the database of a model's images, with their features and verified matches.
-
-    Raises:
-        SceneFormatError: pycolmap could not use one of the photographs.
-    """
+    """Create the database of a model's images, with their features and verified matches."""
     pycolmap, settings = run.pycolmap, run.settings
     device = getattr(pycolmap.Device, settings.device)
     names = {image_id: image.name for image_id, image in sorted(model.images.items())}
@@ -309,11 +301,7 @@ def map_images(run: Run, names: Sequence[str]) -> Path:
 
 
 def triangulate_points(run: Run, poses: Sequence[Image]) -> Path:
-    """Triangulate points with cameras and poses held fixed; the folder of the model.
-
-    Raises:
-        ReconstructionError: Not a single point was found.
-    """
+    """Triangulate points with cameras and poses held fixed; the folder of the model."""
     model_dir = run.work / "model"
     model_dir.mkdir()
     options = _options(run)

@@ -45,10 +45,8 @@ _FOREIGN = "of a format that is not read"
 _DEPTH_MODES = ("I", "F")  # Pillow's names for 16- and 32-bit grey
 _SHOWN = 8
 
-_LOOK_WIDTH = 256
-"""Width in pixels at which frames are analysed."""
-_BLOCK = 64
-"""Side of the blocks whose shifts are measured, in pixels at that width."""
+_LOOK_WIDTH, _BLOCK = 256, 64
+"""Width at which frames are analysed, and the side of the blocks whose shifts are measured, px."""
 _LEAST_STEP = 0.02
 """Least distance, in widths, that the picture moves between chosen frames."""
 _LEAST_FRAMES = 3
@@ -153,12 +151,9 @@ def name_some(names: Sequence[str]) -> str:
 class PickedFrames(NamedTuple):
     """Which frames of a video were chosen."""
 
-    numbers: tuple[int, ...]
-    """Their numbers, from 0."""
-    total: int
-    """How many frames the video has."""
-    way: float
-    """How far the picture moves in total, in widths."""
+    numbers: tuple[int, ...]  # from 0
+    total: int  # how many frames the video has
+    way: float  # how far the picture moves in total, in widths
 
 
 def pick_frames(

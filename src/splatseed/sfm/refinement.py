@@ -31,27 +31,23 @@ COARSE = (6.0, 2.0)
 """Degrees by which an observation may miss its point in the first rounds."""
 FINE = (8.0, 4.0)
 """The same in px in the rounds after; the last, COLMAP's own, is repeated."""
-MAX_ROUNDS = 12
-MAX_ITERATIONS = 30
-"""Of bundle adjustment in a round; the next goes on from there."""
+MAX_ROUNDS, MAX_ITERATIONS = 12, 30
+"""Iterations are of bundle adjustment in a round; the next goes on from there."""
 STILL = 0.1
 """Poses are at rest when a round turns every camera by less than this, in px of its image."""
 FIRST_NOISE = 0.03
 """Standard deviation of given positions that is assumed first, of the cameras' spread."""
-LEAST_NOISE = 1e-4
-"""The smallest that is believed."""
-LEAST_ERROR = 0.05
-"""The smallest reprojection error that is believed, px."""
+LEAST_NOISE, LEAST_ERROR = 1e-4, 0.05
+"""The smallest that is believed, and the smallest reprojection error, px."""
 GAIN = 0.1
 """Given poses are kept when refinement lowers the mean reprojection error by less, in px."""
 LEAST_POINTS = 10
 """A photograph that sees fewer points takes no part: they pin its pose down too loosely."""
 LEAST_KEPT = 0.95
 """Observations that refined poses fit, of those that fit before: a few wrong ones always go."""
-MAX_TURN = 10.0
-"""A camera that turned by more, in degrees, has drifted: devices err by a degree or two."""
-MAX_SHIFT = 0.5
-"""Likewise one that moved by more, of the cameras' spread."""
+MAX_TURN, MAX_SHIFT = 10.0, 0.5
+"""A camera that turned by more degrees has drifted, as devices err by one or two; likewise one that
+moved by more, of the cameras' spread."""
 _ALIGN_ROUNDS = 5  # of fitting the similarity and the noise in turn
 _ALIGN_NOISE = 1e-9  # of the spread, and in radians: equal poses have none
 _TYPICAL = 1.54  # median length of a 3-vector of standard normal numbers
@@ -230,11 +226,9 @@ def _refused(expected: str, found: str) -> ReconstructionError:
 class _Fit(NamedTuple):
     """How photographs and points agree."""
 
-    seeing: Bool[np.ndarray, " N"]
-    """Which photographs see enough points to take part."""
+    seeing: Bool[np.ndarray, " N"]  # which photographs see enough points to take part
     observations: int
-    error: float
-    """Mean over the points of their mean reprojection error, px; infinite without points."""
+    error: float  # mean over the points of their mean reprojection error, px; inf without any
 
 
 def _enough(seeing: Bool[np.ndarray, " N"]) -> bool:
