@@ -163,14 +163,25 @@ def test_too_few_registered_is_an_error_that_names_them(num, photos, tmp_path, m
     assert not list((tmp_path / "temporary").iterdir())
 
 
-def test_interrupt_leaves_nothing(photos, tmp_path):
+def test_photographs_are_told_first_and_an_interrupt_leaves_nothing(photos, tmp_path):
+    folder, told = tmp_path / "photos", []
+    shutil.copytree(photos, folder / "below")
+    PilImage.new("I;16", (320, 240)).save(folder / "depth.png")
+    (folder / "phone.heic").touch()
+
     def interrupt(stage, _):
         if stage == "features":
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        reconstruct(photos, tmp_path / "scene", on_progress=interrupt)
-    assert not list(tmp_path.iterdir())
+        reconstruct(
+            folder,
+            tmp_path / "scene",
+            on_progress=interrupt,
+            on_photos=lambda names, left_out: told.append((names[0], *left_out.values())),
+        )
+    assert told == [("below/view_000.png", ["depth.png"], ["phone.heic"])]
+    assert list(tmp_path.iterdir()) == [folder]
 
 
 @pytest.mark.parametrize(
@@ -214,20 +225,6 @@ def test_bad_folders_are_refused(photos, tmp_path):
     (folder / "images").mkdir()
     (folder / "splatseed.json").write_text('{"command": "upsample"}')
     refused(str(folder / "images"))  # its pictures are no photographs
-
-
-def test_photographs_are_told_before_any_work(photos, tmp_path):
-    shutil.copytree(photos, tmp_path / "photos" / "below")
-    PilImage.new("I;16", (320, 240)).save(tmp_path / "photos" / "depth.png")
-    (tmp_path / "photos" / "phone.heic").touch()
-
-    def stop(names, left_out):
-        raise KeyError(len(names), names[0], *left_out.values())
-
-    with pytest.raises(KeyError) as caught:
-        reconstruct(tmp_path / "photos", tmp_path / "scene", on_photos=stop)
-    assert caught.value.args == (6, "below/view_000.png", ["depth.png"], ["phone.heic"])
-    assert not (tmp_path / "scene").exists()
 
 
 @pytest.mark.parametrize("endian", ["<", ">"])
