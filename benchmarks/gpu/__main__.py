@@ -85,8 +85,6 @@ class Options:
     """By how much its photographs are made smaller."""
     gsplat_examples: Path | None = None
     """The folder examples of a checkout of gsplat v1.5.3, to train with its own trainer too."""
-    golden: Path | None = None
-    """Keep gsplat's results in this .npz, for the tests of machines without a GPU."""
     quick: bool = False
     """Tiny sizes, to see that it works; neither times nor decibels mean anything then."""
 
@@ -133,7 +131,7 @@ def main(options: Options) -> int:
     sizes, report = QUICK if options.quick else FULL, Report()
     print(f"### splatseed on a GPU{' (--quick)' if options.quick else ''}\n")
     _print_machine(report)
-    _print_comparison(report, sizes, options.golden)
+    _print_comparison(report, sizes)
     with tempfile.TemporaryDirectory() as folder:
         _print_both(report, sizes.both, _room(sizes.both, Path(folder) / "small"))
         scene = options.scene or _room(sizes.gpu, Path(folder) / "large")
@@ -156,12 +154,10 @@ def _print_machine(report: Report) -> None:
     print(f"- beside it: {describe()}\n", flush=True)
 
 
-def _print_comparison(report: Report, sizes: Sizes, golden: Path | None) -> None:
+def _print_comparison(report: Report, sizes: Sizes) -> None:
     """Images, alphas, gradients and contributions of both rasterisers."""
     part = "gsplat on CUDA and our CPU rasteriser"
-    results = report.run(
-        part, "compare_gsplat:compare", crowd=sizes.crowd, golden=golden and str(golden.resolve())
-    )
+    results = report.run(part, "compare_gsplat:compare", crowd=sizes.crowd)
     report.check(part, [each["problem"] for each in results or () if each["problem"]])
     rows = [
         [each["case"], "no" if each["problem"] else "yes", *each["worst"]] for each in results or ()

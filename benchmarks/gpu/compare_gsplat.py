@@ -4,25 +4,16 @@ They agree where at most ``ODD_ONES`` of the entries differ by more than ``TOLER
 largest. gsplat works in float32 with a fast exponential and adds gradients in any order; now and
 then a pixel falls on the other side of the cut-off at 1/255, hence the allowance. What ``grow``
 measures, each Gaussian's pixels and errors, is compared as well.
-
-The golden file (.npz) keeps the small cases, inputs and gsplat's results, for the tests of machines
-without a GPU: float32 arrays ``case/inputs/NAME`` and ``case/outputs/NAME`` and, as
-``case/options``, the other arguments in JSON. Outputs are ``image``, ``alpha`` and ``d_NAME``, the
-gradient of sum (image - 0.3)^2 + sum (alpha - 0.5)^2; ``d_means2d`` and ``absgrad`` where not
-packed.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 
-from splatseed.errors import OutputError
 from splatseed.render import rasterization
 from splatseed.train.growing import contributions
 from splatseed.views.view import View
@@ -31,7 +22,6 @@ __all__ = ["ODD_ONES", "TOLERANCE", "compare"]
 
 TOLERANCE = 1e-3
 ODD_ONES = 1e-4
-MAX_GOLDEN_BYTES = 100_000
 CROWD_SIZE = (400, 300)
 INPUTS = ("means", "quats", "scales", "opacities", "colors", "viewmats", "backgrounds")
 
@@ -43,33 +33,26 @@ class Case(NamedTuple):
 
     inputs: Arrays
     options: dict[str, Any]
-    golden: bool
 
 
-def compare(crowd: int, golden: str | None) -> list[dict[str, Any]]:
+def compare(crowd: int) -> list[dict[str, Any]]:
     """All cases: ``case``, ``worst`` array with its differences, and ``problem``, empty if none.
 
     Args:
         crowd: How many Gaussians the larger cases have.
-        golden: Where to keep the small cases, if anywhere.
     """
-    found, kept = [], {}
+    found = []
     for name, case in cases(crowd).items():
         try:
             theirs = run(_gsplat(), case, "cuda")
             found.append(difference(name, run(rasterization, case, "cpu"), theirs))
         except Exception as error:  # noqa: BLE001  (reported; the other cases go on)
             found.append(_failed(name, error))
-            continue
-        if case.golden:
-            kept.update(_flat(name, case, theirs))
     try:
         case = _case(8, n=crowd, size=CROWD_SIZE)
         found.append(difference("contributions", _shares(case, "cpu"), _shares(case, "cuda")))
     except Exception as error:  # noqa: BLE001  (likewise)
         found.append(_failed("contributions", error))
-    if golden:
-        _write(Path(golden), kept)
     return found
 
 
@@ -85,7 +68,7 @@ def _gsplat() -> Callable[..., Any]:
 
 
 def cases(crowd_of: int) -> dict[str, Case]:
-    """Small ones to keep, and crowds as training sees them."""
+    """Small ones, and crowds as training sees them."""
     small = {"n": 32, "size": (21, 13)}
     crowd = {"n": crowd_of, "size": CROWD_SIZE}
     antialiased = {"rasterize_mode": "antialiased", "render_mode": "RGB+ED"}
@@ -130,7 +113,7 @@ def _case(
     if options.get("packed", True):
         del arrays["backgrounds"]  # gsplat 1.5.3 refuses them with packed: it asserts another shape
     inputs = {name: array.astype(np.float32) for name, array in arrays.items()}
-    return Case(inputs, {"width": width, "height": height, **options}, golden=n < 100)
+    return Case(inputs, {"width": width, "height": height, **options})
 
 
 def _viewmat(rng: np.random.Generator, distance: float) -> np.ndarray:
@@ -187,21 +170,3 @@ def difference(name: str, ours: Arrays, theirs: Arrays) -> dict[str, Any]:
         "worst": [worst, f"{largest[worst]:.1e}", f"{odd[worst]:.1e}"],
         "problem": f"{name}: too many entries differ in {wrong}" if wrong else "",
     }
-
-
-def _flat(name: str, case: Case, outputs: Arrays) -> dict[str, Any]:
-    """A case under the names it has in the golden file."""
-    return {
-        f"{name}/options": json.dumps(case.options),
-        **{f"{name}/inputs/{key}": array for key, array in case.inputs.items()},
-        **{f"{name}/outputs/{key}": array for key, array in outputs.items()},
-    }
-
-
-def _write(path: Path, arrays: dict[str, Any]) -> None:
-    np.savez_compressed(path, **arrays)
-    if (size := path.stat().st_size) > MAX_GOLDEN_BYTES:
-        raise OutputError(
-            f"a golden file of at most {MAX_GOLDEN_BYTES:,} bytes, to keep with the tests",
-            found=f"{size:,}", fix="Make the small cases smaller.",
-        )  # fmt: skip

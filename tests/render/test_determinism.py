@@ -1,16 +1,40 @@
-"""The same bytes, forward and backward, whatever the threads and wherever the kernels come from."""
+"""The same bytes, forward and backward, whatever the threads and wherever the kernels come from.
+
+Run as a module: other processes, with other numbers of threads or caches, must print the same.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import os
 import subprocess
 import sys
 from pathlib import Path
 
 import numba
+import numpy as np
 import pytest
+import torch
 
-from .digest import digest
+from .scenes import gradients, random_scene
+
+MODES = (
+    {},
+    {"rasterize_mode": "antialiased", "packed": False},
+    {"render_mode": "RGB+ED", "sh_degree": 3},
+)
+
+
+def digest() -> str:
+    """SHA-256 of images, alphas and all gradients of a crowd in two cameras."""
+    total = hashlib.sha256()
+    for options in MODES:
+        rng, coefficients = np.random.default_rng(0), 16 if "sh_degree" in options else None
+        scene = random_scene(rng, 3000, cameras=2, size=(77, 59), coefficients=coefficients)
+        image, alpha, grads = gradients(scene, **options)
+        for each in (image, alpha, *grads.values()):
+            total.update(each.numpy().tobytes())
+    return total.hexdigest()
 
 
 @pytest.fixture(scope="module")
@@ -39,11 +63,14 @@ def test_freshly_compiled_and_loaded_from_the_cache(expected: str, tmp_path: Pat
 
 
 def _in_new_process(cache: Path) -> str:
-    script = Path(__file__).with_name("digest.py")
     run = subprocess.run(
-        [sys.executable, str(script)], capture_output=True, text=True, check=True,
-        env={**os.environ, "NUMBA_CACHE_DIR": str(cache)},
+        [sys.executable, "-m", "tests.render.test_determinism"], cwd=Path(__file__).parents[2],
+        env={**os.environ, "NUMBA_CACHE_DIR": str(cache)}, capture_output=True, text=True,
+        check=True,
     )  # fmt: skip
-    name, value = run.stdout.split()
-    assert name == "digest"
-    return value
+    return run.stdout.strip()
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    print(digest())  # noqa: T201  (its one result)

@@ -14,7 +14,7 @@ from gsplat.cuda._torch_impl import _isect_offset_encode, _isect_tiles
 from torch import Tensor
 
 from splatseed.render import rasterization
-from splatseed.render.info import LISTS, intersect
+from splatseed.render.rasterize import LISTS
 
 from .scenes import PER_GAUSSIAN, random_scene
 
@@ -41,45 +41,23 @@ def assert_same(ours: Tensor, expected: Tensor) -> None:
 
 @pytest.mark.parametrize(("cameras", "tile_size", "count"), [(1, 16, 50), (3, 7, 50), (3, 16, 0)])
 def test_lists_are_gsplats(cameras: int, tile_size: int, count: int) -> None:
-    info = rasterization(**scene_of(cameras, count), packed=False, tile_size=tile_size)[2]
+    scene = scene_of(cameras, count)
+    info, packed = (
+        rasterization(**scene, packed=each, tile_size=tile_size)[2] for each in (False, True)
+    )
     expected = theirs(info)
     assert count < 50 or bool((info["radii"] == 0).any())
     assert count < 50 or len(expected["isect_ids"]) > 100
     for name in LISTS:
         assert_same(info[name], expected[name])
-
-
-@pytest.mark.parametrize("count", [50, 0])
-def test_packed_lists_name_packed_gaussians(count: int) -> None:
-    """gsplat's PyTorch code has no packed form: the same pairs, numbered another way."""
-    scene = scene_of(3, count)
-    packed, full = (rasterization(**scene, packed=packed)[2] for packed in (True, False))
-    expected, rows = theirs(full), (packed["camera_ids"], packed["gaussian_ids"])
+    # gsplat's PyTorch code has no packed form: the same pairs, numbered another way.
+    rows = packed["camera_ids"], packed["gaussian_ids"]
     assert_same(packed["tiles_per_gauss"], expected["tiles_per_gauss"][rows])
     assert_same(packed["isect_ids"], expected["isect_ids"])
     assert_same(packed["isect_offsets"], expected["isect_offsets"])
+    stacked = (rows[0] * count + rows[1]).int()
+    assert_same(stacked[packed["flatten_ids"].long()], expected["flatten_ids"])
     assert packed["flatten_ids"].dtype == torch.int32
-    stacked = rows[0] * count + rows[1]
-    assert torch.equal(stacked[packed["flatten_ids"].long()].int(), expected["flatten_ids"])
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_boxes_of_all_sizes_and_places(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    means2d = torch.tensor(rng.normal(30, 60, (2, 40, 2)), dtype=torch.float32)
-    radii = torch.tensor(rng.integers(0, 50, (2, 40, 2)) // 5 ** rng.integers(0, 3, (2, 40, 1)))
-    depths = torch.tensor(rng.uniform(0.01, 100, (2, 40)).round(), dtype=torch.float32)
-    (width, height), size = map(int, rng.integers(1, 100, 2)), int(rng.integers(1, 20))
-    expected = _isect_tiles(
-        means2d, radii.int(), depths, size, -(-width // size), -(-height // size)
-    )  # fmt: skip
-    counts, ids, rows, _ = intersect(
-        means2d.view(-1, 2), radii.int().view(-1, 2), depths.flatten(),
-        torch.arange(2).repeat_interleave(40), 2, width, height, size,
-    )  # fmt: skip
-    assert_same(counts, expected[0].flatten())
-    assert_same(ids, expected[1])
-    assert_same(rows, expected[2])
 
 
 @pytest.mark.parametrize("packed", [True, False])

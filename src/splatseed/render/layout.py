@@ -1,8 +1,9 @@
 """Conversion between PyTorch's arrays and those of the blending kernels.
 
-Notation: N Gaussians of which G are visible; ``order`` [G] maps depth rank to index; an image is
-[H, W, D]; records and block images are defined in ``blending``. ``first`` is the first of the up to
-four channels that one pass of blending takes.
+Notation: arrays are float32; N Gaussians of which G are visible; ``order``, uint32 [G], maps depth
+rank to index; an image is [H, W, D], with ``columns`` tiles in a row; T [H, W] is its
+transmittance; records and block images are defined in ``blending``. ``first`` is the first of the
+up to four channels that one pass of blending takes.
 Promise: every array is read and written once, in a fixed order; the same with NumPy's gathers and
 transpositions took a tenth of a training step.
 """
@@ -34,8 +35,8 @@ def mark_visible(radii, opacities, colors, least, visible):
 
     Args:
         radii: int32 [N, 2]; 0 = culled.
-        opacities: float32 [N].
-        colors: float32 [N, D].
+        opacities: [N].
+        colors: [N, D].
         least: Opacities below this are left out.
         visible: Written, bool [N].
     """
@@ -51,17 +52,7 @@ def mark_visible(radii, opacities, colors, least, visible):
 
 @kernel
 def gather(order, means2d, conics, log_opacities, colors, first, records):
-    """Gaussians by index to records by depth rank.
-
-    Args:
-        order: uint32 [G].
-        means2d: float32 [N, 2].
-        conics: float32 [N, 3].
-        log_opacities: By depth rank, float32 [G].
-        colors: float32 [N, D].
-        first: First channel.
-        records: Written, float32 [16 G].
-    """
+    """Gaussians by index, but ``log_opacities`` by depth rank, to records by depth rank [16 G]."""
     wide = min(CHANNELS, colors.shape[1] - first)
     for g in parallel_range(len(order)):
         i, record = order[g], records[RECORD * g : RECORD * (g + 1)]
@@ -97,16 +88,16 @@ def scatter(
     """Sums by depth rank to gradients by index; those of invisible Gaussians stay.
 
     Args:
-        order: uint32 [G].
-        totals: ``blending_vjp``'s sums over each Gaussian's spans, float32 [G, 16].
+        order: Depth rank to index.
+        totals: ``blending_vjp``'s sums over each Gaussian's spans, [G, 16].
         first: First channel.
-        conics: float32 [N, 3].
-        opacities: float32 [N].
-        d_means2d: Added to, float32 [N, 2].
-        d_conics: Added to, float32 [N, 3].
-        d_opacities: Added to, float32 [N].
-        d_colors: Written in this pass's channels, float32 [N, D].
-        d_absolute: Written, the absolute gradients of the 2D means, float32 [N, 2], or empty.
+        conics: [N, 3].
+        opacities: [N].
+        d_means2d: Added to, [N, 2], like the following two.
+        d_conics: [N, 3].
+        d_opacities: [N].
+        d_colors: Written in this pass's channels, [N, D].
+        d_absolute: Written, the absolute gradients of the 2D means, [N, 2], or empty.
     """
     wide = min(CHANNELS, d_colors.shape[1] - first)
     for g in parallel_range(len(order)):
@@ -137,17 +128,7 @@ def _first_lane(x, y, columns):
 
 @kernel
 def from_blocks(blocks, block_T, columns, background, first, image, transmittance):
-    """A block image to this pass's channels of an image, on its background.
-
-    Args:
-        blocks: float32 [t * 4 * CHANNELS * 16].
-        block_T: The transmittance T of the block image, float32 [t * 4 * 16].
-        columns: Tiles in a row.
-        background: float32 [D].
-        first: First channel.
-        image: Written, float32 [H, W, D].
-        transmittance: Written: T, float32 [H, W].
-    """
+    """A block image and its T to this pass's channels of an image, on its background [D], and T."""
     height, width, depth = image.shape
     pixels, out_T = image.reshape(-1), transmittance.reshape(-1)
     for y in parallel_range(height):
@@ -183,17 +164,8 @@ def _from_lanes(colors, T, background, first, count, depth, pixels, out_T):
 def to_blocks(d_image, image, d_alphas, transmittance, columns, first, gradient, behind):
     """This pass's gradient channels as a block image, and the initial value of ``behind``.
 
-    Every pass takes the part of ``behind`` of its own channels; the first also takes that of alpha.
-
-    Args:
-        d_image: d loss / d image, float32 [H, W, D].
-        image: float32 [H, W, D].
-        d_alphas: d loss / d alpha, float32 [H, W].
-        transmittance: T, float32 [H, W].
-        columns: Tiles in a row.
-        first: First channel.
-        gradient: Written, block image, float32 [t * 4 * CHANNELS * 16]; 0 outside the image.
-        behind: Written, gradient . colour - (d loss / d alpha) T, float32 [t * 4 * 16]; likewise.
+    Every pass takes the part of ``behind``, gradient . colour - (d loss / d alpha) T, of its own
+    channels; the first also takes that of alpha. Both are 0 outside the image.
     """
     height, width, depth = image.shape
     d_pixels, pixels = d_image.reshape(-1), image.reshape(-1)

@@ -34,11 +34,8 @@ def compute_relocation(
 ) -> tuple[Tensor, Float[Tensor, "N 3"]]:
     """Opacities (in their shape) and scales [N, 3] of ``ratios`` Gaussians that replace one.
 
-    Args:
-        opacities: From 0 to 1, [N] or [N, 1].
-        scales: Standard deviations, [N, 3].
-        ratios: Number of Gaussians at one place, [N]; limited to M.
-        binoms: gsplat's table of binomial coefficients; only its size is used.
+    Numbers of Gaussians at one place beyond M, the size of gsplat's table of binomial coefficients,
+    count as M.
     """
     if opacities.is_cuda:
         from gsplat.relocation import compute_relocation as on_cuda  # noqa: PLC0415  (needs CUDA)
@@ -65,17 +62,13 @@ def covariances(
     compute_preci: bool = False,
     triu: bool = False,
 ) -> tuple[Float[Tensor, "N 3 3"], None]:
-    """R S S R' of each Gaussian, [N, 3, 3]; written out, because small products are slow in BLAS.
+    """R S S R' of each Gaussian, [N, 3, 3], from wxyz rotations of any length.
 
-    Args:
-        quats: wxyz rotations of any length, [N, 4].
-        scales: Standard deviations, [N, 3].
-        compute_covar: gsplat's flag; on the CPU covariances are always returned.
-        compute_preci: gsplat's flag; on the CPU precisions never are.
-        triu: gsplat's flag; on the CPU matrices are always full.
+    The flags are gsplat's: on the CPU covariances are always returned in full, precisions never.
     """
     if quats.is_cuda:
         return gsplat.quat_scale_to_covar_preci(quats, scales, compute_covar, compute_preci, triu)  # type: ignore[no-any-return]  # gsplat is untyped
+    # Written out, because small products are slow in BLAS.
     half = normalized_quat_to_rotmat(normalize(quats, dim=-1)) * scales[:, None, :]
     return (half[:, :, None, :] * half[:, None, :, :]).sum(dim=-1), None
 
@@ -89,12 +82,9 @@ def _coefficients(largest: int) -> Float[Tensor, "n k"]:
     return torch.tensor(rows, dtype=torch.float64)
 
 
-class _Replaced:
-    """gsplat's own functions, while any ``mcmc_on_cpu`` block runs in any thread."""
-
-    lock = Lock()
-    blocks = 0
-    own: tuple[Any, Any]
+_LOCK = Lock()
+_REPLACED: list[tuple[Any, Any]] = []
+"""What each ``mcmc_on_cpu`` block that runs, in any thread, has replaced; gsplat's own first."""
 
 
 @contextmanager
@@ -103,36 +93,19 @@ def mcmc_on_cpu() -> Iterator[None]:
 
     For code that uses gsplat's ``MCMCStrategy``, or a subclass, and stays unchanged: put its
     training loop into the block. Blocks may be nested and run in several threads.
-
-    Example:
-        >>> with mcmc_on_cpu():  # here gsplat's strategy.step_post_backward(...) works
-        ...     pass
     """
-    with _Replaced.lock:
-        if _Replaced.blocks == 0:
-            _Replaced.own = ops.compute_relocation, ops.quat_scale_to_covar_preci
-            ops.compute_relocation, ops.quat_scale_to_covar_preci = compute_relocation, covariances
-        _Replaced.blocks += 1
+    with _LOCK:
+        _REPLACED.append((ops.compute_relocation, ops.quat_scale_to_covar_preci))
+        ops.compute_relocation, ops.quat_scale_to_covar_preci = compute_relocation, covariances
     try:
         yield
     finally:
-        with _Replaced.lock:
-            _Replaced.blocks -= 1
-            if _Replaced.blocks == 0:
-                ops.compute_relocation, ops.quat_scale_to_covar_preci = _Replaced.own
+        with _LOCK:
+            ops.compute_relocation, ops.quat_scale_to_covar_preci = _REPLACED.pop()
 
 
 class MCMCStrategy(gsplat.MCMCStrategy):  # type: ignore[misc]  # gsplat has no types
-    """gsplat's ``MCMCStrategy``, which relocates and adds Gaussians, for CPU tensors too.
-
-    Arguments, methods and results are gsplat's. Its own class runs CUDA kernels to relocate, add
-    and perturb Gaussians; for CUDA tensors this one does too.
-
-    Example:
-        >>> from splatseed.render import MCMCStrategy
-        >>> MCMCStrategy(cap_max=1000, verbose=True).cap_max
-        1000
-    """
+    """gsplat's ``MCMCStrategy``, which relocates and adds Gaussians, for CPU tensors too."""
 
     def step_post_backward(self, *args: Any, **kwargs: Any) -> None:
         """Run gsplat's step after the optimisers; params, optimizers, state, step, info, lr."""

@@ -1,27 +1,31 @@
-"""``rasterization``: gsplat's signature, on the CPU.
+"""``rasterization``: gsplat's signature, and its ``info`` dictionary, on the CPU.
 
-For code written against gsplat 1.5.3: arguments, results and the ``info`` dict are gsplat's, so
-that its default densification runs unchanged, and MCMC through
+For code written against gsplat 1.5.3: arguments, results and the keys, shapes, types and numbers of
+``info`` are gsplat's, so that its default densification runs unchanged, and MCMC through
 ``splatseed.render.MCMCStrategy``. What the CPU does not support (fisheye and orthographic cameras,
 distributed rendering, rolling shutter) is refused, never ignored.
+
+Notation: N Gaussians, C cameras, B batches, I = B C images, batch by batch; G = I N, or if packed
+the number of visible ones, image by image; P pairs of a Gaussian and a tile. The lists of pairs are
+made when ``info[...]`` first asks for one: a training step does not pay for them, as the rasteriser
+has its own.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
-from functools import partial
 from numbers import Integral
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
-import numpy as np
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from splatseed.errors import ParameterError
-from splatseed.render.autograd import Blend, Harmonics, Lens, Project
+from splatseed.render.autograd import Blend, Harmonics, Lens, Project, is_seen
 from splatseed.render.blending import CHANNELS
 from splatseed.render.harmonics import MAX_DEGREE
-from splatseed.render.info import Info, Projected, make_info
 from splatseed.requirements import require
 
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
@@ -29,20 +33,14 @@ RasterizeMode = Literal["classic", "antialiased"]
 GSPLAT_TILE = 16
 """The size of the tiles that ``info`` lists, px."""
 CUDA_ONLY: Mapping[str, object] = {
-    "distributed": False,
     "camera_model": "pinhole",
-    "segmented": False,
-    "covars": None,
-    "with_ut": False,
-    "with_eval3d": False,
-    "radial_coeffs": None,
-    "tangential_coeffs": None,
-    "thin_prism_coeffs": None,
-    "ftheta_coeffs": None,
-    "rolling_shutter": None,
-    "viewmats_rs": None,
+    **dict.fromkeys(("distributed", "segmented", "with_ut", "with_eval3d"), False),
+    **dict.fromkeys(("radial_coeffs", "tangential_coeffs", "thin_prism_coeffs", "ftheta_coeffs")),
+    **dict.fromkeys(("covars", "rolling_shutter", "viewmats_rs")),
 }
 """gsplat's further arguments with their defaults."""
+LISTS = ("tiles_per_gauss", "isect_ids", "flatten_ids", "isect_offsets")
+"""The entries of ``info`` that are made when read."""
 
 
 def rasterization(
@@ -118,17 +116,6 @@ def rasterization(
         ParameterError: An argument that the CPU rasteriser does not support, or tensors that are
             not float32 or whose shapes do not go together.
         MissingDependencyError: CUDA tensors, and no gsplat.
-
-    Example:
-        >>> import torch
-        >>> one = torch.ones(1, 3)
-        >>> image, alpha, info = rasterization(
-        ...     means=torch.tensor([[0.0, 0.0, 2.0]]), quats=torch.tensor([[1.0, 0, 0, 0]]),
-        ...     scales=0.1 * one, opacities=torch.tensor([0.9]), colors=one,
-        ...     viewmats=torch.eye(4)[None],
-        ...     Ks=torch.tensor([[[20.0, 0, 8], [0, 20.0, 8], [0, 0, 1]]]), width=16, height=16)
-        >>> image.shape, round(float(alpha.max()), 1)
-        (torch.Size([1, 16, 16, 3]), 0.7)
     """
     if isinstance(means, Tensor) and means.is_cuda:
         require("gsplat")
@@ -169,21 +156,24 @@ def rasterization(
         projected = [
             _project(
                 gaussians, poses[camera],
-                Lens(_intrinsics(intrinsics[camera]), width, height, near_plane, far_plane, eps2d,
-                     radius_clip, rasterize_mode == "antialiased"),
+                Lens(intrinsics[camera].detach().contiguous().numpy(), width, height, near_plane,
+                     far_plane, eps2d, radius_clip, rasterize_mode == "antialiased"),
                 sparse_grad,
             )
             for camera in range(len(poses))
         ]  # fmt: skip
         for camera, view in enumerate(projected):
             shade = _colors(scene[0], scene[6:], poses, camera, view, sh_degree)
-            shades.append(_with_depth(shade, view, render_mode))
+            shades.append(_channels(shade, view.depths[:, None], render_mode))
         views += projected
     # Absolute gradients of more channels than one pass takes are not additive.
     limit = f"no more than {CHANNELS} channels, depth included, with absgrad on the CPU"
     _require(not absgrad or shades[0].shape[1] <= CHANNELS, limit, shades[0].shape[1])
-    info = make_info(views, batch, packed, width, height, tile_size)
-    images, alphas = _blend(views, shades, info, _background(backgrounds, render_mode), absgrad)
+    info = _make_info(views, batch, packed, width, height, tile_size)
+    if backgrounds is not None:
+        nothing = torch.zeros_like(backgrounds[..., :1])  # depth
+        backgrounds = _channels(backgrounds, nothing, render_mode).reshape(len(views), -1)
+    images, alphas = _blend(views, shades, info, backgrounds, absgrad)
     if render_mode in {"ED", "RGB+ED"}:
         # Accumulated depth is a sum of weights times z; divided by their sum it is the mean z.
         expected = images[..., -1:] / alphas.clamp(min=1e-10)
@@ -196,10 +186,6 @@ def _unbatched(batch: tuple[int, ...], *tensors: Tensor) -> Iterable[tuple[Tenso
     if not batch:
         return [tensors]
     return zip(*(each.flatten(0, len(batch) - 1).unbind() for each in tensors), strict=True)
-
-
-def _intrinsics(K: Tensor) -> np.ndarray:
-    return np.asarray(K.detach().to(torch.float32).contiguous().numpy())
 
 
 def _project(gaussians: Sequence[Tensor], viewmat: Tensor, lens: Lens, sparse: bool) -> Projected:
@@ -233,20 +219,11 @@ def _colors(
     return shades
 
 
-def _with_depth(colors: Tensor, view: Projected, render_mode: RenderMode) -> Tensor:
+def _channels(colors: Tensor, depth: Tensor, render_mode: RenderMode) -> Tensor:
     """The channels of a render mode, depth last."""
     if render_mode == "RGB":
         return colors
-    depth = view.depths[:, None]
     return depth if render_mode in {"D", "ED"} else torch.cat([colors, depth], dim=-1)
-
-
-def _background(backgrounds: Tensor | None, render_mode: RenderMode) -> Tensor | None:
-    """Backgrounds, with depth 0 if there is a depth channel."""
-    if backgrounds is None or render_mode == "RGB":
-        return backgrounds
-    depth = torch.zeros_like(backgrounds[..., :1])
-    return depth if render_mode in {"D", "ED"} else torch.cat([backgrounds, depth], dim=-1)
 
 
 def _blend(
@@ -257,47 +234,37 @@ def _blend(
     absgrad: bool,
 ) -> tuple[Tensor, Tensor]:
     """Images [..., C, H, W, D] and alphas [..., C, H, W, 1], by way of ``info["means2d"]``."""
-    means2d, ids, batch = info["means2d"], info["gaussian_ids"], info.batch
-    owners = None if ids is None else info.image_ids()
+    means2d, ids = info["means2d"], info["gaussian_ids"]
+    sums: Sequence[Tensor | None] = [None] * len(views)
     if absgrad:
         means2d.absgrad = torch.zeros_like(means2d)
+        sums = info.by_image(means2d.absgrad)
+    seen = None if ids is None else info.by_image(ids)
+    behind = [None] * len(views) if backgrounds is None else backgrounds
     images, alphas = [], []
-    places = np.ndindex(*batch, info["n_cameras"])
-    if backgrounds is not None:
-        backgrounds = backgrounds.reshape(len(views), -1)
-    for image, (place, view, colors) in enumerate(zip(places, views, shades, strict=True)):
-        rows: Any = place if owners is None else owners == image
-        shapes: tuple[Tensor, ...] = (view.conics, colors, view.opacities)
-        depths, radii = view.depths, view.radii
-        if ids is not None:  # a full slice would be copied by backward
-            each = ids[rows]
-            shapes, depths, radii = tuple(t[each] for t in shapes), depths[each], radii[each]
+    for i, centers in enumerate(info.by_image(means2d)):
+        view = views[i]
+        own: tuple[Tensor, ...] = (view.conics, shades[i], view.opacities, view.depths, view.radii)
+        if seen is not None:  # a full slice would be copied by backward
+            own = tuple(each[seen[i]] for each in own)
         pixels, alpha = Blend.apply(  # type: ignore[no-untyped-call]  # PyTorch's apply is untyped
-            means2d[rows], *shapes,
-            None if backgrounds is None else backgrounds[image],
-            depths, radii, info["width"], info["height"],
-            partial(_keep_absgrad, means2d, rows) if absgrad else None,
-        )  # fmt: skip
+            centers, *own[:3], behind[i], *own[3:], info["width"], info["height"], sums[i]
+        )
         images.append(pixels)
         alphas.append(alpha[..., None])
     # Copied even for one camera: backward reads the image, so in-place changes by the caller must
     # not reach it.
-    size = (*batch, info["n_cameras"], info["height"], info["width"], -1)
+    size = (*info.batch, info["n_cameras"], info["height"], info["width"], -1)
     return torch.stack(images).view(size), torch.stack(alphas).view(size)
-
-
-def _keep_absgrad(means2d: Any, rows: Any, gradient: Tensor) -> None:
-    means2d.absgrad[rows] = gradient
 
 
 def _check_unsupported(arguments: Mapping[str, object]) -> None:
     """Refuse arguments that only gsplat's CUDA code supports, and unknown ones."""
     for name, value in arguments.items():
         _require(name in CUDA_ONLY, "arguments of gsplat's rasterization", name)
-        default = CUDA_ONLY[name]
         # gsplat's default for the shutter is an enumeration member, recognised by its name.
-        fits = value is default or getattr(value, "name", None) == "GLOBAL"
-        fits = fits or (isinstance(value, str) and value == default)
+        fits = value is CUDA_ONLY[name] or getattr(value, "name", None) == "GLOBAL"
+        fits = fits or (isinstance(value, str) and value == CUDA_ONLY[name])
         _require(fits, f"{name} to be left at its default on the CPU", value)
 
 
@@ -308,12 +275,14 @@ def _check_tensors(
 ) -> None:
     """Refuse whatever the kernels, which do not check bounds, could not read."""
     parts = colors if isinstance(colors, tuple) else (colors,)
-    for name, each in (*tensors.items(), *(("colors", part) for part in parts)):
+    given: dict[str, Any] = dict(tensors)
+    if given["backgrounds"] is None:
+        del given["backgrounds"]
+    for name, each in (*given.items(), *(("colors", part) for part in parts)):
         fits = isinstance(each, Tensor) and each.dtype == torch.float32
-        fits = fits and each.device.type == "cpu"  # type: ignore[union-attr]  # a tensor
-        optional = each is None and name == "backgrounds"
-        _require(fits or optional, f"{name} as a float32 tensor on the CPU, like means", each)
-    found = {name: tuple(each.shape) for name, each in tensors.items() if each is not None}
+        fits = fits and each.device.type == "cpu"
+        _require(fits, f"{name} as a float32 tensor on the CPU, like means", each)
+    found = {name: tuple(each.shape) for name, each in given.items()}
     *batch, n, _ = found["means"] if len(found["means"]) > 1 else (0, 0, 0)
     _require(0 not in batch, "means of shape [..., N, 3], no batch dimension 0", found["means"])
     cameras = found["viewmats"][-3] if len(found["viewmats"]) == len(batch) + 3 else 0
@@ -337,20 +306,19 @@ def _check_colors(
     sh_degree: int | None,
 ) -> None:
     """Shared by the cameras or one set per camera: the number of axes decides."""
-    first, last = shapes[0], shapes[-1]
+    first, *others = shapes
     if sh_degree is None:
-        fits = len(shapes) == 1 and first[:-1] in (shared, own) and first[-1] >= 1
+        fits = not others and first[:-1] in (shared, own) and first[-1] >= 1
         expected = f"colors of shape {[*shared, 'D']} or {[*own, 'D']}"
     else:
         terms = (sh_degree + 1) ** 2
-        if len(shapes) == 1:
-            fits, rest = first[:-2] in (shared, own), terms
-        else:
-            fits, rest = len(shapes) == 2 and first == (*shared, 1, 3), terms - 1
-            fits = fits and last[:-2] == shared
-        fits = fits and last[-2] >= rest and last[-1] == 3
         ends = [f"K >= {terms}", 3]
         expected = f"colors of shape {[*shared, *ends]} or {[*own, *ends]}, or the former in two"
+        fits = first[:-2] in (shared, own)
+        if others:
+            fits = len(others) == 1 and first == (*shared, 1, 3) and others[0][:-2] == shared
+        fits = fits and all(each[-1] == 3 for each in shapes)
+        fits = fits and sum(each[-2] for each in shapes) >= terms
     _require(fits, expected, list(shapes))
 
 
@@ -360,3 +328,133 @@ def _require(fits: object, expected: str, found: object) -> None:
             found = f"{type(found).__name__} of {found.dtype}"
         fix = "Correct the arguments of rasterization, or render on CUDA."
         raise ParameterError(expected, found=str(found), fix=fix)
+
+
+class Projected(NamedTuple):
+    """N Gaussians in one camera."""
+
+    radii: Tensor
+    """Half the sizes of their boxes, px, int32 [N, 2]; 0 where culled."""
+    means2d: Tensor
+    """px, [N, 2]."""
+    depths: Tensor
+    """z, [N]."""
+    conics: Tensor
+    """Inverse covariances xx, xy, yy, px^-2, [N, 3]."""
+    opacities: Tensor
+    """0 to 1, compensated where antialiased, [N]."""
+
+
+class Info(dict[str, Any]):
+    """A dictionary whose ``LISTS`` are made when ``[]`` reads one of them."""
+
+    batch: tuple[int, ...]
+    """The scenes' batch dimensions."""
+
+    def __missing__(self, name: str) -> Any:
+        if name not in LISTS:
+            raise KeyError(name)
+        depths, images = self["depths"], self["n_batches"] * self["n_cameras"]
+        if self["camera_ids"] is None:
+            owners = torch.arange(images).repeat_interleave(depths.shape[-1])
+        else:
+            owners = self.image_ids()
+        counts, ids, rows, offsets = intersect(
+            self["means2d"].reshape(-1, 2), self["radii"].reshape(-1, 2), depths.flatten(), owners,
+            images, self["width"], self["height"], self["tile_size"],
+        )  # fmt: skip
+        offsets = offsets.view(*self.batch, self["n_cameras"], *offsets.shape[1:])
+        self.update(zip(LISTS, (counts.view_as(depths), ids, rows, offsets), strict=True))
+        return self[name]
+
+    def by_image(self, each: Tensor) -> Sequence[Tensor]:
+        """The images' own parts of an entry."""
+        if self["camera_ids"] is None:
+            return each.flatten(0, -3).unbind()
+        counts = torch.bincount(self.image_ids(), minlength=self["n_batches"] * self["n_cameras"])
+        return torch.split(each, counts.tolist())
+
+    def image_ids(self) -> Tensor:
+        """The image of each packed Gaussian, [G]."""
+        ids: Tensor = self["batch_ids"] * self["n_cameras"] + self["camera_ids"]
+        return ids
+
+
+def _make_info(
+    views: Sequence[Projected],
+    batch: tuple[int, ...],
+    packed: bool,
+    width: int,
+    height: int,
+    tile_size: int,
+) -> Info:
+    """The ``info`` of I images; if packed it lists only visible Gaussians, image by image."""
+    batches = math.prod(batch)
+    cameras = len(views) // batches
+    info = Info(batch_ids=None, camera_ids=None, gaussian_ids=None)
+    if packed:
+        ids = [torch.nonzero(is_seen(view.radii))[:, 0] for view in views]
+        images = torch.cat([torch.full_like(each, image) for image, each in enumerate(ids)])
+        info["batch_ids"], info["camera_ids"] = images // cameras, images % cameras
+        info["gaussian_ids"] = torch.cat(ids)
+    for name, tensors in zip(Projected._fields, zip(*views, strict=True), strict=True):
+        if packed:
+            info[name] = torch.cat([t[each] for t, each in zip(tensors, ids, strict=True)])
+        else:  # a single image's entries are not copied
+            stacked = tensors[0][None] if len(tensors) == 1 else torch.stack(tensors)
+            info[name] = stacked.view(*batch, cameras, *stacked.shape[1:])
+    info.update(
+        tile_width=-(-width // tile_size),
+        tile_height=-(-height // tile_size),
+        width=width,
+        height=height,
+        tile_size=tile_size,
+        n_batches=batches,
+        n_cameras=cameras,
+    )
+    info.batch = batch
+    return info
+
+
+@torch.no_grad()
+def intersect(
+    means2d: Float[Tensor, "G 2"],
+    radii: Int[Tensor, "G 2"],
+    depths: Float[Tensor, " G"],
+    images: Int[Tensor, " G"],
+    count: int,
+    width: int,
+    height: int,
+    size: int,
+) -> tuple[Int[Tensor, " G"], Int[Tensor, " P"], Int[Tensor, " P"], Int[Tensor, "I rows columns"]]:
+    """Pair Gaussians with the tiles that their bounding boxes reach.
+
+    A pair's id is, from the highest bit down, its image, its tile (row by row, in as many bits as
+    the number of tiles needs) and the 32 bits of its depth, so that sorted ids are image by image,
+    tile by tile, front to back: gsplat's ``isect_tiles`` and ``isect_offset_encode``.
+
+    Takes centres and half-sizes of boxes in px (0: culled), depths, the image of each, I, and the
+    sizes of images and tiles in px; returns how many tiles each Gaussian touches, the pairs' ids,
+    sorted, int64, the Gaussian of each pair, and the first pair of each tile.
+    """
+    columns, rows = -(-width // size), -(-height // size)
+    tiles = columns * rows
+    limit, zero = torch.tensor([columns, rows], dtype=torch.float32), torch.zeros(2)
+    center, reach = means2d / size, radii / size
+    # First column and row of tiles of each box, and the number of both; 0 if culled.
+    first = torch.floor(center - reach).clamp(zero, limit)
+    sizes = torch.ceil(center + reach).clamp(zero, limit) - first
+    first, sizes = first.long(), sizes.long() * is_seen(radii)[:, None]
+    counts = sizes.prod(dim=1)
+    owner = torch.repeat_interleave(counts)
+    # Each pair's number within its Gaussian's box of tiles, row by row.
+    place = torch.arange(len(owner)) - (counts.cumsum(0) - counts)[owner]
+    across = sizes[owner, 0]
+    tile = (first[owner, 1] + place // across) * columns + first[owner, 0] + place % across
+    # Bits of a positive float sort like the float; the mask undoes the sign's extension.
+    depth = depths.detach().contiguous().view(torch.int32).long()[owner] & 0xFFFFFFFF
+    keys = (images[owner] << (32 + tiles.bit_length())) | (tile << 32) | depth
+    ids, order = torch.sort(keys, stable=True)
+    pairs = torch.bincount(images[owner] * tiles + tile, minlength=count * tiles)
+    offsets = (pairs.cumsum(0) - pairs).int().view(count, rows, columns)
+    return counts.int(), ids, owner[order].int(), offsets
