@@ -17,7 +17,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before PyTorch: see docs/
 import splatseed as ss
 from splatseed.splat.evaluate import evaluate_views
 from splatseed.synthetic import make_capture, write_capture
-from splatseed.train import RunOptions, TrainSettings, prepare_run
+from splatseed.train import TrainSettings, prepare_run
 
 
 def main(scene_dir: Path, steps: int) -> None:
@@ -32,9 +32,7 @@ def main(scene_dir: Path, steps: int) -> None:
         ("mls 4x", ss.upsample(scene, method="mls", ratio=4, seed=0)),
     ):
         folder = Path("runs") / name.replace(" ", "_")
-        run = prepare_run(
-            scene.replace(points=points), folder, settings, RunOptions(overwrite=True)
-        )
+        run = prepare_run(scene.replace(points=points), folder, settings, overwrite=True)
         run.train()
         result = run.finish(evaluate_views)
         scores = result.scores

@@ -22,7 +22,7 @@ from splatseed import load_scene
 from splatseed.splat.evaluate import evaluate_views
 from splatseed.splat.metrics import l1_and_ssim_by_convolution
 from splatseed.train import TrainSettings
-from splatseed.train.device import peak_gpu_bytes, pick_device
+from splatseed.train.device import pick_device
 from splatseed.train.seeds import usable_seeds
 from splatseed.train.trainer import _fused_ssim
 from splatseed.views.view import View, load_split
@@ -60,7 +60,7 @@ def train(scene: str, settings: dict[str, Any], examples: str) -> dict[str, Any]
         "gaussians": len(runner.splats["means"]),
         "step": (ended - begun) / wanted.max_steps,
         "before": begun - start,
-        "bytes": peak_gpu_bytes(device),
+        "bytes": torch.cuda.max_memory_allocated(device),
     }
 
 

@@ -38,21 +38,21 @@ def points(rng) -> PointCloud:
     return PointCloud(xyz, np.zeros((ORIGINALS + NEW, 3), np.uint8), source)
 
 
-def thinned(
-    points: PointCloud, cap: int, seed: int = 0, **settings
-) -> tuple[PointCloud, list[str]]:
+def thinned(points: PointCloud, cap: int, **settings) -> tuple[PointCloud, list[str]]:
     notes: list[str] = []
-    asked = TrainSettings(cap_max=cap, seed=seed, **settings)
-    return usable_seeds(points, asked, notes.append), notes
+    return usable_seeds(points, TrainSettings(cap_max=cap, **settings), notes.append), notes
 
 
 def test_more_than_the_cap_are_thinned_and_told_of(points):
+    mixed = points.select(np.random.default_rng(0).permutation(len(points)))
     for strategy, most in (("default", 49), ("none", 70)):  # default adds the rest
         seeds, notes = thinned(points, 70, strategy=strategy)
         assert len(seeds) == most
         assert np.isin(seeds.xyz, points.xyz).all()
         assert f"100 seeds were thinned to {most}, {seeds.num_original} of them" in notes[0]
         assert np.array_equal(thinned(points, 70, seed=1, strategy=strategy)[0].xyz, seeds.xyz)
+        # Originals are asked first wherever they stand.
+        assert thinned(mixed, 70, strategy=strategy)[0].num_original == seeds.num_original
 
 
 def test_what_crowds_goes_first(points):
@@ -64,49 +64,30 @@ def test_what_crowds_goes_first(points):
     assert np.array_equal(seeds.xyz, points.xyz[:ORIGINALS])
 
 
-def test_originals_are_asked_first_wherever_they_stand(points):
-    mixed = points.select(np.random.default_rng(0).permutation(len(points)))
-    one, other = (thinned(each, 50)[0] for each in (points, mixed))
-    assert one.num_original == other.num_original
-
-
-def test_points_that_are_not_finite_are_left_out_and_told_of(points):
+def test_points_that_are_not_finite_and_wishes_without_effect_are_told_of(points):
     xyz = points.xyz.copy()
     xyz[3] = np.nan
-    seeds, notes = thinned(points.replace(xyz=xyz), 1000)
+    broken = points.replace(xyz=xyz, sizes=np.full(len(points), np.nan))
+    seeds, notes = thinned(broken, 1000, seed_sizes=True, seed_normals=True)
     assert len(seeds) == ORIGINALS + NEW - 1
-    assert len(notes) == 1
+    assert [note.split()[0] for note in notes] == ["1", "seed_sizes", "seed_normals"]
 
 
-@pytest.fixture
-def known(points) -> PointCloud:
-    """The points with a size that follows from the position, normals of some, and confidence."""
+def test_of_what_is_known_only_what_is_asked_for_has_a_part(points):
     normals = np.tile([0.0, 0, 1], (len(points), 1))
     normals[::3] = np.nan
-    sizes = np.abs(points.xyz[:, 0])
-    return points.replace(normals=normals, sizes=sizes, confidence=np.ones(len(points)))
-
-
-def test_of_what_is_known_only_what_is_asked_for_has_a_part(known, points):
-    begun = {
-        names: usable_seeds(known, TrainSettings(**dict.fromkeys(names, True)), print)
-        for names in ((), ("seed_sizes",), ("seed_normals",), ("seed_sizes", "seed_normals"))
-    }
-    assert [sorted(seeds.attributes) for seeds in begun.values()] == [
-        *([], ["sizes"], ["normals"], ["normals", "sizes"])
-    ]
-    digests = [seeds_digest(seeds) for seeds in begun.values()]
+    sizes, confidence = np.abs(points.xyz[:, 0]), np.ones(len(points))
+    known = points.replace(normals=normals, sizes=sizes, confidence=confidence)
+    digests = []
+    for names in ((), ("sizes",), ("normals",), ("normals", "sizes")):
+        asked = TrainSettings(**{f"seed_{name}": True for name in names})
+        seeds = usable_seeds(known, asked, print)
+        assert tuple(sorted(seeds.attributes)) == names
+        digests.append(seeds_digest(seeds))
     assert len(set(digests)) == 4
     assert digests[0] == seeds_digest(points)
-    few = usable_seeds(known, TrainSettings(cap_max=55, seed_sizes=True), lambda _: None)
+    few = thinned(known, 55, seed_sizes=True)[0]
     np.testing.assert_array_equal(few.sizes, np.abs(few.xyz[:, 0]))
-
-
-def test_asking_for_what_is_not_known_is_told(points):
-    notes: list[str] = []
-    unknown = points.replace(sizes=np.full(len(points), np.nan))
-    usable_seeds(unknown, TrainSettings(seed_sizes=True, seed_normals=True), notes.append)
-    assert [note.split()[0] for note in notes] == ["seed_sizes", "seed_normals"]
 
 
 def test_a_plain_scene_is_seeded_on_request_and_the_user_told(room):
@@ -125,26 +106,23 @@ def test_a_plain_scene_is_seeded_on_request_and_the_user_told(room):
     assert "--seeds scene" not in notes[-1]  # there are none to begin with
 
 
-def test_what_upsample_only_thinned_is_left_alone(room, tmp_path):
-    write_scene(room.replace(points=room.points.select(slice(100))), tmp_path / "thin")
-    thin, asked = load_scene(tmp_path / "thin"), TrainSettings(seeding="auto")
-    (tmp_path / "thin" / MANIFEST).write_text('{"command": "upsample"}')
-    assert seeded(thin, asked, "cpu", print, silent) == (thin, None)
-    (tmp_path / "thin" / MANIFEST).write_text('{"command": "sfm"}')
-    assert len(seeded(thin, asked, "cpu", lambda _: None, silent)[0].points) > len(thin.points)
-
-
-@pytest.mark.parametrize(
-    "settings", [{}, {"seeding": "auto", "strategy": "default-3dgs"}, {"seeding": "auto"}]
-)
-def test_other_points_are_left_alone(settings, room):
-    """Those that are to stay, of 3DGS's conventions, and those that splatseed has added to."""
-    touched = room.replace(
-        points=room.points.replace(source=np.full(len(room.points), 4, np.uint8))
+@pytest.mark.parametrize("why", ["as it is", "3dgs", "added to", "thinned"])
+def test_other_points_are_left_alone(why, room, tmp_path):
+    """Those that are to stay, of 3DGS's conventions, and those that splatseed made."""
+    asked = TrainSettings(
+        seeding="scene" if why == "as it is" else "auto",
+        strategy="default-3dgs" if why == "3dgs" else "default",
     )
-    scene = touched if settings == {"seeding": "auto"} else room
+    scene = room
+    if why == "added to":
+        source = np.full(len(room.points), 4, np.uint8)
+        scene = room.replace(points=room.points.replace(source=source))
+    if why == "thinned":
+        write_scene(room.replace(points=room.points.select(slice(100))), tmp_path / "thin")
+        scene = load_scene(tmp_path / "thin")
+        (tmp_path / "thin" / MANIFEST).write_text('{"command": "upsample"}')
     notes: list[str] = []
-    assert seeded(scene, TrainSettings(**settings), "cpu", notes.append, silent) == (scene, None)
+    assert seeded(scene, asked, "cpu", notes.append, silent) == (scene, None)
     assert not notes
 
 
@@ -176,23 +154,6 @@ def test_they_are_what_a_literal_loop_finds(room, rng):
     assert np.allclose(near_depths(xyz, train), _literal(xyz, train), rtol=1e-5)
 
 
-def test_the_nearest_view_that_sees_a_point_counts():
-    views = [_view([0, 0, 0]), _view([0, 0, 2.0]), _view([30.0, 0, 3.9])]
-    xyz = np.array([[0, 0, 4.0], [0, 0, 1.0], [0, 0, -5.0]])
-    # The third point is behind all cameras: the median of the others.
-    assert near_depths(xyz, views).tolist() == [2.0, 1.0, 1.5]
-    assert near_depths(xyz[2:], views).tolist() == [1.0]
-
-
-def test_many_views_are_sampled_evenly(monkeypatch):
-    views = [_view([0, 0, -0.01 * i]) for i in range(1000)]
-    one = np.array([[0, 0, 1.0]])
-    assert near_depths(one, views[::-1])[0] == pytest.approx(1.0)
-    monkeypatch.setattr("splatseed.train.seeds.MOST_PROJECTIONS", 1)
-    assert near_depths(one, views)[0] == pytest.approx(1.0)  # the first is among those asked
-    assert near_depths(one, views[1:] + views[:1])[0] == pytest.approx(1.0)  # and the last
-
-
 @hypothesis_settings(deadline=None, max_examples=30)
 @given(
     shift=st.floats(-100, 100), scale=st.floats(0.1, 10), seed=st.integers(0, 99)
@@ -219,31 +180,29 @@ def test_whatever_adds_or_moves_gaussians_hands_them_on(begin, strategy):
     assert not lengths.requires_grad
 
 
+def _stepped(room, means, lengths, rate, steps):
+    """How far Adam moves positions and scales of Gaussians whose gradients are all 1."""
+    gaussians = dataclasses.replace(initial_gaussians(room.points), means=means)
+    params = make_parameters(gaussians, torch.device("cpu"), lengths.astype(np.float32))
+    optimizers = make_optimizers(params, make_schedule("none", 100, as_3dgs=False))
+    for _ in range(steps):
+        for value in params.values():
+            value.grad = torch.ones_like(value) if value.requires_grad else None
+        optimize(params, optimizers, dict.fromkeys(optimizers, rate))
+    after = (params[name].detach().numpy().astype(np.float64) for name in ("means", "scales"))
+    return tuple(old - new for old, new in zip((means, gaussians.scales), after, strict=True))
+
+
 def test_steps_of_positions_are_in_near_depths(room):
     """Adam's first step is the learning rate, whatever the gradient."""
-    gaussians = initial_gaussians(room.points)
-    lengths = np.linspace(0.1, 9.0, len(gaussians)).astype(np.float32)
-    params = make_parameters(gaussians, torch.device("cpu"), lengths)
-    optimizers = make_optimizers(params, make_schedule("none", 100, as_3dgs=False))
-    for value in params.values():
-        value.grad = torch.ones_like(value) if value.requires_grad else None
-    optimize(params, optimizers, dict.fromkeys(optimizers, 1e-2))
-    moved = gaussians.means - params["means"].detach().numpy()
+    lengths = np.linspace(0.1, 9.0, len(room.points))
+    moved, grown = _stepped(room, room.points.xyz, lengths, 1e-2, 1)
     assert np.allclose(moved, 1e-2 * lengths[:, None], rtol=1e-3, atol=1e-6)
-    changed = gaussians.scales - params["scales"].detach().numpy()
-    assert np.allclose(changed, 1e-2, rtol=1e-3)
+    assert np.allclose(grown, 1e-2, rtol=1e-3)
 
 
 def test_small_steps_of_far_positions_are_not_lost(room):
     """At the end of a full run a step is far below the last digit of a far position's own."""
-    rate, far = 1.6e-6, 100.0
-    gaussians = initial_gaussians(room.points)
-    away = dataclasses.replace(gaussians, means=np.full_like(gaussians.means, far))
-    params = make_parameters(away, torch.device("cpu"), np.full(len(away), far, np.float32))
-    optimizers = make_optimizers(params, make_schedule("none", 100, as_3dgs=False))
-    for _ in range(50):
-        for value in params.values():
-            value.grad = torch.ones_like(value) if value.requires_grad else None
-        optimize(params, optimizers, dict.fromkeys(optimizers, rate))
-    moved = far - params["means"].detach().double()
-    assert float(moved.mean()) == pytest.approx(50 * rate * far, rel=0.05)
+    rate, far = 1.6e-6, np.full(len(room.points), 100.0, np.float32)
+    moved, _ = _stepped(room, np.repeat(far[:, None], 3, axis=1), far, rate, 50)
+    assert moved.mean() == pytest.approx(50 * rate * 100.0, rel=0.05)

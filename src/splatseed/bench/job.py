@@ -48,7 +48,7 @@ from splatseed.scores import EvalResult
 from splatseed.seeding.advice import DEFAULT_METHOD
 from splatseed.seeding.clouds.method import Cloud
 from splatseed.seeding.upsampling import CELL, thin_to, upsample
-from splatseed.train.depths import stereo_size
+from splatseed.train.seeds import stereo_size
 from splatseed.upsample import Upsampler, chooses_number, configure
 from splatseed.views.view import user_cache_dir
 
@@ -144,7 +144,7 @@ def run_job(
         KeyboardInterrupt: The user stopped it.
     """
     from splatseed.splat.metrics import load_lpips  # noqa: PLC0415  (PyTorch)
-    from splatseed.train.run import RunOptions, prepare_run  # noqa: PLC0415  (PyTorch)
+    from splatseed.train.run import prepare_run  # noqa: PLC0415  (PyTorch)
 
     begun = time.perf_counter()
     with output_folder(run_folder(bench, spec), kind="bench", overwrite=True) as folder:
@@ -157,13 +157,15 @@ def run_job(
         size = stereo_size(scene.split(every)[0], spec.settings, spec.settings.backend)
         # What stereo knows, for growth, is found once for all runs of a repeat, and its time counts
         # in each; not where seeds by auto have paid for it, as splatseed train shares the two.
-        ways = RunOptions(
+        run = prepare_run(
+            scene.replace(points=seeds),
+            work,
+            spec.settings,
             cache_dir=user_cache_dir(),
             depths=bench / "depths" / f"{spec.scene_digest}_{every}_{size}_{spec.repeat}.npz",
             seeding_knew=plain(spec.arm.method) == DEFAULT_METHOD and not _is_full(scene, spec),
+            progress=progress,
         )
-        seeded = scene.replace(points=seeds)
-        run = prepare_run(seeded, work, spec.settings, ways, progress=progress)
         if not run.train(lambda step: progress(TRAIN, step / spec.training.max_steps)):
             raise KeyboardInterrupt
         trained = run.finish(_scorer(spec, bench, lpips, progress), progress)

@@ -371,11 +371,11 @@ def _train_arm(
     """Train from an arm's seeds, and score; also a test view's photograph, render and errors."""
     from splatseed.splat.evaluate import evaluate_views  # noqa: PLC0415  (imports PyTorch)
     from splatseed.splat.rendering import FULL_ERROR, as_bytes, error_map  # noqa: PLC0415  (likewise)
-    from splatseed.train.run import RunOptions, prepare_run  # noqa: PLC0415  (likewise)
+    from splatseed.train.run import prepare_run  # noqa: PLC0415  (likewise)
     from splatseed.view.page import Tile  # noqa: PLC0415  (likewise)
 
-    stage, how = f"train {arm.label}", RunOptions(overwrite=True)
-    run = prepare_run(load_scene(arm.scene), arm.output, settings, how, progress=clock)
+    stage = f"train {arm.label}"
+    run = prepare_run(load_scene(arm.scene), arm.output, settings, overwrite=True, progress=clock)
     clock(stage, 0.0)
     if not run.train(lambda step: clock(stage, step / settings.max_steps)):
         raise KeyboardInterrupt

@@ -33,10 +33,8 @@ from splatseed.seeding.upsampling import parse_budget
 from splatseed.train.folder import RunFolder
 from splatseed.train.seeds import why_not_seeded
 from splatseed.train.settings import (
-    AS_IT_IS,
     BUDGET,
     LEAST_GAUSSIANS,
-    Reading,
     Seeding,
     StrategyName,
     TrainSettings,
@@ -79,8 +77,8 @@ class Options:
     seeds: Seeding | None = None
     """Start from the points that method auto makes of the training photographs (the default, if
     splatseed has not added any to the scene), or from the scene's points as they are."""
-    reading: Annotated[Reading, tyro.conf.arg(name="")] = AS_IT_IS
-    """What to do with the scene before; its fields are options of their own."""
+    refine_poses: bool = False
+    """Refine poses of a phone or SLAM first, and triangulate points; they replace the scene's."""
     resume: bool = False
     """Resume the run in the output folder, with its own settings; begin it if there is none."""
     tensorboard: bool = False
@@ -118,7 +116,7 @@ def parse(arguments: list[str]) -> Options:
 
 def _in_file(path: Path) -> Options:
     """The options in a .toml or in a run's config.json."""
-    kinds = {"training": TrainSettings, "reading": Reading, "": Options}
+    kinds = {"training": TrainSettings, "": Options}
     fields = {
         name: (group, hint)
         for group, kind in kinds.items()
@@ -143,8 +141,8 @@ def _in_file(path: Path) -> Options:
                 fix="Run splatseed train --help.",
             )
     paths: dict[str, Any] = {"scene": tyro.MISSING, "output": tyro.MISSING}
-    training, reading = replace(BEST_SETTINGS, **given["training"]), Reading(**given["reading"])
-    return Options(**{**paths, **given[""]}, training=training, reading=reading)
+    training = replace(BEST_SETTINGS, **given["training"])
+    return Options(**{**paths, **given[""]}, training=training)
 
 
 def _read_config(path: Path) -> dict[str, Any]:
@@ -203,10 +201,10 @@ def run(arguments: list[str]) -> None:
 def _prepare(
     options: Options, settings: TrainSettings, note: Callable[[str], None], clock: Progress
 ) -> TrainingRun:
-    from splatseed.train.run import RunOptions, prepare_run  # noqa: PLC0415  (imports PyTorch)
+    from splatseed.train.run import prepare_run  # noqa: PLC0415  (imports PyTorch)
 
     clock("read", 0.0)
-    has_points = options.seeds == "scene" and not options.reading.refine_poses
+    has_points = options.seeds == "scene" and not options.refine_poses
     scene = load_scene(options.scene, require_points=has_points)
     for warning in scene.warnings:
         note(warning)
@@ -215,14 +213,18 @@ def _prepare(
     settings = _within_budget(options, _sized(options, settings, scene), scene, note)
     if options.seeds == "auto" and (why := why_not_seeded(scene, settings)):
         note(f"--seeds auto has no effect: {why}.")
-    how = RunOptions(
+    return prepare_run(
+        scene,
+        options.output,
+        settings,
         resume=options.resume,
         overwrite=options.overwrite,
+        refine_poses=options.refine_poses,
         tensorboard=options.tensorboard,
         cache_dir=user_cache_dir(),
-        reading=options.reading,
+        note=note,
+        progress=clock,
     )
-    return prepare_run(scene, options.output, settings, how, note=note, progress=clock)
 
 
 def _sized(options: Options, settings: TrainSettings, scene: Scene) -> TrainSettings:

@@ -1,8 +1,8 @@
 """Training: from a scene and its seeds to Gaussians that look like the photographs.
 
 ``prepare_run`` reads what a run needs and opens its folder; the ``TrainingRun`` it returns trains
-and writes the results. ``TrainSettings`` and ``Reading`` can be used without PyTorch: the rest is
-imported when first accessed (``pip install ".[train]"``).
+and writes the results. ``TrainSettings`` can be used without PyTorch: the rest is imported when
+first accessed (``pip install ".[train]"``).
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from splatseed.requirements import require
-from splatseed.train.settings import Reading, TrainSettings
+from splatseed.train.settings import TrainSettings
 
 if TYPE_CHECKING:
-    from splatseed.train.run import RunOptions, TrainingRun, prepare_run
+    from splatseed.train.run import TrainingRun, prepare_run
 
-__all__ = ["Reading", "RunOptions", "TrainSettings", "TrainingRun", "prepare_run"]
+__all__ = ["TrainSettings", "TrainingRun", "prepare_run"]
 
 
 def __getattr__(name: str) -> Any:

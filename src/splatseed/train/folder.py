@@ -1,61 +1,40 @@
-"""The folder of a run: its files, and permission to write.
+"""The folder of a run: its files, permission to write them, and the curve.
 
 Promise: a folder that splatseed did not write is never touched; an earlier run is replaced only on
-request, and not before the new one is ready to start.
+request, and not before the new one is ready to start; the curve's files appear whole or not at all,
+so that a run can be watched while it trains.
 """
 
 from __future__ import annotations
 
+import csv
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from splatseed.errors import OutputError, SceneFormatError
-from splatseed.io import write_scene
+from splatseed.io import staging, write_scene
 from splatseed.io.files import read_text
-from splatseed.io.staging import (
-    MANIFEST,
-    add_files,
-    check_apart,
-    check_output,
-    oserror_as_output_error,
-    remove,
-    write_json,
-)
+from splatseed.io.staging import MANIFEST, atomic_file, write_json
 from splatseed.scene import Scene
 
-KIND = "train"
-"""The kind recorded in a run folder's manifest."""
+KIND = "train"  # in a run folder's manifest
 
 
 class RunFolder:
-    """A run's folder.
-
-    Attributes:
-        path: Where it is, or will be.
-        config: The scene and the settings, as JSON.
-        checkpoint: The state from which an unfinished run is resumed.
-        metrics: The scores, as JSON; written once the run has finished.
-        gaussians: The trained Gaussians.
-        curve_csv: The curve as a table.
-        curve_png: The curve as a picture.
-        renders: Test views beside their photographs.
-        tensorboard: TensorBoard's log, if asked for.
-        scene: The scene at refined poses, if the run refined them.
-    """
+    """A run's folder: the paths in it, whether or not they are there."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.config = path / "config.json"
-        self.checkpoint = path / "checkpoint.pt"
-        self.metrics = path / "metrics.json"
+        self.config = path / "config.json"  # the scene and the settings
+        self.checkpoint = path / "checkpoint.pt"  # from which an unfinished run is resumed
+        self.metrics = path / "metrics.json"  # the scores, once the run has finished
         self.gaussians = path / "point_cloud.ply"
-        self.curve_csv = path / "curve.csv"
-        self.curve_png = path / "curve.png"
-        self.renders = path / "renders"
-        self.tensorboard = path / "tensorboard"
-        self.scene = path / "scene"
+        self.curve_csv, self.curve_png = path / "curve.csv", path / "curve.png"
+        self.renders = path / "renders"  # test views beside their photographs
+        self.tensorboard = path / "tensorboard"  # its log, if asked for
+        self.scene = path / "scene"  # at refined poses, if the run refined them
 
     @property
     def is_run(self) -> bool:
@@ -68,18 +47,20 @@ class RunFolder:
         Raises:
             OutputError: It is taken or protected.
         """
-        if resume and self.metrics.is_file():
+        ended = self.metrics.is_file()
+        if resume and ended:
             raise OutputError(
                 f"an unfinished run to resume at {self.path}",
                 found="a finished one",
                 fix="See its metrics.json, or pass --overwrite to train again.",
             )
         if resume and self.is_run:
-            check_apart(self.path, protect)
+            staging.check_apart(self.path, protect)
             return
-        check_output(self.path, kind=KIND, overwrite=overwrite or self.is_run, protect=protect)
+        staging.check_output(
+            self.path, kind=KIND, overwrite=overwrite or self.is_run, protect=protect
+        )
         if self.is_run and not overwrite:
-            ended = self.metrics.is_file()
             go_on = "" if ended else "--resume, without options that differ, to continue it, "
             raise OutputError(
                 f"no folder, or an empty one, at {self.path}",
@@ -100,8 +81,8 @@ class RunFolder:
         # The manifest first: a run that is interrupted here can be replaced.
         files = [self.config, self.checkpoint, self.metrics, self.gaussians, self.curve_csv]
         files += [self.curve_png, *([] if refined is None else [self.scene])]
-        with oserror_as_output_error(self.path):
-            remove(self.path)
+        with staging.oserror_as_output_error(self.path):
+            staging.remove(self.path)
         manifest = {"command": KIND, "version": config["splatseed"]}
         write_json(self.path / MANIFEST, {**manifest, "files": [path.name for path in files]})
         if refined is not None:  # before the config, so that no run lacks it
@@ -115,7 +96,7 @@ class RunFolder:
         Raises:
             OutputError: The list cannot be written.
         """
-        add_files(self.path, [path.relative_to(self.path).as_posix() for path in paths])
+        staging.add_files(self.path, [path.relative_to(self.path).as_posix() for path in paths])
 
     def read_config(self) -> dict[str, Any]:
         """What ``begin`` wrote.
@@ -125,23 +106,70 @@ class RunFolder:
         """
         try:
             config = json.loads(read_text(self.config))
+            found = type(config).__name__
         except (OSError, ValueError) as error:
-            raise _unreadable(self.config, type(error).__name__) from None
+            config, found = None, type(error).__name__
         if not isinstance(config, dict):
-            raise _unreadable(self.config, type(config).__name__)
+            raise SceneFormatError(
+                f"{self.config} to be the config of a run",
+                found=found,
+                fix="Start again with --overwrite.",
+            )
         return config
 
     def scene_of(self, config: Mapping[str, Any]) -> Any:
-        """Where the scene lies that the run trained: in its folder if poses were refined.
-
-        Args:
-            config: The run's; without a scene of its own, what it says of one is passed on.
-        """
+        """Where the scene lies that a run of this config trained: here if poses were refined."""
         refined = config.get("refine_poses") is True
         return str(self.scene.resolve()) if refined else config.get("scene")
 
 
-def _unreadable(path: Path, found: str) -> SceneFormatError:
-    return SceneFormatError(
-        f"{path} to be the config of a run", found=found, fix="Start again with --overwrite."
-    )
+class Record(NamedTuple):
+    """The progress of a run, taken at regular steps."""
+
+    step: int
+    """Steps done."""
+    seconds: float
+    """Seconds of training alone: not of reading, scoring or writing."""
+    loss: float
+    """Mean since the last record."""
+    train_psnr: float
+    """PSNR of the last training photograph, dB."""
+    test_psnr: float | None
+    """Mean over the test views, dB; None if not evaluated."""
+    num_gaussians: int
+    test_ssim: float | None = None
+    """Mean over the test views; None where it was not taken."""
+
+
+def write_curve_csv(path: Path, records: Sequence[Record]) -> None:
+    """Write one row per record, with a header; a PSNR not taken is left blank."""
+    with atomic_file(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(Record._fields)
+        writer.writerows(records)
+
+
+def write_curve_png(path: Path, records: Sequence[Record]) -> None:
+    """Draw loss, PSNR and number of Gaussians over the steps, one below the other."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415  (slow to import)
+    from matplotlib.figure import Figure  # noqa: PLC0415  (loads with its use)
+
+    figure = Figure(figsize=(7.0, 7.0), layout="constrained")
+    FigureCanvasAgg(figure)
+    losses, psnrs, counts = figure.subplots(3, 1, sharex=True)
+    steps = [r.step for r in records]
+    losses.semilogy(steps, [r.loss for r in records], color="C3")
+    losses.set_ylabel("loss")
+    shown = [r.train_psnr for r in records]
+    psnrs.plot(steps, shown, color="C0", alpha=0.35, label="training, single photographs")
+    tested = [(r.step, r.test_psnr) for r in records if r.test_psnr is not None]
+    psnrs.plot(*zip(*tested, strict=True), "o-", color="C0", label="test, mean")
+    psnrs.set_ylabel("PSNR, dB")
+    psnrs.legend(loc="lower right")
+    counts.plot(steps, [r.num_gaussians for r in records], color="C2")
+    counts.set(ylim=(0, None), ylabel="Gaussians", xlabel="step")
+    counts.yaxis.set_major_formatter("{x:,.0f}")
+    for axes in (losses, psnrs, counts):
+        axes.grid(visible=True, which="both", alpha=0.3)
+    with atomic_file(path) as partial:
+        figure.savefig(partial, dpi=100)

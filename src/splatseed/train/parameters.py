@@ -3,11 +3,8 @@
 Notation: gsplat's parameter dict: ``means``, ``scales`` (logarithms), ``quats``, ``opacities``
 (logits), ``sh0``, ``shN``; one Adam each, as gsplat's strategies need them. In splatseed's
 conventions they are accompanied by ``near_depths`` [N], which are not learnt: whatever adds, moves
-or removes Gaussians treats them like the rest.
-
-Steps on single photographs keep the parameters oscillating about their best values, since only the
-learning rate of positions decays; the mean does not oscillate (Polyak and Juditsky, 1992). Promise:
-the mean restarts when the number of Gaussians changes, so that each value averages one Gaussian.
+or removes Gaussians treats them like the rest. Steps on single photographs keep the parameters
+oscillating; their mean does not oscillate (Polyak and Juditsky, 1992).
 """
 
 from __future__ import annotations
@@ -42,10 +39,7 @@ def make_parameters(
 ) -> Parameters:
     """Trainable copies of the Gaussians' arrays on a device.
 
-    Args:
-        gaussians: The initial ones.
-        device: Where they are trained.
-        near_depths: Their length units; when left out, the cameras' extent is the unit for all.
+    Without ``near_depths``, their length units, the cameras' extent is the unit for all.
     """
     arrays = gaussians.arrays()
     if near_depths is not None:
@@ -93,25 +87,16 @@ class _Adam(torch.optim.Adam):
 
 def make_optimizers(params: Parameters, schedule: Schedule) -> Optimizers:
     """One Adam per parameter, with the schedule's learning rates."""
-    rates = schedule.learning_rates
-    how: dict[str, Any] = {
-        "betas": (ADAM_BETA1, schedule.beta2), "eps": ADAM_EPSILON, "fused": True
-    }  # fmt: skip
+    betas = ADAM_BETA1, schedule.beta2
     return {
-        name: _Adam([{"params": [value]}], lr=rates[name], **how)
+        name: _Adam([value], schedule.learning_rates[name], betas, ADAM_EPSILON, fused=True)
         for name, value in params.items()
         if value.requires_grad
     }
 
 
 def optimize(params: Parameters, optimizers: Optimizers, rates: Mapping[str, float]) -> None:
-    """Take an optimiser step and clear the gradients.
-
-    Args:
-        params: The parameters, with their gradients.
-        optimizers: Their optimisers.
-        rates: Their learning rates; for positions in length units.
-    """
+    """Take an optimiser step at these rates, in length units for positions; clear gradients."""
     means, lengths = params["means"], length_units(params)
     positions = means.data
     # A step from 0 loses no digits, however distant the position.
@@ -129,12 +114,9 @@ def optimize(params: Parameters, optimizers: Optimizers, rates: Mapping[str, flo
 
 @torch.no_grad()
 def add_to_mean(mean: dict[str, Any], params: Parameters) -> None:
-    """Add the current parameters to the mean.
+    """Add the learnt parameters to their means by name, and 1 to ``count``; empty at first.
 
-    Args:
-        mean: The means by name, and ``count``, the number of steps; empty at first, changed in
-            place.
-        params: All learnt parameters are averaged.
+    It restarts when the number of Gaussians changes, so that each value averages one Gaussian.
     """
     if not mean or len(mean["means"]) != len(params["means"]):
         mean.clear()

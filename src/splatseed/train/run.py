@@ -1,22 +1,34 @@
 """A training run, from a scene to a folder of results.
 
 Promise: nothing is written before the scene is known to be trainable; an interrupted run resumes
-where it stopped, with its original settings; results are in the scene's world.
+where it stopped, never with other settings, seeds or poses than it began with; results are in the
+scene's world; the end of a GPU's memory is told in a sentence, with a number to try.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import platform
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatseed.errors import OutputError, PointCloudError, SceneNotFoundError
+from splatseed.errors import (
+    OutputError,
+    ParameterError,
+    PointCloudError,
+    SceneFormatError,
+    SceneNotFoundError,
+)
+from splatseed.io import load_scene
+from splatseed.io.seeds import was_upsampled
 from splatseed.io.staging import write_json
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent
@@ -27,31 +39,18 @@ from splatseed.splat.formats import write_model
 from splatseed.splat.gaussians import TrainingFrame, stray_note, stray_views, training_frame
 from splatseed.splat.rendering import picture_name, write_render
 from splatseed.splat.ssim import WINDOW
-from splatseed.train.depths import known_depths
-from splatseed.train.device import (
-    check_fits,
-    device_name,
-    gpu_memory_told,
-    peak_gpu_bytes,
-    pick_device,
+from splatseed.train.device import check_fits, pick_device
+from splatseed.train.folder import Record, RunFolder, write_curve_csv, write_curve_png
+from splatseed.train.parameters import gaussians_of
+from splatseed.train.seeds import known_depths, seeded, seeds_digest, usable_seeds
+from splatseed.train.settings import TrainSettings
+from splatseed.train.state import (
+    TrainState,
+    first_state,
+    load_checkpoint,
+    make_strategy,
+    save_checkpoint,
 )
-from splatseed.train.folder import RunFolder
-from splatseed.train.parameters import gaussians_of, make_optimizers, make_parameters
-from splatseed.train.record import (
-    Board,
-    Record,
-    check_same_seeds,
-    make_config,
-    resumed_reading,
-    resumed_settings,
-    scene_as_read,
-    write_curve_csv,
-    write_curve_png,
-)
-from splatseed.train.seeds import first_gaussians, seeded, usable_seeds
-from splatseed.train.settings import AS_IT_IS, Reading, TrainSettings
-from splatseed.train.state import TrainState, load_checkpoint, make_strategy, save_checkpoint
-from splatseed.train.strategies import Strategy
 from splatseed.train.trainer import Trainer
 from splatseed.views.view import View, check_lens, load_split, poses_of
 
@@ -61,39 +60,26 @@ Score = Callable[[Render, Sequence[View]], EvalResult]
 
 SAVE_EVERY = 60.0
 """Least seconds between checkpoints, so that saving stays a small part of the time."""
-
-
-@dataclass(frozen=True)
-class RunOptions:
-    """What a run does besides training.
-
-    Args:
-        resume: Resume the run in the folder, if there is one, with its own settings.
-        overwrite: Replace an earlier run in the folder.
-        tensorboard: Also write TensorBoard's log.
-        cache_dir: Where smaller photographs are cached; nowhere when left out.
-        depths: The file in which the depth that stereo finds, for growth, is kept for other runs
-            on the same photographs with the same seed; nowhere when left out. Each run's time
-            counts what finding it took.
-        seeding_knew: Whether that time is already counted as making the seeds.
-        reading: What to do with the scene before.
-    """
-
-    resume: bool = False
-    overwrite: bool = False
-    tensorboard: bool = False
-    cache_dir: Path | None = None
-    depths: Path | None = None
-    seeding_knew: bool = False
-    reading: Reading = AS_IT_IS
+FEWER = 0.8
+"""The part of the Gaussians to try again with where memory ended."""
+OPTIONS = {"seeding": "seeds", "cap_max": "budget"}
+"""Command-line names of settings, where they differ."""
+LOGGED = ("seconds", "loss", "psnr/train", "psnr/test", "gaussians", "ssim/test")
+"""TensorBoard's names of a record's numbers, after the step."""
 
 
 def prepare_run(
     scene: Scene,
     output: Path,
     settings: TrainSettings,
-    options: RunOptions | None = None,
     *,
+    resume: bool = False,
+    overwrite: bool = False,
+    refine_poses: bool = False,
+    tensorboard: bool = False,
+    cache_dir: Path | None = None,
+    depths: Path | None = None,
+    seeding_knew: bool = False,
     note: Callable[[str], None] = lambda _: None,
     progress: Progress = silent,
 ) -> TrainingRun:
@@ -103,115 +89,209 @@ def prepare_run(
         scene: A scene with photographs; its points are the seeds.
         output: The folder of the run.
         settings: How to train.
-        options: What else to do.
+        resume: Resume the run in the folder, if there is one, with its own settings.
+        overwrite: Replace an earlier run in the folder.
+        refine_poses: Refine poses of a phone or SLAM first, and triangulate points, which replace
+            the scene's.
+        tensorboard: Also write TensorBoard's log.
+        cache_dir: Where smaller photographs are cached; nowhere when left out.
+        depths: The file in which the depth that stereo finds, for growth, is kept for other runs
+            on the same photographs with the same seed; nowhere when left out. Each run's time
+            counts what finding it took.
+        seeding_knew: Whether that time is already counted as making the seeds.
         note: Called with notes for the user, one sentence each.
         progress: Called with the stage and the fraction done.
 
     Raises:
         OutputError: ``output`` is taken, protected or cannot be written.
-        SceneNotFoundError: Photographs are missing.
+        SceneNotFoundError: Photographs are missing, or the run to resume lost its refined poses.
         SceneFormatError: A camera, a photograph or the run to resume cannot be used.
         PointCloudError: Too few points, or more than fit into memory.
-        ParameterError: No GPU although one was requested; settings that differ from the run's.
+        ParameterError: No GPU although one was requested; settings or a scene that differ from the
+            run's; poses to be refined under seeds.
         ReconstructionError: Poses cannot be refined.
         MissingDependencyError: TensorBoard or pycolmap is needed and absent.
     """
-    options = options or RunOptions()
-    _check_images(scene)
-    if options.tensorboard:
+    _check_images(scene)  # before the folder is looked at, which may be a cloud's own
+    if tensorboard:
         require("tensorboard")
     folder = RunFolder(Path(output))
     protect = scene.source.inputs if scene.source else ()
-    folder.check(overwrite=options.overwrite, resume=options.resume, protect=protect)
-    begun, reading = None, options.reading
-    if options.resume and folder.is_run:
-        begun = folder.read_config()
-        settings = resumed_settings(begun, settings)
-        reading = resumed_reading(begun, reading)
-    for image in scene.images:
-        check_lens(image, scene.source.root if scene.source else None)
+    folder.check(overwrite=overwrite, resume=resume, protect=protect)
+    begun = folder.read_config() if resume and folder.is_run else None
+    if begun:
+        settings, refine_poses = resumed(begun, settings, refine_poses=refine_poses)
     device = pick_device(settings.backend, progress)
-    earlier = folder if begun else None
-    scene = posed = scene_as_read(scene, reading, earlier, settings.seed, note, progress)
+    if refine_poses:
+        scene = _at_refined_poses(scene, folder, begun, settings.seed, note, progress)
+    posed = scene
     scene, stereo = seeded(scene, settings, device.type, note, progress)
     trained = scene.split(settings.test_every)[0]
     seeds = usable_seeds(scene.points, settings, note, poses_of(trained, settings.data_factor))
     check_fits(len(seeds), device)
-    config = make_config(scene, seeds, settings, device_name(device), reading)
-    if begun:
-        check_same_seeds(folder.config, begun, config)
+    config = make_config(scene, seeds, settings, _name(device), refine_poses=refine_poses)
+    if begun and begun.get("seeds") != config["seeds"]:
+        raise _another_scene(folder, begun, f"points in {config['scene']}")
     views = load_split(
         scene,
         data_factor=settings.data_factor,
         test_every=settings.test_every,
         min_side=WINDOW,  # smaller views have no SSIM
-        cache_dir=options.cache_dir,
+        cache_dir=cache_dir,
         progress=progress,
     )
-    frame, strays = training_frame(views[0]), stray_views(views[0])
-    for name in strays:
+    frame = training_frame(views[0])
+    for name in stray_views(views[0]):
         note(stray_note(name))
-    depths, seconds = known_depths(
+    known, seconds = known_depths(
         scene, frame.scale, settings, device.type,
-        stereo=stereo, kept=options.depths, note=note, progress=progress,
+        stereo=stereo, kept=depths, note=note, progress=progress,
     )  # fmt: skip
-    maps = {name: torch.as_tensor(depth).to(device) for name, depth in depths.items()}
-    strategy = make_strategy(settings, device, maps)
-    near = [frame.view(view) for view in views[0] if view.name not in strays]
-    state = _state(earlier, frame.cloud_from_world(seeds), near, settings, strategy, device)
+    strategy = make_strategy(settings, device, known)
+    if begun and folder.checkpoint.is_file():
+        state = load_checkpoint(folder.checkpoint, strategy, settings.schedule, device)
+    else:
+        state = first_state(seeds, views[0], settings, strategy, device)
     if state.step:
         note(f"Resuming after step {state.step:,} of {settings.max_steps:,}.")
     run = TrainingRun(folder, settings, frame, state, views)
     progress("compile", 0.0)
-    with gpu_memory_told(run.count):
+    with run.told():
         run.trainer.warm_up()
     # What cannot render has failed by now, and leaves no folder.
     if not begun:
-        if not options.seeding_knew:
-            state.watch.seconds += seconds  # the cost of growth includes finding depth
-        folder.begin(config, posed if reading.refine_poses else None)
-    if options.tensorboard:
+        # The cost of growth includes finding depth.
+        state.watch.seconds += 0.0 if seeding_knew else seconds
+        folder.begin(config, posed if refine_poses else None)
+    if tensorboard:
         run.log_to_tensorboard()
     return run
 
 
 def _check_images(scene: Scene) -> None:
-    """Called before the folder is looked at, which may be the cloud's own."""
+    source = scene.source
     if not scene.images:
         raise SceneNotFoundError(
             "a scene with photographs to train on",
-            found=f"points alone{f' ({scene.source.points_path})' if scene.source else ''}",
+            found=f"points alone{f' ({source.points_path})' if source else ''}",
             fix="Name a scene with cameras, images and photographs. To begin with the points of a "
             "scan, add them to it: splatseed upsample SCENE --cloud FILE -o OUT.",
         )
+    for image in scene.images:
+        check_lens(image, source.root if source else None)
 
 
-def _state(
-    begun: RunFolder | None,
+def _at_refined_poses(
+    scene: Scene,
+    folder: RunFolder,
+    begun: Mapping[str, Any] | None,
+    seed: int,
+    note: Callable[[str], None],
+    progress: Progress,
+) -> Scene:
+    """The scene at refined poses; those that a resumed run keeps, if it has ``begun``."""
+    from splatseed.sfm import refined, with_refined  # noqa: PLC0415  (loads with its use)
+
+    if begun is not None:
+        kept = load_scene(folder.scene)
+        if {image.name for image in scene.images} != {image.name for image in kept.images}:
+            where = scene.source.root if scene.source else "the scene"
+            raise _another_scene(folder, begun, f"images in {where}")
+        return with_refined(scene, kept)
+    if was_upsampled(scene):
+        raise ParameterError(
+            "a scene that splatseed has not added points to, with --refine-poses",
+            found="seeds, which triangulated points would replace",
+            fix="Name the scene that they were made from, or refine before seeds are made: "
+            "splatseed upsample SCENE --refine-poses -o OUT.",
+        )
+    scene, told = refined(scene, seed, progress)
+    note(told)
+    return scene
+
+
+def make_config(
+    scene: Scene,
     seeds: PointCloud,
-    views: Sequence[View],
     settings: TrainSettings,
-    strategy: Strategy,
-    device: torch.device,
-) -> TrainState:
-    """The state of a run that left a checkpoint, else the first state."""
-    schedule = settings.schedule
-    if begun and begun.checkpoint.is_file():
-        return load_checkpoint(begun.checkpoint, strategy, schedule, device)
-    gaussians, lengths = first_gaussians(seeds, views, settings)
-    params = make_parameters(gaussians, device, lengths if schedule.near_depths else None)
-    return TrainState(params, make_optimizers(params, schedule), strategy)
+    device: str,
+    *,
+    refine_poses: bool = False,
+) -> dict[str, Any]:
+    """The content of config.json."""
+    source = scene.source
+    points = source.points_path if source and not refine_poses else None
+    return {
+        "splatseed": _version("splatseed"),
+        "scene": str(source.root.resolve()) if source else None,
+        "points": str(points.resolve()) if points else None,
+        "refine_poses": refine_poses,
+        **dataclasses.asdict(settings),
+        "device": device,
+        "seeds": {"count": len(seeds), "digest": seeds_digest(seeds)},
+        "versions": {
+            "python": platform.python_version(),
+            **{name: _version(name) for name in ("torch", "gsplat", "numba", "numpy")},
+        },
+    }
+
+
+def _version(package: str) -> str | None:
+    """None for a package that is run from its source tree."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def resumed(
+    begun: Mapping[str, Any], asked: TrainSettings, *, refine_poses: bool
+) -> tuple[TrainSettings, bool]:
+    """The settings of a resumed run, and whether it refined poses, by the config it began with.
+
+    What the user leaves at its default is as the run has it, but for the backend, which may change;
+    anything else must be the run's own. An older version's config may lack a setting.
+    """
+    default = {**dataclasses.asdict(TrainSettings()), "refine_poses": False}
+    now = {**dataclasses.asdict(asked), "refine_poses": refine_poses}
+    then = {name: begun.get(name, each) for name, each in default.items() if name != "backend"}
+    for name, value in then.items():
+        if now[name] not in (value, default[name]):
+            raise ParameterError(
+                f"--{OPTIONS.get(name, name.replace('_', '-'))} {value}, as when the run began",
+                found=f"{now[name]}",
+                fix="Leave the option out to resume, or start again with --overwrite.",
+            )
+    refined = then.pop("refine_poses") is True
+    try:
+        return dataclasses.replace(asked, **then), refined
+    except TypeError:
+        raise SceneFormatError(
+            "the settings of a run in the config.json of the run",
+            found="a text instead of a number",
+            fix="Start again with --overwrite.",
+        ) from None
+
+
+def _another_scene(folder: RunFolder, begun: Mapping[str, Any], found: str) -> ParameterError:
+    return ParameterError(
+        f"the scene that the run began with ({begun.get('scene')}, says {folder.config})",
+        found=f"other {found}",
+        fix="Name that scene, or start again with --overwrite.",
+    )
+
+
+def _name(device: torch.device) -> str:
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    threads = torch.get_num_threads()
+    return f"CPU, {threads} thread{'s' * (threads > 1)}"
 
 
 class TrainingRun:
-    """A run that is ready to train.
+    """A run that is ready to train, at its first step or where it stopped.
 
-    Args:
-        folder: Where results go.
-        settings: How to train.
-        frame: The training frame.
-        state: The run, at its first step or where it stopped.
-        views: Training and test views, in the world.
+    ``views`` are the training and the test views, in the world.
     """
 
     def __init__(
@@ -226,7 +306,7 @@ class TrainingRun:
         self.settings = settings
         self.state = state
         self._frame = frame
-        self._board: Board | None = None
+        self._board: Any = None  # TensorBoard's writer, if asked for
         self._saved = time.monotonic()
         self._saved_step = state.step or None
         train, test = ([frame.view(view) for view in part] for part in views)
@@ -234,8 +314,12 @@ class TrainingRun:
 
     def log_to_tensorboard(self) -> None:
         """Also write TensorBoard's log, into the run's folder."""
-        self._board = Board(self.folder.tensorboard, self.state.step)
-        self.folder.claim([self.folder.tensorboard])
+        from torch.utils.tensorboard import SummaryWriter  # noqa: PLC0415  (optional)
+
+        # Entries of an interrupted run beyond this step are dropped.
+        path, first = self.folder.tensorboard, self.state.step + 1
+        self._board = SummaryWriter(str(path), purge_step=first)
+        self.folder.claim([path])
 
     def count(self) -> int:
         """The number of Gaussians."""
@@ -244,15 +328,16 @@ class TrainingRun:
     @property
     def device(self) -> str:
         """Where it trains, in words."""
-        return device_name(self.trainer.device)
+        return _name(self.trainer.device)
 
     @property
     def peak_gpu_bytes(self) -> int | None:
         """Most bytes that PyTorch held on the GPU so far; None on the CPU."""
-        return peak_gpu_bytes(self.trainer.device)
+        device = self.trainer.device
+        return torch.cuda.max_memory_allocated(device) if device.type == "cuda" else None
 
     def train(self, on_step: Callable[[int], None] = lambda _: None) -> bool:
-        """Train to the end, or until the user interrupts: then a checkpoint is saved.
+        """Train to the end, or until the user interrupts; a checkpoint is saved.
 
         Args:
             on_step: Called with the number of steps done, after each.
@@ -264,7 +349,7 @@ class TrainingRun:
             OutputError: The checkpoint or the curve cannot be written.
             PointCloudError: The GPU's memory does not suffice; the checkpoint is of the last step.
         """
-        with self._checkpoint_told(), gpu_memory_told(self.count):
+        with self.told():
             if self._saved_step is None:
                 self._save()  # fail now rather than after hours if the disk is full
             try:
@@ -293,38 +378,40 @@ class TrainingRun:
             OutputError: A result cannot be written.
             PointCloudError: The GPU's memory does not suffice.
         """
-        with self._checkpoint_told(), gpu_memory_told(self.count):
+        state, folder, views = self.state, self.folder, self.trainer.test_views
+        with self.told():
             progress("score", 0.0)
-            scores = score(self.trainer.render, self.trainer.test_views)
-            world = self._frame.gaussians_to_world(gaussians_of(self.state.params))
-            scores = replace(scores, num_gaussians=len(world), model_bytes=world.num_bytes)
-            result = self._result(scores)
-            write_model(self.folder.gaussians, world)
-            write_curve_csv(self.folder.curve_csv, self.state.records)
-            write_curve_png(self.folder.curve_png, self.state.records)
-            self._write_renders(progress)
-            write_json(self.folder.metrics, result.to_dict())  # last: the run has finished
-            self.folder.checkpoint.unlink(missing_ok=True)
+            scores = score(self.trainer.render, views)
+            world = self._frame.gaussians_to_world(gaussians_of(state.params))
+            result = TrainingResult(
+                dataclasses.replace(scores, num_gaussians=len(world), model_bytes=world.num_bytes),
+                tuple(
+                    CurvePoint(r.step, r.seconds, r.test_psnr, r.num_gaussians, r.test_ssim)
+                    for r in state.records
+                    if r.test_psnr is not None
+                ),
+                steps=state.step,
+                train_seconds=round(state.watch.seconds, 3),
+                num_seeds=folder.read_config()["seeds"]["count"],
+                held_by_memory_at=state.strategy.capacity.held_at,
+            )
+            write_model(folder.gaussians, world)
+            write_curve_csv(folder.curve_csv, state.records)
+            write_curve_png(folder.curve_png, state.records)
+            pictures = [folder.renders / picture_name(view.name) for view in views]
+            folder.claim(pictures)
+            for i, (view, path) in enumerate(zip(views, pictures, strict=True)):
+                write_render(path, view.photograph, self.trainer.render(view))
+                progress("write", (i + 1) / len(views))
+            write_json(folder.metrics, result.to_dict())  # last: the run has finished
+            folder.checkpoint.unlink(missing_ok=True)
         return result
-
-    def _result(self, scores: EvalResult) -> TrainingResult:
-        state, capacity = self.state, self.state.strategy.capacity
-        return TrainingResult(
-            scores,
-            tuple(
-                CurvePoint(r.step, r.seconds, r.test_psnr, r.num_gaussians, r.test_ssim)
-                for r in state.records
-                if r.test_psnr is not None
-            ),
-            steps=state.step,
-            train_seconds=round(state.watch.seconds, 3),
-            num_seeds=self.folder.read_config()["seeds"]["count"],
-            held_by_memory_at=capacity.held_at if capacity else None,
-        )
 
     def _on_record(self, record: Record) -> None:
         if self._board:
-            self._board.add(record)
+            for name, value in zip(LOGGED, record[1:], strict=True):
+                if value is not None:
+                    self._board.add_scalar(name, value, record.step)
         if record.test_psnr is None:
             return
         write_curve_csv(self.folder.curve_csv, self.state.records)
@@ -336,25 +423,27 @@ class TrainingRun:
         self._saved, self._saved_step = time.monotonic(), self.state.step
 
     @contextmanager
-    def _checkpoint_told(self) -> Iterator[None]:
-        """Say which step is saved, and how to resume, if the run is cut off."""
+    def told(self) -> Iterator[None]:
+        """Say what ended the block, as the end of memory, and which step is kept."""
         try:
             yield
-        except (OutputError, PointCloudError, KeyboardInterrupt) as error:
-            if self._saved_step is None:
-                raise
-            kept = f"The run as of step {self._saved_step:,} is kept: continue it with --resume."
-            if isinstance(error, KeyboardInterrupt):
-                error.add_note(kept)
-                raise
-            raise type(error)(
-                error.expected, found=error.found, fix=f"{error.fix} {kept}"
+        except torch.cuda.OutOfMemoryError as error:
+            raise PointCloudError(
+                "Gaussians and photographs that fit into the GPU's memory",
+                found=f"no memory left with {self.count():,} Gaussians",
+                fix=f"Start again with --budget {round(FEWER * self.count())} or smaller "
+                f"photographs (--data-factor), or end other programs on the GPU.{self._kept()}",
             ) from error
+        except OutputError as error:
+            fix = error.fix + self._kept()
+            raise OutputError(error.expected, found=error.found, fix=fix) from error
+        except KeyboardInterrupt as error:
+            if kept := self._kept():
+                error.add_note(kept.strip())
+            raise
 
-    def _write_renders(self, progress: Progress) -> None:
-        views = self.trainer.test_views
-        names = [picture_name(view.name) for view in views]
-        self.folder.claim([self.folder.renders / name for name in names])
-        for i, (view, name) in enumerate(zip(views, names, strict=True)):
-            write_render(self.folder.renders / name, view.photograph, self.trainer.render(view))
-            progress("write", (i + 1) / len(views))
+    def _kept(self) -> str:
+        """A sentence on the checkpoint, if there is one, after another sentence."""
+        if self._saved_step is None:
+            return ""
+        return f" The run as of step {self._saved_step:,} is kept: continue it with --resume."

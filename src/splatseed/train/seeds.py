@@ -1,29 +1,33 @@
-"""The points that a run starts from, and its first Gaussians.
+"""What a run starts from: its points, its first Gaussians, and the depths that ``grow`` uses.
 
 Notation: N points; a *near depth* is the smallest depth at which a training view sees a point, the
 unit of its Gaussian's size and learning rate. A length divided by it is an angle, so a rate or size
 in near depths looks the same in the photographs wherever a Gaussian is: in front of closely spaced
 cameras, on a table between them, or far behind both. 3DGS uses the cameras' extent for all.
-Promise: points that are left out are reported; which ones are kept depends only on points and
-cameras; the same bytes whatever the number of threads. No PyTorch, so that the same start can be
-written for other trainers: a run begins with exactly what is written.
+Promise: points that are left out are reported; the same points, cameras and settings give the same
+bytes, whatever the number of threads and the clock; test views have no part. No PyTorch, so that
+the same start can be written for other trainers: a run begins with exactly what is written.
 """
 
 from __future__ import annotations
 
 import hashlib
+import math
 import time
-from collections.abc import Callable, Mapping, Sequence
-from types import MappingProxyType
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
+from splatseed.depth.stereo.maps import StereoResult, StereoSettings, stereo_depths
+from splatseed.io.files import ARCHIVE_FAILURES
 from splatseed.io.seeds import saw_all_photographs, was_upsampled
+from splatseed.io.staging import atomic_file
 from splatseed.pointcloud import ORIGINAL, PointCloud
-from splatseed.progress import Progress
-from splatseed.scene import Scene
+from splatseed.progress import Progress, silent
+from splatseed.scene import Image, Scene
 from splatseed.splat.gaussians import (
     Gaussians,
     fit_harmonics,
@@ -31,14 +35,10 @@ from splatseed.splat.gaussians import (
     stray_views,
     training_frame,
 )
-from splatseed.train.depths import stereo_size
 from splatseed.train.settings import AS_3DGS, TrainSettings
 from splatseed.views.view import View
 
-if TYPE_CHECKING:
-    from splatseed.depth.stereo.maps import StereoResult
-
-SEEDS_SHARE: Mapping[str, float] = MappingProxyType({"default": 0.7, "mcmc": 0.7})
+SEEDS_SHARE = {"default": 0.7, "mcmc": 0.7}
 """Most seeds as a fraction of the cap, for strategies that add Gaussians; others may use it all."""
 MOST_PROJECTIONS = 20_000_000
 """Limit on points times views: beyond it, an even subset of the views is used."""
@@ -49,6 +49,15 @@ MARGIN = 0.1
 Gaussian there reaches in."""
 NEAREST = 0.01
 """The rasteriser's near plane: nothing nearer is drawn."""
+PER_RENDERED = {"cpu": 0.13, "cuda": 0.01}
+"""Most pixels compared per pixel rendered in training, by the device that renders: stereo then
+takes about a quarter of training's seconds (on the CPU: fern, 0.045: 5 of 47 s; bonsai at 1,500
+steps, 0.68: 83 of 64 s). Comparing always runs on the CPU, some 0.7 million pixels a second and
+core. The number for a GPU is an estimate: 150 million pixels rendered a second, beside 8 cores;
+benchmarks/gpu measures both."""
+LEAST_SIZE = {"cpu": 64, "cuda": 200}
+"""Smallest size that is returned, in pixels; on the CPU it is not below the size that is trained
+either, which on a GPU is the photographs' own."""
 
 
 def most_seeds(settings: TrainSettings, cap: int) -> int:
@@ -65,18 +74,8 @@ def seeded(
 ) -> tuple[Scene, StereoResult | None]:
     """The scene with the points that method ``auto`` makes, if the settings ask for them.
 
-    Also returns the depth maps that it computed, if any: growth uses them too.
-
-    Args:
-        scene: A scene without points added by splatseed.
-        settings: Their cap limits the points, and they say which photographs are held out.
-        device: Where training renders; see ``stereo_size``.
-        note: Called with what was made, and how to do without.
-        progress: Called with the stage and the fraction done.
-
-    Raises:
-        SceneNotFoundError: Photographs are missing.
-        SceneFormatError: One is damaged.
+    Also returns the depth maps that it computed, if any: growth uses them too. The settings' cap
+    limits the points; ``note`` is called with what was made, and how to do without.
     """
     if saw_all_photographs(scene):
         note(
@@ -97,24 +96,16 @@ def seeded(
         progress=progress,
         note=note,
     )
-    seconds, kept = time.perf_counter() - start, cloud.num_original
+    made, without, kept = f"{len(cloud):,} points", "", cloud.num_original
     if len(scene.points):
-        made = (
-            f"{kept:,} points of the scene and {len(cloud) - kept:,} new ones, in {seconds:.0f} s"
-        )
-        note(f"Seeds by method auto: {made}. --seeds scene begins with the scene's points alone.")
-    else:
-        note(f"Seeds by method auto: {len(cloud):,} points, in {seconds:.0f} s.")
+        made = f"{kept:,} points of the scene and {len(cloud) - kept:,} new ones"
+        without = " --seeds scene begins with the scene's points alone."
+    note(f"Seeds by method auto: {made}, in {time.perf_counter() - start:.0f} s.{without}")
     return scene.replace(points=cloud), stereo
 
 
 def why_not_seeded(scene: Scene, settings: TrainSettings) -> str:
-    """Why a run begins with the scene's points even if ``auto`` is asked for; empty if not.
-
-    Args:
-        scene: The scene.
-        settings: The run's.
-    """
+    """Why a run begins with the scene's points even if ``auto`` is asked for; empty if not."""
     if settings.strategy.endswith(AS_3DGS):
         return f"strategy {settings.strategy} begins with the scene's points as they are"
     if was_upsampled(scene):
@@ -140,38 +131,27 @@ def usable_seeds(
         views: The training views, for their cameras and sizes; when left out, crowding is measured
             in space.
     """
-    seeds = points.select(points.finite)
+    seeds, cap = points.select(points.finite), settings.cap
     if len(seeds) < len(points):
         note(f"{len(points) - len(seeds):,} points without finite coordinates were left out.")
-    if settings.cap is not None and len(seeds) > settings.cap:
-        seeds = _thinned(seeds, settings, settings.cap, note, views)
+    if cap is not None and len(seeds) > cap:
+        from splatseed.seeding.budget import thin  # noqa: PLC0415  (kernels load with use)
+
+        # Thinning takes the earlier of equals: originals first.
+        crowd = seeds.select(np.argsort(seeds.source != ORIGINAL, kind="stable"))
+        first, most = crowd.num_original, most_seeds(settings, cap)
+        seeds = crowd.select(thin(crowd.xyz, views, most, first=first, priority=crowd.confidence))
+        kept = f", {seeds.num_original:,} of them originals" if first else ""
+        room = "" if most == cap else f"; strategy {settings.densification} adds the rest"
+        note(
+            f"{len(crowd):,} seeds were thinned to {most:,}{kept}: there may be {cap:,} Gaussians"
+            f"{room}."
+        )
     used = {"sizes": settings.seed_sizes, "normals": settings.seed_normals}
     for name, asked in used.items():
         if asked and np.isnan(seeds.attributes.get(name, np.nan)).all():
             note(f"seed_{name} has no effect: no seed has known {name}.")
     return seeds.replace(**dict.fromkeys(n for n in seeds.attributes if not used.get(n)))
-
-
-def _thinned(
-    points: PointCloud,
-    settings: TrainSettings,
-    cap: int,
-    note: Callable[[str], None],
-    views: Sequence[View],
-) -> PointCloud:
-    from splatseed.seeding.budget import thin  # noqa: PLC0415  (kernels load with use)
-
-    # Thinning takes the earlier of equals: originals first.
-    points = points.select(np.argsort(points.source != ORIGINAL, kind="stable"))
-    first, most = points.num_original, most_seeds(settings, cap)
-    seeds = points.select(thin(points.xyz, views, most, first=first, priority=points.confidence))
-    kept = f", {seeds.num_original:,} of them originals" if first else ""
-    room = "" if most == cap else f"; strategy {settings.densification} adds the rest"
-    note(
-        f"{len(points):,} seeds were thinned to {most:,}{kept}: there may be {cap:,} Gaussians"
-        f"{room}."
-    )
-    return seeds
 
 
 def seeds_digest(seeds: PointCloud) -> str:
@@ -186,16 +166,13 @@ def seeds_digest(seeds: PointCloud) -> str:
 def first_gaussians(
     seeds: PointCloud, views: Sequence[View], settings: TrainSettings
 ) -> tuple[Gaussians, Float32[np.ndarray, " N"]]:
-    """One Gaussian per seed, and its near depth [N].
+    """One Gaussian per seed, in the training frame, and their near depths [N].
 
-    Args:
-        seeds: Finite points, in the training frame.
-        views: The training views, likewise.
-        settings: Their schedule gives sizes and opacities; they also say what is fitted.
-
-    Raises:
-        PointCloudError: Fewer than two distinct points.
+    Seeds, finite, and training views are in the world; stray cameras have no part.
     """
+    frame, strays = training_frame(views), stray_views(views)
+    seeds = frame.cloud_from_world(seeds)
+    views = [frame.view(view) for view in views if view.name not in strays]
     lengths, schedule = near_depths(seeds.xyz, views), settings.schedule
     harmonics = None
     if settings.seed_colors:
@@ -215,29 +192,17 @@ def first_gaussians(
 def gaussians_of_scene(
     cloud: PointCloud, views: Sequence[View], settings: TrainSettings
 ) -> Gaussians:
-    """The initial Gaussians of training from a cloud, in the scene's world.
-
-    Args:
-        cloud: Seeds in the world; those without finite coordinates are left out.
-        views: Photographs with their cameras.
-        settings: As for ``first_gaussians``.
+    """The initial Gaussians of training from a cloud's finite points, both in the scene's world.
 
     Raises:
         PointCloudError: Fewer than two distinct finite points.
     """
-    frame, strays = training_frame(views), stray_views(views)
-    near = [frame.view(view) for view in views if view.name not in strays]
-    seeds = frame.cloud_from_world(cloud.select(cloud.finite))
-    return frame.gaussians_to_world(first_gaussians(seeds, near, settings)[0])
+    gaussians, _ = first_gaussians(cloud.select(cloud.finite), views, settings)
+    return training_frame(views).gaussians_to_world(gaussians)
 
 
 def near_depths(xyz: Float[np.ndarray, "N 3"], views: Sequence[View]) -> Float32[np.ndarray, " N"]:
-    """The smallest depth of each point among the views that see it; the median if none does.
-
-    Args:
-        xyz: Points.
-        views: The training views; see ``MOST_PROJECTIONS``.
-    """
+    """The smallest depth of each point among the views that see it; the median if none does."""
     nearest = np.full(len(xyz), np.inf)
     columns = np.ascontiguousarray(xyz.T, np.float64)
     # Evenly spaced views, the first and the last among them.
@@ -269,3 +234,91 @@ def _seen_depths(
         seen &= focal * across >= (-MARGIN * size - center) * depths
         seen &= focal * across <= ((1 + MARGIN) * size - center) * depths
     return depths, seen
+
+
+DepthMaps = dict[str, Float32[np.ndarray, "h w"]]
+"""Planar depths by the names of their views."""
+
+
+def stereo_size(images: Sequence[Image], settings: TrainSettings, device: str) -> int:
+    """Most pixels a side at which training photographs are compared, for a run of this length.
+
+    ``StereoSettings``' own where training on ``device``, cpu or cuda, takes much longer than
+    comparing, otherwise fewer.
+    """
+    full = StereoSettings().max_size
+    if not images:
+        return full
+    longest = max(max(image.camera.width, image.camera.height) for image in images)
+    pixels = sum(image.camera.width * image.camera.height for image in images)
+    most = min(full, longest)
+    compared = pixels * (most / longest) ** 2
+    rendered = settings.max_steps * pixels / len(images) / settings.data_factor**2
+    # Pixels go with the square of the size.
+    affordable = int(most * math.sqrt(PER_RENDERED[device] * rendered / compared))
+    least = max(LEAST_SIZE[device], longest // settings.data_factor if device == "cpu" else 0)
+    return min(full, max(least, affordable))
+
+
+def known_depths(
+    scene: Scene,
+    scale: float,
+    settings: TrainSettings,
+    device: str,
+    *,
+    stereo: StereoResult | None = None,
+    kept: Path | None = None,
+    note: Callable[[str], None] = lambda _: None,
+    progress: Progress = silent,
+) -> tuple[DepthMaps, float]:
+    """Depth maps of the training views, in training units, ``scale`` per unit of the world.
+
+    They are 0 where other views do not confirm any; none are made if the settings do not use them,
+    or seeding has made ``stereo``. ``kept`` is a file with the maps of the same photographs and
+    seed, or a path at which to keep them for the next run. Also returns the seconds that it took to
+    find them, here or in the run that kept them.
+    """
+    images = scene.split(settings.test_every)[0]
+    wanted = settings.densification == "grow" and settings.placing == "stereo"
+    if not wanted or len(images) < 2:
+        return {}, 0.0
+    found = _read(kept)
+    if found is None:
+        start = time.perf_counter()
+        if stereo:
+            maps = tuple(stereo.map(i) for i in range(len(stereo.views)))
+        else:
+            compared = scene.replace(images=images)
+            size = stereo_size(images, settings, device)
+            maps = stereo_depths(compared, seed=settings.seed, progress=progress, max_size=size)
+        found = {each.name: each.depth for each in maps}, time.perf_counter() - start
+        if kept:
+            arrays: dict[str, Any] = {f"depth_{i}": each.depth for i, each in enumerate(maps)}
+            names = np.array([each.name for each in maps], dtype=np.str_)
+            with atomic_file(kept) as partial, partial.open("wb") as file:
+                np.savez(file, names=names, seconds=np.float64(found[1]), **arrays)
+    known, seconds = found
+    share = np.mean([np.isfinite(depth).mean() for depth in known.values()])
+    took = "" if stereo else f" ({seconds:.0f} s)"
+    note(
+        f"Stereo knows the depth of {share:.0%} of the pixels{took}: strategy grow places most of "
+        "what it adds there. placing = none only splits."
+    )
+    # Stereo's depths are in world units; unknown ones, NaN, become 0.
+    return {
+        name: np.nan_to_num(depth * scale)
+        for name, depth in known.items()
+        if np.isfinite(depth).any()
+    }, seconds
+
+
+def _read(kept: Path | None) -> tuple[DepthMaps, float] | None:
+    """The maps that ``known_depths`` kept; None without a readable file."""
+    if kept is None:
+        return None
+    try:
+        with np.load(kept, allow_pickle=False) as file:
+            maps = {str(name): file[f"depth_{i}"] for i, name in enumerate(file["names"])}
+            return maps, float(file["seconds"])
+    except ARCHIVE_FAILURES:
+        return None

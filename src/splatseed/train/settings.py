@@ -6,6 +6,7 @@ conventions, as gsplat's trainer has them, for comparison with published numbers
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, cast, get_args
 
@@ -33,17 +34,19 @@ after 4,000 steps and at least level after 10,000; beyond that it was not measur
 BYTES_EACH = 2000
 """Memory per Gaussian in training: its 59 numbers, their gradients and two moments (944 bytes),
 and as much again for the rasteriser's lists and for copies while Gaussians are added."""
-
-
-@dataclass(frozen=True)
-class Reading:
-    """What to do with a scene before it is trained."""
-
-    refine_poses: bool = False
-    """Refine poses of a phone or SLAM first, and triangulate points; they replace the scene's."""
-
-
-AS_IT_IS = Reading()
+ALLOWED: dict[str, int | Sequence[object]] = {
+    "strategy": get_args(StrategyName),
+    "backend": get_args(Backend),
+    "placing": get_args(Placing),
+    "seeding": get_args(Seeding),
+    "sh_degree": range(4),
+    "max_steps": 1,
+    "data_factor": 1,
+    "seed": 0,
+    "test_every": 2,
+    "cap_max": LEAST_GAUSSIANS,
+}
+"""Choices, or the least number, of settings."""
 
 
 @dataclass(frozen=True)
@@ -97,28 +100,18 @@ class TrainSettings:
     left alone."""
 
     def __post_init__(self) -> None:
-        choices = {
-            "strategy": StrategyName, "backend": Backend, "placing": Placing, "seeding": Seeding
-        }  # fmt: skip
-        for name, kind in choices.items():
-            known = get_args(kind)
-            self._require(name, getattr(self, name) in known, f"one of {', '.join(known)}")
-        bounds = {
-            "max_steps": 1, "data_factor": 1, "seed": 0, "test_every": 2,
-            "cap_max": LEAST_GAUSSIANS,
-        }  # fmt: skip
-        for name, least in bounds.items():
+        for name, allowed in ALLOWED.items():
             value = getattr(self, name)
-            self._require(name, value is None or value >= least, f"{least} or more")
-        self._require("sh_degree", 0 <= self.sh_degree <= 3, "0 to 3")
-
-    def _require(self, name: str, fits: bool, expected: str) -> None:
-        if not fits:
-            raise ParameterError(
-                f"--{name.replace('_', '-')} of {expected}".replace("of one of", "among"),
-                found=f"{getattr(self, name)}",
-                fix="Leave it out for the default.",
-            )
+            if isinstance(allowed, int):
+                fits, expected = value is None or value >= allowed, f"of {allowed} or more"
+            else:
+                fits, expected = value in allowed, f"among {', '.join(map(str, allowed))}"
+            if not fits:
+                raise ParameterError(
+                    f"--{name.replace('_', '-')} {expected}",
+                    found=f"{value}",
+                    fix="Leave it out for the default.",
+                )
 
     @property
     def densification(self) -> Densification:

@@ -1,32 +1,43 @@
 """Everything that changes during a run, and its checkpoints.
 
-Promise: a run resumed from a checkpoint takes, on the CPU, bit for bit the steps that it would have
-taken: randomness depends only on the seed and the step, so no generator is stored. A checkpoint
-appears whole or not at all, and loading one executes nothing in it.
+Promise: a resumed run takes, on the CPU, bit for bit the steps that it would have taken: randomness
+depends only on the seed and the step, so no generator is stored. A checkpoint appears whole or not
+at all, and loading one executes nothing in it.
 """
 
 from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float32
 from torch import Tensor
 
 from splatseed.errors import SceneFormatError
 from splatseed.io.staging import atomic_file
+from splatseed.pointcloud import PointCloud
 from splatseed.train.device import Capacity
-from splatseed.train.growing import NOWHERE, Growing
-from splatseed.train.parameters import Optimizers, Parameters, as_parameters, make_optimizers
-from splatseed.train.record import Record
+from splatseed.train.folder import Record
+from splatseed.train.growing import Growing
+from splatseed.train.parameters import (
+    Optimizers,
+    Parameters,
+    as_parameters,
+    make_optimizers,
+    make_parameters,
+)
 from splatseed.train.schedule import Schedule
+from splatseed.train.seeds import first_gaussians
 from splatseed.train.settings import TrainSettings
 from splatseed.train.strategies import Default, Mcmc, Strategy
+from splatseed.views.view import View
 
 FORMAT = 4
 """Version of the checkpoint's content."""
@@ -52,59 +63,60 @@ class Stopwatch:
 
 @dataclass
 class TrainState:
-    """A run at a step.
-
-    Args:
-        params: The Gaussians.
-        optimizers: One per parameter.
-        strategy: What changes their number.
-        step: Steps done.
-        records: The curve so far.
-        watch: Time spent training.
-        losses: Losses of the steps since the last record.
-        mean: Mean of the Gaussians over the end of the run; see ``add_to_mean``.
-    """
+    """A run when ``step`` steps are done."""
 
     params: Parameters
     optimizers: Optimizers
     strategy: Strategy
     step: int = 0
     records: list[Record] = field(default_factory=list)
+    """The curve so far."""
     watch: Stopwatch = field(default_factory=Stopwatch)
     losses: list[Tensor] = field(default_factory=list)
+    """Of the steps since the last record."""
     mean: dict[str, Any] = field(default_factory=dict)
+    """Of the Gaussians over the end of the run; see ``add_to_mean``."""
 
 
 def make_strategy(
     settings: TrainSettings,
     device: torch.device | None = None,
-    depths: Mapping[str, Float[Tensor, "h w"]] = NOWHERE,
+    depths: Mapping[str, Float32[np.ndarray, "h w"]] = MappingProxyType({}),
 ) -> Strategy:
     """The strategy named by the settings, on their schedule.
 
-    Args:
-        settings: How to train.
-        device: The device whose memory limits the number of Gaussians; the CPU by default.
-        depths: Known depths of the training views; see ``Growing``.
+    The memory of ``device``, by default the CPU, limits it; ``depths``: see ``Growing``.
     """
-    capacity = Capacity(settings.cap, device or torch.device("cpu"))
+    device = device or torch.device("cpu")
+    capacity = Capacity(settings.cap, device)
     match settings.densification:
         case "default":
             return Default(settings, capacity)
         case "mcmc":
             return Mcmc(settings, capacity)
         case "grow":
-            return Growing(settings, capacity, depths)
+            maps = {name: torch.as_tensor(each).to(device) for name, each in depths.items()}
+            return Growing(settings, capacity, maps)
         case "none":
-            return Strategy()
+            return Strategy(capacity)
+
+
+def first_state(
+    seeds: PointCloud,
+    views: Sequence[View],
+    settings: TrainSettings,
+    strategy: Strategy,
+    device: torch.device,
+) -> TrainState:
+    """The state before the first step; seeds and training views are in the world."""
+    gaussians, lengths = first_gaussians(seeds, views, settings)
+    schedule = settings.schedule
+    params = make_parameters(gaussians, device, lengths if schedule.near_depths else None)
+    return TrainState(params, make_optimizers(params, schedule), strategy)
 
 
 def save_checkpoint(path: Path, state: TrainState) -> None:
-    """Write the whole state of a run, replacing an older checkpoint.
-
-    Raises:
-        OutputError: The file cannot be written.
-    """
+    """Write the whole state of a run, replacing an older checkpoint."""
     content = {
         "format": FORMAT,
         "step": state.step,
@@ -114,7 +126,7 @@ def save_checkpoint(path: Path, state: TrainState) -> None:
         "params": {name: value.detach() for name, value in state.params.items()},
         "optimizers": {name: each.state_dict() for name, each in state.optimizers.items()},
         "strategy": state.strategy.state,
-        "held_at": state.strategy.capacity and state.strategy.capacity.held_at,
+        "held_at": state.strategy.capacity.held_at,
         "mean": state.mean,
     }
     with atomic_file(path) as partial:
@@ -124,13 +136,7 @@ def save_checkpoint(path: Path, state: TrainState) -> None:
 def load_checkpoint(
     path: Path, strategy: Strategy, schedule: Schedule, device: torch.device
 ) -> TrainState:
-    """The state that ``save_checkpoint`` wrote, on a device.
-
-    Args:
-        path: The checkpoint.
-        strategy: A new one from the run's settings; its state is replaced.
-        schedule: The run's schedule.
-        device: Where to resume.
+    """The state that ``save_checkpoint`` wrote, on a device; replaces that of a new strategy.
 
     Raises:
         SceneFormatError: The file is no checkpoint of this version.
@@ -140,7 +146,22 @@ def load_checkpoint(
         with warnings.catch_warnings(action="ignore"):  # about what a foreign file might be
             content = torch.load(path, map_location=device, weights_only=True)
         if isinstance(content, dict) and content.get("format") == FORMAT:
-            return _state_of(content, strategy, schedule)
+            params = as_parameters(content["params"])
+            optimizers = make_optimizers(params, schedule)
+            for name, optimizer in optimizers.items():
+                optimizer.load_state_dict(content["optimizers"][name])
+            strategy.state = content["strategy"]
+            strategy.capacity.held_at = content["held_at"]
+            return TrainState(
+                params,
+                optimizers,
+                strategy,
+                step=int(content["step"]),
+                records=[Record(*row) for row in content["records"]],
+                watch=Stopwatch(float(content["seconds"])),
+                losses=list(content["losses"]),
+                mean=content["mean"],
+            )
     except Exception as error:  # noqa: BLE001  (PyTorch raises anything for a damaged file)
         found = f"a damaged file ({type(error).__name__})"
     raise SceneFormatError(
@@ -148,17 +169,3 @@ def load_checkpoint(
         found=found,
         fix="Start the run again with --overwrite.",
     )
-
-
-def _state_of(content: Mapping[str, Any], strategy: Strategy, schedule: Schedule) -> TrainState:
-    params = as_parameters(content["params"])
-    optimizers = make_optimizers(params, schedule)
-    for name, optimizer in optimizers.items():
-        optimizer.load_state_dict(content["optimizers"][name])
-    strategy.state = content["strategy"]
-    if strategy.capacity:
-        strategy.capacity.held_at = content["held_at"]
-    records = [Record(*row) for row in content["records"]]
-    watch = Stopwatch(float(content["seconds"]))
-    step, losses = int(content["step"]), list(content["losses"])
-    return TrainState(params, optimizers, strategy, step, records, watch, losses, content["mean"])

@@ -1,9 +1,9 @@
 """The interface of strategies, and gsplat's behind it; splatseed's own is in ``growing``.
 
-Notation: ``info`` is the rasteriser's. Promise: both backends run subclasses of gsplat's
-strategies, which hold growth to a cap and to the memory, and MCMC's growth and noise to splatseed's
-conventions; ``state`` is all that a checkpoint must hold. gsplat 1.5.3 never resets opacities (it
-writes ``step % reset_every == 0 & step > 0``, which is always false): resetting is an option here.
+Promise: both backends run subclasses of gsplat's strategies, which hold growth to a cap and to the
+memory, and MCMC's growth and noise to splatseed's conventions; ``state`` is all that a checkpoint
+must hold. gsplat 1.5.3 never resets opacities (its ``step % reset_every == 0 & step > 0`` is always
+false): resetting is an option here.
 """
 
 from __future__ import annotations
@@ -27,15 +27,10 @@ from splatseed.views.view import View
 
 
 class Strategy:
-    """Changes the number of Gaussians; this one, ``none``, does not.
+    """Changes the number of Gaussians, within a capacity; this one, ``none``, does not."""
 
-    Attributes:
-        state: What it remembers from step to step, for checkpoints.
-        capacity: How many Gaussians it may make; None if it makes none.
-    """
-
-    def __init__(self, capacity: Capacity | None = None) -> None:
-        self.state: dict[str, Any] = {}
+    def __init__(self, capacity: Capacity) -> None:
+        self.state: dict[str, Any] = {}  # what it remembers from step to step
         self.capacity = capacity
 
     def regularization(self, params: Parameters) -> Float[Tensor, ""] | None:  # noqa: ARG002  (the interface's name)
@@ -93,7 +88,7 @@ class Capped(DefaultStrategy):  # type: ignore[misc]  # gsplat has no types
             self.grow_grad2d = wanted
 
     def _threshold(self, params: Parameters, state: Any) -> float:
-        """A gradient exceeded by at most as many Gaussians as there is room: each adds one."""
+        """A gradient that at most as many Gaussians exceed as there is room: each adds one."""
         count, gradients = len(params["means"]), state["grad2d"] / state["count"].clamp_min(1)
         wanted = int((gradients > self.grow_grad2d).sum())
         room = self.capacity.limit(count, count + wanted) - count
@@ -112,15 +107,10 @@ class Default(Strategy):
         super().__init__(capacity)
         schedule = settings.schedule
         self.inner = Capped(
-            # Gradients mean little before the first Gaussians are in place: 500 of 30,000.
             refine_start_iter=schedule.refine_start,
-            # Half of a run is left to those that were added last (15,000 of 30,000).
             refine_stop_iter=schedule.refine_stop,
-            # Each round judges by the gradients since the last one.
             refine_every=schedule.refine_every,
-            # gsplat also begins to prune by size after this many steps.
             reset_every=schedule.reset_every,
-            # Larger Gaussians, in length units, are removed: 0.1.
             prune_scale3d=schedule.prune_size,
         )
         self.inner.capacity = capacity
@@ -145,9 +135,8 @@ class Default(Strategy):
 class _Bounded(MCMCStrategy):
     """gsplat's strategy, but it may grow faster, and never beyond the memory.
 
-    gsplat moves positions by a covariance times noise. A covariance is an area and a displacement a
-    length, so it is divided by the near depth: the noise of a Gaussian of given size in the
-    photographs is then the same there wherever the Gaussian is.
+    gsplat moves positions by a covariance, an area, times noise. Here that is divided by the near
+    depth, so that noise looks the same in the photographs wherever a Gaussian is.
     """
 
     capacity: Capacity

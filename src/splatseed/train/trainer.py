@@ -1,11 +1,10 @@
 """The training loop: render a view, compare it with its photograph, optimise, densify.
 
-Notation: a step shows one training view; all cameras are in the training frame; images are
-[H, W, 3], values about 0..1. The loss is 3DGS's, (1 - s) L1 + s (1 - SSIM) with s = 0.2. Promise:
-on the CPU equal settings and seeds give equal bytes, whatever the number of threads and however
-often the run was interrupted: the order of the photographs is drawn from (seed, epoch), and
-PyTorch's generator, which the strategies use, is set from (seed, step) before each step. On a GPU a
-step waits for it only where gsplat does.
+Notation: a step shows one training view; images are [H, W, 3], values about 0..1. Promise: on the
+CPU equal settings and seeds give equal bytes, whatever the number of threads and however often the
+run was interrupted: the order of the photographs is drawn from (seed, epoch), and PyTorch's
+generator, which the strategies use, is set from (seed, step) before each step. On a GPU a step
+waits for it only where gsplat does.
 """
 
 from __future__ import annotations
@@ -24,8 +23,8 @@ from splatseed.runtime.memory import keep_freed_memory
 from splatseed.splat.metrics import l1_and_ssim_by_convolution, psnr, ssim_of_all
 from splatseed.splat.rendering import Photographs, photograph_of, render_view
 from splatseed.splat.ssim import l1_and_ssim
+from splatseed.train.folder import Record
 from splatseed.train.parameters import add_to_mean, optimize, take_mean
-from splatseed.train.record import Record
 from splatseed.train.settings import TrainSettings
 from splatseed.train.state import TrainState
 from splatseed.views.view import View
@@ -38,14 +37,14 @@ SSIM_WEIGHT = 0.2
 
 
 class Trainer:
-    """Trains a state on views.
+    """Trains a state, which is changed in place, on views in the training frame.
 
     Args:
-        state: The run, at any step; changed in place.
+        state: The run, at any step.
         settings: Its settings.
-        train_views: The views to learn from, in the training frame.
-        test_views: The views to evaluate on, likewise.
-        on_record: Called with each record, and whether the test views were rendered for it.
+        train_views: The views to learn from.
+        test_views: The views to evaluate on.
+        on_record: Called with each record.
 
     Attributes:
         is_whole: Whether the state is that between two steps, which a checkpoint may keep.
@@ -69,13 +68,9 @@ class Trainer:
         keep_freed_memory()
 
     def run(self, on_step: Callable[[int], None] = lambda _: None) -> bool:
-        """Train to the last step, or until the user interrupts.
+        """Train to the last step, or until the user interrupts; returns whether it is done.
 
-        Args:
-            on_step: Called with the number of steps done, after each.
-
-        Returns:
-            Whether the last step is done.
+        ``on_step`` is called with the number of steps done, after each.
         """
         state = self.state
         gpus = [self.device] if self.device.type == "cuda" else []
@@ -112,7 +107,8 @@ class Trainer:
         """Take one step; returns the render and the photograph."""
         state, schedule = self.state, self.settings.schedule
         params, optimizers, strategy = state.params, state.optimizers, state.strategy
-        self._seed_generators(step)
+        words = np.random.SeedSequence([self.settings.seed, step]).generate_state(1, np.uint64)
+        torch.manual_seed(int(words[0] >> 1))  # 63 bits: PyTorch's seeds are signed
         epoch, position = divmod(step, len(self.train_views))
         order = _epoch_order(self.settings.seed, epoch, len(self.train_views))
         view = self.train_views[order[position]]
@@ -136,24 +132,15 @@ class Trainer:
         self.is_whole = True
         return render.detach(), photograph
 
-    def _seed_generators(self, step: int) -> None:
-        """As ``torch.manual_seed``, which also formats the stack for devices that are not used."""
-        words = np.random.SeedSequence([self.settings.seed, step]).generate_state(1, np.uint64)
-        seed = int(words[0] >> 1)  # 63 bits: PyTorch's seeds are signed
-        torch.default_generator.manual_seed(seed)
-        if self.device.type == "cuda":
-            torch.cuda.manual_seed(seed)
-
     def _record(self, render: Float[Tensor, "H W 3"], photograph: Float[Tensor, "H W 3"]) -> None:
         """Note how far the run is; the clock stands still meanwhile."""
         state = self.state
         loss = float(torch.stack(state.losses).mean(dtype=torch.float64))
         state.watch.stop()
         state.losses.clear()
-        tested = self.test_scores() if self._is_due(TESTS) else None
-        count, shown = len(state.params["means"]), round(psnr(render, photograph), 4)
-        tested_psnr, tested_ssim = tested or (None, None)
-        seconds = round(state.watch.seconds, 3)
+        tested_psnr, tested_ssim = self.test_scores() if self._is_due(TESTS) else (None, None)
+        seconds, shown = round(state.watch.seconds, 3), round(psnr(render, photograph), 4)
+        count = len(state.params["means"])
         record = Record(state.step, seconds, loss, shown, tested_psnr, count, tested_ssim)
         state.records.append(record)
         self.on_record(record)
@@ -192,11 +179,8 @@ def photometric_loss(
 ) -> Float[Tensor, ""]:
     """0.8 L1 + 0.2 (1 - SSIM), differentiable in ``render`` (Kerbl et al. 2023, eq. 7).
 
-    On a GPU the fused kernel of the package ``fused-ssim`` serves where it is installed.
-
-    Args:
-        render: The rendered view, float32; at least 11 pixels a side.
-        photograph: The view as captured, likewise.
+    On a GPU the fused kernel of the package ``fused-ssim`` serves where it is installed. Both are
+    float32, at least 11 pixels a side.
     """
     fused = _fused_ssim() if render.is_cuda else None
     if fused is None:
@@ -218,11 +202,7 @@ def _fused_ssim() -> Callable[..., Tensor] | None:
 
 
 class _Loss(torch.autograd.Function):
-    """The loss and the analytic gradient of both of its parts, which ends the graph.
-
-    On the CPU in one Numba pass, whose bytes do not depend on the number of threads; on a GPU by a
-    few convolutions without TF32.
-    """
+    """The loss and its analytic gradient: a Numba pass, on a GPU convolutions without TF32."""
 
     @staticmethod
     def forward(ctx: Any, render: Tensor, photograph: Tensor) -> Tensor:

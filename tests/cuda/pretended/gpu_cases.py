@@ -10,7 +10,6 @@ from __future__ import annotations
 import os
 import signal
 import sys
-import types
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -27,14 +26,14 @@ import torch
 
 from splatseed.errors import MissingDependencyError, PointCloudError
 from splatseed.splat.evaluate import evaluate_views
-from splatseed.splat.metrics import l1_and_ssim_by_convolution, ssim_of_all
+from splatseed.splat.metrics import ssim_of_all
 from splatseed.io import load_scene
 from splatseed.runtime import torch_device
 from splatseed.splat import rendering
 from splatseed.splat.gaussians import initial_gaussians
 from splatseed.synthetic import make_capture, write_capture
 from splatseed.train import TrainSettings, prepare_run, trainer
-from splatseed.train.run import RunOptions
+from splatseed.train.device import Capacity
 from splatseed.view import pictures
 from splatseed.view.models import Shown, stage_frame
 from splatseed.views.view import load_split
@@ -59,15 +58,16 @@ def few_records(monkeypatch):
 
 def _begin(room, output, strategy, backend, max_steps=STEPS, **ways):
     settings = TrainSettings(strategy=strategy, backend=backend, max_steps=max_steps, cap_max=400)
-    return prepare_run(
-        room, output, settings, RunOptions(depths=output.parent / "depths.npz", **ways)
-    )
+    return prepare_run(room, output, settings, depths=output.parent / "depths.npz", **ways)
 
 
 def _waits():
     """What waited for the GPU, but for gsplat's own code: by kind and place."""
-    ours = {key: n for key, n in pc.WHERE.items() if not key[1].startswith("gsplat/")}
-    return {key: n for key, n in ours.items() if key[0] not in {"queued copy", "isect: item"}}
+    return {
+        (kind, place): n
+        for (kind, place), n in pc.WHERE.items()
+        if not place.startswith("gsplat/") and kind not in {"queued copy", "isect: item"}
+    }
 
 
 @pytest.mark.parametrize("strategy", ["default", "mcmc", "grow", "default-3dgs"])
@@ -79,19 +79,17 @@ def test_a_run_on_cuda_takes_the_steps_of_the_cpu(room, tmp_path, strategy):
         gpu.train()
         assert all(each.is_cuda for each in gpu.state.params.values())
         scores = gpu.finish(evaluate_views).scores
-    ours, theirs = ([r.num_gaussians for r in run.state.records] for run in (gpu, cpu))
-    np.testing.assert_allclose(ours, theirs, rtol=0.01)  # a gradient on the threshold
-    ours, theirs = ([r.loss for r in run.state.records] for run in (gpu, cpu))
-    np.testing.assert_allclose(ours, theirs, rtol=2e-3)
+    # A gradient on the threshold may make another Gaussian.
+    for name, tolerance in (("num_gaussians", 0.01), ("loss", 2e-3)):
+        ours, theirs = ([getattr(r, name) for r in run.state.records] for run in (gpu, cpu))
+        np.testing.assert_allclose(ours, theirs, rtol=tolerance)
     assert scores.psnr == pytest.approx(cpu.finish(evaluate_views).scores.psnr, abs=0.1)
 
 
-@pytest.mark.parametrize(
-    ("strategy", "held"), [("default", True), ("mcmc", True), ("grow", True), ("none", False)]
-)
-def test_a_step_does_not_wait_for_the_gpu(room, tmp_path, monkeypatch, strategy, held):
+@pytest.mark.parametrize("strategy", ["default", "mcmc", "grow", "none"])
+def test_a_step_does_not_wait_for_the_gpu(room, tmp_path, monkeypatch, strategy):
     """Once each view was shown, but for rounds, which look at how many Gaussians they change."""
-    if not held:
+    if strategy == "none":  # nor where photographs are sent anew
         monkeypatch.setattr(rendering, "SHARE", 0.0)
     waits = {}
 
@@ -127,9 +125,12 @@ def test_a_checkpoint_goes_on_on_the_other_device(room, tmp_path, strategy, orde
         assert then.state.step == STEPS // 2
         assert then.train()
         assert then.trainer.device.type == order[1]
-        for optimizer in then.state.optimizers.values():
-            moments = [v for s in optimizer.state.values() for k, v in s.items() if k != "step"]
-            assert {each.device.type for each in moments} == {order[1]}
+        states = [s for each in then.state.optimizers.values() for s in each.state.values()]
+        assert {s["exp_avg"].device.type for s in states} == {order[1]}
+
+
+def _ends(*_):
+    raise torch.cuda.OutOfMemoryError("CUDA out of memory.")
 
 
 @pytest.mark.parametrize("during", ["render", "optimize"])
@@ -137,16 +138,13 @@ def test_the_end_of_memory_is_told_and_keeps_the_last_whole_step(
     room, tmp_path, monkeypatch, during
 ):
     """A step cut off in its middle is not kept; the checkpoint before it is."""
-    calls = []
+    name = {"render": "photometric_loss", "optimize": "optimize"}[during]
+    work, calls = getattr(trainer, name), []
 
     def fails(*given):
         calls.append(given)
-        if len(calls) == 6:
-            raise torch.cuda.OutOfMemoryError("CUDA out of memory.")
-        return work(*given)
+        return work(*given) if len(calls) != 6 else _ends()
 
-    name = {"render": "photometric_loss", "optimize": "optimize"}[during]
-    work = getattr(trainer, name)
     with pc.pretended_gpu():
         run = _begin(room, tmp_path / "run", "default", "cuda")
         monkeypatch.setattr(trainer, name, fails)
@@ -162,10 +160,7 @@ def test_the_end_of_memory_is_told_and_keeps_the_last_whole_step(
 
 
 def test_memory_that_ends_before_the_first_step_leaves_no_folder(room, tmp_path, monkeypatch):
-    def fails(*_):
-        raise torch.cuda.OutOfMemoryError("CUDA out of memory.")
-
-    monkeypatch.setattr(trainer, "photometric_loss", fails)
+    monkeypatch.setattr(trainer, "photometric_loss", _ends)
     with pc.pretended_gpu(), pytest.raises(PointCloudError, match="--budget"):
         _begin(room, tmp_path / "run", "default", "cuda")
     assert not (tmp_path / "run").exists()
@@ -188,13 +183,12 @@ def test_without_a_toolkit_one_error_comes_before_any_work(room, tmp_path, monke
 
 
 def test_memory_counts_what_the_next_render_takes_again(monkeypatch):
-    from splatseed.runtime.torch_device import free_bytes
-    from splatseed.train.device import Capacity
-
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda *_: (3 << 30, 24 << 30))
     monkeypatch.setattr(torch.cuda, "memory_reserved", lambda *_: 10 << 30)
     monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda *_: 8 << 30)
-    assert free_bytes(pc.GPU) == 5 << 30  # 3 unreserved, 2 in blocks that no step has used
+    assert (
+        torch_device.free_bytes(pc.GPU) == 5 << 30
+    )  # 3 unreserved, 2 in blocks that no step has used
     capacity = Capacity(None, pc.GPU)
     assert capacity.limit(1000, 10**9) == capacity.held_at == 1000 + (5 << 30) // 2000
 
@@ -227,27 +221,6 @@ def test_the_loss_on_cuda_is_that_of_the_cpu_whatever_tf32_does():
     torch.testing.assert_close(found_gradient, gradient, rtol=1e-3, atol=1e-7)
 
 
-def test_tf32_would_have_been_noticed(monkeypatch):
-    from contextlib import nullcontext
-
-    x, y = _pair()
-    monkeypatch.setattr(torch.backends.cudnn, "flags", lambda **_: nullcontext())
-    with pc.pretended_gpu():
-        ssim = l1_and_ssim_by_convolution(x.to("cuda"), y.to("cuda"), 0.0, 1.0)[1]
-    assert abs(float(ssim.cpu()) - ssim_of_all(x, y)) > 1e-3
-
-
-def test_the_loss_takes_few_operators():
-    x, y = _pair()
-    with pc.pretended_gpu():
-        x, y = x.to("cuda"), y.to("cuda")
-        _loss(x, y)  # the window is copied once
-        pc.COUNTS.clear()
-        x.requires_grad_()
-        trainer.photometric_loss(x, y).backward()
-    assert pc.COUNTS["launch"] <= 80  # of them about half are views, which launch nothing
-
-
 def test_fused_ssim_is_taken_where_it_is_installed(monkeypatch):
     calls = []
 
@@ -255,13 +228,10 @@ def test_fused_ssim_is_taken_where_it_is_installed(monkeypatch):
         calls.append((tuple(x.shape), x.is_contiguous(), padding))
         return (x - y).mean()
 
-    module = types.SimpleNamespace(fused_ssim=fused_ssim)
-    monkeypatch.setitem(sys.modules, "fused_ssim", module)
-    trainer._fused_ssim.cache_clear()
+    monkeypatch.setattr(trainer, "_fused_ssim", lambda: fused_ssim)
     x, y = _pair()
     with pc.pretended_gpu():
         found, _ = _loss(x.to("cuda"), y.to("cuda"))
-    trainer._fused_ssim.cache_clear()
     assert calls == [((1, 3, 40, 31), True, "valid")]
     expected = 0.8 * (x - y).abs().mean() + 0.2 * (1 - (x - y).mean())
     assert found == pytest.approx(float(expected), rel=1e-6)
@@ -279,12 +249,3 @@ def test_the_viewer_renders_all_gaussians_while_the_camera_moves(room, monkeypat
         found = entry.renderer.color(view)
     expected = pictures.Entry(shown, frame).renderer.color(view)
     np.testing.assert_allclose(found, expected, atol=1e-3)
-
-
-def test_mixing_devices_is_noticed():
-    with pc.pretended_gpu():
-        gpu = torch.zeros(3, device="cuda")
-        with pytest.raises(RuntimeError, match="same device"):
-            gpu + torch.ones(3)
-        with pytest.raises(TypeError, match="convert cuda:0"):
-            gpu.numpy()

@@ -11,6 +11,7 @@ from __future__ import annotations
 import ctypes
 import importlib.util
 import os
+import sys
 from collections import Counter
 from contextlib import contextmanager
 from pathlib import Path
@@ -26,8 +27,8 @@ from torch.utils._pytree import tree_flatten, tree_map, tree_unflatten
 
 GPU = torch.device("cuda", 0)
 aten = torch.ops.aten
-COUNTS: Counter = Counter()  # operators that wait for the GPU, and launches
-WHERE: Counter = Counter()  # (kind, file:line) of those
+COUNTS: Counter = Counter()  # launches
+WHERE: Counter = Counter()  # (kind, file:line) of what waits for the GPU
 PINNED: set[int] = set()  # addresses of memory from which copies are queued
 
 
@@ -35,21 +36,13 @@ class Pretend(torch.Tensor):
     @staticmethod
     def __new__(cls, elem):
         assert not isinstance(elem, Pretend)
+        strided = elem.layout == torch.strided
+        where = (elem.stride(), elem.storage_offset()) if strided else (None, 0)
         self = torch.Tensor._make_wrapper_subclass(
-            cls,
-            elem.size(),
-            strides=elem.stride() if elem.layout == torch.strided else None,
-            storage_offset=elem.storage_offset() if elem.layout == torch.strided else 0,
-            dtype=elem.dtype,
-            layout=elem.layout,
-            device=GPU,
-            requires_grad=False,
+            cls, elem.size(), *where, dtype=elem.dtype, layout=elem.layout, device=GPU
         )
         self.elem = elem
         return self
-
-    def __repr__(self, *, tensor_contents=None):
-        return f"Pretend({self.elem!r})"
 
     @classmethod
     def __torch_function__(cls, func, types, args=(), kwargs=None):
@@ -74,67 +67,39 @@ class Pretend(torch.Tensor):
     def __torch_dispatch__(cls, func, types, args=(), kwargs=None):
         return dispatch(func, args, kwargs or {})
 
-    def __reduce_ex__(self, proto):
-        return (_rebuilt, (self.elem.detach(), self.requires_grad))
-
 
 def check_input(dtype=torch.float32, **tensors):
+    """What gsplat's kernels check of what is given."""
     for name, t in tensors.items():
-        if t is None:
-            continue
-        if not isinstance(t, Pretend):
-            raise RuntimeError(f"{name} must be a CUDA tensor")
-        if not t.is_contiguous():
-            raise RuntimeError(f"{name} must be contiguous")
-        if dtype is not None and t.dtype != dtype:
-            raise RuntimeError(f"expected scalar type {dtype} but found {t.dtype} for {name}")
+        if t is not None and not (
+            isinstance(t, Pretend) and t.is_contiguous() and t.dtype == dtype
+        ):
+            raise RuntimeError(f"{name} must be a contiguous CUDA tensor of {dtype}")
 
 
 def elem(t):
     return t.elem.detach() if isinstance(t, Pretend) else t
 
 
-def _rebuilt(elem, requires_grad):
-    return Pretend(elem).requires_grad_(requires_grad)
-
-
 CROSS = {aten.copy_.default, aten._copy_from.default}
-SCALARS = {
-    aten.where.self,
-    aten.where.ScalarSelf,
-    aten.fill_.Tensor,
-    aten.fill.Tensor,
-    aten.masked_fill_.Tensor,
-    aten.masked_fill.Tensor,
+TAKES_CPU_SCALARS = {
+    *(aten.where.self, aten.where.ScalarSelf, aten.fill_.Tensor, aten.fill.Tensor),
+    *(aten.masked_fill_.Tensor, aten.masked_fill.Tensor),
 }
 INDEXING = {
-    aten.index.Tensor,
-    aten.index_put_.default,
-    aten.index_put.default,
-    aten._index_put_impl_.default,
-    aten._unsafe_index.Tensor,
+    *(aten.index.Tensor, aten.index_put_.default, aten.index_put.default),
+    *(aten._index_put_impl_.default, aten._unsafe_index.Tensor),
 }
-SYNC = {
-    aten._local_scalar_dense.default: "item",
-    aten.nonzero.default: "nonzero",
-    aten._unique2.default: "unique",
-    aten.unique_consecutive.default: "unique",
-    aten.masked_select.default: "masked_select",
-    aten.equal.default: "equal",
-    aten.bincount.default: "bincount",
-    aten._assert_async.default: "assert",
-    aten.multinomial.default: "multinomial?",
-}
+WAITS = {
+    "_local_scalar_dense", "nonzero", "_unique2", "unique_consecutive", "masked_select", "equal",
+    "bincount", "_assert_async", "multinomial",
+}  # fmt: skip
 
 
-def _note(kind):
-    COUNTS[kind] += 1
-    import sys
-
-    frame = sys._getframe(2)
-    while frame and (
-        "/torch/" in frame.f_code.co_filename or "pretend_cuda" in frame.f_code.co_filename
-    ):
+def note(kind):
+    """Count what waits for the GPU, by the line outside of PyTorch that asked for it."""
+    frame = sys._getframe(1)
+    while frame and any(part in frame.f_code.co_filename for part in ("/torch/", "pretend_cuda")):
         frame = frame.f_back
     if frame:
         name = frame.f_code.co_filename.split("site-packages/")[-1].split("/src/")[-1]
@@ -153,97 +118,74 @@ def _tf32(x):
 
 
 def dispatch(func, args, kwargs):
+    """Compute an operator on the CPU; its results are on the GPU if its inputs or target are."""
     flat, spec = tree_flatten((args, kwargs))
     gpu = [t for t in flat if isinstance(t, Pretend)]
     cpu = [t for t in flat if isinstance(t, torch.Tensor) and not isinstance(t, Pretend)]
-    target = kwargs.get("device")
-    target = None if target is None else torch.device(target)
-    if gpu and cpu:
-        _check_mixed(func, args, cpu)
+    target = kwargs.get("device") and torch.device(kwargs["device"]).type
     if gpu:
         COUNTS["launch"] += 1
-        if func in SYNC:
-            _note(SYNC[func])
+        _check(func, args, cpu)
+        if func.overloadpacket.__name__ in WAITS:
+            note(func.overloadpacket.__name__)
         if func is aten.index.Tensor and any(
             isinstance(i, Pretend) and i.dtype == torch.bool for i in args[1]
         ):
-            _note("bool index")
-    if func in CROSS and isinstance(args[0], Pretend) != isinstance(args[1], Pretend):
-        _note("copy to GPU" if isinstance(args[0], Pretend) else "copy to CPU")
-    if gpu and func in (aten._fused_adam_.default, aten._fused_adam_.tensor_lr):
-        for group in zip(*args[:4], strict=False):  # the CUDA kernel insists, the CPU's does not
-            if len({_layout(t) for t in group}) != 1:
-                raise RuntimeError(
-                    "params, grads, exp_avgs, and exp_avg_sqs must have same dtype, device, and "
-                    f"layout: {[(t.dtype, tuple(t.shape), t.stride()) for t in group]}"
-                )
+            note("bool index")
+    if func in CROSS:
+        if isinstance(args[0], Pretend) != isinstance(args[1], Pretend):
+            note("copy")
+        func(*map(elem, args[:2]), *args[2:])
+        return args[0]
     if func == aten.is_pinned.default:
-        return getattr(args[0], "_pinned", False)
-    real = [t.elem if isinstance(t, Pretend) else t for t in flat]
-    real = [
-        torch.device("cpu") if isinstance(t, torch.device) and t.type == "cuda" else t for t in real
-    ]
-    a, k = tree_unflatten(real, spec)
-    if isinstance(k.get("device"), str) and "cuda" in k["device"]:
-        k["device"] = torch.device("cpu")
+        return elem(args[0]).data_ptr() in PINNED
+    plain = [t.elem if isinstance(t, Pretend) else t for t in flat]
+    a, k = tree_unflatten(
+        ["cpu" if isinstance(t, torch.device) and t.type == "cuda" else t for t in plain], spec
+    )
+    if target:
+        k["device"] = "cpu"
     pinned = k.pop("pin_memory", None) or func is aten._pin_memory.default
     if gpu and torch.backends.cudnn.allow_tf32:
         # cuDNN rounds the inputs of convolutions, where PyTorch's settings let it.
         inputs = {aten.convolution.default: 2, aten.convolution_backward.default: 3}.get(func, 0)
         a = (*map(_tf32, a[:inputs]), *a[inputs:])
-    moved = func is aten._to_copy.default and target is not None
     out = a[0].clone() if func is aten._pin_memory.default else func(*a, **k)
     if pinned:
         PINNED.add(out.data_ptr())
-    if moved:
-        was, goes = isinstance(args[0], Pretend), target.type == "cuda"
-        if was != goes:
-            queued = goes and kwargs.get("non_blocking") and args[0].data_ptr() in PINNED
-            _note("queued copy" if queued else "copy to GPU" if goes else "copy to CPU")
-    on_gpu = target.type == "cuda" if target is not None else bool(gpu)
-    if func in CROSS:
-        return args[0]
-    back = {id(t.elem): t for t in gpu}
-    mine = {id(t): t for t in cpu}
+    if func is aten._to_copy.default and target and (target == "cuda") != bool(gpu):
+        queued = kwargs.get("non_blocking") and a[0].data_ptr() in PINNED
+        note("queued copy" if queued and not gpu else "copy")
+    on_gpu = target == "cuda" if target else bool(gpu)
+    given = {id(t.elem): t for t in gpu} | {id(t): t for t in cpu}
 
     def wrap(o):
-        if not isinstance(o, torch.Tensor):
+        if not isinstance(o, torch.Tensor) or (id(o) not in given and not on_gpu):
             return o
-        if id(o) in back:
-            w = back[id(o)]
-            if tuple(w.shape) != tuple(w.elem.shape):
-                raise NotImplementedError(f"{func} changes the shape in place")
-            return w
-        if id(o) in mine:
-            return o
-        return Pretend(o) if on_gpu else o
+        again = given.get(id(o))
+        if again is not None and again.shape != o.shape:
+            raise NotImplementedError(f"{func} changes the shape in place")
+        return Pretend(o) if again is None else again
 
     return tree_map(wrap, out)
 
 
-def _check_mixed(func, args, cpu):
-    if func in CROSS:
-        return
-    if (
-        func in INDEXING
-        and isinstance(args[0], Pretend)
-        and all(
-            not isinstance(args[i], torch.Tensor)
-            or isinstance(args[i], Pretend)
-            or args[i].dim() == 0
-            for i in range(2, len(args))
+def _check(func, args, cpu):
+    """What PyTorch refuses on a GPU: other devices' tensors but for scalars and indices, ..."""
+    scalars = all(t.dim() == 0 for t in cpu)
+    allowed = scalars and (torch.Tag.pointwise in func.tags or func in TAKES_CPU_SCALARS)
+    if func in INDEXING and isinstance(args[0], Pretend):
+        values = [t for t in args[2:] if isinstance(t, torch.Tensor)]
+        allowed = all(isinstance(t, Pretend) or t.dim() == 0 for t in values)
+    if cpu and not allowed and func not in CROSS:
+        raise RuntimeError(
+            "Expected all tensors to be on the same device, but found at least two devices, cuda:0 "
+            f"and cpu! (in {func})"
         )
-    ):
-        COUNTS["index with CPU tensors"] += 1
-        return
-    if torch.Tag.pointwise in func.tags and all(t.dim() == 0 for t in cpu):
-        return
-    if func in SCALARS and all(t.dim() == 0 for t in cpu):
-        return
-    raise RuntimeError(
-        "Expected all tensors to be on the same device, but found at least two devices, cuda:0 and "
-        f"cpu! (in {func})"
-    )
+    if func in (aten._fused_adam_.default, aten._fused_adam_.tensor_lr):
+        for group in zip(*args[:4], strict=False):  # ... on which the CPU's kernel does not insist
+            if len({_layout(t) for t in group}) != 1:
+                raise RuntimeError("params, grads, exp_avgs and exp_avg_sqs must have same layout")
 
 
 class PretendMode(TorchDispatchMode):
@@ -252,30 +194,22 @@ class PretendMode(TorchDispatchMode):
 
 
 def _patch_torch():
-    cuda = torch.cuda
-    cuda.is_available = lambda: True
-    cuda.device_count = lambda: 1
-    cuda.current_device = lambda: 0
-    cuda.is_initialized = lambda: True
-    cuda._lazy_init = lambda: None
-    cuda._is_in_bad_fork = lambda: False
-    cuda.get_device_name = lambda *_: "pretended GPU"
-    cuda.manual_seed_all = lambda *_: None
-    cuda.manual_seed = lambda *_: None
-    cuda.get_rng_state = lambda *_: torch.zeros(16, dtype=torch.uint8)
-    cuda.set_rng_state = lambda *_, **__: None
-    cuda.empty_cache = lambda: COUNTS.update(["empty_cache"])
-    cuda.synchronize = lambda *_: COUNTS.update(["synchronize"])
-    cuda.is_current_stream_capturing = lambda: False
-
     def mem_get_info(*_):
-        _note("mem_get_info")
+        note("mem_get_info")
         return (20 << 30, 24 << 30)
 
-    cuda.mem_get_info = mem_get_info
-    cuda.memory_reserved = cuda.memory_allocated = lambda *_: 0
-    cuda.max_memory_allocated = lambda *_: 1 << 30
-    load = torch.load
+    answers = {
+        "is_available": True, "device_count": 1, "current_device": 0, "is_initialized": True,
+        "_lazy_init": None, "_is_in_bad_fork": False, "get_device_name": "pretended GPU",
+        "manual_seed_all": None, "manual_seed": None, "set_rng_state": None, "empty_cache": None,
+        "get_rng_state": torch.zeros(16, dtype=torch.uint8), "synchronize": None,
+        "is_current_stream_capturing": False, "memory_reserved": 0, "memory_allocated": 0,
+        "max_memory_allocated": 1 << 30,
+    }  # fmt: skip
+    for name, answer in answers.items():
+        setattr(torch.cuda, name, lambda *_, answer=answer, **__: answer)
+    torch.cuda.mem_get_info = mem_get_info
+    load, save = torch.load, torch.save
 
     def pretended_load(*args, map_location=None, **kwargs):
         gpu = map_location is not None and torch.device(map_location).type == "cuda"
@@ -283,15 +217,7 @@ def _patch_torch():
         return tree_map(lambda x: Pretend(x) if gpu and isinstance(x, torch.Tensor) else x, content)
 
     torch.load = pretended_load
-    save = torch.save
-
-    def pretended_save(content, *args, **kwargs):
-        def plain(x):
-            return x.detach().elem if isinstance(x, Pretend) else x
-
-        return save(tree_map(plain, content), *args, **kwargs)
-
-    torch.save = pretended_save
+    torch.save = lambda content, *args: save(tree_map(elem, content), *args)
 
 
 @contextmanager
