@@ -275,8 +275,8 @@ def test_the_formats_own_tool_reads_ours(suffix, converter, tmp_path):
     truth = _gaussians()
     write_model(tmp_path / f"ours{suffix}", truth)
     converter(tmp_path / f"ours{suffix}", tmp_path / "theirs.ply")
-    limits = [limit and limit + 1e-6 for limit in LIMITS[suffix]]
-    limits[2] *= 2  # it takes 127.5 for the middle of a byte, not 128
+    limits = [None if limit is None else limit + 1e-6 for limit in LIMITS[suffix]]
+    limits[2] = 2 * limits[2] + 0.01  # it takes 127.5 for the middle of a byte, not 128
     _assert_close(read_model(tmp_path / "theirs.ply"), truth, limits)
 
 

@@ -1,21 +1,30 @@
-"""The viewer in a browser: pages are driven, and what they show is looked at."""
+"""The viewer in a browser, and of a run that trains: pages are driven, and looked at."""
 
 from __future__ import annotations
 
+import base64
+import io
 import shutil
 import socket
+import threading
+import time
 from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 torch = pytest.importorskip("torch", reason="rendering needs PyTorch")
 pytest.importorskip("viser", reason="the viewer needs viser (extra view)")
 
 from splatseed.commands import view as verb
+from splatseed.io import load_scene
 from splatseed.pointcloud import PointCloud
+from splatseed.splat.evaluate import evaluate_views
 from splatseed.splat.gaussians import TrainingFrame
+from splatseed.train.run import prepare_run
+from splatseed.train.settings import TrainSettings
 from splatseed.view import pictures, session as session_module
 from splatseed.view.models import open_shown, stage_frame
 from splatseed.view.pictures import (
@@ -26,11 +35,11 @@ from splatseed.view.pictures import (
     laid_onto,
     stage_pose,
 )
-from splatseed.view.server import Viewer, free_port
+from splatseed.view.server import TrainingViewer, Viewer, free_port
 
-from .page import CHROMIUM, click_text, go, screenshot, served_page, text, toggle, waits_for
+from ..bench import browser
 
-needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
+needs_browser = pytest.mark.skipif(browser.CHROMIUM is None, reason="Chromium is not installed")
 
 BLANK = 15
 """A picture whose values deviate by less shows nothing."""
@@ -61,16 +70,73 @@ def entry(run_folder):
     return _entry(open_shown(run_folder))
 
 
+FLAGS = (
+    *(flag for flag in browser.FLAGS if flag != "--disable-gpu"),
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--ignore-gpu-blocklist",
+)
+
+
+@contextmanager
+def served_page(folder, url):
+    """A page of a browser, with WebGL in software, at an address."""
+    before, browser.FLAGS = browser.FLAGS, FLAGS
+    try:
+        with browser.chromium(folder) as page:
+            page.open(url, 800, 600)
+            yield page
+    finally:
+        browser.FLAGS = before
+
+
+def screenshot(page):
+    """What the page shows, [H, W, 3]."""
+    data = base64.b64decode(page.call("Page.captureScreenshot")["data"])
+    return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
+
+
+def waits_for(condition, seconds=30.0):
+    """What comes true in time."""
+    until = time.monotonic() + seconds
+    while not (answer := condition()) and time.monotonic() < until:
+        time.sleep(0.1)
+    return answer
+
+
+def text(page):
+    return page.run("document.body.innerText")
+
+
+def click_text(page, words, tag):
+    """Click the last element that has just these words."""
+    page.run(
+        f"[...document.querySelectorAll({tag!r})]"
+        f".filter(e => e.innerText === {words!r}).at(-1).click()"
+    )
+
+
+def toggle(page, label):
+    """Click the checkbox that stands beside a label."""
+    page.run(
+        "(() => { let e = [...document.querySelectorAll('*')]"
+        f".filter(e => e.innerText === {label!r}).at(-1);"
+        " while (!e.querySelector('input[type=checkbox]')) e = e.parentElement;"
+        " e.querySelector('input[type=checkbox]').click(); })()"
+    )
+
+
 def _session(viewer):
-    assert waits_for(lambda: viewer._sessions, 90), "the page does not connect"
-    return list(viewer._sessions.values())[-1]
+    assert waits_for(lambda: viewer.sessions, 90), "the page does not connect"
+    return viewer.sessions[-1]
 
 
 def _settled(session):
     """Wait for a full picture of what is shown."""
     canvas = session._client.camera
     full = (canvas.image_height, canvas.image_width)
-    return waits_for(lambda: session._picture is not None and session._picture.shape[:2] == full)
+    drawn = lambda: session._picture is not None and session._picture.shape[:2] == full
+    return waits_for(drawn, 90)
 
 
 # The page ----------------------------------------------------------------------------------------
@@ -188,8 +254,8 @@ def test_two_browsers_have_switches_of_their_own_and_may_go(viewer, tmp_path):
     with served_page(tmp_path / "a", viewer.url) as first:
         one = _session(viewer)
         with served_page(tmp_path / "b", viewer.url):
-            assert waits_for(lambda: len(viewer._sessions) == 2)
-            two = list(viewer._sessions.values())[-1]
+            assert waits_for(lambda: len(viewer.sessions) == 2)
+            two = viewer.sessions[-1]
             assert waits_for(lambda: two._nodes)
             two._kind.value = "depth"
             two._points_on.value = True
@@ -197,13 +263,13 @@ def test_two_browsers_have_switches_of_their_own_and_may_go(viewer, tmp_path):
             assert one._kind.value == "Gaussians"
             assert not next(iter(one._nodes.values())).visible
         # The second was cut off; the first goes on.
-        assert waits_for(lambda: len(viewer._sessions) == 1)
+        assert waits_for(lambda: len(viewer.sessions) == 1)
         assert waits_for(lambda: not two._loop._thread.is_alive())
         frames = one._loop.frames
         one.refresh()
         assert waits_for(lambda: one._loop.frames > frames)
-        go(first, viewer.url)
-        assert waits_for(lambda: list(viewer._sessions.values()) not in ([], [one]))
+        first.open(viewer.url, 800, 600)
+        assert waits_for(lambda: viewer.sessions not in ([], [one]))
 
 
 # What is drawn -----------------------------------------------------------------------------------
@@ -280,6 +346,92 @@ def test_points_of_several_origins_are_switched_apart(rng):
     np.testing.assert_allclose(clouds[0].xyz, 2 * cloud.xyz[:50], rtol=1e-6)
     thinned = clouds_of(cloud, TrainingFrame(np.zeros(3), 2.0), 75)
     assert [(each.count, len(each.xyz)) for each in thinned] == [(50, 25)] * 3
+
+
+# A run that trains -------------------------------------------------------------------------------
+
+STEPS = 40
+
+
+class _Onlooker:
+    """Stands for a browser: without one, nothing is drawn."""
+
+    def refresh(self):
+        pass
+
+    def close(self):
+        pass
+
+
+@pytest.fixture
+def watched(room, tmp_path):
+    pytest.importorskip("gsplat", reason="training needs gsplat's strategies")
+    scene = load_scene(room)
+    settings = TrainSettings(max_steps=STEPS, data_factor=2, test_every=4, strategy="none")
+    run = prepare_run(scene, tmp_path / "run", settings)
+    viewer = TrainingViewer(run, scene, "room", "127.0.0.1", free_port("127.0.0.1", 0))
+    viewer._sessions[0] = _Onlooker()
+    yield run, viewer, scene
+    viewer.close()
+
+
+def test_renders_come_between_steps_and_change_nothing(watched, room, tmp_path):
+    run, viewer, scene = watched
+    canvas, pictures = _canvas_at(viewer.entries[0], scene.images[0], (80, 60)), []
+
+    def look():
+        while len(pictures) < 5:
+            pictures.append(viewer._live.draw("Gaussians", canvas, None))
+
+    thread = threading.Thread(target=look)
+    thread.start()
+    assert run.train(viewer.on_step)
+    viewer._live.close()
+    thread.join(30)
+    drawn = [picture for picture, _ in pictures if picture is not None]
+    assert drawn
+    assert all(picture.std() > 5 for picture in drawn)
+    picture, why = viewer._live.draw("Gaussians", canvas, None)  # who looks after the end is told
+    assert (picture, "ended" in why) == (None, True)
+    numbers = viewer._numbers()
+    for told in (f"step {STEPS}", f"{len(run.state.params['means']):,} Gaussians", "test views"):
+        assert told in numbers
+    alone = prepare_run(load_scene(room), tmp_path / "alone", run.settings)
+    assert alone.train()
+    for name, value in alone.state.params.items():
+        np.testing.assert_array_equal(value.detach(), run.state.params[name].detach())
+
+
+def test_a_pause_holds_and_a_stop_keeps(watched):
+    run, viewer, _ = watched
+    viewer.pause(on=True)
+    seen = []
+
+    def meddle():
+        time.sleep(0.5)
+        seen.append(run.state.step)
+        time.sleep(0.5)
+        seen.append(run.state.step)
+        viewer.pause(on=False)
+        time.sleep(0.2)
+        viewer.stop_and_keep()
+
+    thread = threading.Thread(target=meddle)
+    thread.start()
+    slow = viewer.on_step
+
+    def on_step(step):
+        time.sleep(0.02)
+        slow(step)
+
+    assert not run.train(on_step)
+    thread.join()
+    assert seen[0] == seen[1] == 1
+    assert viewer.kept
+    assert 1 < run.state.step < STEPS
+    assert run.finish(evaluate_views).steps == run.state.step
+    assert run.folder.gaussians.is_file()
+    assert not run.folder.checkpoint.exists()
 
 
 # The command -------------------------------------------------------------------------------------
