@@ -33,7 +33,7 @@ from splatseed.view.page import (
     resized,
     write_grid,
 )
-from splatseed.view.points import origin_colors, picture_size, points_over, render_points
+from splatseed.view.points import origin_colors, points_over, render_points
 from splatseed.views.visibility import choose_camera, choose_image
 
 PAIR_SIDE = 800
@@ -110,7 +110,7 @@ def preview_origins(scene: Scene, points: PointCloud, path: Path | str) -> Path:
     """
     camera = choose_camera(scene)
     scale = PAIR_SIDE / max(camera.width, camera.height)
-    size = picture_size(camera, scale)
+    size = fitted(camera.width, camera.height, PAIR_SIDE)
     photograph = photograph_at(scene, choose_image(scene), size)
     colored = points.replace(rgb=origin_colors(points.source))
     tiles = [
@@ -189,7 +189,7 @@ def cell_picture(
 def _photograph(scene: Scene, side: int, label: str) -> list[Tile]:
     """The photograph of the camera that ``choose_camera`` takes, if it can be read."""
     camera = choose_camera(scene)
-    size = picture_size(camera, side / max(camera.width, camera.height))
+    size = fitted(camera.width, camera.height, side)
     photograph = photograph_at(scene, choose_image(scene), size)
     return [] if photograph is None else [Tile(label, photograph)]
 

@@ -39,7 +39,7 @@ class Tile(NamedTuple):
     picture: UInt8[np.ndarray, "H W 3"]
 
 
-def fitted(width: int, height: int, side: int = GRID_SIDE) -> tuple[int, int]:
+def fitted(width: int, height: int, side: float = GRID_SIDE) -> tuple[int, int]:
     """Width and height that keep the aspect ratio and whose longer side is ``side``."""
     factor = side / max(width, height)
     return max(round(width * factor), 1), max(round(height * factor), 1)

@@ -17,7 +17,7 @@ from splatseed.camera import Camera
 from splatseed.pointcloud import GENERATED, ORIGINAL, PointCloud
 from splatseed.runtime.jit import inline
 from splatseed.upsample.registry import SOURCE_CODES
-from splatseed.view.page import PAPER, resized
+from splatseed.view.page import PAPER, fitted, resized
 
 DISCS_PER_SIDE = 340
 """A disc at the median depth is the picture's longer side divided by this: 2.4 px at 800."""
@@ -41,11 +41,6 @@ COLORS: dict[int, tuple[int, int, int]] = {
     GENERATED: (140, 86, 75),
 }
 """The colour of each origin; others have that of ``GENERATED``."""
-
-
-def picture_size(camera: Camera, scale: float) -> tuple[int, int]:
-    """Width and height of a picture that is ``scale`` times as large as the camera's."""
-    return max(round(camera.width * scale), 1), max(round(camera.height * scale), 1)
 
 
 def render_points(
@@ -81,7 +76,7 @@ def render_points(
         >>> picture[12, 16].tolist(), picture[0, 0].tolist()
         ([255, 0, 0], [255, 255, 255])
     """
-    width, height = picture_size(camera, scale)
+    width, height = (max(round(side * scale), 1) for side in (camera.width, camera.height))
     size = max(width, height) / DISCS_PER_SIDE if point_size is None else point_size
     uv, depth = camera.project(points.xyz[points.finite])
     rgb = points.rgb[points.finite]
@@ -129,7 +124,8 @@ def points_over(
     background: tuple[int, int, int] | UInt8[np.ndarray, "H W 3"] = PAPER
     if photograph is not None:
         grey = np.asarray(PillowImage.fromarray(photograph).convert("L"))
-        shown = resized(grey, picture_size(camera, scale)).astype(np.float64)
+        size = fitted(camera.width, camera.height, max(camera.width, camera.height) * scale)
+        shown = resized(grey, size).astype(np.float64)
         pale = np.round(PALE * 255 + (1 - PALE) * shown).astype(np.uint8)
         background = np.repeat(pale[..., None], 3, axis=2)
     return render_points(points, camera, point_size=point_size, background=background, scale=scale)
