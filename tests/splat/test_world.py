@@ -111,22 +111,20 @@ def test_nerfstudios_transform_begins_at_colmaps_world(room, tmp_path):
     np.testing.assert_allclose(moved, wanted, atol=1e-5)
 
 
-def test_what_gives_no_transform_is_refused(room, tmp_path):
-    scene = load_scene(room)
-    for text in (
-        "{",
-        "# Read me\n\nfirst",
-        "",
-        "{}",
-        '{"transform": [[1, 2], [3, 4]]}',
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("{", "# Read me\n\nfirst", "", "{}", '{"transform": [[1, 2], [3, 4]]}'),
         "[[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]",
         '[{"img_name": "nobody", "position": [0, 0, 0]}]',
-    ):
-        (tmp_path / "t.json").write_text(text)
-        with pytest.raises(SceneFormatError, match=r"t\.json"):
-            find_transform(str(tmp_path / "t.json"), scene)
+    ],
+)
+def test_what_gives_no_transform_is_refused(text, room, tmp_path):
+    (tmp_path / "t.json").write_text(text)
+    with pytest.raises(SceneFormatError, match=r"t\.json"):
+        find_transform(str(tmp_path / "t.json"), load_scene(room))
     with pytest.raises(SceneNotFoundError, match=r"nowhere\.json"):
-        find_transform(str(tmp_path / "nowhere.json"), scene)
+        find_transform(str(tmp_path / "nowhere.json"), load_scene(room))
     with pytest.raises(ParameterError):
         find_transform("gsplat", load_scene(room / "sparse/0/points3D.ply"))
 

@@ -207,15 +207,26 @@ def _camera_in_sight(session):
 
 
 @needs_browser
-def test_a_browser_gets_as_many_points_as_it_draws_quickly(room, tmp_path, monkeypatch):
+def test_switches_act_and_a_browser_gets_as_many_points_as_it_draws(entry, tmp_path, monkeypatch):
     monkeypatch.setattr(session_module, "FIRST_POINTS", 100)
     monkeypatch.setattr(session_module.Session, "_affordable_points", lambda _: 10**6)
-    entry = _entry(open_shown(room))
-    total = len(entry.shown.scene.points)
-    with _served(entry) as viewer, served_page(tmp_path, viewer.url) as page:
+    other, total = _entry(replace(entry.shown, name="other")), len(entry.shown.scene.points)
+    with (
+        _served(entry, other, beside=other) as viewer,
+        served_page(tmp_path, viewer.url) as page,
+    ):
         session = _session(viewer)
-        assert waits_for(lambda: len(session._clouds["original"].xyz) == total)
+        assert (session._second.value, session._split.visible) == ("other: Gaussians", True)
         assert waits_for(lambda: f"original: {total:,}" in text(page))
+        assert waits_for(lambda: len(session._clouds["original"].xyz) == total)
+        before = session._cameras_on.value
+        toggle(page, "Show cameras")
+        assert waits_for(lambda: session._cameras_on.value != before)
+        shots = []
+        session._client.send_file_download = lambda name, data, **_: shots.append((name, data))
+        click_text(page, "Screenshot", "button")
+        assert waits_for(lambda: shots)
+        assert shots[0][1].startswith(b"\x89PNG")
         monkeypatch.undo()
         monkeypatch.setattr(session_module, "FIRST_POINTS", 100)
         assert session._affordable_points() > 0
@@ -226,27 +237,6 @@ def test_a_browser_gets_as_many_points_as_it_draws_quickly(room, tmp_path, monke
         session._points_on.value = True
         session._restyle()
         assert all(node.visible for node in session._nodes.values())
-
-
-@needs_browser
-def test_switches_of_the_page_act_and_what_is_compared_is_there(entry, tmp_path):
-    other = _entry(replace(entry.shown, name="other"))
-    with (
-        _served(entry, other, beside=other) as viewer,
-        served_page(tmp_path, viewer.url) as page,
-    ):
-        session = _session(viewer)
-        assert session._second.value == "other: Gaussians"
-        assert session._split.visible
-        assert waits_for(lambda: "Show cameras" in text(page))
-        before = session._cameras_on.value
-        toggle(page, "Show cameras")
-        assert waits_for(lambda: session._cameras_on.value != before)
-        shots = []
-        session._client.send_file_download = lambda name, data, **_: shots.append((name, data))
-        click_text(page, "Screenshot", "button")
-        assert waits_for(lambda: shots)
-        assert shots[0][1].startswith(b"\x89PNG")
 
 
 @needs_browser

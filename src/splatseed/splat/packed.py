@@ -234,6 +234,16 @@ def decode_compressed_ply(path: Path) -> Gaussians:
         # Files from before 2024 have no colour bounds at all.
         if {*_BOUNDS[4], *_BOUNDS[5]} & set(chunks.dtype.names or ()):
             colors = within(colors, 2)
+        table, shN = tables.get("sh", vertices), np.zeros((len(vertices), 0, 3), np.float32)
+        rest = [name for name in table.dtype.names or () if name.startswith("f_rest_")]
+        if rest:  # all of red, then green, then blue
+            if len(table) != len(vertices) or len(rest) not in {3 * k for k in SH_COUNTS}:
+                raise ValueError(f"{len(table)} rows of {len(rest)} f_rest")
+            values = structured_to_unstructured(table[[f"f_rest_{i}" for i in range(len(rest))]])
+            centers = (values.astype(np.float32) + np.float32(0.5)) / 256
+            centers = np.where(values == 0, 0, np.where(values == 255, 1, centers))
+            rows = (centers.astype(np.float32) - np.float32(0.5)) * np.float32(_SH_RANGE)
+            shN = np.ascontiguousarray(rows.reshape(len(rows), 3, -1).transpose(0, 2, 1))
         three = (_unpack(turn, _THREE_BITS) - np.float32(0.5)) * np.float32(np.sqrt(2))
         return Gaussians(
             means=within(_unpack(position, _VECTOR_BITS), 0),
@@ -241,7 +251,7 @@ def decode_compressed_ply(path: Path) -> Gaussians:
             quats=from_smallest_three((turn >> 30).astype(np.int64), three),
             opacities=opacity_logits((color & 255).astype(np.uint8)),
             sh0=((colors - np.float32(0.5)) / np.float32(SH_C0))[:, None],
-            shN=_coefficients(tables.get("sh", vertices), len(vertices)),
+            shN=shN,
         )
 
 
@@ -257,20 +267,6 @@ def _pack(units: Float32[np.ndarray, "N 3"], layout: _Layout) -> UInt32[np.ndarr
 def _unpack(packed: UInt32[np.ndarray, " N"], layout: _Layout) -> Float32[np.ndarray, "N 3"]:
     columns = [((packed >> shift) & (2**bits - 1)) / (2**bits - 1) for shift, bits in layout]
     return np.stack(columns, axis=1).astype(np.float32)
-
-
-def _coefficients(table: np.ndarray[Any, Any], count: int) -> Float32[np.ndarray, "N K 3"]:
-    """Colour coefficients beyond the first; the file stores all of red, then green, then blue."""
-    rest = sum(name.startswith("f_rest_") for name in table.dtype.names or ())
-    if not rest:
-        return np.zeros((count, 0, 3), np.float32)
-    if len(table) != count or rest not in {3 * each for each in SH_COUNTS}:
-        raise ValueError(f"{len(table)} rows of {rest} f_rest for {count} Gaussians")
-    values = structured_to_unstructured(table[[f"f_rest_{i}" for i in range(rest)]])
-    centers = (values.astype(np.float32) + np.float32(0.5)) / 256
-    centers = np.where(values == 0, 0, np.where(values == 255, 1, centers)).astype(np.float32)
-    rows = ((centers - np.float32(0.5)) * np.float32(_SH_RANGE)).reshape(count, 3, -1)
-    return np.ascontiguousarray(rows.transpose(0, 2, 1))
 
 
 # .spz ---------------------------------------------------------------------------------------------
@@ -333,8 +329,15 @@ def decode_spz(path: Path) -> Gaussians:
         parts = np.split(np.frombuffer(body, np.uint8), count * np.cumsum(sizes)[:-1])
         position, opacity, color, scale, turn, sh = (part.reshape(count, -1) for part in parts)
         harmonics = (sh.reshape(count, rest, 3).astype(np.float32) - 128) / 128
+        if version == 1:  # half floats
+            means = np.ascontiguousarray(position).view("<f2").astype(np.float32)
+        else:
+            digits = position.reshape(-1, 3, 3).astype(np.int32)
+            fixed = digits[..., 0] | digits[..., 1] << 8 | digits[..., 2] << 16
+            fixed = np.where(fixed > _SPZ_MOST, fixed - 2**24, fixed)
+            means = (fixed / 2.0**bits).astype(np.float32)
         return Gaussians(
-            means=_positions(position, bits) * _SPZ_AXES,
+            means=means * _SPZ_AXES,
             scales=(scale / 16 - 10).astype(np.float32),
             quats=_quats(turn) * _SPZ_QUAT,
             opacities=opacity_logits(opacity[:, 0]),
@@ -357,15 +360,6 @@ def _zstd_body(data: bytes, count: int, sizes: list[int]) -> bytes:
         )
         at += length
     return body
-
-
-def _positions(raw: UInt8[np.ndarray, "N B"], bits: int) -> Float32[np.ndarray, "N 3"]:
-    if raw.shape[1] == 6:  # half floats
-        return np.ascontiguousarray(raw).view("<f2").astype(np.float32)
-    digits = raw.reshape(-1, 3, 3).astype(np.int32)
-    fixed: Int64[np.ndarray, "N 3"] = digits[..., 0] | digits[..., 1] << 8 | digits[..., 2] << 16
-    fixed = np.where(fixed > _SPZ_MOST, fixed - 2**24, fixed)
-    return (fixed / 2.0**bits).astype(np.float32)
 
 
 def _quats(raw: UInt8[np.ndarray, "N B"]) -> Float32[np.ndarray, "N 4"]:
