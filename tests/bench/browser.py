@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import itertools
 import json
 import os
@@ -106,14 +105,6 @@ class Page:
             x = to_x if buttons and kind == "mouseMoved" and to_x is not None else x
             self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left",
                       buttons=buttons, clickCount=1)  # fmt: skip
-
-    def picture(self, path, *, top=None, height=None):
-        """A picture of the page, or of a part of it."""
-        size = self.call("Page.getLayoutMetrics")["cssContentSize"]
-        clip = {"x": 0, "y": top or 0, "width": size["width"], "scale": 1,
-                "height": min(height or size["height"], size["height"] - (top or 0))}  # fmt: skip
-        shot = self.call("Page.captureScreenshot", captureBeyondViewport=True, clip=clip)
-        Path(path).write_bytes(base64.b64decode(shot["data"]))
 
 
 @contextmanager

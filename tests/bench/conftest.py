@@ -11,7 +11,8 @@ import shutil
 
 import pytest
 
-from splatseed.bench.plan import Plan, PlannedScene
+from splatseed.bench.plan import Plan
+from splatseed.bench.scenes import PlannedScene
 from splatseed.synthetic import make_capture, write_capture
 from splatseed.train.settings import TrainSettings
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from splatseed.bench.plan import SFM, SHARED, Arm, RunResult, RunSpec
 from splatseed.bench.runs import ERROR, RESULT, Run, begin, run_folder
+from splatseed.bench.scenes import PlannedScene, SceneFacts, survey
 from splatseed.scores import CurvePoint, EvalResult, ViewScore
 from splatseed.train.settings import TrainSettings
 
@@ -41,13 +42,20 @@ def result(psnr, *, steps=1000, points=10, num_gaussians=5000, early=0.0, **chan
     return RunResult(**{**values, **changes})
 
 
+def surveyed(path, *, name="room", images="", depth="", cloud="", with_depth=False):
+    """Facts about a scene on disk."""
+    planned = PlannedScene(str(path), name, images, str(depth), str(cloud))
+    return survey(planned, with_depth=with_depth, with_cloud=bool(cloud))
+
+
 def spec(
     scene, method, ratio, *, strategy="none", repeat=0, profile="default", budget="", **changes
 ):
     values = {"max_steps": 1000, "backend": "cpu", "data_factor": 4, **changes}
     own = {name: values.pop(name) for name in set(values) - set(SHARED)}
+    facts = SceneFacts(own.pop("path", ""), scene, digest=own.pop("digest", f"{scene}0123"))
     arm, training = Arm(method, profile, ratio, strategy, budget), TrainSettings(**values)
-    return RunSpec(scene, f"{scene}0123", arm, repeat, training, **{"version": "0.1.0", **own})
+    return RunSpec(facts, arm, repeat, training, **{"version": "0.1.0", **own})
 
 
 def runs(

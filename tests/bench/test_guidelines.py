@@ -18,7 +18,6 @@ from splatseed.bench.guidelines import (
     guideline_table,
     guidelines,
     rank_correlation,
-    verdict,
     winner_table,
 )
 from splatseed.bench.plan import SFM
@@ -60,56 +59,45 @@ def test_exact_p_is_that_of_all_orders(rng):
                                       n_resamples=math.inf)  # fmt: skip
     assert rho == pytest.approx(statistic(x))
     assert p == pytest.approx(expected.pvalue)
-
-
-def test_many_scenes_are_scipys_approximation(rng):
-    x, y = rng.random(20), rng.random(20)
+    x, y = rng.random(20), rng.random(20)  # many scenes are SciPy's approximation
     assert rank_correlation(x, y) == pytest.approx(tuple(stats.spearmanr(x, y)))
 
 
 def test_a_planted_guideline_is_found(rng):
     derived = guidelines(*plant(rng, 14, 2.0))
-    first = derived[0]
+    first = derived.iloc[0]
     assert (first.descriptor, first.method, first.adjusted <= 0.05) == ("planarity", "mls", True)
     assert first.sentence == "Scenes with more planarity gain more from mls."
     assert first.agree >= 12
-    assert verdict(derived).startswith("Supported by 14 scenes")
+    assert guideline_table(derived, "none").notes[0].startswith("Supported by 14 scenes")
 
 
 def test_chance_is_not_called_support(rng):
-    claimed = sum(
-        any(g.adjusted <= 0.05 for g in guidelines(*plant(rng, 9, 0.0))) for _ in range(20)
-    )
+    claimed = sum((guidelines(*plant(rng, 9, 0.0))["adjusted"] <= 0.05).any() for _ in range(20))
     assert claimed <= 3
 
 
 def test_few_scenes_say_that_they_are_few(rng):
     derived = guidelines(*plant(rng, 5, 2.0))
-    assert not any(each.adjusted <= 0.05 for each in derived)
-    said = verdict(derived)
+    assert not (derived["adjusted"] <= 0.05).any()
+    said = guideline_table(derived, "none").notes[0]
     assert "supports no guideline" in said
     assert "only from 6 scenes on, and here there are 5" in said
-    assert "No guideline" in verdict(guidelines(*plant(rng, 2, 2.0)))
+    assert "No guideline" in guideline_table(guidelines(*plant(rng, 2, 2.0)), "none").notes[0]
 
 
 def test_scenes_without_descriptors_are_left_out(rng):
     study, gained, described = plant(rng, 6, 2.0)
     del described["scene00"]
     described["scene01"]["planarity"] = math.nan
-    counts = {each.descriptor: each.scenes for each in guidelines(study, gained, described)}
+    derived = guidelines(study, gained, described)
+    counts = dict(zip(derived["descriptor"], derived["scenes"], strict=True))
     assert (counts["planarity"], counts["texture"]) == (4, 5)
-    assert guidelines(study, gained, {}) == ()
-
-
-def test_tables_of_guidelines_and_winners(rng):
-    study, gained, described = plant(rng, 4, 2.0)
-    table = guideline_table(guidelines(study, gained, described), "none")
-    assert len(table.rows) == 10
-    del described["scene00"]
+    assert len(guideline_table(derived, "none").rows) == 10
+    assert guideline_table(guidelines(study, gained, {}), "none").rows == []
     winners = winner_table(gained, described)
     assert {row[1] for row in winners.rows} <= {"mls 8x", "linear 8x", "sfm"}
     assert math.isnan(winners.rows[0][4].value)
-    assert guideline_table((), "none").rows == []
 
 
 def cloud(xyz):
@@ -118,21 +106,6 @@ def cloud(xyz):
 
 def plane(rng, n=2000):
     return np.column_stack([rng.uniform(-1, 1, (n, 2)), np.zeros(n)])
-
-
-def test_a_plane_is_planar_a_line_linear_and_a_ball_scatters(rng):
-    shapes = {
-        "planarity": plane(rng),
-        "linearity": np.column_stack([np.linspace(-1, 1, 2000), np.zeros((2000, 2))]),
-        "scattering": rng.standard_normal((2000, 3)),
-    }
-    for most, xyz in shapes.items():
-        described = describe(Scene(cloud(xyz)))
-        if most != "scattering":
-            assert max(shapes, key=lambda name: described[name]) == most
-            assert described["curvature"] == pytest.approx(0, abs=1e-6)
-        else:
-            assert described[most] > 0.25
 
 
 def test_local_shape_against_a_slow_reference(rng):
@@ -145,14 +118,9 @@ def test_local_shape_against_a_slow_reference(rng):
     described = describe(Scene(cloud(xyz)))
     values = [described[n] for n in ("planarity", "linearity", "scattering", "curvature")]
     assert values == pytest.approx(np.mean(total, axis=0), rel=1e-5)
-
-
-def test_units_and_frames_do_not_matter(rng):
-    xyz = rng.standard_normal((500, 3))
     turn = np.linalg.qr(rng.standard_normal((3, 3)))[0]
-    here, there = (describe(Scene(cloud(each))) for each in (xyz, 50 * xyz @ turn + 7))
-    for name in ("planarity", "linearity", "scattering", "curvature", "unevenness"):
-        assert here[name] == pytest.approx(there[name], rel=1e-3)
+    there = describe(Scene(cloud(50 * xyz @ turn + 7)))  # units and frames do not matter
+    assert there == pytest.approx(described, rel=1e-3, nan_ok=True)
 
 
 def view(folder, xyz, pixels, name="a.png"):

@@ -26,7 +26,6 @@ from splatseed.bench.job import (
 )
 from splatseed.bench.plan import plan_runs
 from splatseed.bench.runs import package_version, read_run, read_runs, run_folder
-from splatseed.bench.scenes import survey
 from splatseed.cli import main
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.io import load_scene, write_scene
@@ -35,6 +34,8 @@ from splatseed.runtime.tasks import HereTasks, ProcessTasks
 from splatseed.splat.covisible import read_covisible
 from splatseed.synthetic import make_capture
 from splatseed.train.seeds import seeds_digest
+
+from .planted import surveyed
 
 
 @pytest.fixture
@@ -46,20 +47,20 @@ def specs(small_plan, room_path):
         repeats=1,
         training=dataclasses.replace(small_plan.training, max_steps=4),
     )
-    facts = survey(room_path, "room", with_depth=True)
+    facts = surveyed(room_path, with_depth=True)
     runs = plan_runs(plan, [facts], "cpu", package_version("splatseed"))
     return {run.arm.method: run for run in runs}
 
 
 def test_a_result_says_what_was_measured_and_a_little_is_kept(specs, tmp_path):
     spec = specs["linear"]
-    result = run_job(spec, tmp_path, JobOptions())
+    result = run_job(spec, JobOptions(), tmp_path)
     kept = run_folder(tmp_path, spec)
     metrics = json.loads((kept / "metrics.json").read_text())
     assert result.psnr == metrics["psnr"]
     assert result.psnr == pytest.approx(np.mean([each.psnr for each in result.scores.per_image]))
     assert [point.step for point in result.curve] == [1, 2, 3, 4]
-    assert result.num_seeds == 2 * len(load_scene(spec.scene_path).points)
+    assert result.num_seeds == 2 * len(load_scene(spec.scene.path).points)
     assert result.scores.model_bytes == 4 * (3 + 3 + 4 + 1 + 3) * result.num_gaussians
     assert 0 < result.upsample_seconds < result.wall_seconds
     assert result.peak_bytes > 50e6
@@ -72,8 +73,12 @@ def test_a_result_says_what_was_measured_and_a_little_is_kept(specs, tmp_path):
     seen = read_covisible(next((tmp_path / "covisible").iterdir()))
     assert set(seen) == {view.name for view in result.scores.per_image}
     assert 0.3 < result.scores.covisible_share <= 1
-    run_job(spec, tmp_path, JobOptions(keep_models=True))
+    run_job(spec, JobOptions(keep_models=True), tmp_path)
     assert (kept / "point_cloud.ply").stat().st_size > 1000
+
+
+def _moved(spec, **changes):
+    return dataclasses.replace(spec, scene=dataclasses.replace(spec.scene, **changes))
 
 
 @pytest.mark.parametrize("method", ["sfm", "linear", "depth"])
@@ -87,12 +92,12 @@ def test_seeds_are_those_that_the_command_writes(specs, own_room, tmp_path, meth
     for path in (spoilt / "sparse" / "0").glob("points3D.*"):
         path.unlink()
     write_ply(spoilt / "sparse" / "0" / "points3D.ply", scene.points.replace(xyz=xyz))
-    digest = survey(spoilt, "room").digest
-    spec = dataclasses.replace(specs[method], scene_path=str(spoilt), scene_digest=digest)
-    seeds, seconds = make_seeds(open_unchanged([spec]), spec)
+    digest = surveyed(spoilt).digest
+    spec = _moved(specs[method], path=str(spoilt), digest=digest)
+    seeds, seconds = make_seeds(open_unchanged(spec.scene), spec)
     ratio = "1" if method == "sfm" else "2"
     words = ["--method", "linear"] if method == "sfm" else ["--method", method]
-    words += ["--depth", str(spec.depth_path), "--depth.hold-out", "4"] * (method == "depth")
+    words += ["--depth", str(spec.scene.depth), "--depth.hold-out", "4"] * (method == "depth")
     main(["upsample", str(spoilt), "-o", str(tmp_path / "out"), "--ratio", ratio, *words])
     written = load_scene(tmp_path / "out").points
     assert seeds_digest(seeds) == seeds_digest(written)
@@ -108,9 +113,9 @@ def test_seeds_from_a_scan_are_those_that_the_command_writes(
     surfaces = make_capture(0, 3, 32, 32).surfaces
     np.savez(scan, xyz=surfaces.sample(20_000, np.random.default_rng(2)))
     plan = dataclasses.replace(small_plan, methods=(method,), repeats=1)
-    (spec,) = plan_runs(plan, [survey(room_path, "room", cloud=scan)], "cpu", "1")
-    first, seconds = make_seeds(open_unchanged([spec]), spec, bench=tmp_path)
-    again, known = make_seeds(open_unchanged([spec]), spec, bench=tmp_path)
+    (spec,) = plan_runs(plan, [surveyed(room_path, cloud=scan)], "cpu", "1")
+    first, seconds = make_seeds(open_unchanged(spec.scene), spec, bench=tmp_path)
+    again, known = make_seeds(open_unchanged(spec.scene), spec, bench=tmp_path)
     assert seeds_digest(first) == seeds_digest(again)
     assert min(seconds, known) > 0
     words = ["--method", method.removeprefix("cloud+"), "--cloud.hold-out", "4"]
@@ -126,7 +131,7 @@ def _budgeted(small_plan, room_path, method, budget, strategy="none"):
         small_plan, methods=(method,), ratios=(), budgets=(budget,), repeats=1,
         strategies=(strategy,),
     )  # fmt: skip
-    (spec,) = plan_runs(plan, [survey(room_path, "room")], "cpu", "1")
+    (spec,) = plan_runs(plan, [surveyed(room_path)], "cpu", "1")
     return spec
 
 
@@ -136,7 +141,7 @@ def test_seeds_are_thinned_to_the_budget_or_fill_it(small_plan, room_path):
         ("linear", 9000, "default", 6300),  # what default begins with, of 9,000
     ):  # fmt: skip
         spec = _budgeted(small_plan, room_path, method, budget, strategy)
-        seeds, _ = make_seeds(open_unchanged([spec]), spec)
+        seeds, _ = make_seeds(open_unchanged(spec.scene), spec)
         assert len(seeds) == spec.most_seeds == number
 
 
@@ -145,7 +150,7 @@ def test_points_of_photographs_are_made_once_for_all_budgets(
 ):
     """And are those that a run without the kept ones begins with."""
     spec = _budgeted(small_plan, room_path, "auto", 3000)
-    scene = open_unchanged([spec])
+    scene = open_unchanged(spec.scene)
     plain, _ = make_seeds(scene, spec)
     first, seconds = make_seeds(scene, spec, bench=tmp_path)
     assert seeds_digest(first) == seeds_digest(plain)
@@ -156,7 +161,7 @@ def test_points_of_photographs_are_made_once_for_all_budgets(
 
 
 def test_a_scene_that_has_changed_fails_its_run_alone_and_is_recorded(specs, own_room, tmp_path):
-    broken = dataclasses.replace(specs["sfm"], scene_path=str(own_room))
+    broken = _moved(specs["sfm"], path=str(own_room))
     photograph = next((own_room / "images").iterdir())
     photograph.write_bytes(photograph.read_bytes() + b"\0")
     todo = [broken, specs["linear"]]
@@ -182,16 +187,6 @@ def test_files_of_the_users_are_left_alone(specs, tmp_path):
     assert [path.name for path in mine.parent.iterdir()] == ["thesis.txt"]
 
 
-def test_leftovers_of_a_killed_attempt_go(specs, tmp_path):
-    target = run_folder(tmp_path, specs["sfm"])
-    left = target.with_name(f".{target.name}.partial-0123abcd")
-    left.mkdir(parents=True)
-    (left / "half").write_text("half")
-    os.utime(left, (0, 0))
-    run_job(specs["sfm"], tmp_path, JobOptions())
-    assert [path.name for path in target.parent.iterdir()] == [target.name]
-
-
 @pytest.mark.slow
 def test_a_process_that_dies_fails_its_run_alone(specs, tmp_path, monkeypatch):
     """In its own process each; the folder of one run tells it to kill itself."""
@@ -214,10 +209,10 @@ def test_a_run_elsewhere_comes_back_as_files_and_leaves_nothing(specs, tmp_path,
     assert read_run(tmp_path, specs["sfm"]) == run
     assert list(nodes.iterdir()) == []
     assert len(list((run_folder(tmp_path, specs["sfm"]) / "renders").iterdir())) == 3
-    far = dataclasses.replace(specs["sfm"], scene_path="elsewhere/room")
+    far = _moved(specs["sfm"], path="elsewhere/room")
     with pytest.raises(SceneNotFoundError, match="elsewhere/room"):
         run_away(far, JobOptions())
     with pytest.raises(ParameterError, match=r"0\.0\.1"):
         run_away(dataclasses.replace(specs["sfm"], version="0.0.1"), JobOptions())
     with pytest.raises(SceneFormatError):
-        run_away(dataclasses.replace(specs["sfm"], scene_digest="x"), JobOptions())
+        run_away(_moved(specs["sfm"], digest="x"), JobOptions())

@@ -14,24 +14,15 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from splatseed.bench.plan import (
-    DEMO,
-    SFM,
-    SHARED,
-    Arm,
-    Plan,
-    PlannedScene,
-    RunResult,
-    RunSpec,
-    plan_runs,
-    rule_of_thumb,
-)
-from splatseed.bench.plan_file import KINDS, _laptop, plan_text, preset_plan, read_plan
-from splatseed.bench.scenes import SceneFacts, survey
+from splatseed.bench.plan import SFM, SHARED, Arm, Plan, RunResult, RunSpec, plan_runs
+from splatseed.bench.plan_file import plan_text, preset_plan, read_plan
+from splatseed.bench.scenes import DEMO, PlannedScene, SceneFacts
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.io import load_scene, write_scene
 from splatseed.scores import CurvePoint, EvalResult, ViewScore
 from splatseed.train.settings import StrategyName, TrainSettings
+
+from .planted import surveyed
 
 TEXTS = st.text(st.characters(exclude_categories=["Cs"]), min_size=1, max_size=20)
 RATIOS = st.floats(1, 1e6, exclude_min=True)
@@ -89,10 +80,9 @@ def test_a_plan_survives_its_file(tmp_path_factory, plan):
 
 
 def test_a_file_has_a_key_for_each_field():
-    own = {each.name for each in dataclasses.fields(Plan)} - {"training"}
-    assert set(KINDS) == own | set(SHARED)
     text = plan_text(Plan(training=TrainSettings(cap_max=5), long_side=400))
-    assert set(tomllib.loads(text)) == set(KINDS) - {"scenes", "parameters"}
+    own = {each.name for each in dataclasses.fields(Plan)} - {"training", "scenes", "parameters"}
+    assert set(tomllib.loads(text)) == own | set(SHARED)
 
 
 def test_paths_in_a_file_are_beside_it(tmp_path):
@@ -136,9 +126,6 @@ def test_bad_files_are_refused_by_key(tmp_path, text, key):
     with pytest.raises(SceneFormatError, match=re.escape(key)) as error:
         read_plan(tmp_path / "plan.toml")
     assert "plan.toml" in str(error.value)
-
-
-def test_a_file_that_is_not_there(tmp_path):
     with pytest.raises(SceneNotFoundError, match=r"none\.toml"):
         read_plan(tmp_path / "none.toml")
 
@@ -154,7 +141,7 @@ def test_arms_are_all_combinations_and_the_original_cloud_once():
 
 def test_runs_repeat_only_when_all_have_been_run(small_plan, room_path):
     plan = dataclasses.replace(small_plan, strategies=("none", "default"), repeats=3)
-    facts = survey(room_path, "room")
+    facts = surveyed(room_path)
     runs = plan_runs(plan, [facts, dataclasses.replace(facts, name="other")], "cpu", "1")
     assert [run.repeat for run in runs] == [0] * 8 + [1] * 8 + [2] * 8
     assert len({run.key for run in runs}) == 24
@@ -164,15 +151,15 @@ def test_runs_repeat_only_when_all_have_been_run(small_plan, room_path):
 
 def test_depth_needs_maps_and_never_sees_the_test_photographs(small_plan, room_path, tmp_path):
     plan = dataclasses.replace(small_plan, methods=("sfm", "depth"), repeats=1)
-    without = plan_runs(plan, [survey(room_path, "room")], "cpu", "1")
+    without = plan_runs(plan, [surveyed(room_path)], "cpu", "1")
     assert [run.arm.method for run in without] == [SFM]
-    facts = survey(room_path, "room", with_depth=True)
-    assert facts.depth_path == str(room_path)
+    facts = surveyed(room_path, with_depth=True)
+    assert facts.depth == str(room_path)
     _, depth = plan_runs(plan, [facts], "cpu", "1")
     assert depth.parameters == {"hold_out": plan.training.test_every}
-    assert depth.depth_digest == facts.depth_digest
+    assert depth.scene.depth_digest == facts.depth_digest
     with pytest.raises(SceneNotFoundError, match="folder of depth maps"):
-        survey(room_path, "room", depth=tmp_path / "none", with_depth=True)
+        surveyed(room_path, depth=tmp_path / "none", with_depth=True)
 
 
 def test_a_scan_is_part_of_what_its_methods_depend_on(small_plan, room_path, tmp_path):
@@ -180,28 +167,28 @@ def test_a_scan_is_part_of_what_its_methods_depend_on(small_plan, room_path, tmp
     scan = tmp_path / "scan.xyz"
     scan.write_text("1 2 3\n" * 9)
     plan = dataclasses.replace(small_plan, methods=methods, repeats=1)
-    plain = plan_runs(plan, [survey(room_path, "room")], "cpu", "1")
+    plain = plan_runs(plan, [surveyed(room_path)], "cpu", "1")
     assert [run.arm.method for run in plain] == [SFM]
-    facts = survey(room_path, "room", cloud=scan)
+    facts = surveyed(room_path, cloud=scan)
     sfm, *others = runs = plan_runs(plan, [facts], "cpu", "1")
     assert [run.arm.label for run in runs] == list(methods)
     assert sfm.key == plain[0].key
-    assert {run.cloud_path for run in others} == {str(scan)}
+    assert {run.scene.cloud for run in others} == {str(scan)}
     every = plan.training.test_every
     assert [run.parameters for run in others] == [
         {"hold_out": every}, {"hold_out": every, "cloud.hold_out": every},
     ]  # fmt: skip
     scan.write_text("1 2 4\n" * 9)
-    changed = plan_runs(plan, [survey(room_path, "room", cloud=scan)], "cpu", "1")
+    changed = plan_runs(plan, [surveyed(room_path, cloud=scan)], "cpu", "1")
     assert [run.key == old.key for run, old in zip(changed, runs, strict=True)] == [
         True,
         False,
         False,
     ]
-    assert rule_of_thumb(others[0], facts, 2) > 0
+    assert others[0].seconds(2) > 0
     (tmp_path / "scan.laz").write_bytes(b"no scan")
     with pytest.raises(SceneFormatError, match=r"scan\.laz"):
-        survey(room_path, "room", cloud=tmp_path / "scan.laz")
+        surveyed(room_path, cloud=tmp_path / "scan.laz")
 
 
 def test_a_stray_camera_is_named_before_anything_is_run(room_path, tmp_path):
@@ -209,49 +196,49 @@ def test_a_stray_camera_is_named_before_anything_is_run(room_path, tmp_path):
     first, *others = scene.images
     far = dataclasses.replace(first, translation=first.translation + np.array([0, 0, 1e4]))
     write_scene(scene.replace(images=(far, *others)), tmp_path / "stray")
-    (said,) = survey(tmp_path / "stray", "stray").warnings
+    (said,) = surveyed(tmp_path / "stray", name="stray").warnings
     assert first.name in said
-    assert survey(room_path, "room").warnings == ()
+    assert surveyed(room_path).warnings == ()
 
 
 def test_a_scene_is_known_by_its_content(room_path, own_room):
-    before = survey(room_path, "room", with_depth=True)
-    copy = survey(own_room, "room", with_depth=True)
+    before = surveyed(room_path, with_depth=True)
+    copy = surveyed(own_room, with_depth=True)
     assert copy.path != before.path
     assert (copy.digest, copy.depth_digest) == (before.digest, before.depth_digest)
     photograph = next((own_room / "images").iterdir())
     photograph.write_bytes(photograph.read_bytes() + b"\0")
-    assert survey(own_room, "room").digest != before.digest
+    assert surveyed(own_room).digest != before.digest
     depth = sorted((own_room / "depths").glob("*.png"))
     depth[0].write_bytes(depth[1].read_bytes())
-    after = survey(own_room, "room", with_depth=True)
+    after = surveyed(own_room, with_depth=True)
     assert after.depth_digest != before.depth_digest
 
 
-def test_another_folder_of_photographs_can_be_named(own_room):
+def test_what_would_fail_every_run_is_found_before(own_room):
     (own_room / "images").rename(own_room / "images_4")
     (own_room / "images").mkdir()
-    facts = survey(own_room, "room", images="images_4")
-    assert facts.images == "images_4"
+    assert surveyed(own_room, images="images_4").num_images == 9
     with pytest.raises(SceneNotFoundError, match="images_2"):
-        survey(own_room, "room", images="images_2")
-
-
-def test_what_would_fail_every_run_is_found_before(own_room):
-    missing = own_room / "images" / "view_003.png"
-    missing.unlink()
+        surveyed(own_room, images="images_2")
+    (own_room / "images_4" / "view_003.png").unlink()
     with pytest.raises(SceneNotFoundError, match=r"view_003\.png"):
-        survey(own_room, "room")
+        surveyed(own_room, images="images_4")
     for each in (own_room / "sparse" / "0").iterdir():
         if not each.name.startswith("points3D"):
             each.unlink()
     with pytest.raises(SceneNotFoundError, match="photographs in"):
-        survey(own_room, "room")
+        surveyed(own_room)
 
 
-def test_the_published_results_tell_of_the_laptop_preset():
+def test_the_published_results_tell_of_the_laptop_preset(tmp_path):
     told = (Path(__file__).parents[2] / "docs" / "results" / "README.md").read_text("utf-8")
-    plan = _laptop(Path())
+    for name in ("fern", "fox", "bonsai"):
+        (tmp_path / name).mkdir()
+    plan, missing = preset_plan("laptop", tmp_path)
+    assert ([each.label for each in plan.scenes], missing) == (
+        ["fern", "fox", "bonsai"], ("treehill",)
+    )  # fmt: skip
     assert "--preset laptop --data DIR" in told
     assert plan.repeats == 2
     assert f"{plan.training.max_steps:,} steps, twice" in told
@@ -259,8 +246,13 @@ def test_the_published_results_tell_of_the_laptop_preset():
     assert f"at most {plan.budgets[0].removesuffix('rho')} per pixel" in told
 
 
-FERN = SceneFacts("fern", "ab12", "ab12", 6000, 20, 800 * 600, 800)
-BONSAI = SceneFacts("bonsai", "cd34", "cd34", 110_000, 292, 800 * 533, 800)
+def _facts(name, points, images=20, pixels=800 * 600):
+    return SceneFacts(name, name, digest=name, num_points=points, num_images=images, pixels=pixels,
+                      long_side=800)  # fmt: skip
+
+
+FERN = _facts("fern", 6000)
+BONSAI = _facts("bonsai", 110_000, 292, 800 * 533)
 
 
 def test_a_budget_is_the_same_number_for_every_arm_of_a_scene():
@@ -271,22 +263,14 @@ def test_a_budget_is_the_same_number_for_every_arm_of_a_scene():
     assert plan.budgets == ("0.25rho", "20000")
     runs = plan_runs(plan, [FERN, BONSAI], "cpu", "1")
     assert len(runs) == len({run.key for run in runs}) == 2 * 3 * 2 * 2
-    numbers = {(run.scene, run.arm.budget): run.settings.cap for run in runs}
+    numbers = {(run.scene.name, run.arm.budget): run.settings.cap for run in runs}
     assert numbers == {
         ("fern", "0.25rho"): 30_000, ("fern", "20000"): 20_000,
         ("bonsai", "0.25rho"): 26_600, ("bonsai", "20000"): 20_000,
     }  # fmt: skip
     assert {run.training.data_factor for run in runs} == {2}  # 533 rows become 266
-    seeds = {(r.arm.strategy, r.most_seeds) for r in runs if r.scene == "fern"}
+    seeds = {(r.arm.strategy, r.most_seeds) for r in runs if r.scene.name == "fern"}
     assert seeds == {("default", 21_000), ("default", 14_000), ("grow", 30_000), ("grow", 20_000)}
-
-
-def test_presets_leave_out_scenes_that_are_not_there(tmp_path):
-    for name in ("fern", "fox", "bonsai"):
-        (tmp_path / name).mkdir()
-    plan, missing = preset_plan("laptop", tmp_path)
-    assert [scene.label for scene in plan.scenes] == ["fern", "fox", "bonsai"]
-    assert missing == ("treehill",)
 
 
 def test_budgets_are_told_as_everywhere_else():
@@ -309,7 +293,7 @@ def test_budgets_out_of_range_are_refused(wrong):
 
 ARM = Arm("mls", "default", 8, "none")
 SPEC = RunSpec(
-    "room", "ab12", ARM, repeat=0, training=TrainSettings(max_steps=100, backend="cpu"),
+    _facts("room", 10_000, 80), ARM, repeat=0, training=TrainSettings(max_steps=100, backend="cpu"),
     parameters={"k": 12}, version="1",
 )  # fmt: skip
 
@@ -323,15 +307,16 @@ def test_specs_and_results_survive_json():
 
 
 def test_where_a_scene_lies_and_how_a_ratio_is_written_are_no_part_of_the_key():
-    there = {"scene_path": "/a", "depth_path": "/b", "images": "images_4", "cloud_path": "/c"}
-    assert dataclasses.replace(SPEC, **there).key == SPEC.key
+    there = dataclasses.replace(SPEC.scene, path="/a", depth="/b", images="images_4", cloud="/c")
+    assert dataclasses.replace(SPEC, scene=there).key == SPEC.key
     assert dataclasses.replace(SPEC, arm=Arm("mls", "default", 8.0, "none")).key == SPEC.key
 
 
 @pytest.mark.parametrize(
     "change",
-    [{"scene": "x"}, {"scene_digest": "x"}, {"repeat": 1}, {"version": "2"},
-     {"parameters": {"k": 13}}, {"depth_digest": "x"}, {"cloud_digest": "x"},
+    [*({"scene": dataclasses.replace(SPEC.scene, **{name: "x"})}
+       for name in ("name", "digest", "depth_digest", "cloud_digest")),
+     {"repeat": 1}, {"version": "2"}, {"parameters": {"k": 13}},
      {"arm": Arm("mls", "default", 4, "none")}, {"arm": Arm("mls", "paper", 8, "none")},
      {"arm": Arm("mls", "default", 8, "mcmc")}, {"arm": Arm("linear", "default", 8, "none")},
      *({"training": dataclasses.replace(SPEC.training, **each)} for each in (
@@ -344,12 +329,10 @@ def test_all_else_is(change):
 
 
 def test_more_work_takes_longer_by_the_rule_of_thumb():
-    facts = SceneFacts("room", "", "ab12", 10_000, 80, 800 * 600, 800)
-
     def seconds(threads=2, arm=ARM, **changes):
         training = dataclasses.replace(SPEC.training, **changes)
         spec = dataclasses.replace(SPEC, training=training, arm=arm)
-        return rule_of_thumb(spec, facts, threads)
+        return spec.seconds(threads)
 
     sfm = Arm(SFM, "default", 1, "none")
     for less in ({"max_steps": 50}, {"data_factor": 2}, {"arm": sfm}, {"threads": 8},

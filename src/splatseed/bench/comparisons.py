@@ -1,19 +1,15 @@
 """Comparisons between runs: gains of variants, arms at equal cost, the paper's, two benchmarks.
 
-Notation: a *gain* is the PSNR of a run less that of its baseline, dB, paired by scene and repeat;
-an *arm* is a variant with a strategy. A run *reaches* a target when its test PSNR first equals it;
-between two tests of its curve PSNR is interpolated linearly. Seconds include making the seeds and
-training. Promise: the p values of one strategy's gains are adjusted together: those on single
-scenes as one family, those over scenes as another; those of arms together over all arms. Runs that
-never reach a target are counted, not dropped: a mean over the others would flatter.
+A *gain* is the PSNR of a run less that of its baseline, dB, paired by scene and repeat; an *arm* is
+a variant with a strategy. A run *reaches* a target when its test PSNR, linear between tests, first
+equals it; seconds count making the seeds. Runs that never do are counted, as a mean would flatter.
 """
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from importlib.resources import files
 from statistics import fmean
@@ -34,36 +30,45 @@ from splatseed.bench.statistics import (
     pooled_noise,
     these_scenes,
 )
-from splatseed.bench.study import Study, Variant, studies
+from splatseed.bench.study import Study, studies, variant_order
+from splatseed.literal import counted
 from splatseed.seeding.advice import AS_IT_IS, ROOM, Measured, advise
 from splatseed.train.settings import StrategyName
 
 Key = TypeVar("Key", bound=Hashable)
+_NEVER = (math.nan, math.nan)
 
 
 @dataclass(frozen=True)
 class Gains:
     """What every variant gains over the original cloud under one strategy.
 
-    Args:
-        strategy: The strategy.
-        scenes: Scenes on which anything can be compared.
-        seeds: Labels of the variants that can be compared on some scene.
-        on_scene: By scene and label; absent where no repeat has both.
-        on_these: By label: the mean over its scenes, for these scenes alone.
-        on_like: By label: the same mean, for scenes like these.
+    ``on_scene``: by scene and label; absent where no repeat has both. ``on_these`` and ``on_like``:
+    by label, the mean over its scenes, for these scenes alone and for scenes like these.
     """
 
     strategy: StrategyName
-    scenes: tuple[str, ...]
-    seeds: tuple[str, ...]
     on_scene: Mapping[tuple[str, str], Difference]
     on_these: Mapping[str, Difference]
     on_like: Mapping[str, Difference]
 
+    @property
+    def scenes(self) -> tuple[str, ...]:
+        """Scenes on which anything can be compared."""
+        return tuple(dict.fromkeys(scene for scene, _ in self.on_scene))
+
+    @property
+    def seeds(self) -> tuple[str, ...]:
+        """Labels of the variants that can be compared on some scene."""
+        return tuple(self.on_these)
+
+    def means(self, scene: str) -> dict[str, float]:
+        """Each variant's mean gain on a scene."""
+        return {of: each.mean for (where, of), each in self.on_scene.items() if where == scene}
+
     def top(self, scene: str) -> str | None:
         """The variant with the greatest gain, or the least loss, on a scene, ignoring noise."""
-        means = {of: each.mean for (where, of), each in self.on_scene.items() if where == scene}
+        means = self.means(scene)
         return max(means, key=lambda each: means[each], default=None)
 
     def best(self, scene: str) -> str | None:
@@ -71,43 +76,28 @@ class Gains:
         top = self.top(scene)
         return top if top is not None and self.on_scene[scene, top].mean > 0 else None
 
-    def means(self) -> dict[str, dict[str, float]]:
-        """Mean gains by scene and variant."""
-        return {
-            scene: {of: each.mean for (where, of), each in self.on_scene.items() if where == scene}
-            for scene in self.scenes
-        }
-
 
 @lru_cache(maxsize=64)
 def gains(study: Study, strategy: StrategyName) -> Gains:
     """The gains under a strategy."""
     on_scene = {}
     for scene in study.scenes_under(strategy):
-        scores = _scores(study, strategy, scene)
+        scores = study.scores(strategy, scene)
         differences = paired_differences(scores.to_numpy())
         for label, each in zip(scores.index[1:], differences, strict=True):
             if each is not None:
                 on_scene[scene, label] = each
-    seeds = tuple(label for label in study.seeded if any(label == of for _, of in on_scene))
-    by_label = {v: [each for (_, of), each in on_scene.items() if of == v] for v in seeds}
+    by_label = {
+        label: known
+        for label in study.seeded
+        if (known := [each for (_, of), each in on_scene.items() if of == label])
+    }
     return Gains(
         strategy,
-        tuple(s for s in study.scenes if any(s == scene for scene, _ in on_scene)),
-        seeds,
         _adjusted(on_scene),
         _adjusted({v: these_scenes(each) for v, each in by_label.items()}),
         _adjusted({v: over_scenes([one.mean for one in each]) for v, each in by_label.items()}),
     )
-
-
-def _scores(study: Study, strategy: StrategyName, scene: str) -> pd.DataFrame:
-    """PSNR of a scene, [A, R]: a row per arm, the baseline first, NaN where there is no run."""
-    part = study.under(strategy)
-    scores = part[part["scene"] == scene].pivot_table(
-        index="seeds", columns="repeat", values="psnr"
-    )
-    return scores.reindex([SFM, *study.seeded_under(strategy)])
 
 
 def _adjusted(family: Mapping[Key, Difference]) -> dict[Key, Difference]:
@@ -117,7 +107,7 @@ def _adjusted(family: Mapping[Key, Difference]) -> dict[Key, Difference]:
 
 def clear_best(study: Study, strategy: StrategyName, scene: str) -> bool:
     """Whether a scene's best arm is better than every other one beyond noise."""
-    scores = _scores(study, strategy, scene)
+    scores = study.scores(strategy, scene)
     noise, df = pooled_noise(scores.to_numpy())
     complete = scores.dropna()
     if math.isnan(noise) or len(complete) < 2:
@@ -128,52 +118,10 @@ def clear_best(study: Study, strategy: StrategyName, scene: str) -> bool:
     return difference(high - low, se, df, 1).p * (len(complete) - 1) <= LEVEL
 
 
-class MeanGains(NamedTuple):
-    """Three mean gains over scenes that are easily mistaken for one another; dB.
+def reach(result: RunResult, target: float) -> tuple[float, float]:
+    """Steps and seconds after which a run's test PSNR first is at least ``target``, dB.
 
-    ``over_all``: of all variants together, that of a variant picked blindly. ``over_best``: of
-    ``best``, the variant that gains most on average; slightly optimistic, as it was chosen by the
-    same scores. ``per_scene``: of the best variant of each scene, chosen by the test views it is
-    scored on; not a gain that anybody can have. Variants are those that every scene has.
-    """
-
-    over_all: float
-    best: str
-    over_best: float
-    per_scene: float
-    num_scenes: int
-    num_variants: int
-
-
-def mean_gains(by_scene: Mapping[str, Mapping[str, float]]) -> MeanGains | None:
-    """The three means of gains.
-
-    Args:
-        by_scene: Gains in dB by scene and variant. Variants that some scene lacks are left out.
-
-    Returns:
-        None where no variant is left.
-    """
-    table = pd.DataFrame.from_dict(dict(by_scene), orient="index").dropna(axis=1)
-    if table.empty:
-        return None
-    means = table.mean()
-    best = means.idxmax()
-    per_scene = float(table.max(axis=1).mean())
-    return MeanGains(float(means.mean()), best, float(means[best]), per_scene, *table.shape)
-
-
-class Reached(NamedTuple):
-    """When a target was reached: steps done, and seconds with upsampling."""
-
-    steps: float
-    seconds: float
-
-
-def reach(result: RunResult, target: float) -> Reached | None:
-    """When a run's test PSNR first is at least ``target``, dB; None if it never is.
-
-    A run above it at its first test has reached it there at the latest.
+    A run above it at its first test has reached it there at the latest; NaN if it never does.
     """
     before = None
     for point in result.curve:
@@ -183,9 +131,9 @@ def reach(result: RunResult, target: float) -> Reached | None:
             part = 1.0 if flat else (target - start.psnr) / (point.psnr - start.psnr)
             seconds = start.seconds + part * (point.seconds - start.seconds)
             steps = start.step + part * (point.step - start.step)
-            return Reached(steps, seconds + result.upsample_seconds)
+            return steps, seconds + result.upsample_seconds
         before = point
-    return None
+    return _NEVER
 
 
 def psnr_at(result: RunResult, seconds: float) -> float:
@@ -201,46 +149,6 @@ def psnr_at(result: RunResult, seconds: float) -> float:
     return float(np.interp(seconds, times, [point.psnr for point in result.curve]))
 
 
-class Speed(NamedTuple):
-    """How soon a variant reaches the baseline's last PSNR: in ``reached`` of ``pairs`` of runs.
-
-    ``means``: means over scenes of steps and seconds of those that reach it, and of base_steps and
-    base_seconds, the baseline's first time; NaN if there are none. ``log_steps``, ``log_seconds``:
-    mean differences of the logarithms, if all reach it.
-    """
-
-    pairs: int
-    reached: int
-    means: Mapping[str, float]
-    log_steps: Difference | None
-    log_seconds: Difference | None
-
-
-@lru_cache(maxsize=64)
-def speeds(study: Study, strategy: StrategyName) -> dict[str, Speed]:
-    """How soon each variant that has curves is as good as the baseline's final result."""
-    pairs = paired_runs(study, study.under(strategy), strategy)
-    told = {}
-    for label in study.seeded_under(strategy):
-        part = pairs[pairs["seeds"] == label]
-        times = [_times(*each) for each in zip(part["result_base"], part["result"], strict=True)]
-        frame = pd.DataFrame(times, columns=["base_steps", "base_seconds", "steps", "seconds"])
-        frame = frame.assign(scene=list(part["scene"])).dropna(subset="base_steps")
-        if len(frame):
-            for kind in ("steps", "seconds"):
-                frame[f"log_{kind}"] = _log_ratio(frame[kind], frame[f"base_{kind}"])
-            means = {name: _over_scenes(frame, name) for name in frame.columns if name != "scene"}
-            reached = int(frame["steps"].notna().sum())
-            logs = [_over(frame, f"log_{kind}", whole=True) for kind in ("steps", "seconds")]
-            told[label] = Speed(len(frame), reached, means, *logs)
-    known = [adjusted([getattr(each, log) for each in told.values()])
-             for log in ("log_steps", "log_seconds")]  # fmt: skip
-    return {
-        label: each._replace(log_steps=steps, log_seconds=seconds)
-        for (label, each), steps, seconds in zip(told.items(), *known, strict=True)
-    }
-
-
 def paired_runs(study: Study, runs: pd.DataFrame, strategy: StrategyName) -> pd.DataFrame:
     """Runs beside the baseline's of this strategy, of the same scene and repeat (``X_base``)."""
     base = study.under(strategy)
@@ -248,22 +156,43 @@ def paired_runs(study: Study, runs: pd.DataFrame, strategy: StrategyName) -> pd.
     return runs.merge(base, on=["scene", "repeat"], suffixes=("", "_base"))
 
 
+@lru_cache(maxsize=64)
+def speeds(study: Study, strategy: StrategyName) -> pd.DataFrame:
+    """How soon each variant that has curves is as good as the baseline's final result.
+
+    A row per variant: pairs of runs, those that reach it, means over scenes of steps and seconds of
+    these and of base_steps and base_seconds, the baseline's first time; log_steps and log_seconds
+    are mean differences of the logarithms (``Difference``), or None unless all reach it.
+    """
+    pairs, rows = paired_runs(study, study.under(strategy), strategy), {}
+    for label in study.seeded_under(strategy):
+        part = pairs[pairs["seeds"] == label]
+        times = [_times(*each) for each in zip(part["result_base"], part["result"], strict=True)]
+        frame = pd.DataFrame(times, columns=["base_steps", "base_seconds", "steps", "seconds"])
+        frame = frame.assign(scene=list(part["scene"])).dropna(subset="base_steps")
+        if len(frame):
+            means = frame.groupby("scene").mean().mean().to_dict()
+            rows[label] = {"pairs": len(frame), "reached": int(frame["steps"].count()), **means}
+            for kind in ("steps", "seconds"):
+                frame["log"] = _log_ratio(frame[kind], frame[f"base_{kind}"])
+                rows[label][f"log_{kind}"] = _over(frame, "log", whole=True)
+    for log in ("log_steps", "log_seconds"):
+        known = adjusted([each[log] for each in rows.values()])
+        for each, one in zip(rows.values(), known, strict=True):
+            each[log] = one
+    return pd.DataFrame(list(rows.values()), index=list(rows), dtype=object)
+
+
 def _times(base: RunResult, own: RunResult) -> tuple[float, ...]:
     """Steps and seconds to the baseline's last PSNR, of the baseline and of a run; NaN if never."""
-    never = (math.nan, math.nan)
     if not base.curve or not own.curve or not math.isfinite(base.curve[-1].psnr):
-        return never + never
+        return _NEVER + _NEVER
     target = base.curve[-1].psnr
-    return (*(reach(base, target) or never), *(reach(own, target) or never))
+    return reach(base, target) + reach(own, target)
 
 
 def _log_ratio(own: pd.Series, base: pd.Series) -> pd.Series:
     return np.log(own.clip(lower=1e-9) / base.clip(lower=1e-9))
-
-
-def _over_scenes(frame: pd.DataFrame, column: str) -> float:
-    """Mean over scenes of the means over repeats, of what is known."""
-    return float(frame.groupby("scene")[column].mean().mean())
 
 
 def _over(frame: pd.DataFrame, column: str, *, whole: bool = False) -> Difference | None:
@@ -277,8 +206,8 @@ def _over(frame: pd.DataFrame, column: str, *, whole: bool = False) -> Differenc
     return over_scenes(frame[column].dropna() if len(means) == 1 else means)
 
 
-class Arm(NamedTuple):
-    """A variant by its label, and a strategy."""
+class ArmKey(NamedTuple):
+    """A strategy, and a variant by its label."""
 
     strategy: StrategyName
     seeds: str
@@ -289,19 +218,16 @@ class Arm(NamedTuple):
         return f"{self.seeds} + {self.strategy}"
 
 
-_SCORES = ("psnr", "covisible", "ssim", "lpips")
+SCORES = ("psnr", "covisible", "ssim", "lpips")
 
 
 @dataclass(frozen=True)
 class ComparedArm:
-    """An arm compared with the baseline, over the scenes that both have.
+    """An arm compared with the baseline, over the scenes and the pairs of runs that both have.
 
     Args:
-        arm: The arm.
-        scenes: These scenes.
-        runs: Pairs of runs behind the differences.
-        means: Mean scores (psnr, covisible, ssim, lpips), numbers of Gaussians and seconds of
-            seeding and training; NaN if unknown on some scene.
+        means: Mean scores (``SCORES``), numbers of Gaussians and seconds of seeding and training;
+            NaN if unknown on some scene.
         gains: Differences of the scores; ``in_time``: PSNR at the seconds at which the baseline
             ends, less the baseline's final PSNR, dB; ``sooner``: mean logarithm of the seconds to
             the baseline's final PSNR, relative to the baseline's total. None where not all of its
@@ -309,7 +235,7 @@ class ComparedArm:
         reached: Pairs whose arm reaches the baseline's final PSNR.
     """
 
-    arm: Arm
+    arm: ArmKey
     scenes: tuple[str, ...]
     runs: int
     means: Mapping[str, float]
@@ -324,13 +250,11 @@ class ComparedArm:
         return gain
 
 
-def baseline_of(study: Study) -> Arm | None:
+def baseline_of(study: Study) -> ArmKey | None:
     """The scene's own points with ``default``, or with the first strategy they were run with."""
     present = set(study.runs.loc[study.runs["seeds"] == SFM, "strategy"])
     known = [each for each in study.strategies if each in present]
-    if not known:
-        return None
-    return Arm("default" if "default" in known else known[0], SFM)
+    return ArmKey("default" if "default" in known else known[0], SFM) if known else None
 
 
 @lru_cache(maxsize=64)
@@ -343,22 +267,21 @@ def compared_arms(study: Study) -> tuple[ComparedArm, ...]:
     if base is None:
         return ()
     pairs = paired_runs(study, study.runs, base.strategy)
-    for name in _SCORES:
+    for name in SCORES:
         pairs[f"{name}_gain"] = pairs[name] - pairs[f"{name}_base"]
-    both = list(zip(pairs["result_base"], pairs["result"], strict=True))
-    pairs["in_time"] = [psnr_at(own, first.seconds) - first.psnr for first, own in both]
-    total = pd.Series([first.seconds for first, _ in both], pairs.index, dtype=float)
-    pairs["sooner"] = _log_ratio(
-        pd.Series([_seconds_to(own, first.psnr) for first, own in both], pairs.index, float), total
-    )
-    arms = [Arm(strategy, label) for strategy in study.strategies for label in study.variants]
-    compared = [
-        _compared(arm, part)
-        for arm in arms
-        if len(part := pairs[(pairs["strategy"] == arm.strategy) & (pairs["seeds"] == arm.seeds)])
-    ]
+    times = []
+    for first, own in zip(pairs["result_base"], pairs["result"], strict=True):
+        _, seconds = reach(own, first.psnr)
+        ends = math.isnan(seconds) and own.psnr >= first.psnr  # also the baseline at its own
+        in_time = psnr_at(own, first.seconds) - first.psnr
+        times.append((in_time, own.seconds if ends else seconds, first.seconds))
+    pairs[["in_time", "own", "base"]] = np.array(times, float).reshape(-1, 3)
+    pairs["sooner"] = _log_ratio(pairs["own"], pairs["base"])
+    by_arm = dict(list(pairs.groupby(["strategy", "seeds"])))
+    arms = (ArmKey(strategy, label) for strategy in study.strategies for label in study.variants)
+    compared = [_compared(arm, by_arm[arm]) for arm in arms if arm in by_arm]
     others = [each for each in compared if each.arm != base]
-    for kind in others[0].gains if others else ():
+    for kind in (*SCORES, "in_time", "sooner"):
         column = adjusted([each.gains[kind] for each in others])
         others = [
             replace(each, gains={**each.gains, kind: known})
@@ -368,51 +291,26 @@ def compared_arms(study: Study) -> tuple[ComparedArm, ...]:
     return tuple(sorted(compared, key=lambda each: -each.gain.mean))
 
 
-def _compared(arm: Arm, pairs: pd.DataFrame) -> ComparedArm:
-    columns = (*_SCORES, "gaussians", "seeding", "training")
+def _compared(arm: ArmKey, pairs: pd.DataFrame) -> ComparedArm:
+    columns = (*SCORES, "gaussians", "seeding", "training")
     means = pairs.groupby("scene")[list(columns)].mean().mean(skipna=False)
-    gained = {name: _over(pairs, f"{name}_gain") for name in _SCORES}
+    gained = {name: _over(pairs, f"{name}_gain") for name in SCORES}
     timed = {name: _over(pairs, name, whole=True) for name in ("in_time", "sooner")}
     scenes = tuple(sorted(set(pairs["scene"])))
-    reached = int(pairs["sooner"].notna().sum())
+    reached = int(pairs["sooner"].count())
     return ComparedArm(arm, scenes, len(pairs), dict(means), {**gained, **timed}, reached)
-
-
-def _seconds_to(own: RunResult, target: float) -> float:
-    """When a run reaches that PSNR, also the baseline its own; NaN if it never does."""
-    reached = reach(own, target)
-    if reached is not None:
-        return reached.seconds
-    return own.seconds if own.psnr >= target else math.nan
-
-
-class AdviceScore(NamedTuple):
-    """How good the advice is, scene by scene: leave-one-out.
-
-    ``advised``: the advised method by scene, its threshold fitted on the other scenes only;
-    ``psnr``: mean PSNR by scene and method, dB; ``left_out``: scenes that lack a necessary run.
-    """
-
-    advised: Mapping[str, str]
-    psnr: Mapping[str, Mapping[str, float]]
-    left_out: tuple[str, ...]
-
-    def gain_over(self, scene: str, method: str) -> float:
-        """The gain of the advice on a scene over always taking one method, dB; NaN if unknown."""
-        scores = self.psnr[scene]
-        return scores[self.advised[scene]] - scores.get(method, math.nan)
-
-    def best(self, scene: str) -> str:
-        """The method of the arm that scored highest."""
-        return max(self.psnr[scene], key=lambda each: self.psnr[scene][each])
 
 
 _ROOMS = (1.0, 1.1, 1.3, 1.6, 2.0, 3.0, 5.0, 1e9)
 """Candidate thresholds of the advice; the last leaves every scene as it is."""
 
 
-def score_advice(study: Study, strategy: StrategyName) -> AdviceScore:
-    """Advise each scene with a threshold fitted on the others, and look up the result."""
+def score_advice(study: Study, strategy: StrategyName) -> pd.DataFrame:
+    """How good the advice is, leave-one-out: each scene's threshold is fitted on the others only.
+
+    A row per scene has the advised method (``advice``; None without a necessary run) and mean PSNR
+    in dB by method.
+    """
     psnr = {scene: _by_method(study, strategy, scene) for scene in study.scenes}
     known = {s: each for s, each in psnr.items() if AS_IT_IS in each and "auto" in each}
     base = study.under(strategy)
@@ -421,7 +319,7 @@ def score_advice(study: Study, strategy: StrategyName) -> AdviceScore:
     def followed(scene: str, room: float) -> str:
         """The advised method, or the scene's points as they are if it was not run."""
         run = base.loc[scene]
-        most = study.specs[run["key"]].most_seeds or int(run["gaussians"])
+        most = run["spec"].most_seeds or int(run["gaussians"])
         said = advise(Measured(int(run["num_seeds"]), 0.0), most, strategy=strategy, room=room)
         return said.method if said.method in known[scene] else AS_IT_IS
 
@@ -433,12 +331,13 @@ def score_advice(study: Study, strategy: StrategyName) -> AdviceScore:
         return max(_ROOMS, key=lambda room: (round(served[room], 6), room == ROOM))
 
     advised = {s: followed(s, fitted([other for other in known if other != s])) for s in known}
-    return AdviceScore(advised, known, tuple(s for s in psnr if s not in known))
+    rows = [{"advice": advised.get(scene), **each} for scene, each in psnr.items()]
+    return pd.DataFrame(rows, index=list(psnr))
 
 
 def _by_method(study: Study, strategy: StrategyName, scene: str) -> dict[str, float]:
     """Mean PSNR over repeats by method; the first variant stands for its method."""
-    means = _scores(study, strategy, scene).mean(axis=1).dropna()
+    means = study.scores(strategy, scene).mean(axis=1).dropna()
     scores: dict[str, float] = {}
     for label in [*means.index[means.index != SFM], *means.index[means.index == SFM]]:
         variant = study.variants[label]
@@ -447,82 +346,45 @@ def _by_method(study: Study, strategy: StrategyName, scene: str) -> dict[str, fl
     return scores
 
 
-Entry = tuple[str, float]
-"""Method and ratio; ``("sfm", 1.0)`` for the original cloud."""
-PAPER_STEPS = 30_000
 DATASETS = {"mipnerf360": "Mip-NeRF360", "replica": "Replica"}
-
-
-@dataclass(frozen=True)
-class PaperDataset:
-    """The paper's results on a dataset, from its tables 1 to 3: 30,000 steps; spread unknown.
-
-    Args:
-        key: As in ``DATASETS``.
-        psnr: PSNR in dB by scene and entry.
-        costs: Training seconds and model size in MB by entry, means over scenes; not of all
-            entries that ``psnr`` has.
-    """
-
-    key: str
-    psnr: Mapping[str, Mapping[Entry, float]]
-    costs: Mapping[Entry, tuple[float, float]]
-
-    @property
-    def title(self) -> str:
-        """The dataset's name."""
-        return DATASETS[self.key]
-
-    def gain(self, scene: str, variant: Variant) -> float:
-        """PSNR of a variant on a scene less that of the cloud as it is, dB; NaN where unknown."""
-        scores = self.psnr.get(scene, {})
-        return scores.get((variant.method, variant.ratio), math.nan) - scores.get((SFM, 1.0), 0.0)
-
-    def gains(self) -> dict[str, dict[str, float]]:
-        """All gains by scene and variant, dB."""
-        variants = {
-            scene: [Variant(method, ratio=ratio) for method, ratio in each if method != SFM]
-            for scene, each in self.psnr.items()
-        }
-        return {s: {v.label: self.gain(s, v) for v in each} for s, each in variants.items()}
+_PAPER_PSNR = {"mipnerf360": "table1_mipnerf360_psnr.csv", "replica": "table2_replica_psnr.csv"}
 
 
 @cache
-def paper_dataset(key: str) -> PaperDataset:
-    """The paper's numbers of a dataset.
-
-    Args:
-        key: As in ``DATASETS``.
+def paper_psnr(key: str) -> pd.DataFrame:
+    """The paper's PSNR on a dataset (30,000 steps): a row per scene, a column per method and ratio.
 
     Example:
-        >>> paper_dataset("mipnerf360").psnr["bonsai"]["sfm", 1.0]
+        >>> float(paper_psnr("mipnerf360").loc["bonsai", ("sfm", 1.0)])
         32.291
     """
-    psnr: dict[str, dict[Entry, float]] = {}
-    name = {"mipnerf360": "table1_mipnerf360_psnr.csv", "replica": "table2_replica_psnr.csv"}[key]
-    for row in _read(name):
-        entry = row["method"], float(row["ratio"])
-        psnr.setdefault(row["scene"], {})[entry] = float(row["psnr_db"])
-    costs = {
-        (row["method"], float(row["ratio"])): (
-            float(row["train_time_s"]),
-            float(row["model_size_mb"]),
-        )
-        for row in _read("table3_time_size.csv")
-        if row["dataset"] == key
-    }
-    return PaperDataset(key, psnr, costs)
+    return _read(_PAPER_PSNR[key]).pivot_table(
+        index="scene", columns=["method", "ratio"], values="psnr_db", sort=False
+    )
 
 
-def dataset_of(scene: str) -> PaperDataset | None:
-    """The paper's dataset that has a scene of this name; None if neither has."""
-    datasets = (paper_dataset(key) for key in DATASETS)
-    return next((each for each in datasets if scene in each.psnr), None)
+@cache
+def paper_gains(key: str) -> pd.DataFrame:
+    """The paper's PSNR less that of the cloud as it is, dB."""
+    table = paper_psnr(key)
+    return table.drop(columns=[(SFM, 1.0)]).sub(table[SFM, 1.0], axis=0)
 
 
-def _read(name: str) -> list[dict[str, str]]:
-    text = (files("splatseed.bench") / "data" / name).read_text("utf-8")
-    return list(csv.DictReader(text.splitlines()))
+def paper_costs(key: str) -> pd.DataFrame:
+    """The paper's train_time_s and model_size_mb by method and ratio, not of all that it scored."""
+    table = _read("table3_time_size.csv")
+    return table[table["dataset"] == key].set_index(["method", "ratio"])
+
+
+def dataset_of(scene: str) -> str:
+    """The paper's dataset that has a scene of this name; empty if neither has."""
+    return next((key for key in DATASETS if scene in paper_psnr(key).index), "")
+
+
+@cache
+def _read(name: str) -> pd.DataFrame:
+    with (files("splatseed.bench") / "data" / name).open(encoding="utf-8") as file:
+        return pd.read_csv(file, dtype={"ratio": float})
 
 
 Place = tuple[StrategyName, str, str]
@@ -541,67 +403,67 @@ class Comparison:
         settings: Settings that differ, with A's value and B's.
         changes: B less A of each arm on each scene that both have, dB.
         means: The mean change of each arm over these scenes.
-        only_a: Arms on scenes that only A has.
-        only_b: Likewise for B.
-        same_runs: Runs that are in both, with the same key and the same PSNR.
-        content: Scenes of the same name whose files differ.
+        only: Arms on scenes that only one has: "A" or "B", strategy, scene and label.
+        notes: What else there is to say, a sentence each.
     """
 
     settings: tuple[tuple[str, str, str], ...]
     changes: Mapping[Place, Difference]
-    means: Mapping[Arm, Difference]
-    only_a: tuple[Place, ...] = ()
-    only_b: tuple[Place, ...] = ()
-    same_runs: int = 0
-    content: tuple[str, ...] = field(default=())
+    means: Mapping[ArmKey, Difference]
+    only: tuple[tuple[str, str, str, str], ...]
+    notes: tuple[str, ...]
 
 
 def compare(a: Sequence[Run], b: Sequence[Run]) -> Comparison | None:
     """Compare two benchmarks: from each, the set of runs whose settings differ least.
 
-    Args:
-        a: The runs of the first.
-        b: The runs of the second.
-
-    Returns:
-        None if one of them has no finished run.
+    None if one of them has no finished run.
     """
     pairs = [(one, other) for one in studies(a) for other in studies(b)]
     if not pairs:
         return None
-    first, second = min(pairs, key=_distance)
-    orders = {label: each.order for label, each in {**first.variants, **second.variants}.items()}
+    # Among sets that differ equally, the ones with most in common.
+    first, second = both = min(
+        pairs, key=lambda pair: (len(_differing(*pair)), -len(_places(pair[0]) & _places(pair[1])))
+    )
+    known = [*first.variants.items(), *second.variants.items()]
+    orders = {variant[0]: variant_order(variant) for variant in known}
 
-    def ordered(places: set[Place]) -> tuple[Place, ...]:
-        return tuple(sorted(places, key=lambda each: (each[0], orders[each[1]], each[2])))
+    def ordered(places: set[Place]) -> list[Place]:
+        return sorted(places, key=lambda each: (each[0], orders[each[1]], each[2]))
 
     shared = ordered(_places(first) & _places(second))
     changes = {place: _change(first, second, place) for place in shared}
-    by_arm: dict[Arm, list[Difference]] = {}
+    by_arm: dict[ArmKey, list[Difference]] = {}
     for (strategy, label, _), each in changes.items():
-        by_arm.setdefault(Arm(strategy, label), []).append(each)
+        by_arm.setdefault(ArmKey(strategy, label), []).append(each)
+    only = {"A": _places(first) - _places(second), "B": _places(second) - _places(first)}
+    settings = _differing(*both)
     scores = [{run.spec.key: run.result.psnr for run in runs if run.result} for runs in (a, b)]
-    digests = [dict(zip(each.runs["scene"], each.runs["digest"], strict=True))
-               for each in (first, second)]  # fmt: skip
-    common = digests[0].keys() & digests[1].keys()
+    same = len(scores[0].items() & scores[1].items())
+    digests: list[dict[str, str]] = [
+        {name: spec.scene.digest for name, spec in
+         zip(each.runs["scene"], each.runs["spec"], strict=True)} for each in both
+    ]  # fmt: skip
+    content = [s for s in sorted(digests[0]) if digests[1].get(s, digests[0][s]) != digests[0][s]]
+    notes = [
+        "" if settings else "All settings are the same.",
+        "" if changes else "They have no scene and method in common.",
+        f"{counted(same, 'run')} in both, with the same key and score." if same else "",
+        *(f"{each} is not the same in both: its points, cameras or photographs differ."
+          for each in content),
+    ]  # fmt: skip
     return Comparison(
-        settings=_differing(first, second),
-        changes=_adjusted(changes),
-        means=_adjusted({arm: these_scenes(each) for arm, each in by_arm.items()}),
-        only_a=ordered(_places(first) - _places(second)),
-        only_b=ordered(_places(second) - _places(first)),
-        same_runs=len(scores[0].items() & scores[1].items()),
-        content=tuple(sorted(scene for scene in common if digests[0][scene] != digests[1][scene])),
+        settings,
+        _adjusted(changes),
+        _adjusted({arm: these_scenes(each) for arm, each in by_arm.items()}),
+        tuple((name, s, scene, v) for name, of in only.items() for s, v, scene in ordered(of)),
+        tuple(filter(None, notes)),
     )
 
 
 def _places(study: Study) -> set[Place]:
     return set(study.runs[["strategy", "seeds", "scene"]].itertuples(index=False, name=None))
-
-
-def _distance(pair: tuple[Study, Study]) -> tuple[int, int]:
-    """How many settings of two studies differ; among equals, the one with most in common."""
-    return len(_differing(*pair)), -len(_places(pair[0]) & _places(pair[1]))
 
 
 def _differing(a: Study, b: Study) -> tuple[tuple[str, str, str], ...]:
@@ -615,7 +477,7 @@ def _change(a: Study, b: Study, place: Place) -> Difference:
     strategy, label, scene = place
     means, errors, freedoms, count = [], [], [], 0
     for study in (a, b):
-        scores = _scores(study, strategy, scene)
+        scores = study.scores(strategy, scene)
         rest = scores.sub(scores.mean(axis=1), axis=0).to_numpy()
         df = int(np.isfinite(rest).sum() - scores.notna().any(axis=1).sum())
         own = scores.loc[label].dropna()

@@ -1,9 +1,7 @@
 """Figures: PSNR over steps and seconds, gains by scene and ratio, arms at equal cost.
 
-Notation: a colour is a method, a mark's shape a ratio, and in figures of arms a line's dashes a
-strategy, in all figures the same; a dashed line or a hollow mark is the profile "paper". The
-baseline is thick and black. Promise: bars and bands say in the caption what they are; equal data
-give equal bytes.
+In all of them a colour is a method, a mark's shape a ratio, a dashed line or a hollow mark the
+profile "paper"; the baseline is thick and black. Equal data give equal bytes.
 """
 
 from __future__ import annotations
@@ -11,33 +9,33 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from io import BytesIO
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
-from splatseed.bench.comparisons import Arm, baseline_of, compared_arms, gains
-from splatseed.bench.plan import SFM, RunResult
+from splatseed.bench.comparisons import ArmKey, baseline_of, compared_arms, gains
+from splatseed.bench.plan import SFM, Arm, RunResult
 from splatseed.bench.statistics import Difference
-from splatseed.bench.study import Study, Variant
+from splatseed.bench.study import Study
 from splatseed.train.settings import StrategyName
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-COLORS = {
-    "sfm": "#222222", "linear": "#0072B2", "triangle": "#56B4E9", "spline": "#E69F00",
+_BLACK = "#222222"
+_COLORS = {
+    SFM: _BLACK, "linear": "#0072B2", "triangle": "#56B4E9", "spline": "#E69F00",
     "mls": "#D55E00", "voronoi": "#009E73", "depth": "#CC79A7", "random": "#999999",
     "cover": "#B8860B", "stereo": "#1B7837", "auto": "#7B4FA3",
 }  # fmt: skip
 """Colours that the colour-blind can tell apart (Okabe and Ito)."""
-_MARKS = {2.0: "v", 4.0: "s", 8.0: "o", 16.0: "^", 32.0: "D"}
-"""Marks by ratio; other ratios have a cross."""
+_MARKS = {2.0: "v", 4.0: "s", 8.0: "o", 16.0: "^", 32.0: "D"}  # others have a cross
 _DASHES = {"default": "-", "mcmc": "--", "grow": "-.", "none": ":"}
-_MANY = 8
-"""More curves than this in one picture cannot be told apart."""
-_LATE = 0.2
-"""Curves are scaled to what is after this share: before it, all rise equally steeply."""
+_AS_3DGS = (0, (1, 3))
+_HIGHEST = " Of each method, the highest ratio."
+_MANY = 8  # more curves than this in one picture cannot be told apart
+_LATE = 0.2  # curves are scaled to what is after this share: before it, all rise equally steeply
 
 Style = Mapping[str, Any]
 
@@ -54,28 +52,16 @@ def shown_seeds(study: Study, seeds: Sequence[str]) -> tuple[str, ...]:
     """All variants, or if they are too many the highest ratio of each method and profile."""
     if len(seeds) <= _MANY:
         return tuple(seeds)
-    return tuple({study.variants[label].family: label for label in seeds}.values())
+    return tuple({study.family(label): label for label in seeds}.values())
 
 
-def _left_out(shown: Sequence[str], seeds: Sequence[str]) -> str:
-    return "" if len(shown) == len(seeds) else " Of each method, the highest ratio."
-
-
-def _new_figure(width: float, height: float) -> Figure:
-    """An empty figure, its size in inches."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415  (slow to import)
-    from matplotlib.figure import Figure  # noqa: PLC0415  (loads with its use)
-
-    figure = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def _panels(count: int) -> tuple[Figure, list[Axes]]:
-    """A figure of ``count`` panels, up to three per row."""
+def _new_figure(width: float, height: float, count: int = 1) -> tuple[Figure, list[Axes]]:
+    """A figure of ``count`` panels, up to three per row, of a size in inches each."""
     columns = min(count, 3)
     rows = -(-count // columns)
-    figure = _new_figure(max(3.6 * columns, 5.0), 2.9 * rows + 0.4)
+    size = max(width * columns, 5.0), height * rows + 0.4
+    figure = Figure(figsize=size, layout="constrained")
+    FigureCanvasAgg(figure)
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
     for axes in panels[count:]:
         axes.remove()
@@ -84,8 +70,6 @@ def _panels(count: int) -> tuple[Figure, list[Axes]]:
 
 def _plot(name: str, caption: str, figure: Figure, named: Mapping[str, Style]) -> Plot:
     """The finished figure, with names above its panels at the left."""
-    from matplotlib.lines import Line2D  # noqa: PLC0415  (slow to import)
-
     if named:
         handles = [Line2D([], [], label=name, **style) for name, style in named.items()]
         columns = min(4, len(handles))
@@ -97,12 +81,13 @@ def _plot(name: str, caption: str, figure: Figure, named: Mapping[str, Style]) -
     return Plot(name, caption, out.getvalue())
 
 
-def _style(variant: Variant, *, line: bool = True, mark: bool = True) -> dict[str, Any]:
-    color, paper = COLORS.get(variant.method, "#8C564B"), variant.profile == "paper"
+def _style(study: Study, label: str, *, line: bool = True, mark: bool = True) -> dict[str, Any]:
+    arm = study.variants.get(label, Arm(SFM, "default", 1.0, "default"))
+    color, paper = _COLORS.get(arm.method, "#8C564B"), arm.profile == "paper"
     style = {"color": color, "linestyle": ("--" if paper else "-") if line else "none"}
-    if not mark or (line and variant.method == SFM):
+    if not mark or (line and label == SFM):
         return style
-    shape, hollow = _MARKS.get(variant.ratio, "P"), "white" if paper else color
+    shape, hollow = _MARKS.get(arm.ratio, "P"), "white" if paper else color
     return {**style, "marker": shape, "markersize": 5.0, "markerfacecolor": hollow}
 
 
@@ -110,16 +95,14 @@ def curve_figure(study: Study, strategy: StrategyName, by: str) -> Plot | None:
     """Test PSNR over "steps" or "seconds", a panel per scene; None where there are no curves."""
     seeds = study.seeded_under(strategy)
     shown = (SFM, *shown_seeds(study, seeds))
-    styles = {label: _style(study.variants.get(label, Variant(SFM))) for label in shown}
-    arms = {label: Arm(strategy, label) for label in shown}
+    styles = {label: _style(study, label) for label in shown}
+    arms = {label: ArmKey(strategy, label) for label in shown}
     figure = _draw_curves(study, study.scenes_under(strategy), arms, styles, by)
-    if figure is None:
-        return None
     caption = (
         f"Test PSNR (dB) over {by}, strategy {strategy}: mean over repeats, and a band from the "
-        f"lowest to the highest.{_left_out(shown[1:], seeds)}"
+        f"lowest to the highest.{_HIGHEST * (len(shown) <= len(seeds))}"
     )
-    return _plot(f"psnr_{by}_{strategy}", caption, figure, styles)
+    return _plot(f"psnr_{by}_{strategy}", caption, figure, styles) if figure else None
 
 
 def seconds_figure(study: Study) -> Plot | None:
@@ -127,31 +110,26 @@ def seconds_figure(study: Study) -> Plot | None:
     base, compared = baseline_of(study), compared_arms(study)
     if base is None or len(compared) < 2:
         return None
-    arms = [base, *(each.arm for each in compared if each.arm != base)][:_MANY]
-    styles = {arm.label: _arm_style(study, arm) for arm in arms}
-    by_label = {arm.label: arm for arm in arms}
-    figure = _draw_curves(study, study.scenes, by_label, styles, "seconds")
-    if figure is None:
-        return None
-    left = len(compared) - len(arms)
-    more = f" Of {len(compared)} arms, those with the highest mean gain." if left else ""
+    arms = {arm.label: arm for arm in (base, *(each.arm for each in compared if each.arm != base))}
+    arms = dict(list(arms.items())[:_MANY])
+    styles = {}
+    for label, arm in arms.items():
+        dashes = _DASHES.get(arm.strategy, _AS_3DGS if arm.strategy.endswith("-3dgs") else "-")
+        styles[label] = {**_style(study, arm.seeds, mark=False), "linestyle": dashes}
+    figure = _draw_curves(study, study.scenes, arms, styles, "seconds")
+    more = f" Of {len(compared)} arms, those with the highest mean gain."
     caption = (
         "Test PSNR (dB) over wall seconds, those of making the seeds included; mean over repeats, "
-        f"and a band from the lowest to the highest. The thick line is {base.label}.{more}"
+        f"and a band from the lowest to the highest. The thick line is {base.label}."
+        f"{more * (len(compared) > len(arms))}"
     )
-    return _plot("psnr_seconds_arms", caption, figure, styles)
-
-
-def _arm_style(study: Study, arm: Arm) -> dict[str, Any]:
-    plain_name = arm.strategy.removesuffix("-3dgs")
-    dashes = _DASHES.get(plain_name, "-") if plain_name == arm.strategy else (0, (1, 3))
-    return {**_style(study.variants[arm.seeds], mark=False), "linestyle": dashes}
+    return _plot("psnr_seconds_arms", caption, figure, styles) if figure else None
 
 
 def _draw_curves(
     study: Study,
     scenes: Sequence[str],
-    arms: Mapping[str, Arm],
+    arms: Mapping[str, ArmKey],
     styles: Mapping[str, Style],
     by: str,
 ) -> Figure | None:
@@ -164,7 +142,7 @@ def _draw_curves(
             drawn[scene] = known
     if not drawn:
         return None
-    figure, panels = _panels(len(drawn))
+    figure, panels = _new_figure(3.6, 2.9, len(drawn))
     baseline = next(iter(arms))
     for (scene, each), axes in zip(drawn.items(), panels, strict=True):
         end = each.get(baseline, next(iter(each.values())))[0][-1]
@@ -205,10 +183,9 @@ def scene_figure(study: Study, strategy: StrategyName) -> Plot | None:
     if not gained.on_scene:
         return None
     seeds = shown_seeds(study, gained.seeds)
-    styles = {label: _style(study.variants[label], line=False) for label in seeds}
+    styles = {label: _style(study, label, line=False) for label in seeds}
     names = [*gained.scenes, "mean, these scenes"]
-    figure = _new_figure(7.2, 1.1 + 0.15 * len(names) * (len(seeds) + 1.5))
-    axes = figure.subplots()
+    figure, (axes,) = _new_figure(7.2, 0.7 + 0.15 * len(names) * (len(seeds) + 1.5))
     for row, name in enumerate(names):
         for i, label in enumerate(seeds):
             known = gained.on_scene.get((name, label))
@@ -218,9 +195,10 @@ def scene_figure(study: Study, strategy: StrategyName) -> Plot | None:
                 axes.errorbar(gain.mean, place, xerr=_interval(gain), **styles[label])
     axes.axhline(len(gained.scenes) - 0.5, color="#bbbbbb", linewidth=0.8)
     _finish_rows(axes, names, SFM)
+    some = _HIGHEST * (len(seeds) < len(gained.seeds))
     caption = (
         f"Gain over sfm on each scene, strategy {strategy}: mean over repeats and 95% interval (of "
-        f"each comparison alone, not adjusted for their number).{_left_out(seeds, gained.seeds)}"
+        f"each comparison alone, not adjusted for their number).{some}"
     )
     return _plot(f"gain_by_scene_{strategy}", caption, figure, styles)
 
@@ -232,7 +210,7 @@ def _interval(gain: Difference) -> list[list[float]] | None:
 
 def _finish_rows(axes: Axes, names: Sequence[str], base: str) -> None:
     """Names at the left, one per row, and a line at no gain."""
-    axes.axvline(0.0, color=COLORS["sfm"], linewidth=1)
+    axes.axvline(0.0, color=_BLACK, linewidth=1)
     axes.set_yticks(range(len(names)), names, parse_math=False)
     axes.set_ylim(len(names) - 0.5, -0.5)
     axes.set_xlabel(f"gain over {base}, dB")
@@ -241,32 +219,32 @@ def _finish_rows(axes: Axes, names: Sequence[str], base: str) -> None:
 
 def ratio_figure(study: Study) -> Plot | None:
     """Mean gain over the ratio, one panel per strategy; None if there is only one ratio."""
-    with_ratio = [v for v in study.variants.values() if v.ratio and v.method != SFM]
-    ratios = sorted({variant.ratio for variant in with_ratio})
+    families: dict[str, dict[str, float]] = {}  # ratios by label
+    for label in study.seeded:
+        if ratio := study.variants[label].ratio:
+            families.setdefault(study.family(label), {})[label] = ratio
+    ratios = sorted({ratio for each in families.values() for ratio in each.values()})
     if len(ratios) < 2:
         return None
-    families: dict[str, list[Variant]] = {}
-    for variant in with_ratio:
-        families.setdefault(variant.family, []).append(variant)
-    figure, panels = _panels(len(study.strategies))
+    styles = {f: _style(study, next(iter(each)), mark=False) for f, each in families.items()}
+    figure, panels = _new_figure(3.6, 2.9, len(study.strategies))
     for strategy, axes in zip(study.strategies, panels, strict=True):
         on_these = gains(study, strategy).on_these
-        for family in families.values():
-            known = [(v, on_these[v.label]) for v in family if v.label in on_these]
-            means = [gain.mean for _, gain in known]
-            axes.plot([v.ratio for v, _ in known], means, **_style(family[0], mark=False))
-            for variant, gain in known:
-                style = _style(variant, line=False)
-                axes.errorbar(variant.ratio, gain.mean, yerr=_interval(gain), **style)
+        for family, each in families.items():
+            known = {label: on_these[label] for label in each if label in on_these}
+            means = [gain.mean for gain in known.values()]
+            axes.plot([each[label] for label in known], means, **styles[family])
+            for label, gain in known.items():
+                style = _style(study, label, line=False)
+                axes.errorbar(each[label], gain.mean, yerr=_interval(gain), **style)
         axes.set_xscale("log", base=2)
         axes.set_xticks(ratios, [f"{ratio:g}x" for ratio in ratios])
         axes.set_xticks([], minor=True)
-        axes.axhline(0.0, color=COLORS["sfm"], linewidth=1)
+        axes.axhline(0.0, color=_BLACK, linewidth=1)
         axes.set_title(f"strategy {strategy}")
         axes.set_xlabel("points, per original")
         axes.set_ylabel("gain over sfm, dB")
         axes.grid(visible=True, alpha=0.25)
-    styles = {name: _style(each[0], mark=False) for name, each in families.items()}
     caption = (
         "Mean gain over sfm (dB) on these scenes by ratio, with 95% interval of training again."
     )
@@ -279,10 +257,9 @@ def arm_figure(study: Study) -> Plot | None:
     others = [each for each in compared if each.arm != base]
     if base is None or not others:
         return None
-    figure = _new_figure(7.2, 1.2 + 0.24 * len(others))
-    axes = figure.subplots()
+    figure, (axes,) = _new_figure(7.2, 0.8 + 0.24 * len(others))
     for row, each in enumerate(others):
-        style = _style(study.variants[each.arm.seeds], line=False, mark=False)
+        style = _style(study, each.arm.seeds, line=False, mark=False)
         axes.errorbar(each.gain.mean, row, xerr=_interval(each.gain), marker="o", **style)
     _finish_rows(axes, [each.arm.label for each in others], base.label)
     alone = all(len(each.scenes) == 1 for each in others)

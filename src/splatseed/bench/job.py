@@ -1,15 +1,12 @@
 """One run of the benchmark: its seeds, its training, its scores, and the folder that keeps them.
 
-Notation: ``BENCH/runs/KEY`` is a run's folder; ``BENCH/seeds``, ``depths`` and ``covisible`` hold
-what several runs share. Promise: a run's folder appears whole or not at all, and is small: models
-are kept only on request. Seeds are the points that ``splatseed upsample`` would write for the same
-scene, method, ratio, budget and seed; their time is that of upsampling and thinning, without the
-compilation of kernels. Files that differ from the planned ones are an error.
+A run's folder appears whole or not at all, and keeps models only on request. Seeds are the points
+that ``splatseed upsample`` would write; their time is that of upsampling and thinning, without the
+compilation of kernels. ``BENCH/seeds``, ``depths`` and ``covisible`` hold what several runs share.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import shutil
@@ -19,7 +16,8 @@ import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,7 +25,7 @@ import numpy as np
 
 from splatseed.bench.plan import CLOUD, SFM, WITH_CLOUD, RunResult, RunSpec, plain
 from splatseed.bench.runs import ERROR, RESULT, Run, package_version, run_folder
-from splatseed.bench.scenes import cloud_digest, depth_digest, open_scene, scene_digest
+from splatseed.bench.scenes import SceneFacts, fingerprints, open_scene
 from splatseed.errors import (
     OutputError,
     ParameterError,
@@ -49,14 +47,13 @@ from splatseed.seeding.advice import DEFAULT_METHOD
 from splatseed.seeding.clouds.method import Cloud
 from splatseed.seeding.upsampling import CELL, thin_to, upsample
 from splatseed.train.seeds import stereo_size
+from splatseed.train.settings import TrainSettings
 from splatseed.upsample import Upsampler, chooses_number, configure
 from splatseed.views.view import user_cache_dir
 
 if TYPE_CHECKING:  # PyTorch, which takes a while
     from splatseed.train.run import TrainingRun
 
-TRAIN = "train"
-"""The stage of training, as progress calls it."""
 _PICTURES = 3
 """Test views that are kept as pictures."""
 
@@ -82,7 +79,7 @@ def do_runs(
     Args:
         bench: The benchmark's folder.
         specs: The runs, none of them finished.
-        tasks: Who carries them out.
+        tasks: What carries them out.
         options: Options of the runs.
         away: Whether that is elsewhere, so that the folders come back as bytes.
         report: Told how far each is, by its place in ``specs``.
@@ -92,7 +89,7 @@ def do_runs(
         KeyboardInterrupt: The user stopped them.
     """
     function = run_away if away else run_job
-    calls = [(spec, options) if away else (spec, bench, options) for spec in specs]
+    calls = [(spec, options) if away else (spec, options, bench) for spec in specs]
     try:
         for ended in tasks.run(function, calls, report):
             spec, value = specs[ended.index], ended.value
@@ -129,57 +126,39 @@ def _keep_files(bench: Path, spec: RunSpec, files: Mapping[str, bytes]) -> None:
 
 
 def run_job(
-    spec: RunSpec, bench: Path, options: JobOptions, progress: Progress = silent
+    spec: RunSpec, options: JobOptions, bench: Path, progress: Progress = silent
 ) -> RunResult:
-    """Carry out a run, and make its folder.
-
-    Args:
-        spec: The run.
-        bench: The benchmark's folder.
-        options: What else to do.
-        progress: Told the stages, training among them.
-
-    Raises:
-        SplatseedError: The run cannot be done.
-        KeyboardInterrupt: The user stopped it.
-    """
+    """Carry out a run, and make its folder in the benchmark's."""
     from splatseed.splat.metrics import load_lpips  # noqa: PLC0415  (PyTorch)
     from splatseed.train.run import prepare_run  # noqa: PLC0415  (PyTorch)
 
     begun = time.perf_counter()
     with output_folder(run_folder(bench, spec), kind="bench", overwrite=True) as folder:
         progress("read", 0.0)
-        scene = open_unchanged([spec])
+        scene = open_unchanged(spec.scene)
         lpips = load_lpips() if options.lpips else None
         seeds, seeding = make_seeds(scene, spec, progress, bench)
-        work = folder / "work"
         every = spec.training.test_every
         size = stereo_size(scene.split(every)[0], spec.settings, spec.settings.backend)
         # What stereo knows, for growth, is found once for all runs of a repeat, and its time counts
         # in each; not where seeds by auto have paid for it, as splatseed train shares the two.
         run = prepare_run(
             scene.replace(points=seeds),
-            work,
+            folder / "work",
             spec.settings,
             cache_dir=user_cache_dir(),
-            depths=bench / "depths" / f"{spec.scene_digest}_{every}_{size}_{spec.repeat}.npz",
+            depths=bench / "depths" / f"{spec.scene.digest}_{every}_{size}_{spec.repeat}.npz",
             seeding_knew=plain(spec.arm.method) == DEFAULT_METHOD and not _is_full(scene, spec),
             progress=progress,
         )
-        if not run.train(lambda step: progress(TRAIN, step / spec.training.max_steps)):
+        if not run.train(lambda step: progress("train", step / spec.training.max_steps)):
             raise KeyboardInterrupt
-        trained = run.finish(_scorer(spec, bench, lpips, progress), progress)
+        trained = run.finish(partial(_score, spec, bench, lpips, progress), progress)
+        curve = tuple(point for point in trained.curve if math.isfinite(point.psnr))
         result = RunResult(
-            scores=trained.scores,
-            curve=tuple(point for point in trained.curve if math.isfinite(point.psnr)),
-            num_seeds=trained.num_seeds,
-            upsample_seconds=seeding,
-            train_seconds=trained.train_seconds,
-            peak_bytes=peak_bytes(),
-            device=run.device,
-            peak_gpu_bytes=run.peak_gpu_bytes,
-            wall_seconds=round(time.perf_counter() - begun, 3),
-        )
+            trained.scores, curve, trained.num_seeds, seeding, trained.train_seconds, peak_bytes(),
+            run.device, run.peak_gpu_bytes, wall_seconds=round(time.perf_counter() - begun, 3),
+        )  # fmt: skip
         _keep(run, folder, models=options.keep_models)
         content = {"key": spec.key, "spec": spec.to_dict(), "result": result.to_dict()}
         write_json(folder / RESULT, content)
@@ -187,11 +166,7 @@ def run_job(
 
 
 def run_away(spec: RunSpec, options: JobOptions) -> tuple[RunResult, dict[str, bytes]]:
-    """Carry out a run on a node of a cluster, and return the files of its folder by name.
-
-    Raises:
-        SplatseedError: The run cannot be done, or the node lacks the scene or this version.
-    """
+    """Carry out a run on a node of a cluster, and return the files of its folder by name."""
     host, here = socket.gethostname(), package_version("splatseed")
     if here != spec.version:
         raise ParameterError(
@@ -199,14 +174,14 @@ def run_away(spec: RunSpec, options: JobOptions) -> tuple[RunResult, dict[str, b
             found=here or "none",
             fix="Install the same version on every node.",
         )
-    if not Path(spec.scene_path).exists():
+    if not Path(spec.scene.path).exists():
         raise SceneNotFoundError(
-            f"the scene {spec.scene_path} on the node {host}",
+            f"the scene {spec.scene.path} on the node {host}",
             found="no such folder",
             fix="Every node must have the scenes at the same path: share the disk, or copy them.",
         )
     with tempfile.TemporaryDirectory(prefix="splatseed-", ignore_cleanup_errors=True) as temporary:
-        result = run_job(spec, Path(temporary), options)
+        result = run_job(spec, options, Path(temporary))
         folder = run_folder(Path(temporary), spec)
         paths = [path for path in folder.rglob("*") if path.is_file() and path.name != MANIFEST]
         return result, {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths}
@@ -228,8 +203,10 @@ def _keep(run: TrainingRun, folder: Path, *, models: bool) -> None:
     shutil.rmtree(run.folder.path)
 
 
-def _scorer(spec: RunSpec, bench: Path, lpips: Any, progress: Progress) -> Callable[..., Any]:
-    """Scores test views, also over the pixels that two training views see.
+def _score(
+    spec: RunSpec, bench: Path, lpips: Any, progress: Progress, render: Any, views: Sequence[Any]
+) -> EvalResult:
+    """Score test views, also over the pixels that two training views see.
 
     These are computed once per scene; it is opened anew for that, so that an arm's depth maps make
     no difference.
@@ -243,43 +220,27 @@ def _scorer(spec: RunSpec, bench: Path, lpips: Any, progress: Progress) -> Calla
     from splatseed.splat.evaluate import evaluate_views  # noqa: PLC0415  (PyTorch)
 
     every = spec.training.test_every
-
-    def score(render: Any, views: Sequence[Any]) -> EvalResult:
-        kept = bench / "covisible" / f"{spec.scene_digest}_{every}.npz"
-        grids = read_covisible(kept)
-        if grids is None:
-            scene = open_scene(Path(spec.scene_path), images=spec.images)
-            grids = find_covisible(scene, every, progress)
-            write_covisible(kept, grids)
-        seen = pixel_masks(grids, views)
-        return evaluate_views(render, views, lpips=lpips, covisible=seen, progress=progress)
-
-    return score
+    kept = bench / "covisible" / f"{spec.scene.digest}_{every}.npz"
+    grids = read_covisible(kept)
+    if grids is None:
+        grids = find_covisible(open_scene(replace(spec.scene, depth="")), every, progress)
+        write_covisible(kept, grids)
+    seen = pixel_masks(grids, views)
+    return evaluate_views(render, views, lpips=lpips, covisible=seen, progress=progress)
 
 
-def open_unchanged(specs: Sequence[RunSpec]) -> Scene:
-    """The scene of some runs before upsampling, with depth maps if any of them needs these.
-
-    Args:
-        specs: Runs on one scene, at least one.
+def open_unchanged(facts: SceneFacts) -> Scene:
+    """A scene before upsampling, with the depth maps that it names.
 
     Raises:
-        SceneNotFoundError: It, or its depth maps, are not where the runs say.
-        SceneFormatError: It cannot be read, or differs from the plan: changed since, or different
-            on this node.
+        SceneNotFoundError: It, or its depth maps, are not where they should be.
+        SceneFormatError: It cannot be read, or has changed, or is different on this node.
     """
-    spec = next((each for each in specs if each.depth_path), specs[0])
-    depth = Path(spec.depth_path) if spec.depth_path else None
-    scene = open_scene(Path(spec.scene_path), images=spec.images, depth=depth)
-    folder = scene.source.image_dir if scene.source else None
-    same = folder is not None and scene_digest(scene, folder) == spec.scene_digest
-    if same and spec.depth_digest and scene.depths is not None:
-        same = depth_digest(scene.depths) == spec.depth_digest
-    if same and spec.cloud_digest:
-        same = cloud_digest(Path(spec.cloud_path)) == spec.cloud_digest
-    if not same:
+    scene = open_scene(facts)
+    now = fingerprints(scene, facts.depth, facts.cloud)
+    if now != {name: getattr(facts, name) for name in now}:
         raise SceneFormatError(
-            f"the files of {spec.scene_path} as they were when the benchmark was planned",
+            f"the files of {facts.path} as they were when the benchmark was planned",
             found="other points, cameras, photographs, depth maps or scan",
             fix="Start the benchmark again, which plans anew; or put them back.",
         )
@@ -289,43 +250,36 @@ def open_unchanged(specs: Sequence[RunSpec]) -> Scene:
 def make_seeds(
     scene: Scene, spec: RunSpec, progress: Progress = silent, bench: Path | None = None
 ) -> tuple[PointCloud, float]:
-    """The points that a run trains from, and the seconds that new ones took.
+    """The points that a run on a scene trains from, and the seconds that new ones took.
 
-    Args:
-        scene: The scene as opened by ``open_unchanged``.
-        spec: The run.
-        progress: Told the stages of upsampling.
-        bench: The benchmark's folder, where points made from photographs are kept, which took a
-            minute or more and which budgets and strategies thin; made anew when left out. Their
-            seconds count in each of these runs.
-
-    Raises:
-        SplatseedError: As ``splatseed.upsample``.
+    Points made from photographs, which took a minute or more and which budgets and strategies thin,
+    are kept in the benchmark's folder, if that is given. Their seconds count in each of these runs.
     """
     arm, most, seed = spec.arm, spec.most_seeds, spec.repeat
     if arm.method == SFM and most is None:
         return scene.points, 0.0
     method, numbers = _asked(scene, spec)
+
+    make = partial(_timed, upsample, scene, method, **numbers, seed=seed, progress=progress)
     looks = arm.method != SFM and chooses_number(plain(arm.method))
     if bench is None or not looks or _is_full(scene, spec):
-        seeds, seconds = _timed(
-            lambda: upsample(scene, method, **numbers, budget=most, seed=seed, progress=progress)
-        )
+        seeds, seconds = make(budget=most)
         return seeds.select(seeds.distinct), seconds
-    path = bench / "seeds" / f"{_seeds_key(spec)}.npz"
-    made = _read_seeds(path)
-    if made is None:
-        made = _timed(lambda: upsample(scene, method, **numbers, seed=seed, progress=progress))
+    # Its key is that of a run whose settings of training do not matter.
+    key = replace(spec, arm=replace(arm, strategy="none", budget=""), training=TrainSettings()).key
+    path = bench / "seeds" / f"{key}.npz"
+    if (made := _read_seeds(path)) is None:
+        made = make()
         _write_seeds(path, *made)
-    seeds, seconds = whole, _ = made
+    seeds, seconds = made
     if most is not None:
         held = getattr(method, "hold_out", 0)
-        seeds, more = _timed(lambda: thin_to(scene, whole, most, CELL, held, seed, progress))
+        seeds, more = _timed(thin_to, scene, seeds, most, CELL, held, seed, progress)
         seconds += more
     return seeds.select(seeds.distinct), seconds
 
 
-def _timed(make: Callable[[], PointCloud]) -> tuple[PointCloud, float]:
+def _timed(make: Callable[..., PointCloud], *args: Any, **named: Any) -> tuple[PointCloud, float]:
     """Points, and the seconds that making them took without compiling kernels."""
     compiling, running = 0.0, list[float]()
 
@@ -333,14 +287,14 @@ def _timed(make: Callable[[], PointCloud]) -> tuple[PointCloud, float]:
         nonlocal compiling
         if begins:
             running.append(time.perf_counter())
-        elif len(running) == 1:  # else it is nested in another, which counts it
-            compiling += time.perf_counter() - running.pop()
-        else:
-            running.pop()
+            return
+        begun = running.pop()
+        if not running:  # else it is nested in another, which counts it
+            compiling += time.perf_counter() - begun
 
     with watched(watch):
         start = time.perf_counter()
-        cloud = make()
+        cloud = make(*args, **named)
         return cloud, max(time.perf_counter() - start - compiling, 0.0)
 
 
@@ -359,36 +313,21 @@ def _asked(scene: Scene, spec: RunSpec) -> tuple[Upsampler, dict[str, Any]]:
 
     Under a budget, a method without a ratio fills the room that the originals leave.
     """
-    arm, most = spec.arm, spec.most_seeds
+    arm, most, begin = spec.arm, spec.most_seeds, f"{CLOUD}."
     if arm.method == SFM:  # no points are to be made: any method would do
         return configure("linear"), {"ratio": 1.0}
     if arm.method == CLOUD:
-        return Cloud(**spec.parameters).of(spec.cloud_path), {}
+        return Cloud(**spec.parameters).of(spec.scene.cloud), {}
+    own = {name: v for name, v in spec.parameters.items() if not name.startswith(begin)}
+    method = configure(plain(arm.method), arm.profile, **own)
     if arm.method in WITH_CLOUD:
-        begin = f"{CLOUD}."
-        own = {name: v for name, v in spec.parameters.items() if not name.startswith(begin)}
         cloud = {n.removeprefix(begin): v for n, v in spec.parameters.items() if n not in own}
-        extra = Cloud(**cloud).of(spec.cloud_path)
-        return configure(plain(arm.method), arm.profile, **own), {"extra_method": extra}
-    method = configure(arm.method, arm.profile, **spec.parameters)
+        return method, {"extra_method": Cloud(**cloud).of(spec.scene.cloud)}
     if chooses_number(arm.method):
         return method, {}
     if arm.ratio or most is None:
         return method, {"ratio": arm.ratio}
     return method, {"num_points": most} if most > _num_original(scene) else {"ratio": 1.0}
-
-
-def _seeds_key(spec: RunSpec) -> str:
-    """The fingerprint of everything that determines a method's points before thinning."""
-    arm = spec.arm
-    told: Mapping[str, Any] = {
-        "scene": [spec.scene_digest, spec.depth_digest, spec.cloud_digest],
-        "arm": [arm.method, arm.profile, arm.ratio, spec.repeat],
-        "parameters": dict(spec.parameters),
-        "version": spec.version,
-    }
-    text = json.dumps(told, sort_keys=True)
-    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
 
 def _write_seeds(path: Path, cloud: PointCloud, seconds: float) -> None:

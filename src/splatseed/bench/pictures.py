@@ -1,11 +1,7 @@
 """Pictures of a report: each method's seeds from one camera, and test views of the best variant.
 
-Notation: runs keep a few test views as pictures, with photograph, render and error map in a row
-(see ``splat.rendering``); descriptors are kept in ``BENCH/descriptors.json``, pictures of seeds in
-``BENCH/figures`` under names that tell what they depend on. Promise: seeds are made
-exactly as in the runs, and only if the scene's files are unchanged; a scene is opened only for what
-is not kept; if it is gone, only its pictures are missing. Both renders of a view are of the same
-repeat; the best variant is chosen by mean gain on the scene, not by the view that is shown.
+Seeds are made exactly as in the runs, and only if the scene's files are unchanged; a scene is
+opened only for what an earlier report has not kept; if it is gone, only its pictures are missing.
 """
 
 from __future__ import annotations
@@ -36,26 +32,19 @@ from splatseed.io.files import read_file, read_text
 from splatseed.io.photograph import decode_photograph, photograph_bytes
 from splatseed.io.staging import write_json
 from splatseed.progress import Progress, silent
+from splatseed.scene import Scene
 from splatseed.train.settings import StrategyName
 from splatseed.view.clouds import preview_methods
 
 FIGURES = "figures"
-"""The folder of a benchmark's figures."""
 _DESCRIPTORS = "descriptors.json"
-_MOST = 10
-"""Clouds in a picture."""
+_MOST = 10  # clouds in a picture
 _SIDE, _CLOUD_SIDE = 960, 1800
 
 
 @dataclass
 class ScenePictures:
-    """The pictures and descriptors of a study's scenes.
-
-    Args:
-        described: Descriptors by scene.
-        clouds: File name without suffix and PNG, by scene.
-        notes: What could not be shown, one sentence each.
-    """
+    """A study's scenes: descriptors, file name without suffix and PNG, and what is not shown."""
 
     described: dict[str, Descriptors] = field(default_factory=dict)
     clouds: dict[str, tuple[str, bytes]] = field(default_factory=dict)
@@ -63,49 +52,32 @@ class ScenePictures:
 
 
 def scene_pictures(bench: Path, study: Study, progress: Progress = silent) -> ScenePictures:
-    """Descriptors and pictures of a study's scenes, kept or new.
-
-    Args:
-        bench: The benchmark's folder.
-        study: The study.
-        progress: Told the stages.
-
-    Raises:
-        OutputError: Descriptors cannot be kept.
-    """
+    """Descriptors and pictures of a study's scenes, kept or new."""
     pictures, kept = ScenePictures(), _kept_descriptors(bench)
     for scene in study.scenes:
         specs = _seed_specs(study, scene)
-        runs = study.runs[study.runs["scene"] == scene]
-        digest = str(runs["digest"].iloc[0])
-        told = [digest, *((name, each.repeat, each.depth_digest, each.version)
+        any_run = study.runs.loc[study.runs["scene"] == scene, "spec"].iloc[0]
+        digest = any_run.scene.digest
+        told = [digest, *((name, each.repeat, each.scene.depth_digest, each.version)
                           for name, each in specs.items())]  # fmt: skip
         key = hashlib.blake2b(json.dumps(told).encode(), digest_size=8).hexdigest()
         name = f"clouds_{safe_name(scene)}_{key}"
         with suppress(OSError):
             pictures.clouds[scene] = name, read_file(bench / FIGURES / f"{name}.png")
-        if digest in kept:
-            pictures.described[scene] = kept[digest]
-        if digest in kept and (scene in pictures.clouds or not specs):
-            continue
         try:
-            opened = open_unchanged([*specs.values(), study.specs[runs["key"].iloc[0]]])
-            if digest not in kept:
-                kept[digest] = pictures.described[scene] = describe(opened, progress)
-            if specs and scene not in pictures.clouds:
-                seeds = {
-                    n: make_seeds(opened, spec, progress, bench)[0] for n, spec in specs.items()
-                }
-                progress("draw points", 0.0)
-                with tempfile.TemporaryDirectory() as folder:
-                    drawn = preview_methods(opened, seeds, Path(folder) / "clouds.png").read_bytes()
-                pictures.clouds[scene] = name, drawn
+            if digest not in kept or (specs and scene not in pictures.clouds):
+                facts = [spec.scene for spec in (*specs.values(), any_run)]
+                opened = open_unchanged(next((each for each in facts if each.depth), facts[0]))
+                if digest not in kept:
+                    kept[digest] = describe(opened, progress)
+                if specs and scene not in pictures.clouds:
+                    pictures.clouds[scene] = name, _draw_seeds(opened, specs, progress, bench)
         except SplatseedError as error:
             pictures.notes.append(f"{scene}: its points are not shown or described: {error}")
+        if digest in kept:
+            pictures.described[scene] = kept[digest]
     if kept:
-        content = {digest: {k: None if np.isnan(v) else v for k, v in each.items()}
-                    for digest, each in sorted(kept.items())}  # fmt: skip
-        write_json(bench / _DESCRIPTORS, content)
+        write_json(bench / _DESCRIPTORS, kept)
     return pictures
 
 
@@ -113,12 +85,7 @@ def _kept_descriptors(bench: Path) -> dict[str, Descriptors]:
     """The descriptors of an earlier report, by fingerprint; empty if there are none."""
     with suppress(OSError, ValueError, TypeError, AttributeError):
         content = json.loads(read_text(bench / _DESCRIPTORS))
-        return {
-            digest: {
-                name: np.nan if value is None else float(value) for name, value in each.items()
-            }
-            for digest, each in content.items()
-        }
+        return {digest: {k: float(v) for k, v in each.items()} for digest, each in content.items()}
     return {}
 
 
@@ -126,9 +93,18 @@ def _seed_specs(study: Study, scene: str) -> dict[str, RunSpec]:
     """A run of each variant of a scene whose seeds to show: the one with the lowest repeat."""
     runs = study.runs[(study.runs["scene"] == scene) & (study.runs["seeds"] != SFM)]
     first = runs.sort_values("repeat", kind="stable").drop_duplicates("seeds")
-    keys = dict(zip(first["seeds"], first["key"], strict=True))
-    shown = shown_seeds(study, [label for label in study.seeded if label in keys])
-    return {label: study.specs[keys[label]] for label in shown[:_MOST]}
+    specs = dict(zip(first["seeds"], first["spec"], strict=True))
+    shown = shown_seeds(study, [label for label in study.seeded if label in specs])
+    return {label: specs[label] for label in shown[:_MOST]}
+
+
+def _draw_seeds(
+    scene: Scene, specs: Mapping[str, RunSpec], progress: Progress, bench: Path
+) -> bytes:
+    seeds = {label: make_seeds(scene, spec, progress, bench)[0] for label, spec in specs.items()}
+    progress("draw points", 0.0)
+    with tempfile.TemporaryDirectory() as folder:
+        return preview_methods(scene, seeds, Path(folder) / "clouds.png").read_bytes()
 
 
 def safe_name(text: str) -> str:
@@ -166,19 +142,14 @@ class ComparedView(NamedTuple):
 
 def compared_views(study: Study, strategy: StrategyName, bench: Path) -> Iterator[ComparedView]:
     """The views that can be shown of each scene; none where the runs' pictures are gone."""
-    gained = gains(study, strategy)
+    gained, part = gains(study, strategy), study.under(strategy)
     most = 2 if len(study.strategies) == 1 else 1
-    part = study.under(strategy)
-    places = zip(part["scene"], part["seeds"], part["repeat"], strict=True)
-    renders = {
-        place: run_folder(bench, study.specs[key]) / "renders"
-        for place, key in zip(places, part["key"], strict=True)
-    }
+    specs = part.set_index(["scene", "seeds", "repeat"])["spec"].to_dict()
     for scene in gained.scenes:
         best = gained.top(scene) or SFM
         for repeat in sorted(part["repeat"].unique()):
-            both = [(scene, label, repeat) for label in (SFM, best)]
-            folders = [renders[place] for place in both if place in renders]
+            both = [specs.get((scene, label, repeat)) for label in (SFM, best)]
+            folders = [run_folder(bench, spec) / "renders" for spec in both if spec is not None]
             names = [{path.name for path in folder.glob("*.png")} for folder in folders]
             if len(folders) == 2 and set.intersection(*names):
                 gain = gained.on_scene[scene, best].mean

@@ -1,28 +1,27 @@
 """The report of a benchmark: the answer, tables and figures, and a page that holds all of them.
 
-Notation: it is ``BENCH/report.html``, ``tables/NAME.{csv,md,tex,html}``, ``figures/NAME.png``.
-Promise: a report can be made at any time, from whatever is done so far, while runs continue; what
-is missing or has failed is listed; the page needs no network and no other file, every text on it is
-escaped, and it shows everything without its few lines of script; an earlier report is replaced as a
-whole. A gain is claimed only if it exceeds noise after adjusting for the number of variants.
+It can be made at any time, from whatever is done so far; what is missing or has failed is listed.
+The page (``data/report.html``) needs no network and no other file, every text on it is escaped; an
+earlier report is replaced as a whole. A gain is claimed only if it exceeds noise after adjusting.
 """
 
 from __future__ import annotations
 
 import math
 from base64 import b64encode
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from html import escape
 from importlib.resources import files
 from pathlib import Path
 from statistics import fmean
-from string import Template
-from typing import Any
+from typing import Any, TypeAlias
 
+import jinja2
+
+from splatseed.bench import figures, pictures, study_tables
 from splatseed.bench.comparisons import (
-    Arm,
+    ArmKey,
     ComparedArm,
     Gains,
     baseline_of,
@@ -31,43 +30,12 @@ from splatseed.bench.comparisons import (
     paired_runs,
     speeds,
 )
-from splatseed.bench.figures import (
-    Plot,
-    arm_figure,
-    curve_figure,
-    ratio_figure,
-    scene_figure,
-    seconds_figure,
-)
-from splatseed.bench.guidelines import Descriptors, guideline_table, guidelines, winner_table
-from splatseed.bench.pictures import (
-    FIGURES,
-    ComparedView,
-    ScenePictures,
-    cloud_jpeg,
-    compared_views,
-    scene_pictures,
-)
+from splatseed.bench.guidelines import guideline_table, guidelines, winner_table
 from splatseed.bench.plan import SFM
 from splatseed.bench.plan_file import PLAN
 from splatseed.bench.runs import Run, counts, read_calls, read_runs
 from splatseed.bench.statistics import LEVEL, Difference
 from splatseed.bench.study import Study, studies
-from splatseed.bench.study_tables import (
-    EQUAL,
-    advice_table,
-    arm_table,
-    convergence_table,
-    cost_table,
-    equal_count_table,
-    gain_table,
-    mean_gain_table,
-    psnr_tables,
-    quality_table,
-    scene_arm_table,
-    seconds_table,
-    strategy_table,
-)
 from splatseed.bench.tables import Table, to_html, write_table
 from splatseed.io.files import read_text
 from splatseed.io.staging import atomic_file, output_folder
@@ -77,7 +45,6 @@ from splatseed.train.settings import StrategyName
 
 REPORT, TABLES = "report.html", "tables"
 _KIND = "bench report"
-"""The kind recorded in the manifests of the folders of tables and figures."""
 _SHOWN = 0.005
 """The least gain in dB that does not read 0.00."""
 _LISTED = 200
@@ -87,19 +54,12 @@ _DOUBTS = {
     "unknown": ", which a single run cannot confirm",
 }
 """What follows a difference that is not shown, by verdict."""
+Part: TypeAlias = Mapping[str, Any] | Table | figures.Plot | str | None
 
 
 @dataclass(frozen=True)
 class Report:
-    """What was written.
-
-    Args:
-        path: The page.
-        tables: How many tables, each in four formats.
-        figures: How many figures.
-        summary: The answer, a sentence or two each.
-        notes: What is missing or could not be shown, one sentence each.
-    """
+    """What was written: the page, how many tables and figures; the answer, and what is missing."""
 
     path: Path
     tables: int
@@ -111,47 +71,90 @@ class Report:
 def write_report(bench: Path, progress: Progress = silent) -> Report:
     """Write the report of a benchmark into its folder.
 
-    Scenes are opened to describe them and to draw each method's seeds, unless an earlier report has
-    kept that.
-
-    Args:
-        bench: The folder.
-        progress: Told the stages.
-
     Raises:
         SceneNotFoundError: There is no benchmark.
         OutputError: A file cannot be written.
     """
     runs = read_runs(bench)
-    parts = []
-    found = studies(runs)
+    found, page, notes = studies(runs), _Page(), dict[str, None]()
+    page.add("summary", "Summary", *_summary_parts(found))
     for number, study in enumerate(found, start=1):
-        pictures = scene_pictures(bench, study, progress)
+        drawn = pictures.scene_pictures(bench, study, progress)
         progress("tables and figures", 0.0)
-        prefix, title = ("", "") if number == 1 else (f"set{number}_", f"Set {number}: ")
-        part = _Part(study, pictures, prefix, title)
-        part.fill(bench)
-        parts.append(part)
+        page.prefix, page.title = ("", "") if number == 1 else (f"set{number}_", f"Set {number}: ")
+        for key, title, parts in _study_sections(study, drawn, bench):
+            page.add(key, title, *parts)
+        page.images |= dict(drawn.clouds.values())
+        notes |= dict.fromkeys(drawn.notes)
     progress("page", 0.0)
-    sections = [_summary_section(found), *(each for part in parts for each in part.sections)]
-    sections += [_run_section(runs, found), _setup_section(bench, runs)]
-    tables = [table for part in parts for table in part.tables]
+    page.prefix = page.title = ""
+    written = len(page.tables)
+    page.add("runs", "Runs", *_run_parts(runs, found))
+    page.add("setup", "How it was run", *_setup_parts(bench, runs))
     with output_folder(bench / TABLES, kind=_KIND, overwrite=True) as partial:
-        for table in tables:
+        for table in page.tables[:written]:
             write_table(table, partial)
-    images = {plot.name: plot.png for part in parts for plot in part.plots}
-    images |= {name: png for part in parts for name, png in part.pictures.clouds.values()}
-    with output_folder(bench / FIGURES, kind=_KIND, overwrite=True) as partial:
-        for name, png in images.items():
+    with output_folder(bench / pictures.FIGURES, kind=_KIND, overwrite=True) as partial:
+        for name, png in page.images.items():
             (partial / f"{name}.png").write_bytes(png)
     with atomic_file(bench / REPORT) as partial:
-        partial.write_text(_page(runs, sections), "utf-8", errors="backslashreplace")
-    notes = list(dict.fromkeys(note for part in parts for note in part.pictures.notes))
-    if any(run.result is None for run in runs):
-        notes.insert(0, f"Not all runs are done, and the rest can change what is said: "
-                     f"{counts(runs)}.")  # fmt: skip
+        partial.write_text(page.html(runs), "utf-8", errors="backslashreplace")
+    left = f"Not all runs are done, and the rest can change what is said: {counts(runs)}."
+    told = [left] if any(run.result is None for run in runs) else []
     said = tuple(_said(found)) or ("No run is done yet.",)
-    return Report(bench / REPORT, len(tables), len(images), said, tuple(notes))
+    return Report(bench / REPORT, written, len(page.images), said, (*told, *notes))
+
+
+@dataclass
+class _Page:
+    """The sections of a page, and the tables and figures that it shows.
+
+    ``prefix`` is before the names of what is added next, ``title`` before its headings.
+    """
+
+    prefix: str = ""
+    title: str = ""
+    sections: list[Mapping[str, Any]] = field(default_factory=list)
+    tables: list[Table] = field(default_factory=list)
+    images: dict[str, bytes] = field(default_factory=dict)
+
+    def add(self, key: str, title: str, *parts: Part) -> None:
+        """Add a section, unless it has no parts."""
+        shown = [self._shown(part) for part in parts if part]
+        if shown:
+            section = {"key": self.prefix + key, "title": self.title + title, "parts": shown}
+            self.sections.append(section)
+
+    def _shown(self, part: Part) -> Part:
+        if isinstance(part, str):
+            return _text(part)
+        if isinstance(part, Table):
+            self.tables.append(replace(part, name=self.prefix + part.name))
+            return {"kind": "table", "table": self.tables[-1], "html": to_html(part)}
+        if isinstance(part, figures.Plot):
+            self.images[self.prefix + part.name] = part.png
+            return _figure(part.png, part.caption)
+        return part
+
+    def html(self, runs: Sequence[Run]) -> str:
+        """The page."""
+        scenes = ", ".join(dict.fromkeys(run.spec.scene.name for run in runs))
+        question = "Does upsampling help on these scenes, by which method, at what cost?"
+        data = files("splatseed.bench") / "data"
+        page, style, script = (
+            (data / f"report.{kind}").read_text("utf-8") for kind in ("html", "css", "js")
+        )
+        return (
+            jinja2.Environment(autoescape=True, keep_trailing_newline=True)
+            .from_string(page)
+            .render(
+                title=f"Benchmark of {scenes}" if scenes else "Benchmark without runs",
+                subtitle=f"{question} {counts(runs)}.",
+                sections=self.sections,
+                style=style,
+                script=script,
+            )
+        )
 
 
 def _said(found: Sequence[Study]) -> Iterator[str]:
@@ -167,7 +170,7 @@ def _said(found: Sequence[Study]) -> Iterator[str]:
 def unequal_numbers(study: Study) -> str | None:
     """A warning that the arms end with different numbers of Gaussians; None if they do not."""
     numbers = [each.means["gaussians"] for each in compared_arms(study)]
-    if not numbers or max(numbers) <= min(numbers) * (1 + EQUAL):
+    if not numbers or max(numbers) <= min(numbers) * (1 + study_tables.EQUAL):
         return None
     hint = "" if study.settings["budget"] else ": --budgets bounds every arm alike"
     return (
@@ -213,7 +216,7 @@ def answer_at_equal_cost(study: Study) -> tuple[str, ...]:
     return tuple(said)
 
 
-def _against(each: ComparedArm, base: Arm) -> str:
+def _against(each: ComparedArm, base: ArmKey) -> str:
     """A gain in words."""
     gain = each.gain
     if abs(gain.mean) < _SHOWN:
@@ -301,9 +304,10 @@ def _cost(study: Study, strategy: StrategyName, best: str) -> str:
         f"{times('training'):.2f} times as long as {SFM} and ends with {times('gaussians'):.2f} "
         "times as many Gaussians."
     )
-    speed = speeds(study, strategy).get(best)
-    if speed is None:
+    known = speeds(study, strategy)
+    if best not in known.index:
         return text
+    speed = known.loc[best]
     if speed.log_steps is None or speed.log_seconds is None:
         return f"{text} {speed.reached} of {speed.pairs} runs reach {SFM}'s final PSNR."
     both = {"steps": speed.log_steps, "seconds": speed.log_seconds}
@@ -316,243 +320,148 @@ def _cost(study: Study, strategy: StrategyName, best: str) -> str:
     return f"{text} To reach {SFM}'s final PSNR it takes {share} that {SFM} takes."
 
 
-@dataclass(frozen=True)
-class _Section:
-    """A part of the page: its anchor, heading, and HTML; left out without any."""
-
-    key: str
-    title: str
-    blocks: Sequence[str]
-
-
-@dataclass
-class _Part:
-    """A study's part of the report; the page shows exactly what is written to files.
-
-    ``prefix`` is before the names of files and links, ``title`` before headings.
-    """
-
-    study: Study
-    pictures: ScenePictures
-    prefix: str = ""
-    title: str = ""
-    tables: list[Table] = field(default_factory=list)
-    plots: list[Plot] = field(default_factory=list)
-    sections: list[_Section] = field(default_factory=list)
-
-    def fill(self, bench: Path) -> None:
-        """Make all tables, figures and sections."""
-        study, each = self.study, self.study.strategies
+def _study_sections(
+    study: Study, drawn: pictures.ScenePictures, bench: Path
+) -> Iterator[tuple[str, str, Sequence[Part]]]:
+    """A study's sections: key, title and parts. The page shows exactly what is written to files."""
+    each, tables = study.strategies, study_tables
+    base = baseline_of(study)
+    if base is not None and len(compared_arms(study)) > 1:
         title = "At equal cost" if study.settings["budget"] else "All arms"
-        if len(compared_arms(study)) > 1:
-            arms = (arm_table(study), arm_figure(study), scene_arm_table(study))
-            timed = (seconds_figure(study), seconds_table(study))
-            self._add("cost", title, unequal_numbers(study), *arms, *timed)
-        self._add("scores", "Scores", *(
-            table for s in each for table in (*psnr_tables(study, s), quality_table(study, s))
-        ))  # fmt: skip
-        if study.seeded:
-            parts = [made for s in each for made in (gain_table(study, s), scene_figure(study, s))]
-            self._add("gains", "Gains", *parts, mean_gain_table(study), ratio_figure(study),
-                      strategy_table(study), equal_count_table(study))  # fmt: skip
-        else:
-            self._add("gains", "Gains", "There is nothing to compare with yet: runs of sfm are "
-                      "missing, or all others.")  # fmt: skip
-        for s in each:
-            self._add(f"convergence_{s}", f"Convergence, strategy {s}",
-                      curve_figure(study, s, "steps"), curve_figure(study, s, "seconds"),
-                      convergence_table(study, s) if study.seeded_under(s) else None)  # fmt: skip
-        self._add("resources", "Time and memory", *(cost_table(study, s) for s in each))
-        self._add_pictures(bench)
-        self._add("guidelines", "Guidelines", *self._guidelines(self.pictures.described))
-
-    def _guidelines(self, described: Mapping[str, Descriptors]) -> Iterator[Table | None]:
-        for strategy in self.study.strategies if self.study.seeded else ():
-            gained = gains(self.study, strategy)
-            yield winner_table(gained, described)
-            yield guideline_table(guidelines(self.study, gained, described), strategy)
-            if self.study.settings["budget"]:
-                yield advice_table(self.study, strategy)
-
-    def _add(self, key: str, title: str, *parts: Table | Plot | str | None) -> None:
-        blocks = []
-        for part in parts:
-            if isinstance(part, str):
-                blocks.append(_paragraphs([part]))
-            elif isinstance(part, Table):
-                self.tables.append(replace(part, name=self.prefix + part.name))
-                blocks.append(_table(self.tables[-1]))
-            elif part is not None:
-                self.plots.append(part._replace(name=self.prefix + part.name))
-                blocks.append(_figure(part.png, part.caption))
-        self.sections.append(_Section(self.prefix + key, self.title + title, blocks))
-
-    def _add_pictures(self, bench: Path) -> None:
-        blocks = [
-            _figure(cloud_jpeg(png), f"{scene}: what training begins with.", "image/jpeg")
-            for scene, (_, png) in self.pictures.clouds.items()
-        ]
-        for i, strategy in enumerate(self.study.strategies):
-            sliders = [_slider(view) for view in compared_views(self.study, strategy, bench)]
-            blocks.append(_folded(f"Test views, strategy {strategy}", sliders, is_open=i == 0))
-        blocks.append(_paragraphs(self.pictures.notes, "note"))
-        self.sections.append(_Section(f"{self.prefix}pictures", f"{self.title}Pictures", blocks))
+        yield "cost", title, [
+            unequal_numbers(study), tables.arm_table(study), figures.arm_figure(study),
+            tables.scene_arm_table(study, base), figures.seconds_figure(study),
+            tables.seconds_table(study, base),
+        ]  # fmt: skip
+    scores: list[Part] = []
+    for s in each:
+        scores += [*tables.psnr_tables(study, s), tables.quality_table(study, s)]
+    yield "scores", "Scores", scores
+    gained: list[Part] = []
+    for s in each if study.seeded else ():
+        gained += [tables.gain_table(study, s), figures.scene_figure(study, s)]
+    nothing = "There is nothing to compare with yet: runs of sfm are missing, or all others."
+    yield "gains", "Gains", [
+        *gained, tables.mean_gain_table(study), figures.ratio_figure(study),
+        tables.strategy_table(study), tables.equal_count_table(study),
+    ] if gained else [nothing]  # fmt: skip
+    for s in each:
+        yield f"convergence_{s}", f"Convergence, strategy {s}", [
+            figures.curve_figure(study, s, "steps"), figures.curve_figure(study, s, "seconds"),
+            tables.convergence_table(study, s) if study.seeded_under(s) else None,
+        ]  # fmt: skip
+    yield "resources", "Time and memory", [tables.cost_table(study, s) for s in each]
+    yield "pictures", "Pictures", [
+        *(_figure(pictures.cloud_jpeg(png), f"{scene}: what training begins with.", "image/jpeg")
+          for scene, (_, png) in drawn.clouds.items()),
+        *(_folded(f"Test views, strategy {s}",
+                  [_views(view) for view in pictures.compared_views(study, s, bench)],
+                  is_open=i == 0) for i, s in enumerate(each)),
+        _text(*drawn.notes, mark="note"),
+    ]  # fmt: skip
+    guided: list[Part] = []
+    for s in each if study.seeded else ():
+        known = gains(study, s)
+        derived = guidelines(study, known, drawn.described)
+        guided += [winner_table(known, drawn.described), guideline_table(derived, s)]
+        guided.append(tables.advice_table(study, s) if study.settings["budget"] else None)
+    yield "guidelines", "Guidelines", guided
 
 
-def _summary_section(found: Sequence[Study]) -> _Section:
+def _summary_parts(found: Sequence[Study]) -> Iterator[Part]:
     """The answer, set by set where runs differ in more than what is compared."""
-    blocks = [] if found else [_answer_block(["No run is done yet."])]
+    if not found:
+        yield _answer_block(["No run is done yet."])
     if len(found) > 1:
-        note = "Runs of different settings or versions are never compared: they are in sets."
-        blocks.append(_paragraphs([note], "note"))
+        said = "Runs of different settings or versions are never compared: they are in sets."
+        yield _text(said, mark="note")
     for number, study in enumerate(found, start=1):
         name = f"Set {number}" if len(found) > 1 else "All runs"
         of_all = answer_at_equal_cost(study)
-        blocks += [_answer_block(of_all)] if of_all else []
-        blocks.append(_paragraphs([f"{name}: {study.description}."], "note"))
+        yield _answer_block(of_all)
+        yield _text(f"{name}: {study.description}.", mark="note")
         by_strategy = [_answer_block(summary(study, each)) for each in study.strategies]
         if of_all:
-            by_strategy = [_folded("Strategy by strategy", by_strategy, is_open=False)]
-        blocks += by_strategy
-    return _Section("summary", "Summary", blocks)
+            yield _folded("Strategy by strategy", by_strategy, is_open=False)
+        else:
+            yield from by_strategy
 
 
-def _run_section(runs: Sequence[Run], found: Sequence[Study]) -> _Section:
-    blocks = [_paragraphs([f"{counts(runs)}."])]
-    kinds: tuple[tuple[str, str, Callable[[Run], bool]], ...] = (
-        ("failed", "Failed runs", lambda run: bool(run.error)),
-        ("missing", "Runs still missing", lambda run: run.result is None and not run.error),
-    )
-    for name, title, is_one in kinds:
-        listed = [run for run in runs if is_one(run)]
+def _run_parts(runs: Sequence[Run], found: Sequence[Study]) -> Iterator[Part]:
+    yield f"{counts(runs)}."
+    failed = [run for run in runs if run.error]
+    missing = [run for run in runs if run.result is None and not run.error]
+    for name, title, listed in (
+        ("failed", "Failed runs", failed), ("missing", "Runs still missing", missing)
+    ):  # fmt: skip
         rows = [
-            (run.spec.scene, run.spec.arm.label, run.spec.arm.strategy, f"{run.spec.repeat}",
+            (run.spec.scene.name, run.spec.arm.label, run.spec.arm.strategy, f"{run.spec.repeat}",
              run.error)
             for run in listed[:_LISTED]
         ]  # fmt: skip
+        more = len(listed) - len(rows)
+        header = ("scene", "method", "strategy", "repeat", "error")
+        notes = (f"And {more:,} more.",) if more else ()
         if rows:
-            more = len(listed) - len(rows)
-            header = ("scene", "method", "strategy", "repeat", "error")
-            notes = (f"And {more:,} more.",) if more else ()
-            blocks.append(_table(Table(name, f"{title}: {len(listed):,}", header, rows, notes)))
+            yield Table(name, f"{title}: {len(listed):,}", header, rows, notes)
     odd = [name for study in found for name in study.not_finite]
     if odd:
-        said = f"PSNR is not finite, so that these runs are in no mean: {'; '.join(odd)}."
-        blocks.append(_paragraphs([said]))
-    return _Section("runs", "Runs", blocks)
+        yield f"PSNR is not finite, so that these runs are in no mean: {'; '.join(odd)}."
 
 
-def _setup_section(bench: Path, runs: Sequence[Run]) -> _Section:
-    calls, blocks = read_calls(bench), []
+def _setup_parts(bench: Path, runs: Sequence[Run]) -> Iterator[Part]:
+    calls = read_calls(bench)
     commands = dict.fromkeys(str(each.get("command", "")) for each in calls)
     if commands:
-        blocks += [_paragraphs(["The commands, in order:"]), _preformatted("\n".join(commands))]
+        yield "The commands, in order:"
+        yield {"kind": "preformatted", "text": "\n".join(commands)}
     devices = dict.fromkeys(run.result.device for run in runs if run.result is not None)
-    facts: dict[str, Any] = {"trained on": ", ".join(devices)}
-    facts |= {name: value for name, value in (calls[-1] if calls else {}).items()
-              if name != "command"}  # fmt: skip
-    rows = [(name, _fact(value)) for name, value in facts.items() if value]
+    facts: dict[str, Any] = {"trained on": ", ".join(devices), **(calls[-1] if calls else {})}
+    facts.pop("command", None)
+    for name, value in facts.items():
+        if isinstance(value, Mapping):
+            facts[name] = ", ".join(f"{key} {each}" for key, each in value.items())
+    rows = [(name, str(value)) for name, value in facts.items() if value]
     if rows:
-        blocks.append(_table(Table("environment", "Environment", ("what", "found"), rows)))
+        yield Table("environment", "Environment", ("what", "found"), rows)
     with suppress(OSError, UnicodeDecodeError):
-        said = "The plan; save it as plan.toml and run splatseed bench --plan plan.toml:"
-        blocks += [_paragraphs([said]), _preformatted(read_text(bench / PLAN))]
-    return _Section("setup", "How it was run", blocks)
+        plan = read_text(bench / PLAN)
+        yield "The plan; save it as plan.toml and run splatseed bench --plan plan.toml:"
+        yield {"kind": "preformatted", "text": plan}
 
 
-def _fact(value: object) -> str:
-    if isinstance(value, Mapping):
-        return ", ".join(f"{key} {each}" for key, each in value.items())
-    return str(value)
+def _text(*texts: str, mark: str = "") -> Part:
+    """Paragraphs, of a class in the style sheet."""
+    return {"kind": "text", "texts": texts, "mark": mark} if texts else None
 
 
-def _page(runs: Sequence[Run], sections: Iterable[_Section]) -> str:
-    shown = [section for section in sections if any(section.blocks)]
-    scenes = ", ".join(dict.fromkeys(run.spec.scene for run in runs))
-    question = "Does upsampling help on these scenes, by which method, at what cost?"
-    resources = files("splatseed.bench") / "data"
-    body = "".join(
-        f'<section id="{escape(s.key)}"><h2>{escape(s.title)}</h2>{"".join(s.blocks)}</section>'
-        for s in shown
-    )
-    return Template((resources / "report.html").read_text("utf-8")).substitute(
-        title=escape(f"Benchmark of {scenes}" if scenes else "Benchmark without runs"),
-        subtitle=escape(f"{question} {counts(runs)}."),
-        links="".join(f'<a href="#{escape(s.key)}">{escape(s.title)}</a>' for s in shown),
-        body=body,
-        style=(resources / "report.css").read_text("utf-8"),
-        script=(resources / "report.js").read_text("utf-8"),
-    )
-
-
-def _paragraphs(texts: Iterable[str], kind: str = "") -> str:
-    """Paragraphs of plain text, of a class in the style sheet."""
-    mark = f' class="{escape(kind)}"' if kind else ""
-    return "".join(f"<p{mark}>{escape(text)}</p>" for text in texts)
-
-
-def _answer_block(sentences: Sequence[str]) -> str:
+def _answer_block(sentences: Sequence[str]) -> Part:
     """The sentences of an answer, the first of them the answer itself."""
-    lead, rest = _paragraphs(sentences[:1], "lead"), _paragraphs(sentences[1:])
-    return f'<div class="answer">{lead}{rest}</div>'
+    return {"kind": "answer", "texts": sentences} if sentences else None
 
 
-def _preformatted(text: str) -> str:
-    """Text as it is, such as a command, that scrolls where it is wide."""
-    return f'<pre tabindex="0">{escape(text)}</pre>'
+def _folded(title: str, parts: Sequence[Part], *, is_open: bool) -> Part:
+    """Parts under a title that opens and closes."""
+    return {"kind": "folded", "title": title, "parts": parts, "open": is_open} if parts else None
 
 
-def _table(content: Table) -> str:
-    """A table that scrolls sideways where it is wide, with its notes folded below."""
-    inner = f'<div class="scroll" tabindex="0">{to_html(content)}</div>'
-    if not content.rows:
-        inner = _paragraphs(["None.", *content.notes[:1]])
-    notes = _paragraphs(content.notes)
-    folded = f"<details><summary>How to read this</summary>{notes}</details>" if notes else ""
-    title = f"<h3>{escape(content.title)}</h3>"
-    return f'<div class="table" id="table-{escape(content.name)}">{title}{inner}{folded}</div>'
+def _figure(content: bytes, caption: str, kind: str = "image/png") -> Part:
+    return {"kind": "figure", "url": _url(content, kind), "caption": caption}
 
 
-def _image(content: bytes, alt: str, kind: str) -> str:
-    data = f"data:{kind};base64,{b64encode(content).decode('ascii')}"
-    return f'<img src="{data}" alt="{escape(alt)}">'
+def _url(content: bytes, kind: str) -> str:
+    return f"data:{kind};base64,{b64encode(content).decode('ascii')}"
 
 
-def _figure(content: bytes, caption: str, kind: str = "image/png") -> str:
-    """A picture with its caption, that scrolls where it is wider than the page."""
-    return (
-        f'<figure><div class="scroll paper" tabindex="0">{_image(content, caption, kind)}</div>'
-        f"<figcaption>{escape(caption)}</figcaption></figure>"
-    )
-
-
-def _folded(title: str, blocks: Sequence[str], *, is_open: bool) -> str:
-    """Blocks under a title that opens and closes; nothing without blocks."""
-    if not blocks:
-        return ""
-    summary = f"<summary>{escape(title)}</summary>"
-    return f'<details class="fold"{" open" * is_open}>{summary}{"".join(blocks)}</details>'
-
-
-def _slider(view: ComparedView) -> str:
+def _views(view: pictures.ComparedView) -> Part:
     """Pictures of one size stacked on each other, with a slider between any two of them."""
     chosen = "the best on this scene"
     if view.gain < _SHOWN:
         lost = "level with sfm" if view.gain > -_SHOWN else "though it loses"
         chosen = f"the best of the others on this scene, {lost}"
-    title = (
+    caption = (
         f"{view.scene}, test view {view.name}: {view.best}, {chosen} ({view.gain:+.2f} dB over all "
         "its test views). Error maps: black is none, the brightest 0.25 or more."
     )
-    images = "".join(
-        _image(content, f"{name}, {title}", "image/jpeg") for name, content in view.pictures.items()
-    )
-    choices = "".join(f"<option>{escape(name)}</option>" for name in view.pictures)
-    return (
-        f'<figure class="compare" style="--shape: {view.shape:.4f}">'
-        f"<figcaption>{escape(title)}</figcaption>"
-        f'<div class="stage">{images}</div>'
-        '<input type="range" min="0" max="100" value="50" aria-label="where the two meet">'
-        f'<div class="choices"><label>left <select data-side="left">{choices}</select></label>'
-        f'<label>right <select data-side="right">{choices}</select></label></div></figure>'
-    )
+    urls = {name: _url(content, "image/jpeg") for name, content in view.pictures.items()}
+    return {"kind": "views", "shape": f"{view.shape:.4f}", "caption": caption, "urls": urls}

@@ -1,10 +1,8 @@
-"""The folder of a benchmark, whose runs are folders: reading them, and carrying out what is left.
+"""The folder of a benchmark, whose runs are folders: reading them, and what is left to do.
 
-Notation: ``BENCH`` holds ``plan.toml``, ``planned.json`` with the calls of the command and the runs
-of the last plan, and ``runs/KEY`` for each run that ended: ``result.json`` if it is finished,
-``error.json`` if it failed; ``scenes/demo`` if a plan asks for it. Promise: the folders are the
-record: a run with a ``result.json`` is finished and never repeated, anything else is started anew;
-a folder that is not a benchmark's is never written to.
+``planned.json`` has the calls of the command and the runs of the last plan, ``runs/KEY`` each run
+that ended: with a ``result.json`` it is finished and never repeated, with an ``error.json`` it
+failed. A folder that is not a benchmark's is never written to.
 """
 
 from __future__ import annotations
@@ -23,8 +21,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from splatseed.bench.plan import RunResult, RunSpec, rule_of_thumb
-from splatseed.bench.scenes import SceneFacts
+from splatseed.bench.plan import RunResult, RunSpec
 from splatseed.errors import OutputError, SceneFormatError, SceneNotFoundError
 from splatseed.io.files import read_text
 from splatseed.io.staging import MANIFEST, check_apart, check_output, read_manifest, write_json
@@ -32,17 +29,7 @@ from splatseed.literal import counted
 
 RESULT, ERROR = "result.json", "error.json"
 _PLANNED = "planned.json"
-DEMO_FACTS = SceneFacts(
-    "demo",
-    "demo:",
-    "not made yet",
-    num_points=11_364,
-    num_images=40,
-    pixels=400 * 300,
-    long_side=400,
-    depth_digest="not made yet",
-)
-"""Facts about the synthetic room before it is made; the number of points is approximate."""
+_PACKAGES = ("splatseed", "torch", "gsplat", "torchmetrics", "numpy", "scipy", "numba", "ray")
 
 
 @dataclass(frozen=True)
@@ -65,11 +52,7 @@ def read_run(bench: Path, spec: RunSpec) -> Run:
 
 
 def _read(folder: Path, spec: RunSpec | None = None) -> Run:
-    """What a run's folder tells; of an unfinished run whose specification is given, that.
-
-    Raises:
-        SceneFormatError: It is not of the layout that this version writes.
-    """
+    """What a run's folder tells; of an unfinished run whose specification is given, that."""
     for name in (RESULT, ERROR):
         with suppress(FileNotFoundError, NotADirectoryError):
             text = read_text(folder / name)
@@ -111,8 +94,8 @@ def read_runs(bench: Path) -> list[Run]:
 
 def counts(runs: Sequence[Run]) -> str:
     """How many runs there are of each kind, in words."""
-    done, failed = (sum(map(bool, kind)) for kind in
-                    ([run.result for run in runs], [run.error for run in runs]))  # fmt: skip
+    done = sum(run.result is not None for run in runs)
+    failed = sum(bool(run.error) for run in runs)
     left = len(runs) - done - failed
     kinds = {"done": done, "failed": failed, "to do": left if done or failed else 0}
     return ", ".join(
@@ -121,15 +104,10 @@ def counts(runs: Sequence[Run]) -> str:
 
 
 def check_bench_folder(folder: Path, verb: str, protect: Sequence[Path]) -> None:
-    """Refuse a folder that this verb did not write, before any work is done.
-
-    Args:
-        folder: The folder, which need not be there.
-        verb: "bench" or "tune".
-        protect: Scenes, which the folder must lie apart from.
+    """Refuse a folder that this verb (bench or tune) did not write, before any work is done.
 
     Raises:
-        OutputError: It is another's, or lies in a scene or around one.
+        OutputError: It is another's, or lies in a scene of ``protect`` or around one.
     """
     kind = read_manifest(folder).get("command")
     if kind == verb:
@@ -146,12 +124,6 @@ def check_bench_folder(folder: Path, verb: str, protect: Sequence[Path]) -> None
 
 def begin(bench: Path, verb: str, specs: Iterable[RunSpec], words: Sequence[str]) -> None:
     """Make the folder unless it exists, and record a call of the command and its runs.
-
-    Args:
-        bench: The folder.
-        verb: "bench" or "tune".
-        specs: The runs.
-        words: What followed the verb on the command line.
 
     Raises:
         OutputError: It cannot be written.
@@ -175,12 +147,10 @@ def _planned(bench: Path) -> dict[str, list[Any]]:
 
 
 def _describe_call(verb: str, words: Sequence[str]) -> dict[str, Any]:
-    packages = ("splatseed", "torch", "gsplat", "torchmetrics", "numpy", "scipy", "numba", "ray")
     cpu = platform.processor() or platform.machine()
     with suppress(OSError, StopIteration):
         lines = Path("/proc/cpuinfo").read_text("utf-8", "replace").splitlines()
-        named = next(line for line in lines if line.startswith("model name"))
-        cpu = named.partition(":")[2].strip()
+        cpu = next(line.partition(": ")[2] for line in lines if line.startswith("model name"))
     return {
         "command": shlex.join(["splatseed", verb, *words]),
         "started": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
@@ -190,7 +160,7 @@ def _describe_call(verb: str, words: Sequence[str]) -> dict[str, Any]:
         "cpu": cpu,
         "cores": os.cpu_count(),
         "python": platform.python_version(),
-        "versions": {name: known for name in packages if (known := package_version(name))},
+        "versions": {name: known for name in _PACKAGES if (known := package_version(name))},
     }
 
 
@@ -202,46 +172,15 @@ def package_version(package: str) -> str:
         return ""
 
 
-def make_demo_scene(folder: Path) -> Path:
-    """The synthetic room of ``splatseed demo`` in a folder, made unless it exists; its place.
-
-    Raises:
-        OutputError: It cannot be written.
-    """
-    path = folder / "demo"
-    if path.is_dir():
-        return path
-    from splatseed.synthetic import make_capture, write_capture  # noqa: PLC0415  (Numba)
-
-    return write_capture(make_capture(), path)
-
-
-def estimate(
-    specs: Sequence[RunSpec], scenes: Iterable[SceneFacts], runs: Iterable[Run], threads: int
-) -> list[float]:
-    """Seconds of each of some runs: by the pace of finished ones, else by a rule of thumb.
-
-    Args:
-        specs: The runs.
-        scenes: Facts about their scenes.
-        runs: Runs of which some may be finished.
-        threads: Threads of each run, on the CPU.
-    """
-    facts = {scene.digest: scene for scene in scenes}
-    paces: dict[tuple[str, ...], list[float]] = {}
+def estimate(specs: Sequence[RunSpec], runs: Iterable[Run], threads: int) -> float:
+    """Seconds of runs one after another, each on so many threads, at the pace of finished ones."""
+    paces: dict[tuple[str, str], list[float]] = {}
     for run in runs:
-        if run.result is not None and run.spec.scene_digest in facts:
-            modelled = rule_of_thumb(run.spec, facts[run.spec.scene_digest], threads)
-            for known in _likeness(run.spec):
-                paces.setdefault(known, []).append(run.result.wall_seconds / modelled)
-    seconds = []
-    for spec in specs:
-        pace = next((paces[each] for each in _likeness(spec) if each in paces), [1.0])
-        seconds.append(median(pace) * rule_of_thumb(spec, facts[spec.scene_digest], threads))
-    return seconds
-
-
-def _likeness(spec: RunSpec) -> tuple[tuple[str, ...], ...]:
-    """What a run has in common with others, the most telling first."""
-    scene, strategy = spec.scene_digest, spec.arm.strategy
-    return (scene, strategy, spec.arm.method), (scene, strategy), (strategy,), ()
+        if run.result is not None:
+            pace = run.result.wall_seconds / run.spec.seconds(threads)
+            paces.setdefault((run.spec.scene.digest, run.spec.arm.strategy), []).append(pace)
+    whole = [pace for each in paces.values() for pace in each] or [1.0]
+    return sum(
+        median(paces.get((spec.scene.digest, spec.arm.strategy), whole)) * spec.seconds(threads)
+        for spec in specs
+    )

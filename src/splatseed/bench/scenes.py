@@ -1,21 +1,16 @@
 """Scenes of a benchmark: opening one, checking it before it is run, and its fingerprints.
 
-Promise: a benchmark always opens a scene in the same way; whatever would make every run on a scene
-fail (no photographs, lenses with distortion, unreadable depth or scan) is detected here, before any
-run. A fingerprint depends on content alone, not on where files are, when they were written, or the
-order in which a system lists them; photographs and scans count byte for byte, depth maps as read.
+Whatever would make every run on a scene fail is detected here, before any run. A fingerprint
+depends on content alone: not on where files are, or the order in which a system lists them;
+photographs and scans count byte for byte, depth maps as read.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
-import os
-from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 
@@ -26,47 +21,57 @@ from splatseed.io.clouds import open_cloud
 from splatseed.io.files import open_file
 from splatseed.io.load import search_depths
 from splatseed.io.photograph import open_photograph, photograph_bytes
-from splatseed.progress import Progress, silent
+from splatseed.progress import Progress, in_threads, silent
 from splatseed.scene import Scene
 from splatseed.splat.gaussians import stray_note, stray_views
 from splatseed.views.view import check_lens, poses_of
 
-Item = TypeVar("Item")
+DEMO = "demo:"
+"""The path of the synthetic room, which is made in the benchmark's folder on demand."""
 _SIZE = 16
 """Bytes of a fingerprint."""
 
 
 @dataclass(frozen=True)
-class SceneFacts:
-    """Facts about a scene.
+class PlannedScene:
+    """A scene of a plan."""
 
-    Args:
-        name: The scene's name in tables.
-        path: Its folder, absolute.
-        digest: Fingerprint of its points, cameras and photographs.
-        num_points: Distinct finite points, which plain ``SFM`` trains from.
-        num_images: Number of photographs.
-        pixels: Pixels of the first photograph, as in its file.
-        long_side: Pixels of its longer side.
-        images: The folder of photographs within the scene's; empty for the default one.
-        depth_path: Where its depth maps lie, absolute; empty without.
-        depth_digest: Their fingerprint; empty without.
-        cloud_path: The file of its scan, absolute; empty without.
-        cloud_digest: Its fingerprint; empty without.
-        warnings: What is odd about it, one sentence each.
+    path: str
+    """Its folder; ``DEMO`` for the synthetic room."""
+    name: str = ""
+    """Its name in tables; the folder's name when left empty."""
+    images: str = ""
+    """The folder of photographs within it, such as ``images_4``; detected when left empty."""
+    depth: str = ""
+    """The folder of its depth maps; looked for in the scene when left out."""
+    cloud: str = ""
+    """The file of its scan, in the scene's frame."""
+
+    @property
+    def is_demo(self) -> bool:
+        """Whether it is the synthetic room."""
+        return self.path == DEMO
+
+    @property
+    def label(self) -> str:
+        """Its name, or its folder's."""
+        return self.name or ("demo" if self.is_demo else Path(self.path).resolve().name)
+
+
+@dataclass(frozen=True)
+class SceneFacts(PlannedScene):
+    """A scene after ``survey``: with its name, absolute paths, and what they hold.
+
+    ``num_points`` are distinct finite ones, which plain ``SFM`` trains from; ``pixels`` and
+    ``long_side`` are the first photograph's; digests are fingerprints, empty without such files.
     """
 
-    name: str
-    path: str
-    digest: str
-    num_points: int
-    num_images: int
-    pixels: int
-    long_side: int
-    images: str = ""
-    depth_path: str = ""
+    digest: str = ""
+    num_points: int = 0
+    num_images: int = 0
+    pixels: int = 1
+    long_side: int = 1
     depth_digest: str = ""
-    cloud_path: str = ""
     cloud_digest: str = ""
     warnings: tuple[str, ...] = ()
 
@@ -76,59 +81,67 @@ class SceneFacts:
         return (self.long_side // factor) * (short_side // factor)
 
 
-def open_scene(path: Path, *, images: str = "", depth: Path | None = None) -> Scene:
-    """A scene with its original points, as a run begins with it.
+_DEMO_FACTS = SceneFacts(
+    DEMO, "demo", digest="not made yet", num_points=11_364, num_images=40, pixels=400 * 300,
+    long_side=400, depth_digest="not made yet",
+)  # fmt: skip
+"""Facts about the synthetic room before it is made; the number of points is approximate."""
 
-    Args:
-        path: Its folder.
-        images: The folder of photographs within it; the default one when left out.
-        depth: The folder of its depth maps, if needed.
+
+def open_scene(scene: PlannedScene) -> Scene:
+    """A scene with its original points, and with the depth maps that are named.
 
     Raises:
         SceneNotFoundError: There is no scene, or no such folder.
         SceneFormatError: A file is not what its format promises.
     """
-    scene = load_originals(path)
-    if images:
-        if scene.source is None or not (scene.source.root / images).is_dir():
+    opened = load_originals(Path(scene.path))
+    if scene.images:
+        if opened.source is None or not (opened.source.root / scene.images).is_dir():
             raise SceneNotFoundError(
-                f"the folder {images} in {path}",
+                f"the folder {scene.images} in {scene.path}",
                 found="no such folder",
                 fix="Name another folder of photographs, or none.",
             )
-        source = dataclasses.replace(scene.source, image_dir=scene.source.root / images)
-        scene = scene.replace(source=source)
-    return scene if depth is None else scene.replace(depths=find_depths(scene, depth))
+        source = replace(opened.source, image_dir=opened.source.root / scene.images)
+        opened = opened.replace(source=source)
+    return opened.replace(depths=find_depths(opened, Path(scene.depth))) if scene.depth else opened
 
 
 def survey(
-    path: Path,
-    name: str,
+    planned: PlannedScene,
     *,
-    images: str = "",
-    depth: Path | None = None,
+    demo: Path | None = None,
     with_depth: bool = False,
-    cloud: Path | None = None,
+    with_cloud: bool = False,
     progress: Progress = silent,
 ) -> SceneFacts:
     """Check a scene and all files that a run on it reads.
 
     Args:
-        path: Where it lies.
-        name: What to call it.
-        images: The folder of photographs within it; the one that is found when left out.
-        depth: The folder of its depth maps; if left out, they are looked for in the scene's.
-        with_depth: Whether depth maps are needed at all.
-        cloud: The file of its scan, if needed.
+        planned: The scene.
+        demo: Where the synthetic room is, or is to be made; None for its known facts.
+        with_depth: Whether depth maps are needed; if none are named, they are looked for.
+        with_cloud: Whether its scan is needed.
         progress: Told how far reading is.
 
     Raises:
         SceneNotFoundError: There is no scene, or a file is missing.
         SceneFormatError: A file is not what its format promises, or cameras have distortion.
     """
-    scene = open_scene(path, images=images)
+    if planned.is_demo:
+        if demo is None:
+            return replace(_DEMO_FACTS, name=planned.label)
+        planned = replace(planned, path=str(demo), name=planned.label)
+        if not demo.is_dir():
+            from splatseed.synthetic import make_capture, write_capture  # noqa: PLC0415  (Numba)
+
+            progress("make the demo scene", 0.0)
+            write_capture(make_capture(), demo)
+    path = Path(planned.path)
+    scene = open_scene(replace(planned, depth=""))
     folder = scene.source.image_dir if scene.source else None
-    if folder is None or not scene.images:
+    if scene.source is None or folder is None or not scene.images:
         raise SceneNotFoundError(
             f"photographs in {path}",
             found="none",
@@ -138,22 +151,25 @@ def survey(
         check_lens(image, path)
     first = folder / scene.images[0].name
     size = open_photograph(first, photograph_bytes(first)).size
-    maps = _depth_folder(scene, depth) if with_depth else None
+    cloud = Path(planned.cloud) if with_cloud and planned.cloud else None
     if cloud is not None:
         open_cloud(cloud)  # a header that makes no sense is told now
+    depth = Path(planned.depth) if planned.depth else scene.source.root
+    maps = ""
+    if with_depth and (planned.depth or search_depths(scene, depth) is not None):
+        maps, scene = str(depth.resolve()), scene.replace(depths=find_depths(scene, depth))
+    scan = "" if cloud is None else str(cloud.resolve())
     return SceneFacts(
-        name=name,
         path=str(path.resolve()),
-        digest=scene_digest(scene, folder, progress),
+        name=planned.label,
+        images=planned.images,
+        depth=maps,
+        cloud=scan,
         num_points=len(scene.points),
         num_images=len(scene.images),
         pixels=size[0] * size[1],
         long_side=max(size),
-        images=images,
-        depth_path="" if maps is None else str(maps.resolve()),
-        depth_digest="" if maps is None else depth_digest(find_depths(scene, maps), progress),
-        cloud_path="" if cloud is None else str(cloud.resolve()),
-        cloud_digest="" if cloud is None else cloud_digest(cloud, progress),
+        **fingerprints(scene, maps, scan, progress),
         warnings=(
             *scene.warnings,
             *([scene.listed.sentence] if scene.listed else []),
@@ -162,27 +178,21 @@ def survey(
     )
 
 
-def _depth_folder(scene: Scene, depth: Path | None) -> Path | None:
-    """Where the depth maps lie: what is named, else the scene's own folder if it has some."""
-    if depth is not None:
-        find_depths(scene, depth)
-        return depth
-    root = scene.source.root if scene.source else None
-    return root if root is not None and search_depths(scene, root) is not None else None
+def fingerprints(
+    scene: Scene, depth: str, cloud: str, progress: Progress = silent
+) -> dict[str, str]:
+    """The digests of ``SceneFacts``, as files are now; empty without a path of depth or scan."""
+    folder = scene.source.image_dir if scene.source else None
+    maps = scene.depths if depth else None
+    return {
+        "digest": "" if folder is None else scene_digest(scene, folder, progress),
+        "depth_digest": "" if maps is None else _depth_digest(maps, progress),
+        "cloud_digest": _cloud_digest(Path(cloud), progress) if cloud else "",
+    }
 
 
 def scene_digest(scene: Scene, folder: Path, progress: Progress = silent) -> str:
-    """Fingerprint of a scene's points, tracks, cameras and photographs: 32 hexadecimal digits.
-
-    Args:
-        scene: The scene.
-        folder: Where its photographs lie.
-        progress: Told how far reading is.
-
-    Raises:
-        SceneNotFoundError: A photograph is missing.
-        SceneFormatError: One cannot be read.
-    """
+    """Fingerprint of a scene's points, tracks, cameras and photographs: 32 hexadecimal digits."""
     digest = hashlib.blake2b(digest_size=_SIZE)
     _add(digest, scene.points.xyz, scene.points.rgb)
     if scene.tracks is not None:
@@ -191,56 +201,36 @@ def scene_digest(scene: Scene, folder: Path, progress: Progress = silent) -> str
     images = sorted(scene.images, key=lambda image: image.name)
     for image in images:
         lens = image.intrinsics
-        _add_words(digest, (image.name, lens.model, lens.width, lens.height))
+        _add(digest, (image.name, lens.model, lens.width, lens.height))
         _add(digest, np.array(lens.params, np.float64), image.quat, image.translation)
         if image.observations is not None:
             _add(digest, image.observations.xy, image.observations.point_ids)
     if scene.listed is not None:
-        _add_words(digest, (sorted(scene.listed.train), sorted(scene.listed.test)))
-    photographs = [folder / image.name for image in images]
+        _add(digest, (sorted(scene.listed.train), sorted(scene.listed.test)))
 
-    def of_file(path: Path) -> bytes:
-        return hashlib.blake2b(photograph_bytes(path), digest_size=_SIZE).digest()
+    def of_file(i: int) -> bytes:
+        content = photograph_bytes(folder / images[i].name)
+        return hashlib.blake2b(content, digest_size=_SIZE).digest()
 
-    for each in _in_threads(of_file, photographs, "fingerprint photographs", progress):
-        digest.update(each)
-    return digest.hexdigest()
+    return _with_files(digest, of_file, len(images), "fingerprint photographs", progress)
 
 
-def depth_digest(maps: DepthMaps, progress: Progress = silent) -> str:
-    """Fingerprint of a scene's depth maps as they are read: 32 hexadecimal digits.
+def _depth_digest(maps: DepthMaps, progress: Progress) -> str:
+    """Fingerprint of depth maps as they are read."""
+    names = sorted(maps)
 
-    Args:
-        maps: The maps.
-        progress: Told how far reading is.
-
-    Raises:
-        SceneNotFoundError: A file is gone.
-        SceneFormatError: One is not what its format promises.
-    """
-
-    def of_map(name: str) -> bytes:
-        depth_map = maps.read(name)
-        digest = hashlib.blake2b(f"{name}\n{depth_map.kind}\n".encode(), digest_size=_SIZE)
+    def of_map(i: int) -> bytes:
+        depth_map = maps.read(names[i])
+        digest = hashlib.blake2b(f"{names[i]}\n{depth_map.kind}\n".encode(), digest_size=_SIZE)
         _add(digest, depth_map.values)
         return digest.digest()
 
     digest = hashlib.blake2b(digest_size=_SIZE)
-    for each in _in_threads(of_map, sorted(maps), "fingerprint depth", progress):
-        digest.update(each)
-    return digest.hexdigest()
+    return _with_files(digest, of_map, len(names), "fingerprint depth", progress)
 
 
-def cloud_digest(path: Path, progress: Progress = silent) -> str:
-    """Fingerprint of a scan's file, byte for byte: 32 hexadecimal digits.
-
-    Args:
-        path: The file.
-        progress: Told that it is read.
-
-    Raises:
-        SceneNotFoundError: There is no such file.
-    """
+def _cloud_digest(path: Path, progress: Progress) -> str:
+    """Fingerprint of a scan's file, byte for byte."""
     progress("fingerprint the scan", 0.0)
     digest = hashlib.blake2b(digest_size=_SIZE)
     with open_file(path) as file:
@@ -249,22 +239,29 @@ def cloud_digest(path: Path, progress: Progress = silent) -> str:
     return digest.hexdigest()
 
 
-def _add(digest: hashlib.blake2b, *arrays: np.ndarray) -> None:
-    """Arrays, hashed with their shapes so that two are never taken for one."""
-    for array in arrays:
-        digest.update(repr((array.shape, array.dtype.str)).encode())
-        digest.update(array.tobytes())
+def _add(digest: hashlib.blake2b, *values: object) -> None:
+    """Arrays, hashed with their shapes so that two are never taken for one, and words."""
+    for value in values:
+        if isinstance(value, np.ndarray):
+            digest.update(repr((value.shape, value.dtype.str)).encode())
+            digest.update(value.tobytes())
+        else:
+            digest.update(repr(value).encode("utf-8", "backslashreplace"))
 
 
-def _add_words(digest: hashlib.blake2b, words: tuple[object, ...]) -> None:
-    digest.update(repr(words).encode("utf-8", "backslashreplace"))
+def _with_files(
+    digest: hashlib.blake2b,
+    of_file: Callable[[int], bytes],
+    count: int,
+    stage: str,
+    progress: Progress,
+) -> str:
+    """The fingerprint with those of files, which several threads read."""
+    each = [b""] * count
 
+    def work(start: int, _stop: int) -> None:
+        each[start] = of_file(start)
 
-def _in_threads(
-    work: Callable[[Item], bytes], items: Sequence[Item], stage: str, progress: Progress
-) -> Iterable[bytes]:
-    """The work's results in the order of the items."""
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        for done, each in enumerate(pool.map(work, items), start=1):
-            yield each
-            progress(stage, done / len(items))
+    in_threads(work, count, 1, stage, progress)
+    digest.update(b"".join(each))
+    return digest.hexdigest()

@@ -1,9 +1,8 @@
 """Studies: sets of finished runs that differ only in their seeds and so can be compared.
 
-Notation: a *variant* is what makes the seeds (method, profile, ratio, parameters), known by its
-label, such as ``mls 8x``; a *study* holds runs whose settings are equal in all but the variant, the
-strategy, the scene and the repeat. Promise: runs of different settings or versions are never
-compared; a run whose PSNR is not finite is set aside and counted, not averaged.
+A *variant* is what makes the seeds (method, profile, ratio, parameters), known by its label, such
+as ``mls 8x``. Runs of different settings or versions are never compared; a run whose PSNR is not
+finite is set aside and counted, not averaged.
 """
 
 from __future__ import annotations
@@ -17,76 +16,35 @@ from typing import get_args
 
 import pandas as pd
 
-from splatseed.bench.plan import SFM, SHARED, RunResult, RunSpec
+from splatseed.bench.plan import SFM, SHARED, Arm, RunResult, RunSpec
 from splatseed.bench.runs import Run
 from splatseed.train.settings import StrategyName
 from splatseed.upsample import METHODS
 
-STRATEGIES: tuple[StrategyName, ...] = get_args(StrategyName)
-
-
-@dataclass(frozen=True)
-class Variant:
-    """How seeds are made.
-
-    Args:
-        method: ``SFM``, or a key of ``splatseed.METHODS``.
-        profile: "default" or "paper".
-        ratio: Points in all, per original; 0 for any.
-        parameters: Differences from the profile, as words such as ``k=12``.
-    """
-
-    method: str
-    profile: str = "default"
-    ratio: float = 1.0
-    parameters: tuple[str, ...] = ()
-
-    @property
-    def label(self) -> str:
-        """In a few words, such as ``mls 8x`` or ``mls 8x (paper) k=12``."""
-        if self.method == SFM:
-            return SFM
-        ratio = f" {self.ratio:g}x" if self.ratio else ""
-        profile = " (paper)" if self.profile == "paper" else ""
-        return " ".join([f"{self.method}{ratio}{profile}", *self.parameters])
-
-    @property
-    def family(self) -> str:
-        """The label without the ratio: that of variants which differ in nothing else."""
-        return replace(self, ratio=0.0).label
-
-    @property
-    def order(self) -> tuple[int, str, str, float, tuple[str, ...]]:
-        """Sorts variants: the baseline, then the methods in the registry's order."""
-        names = [SFM, *METHODS]
-        place = names.index(self.method) if self.method in names else len(names)
-        return place, self.method, self.profile, self.ratio, self.parameters
+_COLUMNS = ("strategy", "scene", "seeds", "repeat", "spec", "result")
 
 
 @dataclass(frozen=True, eq=False)
 class Study:
-    """Runs that can be compared.
+    """Runs that can be compared: with the same training settings, budget and version.
 
     Args:
-        settings: What they have in common: training settings by name, budget and version.
+        settings: These, by name.
         runs: A row for each run, with the columns strategy, scene, seeds (the variant's label),
-            repeat, key, digest (the scene's), result, and the measures of ``_measures``; NaN where
-            something was not measured.
-        variants: By label, in order; the baseline first if there is one.
-        specs: The runs' specifications, by key.
+            repeat, spec, result, and those of ``_measures``; NaN where it was not measured.
+        variants: One of each variant's arms by its label, in order, the baseline first.
         not_finite: Finished runs whose PSNR is infinite or NaN, in words.
     """
 
     settings: Mapping[str, object]
     runs: pd.DataFrame
-    variants: Mapping[str, Variant]
-    specs: Mapping[str, RunSpec]
+    variants: Mapping[str, Arm]
     not_finite: tuple[str, ...] = ()
 
     @cached_property
     def strategies(self) -> tuple[StrategyName, ...]:
         """The strategies that have runs."""
-        return tuple(name for name in STRATEGIES if name in set(self.runs["strategy"]))
+        return tuple(name for name in get_args(StrategyName) if name in set(self.runs["strategy"]))
 
     @cached_property
     def scenes(self) -> tuple[str, ...]:
@@ -97,6 +55,11 @@ class Study:
     def seeded(self) -> tuple[str, ...]:
         """The labels of all variants but the baseline."""
         return tuple(label for label in self.variants if label != SFM)
+
+    def family(self, label: str) -> str:
+        """A variant's label without the ratio: that of variants which differ in nothing else."""
+        arm = self.variants[label]
+        return replace(arm, ratio=0.0).label + label.removeprefix(arm.label)
 
     def under(self, strategy: StrategyName) -> pd.DataFrame:
         """The runs under a strategy."""
@@ -116,6 +79,14 @@ class Study:
         part = self.under(strategy)
         part = part[(part["scene"] == scene) & (part["seeds"] == label)]
         return dict(sorted(zip(part["repeat"], part["result"], strict=True)))
+
+    def scores(self, strategy: StrategyName, scene: str) -> pd.DataFrame:
+        """PSNR of a scene, [A, R]: a row per variant, the baseline first, NaN without a run."""
+        part = self.under(strategy)
+        scores = part[part["scene"] == scene].pivot_table(
+            index="seeds", columns="repeat", values="psnr"
+        )
+        return scores.reindex([SFM, *self.seeded_under(strategy)])
 
     @property
     def description(self) -> str:
@@ -161,22 +132,31 @@ def _size(factor: object) -> str:
     return "at full size" if factor == 1 else f"at 1/{factor} of their size"
 
 
+def variant_order(variant: tuple[str, Arm]) -> tuple[object, ...]:
+    """Sorts variants with their labels: the baseline, then methods in the registry's order."""
+    (label, arm), names = variant, [SFM, *METHODS]
+    place = names.index(arm.method) if arm.method in names else len(names)
+    return place, arm.method, arm.profile, arm.ratio, label
+
+
 def studies(runs: Iterable[Run]) -> tuple[Study, ...]:
-    """The studies in some runs; the one with the most runs first.
+    """The studies in some runs, those that are finished; the one with the most runs first.
 
     Scenes may differ in size; only where one scene was run at several ``data_factor`` are these
     kept apart. If a scene's name stands for different content, its label says which.
-
-    Args:
-        runs: Those not finished are passed over.
     """
     groups: dict[tuple[tuple[str, object], ...], list[Run]] = defaultdict(list)
     for run in runs:
         if run.result is not None:
             groups[tuple(_common(run.spec).items())].append(run)
-    grouped = [
-        _study(dict(key), part) for key, group in groups.items() for part in _by_factor(group)
-    ]
+    grouped = []
+    for key, group in groups.items():
+        sizes = {(run.spec.scene.digest, run.spec.training.data_factor) for run in group}
+        parts: dict[int, list[Run]] = defaultdict(list)
+        for run in group:  # apart where a scene has several sizes
+            alone = len(sizes) > len({digest for digest, _ in sizes})
+            parts[run.spec.training.data_factor if alone else 0].append(run)
+        grouped += [_study(dict(key), part) for part in parts.values()]
     return tuple(sorted(grouped, key=lambda study: -len(study.runs)))
 
 
@@ -188,58 +168,34 @@ def _common(spec: RunSpec) -> dict[str, object]:
     return {**settings, "budget": spec.arm.budget, "version": spec.version}
 
 
-def _by_factor(runs: Sequence[Run]) -> list[list[Run]]:
-    """The runs as one group, or one per ``data_factor`` where a scene has several."""
-    factors: dict[str, set[int]] = defaultdict(set)
-    groups: dict[int, list[Run]] = defaultdict(list)
-    for run in runs:
-        factors[run.spec.scene_digest].add(run.spec.training.data_factor)
-        groups[run.spec.training.data_factor].append(run)
-    several = any(len(each) > 1 for each in factors.values())
-    return list(groups.values()) if several else [list(runs)]
-
-
 def _study(settings: Mapping[str, object], runs: Sequence[Run]) -> Study:
     digests, maps = defaultdict(set), defaultdict(set)
-    for run in runs:
-        digests[run.spec.scene].add(run.spec.scene_digest)
-        maps[run.spec.scene_digest].add(run.spec.depth_digest)
+    for of in (run.spec.scene for run in runs):
+        digests[of.name].add(of.digest)
+        maps[of.digest].add(of.depth_digest)
     several_maps = any(len(each - {""}) > 1 for each in maps.values())
-    variants: dict[str, Variant] = {}
+    variants: dict[str, Arm] = {}
     factors: dict[str, int] = {}
     rows, odd = [], []
     for run in runs:
         spec, result = run.spec, run.result
         assert result is not None  # noqa: S101  (only finished runs are grouped)
-        told = len(digests[spec.scene]) > 1
-        scene = f"{spec.scene} ({spec.scene_digest[:4]})" if told else spec.scene
+        arm, of = spec.arm, spec.scene
+        scene = f"{of.name} ({of.digest[:4]})" if len(digests[of.name]) > 1 else of.name
         if not math.isfinite(result.psnr):
-            odd.append(f"{scene}, {spec.arm.label}, {spec.arm.strategy}, {spec.repeat}")
+            odd.append(f"{scene}, {arm.label}, {arm.strategy}, {spec.repeat}")
             continue
-        variant = _variant(spec, with_maps=several_maps)
-        variants[variant.label] = variant
+        label = _label(spec, with_maps=several_maps)
+        variants.setdefault(label, arm)
         factors[scene] = min(spec.training.data_factor, factors.get(scene, 10**9))
-        rows.append(
-            {
-                "strategy": spec.arm.strategy,
-                "scene": scene,
-                "seeds": variant.label,
-                "repeat": spec.repeat,
-                "key": spec.key,
-                "digest": spec.scene_digest,
-                "result": result,
-                **_measures(result),
-            }
-        )
+        row = zip(_COLUMNS, (arm.strategy, scene, label, spec.repeat, spec, result), strict=True)
+        rows.append({**dict(row), **_measures(result)})
     same_size = len(set(factors.values())) == 1
     factor = next(iter(factors.values())) if same_size else dict(sorted(factors.items()))
-    ordered = sorted(variants.values(), key=lambda each: each.order)
-    columns = None if rows else ["strategy", "scene", "seeds", "repeat", "key", "digest", "result"]
     return Study(
         {**settings, "data_factor": factor},
-        pd.DataFrame(rows, columns=columns),
-        {each.label: each for each in ordered},
-        {run.spec.key: run.spec for run in runs},
+        pd.DataFrame(rows, columns=None if rows else _COLUMNS),
+        dict(sorted(variants.items(), key=variant_order)),
         tuple(odd),
     )
 
@@ -265,14 +221,12 @@ def _measures(result: RunResult) -> dict[str, float]:
     return {name: math.nan if value is None else float(value) for name, value in measures.items()}
 
 
-def _variant(spec: RunSpec, *, with_maps: bool) -> Variant:
-    """The variant of a run; told by its depth maps if a scene has several sets of them."""
+def _label(spec: RunSpec, *, with_maps: bool) -> str:
+    """A variant's label; it names the depth maps if a scene has several sets of them."""
     if spec.arm.method == SFM:
-        return Variant(SFM)
+        return SFM
     # A plan asks every method that looks at photographs to hold out the test views.
     usual = [("hold_out", spec.training.test_every), ("cloud.hold_out", spec.training.test_every)]
-    told = [each for each in sorted(spec.parameters.items()) if each not in usual]
-    words = [f"{name}={value}" for name, value in told]
-    if with_maps and spec.depth_digest:
-        words.append(f"maps={spec.depth_digest[:4]}")
-    return Variant(spec.arm.method, spec.arm.profile, spec.arm.ratio, tuple(words))
+    told = [f"{k}={v}" for k, v in sorted(spec.parameters.items()) if (k, v) not in usual]
+    maps = [f"maps={spec.scene.depth_digest[:4]}"] if with_maps and spec.scene.depth_digest else []
+    return " ".join([spec.arm.label, *told, *maps])

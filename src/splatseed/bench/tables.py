@@ -1,8 +1,6 @@
-"""Tables as CSV, Markdown, LaTeX and HTML.
+"""Tables as CSV, Markdown, LaTeX and HTML; ``data/tables.toml`` has their titles and notes.
 
-Notation: a *cell* is words, or a number with its standard error, a mark and whether it is bold.
-Promise: CSV has unrounded numbers, with separate columns for standard errors and marks; the others
-have rounded ones, with their marks explained below; names are escaped.
+CSV has unrounded numbers, with separate columns for standard errors and marks; names are escaped.
 """
 
 from __future__ import annotations
@@ -10,34 +8,31 @@ from __future__ import annotations
 import html
 import math
 import re
+import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import pandas as pd
 
 from splatseed.io.staging import atomic_file
 
-_TEX = {
+_TEX = str.maketrans({
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_",
     "{": r"\{", "}": r"\}", "~": r"$\sim$", "^": r"\^{}", "±": r"$\pm$", "†": r"$\dagger$",
     "∞": r"$\infty$", "≤": r"$\le$", "<": r"$<$", ">": r"$>$",
-}  # fmt: skip
+})  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Number:
-    """A number in a table.
+    """A number in a table, NaN where it is unknown, shown with so many decimals.
 
-    Args:
-        value: The number; NaN where it is unknown.
-        digits: Decimals shown.
-        se: Its standard error, NaN where one sample leaves it unknown; None where it has none.
-        signed: Whether a gain is shown with its plus.
-        text: Words behind it.
-        mark: A sign behind it, explained in the table's notes.
-        bold: Whether it is the best of its row.
+    ``se`` is its standard error, NaN where one sample leaves it unknown, None where it has none;
+    ``signed`` is for gains; ``text`` and a ``mark``, which the notes explain, stand behind it.
     """
 
     value: float
@@ -54,25 +49,57 @@ Cell: TypeAlias = Number | str
 
 @dataclass(frozen=True)
 class Table:
-    """A table.
-
-    Args:
-        name: Its file name without suffix.
-        title: What it shows.
-        header: One name per column.
-        rows: The cells, as many per row; the first names the row.
-        notes: Explanations, a sentence or more each.
-    """
+    """A table; ``name`` is its file's without suffix, and the first cell of a row names the row."""
 
     name: str
     title: str
-    header: tuple[str, ...]
+    header: Sequence[str]
     rows: Sequence[tuple[Cell, ...]]
-    notes: tuple[str, ...] = ()
+    notes: Sequence[str] = ()
+
+    def shown(
+        self, escape: Callable[[str], str] = str, bold: str = "{}", mark: str = " {}"
+    ) -> pd.DataFrame:
+        """The cells as text, with templates for bold ones and for marks."""
+
+        def text_of(cell: Cell) -> str:
+            text = escape(_cell_text(cell))
+            if isinstance(cell, str) or not text:
+                return text
+            text = bold.format(text) if cell.bold else text
+            return text + mark.format(escape(cell.mark)) if cell.mark else text
+
+        rows = [tuple(map(text_of, row)) for row in self.rows]
+        return pd.DataFrame(rows, columns=list(map(escape, self.header)))
 
 
-def cell_text(cell: Cell) -> str:
-    """A cell's number and words, as they are shown; without its mark."""
+def make_table(
+    kind: str,
+    header: Sequence[str],
+    rows: Sequence[tuple[Cell, ...]],
+    *,
+    name: str = "",
+    strategy: str = "",
+    **words: object,
+) -> Table:
+    """A table with its kind's title and notes, in which ``words`` take the place of braces.
+
+    Its name is the kind, unless it has another one, and the strategy, if any.
+    """
+    spec = _texts()[kind]
+    texts = [spec["title"], *spec["notes"]]
+    title, *notes = (text.format(strategy=strategy, **words) for text in texts)
+    full = "_".join(filter(None, (name or kind, strategy)))
+    return Table(full, title, header, rows, list(filter(None, notes)))
+
+
+@cache
+def _texts() -> dict[str, Any]:
+    return tomllib.loads((files("splatseed.bench") / "data" / "tables.toml").read_text("utf-8"))
+
+
+def _cell_text(cell: Cell) -> str:
+    """A cell's number and words, without its mark."""
     if isinstance(cell, str):
         return cell
     if math.isnan(cell.value):
@@ -91,41 +118,22 @@ def _rounded(value: float, digits: int, *, signed: bool = False) -> str:
     return text.lstrip("+-") if not text.strip("+-0.,") else text
 
 
-def _shown(
-    table: Table, escape: Callable[[str], str], bold: str, mark: str = " {}"
-) -> pd.DataFrame:
-    """The cells as strings, with templates for bold ones and for marks."""
-
-    def shown(cell: Cell) -> str:
-        text = escape(cell_text(cell))
-        if isinstance(cell, str) or not text:
-            return text
-        text = bold.format(text) if cell.bold else text
-        return text + mark.format(escape(cell.mark)) if cell.mark else text
-
-    rows = [tuple(map(shown, row)) for row in table.rows]
-    return pd.DataFrame(rows, columns=list(map(escape, table.header)))
-
-
 def to_csv(table: Table) -> str:
     """The table as CSV, numbers in full."""
-    cells = zip(*table.rows, strict=True) if table.rows else ((),) * len(table.header)
-    parts = [part for name, column in zip(table.header, cells, strict=True)
-             for part in _csv_columns(name, column)]  # fmt: skip
-    frame = pd.DataFrame(dict(enumerate(values for _, values in parts)))
-    return str(frame.to_csv(index=False, header=[name for name, _ in parts], lineterminator="\n"))
+    columns = [part for i, name in enumerate(table.header)
+               for part in _csv_columns(name, [row[i] for row in table.rows])]  # fmt: skip
+    frame = pd.DataFrame(dict(enumerate(values for _, values in columns)))
+    return str(frame.to_csv(index=False, header=[name for name, _ in columns], lineterminator="\n"))
 
 
 def _csv_columns(name: str, cells: Sequence[Cell]) -> Iterator[tuple[str, list[str]]]:
     """A column, and where any cell has them one for standard errors and one for marks."""
-    yield name, [each if isinstance(each, str) else _full(each.value) for each in cells]
     numbers = [each if isinstance(each, Number) else Number(math.nan) for each in cells]
+    full = [_full(number.value) for number in numbers]
+    yield name, [c if isinstance(c, str) else n for c, n in zip(cells, full, strict=True)]
     if any(each.se is not None for each in numbers):
         yield f"{name} se", [_full(each.se) for each in numbers]
-    marks = [
-        " ".join(filter(None, ["best" if each.bold else "", each.mark, each.text]))
-        for each in numbers
-    ]
+    marks = [" ".join(filter(None, ("best" * each.bold, each.mark, each.text))) for each in numbers]
     if any(marks):
         yield f"{name} mark", marks
 
@@ -136,7 +144,7 @@ def _full(value: float | None) -> str:
 
 def to_markdown(table: Table) -> str:
     """The table in Markdown, with its title above and its notes below."""
-    shown = _shown(table, _escape_markdown, "**{}**")
+    shown = table.shown(_escape_markdown, "**{}**")
     right = ["---", *(["---:"] * (len(table.header) - 1))]
     lines = [table.header, right, *shown.itertuples(index=False, name=None)]
     notes = "".join(f"\n{_escape_markdown(note)}\n" for note in table.notes)
@@ -150,7 +158,7 @@ def _escape_markdown(text: str) -> str:
 
 def to_tex(table: Table) -> str:
     """The table as a LaTeX ``table``, for the package booktabs."""
-    text = _shown(table, _escape_tex, r"\textbf{{{}}}").to_latex(
+    text = table.shown(_escape_tex, r"\textbf{{{}}}").to_latex(
         index=False,
         escape=False,
         caption=_escape_tex(table.title),
@@ -162,34 +170,20 @@ def to_tex(table: Table) -> str:
 
 
 def _escape_tex(text: str) -> str:
-    return "".join(_TEX.get(letter, letter) for letter in text)
+    return text.translate(_TEX)
 
 
 def to_html(table: Table) -> str:
     """The table in HTML, without title and notes; the first column heads the rows."""
     mark = ' <span class="mark">{}</span>'
-    shown = _shown(table, html.escape, "<strong>{}</strong>", mark)
-    first = shown.columns[0]
-    shown.index = pd.Index(shown.pop(first))
-    shown.index.name = None
-    shown.columns.name = first
+    shown = table.shown(html.escape, "<strong>{}</strong>", mark)
+    shown = shown.set_index(shown.columns[0]).rename_axis(index=None, columns=shown.columns[0])
     return str(shown.to_html(escape=False, border=0, justify="right"))
 
 
-def write_table(table: Table, folder: Path) -> tuple[Path, ...]:
-    """Write ``NAME.csv``, ``NAME.md``, ``NAME.tex`` and ``NAME.html``.
-
-    Args:
-        table: The table.
-        folder: Where to.
-
-    Raises:
-        OutputError: A file cannot be written.
-    """
+def write_table(table: Table, folder: Path) -> None:
+    """Write ``NAME.csv``, ``NAME.md``, ``NAME.tex`` and ``NAME.html``."""
     kinds = {"csv": to_csv, "md": to_markdown, "tex": to_tex, "html": to_html}
-    paths = []
     for suffix, text in kinds.items():
-        paths.append(folder / f"{table.name}.{suffix}")
-        with atomic_file(paths[-1]) as partial:
+        with atomic_file(folder / f"{table.name}.{suffix}") as partial:
             partial.write_text(text(table), "utf-8", errors="backslashreplace")
-    return tuple(paths)

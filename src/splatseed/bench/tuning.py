@@ -1,21 +1,20 @@
 """Tuning one scene by successive halving: many arms in short runs, the best of them in longer ones.
 
-Notation: a *rung* trains some arms for a number of steps; the best go on to the next rung, which
-has twice the steps. The *baseline* (the scene's own points with ``default``) is in every rung.
-Promise: arms are ranked by validation views only, of a scene that lists training views alone: the
-photographs of test views are never opened; the verdict rests on the last finished rung, paired by
-view and repeat. After Jamieson and Talwalkar (2016), but every rung trains from the start, as a
-run's schedule depends on its length.
+A *rung* trains some arms; the best go on to the next, of twice the steps, which train from the
+start (Jamieson and Talwalkar 2016, but for that). Arms are ranked by validation views only, of a
+scene without the test views; the verdict rests on the last finished rung, paired by view.
 """
 
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 from statistics import fmean
+from typing import NamedTuple
 
 import numpy as np
 
@@ -31,6 +30,8 @@ KEPT = (1.0, 1 / 3, 1 / 6)
 """Share of the arms in each rung; the last rung repeats its runs."""
 LAST_REPEATS = 2
 LEAST_STEPS = 100
+_STEP = 10
+"""Steps of a first rung are tried in multiples of this."""
 _OVERTIME = 1.1
 """By how much the estimated time may exceed the time given."""
 _LEAST_VIEWS = 4
@@ -48,18 +49,12 @@ class Rung:
     repeats: int
 
 
-@dataclass(frozen=True)
-class Verdict:
+class Verdict(NamedTuple):
     """The verdict of the last rung.
 
-    Args:
-        winner: The arm with the highest mean PSNR.
-        gain: Its PSNR minus the baseline's, dB: mean and standard error over validation views and
-            repeats.
-        steps: Steps of its runs.
-        views: Number of validation views.
-        repeats: Runs of each arm.
-        ranking: All arms of that rung with their mean PSNR in dB, the best first.
+    ``winner`` is the arm with the highest mean PSNR, and ``gain`` what it gains over the baseline,
+    dB: mean and standard error over ``views`` validation views and ``repeats``; ``ranking`` has all
+    arms with their mean PSNR in dB, the best first.
     """
 
     winner: Arm
@@ -82,30 +77,25 @@ def plan_rungs(
     cost: Callable[[Sequence[Rung]], float],
     least_steps: int = 0,
 ) -> tuple[Rung, ...]:
-    """The longest rungs that fit into a time.
+    """The longest rungs that fit into a time, by an estimate of their cost in seconds.
 
-    Args:
-        num_arms: Number of arms.
-        seconds: The time.
-        most_steps: Most steps of the last rung.
-        cost: Estimates the seconds of some rungs.
-        least_steps: Fewest steps of the first rung.
+    The last has at most ``most_steps``, the first at least ``least_steps``.
 
     Raises:
         ParameterError: Not even the shortest sensible rungs fit.
     """
+    counts = [min(max(2, round(part * num_arms)), num_arms) for part in KEPT]
+    repeats = [1] * (len(KEPT) - 1) + [LAST_REPEATS]
 
     def rungs(steps: int) -> tuple[Rung, ...]:
-        counts = [min(max(2, round(part * num_arms)), num_arms) for part in KEPT]
-        repeats = [1] * (len(KEPT) - 1) + [LAST_REPEATS]
         pairs = enumerate(zip(counts, repeats, strict=True))
         return tuple(Rung(steps << i, arms, runs) for i, (arms, runs) in pairs)
 
     low = max(LEAST_STEPS, least_steps)
-    high = max(most_steps >> (len(KEPT) - 1), low)
-    while high - low > max(LEAST_STEPS // 10, 1):
-        middle = (low + high) // 2
-        low, high = (middle, high) if cost(rungs(middle)) <= seconds else (low, middle)
+    longer = range(low, (most_steps >> (len(KEPT) - 1)) + 1, _STEP)
+    fitting = bisect_right(longer, seconds, key=lambda steps: cost(rungs(steps)))
+    if fitting:
+        return rungs(longer[fitting - 1])
     if (needed := cost(rungs(low))) > _OVERTIME * seconds:
         raise ParameterError(
             f"--minutes {math.ceil(needed / 60)} or more: the shortest runs in which all arms come "
@@ -130,12 +120,9 @@ def _ranking(results: Results) -> list[tuple[Arm, float]]:
 
 
 def verdict(results: Results, steps: int) -> Verdict | None:
-    """The verdict of a rung; None without a run of the baseline, or of another arm.
+    """The verdict of a rung of so many steps; None without a run of the baseline, or of another.
 
-    Args:
-        results: Results of the rung. Of a round that was stopped, which has more repeats of some
-            arms, those count that all have.
-        steps: Steps of its runs.
+    Of a round that was stopped, which has more repeats of some arms, those count that all have.
     """
     done = [set(runs) for runs in results.values() if runs]
     common = set.intersection(*done) if done else set()
@@ -147,10 +134,8 @@ def verdict(results: Results, steps: int) -> Verdict | None:
         return None
     winner = ranking[0][0]
     shared = sorted(results[base].keys() & results[winner].keys())
-    if not shared:
-        return None
-    gains = np.stack([_of_views(results[winner][r]) - _of_views(results[base][r]) for r in shared])
-    gains = gains[:, np.isfinite(gains).all(axis=0)]
+    gains = np.array([_of_views(results[winner][r]) - _of_views(results[base][r]) for r in shared])
+    gains = gains[:, np.isfinite(gains).all(axis=0)] if shared else gains
     if not gains.size:
         return None
     gain = over_views_and_repeats(gains)
@@ -158,8 +143,7 @@ def verdict(results: Results, steps: int) -> Verdict | None:
 
 
 def _of_views(result: RunResult) -> np.ndarray:
-    scores = {view.name: view.psnr for view in result.scores.per_image}
-    return np.array([scores[name] for name in sorted(scores)])
+    return np.array([view.psnr for view in sorted(result.scores.per_image, key=lambda v: v.name)])
 
 
 def growth_within(steps: int) -> float:
@@ -176,11 +160,6 @@ def growth_within(steps: int) -> float:
     return float((1 + FASTEST) ** max(0, rounds - 1))
 
 
-def most_grown(num_points: int, steps: int) -> int:
-    """The most Gaussians that ``grow`` is sure to reach from so many points in so many steps."""
-    return max(2, math.floor(num_points * growth_within(steps)))
-
-
 def steps_to_grow(factor: float) -> int:
     """The fewest steps in which ``grow`` multiplies its Gaussians by a factor.
 
@@ -191,17 +170,9 @@ def steps_to_grow(factor: float) -> int:
 
 
 def make_validation_scene(scene_path: Path, target: Path, test_every: int = 8) -> Path:
-    """Write a scene's training views as a scene of their own, unless that exists.
+    """Write a scene's training views as a scene of their own, unless that exists; ``target``.
 
     Its runs are scored on every eighth of them; photographs are linked.
-
-    Args:
-        scene_path: The scene.
-        target: The folder to write.
-        test_every: Every n-th view is kept for testing.
-
-    Returns:
-        ``target``.
 
     Raises:
         SceneNotFoundError: There is no scene, or it has too few images.

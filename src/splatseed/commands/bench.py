@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import sys
-import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -14,47 +13,27 @@ from shutil import which
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
-from rich.progress import BarColumn, Progress as Bar, TaskID, TextColumn
+from rich.progress import BarColumn, Progress as Bar, TaskID, TextColumn, TimeRemainingColumn
 
 from splatseed.bench.job import JobOptions, do_runs
-from splatseed.bench.plan import (
-    DEMO,
-    DEPTH,
-    SFM,
-    Plan,
-    PlannedScene,
-    RunSpec,
-    expected_gaussians,
-    needs_cloud,
-    plan_runs,
-)
+from splatseed.bench.plan import DEPTH, SFM, Plan, RunSpec, needs_cloud, plan_runs
 from splatseed.bench.plan_file import PLAN, PresetName, plan_text, preset_plan, read_plan
 from splatseed.bench.runs import (
-    DEMO_FACTS,
     Run,
     begin,
     check_bench_folder,
     counts,
     estimate,
-    make_demo_scene,
     package_version,
     read_run,
     read_runs,
 )
-from splatseed.bench.scenes import SceneFacts, survey
+from splatseed.bench.scenes import PlannedScene, SceneFacts, survey
 from splatseed.commands.options import check_least, parse_options
-from splatseed.console import (
-    ERR,
-    OUT,
-    print_note,
-    print_pairs,
-    print_table,
-    stage_display,
-)
+from splatseed.console import ERR, OUT, print_note, print_pairs, print_table, stage_display
 from splatseed.errors import ParameterError, SceneNotFoundError
 from splatseed.io.staging import atomic_file, check_output, output_folder
 from splatseed.literal import counted, did_you_mean, quoted, visible
-from splatseed.progress import Progress
 from splatseed.requirements import require
 from splatseed.runtime.interruption import exit_code
 from splatseed.runtime.memory import check_memory
@@ -163,36 +142,16 @@ def run(arguments: list[str]) -> None:
             found=repr(arguments[0]),
             fix=f"{meant}Name scenes with --scenes; see splatseed bench --help.",
         )
-    options, asked = parse_plan(arguments)
-    with open_machine(options, asked.plan.training.backend) as machine:
-        if options.dry_run or options.output is None:
-            _dry_run(options, asked, machine)
-        else:
-            _run(asked, options.output, machine, arguments)
+    options, plan, missing = parse_plan(arguments)
+    with open_machine(options, plan.training.backend) as machine:
+        _bench(options, plan, missing, machine, arguments)
 
 
-@dataclass(frozen=True)
-class Asked:
-    """What the options ask for: a plan, and the scenes of a preset that do not exist.
-
-    ``lenient``: whether unusable scenes are skipped.
-    """
-
-    plan: Plan
-    missing: tuple[str, ...] = ()
-    lenient: bool = False
-
-
-def parse_plan(arguments: Sequence[str]) -> tuple[Options, Asked]:
-    """The options of a command line, and the plan that they ask for.
+def parse_plan(arguments: Sequence[str]) -> tuple[Options, Plan, tuple[str, ...]]:
+    """The options of a command line, the plan that they ask for, and a preset's missing scenes.
 
     An option that is not given leaves the plan unchanged: that of a preset, of a file, of the
     folder to resume, or the default one.
-
-    Raises:
-        ParameterError: Options contradict each other, or a value is out of its range.
-        SceneNotFoundError: A plan or a preset's scenes are not there.
-        SceneFormatError: The plan's file is not one.
     """
     options = parse_options(Options, "bench", arguments)
     check_least(options, 1, "jobs", "repeats", "long_side", "max_steps", "data_factor")
@@ -210,79 +169,67 @@ def parse_plan(arguments: Sequence[str]) -> tuple[Options, Asked]:
     ):  # fmt: skip
         if not fits:
             raise ParameterError(expected, found=found, fix=fix)
-    asked = Asked(_DEFAULT)
+    plan, missing = _DEFAULT, tuple[str, ...]()
     earlier = options.output / PLAN if options.output and not options.scenes else None
     if options.preset is not None:
         plan, missing = preset_plan(options.preset, options.data)
-        asked = Asked(plan, missing, lenient=options.preset != "quick")
     elif options.plan is not None:
-        asked = Asked(read_plan(options.plan))
+        plan = read_plan(options.plan)
     elif earlier is not None and earlier.is_file():
-        asked = Asked(read_plan(earlier))
-    plan = _changed(asked.plan, options)
+        plan = read_plan(earlier)
+    plan = _changed(plan, options)
     if not plan.scenes:
         raise ParameterError(
             "--scenes DIR..., --preset or --plan",
             found="none of them",
             fix="splatseed bench --preset quick -o BENCH tries it on a synthetic room.",
         )
-    return options, replace(asked, plan=plan)
+    return options, plan, missing
 
 
 def _changed(plan: Plan, options: Options) -> Plan:
     """A plan with what is given as options."""
-    names = ("methods", "ratios", "budgets", "strategies", "profiles", "repeats", "long_side")
-    changes: dict[str, Any] = {
-        name: value for name in names if (value := getattr(options, name)) not in (None, ())
-    }
-    own = {name: getattr(options, name) for name in ("max_steps", "data_factor")}
-    training = replace(plan.training, **{n: v for n, v in own.items() if v is not None})
+
+    def given(*names: str) -> dict[str, Any]:
+        return {n: value for n in names if (value := getattr(options, n)) not in (None, ())}
+
+    training = replace(plan.training, **given("max_steps", "data_factor"))
+    changes = given(
+        "methods", "ratios", "budgets", "strategies", "profiles", "repeats", "long_side"
+    )
     if options.budgets and not options.ratios:
         changes["ratios"] = ()
     scenes = [PlannedScene(path) for path in options.scenes] or list(plan.scenes)
     labels = Counter(scene.label for scene in scenes)
     for i, scene in enumerate(scenes):  # folders of the same name are told apart by their parents
-        if labels[scene.label] > 1 and scene.path != DEMO and not scene.name:
+        if labels[scene.label] > 1 and not scene.is_demo and not scene.name:
             name = "_".join(Path(scene.path).resolve().parts[-2:])
             scenes[i] = replace(scene, name=name)
-    scenes = _with_files(scenes, "depth", options.depth)
-    scenes = _with_files(scenes, "cloud", options.clouds)
+    maps = options.depth
+    if len(maps) == 1 and any((maps[0] / scene.label).is_dir() for scene in scenes):
+        below = [maps[0] / scene.label for scene in scenes]
+        scenes = [replace(scene, depth=str(folder) if folder.is_dir() else "")
+                  for scene, folder in zip(scenes, below, strict=True)]  # fmt: skip
+        maps = ()
+    for option, what, files in (("--depth", "depth", maps), ("--clouds", "cloud", options.clouds)):
+        if len(files) not in {0, len(scenes)}:
+            raise ParameterError(
+                f"{option} with one for each of {len(scenes)} scenes",
+                found=f"{len(files)}",
+                fix="See --dry-run for the scenes and their order; a plan may have one for some "
+                "only. --depth may be one folder with subfolders of the scenes' names.",
+            )
+        if files:
+            pairs = zip(scenes, map(str, files), strict=True)
+            scenes = [replace(scene, **{what: file}) for scene, file in pairs]
     return replace(plan, training=training, scenes=tuple(scenes), **changes)
-
-
-def _with_files(
-    scenes: list[PlannedScene], what: Literal["depth", "cloud"], files: Sequence[Path]
-) -> list[PlannedScene]:
-    """The scenes with their folders of depth maps, or scans."""
-    if not files:
-        return scenes
-    if what == "depth" and len(files) == 1 and any((files[0] / s.label).is_dir() for s in scenes):
-        below = [files[0] / scene.label for scene in scenes]
-        named = [str(folder) if folder.is_dir() else "" for folder in below]
-    elif len(files) == len(scenes):
-        named = list(map(str, files))
-    else:
-        option = {"depth": "--depth", "cloud": "--clouds"}[what]
-        raise ParameterError(
-            f"{option} with one for each of {len(scenes)} scenes",
-            found=f"{len(files)}",
-            fix="See --dry-run for the scenes and their order; a plan may have one for some only. "
-            "--depth may be one folder with subfolders of the scenes' names.",
-        )
-    return [replace(each, **{what: name}) for each, name in zip(scenes, named, strict=True)]
 
 
 @dataclass(frozen=True)
 class Machine:
-    """Where runs are carried out.
+    """Where runs are carried out: how many ``jobs`` at a time, of so many threads on the CPU each.
 
-    Args:
-        name: Its name.
-        backend: The backend of training: not "auto".
-        jobs: Number of runs at a time.
-        threads: Threads of each run on the CPU.
-        tasks: Who carries out runs.
-        away: Whether that is on other machines.
+    ``backend`` is not "auto"; ``away`` is whether ``tasks`` are carried out on other machines.
     """
 
     name: str
@@ -301,16 +248,7 @@ class Machine:
 
 @contextmanager
 def open_machine(options: Options, backend: Backend) -> Iterator[Machine]:
-    """The machine to run on, while the block runs.
-
-    Args:
-        options: The user's options.
-        backend: The plan's backend.
-
-    Raises:
-        ParameterError: A GPU is requested and there is none, or there is no such cluster.
-        MissingDependencyError: PyTorch, gsplat or Ray is absent.
-    """
+    """The machine to run on, for a plan's backend, while the block runs."""
     require("torch", "gsplat", "pandas")
     if options.executor == "local":
         yield _local_machine(options.jobs, backend)
@@ -344,14 +282,9 @@ def _local_machine(jobs: int | None, backend: Backend) -> Machine:
 
 
 def check_machine(machine: Machine, seeds: int) -> None:
-    """Refuse runs that do not fit into this machine's memory, rather than have them killed.
+    """Refuse runs of so many seeds that do not fit into this machine, rather than have them killed.
 
-    Args:
-        machine: Where they will run; the memory of a cluster's nodes is unknown.
-        seeds: Gaussians that the largest of them begins with.
-
-    Raises:
-        ParameterError: This many at a time do not fit.
+    The memory of a cluster's nodes is unknown.
     """
     if not machine.away and machine.backend == "cpu":
         check_memory(
@@ -362,34 +295,28 @@ def check_machine(machine: Machine, seeds: int) -> None:
         )
 
 
-@dataclass(frozen=True)
-class _Prepared:
-    """A benchmark that can be run: its plan with the scenes that exist, its runs, and notes."""
+def _prepare(
+    options: Options, plan: Plan, missing: Sequence[str], machine: Machine, demo: Path | None
+) -> tuple[Plan, list[SceneFacts], list[RunSpec], list[str]]:
+    """Check all scenes of a plan: the plan of those that can be used, these, its runs, and notes.
 
-    plan: Plan
-    scenes: Sequence[SceneFacts]
-    specs: Sequence[RunSpec]
-    notes: Sequence[str]
-
-
-def _prepare(asked: Asked, machine: Machine, made: Path | None, progress: Progress) -> _Prepared:
-    """Check all scenes of a plan, and list its runs.
-
-    ``made`` is where to put a synthetic scene; None to use its known facts without making it.
+    ``demo`` is where to put a synthetic scene; None to use its known facts without making it.
     """
-    notes = [f"not there: {', '.join(asked.missing)}"] if asked.missing else []
+    notes = [f"not there: {', '.join(missing)}"] if missing else []
     present: list[tuple[PlannedScene, SceneFacts]] = []
-    for scene in asked.plan.scenes:
-        try:
-            present.append((scene, _survey(scene, asked.plan, made, progress)))
-        except SceneNotFoundError as error:
-            if not asked.lenient:
-                raise
-            notes.append(f"{scene.label} is left out: {error}")
+    needs = {"with_depth": DEPTH in plan.methods, "with_cloud": any(map(needs_cloud, plan.methods))}
+    with stage_display() as clock:
+        for scene in plan.scenes:
+            try:
+                present.append((scene, survey(scene, demo=demo, **needs, progress=clock)))
+            except SceneNotFoundError as error:
+                if options.preset in {None, "quick"}:
+                    raise
+                notes.append(f"{scene.label} is left out: {error}")
     if not present:
         fix = "Name the folder that holds the preset's scenes with --data."
         raise SceneNotFoundError("scenes to run", found=f"none; {'; '.join(notes)}", fix=fix)
-    plan = replace(asked.plan, scenes=tuple(scene for scene, _ in present))
+    plan = replace(plan, scenes=tuple(scene for scene, _ in present))
     scenes = [facts for _, facts in present]
     specs = plan_runs(plan, scenes, machine.backend, package_version("splatseed"))
     notes += _notes(plan, scenes, specs)
@@ -399,26 +326,8 @@ def _prepare(asked: Asked, machine: Machine, made: Path | None, progress: Progre
             found="; ".join(notes) or "none",
             fix="Name other methods, or what these need.",
         )
-    facts = {each.digest: each for each in scenes}
-    seeds = (expected_gaussians(spec, facts[spec.scene_digest])[0] for spec in specs)
-    check_machine(machine, int(max(seeds)))
-    return _Prepared(plan, scenes, specs, notes)
-
-
-def _survey(scene: PlannedScene, plan: Plan, made: Path | None, progress: Progress) -> SceneFacts:
-    if scene.is_demo and made is None:
-        return replace(DEMO_FACTS, name=scene.label)
-    if scene.is_demo:
-        progress("make the demo scene", 0.0)
-    return survey(
-        make_demo_scene(made) if made and scene.is_demo else Path(scene.path),
-        scene.label,
-        images=scene.images,
-        depth=Path(scene.depth) if scene.depth else None,
-        with_depth=DEPTH in plan.methods,
-        cloud=Path(scene.cloud) if scene.cloud and any(map(needs_cloud, plan.methods)) else None,
-        progress=progress,
-    )
+    check_machine(machine, int(max(spec.gaussians[0] for spec in specs)))
+    return plan, scenes, specs, notes
 
 
 def _notes(plan: Plan, scenes: Sequence[SceneFacts], specs: Sequence[RunSpec]) -> Iterator[str]:
@@ -435,13 +344,12 @@ def _notes(plan: Plan, scenes: Sequence[SceneFacts], specs: Sequence[RunSpec]) -
         yield "No method needs the scans: name cloud or cloud+auto among --methods."
     if SFM not in plan.methods:
         yield "Without sfm among the methods there is nothing to compare with."
-    there = {facts.name: facts.num_points for facts in scenes}
-    most = {(spec.scene, spec.arm.budget): spec.most_seeds for spec in specs}
-    for (name, budget), number in most.items():
-        if number is not None and number <= there[name] and set(plan.methods) != {SFM}:
+    most = {(s.scene.name, s.arm.budget): (s.most_seeds, s.scene.num_points) for s in specs}
+    for (name, budget), (number, there) in most.items():
+        if number is not None and number <= there and set(plan.methods) != {SFM}:
             yield (
                 f"{name}: under {budget} a run begins with {number:,} seeds at most, and it has "
-                f"{there[name]:,} points: auto and the methods that interpolate add none."
+                f"{there:,} points: auto and the methods that interpolate add none."
             )
 
 
@@ -457,23 +365,40 @@ def _job_options(plan: Plan) -> JobOptions:
     return JobOptions(keep_models=plan.keep_models, lpips=lpips_is_here())
 
 
-def _run(asked: Asked, bench: Path, machine: Machine, arguments: Sequence[str]) -> None:
-    protect = [Path(scene.path) for scene in asked.plan.scenes if not scene.is_demo]
-    check_bench_folder(bench, "bench", protect)
-    job_options = _job_options(asked.plan)
-    with stage_display() as clock:
-        prepared = _prepare(asked, machine, bench / "scenes", clock)
-    begin(bench, "bench", prepared.specs, arguments)
+def _bench(
+    options: Options,
+    plan: Plan,
+    missing: Sequence[str],
+    machine: Machine,
+    arguments: Sequence[str],
+) -> None:
+    """Run a plan; or print it as TOML with all else in comments, so that both can be saved."""
+    bench = options.output
+    demo = bench / "scenes" / "demo" if bench else None
+    if bench is None or options.dry_run:
+        if plan.lpips:
+            _job_options(plan)  # refuses now what a run would
+        demo = demo if demo and demo.is_dir() else None
+        plan, _, specs, notes = _prepare(options, plan, missing, machine, demo)
+        runs = [read_run(bench, spec) if bench else Run(spec) for spec in specs]
+        told = [*notes, *_announcement(plan, runs, machine)]
+        comments = "".join(f"# {' '.join(line.split())}\n" for line in told)
+        OUT.print(f"{plan_text(plan)}\n{comments}", end="", soft_wrap=True)
+        return
+    check_bench_folder(bench, "bench", [Path(s.path) for s in plan.scenes if not s.is_demo])
+    job_options = _job_options(plan)
+    plan, scenes, specs, notes = _prepare(options, plan, missing, machine, demo)
+    begin(bench, "bench", specs, arguments)
     with atomic_file(bench / PLAN) as partial:  # names that are no text are escaped
-        partial.write_text(plan_text(prepared.plan), "utf-8", "backslashreplace")
-    runs = [read_run(bench, spec) for spec in prepared.specs]
-    for note in prepared.notes:
+        partial.write_text(plan_text(plan), "utf-8", "backslashreplace")
+    runs = [read_run(bench, spec) for spec in specs]
+    for note in notes:
         print_note(note)
-    scenes = ", ".join(f"{visible(s.name)} ({s.num_points:,} points)" for s in prepared.scenes)
-    lines = [scenes, *(f"  -> {line}" for line in _announcement(prepared, runs, machine))]
-    OUT.print("\n".join([*lines, f"  -> {visible(bench)}"]), soft_wrap=True)
-    ended = carry_out(bench, runs, prepared.scenes, machine, job_options)
-    runs = [read_run(bench, spec) for spec in prepared.specs]
+    named = ", ".join(f"{visible(s.name)} ({s.num_points:,} points)" for s in scenes)
+    told = [*_announcement(plan, runs, machine), visible(bench)]
+    OUT.print("\n  -> ".join([named, *told]), soft_wrap=True)
+    ended = carry_out(bench, runs, machine, job_options)
+    runs = [read_run(bench, spec) for spec in specs]
     _print_summary(bench, runs)
     if not ended:
         sys.exit(exit_code())
@@ -481,66 +406,27 @@ def _run(asked: Asked, bench: Path, machine: Machine, arguments: Sequence[str]) 
         sys.exit(_SOME_FAILED)
 
 
-def _announcement(prepared: _Prepared, runs: Sequence[Run], machine: Machine) -> Iterator[str]:
+def _announcement(plan: Plan, runs: Sequence[Run], machine: Machine) -> Iterator[str]:
     """What will be done, and hours and disk for the remaining runs."""
     yield f"{counts(runs)}; {machine.words}"
     left = [run.spec for run in runs if run.result is None]
     if left:
-        seconds = sum(estimate(left, prepared.scenes, runs, machine.threads))
-        measured = sum(run.result is not None for run in runs)
+        measured = len(runs) - len(left)
         by = f"by {counted(measured, 'finished run')}" if measured else "by a rule of thumb"
-        facts = {scene.digest: scene for scene in prepared.scenes}
+        time_left = estimate(left, runs, machine.threads) / min(machine.jobs, len(left))
         disk = 0.0
         for spec in left:
-            scene = facts[spec.scene_digest]
-            disk += 60e3 + 18 * scene.pixels_at(spec.training.data_factor)  # three pictures
-            disk += 236 * expected_gaussians(spec, scene)[1] * prepared.plan.keep_models
-        time_left = spoken_time(seconds / min(machine.jobs, len(left)))
-        yield f"about {time_left} ({by}), {disk / 1e6:,.1f} MB kept"
+            disk += 60e3 + 18 * spec.scene.pixels_at(spec.training.data_factor)  # three pictures
+            disk += 236 * spec.gaussians[1] * plan.keep_models
+        yield f"about {spoken_time(time_left)} ({by}), {disk / 1e6:,.1f} MB kept"
 
 
-def _dry_run(options: Options, asked: Asked, machine: Machine) -> None:
-    """Print the plan as TOML, with everything else in comments, so that all can be saved as one."""
-    if asked.plan.lpips:
-        _job_options(asked.plan)  # refuses now what a run would
-    kept = options.output / "scenes" if options.output else None
-    scenes = kept if kept and (kept / "demo").is_dir() else None
-    with stage_display() as clock:
-        prepared = _prepare(asked, machine, scenes, clock)
-    runs = [read_run(options.output, spec) if options.output else Run(spec)
-            for spec in prepared.specs]  # fmt: skip
-    told = [*prepared.notes, *_announcement(prepared, runs, machine)]
-    comments = "".join(f"# {' '.join(line.split())}\n" for line in told)
-    OUT.print(f"{plan_text(prepared.plan)}\n{comments}", end="", soft_wrap=True)
-
-
-def carry_out(
-    bench: Path,
-    runs: Sequence[Run],
-    scenes: Sequence[SceneFacts],
-    machine: Machine,
-    options: JobOptions,
-) -> bool:
-    """Carry out the unfinished ones among some runs, with a display; failed ones anew.
-
-    Args:
-        bench: The benchmark's folder.
-        runs: The runs.
-        scenes: Facts about their scenes.
-        machine: Where they will run.
-        options: Options of the runs.
-
-    Returns:
-        Whether all have ended; else the user has stopped them.
-
-    Raises:
-        OutputError: The folder cannot be written.
-    """
+def carry_out(bench: Path, runs: Sequence[Run], machine: Machine, options: JobOptions) -> bool:
+    """Carry out the unfinished ones among some runs; whether all ended, else the user stopped."""
     left = [run.spec for run in runs if run.result is None]
     if not left:
         return True
-    seconds = sum(estimate(left, scenes, runs, machine.threads)) / machine.jobs
-    display = _Display(left, len(runs), seconds)
+    display = _Display(left, len(runs))
     ended = do_runs(bench, left, machine.tasks, options, machine.away, display.report)
     try:
         with display.bar:
@@ -553,21 +439,17 @@ def carry_out(
 
 
 class _Display:
-    """The progress of runs: bars where stderr is a terminal, and a line per run that ended.
+    """The progress of runs: bars where stderr is a terminal, and a line per run that ended."""
 
-    ``report`` is called from several threads.
-    """
-
-    def __init__(self, specs: Sequence[RunSpec], total: int, seconds: float) -> None:
-        self._specs, self._total, self._left, self._expected = specs, total, len(specs), seconds
-        self._begun, self._tasks = time.monotonic(), dict[str, TaskID]()
+    def __init__(self, specs: Sequence[RunSpec], total: int) -> None:
+        self._specs, self._tasks = specs, dict[str, TaskID]()
+        self._total, self._ended = total, total - len(specs)
         columns = (BarColumn(20), TextColumn("{task.description}", markup=False))
         # What goes into a file on stdout must not end up on the terminal.
         shared = sys.stdout.isatty()
-        self.bar = Bar(*columns, console=ERR, transient=True, redirect_stdout=shared,
-                       disable=not ERR.is_terminal)  # fmt: skip
-        self._whole = self.bar.add_task("", total=total)
-        self._draw()
+        self.bar = Bar(*columns, TimeRemainingColumn(), console=ERR, transient=True,
+                       redirect_stdout=shared, disable=not ERR.is_terminal)  # fmt: skip
+        self._whole = self.bar.add_task("runs", total=total, completed=self._ended)
 
     def report(self, index: int, stage: str, fraction: float) -> None:
         """Show how far a run is."""
@@ -581,28 +463,21 @@ class _Display:
         """Print a run's result, or why it failed."""
         if (task := self._tasks.pop(run.spec.key, None)) is not None:
             self.bar.remove_task(task)
-        self._left -= 1
+        self._ended += 1
         said = f" failed: {run.error}"
         if run.result:
             count, seconds = run.result.num_gaussians, run.result.wall_seconds
             said = f": {run.result.psnr:.2f} dB, {count:,} Gaussians, {seconds:.0f} s"
-        number = f"[{self._total - self._left}/{self._total}]"
+        number = f"[{self._ended}/{self._total}]"
         OUT.print(f"{number} {_describe(run.spec)}{said}", soft_wrap=True)
-        self._draw()
-
-    def _draw(self) -> None:
-        done, ended = len(self._specs) - self._left, self._total - self._left
-        seconds = self._expected / len(self._specs)
-        seconds = (time.monotonic() - self._begun) / done if done else seconds
-        label = f"{ended} of {self._total} ended, {spoken_time(seconds * self._left)} left"
-        self.bar.update(self._whole, completed=ended, description=label)
+        self.bar.advance(self._whole)
 
 
 def _describe(spec: RunSpec) -> str:
     """A run in a few words."""
     budget = f", {spec.arm.budget}" if spec.arm.budget else ""
     arm = f"{spec.arm.label}, {spec.arm.strategy}{budget}"
-    return f"{visible(spec.scene)}, {arm}, repeat {spec.repeat + 1}"
+    return f"{visible(spec.scene.name)}, {arm}, repeat {spec.repeat + 1}"
 
 
 def spoken_time(seconds: float) -> str:
@@ -633,7 +508,7 @@ def _print_summary(bench: Path, runs: Sequence[Run]) -> None:
 def _report(arguments: list[str]) -> None:
     """``splatseed bench report``."""
     options = parse_options(ReportOptions, "bench report", arguments)
-    require("pandas")
+    require("pandas", "jinja2")
     from splatseed.bench.report import write_report  # noqa: PLC0415  (pandas, an extra)
 
     with stage_display() as clock:
@@ -672,17 +547,8 @@ def _compare(arguments: list[str]) -> None:
     for table in tables:
         if table.rows:
             _print_table(table)
-    same = counted(comparison.same_runs, "run")
-    notes = [
-        (not comparison.settings, "All settings are the same."),
-        (not comparison.changes, "They have no scene and method in common."),
-        (comparison.same_runs, f"{same} in both, with the same key and score."),
-        *((True, f"{each} is not the same in both: its points, cameras or photographs differ.")
-          for each in comparison.content),
-    ]  # fmt: skip
-    for is_so, note in notes:
-        if is_so:
-            print_note(note)
+    for note in comparison.notes:
+        print_note(note)
     if options.output is not None:
         with output_folder(options.output, **written) as partial:
             for table in tables:
@@ -691,11 +557,6 @@ def _compare(arguments: list[str]) -> None:
 
 
 def _print_table(table: Table) -> None:
-    from splatseed.bench.tables import cell_text  # noqa: PLC0415  (pandas)
-
-    marks = [[getattr(cell, "mark", "") for cell in row] for row in table.rows]
-    rows = [[f"{cell_text(cell)} {mark}".strip() for cell, mark in zip(*each, strict=True)]
-            for each in zip(table.rows, marks, strict=True)]  # fmt: skip
-    print_table(table.title, table.header, rows)
+    print_table(table.title, table.header, table.shown().to_numpy().tolist())
     for note in table.notes:
         OUT.print(note, style="dim")

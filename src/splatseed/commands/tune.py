@@ -16,18 +16,18 @@ from typing import Annotated, Any
 import tyro
 
 from splatseed.bench.job import JobOptions
-from splatseed.bench.plan import SFM, Arm, Plan, PlannedScene, RunResult, RunSpec, plan_runs
+from splatseed.bench.plan import SFM, Arm, Plan, RunResult, RunSpec, plan_runs
 from splatseed.bench.runs import begin, check_bench_folder, estimate, package_version, read_run
-from splatseed.bench.scenes import SceneFacts, survey
+from splatseed.bench.scenes import PlannedScene, SceneFacts, survey
 from splatseed.bench.statistics import LEVEL
 from splatseed.bench.tuning import (
     Results,
     Rung,
     Verdict,
     best_arms,
+    growth_within,
     is_baseline,
     make_validation_scene,
-    most_grown,
     plan_rungs,
     steps_to_grow,
     verdict,
@@ -112,12 +112,13 @@ def _open(
     with stage_display() as clock:
         clock("read", 0.0)
         path = make_validation_scene(options.scene, folder / "scene", _TEST_EVERY)
-        facts = survey(path, options.scene.resolve().name, progress=clock)
+        facts = survey(PlannedScene(str(path), options.scene.resolve().name), progress=clock)
     factor = max(1, -(-facts.long_side // _LONG_SIDE))
     most = asked_for = parse_budget(options.budget, facts.pixels_at(factor))
     least_steps = 0
     if "grow" in options.strategies:
-        most = min(asked_for, most_grown(facts.num_points, options.max_steps))
+        grown = math.floor(facts.num_points * growth_within(options.max_steps))
+        most = min(asked_for, max(2, grown))
         least_steps = steps_to_grow(most / max(1, facts.num_points))
     budget = options.budget if most == asked_for else str(most)
     tuning = _Tuning(options, folder, facts, machine, budget, [])
@@ -140,7 +141,7 @@ class _Tuning:
     def specs(self, rung: Rung, arms: Collection[Arm] | None = None) -> list[RunSpec]:
         """The runs of a rung, for these arms or for all."""
         plan = Plan(
-            scenes=(PlannedScene(self.facts.path, self.facts.name),),
+            scenes=(self.facts,),
             methods=self.options.methods,
             ratios=(),
             budgets=(self.budget,),
@@ -163,7 +164,9 @@ class _Tuning:
 
     def plan(self, least_steps: int) -> None:
         """Take the rungs that were planned when the folder was begun, or plan new ones."""
-        path, asked = self.folder / "tune.json", _asked(self.options)
+        path, decisive = self.folder / "tune.json", ("minutes", "budget", "max_steps")
+        asked: dict[str, Any] = {name: getattr(self.options, name) for name in decisive}
+        asked |= {name: list(getattr(self.options, name)) for name in ("methods", "strategies")}
         if path.is_file():
             try:
                 kept = json.loads(read_text(path))
@@ -190,7 +193,7 @@ class _Tuning:
         for rung in rungs:
             specs = self.specs(rung)
             share = rung.arms / len({spec.arm for spec in specs})
-            total += share * sum(estimate(specs, [self.facts], (), self.machine.threads))
+            total += share * estimate(specs, (), self.machine.threads)
         return total / self.machine.jobs
 
     def announce(self) -> None:
@@ -217,7 +220,7 @@ class _Tuning:
             specs = self.specs(rung, arms)
             OUT.print(f"\n{rung.steps:,} steps, {len({spec.arm for spec in specs})} arms")
             runs = [read_run(self.folder, spec) for spec in specs]
-            if not bench.carry_out(self.folder, runs, [self.facts], self.machine, JobOptions()):
+            if not bench.carry_out(self.folder, runs, self.machine, JobOptions()):
                 return False
             if i + 1 < len(self.rungs):
                 arms = best_arms(self.results(rung), self.rungs[i + 1].arms)
@@ -225,13 +228,11 @@ class _Tuning:
 
     def report(self, *, ended: bool) -> None:
         """Print the verdict of the longest finished runs, and the command that follows from it."""
-        results: Results = {}
-        said = None
-        for rung in reversed(self.rungs):  # the highest with two or more finished arms
-            results = self.results(rung)
-            said = verdict(results, rung.steps)
-            if said is not None:
-                break
+        rungs = [(self.results(rung), rung.steps) for rung in reversed(self.rungs)]
+        # The highest with two or more finished arms.
+        results, said = next(
+            ((each, said) for each, steps in rungs if (said := verdict(each, steps))), ({}, None)
+        )
         if said is None:
             print_note("Nothing can be said yet: repeat the command to continue.")
             return
@@ -254,16 +255,14 @@ class _Tuning:
         if few:
             print_note(f"Compare with care: {', '.join(few)} ended with fewer Gaussians.")
         OUT.print(sentence(said), soft_wrap=True)
-        print_pairs("next", self._commands(said))
+        print_pairs("next", self._commands(said.winner))
 
-    def _commands(self, said: Verdict) -> list[tuple[str, str]]:
-        """The winner's commands, for the whole scene and the planned steps."""
-        arm, options = said.winner, self.options
+    def _commands(self, arm: Arm) -> list[tuple[str, str]]:
+        """An arm's commands, for the whole scene and the planned steps."""
+        options, scene, commands = self.options, self.options.scene, []
         rung = Rung(options.max_steps, 0, 1)
         spec = next(each for each in self.specs(rung) if each.arm == arm)
-        scene, name = options.scene, options.scene.resolve().name
-        seeded = f"{name}_{arm.method}"
-        commands = []
+        seeded = f"{scene.resolve().name}_{arm.method}"
         if arm.method != SFM:
             points = max(spec.most_seeds or 0, self.facts.num_points)
             looks = "hold_out" in spec.parameters
@@ -280,13 +279,6 @@ class _Tuning:
             f"-o {quoted(f'run_{seeded}_{arm.strategy}')}"
         )
         return [*commands, ("training", training)]
-
-
-def _asked(options: Options) -> dict[str, Any]:
-    """The options that decide on the rungs."""
-    told = ("minutes", "budget", "max_steps", "methods", "strategies")
-    values = {name: getattr(options, name) for name in told}
-    return {name: list(v) if isinstance(v, tuple) else v for name, v in values.items()}
 
 
 def sentence(said: Verdict) -> str:
