@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from contextlib import suppress
-from itertools import permutations, product
+from itertools import count as count_from, permutations, product
 from statistics import fmean
 
 import numpy as np
@@ -26,15 +26,13 @@ from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 from splatseed.seeding.diagnostics import empty_regions
 
-DESCRIPTIONS = {
+DESCRIPTIONS = {  # in words that can follow "scenes with more"
     "planarity": "planarity", "linearity": "linearity", "scattering": "scattering",
     "curvature": "curvature", "gap": "wide gaps between points",
     "unevenness": "unevenly spaced points", "empty": "image area without points",
     "texture": "texture",
 }  # fmt: skip
-"""Each descriptor in words that can follow "scenes with more"."""
-Descriptors = Mapping[str, float]
-"""A scene's descriptors by name; NaN where unknown."""
+Descriptors = Mapping[str, float]  # of a scene by name; NaN where unknown
 _NEIGHBORS = 16
 _VIEWS = 24  # evenly spaced, for gaps, empty area and texture
 _SIDE = 320  # longer side of photographs at which their gradients are measured, pixels
@@ -89,7 +87,6 @@ def describe(scene: Scene, progress: Progress = silent) -> dict[str, float]:
 
 
 def _gap(scene: Scene, xyz: np.ndarray, spacing: np.ndarray) -> float:
-    """Median over views and their points of h f / z over the image's longer side."""
     seen = [np.empty(0)]
     for camera in (image.camera for image in scene.images):
         uv, depth = camera.project(xyz)
@@ -160,16 +157,14 @@ def rank_correlation(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
 
 
 def _verdict(derived: pd.DataFrame) -> str:
-    """The conclusion from all guidelines of a strategy, in a sentence or two."""
     if derived.empty:
         return f"No guideline: that takes {_FEWEST} scenes with gains and with descriptors."
     scenes, count = int(derived["scenes"].max()), len(derived)
     supported = derived.loc[derived["adjusted"] <= LEVEL, "sentence"]
     if len(supported):
         return f"Supported by {scenes} scenes, after {count} were looked at: {' '.join(supported)}"
-    fewest = _FEWEST
-    while 2 / math.factorial(fewest) * count > LEVEL:  # two of all orders are perfect
-        fewest += 1
+    # Two of all orders are perfect.
+    fewest = next(n for n in count_from(_FEWEST) if 2 / math.factorial(n) * count <= LEVEL)
     why = (
         f" It could hardly be otherwise: with {count} of them looked at, even a perfect order of "
         f"scenes is evidence only from {fewest} scenes on, and here there are {scenes}."
