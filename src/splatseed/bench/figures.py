@@ -209,7 +209,6 @@ def _interval(gain: Difference) -> list[list[float]] | None:
 
 
 def _finish_rows(axes: Axes, names: Sequence[str], base: str) -> None:
-    """Names at the left, one per row, and a line at no gain."""
     axes.axvline(0.0, color=_BLACK, linewidth=1)
     axes.set_yticks(range(len(names)), names, parse_math=False)
     axes.set_ylim(len(names) - 0.5, -0.5)

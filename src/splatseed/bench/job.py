@@ -107,7 +107,6 @@ def do_runs(
 
 
 def _keep_error(bench: Path, spec: RunSpec, error: Exception) -> str:
-    """Record why a run failed; in one line."""
     ours = isinstance(error, SplatseedError)
     line = " ".join((str(error) if ours else f"{type(error).__name__}: {error}").split())
     told = "".join(traceback.format_exception(error))

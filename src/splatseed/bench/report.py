@@ -137,7 +137,6 @@ class _Page:
         return part
 
     def html(self, runs: Sequence[Run]) -> str:
-        """The page."""
         scenes = ", ".join(dict.fromkeys(run.spec.scene.name for run in runs))
         question = "Does upsampling help on these scenes, by which method, at what cost?"
         data = files("splatseed.bench") / "data"
@@ -217,7 +216,6 @@ def answer_at_equal_cost(study: Study) -> tuple[str, ...]:
 
 
 def _against(each: ComparedArm, base: ArmKey) -> str:
-    """A gain in words."""
     gain = each.gain
     if abs(gain.mean) < _SHOWN:
         return f"level with {base.label}"
@@ -243,7 +241,6 @@ def summary(study: Study, strategy: StrategyName) -> tuple[str, ...]:
 
 
 def _answer(gained: Gains, best: str) -> str:
-    """Whether any variant gains, and which gains most."""
     lead = f"Strategy {gained.strategy}, {counted(len(gained.scenes), 'scene')}:"
     top, of = gained.on_these[best], counted(len(gained.seeds), "variant")
     spread = "" if math.isnan(top.se) else f", ± {top.se:.2f} by the repeats of all variants"
@@ -267,7 +264,6 @@ def _answer(gained: Gains, best: str) -> str:
 
 
 def _by_scene(gained: Gains, best: str) -> str:
-    """On how many scenes the best variant gains and loses."""
     known = [each.verdict for (_, of), each in gained.on_scene.items() if of == best]
     if len(known) < 2 or set(known) == {"unknown"}:
         return ""
@@ -278,7 +274,6 @@ def _by_scene(gained: Gains, best: str) -> str:
 
 
 def _elsewhere(like: Difference) -> str:
-    """Whether the gain can be expected on other scenes."""
     if like.verdict == "unknown":
         return "One scene says nothing about others."
     low, high = like.interval()
@@ -436,12 +431,10 @@ def _text(*texts: str, mark: str = "") -> Part:
 
 
 def _answer_block(sentences: Sequence[str]) -> Part:
-    """The sentences of an answer, the first of them the answer itself."""
     return {"kind": "answer", "texts": sentences} if sentences else None
 
 
 def _folded(title: str, parts: Sequence[Part], *, is_open: bool) -> Part:
-    """Parts under a title that opens and closes."""
     return {"kind": "folded", "title": title, "parts": parts, "open": is_open} if parts else None
 
 

@@ -161,7 +161,6 @@ def cost_table(study: Study, strategy: StrategyName) -> Table:
 
 
 def _with_baseline(study: Study, strategy: StrategyName) -> pd.DataFrame:
-    """The runs under a strategy on scenes that have sfm too."""
     part = study.under(strategy)
     return part[part["scene"].isin(part.loc[part["seeds"] == SFM, "scene"])]
 

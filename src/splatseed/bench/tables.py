@@ -99,7 +99,6 @@ def _texts() -> dict[str, Any]:
 
 
 def _cell_text(cell: Cell) -> str:
-    """A cell's number and words, without its mark."""
     if isinstance(cell, str):
         return cell
     if math.isnan(cell.value):

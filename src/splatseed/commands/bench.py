@@ -188,7 +188,6 @@ def parse_plan(arguments: Sequence[str]) -> tuple[Options, Plan, tuple[str, ...]
 
 
 def _changed(plan: Plan, options: Options) -> Plan:
-    """A plan with what is given as options."""
 
     def given(*names: str) -> dict[str, Any]:
         return {n: value for n in names if (value := getattr(options, n)) not in (None, ())}
@@ -452,7 +451,6 @@ class _Display:
         self._whole = self.bar.add_task("runs", total=total, completed=self._ended)
 
     def report(self, index: int, stage: str, fraction: float) -> None:
-        """Show how far a run is."""
         spec = self._specs[index]
         label = f"  {_describe(spec)}: {stage}"
         if spec.key not in self._tasks:
@@ -460,7 +458,6 @@ class _Display:
         self.bar.update(self._tasks[spec.key], completed=fraction, description=label)
 
     def ended(self, run: Run) -> None:
-        """Print a run's result, or why it failed."""
         if (task := self._tasks.pop(run.spec.key, None)) is not None:
             self.bar.remove_task(task)
         self._ended += 1
@@ -474,7 +471,6 @@ class _Display:
 
 
 def _describe(spec: RunSpec) -> str:
-    """A run in a few words."""
     budget = f", {spec.arm.budget}" if spec.arm.budget else ""
     arm = f"{spec.arm.label}, {spec.arm.strategy}{budget}"
     return f"{visible(spec.scene.name)}, {arm}, repeat {spec.repeat + 1}"
@@ -488,7 +484,6 @@ def spoken_time(seconds: float) -> str:
 
 
 def _print_summary(bench: Path, runs: Sequence[Run]) -> None:
-    """All arms so far, failures, and what to run next."""
     from splatseed.bench.study import studies  # noqa: PLC0415  (pandas, which takes a while)
     from splatseed.bench.study_tables import arm_table  # noqa: PLC0415  (pandas)
 
@@ -506,7 +501,6 @@ def _print_summary(bench: Path, runs: Sequence[Run]) -> None:
 
 
 def _report(arguments: list[str]) -> None:
-    """``splatseed bench report``."""
     options = parse_options(ReportOptions, "bench report", arguments)
     require("pandas", "jinja2")
     from splatseed.bench.report import write_report  # noqa: PLC0415  (pandas, an extra)
@@ -526,7 +520,6 @@ def _report(arguments: list[str]) -> None:
 
 
 def _compare(arguments: list[str]) -> None:
-    """``splatseed bench compare``."""
     options = parse_options(CompareOptions, "bench compare", arguments)
     require("pandas")
     from splatseed.bench.comparisons import compare  # noqa: PLC0415  (pandas, an extra)

@@ -139,7 +139,6 @@ class _Tuning:
     rungs: list[Rung]
 
     def specs(self, rung: Rung, arms: Collection[Arm] | None = None) -> list[RunSpec]:
-        """The runs of a rung, for these arms or for all."""
         plan = Plan(
             scenes=(self.facts,),
             methods=self.options.methods,
@@ -197,7 +196,6 @@ class _Tuning:
         return total / self.machine.jobs
 
     def announce(self) -> None:
-        """Print what will be done."""
         facts, minutes = self.facts, bench.spoken_time(self.seconds(self.rungs))
         steps = ", then ".join(f"{rung.arms} arms for {rung.steps:,} steps" for rung in self.rungs)
         OUT.print(
@@ -214,7 +212,6 @@ class _Tuning:
             )
 
     def climb(self) -> bool:
-        """Run the rungs in order; whether all were finished."""
         arms: Collection[Arm] | None = None
         for i, rung in enumerate(self.rungs):
             specs = self.specs(rung, arms)
@@ -258,7 +255,6 @@ class _Tuning:
         print_pairs("next", self._commands(said.winner))
 
     def _commands(self, arm: Arm) -> list[tuple[str, str]]:
-        """An arm's commands, for the whole scene and the planned steps."""
         options, scene, commands = self.options, self.options.scene, []
         rung = Rung(options.max_steps, 0, 1)
         spec = next(each for each in self.specs(rung) if each.arm == arm)
