@@ -170,6 +170,15 @@ def test_cameras_are_those_of_reduced_photographs_and_points_stand_in_for_tracks
     xyz, _ = _fused_points(tmp_path / "w", small.images[0])
     assert np.median(np.abs(capture.surfaces.distance(xyz))) < ON_SURFACE
     assert (tmp_path / "w/stereo/fusion.cfg").read_text().count("\n") == 2
+    report = write_dense_maps(scene, iter(maps[4]), tmp_path / "plain")
+    known = sum(int(np.isfinite(each.depth).sum()) for each in maps[4])
+    assert (report.num_maps, report.num_known) == (8, known)
+    assert len(find_depths(scene, tmp_path / "plain")) == 8
+    first = maps[4][0]
+    rest = np.load(tmp_path / "plain" / f"{first.name}.stereo.npz", allow_pickle=False)
+    np.testing.assert_array_equal(rest["normal"], first.normal)
+    np.testing.assert_array_equal(rest["agreeing"], first.agreeing)
+    assert tuple(rest["sources"]) == first.sources
     write_dense_workspace(scene.replace(tracks=None), maps[4][:2], tmp_path / "no tracks")
     model = load_scene(tmp_path / "no tracks")
     assert 200 <= len(model.points) <= 400
@@ -181,23 +190,6 @@ def test_cameras_are_those_of_reduced_photographs_and_points_stand_in_for_tracks
         mine = model.tracks.image_ids == image.image_id
         owner = np.repeat(model.tracks.point_ids, model.tracks.lengths)[mine]
         np.testing.assert_array_equal(ids[model.tracks.point2d_idx[mine]], owner)
-
-
-def test_a_plain_folder_and_the_rest_beside_it(maps, room, tmp_path):
-    some = maps[4]
-    report = write_dense_maps(room, iter(some), tmp_path / "a")
-    write_dense_maps(room, some, tmp_path / "b")
-    known = sum(int(np.isfinite(each.depth).sum()) for each in some)
-    assert (report.num_maps, report.num_known) == (8, known)
-    name = some[0].name
-    for file in (f"{name}.npy", f"{name}.stereo.npz"):
-        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
-    depths = find_depths(room, tmp_path / "a")
-    assert (len(depths), depths.kind) == (8, "z")
-    rest = np.load(tmp_path / "a" / f"{name}.stereo.npz", allow_pickle=False)
-    np.testing.assert_array_equal(rest["normal"], some[0].normal)
-    np.testing.assert_array_equal(rest["agreeing"], some[0].agreeing)
-    assert tuple(rest["sources"]) == some[0].sources
 
 
 @pytest.mark.parametrize("write", [write_dense_workspace, write_dense_maps])

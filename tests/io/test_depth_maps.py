@@ -143,15 +143,10 @@ def test_rgbd_capture_by_the_frames_numbers(tmp_path, name):
     put(tmp_path / "room/results/depth000007.png", 500)
     put(tmp_path / "room/results/depth12.png", 1000)
     (tmp_path / "cam_params.json").write_text('{"camera": {"scale": 250.0}}')
-    depths = find_depths(scene_of("frame7.jpg", "frame000012.jpg"), tmp_path / "room" / name)
-    assert depths.read("frame7.jpg").values[0, 0] == 2
-    assert depths.read("frame000012.jpg").values[0, 0] == 4
-    assert (
-        find_depths(scene_of("frame7.jpg"), tmp_path / "room", scale=500)
-        .read("frame7.jpg")
-        .values[0, 0]
-        == 1
-    )
+    scene = scene_of("frame7.jpg", "frame000012.jpg")
+    for options, expected in (({}, (2, 4)), ({"scale": 500}, (1, 2))):
+        depths = find_depths(scene, tmp_path / "room" / name, **options)
+        assert tuple(depths.read(im.name).values[0, 0] for im in scene.images) == expected
 
 
 def test_description_beside_the_maps(tmp_path):
@@ -185,30 +180,28 @@ def test_bad_descriptions_and_options_are_named(tmp_path, content):
         find_depths(scene, tmp_path, **options)
 
 
-def test_where_nothing_is_known(tmp_path):
-    known = [0.5, 1e-30, 9e8]
-    unknown = [0, -0.0, -1, np.nan, np.inf, -np.inf, 1e10, 1e9]
-    np.save(tmp_path / "a.npy", np.array([[*known, *unknown]], np.float64))
-    values = find_depths(scene_of("a.jpg"), tmp_path).read("a.jpg").values
-    np.testing.assert_array_equal(values, np.array([[*known, *[np.nan] * 8]], np.float32))
+NAN, INF = np.nan, np.inf
 
 
-def test_inverse_depth_may_be_zero_or_less(tmp_path):
-    np.save(tmp_path / "a.npy", np.array([[0.0, -2, 3, np.nan, -np.inf]]))
-    PilImage.fromarray(np.array([[0, 5, 65535]], np.uint16)).save(tmp_path / "b.png")
-    depths = find_depths(scene_of("a.jpg", "b.jpg"), tmp_path, kind="inverse", scale=1)
-    np.testing.assert_array_equal(depths.read("a.jpg").values, [[0, -2, 3, np.nan, np.nan]])
-    np.testing.assert_array_equal(depths.read("b.jpg").values, [[np.nan, 5, 65535]])
-
-
-def test_integers_count_millimetres_unless_told(tmp_path):
-    PilImage.fromarray(np.array([[0, 1500, 65535]], np.uint16)).save(tmp_path / "a.png")
-    PilImage.fromarray(np.array([[0, 255, 100]], np.uint8)).save(tmp_path / "b.png")
-    np.save(tmp_path / "c.npy", np.array([[2000]]))
-    depths = find_depths(scene_of("a.jpg", "b.jpg", "c.jpg"), tmp_path)
-    np.testing.assert_array_equal(depths.read("a.jpg").values, [[np.nan, 1.5, np.nan]])
-    np.testing.assert_allclose(depths.read("b.jpg").values, [[np.nan, 0.255, 0.1]])
-    np.testing.assert_array_equal(depths.read("c.jpg").values, [[2]])
+@pytest.mark.parametrize(
+    ("stored", "options", "expected"),
+    [
+        (np.array([0.5, 1e-30, 9e8, 0, -0.0, -1]), {}, [0.5, 1e-30, 9e8, NAN, NAN, NAN]),
+        (np.array([NAN, INF, -INF, 1e10, 1e9]), {}, [NAN] * 5),
+        (np.array([0.0, -2, 3, NAN, -INF]), {"kind": "inverse"}, [0, -2, 3, NAN, NAN]),
+        (np.uint16([0, 5, 65535]), {"kind": "inverse", "scale": 1}, [NAN, 5, 65535]),
+        (np.uint16([0, 1500, 65535]), {}, [NAN, 1.5, NAN]),  # millimetres
+        (np.uint8([0, 255, 100]), {}, [NAN, 0.255, 0.1]),
+        (np.array([2000]), {}, [2]),
+    ],
+)
+def test_what_numbers_mean_and_where_nothing_is_known(tmp_path, stored, options, expected):
+    if stored.dtype.kind == "u":
+        PilImage.fromarray(stored[None]).save(tmp_path / "a.png")
+    else:
+        np.save(tmp_path / "a.npy", stored[None])
+    values = find_depths(scene_of("a.jpg"), tmp_path, **options).read("a.jpg").values
+    np.testing.assert_array_equal(values, np.array([expected], np.float32))
 
 
 def test_many_threads_read_what_one_does(tmp_path, rng):

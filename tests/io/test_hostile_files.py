@@ -61,7 +61,8 @@ def test_what_is_no_file_is_not_called_missing(odd, name, is_, scene_dir, model)
     assert untrainable(scene) == (
         f"Training needs all {len(model.images)} photographs: {odd / name} is {is_}, not a file."
     )
-    path = write_scene(scene_of_files(scene_dir), odd / "json", format="transforms").path
+    inside = scene.replace(images=scene.images[1:])
+    path = write_scene(inside, odd / "json", format="transforms").path
     content = json.loads((path / "transforms.json").read_text())
     (path / "transforms.json").write_text(json.dumps(content | {"ply_file_path": f"../{name}"}))
     assert f"ply_file_path ../{name} is {is_}, not a file." in load_scene(path).warnings
@@ -93,12 +94,6 @@ def test_all_else_is_read_by_what_refuses_pipes_and_devices():
         if re.search(r"\.read_(text|bytes)\(", path.read_text())
     }
     assert reads == READ_WHOLE
-
-
-def scene_of_files(scene_dir):
-    """The scene as transforms.json can hold it: all its images lie in one folder."""
-    scene = load_scene(scene_dir)
-    return scene.replace(images=scene.images[1:])
 
 
 def test_a_file_larger_than_the_memory_is_not_read(tmp_path, monkeypatch):

@@ -11,11 +11,16 @@ import numpy as np
 import pytest
 from PIL import Image as PilImage
 
+from splatseed.depth.alignment import align_map
+from splatseed.depthmap import DepthMap
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io import colmap, load_scene
+from splatseed.io.cleaning import clean_scene
 from splatseed.io.ply import write_ply
 from splatseed.pointcloud import PointCloud
-from splatseed.scene import LeftOut
+from splatseed.scene import LeftOut, Scene
+from splatseed.upsample import upsample
+from splatseed.views.visibility import camera_points
 
 from .checks import assert_same_points
 
@@ -199,3 +204,24 @@ def test_what_is_no_scene_is_one_error(tmp_path, scene_dir, name, error, names):
     (tmp_path / "run/metrics.json").write_text("{}")
     with pytest.raises(error, match=names):
         load_scene(tmp_path / name)
+
+
+@pytest.mark.parametrize("method", ["mls", "linear", "spline", "voronoi", "triangle"])
+def test_a_point_beyond_all_distances_is_left_out(method, rng):
+    xyz = rng.normal(size=(500, 3))
+    xyz[0] = 1e30
+    cloud = PointCloud(xyz, np.zeros((500, 3), np.uint8))
+    clean = clean_scene(Scene(cloud))
+    assert clean.warnings == ("1 point is beyond 1e15 and was left out.",)
+    assert len(clean.points) == 499
+    assert np.abs(upsample(cloud, method, num_points=800).xyz[500:]).max() < 10
+
+
+def test_a_depth_map_of_one_value(model):
+    camera = model.images[0].camera
+    uv = np.array([[x, y] for x in range(50, 600, 50) for y in range(50, 400, 50)], np.float64)
+    seen = camera_points(camera, camera.unproject(uv, np.linspace(2, 5, len(uv))))
+    depth = DepthMap(np.full((480, 640), 3.0, np.float32), "z")
+    assert "one value" in align_map(depth, camera, seen, "robust", 20).rejected
+    depth.values[0, 0] = 2.0
+    assert align_map(depth, camera, seen, "robust", 20).rejected is None

@@ -232,23 +232,17 @@ def test_an_output_in_an_output_has_its_own_list(output):
 # What a kill leaves
 
 
-def leave(path, seconds=100):
-    path.mkdir() if not path.suffix.endswith(".csv") else path.touch()
-    os.utime(path, (time.time() - seconds,) * 2)
-
-
 @pytest.mark.skipif(sys.platform == "win32", reason="needs locks of folders")
 def test_what_a_kill_left_is_removed_and_told_of(tmp_path, caplog):
     gone = [".out.partial-0123abcd", ".curve.csv.partial-0123abcd.csv"]
-    others = [".other.partial-0123abcd", ".out.partial-notes", ".curve.csv.partial-mine.csv"]
-    for name in (*gone, *others):
-        leave(tmp_path / name)
-    leave(tmp_path / ".out.partial-0000aaaa", 0)  # perhaps another process's, not yet locked
+    kept = [".other.partial-0123abcd", ".out.partial-notes", ".curve.csv.partial-mine.csv"]
+    for name in (*gone, *kept):
+        (tmp_path / name).touch() if name.endswith(".csv") else (tmp_path / name).mkdir()
+        os.utime(tmp_path / name, (time.time() - 100,) * 2)
+    (tmp_path / ".out.partial-0000aaaa").mkdir()  # perhaps another process's, not yet locked
     with caplog.at_level(logging.WARNING), atomic_file(tmp_path / "curve.csv"):
-        pass
-    with caplog.at_level(logging.WARNING):
         write_output(tmp_path / "out")
-    assert hidden(tmp_path) == sorted([*others, ".out.partial-0000aaaa"])
+    assert hidden(tmp_path) == sorted([*kept, ".out.partial-0000aaaa"])
     assert all(name in caplog.text for name in gone)
 
 

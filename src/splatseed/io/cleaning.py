@@ -1,9 +1,8 @@
 """Points that training can use: distinct, finite, near 0, and numbered as COLMAP's files want them.
 
-A duplicate has the float32 position of an earlier point. Scenes in national grids are moved around
-0 in double precision; nothing is turned or scaled. A *feature* is one observation slot of an image;
-all features of all images in a row are numbered by *slot*. A track element (image id, feature
-index) and a feature's point id state the same fact twice.
+A duplicate has the float32 position of an earlier point. A *feature* is one observation slot of an
+image; all features of all images in a row are numbered by *slot*. A track element (image id,
+feature index) and a feature's point id state the same fact twice.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 A *block* is some rows (points) as values by the names of columns; *full* is the value that means
 255: 1, 255 or 65535. Many writers fill 16-bit colours with 8-bit values, so the values decide, not
 the type; they are looked at in a sample before the first chunk, so that chunks of any size give the
-same points. Colours beyond the range are clipped, and what is not a number becomes mid grey.
+same points.
 """
 
 from __future__ import annotations

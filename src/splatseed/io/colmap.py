@@ -1,10 +1,8 @@
 """COLMAP's files: cameras, images and points3D, binary (read and written) and as text (read).
 
-Notation: ``where`` is the place that an error names, "file, record" or "file, line"; of N binary
-points, ``starts`` [N + 1] are the records' byte offsets, ended by the end of the last. Layouts as
-COLMAP's documentation of its output format gives them, little-endian. Promise: a binary file that
-was read is written back byte for byte; both forms of a model give the same, to the last bit; a
-malformed file is one error, which names the place. Writers let ``OSError`` pass.
+``where`` is the place that an error names; of N binary points, ``starts`` [N + 1] are the records'
+byte offsets, ended by the end of the last. Promise: a binary file that was read is written back
+byte for byte; both forms of a model give the same, to the last bit.
 """
 
 from __future__ import annotations

@@ -1,13 +1,11 @@
 """Writing stereo's depth and normal maps: a COLMAP dense workspace, or a plain folder.
 
-A workspace has ``images/``, ``sparse/`` and ``stereo/`` as COLMAP's image_undistorter lays them
-out, for its ``stereo_fusion``. COLMAP places pixel (column, row) of a map at (column, row) of its
-camera, whereas everyone else, its own sparse model included, has (column + 0.5, row + 0.5). Maps
-(mvs/mat.h) and consistency graphs (mvs/consistency_graph.h), little-endian, begin with the text
-``W&H&C&``; a map follows with C x H x W float32, a graph with int32: column, row, n and n image
-indices (places in the model, ascending by id) for each pixel that has any. Promise: depths are
-those along COLMAP's rays, so fused points lie where the scene has them, whatever the size of the
-maps; a pixel is moved along the plane given by its normal and never mixed with its neighbours.
+COLMAP places pixel (column, row) of a map at (column, row) of its camera, whereas everyone else,
+its own sparse model included, has (column + 0.5, row + 0.5). Maps (mvs/mat.h) and consistency
+graphs (mvs/consistency_graph.h), little-endian, begin with the text ``W&H&C&``; a map follows with
+C x H x W float32, a graph with int32: column, row, n and n image indices (places in the model,
+ascending by id) for each pixel that has any. Promise: depths are those along COLMAP's rays, so
+fused points lie where the scene has them; no depth is mixed with its neighbours'.
 """
 
 from __future__ import annotations

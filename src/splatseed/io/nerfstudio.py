@@ -1,11 +1,9 @@
 """Scenes in ``transforms.json``, of nerfstudio, instant-ngp and Blender's data sets; similarities.
 
-Notation: a *frame* is one posed image; its ``transform_matrix`` is ``world_from_cam`` in OpenGL
-axes (x right, y up, z back). The *transforms' space* is the world of the file's poses;
-``applied_transform`` [3, 4] takes the world of the Structure-from-Motion model there. Points come
-from the file that the JSON names, else from a PLY known to lie in that space, else from a COLMAP
-model whose cameras determine the map into that space. Source: nerfstudio's "data conventions" page
-and instant-ngp's ``colmap2nerf`` output.
+A *frame* is one posed image; its ``transform_matrix`` is ``world_from_cam`` in OpenGL axes (x
+right, y up, z back). The *transforms' space* is the world of the file's poses;
+``applied_transform`` [3, 4] takes the world of the Structure-from-Motion model there. Source:
+nerfstudio's "data conventions" page and instant-ngp's ``colmap2nerf`` output.
 """
 
 from __future__ import annotations
@@ -278,7 +276,11 @@ def _matrix(where: str, value: Any) -> Float64[np.ndarray, "3 4"]:
 
 
 def _find_points(transforms: Transforms) -> tuple[PointCloud, Path, list[str]]:
-    """The cloud, the file it came from, and notes for the user."""
+    """The cloud, the file it came from, and notes for the user.
+
+    It is the PLY that the JSON names, else one known to lie in the transforms' space, else the
+    points of a COLMAP model whose cameras determine the map into that space.
+    """
     root, notes = transforms.path.parent, []
     named = transforms.json.get("ply_file_path")
     names = [name for name in (named, *_POINT_FILES) if isinstance(name, str)]

@@ -1,16 +1,11 @@
 """RGB-D captures: NICE-SLAM's layout of Replica, and TUM's RGB-D benchmark (also 7-Scenes').
 
-Replica: ``results/frame*.jpg`` (or .png) and ``results/depth*.png``, ``traj.txt`` with one
-row-major 4x4 ``world_from_cam`` in OpenCV axes and metres per line, a line per frame in the order
-of the frames' numbers, and ``cam_params.json``, here or one folder up. The principal point counts
-from the corner of the image, as COLMAP's does: Replica's own renderer gives OpenGL (w - 1) / 2, so
-the 1200 pixel wide images have cx = 599.5; their depth maps agree with each other there (0.04 mm,
-and 0.12 with cx = 600).
-
-TUM: ``rgb.txt`` and ``depth.txt`` (``time path`` a line, times in seconds), ``groundtruth.txt``
-(``time tx ty tz qx qy qz qw`` a line, ``world_from_cam`` in OpenCV axes and metres) and the images;
-depth PNGs hold planar z times 5000. Lines that begin with # are comments. Measurements at different
-times belong together if the times are within 0.02 s, the benchmark's own tolerance.
+Replica: ``results/frame*.jpg`` (or .png) and ``results/depth*.png``, ``traj.txt`` with a row-major
+4x4 ``world_from_cam`` a line, in the order of the frames' numbers, and ``cam_params.json``, here or
+one folder up. The principal point counts from the corner of the image: Replica's own renderer gives
+OpenGL (w - 1) / 2, and its depth maps agree with each other there. TUM: ``rgb.txt`` and
+``depth.txt`` (``time path``, in seconds), ``groundtruth.txt`` (``time tx ty tz qx qy qz qw`` of
+``world_from_cam``); depth PNGs hold planar z times 5000. OpenCV axes and metres in both.
 """
 
 from __future__ import annotations

@@ -1,11 +1,10 @@
 """Which points of a scene that splatseed wrote are originals, and what is known about the others.
 
 Point files have no field for a point's origin, but ``splatseed.json`` beside them counts the
-originals, which come first, and ``seeds.npz`` has, in the order of the point files, ``source``
-uint8 [N], ``normals`` float16 [N, 3], ``sizes`` float32 [N] and ``confidence`` float16 [N], each
-present if known for any point, and a ``digest`` of their positions. Promise: equal clouds give
-equal bytes; a file that is damaged or belongs to other points is reported and not used; no pickle
-is loaded, and nothing is allocated on the word of a header.
+originals, which come first, and ``seeds.npz`` has, in their order, ``source`` uint8 [N],
+``normals`` float16 [N, 3], ``sizes`` float32 [N] and ``confidence`` float16 [N], each present if
+known for any point, and a ``digest`` of their positions. A file that is damaged or belongs to other
+points is reported and not used.
 """
 
 from __future__ import annotations

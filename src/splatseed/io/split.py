@@ -1,10 +1,8 @@
 """Which images train and which test, for scenes with files that say so.
 
-Promise: the first of these that fits is used, and reported: ``train_filenames`` and
-``test_filenames`` (else ``val_filenames``) of a transforms.json, as nerfstudio writes them; text
-files with one image name per line, as nerfstudio's COLMAP reader, graphdeco (beside the model) and
-others have them. A list whose names match no image is ignored, and reported too, as are single
-names that match none.
+The first of these that fits is used, and reported: ``train_filenames`` and ``test_filenames`` (else
+``val_filenames``) of a transforms.json, as nerfstudio writes them; text files with one image name
+per line, as nerfstudio's COLMAP reader, graphdeco (beside the model) and others have them.
 """
 
 from __future__ import annotations

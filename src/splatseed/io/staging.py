@@ -1,11 +1,10 @@
 """Output that appears whole or not at all, and replaces only what splatseed wrote.
 
 The *target* is what the user named; the *partial* is a hidden sibling ``.NAME.partial-XXXX`` that
-is written first and renamed to the target at the end, or removed, after a kill by the next process
-that writes the same target. A folder's *manifest*, ``splatseed.json``, says what wrote it, its
-*kind* (``command``), and lists its files; an entry that names a folder with a manifest of its own
-stands for that one's list. A folder is replaced on request only, by its own kind, and only if its
-manifest lists everything in it.
+is written first and renamed at the end, or removed, after a kill by the next process that writes
+the same target. A folder's *manifest*, ``splatseed.json``, says what wrote it, its *kind*
+(``command``), and lists its files; an entry that names a folder with a manifest of its own stands
+for that one's list.
 """
 
 from __future__ import annotations

@@ -27,7 +27,6 @@ from splatseed.camera import CAMERA_MODELS, Intrinsics
 from splatseed.errors import OutputError, PointCloudError
 from splatseed.io import colmap, nerfstudio
 from splatseed.io.cleaning import clean_scene, renumber
-from splatseed.io.colmap import read_model_cameras
 from splatseed.io.files import open_file
 from splatseed.io.ply import ply_header, ply_rows, write_ply
 from splatseed.io.seeds import SEEDS, PositionDigest, write_origins, write_seeds
@@ -288,20 +287,18 @@ def _copy_files(source: Path, names: Sequence[str], target: Path) -> None:
 def _rigs(scene: Scene, model_dir: Path) -> tuple[list[str], list[str]]:
     """The model's rigs and frames if they are valid for the output, else a note saying why not."""
     there = [name for name in ("rigs.bin", "frames.bin") if (model_dir / name).is_file()]
-    if there:
-        # They repeat the poses of the images.
+    why = "as text they would not be read beside the binary model"
+    if there:  # they repeat the poses of the images
         now, before = (
             {(im.image_id, im.name): im.camera.cam_from_world for im in images}
-            for images in (scene.images, read_model_cameras(model_dir)[1])
+            for images in (scene.images, colmap.read_model_cameras(model_dir)[1])
         )
         if now.keys() == before.keys() and all(
             np.allclose(now[key], before[key], rtol=_SAME_POSE, atol=_SAME_POSE) for key in now
         ):
             return there, []
         why = "the scene no longer has the same images and poses"
-    elif any((model_dir / name).is_file() for name in ("rigs.txt", "frames.txt")):
-        why = "as text they would not be read beside the binary model"
-    else:
+    elif not any((model_dir / name).is_file() for name in ("rigs.txt", "frames.txt")):
         return [], []
     return [], [f"Rigs and frames were left out: {why}."]
 
