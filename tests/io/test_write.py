@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from splatseed.errors import OutputError, PointCloudError
-from splatseed.io import colmap, load_scene, write, write_scene
+from splatseed.io import colmap, load_scene, write_scene
 from splatseed.io.ply import read_ply, write_ply
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Observations, Scene
@@ -222,24 +222,3 @@ def test_images_are_copied_when_asked_or_when_links_fail(scene_dir, tmp_path, mo
     assert not any("missing" in text for text in scene.warnings)
     assert [path.name for path in (tmp_path / "out/images").iterdir()] == ["left"]
     assert not (tmp_path / "out/images").is_symlink()
-
-
-@pytest.mark.parametrize(
-    "failure", [OSError(errno.ENOSPC, "No space left on device"), KeyboardInterrupt()]
-)
-@pytest.mark.parametrize("function", ["write_ply", "write_json"])
-def test_an_interrupted_or_full_disk_leaves_nothing(
-    scene_dir, tmp_path, monkeypatch, failure, function
-):
-    def fail(path, _content):
-        path.write_bytes(b"half")
-        raise failure
-
-    monkeypatch.setattr(write, function, fail)
-    form = "transforms" if function == "write_json" else "colmap"
-    expected = OutputError if isinstance(failure, OSError) else KeyboardInterrupt
-    scene = load_scene(scene_dir)
-    before = sorted(tmp_path.rglob("*"))
-    with pytest.raises(expected):
-        write_scene(scene, tmp_path / "deep/out", format=form)
-    assert sorted(tmp_path.rglob("*")) == before

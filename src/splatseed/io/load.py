@@ -57,7 +57,12 @@ def load_scene(path: str | Path, *, require_points: bool = True) -> Scene:
     """
     path = Path(path)
     try:
-        scene = _read(path)
+        if not path.is_file():
+            check_there(path)
+        reader = partial(_read_file, path) if path.is_file() else _reader(path)
+        if reader is None:
+            raise _no_scene(path)
+        scene = reader()
     except OSError as error:  # from looking for files; reading them raises our own
         raise SceneFormatError(
             f"a scene at {path} that can be read",
@@ -121,16 +126,6 @@ def _reader(folder: Path) -> Callable[[], Scene] | None:
     if (folder / "traj.txt").is_file():
         return partial(load_rgbd, folder)
     return partial(load_tum, folder) if is_tum(folder) else None
-
-
-def _read(path: Path) -> Scene:
-    if path.is_file():
-        return _read_file(path)
-    check_there(path)
-    reader = _reader(path)
-    if reader is None:
-        raise _no_scene(path)
-    return reader()
 
 
 def _read_file(path: Path) -> Scene:
