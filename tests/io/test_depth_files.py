@@ -105,20 +105,17 @@ def test_colmaps_own_depth_maps(tmp_path, array):
     assert_read(path, array)
 
 
-@pytest.mark.parametrize("suffix", [".png", ".tiff"])
-@repeat
-@given(array=hnp.arrays(np.uint8, SHAPES) | hnp.arrays(np.uint16, SHAPES))
-def test_integer_pictures(tmp_path, suffix, array):
-    PilImage.fromarray(array).save(tmp_path / f"a{suffix}")
-    assert_read(tmp_path / f"a{suffix}", array)
-
-
 @pytest.mark.parametrize("compression", [None, "tiff_lzw", "tiff_adobe_deflate"])
 @repeat
-@given(array=FLOATS | hnp.arrays(np.int32, SHAPES))
-def test_wide_tiff(tmp_path, compression, array):
-    PilImage.fromarray(array).save(tmp_path / "a.tif", compression=compression)
-    assert_read(tmp_path / "a.tif", array)
+@given(data=st.data())
+def test_pictures(tmp_path, compression, data):
+    narrow = data.draw(hnp.arrays(np.uint8, SHAPES) | hnp.arrays(np.uint16, SHAPES))
+    wide = data.draw(FLOATS | hnp.arrays(np.int32, SHAPES))
+    PilImage.fromarray(narrow).save(tmp_path / "a.png")
+    assert_read(tmp_path / "a.png", narrow)
+    for array in (narrow, wide):
+        PilImage.fromarray(array).save(tmp_path / "a.tiff", compression=compression)
+        assert_read(tmp_path / "a.tiff", array)
 
 
 @pytest.mark.parametrize(

@@ -51,7 +51,12 @@ READERS = {
     "rgb.txt": _read_list,
     "groundtruth.txt": _read_track,
 }
-TEXT = [name for name in READERS if name.endswith((".txt", "ascii.ply"))]
+TEXT = (".txt", "ascii.ply")
+WORDS = st.sampled_from(
+    [*"0123456789", "-1", "255", "1e999", "nan", "-inf", "1_0", "0x1", "99999999999999999999", "#"]
+    + ["\n"] * 6
+    + ["\r\n", "\t", "\0", "\x1c", "\u2028", "\u0663", "PINHOLE", "OPENCV", "a b.jpg", '"']
+)
 CLOUDS = (
     *("a.las", "a.laz", "new.laz", "a.e57", "cloud.ply", "text.ply", "a.glb", "map.npz"),
     *("packed.npz", "a.pcd", "text.pcd", "packed.pcd", "a.xyz", "a.csv", "a.pts"),
@@ -182,11 +187,16 @@ def damages(draw, data: bytes) -> bytes:
 
 @pytest.mark.parametrize("name", READERS)
 @fuzz
-@given(data=st.binary(max_size=300), header=HEADERS)
-def test_random_bytes(name, target, data, header, valid):
-    target = target.with_name(name)
-    assert_only_our_errors(READERS[name], target, header + data)
-    assert_only_our_errors(READERS[name], target, valid[name][: len(data)] + data)
+@given(data=st.data())
+def test_random_bytes_and_words(name, target, data, valid):
+    drawn, start = data.draw(st.binary(max_size=300)), valid[name].find(b"end_header\n") + 11
+    befores = [data.draw(HEADERS), valid[name][: len(drawn)]]
+    if name.endswith(TEXT) and data.draw(st.booleans()):
+        words = data.draw(st.lists(WORDS | st.text(max_size=5), max_size=60))
+        drawn = " ".join(words).encode("utf-8", errors="replace")
+        befores = [b"", valid[name], valid[name][:start]]
+    for before in befores:
+        assert_only_our_errors(READERS[name], target.with_name(name), before + drawn)
 
 
 @pytest.mark.parametrize("name", READERS)
@@ -204,23 +214,6 @@ def test_damaged_clouds(name, target, data, clouds):
     # Text is read in blocks of 16 MB.
     damaged = data.draw(damages(clouds[name]))
     assert_only_our_errors(drain, target.with_name(name), damaged, 64 << 20)
-
-
-WORDS = st.sampled_from(
-    [*"0123456789", "-1", "255", "1e999", "nan", "-inf", "1_0", "0x1", "99999999999999999999", "#"]
-    + ["\n"] * 6
-    + ["\r\n", "\t", "\0", "\x1c", "\u2028", "\u0663", "PINHOLE", "OPENCV", "a b.jpg", '"']
-)
-
-
-@pytest.mark.parametrize("name", TEXT)
-@fuzz
-@given(words=st.lists(WORDS | st.text(max_size=5), max_size=60))
-def test_random_words(name, target, words, valid):
-    target, text = target.with_name(name), " ".join(words).encode("utf-8", errors="replace")
-    start = valid[name].find(b"end_header\n") + len(b"end_header\n")
-    for before in (b"", valid[name], valid[name][:start]):
-        assert_only_our_errors(READERS[name], target, before + text)
 
 
 @pytest.mark.parametrize(
