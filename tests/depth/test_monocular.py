@@ -143,9 +143,8 @@ def test_depth_pro_leaves_its_maps_to_its_processor():
         def forward(self, pixel_values):
             return SimpleNamespace(predicted_depth=pixel_values[:, 0], field_of_view=40.0)
 
-    depth = DepthNetwork(Processor(), Network(), Meaning("z", "made"), CPU)(
-        np.zeros((6, 9, 3), "B")
-    )
+    network = DepthNetwork(Processor(), Network(), Meaning("z", "made"), CPU)
+    depth = network(np.zeros((6, 9, 3), np.uint8))
     np.testing.assert_array_equal(depth, np.full((6, 9), 40))
 
 

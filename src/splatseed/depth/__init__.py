@@ -1,4 +1,4 @@
-"""Depth-guided lifting: turning pixels of the photographs into points by their depth maps.
+"""Points from depth maps, pixel by pixel, and the maps that ``stereo`` and ``monocular`` make.
 
 Promise: photographs and maps are read one at a time by each thread, whatever the number of images.
 """

@@ -249,7 +249,11 @@ def _too_small(
 def file_from_camera(
     path: Path, file_size: tuple[int, int], camera_size: tuple[int, int]
 ) -> Float64[np.ndarray, " 2"]:
-    """How many pixels of the file a pixel of the camera record is, along x and y."""
+    """How many pixels of the file a pixel of the camera record is, along x and y.
+
+    Raises:
+        SceneFormatError: Their aspect ratios differ.
+    """
     scale = np.array(file_size) / np.array(camera_size)
     if abs(scale[0] / scale[1] - 1) > ASPECT_SLACK:
         raise SceneFormatError(
