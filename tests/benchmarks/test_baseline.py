@@ -6,7 +6,6 @@ import pytest
 
 pytest.importorskip("torch", reason="training needs PyTorch")
 
-from splatseed.errors import ParameterError
 from splatseed.io import load_scene
 from splatseed.synthetic import make_capture, write_capture
 from splatseed.train import TrainSettings
@@ -78,9 +77,3 @@ def test_what_is_in_the_ledger_is_not_run_again(bench, captures, monkeypatch, tm
     rows = [line for line in capsys.readouterr().out.splitlines() if line.startswith("| none")]
     assert rows[0] == rows[1]
     assert "20.50 / 0.5000 (1k, 2 s)" in rows[0]
-
-
-@pytest.mark.parametrize("wrong", [{"scenes": ("garden",)}, {"arms": ("magic",)}])
-def test_names_that_are_not_known_are_refused(bench, wrong):
-    with pytest.raises(ParameterError, match=next(iter(wrong))):
-        bench.baseline.Settings(**wrong)

@@ -99,6 +99,12 @@ def test_a_container_has_less_than_its_machine(monkeypatch, tmp_path):
     assert memory.free_memory() == pytest.approx(whole, rel=0.5)
 
 
+def test_amounts_of_memory():
+    bytes_of = memory.bytes_of
+    assert bytes_of("4G") == bytes_of("4GB") == bytes_of(" 4gib ") == 4 << 30
+    assert (bytes_of("500M"), bytes_of("123"), bytes_of("1.5K")) == (500 << 20, 123, 1536)
+
+
 def test_an_unknown_amount_refuses_nothing(free):
     free(None)
     assert number_of_new(None, "mls", 10, None, 10**9) == 10**9 - 10

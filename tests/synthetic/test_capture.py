@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image as PillowImage
 
-from splatseed.errors import OutputError, ParameterError
+from splatseed.errors import ParameterError
 from splatseed.io import find_depths, load_scene
 from splatseed.synthetic import DEPTH_SCALE, make_capture, write_capture
 from splatseed.synthetic.room import visible
@@ -154,13 +154,6 @@ def test_a_written_capture_loads_as_the_same_scene(capture, tmp_path):
         read = maps.read(image.name).values
         np.testing.assert_allclose(read[depth > 0], depth[depth > 0], atol=0.51 / DEPTH_SCALE)
         assert np.isnan(read[depth == 0]).all()
-
-
-def test_a_capture_is_not_written_over_another_folder(capture, tmp_path):
-    (tmp_path / "mine.txt").write_text("keep")
-    with pytest.raises(OutputError):
-        write_capture(capture, tmp_path, overwrite=True)
-    assert [entry.name for entry in tmp_path.iterdir()] == ["mine.txt"]
 
 
 def _read(path):

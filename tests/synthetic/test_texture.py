@@ -20,12 +20,6 @@ def test_noise_is_bounded_smooth_and_differs_by_seed(rng):
     assert np.abs(value_noise(xyz, 3, seed=2) - noise).max() > 0.2
 
 
-def test_noise_has_no_seam_at_the_origin():
-    x = np.linspace(-1e-6, 1e-6, 9)
-    noise = value_noise(np.stack([x, x, x], axis=1), 4, seed=0)
-    assert np.ptp(noise) < 1e-3
-
-
 def test_a_tile_has_one_colour_without_its_grain():
     flat = Mottled(((1.0,) * 3, (1.0,) * 3), (1, 1, 1), octaves=1)
     tiles = Tiles(((0.1, 0.2, 0.3), (0.9, 0.8, 0.7)), (1.0, 1.0, 1.0), flat)

@@ -82,11 +82,9 @@ class Tasks(ABC):
 
     Attributes:
         words: A description for the user.
-        processes: Processes of this machine that hold memory at a time, this one included.
     """
 
     words: str
-    processes: int = 1
 
     @abstractmethod
     def run(
@@ -147,7 +145,6 @@ class ProcessTasks(Tasks):
     def __init__(self, environments: Sequence[Mapping[str, str]], *, fresh: bool = False) -> None:
         self._environments, self._fresh = environments, fresh
         self.words = f"{len(environments)} processes"
-        self.processes = 1 + len(environments)
 
     def run(
         self, function: Function, calls: Sequence[tuple[Any, ...]], report: Report | None = None

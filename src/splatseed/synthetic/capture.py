@@ -29,8 +29,6 @@ from splatseed.synthetic.tracks import TrackedPoints, track_points
 DEPTH_SCALE = 5000
 """Depth PNGs hold metres times this, rounded to 16 bits (as TUM's); 0 = no depth."""
 
-CAMERA_ID = 1
-
 
 @dataclass(frozen=True, eq=False)
 class Capture:
@@ -147,28 +145,16 @@ def _scene(
     cameras: Sequence[Camera], images: UInt8[np.ndarray, "V H W 3"], tracked: TrackedPoints
 ) -> Scene:
     """The COLMAP model of the points; point i has id i + 1, view v has id v + 1."""
-    K = cameras[0].K
+    K, images_of_scene = cameras[0].K, []
     params = (K[0, 0], K[1, 1], K[0, 2], K[1, 2])
-    intrinsics = Intrinsics(CAMERA_ID, "PINHOLE", cameras[0].width, cameras[0].height, params)
+    intrinsics = Intrinsics(1, "PINHOLE", cameras[0].width, cameras[0].height, params)
+    for view, camera in enumerate(cameras):
+        mine, pose = tracked.view_idx == view, camera.cam_from_world
+        seen = Observations(tracked.uv[mine], tracked.point_idx[mine] + 1)
+        turn, name = quat_from_rotation(pose[:3, :3]), f"view_{view:03d}.png"
+        images_of_scene.append(Image(name, view + 1, intrinsics, turn, pose[:3, 3], seen))
     points = PointCloud(tracked.xyz.astype(np.float32), _point_colors(images, tracked))
-    return Scene(
-        points,
-        tuple(_image(v, camera, intrinsics, tracked) for v, camera in enumerate(cameras)),
-        (intrinsics,),
-        _tracks(tracked),
-    )
-
-
-def _image(view: int, camera: Camera, intrinsics: Intrinsics, tracked: TrackedPoints) -> Image:
-    mine = tracked.view_idx == view
-    return Image(
-        f"view_{view:03d}.png",
-        view + 1,
-        intrinsics,
-        quat_from_rotation(camera.cam_from_world[:3, :3]),
-        camera.cam_from_world[:3, 3],
-        Observations(tracked.uv[mine], tracked.point_idx[mine] + 1),
-    )
+    return Scene(points, tuple(images_of_scene), (intrinsics,), _tracks(tracked))
 
 
 def _tracks(tracked: TrackedPoints) -> Tracks:

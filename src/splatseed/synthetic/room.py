@@ -24,7 +24,6 @@ from splatseed.synthetic.surfaces import (
     Box,
     Cylinder,
     Discs,
-    Numbers,
     Points,
     Rectangle,
     SineSheet,
@@ -169,13 +168,9 @@ def orbit_cameras(num_views: int, width: int, height: int) -> tuple[Camera, ...]
     azimuth = np.radians(-15.0 + 120.0 * share)
     elevation = np.radians(30.0 + 17.0 * np.sin(2.0 * np.pi * 3.0 * share))
     radius = 2.75 + 0.25 * np.cos(2.0 * np.pi * 5.0 * share)
+    across = np.cos(elevation)
     outward = np.stack(
-        [
-            np.cos(azimuth) * np.cos(elevation),
-            np.sin(azimuth) * np.cos(elevation),
-            np.sin(elevation),
-        ],
-        axis=1,
+        [np.cos(azimuth) * across, np.sin(azimuth) * across, np.sin(elevation)], axis=1
     )
     eyes = LOOK_AT + radius[:, None] * outward
     return tuple(Camera(K, width, height, look_at(eye, LOOK_AT, UP)) for eye in eyes)
@@ -236,15 +231,11 @@ def _shade(room: Room, camera: Camera, directions: Points) -> Points:
         mine = np.flatnonzero(which == i)
         if len(mine):
             xyz = camera.center + t[mine, None] * directions[mine]
-            light = _lambert(surface.normals(xyz), directions[mine])
+            normals = surface.normals(xyz)
+            facing = -np.sign(np.einsum("ij,ij->i", normals, directions[mine]))  # of two sides
+            light = AMBIENT + (1.0 - AMBIENT) * np.maximum(facing * (normals @ SUN), 0.0)
             colors[mine] = texture(xyz) * light[:, None]
     return colors
-
-
-def _lambert(normals: Points, directions: Points) -> Numbers:
-    """Lambertian brightness 0..1 of the visible side: sheets and leaves have two."""
-    facing = -np.sign(np.einsum("ij,ij->i", normals, directions))
-    return np.asarray(AMBIENT + (1.0 - AMBIENT) * np.maximum(facing * (normals @ SUN), 0.0))
 
 
 def visible(surfaces: Surface, camera: Camera, xyz: Points) -> Bool[np.ndarray, " N"]:

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int64
@@ -141,14 +141,9 @@ class Box:
     frame: Frame
 
     @property
-    def _face_areas(self) -> Vector:
-        """Area of one face normal to each axis, [3]."""
-        return np.asarray(4.0 * self.half.prod() / self.half)
-
-    @property
     def area(self) -> float:
         """See ``Surface.area``."""
-        return float(2.0 * self._face_areas.sum())
+        return float(8.0 * (self.half.prod() / self.half).sum())
 
     def distance(self, xyz: Points) -> Numbers:
         """See ``Surface.distance``."""
@@ -159,7 +154,8 @@ class Box:
 
     def sample(self, num: int, rng: np.random.Generator) -> Points:
         """See ``Surface.sample``."""
-        axis = rng.choice(3, num, p=self._face_areas / self._face_areas.sum())
+        faces = 4.0 * self.half.prod() / self.half  # normal to each axis
+        axis = rng.choice(3, num, p=faces / faces.sum())
         local = rng.uniform(-1.0, 1.0, (num, 3))
         local[np.arange(num), axis] = rng.choice([-1.0, 1.0], num)
         return np.asarray(self.center + (local * self.half) @ self.frame)
@@ -429,18 +425,12 @@ class SineSheet:
             going = ~crossed & (t < far[active])
             low[active[going]] = t[going]
             active = active[going]
-        hit = np.isfinite(high)
-        high[hit] = self._bisect(start, directions[hit], low[hit], high[hit])
-        return high
-
-    def _bisect(
-        self, start: np.ndarray, directions: np.ndarray, low: np.ndarray, high: np.ndarray
-    ) -> np.ndarray:
-        side = self._above(start, directions, low)
+        hit = np.flatnonzero(np.isfinite(high))
+        side = self._above(start, directions[hit], low[hit])
         for _ in range(_BISECTIONS):
-            middle = (low + high) / 2
-            before = self._above(start, directions, middle) == side
-            low, high = np.where(before, middle, low), np.where(before, high, middle)
+            middle = (low[hit] + high[hit]) / 2
+            before = self._above(start, directions[hit], middle) == side
+            low[hit[before]], high[hit[~before]] = middle[before], middle[~before]
         return high
 
     def _above(self, start: np.ndarray, directions: np.ndarray, t: np.ndarray) -> np.ndarray:
@@ -485,10 +475,9 @@ class Discs:
         """See ``Surface.distance``."""
         return np.asarray(self._nearest(xyz)[0])
 
-    def _nearest(self, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _nearest(self, xyz: np.ndarray) -> Any:
         points = np.ascontiguousarray(xyz, np.float64)
-        distances, which = _nearest_disc(points, self.centers, self.axes, self.radii)
-        return np.asarray(distances), np.asarray(which)
+        return _nearest_disc(points, self.centers, self.axes, self.radii)
 
     def sample(self, num: int, rng: np.random.Generator) -> Points:
         """See ``Surface.sample``."""

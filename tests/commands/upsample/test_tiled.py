@@ -11,7 +11,6 @@ import pytest
 from splatseed.io.ply import read_ply, write_ply
 from splatseed.pointcloud import PointCloud
 from splatseed.runtime import tasks
-from splatseed.runtime.memory import bytes_of
 from splatseed.upsample.tiles import making, work
 
 
@@ -55,7 +54,7 @@ def test_large_clouds_are_shared_among_processes(cloud, tmp_path, splatseed, mon
         """As many as asked for, all of them this one."""
 
         def __init__(self, environments):
-            self.words, self.processes = f"{len(environments)} processes", 1 + len(environments)
+            self.words = f"{len(environments)} processes"
 
     monkeypatch.setattr(tasks, "ProcessTasks", Processes)
     monkeypatch.setattr(tasks, "cores", lambda: 2)
@@ -120,44 +119,31 @@ def test_a_survey_far_from_zero_is_moved_and_says_so(tmp_path, splatseed):
 SCAN = "with splatseed upsample SCENE --cloud SCAN."
 
 
-@pytest.mark.parametrize(
-    ("words", "told"),
-    [
-        (("--memory", "100M"), "at least"),
-        (("--memory", "much"), "'much'"),
-        (("--tile-points", "99", "--budget", "50"), "--budget"),
-        (("--tile-points", "99", "--method", "stereo"), SCAN),
-        (("--jobs", "2", "--memory", "1G", "--verify"), "--verify"),
-        (
-            ("--tile-points", "99", "--method", "voronoi", "--profile", "paper"),
-            "leave out --memory",
-        ),
-    ],
-)
-def test_what_cannot_be_is_refused(words, told, cloud, tmp_path, splatseed):
-    method = () if "--method" in words else ("--method", "linear")
-    run = splatseed("upsample", cloud, "-o", tmp_path / "out", *method, *words)
+REFUSED = [
+    ("ply", "--memory 100M", "at least"),
+    ("ply", "--memory much", "'much'"),
+    ("ply", "--tile-points 99 --budget 50", "--budget"),
+    ("ply", "--tile-points 99 --method stereo", SCAN),
+    ("ply", "--jobs 2 --memory 1G --verify", "--verify"),
+    ("ply", "--tile-points 99 --method voronoi --profile paper", "leave out --memory"),
+    ("npz", "--method stereo", SCAN),
+    ("npz", "--preview --budget 50", SCAN),
+    ("ply, little memory", "--preview", "or use a machine with 3"),
+    ("room", "--memory 200M", "MB of memory for the points and tracks of"),
+]
+
+
+@pytest.mark.parametrize(("given", "words", "told"), REFUSED)
+def test_what_cannot_be_is_refused(
+    given, words, told, cloud, room, tmp_path, splatseed, monkeypatch
+):
+    path = room if given == "room" else npz(cloud) if given == "npz" else cloud
+    if "little" in given:
+        monkeypatch.setattr("splatseed.commands.upsample.tiled.free_memory", lambda: 200 << 20)
+    words = words if "--method" in words else f"{words} --method mls"
+    run = splatseed("upsample", path, "-o", tmp_path / "out", *words.split())
     assert (run.code, told in " ".join(run.err.split())) == (2, True)
     assert not list(tmp_path.glob("out*"))
-
-
-@pytest.mark.parametrize(
-    "words", [("--method", "stereo"), ("--method", "mls", "--preview", "--budget", "50")]
-)
-def test_a_lone_scan_is_led_to_its_photographs(words, cloud, tmp_path, splatseed):
-    run = splatseed("upsample", npz(cloud), "-o", tmp_path / "out", *words)
-    assert run.code == 2
-    assert " ".join(run.err.split()).endswith(SCAN)
-
-
-def test_what_the_machine_alone_cuts_into_tiles_is_told_what_it_takes(
-    cloud, tmp_path, splatseed, monkeypatch
-):
-    monkeypatch.setattr("splatseed.commands.upsample.tiled.free_memory", lambda: 200 << 20)
-    run = splatseed("upsample", cloud, "-o", tmp_path / "out", "--method", "mls", "--preview")
-    assert run.code == 2
-    message = " ".join(run.err.split())
-    assert re.search(r"or use a machine with 3\d\d MB of free memory", message), message
 
 
 @pytest.mark.parametrize("content", ["nan nan nan\n" * 9, "1 2 3\n" * 99 + "1 2\n"])
@@ -167,18 +153,6 @@ def test_of_a_damaged_cloud_nothing_is_kept(content, tmp_path, splatseed):
     assert run.code == 2
     assert re.search("row 100 of|none of them finite", run.err.replace("\n", " "))
     assert [each.name for each in tmp_path.iterdir()] == ["a.xyz"]
-
-
-def test_a_model_larger_than_the_memory_is_refused_before_it_is_read(
-    room, tmp_path, splatseed, monkeypatch
-):
-    monkeypatch.setattr("splatseed.commands.upsample.tiled.load_scene", None)  # must not be called
-    run = splatseed("upsample", room, "-o", tmp_path / "out", "--method", "mls", "--memory", "200M")
-    assert run.code == 2
-    told = " ".join(run.err.split())
-    assert "MB of memory for the points and tracks of" in told
-    assert "found 200 MB. Pass --memory 30" in told
-    assert not list(tmp_path.glob("out*"))
 
 
 def test_interrupted_it_says_what_is_kept_and_goes_on(cloud, tmp_path, splatseed, monkeypatch):
@@ -195,8 +169,3 @@ def test_interrupted_it_says_what_is_kept_and_goes_on(cloud, tmp_path, splatseed
     assert "half-written" not in run.err
     run = splatseed(*words)
     assert f"Going on with the work in {tmp_path / 'out.tiles'}" in run.out
-
-
-def test_amounts_of_memory():
-    assert bytes_of("4G") == bytes_of("4GB") == bytes_of(" 4gib ") == 4 << 30
-    assert (bytes_of("500M"), bytes_of("123"), bytes_of("1.5K")) == (500 << 20, 123, 1536)

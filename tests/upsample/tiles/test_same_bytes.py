@@ -87,15 +87,6 @@ def test_draws_of_many_blocks_are_those_in_memory(sheet, tiles, monkeypatch):
     )
 
 
-def test_blocks_change_no_draw_of_a_cloud_within_one(sheet):
-    """What was drawn before there were blocks."""
-    cloud = neighbors.prepare(distinct(sheet))
-    weight = np.linspace(0, 1, len(cloud))
-    bases = neighbors.draw_bases(cloud, 999, np.random.default_rng(3), weight=weight[cloud.rank])
-    expected = np.random.default_rng(3).multinomial(999, weight / weight.sum())
-    np.testing.assert_array_equal(bases.count, expected[cloud.rank])
-
-
 def test_tracks_are_heeded(tiles):
     rng = np.random.default_rng(2)
     xyz = rng.random((200, 3)).astype(np.float32)
