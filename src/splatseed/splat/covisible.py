@@ -26,15 +26,12 @@ from splatseed.scene import Image, Scene
 from splatseed.seeding.coverage import NEARER, cell_depths, grid_from_world, grid_of
 from splatseed.views.view import View, data_factor, poses_of
 
-_LEAST_VIEWS = 2
-"""Training views that must see a pixel."""
+_LEAST_VIEWS = 2  # training views that must see a pixel
 _CELLS, _LEAST_CELL = 100, 2.0
 """Cells along the longer side (the SfM points of a capture fill most of so many), and the smallest
 side of a cell, in pixels."""
-_MAX_SIZE = 800
-"""Longer side in pixels of the frames that are divided into cells."""
-_NEAREST = 4
-"""Covered cells over which an empty cell takes the median of inverse depth."""
+_MAX_SIZE = 800  # longer side in pixels of the frames that are divided into cells
+_NEAREST = 4  # covered cells over which an empty cell takes the median of inverse depth
 _STAGE = "find co-visible pixels"
 
 Grids = Mapping[str, Bool[np.ndarray, "rows cols"]]

@@ -25,21 +25,18 @@ from splatseed.views.view import View
 
 SH_C0 = 0.28209479177387814
 """The spherical harmonic of degree 0, 1 / (2 sqrt(pi)); colour = 0.5 + SH_C0 * sh0."""
-SH_C1 = 0.4886025119029199
-"""Constant of degree 1, sqrt(3 / (4 pi))."""
+SH_C1 = 0.4886025119029199  # of degree 1, sqrt(3 / (4 pi))
 SCENE_SCALE = 1.1
 """Scene size for the strategies and the learning rate of positions: the cameras' extent plus a
 tenth, as in 3DGS."""
-NEIGHBORS = 3
-"""Neighbours whose mean square distance is a Gaussian's first size, as in 3DGS."""
+NEIGHBORS = 3  # whose mean square distance is a Gaussian's first size, as in 3DGS
 COINCIDENT, GAP = 1e-2, 10.0
 """Bounds of a first size, relative to the median: beyond the second a point is isolated, and below
 the first it would stay invisible."""
 OWN, EVEN = 0.3, 1.0
 """Weights, in photographs, of a seed's own colour, and of the prior against view dependence, which
 few views do not determine."""
-CELL = 4.0
-"""Side in pixels of the cells within which seeds occlude each other."""
+CELL = 4.0  # side in pixels of the cells within which seeds occlude each other
 LEAST_VIEWS, MOST_PROJECTIONS = 16, 50_000_000
 """An even subset of the views, but never fewer than the first, is used beyond as many seeds times
 views as the second."""

@@ -29,8 +29,7 @@ from splatseed.splat.ssim import C1, C2, WINDOW, l1_and_ssim, window_weights
 LPIPS_NET, LPIPS_FILE = "vgg", "vgg16-397923af.pth"
 """The network of LPIPS, which papers on 3DGS report, and PyTorch's name for the file of weights."""
 _URL = "https://download.pytorch.org/models/"
-_TAPS = (3, 8, 15, 22, 29)
-"""The layers whose output is compared."""
+_TAPS = (3, 8, 15, 22, 29)  # the layers whose output is compared
 # Each channel of an image in [-1, 1] becomes (value - SHIFT) / SCALE, as in the metric's code.
 _SHIFT = (-0.030, -0.088, -0.188)
 _SCALE = (0.458, 0.448, 0.450)

@@ -24,14 +24,11 @@ from splatseed.runtime.torch_device import free_bytes
 from splatseed.splat.gaussians import Gaussians, TrainingFrame
 from splatseed.views.view import View
 
-SHARE = 0.25
-"""Most of a GPU's free memory that photographs may take."""
-LEAST_ALPHA = 0.05
-"""Alpha below which a pixel has no depth."""
+SHARE = 0.25  # most of a GPU's free memory that photographs may take
+LEAST_ALPHA = 0.05  # below which a pixel has no depth
 FULL_ERROR = 0.25
 """The error that is drawn brightest, in all pictures, so that they can be compared."""
-GAP = 4
-"""White columns between the pictures of a row."""
+GAP = 4  # white columns between the pictures of a row
 
 
 class CameraTensors(NamedTuple):

@@ -28,10 +28,8 @@ CONVERTER = "npx @playcanvas/splat-transform"
 
 _VERSION = 2
 _META = "meta.json"
-_PER_ROW = 64
-"""Palette entries per row of the centroid picture."""
-_MOST_LEVELS = 16
-"""The palette grows with the number of Gaussians, to 2^16 entries at most."""
+_PER_ROW = 64  # palette entries per row of the centroid picture
+_MOST_LEVELS = 16  # the palette grows with the number of Gaussians, to 2^16 entries
 _MOST_BYTES, _MOST_META = 1 << 31, 1 << 24
 """Larger pictures of an archive, and a larger meta.json, are refused unread."""
 _QUAT_MARK = 252

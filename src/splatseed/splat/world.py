@@ -32,8 +32,7 @@ APART, DOUBTFUL, CLOSER = 8.0, 1.5, 3.0
 world is closer by the third as a factor."""
 LEAST, SAMPLES = 20, 3000
 """Fewest and most points and Gaussians whose distances are measured."""
-VISIBLE = -2.2
-"""Logit of the least opacity that counts, a tenth."""
+VISIBLE = -2.2  # logit of the least opacity that counts, a tenth
 FILES = (NERFSTUDIO, "cameras.json")
 """Files of nerfstudio and graphdeco, in the model's folder or up to three above, that give a
 transform."""

@@ -42,8 +42,7 @@ NEAR, FAR = np.array([0, 114, 178]), np.array([213, 94, 0])
 """Colours of points on an aligned cloud and of those off it."""
 EMPTY, BLEND = np.array([214.0, 20.0, 190.0]), 0.6
 """Colour of cells without a seed, magenta, the rarest in photographs, and its opacity."""
-DIM = 0.75
-"""Factor on the brightness of the photograph under cells."""
+DIM = 0.75  # the photograph under cells
 
 
 class CoveredView(NamedTuple):

@@ -33,10 +33,8 @@ from splatseed.view.page import depth_picture, nearness, usual_range
 from splatseed.views.view import View
 from splatseed.views.visibility import look_at
 
-SMOOTHING = 0.02
-"""Standard deviation of the filter along a path, as a fraction of the path's length."""
-FINE = 8
-"""Samples per frame at which a path is smoothed."""
+SMOOTHING, FINE = 0.02, 8
+"""Standard deviation of the filter along a path, as a fraction of its length; samples a frame."""
 DETOUR = 2.0
 """Names give no order if following them takes this many times the way by nearest neighbours."""
 MOST_FRAMES = 100_000
@@ -47,12 +45,8 @@ share of the Gaussians does, and more than half must not."""
 FAR_AWAY = 10.0
 """A path is far away beyond this many times the cameras' extent."""
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-DEPTH_SAMPLES = 7
-"""How many frames of a path are rendered to find its depth range."""
-QUALITY = 8
-"""imageio-ffmpeg's quality, 0 to 10."""
-
-Point = Float64[np.ndarray, " 3"]
+DEPTH_SAMPLES = 7  # frames of a path that are rendered to find its depth range
+QUALITY = 8  # imageio-ffmpeg's, 0 to 10
 
 # Paths --------------------------------------------------------------------------------------------
 
@@ -64,10 +58,10 @@ def smooth_path(views: Sequence[View], frames: int, size: tuple[int, int]) -> li
         ParameterError: There are fewer than two cameras, or all are in one place.
     """
     strays = stray_views(views)
-    stops = _in_order([view for view in views if view.name not in strays])
-    poses = _poses(stops)
-    reach = np.linalg.norm(poses[:, :3] - poses[:, :3].mean(axis=0), axis=1).max() if stops else 0
-    if len(stops) < 2 or not reach > 0:
+    ordered = _in_order([view for view in views if view.name not in strays])
+    poses = _poses(ordered)
+    reach = np.linalg.norm(poses[:, :3] - poses[:, :3].mean(axis=0), axis=1).max() if ordered else 0
+    if len(ordered) < 2 or not reach > 0:
         raise ParameterError(
             "cameras in at least two places, for a path through them",
             found=counted(len(views), "camera"),
@@ -79,11 +73,9 @@ def smooth_path(views: Sequence[View], frames: int, size: tuple[int, int]) -> li
     # Then at even speed: by the distance covered, not by the stops passed.
     fine = gaussian_filter1d(fine, SMOOTHING * len(fine), axis=0, mode="nearest")
     moved = np.linalg.norm(np.diff(fine[:, :3], axis=0), axis=1)
-    lens = _lens(views, size)
-    return [
-        _posed(lens, i, pose[:3], pose[:3] + pose[3:6], pose[6:])
-        for i, pose in enumerate(_resampled(fine, moved + 1e-9 * reach, frames))
-    ]
+    even = _resampled(fine, moved + 1e-9 * reach, frames)
+    stops = [(pose[:3], pose[:3] + pose[3:6], pose[6:]) for pose in even]
+    return _posed(_lens(views, size), stops)
 
 
 def orbit(
@@ -111,7 +103,7 @@ def orbit(
         focus + np.median(heights) * up + radius * (np.cos(angle) * first + np.sin(angle) * side)
         for angle in 2 * np.pi * np.arange(frames) / frames
     ]
-    return [_posed(lens, i, eye, focus, up) for i, eye in enumerate(eyes)]
+    return _posed(lens, [(eye, focus, up) for eye in eyes])
 
 
 def focus_of(views: Sequence[View]) -> Float64[np.ndarray, " 3"]:
@@ -216,8 +208,10 @@ def _poses(views: Sequence[View]) -> Float64[np.ndarray, "V 9"]:
     return np.hstack([centers, poses[:, 2, :3], -poses[:, 1, :3]])
 
 
-def _posed(lens: View, i: int, eye: Point, target: Point, up: Point) -> View:
-    return dataclasses.replace(lens, name=f"{i}", cam_from_world=look_at(eye, target, up))
+def _posed(lens: View, stops: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> list[View]:
+    """Views from some places to targets, with their directions up."""
+    poses = [look_at(*stop) for stop in stops]
+    return [dataclasses.replace(lens, name=f"{i}", cam_from_world=p) for i, p in enumerate(poses)]
 
 
 def _resampled(

@@ -33,10 +33,8 @@ from splatseed.view.page import (
 from splatseed.view.points import points_over
 from splatseed.views.visibility import find_visibility
 
-SIDE, CHECK_SIDE = 440, 480
-"""The longer side of a tile, of maps and of depth that is checked."""
-LABEL, CHECK_LABEL = 40, 46
-"""Characters of a label that fit above it."""
+(SIDE, LABEL), (CHECK_SIDE, CHECK_LABEL) = (440, 40), (480, 46)
+"""The longer side of a tile, and characters that fit above it, of maps and of checked depth."""
 LIMIT = 0.1
 """Relative errors of depth from this value on have the last colour."""
 

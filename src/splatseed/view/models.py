@@ -29,20 +29,15 @@ MODEL_SUFFIXES = (".spz", ".splat", ".sog", ".ksplat", ".glb")
 _HEADER = 1 << 16
 CORE = 0.6
 """Share of the points, nearest to their median, that the stage is fitted to without cameras."""
-LINE = 2
-"""Width of the border between two pictures."""
+LINE = 2  # the border between two pictures
 
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """What a viewer shows: a scene, a model, or a model with its scene.
+    """What a viewer shows: a scene, a model, or a model with its scene, in the scene's world.
 
-    Args:
-        name: What to call it.
-        scene: Points, cameras and photographs; None for a lone model.
-        gaussians: The model, in the scene's world; None for a lone scene.
-        data_factor: The factor by which the run downsampled its photographs; 1 if unknown.
-        test_every: Every ``test_every``-th image, sorted by name, is a test view.
+    ``data_factor`` downsampled the photographs of the model's run; every ``test_every``-th image,
+    sorted by name, is a test view.
     """
 
     name: str

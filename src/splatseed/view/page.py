@@ -22,12 +22,10 @@ from splatseed.scene import Image, Scene
 
 GRID_SIDE = 600
 """Longer side of a picture in a grid, in pixels."""
-LABEL_SIZES = (20, 11)
-"""Usual and smallest size of letters."""
+LABEL_SIZES = (20, 11)  # usual and smallest, of letters
 GAP, LABEL_HEIGHT, STRIP_HEIGHT = 12, 34, 44
 PAPER, INK, UNKNOWN = (255, 255, 255), (20, 20, 20), (150, 150, 150)
-BLANK = (230, 230, 230)
-"""Stands in for a photograph."""
+BLANK = (230, 230, 230)  # stands in for a photograph
 RANGE = (2, 98)
 """Percentiles of a map's values between which its colours vary."""
 

@@ -40,13 +40,11 @@ Drawn = tuple[Picture | None, str]
 MOST_MOVING = 250_000
 """Gaussians rendered while a camera moves, on the CPU: projecting a million takes longer there than
 all pixels. A GPU, which projects millions in milliseconds, renders all."""
-CELL = 8
-"""Side in pixels of the cells that are tested for seeds."""
+CELL = 8  # side in pixels of the cells that are tested for seeds
 PHOTOGRAPH_SIDE, CELLS_SIDE = 1600, 800
 AT_A_CAMERA = {"photograph", "error", "depth map", "uncovered cells"}
 GO = "Click a camera to stand where a photograph was taken."
-MOST_CAMERAS = 400
-"""Most cameras that are drawn; of more, an even subset."""
+MOST_CAMERAS = 400  # that are drawn; of more, an even subset
 FRUSTUM, LEAST_FRUSTUM, MOST_FRUSTUM = 0.5, 0.008, 0.05
 """Size of a camera relative to the distance to the next one, and its bounds on the stage."""
 POINT_PIXELS = 1.4

@@ -37,13 +37,10 @@ from splatseed.views.visibility import choose_camera, choose_image
 if TYPE_CHECKING:
     from splatseed.train.run import TrainingRun
 
-STEP_BACK = 0.6
-"""How far behind the first camera a browser begins, on the stage, so that it sees that camera."""
-REFRESH_SECONDS = 2.0
-"""Seconds between pictures of a run that are sent unasked."""
-PATIENCE = 60.0
-"""Seconds that a picture waits for the current step."""
-PAUSED_POLL = 0.05
+STEP_BACK = 0.6  # on the stage, behind the first camera, so that a browser sees it
+REFRESH_SECONDS, PATIENCE, PAUSED_POLL = 2.0, 60.0, 0.05
+"""Seconds between pictures of a run that are sent unasked; that a picture waits for a step; and
+between looks for requests while a run is paused."""
 ENDED = "The training has ended: look at the run with splatseed view."
 
 

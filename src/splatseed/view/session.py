@@ -38,17 +38,14 @@ MOVING_SECONDS, STILL_AFTER = 0.12, 0.2
 """Seconds a frame may take while the camera moves, and without movement until the full picture."""
 LEAST_SCALE, FIRST_SCALE = 0.12, 0.3
 """Coarsest scale of a frame, and the scale before any frame has been timed."""
-CLOSE_SECONDS = 2.0
-"""Seconds to wait for the frame being drawn."""
+CLOSE_SECONDS = 2.0  # to wait for the frame being drawn
 MEMORY = 0.5
 """Weight of the latest frame in the running estimate of the cost per pixel."""
-MOST_PIXELS = 1_600_000
-"""The most pixels of a full picture; on larger canvases it is stretched."""
+MOST_PIXELS = 1_600_000  # of a full picture; on larger canvases it is stretched
 THUMBNAIL = 96
-MOST_POINTS = 5_000_000
-"""The most points sent to a browser, if it is quick enough; larger clouds are thinned evenly."""
-FIRST_POINTS, ENOUGH_MORE = 300_000, 1.5
-"""Points sent at once, and how many times as many are worth sending again."""
+FIRST_POINTS, ENOUGH_MORE, MOST_POINTS = 300_000, 1.5, 5_000_000
+"""Points sent at once, how many times as many are worth sending again, and the most that a quick
+browser gets; larger clouds are thinned evenly."""
 PATIENCE, MOST_PATIENCE = 0.3, 30.0
 """Seconds that the points of a picture may take (without a GPU a million take some seconds), and
 the longest wait for an answer."""
