@@ -25,7 +25,7 @@ from splatseed.splat.formats import (
     write_model,
 )
 from splatseed.splat.gaussians import Gaussians
-from splatseed.splat.sog import _MOST_META, codebook, codes, palette
+from splatseed.splat.sog import _MOST_META
 
 SUFFIXES = [each.suffix for each in FORMATS.values()]
 # Of positions, log-scales, degrees of rotation, opacities, first and further coefficients.
@@ -128,19 +128,6 @@ def test_opacities_of_0_and_1_stay_finite(tmp_path):
         write_model(tmp_path / f"m{suffix}", sure)
         opacities = read_model(tmp_path / f"m{suffix}").opacities
         assert (np.isfinite(opacities) & (opacities > 5)).all()
-
-
-def test_codebooks_and_palettes_err_less_than_even_steps(rng):
-    values = rng.standard_t(3, 20_000).astype(np.float32)
-    centers = codebook(values)
-    error = np.abs(centers[codes(values, centers)] - values)
-    even = np.linspace(values.min(), values.max(), 256)
-    assert error.mean() < np.abs(even[codes(values, even)] - values).mean() / 3
-    vectors = rng.normal(size=(4096, 6)).astype(np.float32)
-    entries, labels = palette(vectors, 8)
-    assert (labels.min(), labels.max(), len(entries)) == (0, 255, 256)
-    some = vectors[rng.integers(0, 4096, 4096)]
-    assert ((entries[labels] - vectors) ** 2).mean() < ((some - vectors) ** 2).mean() / 3
 
 
 # Damage ------------------------------------------------------------------------------------------

@@ -115,14 +115,14 @@ def test_what_is_no_path_is_refused(content, tmp_path):
 def test_depth_is_that_of_a_wall():
     """A wall of Gaussians 4 units ahead, in a world 100 units large."""
     xy = np.stack(np.meshgrid(*2 * [np.linspace(-4, 4, 41)]), axis=-1).reshape(-1, 2)
-    count = len(xy)
+    ones = np.ones((len(xy), 1), np.float32)
     wall = Gaussians(
-        means=np.column_stack([xy, np.full(count, 4.0)]).astype(np.float32) + np.float32(100),
-        scales=np.full((count, 3), np.log(0.15), np.float32) + np.array([0, 0, -3], np.float32),
-        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
-        opacities=np.full(count, 4, np.float32),
-        sh0=np.zeros((count, 1, 3), np.float32),
-        shN=np.zeros((count, 0, 3), np.float32),
+        means=np.float32([100, 100, 104]) + np.hstack([xy, 0 * ones]).astype(np.float32),
+        scales=ones * np.float32([np.log(0.15), np.log(0.15), np.log(0.15) - 3]),
+        quats=ones * np.float32([1, 0, 0, 0]),
+        opacities=4 * ones[:, 0],
+        sh0=np.zeros((len(xy), 1, 3), np.float32),
+        shN=np.zeros((len(xy), 0, 3), np.float32),
     )
     pose = np.eye(4)
     pose[:3, 3] = -100
