@@ -93,7 +93,9 @@ def test_models_survive_a_round_trip(tmp_path_factory, data):
     tracks = Tracks(np.array(ids, np.int64), xyz, errors, offsets, *pairs)
     with np.errstate(over="ignore"):
         points = PointCloud(xyz.astype(np.float32), array(np.uint8, xyz.shape))
-    folder = written(tmp_path_factory.getbasetemp(), Model(tuple(cameras), images, points, tracks))
+    folder = written(
+        tmp_path_factory.mktemp("model"), Model(tuple(cameras), images, points, tracks)
+    )
     again, again_images, *again_points = read(folder)
     assert again == tuple(cameras)
     assert_same_images(again_images, images)
