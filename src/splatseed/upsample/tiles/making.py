@@ -318,29 +318,21 @@ def _draw(work: Path, num_new: int, seed: int, progress: Progress) -> None:
 def _weights(
     store: TileStore, progress: Progress
 ) -> Iterator[tuple[Int32[np.ndarray, " b"], Float64[np.ndarray, " b"]]]:
-    """The tiles and the weights of each block of points in file order."""
-    taken = np.zeros(len(store.counts), np.int64)
-    for tiles in _kept_tiles(Rows(store.work), neighbors.DRAW_BLOCK, progress):
-        weight = np.empty(len(tiles))
-        for tile, places in by_tile(tiles):
-            path = store.work / "weighed" / tile_name(tile) / "weight.npy"
-            known = np.load(path, mmap_mode="r")
-            weight[places] = known[taken[tile] : taken[tile] + len(places)]
-            taken[tile] += len(places)
-        yield tiles, weight
-
-
-def _kept_tiles(rows: Rows, size: int, progress: Progress) -> Iterator[Int32[np.ndarray, " b"]]:
-    """The tiles of all rows that did not drop out, ``size`` at a time."""
+    """The tiles and the weights of each block of points in file order, without dropped rows."""
+    rows, size, taken = Rows(store.work), neighbors.DRAW_BLOCK, np.zeros_like(store.counts)
     left = np.empty(0, np.int32)
     for first, last in blocks(rows.count, size, "draw", progress):
         tiles = rows.tiles(first, last)
         left = np.concatenate([left, tiles[tiles >= 0]])
-        if len(left) >= size:
-            yield left[:size]
-            left = left[size:]
-    if len(left):
-        yield left
+        while len(left) >= size or (len(left) and last == rows.count):
+            tiles, left = left[:size], left[size:]
+            weight = np.empty(len(tiles))
+            for tile, places in by_tile(tiles):
+                path = store.work / "weighed" / tile_name(tile) / "weight.npy"
+                part = slice(taken[tile], taken[tile] + len(places))
+                weight[places] = np.load(path, mmap_mode="r")[part]
+                taken[tile] += len(places)
+            yield tiles, weight
 
 
 def place(work: Path, method: NearestMethod, tile: str) -> None:
