@@ -13,7 +13,7 @@ from importlib.metadata import entry_points, version
 import numpy as np
 import pytest
 
-from splatseed.cli import VERBS, main
+from splatseed.cli import COMPLETION, VERBS, main
 from splatseed.io.ply import write_ply
 from splatseed.pointcloud import PointCloud
 
@@ -50,10 +50,7 @@ def test_from_end_to_end(ply, tmp_path):
     run = _run("info", tmp_path / "out", text=True)
     assert (run.returncode, run.stderr) == (0, "")
     assert re.search(r"points +600\n", run.stdout)
-
-
-def test_errors_go_to_stderr_with_code_2(ply, tmp_path):
-    run = _run("upsample", ply, "-o", tmp_path / "out", "--ratio", "0.5", text=True)
+    run = _run("upsample", ply, "-o", tmp_path / "more", "--ratio", "0.5", text=True)
     assert (run.returncode, run.stdout) == (2, "")
     assert re.fullmatch(r"error: expected .*; found .*\n", run.stderr)
 
@@ -123,23 +120,14 @@ def test_stopping_while_writing_leaves_nothing(ply, tmp_path, stop, code):
     assert [path.name for path in tmp_path.iterdir()] == [ply.name]
 
 
-def test_a_reader_that_leaves_early_is_no_traceback(ply):
-    words = [*COMMAND, "info", str(ply)]
+@pytest.mark.parametrize("words", [["info", "PLY"], ["upsample", "--help"]])
+def test_a_reader_that_leaves_early_is_no_traceback(words, ply):
     read, write = os.pipe()
     os.close(read)
+    words = [sys.executable, "-m", "splatseed", *(str(ply) if w == "PLY" else w for w in words)]
     run = subprocess.run(words, stdout=write, stderr=subprocess.PIPE, check=False, timeout=60)
     os.close(write)
-    assert b"Traceback" not in run.stderr
-
-
-def test_help_that_nobody_reads_on_is_no_error():
-    read, write = os.pipe()
-    os.close(read)
-    words = [sys.executable, "-m", "splatseed", "upsample", "--help"]
-    run = subprocess.run(words, stdout=write, stderr=subprocess.PIPE, check=False, timeout=60)
-    os.close(write)
-    assert run.returncode == 1
-    assert run.stderr == b""
+    assert (run.returncode, run.stderr) == (1, b"")
 
 
 def test_names_that_are_no_text(ply, tmp_path):
@@ -150,31 +138,37 @@ def test_names_that_are_no_text(ply, tmp_path):
     assert b"odd\\udcff.ply" in run.stdout
 
 
-@pytest.mark.parametrize("words", [[], ["-h"], ["--help"]])
-def test_help_names_every_verb(words, capsys):
-    main(words)
-    out, err = capsys.readouterr()
-    assert err == ""
-    for verb, does in VERBS.items():
-        assert re.search(rf"^  {verb} +{re.escape(does)}", out, re.MULTILINE)
-
-
-def test_version(capsys):
-    main(["--version"])
-    assert capsys.readouterr().out == f"splatseed {version('splatseed')}\n"
+def test_help_names_every_verb_and_the_version(splatseed):
+    for words in ([], ["-h"], ["--help"]):
+        run = splatseed(*words)
+        assert (run.code, run.err) == (0, "")
+        for verb, does in VERBS.items():
+            assert re.search(rf"^  {verb} +{re.escape(does)}", run.out, re.MULTILINE)
+    for option in ("-V", "--version"):
+        assert splatseed(option).out == f"splatseed {version('splatseed')}\n"
 
 
 @pytest.mark.parametrize("verb", VERBS)
-def test_every_verb_explains_itself(verb, capsys):
-    with pytest.raises(SystemExit) as stop:
-        main([verb, "--help"])
-    assert not stop.value.code
-    out = capsys.readouterr().out
-    assert f"splatseed {verb}" in out
-    assert "-h, --help" in out
+def test_every_verb_explains_itself(verb, splatseed):
+    run = splatseed(verb, "--help")
+    assert (run.code, run.err) == (0, "")
+    assert f"splatseed {verb}" in run.out
+    assert "-h, --help" in run.out
 
 
-def test_help_waits_for_nothing_heavy():
-    code = "import sys; from splatseed.cli import main; main(['--help']); print(*sys.modules)"
-    run = _run(command=(sys.executable, "-c", code), text=True)
-    assert not {"numba", "scipy", "matplotlib", "torch"} & set(run.stdout.split())
+def test_help_of_a_method_lists_its_options_alone(splatseed):
+    plain, one = splatseed("upsample", "--help"), splatseed("upsample", "--method", "mls", "--help")
+    assert "--mls.k" not in plain.out
+    assert "--mls.k INT" in one.out
+    assert "--spline.k" not in one.out
+
+
+def test_a_shell_completes_verbs_and_options(splatseed):
+    run = splatseed(COMPLETION, "bash")
+    assert (run.code, run.err) == (0, "")
+    for words in ("ups -> upsample", "info --pi -> --picture", "upsample --mls.k -> --mls.k"):
+        typed, offered = words.split(" -> ")
+        asked = f"COMP_WORDS=(splatseed {typed}); COMP_CWORD={len(typed.split())}"
+        program = f'{run.out}\n{asked}; _tyro_splatseed; printf "%s\\n" "${{COMPREPLY[@]}}"'
+        done = subprocess.run(["bash", "-c", program], capture_output=True, text=True, check=True)
+        assert offered in done.stdout.split()

@@ -1,23 +1,34 @@
-"""What the terminal shows, and what it must not break."""
+"""What the terminal shows, what it must not break, and names that come to it as they are."""
 
 from __future__ import annotations
 
 import io
+import shutil
+import subprocess
+from pathlib import Path
 
 import pytest
+from hypothesis import given, strategies as st
 from rich.console import Console
 
+import splatseed
 from splatseed import console
 from splatseed.console import (
+    LiteralConsole,
     StageClock,
     print_note,
     print_pairs,
     print_table,
     stage_display,
 )
+from splatseed.literal import quoted, visible
 from splatseed.runtime import compilation
 
 LONG = "/".join(["a_rather_long_folder_name"] * 9)
+EVIL = "a\x1b[31mb\x1b]0;title\x07 :fire: [red]c[/red] \u202ereversed\rd\n{e} \\ ' \"f"
+SHOWN = r"a\x1b[31mb\x1b]0;title\x07 :fire: [red]c[/red] \u202ereversed\rd\n{e} \ ' \"f".replace(
+    r"\"", '"'
+)
 
 
 def test_a_stage_lasts_until_the_next_begins(monkeypatch):
@@ -66,33 +77,21 @@ def terminal(monkeypatch):
     return drawn
 
 
-def test_a_terminal_sees_what_is_left(terminal):
+def test_a_terminal_sees_the_stages_and_what_is_left(terminal, capsys):
     with stage_display(remaining=True) as clock:
         clock.expect("features", "matching", "mapping")
         clock("features", 0.5)
-    drawn = [terminal.getvalue().rfind(stage) for stage in ("features", "matching", "mapping")]
-    assert 0 <= drawn[0] < drawn[1] < drawn[2]
-    assert list(clock.seconds()) == ["features"]
-
-
-def test_a_terminal_sees_the_stages(terminal, capsys):
-    with stage_display() as clock:
-        clock("read", 1.0)
-    with stage_display(clock):
-        clock("write", 0.5)
-    assert "read" in terminal.getvalue()
-    assert "write" in terminal.getvalue()
-    assert capsys.readouterr() == ("", "")
-    assert list(clock.seconds()) == ["read", "write"]
-
-
-def test_compilation_is_shown_once_and_taken_away(terminal):
-    with stage_display() as clock:
         for _ in range(3):
             clock.compilation(True)
             clock.compilation(False)
-        clock("fit", 0.1)
+    drawn = [terminal.getvalue().rfind(stage) for stage in ("features", "matching", "mapping")]
+    assert 0 <= drawn[0] < drawn[1] < drawn[2]
     assert "compiling kernels" in terminal.getvalue()
+    with stage_display(clock):
+        clock("write", 0.5)
+    assert "write" in terminal.getvalue()
+    assert capsys.readouterr() == ("", "")
+    assert list(clock.seconds()) == ["features", "compiling kernels", "write"]
 
 
 def test_the_bars_go_away_when_the_work_fails(terminal):
@@ -113,18 +112,79 @@ def test_the_bars_go_away_when_the_work_fails(terminal):
 
 @pytest.mark.parametrize("text", [LONG, "[bold]no markup[/bold]", "a [3, 4] b", "3 x 4 = 12.5"])
 def test_text_is_printed_as_it_is_on_one_line(text, capsys):
-    print_pairs(text, [("label", text)])
-    print_pairs(text, [("", text)])
+    print_pairs(text, [("label", text), ("", text)])
     print_note(text)
-    print_table(text, ("name", "value"), [("one", "1")])
+    print_table(text, ("image", *(f"column {i}" for i in range(8))), [(text, *"12345678")])
     out = capsys.readouterr().out
-    lines = [line for line in out.splitlines() if text in line]
-    assert len(lines) == 6
+    assert sum(text in line for line in out.splitlines()) == 6  # also in a table in a file
     assert "\x1b" not in out
 
 
-def test_a_table_in_a_file_cuts_no_name_short(capsys):
-    name = "a photograph with quite a long name, taken at 1305031102.175304.png"
-    header = ("image", *(f"column {i}" for i in range(8)))
-    print_table("title", header, [(name, *"12345678")])
-    assert name in capsys.readouterr().out
+@pytest.fixture
+def out(monkeypatch):
+    """What goes to a terminal of 400 columns."""
+    written = io.StringIO()
+    screen = LiteralConsole(file=written, force_terminal=True, width=400, color_system=None)
+    monkeypatch.setattr(console, "OUT", screen)
+    return written
+
+
+@pytest.mark.parametrize(
+    "show",
+    [
+        lambda: print_note(EVIL),
+        lambda: print_pairs(EVIL, [("what", "")]),
+        lambda: print_pairs("", [("what", EVIL)]),
+        lambda: print_table("", ("what",), [(EVIL,)]),
+    ],
+)
+def test_what_is_printed_is_literal(show, out):
+    show()
+    assert SHOWN in out.getvalue()
+    assert "\x1b" not in out.getvalue().replace("\x1b[0m", "")
+
+
+def test_all_that_is_printed_goes_through_the_literal_console():
+    for path in Path(splatseed.__file__).parent.rglob("*.py"):
+        text = path.read_text("utf-8")
+        if path.name != "console.py":
+            assert "rich.console" not in text, path
+            assert "TextColumn" not in text or "markup=False" in text, path
+
+
+def test_languages_stay_readable():
+    name = "日本語\u3000写真 Ελλάδα ñ 📷.jpg"
+    assert visible(name) == name
+    assert quoted(name) == f"'{name}'"
+
+
+@given(
+    st.text(st.characters(exclude_characters="\0"), min_size=1).filter(lambda t: t[0] < "\ud800")
+)
+def test_visible_text_has_nothing_that_acts(text):
+    assert not any(ord(each) < 32 or 127 <= ord(each) < 160 for each in visible(text))
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="needs a shell")
+def test_a_shell_reads_quoted_names_back():
+    names = [
+        EVIL,
+        "a b",
+        "$(touch x)",
+        "`x`",
+        "~",
+        "*",
+        "it's",
+        "-rf",
+        "a\udcffb",
+        "\x01",
+        "é\n",
+        "x\\'\n",
+    ]
+    words = " ".join(map(quoted, names))
+    done = subprocess.run(
+        ["bash", "-c", f"printf '%s\\0' {words}".encode("utf-8", "surrogateescape")],
+        capture_output=True, check=True,
+    )  # fmt: skip
+    read = done.stdout.decode("utf-8", "surrogateescape").split("\0")[:-1]
+    assert [each.removeprefix("./") for each in read] == names

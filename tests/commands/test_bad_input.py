@@ -1,134 +1,280 @@
-"""Bad input gives one line on stderr that says what to do, exit code 2, and no output."""
+"""Bad input: exit code 2, a message that names the file or option, and nothing is written."""
 
 from __future__ import annotations
 
 import errno
 import os
+import re
 import shutil
 import struct
+import sys
+import warnings
+import zipfile
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+torch = pytest.importorskip("torch", reason="some verbs import PyTorch")
+
+from splatseed.bench.runs import begin
+from splatseed.cli import VERBS
 from splatseed.commands import info
+from splatseed.errors import OutputError, SceneFormatError
 from splatseed.io import colmap, load_scene
 from splatseed.io.ply import write_ply
+from splatseed.io.staging import MANIFEST, atomic_file, output_folder
 from splatseed.pointcloud import PointCloud
+from splatseed.splat.formats import write_model
+from splatseed.splat.gaussians import initial_gaussians
+from splatseed.splat.metrics import load_lpips
+from splatseed.train.folder import RunFolder
+from splatseed.train.settings import TrainSettings
+from splatseed.train.state import load_checkpoint, make_strategy
+
+from ..command_line import parser_of
 
 
-def _assert_refused(run, *says):
-    """The rules that every error on the command line obeys."""
+def _refused(run, *says):
+    """The rules that every error on the command line obeys; gives what is said on one line."""
     assert run.code == 2, run
-    assert run.err.startswith("error: expected ")
-    assert run.err.count("\n") == 1
-    assert "; found " in run.err
     assert "Traceback" not in run.out + run.err
+    said = " ".join(re.sub("[│╭╮╰╯─]", " ", run.err).split())  # tyro's boxes
+    if run.err.startswith("error: "):
+        assert run.err.startswith("error: expected ")
+        assert run.err.count("\n") == 1
+        assert "; found " in run.err
+    else:
+        assert "--help" in said
     for text in says:
-        assert str(text) in run.err
+        assert str(text) in said, run
+    return said
 
 
-def _names(folder):
-    return sorted(path.name for path in folder.iterdir())
+def _contents(folder):
+    return {
+        path: path.read_bytes() if path.is_file() else b"" for path in sorted(folder.rglob("*"))
+    }
 
 
-def _truncate(room):
-    path = room / "sparse/0/points3D.bin"
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+# Words -------------------------------------------------------------------------------------------
 
+OUT = ("-o", "OUT")
+UP = ("upsample", "ROOM", *OUT)
+LIFT = (*UP, "--method", "depth")
+MLS = (*UP, "--method", "mls")
+TRAIN = ("train", "ROOM", *OUT)
+DEPTH = ("depth", "ROOM", *OUT)
+SFM = ("sfm", "ROOM/images", *OUT)
+QUICK = ("bench", "--preset", "quick", *OUT)
+EVALUATE = ("evaluate", "model.ply", "--scene", "ROOM")
 
-def _claim_too_much(room):
-    path = room / "sparse/0/points3D.bin"
-    path.write_bytes(struct.pack("<Q", 1 << 60) + path.read_bytes()[8:])
-
-
-def _append(room):
-    with (room / "sparse/0/points3D.bin").open("ab") as file:
-        file.write(b"more")
-
-
-def _text_garbage(room):
-    (room / "sparse/0/points3D.bin").unlink()
-    (room / "sparse/0/points3D.ply").unlink()
-    (room / "sparse/0/points3D.txt").write_text("# points\n1 2 3 these are no numbers\n")
-
-
-def _unknown_model(room):
-    path = room / "sparse/0/cameras.bin"
-    data = bytearray(path.read_bytes())
-    struct.pack_into("<i", data, 12, 99)  # count u64, camera id u32, then the model
-    path.write_bytes(data)
-
-
-def _unknown_model_name(room):
-    (room / "sparse/0/cameras.bin").unlink()
-    (room / "sparse/0/cameras.txt").write_text("1 FISHEYE_9 120 90 100 60 45\n")
-
-
-def _no_points(room):
-    for path in (room / "sparse/0").glob("points3D.*"):
-        path.unlink()
-    (room / "sparse/0/points3D.bin").write_bytes(struct.pack("<Q", 0))
-
-
-def _folder_for_file(room):
-    (room / "sparse/0/points3D.bin").unlink()
-    (room / "sparse/0/points3D.ply").unlink()
-    (room / "sparse/0/points3D.ply").write_bytes(b"")
-
-
-def _broken_json(room):
-    shutil.rmtree(room / "sparse")
-    (room / "transforms.json").write_text('{"frames": [')
-
-
-def _nothing(room):
-    shutil.rmtree(room / "sparse")
-
-
-DAMAGE = [
-    (_truncate, "points3D.bin"),
-    (_claim_too_much, "points3D.bin"),
-    (_append, "points3D.bin"),
-    (_text_garbage, "points3D.txt"),
-    (_unknown_model, "99"),
-    (_unknown_model_name, "FISHEYE_9"),
-    (_no_points, "--poses-from"),
-    (_folder_for_file, "points3D.ply"),
-    (_broken_json, "transforms.json"),
-    (_nothing, "splatseed sfm"),
+WORDS = [
+    (("--no-such-verb",), "--no-such-verb"),
+    (("upsmaple",), "Did you mean upsample?"),
+    (("Info",), "Did you mean info?"),
+    (("--verison",), "Did you mean --version?"),
+    (("info",), "PATH"),
+    (("info", "nowhere"), "nowhere"),
+    (("info", "nowhere", "--bogus"), "--bogus"),
+    (("info", "ROOM", "--max-steps", "0"), "--max-steps"),
+    (("info", "ROOM", "b", "c"), "b, c"),
+    (("info", "ROOM", "--picture", "a.png"), "--depth DIR"),
+    (("info", "ROOM", "--depth-kind", "ray"), "--depth DIR"),
+    (("info", "ROOM", "--depth-scale", "5"), "--depth DIR"),
+    (("info", "ROOM", "--depth", "gone"), "gone"),
+    (("info", "ROOM", "--depth", "ROOM", "--depth-scale", "0"), "scale"),
+    (("info", "ROOM", "--depth", "ROOM", "--depth-kind", "up"), "--depth-kind"),
+    (("upsample",), "-o"),
+    (("upsample", "ROOM"), "-o"),
+    (("upsample", "nowhere", *OUT), "nowhere"),
+    (("upsample", "ROOM", "-o", "more.ply"), "-o more"),
+    ((*UP, "--address", "auto"), "--executor ray"),
+    ((*UP, "--jobs", "0"), "--jobs"),
+    ((*UP, "--budget", "1e-9rho"), "1e-9rho"),
+    ((*UP, "--cover", "8"), "--auto.cell"),
+    ((*UP, "--auto.grid", "0"), "grid"),
+    ((*UP, "--method", "magic"), "magic"),
+    ((*UP, "--profile", "papers"), "papers"),
+    ((*UP, "--format", "nerf"), "nerf"),
+    ((*UP, "--ratoi", "4"), "--ratio"),
+    ((*MLS, "another"), "another"),
+    ((*MLS, "--seed", "-1"), "--seed"),
+    ((*MLS, "--mls.k", "2"), "mls.k"),
+    ((*MLS, "--mls.k", "two"), "--mls.k"),
+    ((*MLS, "--mls.frame", "up"), "--mls.frame"),
+    ((*MLS, "--linear.k", "2"), "--linear.k"),
+    ((*MLS, "--cover", "0"), "--cover"),
+    ((*MLS, "--ratio"), "--ratio"),
+    ((*MLS, "--ratio", "0.5"), "ratio"),
+    ((*MLS, "--ratio", "nan"), "ratio"),
+    ((*MLS, "--ratio", "1e12"), "4,294,967,296"),
+    ((*MLS, "--ratio", "many"), "--ratio"),
+    ((*MLS, "--num-points", "10"), "found 10"),
+    ((*MLS, "--num-points", "500k"), "--num-points"),
+    ((*MLS, "--ratio", "2", "--num-points", "5000"), "both"),
+    ((*LIFT, "--depth", "nowhere"), "nowhere"),
+    ((*LIFT, "--depth-kind", "ray"), "--depth DIR"),
+    ((*LIFT, "--depth", "ROOM", "--depth-scale", "0"), "scale"),
+    ((*LIFT, "--depth", "ROOM", "--depth.tolerance", "2"), "tolerance"),
+    (("train", "ROOM"), "-o"),
+    ((*TRAIN, "--max-step", "4"), "--max-steps"),
+    ((*TRAIN, "--strategy", "defalt"), "--strategy"),
+    ((*TRAIN, "--data-factor", "1000"), "--data-factor"),
+    ((*TRAIN, "--long-side", "5"), "--long-side"),
+    ((*TRAIN, "--budget", "1"), "--budget"),
+    ((*TRAIN, "--budget", "many"), "many"),
+    ((*TRAIN, "--config", "nowhere.toml"), "nowhere.toml"),
+    ((*TRAIN, "--config"), "--config"),
+    ((*EVALUATE, "--data-factor", "0"), "--data-factor"),
+    ((*EVALUATE, "--test-every", "1"), "--test-every"),
+    ((*EVALUATE, "--backend", "gpu"), "--backend"),
+    (("evaluate", "model.ply"), "--scene"),
+    (DEPTH, "--stereo"),
+    ((*DEPTH, "--stereo", "--model", "some"), "--model"),
+    ((*DEPTH, "--stereo", "--max-size", "5"), "--max-size"),
+    ((*DEPTH, "--stereo", "--grid", "99"), "--grid"),
+    ((*DEPTH, "--stereo", "--depth-kind", "z"), "--depth-kind"),
+    ((*DEPTH, "--model", "some", "--colmap"), "--colmap"),
+    ((*DEPTH, "--model", "nobody/Depth-Nothing-hf"), "nobody/Depth-Nothing-hf"),
+    ((*DEPTH, "--model", "gone.onnx"), "gone.onnx"),
+    (("sfm",), "-o"),
+    (("sfm", "x", "-o"), "-o"),
+    (("sfm", "nowhere", *OUT), "nowhere"),
+    ((*SFM, "--frames", "5"), "--frames"),
+    ((*SFM, "--device", "abacus"), "abacus"),
+    ((*SFM, "--camera-model", "FOO"), "FOO"),
+    ((*SFM, "--refine-poses"), "--poses-from"),
+    ((*SFM, "--poses-from", "ROOM", "--camera-model", "PINHOLE"), "--camera-model"),
+    (("bench", "reprot", "B"), "Did you mean report?"),
+    ((*QUICK, "--repeats", "0"), "--repeats"),
+    ((*QUICK, "--long-side", "0"), "--long-side"),
+    (("demo", "--views", "many"), "--views"),
+    (("demo", "--views", "2"), "views"),
+    (("demo", "--train-steps", "-1"), "--train-steps"),
+    ((*MLS, "--cloud", "SCAN"), "with --cloud; found mls"),
+    ((*MLS, "--gaussians", "start.splat"), "FILE.ply"),
+    ((*MLS, "--gaussians", "OUT/start.ply"), "beside the folder"),
+    ((*MLS, "--gaussians", "model.ply"), "--overwrite"),
+    ((*MLS, "--refine-poses", "--depth-scale", "2"), "--depth DIR"),
+    ((*LIFT, "--depth", "ROOM", "--depth-scale", "5", "--depth.no-align"), "scale"),
+    ((*LIFT, "--depth", "ROOM", "--depth-kind", "inverse"), "depth"),
+    ((*LIFT, "--depth", "ROOM", "--ratio", "3000"), "points"),
+    ((*UP, "--method", "cloud"), "--cloud FILE"),
+    ((*UP, "--transform", "x.txt"), "--cloud FILE"),
+    ((*UP, "--align"), "--cloud FILE"),
+    ((*UP, "--cloud", "none.laz"), "none.laz"),
+    ((*UP, "--cloud", "SCAN", "--memory", "500M"), "Pass --memory 6"),
+    ((*UP, "--cloud", "SCAN", "--memory", "a lot"), "found 'a lot'"),
+    ((*UP, "--cloud", "SCAN", "--align", "--transform", "t.txt"), "found both"),
+    ((*UP, "--cloud", "SCAN", "--transform", "none.txt"), "none.txt"),
+    ((*UP, "--cloud", "SCAN", "--recenter", "--format", "transforms"), "--format colmap"),
+    (("evaluate", "ROOM"), "splatseed train ROOM"),
+    ((*EVALUATE, "--lpips-weights", "nowhere"), "nowhere"),
+    (("evaluate", "junk.ply", "--scene", "ROOM"), "junk.ply"),
+    (("evaluate", "nothing", "--scene", "ROOM"), "nothing"),
+    (("export", "nowhere", "-o", "a.spz"), "nothing there"),
+    (("export", "model.ply", "-o", "a.glb"), "splat-transform"),
+    (("export", "model.ply", "-o", "a.spz", "--crop", "1,2"), "--crop"),
+    (("export", "model.ply", "-o", "a.spz", "--min-opacity", "2"), "--min-opacity"),
+    ((*SFM, "--frames", "0"), "--frames"),
+    ((*SFM, "--poses-from", "ROOM", "--no-shared-camera"), "shared"),
+    (("sfm", "film.mp4", *OUT, "--poses-from", "ROOM"), "--poses-from"),
+    (("sfm", "film.mp4", *OUT), "film.mp4"),
+    (("undistort", "nowhere", *OUT), "nowhere"),
+    (("demo", *OUT, "--training", "only"), "splatseed demo"),
 ]
 
 
-@pytest.mark.parametrize(("spoil", "says"), DAMAGE)
-def test_a_damaged_scene(spoil, says, own_room, tmp_path, splatseed):
-    spoil(own_room)
-    before = _names(tmp_path)
-    words = ["--method", "mls"] if spoil is _no_points else []  # photographs alone do for others
-    _assert_refused(splatseed("upsample", own_room, *words, "-o", tmp_path / "out"), says)
-    assert _names(tmp_path) == before
-    if spoil is not _no_points:  # which info reports
-        _assert_refused(splatseed("info", own_room), says)
+@pytest.fixture
+def refused(room, tmp_path, monkeypatch, splatseed):
+    """Checks that words are refused, where ROOM is a scene and SCAN a cloud."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "junk.ply").write_bytes(b"ply\n")
+    write_model(tmp_path / "model.ply", initial_gaussians(load_scene(room).points))
+    (tmp_path / "film.mp4").write_bytes(b"\0" * 999)
+    np.savez(tmp_path / "scan.npz", xyz=np.random.default_rng(0).random((99, 3)))
+    before = _contents(tmp_path)
+
+    def check(*words):
+        named = {"ROOM": str(room), "SCAN": "scan.npz"}
+        run = splatseed(*(re.sub("ROOM|SCAN", lambda each: named[each[0]], w) for w in words))
+        assert not run.out or "--depth" in words, run
+        assert _contents(tmp_path) == before
+        return _refused(run).replace(str(room), "ROOM")
+
+    return check
 
 
-@pytest.mark.parametrize("method", ["linear", "triangle", "spline", "mls", "voronoi"])
-def test_one_point_is_too_few(method, tmp_path, splatseed):
-    write_ply(tmp_path / "one.ply", _cloud([[1, 2, 3]]))
-    words = ("upsample", tmp_path / "one.ply", "-o", tmp_path / "deep/out", "--method", method)
-    _assert_refused(splatseed(*words), "point")
-    assert _names(tmp_path) == ["one.ply"]
+@pytest.mark.parametrize(
+    ("words", "named"),
+    WORDS,
+    ids=lambda each: each if isinstance(each, str) else " ".join(each)[-40:],
+)
+def test_what_makes_no_sense_is_refused_by_name(words, named, refused):
+    needed = {"sfm": "pycolmap", "depth": "transformers"}.get(words[0])
+    if needed:
+        pytest.importorskip(needed)
+    assert named in refused(*words)
 
 
-def _cloud(xyz):
-    xyz = np.array(xyz, np.float32)
-    return PointCloud(xyz, np.full(xyz.shape, 100, np.uint8))
+THINGS = {"sfm": ["ROOM/images"], "bench": QUICK[1:], "evaluate": EVALUATE[1:]}
+MODELS = {"flight": "out.mp4", "export": "out.splat"}
+ALSO = {"upsample": ["--method", "mls"], "depth": ["--stereo"]}
+ANY = {("sfm", "--threads")}
+"""Where -1 stands for all."""
 
 
-def test_nan_points_are_left_out_and_told_of(rng, tmp_path, splatseed):
-    xyz = rng.random((100, 3))
-    xyz[[3, 50]] = np.nan
-    xyz[60] = xyz[61]
-    write_ply(tmp_path / "some.ply", _cloud(xyz))
+@pytest.mark.parametrize("verb", sorted({*VERBS} - {"demo", "view"}))
+def test_no_number_is_below_its_least(verb, refused):
+    kind = import_module(f"splatseed.commands.{verb}").Options
+    things = ["model.ply"] if verb in MODELS else THINGS.get(verb, ["ROOM"])
+    output = [] if verb in {"info", "evaluate", "bench"} else ["-o", MODELS.get(verb, "OUT")]
+    for action in parser_of(kind)._actions:
+        option = action.option_strings[-1] if action.option_strings else ""
+        values = {"INT": ["-1"], "FLOAT": ["-1", "nan"]}.get(str(action.metavar), [])
+        for value in [] if (verb, option) in ANY else values:
+            said = refused(verb, *things, *ALSO.get(verb, []), *output, f"{option}={value}")
+            field = option.removeprefix("--").replace("-", "_")
+            assert option in said or field in said or "--depth DIR" in said, said
+
+
+# Scenes ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "says"),
+    [
+        ("points3D.bin", struct.pack("<Q", 1 << 60) + bytes(50), "points3D.bin"),
+        ("cameras.txt", b"1 FISHEYE_9 120 90 1 6 4\n", "FISHEYE_9"),
+        ("", None, "splatseed sfm"),
+    ],
+)
+def test_a_damaged_scene(name, data, says, own_room, tmp_path, splatseed):
+    model = own_room / "sparse/0"
+    for path in sorted(model.glob(f"{name.partition('.')[0]}*")):
+        path.unlink()
+    if data is not None:
+        (model / name).write_bytes(data)
+    before = _contents(tmp_path)
+    _refused(splatseed("upsample", own_room, "-o", tmp_path / "out"), says)
+    _refused(splatseed("info", own_room), says)
+    assert _contents(tmp_path) == before
+
+
+def test_too_few_points_and_those_that_are_nowhere(rng, own_room, tmp_path, splatseed):
+    for path in (own_room / "sparse/0").glob("points3D.*"):
+        path.write_bytes(struct.pack("<Q", 0)) if path.suffix == ".bin" else path.unlink()
+    out = ("--method", "mls", "-o", tmp_path / "deep/out")
+    _refused(splatseed("upsample", own_room, *out), "--poses-from")
+    xyz = rng.random((100, 3)).astype(np.float32)
+    xyz[[3, 50]], xyz[60] = np.nan, xyz[61]
+    for name, some in (("one", xyz[:1]), ("some", xyz)):
+        cloud = PointCloud(some, np.zeros(some.shape, np.uint8))
+        write_ply(tmp_path / f"{name}.ply", cloud)
+    _refused(splatseed("upsample", tmp_path / "one.ply", *out), "point")
+    assert not (tmp_path / "deep").exists()
     run = splatseed("upsample", tmp_path / "some.ply", "-o", tmp_path / "out", "--ratio", 2)
     assert run.code == 0
     assert "2 points are not finite" in run.out
@@ -138,24 +284,84 @@ def test_nan_points_are_left_out_and_told_of(rng, tmp_path, splatseed):
     assert written.finite.all()
 
 
-def test_missing_images_are_a_note(own_room, tmp_path, splatseed):
-    (own_room / "images/view_003.png").unlink()
-    run = splatseed("upsample", own_room, "-o", tmp_path / "out")
-    assert (run.code, run.err) == (0, "")
-    assert "view_003.png" in run.out
-    shutil.rmtree(own_room / "images")
-    run = splatseed("upsample", own_room, "-o", tmp_path / "second")
-    assert run.code == 0
-    assert "images" in run.out.splitlines()[0]
+PYTHON = re.compile(r"<\w+[.\w]* |0x[0-9a-f]{5}|\bb['\"]|\\x|\b\w+Error\b")
+"""What only Python's programmers understand."""
+JUNK = {"bytes": bytes([137, 3, 0, 255, 13]) * 40, "text": b"some words\n" * 9, "empty": b""}
+
+
+@pytest.mark.parametrize("junk", JUNK)
+@pytest.mark.parametrize(
+    "words",
+    [
+        "info junk.ply",
+        "info room",
+        "upsample room -o out",
+        "train room -o out --max-steps 1",
+        "sfm room/images -o out",
+        "depth room --stereo -o out",
+        "info room --depth maps",
+        "info transforms",
+        "export junk.ply -o out.splat",
+        "evaluate junk.ply --scene room",
+        "upsample room -o out --cloud junk.ply",
+    ],
+)
+def test_junk_is_told_without_python(words, junk, own_room, tmp_path, monkeypatch, splatseed):
+    if words.startswith("sfm"):
+        pytest.importorskip("pycolmap", reason="sfm needs pycolmap")
+    monkeypatch.chdir(tmp_path)
+    own_room.rename("room")
+    (tmp_path / "maps").mkdir()
+    for image in sorted((tmp_path / "room" / "images").iterdir()):
+        (tmp_path / "maps" / f"{image.stem}.npy").write_bytes(JUNK[junk])
+        image.write_bytes(JUNK[junk])
+    (tmp_path / "transforms").mkdir()
+    (tmp_path / "junk.ply").write_bytes(JUNK[junk])
+    (tmp_path / "transforms" / "transforms.json").write_bytes(JUNK[junk])
+    run = splatseed(*words.split())
+    assert not PYTHON.search(run.out + run.err), run
+    if words != "info room":  # which lists photographs that cannot be read
+        _refused(run)
+        assert not (tmp_path / "out").exists()
+
+
+def _load_checkpoint(path):
+    settings, cpu = TrainSettings(strategy="none", backend="cpu"), torch.device("cpu")
+    return load_checkpoint(path, make_strategy(settings, cpu), settings.schedule, cpu)
+
+
+READ = {"weights": load_lpips, "checkpoint": _load_checkpoint}
+
+
+@pytest.mark.parametrize("how", ["cut", "flipped", "text", "pickle", "zip"])
+@pytest.mark.parametrize("what", READ)
+def test_a_damaged_file_of_pytorchs(what, how, rng, tmp_path):
+    path, read = tmp_path / "file", READ[what]
+    torch.save({"format": 2, "params": {"means": torch.zeros(30, 3)}, "step": 3}, path)
+    whole = path.read_bytes()
+    for _ in range(20 if how == "flipped" else 1):
+        flipped = bytearray(whole)
+        for at in rng.integers(0, len(whole), 40):
+            flipped[at] ^= int(rng.integers(1, 256))
+        pickled = b"\x80\x04cos\nsystem\n(X\x02\x00\x00\x00lstR."
+        data = {"cut": whole[: len(whole) // 2], "text": b"junk", "pickle": pickled}
+        path.write_bytes(data.get(how, bytes(flipped)))
+        if how == "zip":
+            with zipfile.ZipFile(path, "w") as archive:
+                archive.writestr("archive/data.pkl", b"(")
+        with pytest.raises(SceneFormatError), warnings.catch_warnings(action="error"):
+            read(path)
+
+
+# Outputs -----------------------------------------------------------------------------------------
 
 
 def test_a_taken_output_is_refused(room, tmp_path, splatseed):
     out = tmp_path / "out"
-    assert splatseed("upsample", room, "-o", out).code == 0
-    before = {path: path.read_bytes() for path in out.rglob("*.bin")}
-    _assert_refused(splatseed("upsample", room, "-o", out, "--ratio", 2), out, "--overwrite")
-    assert {path: path.read_bytes() for path in out.rglob("*.bin")} == before
-    assert _names(tmp_path) == ["out"]
+    assert splatseed("upsample", room, "--method", "mls", "-o", out).code == 0
+    before = _contents(tmp_path)
+    _refused(splatseed("upsample", room, "-o", out, "--ratio", 2), out, "--overwrite")
+    assert _contents(tmp_path) == before
 
 
 @pytest.mark.parametrize("words", [[], ["--overwrite"]])
@@ -163,69 +369,54 @@ def test_what_splatseed_did_not_write_is_never_replaced(words, room, tmp_path, s
     thesis = tmp_path / "work" / "thesis.tex"
     thesis.parent.mkdir()
     thesis.write_text("years")
-    _assert_refused(splatseed("upsample", room, "-o", thesis.parent, *words), "did not write")
-    _assert_refused(splatseed("upsample", room, "-o", thesis, *words), "a file")
-    assert thesis.read_text() == "years"
-    assert _names(tmp_path) == ["work"]
+    before = _contents(tmp_path)
+    _refused(splatseed("upsample", room, "-o", thesis.parent, *words), "did not write")
+    _refused(splatseed("upsample", room, "-o", thesis, *words), "a file")
+    assert _contents(tmp_path) == before
 
 
-@pytest.mark.parametrize("words", [[], ["--overwrite"]])
-@pytest.mark.parametrize("place", [".", "up", "sparse", "sparse/0/up", ".."])
-def test_the_input_is_no_place_for_the_output(place, words, own_room, tmp_path, splatseed):
-    before = sorted(tmp_path.rglob("*"))
-    run = splatseed("upsample", own_room, "-o", own_room / place, *words)
-    _assert_refused(run, "apart from the input")
-    assert sorted(tmp_path.rglob("*")) == before
+@pytest.mark.parametrize("place", [".", "up", "sparse", "sparse/0/up", "..", "depths/up"])
+def test_the_input_is_no_place_for_the_output(place, own_room, tmp_path, splatseed):
+    before = _contents(tmp_path)
+    for words in ([], ["--overwrite"], ["--method", "depth", "--depth", own_room / "depths"]):
+        run = splatseed("upsample", own_room, "-o", own_room / place, *words)
+        _refused(run, "apart from the input")
+    assert _contents(tmp_path) == before
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere; simulated below")
 def test_no_permission_to_write(room, tmp_path, splatseed):
     locked = tmp_path / "locked"
     locked.mkdir(mode=0o500)
-    _assert_refused(splatseed("upsample", room, "-o", locked / "out"), "write-protected")
+    _refused(splatseed("upsample", room, "-o", locked / "out"), "write-protected")
 
 
 @pytest.mark.parametrize(
-    ("number", "says"), [(errno.ENOSPC, "Free some space"), (errno.EACCES, "may write to")]
+    ("error", "code", "says"),
+    [
+        (OSError(errno.ENOSPC, "full"), 2, "Free some space"),
+        (OSError(errno.EACCES, "forbidden"), 2, "may write to"),
+        (MemoryError("none"), 2, "fewer points"),
+        (KeyboardInterrupt(), 130, "interrupted"),
+    ],
 )
-def test_a_full_or_forbidden_disk_leaves_nothing(
-    number, says, room, tmp_path, splatseed, monkeypatch
+def test_what_fails_halfway_leaves_nothing_and_spares_the_earlier_output(
+    error, code, says, room, tmp_path, splatseed, monkeypatch
 ):
-    _fail_halfway(monkeypatch, OSError(number, os.strerror(number)))
-    _assert_refused(splatseed("upsample", room, "-o", tmp_path / "deep/out"), says)
-    assert _names(tmp_path) == []
-
-
-def test_a_full_disk_spares_the_earlier_output(room, tmp_path, splatseed, monkeypatch):
     out = tmp_path / "out"
-    assert splatseed("upsample", room, "-o", out).code == 0
-    before = {path: path.read_bytes() for path in out.rglob("*.bin")}
-    _fail_halfway(monkeypatch, OSError(errno.ENOSPC, "full"))
-    _assert_refused(splatseed("upsample", room, "-o", out, "--ratio", 2, "--overwrite"))
-    assert {path: path.read_bytes() for path in out.rglob("*.bin")} == before
-    assert _names(tmp_path) == ["out"]
-
-
-@pytest.mark.parametrize(
-    ("what", "code", "says"),
-    [(KeyboardInterrupt(), 130, "interrupted"), (MemoryError("none"), 2, "fewer points")],
-)
-def test_an_interrupt_leaves_nothing(what, code, says, room, tmp_path, splatseed, monkeypatch):
-    _fail_halfway(monkeypatch, what)
-    run = splatseed("upsample", room, "-o", tmp_path / "deep/out")
-    assert run.code == code
-    assert says in run.err
-    assert _names(tmp_path) == []
-
-
-def _fail_halfway(monkeypatch, error):
-    """Let the points' file fail after some of it is written."""
+    assert splatseed("upsample", room, "--method", "mls", "-o", out).code == 0
+    before = _contents(tmp_path)
 
     def write(path, points, tracks=None):
         Path(path).write_bytes(b"half")
         raise error
 
     monkeypatch.setattr(colmap, "write_points3d", write)
+    for words in (["-o", out, "--overwrite"], ["-o", tmp_path / "deep/out"]):
+        run = splatseed("upsample", room, "--method", "linear", *words)
+        assert run.code == code
+        assert says in run.err
+        assert _contents(tmp_path) == before
 
 
 def test_memory_that_ran_out_is_said_so_whatever_the_error_says(splatseed, monkeypatch):
@@ -234,4 +425,86 @@ def test_memory_that_ran_out_is_said_so_whatever_the_error_says(splatseed, monke
         (MemoryError("a lot"), "found a lot."),
     ):
         monkeypatch.setattr(info, "run", lambda _, error=error: (_ for _ in ()).throw(error))
-        _assert_refused(splatseed("info", "somewhere"), says)
+        _refused(splatseed("info", "somewhere"), says)
+
+
+def test_a_link_to_itself(room, tmp_path, splatseed):
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    for verb in (["upsample", room], ["depth", room, "--stereo"], ["train", room]):
+        _refused(splatseed(*verb, "-o", tmp_path / "loop"), "leads back to itself")
+    _refused(splatseed("info", tmp_path / "loop"), "loop")
+    with pytest.raises(OutputError, match="loop"), atomic_file(tmp_path / "loop"):
+        pass
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_a_full_output(room, splatseed, monkeypatch):
+    with pytest.raises(OutputError, match="a device"), atomic_file(Path("/dev/full")):
+        pass
+    with pytest.raises(OutputError, match="a file"), output_folder(Path("/dev/full"), kind="x"):
+        pass
+    assert Path("/dev/full").is_char_device()
+    with Path("/dev/full").open("w") as full:
+        monkeypatch.setattr(sys, "stdout", full)
+        run = splatseed("info", room)
+        full.close = lambda: None  # what is left in its buffer cannot be written
+    _refused(run, "No space left on device")
+
+
+def _run_folder(path):
+    RunFolder(path).begin({"splatseed": "0"})
+    (path / "point_cloud.ply").touch()
+
+
+def _bench(path):
+    begin(path, "bench", [], [])
+    (path / "plan.toml").touch()
+
+
+def _notes(path):
+    path.mkdir()
+    (path / MANIFEST).write_text("{}")
+    (path / "thesis.tex").write_text("years")
+
+
+WRITERS = {
+    "upsample": ["ROOM", "--overwrite"],
+    "depth": ["ROOM", "--stereo", "--overwrite"],
+    "sfm": ["ROOM/images", "--overwrite"],
+    "undistort": ["ROOM", "--overwrite"],
+    "demo": ["--overwrite"],
+    "train": ["ROOM", "--overwrite"],
+    "bench": ["--scenes", "ROOM"],
+    "tune": ["ROOM"],
+}
+"""The last two have no --overwrite, as they go on with what is theirs."""
+
+
+@pytest.mark.parametrize("make", [_run_folder, _bench, _notes])
+@pytest.mark.parametrize("verb", WRITERS)
+def test_another_kinds_folder_is_refused(make, verb, room, tmp_path, splatseed):
+    if (make, verb) in {(_run_folder, "train"), (_bench, "bench")}:
+        pytest.skip("its own kind")
+    out = tmp_path / "out"
+    make(out)
+    before = _contents(out)
+    words = [word.replace("ROOM", str(room)) for word in WRITERS[verb]]
+    _refused(splatseed(verb, *words, "-o", out), out)
+    assert _contents(out) == before
+
+
+# Names -------------------------------------------------------------------------------------------
+
+NAME = "room\x1b[31m:fire:[red]\nx"
+
+
+@pytest.mark.parametrize("words", [["info"], ["upsample", "--method", "linear"]])
+def test_a_name_that_would_act_is_printed_literally(words, room, tmp_path, splatseed):
+    scene = shutil.copytree(room, tmp_path / NAME)
+    output = [] if words == ["info"] else ["-o", tmp_path / f"out{NAME}"]
+    run = splatseed(words[0], scene, *words[1:], *output)
+    assert run.code == 0, run
+    assert "\x1b" not in run.out
+    assert r"$'" in run.out
+    assert r"room\x1b[31m:fire:[red]\nx" in run.out
+    _refused(splatseed("info", tmp_path / f"no{NAME}"), r"noroom\x1b[31m:fire:[red] x")

@@ -38,18 +38,23 @@ def test_a_model_becomes_another_format_and_back(suffix, model, splatseed, tmp_p
     assert len(read_model(tmp_path / "back.ply")) == 400
 
 
-def test_a_run_is_exported_cropped_and_cleaned(model, splatseed, tmp_path):
-    folder = tmp_path / "run"
+def test_a_run_is_exported_cropped_cleaned_and_can_be_scored(model, splatseed, tmp_path):
+    folder, out = tmp_path / "run", tmp_path / "out.spz"
     folder.mkdir()
-    for name in ("config.json", "splatseed.json"):
-        (folder / name).write_text(json.dumps({}))
+    config = {"scene": "/data/my scene", "data_factor": 2, "test_every": 5}
+    for name, content in (("config.json", config), ("splatseed.json", {})):
+        (folder / name).write_text(json.dumps(content))
     model.rename(folder / "point_cloud.ply")
-    out = tmp_path / "out.spz"
-    box = "--crop=-1,-1,0,1,1,1"
-    assert splatseed("export", folder, "-o", out, box, "--min-opacity", 0.05).code == 0
+    how = ("--crop=-1,-1,0,1,1,1", "--min-opacity", 0.05, "--overwrite")
+    for named in ("", "point_cloud.ply"):
+        run = splatseed("export", folder / named, "-o", out, *how)
+        assert run.code == 0, run
+        said = " ".join(run.out.split())
+        assert f"{out} --scene '/data/my scene' --data-factor 2 --test-every 5" in said
     kept = read_model(out)
     assert 70 < len(kept) < 130
     assert kept.means[:, 2].min() > -0.01
+    assert splatseed("export", folder, "-o", folder / "out.spz").code == 2  # a run's own folder
 
 
 def test_nothing_is_replaced_unasked_and_no_run_is_written_into(model, splatseed, tmp_path):
@@ -61,47 +66,6 @@ def test_nothing_is_replaced_unasked_and_no_run_is_written_into(model, splatseed
     before = model.read_bytes()
     assert splatseed("export", model, "-o", model, "--overwrite").code == 2
     assert model.read_bytes() == before
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["nowhere", "-o", "a.spz"], "nothing there"),
-        (["MODEL", "-o", "a.glb"], "splat-transform"),
-        (["MODEL", "-o", "a.spz", "--crop", "1,2"], "--crop"),
-        (["MODEL", "-o", "a.spz", "--min-opacity", "2"], "--min-opacity"),
-    ],
-)
-def test_bad_input_is_one_line(words, said, model, splatseed, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    run = splatseed("export", *(str(model) if word == "MODEL" else word for word in words))
-    assert (run.code, run.out) == (2, "")
-    assert said in run.err
-    assert run.err.count("\n") == 1
-    assert not (tmp_path / "a.spz").exists()
-
-
-@pytest.fixture
-def run_of(model, tmp_path):
-    """A function that makes a run with a config around the model."""
-
-    def make(**config: object):
-        folder = tmp_path / "run"
-        folder.mkdir()
-        for name, content in (("config.json", config), ("splatseed.json", {})):
-            (folder / name).write_text(json.dumps(content))
-        model.rename(folder / "point_cloud.ply")
-        return folder
-
-    return make
-
-
-@pytest.mark.parametrize("named", ["", "point_cloud.ply"])
-def test_the_command_that_scores_a_run_has_its_scene_and_size(named, run_of, splatseed, tmp_path):
-    folder = run_of(scene="/data/my scene", data_factor=2, test_every=5)
-    out = tmp_path / "out.spz"
-    said = " ".join(splatseed("export", folder / named, "-o", out).out.split())
-    assert f"{out} --scene '/data/my scene' --data-factor 2 --test-every 5" in said
 
 
 def test_what_a_bare_file_cannot_tell_is_left_as_a_word(model, splatseed, tmp_path):

@@ -12,8 +12,6 @@ import pytest
 from splatseed.camera import Intrinsics
 from splatseed.io import load_scene, write_scene
 
-START, PERIOD = 1305031102.175304, 0.1
-
 
 def lines_of(out: str) -> list[list[str]]:
     """The words after ``splatseed`` of the commands below "next"."""
@@ -66,15 +64,6 @@ def test_what_info_advises_works(kind, verbs, request, tmp_path, monkeypatch, sp
     assert len(load_scene("OUT").points) > 500
 
 
-def test_a_scene_is_named_as_it_was_typed(own_room, tmp_path, monkeypatch, splatseed):
-    monkeypatch.chdir(own_room)
-    run = splatseed("upsample", ".", "--method", "mls", "-o", "../out")
-    ours, *others = run.out.partition("train it with\n")[2].splitlines()
-    assert ours.split()[1:] == ["splatseed", "train", "../out", "-o", "../out-run"]
-    assert others
-    assert all(str(tmp_path.resolve() / "out") in line for line in others)
-
-
 @pytest.mark.parametrize("kept", ["none", "some", "no folder"])
 def test_nothing_is_to_be_trained_without_its_photographs(kept, own_room, tmp_path, splatseed):
     images = own_room / "images"
@@ -115,25 +104,20 @@ def test_only_trainers_that_undistort_are_named_for_a_distorted_scene(bent, tmp_
     assert f"splatseed undistort {bent} -o {bent}_undistorted" in after
 
 
-def test_maps_that_give_few_points_are_asked_for_few(room, tmp_path, monkeypatch, splatseed):
-    monkeypatch.chdir(tmp_path)
-    run = splatseed("depth", room, "--stereo", "--max-size", 60, "--grid", 3, "-o", "maps")
-    assert run.code == 0, run.err
-    assert "--ratio 16" not in run.out
-    assert follow(run.out, splatseed) == ["info", "upsample"]
-    shown = splatseed("info", room, "--depth", "maps")
-    shutil.rmtree("OUT")
-    assert follow(shown.out, splatseed) == ["upsample"]
-
-
-def test_maps_of_a_scene_without_points_are_used_without_alignment(
-    room, tmp_path, monkeypatch, splatseed
+@pytest.mark.parametrize("points", [True, False])
+def test_maps_that_stereo_made_are_looked_at_and_used(
+    points, room, tmp_path, monkeypatch, splatseed
 ):
     monkeypatch.chdir(tmp_path)
     scene = load_scene(room)
     empty = scene.replace(points=scene.points.select(slice(0)), tracks=None)
-    path = write_scene(empty, tmp_path / "empty", require_points=False).path
-    run = splatseed("depth", path, "--stereo", "--max-size", 120, "--grid", 2, "-o", "maps")
+    write_scene(scene if points else empty, tmp_path / "scene", require_points=False)
+    run = splatseed("depth", "scene", "--stereo", "--max-size", 120, "--grid", 3, "-o", "maps")
     assert run.code == 0, run.err
+    assert "--ratio 16" not in run.out  # there are too few pixels
     assert follow(run.out, splatseed) == ["info", "upsample"]
     assert len(load_scene("OUT").points)
+    if points:  # else there is a choice, and both write to OUT
+        shutil.rmtree("OUT")
+        shown = splatseed("info", "scene", "--depth", "maps")
+        assert follow(shown.out, splatseed) == ["upsample"]

@@ -67,25 +67,3 @@ def test_known_poses_are_triangulated_and_refined_when_asked(called, room, tmp_p
     for text in ("9.440 px", "0.160 px", "0.04 units", "0.113", "1.24 degrees", "3.66"):
         assert text in moved
     assert "kept as given" in splatseed(*words, "--refine-poses").out
-
-
-@pytest.mark.parametrize(
-    ("words", "named"),
-    [
-        (("{room}/images", "--refine-poses"), "--poses-from"),
-        (("{room}/images", "--frames", 0), "--frames"),
-        (("{room}/images", "--frames", 20), "--frames"),
-        (("{room}/images", "--poses-from", "{room}", "--no-shared-camera"), "shared"),
-        (("{film}", "--poses-from", "{room}"), "--poses-from"),
-        (("{film}",), "film.mp4"),
-    ],
-)
-def test_bad_words_end_in_one_line_and_no_folder(words, named, room, tmp_path, splatseed):
-    pytest.importorskip("imageio_ffmpeg", reason="videos need imageio-ffmpeg (extra sfm)")
-    film = tmp_path / "film.mp4"
-    film.write_bytes(b"\0" * 999)
-    words = [str(word).format(room=room, film=film) for word in words]
-    run = splatseed("sfm", *words, "-o", tmp_path / "out")
-    assert (run.code, run.err.count("\n")) == (2, 1), run
-    assert named in run.err
-    assert list(tmp_path.iterdir()) == [film]

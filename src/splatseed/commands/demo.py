@@ -160,11 +160,7 @@ def compiled_ahead(parts: Sequence[str]) -> Iterator[Callable[[], None]]:
 
 
 def compile_ahead(parts: Sequence[str]) -> None:
-    """Compile what methods and training need by running a small demo; a second process does.
-
-    Args:
-        parts: Keys of ``METHODS``, or ``TRAINING``.
-    """
+    """Compile what methods and training need by running a small demo; a second process does."""
     from splatseed.synthetic import make_capture, write_capture  # noqa: PLC0415  (loads Numba)
 
     waiting = list(parts)

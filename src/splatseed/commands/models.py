@@ -15,11 +15,7 @@ from splatseed.train.folder import RunFolder
 
 
 def model_file(path: Path) -> Path:
-    """The file of a model's Gaussians; for a run, its result.
-
-    Raises:
-        SceneNotFoundError: There is none.
-    """
+    """The file of a model's Gaussians; for a run, its result."""
     folder = RunFolder(path)
     for file in (path, folder.gaussians):
         if file.is_file():
@@ -40,11 +36,7 @@ def model_file(path: Path) -> Path:
 
 
 def check_free(path: Path, *, overwrite: bool) -> None:
-    """Refuse a file that may not be written, before any work is done.
-
-    Raises:
-        OutputError: It is there and may not be replaced, or its folder cannot be made.
-    """
+    """Refuse a file that may not be written, before any work is done."""
     check_parents(path)
     if path.exists() and not overwrite:
         fix = "Pass --overwrite to replace it, or choose another name."
@@ -55,9 +47,6 @@ def config_of(path: Path) -> Mapping[str, Any]:
     """The config of a run, named by its folder or its result; empty for what belongs to no run.
 
     Its scene is the one that was trained.
-
-    Raises:
-        SceneFormatError: It cannot be read.
     """
     folder = RunFolder(path if path.is_dir() else path.parent)
     if path not in (folder.path, folder.gaussians) or not folder.is_run:

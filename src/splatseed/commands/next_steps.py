@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,6 +22,7 @@ PER_POINT = 8
 """Pixels of known depth per new point. Beyond that, lifting runs out of pixels that are free and
 away from depth discontinuities: on stereo's maps of a kitchen with 14% known, one in 8.2 was."""
 COLMAP_ONLY = frozenset({"gsplat", "graphdeco", "LichtFeld"})
+"""Trainers that do not read transforms.json, or not as well."""
 PINHOLE_ONLY = frozenset({"splatseed", "graphdeco", "OpenSplat", "LichtFeld"})
 """Trainers that do not deal with lens distortion themselves, as far as we know."""
 COMMON_LENSES = frozenset({"SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"})
@@ -30,18 +31,8 @@ COMMON_LENSES = frozenset({"SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"
 Commands = list[tuple[str, str]]
 
 
-@dataclass(frozen=True)
-class Planned:
-    """How a scene will be trained.
-
-    Args:
-        budget: Most Gaussians at the end.
-        max_steps: Training steps.
-        strategy: The strategy that ``splatseed train`` chooses for these steps.
-        most_seeds: Most seeds with which training begins.
-        flags: The options of ``splatseed train`` that differ from its defaults.
-        tuning: Those of ``splatseed tune`` that plan the same.
-    """
+class Planned(NamedTuple):
+    """How a scene will be trained, and the options of train and tune that say so."""
 
     budget: int
     max_steps: int
@@ -52,11 +43,7 @@ class Planned:
 
     @classmethod
     def of(cls, scene: Scene, budget: str | None = None, max_steps: int = FULL_RUN) -> Planned:
-        """A scene's plan, from the options.
-
-        Raises:
-            ParameterError: One of them is out of its range.
-        """
+        """A scene's plan, from the options."""
         sizes = [image.intrinsics.width * image.intrinsics.height for image in scene.images]
         pixels = round(float(np.median(sizes))) if sizes else BUDGET
         number, flags, tuning = max(2, min(BUDGET, pixels)), "", ""
@@ -76,15 +63,7 @@ class Planned:
 def advice_commands(
     path: Path, scene: Scene, advice: Advice, planned: Planned, *, refine: bool
 ) -> Commands:
-    """The commands that follow the advice for a scene.
-
-    Args:
-        path: Where the scene lies.
-        scene: The scene.
-        advice: The advice.
-        planned: How it will be trained.
-        refine: Whether its poses should be refined.
-    """
+    """The commands that follow the advice for a scene; ``refine``: its poses first."""
     trains = not untrainable(scene)
     first: Commands = []
     if trains and is_distorted(scene):
@@ -140,14 +119,9 @@ def look(path: Path, maps: Path) -> tuple[str, str]:
 
 
 def number_for(points: int, known: int, most: int) -> str:
-    """The option for as many points as maps can give and training can begin with.
+    """The option for as many points as ``known`` pixels of depth give and training begins with.
 
     Of a scene with points, at most ``RATIO`` times as many.
-
-    Args:
-        points: Points of the scene.
-        known: Number of pixels with a depth, of all maps.
-        most: Most seeds with which training can begin.
     """
     number = max(points + 1, min(most, points + known // PER_POINT))
     return f"--ratio {RATIO}" if 0 < RATIO * points <= number else f"--num-points {number}"
@@ -167,14 +141,7 @@ def triangulate_command(path: Path, scene: Scene, output: str) -> str:
 
 
 def tell_training(read_from: Path, scene: Scene, output: Path, layout: SceneFormat) -> None:
-    """Print the commands that train a scene that was written, and what some of them need first.
-
-    Args:
-        read_from: Where the scene was read.
-        scene: The scene as it was read.
-        output: The scene folder that was written.
-        layout: Its layout.
-    """
+    """Print the commands that train a scene that was written, and what some of them need first."""
     if not scene.images:  # writing it said so
         return
     if missing := untrainable(scene):
@@ -193,12 +160,6 @@ def tell_training(read_from: Path, scene: Scene, output: Path, layout: SceneForm
 
 def training_commands(path: Path, layout: SceneFormat, *, distorted: bool = False) -> Commands:
     """(trainer, command) for every trainer that reads the scene at ``path`` unchanged.
-
-    Args:
-        path: The scene folder that was written.
-        layout: "colmap" or "transforms": gsplat's examples and graphdeco's code read only the
-            former, and LichtFeld Studio is made for it.
-        distorted: Whether cameras have lens distortion, with which only some trainers deal.
 
     Example:
         >>> dict(training_commands(Path("/data/out"), "colmap"))["graphdeco"]

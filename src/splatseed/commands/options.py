@@ -18,12 +18,7 @@ CONFIG = (tyro.conf.DisallowNone, tyro.conf.FlagCreatePairsOff)
 def parse_options(
     kind: type[Options], verb: str, arguments: Sequence[str], default: Options | None = None
 ) -> Options:
-    """The options in ``arguments``, the words after the verb; ``default`` gives the others.
-
-    Raises:
-        SystemExit: With code 2 after telling what is wrong with an option; 0 after the help.
-        ParameterError: A value is out of the range that a dataclass gives for it.
-    """
+    """The options in ``arguments``, the words after the verb; ``default`` gives the others."""
     given: dict[str, Any] = {} if default is None else {"default": default}
     prog = f"splatseed {verb}"
     options: Options = tyro.cli(kind, prog=prog, args=list(arguments), config=CONFIG, **given)
@@ -31,25 +26,14 @@ def parse_options(
 
 
 def refuse(*faults: tuple[object, str, object, str]) -> None:
-    """Refuse the first of several faults that there is.
-
-    Args:
-        faults: Of each, whether it is there; what was expected, what was found, and what to do.
-
-    Raises:
-        ParameterError: One is there.
-    """
+    """Refuse the first (whether it is there, what was expected, found, and helps) that is there."""
     for there, expected, found, fix in faults:
         if there:
             raise ParameterError(expected, found=str(found), fix=fix)
 
 
 def check_least(options: object, least: float, *names: str) -> None:
-    """Refuse fields of parsed options below ``least``; None, for one not given, is none.
-
-    Raises:
-        ParameterError: One is smaller, or no number.
-    """
+    """Refuse fields of parsed options below ``least``; None, for one not given, is none."""
     for name in names:
         value, option = getattr(options, name), f"--{name.replace('_', '-')}"
         wrong = value is not None and not value >= least

@@ -102,14 +102,9 @@ class Options:
 
 
 def parse(arguments: list[str]) -> Options:
-    """The options; those on the command line replace those of a file that --config names.
-
-    Raises:
-        SceneNotFoundError: There is no such file.
-        SceneFormatError: It cannot be read, or a key or a value is not an option's.
-    """
+    """The options; those on the command line replace those of a file that --config names."""
     parser = ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument("--config", type=Path)
+    parser.add_argument("--config", type=Path, nargs="?")  # what is missing, tyro tells
     path = parser.parse_known_args(arguments)[0].config
     return parse_options(Options, "train", arguments, None if path is None else _in_file(path))
 

@@ -66,14 +66,7 @@ class LoadedCloud(NamedTuple):
 
 
 def load_cloud(options: Options, scene: Scene, method: Cloud, progress: Progress) -> LoadedCloud:
-    """The scene, recentred if so asked, and the method ``cloud`` with its files in its frame.
-
-    Raises:
-        ParameterError: The scene's coordinates need recentring, or the memory is not enough.
-        PointCloudError: An alignment is not sure.
-        SceneNotFoundError: A file is missing.
-        SceneFormatError: One is damaged.
-    """
+    """The scene, recentred if so asked, and the method ``cloud`` with its files in its frame."""
     files, memory = options.cloud_files, options.memory_bytes
     plan = method.of(*files, memory=memory).plan(scene)
     most = f"at most {plan.capacity:,} voxels, {words_of(plan.memory)} of memory"

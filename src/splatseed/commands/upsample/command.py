@@ -130,7 +130,7 @@ def parse(arguments: list[str]) -> tuple[Options, dict[str, Upsampler]]:
     """The options, and every method with its parameters, from the words of the command line."""
     parser = ArgumentParser(add_help=False, allow_abbrev=False)
     for option in ("--profile", "--method"):
-        parser.add_argument(option)
+        parser.add_argument(option, nargs="?")  # what is missing, tyro tells
     named = parser.parse_known_args(arguments)[0]
     # The profile sets the defaults of the methods' options, so it is parsed before them.
     profile: Profile = named.profile if named.profile in get_args(Profile) else "default"

@@ -60,12 +60,7 @@ def method_words(name: str, method: Upsampler, profile: Profile) -> str:
 
 
 def number_words(total: int | None, most: int | None, changed_by: Sequence[str] = ()) -> str:
-    """How many points there will be.
-
-    Args:
-        total: Points in all; None if the photographs determine the number.
-        most: The budget, if there is one.
-        changed_by: Options that add points to the method's, or drop some of them.
+    """How many points there will be, if ``changed_by`` adds none and drops none.
 
     Example:
         >>> number_words(None, 50_000), number_words(800, 1000)
@@ -149,16 +144,7 @@ def summarise(
     seconds: Mapping[str, float],
     found: Sequence[tuple[str, str]],
 ) -> None:
-    """Print the final table and the commands to run next.
-
-    Args:
-        options: The options.
-        scene: The scene as it was read.
-        seeds: The points that were to be written.
-        report: The report of writing.
-        seconds: Seconds by stage.
-        found: What ``findings`` gave.
-    """
+    """Print the final table and the commands to run next."""
     output = options.output
     written = seeds if len(seeds) == report.num_points else seeds.select(seeds.distinct)
     codes, counts = np.unique(written.source, return_counts=True)

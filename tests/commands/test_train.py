@@ -1,12 +1,18 @@
-"""``splatseed train --refine-poses``: what is done before it trains."""
+"""``splatseed train``: its --config, its progress line, and --refine-poses."""
 
 from __future__ import annotations
 
 import json
 import shutil
+from io import StringIO
+from pathlib import Path
 
 import pytest
+from rich.progress import Progress
 
+from splatseed.commands.train import bar_columns, parse
+from splatseed.console import LiteralConsole
+from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io import load_scene, write_scene
 from splatseed.sfm import Refinement, SfmReport
 
@@ -15,8 +21,53 @@ pytest.importorskip("gsplat", reason="training needs gsplat's strategies")
 
 from splatseed.view.models import open_shown
 
+LINE = "PSNR 27.31, test 26.05 dB  1,234,567 Gaussians  12.3 steps/s  loss 0.0412"
 SHORT = ("--max-steps", "3", "--data-factor", "2")
-ENDED = ("metrics.json", "point_cloud.ply")
+
+
+@pytest.mark.parametrize(("width", "says"), [(200, LINE), (80, "PSNR 27.31, test 26."), (48, "P")])
+def test_steps_and_time_left_are_always_there(width, says):
+    out = StringIO()
+    console = LiteralConsole(file=out, force_terminal=True, width=width, color_system=None)
+    bar = Progress(*bar_columns(), console=console, expand=True, auto_refresh=False)
+    bar.add_task(LINE, total=30_000, completed=12_345)
+    console.print(bar.get_renderable())
+    (line,) = out.getvalue().splitlines()
+    assert len(line) <= width
+    assert "12345/30000" in line
+    assert "-:--:--" in line  # the time left, before there is a speed
+    assert says in line
+    assert ("…" in line) == (width < 200)
+
+
+def test_a_file_gives_options_and_the_command_line_wins(tmp_path):
+    toml = tmp_path / "run.toml"
+    toml.write_text('scene = "room"\nmax_steps = 7\nopacity_reset = true\nseeds = "scene"\n')
+    options = parse(["-o", "out", "--config", str(toml)])
+    assert (options.scene, options.output) == (Path("room"), Path("out"))
+    assert (options.training.max_steps, options.training.opacity_reset) == (7, True)
+    assert options.seeds == "scene"
+    options = parse(["mine", f"--config={toml}", "--max-steps=9", "-o", "out"])
+    assert (options.scene, options.training.max_steps) == (Path("mine"), 9)
+    with pytest.raises(SceneNotFoundError):
+        parse(["--config", str(tmp_path / "none.toml")])
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ("max_stepz = 3", "Did you mean max_steps"),
+        ("max_steps = [1]", "max_steps"),
+        ("max_steps = true", "max_steps"),
+        ("opacity_reset = 1", "opacity_reset"),
+        ('strategy = "defalt"', "strategy"),
+        ("max_steps 3", r"run\.toml"),
+    ],
+)
+def test_what_is_no_option_is_told(content, said, tmp_path):
+    (tmp_path / "run.toml").write_text(content)
+    with pytest.raises(SceneFormatError, match=said):
+        parse(["--config", str(tmp_path / "run.toml")])
 
 
 @pytest.fixture
@@ -42,29 +93,27 @@ def bare(room, as_by_a_device, tmp_path):
     return tmp_path / "bare"
 
 
-def _contents(folder):
-    return {path: path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
-
-
 def _poses(scene):
     return {image.name: (*image.quat, *image.translation) for image in scene.images}
 
 
 def _unfinish(run):
     """As a run is that was killed before its first checkpoint."""
-    for name in ENDED:
+    for name in ("metrics.json", "point_cloud.ply"):
         (run / name).unlink()
+
+
+def _gaussians(run):
+    return (run / "point_cloud.ply").read_bytes()
 
 
 def test_refined_poses_are_what_is_trained_scored_and_shown(
     room, bare, refining, splatseed, tmp_path
 ):
-    before = _contents(bare)
     run = splatseed("train", bare, *SHORT, "--refine-poses", "-o", tmp_path / "run")
     assert (run.code, run.err) == (0, "")
     assert "note: Refined poses lower the mean reprojection error from 9.00 to 0.50 px" in run.out
     assert "Seeds by method auto: " in run.out
-    assert _contents(bare) == before
     config = json.loads((tmp_path / "run/config.json").read_text())
     assert (config["scene"], config["refine_poses"]) == (str(bare), True)
     moved = (tmp_path / "run").rename(tmp_path / "moved")
@@ -81,14 +130,9 @@ def test_refined_poses_are_what_is_trained_scored_and_shown(
     assert f"--scene {moved / 'scene'}" in exported.out
     again = splatseed("train", "--config", moved / "config.json", "-o", tmp_path / "again")
     assert (again.code, len(refining)) == (0, 2)
-    assert _same_gaussians(moved, tmp_path / "again")
+    assert _gaussians(moved) == _gaussians(tmp_path / "again")
     assert splatseed("train", room, *SHORT, "--overwrite", "-o", moved).code == 0
     assert not (moved / "scene").exists()
-
-
-def _same_gaussians(first, second):
-    one, other = ((run / "point_cloud.ply").read_bytes() for run in (first, second))
-    return one == other
 
 
 @pytest.mark.parametrize("named", [(), ("--refine-poses",)])
@@ -100,7 +144,7 @@ def test_a_run_goes_on_at_the_poses_that_it_began_with(named, bare, refining, sp
     resumed = splatseed("train", bare, *named, "--resume", "-o", run)
     assert (resumed.code, resumed.err) == (0, "")
     assert len(refining) == 1
-    assert _same_gaussians(run, kept)
+    assert _gaussians(run) == _gaussians(kept)
 
 
 def test_a_run_that_lost_its_poses_or_its_photographs_does_not_go_on(
@@ -121,46 +165,19 @@ def test_a_run_that_lost_its_poses_or_its_photographs_does_not_go_on(
     assert str(run / "scene") in lost.err
 
 
-def test_a_run_that_began_without_does_not_go_on_with_it(room, splatseed, tmp_path):
+def test_what_refining_does_not_go_with(room, refining, splatseed, tmp_path):
     run = tmp_path / "run"
     assert splatseed("train", room, *SHORT, "-o", run).code == 0
     _unfinish(run)
     resumed = splatseed("train", room, "--refine-poses", "--resume", "-o", run)
     assert (resumed.code, resumed.err.count("error:")) == (2, 1)
     assert "--refine-poses False, as when the run began" in resumed.err
-
-
-def test_seeds_are_not_thrown_away(room, refining, splatseed, tmp_path):
-    assert splatseed("upsample", room, "--method", "linear", "-o", tmp_path / "seeded").code == 0
-    words = (*SHORT, "--refine-poses", "-o", tmp_path / "run")
-    run = splatseed("train", tmp_path / "seeded", *words)
-    assert (run.code, run.err.count("error:")) == (2, 1)
-    assert "upsample SCENE --refine-poses -o OUT" in run.err
+    seeded = tmp_path / "seeded"  # whose seeds would be thrown away
+    assert splatseed("upsample", room, "--method", "linear", "-o", seeded).code == 0
+    other = splatseed("train", seeded, *SHORT, "--refine-poses", "-o", tmp_path / "other")
+    assert (other.code, other.err.count("error:")) == (2, 1)
+    assert "upsample SCENE --refine-poses -o OUT" in other.err
     assert not refining
-
-
-def test_those_who_watch_see_the_refined_cameras(
-    room, bare, refining, splatseed, tmp_path, monkeypatch
-):
-    pytest.importorskip("viser", reason="watching needs viser")
-    watched = []
-
-    class Viewer:
-        kept = False
-
-        def __init__(self, training, scene, *_):
-            watched.append(scene)
-
-        def on_step(self, step):
-            pass
-
-        def close(self):
-            pass
-
-    monkeypatch.setattr("splatseed.view.server.TrainingViewer", Viewer)
-    words = (*SHORT, "--refine-poses", "--view", "-o", tmp_path / "run")
-    assert splatseed("train", bare, *words).code == 0
-    assert _poses(watched[0]) == _poses(load_scene(room))
 
 
 def test_poses_are_refined_by_pycolmap(sharp_bare, splatseed, tmp_path):

@@ -1,0 +1,129 @@
+"""``splatseed depth``: from its words to its folder of maps, by a network or by stereo."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import splatseed.depth.stereo
+from splatseed.io import find_depths, load_scene
+from splatseed.synthetic import make_capture, write_capture
+
+from ..bent import bend
+from ..networks import save_network
+from ..stereo_maps import true_maps
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory):
+    pytest.importorskip("transformers", reason="needs splatseed[depth]")
+    return save_network("depth_anything", tmp_path_factory.mktemp("model") / "tiny")
+
+
+def test_a_network_of_transformers(room, model, tmp_path, splatseed):
+    words = ("depth", room, "--model", model, "-o", tmp_path / "d")
+    run = splatseed(*words, "--device", "cpu", "--max-size", 100)
+    assert (run.code, run.err) == (0, "")
+    for text in ("inverse", "12 of 100 x 75", f"splatseed info {room} --depth {tmp_path / 'd'}"):
+        assert text in run.out
+    depths = find_depths(load_scene(room), tmp_path / "d")
+    assert {depths.read(name).kind for name in depths} == {"inverse"}
+    assert len(depths) == 12
+    manifest = json.loads((tmp_path / "d" / "splatseed.json").read_text())
+    assert manifest["options"]["model"] == str(model)
+    assert manifest["kind"] == "inverse"
+    assert splatseed(*words).code == 2  # it is there
+    assert splatseed(*words, "--overwrite").code == 0
+
+
+def test_a_blind_network_is_told_of(room, model, tmp_path, splatseed, monkeypatch):
+    from splatseed.depth.monocular import DepthNetwork
+
+    predict = DepthNetwork.__call__
+    monkeypatch.setattr(DepthNetwork, "__call__", lambda *a: 0 * predict(*a))
+    run = splatseed("depth", room, "--model", model, "--depth-kind", "z", "-o", tmp_path / "d")
+    assert run.code == 0
+    assert "predicted no depth" in run.out
+    assert "and 7 more" in run.out
+
+
+@pytest.fixture
+def stereo(monkeypatch):
+    """Stereo that knows the truth; ``calls`` notes how it was asked, ``maps`` is what it
+    answers."""
+    maps = true_maps(make_capture(0, num_views=12, width=120, height=90), 2)
+    known = SimpleNamespace(calls=[], maps=maps)
+
+    def stereo_depths(scene, *, max_size=800, grid=4, seed=0, progress=None):
+        known.calls.append((len(scene.images), max_size, grid, seed))
+        progress("stereo", 1.0)
+        return known.maps
+
+    monkeypatch.setattr(splatseed.depth.stereo, "stereo_depths", stereo_depths, raising=False)
+    return known
+
+
+def test_a_plain_folder(room, tmp_path, splatseed, stereo):
+    out, words = tmp_path / "maps", ("depth", room, "--stereo", "-o", tmp_path / "maps")
+    run = splatseed(*words)
+    assert (run.code, run.err) == (0, "")
+    assert "12 depth maps of 60 x 45: 9" in run.out  # 9x% of their pixels
+    assert f"--method depth --depth {out}" in run.out
+    depths, known = find_depths(load_scene(room), out), stereo.maps[3]
+    assert depths.kind == "z"
+    np.testing.assert_allclose(depths.read(known.name).values, known.depth, rtol=1e-6)
+    assert json.loads((out / "splatseed.json").read_text())["options"]["stereo"] is True
+    assert splatseed(*words).code == 2  # it is there
+    assert splatseed(*words, "--overwrite", "--max-size", 500, "--grid", 2).code == 0
+    assert stereo.calls == [(12, 800, 4, 0), (12, 500, 2, 0)]
+
+
+def test_a_distorted_capture_becomes_a_cloud_on_its_surfaces(tmp_path, splatseed):
+    """From its own stereo to COLMAP's fusion."""
+    capture = make_capture(0, num_views=16, width=160, height=120)
+    scene = write_capture(bend(capture), tmp_path / "bent")
+    out = tmp_path / "dense"
+    words = ("--stereo", "--colmap", "--grid", 2, "--preview")
+    run = splatseed("depth", scene, *words, "-o", out)
+    assert (run.code, run.err) == (0, "")
+    assert f"splatseed info {out} --depth {out}" in run.out
+    assert splatseed("info", out, "--depth", out).code == 0
+    if shutil.which("colmap") is None:
+        pytest.skip("colmap is not installed: the command that was printed is not run")
+    line = next(line for line in run.out.splitlines() if "stereo_fusion" in line)
+    subprocess.run(line.split()[1:], check=True, capture_output=True)
+    xyz = load_scene(out / "fused.ply").points.xyz
+    assert len(xyz) > 1_000
+    assert np.median(capture.surfaces.distance(xyz.astype(float))) < 0.01  # metres
+
+
+@pytest.mark.usefixtures("stereo")
+def test_a_plain_folder_of_a_distorted_capture_says_what_it_fits(tmp_path, splatseed):
+    capture = make_capture(0, num_views=12, width=120, height=90)
+    scene = write_capture(bend(capture), tmp_path / "bent")
+    run = splatseed("depth", scene, "--stereo", "-o", tmp_path / "maps")
+    assert "--colmap writes both" in run.out
+    assert "--method depth" not in run.out
+
+
+@pytest.mark.parametrize("words", [("--stereo", "--colmap"), ("--model",)])
+def test_a_photograph_that_is_not_whole_is_found_before_any_work(
+    words, own_room, model, tmp_path, splatseed, stereo
+):
+    scene = load_scene(own_room)
+    path = scene.source.image_dir / scene.images[-1].name
+    if "--stereo" in words:
+        path.unlink()
+    else:
+        path.write_bytes(path.read_bytes()[:-200])
+        words = (*words, model)
+    run = splatseed("depth", own_room, *words, "-o", tmp_path / "d")
+    assert run.code == 2
+    assert path.name in run.err
+    assert not (tmp_path / "d").exists()
+    assert not stereo.calls

@@ -1,0 +1,351 @@
+"""``splatseed info``: every kind of scene, its depth maps, its poses, and what it advises."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image as PilImage
+from scipy.spatial.transform import Rotation
+
+from splatseed.commands.next_steps import number_for
+from splatseed.depth.alignment import align
+from splatseed.io import find_depths, load_scene, write_scene
+from splatseed.io.colmap import write_points3d
+from splatseed.io.depth_maps import depth_folder
+from splatseed.io.ply import write_ply
+from splatseed.pointcloud import PointCloud
+from splatseed.synthetic import make_capture, write_capture
+from splatseed.train.folder import RunFolder
+from splatseed.upsample import upsample
+
+
+def _pairs(out):
+    """Label to value, from the tables."""
+    lines = [line.strip().split("  ", 1) for line in out.splitlines()]
+    return {line[0]: line[1].strip() for line in lines if len(line) == 2}
+
+
+def test_a_colmap_scene(room, splatseed):
+    run = splatseed("info", room)
+    assert (run.code, run.err) == (0, "")
+    scene, rows = load_scene(room), _pairs(run.out)
+    assert rows["format"] == "colmap"
+    assert rows["cameras"] == "1 PINHOLE 120x90"
+    assert rows["images"] == "12 (10 to train, 2 to test)"
+    assert rows["points"] == f"{len(scene.points):,}"
+    assert rows["track length, images"].startswith(f"mean {scene.tracks.lengths.mean():.3g},")
+    assert rows["reprojection error, px"].startswith(f"mean {scene.tracks.errors.mean():.3f},")
+    low = [float(x) for x in rows["bounding box"].split()[:3]]
+    np.testing.assert_allclose(low, scene.points.xyz.min(axis=0), rtol=1e-3)
+    assert run.out.partition("\nnext\n")[2].split()[1:3] == ["splatseed", "upsample"]
+
+
+def test_for_scripts_it_is_json_alone(room, splatseed):
+    run = splatseed("info", room, "--json")
+    assert (run.code, run.err) == (0, "")
+    facts = json.loads(run.out)
+    assert (facts["images"], facts["train_images"] + facts["test_images"]) == (12, 12)
+    assert facts["points"]["num_points"] > 400
+    assert len(facts["points"]["spacing"]) == 5
+    assert isinstance(facts["problems"], list)
+    assert facts["poses"] is None  # points vouch for them
+
+
+def test_the_advice_depends_on_the_plan(room, splatseed):
+    full = splatseed("info", room, "--budget", 60, "--max-steps", 500).out
+    assert "leave the points as they are" in full
+    assert "--seeds scene --budget 60 --max-steps 500" in full.partition("\nnext\n")[2]
+    sparse = splatseed("info", room, "--budget", 5400, "--max-steps", 20000).out
+    assert "add points by method auto" in sparse
+    assert f"splatseed upsample {room} --budget" in sparse
+    assert "--minutes 30 --budget 0.5rho --max-steps 20000\n" in sparse
+
+
+def test_info_does_not_wait_for_numba(room):
+    code = "import sys; from splatseed.cli import main; main(sys.argv[1:]); print(*sys.modules)"
+    words = [sys.executable, "-c", code, "info", str(room)]
+    run = subprocess.run(words, capture_output=True, check=False, text=True, timeout=60)
+    assert (run.returncode, run.stderr) == (0, "")
+    assert "image area without points" in run.stdout
+    assert not {"numba", "torch"} & set(run.stdout.splitlines()[-1].split())
+
+
+def test_photographs_that_cannot_be_compared(rgbd, splatseed):
+    lines = (rgbd / "traj.txt").read_text().splitlines()
+    (rgbd / "traj.txt").write_text(lines[0] + "\n")
+    for path in (rgbd / "results").glob("*[!0]?.png"):
+        path.unlink()
+    for path in (rgbd / "results").glob("*[!0].png"):
+        path.unlink()
+    run = splatseed("info", rgbd)
+    assert run.code == 0
+    assert _pairs(run.out)["format"] == "rgbd"
+    assert f"splatseed sfm {rgbd / 'results'}" in run.out
+    assert "no points yet: splatseed upsample makes some from the photographs" in run.out
+    assert "cannot be compared: expected at least two photographs with a pose" in run.out
+    assert "  seeds" not in run.out
+
+
+def test_poses_without_points_ask_for_triangulation(room, tmp_path, splatseed):
+    write_scene(load_scene(room), tmp_path / "nerf", format="transforms")
+    for path in (tmp_path / "nerf").glob("*.ply"):
+        path.unlink()
+    run = splatseed("info", tmp_path / "nerf")
+    assert run.code == 0
+    assert _pairs(run.out)["points"] == "none"
+    assert "there are no points" in run.out
+    assert f"--poses-from {tmp_path / 'nerf'}" in run.out
+    assert "nan" not in run.out
+
+
+@pytest.mark.parametrize(
+    ("xyz", "points", "finite"),
+    [(np.zeros((0, 3)), "none", True), (np.full((4, 3), np.nan), "4", False)],
+)
+def test_clouds_of_nothing(xyz, points, finite, tmp_path, splatseed):
+    write_ply(tmp_path / "cloud.ply", PointCloud(xyz, np.zeros(xyz.shape, np.uint8)))
+    run = splatseed("info", tmp_path / "cloud.ply")
+    assert run.code == 0
+    assert _pairs(run.out)["points"] == points
+    assert ("not finite" in run.out) != finite
+    assert "nan" not in run.out
+
+
+def test_points_that_were_put_into_another_model_are_a_problem(own_room, room, splatseed):
+    write_points3d(own_room / "sparse/0/points3D.bin", load_scene(room).points, None)
+    out = splatseed("info", own_room).out
+    assert _pairs(out)["tracks"] == "none"
+    assert "features of the photographs name points, but no point has a track" in out
+    assert "nan" not in out
+    assert (
+        splatseed("upsample", own_room, "--method", "mls", "-o", own_room.with_name("up")).code == 0
+    )
+    assert "name points, but" not in splatseed("info", own_room.with_name("up")).out
+
+
+# Depth maps ---------------------------------------------------------------------------------------
+
+
+ROW = re.compile(r"^(\S+\.\w+) +([\d,]+) +(\S+)(?: +(\S+))? +(\S+%|-)$", re.MULTILINE)
+
+
+def _rows(out):
+    """The images that are listed, and their columns."""
+    return {row[0]: row[1:] for row in ROW.findall(out)}
+
+
+@pytest.fixture(scope="session")
+def tour(tmp_path_factory):
+    """A room of 15 views: more than are listed. Not to be written to."""
+    path = tmp_path_factory.mktemp("tour") / "tour"
+    return write_capture(make_capture(0, num_views=15, width=96, height=72), path)
+
+
+def _rewrite(path, output, change, kind="z", names=None):
+    """Depth maps of a capture, each made another one by ``change(index, values)``."""
+    scene = load_scene(path)
+    depths = find_depths(scene, path / "depths")
+    with depth_folder(output, kind) as writer:
+        for i, name in enumerate(sorted(depths)):
+            if names is None or name in names:
+                writer.write(name, np.float32(change(i, depths.read(name).values)))
+    return output
+
+
+def test_nothing_follows_from_maps_that_do_not_fit(room, splatseed):
+    run = splatseed("info", room, "--depth", room / "depths", "--depth-kind", "inverse")
+    assert "12 of 12 depth maps cannot be aligned" in run.out
+    assert "--method depth" not in run.out
+    assert "by method depth" not in run.out
+    assert _pairs(run.out)["depth maps"] == "12"
+
+
+def test_true_depth_fits(room, splatseed):
+    run = splatseed("info", room, "--depth", room / "depths")
+    assert (run.code, run.err) == (0, "")
+    pairs, rows = _pairs(run.out), _rows(run.out)
+    assert pairs["maps"] == "12 of 12 images, the first 120 x 90, kind z"
+    assert pairs["left out"] == "0"
+    scene = load_scene(room)
+    expected = align(scene.replace(depths=find_depths(scene, room / "depths")))
+    assert rows.keys() == expected.keys()
+    for name, (points, scale, _, residual) in rows.items():
+        assert int(points.replace(",", "")) == expected[name].num_points
+        assert float(scale) == pytest.approx(expected[name].scale, rel=1e-3)
+        assert float(scale) == pytest.approx(1, abs=0.02)
+        assert float(residual.rstrip("%")) == pytest.approx(100 * expected[name].residual, abs=0.01)
+    assert f"--method depth --depth {room / 'depths'}" in run.out.splitlines()[-1]
+
+
+def test_the_worst_are_listed_first_and_the_rest_on_demand(tour, tmp_path, splatseed):
+    def spoil(i, z):
+        return np.where(np.random.default_rng(i).random(z.shape) < 0.4, z * 1.3, z) if i == 4 else z
+
+    maps = _rewrite(tour, tmp_path / "maps", spoil)
+    short = splatseed("info", tour, "--depth", maps).out
+    assert "the 12 worst; --json has all" in short
+    assert len(_rows(short)) == 12
+    assert next(iter(_rows(short))) == sorted(find_depths(load_scene(tour), maps))[4]
+    assert len(json.loads(splatseed("info", tour, "--depth", maps, "--json").out)["depth"]) == 15
+
+
+def test_why_an_image_is_left_out(tour, tmp_path, splatseed):
+    names = sorted(image.name for image in load_scene(tour).images)[:8]
+    blind = lambda i, z: z * np.nan if i == 2 else z
+    maps = _rewrite(tour, tmp_path / "maps", blind, names=names)
+    out = splatseed("info", tour, "--depth", maps).out
+    pairs = _pairs(out)
+    assert pairs["maps"].startswith("8 of 15 images")
+    assert pairs["left out"] == "1"
+    assert f"- {names[2]}: the map has no depth at any pixel" in out
+    assert "- 1 of 8 depth maps cannot be aligned with the points" in out.partition("problems")[2]
+    assert "no problems" not in out
+    assert _rows(out)[names[2]] == ("0", "-", "", "-")
+    assert next(iter(_rows(out))) == names[2]
+
+
+@pytest.mark.parametrize(
+    ("points", "known", "most", "said"),
+    [
+        (100, 10**6, 10**6, "--ratio 16"),
+        (100, 10**6, 900, "--num-points 900"),  # training would thin out the others
+        (100, 80, 900, "--num-points 110"),
+        (100, 10**6, 50, "--num-points 101"),
+        (0, 800, 10**6, "--num-points 100"),
+    ],
+)
+def test_no_more_points_are_asked_for_than_there_is_room_for(points, known, most, said):
+    assert number_for(points, known, most) == said
+
+
+def test_the_picture_shows_photographs_depth_and_points(tour, tmp_path, splatseed):
+    blind = lambda i, z: z * np.nan if i == 2 else z
+    maps = _rewrite(tour, tmp_path / "maps", blind)
+    assert splatseed("info", tour, "--depth", maps, "--picture", tmp_path / "a.png").code == 0
+    page = np.asarray(PilImage.open(tmp_path / "a.png")).astype(int)
+    assert page.shape == (4 * (360 + 34) + 12 + 44, 3 * (480 + 12) + 12, 3)
+    rows = [page[34 + r * 394 : 394 + r * 394] for r in range(4)]
+    tiles = [[row[:, 12 + c * 492 : 492 + c * 492] for c in range(3)] for row in rows]
+    for photograph, depth, points in tiles[:3]:
+        assert len(np.unique(photograph.reshape(-1, 3), axis=0)) > 500
+        assert not (depth == 150).all()
+        assert 0.5 < (np.ptp(points, axis=2) == 0).mean() < 0.999  # grey but for the points
+    assert (tiles[3][1] == 150).all()
+    assert (np.ptp(tiles[3][2], axis=2) == 0).all()
+
+
+def test_a_scenes_own_maps_are_counted_and_can_be_lifted(rgbd, tmp_path, splatseed):
+    assert _pairs(splatseed("info", rgbd).out)["depth maps"] == "12"
+    run = splatseed("info", rgbd, "--depth", rgbd)
+    assert run.code == 0
+    assert "no points to align the depth maps with" in run.out
+    assert "left out" not in run.out
+    lifted, triangulated = run.out.splitlines()[-2:]
+    assert "splatseed sfm" in triangulated
+    words = shlex.split(lifted.split("splatseed ")[1])
+    made = splatseed(*[tmp_path / "out" if word == "OUT" else word for word in words])
+    assert made.code == 0, made.err
+    wanted = int(words[words.index("--num-points") + 1])
+    assert len(load_scene(tmp_path / "out").points) == wanted > 100
+
+
+# What splatseed wrote -----------------------------------------------------------------------------
+
+
+def test_points_of_a_seeded_scene_are_no_problem_for_being_isolated(room, tmp_path, splatseed):
+    scene = load_scene(room)
+    far = scene.points.xyz.copy()
+    far[:40] += 100 * np.arange(1, 41)[:, None]
+    scene = scene.replace(points=scene.points.replace(xyz=far), tracks=None)
+    write_scene(scene, tmp_path / "plain", provenance={})
+    assert "are isolated" in splatseed("info", tmp_path / "plain").out
+    seeds = upsample(scene, "linear", ratio=2)
+    write_scene(scene.replace(points=seeds), tmp_path / "out", provenance={"command": "upsample"})
+    assert "are isolated" not in splatseed("info", tmp_path / "out").out
+
+
+def test_a_run_is_told_from_a_scene(tmp_path, splatseed):
+    RunFolder(tmp_path / "run").begin({"splatseed": "1", "scene": "/data/fox"})
+    run = splatseed("info", tmp_path / "run")
+    assert (run.code, run.out) == (2, "")
+    assert "a run of splatseed train" in run.err
+    assert f"splatseed view {tmp_path / 'run'}" in run.err
+    assert f"splatseed evaluate {tmp_path / 'run'}" in run.err
+
+
+def test_a_seeded_scene_is_to_be_trained_and_not_seeded_again(room, tmp_path, splatseed):
+    scene, path = load_scene(room), tmp_path / "my seeds"
+    seeds = upsample(scene, "linear", ratio=4)
+    write_scene(scene.replace(points=seeds), path, provenance={"command": "upsample"})
+    run = splatseed("info", path)
+    assert (run.code, run.err) == (0, "")
+    assert "train it" in run.out
+    assert "made 1,392 of its points and kept 464" in run.out
+    assert run.out.rstrip().endswith(f"splatseed train '{path}' -o RUN")
+    assert "upsampl" not in run.out.replace("splatseed upsample made", "")
+    assert _pairs(run.out)["isolated"] == _pairs(splatseed("info", room).out)["isolated"]
+
+
+# Poses --------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def large(tmp_path_factory) -> Path:
+    """The room in photographs that are large enough for corners to be found again."""
+    capture = make_capture(0, num_views=16, width=240, height=180)
+    return write_capture(capture, tmp_path_factory.mktemp("large") / "room")
+
+
+@pytest.fixture
+def bare(large, tmp_path) -> Path:
+    """The same in nerfstudio's layout, without its points."""
+    folder = tmp_path / "bare"
+    write_scene(load_scene(large), folder, format="transforms")
+    for path in folder.glob("*.ply"):
+        path.unlink()
+    content = json.loads((folder / "transforms.json").read_text())
+    del content["ply_file_path"]
+    (folder / "transforms.json").write_text(json.dumps(content))
+    return folder
+
+
+def _turn(folder: Path, turn_of: object) -> None:
+    """Turn each camera about its own axes."""
+    path = folder / "transforms.json"
+    content = json.loads(path.read_text())
+    for number, frame in enumerate(content["frames"]):
+        pose = np.array(frame["transform_matrix"])
+        pose[:3, :3] @= turn_of(number)  # type: ignore[operator]
+        frame["transform_matrix"] = pose.tolist()
+    path.write_text(json.dumps(content))
+
+
+def test_sound_poses_and_those_of_a_device(bare, splatseed):
+    facts = json.loads(splatseed("info", bare, "--json").out)
+    assert facts["poses"]["agreement"] > 0.3
+    assert facts["poses"]["error"]["exact"]
+    assert len(facts["problems"]) == 1  # that there are no points
+    rng = np.random.default_rng(0)
+    _turn(bare, lambda _: Rotation.from_rotvec(np.radians(0.8) * rng.normal(size=3)).as_matrix())
+    poses = json.loads(splatseed("info", bare, "--json").out)["poses"]
+    assert not poses["error"]["exact"]
+    assert 0.3 < poses["error"]["degrees"] < 2
+    told = splatseed("info", bare).out
+    assert "photographs miss each other by about" in told
+    assert f"splatseed upsample {bare} --budget" in told.partition("next")[2]
+    assert told.partition("next")[2].count("--refine-poses") == 2
+
+
+def test_wrong_axes_are_a_problem_not_an_error(bare, splatseed):
+    _turn(bare, lambda _: np.diag([1.0, -1.0, -1.0]))
+    run = splatseed("info", bare)
+    assert run.code == 0
+    assert "once the y and z axes of every camera are negated" in run.out
+    assert "splatseed upsample" not in run.out.partition("next")[2]
