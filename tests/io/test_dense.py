@@ -29,7 +29,7 @@ from splatseed.io.dense import (
 )
 from splatseed.io.ply import read_ply
 from splatseed.synthetic import make_capture, write_capture
-from splatseed.views.undistortion import undistort
+from splatseed.views.projection import undistort
 
 from ..bent import bend
 from ..stereo_maps import true_maps

@@ -1,4 +1,4 @@
-"""Budgets: numbers, and which points are kept of too many."""
+"""Which cells hold a point, and which points are kept of too many: held to literal loops."""
 
 from __future__ import annotations
 
@@ -7,11 +7,47 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from splatseed.errors import ParameterError, PointCloudError
+from splatseed.errors import ParameterError, PointCloudError, SplatseedError
 from splatseed.seeding.budget import _places_in_views, thin
-from splatseed.seeding.coverage import covered_share
+from splatseed.seeding.coverage import cell_depths, covered_cells, covered_share
 
 from . import references as slow
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from([1, 3, 8, 100]), st.floats(0.01, 5.0))
+@settings(max_examples=25, deadline=None)
+def test_depths_are_those_of_the_loop(seed, cell, spread):
+    rng = np.random.default_rng(seed)
+    width, height = rng.integers(1, 50, 2)
+    view = slow.make_view(rng, int(width), int(height), rng.uniform(1, 200))
+    xyz = (spread * rng.normal(size=(rng.integers(0, 600), 3))).astype(np.float32)
+    expected = slow.cell_depths(view, xyz, cell)
+    np.testing.assert_array_equal(cell_depths(view, xyz, cell), expected)
+
+
+def lattice(view, cells, depth):
+    """A point in the middle of each of some cells, at a depth."""
+    return [slow.lift(view, 8, i, j, depth) for i, j in cells]
+
+
+CELLS = [divmod(k, 10) for k in range(100)]
+
+
+def test_a_surface_hides_what_shows_between_its_points(rng):
+    view = slow.make_view(rng, 80, 80, 80, eye=(0, -1, 0))
+    depth = np.linalg.norm(view.camera.center)
+    hole = [cell for cell in CELLS if cell != (4, 4)]
+    for behind, covered in ((1.5, 99), (1.05, 100)):
+        points = [*lattice(view, hole, depth), slow.lift(view, 8, 4, 4, behind * depth)]
+        (cells,) = covered_cells([view], np.float32(points))
+        assert cells.sum() == covered
+    assert covered_share([view], np.float32(lattice(view, CELLS, depth))) == 1.0
+
+
+def test_a_point_that_hangs_before_a_surface_does_not_hide_it(rng):
+    view = slow.make_view(rng, 80, 80, 80, eye=(0, -1, 0))
+    points = [*(4 * lattice(view, CELLS, 4.0)), slow.lift(view, 8, 5, 5, 0.1)]
+    np.testing.assert_allclose(cell_depths(view, np.float32(points), 8), 4.0, rtol=1e-5)
 
 
 def sheet(rng, num):
@@ -55,8 +91,7 @@ def test_exactly_so_many_are_kept(seed, num, first, num_views):
 def test_thinning_leaves_the_picture_covered(rng):
     xyz, views = sheet(rng, 20_000), views_of(rng, 6)
     chance = rng.choice(len(xyz), 1200, replace=False)
-    kept = thin(xyz, views, 1200)
-    ours, whole = covered_share(views, xyz[kept], 3), covered_share(views, xyz, 3)
+    ours, whole = covered_share(views, xyz[thin(xyz, views, 1200)], 3), covered_share(views, xyz, 3)
     assert ours > 0.85 * whole
     assert ours > covered_share(views, xyz[chance], 3) + 0.1 * whole
 
@@ -64,21 +99,19 @@ def test_thinning_leaves_the_picture_covered(rng):
 def test_the_only_seed_of_a_cell_stays_before_the_second_of_another(rng):
     """A crowd of originals in one corner, and lone new points: all of these are kept."""
     view = slow.make_view(rng, 640, 480, 600, eye=(0, -1, 0))
-    crowd = [slow.lift(view, 8, *rng.uniform(0, 6, 2), 3.0) for _ in range(500)]
-    i, j = np.divmod(np.arange(30), 6)
-    lone = [slow.lift(view, 8, 8 + 8 * a, 8 + 8 * b, 3.0) for a, b in zip(i, j, strict=True)]
+    crowd = lattice(view, rng.uniform(0, 6, (500, 2)), 3.0)
+    lone = lattice(view, [(8 + 8 * (k // 6), 8 + 8 * (k % 6)) for k in range(30)], 3.0)
     kept = thin(np.float32([*crowd, *lone]), [view], 60, first=500)
     assert set(range(500, 530)) <= set(kept.tolist())
 
 
 def test_originals_come_first_among_equals(rng):
     xyz = sheet(rng, 500)
-    twice = np.concatenate([xyz, xyz])
-    assert (thin(twice, views_of(rng, 3), 100, first=500) < 500).all()
+    twice, views, high = np.concatenate([xyz, xyz]), views_of(rng, 3), np.arange(1000) >= 500
+    assert (thin(twice, views, 100, first=500) < 500).all()
     assert (thin(twice, (), 100, first=500) < 500).all()
-    high = np.arange(1000) >= 500
-    assert (thin(twice, views_of(rng, 3), 100, priority=high) >= 500).all()
-    assert (thin(twice, views_of(rng, 3), 100, first=500, priority=high) < 500).all()
+    assert (thin(twice, views, 100, priority=high) >= 500).all()
+    assert (thin(twice, views, 100, first=500, priority=high) < 500).all()
 
 
 def test_threads_change_nothing(rng):
@@ -91,12 +124,24 @@ def test_threads_change_nothing(rng):
     assert found[0] == found[1]
 
 
-def test_bad_input_is_refused(rng):
-    xyz, views = sheet(rng, 9), views_of(rng, 1)
-    with pytest.raises(ParameterError, match="at least 1 point"):
-        thin(xyz, views, 0)
-    with pytest.raises(PointCloudError, match=r"priority of shape \[9\]"):
-        thin(xyz, views, 3, priority=np.zeros(8))
-    for given_views in (views, ()):
-        with pytest.raises(PointCloudError, match=r"\[N, 3\]"):
-            thin(xyz[:, :2], given_views, 3)
+ONE = [slow.make_view(np.random.default_rng(0))]
+XYZ = np.zeros((9, 3), np.float32)
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "says"),
+    [
+        (lambda: thin(XYZ, ONE, 0), ParameterError, "at least 1 point"),
+        (lambda: thin(XYZ, ONE, 3, priority=np.zeros(8)), PointCloudError, r"of shape \[9\]"),
+        (lambda: thin(XYZ[:, :2], ONE, 3), PointCloudError, r"\[N, 3\]"),
+        (lambda: thin(XYZ[:, :2], (), 3), PointCloudError, r"\[N, 3\]"),
+        (lambda: covered_share([], XYZ), ParameterError, "at least one view"),
+        (lambda: covered_share(ONE, XYZ, 0.5), ParameterError, "at least 1 pixel"),
+        (lambda: covered_share(ONE, XYZ, np.nan), ParameterError, "at least 1 pixel"),
+        (lambda: covered_share(ONE, XYZ[:, :2]), PointCloudError, r"\[N, 3\]"),
+    ],
+)
+def test_bad_input_is_refused(call, error, says):
+    with pytest.raises(SplatseedError, match=says) as caught:
+        call()
+    assert type(caught.value) is error

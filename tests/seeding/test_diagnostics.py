@@ -9,17 +9,7 @@ from splatseed.camera import Intrinsics
 from splatseed.errors import PointCloudError
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene, Tracks
-from splatseed.seeding.diagnostics import (
-    CloudStatistics,
-    EmptyRegions,
-    cloud_statistics,
-    empty_regions,
-    far_share,
-    find_problems,
-    measure,
-    spacing,
-    track_statistics,
-)
+from splatseed.seeding import diagnostics as module
 from splatseed.synthetic import SHAPES
 
 SHARES = [5, 25, 50, 75, 95]
@@ -41,32 +31,27 @@ def test_counts_spacing_and_bounds(rng):
     xyz = rng.normal(size=(200, 3)).astype(np.float32)
     xyz[10:15] = xyz[0]
     scene = _scene(np.concatenate([xyz, [[np.nan, 0, 0], [0, np.inf, 0]]]))
-    found = cloud_statistics(scene)
+    found = module.cloud_statistics(scene)
     assert (found.num_points, found.non_finite, found.duplicates) == (202, 2, 5)
     expected = np.percentile(_brute_spacing(xyz), SHARES)
     np.testing.assert_allclose(found.spacing, expected, rtol=1e-6)
     np.testing.assert_array_equal(found.low, xyz.min(axis=0))
     np.testing.assert_array_equal(found.high, xyz.max(axis=0))
+    greatest = np.abs(xyz).max()
+    assert found.resolution == np.nextafter(greatest, np.float32(np.inf)) - greatest
 
 
 def test_a_point_far_from_a_cluster_is_isolated(rng):
     grid = np.stack(np.meshgrid(*[np.arange(10.0)] * 2, [0.0]), axis=-1).reshape(-1, 3)
     grid += 0.01 * rng.normal(size=grid.shape)
-    assert cloud_statistics(_scene(grid)).isolated == 0
+    assert module.cloud_statistics(_scene(grid)).isolated == 0
     strays = [[40, 40, 40], [-60, 0, 50]]
-    assert cloud_statistics(_scene(np.concatenate([grid, strays]))).isolated == 2
-
-
-@pytest.mark.parametrize("far", [1.0, 1e3, 5e6])
-def test_resolution_is_the_step_to_the_next_float32(far):
-    next_one = np.nextafter(np.float32(far), np.float32(np.inf))
-    found = cloud_statistics(_scene([[0, 0, 0], [0, -far, 0]]))
-    assert found.resolution == float(next_one) - far
+    assert module.cloud_statistics(_scene(np.concatenate([grid, strays]))).isolated == 2
 
 
 @pytest.mark.parametrize("xyz", [np.zeros((0, 3)), np.full((3, 3), np.nan)])
 def test_clouds_of_nothing_have_no_measures(xyz):
-    found = cloud_statistics(_scene(xyz))
+    found = module.cloud_statistics(_scene(xyz))
     assert (found.num_points, found.non_finite) == (len(xyz), len(xyz))
     assert np.isnan([*found.spacing, *found.low, *found.high]).all()
 
@@ -78,12 +63,12 @@ def test_tracks(rng):
     seen = np.zeros(offsets[-1], np.uint32)
     xyz, known = rng.random((40, 3)), errors[errors >= 0]
     tracks = Tracks(np.arange(40), xyz, errors, offsets, seen, seen)
-    found = track_statistics(_scene(xyz, tracks=tracks))
+    found = module.track_statistics(_scene(xyz, tracks=tracks))
     assert found.mean_length == pytest.approx(lengths.mean())
     assert found.mean_error == pytest.approx(known.mean())
     np.testing.assert_allclose(found.length, np.percentile(lengths, SHARES))
     np.testing.assert_allclose(found.error, np.percentile(known, SHARES))
-    assert track_statistics(_scene(xyz)) is None
+    assert module.track_statistics(_scene(xyz)) is None
 
 
 def _brute_empty(xyz, size, cell):
@@ -104,7 +89,7 @@ def test_empty_regions(size, rng):
         Image(name, 1, lens, np.array(quat), np.zeros(3))
         for name, quat in (("a.png", [1.0, 0, 0, 0]), ("b.png", [0.0, 1, 0, 0]))
     )
-    regions = empty_regions(_scene(xyz, images=images))
+    regions = module.empty_regions(_scene(xyz, images=images))
     shares = [_brute_empty(xyz, size, 10), _brute_empty(xyz * [1, -1, -1], size, 10)]
     assert regions.mean == pytest.approx(np.mean(shares))
     assert regions.worst == pytest.approx(max(shares))
@@ -113,55 +98,47 @@ def test_empty_regions(size, rng):
 
 def _statistics(num_points, isolated, duplicates=0):
     three, five = (0.0,) * 3, (1.0,) * 5
-    return CloudStatistics(num_points, 0, duplicates, isolated, five, three, three, 0.0)
+    return module.CloudStatistics(num_points, 0, duplicates, isolated, five, three, three, 0.0)
 
 
 def test_problems_are_told_and_the_readers_come_first(rng):
     scene = _scene(rng.random((5, 3)), warnings=("The reader's.",))
-    sound = find_problems(scene, _statistics(1000, 1), EmptyRegions(0.1, 0.9, "a"))
+    sound = module.find_problems(scene, _statistics(1000, 1), module.EmptyRegions(0.1, 0.9, "a"))
     assert sound == ("The reader's.",)
-    first, *others = find_problems(scene, _statistics(1000, 100), EmptyRegions(0.8, 0.9, "a"))
+    first, *others = module.find_problems(
+        scene, _statistics(1000, 100), module.EmptyRegions(0.8, 0.9, "a")
+    )
     assert first == "The reader's."
     assert [text.split()[0] for text in others] == ["100", "80%"]
-    (repeats,) = find_problems(_scene(rng.random((5, 3))), _statistics(1000, 100, 200), None)
+    (repeats,) = module.find_problems(_scene(rng.random((5, 3))), _statistics(1000, 100, 200), None)
     assert repeats.startswith("100 points (12.5%)")  # of those that are left
-    assert "no points" in find_problems(_scene([]), _statistics(0, 0), None)[0]
+    assert "no points" in module.find_problems(_scene([]), _statistics(0, 0), None)[0]
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e6])
 def test_spacing_is_the_mean_over_six_neighbours_in_any_unit(scale, rng):
     xyz = rng.normal(size=(300, 3))
-    assert spacing(scale * xyz) == pytest.approx(scale * _brute_spacing(xyz).mean())
+    assert module.spacing(scale * xyz) == pytest.approx(scale * _brute_spacing(xyz).mean())
+    twice = np.array([[0.0, 0, 0], [scale, 0, 0], [0, 0, 0], [scale, 0, 0], [np.nan, 0, 0]])
+    assert module.spacing(twice) == scale
 
 
-def test_duplicates_and_nan_points_are_no_neighbours():
-    pair = np.array([[0.0, 0, 0], [1.0, 0, 0]])
-    assert spacing(np.concatenate([pair, pair, [[np.nan, 0, 0]]])) == 1.0
-
-
-def test_measure_on_a_plane_moved_off_by_half_a_spacing(rng):
-    plane = SHAPES["plane"]()
+def test_points_beside_a_plane_and_beyond_a_sphere_are_measured(rng):
+    plane, sphere = SHAPES["plane"](), SHAPES["sphere"]()
     originals = plane.sample(2000, rng)
-    h = spacing(originals)
+    h = module.spacing(originals)
     new = plane.sample(1000, rng) + 0.5 * h * plane.frame[2]
     whole = np.concatenate([originals, new])
-    score = measure(new, whole, plane, plane.sample(4000, rng), h)
-    assert score.error == pytest.approx(0.5)
-    assert score.p95 == pytest.approx(0.5)
+    score = module.measure(new, whole, plane, plane.sample(4000, rng), h)
+    assert (score.error, score.p95) == (pytest.approx(0.5), pytest.approx(0.5))
     assert score.share_far == 0
-
-
-def test_more_points_cover_more_and_outliers_are_far(rng):
-    sphere = SHAPES["sphere"]()
     originals, extra = sphere.sample(500, rng), sphere.sample(1500, rng)
-    samples = sphere.sample(5000, rng)
-    h = spacing(originals)
-    before = measure(originals, originals, sphere, samples, h)
-    after = measure(extra, np.concatenate([originals, extra]), sphere, samples, h)
+    samples, h = sphere.sample(5000, rng), module.spacing(originals)
+    before = module.measure(originals, originals, sphere, samples, h)
+    after = module.measure(extra, np.concatenate([originals, extra]), sphere, samples, h)
     assert after.coverage < 0.6 * before.coverage
-    assert before.share_far == after.share_far == 0
     astray = np.concatenate([extra[:900], 3 * extra[900:1000]])
-    score = measure(astray, np.concatenate([originals, astray]), sphere, samples, h)
+    score = module.measure(astray, np.concatenate([originals, astray]), sphere, samples, h)
     assert score.share_far == pytest.approx(0.1)
 
 
@@ -169,18 +146,18 @@ def test_far_is_three_local_spacings_of_the_nearest_original():
     near = np.stack(np.meshgrid(*[np.arange(4.0)] * 2, [0.0]), axis=-1).reshape(-1, 3)
     far = 100 * near + [1000.0, 0, 0]
     originals, up = np.concatenate([near, far]), np.array([0, 0, 1.0])
-    assert far_share(originals, near + 2.9 * up) == 0
-    assert far_share(originals, near + 9 * up) == 1
-    assert far_share(originals, far + 9 * up) == 0  # the same height over sparser points
+    assert module.far_share(originals, near + 2.9 * up) == 0
+    assert module.far_share(originals, near + 9 * up) == 1
+    assert module.far_share(originals, far + 9 * up) == 0  # the same height over sparser points
 
 
 def test_far_share_of_odd_clouds():
     one = np.zeros((1, 3))
-    assert far_share(one, np.empty((0, 3))) == 0
-    assert far_share(one, one) == 0
-    assert far_share(one, one + 1) == 1
-    assert far_share(one, np.array([[0.0, 0, 0], [np.nan, 0, 0]])) == 0.5
-    assert far_share(one, np.repeat([[0.0, 0, 0], [1.0, 0, 0]], 40_000, axis=0)) == (
+    assert module.far_share(one, np.empty((0, 3))) == 0
+    assert module.far_share(one, one) == 0
+    assert module.far_share(one, one + 1) == 1
+    assert module.far_share(one, np.array([[0.0, 0, 0], [np.nan, 0, 0]])) == 0.5
+    assert module.far_share(one, np.repeat([[0.0, 0, 0], [1.0, 0, 0]], 40_000, axis=0)) == (
         pytest.approx(0.5, abs=0.02)  # a sample of them
     )
 
@@ -188,12 +165,12 @@ def test_far_share_of_odd_clouds():
 @pytest.mark.parametrize(
     ("call", "says"),
     [
-        *((lambda xyz=xyz: spacing(xyz), "two distinct finite points")
+        *((lambda xyz=xyz: module.spacing(xyz), "two distinct finite points")
           for xyz in (np.empty((0, 3)), np.ones((1, 3)), np.ones((9, 3)))),
-        *((lambda num=num, h=h: measure(
+        *((lambda num=num, h=h: module.measure(
             np.zeros((num, 3)), np.zeros((num, 3)), SHAPES["sphere"](), np.ones((3, 3)), h
         ), "spacing above zero") for num, h in ((0, 1.0), (5, 0.0), (5, np.nan))),
-        (lambda: far_share(np.full((2, 3), np.nan), np.zeros((1, 3))), "finite original points"),
+        (lambda: module.far_share(np.full((2, 3), np.nan), np.zeros((1, 3))), "finite original"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_measured_is_refused(call, says):

@@ -11,10 +11,10 @@ from splatseed.errors import ParameterError
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import silent
 from splatseed.seeding.upsampling import parse_budget, share_covered, thin_to
-from splatseed.upsample.registry import SOURCE_CODES
+from splatseed.upsample import SOURCE_CODES
 from splatseed.views import view
 
-PHOTOGRAPH_METHODS = ("stereo", "cover", "auto")
+by_photographs = pytest.mark.parametrize("method", ["stereo", "cover", "auto"])
 STEREO, COVER, CLOUD = (SOURCE_CODES[name] for name in ("stereo", "cover", "cloud"))
 
 
@@ -46,24 +46,21 @@ def test_the_maps_are_those_that_seeds_are_made_of(room, seeds):
     assert close > 50
 
 
-@pytest.mark.parametrize("method", PHOTOGRAPH_METHODS)
+@by_photographs
 def test_the_same_seed_gives_the_same_bytes_on_any_number_of_threads(method, room):
-    first = ss.upsample(room, method, seed=3)
-    threads = numba.get_num_threads()
+    first, threads = ss.upsample(room, method, seed=3), numba.get_num_threads()
     numba.set_num_threads(1)
     try:
         second = ss.upsample(room, method, seed=3)
     finally:
         numba.set_num_threads(threads)
-    assert first.xyz.tobytes() == second.xyz.tobytes()
-    assert first.rgb.tobytes() == second.rgb.tobytes()
-    assert first.source.tobytes() == second.source.tobytes()
+    for name in ("xyz", "rgb", "source"):
+        assert getattr(first, name).tobytes() == getattr(second, name).tobytes()
 
 
-@pytest.mark.parametrize("method", PHOTOGRAPH_METHODS)
+@by_photographs
 def test_held_out_photographs_are_never_read(method, room, monkeypatch):
-    read = []
-    load = view.load_photograph
+    read, load = [], view.load_photograph
     monkeypatch.setattr(
         view, "load_photograph", lambda path, *a: (read.append(path.name), load(path, *a))[1]
     )
@@ -72,19 +69,19 @@ def test_held_out_photographs_are_never_read(method, room, monkeypatch):
     assert sorted(read) == [name for i, name in enumerate(names) if i % 4]
 
 
+@by_photographs
+@pytest.mark.parametrize("size", [{"ratio": 4}, {"num_points": 5000}], ids=str)
+def test_the_photographs_say_how_many(method, size, room):
+    with pytest.raises(ParameterError, match="--budget"):
+        ss.upsample(room, method, **size)
+
+
 def test_without_photographs_mls_stands_in_and_says_so(room):
     notes = []
     seeds = ss.upsample(room.points, note=notes.append)
     assert len(seeds) == 4 * len(room.points)
     assert set(seeds.source) == {0, SOURCE_CODES["mls"]}
     assert any("photographs" in note and "mls" in note for note in notes)
-
-
-@pytest.mark.parametrize("method", PHOTOGRAPH_METHODS)
-@pytest.mark.parametrize("size", [{"ratio": 4}, {"num_points": 5000}], ids=str)
-def test_the_photographs_say_how_many(method, size, room):
-    with pytest.raises(ParameterError, match="--budget"):
-        ss.upsample(room, method, **size)
 
 
 def test_cover_fills_the_gaps_of_any_method(room):
@@ -108,41 +105,35 @@ def test_a_budget_is_met_and_keeps_the_pictures_covered(method, room, seeds):
     assert share_covered(room, thinned) > share_covered(room, at_random)
 
 
-def test_a_budget_may_be_below_the_originals_and_a_share_of_the_pixels(room):
-    count = len(room.points)
-    assert len(ss.upsample(room, "linear", budget=count // 2)) == count // 2
-    pixels = 160 * 120
-    assert len(ss.upsample(room, "cover", budget=f"{count / 2 / pixels}rho")) == round(count / 2)
-
-
-def test_a_budget_that_originals_fill_is_theirs_alone(room):
-    """As if new points had been made and thinned away; the user is told."""
-    count, notes = room.points.num_original, []
-    thinned = ss.upsample(room, budget=count // 2, note=notes.append)
-    assert len(thinned) == thinned.num_original == count // 2
+def test_a_budget_may_be_below_the_originals(room):
+    """The default then makes nothing, as if new points had been thinned away, and says so."""
+    num, notes = room.points.num_original // 2, []
+    assert len(ss.upsample(room, "linear", budget=num)) == num
+    assert len(ss.upsample(room, "cover", budget=f"{num / (160 * 120)}rho")) == num
+    thinned = ss.upsample(room, budget=num, note=notes.append)
+    assert len(thinned) == thinned.num_original == num
     assert "are thinned, and none are added" in notes[-1]
-    made = ss.upsample(room, cover=8, budget=count // 2)  # the long way
+    made = ss.upsample(room, cover=8, budget=num)  # the long way
     np.testing.assert_array_equal(made.xyz, thinned.xyz)
 
 
 def test_a_small_budget_keeps_a_part_of_a_scan(room):
-    scan = room.points.originals
-    scan = scan.replace(xyz=scan.xyz + np.float32(0.2), source=np.full(len(scan), CLOUD, np.uint8))
-    guesses = scan.replace(
-        xyz=scan.xyz + np.float32(0.2), source=np.full(len(scan), COVER, np.uint8)
+    own = room.points.originals
+    scan, guesses = (
+        own.replace(xyz=own.xyz + np.float32(off), source=np.full(len(own), code, np.uint8))
+        for off, code in ((0.2, CLOUD), (0.4, COVER))
     )
-    cloud = PointCloud.concatenate(room.points.originals, scan, guesses)
-    num = room.points.num_original // 2
+    cloud = PointCloud.concatenate(PointCloud.concatenate(own, scan), guesses)
+    num = len(own) // 2
     kept = thin_to(room, cloud, num, 8, 0, 0, silent)
     assert len(kept) == num
     assert np.count_nonzero(kept.source == CLOUD) > num // 10
 
 
 def test_verify_moves_and_drops_interpolated_points(room, room_capture):
-    notes = []
+    notes, count = [], len(room.points)
     plain = ss.upsample(room, "mls", ratio=4)
     checked = ss.upsample(room, "mls", ratio=4, verify=True, note=notes.append)
-    count = len(room.points)
     np.testing.assert_array_equal(checked.xyz[:count], room.points.xyz)
     assert count < len(checked) < len(plain)
     off = room_capture.surfaces.distance
@@ -150,32 +141,27 @@ def test_verify_moves_and_drops_interpolated_points(room, room_capture):
     assert any("agree with the photographs" in each for each in notes)
 
 
+BUDGETS = {"50000": 50_000, " 5e4": 50_000, 50_000: 50_000, "50k": 50_000, "0.5M": 500_000}
+
+
 @pytest.mark.parametrize(
-    ("budget", "number"),
-    [
-        ("50000", 50_000),
-        (" 5e4", 50_000),
-        (50_000, 50_000),
-        ("50k", 50_000),
-        ("0.5M", 500_000),
-        ("0.25rho", 500),
-        ("1 RHO", 2000),
-        (2.6, 3),
-    ],
+    ("budget", "number"), [*BUDGETS.items(), ("0.25rho", 500), ("1 RHO", 2000), (2.6, 3)]
 )
 def test_a_budget_is_a_number_or_a_density(budget, number):
     assert parse_budget(budget, 2000) == number
 
 
+WRONG = ["", "many", "rho", "-3", "0", "0.1", "nan", "inf", "1e-9rho", "1e30", "0,25rho"]
+
+
 @pytest.mark.parametrize(
-    "budget", ["", "many", "rho", "-3", "0", "0.1", "nan", "inf", "1e-9rho", "1e30", "0,25rho"]
+    ("budget", "says"),
+    [
+        *((budget, "expected a budget such as 50000") for budget in WRONG),
+        ("0.25", r"Did you mean 0.25rho\?"),
+        (0.75, r"Did you mean 0.75rho\?"),
+    ],
 )
-def test_no_other_budget_is_taken(budget):
-    with pytest.raises(ParameterError, match="expected a budget such as 50000"):
-        parse_budget(budget, 2000)
-
-
-@pytest.mark.parametrize("budget", ["0.25", 0.75])
-def test_a_fraction_alone_may_have_been_meant_as_a_density(budget):
-    with pytest.raises(ParameterError, match=rf"Did you mean {budget}rho\?"):
+def test_no_other_budget_is_taken(budget, says):
+    with pytest.raises(ParameterError, match=says):
         parse_budget(budget, 2000)

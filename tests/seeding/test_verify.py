@@ -1,9 +1,14 @@
-"""verify: points beside a planted plane go back onto it, points far from it go, nothing is made
-up."""
+"""verify: points beside a planted plane go back onto it, points far from it go, nothing is made up.
+
+The plane goes through the world's origin, ``NORMAL`` towards the cameras; originals lie on it in
+rows and columns, ``STEP`` metres apart. New points carry their numbers in their colours, so that
+what is left can be told. Who judges a point is held to literal loops.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 import os
 
 import numba
@@ -11,37 +16,36 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from splatseed.seeding.sliding import REACH
-from splatseed.seeding.verify import (
-    BARE_CONFIDENCE,
-    MAX_COST,
-    TEXTURE,
-    Surroundings,
-    _decide,
-    _Trials,
-)
+from splatseed.camera import Intrinsics, quat_from_rotation
+from splatseed.scene import Image
+from splatseed.seeding import verify as module
+from splatseed.synthetic.room import Room, render_view
+from splatseed.upsample.method import NewPoints
+from splatseed.views.view import View
+from splatseed.views.visibility import Visibility
 
-from ..depth.stereo.made import WIDTH
-from .planted import (
-    NORMAL,
-    constant,
-    hold,
-    numbered,
-    numbers,
-    on_plane,
-    originals,
-    photographs,
-    spacings,
-)
+from ..depth.stereo.made import DOWN, STONE, WIDTH, arc, tilted_plane
+from .references import make_view, matrix_of, project
 
-KNOWN = originals()
+STEP = 0.12
+ALONG = np.array([np.cos(np.pi / 6), 0.0, np.sin(np.pi / 6)])
+NORMAL = np.array([ALONG[2], 0.0, -ALONG[0]])
 INNER = 0.45
 """Metres about the origin that all views see."""
 
 
-@pytest.fixture(scope="module")
-def views():
-    return photographs()
+def on_plane(places):
+    """World positions of places in the plane, [N, 2] to [N, 3]."""
+    return places[:, :1] * ALONG + places[:, 1:] * DOWN
+
+
+KNOWN = on_plane(np.stack(np.meshgrid(*[STEP * np.arange(-5, 6)] * 2), axis=-1).reshape(-1, 2))
+ROOM = Room(("plane",), tilted_plane(30.0), (STONE,))
+VIEWS = [
+    View(f"{k}", render_view(ROOM, c)[0], c.K, c.width, c.height, c.cam_from_world)
+    for k, c in enumerate(arc())
+]
+"""Five views of the plane, 96 x 80."""
 
 
 @pytest.fixture
@@ -50,21 +54,55 @@ def places(rng):
     return on_plane(rng.uniform(-INNER, INNER, (300, 2)))
 
 
+def constant(view):
+    """The same view of nothing but one grey."""
+    return dataclasses.replace(view, photograph=np.full_like(view.photograph, 128))
+
+
+def spacings(known, xyz):
+    """Mean distance of each point's nearest original to the six nearest to that, [M]."""
+    apart = np.linalg.norm(known[:, None] - known, axis=2)
+    base = np.linalg.norm(xyz[:, None] - known, axis=2).argmin(axis=1)
+    return np.sort(apart, axis=1)[base, 1:7].mean(axis=1)
+
+
 def shifted(places, spacings_off):
     """Places moved off the plane by so many spacings, [M, 3]."""
     return places + (np.asarray(spacings_off) * spacings(KNOWN, places))[:, None] * NORMAL
 
 
-def project(view, xyz):
-    """Pixels of points, [M, 2]."""
-    cam = xyz @ view.cam_from_world[:3, :3].T + view.cam_from_world[:3, 3]
-    return (cam @ view.K.T)[:, :2] / cam[:, 2:]
+def hold(views, known, new, seen=None):
+    """``verify`` of new points [M, 3]; ``seen``: the originals of each view, all when left out."""
+    seen = [range(len(known))] * len(views) if seen is None else seen
+    starts = np.cumsum([0, *map(len, seen)]).tolist()
+    rows = np.array([row for each in seen for row in each], np.int64)
+    counts = {k: len(each) for k, each in enumerate(seen)}
+    visibility = Visibility(np.asarray(known, np.float64), rows, dict(enumerate(starts)), counts)
+    images = []
+    for k, view in enumerate(views):
+        K, pose = view.K, view.cam_from_world
+        params = (K[0, 0], K[1, 1], K[0, 2], K[1, 2])
+        lens = Intrinsics(1, "PINHOLE", view.width, view.height, params)
+        images.append(Image(view.name, k, lens, quat_from_rotation(pose[:3, :3]), pose[:3, 3]))
+    return module.verify(views, images, visibility, numbered(new))
 
 
-def test_points_beside_a_plane_slide_back_onto_it(views, places, rng):
+def numbered(xyz):
+    """Points whose colours say which they are."""
+    number = np.arange(len(xyz))
+    rgb = np.stack([number % 256, number // 256, 0 * number], axis=1).astype(np.uint8)
+    return NewPoints(np.asarray(xyz, np.float32), rgb, source=np.full(len(xyz), 4, np.uint8))
+
+
+def numbers(points):
+    """Which of the points that were given are left, [K]."""
+    return points.rgb[:, 0].astype(int) + 256 * points.rgb[:, 1].astype(int)
+
+
+def test_points_beside_a_plane_slide_back_onto_it(places, rng):
     off = rng.uniform(0.3, 1.2, len(places)) * rng.choice([-1, 1], len(places))
     new = shifted(places, off)
-    kept = hold(views, KNOWN, new)
+    kept = hold(VIEWS, KNOWN, new)
     assert len(kept.xyz) > 0.95 * len(new)
     before = np.abs(new[numbers(kept)] @ NORMAL) / spacings(KNOWN, new[numbers(kept)])
     after = np.abs(kept.xyz @ NORMAL) / spacings(KNOWN, new[numbers(kept)])
@@ -76,50 +114,48 @@ def test_points_beside_a_plane_slide_back_onto_it(views, places, rng):
 
 
 @pytest.mark.parametrize("spacings_off", [-6.0, 5.0])
-def test_points_far_from_the_surface_are_dropped(spacings_off, views, places):
+def test_points_far_from_the_surface_are_dropped(spacings_off, places):
     new = shifted(places, np.full(len(places), spacings_off))
-    assert len(hold(views, KNOWN, new).xyz) < 0.1 * len(new)
+    assert len(hold(VIEWS, KNOWN, new).xyz) < 0.1 * len(new)
 
 
-def test_without_texture_flat_places_stay_and_others_go(views, places, rng):
-    grey = [constant(view) for view in views]
+def test_without_texture_flat_places_stay_and_others_go(places, rng):
+    grey = [constant(view) for view in VIEWS]
     flat = hold(grey, KNOWN, places)
     np.testing.assert_array_equal(flat.xyz, places.astype(np.float32))
-    assert (flat.confidence == np.float32(BARE_CONFIDENCE)).all()
+    assert (flat.confidence == np.float32(module.BARE_CONFIDENCE)).all()
     rough = KNOWN + rng.normal(scale=0.3, size=(len(KNOWN), 3))
     assert len(hold(grey, rough, places).xyz) < 0.1 * len(places)
 
 
-def test_what_no_pair_of_photographs_sees_is_kept_unchecked(views, places):
+def test_what_no_pair_of_photographs_sees_is_kept_unchecked(places):
     beside = shifted(places, np.full(len(places), 0.8))
     half = len(KNOWN) // 2
     apart = [range(half), range(half, len(KNOWN))]
-    dark = [dataclasses.replace(v, mask=np.zeros((v.height, v.width), bool)) for v in views]
-    results = [
-        hold(views[:1], KNOWN, beside),
-        hold(views[:2], KNOWN, beside, apart),
-        hold([views[0]] * 2, KNOWN, beside),
+    dark = [dataclasses.replace(v, mask=np.zeros((v.height, v.width), bool)) for v in VIEWS]
+    for kept in (
+        hold(VIEWS[:1], KNOWN, beside),
+        hold(VIEWS[:2], KNOWN, beside, apart),
+        hold([VIEWS[0]] * 2, KNOWN, beside),
         hold(dark, KNOWN, beside),
         hold([], KNOWN, beside),
-        hold(views, KNOWN[:1], beside),
-        hold(views, KNOWN[:0], beside),
-    ]
-    for kept in results:
+        hold(VIEWS, KNOWN[:1], beside),
+        hold(VIEWS, KNOWN[:0], beside),
+    ):
         np.testing.assert_array_equal(kept.xyz, beside.astype(np.float32))
         assert np.isnan(kept.confidence).all()
         assert "unchecked" in kept.notes[-1]
 
 
-def test_of_a_photograph_only_what_it_shows_judges(views, places):
+def test_of_a_photograph_only_what_it_shows_judges(places):
     """The half that is black tells nothing: points there are not dropped for it."""
     cut = []
-    for view in views:
+    for view in VIEWS:
         mask = np.arange(view.width) < np.full((view.height, 1), view.width // 2)
-        cut.append(
-            dataclasses.replace(view, mask=mask, photograph=view.photograph * mask[..., None])
-        )
+        shown = view.photograph * mask[..., None]
+        cut.append(dataclasses.replace(view, mask=mask, photograph=shown))
     far = np.concatenate([shifted(places, np.full(len(places), off)) for off in (-5.0, 5.0)])
-    columns = np.array([project(v, far)[:, 0] for v in views])
+    columns = np.array([v.camera.project(far)[0][:, 0] for v in VIEWS])
     black, lit = (columns > WIDTH // 2).all(axis=0), (columns < WIDTH // 2 - 5).all(axis=0)
     assert min(black.sum(), lit.sum()) > 20
     kept = hold(cut, KNOWN, far)
@@ -129,39 +165,35 @@ def test_of_a_photograph_only_what_it_shows_judges(views, places):
     assert lit[left].sum() < 0.1 * lit.sum()
 
 
-def test_one_and_two_threads_give_the_same_bytes(views, places, rng, monkeypatch):
+def test_one_and_two_threads_give_the_same_bytes(places, rng, monkeypatch):
     new = shifted(places, rng.uniform(-3, 3, len(places)))
-    first, threads = hold(views, KNOWN, new), numba.get_num_threads()
+    first, threads = hold(VIEWS, KNOWN, new), numba.get_num_threads()
     monkeypatch.setattr(os, "cpu_count", lambda: 1)
     numba.set_num_threads(1)
     try:
-        second = hold(views, KNOWN, new)
+        second = hold(VIEWS, KNOWN, new)
     finally:
         numba.set_num_threads(threads)
     assert 0 < len(first.xyz) < len(new)
     for one, other in zip(first, second, strict=True):
-        same = one == other if isinstance(one, tuple) or one is None else None
-        assert same or one.tobytes() == other.tobytes()
+        np.testing.assert_array_equal(one, other)
+
+
+SHAPES = {"apart": [1, 1, 1], "at one place": 0, "on a line": [1, 0, 0], "on a plane": [1, 1, 0]}
 
 
 @given(
     st.integers(0, 2**32 - 1),
     st.integers(1, 3),
     st.integers(0, 9),
-    st.sampled_from(["apart", "at one place", "on a line", "on a plane"]),
+    st.sampled_from(list(SHAPES)),
     st.sampled_from(["noise", "constant", "one of each"]),
 )
 @settings(max_examples=30, deadline=None)
 def test_nothing_is_made_up_from_degenerate_input(seed, num_views, num_known, shape, look):
     rng = np.random.default_rng(seed)
-    known = rng.normal(scale=0.2, size=(num_known, 3))
-    known *= {
-        "apart": [1, 1, 1],
-        "at one place": 0,
-        "on a line": [1, 0, 0],
-        "on a plane": [1, 1, 0],
-    }[shape]
-    views = MANY[:num_views]
+    known = rng.normal(scale=0.2, size=(num_known, 3)) * SHAPES[shape]
+    views = VIEWS[:num_views]
     if look != "noise":
         views = [constant(v) if k or look == "constant" else v for k, v in enumerate(views)]
     new = rng.normal(scale=0.3, size=(rng.integers(0, 12), 3)).astype(np.float32)
@@ -171,29 +203,16 @@ def test_nothing_is_made_up_from_degenerate_input(seed, num_views, num_known, sh
     left = numbers(kept)
     assert (np.diff(left) > 0).all()
     assert np.isfinite(kept.xyz).all()
-    sure = kept.confidence > BARE_CONFIDENCE
-    assert ((kept.confidence[sure] >= 1 - MAX_COST) & (kept.confidence[sure] <= 1)).all()
+    sure = kept.confidence > module.BARE_CONFIDENCE
+    assert ((kept.confidence[sure] >= 1 - module.MAX_COST) & (kept.confidence[sure] <= 1)).all()
     np.testing.assert_array_equal(kept.xyz[~sure], new[left[~sure]])
-    if len(known) > 1:  # at most REACH spacings along a normal that is not steeper than 73 degrees
+    if len(known) > 1:  # at most so many spacings along a normal of 73 degrees at most
         moved = np.linalg.norm(kept.xyz - new[left], axis=1)
-        assert (moved <= REACH / 0.29 * spacings(known, new[left]) + 1e-5).all()
+        assert (moved <= module.REACH / 0.29 * spacings(known, new[left]) + 1e-5).all()
 
 
-MANY = photographs()
-
-
-def trials(costs, variances, moves=0.0):
-    """What two judges found of one point, which they put at (1, 1, 1) and (2, 2, 2)."""
-    return _Trials(
-        np.array([[[1.0] * 3, [2.0] * 3]], np.float32),
-        np.full((1, 2), moves, np.float32),
-        np.array([costs], np.float32),
-        np.array([variances], np.float32),
-    )
-
-
-GOOD, BAD, NONE = MAX_COST - 0.3, MAX_COST + 0.1, np.inf
-RICH, BARE = 10 * TEXTURE, 0.1 * TEXTURE
+GOOD, BAD, NONE = module.MAX_COST - 0.3, module.MAX_COST + 0.1, np.inf
+RICH, BARE = 10 * module.TEXTURE, 0.1 * module.TEXTURE
 
 
 @pytest.mark.parametrize(
@@ -207,16 +226,21 @@ RICH, BARE = 10 * TEXTURE, 0.1 * TEXTURE
         ((0.0, BAD), (BARE, RICH), True, None, None),
         ((BAD, NONE), (RICH, 0.0), True, None, None),
         ((GOOD, GOOD), (BARE, BARE), False, None, None),
-        ((GOOD, NONE), (BARE, 0.0), True, 0, BARE_CONFIDENCE),
+        ((GOOD, NONE), (BARE, 0.0), True, 0, module.BARE_CONFIDENCE),
         ((NONE, NONE), (0.0, 0.0), False, 0, np.nan),
         ((NONE, NONE), (0.0, 0.0), True, 0, np.nan),
     ],
 )
 def test_the_fate_of_a_point(costs, variances, flat, xyz, confidence):
+    """Of one at 0, which two judges put at (1, 1, 1) and (2, 2, 2)."""
     normal = np.array([[0.0, 0.0, 1.0]])
-    around = Surroundings(np.zeros(1, int), np.ones(1), normal, np.array([flat]))
+    around = module.Surroundings(np.zeros(1, int), np.ones(1), normal, np.array([flat]))
+    put = np.array([[[1.0] * 3, [2.0] * 3]])
+    found = module._Trials(
+        *(np.array(e, np.float32) for e in (put, [[0, 0]], [costs], [variances]))
+    )
     centers = np.array([[[0.0, 0.0, -3.0]] * 2])
-    decided = _decide(numbered(np.zeros((1, 3))), around, trials(costs, variances), centers)
+    decided = module._decide(numbered(np.zeros((1, 3))), around, found, centers)
     if xyz is None:
         assert len(decided.xyz) == 0
         return
@@ -224,3 +248,82 @@ def test_the_fate_of_a_point(costs, variances, flat, xyz, confidence):
     np.testing.assert_allclose(decided.confidence, [confidence], rtol=1e-6)
     if not np.isnan(confidence):
         np.testing.assert_array_equal(decided.normals, -normal)  # towards the judge
+
+
+def holds(view, point):
+    """Whether a point falls into a view, away from its edge."""
+    at = project(point, matrix_of(view, 1)[0])
+    sizes = (view.width, view.height)
+    return at is not None and all(
+        module.MARGIN <= x <= s - module.MARGIN for x, s in zip(at, sizes, strict=False)
+    )
+
+
+def worth(view, point, normal):
+    """How well a view sees a surface."""
+    ray = point.astype(float) - view.camera.center
+    distance = np.linalg.norm(ray)
+    cosine = 0.0 if np.isnan(normal).any() else abs(ray @ normal) / distance
+    return view.K[0, 0] * (cosine + module.OBLIQUE) / distance
+
+
+def judges_of(point, base, normal, views, seen, sources):
+    """The views that judge a point, best first."""
+    able = []
+    for k, view in enumerate(views):
+        asked = [j for j in sources[k] if j >= 0]
+        holding = sum(holds(views[j], point) for j in asked)
+        enough = holding >= min(len(asked), module.WITNESSES) and holding > 0
+        if base in seen[k] and holds(view, point) and enough:
+            able.append((-worth(view, point, normal), k))
+    best = [k for _, k in sorted(able)[: module.REFERENCE_VIEWS]]
+    return best + [-1] * (module.REFERENCE_VIEWS - len(best))
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 5), st.integers(0, 3))
+@settings(max_examples=30, deadline=None)
+def test_judges_are_those_of_the_loop(seed, num_views, num_sources):
+    rng = np.random.default_rng(seed)
+    views = [make_view(rng, *rng.integers(12, 60, 2).tolist()) for _ in range(num_views)]
+    xyz = rng.normal(scale=0.7, size=(25, 3)).astype(np.float32)
+    normals = rng.normal(size=(25, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals[::7] = np.nan
+    seen = [np.flatnonzero(rng.random(8) < 0.7) for _ in views]
+    sources = np.full((num_views, num_sources), -1)
+    for k in range(num_views):
+        others = rng.permutation(np.delete(np.arange(num_views), k))[:num_sources]
+        sources[k, : len(others)] = others
+    base = rng.integers(0, 8, 25)
+    around = module.Surroundings(base, np.ones(25), normals, np.ones(25, bool))
+    found = module.choose_reference_views(xyz, around, views, seen, 8, sources)
+    expected = [
+        judges_of(point, b, n, views, seen, sources.tolist())
+        for point, b, n in zip(xyz, base, normals, strict=True)
+    ]
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_surroundings_are_those_of_the_loop(rng):
+    known = rng.normal(size=(60, 3)).astype(np.float32).astype(float)
+    xyz = rng.normal(size=(40, 3)).astype(np.float32)
+    around = module.survey(known, xyz)
+    for i, point in enumerate(xyz):
+        base = int(np.argmin([math.dist(point, each) for each in known]))
+        assert around.base[i] == base
+        near = known[np.argsort([math.dist(known[base], each) for each in known])]
+        apart = [math.dist(known[base], each) for each in near[1:7]]
+        assert around.spacing[i] == pytest.approx(np.mean(apart))
+        axes = np.linalg.eigh(np.cov(near[: module.NEIGHBORS + 1].T))[1]
+        assert abs(axes[:, 0] @ around.normals[i]) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_planes_are_flat_and_clouds_are_not(rng):
+    cloud = rng.normal(size=(300, 3))
+    plane = cloud * [1, 1, 0.02]
+    line = np.linspace(-1, 1, 30)[:, None] * [1.0, 2.0, 3.0]
+    assert module.survey(plane, plane[:50].astype(np.float32)).flat.mean() > 0.95
+    assert module.survey(cloud, cloud[:50].astype(np.float32)).flat.mean() < 0.2
+    beside = module.survey(line, line.astype(np.float32))
+    assert not beside.flat.any()
+    assert np.isnan(beside.normals).all()

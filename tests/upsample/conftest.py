@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import sys
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from splatseed import METHODS, PointCloud
-from splatseed.upsample import registry
 
 from .contract import Copies
 from .references import Cloud
@@ -18,7 +18,9 @@ from .references import Cloud
 def third_party(monkeypatch):
     """Installs a package that registers the method "copies", and one that wants to be "mls"."""
     found = [SimpleNamespace(name=name, load=lambda: Copies) for name in ("copies", "mls")]
-    monkeypatch.setattr(registry, "entry_points", lambda *, group: found if group else [])
+    # The front door has a function of the package's name.
+    package = sys.modules["splatseed.upsample"]
+    monkeypatch.setattr(package, "entry_points", lambda *, group: found if group else [])
     METHODS.__dict__.pop("_plugins", None)
     yield
     METHODS.__dict__.pop("_plugins", None)

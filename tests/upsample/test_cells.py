@@ -10,12 +10,7 @@ from splatseed import PointCloud
 from splatseed.errors import PointCloudError
 from splatseed.progress import silent
 from splatseed.upsample import cells as module
-from splatseed.upsample.cells import (
-    MAX_NEIGHBORS,
-    Cells,
-    box_cells,
-    build_cells,
-)
+from splatseed.upsample.cells import MAX_NEIGHBORS, Cells, box_cells, build_cells
 from splatseed.upsample.neighbors import prepare
 from splatseed.upsample.patches import local_frames
 
@@ -60,16 +55,6 @@ def test_open_cells_are_cut_from_their_cube(k, wavy, wavy_exact):
             wavy_exact.xyz[i] + cells.center[row], center, rtol=0, atol=1e-6 * radius
         )
         assert cells.radius[row] == pytest.approx(radius, rel=1e-6)
-
-
-def test_closed_cells_do_not_overlap_and_fill_a_lattice():
-    lattice = np.stack(np.meshgrid(*[np.arange(7.0)] * 3), axis=-1).reshape(-1, 3)
-    cloud = prepared(lattice)
-    cells, _ = meshless(cloud, 40)
-    inner = (np.abs(cloud.xyz) < 1.5).all(axis=1)
-    np.testing.assert_allclose(cells.volume[inner], 1.0, rtol=1e-6)
-    np.testing.assert_allclose(cells.center[inner], 0.0, atol=1e-6)
-    np.testing.assert_allclose(cells.radius[inner], np.sqrt(0.75), rtol=1e-6)
 
 
 @pytest.mark.parametrize("shape", ["plane", "line", "lattice", "near twins", "ring"])

@@ -63,33 +63,21 @@ def test_triangle_is_uniform_in_the_triangle():
     assert np.abs(rgb[:, 0] - 255 * (1 - x - y)).max() <= 0.501
 
 
-def test_disc_is_uniform_by_area(one_base, rng):
-    _, neighbors, bases, _ = one_base
+def test_places_on_a_patch(one_base, rng):
+    cloud, neighbors, bases, frames = one_base
     flat = np.zeros(len(neighbors.idx), bool)
     u, v = place_on_disc(neighbors, bases, flat, 1.5, rng).astype(np.float64).T
-    radius = 1.5 * np.arange(1, 7).mean()  # h: the mean of the 6 nearest
-    assert_uniform((u**2 + v**2) / radius**2)
+    assert_uniform((u**2 + v**2) / (1.5 * 3.5) ** 2)  # h: the mean of the 6 nearest
     assert_uniform((np.arctan2(v, u) / (2 * np.pi)) % 1.0)
-
-
-def test_every_pair_of_the_eight_nearest_spans_a_triangle(one_base, rng):
-    cloud, neighbors, bases, frames = one_base
-    uv = place_in_triangle(cloud, neighbors, bases, frames, rng).astype(np.float64)
-    corners = [(r * np.cos(r - 1), r * np.sin(r - 1)) for r in range(1, 9)]
-    mean = np.mean(corners, axis=0) * 2 / 3  # the mean of 28 centroids of (0, p, q)
-    spread = uv.std(axis=0) / np.sqrt(NUM)
-    assert (np.abs(uv.mean(axis=0) - mean) < 4 * spread).all()
-    assert np.linalg.norm(uv, axis=1).max() < 8.0
-    assert np.linalg.norm(uv, axis=1).max() > 7.0
-
-
-def test_box_is_uniform_in_the_neighborhoods_box(one_base, rng):
-    cloud, neighbors, bases, frames = one_base
     uv = place_in_box(cloud, neighbors, bases, frames, rng).astype(np.float64)
     low, high = cloud.xyz[:, :2].min(axis=0), cloud.xyz[:, :2].max(axis=0)
-    at = cloud.xyz[cloud.rank == 0][0, :2]
-    for axis in range(2):
-        assert_uniform((uv[:, axis] + at[axis] - low[axis]) / (high[axis] - low[axis]))
+    for axis in (uv + cloud.xyz[cloud.rank == 0, :2] - low).T / (high - low)[:, None]:
+        assert_uniform(axis)
+    # Every pair of the eight nearest spans a triangle with the base.
+    uv = place_in_triangle(cloud, neighbors, bases, frames, rng).astype(np.float64)
+    mean = 2 / 3 * np.mean([(r * np.cos(r - 1), r * np.sin(r - 1)) for r in range(1, 9)], axis=0)
+    assert (np.abs(uv.mean(axis=0) - mean) < 4 * uv.std(axis=0) / np.sqrt(NUM)).all()
+    assert 7.0 < np.linalg.norm(uv, axis=1).max() < 8.0
 
 
 def test_voronoi_is_uniform_in_the_ball_of_a_cell():
@@ -109,6 +97,6 @@ def test_random_is_uniform_in_the_bounding_box_with_the_originals_colors(rng):
     cloud = rng.random((50, 3)) * [1.0, 2.0, 3.0]
     xyz, rgb = new_points(cloud, "random")
     low, high = cloud.min(axis=0), cloud.max(axis=0)
-    for axis in range(3):
-        assert_uniform((xyz[:, axis] - low[axis]) / (high[axis] - low[axis]))
+    for axis in ((xyz - low) / (high - low)).T:
+        assert_uniform(axis)
     assert stats.binomtest(int((rgb[:, 0] == 255).sum()), NUM, 1 / 50).pvalue > 1e-3

@@ -1,4 +1,4 @@
-"""What the methods are worth on surfaces that are known.
+"""Principal axes against an eigensolver, and what the methods are worth on known surfaces.
 
 Lengths are in units of h, the mean distance to the 6 nearest originals. Error: new points to the
 surface. Coverage: the surface to its nearest point, original or new (smaller is better).
@@ -11,11 +11,15 @@ import functools
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 import splatseed as ss
 from splatseed.synthetic import SHAPES
 from splatseed.synthetic.surfaces import parallel_plates, plane
 from splatseed.upsample.neighbors import prepare, sound_bases
+from splatseed.upsample.patches import local_frames
+
+from . import references as slow
 
 NUM = 1500
 NOISE = 0.1
@@ -63,39 +67,26 @@ def test_surface_fits_cover_far_better_than_chords(shape, method):
         assert error + coverage < 0.8 * (simple_error + simple_coverage)
 
 
-def sphere_error(method, num):
-    """Distance to the unit sphere, from exact samples of it."""
-    xyz = SHAPES["sphere"]().sample(num, np.random.default_rng(1)).astype(np.float32)
-    new, _ = ss.upsample_points(xyz, np.zeros(xyz.shape, np.uint8), method, ratio=8)
-    return np.abs(np.linalg.norm(new[num:].astype(np.float64), axis=1) - 1.0).mean()
-
-
 @pytest.mark.parametrize(
     ("method", "order"), [("linear", 2), ("triangle", 2), ("mls", 3), ("spline", 2)]
 )
 def test_errors_shrink_with_the_spacing_to_the_order_of_the_fit(method, order):
-    # Eight times as many points on a surface are spaced sqrt(8) times as closely.
-    assert sphere_error(method, 500) / sphere_error(method, 4000) > 0.9 * 8 ** (order / 2)
+    error = {}
+    for num in (500, 4000):  # of exact samples of a sphere, eight times as many: spaced by sqrt(8)
+        xyz = SHAPES["sphere"]().sample(num, np.random.default_rng(1)).astype(np.float32)
+        new, _ = ss.upsample_points(xyz, np.zeros(xyz.shape, np.uint8), method, ratio=8)
+        error[num] = np.abs(np.linalg.norm(new[num:].astype(np.float64), axis=1) - 1.0).mean()
+    assert error[500] / error[4000] > 0.9 * 8 ** (order / 2)
 
 
-def wall(tilt):
-    """A noisy plane turned by ``tilt`` degrees; at 90 it is upright."""
+@pytest.mark.parametrize("tilt", [0, 45, 90])
+def test_walls_are_as_good_as_floors_but_for_the_papers_spline(tilt):
     rng = np.random.default_rng(5)
     xyz = plane(tilt).sample(NUM, rng) + 0.005 * rng.normal(size=(NUM, 3))
-    return ss.PointCloud(xyz.astype(np.float32), np.full((NUM, 3), 128, np.uint8))
-
-
-@pytest.mark.parametrize("method", ["mls", "spline"])
-@pytest.mark.parametrize("tilt", [0, 45, 90])
-def test_walls_are_as_good_as_floors(method, tilt):
-    assert far_share(wall(tilt), method=method) < 0.01
-
-
-def test_the_papers_spline_flies_off_walls():
-    assert far_share(wall(90), method="spline", profile="paper") > 0.05
-    assert far_share(wall(90), method="spline", profile="paper") > 3 * far_share(
-        wall(0), method="spline", profile="paper"
-    )
+    wall = ss.PointCloud(xyz.astype(np.float32), np.full((NUM, 3), 128, np.uint8))
+    assert far_share(wall, method="mls") < 0.01
+    assert far_share(wall, method="spline") < 0.01
+    assert (far_share(wall, method="spline", profile="paper") > 0.05) == (tilt == 90)
 
 
 def test_clamped_cells_stay_near_and_boxed_ones_do_not():
@@ -114,17 +105,36 @@ def test_few_bridges_between_plates(method, gap, bridging):
     assert np.mean(np.minimum(np.abs(height), np.abs(height - gap)) > 0.1 * gap) <= bridging
 
 
-def with_outliers(num_outliers):
-    """A noisy sphere and, last, points strewn around it."""
-    cloud, _ = scanned("sphere")
-    strewn = np.random.default_rng(7).uniform(-1.5, 1.5, (num_outliers, 3)).astype(np.float32)
-    xyz = np.concatenate([cloud.xyz, strewn])
-    return ss.PointCloud(xyz, np.zeros(xyz.shape, np.uint8))
-
-
 def test_the_isolated_rule_finds_outliers_and_spares_the_rest():
-    cloud = prepare(with_outliers(60))
+    strewn = np.random.default_rng(7).uniform(-1.5, 1.5, (60, 3)).astype(np.float32)
+    xyz = np.concatenate([scanned("sphere")[0].xyz, strewn])
+    cloud = prepare(ss.PointCloud(xyz, np.zeros(xyz.shape, np.uint8)))
     lonely = np.empty(len(cloud), bool)
     lonely[cloud.rank] = sound_bases(cloud, cloud.neighbors(16)) == 0
     assert lonely[NUM:].mean() > 0.5
     assert lonely[:NUM].mean() < 0.01
+
+
+STRETCHES = [
+    (1.0, 0.7, 0.4), (1.0, 0.8, 0.01), (1.0, 0.8, 0.0), (1.0, 0.01, 0.005), (1.0, 1e-3, 1e-6),
+    (1.0, 0.0, 0.0), (1.0, 1.0, 1.0),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("stretch", STRETCHES)
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+def test_principal_axes_in_every_shape_of_a_neighbourhood(stretch, scale, rng):
+    others = [[j for j in range(17) if j != i] for i in range(17)]
+    for _ in range(50):
+        turn = Rotation.random(random_state=int(rng.integers(1000)))
+        points = scale * turn.apply(rng.normal(size=(17, 3)) * stretch)
+        (frame, *_), (collinear, *_) = local_frames(points, np.array(others, np.int32))
+        np.testing.assert_allclose(frame @ frame.T, np.eye(3), rtol=0, atol=1e-9)
+        assert np.linalg.det(frame) > 0
+        assert collinear == (stretch[1] == 0)
+        if collinear:
+            along = (points[1] - points[0]) / np.linalg.norm(points[1] - points[0])
+            assert abs(frame[0] @ along) == pytest.approx(1.0)
+        elif stretch[1] < 1:
+            expected = slow.frame_at(points, 0, others[0])
+            np.testing.assert_allclose(frame, expected, rtol=0, atol=1e-6)

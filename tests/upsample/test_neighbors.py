@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-
 import numpy as np
 import pytest
 from scipy import stats
@@ -12,14 +10,7 @@ from splatseed import PointCloud, Scene
 from splatseed.progress import silent
 from splatseed.scene import Tracks
 from splatseed.upsample import configure
-from splatseed.upsample.nearest import interpolate_colors
-from splatseed.upsample.neighbors import (
-    distances_of,
-    draw_bases,
-    prepare,
-    sound_bases,
-    trusted_originals,
-)
+from splatseed.upsample.neighbors import draw_bases, prepare, sound_bases, trusted_originals
 
 from . import references as slow
 
@@ -68,15 +59,6 @@ def test_neighbors_are_those_of_brute_force(wavy_exact, prepared, k):
     np.testing.assert_array_equal(first.idx, found.idx[:, :4])
 
 
-def test_distances_are_the_same_bytes_without_numba(rng, monkeypatch):
-    xyz = rng.normal(size=(30_000, 3)) * 10.0 ** rng.integers(-6, 6, (30_000, 1))
-    idx = rng.integers(0, len(xyz), (20_000, 5)).astype(np.int32)
-    by_kernel = distances_of(xyz, idx, 1e-3)
-    monkeypatch.delitem(sys.modules, "numba")
-    np.testing.assert_array_equal(distances_of(xyz, idx, 1e-3), by_kernel)
-    assert by_kernel.min() == 1e-3
-
-
 @pytest.mark.parametrize("k", [8, 16, 25])
 def test_isolated_points_are_those_of_the_rule(wavy_exact, prepared, k):
     fast = in_file_order(prepared, sound_bases(prepared, prepared.neighbors(k)))
@@ -101,18 +83,9 @@ def test_outputs_are_laid_out_by_rank_without_gaps(prepared, rng):
 
 
 def scene_with(lengths, errors):
-    n = len(lengths)
-    xyz = np.random.default_rng(0).random((n, 3)).astype(np.float32)
-    offsets = np.concatenate([[0], np.cumsum(lengths)])
-    total = int(offsets[-1])
-    tracks = Tracks(
-        np.arange(1, n + 1),
-        xyz.astype(np.float64),
-        np.asarray(errors, np.float64),
-        offsets,
-        np.zeros(total, np.uint32),
-        np.zeros(total, np.uint32),
-    )
+    n, offsets = len(lengths), np.concatenate([[0], np.cumsum(lengths)])
+    xyz, seen = np.random.default_rng(0).random((n, 3)), np.zeros(offsets[-1], np.uint32)
+    tracks = Tracks(np.arange(1, n + 1), xyz, np.asarray(errors, float), offsets, seen, seen)
     return Scene(PointCloud(xyz, np.zeros((n, 3), np.uint8)), tracks=tracks)
 
 
@@ -140,32 +113,3 @@ def test_nothing_grows_from_a_mistrusted_point(profile, weight):
     cloud = prepare(MISTRUSTED.points, trusted_originals(MISTRUSTED))
     weights, _ = configure("linear", profile).weigh(cloud, cloud.neighbors(8), silent)
     assert weights[cloud.rank == 7] == weight
-
-
-def colors_at(cloud, place, k=5):
-    """Colour of one new point per row, at ``place(row)`` relative to the base."""
-    prepared = prepare(cloud)
-    neighbors, n = prepared.neighbors(k), len(prepared)
-    bases = draw_bases(prepared, n, np.random.default_rng(0), weight=np.ones(n))
-    bases.count[:], bases.start[:] = 1, prepared.rank
-    xyz = np.empty((n, 3), np.float32)
-    xyz[bases.start] = place(prepared, neighbors) + prepared.center
-    return interpolate_colors(prepared, neighbors, bases, xyz), xyz
-
-
-def test_a_point_on_its_base_has_nearly_its_color(wavy):
-    rgb, _ = colors_at(wavy, lambda prepared, _: prepared.xyz)
-    assert np.abs(rgb.astype(int) - wavy.rgb).max() <= 255 * 5 * 0.01 * 2
-    assert np.abs(rgb.astype(int) - wavy.rgb).mean() < 4
-
-
-def test_a_point_midway_to_its_neighbor_mixes_both_equally(wavy):
-    def middle(prepared, neighbors):
-        return (prepared.xyz + prepared.xyz[neighbors.idx[:, 0]]) / 2
-
-    rgb, xyz = colors_at(wavy, middle, k=1)
-    distance = np.linalg.norm(wavy.xyz[None].astype(np.float64) - wavy.xyz[:, None], axis=2)
-    np.fill_diagonal(distance, np.inf)
-    expected = (wavy.rgb.astype(float) + wavy.rgb[distance.argmin(axis=1)]) / 2
-    assert np.abs(rgb - expected).max() <= 1.0
-    assert np.isfinite(xyz).all()

@@ -13,7 +13,7 @@ from splatseed.depth.stereo import StereoMap
 from splatseed.errors import OutputError
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene, SceneSource
-from splatseed.upsample.registry import SOURCE_CODES
+from splatseed.upsample import SOURCE_CODES
 from splatseed.view.clouds import (
     CoveredView,
     cell_picture,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shutil
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from splatseed.camera import Intrinsics
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.io import load_scene
 from splatseed.lens import image_points
-from splatseed.views.undistortion import undistort
+from splatseed.views.projection import undistort
 from splatseed.views.view import load_photograph, load_split, load_views
 
 
@@ -50,14 +51,11 @@ def test_the_cache_is_used_and_knows_a_changed_photograph(picture, tmp_path):
 @pytest.mark.parametrize("factor", [1, 2, 3])
 def test_a_point_stays_on_its_pixel(room, factor):
     """A point's pixel in the view is its pixel in the camera record over the factor."""
-    image = room.images[0]
+    image, xyz = room.images[0], room.points.xyz[:50]
     (view,) = load_views(room, [image], data_factor=factor)
-    xyz = room.points.xyz[:50]
     uv, depth = image.camera.project(xyz)
-    homogeneous = (view.cam_from_world[:3, :3] @ xyz.T).T + view.cam_from_world[:3, 3]
-    small = (homogeneous / homogeneous[:, 2:]) @ view.K[:2].T
-    seen = depth > 0
-    assert np.allclose(small[seen], uv[seen] / factor, atol=1e-6)
+    small = view.camera.project(xyz)[0]
+    assert np.allclose(small[depth > 0], uv[depth > 0] / factor, atol=1e-6)
 
 
 def test_split_takes_every_eighth_by_name(room):
@@ -67,43 +65,43 @@ def test_split_takes_every_eighth_by_name(room):
     assert sorted(view.name for view in (*train, *test)) == names
 
 
-def test_files_resized_beforehand_scale_the_intrinsics(room_path, tmp_path):
-    import shutil
+@pytest.fixture
+def copied(room_path, tmp_path):
+    shutil.copytree(room_path, tmp_path / "copy")
+    return load_scene(tmp_path / "copy")
 
-    copy = tmp_path / "copy"
-    shutil.copytree(room_path, copy)
-    scene = load_scene(copy)
-    path = copy / "images" / scene.images[0].name
+
+def test_files_resized_beforehand_scale_the_intrinsics(copied):
+    image = copied.images[0]
+    path = copied.source.image_dir / image.name
     PilImage.open(path).resize((48, 36)).save(path)
-    (view,) = load_views(scene, scene.images[:1])
-    assert np.allclose(view.K[:2], scene.images[0].camera.K[:2] / 2)
+    (view,) = load_views(copied, [image])
+    assert np.allclose(view.K[:2], image.camera.K[:2] / 2)
     PilImage.open(path).resize((48, 48)).save(path)
     with pytest.raises(SceneFormatError, match="aspect ratio of its camera"):
-        load_views(scene, scene.images[:1])
+        load_views(copied, [image])
 
 
-def test_distortion_is_refused(room):
-    image = room.images[0]
-    lens = Intrinsics(1, "SIMPLE_RADIAL", 96, 72, (80.0, 48.0, 36.0, 0.1))
-    with pytest.raises(SceneFormatError, match="splatseed undistort"):
-        load_views(room, [dataclasses.replace(image, intrinsics=lens)])
-    straight = dataclasses.replace(lens, params=(80.0, 48.0, 36.0, 0.0))
-    assert load_views(room, [dataclasses.replace(image, intrinsics=straight)])
+def bent(room, k):
+    lens = Intrinsics(1, "SIMPLE_RADIAL", 96, 72, (80.0, 48.0, 36.0, k))
+    return dataclasses.replace(room.images[0], intrinsics=lens)
 
 
 def test_what_cannot_be_read_is_said(room, tmp_path):
     bad = tmp_path / "bad.png"
     bad.write_bytes(b"no image")
-    with pytest.raises(SceneFormatError, match="to be an image"):
-        load_photograph(bad)
-    with pytest.raises(SceneNotFoundError, match="no such file"):
-        load_photograph(tmp_path / "none.png")
-    with pytest.raises(ParameterError, match="never enlarged"):
-        load_photograph(bad, 0)
+    for error, says, read, *words in (
+        (SceneFormatError, "undistort", load_views, room, [bent(room, 0.1)]),
+        (SceneFormatError, "to be an image", load_photograph, bad),
+        (SceneNotFoundError, "no such file", load_photograph, tmp_path / "none.png"),
+        (ParameterError, "never enlarged", load_photograph, bad, 0),
+        (SceneNotFoundError, "at least two images", load_split, room.replace(images=())),
+    ):
+        with pytest.raises(error, match=says):
+            read(*words)
     with pytest.raises(SceneFormatError, match="smaller --data-factor"):
         load_views(room, room.images[:1], data_factor=9, min_side=11)
-    with pytest.raises(SceneNotFoundError, match="at least two images"):
-        load_split(room.replace(images=()))
+    assert load_views(room, [bent(room, 0.0)])
 
 
 WIDTH, HEIGHT = 96, 72
@@ -123,6 +121,9 @@ def rays_of(K, column, row):
     return np.stack([(column - K[0, 2]) / K[0, 0], (row - K[1, 2]) / K[1, 1]], axis=-1)
 
 
+COLUMN, ROW = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+
+
 def painting(xy):
     """A smooth picture of the plane at depth 1."""
     x, y = xy[..., 0], xy[..., 1]
@@ -132,9 +133,7 @@ def painting(xy):
 
 def photograph(lens):
     """What the lens sees of the painting: rays of its pixels by fixed-point iteration."""
-    column, row = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
-    goal = np.stack([column, row], axis=-1)
-    xy = rays_of(lens.K, column, row)
+    goal, xy = np.stack([COLUMN, ROW], axis=-1), rays_of(lens.K, COLUMN, ROW)
     for _ in range(200):
         xy = xy + 0.5 * (goal - image_points(lens, xy)) / lens.K[[0, 1], [0, 1]]
     assert np.abs(image_points(lens, xy) - goal).max() < 1e-6
@@ -145,8 +144,7 @@ def photograph(lens):
 def test_every_known_pixel_shows_what_lies_along_its_ray(model, params):
     lens = lens_of(model, params)
     pixels, known = undistort(photograph(lens), lens, lens.K)
-    column, row = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
-    rays = rays_of(lens.K, column, row)
+    rays = rays_of(lens.K, COLUMN, ROW)
     uv = image_points(lens, rays)
     assert np.array_equal(known, np.all((uv >= 0) & (uv <= [WIDTH, HEIGHT]), axis=-1))
     inner = np.all((uv >= 0.5) & (uv <= [WIDTH - 0.5, HEIGHT - 0.5]), axis=-1)
@@ -178,8 +176,7 @@ def test_what_a_fold_would_show_again_is_unknown():
     lens = lens_of("SIMPLE_RADIAL", (30.0, 48.0, 36.0, -0.3))
     white = np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
     pixels, known = undistort(white, lens, lens.K)
-    column, row = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
-    rays = rays_of(lens.K, column, row)
+    rays = rays_of(lens.K, COLUMN, ROW)
     uv = image_points(lens, rays)
     assert np.all((uv > 0) & (uv < [WIDTH, HEIGHT]), axis=-1).all()  # all would show something
     distance = np.linalg.norm(rays, axis=-1)
@@ -189,27 +186,18 @@ def test_what_a_fold_would_show_again_is_unknown():
     assert np.array_equal(pixels[..., 0] == 255, known)
 
 
-@pytest.fixture
-def distorted(room_path, tmp_path):
-    """The room with one photograph of a lens, of which a copy of half the size is on disk."""
-    import shutil
-
-    shutil.copytree(room_path, tmp_path / "copy")
-    scene = load_scene(tmp_path / "copy")
-    lens = lens_of(*LENSES[1])
-    image = dataclasses.replace(scene.images[0], intrinsics=lens)
-    half = PilImage.fromarray(photograph(lens)).reduce(2)
-    half.save(tmp_path / "copy" / "images" / image.name)
-    return scene.replace(images=(image, *scene.images[1:]))
-
-
-def test_views_are_undistorted_where_that_is_asked_for(distorted):
-    lens, straight = load_views(distorted, distorted.images[:2], undistort=True)
+def test_views_are_undistorted_where_that_is_asked_for(copied):
+    """One photograph is of a lens, and a copy of half the size."""
+    bent = lens_of(*LENSES[1])
+    image, other = dataclasses.replace(copied.images[0], intrinsics=bent), copied.images[1]
+    half = PilImage.fromarray(photograph(bent)).reduce(2)
+    half.save(copied.source.image_dir / image.name)
+    lens, straight = load_views(copied, [image, other], undistort=True)
     assert lens.mask.shape == lens.photograph.shape[:2] == (HEIGHT // 2, WIDTH // 2)
-    assert np.allclose(lens.K[:2], distorted.images[0].intrinsics.K[:2] / 2)
+    assert np.allclose(lens.K[:2], bent.K[:2] / 2)
     column, row = np.meshgrid(np.arange(WIDTH // 2) + 0.5, np.arange(HEIGHT // 2) + 0.5)
     error = np.abs(lens.photograph - painting(rays_of(lens.K, column, row))).max(axis=-1)
     assert np.mean(error[lens.mask] < 5) > 0.95
     assert straight.mask is None
-    (alone,) = load_views(distorted, distorted.images[1:2])
+    (alone,) = load_views(copied, [other])
     assert np.array_equal(alone.photograph, straight.photograph)

@@ -174,7 +174,7 @@ def _run_stereo(options: Options) -> None:
         how: dict[str, Any] = {"overwrite": options.overwrite, "progress": clock}
         write = dense.write_dense_maps
         if options.colmap:
-            from splatseed.views.undistortion import undistort  # noqa: PLC0415  (Numba)
+            from splatseed.views.projection import undistort  # noqa: PLC0415  (Numba)
 
             write, how["undistort"] = dense.write_dense_workspace, undistort
         report = write(scene, maps, options.output, provenance=_provenance(options), **how)

@@ -1,15 +1,11 @@
 """Which seeds? The one answer: what to do with a scene's points before training, and why.
 
-Notation: *room* is the number of seeds with which training can begin under its budget, per point
-of the scene. Promise: ``advise`` depends only on the measurements and the plan, not on files or
-chance, so that it can be tested against a benchmark's runs; it may advise against any change.
-
-The rules rest on validation views at 1,500 steps (benchmarks/README.md): where
+*Room* is the number of seeds with which training can begin under its budget, per point of the
+scene. ``advise`` depends only on the measurements and the plan, so that it can be tested against a
+benchmark's runs. The rules rest on validation views at 1,500 steps (benchmarks/README.md): where
 Structure-from-Motion left room (fern, fox), ``auto`` gained 0 to 0.5 dB with densification and 1.1
 to 1.5 dB without; where its points alone filled the budget (bonsai, treehill), adding points cost
-up to 0.4 dB. Under strategy ``grow``, which places Gaussians at stereo's depth itself, ``auto``
-gained 0.02 to 0.05 dB there (seed 0 of both), and -0.05 to 0.09 dB on the test views
-(docs/results/tables/arms_by_scene.csv); it cost 0.4 dB in the synthetic room.
+up to 0.4 dB; under strategy ``grow`` it gained -0.05 to 0.09 dB, and cost 0.4 in a synthetic room.
 """
 
 from __future__ import annotations
@@ -32,8 +28,7 @@ AS_IT_IS, SEEDED = "sfm", "seeded"
 ROOM = 1.1
 """Least room at which new points are worth making. On validation views fox, with a room of 1.17,
 gained 0.41 dB (two seeds), and scenes with a room of 1.0 lost; nothing was measured between."""
-SAME_WAY = 0.95
-"""Least length of the mean viewing direction at which cameras face one way."""
+SAME_WAY = 0.95  # least length of the mean viewing direction at which cameras face one way
 INWARD = 0.7
 """Least share of cameras that look towards the point nearest to all optical axes in an orbit."""
 
@@ -73,11 +68,8 @@ def advice_for(
 ) -> Advice:
     """What to do with a scene's points before training; no photograph is opened.
 
-    Args:
-        scene: The scene.
-        most_seeds: Most seeds with which training can begin under its budget.
-        strategy: The strategy of that training.
-        empty: Share of the photographs' cells without points, if known.
+    Training can begin with ``most_seeds`` under its budget; ``empty`` is the share of the
+    photographs' cells without points, if known.
     """
     measured = measure(scene, empty)
     if was_upsampled(scene) and len(scene.points):
@@ -104,17 +96,15 @@ def advise(
     measured: Measured, most_seeds: int, *, strategy: str = "default", room: float = ROOM
 ) -> Advice:
     """The rule behind ``advice_for``, which scoring calls with other values of ``room``."""
-
-    def said(method: str, *reasons: str) -> Advice:
-        return Advice(method, reasons, measured)
-
     if not measured.num_points:
         maps = "Its depth maps can give some, too: --method depth --depth.no-align --num-points N."
         how = ": depth comes from comparing the photographs" if measured.photographs else ""
         none = f"There are no points to begin with{how}."
-        return said(DEFAULT_METHOD, none, *([maps] if measured.depth_maps else []))
+        return Advice(DEFAULT_METHOD, (none, *([maps] if measured.depth_maps else [])), measured)
     if not measured.photographs:
-        return said(FALLBACK, "Without photographs and their poses, points are interpolated.")
+        return Advice(
+            FALLBACK, ("Without photographs and their poses, points are interpolated.",), measured
+        )
     has = most_seeds / measured.num_points
     share = measured.num_points / measured.pixels if measured.pixels else 0.0
     share_said = f"{share:.2f}" if share >= 0.01 or not share else f"{share:.1g}"
@@ -124,21 +114,21 @@ def advise(
             f"Training begins with {most_seeds:,} at most, so there is no room for more: adding "
             "some cost up to 0.4 dB where that was measured."
         )
-        return said(AS_IT_IS, f"It has {per_pixel}.", full)
+        return Advice(AS_IT_IS, (f"It has {per_pixel}.", full), measured)
     if strategy == "grow":
         places_itself = (
             "Strategy grow puts new Gaussians at the depth that stereo finds; points that method "
             "auto added before it gained 0.1 dB at most on some of the captures measured, and cost "
             "as much on others."
         )
-        return said(AS_IT_IS, f"It has {per_pixel}.", places_itself)
+        return Advice(AS_IT_IS, (f"It has {per_pixel}.", places_itself), measured)
     reasons = [f"It has {per_pixel}, and room for {has:.1f} times as many seeds."]
     if measured.depth_maps:
-        return said("depth", *reasons, "Its depth maps say where the surfaces are.")
+        return Advice("depth", (*reasons, "Its depth maps say where the surfaces are."), measured)
     if measured.empty is not None:
         cells = f"{measured.empty:.0%} of the cells of a coarse grid over the pictures"
         reasons.append(f"No point falls in {cells}.")
-    return said(DEFAULT_METHOD, *reasons)
+    return Advice(DEFAULT_METHOD, tuple(reasons), measured)
 
 
 def measure(scene: Scene, empty: float | None = None) -> Measured:

@@ -29,27 +29,19 @@ from splatseed.views.view import View
 CLOSEST = 4
 """Views in which a kept point is marked: enough for neighbours to share one, few enough to be
 quick."""
-DEEP = 4.0
-"""Slices of depth, in cells: deep enough that noise along the ray makes no new cell."""
+DEEP = 4.0  # slices of depth, in cells: deep enough that noise along the ray makes no new cell
 CHUNKS = 64
 BLOCK = 512
-FINEST, COARSEST = 1.0 / 16, 1 << 14
-"""Range of spacings that are tried, in pixels."""
-CLOSE_ENOUGH = 0.02
-"""By how many points a spacing may fall short of the number."""
+FINEST, COARSEST = 1.0 / 16, 1 << 14  # range of spacings that are tried, in pixels
+CLOSE_ENOUGH = 0.02  # by how many points a spacing may fall short of the number
 STEPS = 24
 LEAST_POWER = 0.2
 """Least exponent e assumed in: number kept ~ (1 / spacing)^e; bounds a step. On surfaces e is 2."""
-ACROSS = 4096.0
-"""Nominal width in pixels of a cloud without views."""
+ACROSS = 4096.0  # nominal width in pixels of a cloud without views
 
 
 def median_pixels(views: Sequence[View]) -> float:
-    """The number of pixels of the median view.
-
-    Raises:
-        ParameterError: There is no view.
-    """
+    """The number of pixels of the median view; ParameterError if there is none."""
     if not views:
         raise ParameterError(
             "images, for a budget in rho", found="none", fix="Give a number of seeds instead."
@@ -65,19 +57,15 @@ def thin(
     first: int = 0,
     priority: Float[np.ndarray, " N"] | None = None,
 ) -> Int64[np.ndarray, " num"]:
-    """Which points to keep.
+    """Which points to keep: indices, rising, min(num, N).
 
     Args:
         xyz: The points, in the world.
         views: Only their cameras and sizes matter. Without any, cells are cubes in space.
         num: How many to keep, at least 1.
-        first: How many of the points, from the first on, are visited before the others: the
-            originals.
-        priority: Higher ones are visited earlier, among originals and among the others; all equal
-            when left out. Points of equal priority are visited in their order.
-
-    Returns:
-        Indices, rising, int64 [min(num, N)].
+        first: How many of the points are visited before the others: the originals.
+        priority: Higher ones are visited earlier, among originals and among the others; equal ones
+            in their order.
 
     Raises:
         ParameterError: ``num`` is below 1.
@@ -122,15 +110,10 @@ def _order(
 
 @dataclass(frozen=True, eq=False)
 class _Places:
-    """Where points lie in the views that see them most closely.
+    """Where points lie in the views that see them most closely."""
 
-    Args:
-        group: The views, closest first, int32 [N, k]; -1 where there are no more.
-        place: Column, row and slice of depth in pixels, float32 [N, k, 3].
-    """
-
-    group: Int32[np.ndarray, "N k"]
-    place: Float32[np.ndarray, "N k 3"]
+    group: Int32[np.ndarray, "N k"]  # the views, closest first; -1 where there are no more
+    place: Float32[np.ndarray, "N k 3"]  # column, row and slice of depth in pixels
 
     def keep(
         self,

@@ -41,19 +41,12 @@ SECTORS = 8
 
 @dataclass(frozen=True, eq=False)
 class Witnesses:
-    """The depths at which each of V views sees the initial points.
+    """The depths at which each of V views sees the initial points."""
 
-    Args:
-        grid_from_world: To columns and rows of cells, and depth, float64 [V, 3, 4].
-        shapes: Rows and columns of each view, int64 [V, 2].
-        starts: Start of each view's depths, int64 [V].
-        depths: Of all cells, view by view and row by row, float32; infinite where not covered.
-    """
-
-    grid_from_world: Float64[np.ndarray, "V 3 4"]
-    shapes: Int64[np.ndarray, "V 2"]
-    starts: Int64[np.ndarray, " V"]
-    depths: Float32[np.ndarray, " C"]
+    grid_from_world: Float64[np.ndarray, "V 3 4"]  # to columns and rows of cells, and depth
+    shapes: Int64[np.ndarray, "V 2"]  # rows and columns of each view
+    starts: Int64[np.ndarray, " V"]  # where each view's depths begin
+    depths: Float32[np.ndarray, " C"]  # of all cells, row by row; infinite where not covered
 
 
 def depth_maps_of_views(
@@ -71,10 +64,7 @@ def depth_maps_of_views(
 
 
 def world_from_grid(view: View, cell: float) -> Float64[np.ndarray, "3 4"]:
-    """(column depth, row depth, depth, 1) to the world, columns and rows in cells.
-
-    Float64 [3, 4].
-    """
+    """(column depth, row depth, depth, 1) to the world, columns and rows in cells."""
     forward = np.vstack([grid_from_world(view, cell), [0.0, 0.0, 0.0, 1.0]])
     return np.asarray(np.linalg.inv(forward)[:3])
 
@@ -86,14 +76,10 @@ def guess_depths(
     witnesses: Witnesses,
     asked: Int64[np.ndarray, " K"],
 ) -> tuple[Float32[np.ndarray, " M"], Float32[np.ndarray, " M"]]:
-    """The depth of each empty cell, and its distance in cells to the nearest covered one.
+    """Depths of empty cells, given as row * cols + column, and distances to covered ones, in cells.
 
-    Args:
-        depths: Of the view's cells, infinite where not covered; at least one is covered.
-        empty: The cells to guess, as row * cols + column.
-        back: The view's ``world_from_grid``.
-        witnesses: What all views see.
-        asked: Which of them may contradict.
+    At least one is covered; ``back`` is the view's ``world_from_grid``, and ``asked`` views may
+    contradict.
     """
     guesses, reach = np.empty(len(empty), np.float32), np.empty(len(empty), np.float32)
     _guess(
@@ -198,10 +184,8 @@ def _weighted_median(values, weights):  # type: ignore[no-untyped-def]  # Numba'
     return values[order[0]]  # never: half of a sum in the same order is no more than the sum
 
 
-WITNESSES = 12
-"""Other views that are asked whether they look through a seed."""
-WITNESS_CELL = 8
-"""Smallest cell of these views, in pixels."""
+WITNESSES = 12  # other views that are asked whether they look through a seed
+WITNESS_CELL = 8  # smallest cell of these views, in pixels
 MOST_CONFIDENT, LEAST_CONFIDENT = 0.3, 0.1
 """Confidence of a seed beside a covered cell, and of one far from all."""
 
@@ -210,21 +194,13 @@ Mask = Bool[np.ndarray, "H W"]
 
 @dataclass(frozen=True, eq=False)
 class CoverSeeds:
-    """Seeds in cells that no point covered, in the order in which the views were taken.
+    """Seeds in cells that no point covered, in the order in which the views were taken."""
 
-    Args:
-        xyz: Positions, float32 [M, 3], world.
-        rgb: Mean colour of the cell, uint8 [M, 3].
-        view: The view each was made for, int32 [M].
-        size: Side of the cell at the seed's depth, float32 [M], scene units.
-        confidence: 0.3 beside a covered cell, falling to 0.1, float32 [M].
-    """
-
-    xyz: Float32[np.ndarray, "M 3"]
-    rgb: UInt8[np.ndarray, "M 3"]
-    view: Int32[np.ndarray, " M"]
-    size: Float32[np.ndarray, " M"]
-    confidence: Float32[np.ndarray, " M"]
+    xyz: Float32[np.ndarray, "M 3"]  # world
+    rgb: UInt8[np.ndarray, "M 3"]  # mean of the cell
+    view: Int32[np.ndarray, " M"]  # the view each was made for
+    size: Float32[np.ndarray, " M"]  # side of the cell at the seed's depth, scene units
+    confidence: Float32[np.ndarray, " M"]  # 0.3 beside a covered cell, falling to 0.1
 
     def __len__(self) -> int:
         return len(self.xyz)
@@ -245,20 +221,13 @@ def cover(
     masks: Sequence[Mask | None] | None = None,
     progress: Progress = silent,
 ) -> CoverSeeds:
-    """A seed in every cell of every view that no point covers.
+    """A seed in every cell, ``cell`` pixels wide, of every view that no point covers.
 
-    Args:
-        views: Photographs with their cameras.
-        xyz: The existing points, in the world; those that are not finite are in no cell.
-        cell: Side of a cell in pixels of the views, at least 1.
-        rng: Draws the order of the views.
-        masks: Which pixels of each view count; None for all. A cell gets a seed only if at least
-            half of its pixels count.
-        progress: Called with the stage and the fraction done.
+    Masks tell which pixels of each view count, None: all; a cell needs half of its pixels. Points
+    that are not finite are in no cell. ``rng`` draws the order of the views.
 
     Raises:
-        ParameterError: There is no view, a view has no pixels, ``cell`` is below 1, or masks do not
-            fit.
+        ParameterError: There is no view, one has no pixels, ``cell`` is below 1, or masks misfit.
         PointCloudError: ``xyz`` is not of shape [N, 3], or no point lies in any view.
     """
     xyz = check_points(views, xyz, cell)

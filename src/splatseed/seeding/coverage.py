@@ -7,10 +7,9 @@ are nearer by more than ``NEARER``: a surface hides what shows between its point
 *covered* if it holds a point and is not hidden.
 Promise: the bytes depend neither on the order of the points nor on the threads.
 
-The nearest depth, as in a z-buffer, does not work: a z-buffer that looks at neighbouring cells
-hides 7% (fox) to 97% (treehill) of the points that their own tracks prove to be visible, because
-Structure-from-Motion leaves a few points floating in front of the cameras. This rule hides 0.3% to
-16%.
+A z-buffer that looks at neighbouring cells hides 7% (fox) to 97% (treehill) of the points that
+their own tracks prove to be visible, as a few points float in front of the cameras; this rule 0.3%
+to 16%.
 """
 
 from __future__ import annotations
@@ -28,14 +27,11 @@ from splatseed.runtime.jit import inline
 from splatseed.views.projection import place
 from splatseed.views.view import View
 
-NEARER = 0.1
-"""By what fraction of a cell's depth its neighbours must be nearer to hide it."""
-HIDING = 5
-"""How many of the eight neighbours must be nearer."""
+NEARER = 0.1  # by what fraction of a cell's depth its neighbours must be nearer to hide it
+HIDING = 5  # how many of the eight neighbours must be nearer
 BLOCK = 512
 """Points projected at a time before being sorted into cells, so that projection is vectorised."""
-GREATEST_DEPTH = 3e38
-"""Depths that float32 can hold."""
+GREATEST_DEPTH = 3e38  # depths that float32 can hold
 NONE = np.float32(np.inf)
 
 
@@ -45,13 +41,9 @@ def covered_share(
     cell: float = 8,
     progress: Progress = silent,
 ) -> float:
-    """The fraction of a view's cells that are covered, 0 to 1, averaged over the views.
+    """The fraction of a view's cells, ``cell`` pixels wide, that points cover: the mean over views.
 
-    Args:
-        views: The views; only their cameras and sizes matter.
-        xyz: The points, in the world.
-        cell: Side of a cell in pixels, at least 1.
-        progress: Called with the stage and the fraction done.
+    Only their cameras and sizes matter.
 
     Raises:
         ParameterError: There is no view, or ``cell`` is below 1.
@@ -91,12 +83,7 @@ def depths_of_views(
 def check_points(
     views: Sequence[View], xyz: Float32[np.ndarray, "N 3"], cell: float
 ) -> Float32[np.ndarray, "N 3"]:
-    """The points as the kernels need them.
-
-    Raises:
-        ParameterError: There is no view, or ``cell`` is below 1.
-        PointCloudError: ``xyz`` is not of shape [N, 3].
-    """
+    """The points as the kernels need them; errors are those of ``covered_share``."""
     if not views:
         raise ParameterError("at least one view", found="none", fix="Name a scene with images.")
     if not (np.isfinite(cell) and cell >= 1):
@@ -115,7 +102,7 @@ def grid_of(view: View, cell: float) -> tuple[int, int]:
 
 
 def grid_from_world(view: View, cell: float) -> Float64[np.ndarray, "3 4"]:
-    """Homogeneous world coordinates to columns and rows of cells, and depth; float64 [3, 4].
+    """Homogeneous world coordinates to columns and rows of cells, and depth.
 
     Cell (i, j) spans rows i to i + 1 and columns j to j + 1.
     """

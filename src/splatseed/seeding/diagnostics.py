@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float64
@@ -206,46 +206,34 @@ def is_distorted(scene: Scene) -> bool:
     return any(image.intrinsics.has_distortion for image in scene.images)
 
 
-class _Measurable(Protocol):
-    def distance(self, xyz: Float[np.ndarray, "N 3"]) -> Float64[np.ndarray, " N"]: ...
-
-
 @dataclass(frozen=True)
 class GeometryScore:
     """Geometric quality of upsampled points, in units of the originals' spacing h.
 
-    Args:
-        error: Mean distance from a new point to the surface; NaN without new points. A few
-            mismatched originals can make up most of it.
-        median: Median of the same.
-        p95: 95th percentile of the same.
-        coverage: Mean distance from a surface sample to the nearest of all points.
-        share_far: Share of new points far from every original (see ``far_share``).
+    A few mismatched originals can make up most of the mean error.
     """
 
-    error: float
-    median: float
-    p95: float
-    coverage: float
-    share_far: float
+    error: float  # mean distance from a new point to the surface; NaN without new points
+    median: float  # of the same
+    p95: float  # of the same
+    coverage: float  # mean distance from a surface sample to the nearest of all points
+    share_far: float  # share of new points far from every original (``far_share``)
 
 
 def measure(
     new_xyz: Float[np.ndarray, "M 3"],
     all_xyz: Float[np.ndarray, "N 3"],
-    surfaces: _Measurable,
+    surfaces: Any,
     surface_samples: Float[np.ndarray, "S 3"],
     h: float,
 ) -> GeometryScore:
     """Compare points with known surfaces.
 
-    To score only the originals, pass them as both ``new_xyz`` and ``all_xyz``.
-
     Args:
-        new_xyz: The new points, world, [M, 3].
-        all_xyz: The whole cloud, [N, 3]: originals first, the new points last.
+        new_xyz: The new points; the originals, to score only these.
+        all_xyz: The whole cloud: originals first, the new points last.
         surfaces: The ground truth: anything with ``distance(xyz)``.
-        surface_samples: Points spread evenly on the surfaces, [S, 3].
+        surface_samples: Points spread evenly on the surfaces.
         h: The unit of the result, usually ``spacing(originals)``.
 
     Raises:
@@ -294,10 +282,7 @@ def _spacing(tree: cKDTree, xyz: Float[np.ndarray, "M 3"]) -> Float64[np.ndarray
 def far_share(originals_xyz: Float[np.ndarray, "N 3"], new_xyz: Float[np.ndarray, "M 3"]) -> float:
     """Share 0..1 of new points farther than 3 h from any original, h local to the nearest one.
 
-    Args:
-        originals_xyz: The originals, [N, 3].
-        new_xyz: The new points, [M, 3], of which a sample is judged; a non-finite one counts as
-            far.
+    A sample of the new points is judged; a non-finite one counts as far.
 
     Raises:
         PointCloudError: There are new points but no finite original.

@@ -1,9 +1,7 @@
-"""Methods that look at the photographs: ``auto``, ``stereo`` and ``cover``.
+"""Methods that look at the photographs, which determine the number of seeds: not a ratio.
 
-``stereo`` puts seeds on surfaces by comparing photographs; ``cover`` puts one in every part of
-every photograph that no point falls in; ``auto`` does both, in this order.
-Promise: the photographs, not a ratio, determine the number of seeds; held-out views are never
-looked at.
+``stereo`` puts seeds on surfaces by comparing them; ``cover`` puts one in every part of every
+photograph that no point falls in; ``auto`` does both. Held-out views are never looked at.
 """
 
 from __future__ import annotations
@@ -20,16 +18,14 @@ from splatseed.errors import PointCloudError, SceneNotFoundError
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress
 from splatseed.scene import Image, Scene
-from splatseed.upsample import as_cloud
+from splatseed.upsample import as_cloud, source_code
 from splatseed.upsample.method import NewPoints, Traits, check_fields, require
-from splatseed.upsample.registry import source_code
 from splatseed.views.view import View, data_factor, load_views
 
 if TYPE_CHECKING:
     from splatseed.depth.stereo.maps import StereoMap, StereoResult
 
-MAX_SIZE = 800
-"""Longer side in pixels at which photographs are used."""
+MAX_SIZE = 800  # longer side in pixels at which photographs are used
 
 
 @dataclass(frozen=True)
@@ -66,13 +62,9 @@ class Stereo(PhotographMethod):
     def maps(
         self, scene: Scene, only: Sequence[int], seed: int, progress: Progress
     ) -> tuple[StereoMap, ...]:
-        """Depth and normals of some photographs, as ``upsample`` computes them with this seed.
+        """Depth and normals of photographs, as ``upsample`` computes them with this seed.
 
-        Args:
-            scene: The scene.
-            only: Indices into ``photographed(scene, hold_out)``.
-            seed: The same seed gives the same bytes.
-            progress: Called with the stage and the fraction done.
+        ``only`` indexes ``photographed(scene, hold_out)``.
         """
         images = photographed(scene, self.hold_out)
         views = read_views(scene, images, self.max_size, progress)
@@ -81,11 +73,7 @@ class Stereo(PhotographMethod):
         return tuple(stereo.map(i) for i in only)
 
     def __call__(
-        self,
-        scene: Scene,
-        num_new: int,  # noqa: ARG002  (the photographs determine the number)
-        rng: np.random.Generator,
-        progress: Progress,
+        self, scene: Scene, num_new: int, rng: np.random.Generator, progress: Progress
     ) -> NewPoints:
         """Make the new points of a scene."""
         return self.seeds_and_stereo(scene, rng, progress)[0]
@@ -130,11 +118,7 @@ class Cover(PhotographMethod):
     name: ClassVar[str] = "cover"
 
     def __call__(
-        self,
-        scene: Scene,
-        num_new: int,  # noqa: ARG002  (the photographs determine the number)
-        rng: np.random.Generator,
-        progress: Progress,
+        self, scene: Scene, num_new: int, rng: np.random.Generator, progress: Progress
     ) -> NewPoints:
         """Make the new points of a scene, which needs some already: their depths are carried on."""
         originals = scene.points.originals
@@ -189,15 +173,10 @@ def begins_from_points(scene: Scene) -> bool:
 def photographed(
     scene: Scene, hold_out: int = 0, *, without: str = "choose --method mls"
 ) -> tuple[Image, ...]:
-    """The images whose photographs are used, by name.
-
-    Args:
-        scene: The scene.
-        hold_out: Leave out every n-th image by name, as in ``PhotographMethod``.
-        without: What to do if there are none, for the error.
+    """The images whose photographs are used, by name; ``hold_out`` as in ``PhotographMethod``.
 
     Raises:
-        SceneNotFoundError: There are none.
+        SceneNotFoundError: There are none; the message says to do ``without``.
     """
     folder = scene.source.image_dir if scene.source else None
     ordered = sorted(scene.images, key=lambda image: image.name)

@@ -1,16 +1,12 @@
 """Scenes that have poses and no points: are the poses sound, how exact are they, where to begin.
 
-*Check.* Poses are ``cam_from_world`` [V, 4, 4]. A *look* compares a photograph and its best
-partners, ``SIDE`` pixels wide, over every depth; its *share* is that of the pixels whose depth
-others confirm. A *turn* undoes a usual mistake in writing poses. A scene is refused only if its
-photographs agree by chance at most, or clearly better after a turn.
-
-*Error.* What lies along an epipolar line is depth's; what lies across it is the poses' fault. View
-i's partner j is turned into i's orientation first, so that a point at inverse depth w moves from
-pixel p to ``K (K^-1 p + w c)``, c the partner's step. A *corner* of i is looked for in a band along
-that line; the *miss* is how far beside the line it is found. A corner counts only where one place
-of the band is clearly most alike.
-Promise: the scene's scale plays no part.
+A *look* compares a photograph and its best partners, ``SIDE`` pixels wide, over every depth; its
+*share* is that of the pixels whose depth others confirm. A *turn* undoes a usual mistake in writing
+poses. A scene is refused only if its photographs agree by chance at most, or clearly better after a
+turn. What lies across an epipolar line is the poses' fault: a *corner* of view i is looked for in a
+band along its line in view j, turned into i's orientation first, so that a point at inverse depth w
+moves from pixel p to ``K (K^-1 p + w c)``, c the step; the *miss* is how far beside the line it is
+found, where one place is clearly most alike.
 """
 
 from __future__ import annotations
@@ -25,6 +21,7 @@ from jaxtyping import Bool, Float64
 from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter, sobel, uniform_filter
 from scipy.signal import correlate
 
+from splatseed.camera import Camera
 from splatseed.depth.stereo.depths import any_depth
 from splatseed.depth.stereo.maps import StereoSettings
 from splatseed.depth.stereo.matching import match_views
@@ -33,28 +30,22 @@ from splatseed.literal import quoted
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
-from splatseed.views.pairs import choose_by_pose
-from splatseed.views.view import View, data_factor, load_views, poses_of
+from splatseed.views.projection import choose_by_pose
+from splatseed.views.view import View, data_factor, load_views
 
 Gray = Float64[np.ndarray, "H W"]
 Pixel = Float64[np.ndarray, " 2"]
 
-CORNERS_SIDE = 400
-"""Longer side of the photographs that are compared, in pixels."""
+CORNERS_SIDE = 400  # longer side of the photographs that are compared, in pixels
 CORNERS_LOOKS, CORNERS_PARTNERS = 5, 2
 """Photographs looked at, and those that each is compared with."""
-CORNERS, APART = 100, 9
-"""Corners of a photograph, at most; and pixels between them, at least."""
-HALF = 5
-"""A patch is 2 HALF + 1 pixels wide."""
-REACH = 24
-"""Largest miss that is looked for, in pixels."""
-FARTHEST = 0.3
-"""A band's length: what a point moves at most, in widths of a photograph."""
+CORNERS, APART = 100, 9  # corners of a photograph, at most; and pixels between them, at least
+HALF = 5  # a patch is 2 HALF + 1 pixels wide
+REACH = 24  # largest miss that is looked for, in pixels
+FARTHEST = 0.3  # a band's length: what a point moves at most, in widths of a photograph
 ALIKE, CLEARLY_BEST = 0.85, 0.1
 """Least correlation of a corner's best place, and by how much it is above any other."""
-LEAST_FOUND = 8
-"""Corners of a pair that must be found for it to count."""
+LEAST_FOUND = 8  # corners of a pair that must be found for it to count
 LEAST_PAIRS = 1 / 3
 """Share of the pairs that must count; at sound poses of eight captures six of ten and more do."""
 BY_CHANCE = 10.0
@@ -89,22 +80,17 @@ class PoseError:
 def pose_error(
     scene: Scene, images: Sequence[Image], progress: Progress = silent
 ) -> PoseError | None:
-    """Measure how exact the poses of photographs are, in a few seconds; points are not used.
+    """Measure how exact the poses of two photographs or more are, in a few seconds, without points.
 
-    Args:
-        scene: A scene with photographs.
-        images: The images whose photographs are compared; two at least.
-        progress: Called with the stage and the fraction done.
-
-    Returns:
-        None if too few corners are found again, as on plain walls or at poses that are far off.
+    None if too few corners are found again, as on plain walls or at poses that are far off.
 
     Raises:
         SceneFormatError: A photograph cannot be used.
     """
     poses = np.array([image.camera.cam_from_world for image in images])
     partners = choose_by_pose(poses, CORNERS_PARTNERS)
-    factor, looked = data_factor(images, CORNERS_SIDE), _spread(len(images), CORNERS_LOOKS)
+    factor = data_factor(images, CORNERS_SIDE)
+    looked = np.unique(np.linspace(0, len(images) - 1, CORNERS_LOOKS).round().astype(int)).tolist()
     misses, pairs = [], 0
     for number, i in enumerate(looked):
         some = [images[i], *(images[j] for j in partners[i].tolist() if j >= 0)]
@@ -123,11 +109,6 @@ def pose_error(
         return None
     exact = px * factor <= MOST_MISSED * data_factor(images, StereoSettings.max_size)
     return PoseError(px * factor, degrees, exact)
-
-
-def _spread(total: int, most: int) -> list[int]:
-    """At most so many of the numbers below ``total``, evenly spaced."""
-    return sorted(set(np.linspace(0, total - 1, most).round().astype(int).tolist()))
 
 
 def _misses(view: View, other: View) -> Float64[np.ndarray, " M"]:
@@ -192,7 +173,7 @@ def _miss(
     patch = _sample(image, p, along, (-HALF, HALF), HALF)
     if not np.isfinite(patch).all():  # beyond the picture's border
         return None
-    # A little backwards, too: with wrong poses a far point may seem to be behind infinity.
+    # a little backwards, too: with wrong poses a far point may seem to be behind infinity.
     length = -HALF - REACH, HALF + int(farthest)
     scores = _correlation(patch, _sample(turned, p + margin, along, length, HALF + REACH))
     at = np.unravel_index(np.argmax(scores), scores.shape)
@@ -234,22 +215,16 @@ def _correlation(patch: Gray, band: Gray) -> Gray:
 
 Poses = Float64[np.ndarray, "V 4 4"]
 
-SIDE, PARTNERS = 200, 5
-"""Size of the photographs of a look, and views that each is compared with."""
+SIDE, PARTNERS = 200, 5  # size of the photographs of a look, and views that each is compared with
 SETTINGS = StereoSettings(grid=4, sweeps=6, tolerance=0.03, max_cost=0.4)
-LOOKS = 3
-"""Photographs looked at, while what is seen decides nothing."""
-ENOUGH = 0.3
-"""Share at which nothing else is tried; wrong poses reached 0.17."""
-CLEARLY = 2.0
-"""A share so many times another is clearly above it."""
-LEAST = 0.1
-"""Least share after a turn at which the turn is believed."""
+LOOKS = 3  # photographs looked at, while what is seen decides nothing
+ENOUGH = 0.3  # share at which nothing else is tried; wrong poses reached 0.17
+CLEARLY = 2.0  # a share so many times another is clearly above it
+LEAST = 0.1  # least share after a turn at which the turn is believed
 NIL = 0.03
 """Share that photographs of eleven captures reached by chance, with their poses exchanged; with
 their own, the hardest reached 0.07."""
-MOST_SEEN = 24
-"""Photographs whose pictures are searched for any overlap."""
+MOST_SEEN = 24  # photographs whose pictures are searched for any overlap
 
 _YZ, _XY = np.diag([1.0, -1.0, -1.0, 1.0]), np.diag([-1.0, -1.0, 1.0, 1.0])
 TURNS: Mapping[str, Callable[[Poses], Poses]] = MappingProxyType(
@@ -273,12 +248,7 @@ WRITTEN = {
 
 
 def check_poses(scene: Scene, images: Sequence[Image], progress: Progress = silent) -> float:
-    """Refuse photographs that cannot be compared at their poses, within seconds.
-
-    Args:
-        scene: A scene with photographs, whose points are not used.
-        images: The images whose photographs are to be compared.
-        progress: Called with the stage and the fraction done.
+    """Refuse photographs that cannot be compared at their poses, within seconds, without points.
 
     Returns:
         The largest share of pixels whose depth other photographs confirm, of those looked at.
@@ -312,7 +282,7 @@ def check_poses(scene: Scene, images: Sequence[Image], progress: Progress = sile
     else:
         if (share := float(np.mean(shares))) <= NIL:
             new = f"splatseed sfm {quoted(scene.source.image_dir or 'IMAGES')} -o SCENE"
-            if not _any_overlap(poses_of(images)):
+            if not _any_overlap([image.camera for image in images]):
                 raise SceneFormatError(
                     f"photographs that show the same places, at the poses of {scene.source.root}",
                     found=f"no two of {len(images)} whose pictures overlap at any depth",
@@ -364,20 +334,17 @@ def _look(scene: Scene, images: Sequence[Image], poses: Poses, number: int) -> f
     return float(np.mean([stereo.kept(i).mean() for i in range(len(views))]))
 
 
-def _any_overlap(views: Sequence[View]) -> bool:
-    """Whether a point at some depth before one view falls into another's picture."""
+def _any_overlap(cameras: Sequence[Camera]) -> bool:
+    """Whether a point at some depth before one camera falls into another's picture."""
     uv = (np.indices((4, 5)).reshape(2, -1).T[:, ::-1] + 0.5) / [5, 4]
-    for i in _spread(len(views), MOST_SEEN):
-        for j in range(len(views)):
-            first, other = views[i].camera, views[j].camera
-            gap = float(np.linalg.norm(first.center - other.center))
-            if i == j or not gap:
-                continue
-            z = gap * np.repeat(np.geomspace(0.1, 1000.0, 12), len(uv))
-            xyz = first.unproject(np.tile(uv * [first.width, first.height], (12, 1)), z)
-            seen = other.project(xyz)[0]  # NaN behind the camera
-            if ((seen >= 0) & (seen < [other.width, other.height])).all(axis=1).any():
-                return True
+    for first in cameras[:: -(-len(cameras) // MOST_SEEN)]:
+        for other in cameras:
+            if gap := float(np.linalg.norm(first.center - other.center)):
+                z = gap * np.repeat(np.geomspace(0.1, 1000.0, 12), len(uv))
+                xyz = first.unproject(np.tile(uv * [first.width, first.height], (12, 1)), z)
+                seen = other.project(xyz)[0]  # NaN behind the camera
+                if ((seen >= 0) & (seen < [other.width, other.height])).all(axis=1).any():
+                    return True
     return False
 
 
@@ -386,12 +353,9 @@ def random_start(
 ) -> PointCloud:
     """Points as a trainer draws them for a scene that has none, uniform in position and colour.
 
-    Args:
-        scene: A scene with at least two cameras.
-        rng: Draws positions and colours.
-        trainer: Whose rule: that of gsplat 1.5.3's simple_trainer (``init_type`` random), 100,000
-            points in a cube that reaches 3.3 times as far as the cameras; or nerfstudio 1.1.5's
-            splatfacto, 50,000 that reach 5 times as far as their coordinates.
+    By gsplat 1.5.3's simple_trainer (``init_type`` random), 100,000 in a cube that reaches 3.3
+    times as far as the cameras, two at least; by nerfstudio 1.1.5's splatfacto, 50,000 that reach 5
+    times as far as their coordinates.
     """
     centers = np.stack([image.camera.center for image in scene.images])
     middle, num = centers.mean(axis=0), 50_000

@@ -1,11 +1,7 @@
 """``upsample``: new points for a scene, made, verified, completed and thinned to a budget.
 
-Four steps, all but the first optional: a method makes points; ``verify`` checks interpolated ones
-against the photographs; ``cover`` gives a seed to the parts of photographs that no point falls in;
-a budget thins all: measured points by visibility, then guesses.
-Promise: without a budget the originals come first and unchanged; with one, there are no more points
-than its number, and exactly the number if there are enough; the same seed gives the same bytes
-whatever the number of threads; every point is finite.
+A method makes points; if asked, ``verify`` checks interpolated ones against the photographs,
+``cover`` gives a seed to the parts of photographs that no point falls in, and a budget thins all.
 """
 
 from __future__ import annotations
@@ -22,24 +18,19 @@ from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 from splatseed.seeding.advice import DEFAULT_METHOD, method_for
 from splatseed.seeding.photographs import MAX_SIZE, Stereo, photographed, read_views, with_cover
-from splatseed.upsample import Profile, Upsampler, as_cloud, upsample as add_points
+from splatseed.upsample import Profile, Upsampler, as_cloud, source_code, upsample as add_points
 from splatseed.upsample.method import NewPoints
-from splatseed.upsample.registry import source_code
 from splatseed.views.view import View, data_factor, poses_of
 
 if TYPE_CHECKING:
     from splatseed.depth.stereo.maps import StereoResult
 
-RHO = "rho"
-"""The unit of Gaussians per pixel of a photograph."""
-MOST = 10**12
-"""More points than any trainer holds."""
-CELL = 8
-"""Side in pixels of the cells by which coverage is measured."""
+RHO = "rho"  # the unit of Gaussians per pixel of a photograph
+MOST = 10**12  # more points than any trainer holds
+CELL = 8  # side in pixels of the cells by which coverage is measured
 INTERPOLATING = ("linear", "triangle", "spline", "mls", "voronoi", "random")
 """Methods whose points ``verify`` checks against the photographs."""
-FILLING = ("auto", "cover", "stereo")
-"""Methods that look where there are points already."""
+FILLING = ("auto", "cover", "stereo")  # methods that look where there are points already
 COVER, CLOUD = source_code("cover"), source_code("cloud")
 MOST_COVER, COARSER = 0.1, 1.25
 """Largest part of a budget for cover's guesses, whose cells grow by a factor until they fit."""
@@ -170,10 +161,7 @@ def _full_already(
 
 
 def _with(scene: Scene, points: PointCloud, method: str | Upsampler) -> Scene:
-    """The scene with other points, for a method.
-
-    Methods that fill gaps look at originals only, so for these all points are.
-    """
+    """The scene with other points; methods that fill gaps look at originals only, so all are."""
     name = method if isinstance(method, str) else getattr(method, "name", None)
     return scene.replace(points=points.replace(source=None) if name in FILLING else points)
 
@@ -188,12 +176,7 @@ def add_cover(
 ) -> PointCloud:
     """A cloud plus a seed for each part of the photographs that it leaves empty.
 
-    Args:
-        scene: The scene with the photographs.
-        cloud: The points; the scene's own when left out.
-        cell: Side of a part in pixels, at the size that methods use.
-        seed: The same seed gives the same bytes.
-        progress: Called with the stage and the fraction done.
+    Without a cloud, the scene's own; parts are ``cell`` pixels wide, at the size that methods use.
 
     Raises:
         ParameterError: The side is below 1.
@@ -227,21 +210,14 @@ def _add_verified(scene: Scene, cloud: PointCloud, progress: Progress, note: Not
 
 
 def share_covered(scene: Scene, cloud: PointCloud, cell: int = CELL) -> float:
-    """The fraction of the photographs' cells, so many pixels wide, that hold a point.
-
-    The photographs count at the size that methods use; their files need not exist.
-    """
+    """The fraction of the photographs' cells that hold a point, at the size that methods use."""
     from splatseed.seeding.coverage import covered_share  # noqa: PLC0415  (kernels load with use)
 
     return covered_share(frames_of(scene), cloud.xyz[cloud.finite], cell)
 
 
 def points_within(scene: Scene, budget: int | str) -> int:
-    """The number of points that a budget allows a scene, whose photographs define rho.
-
-    Raises:
-        ParameterError: As for ``parse_budget``.
-    """
+    """``parse_budget`` with the photographs of a scene."""
     from splatseed.seeding.budget import median_pixels  # noqa: PLC0415  (loads Numba)
 
     photographs = poses_of(scene.images)
@@ -259,19 +235,10 @@ def thin_to(
 ) -> PointCloud:
     """At most ``num`` of a cloud's points, originals before others of equal use.
 
-    Cover is recomputed for what thinning leaves: a guess fills a gap, and must not replace a
-    measured point. If there are at least ``num`` originals, only originals stay: they are dense
-    where there is detail, which is where few Gaussians are needed most. But a scan's points, which
-    the user has asked for, are thinned together with them.
-
-    Args:
-        scene: The scene of the points.
-        cloud: The points.
-        num: How many, at least 1.
-        cell: Smallest side of cover's cells, in pixels.
-        hold_out: Photographs that cover must not use, as in ``PhotographMethod``.
-        seed: Determines the order of the views.
-        progress: Called with the stage and the fraction done.
+    Cover, whose cells are ``cell`` pixels wide at least, is recomputed for what thinning leaves: a
+    guess fills a gap, and must not replace a measured point. If there are at least ``num``
+    originals, only originals stay: they are dense where there is detail, which is where few
+    Gaussians are needed most. But a scan's points are thinned together with them.
     """
     if len(cloud) <= num:
         return cloud
@@ -311,12 +278,7 @@ def _keep(scene: Scene, points: PointCloud, num: int) -> PointCloud:
 
 
 def parse_budget(budget: str | float, pixels: float) -> int:
-    """The number of points or Gaussians that a budget allows.
-
-    Args:
-        budget: A number such as 50000, "50000", "50k" or "0.5M", or "0.25rho" for Gaussians per
-            pixel of one image.
-        pixels: Pixels of one image.
+    """The number of points or Gaussians that a budget allows; rho are those per pixel of an image.
 
     Raises:
         ParameterError: It is neither, or allows none, or more than anything can hold.
@@ -336,8 +298,6 @@ def parse_budget(budget: str | float, pixels: float) -> int:
         raise ParameterError(
             "a budget such as 50000, 50k, or 0.25rho (a quarter of the pixels of an image)",
             found=f"{budget!r}, of {pixels:,.6g} pixels" if unit == RHO else repr(budget),
-            fix=f"Did you mean {text}rho?"
-            if not unit and 0 < number < 1
-            else "Give a number of at least 1.",
+            fix=f"Did you mean {text}rho?" if not unit and 0 < number < 1 else "Give 1 or more.",
         )
     return round(number)

@@ -5,8 +5,15 @@ mean distance of the base to its 6 nearest, its spacing. The normal is the last 
 the base and its 16 nearest. Up to two *reference views* judge a point: those that see its base, and
 in whose frame, and in those of two of their sources (of the only one, if there is no more), it lies
 well within; the closer and the more frontal a view, the better it sees the point. In each, the
-point slides along its normal to where the photographs agree best (``sliding``), at a cost of one
-minus correlation; the better view counts.
+point slides along its normal to where the photographs agree best, at a cost of one minus
+correlation; the better view counts.
+
+A point of one view, seen at pixel (u, v), slides with the plane through it: inverse depth w and its
+slopes gx, gy per pixel (``stereo.cost``). Moving the plane by t spacings h along its normal n,
+where n X is its distance from the camera, multiplies all three by 1 / (1 + t h / (n X)); the point
+then lies where the plane meets the ray of (u, v), so that its window in the view stays the same.
+Of the t, the one with the smallest (cost(t) + FLOOR) (1 + t^2) wins: a clearly low cost may move a
+point, small differences between high costs may not.
 Promise: the order of points stays; a point's surroundings and reference views depend on that point,
 the originals, poses and visibility, not on other points; the same input gives the same bytes,
 whatever the number of threads; points that no photograph can judge are kept and reported.
@@ -20,23 +27,21 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
-from splatseed.depth.stereo.cost import grey_image
+from splatseed.depth.stereo.cost import NOISE, SAMPLES, best_cost, grey_image, prepare_window
 from splatseed.depth.stereo.matching import make_quad_images
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, in_threads, silent
-from splatseed.runtime.jit import inline, kernel, parallel_range
+from splatseed.runtime.jit import always_inline, inline, kernel, parallel_range
+from splatseed.runtime.simd import LANES
 from splatseed.scene import Image
-from splatseed.seeding.sliding import slide
 from splatseed.upsample.method import NewPoints
 from splatseed.upsample.neighbors import Neighbors, PreparedCloud, prepare
 from splatseed.upsample.patches import local_frames
-from splatseed.views.pairs import choose_sources, views_of_points
-from splatseed.views.projection import place
+from splatseed.views.projection import choose_sources, place, views_of_points
 from splatseed.views.view import View
 from splatseed.views.visibility import Visibility
 
-NEIGHBORS = 16
-"""Neighbours that determine a normal, as for mls."""
+NEIGHBORS = 16  # neighbours that determine a normal, as for mls
 FLAT = 0.4
 """A neighbourhood counts as flat up to this ratio of thickness to width; noise alone has about
 0.7."""
@@ -45,19 +50,12 @@ BLOCK = 1 << 13
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """The surroundings of M new points.
+    """The surroundings of M new points."""
 
-    Args:
-        base: The nearest original, as its row, int64 [M].
-        spacing: h, float64 [M], scene units.
-        normals: Unit, of either sign, float64 [M, 3]; NaN where the originals are collinear.
-        flat: Whether the originals there are coplanar, bool [M].
-    """
-
-    base: Int64[np.ndarray, " M"]
-    spacing: Float64[np.ndarray, " M"]
-    normals: Float64[np.ndarray, "M 3"]
-    flat: Bool[np.ndarray, " M"]
+    base: Int64[np.ndarray, " M"]  # row of the nearest original
+    spacing: Float64[np.ndarray, " M"]  # h
+    normals: Float64[np.ndarray, "M 3"]  # unit, of either sign; NaN where originals are collinear
+    flat: Bool[np.ndarray, " M"]  # whether the originals there are coplanar
 
 
 def survey(
@@ -114,12 +112,9 @@ def _nearest(
 
 REFERENCE_VIEWS = 2
 """Views that judge a point; the better verdict counts, as one of them may not see it after all."""
-WITNESSES = 2
-"""Sources that must contain a point: this many determine its cost."""
-MARGIN = 5.0
-"""Pixels between a point and the frame: the window around it lies inside."""
-OBLIQUE = 0.3
-"""Weight of closeness for a surface seen edge on: normals are uncertain."""
+WITNESSES = 2  # sources that must contain a point: this many determine its cost
+MARGIN = 5.0  # pixels between a point and the frame: the window around it lies inside
+OBLIQUE = 0.3  # weight of closeness for a surface seen edge on: normals are uncertain
 
 
 def choose_reference_views(
@@ -130,7 +125,7 @@ def choose_reference_views(
     num_originals: int,
     sources: Int64[np.ndarray, "V K"],
 ) -> Int64[np.ndarray, "M J"]:
-    """The views that judge each point, best first, int64 [M, REFERENCE_VIEWS]; -1 for none.
+    """The views that judge each point, best first; -1 for none.
 
     ``seen`` are the originals that each view sees, ``sources`` the views it is compared with.
     """
@@ -204,39 +199,124 @@ def _sight(point, normal, center):  # type: ignore[no-untyped-def]  # Numba's ty
     return (abs(dot) / distance + OBLIQUE) / distance
 
 
-NUM_SOURCES = 5
-"""Views that a judge is compared with."""
-MAX_COST = 0.4
-"""A point whose lowest cost is higher fits nowhere."""
-TEXTURE = 4.0
-"""Variance of grey levels around a pixel below which there is nothing to compare."""
-BARE_CONFIDENCE = 0.1
-"""Confidence of points on flat untextured surfaces, which stay in place."""
+REACH = 1.5  # how far a point may move, in spacings
+OFFSETS = 13  # number of offsets tried first, evenly spaced
+REFINEMENTS = 4
+"""Refinement steps: half a step to both sides of the best is tried, then the step is halved."""
+FLOOR = 0.02  # cost of two photographs of one surface: anything lower is chance
+
+_FLOOR, _NOISE, _ONE = (np.float32(each) for each in (FLOOR, NOISE, 1.0))
+
+
+@inline
+def slide(quad_images, uv, planes, reach, moves, costs, variances):  # type: ignore[no-untyped-def]  # Numba\'s types
+    """The best offset of each point.
+
+    Args:
+        quad_images: ``stereo.patchmatch.QuadImages``; its grid and bounds are not used.
+        uv: Pixels of the points, float32 [M, 2].
+        planes: w, gx, gy through each, float32 [M, 3].
+        reach: h / (n X), float32 [M], magnitude below 1 / REACH.
+        moves: Filled with t, float32 [M].
+        costs: Filled with the cost there, float32 [M].
+        variances: Filled with the variance of the grey levels around the pixel, float32 [M].
+    """
+    places, window = np.zeros((2, LANES), np.float32), np.zeros((2, SAMPLES * LANES), np.float32)
+    own, tried = np.zeros((4, LANES), np.float32), np.zeros(3 * LANES, np.float32)
+    # Rows: t to try, cost, best value, its t, its cost, the t that half steps start from.
+    state = np.zeros((6, LANES), np.float32)
+    for first in range(0, len(uv), LANES):
+        _fill_lanes(first, uv, planes, reach, places, own, state)
+        prepare_window(
+            quad_images.quads, quad_images.size[0], quad_images.size[1], places[0], places[1],
+            window[0], window[1],
+        )  # fmt: skip
+        _search(quad_images, places, window, own, tried, state)
+        for lane in range(min(LANES, len(uv) - first)):
+            moves[first + lane], costs[first + lane] = state[3, lane], state[4, lane]
+            variances[first + lane] = _variance(window, lane)
+
+
+@inline
+def _fill_lanes(first, uv, planes, reach, places, own, state):  # type: ignore[no-untyped-def]  # Numba\'s types
+    """Sixteen points; beyond the end, the last one again."""
+    for lane in range(LANES):
+        i = min(first + lane, len(uv) - 1)
+        places[0, lane], places[1, lane] = uv[i, 0], uv[i, 1]
+        own[0, lane], own[1, lane], own[2, lane] = planes[i, 0], planes[i, 1], planes[i, 2]
+        own[3, lane] = reach[i]
+        state[2, lane] = np.inf
+
+
+@inline
+def _search(quad_images, places, window, own, tried, state):  # type: ignore[no-untyped-def]  # Numba\'s types
+    """Try evenly spaced offsets, then ever closer ones around the best."""
+    # 13 offsets from -1.5 to 1.5 spacings, a quarter apart; then 1/8, 1/16, 1/32 and 1/64.
+    step = np.float32(2.0 * REACH / (OFFSETS - 1))
+    for k in range(OFFSETS):
+        state[0, :] = step * np.float32(k - OFFSETS // 2)
+        _try(quad_images, places, window, own, tried, state)
+    for _ in range(REFINEMENTS):
+        step *= np.float32(0.5)
+        state[5, :] = state[3, :]
+        for side in range(2):
+            state[0, :] = state[5, :] + (step if side else -step)
+            _try(quad_images, places, window, own, tried, state)
+
+
+@inline
+def _try(quad_images, places, window, own, tried, state):  # type: ignore[no-untyped-def]  # Numba\'s types
+    """Accept the offsets tried where they are better."""
+    for lane in range(LANES):
+        # w(t) = w / (1 + t h / (n X)), and likewise its slopes
+        scale = _ONE / (_ONE + state[0, lane] * own[3, lane])
+        for part in range(3):
+            tried[part * LANES + lane] = scale * own[part, lane]
+    best_cost(
+        quad_images.sources, quad_images.sizes, quad_images.offsets, quad_images.warps,
+        places[0], places[1], tried, window[0], window[1], state[1],
+    )  # fmt: skip
+    for lane in range(LANES):
+        t, cost = state[0, lane], state[1, lane]
+        # (cost(t) + FLOOR) (1 + t^2): far moves must pay off.
+        value = (cost + _FLOOR) * (_ONE + t * t)
+        if value < state[2, lane]:
+            state[2, lane], state[3, lane], state[4, lane] = value, t, cost
+
+
+@always_inline
+def _variance(window, lane):  # type: ignore[no-untyped-def]  # Numba\'s types
+    """Variance of a reference window, from its weights c and samples a (``stereo.cost``)."""
+    # sum a^2 / c = var / (var + NOISE)
+    share = np.float32(0.0)
+    for k in range(SAMPLES):
+        a = window[1, k * LANES + lane]
+        share += a * a / window[0, k * LANES + lane]
+    # Solved for var; a share of 1 would be infinite variance.
+    return _NOISE * share / max(_ONE - share, np.float32(1e-6))
+
+
+NUM_SOURCES = 5  # views that a judge is compared with
+MAX_COST = 0.4  # a point whose lowest cost is higher fits nowhere
+TEXTURE = 4.0  # variance of grey levels around a pixel below which there is nothing to compare
+BARE_CONFIDENCE = 0.1  # confidence of points on flat untextured surfaces, which stay in place
 STEEPEST = 0.3
 """Smallest cosine between ray and normal; steeper normals are taken to be wrong and turned to
 this."""
 LARGEST_MOVE = 0.3
 """Largest move of a plane along its normal, in spacings, as a fraction of its distance from the
 camera."""
-MOVED = 0.25
-"""Spacings from which on a point is reported as moved."""
+MOVED = 0.25  # spacings from which on a point is reported as moved
 
 
 @dataclass(frozen=True, eq=False)
 class _Trials:
-    """The verdicts of the judges of M points; infinite cost where there is no judge.
+    """The verdicts of the judges of M points; infinite cost where there is no judge."""
 
-    Args:
-        xyz: The best position, float32 [M, J, 3].
-        moves: Its offset from the point along the normal, in spacings, float32 [M, J].
-        costs: One minus correlation there, float32 [M, J].
-        variances: Of the grey levels around the judge's pixel, float32 [M, J].
-    """
-
-    xyz: Float32[np.ndarray, "M J 3"]
-    moves: Float32[np.ndarray, "M J"]
-    costs: Float32[np.ndarray, "M J"]
-    variances: Float32[np.ndarray, "M J"]
+    xyz: Float32[np.ndarray, "M J 3"]  # the best position
+    moves: Float32[np.ndarray, "M J"]  # its offset from the point along the normal, in spacings
+    costs: Float32[np.ndarray, "M J"]  # one minus correlation there
+    variances: Float32[np.ndarray, "M J"]  # of the grey levels around the judge's pixel
 
 
 def verify(
@@ -253,17 +333,9 @@ def verify(
     without texture, and with unknown confidence (NaN) if fewer than two photographs see it. All
     others are dropped.
 
-    Args:
-        views: The photographs, at the size to compare.
-        images: Their images, in the same order.
-        visibility: The originals that the points were made from, and who sees them.
-        new: The points, finite.
-        progress: Called with the stage and the fraction done.
-
-    Returns:
-        The points that stay, in order, with confidence and normals (towards the judge; NaN where
-        the originals are collinear), their other attributes, and notes on how many were dropped and
-        why.
+    The views are at the size to compare, the images theirs; ``visibility`` tells who sees the
+    originals that the points were made from. Those that stay have normals, too (towards the judge;
+    NaN where the originals are collinear), and notes on how many were dropped and why.
     """
     if len(visibility.xyz) < 2 or not len(new.xyz) or not views:
         return _unchecked(new)
@@ -323,10 +395,7 @@ def _judge(
     mine: Int64[np.ndarray, " T"],
     trials: _Trials,
 ) -> None:
-    """Let view i judge its points.
-
-    ``mine`` indexes the trials, judge by judge within each point.
-    """
+    """Let view i judge its points; ``mine`` indexes the trials, judge by judge within each."""
     view, (point, judge) = views[i], np.unravel_index(mine, trials.costs.shape)
     world = xyz[point].astype(np.float64)
     uv, planes, reach = _planes(view, world, around.normals[point], around.spacing[point])
@@ -371,10 +440,7 @@ def _planes(
 def _facing(
     normals: Float64[np.ndarray, "T 3"], cam: Float64[np.ndarray, "T 3"]
 ) -> Float64[np.ndarray, "T 3"]:
-    """Normals in camera axes turned towards the camera, at least by an angle of ``STEEPEST``.
-
-    Unknown normals become the direction to the camera.
-    """
+    """Normals in camera axes, turned towards the camera by ``STEEPEST`` at least, or if unknown."""
     back = -cam / np.linalg.norm(cam, axis=1, keepdims=True)
     n = np.where(np.isnan(normals), back, normals)
     cosine = np.einsum("ij,ij->i", n, back)[:, None]
@@ -387,10 +453,7 @@ def _facing(
 
 
 def _decide(
-    new: NewPoints,
-    around: Surroundings,
-    trials: _Trials,
-    centers: Float64[np.ndarray, "M J 3"],
+    new: NewPoints, around: Surroundings, trials: _Trials, centers: Float64[np.ndarray, "M J 3"]
 ) -> NewPoints:
     """Keep, move and drop points by their judges' verdicts; ``centers`` are the judges' centres."""
     judged, textured = np.isfinite(trials.costs), trials.variances >= TEXTURE

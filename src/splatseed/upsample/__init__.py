@@ -3,25 +3,32 @@
 ``upsample`` takes a scene or a cloud, ``upsample_points`` bare arrays; ``METHODS`` has the methods.
 Promise: the originals come first and unchanged; the same seed gives the same bytes whatever the
 number of threads; new points are finite.
+
+METHODS has every method by name, imported when first looked up. Built-in methods come first: those
+in ``methods/``, and those that higher parts of the package add when they are imported along with it
+(``add_built_in``). Then come those that installed packages register under the entry-point group
+``splatseed.methods`` (``name = "package.module:Class"``). A built-in name cannot be overridden.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
+from functools import cached_property
+from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
 from numbers import Real
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 from splatseed.errors import ParameterError, PointCloudError
-from splatseed.pointcloud import ATTRIBUTES, ORIGINAL, PointCloud
+from splatseed.pointcloud import ATTRIBUTES, GENERATED, ORIGINAL, PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.runtime.memory import check_memory
 from splatseed.scene import Scene
 from splatseed.upsample.method import Need, NewPoints, Traits, Upsampler, traits_of
-from splatseed.upsample.registry import METHODS, source_code
 
 __all__ = [
     "DEFAULT_RATIO",
@@ -41,12 +48,76 @@ __all__ = [
     "upsample_points",
 ]
 
+GROUP = "splatseed.methods"
+
+BUILT_IN = {
+    "linear": "splatseed.upsample.methods.simplices:Linear",
+    "triangle": "splatseed.upsample.methods.simplices:Triangle",
+    "spline": "splatseed.upsample.methods.spline:Spline",
+    "mls": "splatseed.upsample.methods.mls:Mls",
+    "voronoi": "splatseed.upsample.methods.voronoi:Voronoi",
+    "depth": "splatseed.upsample.methods.depth:Depth",
+    "random": "splatseed.upsample.methods.bounding_box:BoundingBox",
+}
+
+_CODED = "linear triangle spline mls voronoi depth random stereo cover cloud"
+SOURCE_CODES = {name: code for code, name in enumerate(_CODED.split(), start=1)}
+"""The ``PointCloud.source`` code of each built-in method, which files keep."""
+
+
+class MethodRegistry(Mapping[str, type[Upsampler]]):
+    """The methods by name; a class is imported when it is first looked up."""
+
+    def __getitem__(self, name: str) -> type[Upsampler]:
+        if name in BUILT_IN:
+            module, _, attribute = BUILT_IN[name].partition(":")
+            return cast("type[Upsampler]", getattr(import_module(module), attribute))
+        if name in self._plugins:
+            return cast("type[Upsampler]", self._plugins[name].load())
+        raise ParameterError(
+            f"one of the methods {', '.join(self)}", found=repr(name), fix="Choose one of these."
+        )
+
+    def __contains__(self, name: object) -> bool:
+        return name in BUILT_IN or name in self._plugins
+
+    def __iter__(self) -> Iterator[str]:
+        yield from BUILT_IN
+        yield from self._plugins
+
+    def __len__(self) -> int:
+        return len(BUILT_IN) + len(self._plugins)
+
+    @cached_property
+    def _plugins(self) -> dict[str, EntryPoint]:
+        return {
+            entry.name: entry for entry in entry_points(group=GROUP) if entry.name not in BUILT_IN
+        }
+
+
+METHODS = MethodRegistry()
+
+
+def add_built_in(methods: Mapping[str, str]) -> None:
+    """Let a part of the package that imports this one add methods: "module:Class" by name."""
+    BUILT_IN.update(methods)
+
+
+def source_code(name: str) -> int:
+    """The ``PointCloud.source`` code of a method; 255 for every third-party method."""
+    return SOURCE_CODES.get(name, GENERATED)
+
+
+def origin_name(code: int) -> str:
+    """The name of a ``PointCloud.source`` code."""
+    names = {ORIGINAL: "original", **{code: name for name, code in SOURCE_CODES.items()}}
+    return names.get(code, "other")
+
+
 Profile = Literal["default", "paper"]
 DEFAULT_RATIO = 4.0
-BYTES_EACH = 200
-"""Memory per point while it is made and written; measured as 125, from 1 to 3 million points."""
-MAX_POINTS = 1 << 32
-"""A request for more points than this is a typo."""
+BYTES_EACH = 200  # memory per point while it is made and written; measured as 125 at 1 to 3 million
+MAX_POINTS = 1 << 32  # a request for more points than this is a typo
 
 
 def configure(method: str, profile: Profile = "default", **parameters: Any) -> Upsampler:
@@ -125,10 +196,23 @@ def upsample(
     """
     whole = scene if isinstance(scene, Scene) else Scene(scene)
     originals = whole.points.originals
-    chosen = _choose(method, profile, parameters)
-    name = method if isinstance(method, str) else _name_of(chosen)
+    if isinstance(method, str):
+        chosen, name = configure(method, profile, **parameters), method
+    elif extra := [*parameters, *(["profile"] if profile != "default" else [])]:
+        raise ParameterError(
+            f"nothing beside {method!r}, which has its own parameters",
+            found=", ".join(extra),
+            fix="Give the method by name, or set its fields with dataclasses.replace.",
+        )
+    else:
+        chosen, kind = method, type(method)
+        name = next((each for each in METHODS if METHODS[each] is kind), kind.__name__)
     num_new = number_of_new(chosen, name, len(originals), ratio, num_points)
-    rng = _generator(seed)
+    if not isinstance(seed, (int, np.integer)) or seed < 0:
+        raise ParameterError(
+            "a seed that is a whole number from 0", found=repr(seed), fix="Choose such a seed."
+        )
+    rng = np.random.default_rng(seed)
     if num_new == 0 and len(originals) > 0:
         return originals
     if "points" in traits_of(chosen).needs and not originals.finite.any():
@@ -145,11 +229,7 @@ def upsample(
 
 
 def number_of_new(
-    method: Upsampler,
-    name: str,
-    num_original: int,
-    ratio: float | None,
-    num_points: int | None,
+    method: Upsampler, name: str, num_original: int, ratio: float | None, num_points: int | None
 ) -> int | None:
     """How many points to make; None if the photographs determine it.
 
@@ -185,14 +265,7 @@ def upsample_points(
 ) -> tuple[Float32[np.ndarray, "M 3"], UInt8[np.ndarray, "M 3"]]:
     """Arrays in, arrays out: ``upsample`` without a cloud around them.
 
-    Args:
-        xyz: Positions, [N, 3].
-        rgb: Colours, uint8 [N, 3].
-        method: As in ``upsample``.
-        options: As in ``upsample``: ratio, num_points, seed, profile, parameters of the method.
-
-    Returns:
-        xyz float32 [M, 3] and rgb uint8 [M, 3]; the first N rows are the input.
+    The first N rows of the result are the input; method and options are those of ``upsample``.
 
     Raises:
         PointCloudError: The arrays' shapes or types do not fit, or there are too few points.
@@ -237,36 +310,10 @@ def planned_size(num_original: int, ratio: float | None, num_points: int | None)
     return num_points
 
 
-def _choose(method: str | Upsampler, profile: Profile, parameters: dict[str, Any]) -> Upsampler:
-    """The method to run; one that comes with its parameters takes no others."""
-    if isinstance(method, str):
-        return configure(method, profile, **parameters)
-    extra = [*parameters, *(["profile"] if profile != "default" else [])]
-    if extra:
-        raise ParameterError(
-            f"nothing beside {method!r}, which has its own parameters",
-            found=", ".join(extra),
-            fix="Give the method by name, or set its fields with dataclasses.replace.",
-        )
-    return method
-
-
-def _generator(seed: int) -> np.random.Generator:
-    """The source of all random numbers."""
-    if not isinstance(seed, (int, np.integer)) or seed < 0:
-        raise ParameterError(
-            "a seed that is a whole number from 0", found=repr(seed), fix="Choose such a seed."
-        )
-    return np.random.default_rng(seed)
-
-
 def as_cloud(new: NewPoints, num_new: int, code: int) -> PointCloud:
-    """The new points with all attributes from their method; third parties' are checked, too.
+    """What a method returned that was to make ``num_new`` points, checked.
 
-    Args:
-        new: What a method returned.
-        num_new: How many points it was to make.
-        code: Their ``source``, if the method gives none.
+    ``code`` is their ``source``, if the method gives none.
 
     Raises:
         PointCloudError: Points are not finite, arrays do not fit, or new points claim to be
@@ -288,8 +335,3 @@ def as_cloud(new: NewPoints, num_new: int, code: int) -> PointCloud:
         )
     known = {name: getattr(new, name) for name in ATTRIBUTES}
     return PointCloud(new.xyz, new.rgb, source, **known)
-
-
-def _name_of(method: Upsampler) -> str:
-    """The registered name of a method instance, or its class name."""
-    return next((n for n in METHODS if METHODS[n] is type(method)), type(method).__name__)

@@ -34,8 +34,7 @@ from splatseed.progress import Progress
 from splatseed.runtime.jit import inline, kernel, parallel_range
 from splatseed.upsample.neighbors import PreparedCloud
 
-MAX_NEIGHBORS = 58
-"""So that planes, with the cube's 6, are 64."""
+MAX_NEIGHBORS = 58  # so that planes, with the cube's 6, are 64
 MAX_PLANES = 6 + MAX_NEIGHBORS
 MAX_VERTICES = 2 * MAX_PLANES  # 2 F - 4 on a simple polytope of F faces
 COINCIDENT = 1e-12
@@ -45,18 +44,15 @@ COINCIDENT = 1e-12
 class Cells(NamedTuple):
     """Cells of n sites, all relative to the site.
 
-    ``center`` and ``radius`` describe the cell with its vertices clamped to the clamping distance.
+    ``center``, their mean, and ``radius``, the largest distance from it, are of vertices clamped to
+    the clamping distance; ``closed`` tells true Voronoi cells: no face of the cube is left, and the
+    security radius was passed.
     """
 
     center: Float64[np.ndarray, "n 3"]
-    """Mean of the clamped vertices, [n, 3]."""
     radius: Float64[np.ndarray, " n"]
-    """Largest distance of a clamped vertex from ``center``, [n]."""
-    volume: Float64[np.ndarray, " n"]
-    """Volume of the cell within its cube, [n]."""
+    volume: Float64[np.ndarray, " n"]  # within the cube
     closed: Bool[np.ndarray, " n"]
-    """Whether the cell is the true Voronoi cell: no cube face is left, and the security radius was
-    passed, [n]."""
 
 
 def build_cells(
@@ -70,14 +66,8 @@ def build_cells(
 ) -> None:
     """Fill rows ``first:last`` of ``cells``.
 
-    Args:
-        xyz: Sites, [n, 3].
-        idx: Their neighbours, nearest first, [n, k] with k <= 58.
-        distance: Distances of the neighbours, [n, k].
-        frames: Axes of each cube, [n, 3, 3].
-        first: First row.
-        last: One past the last row.
-        cells: Written in place.
+    ``frames`` are the axes of each cube, ``idx`` and ``distance`` its neighbours, nearest first,
+    ``MAX_NEIGHBORS`` at most.
     """
     _build(xyz, idx, distance, frames, first, last, *cells)
 
@@ -259,21 +249,17 @@ def _clamp(vertex, count, reach, center):  # type: ignore[no-untyped-def]  # Num
     return math.sqrt(largest)
 
 
-ENLARGE = 0.1
-"""The paper's 10%."""
-FLAT = 1e-14
-"""Tetrahedra flatter than this, relative to their edges, have no usable circumcentre."""
-SAME = 1e-9
-"""Circumcentres of neighbours closer than this, in circumradii, are one Voronoi vertex."""
+ENLARGE = 0.1  # the paper's 10%
+FLAT = 1e-14  # tetrahedra flatter than this, relative to their edges, have no usable circumcentre
+SAME = 1e-9  # circumcentres of neighbours closer than this, in circumradii, are one Voronoi vertex
 
 
 def box_cells(
     cloud: PreparedCloud, progress: Progress
 ) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
-    """Centre relative to the site [n, 3], radius [n] and volume [n] of each original's cell.
+    """Centre relative to the site, radius and volume of each original's cell.
 
-    The centre is the mean of the cell's vertices, the radius the largest distance of a vertex from
-    it.
+    The centre is the mean of the vertices, the radius the largest distance of one from it.
 
     Raises:
         PointCloudError: Qhull fails, as it can on coplanar input.
@@ -301,7 +287,7 @@ def box_cells(
 def _corners(xyz: np.ndarray) -> np.ndarray:
     """Corners [8, 3] of the bounding box enlarged by 10% about its middle."""
     low, high = xyz.min(axis=0), xyz.max(axis=0)
-    # A flat cloud gets a box of some thickness, or the corners would coincide.
+    # a flat cloud gets a box of some thickness, or the corners would coincide.
     half = np.maximum((high - low) / 2, 1e-3 * (high - low).max()) * (1 + ENLARGE)
     signs = np.array(list(itertools.product((-1, 1), repeat=3)))
     return np.asarray((low + high) / 2 + signs * half)

@@ -11,17 +11,8 @@ from __future__ import annotations
 import dataclasses
 import math
 import types
-from typing import (
-    Any,
-    Literal,
-    NamedTuple,
-    Protocol,
-    Union,
-    get_args,
-    get_origin,
-    get_type_hints,
-    runtime_checkable,
-)
+import typing
+from typing import Any, Literal, NamedTuple, Protocol, Union, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32, UInt8
@@ -32,22 +23,15 @@ from splatseed.scene import Scene
 
 
 class NewPoints(NamedTuple):
-    """What a method returns: positions, colours, and optional attributes of its points."""
+    """What a method returns; attributes of points are NaN where unknown."""
 
-    xyz: Float32[np.ndarray, "M 3"]
-    """World positions, float32 [M, 3]."""
+    xyz: Float32[np.ndarray, "M 3"]  # world
     rgb: UInt8[np.ndarray, "M 3"]
-    """Colours, uint8 [M, 3]."""
-    notes: tuple[str, ...] = ()
-    """Notes for the user, one sentence each."""
-    normals: Float32[np.ndarray, "M 3"] | None = None
-    """Unit normals, world axes, float32 [M, 3]; NaN where unknown."""
-    sizes: Float32[np.ndarray, " M"] | None = None
-    """Initial radius of a Gaussian there, float32 [M], scene units; NaN where unknown."""
-    confidence: Float32[np.ndarray, " M"] | None = None
-    """Confidence that a surface is there, float32 [M], 0 to 1; NaN where unknown."""
-    source: UInt8[np.ndarray, " M"] | None = None
-    """Codes of the methods that made them, uint8 [M], never 0; the method's own when left out."""
+    notes: tuple[str, ...] = ()  # for the user, one sentence each
+    normals: Float32[np.ndarray, "M 3"] | None = None  # unit, world axes
+    sizes: Float32[np.ndarray, " M"] | None = None  # initial radius of a Gaussian, scene units
+    confidence: Float32[np.ndarray, " M"] | None = None  # that a surface is there, 0 to 1
+    source: UInt8[np.ndarray, " M"] | None = None  # codes of their methods, never 0; None: its own
 
 
 Need = Literal["points", "depth", "photographs", "cloud"]
@@ -55,12 +39,9 @@ Need = Literal["points", "depth", "photographs", "cloud"]
 
 @dataclasses.dataclass(frozen=True)
 class Traits:
-    """What a method needs from a scene, and who determines its number of points.
+    """What a method needs from a scene, and whether the photographs determine its number of points.
 
-    Args:
-        needs: What the scene must have.
-        chooses_number: Whether the photographs determine the number of points; the method is then
-            called with 0.
+    If so, the method is called with 0.
     """
 
     needs: frozenset[Need] = frozenset({"points"})
@@ -108,7 +89,7 @@ def check_fields(method: Any) -> None:
     Raises:
         ParameterError: A field is not of its type, or not one of its choices.
     """
-    hints = get_type_hints(type(method))
+    hints = typing.get_type_hints(type(method))
     label = getattr(method, "name", type(method).__name__.lower())
     for field in dataclasses.fields(method):
         value, hint = getattr(method, field.name), hints[field.name]
@@ -119,10 +100,10 @@ def check_fields(method: Any) -> None:
 
 def fits(value: object, hint: Any) -> bool:
     """Whether a value has a type: a plain one, a choice of literals, or a union of these."""
-    if get_origin(hint) is Literal:
-        return isinstance(value, str) and value in get_args(hint)
-    if get_origin(hint) in {Union, types.UnionType}:
-        return any(fits(value, choice) for choice in get_args(hint))
+    if typing.get_origin(hint) is Literal:
+        return isinstance(value, str) and value in typing.get_args(hint)
+    if typing.get_origin(hint) in {Union, types.UnionType}:
+        return any(fits(value, choice) for choice in typing.get_args(hint))
     if isinstance(value, (bool, np.bool_)):
         return hint is bool
     if hint is float:
@@ -134,8 +115,8 @@ def fits(value: object, hint: Any) -> bool:
 
 def _describe(hint: Any) -> str:
     """A type in words."""
-    if get_origin(hint) in {Literal, Union, types.UnionType}:
-        return " or ".join(_describe(choice) for choice in get_args(hint))
+    if typing.get_origin(hint) in {Literal, Union, types.UnionType}:
+        return " or ".join(_describe(choice) for choice in typing.get_args(hint))
     plain = {int: "a whole number", float: "a finite number", bool: "true or false"}
     if isinstance(hint, type):
         return "none" if hint is type(None) else plain.get(hint, hint.__name__)

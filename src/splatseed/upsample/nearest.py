@@ -12,7 +12,7 @@ values as in the paper, rounded to the nearest.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol, Self, TypeAlias
 
@@ -40,10 +40,10 @@ RowData: TypeAlias = Mapping[str, np.ndarray]
 
 
 class UniformSource(Protocol):
-    """A source of uniform numbers: a NumPy generator, or the part of its stream that a tile has."""
+    """A NumPy generator, or the part of its stream that a tile has."""
 
     def random(self, size: Any, dtype: Any) -> Float32[np.ndarray, "..."]:
-        """Numbers from 0 to 1, float32; the first axis is that of the new points."""
+        """Numbers from 0 to 1; the first axis is that of the new points."""
         ...
 
 
@@ -94,11 +94,7 @@ class NearestMethod(ABC):
         return self.place(cloud, neighbors, known, bases, rng, progress)
 
     def check_enough(self, number: int) -> None:
-        """Refuse a cloud with fewer distinct points than the method needs.
-
-        Raises:
-            PointCloudError: It has.
-        """
+        """Refuse a cloud with fewer distinct points than the method needs (PointCloudError)."""
         if number < self.min_points:
             raise PointCloudError(
                 f"at least {self.min_points} distinct finite points for {type(self).__name__}",
@@ -107,17 +103,11 @@ class NearestMethod(ABC):
             )
 
     def weigh(
-        self,
-        cloud: PreparedCloud,
-        neighbors: Neighbors,
-        progress: Progress,  # noqa: ARG002  (some methods take long)
+        self, cloud: PreparedCloud, neighbors: Neighbors, progress: Progress
     ) -> tuple[Float64[np.ndarray, " n"], RowData]:
-        """Each own row's weight as a base, [n], and what ``place`` is to know of own rows.
+        """Each own row's weight as a base, and what ``place`` is to know of own rows.
 
-        Args:
-            cloud: The prepared originals.
-            neighbors: ``num_queried`` neighbours, of own rows and of all their neighbours.
-            progress: Told the stage.
+        ``neighbors`` are ``num_queried``, of own rows and of all their neighbours.
         """
         if not self.reject_isolated:
             return np.ones(cloud.num_own), {}
@@ -133,52 +123,17 @@ class NearestMethod(ABC):
         rng: UniformSource,
         progress: Progress,
     ) -> NewPoints:
-        """Make the points of all bases.
+        """Make the points of all bases; ``neighbors`` are ``num_neighbors`` of own rows.
 
-        Args:
-            cloud: The prepared originals.
-            neighbors: ``num_neighbors`` neighbours of own rows.
-            known: What ``weigh`` has found.
-            bases: How many points each own row makes.
-            rng: Where random numbers come from.
-            progress: Told the stage.
+        ``known`` is what ``weigh`` has found.
         """
 
 
-def blended(
-    blend: Callable[..., None],
-    cloud: PreparedCloud,
-    neighbors: Neighbors,
-    bases: Bases,
-    draws: Float32[np.ndarray, "new ..."],
-) -> NewPoints:
-    """New points that a kernel blends from each base and its neighbours.
-
-    Args:
-        blend: A kernel of positions, colours, centre, neighbours, each row's first new point and
-            number of them, and draws; it fills positions and colours.
-        cloud: The prepared originals.
-        neighbors: Neighbours of own rows.
-        bases: How many points each own row makes.
-        draws: Uniform numbers, a row per new point.
-    """
-    new = NewPoints(np.empty((len(draws), 3), np.float32), np.empty((len(draws), 3), np.uint8))
-    blend(
-        cloud.xyz, cloud.rgb, cloud.center, neighbors.idx, bases.start, bases.count, draws,
-        new.xyz, new.rgb,
-    )  # fmt: skip
-    return new
-
-
-FLOOR = 0.01
-"""Lower limit of distances, in units of the base point's spacing."""
+FLOOR = 0.01  # lower limit of distances, in units of the base point's spacing
 
 
 def interpolate_colors(
-    cloud: PreparedCloud,
-    neighbors: Neighbors,
-    bases: Bases,
-    new_xyz: Float32[np.ndarray, "M 3"],
+    cloud: PreparedCloud, neighbors: Neighbors, bases: Bases, new_xyz: Float32[np.ndarray, "M 3"]
 ) -> UInt8[np.ndarray, "M 3"]:
     """Colours uint8 [M, 3] of new points at world positions ``new_xyz``."""
     rgb = np.empty((bases.total, 3), np.uint8)

@@ -14,7 +14,6 @@ neighbours of its own, but no bases (``upsample.tiles``).
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -28,20 +27,15 @@ from splatseed.progress import Progress, in_threads, silent
 from splatseed.runtime.memory import check_memory
 from splatseed.scene import Scene
 
-SPACING_NEIGHBORS = 6
-"""Nearest points over which the spacing h is averaged."""
-OUTLIER_NEIGHBORS = 16
-"""Neighbours that a point's spacing is compared with."""
+SPACING_NEIGHBORS = 6  # nearest points over which the spacing h is averaged
+OUTLIER_NEIGHBORS = 16  # neighbours that a point's spacing is compared with
 OUTLIER_FACTOR = 3.0
 """Times their lower quartile, at which a point is isolated: catches 62% of planted outliers."""
 NEIGHBOR_BYTES = 12
 """What is held of each neighbour of each point: its row, int32, and its distance, float64."""
-QUERY_BLOCK = 1 << 13
-"""Rows per task of a thread."""
-SHORT_TRACK = 3
-"""Images, up to which a track counts as short."""
-BAD_ERROR = 2.0
-"""Reprojection errors above this are bad, in units of the scene's median."""
+QUERY_BLOCK = 1 << 13  # rows per task of a thread
+SHORT_TRACK = 3  # images, up to which a track counts as short
+BAD_ERROR = 2.0  # reprojection errors above this are bad, in units of the scene's median
 DRAW_BLOCK = 1 << 20
 """Ranks whose bases are drawn together: first how many each block of ranks makes, then which in it
 make them, so that clouds larger than memory are drawn a block at a time."""
@@ -49,12 +43,7 @@ make them, so that clouds larger than memory are drawn a block at a time."""
 
 @dataclass(frozen=True, eq=False)
 class Neighbors:
-    """The k nearest other originals of every row.
-
-    Args:
-        idx: Rows of the neighbours, int32 [n, k], nearest first.
-        distance: Their distances, float64 [n, k], scene units.
-    """
+    """Rows of the k nearest other originals of every row, nearest first, and their distances."""
 
     idx: Int32[np.ndarray, "n k"]
     distance: Float64[np.ndarray, "n k"]
@@ -80,28 +69,16 @@ class Neighbors:
 
 @dataclass(frozen=True, eq=False)
 class PreparedCloud:
-    """Distinct finite originals in spatial order.
+    """Distinct finite originals in spatial order."""
 
-    Args:
-        xyz: Positions relative to ``center``, float64 [n, 3], scene units.
-        rgb: Colours, uint8 [n, 3].
-        rank: Place of each row in file order, int64 [n].
-        trusted: Rows that may serve as bases, bool [n].
-        center: Centroid in the world, float64 [3].
-        tree: kd-tree over the positions in file order; None in a tile of a larger cloud, whose
-            neighbours are found elsewhere.
-        progress: Called with the stage and the fraction done.
-        halo: Rows at the end that are neighbours only.
-    """
-
-    xyz: Float64[np.ndarray, "n 3"]
+    xyz: Float64[np.ndarray, "n 3"]  # relative to ``center``, scene units
     rgb: UInt8[np.ndarray, "n 3"]
-    rank: Int64[np.ndarray, " n"]
-    trusted: Bool[np.ndarray, " n"]
-    center: Float64[np.ndarray, " 3"]
-    tree: cKDTree
+    rank: Int64[np.ndarray, " n"]  # place of each row in file order
+    trusted: Bool[np.ndarray, " n"]  # rows that may serve as bases
+    center: Float64[np.ndarray, " 3"]  # centroid in the world
+    tree: cKDTree  # over the positions in file order; None in a tile of a larger cloud
     progress: Progress = silent
-    halo: int = 0
+    halo: int = 0  # rows at the end that are neighbours only
 
     def __len__(self) -> int:
         return len(self.xyz)
@@ -152,9 +129,7 @@ def least_distance(farthest: float) -> float:
 
 
 def prepare(
-    points: PointCloud,
-    trusted: Bool[np.ndarray, " N"] | None = None,
-    progress: Progress = silent,
+    points: PointCloud, trusted: Bool[np.ndarray, " N"] | None = None, progress: Progress = silent
 ) -> PreparedCloud:
     """Mask, de-duplicate, centre and sort the originals of a cloud.
 
@@ -185,20 +160,12 @@ def prepare(
 
 
 def prepare_scene(scene: Scene, progress: Progress = silent) -> PreparedCloud:
-    """The originals of a scene, prepared; only trusted ones may serve as bases.
-
-    Args:
-        scene: The scene; its tracks determine which originals are trusted.
-        progress: Called with the stage "neighbours" during the neighbour query.
-
-    Raises:
-        PointCloudError: No finite original is left.
-    """
+    """``prepare`` the originals of a scene; only ``trusted_originals`` may serve as bases."""
     return prepare(scene.points.originals, trusted_originals(scene), progress)
 
 
 def trusted_originals(scene: Scene) -> Bool[np.ndarray, " N"] | None:
-    """Which of the N originals may be bases, having a long track or a fair error.
+    """Which of the N originals may be bases, having a long track or a fair error; None: all.
 
     A point that few images saw and that reprojects badly is often a mismatch. On the demo capture,
     whose outliers are planted, this rule catches 43% of them and costs 0.8% of the rest, and
@@ -206,9 +173,6 @@ def trusted_originals(scene: Scene) -> Bool[np.ndarray, " N"] | None:
     (7-Scenes red kitchen against its depth maps) it catches only 3% of the points over 40 cm off:
     it is a safeguard, and therefore cautious. An untrusted point stays in the output; only nothing
     is made from it.
-
-    Returns:
-        bool [N]; None if the scene has no tracks, or none with a known error.
     """
     tracks = scene.tracks
     if tracks is None or len(tracks) != scene.points.num_original or len(tracks) == 0:
@@ -224,12 +188,7 @@ def trusted_originals(scene: Scene) -> Bool[np.ndarray, " N"] | None:
 class Bases:
     """How many new points each row makes, and where they go (a CSR layout).
 
-    Row i makes the new points ``start[i] : start[i] + count[i]``, ordered by rank.
-
-    Args:
-        start: First new point of each row, int64 [n].
-        count: New points of each row, int64 [n].
-        total: All new points, M.
+    Row i makes the new points ``start[i] : start[i] + count[i]``, ordered by rank; all are M.
     """
 
     start: Int64[np.ndarray, " n"]
@@ -280,20 +239,13 @@ def draw_in_block(
 
 
 def sound_bases(cloud: PreparedCloud, neighbors: Neighbors) -> Float64[np.ndarray, " n"]:
-    """Weight 1 for own rows that may serve as bases and are not isolated, else 0, float64 [n].
+    """Weight 1 for own rows that may serve as bases and are not isolated, else 0.
 
     A row is isolated when its spacing is over 3 times the lower quartile of its neighbours'
     spacings: local, so that a sparse background is not taken for noise as a global filter would.
     """
-    own = slice(cloud.num_own)
-    lonely = _isolated(neighbors.idx[own, :OUTLIER_NEIGHBORS], neighbors.spacing)
-    return np.asarray(cloud.trusted[own] & ~lonely, np.float64)
-
-
-def _isolated(
-    idx: Int32[np.ndarray, "n k"], spacing: Float64[np.ndarray, " n"]
-) -> Bool[np.ndarray, " n"]:
-    """Rows whose spacing exceeds 3 times the lower quartile of their neighbours'."""
+    own, spacing = slice(cloud.num_own), neighbors.spacing
+    idx = neighbors.idx[own, :OUTLIER_NEIGHBORS]
     isolated = np.empty(len(idx), bool)
     # The lower quartile, which a few outliers among the neighbours do not move.
     nth = idx.shape[1] // 4
@@ -303,35 +255,24 @@ def _isolated(
         isolated[start:stop] = spacing[start:stop] > OUTLIER_FACTOR * quartile
 
     in_threads(judge, len(idx), QUERY_BLOCK, "isolated points", silent)
-    return isolated
+    return np.asarray(cloud.trusted[own] & ~isolated, np.float64)
 
 
-AT_ONCE = 1 << 20
-"""Neighbours fetched at once for points at whose k-th distance there are several."""
-FEW = 1 << 22
-"""Distances up to which NumPy is quick enough where Numba is not loaded, as in ``splatseed info``;
-the kernel gives the same bytes."""
-ROWS = 1 << 14
-"""Points at a time, so that what is computed on the way stays in the cache."""
+AT_ONCE = 1 << 20  # neighbours fetched at once for points at whose k-th distance there are several
 
 
 def nearest_others(
     tree: cKDTree, xyz: Float64[np.ndarray, "q 3"], own: Int64[np.ndarray, " q"], k: int
 ) -> tuple[Float64[np.ndarray, "q k"], Int64[np.ndarray, "q k"]]:
-    """The k points of a tree nearest to each query, itself left out.
+    """Distances and numbers of the k points of a tree nearest to each query, itself left out.
 
-    Args:
-        tree: The tree, of n points.
-        xyz: Queries, [q, 3].
-        own: Number of the tree's point that a query is, [q]; -1 if it is none of them.
-        k: Neighbours per query.
-
-    Returns:
-        Distances, nearest first, infinite where the tree has fewer points; and numbers, n there.
+    ``own`` is the number of the tree's point that a query is, -1 if it is none of them. Where the
+    tree, of n points, has fewer, distances are infinite and numbers n.
     """
     # One for the query itself, and one to see whether another is as far as the k-th.
     distance, number = _others(tree, xyz, own, k + 2)
-    tied = np.flatnonzero(_has_ties(distance[:, : k + 1]))
+    first, second = distance[:, :k], distance[:, 1 : k + 1]
+    tied = np.flatnonzero(((first == second) & np.isfinite(second)).any(axis=1))
     if len(tied):
         distance[tied, :k], number[tied, :k] = _resolved(tree, xyz[tied], own[tied], k, k + 2)
     return distance[:, :k], number[:, :k]
@@ -356,12 +297,6 @@ def _others(
             rows = values[other]
             values[other] = np.where(moved, np.roll(rows, 1, axis=1), rows)
     return distance[:, 1:], number[:, 1:]
-
-
-def _has_ties(distance: np.ndarray) -> np.ndarray:
-    """Rows in which two finite distances are equal."""
-    equal = (distance[:, 1:] == distance[:, :-1]) & np.isfinite(distance[:, 1:])
-    return np.asarray(equal.any(axis=1))
 
 
 def _resolved(
@@ -392,21 +327,18 @@ def sort_rows(
 def distances_of(
     xyz: Float64[np.ndarray, "n 3"], idx: Int32[np.ndarray, "m k"], least: float
 ) -> Float64[np.ndarray, "m k"]:
-    """The distances of the first m rows from their neighbours, at least ``least``, [m, k].
+    """The distances of the first m rows from their neighbours, at least ``least``.
 
     Computed here and not taken from the tree, so that neighbours that were stored as numbers alone
     get the same distances again.
     """
     distance = np.empty(idx.shape)
-    if idx.size > FEW or "numba" in sys.modules:
-        from splatseed.upsample.distances import fill_distances  # noqa: PLC0415  (loads Numba)
 
-        fill_distances(xyz, idx, float(least), distance)
-        return distance
-    for start in range(0, len(idx), ROWS):
-        part = slice(start, start + ROWS)
-        apart = xyz[idx[part]] - xyz[part][: len(idx[part]), None]
+    def fill(start: int, stop: int) -> None:
+        apart = xyz[idx[start:stop]] - xyz[start:stop, None]
         apart *= apart
         squared = apart[..., 0] + apart[..., 1] + apart[..., 2]
-        distance[part] = np.maximum(np.sqrt(squared), least)
+        distance[start:stop] = np.maximum(np.sqrt(squared), least)
+
+    in_threads(fill, len(idx), QUERY_BLOCK, "distances", silent)
     return distance

@@ -30,25 +30,10 @@ COLLINEAR = 1e-9
 """Ratio of the two largest variances below which a neighbourhood counts as collinear."""
 
 
-def world_frames(
-    n: int,
-) -> tuple[Float64[np.ndarray, "n 3 3"], Bool[np.ndarray, " n"]]:
-    """The world's axes for each of ``n`` rows, [n, 3, 3], none of them collinear."""
-    return np.ascontiguousarray(np.broadcast_to(np.eye(3), (n, 3, 3))), np.zeros(n, bool)
-
-
 def local_frames(
     xyz: Float64[np.ndarray, "n 3"], idx: Int32[np.ndarray, "m k"]
 ) -> tuple[Float64[np.ndarray, "m 3 3"], Bool[np.ndarray, " m"]]:
-    """Principal axes of the first m rows and their k neighbours.
-
-    Args:
-        xyz: Positions, float64 [n, 3].
-        idx: Neighbour rows, int32 [m, k].
-
-    Returns:
-        Frames [m, 3, 3] with rows e_u, e_v, e_n, and which rows are collinear, bool [m].
-    """
+    """Axes e_u, e_v, e_n of the first m rows and their neighbours, and which are collinear."""
     frames, collinear = np.empty((len(idx), 3, 3)), np.empty(len(idx), bool)
     _frames(xyz, idx, frames, collinear, COLLINEAR)
     return frames, collinear
@@ -213,8 +198,7 @@ def _fix_signs(xyz, i, rows, frame):  # type: ignore[no-untyped-def]  # Numba's 
     frame[2, 2] = e_u[0] * e_v[1] - e_u[1] * e_v[0]
 
 
-TRIANGLE_NEIGHBORS = 8
-"""Neighbours from which the other two corners are drawn."""
+TRIANGLE_NEIGHBORS = 8  # neighbours from which the other two corners are drawn
 
 
 def place_on_disc(
@@ -304,30 +288,18 @@ def _box(xyz, idx, frames, start, count, uv):  # type: ignore[no-untyped-def]  #
                 uv[m, axis] = low + uv[m, axis] * (high - low)
 
 
-BLOCK = 1 << 13
-"""Base points that are fitted between two updates of the progress bar."""
-MIN_NEIGHBORS = 3
-"""Points other than the base that determine a plane with room for a height."""
+BLOCK = 1 << 13  # base points that are fitted between two updates of the progress bar
+MIN_NEIGHBORS = 3  # points other than the base that determine a plane with room for a height
 
 
 @dataclass(frozen=True, eq=False)
 class Patches:
-    """One patch per row, and the places on it where new points go.
-
-    Args:
-        cloud: The prepared originals, n rows.
-        neighbors: The k neighbours of each row.
-        bases: The new points of each row, M in all.
-        frames: Axes of each patch as rows e_u, e_v, e_n, float64 [n, 3, 3].
-        collinear: Rows with a collinear neighbourhood, bool [n].
-        uv: Position of each new point on its patch, float32 [M, 2], scene units.
-    """
+    """One patch per row, with its axes, and the places on it where new points go."""
 
     cloud: PreparedCloud
     neighbors: Neighbors
     bases: Bases
     frames: Float64[np.ndarray, "n 3 3"]
-    collinear: Bool[np.ndarray, " n"]
     uv: Float32[np.ndarray, "M 2"]
 
 
@@ -354,9 +326,8 @@ class PatchMethod(NearestMethod, ABC):
         super().__post_init__()
         require(self.k >= MIN_NEIGHBORS, f"{self.name}.k of at least {MIN_NEIGHBORS}", self.k)
         require(self.disc_radius > 0, f"{self.name}.disc_radius above 0", self.disc_radius)
-        require(
-            self.clamp is None or self.clamp >= 0, f"{self.name}.clamp of at least 0", self.clamp
-        )
+        clamp = self.clamp
+        require(clamp is None or clamp >= 0, f"{self.name}.clamp of at least 0", clamp)
 
     @abstractmethod
     def heights(
@@ -373,7 +344,7 @@ class PatchMethod(NearestMethod, ABC):
         self,
         cloud: PreparedCloud,
         neighbors: Neighbors,
-        known: RowData,  # noqa: ARG002  (the base's)
+        known: RowData,
         bases: Bases,
         rng: UniformSource,
         progress: Progress,
@@ -393,26 +364,24 @@ class PatchMethod(NearestMethod, ABC):
         if self.frame == "local":
             frames, collinear = local_frames(cloud.xyz, neighbors.idx)
         else:
-            frames, collinear = world_frames(len(neighbors.idx))
+            n = len(neighbors.idx)
+            frames, collinear = np.tile(np.eye(3), (n, 1, 1)), np.zeros(n, bool)
         if self.placement == "disc":
             uv = place_on_disc(neighbors, bases, collinear, self.disc_radius, rng)
         elif self.placement == "triangle":
             uv = place_in_triangle(cloud, neighbors, bases, frames, rng)
         else:
             uv = place_in_box(cloud, neighbors, bases, frames, rng)
-        return Patches(cloud, neighbors, bases, frames, collinear, uv)
+        return Patches(cloud, neighbors, bases, frames, uv)
 
 
 def lift(
     patches: Patches, height: Float32[np.ndarray, " M"], clamp: float | None
 ) -> Float32[np.ndarray, "M 3"]:
-    """World positions of the new points, float32 [M, 3].
+    """World positions of the new points at heights S(u, v).
 
-    Args:
-        patches: The patches.
-        height: S(u, v) of every new point, float32 [M].
-        clamp: Heights are clamped to the neighbours' range, widened on both sides by this fraction
-            of it; None leaves them unchanged.
+    Heights are clamped to the neighbours' range, widened on both sides by the fraction ``clamp`` of
+    it; None leaves them unchanged.
     """
     cloud, bases = patches.cloud, patches.bases
     out = np.empty((bases.total, 3), np.float32)

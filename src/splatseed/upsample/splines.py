@@ -29,19 +29,16 @@ from jaxtyping import Float32, Float64, Int8
 from splatseed.runtime.jit import inline, kernel, parallel_range
 from splatseed.upsample.patches import Patches
 
-CONTROL = 6
-"""Control values a side: 3 uniform intervals and cubic degree."""
-HEIGHT_UNIT = 1.5
-"""Unit of heights, in distances of the k-th neighbour."""
-LINE = 1e-6
-"""Least extent along v, as a fraction of the k-th distance: a collinear patch has none."""
+CONTROL = 6  # control values a side: 3 uniform intervals and cubic degree
+COEFFICIENTS = CONTROL * CONTROL
+HEIGHT_UNIT = 1.5  # unit of heights, in distances of the k-th neighbour
+LINE = 1e-6  # least extent along v, as a fraction of the k-th distance: a collinear patch has none
 
 
 def penalty() -> Float64[np.ndarray, "36 36"]:
     """The penalty matrix P, so that roughness = c' P c."""
     identity = np.eye(CONTROL)
-    first = np.diff(identity, axis=0)
-    second = np.diff(identity, n=2, axis=0)
+    first, second = np.diff(identity, axis=0), np.diff(identity, n=2, axis=0)
     slopes, bends = first.T @ first, second.T @ second
     return np.asarray(
         np.kron(bends, identity) + 2.0 * np.kron(slopes, slopes) + np.kron(identity, bends)
@@ -51,23 +48,17 @@ def penalty() -> Float64[np.ndarray, "36 36"]:
 class PatchBasis(NamedTuple):
     """The basis at the m = k + 1 data points of some rows; the base point is the last of each."""
 
-    weight: Float64[np.ndarray, "rows m 2 4"]
-    """The four non-zero cubic B-splines along u and along v."""
-    cell: Int8[np.ndarray, "rows m 2"]
-    """Index of the first of them."""
-    z: Float64[np.ndarray, "rows m"]
-    """Scaled heights."""
-    scale: Float64[np.ndarray, "rows 3"]
-    """Scene units per unit of u, v and z."""
+    weight: Float64[np.ndarray, "rows m 2 4"]  # the four non-zero B-splines along u and along v
+    cell: Int8[np.ndarray, "rows m 2"]  # index of the first of them
+    z: Float64[np.ndarray, "rows m"]  # scaled heights
+    scale: Float64[np.ndarray, "rows 3"]  # scene units per unit of u, v and z
 
 
 def patch_basis(patches: Patches, first: int, last: int) -> PatchBasis:
     """The basis at the data points of rows ``first:last``; rows without new points stay empty."""
     rows, m = last - first, patches.neighbors.k + 1
-    basis = PatchBasis(
-        np.zeros((rows, m, 2, 4)), np.zeros((rows, m, 2), np.int8), np.zeros((rows, m)),
-        np.ones((rows, 3)),
-    )  # fmt: skip
+    cell, z = np.zeros((rows, m, 2), np.int8), np.zeros((rows, m))
+    basis = PatchBasis(np.zeros((rows, m, 2, 4)), cell, z, np.ones((rows, 3)))
     _patch_basis(
         patches.cloud.xyz, patches.neighbors.idx, patches.neighbors.distance, patches.frames,
         patches.bases.count, first, last, *basis,
@@ -85,7 +76,7 @@ def evaluate(
 ) -> None:
     """Write S(u, v), in scene units, of all new points of rows ``first:last`` into ``out``.
 
-    Positions outside the domain get the height of the nearest position in it.
+    Outside the domain it is that of the nearest position in it.
     """
     _evaluate(
         patches.bases.start, patches.bases.count, patches.uv, coefficients, scale, first, last, out
@@ -157,11 +148,8 @@ def _evaluate(start, count, uv, coefficients, scale, first, last, out):  # type:
             out[m] = unit[2] * total
 
 
-LAMBDAS = np.logspace(-3.0, 2.0, 11)
-"""The candidates: from near interpolation to near a plane."""
-COEFFICIENTS = CONTROL * CONTROL
-FREE = 3
-"""Dimension of the planes."""
+LAMBDAS = np.logspace(-3.0, 2.0, 11)  # the candidates: from near interpolation to near a plane
+FREE = 3  # dimension of the planes
 
 
 def cross_validate(basis: PatchBasis, count: np.ndarray) -> Float64[np.ndarray, " rows"]:
@@ -238,7 +226,7 @@ def _remove_planes(planes, gram, y):  # type: ignore[no-untyped-def]  # Numba's 
         alpha = -math.copysign(math.sqrt(squared), v[column])
         v[column] -= alpha
         squared += alpha * alpha - 2.0 * alpha * (v[column] + alpha)
-        # A column that is 0 already, as of a collinear patch, needs no reflection.
+        # a column that is 0 already, as of a collinear patch, needs no reflection.
         if squared > 1e-24 * m:
             _reflect_rows(planes, v, column, squared)
             _reflect_rows(gram, v, column, squared)

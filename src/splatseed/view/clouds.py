@@ -18,7 +18,7 @@ from PIL import Image as PillowImage, ImageDraw
 from splatseed.camera import Camera
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
-from splatseed.upsample.registry import origin_name
+from splatseed.upsample import origin_name
 from splatseed.view.page import (
     GRID_SIDE,
     INK,

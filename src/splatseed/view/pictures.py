@@ -27,7 +27,7 @@ from splatseed.scene import Image, Scene
 from splatseed.seeding.coverage import covered_cells
 from splatseed.splat.gaussians import Gaussians, TrainingFrame
 from splatseed.splat.rendering import ModelRenderer, as_bytes, error_map
-from splatseed.upsample.registry import origin_name
+from splatseed.upsample import origin_name
 from splatseed.view.clouds import cell_picture
 from splatseed.view.models import Shown, pinhole_view
 from splatseed.view.page import BLANK, depth_picture, photograph_at

@@ -16,7 +16,7 @@ from PIL import Image as PillowImage
 from splatseed.camera import Camera
 from splatseed.pointcloud import GENERATED, ORIGINAL, PointCloud
 from splatseed.runtime.jit import inline
-from splatseed.upsample.registry import SOURCE_CODES
+from splatseed.upsample import SOURCE_CODES
 from splatseed.view.page import PAPER, fitted, resized
 
 DISCS_PER_SIDE = 340

@@ -1,5 +1,1 @@
-"""Photographs at a size, with their cameras: the input of depth, stereo, seeding and training.
-
-``view`` reads a scene's images as pinhole views, ``visibility`` tells which points each sees, and
-``pairs`` which to compare.
-"""
+"""Photographs at a size, with their cameras; which points each sees, and which views to compare."""

@@ -1,12 +1,9 @@
-"""Views: posed photographs in memory, at the size they are used at.
+"""Views: posed photographs of pinhole cameras in memory, at the size they are used at.
 
-Notation: a view is W x H pixels; ``K`` is in its own pixels, the centre of the top-left one at
-(0.5, 0.5); ``cam_from_world`` maps the scene's world to OpenCV camera axes. Promise: views have
-pinhole cameras only. A photograph is downsampled once, by a whole factor f, and never enlarged: a
-smaller copy is the mean over f x f blocks, rounded (pixels at the right and lower edge that do not
-fill a block are cut off), so intrinsics are divided by f and nothing else changes. Copies are kept
-by the content of the original, so a changed photograph is never mistaken for the old one. Only
-``cache_dir`` is written to, and a failure to write there is ignored.
+A photograph is downsampled once, by a whole factor f, and never enlarged: a smaller copy is the
+mean over f x f blocks, rounded (pixels at the right and lower edge that do not fill a block are cut
+off), so intrinsics are divided by f and nothing else changes. Copies are kept by the content of the
+original in ``cache_dir``, and a failure to write there is ignored.
 """
 
 from __future__ import annotations
@@ -18,9 +15,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool, Float64, UInt8
@@ -34,38 +29,22 @@ from splatseed.progress import Progress, silent
 from splatseed.runtime.memory import check_memory
 from splatseed.scene import Image, Scene
 
-if TYPE_CHECKING:
-    from PIL import Image as PilImage
-
 ASPECT_SLACK = 0.02
 """By how much a file's aspect ratio may differ from its camera's: the rounding of a copy."""
-READERS = 4
-"""Threads that decode photographs."""
-BYTES_A_PIXEL = 3
-"""Bytes per pixel of a photograph in memory: three colours."""
+READERS = 4  # threads that decode photographs
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A posed photograph.
+    """A posed photograph."""
 
-    Args:
-        name: The image's name in its scene.
-        photograph: Its pixels, sRGB, uint8 [H, W, 3].
-        K: Pinhole matrix in pixels of ``photograph``, float64 [3, 3].
-        width: W.
-        height: H.
-        cam_from_world: World to OpenCV camera axes, float64 [4, 4].
-        mask: Which pixels the photograph shows, bool [H, W]; the others are black. None: all.
-    """
-
-    name: str
-    photograph: UInt8[np.ndarray, "H W 3"]
-    K: Float64[np.ndarray, "3 3"]
+    name: str  # the image's name in its scene
+    photograph: UInt8[np.ndarray, "H W 3"]  # sRGB
+    K: Float64[np.ndarray, "3 3"]  # in pixels of the photograph
     width: int
     height: int
     cam_from_world: Float64[np.ndarray, "4 4"]
-    mask: Bool[np.ndarray, "H W"] | None = None
+    mask: Bool[np.ndarray, "H W"] | None = None  # pixels it shows, the others are black; None: all
 
     @property
     def camera(self) -> Camera:
@@ -74,15 +53,7 @@ class View:
 
 
 def poses_of(images: Sequence[Image], data_factor: int = 1) -> tuple[View, ...]:
-    """The views of some images without their pixels, where only their frames matter.
-
-    Args:
-        images: The images.
-        data_factor: The factor by which photographs are downsampled.
-
-    Raises:
-        SceneFormatError: A photograph would have no pixel left.
-    """
+    """The views of some images without their pixels, where only their frames matter."""
     unseen, views = np.empty((0, 0, 3), np.uint8), []
     shrink = np.diag([1 / data_factor, 1 / data_factor, 1.0])
     for image in images:
@@ -109,15 +80,9 @@ def load_split(
     cache_dir: Path | None = None,
     progress: Progress = silent,
 ) -> tuple[tuple[View, ...], tuple[View, ...]]:
-    """The training and the test views of a scene, sorted by name; see ``Scene.split``.
+    """The training and the test views of a scene, sorted by name: see ``Scene.split``.
 
-    Args:
-        scene: A scene with images, as read from files.
-        data_factor: The factor by which photographs are downsampled.
-        test_every: Every ``test_every``-th image, sorted by name, is a test view.
-        min_side: The least number of pixels of a view's shorter side.
-        cache_dir: Where smaller copies are kept for the next run; nowhere when left out.
-        progress: Called with the stage and the fraction done.
+    Every ``test_every``-th is a test view; the other arguments are those of ``load_views``.
 
     Raises:
         SceneNotFoundError: Images are missing, or too few.
@@ -131,13 +96,9 @@ def load_split(
             fix="Name a scene with photographs: a point cloud alone cannot be trained.",
         )
     views = load_views(
-        scene,
-        (*train, *test),
-        data_factor=data_factor,
-        min_side=min_side,
-        cache_dir=cache_dir,
+        scene, (*train, *test), data_factor=data_factor, min_side=min_side, cache_dir=cache_dir,
         progress=progress,
-    )
+    )  # fmt: skip
     return views[: len(train)], views[len(train) :]
 
 
@@ -158,8 +119,8 @@ def load_views(
         images: The images.
         data_factor: The factor by which photographs are downsampled.
         min_side: The least number of pixels of a view's shorter side.
-        undistort: Remove lens distortion from photographs that have some, instead of refusing them.
-        cache_dir: Where smaller copies are kept for the next run; nowhere when left out.
+        undistort: Remove lens distortion instead of refusing it.
+        cache_dir: Where smaller copies are kept for the next run, if anywhere.
         progress: Called with the stage and the fraction done.
 
     Raises:
@@ -180,16 +141,15 @@ def load_views(
         first, factor = folder / images[0].name, max(data_factor, 1)
         width, height = open_photograph(first, photograph_bytes(first)).size
         check_memory(
-            len(images) * width * height // factor**2, BYTES_A_PIXEL, "pixels of photographs",
+            len(images) * width * height // factor**2, 3, "pixels of photographs",
             found=f"{len(images)} of {width} x {height}, downsampled by {factor}",
             fix="Downsample more (--data-factor), take fewer, or free some memory.",
         )  # fmt: skip
-    read = partial(
-        _load_view, folder=folder, data_factor=data_factor, min_side=min_side, cache_dir=cache_dir
-    )
     views = []
     with ThreadPoolExecutor(READERS) as pool:
-        for view in pool.map(read, images):
+        for view in pool.map(
+            lambda image: _load_view(image, folder, data_factor, min_side, cache_dir), images
+        ):
             views.append(view)
             progress("read images", len(views) / len(images))
     return tuple(views)
@@ -198,15 +158,9 @@ def load_views(
 def check_lens(
     image: Image, scene: Path | None = None, reason: str = "which Gaussians are drawn with"
 ) -> None:
-    """Refuse an image whose camera has lens distortion.
+    """Refuse an image whose camera has lens distortion (SceneFormatError), and tell the ``reason``.
 
-    Args:
-        image: The image.
-        scene: The folder of its scene, for the command in the advice.
-        reason: Why the camera must be a pinhole.
-
-    Raises:
-        SceneFormatError: It has distortion.
+    ``scene`` is the folder of its scene, for the command in the advice.
     """
     if image.intrinsics.has_distortion:
         raise SceneFormatError(
@@ -229,7 +183,7 @@ def _load_view(
     K = np.diag([*scale, 1.0]) @ camera.K
     if not image.intrinsics.has_distortion:
         return View(image.name, photograph, K, width, height, camera.cam_from_world)
-    from splatseed.views.undistortion import undistort  # noqa: PLC0415  (loads Numba)
+    from splatseed.views.projection import undistort  # noqa: PLC0415  (loads Numba)
 
     photograph, known = undistort(photograph, image.intrinsics, K)
     return View(image.name, photograph, K, width, height, camera.cam_from_world, known)
@@ -264,26 +218,16 @@ def file_from_camera(
     return np.asarray(scale)
 
 
-FILTER = "box-2"
-"""Part of the key: change it whenever the downsampling changes."""
+FILTER = "box-2"  # part of the key: change it whenever the downsampling changes
 
 
 def load_photograph(
     path: Path, factor: int = 1, cache_dir: Path | None = None
 ) -> tuple[UInt8[np.ndarray, "H W 3"], tuple[int, int]]:
-    """The pixels of an image file, downsampled by ``factor``, and the file's width and height.
+    """The pixels of an image file, each a block of ``factor``^2, and the file's width and height.
 
-    Transparent pixels are laid over black, which Gaussians are drawn on.
-
-    Args:
-        path: The image.
-        factor: 1 or more; a block of factor x factor pixels becomes one.
-        cache_dir: Where smaller copies are kept; nowhere when left out.
-
-    Raises:
-        ParameterError: The factor is less than 1.
-        SceneNotFoundError: There is no such file.
-        SceneFormatError: It is no image, or too small for the factor.
+    Transparent pixels are laid over black, which Gaussians are drawn on. Smaller copies are kept in
+    ``cache_dir``, if there is one.
     """
     if factor < 1:
         raise ParameterError(
@@ -297,7 +241,12 @@ def load_photograph(
             photograph = decode_photograph(kept, photograph_bytes(kept))
             return np.array(photograph), open_photograph(path, encoded).size
     original = decode_photograph(path, encoded)
-    photograph = _reduce(path, original, factor)
+    width, height = original.width // factor, original.height // factor
+    if not width or not height:
+        raise _too_small(path, 1, factor, (width, height))
+    photograph = original
+    if factor > 1:
+        photograph = original.reduce(factor, (0, 0, width * factor, height * factor))
     if kept is not None:
         with suppress(OutputError, OSError):  # a cache that cannot be written is done without
             kept.parent.mkdir(parents=True, exist_ok=True)
@@ -315,16 +264,3 @@ def user_cache_dir() -> Path:
     else:
         base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(base) / "splatseed" / "images"
-
-
-def _reduce(path: Path, original: PilImage.Image, factor: int) -> PilImage.Image:
-    if factor == 1:
-        return original
-    width, height = original.width // factor, original.height // factor
-    if not width or not height:
-        raise SceneFormatError(
-            f"{path} to be larger than --data-factor {factor}",
-            found=f"{original.width} x {original.height}",
-            fix="Choose a smaller --data-factor.",
-        )
-    return original.reduce(factor, (0, 0, width * factor, height * factor))

@@ -1,11 +1,9 @@
 """Which points each image sees, and the camera from which to look at a scene.
 
-Notation: V images, N points; ``xyz`` float64 [M, 3] are the points of one image, in the world;
-``uv`` are pixels [M, 2]; an image's *fill* is how much of its frame has points.
-Promise: only distinct finite originals are seen. A point with a track is seen by the images of the
-track. Without tracks, points are projected; where several fall close together in an image, only the
+Only distinct finite originals are seen. A point with a track is seen by the images of the track.
+Without tracks, points are projected; where several fall close together in an image, only the
 nearest are kept, as the others are probably hidden. The camera chosen is one of the scene's own if
-it has any, else one made up from the cloud alone.
+it has any, else one made up from the cloud alone. An image's *fill* is how much of it has points.
 """
 
 from __future__ import annotations
@@ -21,20 +19,15 @@ from splatseed.errors import PointCloudError
 from splatseed.pointcloud import ORIGINAL
 from splatseed.scene import Image, Scene
 
-CELLS = 40
-"""Columns and rows of the grid over an image in whose cells points hide each other."""
-
-HIDDEN = 1.1
-"""A point this many times as far as the nearest one in its cell counts as hidden."""
+CELLS = 40  # columns and rows of the grid over an image in whose cells points hide each other
+HIDDEN = 1.1  # a point this many times as far as the nearest one in its cell counts as hidden
 
 
 class SeenPoints(NamedTuple):
-    """Points within an image."""
+    """Points within an image: pixels, and planar depths."""
 
     uv: Float64[np.ndarray, "M 2"]
-    """Where they are, in pixels."""
     z: Float64[np.ndarray, " M"]
-    """Their planar depth, scene units."""
 
 
 def camera_points(camera: Camera, xyz: Float64[np.ndarray, "N 3"]) -> SeenPoints:
@@ -46,19 +39,12 @@ def camera_points(camera: Camera, xyz: Float64[np.ndarray, "N 3"]) -> SeenPoints
 
 @dataclass(frozen=True, eq=False)
 class Visibility:
-    """The points that every image sees.
+    """The points that every image sees."""
 
-    Args:
-        xyz: The distinct finite originals, float64 [N, 3], scene units.
-        point_idx: Rows of ``xyz``, image after image, int64 [T].
-        start: Where each image begins in ``point_idx``, by its id.
-        count: How many each image sees, by its id.
-    """
-
-    xyz: Float64[np.ndarray, "N 3"]
-    point_idx: Int64[np.ndarray, " T"]
-    start: dict[int, int]
-    count: dict[int, int]
+    xyz: Float64[np.ndarray, "N 3"]  # the distinct finite originals
+    point_idx: Int64[np.ndarray, " T"]  # rows of ``xyz``, image after image
+    start: dict[int, int]  # where each image begins in ``point_idx``, by its id
+    count: dict[int, int]  # how many each sees, by its id
 
     def of(self, image: Image) -> Float64[np.ndarray, "M 3"]:
         """The points an image sees, world positions [M, 3]: by tracks, or else by projection."""
@@ -106,38 +92,23 @@ def _in_front(xyz: Float64[np.ndarray, "N 3"], camera: Camera) -> Int64[np.ndarr
     cell = row * CELLS + column
     nearest = np.full(CELLS * CELLS, np.inf)
     np.minimum.at(nearest, cell, z[inside])
-    # A tenth beyond the nearest point of the cell may still be its surface.
+    # a tenth beyond the nearest point of the cell may still be its surface.
     return np.asarray(inside[z[inside] <= HIDDEN * nearest[cell]])
 
 
-SAMPLE = 20_000
-"""Points considered when choosing a camera."""
-
-FRAME_CELLS = (16, 12)
-"""Columns and rows of the grid by which a frame's fill is measured."""
-
-CORE_SHARE = 0.6
-"""Share of the points, those nearest to the median, that a made-up camera frames."""
-
-ELEVATION = 28.0
-"""Degrees by which a made-up camera looks down."""
-MADE_UP_SIZE = (800, 600)
-"""Its width and height in pixels."""
-MADE_UP_FOCAL = 900.0
-"""Its focal length in pixels."""
+SAMPLE = 20_000  # points considered when choosing a camera
+FRAME_CELLS = (16, 12)  # columns and rows of the grid by which a frame's fill is measured
+CORE_SHARE = 0.6  # share of the points, those nearest to the median, that a made-up camera frames
+ELEVATION, MADE_UP_SIZE, MADE_UP_FOCAL = 28.0, (800, 600), 900.0
+"""Degrees by which a made-up camera looks down, and its size and focal length in pixels."""
 
 
 def look_at(
-    eye: Float64[np.ndarray, " 3"],
-    target: Float64[np.ndarray, " 3"],
-    up: Float64[np.ndarray, " 3"],
+    eye: Float64[np.ndarray, " 3"], target: Float64[np.ndarray, " 3"], up: Float64[np.ndarray, " 3"]
 ) -> Float64[np.ndarray, "4 4"]:
     """``cam_from_world`` [4, 4] of an OpenCV camera at ``eye`` that sees ``target`` upright.
 
-    Args:
-        eye: The camera's centre, world, [3].
-        target: A point on its axis, apart from ``eye``, [3].
-        up: The direction that is upward in the image, not along the view, [3].
+    ``up`` is the direction that is upward in the image, not along the view.
     """
     forward = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross(forward, up)
@@ -152,11 +123,8 @@ def look_at(
 def choose_camera(scene: Scene) -> Camera:
     """The camera of ``choose_image``; for a bare cloud, one made up to frame its densest part.
 
-    The made-up camera takes the direction in which the cloud is flattest as the vertical, upward
-    where the cloud thins out, and looks down on the points nearest the median at 28 degrees.
-
-    Raises:
-        PointCloudError: The scene has neither finite points nor images.
+    It takes the direction in which the cloud is flattest as the vertical, upward where the cloud
+    thins out, and looks down on the points nearest the median at 28 degrees.
     """
     image = choose_image(scene)
     return _made_up_camera(_finite_sample(scene)) if image is None else image.camera
@@ -168,26 +136,17 @@ def choose_image(scene: Scene) -> Image | None:
     An image's points are its features with a 3D point if the scene has features at all, else those
     of a sample that project into its frame. The mere number of points would favour close-ups of the
     richest texture. A scene without points, such as an RGB-D capture, gives the image in the middle
-    of its list; one without images gives None.
-
-    Raises:
-        PointCloudError: The scene has neither finite points nor images.
+    of its list; one without images gives None, or PointCloudError if it has no points, either.
     """
     if scene.images and not scene.points.finite.any():
         return scene.images[len(scene.images) // 2]
     xyz = _finite_sample(scene)
-    seen = [_features(image) for image in scene.images]
+    features = [image.observations for image in scene.images]
+    seen = [each.xy[each.point_ids >= 0] if each else np.empty((0, 2)) for each in features]
     if not any(len(uv) for uv in seen):
         seen = [image.camera.project(xyz)[0] for image in scene.images]
     fill = [_fill(image.camera, uv) for image, uv in zip(scene.images, seen, strict=True)]
     return scene.images[fill.index(max(fill))] if fill else None
-
-
-def _features(image: Image) -> Float64[np.ndarray, "M 2"]:
-    """Pixels of the image's features that belong to a point."""
-    if image.observations is None:
-        return np.empty((0, 2))
-    return image.observations.xy[image.observations.point_ids >= 0]
 
 
 def _fill(camera: Camera, uv: Float64[np.ndarray, "M 2"]) -> tuple[int, int]:
@@ -219,8 +178,7 @@ def _made_up_camera(xyz: Float64[np.ndarray, "N 3"]) -> Camera:
     backward = _thin_side(core - center, axes[:, 1])
     tilt = np.radians(ELEVATION)
     toward_eye = np.cos(tilt) * backward + np.sin(tilt) * up
-    width, height = MADE_UP_SIZE
-    extent = float(np.linalg.norm(core - center, axis=1).max()) or 1.0
+    (width, height), extent = MADE_UP_SIZE, np.linalg.norm(core - center, axis=1).max() or 1.0
     eye = center + toward_eye * extent * 2.0 * MADE_UP_FOCAL / width
     K = np.array([[MADE_UP_FOCAL, 0, width / 2], [0, MADE_UP_FOCAL, height / 2], [0, 0, 1.0]])
     return Camera(K, width, height, look_at(eye, center, up))

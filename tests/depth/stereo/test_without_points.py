@@ -14,7 +14,7 @@ from splatseed.depth.stereo.depths import SAMPLES, coarse_stereo, known_visibili
 from splatseed.depthmap import DepthMap
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import silent
-from splatseed.views.pairs import choose_by_pose
+from splatseed.views.projection import choose_by_pose
 from splatseed.views.view import load_views
 from splatseed.views.visibility import find_visibility
 

@@ -22,8 +22,7 @@ from splatseed.seeding.upsampling import CELL, share_covered
 from splatseed.splat.formats import write_model
 from splatseed.train.seeds import gaussians_of_scene
 from splatseed.train.settings import TrainSettings
-from splatseed.upsample import Profile, Upsampler, chooses_number, configure
-from splatseed.upsample.registry import origin_name
+from splatseed.upsample import Profile, Upsampler, chooses_number, configure, origin_name
 
 if TYPE_CHECKING:
     from splatseed.commands.upsample.command import Options

@@ -31,8 +31,7 @@ from splatseed.progress import Progress
 from splatseed.runtime.memory import free_memory, option_of, words_of
 from splatseed.scene import Scene
 from splatseed.seeding.advice import DEFAULT_METHOD, method_for
-from splatseed.upsample import BYTES_EACH, Upsampler, planned_size, traits_of
-from splatseed.upsample.registry import source_code
+from splatseed.upsample import BYTES_EACH, Upsampler, planned_size, source_code, traits_of
 
 if TYPE_CHECKING:
     from splatseed.commands.upsample.command import Options

@@ -22,7 +22,7 @@ from splatseed.depthmap import DepthMap
 from splatseed.progress import Progress, silent
 from splatseed.runtime.jit import inline
 from splatseed.scene import Image, Scene
-from splatseed.views.pairs import choose_by_pose, choose_sources
+from splatseed.views.projection import choose_by_pose, choose_sources
 from splatseed.views.view import View
 from splatseed.views.visibility import Visibility, find_visibility
 

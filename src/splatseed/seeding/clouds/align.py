@@ -1,24 +1,18 @@
-"""Aligning a cloud with a scene, or refusing to, with the reason.
+"""Aligning a cloud with a scene, or refusing to, with the reason. Nothing is random.
 
 Notation: *marks* are the scene's own points; *extent* is their root mean square distance from
 their median. The *share* is the fraction of marks within ``CLOSE`` extents of the cloud's surface.
 A *rival* is another alignment, turned by more than ``TURNED`` degrees, scaled by more than
 ``SCALED`` or shifted by more than ``SHIFTED`` extents. The *error* is the standard error of the
-alignment at the farthest corner of the marks, whatever their variances: it is large where the cloud
-lets the scene slide. It is that of the marks: a principal point that is off moves all of them at
-once, and the *sensitivity* is how far half a pixel of it would turn the alignment.
-Promise: an alignment is returned only if most marks lie on the cloud, no rival is nearly as good,
-and the error is small; else the reason is told. Nothing is random.
+alignment at the farthest corner of the marks: it is large where the cloud lets the scene slide.
 
 Every orientation and shift is tried at several scales, with both clouds at root mean square size 1
 around 0. A start takes a mark to the cloud's frame: x -> s R x + t. Its *reward* is the mean over
-the marks of max(``FAR`` - d / s, 0), with d the distance to the cloud: in the scene's units, as
-otherwise shrinking all marks to one point of the cloud would be best. For each rotation and scale
-the rewards of all shifts are one correlation of the marks' histogram with the grid of
-max(``FAR`` - d / s, 0), computed by Fourier transforms. Then the orientations around the best ones
-are tried: halfway between two of the first is too far from either for ICP in a sparse cloud.
-Orientations are Alexa's super-Fibonacci spirals on unit quaternions ("Super-Fibonacci Spirals:
-Fast, Low-Discrepancy Sampling of SO(3)", CVPR 2022).
+the marks of max(``FAR`` - d / s, 0), with d the distance to the cloud, in the scene's units:
+otherwise shrinking all marks to one point would be best. For each rotation and scale the rewards of
+all shifts are one correlation of the marks' histogram with the grid of these values, by Fourier
+transforms. Then orientations around the best are tried. They are Alexa's super-Fibonacci spirals on
+unit quaternions ("Super-Fibonacci Spirals: Fast, Low-Discrepancy Sampling of SO(3)", CVPR 2022).
 """
 
 from __future__ import annotations
@@ -38,24 +32,15 @@ from scipy.spatial.transform import Rotation
 from splatseed.errors import PointCloudError
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
-from splatseed.seeding.clouds.icp import (
-    LEAST_MARKS,
-    MOST_MARKS,
-    Fitted,
-    Marks,
-    Polished,
-    Surface,
-    find_marks,
-    fit,
-    polish,
-)
+from splatseed.seeding.clouds import icp
+from splatseed.seeding.clouds.icp import Fitted, Marks, Points, Surface
 from splatseed.seeding.clouds.voxels import sample_cloud
 from splatseed.similarity import Similarity
 
 ROUNDS = (
     (100, 250, 20, 0.3, 0.04, 0.04, 0.85),
     (16, 1500, 20, 0.2, 0.02, 0.02, 0.82),
-    (4, MOST_MARKS, 40, 0.04, 0.005, 0.01, 0.75),
+    (4, icp.MOST_MARKS, 40, 0.04, 0.005, 0.01, 0.75),
 )
 """Stages: alignments, marks, rounds of ICP, the first and the last reach, within how much of the
 cloud marks count, in extents, and the factor of the reach from round to round. The first begins
@@ -71,10 +56,8 @@ the next are always so."""
 TURNED, SCALED, SHIFTED = 8.0, 0.08, 0.1
 LIKE, UNLIKE = 0.5, 0.25
 """Correlations of colours at the marks that tell an alignment from its rival."""
-SURE = 0.003
-"""Greatest error, in extents."""
-EXACT = 0.1
-"""Degrees that the alignment should not be off by: a doubt that is greater is told."""
+SURE = 0.003  # greatest error, in extents
+EXACT = 0.1  # degrees that the alignment should not be off by: a doubt that is greater is told
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,9 +73,9 @@ class CloudAlignment:
     extent: float
     likeness: float | None  # correlation of brightness of marks and cloud; None without colours
     rival: float  # share of the best rival; 0 without one
-    marks: Float64[np.ndarray, "M 3"]
+    marks: Points
     residuals: Float64[np.ndarray, " M"]
-    sample: Float64[np.ndarray, "N 3"]  # the cloud in the scene's frame
+    sample: Points  # the cloud in the scene's frame
     rgb: UInt8[np.ndarray, "N 3"] | None
 
     @property
@@ -131,25 +114,20 @@ class CloudAlignment:
 
 
 def align(scene: Scene, paths: Sequence[Path], progress: Progress = silent) -> CloudAlignment:
-    """Find where clouds lie in a scene.
-
-    Args:
-        scene: With points of its own.
-        paths: Clouds in one frame, of any scale.
-        progress: Told how far it is.
+    """Find where clouds, in one frame of any scale, lie in a scene with points of its own.
 
     Raises:
         PointCloudError: The scene or the cloud has too few points, or the alignment is not sure.
         SceneNotFoundError: A file is missing.
         SceneFormatError: One is damaged.
     """
-    marks = find_marks(scene)
+    marks = icp.find_marks(scene)
     offset, xyz, rgb = sample_cloud(paths, progress)
     progress("align", 0.0)
     unit_of_marks, unit_of_cloud = to_unit_size(marks.xyz), to_unit_size(xyz)
     small, surface = marks.through(unit_of_marks), Surface.of(unit_of_cloud.points(xyz))
     first, *others = _candidates(surface, small.xyz, progress)
-    polished = polish(surface, small, first.cloud_from_scene, CLOSE)
+    polished = icp.polish(surface, small, first.cloud_from_scene, CLOSE)
     best = polished or first
     share = best.share(CLOSE)
     rival = next((each for each in others if _differs(best, each)), None)
@@ -168,8 +146,9 @@ def align(scene: Scene, paths: Sequence[Path], progress: Progress = silent) -> C
                 "scene's points on the cloud): the place looks alike from several sides, or is "
                 "another"
             )
-    error = _error(polished, small.xyz) if polished else np.inf
-    if polished is None or error > SURE:
+    if polished is None:
+        raise _unsure("it free to slide: there is little but one plane")
+    if (error := _error(polished, small.xyz)) > SURE:
         raise _unsure(
             f"it free to slide by {error:.2%} of the scene's extent: there is little but one plane"
         )
@@ -191,9 +170,7 @@ def _unsure(found: str) -> PointCloudError:
     return PointCloudError("one alignment of the cloud that is sure", found=found, fix=fix)
 
 
-def _candidates(
-    surface: Surface, marks: Float64[np.ndarray, "M 3"], progress: Progress
-) -> list[Fitted]:
+def _candidates(surface: Surface, marks: Points, progress: Progress) -> list[Fitted]:
     """Alignments, best first, no two alike; refused if none holds."""
     waiting = find_starts(surface.xyz, marks, ROUNDS[0][0], progress)
     for stage, (num, count, rounds, far, least, close, shrink) in enumerate(ROUNDS):
@@ -201,7 +178,7 @@ def _candidates(
         candidates: list[Fitted] = []
         for i, start in enumerate(waiting[:num]):
             with suppress(np.linalg.LinAlgError):
-                fitted = fit(surface, some, start, far, rounds, least, shrink)
+                fitted = icp.fit(surface, some, start, far, rounds, least, shrink)
                 if 0.3 < fitted.cloud_from_scene.scale < 3.0:
                     candidates.append(fitted)
             progress("align", (stage + (i + 1) / len(waiting[:num])) / len(ROUNDS))
@@ -230,14 +207,14 @@ def _likeness(
 ) -> float | None:
     """Correlation of brightness between marks and their nearest cloud points."""
     on = fitted.residuals < CLOSE
-    if rgb is None or marks.brightness.std() == 0 or np.count_nonzero(on) < LEAST_MARKS // 2:
+    if rgb is None or marks.brightness.std() == 0 or np.count_nonzero(on) < icp.LEAST_MARKS // 2:
         return None
     idx = surface.tree.query(fitted.cloud_from_scene.points(marks.xyz[on]))[1]
     there = rgb[idx].astype(np.float64).mean(axis=1)
     return float(np.corrcoef(there, marks.brightness[on])[0, 1]) if there.std() > 0 else None
 
 
-def _error(fitted: Polished, marks: Float64[np.ndarray, "M 3"]) -> float:
+def _error(fitted: icp.Polished, marks: Points) -> float:
     """Standard error at the farthest corner of the marks, in their extents."""
     q = fitted.cloud_from_scene.points(np.percentile(marks, (2, 98), axis=0))
     corners = np.stack(np.meshgrid(*q.T, indexing="ij"), axis=-1).reshape(-1, 3) - fitted.center
@@ -249,20 +226,17 @@ def _error(fitted: Polished, marks: Float64[np.ndarray, "M 3"]) -> float:
     return float(np.sqrt(worst)) / fitted.cloud_from_scene.scale
 
 
-ROTATIONS = 1200
-"""About 18 degrees from any orientation to the nearest."""
+ROTATIONS = 1200  # about 18 degrees from any orientation to the nearest
 BEST, AROUND = 12, (-9.0, 0.0, 9.0)
 """Of how many orientations those around are tried, and by how many degrees about each axis."""
 SCALES = (0.7, 0.84, 1.0, 1.19, 1.42)
-EVEN = 0.1
-"""Side of the cells of which each counts once, however many marks it holds."""
-CELLS, HALF = 36, 2.7
-"""Cells of the grid along each axis, and half its side."""
+EVEN = 0.1  # side of the cells of which each counts once, however many marks it holds
+CELLS, HALF = 36, 2.7  # cells of the grid along each axis, and half its side
 FAR = 0.3
 INNER = 0.95
 
 
-def to_unit_size(xyz: Float64[np.ndarray, "N 3"]) -> Similarity:
+def to_unit_size(xyz: Points) -> Similarity:
     """From a cloud's own frame to unit size around 0; the farthest twentieth does not count."""
     center = np.median(xyz, axis=0)
     for _ in range(3):
@@ -274,10 +248,7 @@ def to_unit_size(xyz: Float64[np.ndarray, "N 3"]) -> Similarity:
 
 
 def find_starts(
-    cloud: Float64[np.ndarray, "N 3"],
-    marks: Float64[np.ndarray, "M 3"],
-    num: int,
-    progress: Progress = silent,
+    cloud: Points, marks: Points, num: int, progress: Progress = silent
 ) -> list[Similarity]:
     """The ``num`` best starts, one for each orientation, of points at unit size."""
     side = 2 * HALF / CELLS
@@ -305,7 +276,7 @@ def _best_first(starts: list[tuple[float, Similarity]]) -> list[tuple[float, Sim
 
 def _correlate(
     fields: list[np.ndarray],
-    marks: Float64[np.ndarray, "M 3"],
+    marks: Points,
     rotations: Float64[np.ndarray, "n 3 3"],
     stage: str,
     progress: Progress,

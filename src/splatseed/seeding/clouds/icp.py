@@ -1,30 +1,26 @@
 """Marks, the scene's own points, and refining how they lie on a cloud.
 
 *Marks.* Mark X was observed by cameras k with Jacobians J_k = d pixel / d X [2, 3]. With errors of
-sigma pixels in each coordinate its covariance is sigma^2 (sum J_k^T J_k)^-1, to first order
-(Hartley and Zisserman, "Multiple View Geometry", 2nd ed., sec. 5.2): long along the rays where
-cameras stand close together. If all principal points were off by c pixels, it would lie off by
--(sum J_k^T J_k)^-1 (sum J_k^T) c: its *sensitivity*, which all marks share, so that no number of
-marks makes it smaller.
+sigma pixels its covariance is sigma^2 (sum J_k^T J_k)^-1, to first order (Hartley and Zisserman,
+"Multiple View Geometry", 2nd ed., sec. 5.2). If all principal points were off by c pixels, it would
+lie off by -(sum J_k^T J_k)^-1 (sum J_k^T) c: its *sensitivity*, which all marks share, so that no
+number of marks makes it smaller.
 
 *ICP.* Marks slide onto the tangent planes of a cloud, with one free scale. A mark p goes to
 q = s R p + t, whose nearest cloud point is y with normal n. Each round minimises the sum of
 w (n . (q - y))^2 over a small rotation, a shift and a change of scale about the marks' centre (Chen
 and Medioni 1992, with a seventh unknown), with Tukey's weights w, whose reach falls from round to
-round. Residuals are in the cloud's units, and divided by s where alignments are compared. The last
-reach is far below the marks' noise: their errors are long-tailed and to one side, so the mode of
+round, to far below the marks' noise: their errors are long-tailed and to one side, so the mode of
 the residuals is more exact than their mean (red kitchen: 7 mm instead of 36).
 
-*Polish.* A mark has the covariance C in its own frame. Its *patch* is the plane through the
-``NEIGHBORS`` cloud points around the nearest one: their mean m, normal n, and thickness e, their
-root mean square distance from it. The residual r = n . (q - m) has the variance
-v = n^T (s R) C (s R)^T n + e^2 + f^2, with a floor f for what no model holds. Each round minimises
-sum w r^2 with w = T(r / (c k sqrt(v))) T(r / reach) / v: Tukey's weights T, c = ``TUKEY``, and k
-the median ratio of residuals to sqrt(v), so that only the ratios of the variances matter. Patches
-over edges, whose mean lies off the surface, are left out. The covariance is the robust one
-("sandwich": Huber 1967; by clusters, Liang and Zeger 1986), H^-1 (sum over cells of g g^T) H^-1
-with g = sum w r a over the marks of a cell and a their rows: it holds whatever the variances are,
-and marks beside each other may err alike.
+*Polish.* A mark's *patch* is the plane through the ``NEIGHBORS`` cloud points around the nearest
+one: their mean m, normal n, and thickness e, their root mean square distance from it. The residual
+r = n . (q - m) has the variance v = n^T (s R) C (s R)^T n + e^2 + f^2, with C the mark's covariance
+and a floor f. Each round minimises sum w r^2 with w = T(r / (c k sqrt(v))) T(r / reach) / v:
+Tukey's weights T, c = ``TUKEY``, and k the median ratio of residuals to sqrt(v). Patches over edges
+are left out. The covariance is the robust one by clusters ("sandwich": Huber 1967, Liang and Zeger
+1986), H^-1 (sum over cells of g g^T) H^-1 with g = sum w r a over the marks of a cell and a their
+rows: it holds whatever the variances are, and marks beside each other may err alike.
 """
 
 from __future__ import annotations
@@ -41,12 +37,12 @@ from splatseed.pointcloud import ORIGINAL
 from splatseed.scene import Image, Scene, Tracks
 from splatseed.similarity import Similarity
 
+Points = Float64[np.ndarray, "N 3"]
+
 LEAST_MARKS = 200
 MOST_MARKS = 6000
-LEAST_VIEWS = 3
-"""Two rays may meet by chance."""
-PRIOR = 4
-"""Degrees of freedom that the median pixel error of all marks counts for, in that of each."""
+LEAST_VIEWS = 3  # two rays may meet by chance
+PRIOR = 4  # degrees of freedom that the median pixel error of all marks counts for, in that of each
 GRAZING = 0.1
 """Least depth of an observation over its distance: a pinhole's pixels grow without bound aside."""
 RIDGE = 1e-9
@@ -56,7 +52,7 @@ RIDGE = 1e-9
 class Marks:
     """Points of the scene, to align a cloud with."""
 
-    xyz: Float64[np.ndarray, "M 3"]
+    xyz: Points
     brightness: Float64[np.ndarray, " M"]  # 0 to 255
     covariance: Float64[np.ndarray, "M 3 3"]  # scene units squared; 0 if no mark has a track
     sensitivity: Float64[np.ndarray, "M 3 2"]  # scene units per pixel of principal points in x, y
@@ -69,11 +65,7 @@ class Marks:
 
 
 def find_marks(scene: Scene) -> Marks:
-    """An even choice of the scene's points; without a track they have the others' median variance.
-
-    Raises:
-        PointCloudError: There are too few.
-    """
+    """An even choice of the scene's points; those without a track get the median variance."""
     points, tracks = scene.points, scene.tracks
     own = (points.source == ORIGINAL) & points.distinct
     if tracks is not None:
@@ -156,8 +148,7 @@ def pixel_noise(
 
 
 STILL = 1e-7
-LEAST = 12
-"""Marks within reach that a fit needs."""
+LEAST = 12  # marks within reach that a fit needs
 TANGENT_NEIGHBORS = 12
 BLOCK = 1 << 15
 
@@ -166,12 +157,12 @@ BLOCK = 1 << 15
 class Surface:
     """A cloud to align with: points, unit normals of either sign, and a tree."""
 
-    xyz: Float64[np.ndarray, "N 3"]
-    normals: Float64[np.ndarray, "N 3"]
+    xyz: Points
+    normals: Points
     tree: cKDTree
 
     @classmethod
-    def of(cls, xyz: Float64[np.ndarray, "N 3"]) -> Surface:
+    def of(cls, xyz: Points) -> Surface:
         """Normals are the last principal axes of a point and its 11 neighbours."""
         tree, normals = cKDTree(xyz, balanced_tree=False), np.empty_like(xyz)
         for start in range(0, len(xyz), BLOCK):
@@ -181,9 +172,7 @@ class Surface:
             normals[part] = np.linalg.eigh(np.einsum("nki,nkj->nij", near, near))[1][:, :, 0]
         return cls(xyz, normals, tree)
 
-    def pairs(
-        self, q: Float64[np.ndarray, "M 3"], bound: float = np.inf
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def pairs(self, q: Points, bound: float = np.inf) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Normals, signed plane residuals and distances of marks in the cloud's frame.
 
         Beyond ``bound`` the distance is infinite, and the others say nothing.
@@ -225,7 +214,7 @@ class Polished(Fitted):
 
 def fit(
     surface: Surface,
-    marks: Float64[np.ndarray, "M 3"],
+    marks: Points,
     start: Similarity,
     far: float,
     rounds: int,
@@ -254,7 +243,7 @@ def _check_enough(used: np.ndarray) -> None:
 
 
 def _step(
-    surface: Surface, marks: Float64[np.ndarray, "M 3"], start: Similarity, reach: float
+    surface: Surface, marks: Points, start: Similarity, reach: float
 ) -> tuple[Similarity, float]:
     """One round: the better similarity, and how far it moved."""
     q, limit = start.points(marks), reach * start.scale
@@ -294,7 +283,7 @@ def moved(start: Similarity, center: np.ndarray, x: np.ndarray) -> Similarity:
 
 
 def _residuals(
-    surface: Surface, marks: Float64[np.ndarray, "M 3"], similarity: Similarity, reach: float
+    surface: Surface, marks: Points, similarity: Similarity, reach: float
 ) -> tuple[Float64[np.ndarray, " M"], Bool[np.ndarray, " M"]]:
     """Distances of marks from the cloud, as ``Fitted`` has them, and which are within reach."""
     limit = reach * similarity.scale
@@ -307,24 +296,19 @@ NEIGHBORS = 20
 FLAT = 0.1
 """Greatest thickness of a patch, over its narrower extent; half of the patches always pass, so that
 noisy clouds keep theirs."""
-FLOOR = 0.0005
-"""f, in the scene's units."""
-TUKEY = 4.685
-"""Loses 5% of the precision of least squares where errors are normal."""
-NORMAL_MEDIAN = 0.6745
-"""Median absolute deviation of a normal distribution, in standard deviations."""
-EXACT = 1e-3
-"""Least k: marks without any error would not count at all."""
+FLOOR = 0.0005  # f, in the scene's units
+TUKEY = 4.685  # loses 5% of the precision of least squares where errors are normal
+NORMAL_MEDIAN = 0.6745  # median absolute deviation of a normal distribution, in standard deviations
+EXACT = 1e-3  # least k: marks without any error would not count at all
 ROUNDS, STEPS = 4, 12
-CELL = 0.1
-"""Side of the cells in which errors may be alike, in the scene's units."""
+CELL = 0.1  # side of the cells in which errors may be alike, in the scene's units
 
 
 class _Patches(NamedTuple):
     """Planes for some marks."""
 
-    mean: Float64[np.ndarray, "M 3"]
-    normal: Float64[np.ndarray, "M 3"]
+    mean: Points
+    normal: Points
     thickness: Float64[np.ndarray, " M"]
     radius: Float64[np.ndarray, " M"]
     flat: Bool[np.ndarray, " M"]
@@ -370,7 +354,7 @@ def polish(surface: Surface, marks: Marks, start: Similarity, reach: float) -> P
     return Polished(similarity, residuals, covariance, center, sensitivity[:3])
 
 
-def _patches(surface: Surface, q: Float64[np.ndarray, "M 3"]) -> _Patches:
+def _patches(surface: Surface, q: Points) -> _Patches:
     nearest = surface.tree.query(q)[1]
     around = surface.tree.query(surface.xyz[nearest], min(NEIGHBORS, len(surface.xyz)))[1]
     points = surface.xyz[around]

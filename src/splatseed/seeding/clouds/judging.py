@@ -78,20 +78,16 @@ def _key(point, side, a, b, c):  # type: ignore[no-untyped-def]  # Numba's types
     return max(key, FREE + np.uint64(1))
 
 
-CELLS = (4, 8, 16, 32)
-"""Sides of cells to choose from, in pixels."""
+CELLS = (4, 8, 16, 32)  # sides of cells to choose from, in pixels
 FILLED = 3
 BEHIND = 0.03
 """How far behind a surface a point still counts as on it, as a share of the depth, at cells of 4
 pixels; surfaces slant within a cell."""
 CLOSEST = 6
 ALIKE = 32
-RAY_CELL = 4
-"""Side in pixels of the cells in which rays are free."""
-NEARER_BY = 0.1
-"""A point is clearly nearer by this share of the depth."""
-FITS = 0.03
-"""Share of the depth within which a scene's own point lies on a cloud's surface."""
+RAY_CELL = 4  # side in pixels of the cells in which rays are free
+NEARER_BY = 0.1  # a point is clearly nearer by this share of the depth
+FITS = 0.03  # share of the depth within which a scene's own point lies on a cloud's surface
 BLOCK = 1 << 20
 NO_VIEW = np.float32(0.0)
 
@@ -105,8 +101,7 @@ def free_rays(
 ) -> tuple[Surface, ...]:
     """How far rays are known to be free: in each view, the least depth per cell; infinite if none.
 
-    Of the points that each sees for certain, and of what stereo knows of each; cells are those of
-    stereo's maps, else of ``RAY_CELL`` pixels.
+    By the points that each sees for certain, and by stereo's maps, whose cells they have.
     """
     nearest = []
     for v, (view, xyz) in enumerate(zip(views, seen, strict=True)):
@@ -121,16 +116,11 @@ def free_rays(
 class Evidence(NamedTuple):
     """The evidence for and against N points."""
 
-    seen: UInt16[np.ndarray, " N"]
-    """In how many views each is visible."""
-    rgb: UInt8[np.ndarray, "N 3"]
-    """Robust mean of its samples; mid grey without any."""
-    agreement: Float32[np.ndarray, " N"]
-    """Of its samples, 0 to 1; NaN for fewer than two."""
-    through: UInt16[np.ndarray, " N"]
-    """How many views see through it."""
-    confirmed: UInt16[np.ndarray, " N"]
-    """How many views confirm it."""
+    seen: UInt16[np.ndarray, " N"]  # in how many views each is visible
+    rgb: UInt8[np.ndarray, "N 3"]  # robust mean of its samples; mid grey without any
+    agreement: Float32[np.ndarray, " N"]  # of its samples, 0 to 1; NaN for fewer than two
+    through: UInt16[np.ndarray, " N"]  # how many views see through it
+    confirmed: UInt16[np.ndarray, " N"]  # how many views confirm it
 
     def select(self, which: Bool[np.ndarray, " N"]) -> Evidence:
         """That on some of the points."""
@@ -164,10 +154,7 @@ def find_evidence(
     rays: Sequence[Surface] | None,
     progress: Progress,
 ) -> Evidence:
-    """Hold points against photographs; ``surfaces`` and ``cell`` are those of ``find_surfaces``.
-
-    Views without pixels give no colours; ``rays`` are known to be free.
-    """
+    """Hold points against photographs; views without pixels give no colours."""
     num = len(xyz)
     evidence = Evidence(
         np.zeros(num, np.uint16),
@@ -200,11 +187,7 @@ def find_evidence(
 def surface_agreement(
     views: Sequence[View], surfaces: Sequence[Surface], seen: Sequence[Float64[np.ndarray, "M 3"]]
 ) -> tuple[float, int]:
-    """How well a scene's own points, seen by each view, fit the surfaces of a cloud.
-
-    Of those that are seen where the cloud has a surface, the share within ``FITS`` of its depth;
-    and their number.
-    """
+    """Of a scene's points seen where a cloud has a surface: the share that fits, and the number."""
     close = total = 0
     for view, surface, xyz in zip(views, surfaces, seen, strict=True):
         rows, cols, depth = _cells(view, xyz, surface.shape)
@@ -305,8 +288,7 @@ def _is_alike(sample, middle):  # type: ignore[no-untyped-def]  # Numba's types
 AGREES = 0.5
 """Least agreement of the photographs on a voxel's colour, where at least ``ASKED`` see it."""
 ASKED = 4
-THROUGH = 2
-"""Views that see past a voxel from which on it is not there, if fewer confirm it."""
+THROUGH = 2  # views that see past a voxel from which on it is not there, if fewer confirm it
 CONFIRMED = 2
 """Views that confirm a voxel from which on the photographs need not agree on its colour."""
 OTHER = 64
@@ -314,25 +296,18 @@ OTHER = 64
 anyway."""
 LIKELY = 4.0
 ALONE = 0.05
-AGAIN = 0.002
-"""Share of voxels that go from which on the others are judged once more."""
+AGAIN = 0.002  # share of voxels that go from which on the others are judged once more
 
 
 class Judged(NamedTuple):
     """The verdict on a cloud's voxels."""
 
-    kept: Int64[np.ndarray, " K"]
-    """Those that stay, rising."""
-    evidence: Evidence
-    """On these."""
-    fit: float
-    """Of the scene's own points seen where the cloud has a surface, the share at its depth."""
-    asked: int
-    """The number of these points."""
-    hidden: int
-    """Voxels that no photograph sees."""
-    reasons: dict[str, int]
-    """How many others went, by reason."""
+    kept: Int64[np.ndarray, " K"]  # those that stay, rising
+    evidence: Evidence  # on these
+    fit: float  # of the scene's points seen where the cloud has a surface, the share at its depth
+    asked: int  # the number of these points
+    hidden: int  # voxels that no photograph sees
+    reasons: dict[str, int]  # how many others went, by reason
 
 
 def judge(
@@ -349,9 +324,6 @@ def judge(
 
     ``seen`` are the scene's own points that each view sees, ``colors`` the cloud's own; without
     ``clean`` only hidden voxels go.
-
-    Raises:
-        PointCloudError: No photograph sees any voxel.
     """
     reasons: Counter[str] = Counter()
     active = np.arange(len(voxels))

@@ -1,11 +1,7 @@
 """The method ``cloud``: seeds from scans and dense clouds, as many as the photographs resolve.
 
-Points stream into voxels (``voxels``); of these, those stay that a photograph sees and nothing
-contradicts (``judging``): no ray of Structure-from-Motion or stereo passes through
-them, the photographs that see them agree on a colour, and they do not float alone. A budget thins
-them afterwards, as those of every method.
-Promise: memory does not grow with the clouds; a cloud that is nowhere near the cameras, or does not
-fit the scene's own points, is refused with the reason.
+Points stream into voxels; those stay that a photograph sees and nothing contradicts (``judging``).
+A cloud that is nowhere near the cameras, or does not fit the scene's own points, is refused.
 """
 
 from __future__ import annotations
@@ -25,8 +21,8 @@ from splatseed.scene import Image, Scene
 from splatseed.seeding.photographs import MAX_SIZE, compare, photographed, read_views
 from splatseed.seeding.upsampling import CELL, frames_of
 from splatseed.similarity import Similarity
+from splatseed.upsample import source_code
 from splatseed.upsample.method import NewPoints, Traits, check_fields, require
-from splatseed.upsample.registry import source_code
 
 if TYPE_CHECKING:
     from splatseed.seeding.clouds.judging import Judged, Surface
@@ -37,14 +33,10 @@ FITS = 0.2
 """Below this share of the scene's own points at the cloud's depth it is another's: a cloud of
 another place has 0 to 0.1, one in the right place 0.36 (red kitchen, noisy) to 0.92 (room0)."""
 DOUBTFUL = 0.55
-ENOUGH = 50
-"""Points of the scene below which the share says nothing."""
-UNKNOWN = 0.5
-"""Confidence of a point that fewer than two photographs see."""
-CORNER = 0.5
-"""Below this share of the photographs' cells, a note says how little the cloud covers."""
-GRID = 1e5
-"""Coordinates from here on, in metres, are those of a national grid."""
+ENOUGH = 50  # points of the scene below which the share says nothing
+UNKNOWN = 0.5  # confidence of a point that fewer than two photographs see
+CORNER = 0.5  # below this share of the photographs' cells, a note says how little the cloud covers
+GRID = 1e5  # coordinates from here on, in metres, are those of a national grid
 
 
 @dataclass(frozen=True)
@@ -70,28 +62,17 @@ class Cloud:
     def of(
         self, *files: Path | str, transform: Similarity | None = None, memory: int | None = None
     ) -> GivenClouds:
-        """The method for some files.
+        """The method for some files in one frame, with the transform from there to the scene's.
 
-        Args:
-            files: The clouds, in one frame.
-            transform: From their frame to the scene's; the same frame when None.
-            memory: Most bytes of memory; voxels grow where they do not fit. 4 GB when None.
+        Voxels grow where they do not fit into ``memory`` bytes, by default 4 GB.
         """
         paths = tuple(map(str, files))
         return GivenClouds(**vars(self), files=paths, transform=transform, memory=memory)
 
     def __call__(
-        self,
-        scene: Scene,  # noqa: ARG002  (a method's arguments)
-        num_new: int,  # noqa: ARG002  (likewise)
-        rng: np.random.Generator,  # noqa: ARG002  (likewise)
-        progress: Progress,  # noqa: ARG002  (likewise)
+        self, scene: Scene, num_new: int, rng: np.random.Generator, progress: Progress
     ) -> NewPoints:
-        """Ask for a cloud: ``of`` names it.
-
-        Raises:
-            ParameterError: Always.
-        """
+        """Ask for a cloud: ``of`` names it."""
         raise ParameterError(
             "--cloud FILE for the method cloud", found="none", fix="Name the scan."
         )
@@ -102,13 +83,9 @@ class GivenClouds(Cloud):
     """The method for some files; ``Cloud.of`` makes it."""
 
     files: tuple[str, ...] = ()
-    """The clouds."""
-    transform: Similarity | None = None
-    """From their frame to the scene's; the same frame when None."""
-    memory: int | None = None
-    """Most bytes of memory; 4 GB when None, and never more than is free."""
-    alone: bool = True
-    """Whether no other method adds what the clouds lack: notes then name one."""
+    transform: Similarity | None = None  # from their frame to the scene's
+    memory: int | None = None  # most bytes
+    alone: bool = True  # whether no other method adds what the clouds lack: notes then name one
 
     def plan(self, scene: Scene) -> MemoryPlan:
         """What it will take for a scene.
@@ -127,20 +104,9 @@ class GivenClouds(Cloud):
         return plan_memory(self.memory, frames_of(scene))
 
     def __call__(
-        self,
-        scene: Scene,
-        num_new: int,  # noqa: ARG002  (the photographs determine the number)
-        rng: np.random.Generator,
-        progress: Progress,
+        self, scene: Scene, num_new: int, rng: np.random.Generator, progress: Progress
     ) -> NewPoints:
-        """Seeds from the clouds.
-
-        Raises:
-            SceneNotFoundError: A file is missing.
-            SceneFormatError: One is damaged.
-            PointCloudError: No point is in view, or the cloud does not fit the scene.
-            ParameterError: The scene has no cameras, or the memory is not enough.
-        """
+        """Seeds from the clouds."""
         from splatseed.seeding.clouds.judging import judge  # noqa: PLC0415  (loads Numba)
         from splatseed.seeding.clouds.voxels import stream  # noqa: PLC0415  (loads Numba)
         from splatseed.seeding.coverage import covered_share  # noqa: PLC0415  (loads Numba)

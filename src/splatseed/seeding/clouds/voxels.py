@@ -38,8 +38,7 @@ UNSEEN = -(1 << 15)
 ASIDE = 0.381966
 """Where voxels begin along each axis: walls at round coordinates would lie on their sides, and
 rounding put their points into either."""
-FINEST = 20
-"""Halvings of the first points' extent that make the first side of even voxels."""
+FINEST = 20  # halvings of the first points' extent that make the first side of even voxels
 
 
 class _Table(NamedTuple):
@@ -64,16 +63,9 @@ class _Table(NamedTuple):
 class Voxels:
     """Points merged as they come, in voxels that all double in side when none is free.
 
-    Args:
-        capacity: Most voxels.
-        views: Only their cameras and sizes matter. Without any, all voxels have one side, the
-            smallest that ``capacity`` allows.
-        pixels: Side of a voxel in pixels of the view that sees it most closely.
-
-    Attributes:
-        coarser: s, how often they grew.
-        total: Points given.
-        unseen: Of these, those that fall in no frame.
+    A side is so many ``pixels`` of the view that sees it most closely; without views all have one,
+    the smallest that ``capacity`` allows. They grew ``coarser`` times; of ``total`` points,
+    ``unseen`` fall in no frame.
     """
 
     def __init__(self, capacity: int, views: Sequence[View] = (), pixels: float = 2.0) -> None:
@@ -244,18 +236,13 @@ def _slot(key, keys, table):  # type: ignore[no-untyped-def]  # Numba's types
     return slot
 
 
-CHUNK = 1 << 19
-"""Points in memory at a time: 50 MB with all that is computed of them."""
-FEWEST, MOST = 1 << 16, 1 << 24
-"""Least and greatest number of voxels."""
-DEFAULT = 4 << 30
-"""Most bytes of memory, unless the user says so."""
-RESERVED = 700_000_000
-"""Bytes for the program, its libraries and a chunk."""
+CHUNK = 1 << 19  # points in memory at a time: 50 MB with all that is computed of them
+FEWEST, MOST = 1 << 16, 1 << 24  # least and greatest number of voxels
+DEFAULT = 4 << 30  # most bytes of memory, unless the user says so
+RESERVED = 700_000_000  # bytes for the program, its libraries and a chunk
 PER_PIXEL = 8
 """Bytes for each pixel of the photographs: the pixel, grey as well, and what stereo knows of it."""
-SAMPLE, LEAST_SAMPLE = 1 << 18, 1000
-"""Most and fewest voxels of an even sample."""
+SAMPLE, LEAST_SAMPLE = 1 << 18, 1000  # most and fewest voxels of an even sample
 TEXT_ROW = 40
 """Bytes of a line of text, to tell how far reading is where the number of lines is not known."""
 
@@ -281,9 +268,6 @@ def plan_memory(most: int | None, views: Sequence[View]) -> MemoryPlan:
     """How many voxels fit into ``most`` bytes of memory, beside photographs.
 
     ``DEFAULT`` when None; never more than is free.
-
-    Raises:
-        ParameterError: The program, the photographs and the fewest voxels do not fit.
     """
     free = free_memory()
     allowed = min(DEFAULT if most is None else most, free if free is not None else DEFAULT)
@@ -309,13 +293,7 @@ def stream(
     capacity: int,
     progress: Progress,
 ) -> Streamed:
-    """Read clouds of one frame into voxels of so many pixels of the views.
-
-    Raises:
-        SceneNotFoundError: A file is missing.
-        SceneFormatError: One is damaged.
-        PointCloudError: One holds no finite point.
-    """
+    """Read clouds of one frame into voxels of so many pixels of the views."""
     files = tuple(open_cloud(path) for path in paths)
     painted = all(file.colors != "none" for file in files)
     voxels = Voxels(capacity, views, pixels)
@@ -356,13 +334,7 @@ def _finite_chunks(
 def sample_cloud(
     paths: Sequence[Path], progress: Progress
 ) -> tuple[Float64[np.ndarray, " 3"], Float64[np.ndarray, "N 3"], UInt8[np.ndarray, "N 3"] | None]:
-    """An even sample of clouds of one frame: what was subtracted, positions, and colours if known.
-
-    Raises:
-        SceneNotFoundError: A file is missing.
-        SceneFormatError: One is damaged.
-        PointCloudError: There are too few points.
-    """
+    """An even sample of clouds of one frame: an offset, positions less it, and colours if known."""
     files = [open_cloud(path) for path in paths]
     painted = all(file.has_color for file in files)
     voxels, offset = Voxels(SAMPLE), np.zeros(3)

@@ -20,15 +20,7 @@ BLOCK = 1 << 18
 
 @dataclass(frozen=True)
 class BoundingBox:
-    """Points uniform in the bounding box, coloured as random originals: the baseline.
-
-    Example:
-        >>> import numpy as np, splatseed as ss
-        >>> xyz = np.array([[0, 0, 0], [1, 2, 3]], np.float32)
-        >>> more, _ = ss.upsample_points(xyz, np.zeros((2, 3), np.uint8), method="random", ratio=50)
-        >>> bool((more.min(axis=0) == 0).all() and (more.max(axis=0) == [1, 2, 3]).all())
-        True
-    """
+    """Points uniform in the bounding box, coloured as random originals: the baseline."""
 
     def __call__(
         self, scene: Scene, num_new: int, rng: np.random.Generator, progress: Progress

@@ -29,20 +29,20 @@ class Depth(Settings):
 
     def __post_init__(self) -> None:
         check_fields(self)
-        require(self.min_points >= 1, "depth.min_points of at least 1", self.min_points)
-        require(0 < self.region <= 1, "depth.region above 0, 1 at most", self.region)
+        edge, color, views = self.edge_tolerance, self.color_tolerance, self.num_neighbors
         ratio = self.max_residual_ratio
-        require(ratio is None or ratio >= 1, "depth.max_residual_ratio of at least 1", ratio)
-        edge = self.edge_tolerance
-        require(edge is None or edge > 0, "depth.edge_tolerance above 0", edge)
-        require(1 <= self.edge_radius <= 100, "depth.edge_radius from 1 to 100", self.edge_radius)
-        views = self.num_neighbors
-        require(1 <= views <= MAX_VIEWS, f"depth.num_neighbors from 1 to {MAX_VIEWS}", views)
-        agreeing = self.min_agreeing
-        require(0 <= agreeing <= views, f"depth.min_agreeing from 0 to {views}", agreeing)
-        require(0 < self.tolerance < 1, "depth.tolerance between 0 and 1", self.tolerance)
-        color = self.color_tolerance
-        require(color is None or 0 < color <= 1, "depth.color_tolerance above 0, 1 at most", color)
+        for field, fits, expected in (
+            ("min_points", self.min_points >= 1, "of at least 1"),
+            ("region", 0 < self.region <= 1, "above 0, 1 at most"),
+            ("max_residual_ratio", ratio is None or ratio >= 1, "of at least 1"),
+            ("edge_tolerance", edge is None or edge > 0, "above 0"),
+            ("edge_radius", 1 <= self.edge_radius <= 100, "from 1 to 100"),
+            ("num_neighbors", 1 <= views <= MAX_VIEWS, f"from 1 to {MAX_VIEWS}"),
+            ("min_agreeing", 0 <= self.min_agreeing <= views, f"from 0 to {views}"),
+            ("tolerance", 0 < self.tolerance < 1, "between 0 and 1"),
+            ("color_tolerance", color is None or 0 < color <= 1, "above 0, 1 at most"),
+        ):
+            require(fits, f"depth.{field} {expected}", getattr(self, field))
 
     @property
     def traits(self) -> Traits:
@@ -53,19 +53,10 @@ class Depth(Settings):
     def paper(cls) -> Self:
         """The parameters that follow the paper to the letter."""
         return cls(
-            fit="least-squares",
-            min_points=1,
-            max_residual_ratio=None,
-            synchronize_scales=False,
-            unit_ray=True,
-            region=0.5,
-            placement="uniform",
-            edge_tolerance=None,
-            min_agreeing=0,
-            see_through=True,
-            color_tolerance=None,
-            spread=False,
-        )
+            fit="least-squares", min_points=1, max_residual_ratio=None, synchronize_scales=False,
+            unit_ray=True, region=0.5, placement="uniform", edge_tolerance=None, min_agreeing=0,
+            see_through=True, color_tolerance=None, spread=False,
+        )  # fmt: skip
 
     def __call__(
         self, scene: Scene, num_new: int, rng: np.random.Generator, progress: Progress

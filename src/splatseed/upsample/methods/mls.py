@@ -19,26 +19,13 @@ from jaxtyping import Float32
 from splatseed.runtime.jit import inline, kernel, parallel_range
 from splatseed.upsample.patches import Patches, PatchMethod
 
-TERMS = 6
-"""1, u, v, u^2, uv, v^2."""
-RIDGE = 1e-6
-"""Relative to the mean diagonal: far below what six or more points determine."""
+TERMS = 6  # 1, u, v, u^2, uv, v^2
+RIDGE = 1e-6  # relative to the mean diagonal: far below what six or more points determine
 
 
 @dataclass(frozen=True)
 class Mls(PatchMethod):
-    """Points on weighted quadratic fits to the neighbours (moving least squares, eqs. 4-5).
-
-    Example:
-        >>> import numpy as np, splatseed as ss
-        >>> u, v = np.random.default_rng(0).uniform(-1, 1, (2, 500))
-        >>> xyz = np.stack([u, v, u * u - v * v], axis=1).astype(np.float32)  # a saddle
-        >>> rgb = np.full((500, 3), 128, np.uint8)
-        >>> more, _ = ss.upsample_points(xyz, rgb, method="mls", ratio=8)
-        >>> x, y, z = more.T
-        >>> bool(np.abs(z - (x * x - y * y)).mean() < 0.002)
-        True
-    """
+    """Points on weighted quadratic fits to the neighbours (moving least squares, eqs. 4-5)."""
 
     k: int = 16
     """Neighbours in a fit (paper: 10)."""

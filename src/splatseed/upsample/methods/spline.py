@@ -19,38 +19,19 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from splatseed.runtime.jit import inline, kernel, parallel_range
+from splatseed.upsample import splines
 from splatseed.upsample.method import require
 from splatseed.upsample.patches import Patches, PatchMethod
-from splatseed.upsample.splines import (
-    CONTROL,
-    PatchBasis,
-    bicubic_heights,
-    cross_validate,
-    evaluate,
-    patch_basis,
-    penalty,
-)
+from splatseed.upsample.splines import COEFFICIENTS, CONTROL, PatchBasis
 
-COEFFICIENTS = CONTROL * CONTROL
 BAND = 3 * CONTROL + 3
 """Bandwidth: two overlapping basis functions are at most this far apart in the flat order."""
-RIDGE = 1e-9
-"""Ridge for control values that no data and, for a plane, no penalty determines."""
+RIDGE = 1e-9  # ridge for control values that no data and, for a plane, no penalty determines
 
 
 @dataclass(frozen=True)
 class Spline(PatchMethod):
-    """Points on smooth B-spline surfaces fitted to the neighbours (eq. 3).
-
-    Example:
-        >>> import numpy as np, splatseed as ss
-        >>> u, v = np.random.default_rng(0).uniform(-1, 1, (2, 500))
-        >>> xyz = np.stack([u, v, np.sin(2 * u)], axis=1).astype(np.float32)
-        >>> rgb = np.full((500, 3), 128, np.uint8)
-        >>> more, _ = ss.upsample_points(xyz, rgb, method="spline", ratio=8)
-        >>> bool(np.abs(more[:, 2] - np.sin(2 * more[:, 0])).mean() < 0.01)
-        True
-    """
+    """Points on smooth B-spline surfaces fitted to the neighbours (eq. 3)."""
 
     k: int = 25
     """Neighbours in a fit (paper: 25)."""
@@ -80,18 +61,16 @@ class Spline(PatchMethod):
     ) -> None:
         """Fit rows ``first:last`` and write S(u, v) of all their new points into ``out`` [M]."""
         if self.basis == "bicubic":
-            bicubic_heights(patches, first, last, out)
+            splines.bicubic_heights(patches, first, last, out)
             return
-        basis = patch_basis(patches, first, last)
+        basis = splines.patch_basis(patches, first, last)
         count = patches.bases.count[first:last]
-        coefficients = fit(basis, count, self._smoothing(basis, count))
-        evaluate(patches, coefficients, basis.scale, first, last, out)
-
-    def _smoothing(self, basis: PatchBasis, count: np.ndarray) -> Float64[np.ndarray, " rows"]:
-        """The penalty's weight for each row."""
         if isinstance(self.smoothing, str):
-            return cross_validate(basis, count)
-        return np.full(len(basis.z), float(self.smoothing))
+            smoothing = splines.cross_validate(basis, count)
+        else:
+            smoothing = np.full(len(basis.z), float(self.smoothing))
+        coefficients = fit(basis, count, smoothing)
+        splines.evaluate(patches, coefficients, basis.scale, first, last, out)
 
 
 def fit(
@@ -99,7 +78,7 @@ def fit(
 ) -> Float64[np.ndarray, "rows 36"]:
     """Control values of every row with new points (``count`` > 0), [rows, 36]; else 0."""
     coefficients = np.zeros((len(basis.z), COEFFICIENTS))
-    _fit(basis.weight, basis.cell, basis.z, count, smoothing, penalty(), coefficients)
+    _fit(basis.weight, basis.cell, basis.z, count, smoothing, splines.penalty(), coefficients)
     return coefficients
 
 

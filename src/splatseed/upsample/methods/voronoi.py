@@ -32,15 +32,7 @@ BLOCK = 1 << 14
 
 @dataclass(frozen=True)
 class Voronoi(NearestMethod):
-    """Points in the Voronoi cells of the originals, more where cells are large (eq. 6).
-
-    Example:
-        >>> import numpy as np, splatseed as ss
-        >>> xyz = np.random.default_rng(0).random((200, 3))
-        >>> more, _ = ss.upsample_points(xyz, np.zeros((200, 3), np.uint8), method="voronoi")
-        >>> more.shape
-        (800, 3)
-    """
+    """Points in the Voronoi cells of the originals, more where cells are large (eq. 6)."""
 
     k: int = 25
     """Neighbours that shape a cell; half the distance of the last bounds it."""
@@ -88,7 +80,9 @@ class Voronoi(NearestMethod):
             center, radius, volume = box_cells(cloud, progress)
             return weight * volume, {"center": center, "radius": radius}
         center, radius, volume, _ = _clamped_cells(cloud, neighbors, progress)
-        weight = weight * _relative(volume, neighbors, self.max_weight, cloud.num_own)
+        relative = np.empty(cloud.num_own)
+        _relative_volume(volume, neighbors.idx, float(self.max_weight), relative)
+        weight = weight * relative
         own = slice(cloud.num_own)
         return weight, {"center": center[own], "radius": radius[own]}
 
@@ -99,7 +93,7 @@ class Voronoi(NearestMethod):
         known: RowData,
         bases: Bases,
         rng: UniformSource,
-        progress: Progress,  # noqa: ARG002  (the base's)
+        progress: Progress,
     ) -> NewPoints:
         """Put the points of all bases in the balls of their cells."""
         frames, _ = local_frames(cloud.xyz, neighbors.idx)
@@ -123,17 +117,9 @@ def _clamped_cells(cloud: PreparedCloud, neighbors: Neighbors, progress: Progres
     return cells
 
 
-def _relative(
-    volume: Float64[np.ndarray, " n"], neighbors: Neighbors, cap: float, num_own: int
-) -> Float64[np.ndarray, " own"]:
-    """Each own volume relative to the median of its neighbours', at most ``cap``, [num_own]."""
-    relative = np.empty(num_own)
-    _relative_volume(volume, neighbors.idx, float(cap), relative)
-    return relative
-
-
 @kernel
 def _relative_volume(volume, idx, cap, relative):  # type: ignore[no-untyped-def]  # Numba's types
+    """Each own volume relative to the median of its neighbours', at most ``cap``."""
     for i in parallel_range(len(relative)):
         around = np.sort(volume[idx[i]])
         median = 0.5 * (around[(around.size - 1) // 2] + around[around.size // 2])
