@@ -25,8 +25,7 @@ from splatseed.pointcloud import PointCloud
 from splatseed.similarity import Similarity
 from splatseed.splat.formats import read_model
 from splatseed.synthetic import make_capture
-from splatseed.upsample import METHODS, chooses_number, configure
-from splatseed.upsample.registry import SOURCE_CODES
+from splatseed.upsample import METHODS, SOURCE_CODES, chooses_number, configure
 
 WITH_RATIO = [name for name in METHODS if not chooses_number(name)]
 
