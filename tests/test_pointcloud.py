@@ -125,15 +125,6 @@ def test_what_is_known_of_a_point_goes_where_it_goes(first, second, data):
         assert set(part.attributes) == set(both.attributes)
 
 
-def test_an_attribute_can_be_taken_out_and_put_in(cloud):
-    sized = cloud.replace(sizes=np.arange(1, 7))
-    assert sized.sizes.dtype == np.float32
-    with pytest.raises(ValueError, match="read-only"):
-        sized.sizes[0] = 1
-    assert sized.replace(xyz=cloud.xyz + 1).sizes.tolist() == [1, 2, 3, 4, 5, 6]
-    assert sized.replace(sizes=None).attributes == {}
-
-
 @pytest.mark.parametrize(
     ("name", "values", "says"),
     [

@@ -133,20 +133,6 @@ def test_empty_models_are_models(tmp_path, name, data):
     assert (tracks.offsets.tolist(), tracks.image_ids.dtype) == ([0], np.uint32)
 
 
-@pytest.mark.parametrize(
-    ("name", "data"),
-    [
-        ("a.bin", struct.pack("<QQ3d3BdQ", 1, 5, np.nan, np.inf, 1e300, 1, 2, 3, np.nan, 0)),
-        ("a.txt", b"5 nan inf 1e300 1 2 3 nan"),
-    ],
-)
-def test_non_finite_points_pass(tmp_path, name, data):
-    (tmp_path / name).write_bytes(data)
-    points, tracks = colmap.read_points3d(tmp_path / name)
-    np.testing.assert_array_equal(points.xyz, [[np.nan, np.inf, np.inf]])
-    np.testing.assert_array_equal(tracks.xyz, [[np.nan, np.inf, 1e300]])
-
-
 CAMERA = struct.pack("<QIiQQ4d", 1, 1, 1, 640, 480, 500, 500, 320, 240)
 IMAGE = struct.pack("<QI7dI", 1, 1, 1, 0, 0, 0, 0, 0, 0, 1) + b"a.jpg\0" + struct.pack("<Q", 0)
 POINT = struct.pack("<Q3d3BdQ2I", 1, 0, 0, 0, 1, 2, 3, 0.5, 1, 1, 0)  # without the file's count
@@ -246,11 +232,7 @@ def test_text_may_have_comments_blank_lines_any_line_ends_and_names_with_spaces(
     lines[2] += "1 2 -1 3 4 9\n3 1 0 0 0 0 0 0 1 c.jpg"  # whose line of features is missing
     (tmp_path / "images.txt").write_text("\n".join(lines))
     images = colmap.read_images(tmp_path / "images.txt", CAMERAS)
-    assert [image.name for image in images] == [
-        "my photos/1  b.jpg",
-        "my photos/2  b.jpg",
-        "c.jpg",
-    ]
+    assert [image.name for image in images] == ["my photos/1  b.jpg", "my photos/2  b.jpg", "c.jpg"]
     assert [len(image.observations) for image in images] == [0, 2, 0]
     assert images[1].observations.xy.tolist() == [[1, 2], [3, 4]]
     assert images[1].observations.point_ids.tolist() == [-1, 9]
@@ -297,30 +279,3 @@ def test_pycolmap_reads_what_we_write_and_we_what_it_writes(model, tmp_path):
     reconstruction.write_text(tmp_path / "theirs")
     for suffix in ("bin", "txt"):
         assert_agree(reconstruction, *read(tmp_path / "theirs", suffix))
-
-
-def test_pycolmap_takes_points_without_tracks_and_images_without_features(model, tmp_path):
-    pycolmap = pytest.importorskip("pycolmap")
-    grown = PointCloud.concatenate(model.points, model.points)
-    reconstruction = pycolmap.Reconstruction(written(tmp_path, model._replace(points=grown)))
-    new = [p for p in reconstruction.points3D.values() if not p.track.length()]
-    assert (len(reconstruction.points3D), len(new)) == (20, 10)
-    assert {p.error for p in new} == {pycolmap.Point3D().error}
-    images = tuple(replace(image, observations=None) for image in model.images)
-    written(tmp_path, model._replace(images=images))
-    colmap.write_points3d(tmp_path / "points3D.bin", model.points, None)
-    theirs = pycolmap.Reconstruction(tmp_path).images
-    assert {image.name for image in theirs.values()} == {image.name for image in images}
-    assert [len(image.observations) for image in read(tmp_path)[1]] == [0] * 4
-
-
-def test_both_forms_of_a_real_model_agree(scenes, tmp_path):
-    pycolmap = pytest.importorskip("pycolmap")
-    reconstruction = pycolmap.Reconstruction(scenes / "fern" / "sparse" / "0")
-    reconstruction.write_binary(tmp_path)
-    reconstruction.write_text(tmp_path)
-    cameras, images, *points = read(tmp_path)
-    text_cameras, text_images, *text_points = read(tmp_path, "txt")
-    assert text_cameras == cameras
-    assert_same_images(text_images, images)
-    assert_same_points(text_points, points)

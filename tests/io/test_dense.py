@@ -12,12 +12,7 @@ from PIL import Image as PilImage
 
 from splatseed.camera import Camera
 from splatseed.depth.stereo import StereoMap
-from splatseed.errors import (
-    InputError,
-    OutputError,
-    SceneFormatError,
-    SceneNotFoundError,
-)
+from splatseed.errors import InputError, OutputError, SceneFormatError, SceneNotFoundError
 from splatseed.io import find_depths, load_scene
 from splatseed.io.dense import (
     depth_along,

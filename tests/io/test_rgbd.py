@@ -123,20 +123,7 @@ def test_images_without_pose_or_file_are_left_out_and_told(capture):
     assert "1 image without a file is left out" in without_file
 
 
-DISTORTED = (
-    517.3,
-    516.5,
-    319.1,
-    255.8,
-    0.2624,
-    -0.9531,
-    -0.0054,
-    0.0026,
-    1.1633,
-    0.01,
-    -0.02,
-    0.03,
-)
+DISTORTED = (517.3, 516.5, 319.1, 255.8, 0.26, -0.95, -0.005, 0.003, 1.16, 0.01, -0.02, 0.03)
 
 
 def test_undistorted_map_has_the_value_that_the_lens_saw_along_each_ray():

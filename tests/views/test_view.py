@@ -58,13 +58,6 @@ def test_a_point_stays_on_its_pixel(room, factor):
     assert np.allclose(small[depth > 0], uv[depth > 0] / factor, atol=1e-6)
 
 
-def test_split_takes_every_eighth_by_name(room):
-    train, test = load_split(room)
-    names = sorted(image.name for image in room.images)
-    assert [view.name for view in test] == names[::8]
-    assert sorted(view.name for view in (*train, *test)) == names
-
-
 @pytest.fixture
 def copied(room_path, tmp_path):
     shutil.copytree(room_path, tmp_path / "copy")
