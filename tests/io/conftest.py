@@ -1,7 +1,8 @@
-"""Small COLMAP models for the tests of the formats."""
+"""Small COLMAP models and clouds for the tests of the formats."""
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 from typing import NamedTuple
 
@@ -58,14 +59,20 @@ def model(rng) -> Model:
     return Model(intrinsics, tuple(images), points, tracks)
 
 
+def written(folder: Path, model: Model) -> Path:
+    """The folder, with the model's files in binary."""
+    colmap.write_cameras(folder / "cameras.bin", model.intrinsics)
+    colmap.write_images(folder / "images.bin", model.images)
+    colmap.write_points3d(folder / "points3D.bin", model.points, model.tracks)
+    return folder
+
+
 @pytest.fixture
 def scene_dir(tmp_path, model) -> Path:
     """The model as a scene folder with its photographs."""
     root = tmp_path / "scene"
     (root / "sparse" / "0").mkdir(parents=True)
-    colmap.write_cameras(root / "sparse/0/cameras.bin", model.intrinsics)
-    colmap.write_images(root / "sparse/0/images.bin", model.images)
-    colmap.write_points3d(root / "sparse/0/points3D.bin", model.points, model.tracks)
+    written(root / "sparse/0", model)
     for image in model.images:
         path = root / "images" / image.name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -78,3 +85,57 @@ def scene_dir(tmp_path, model) -> Path:
 def target(tmp_path_factory) -> Path:
     """A file for fuzzed bytes."""
     return tmp_path_factory.mktemp("fuzz") / "file"
+
+
+class CloudFiles(NamedTuple):
+    folder: Path
+    xyz: np.ndarray
+    """[60, 3], of 3 decimals."""
+    rgb: np.ndarray
+
+
+TABLES = (
+    *("cloud.ply", "text.ply", "a.glb", "map.npz", "packed.npz", "a.pcd", "text.pcd"),
+    *("packed.pcd", "a.xyz", "a.csv", "a.pts"),
+)
+CLOUDS = ("a.las", "a.laz", "new.laz", "a.e57", *TABLES)
+PCD = "FIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F U\nCOUNT 1 1 1 1\nWIDTH 60\nHEIGHT 1\nDATA "
+
+
+@pytest.fixture(scope="session")
+def cloud_files(tmp_path_factory) -> CloudFiles:
+    """One cloud in every format, mostly by other packages."""
+    pye57, trimesh = pytest.importorskip("pye57"), pytest.importorskip("trimesh")
+    laspy = pytest.importorskip("laspy")
+    folder, rng = tmp_path_factory.mktemp("clouds"), np.random.default_rng(0)
+    xyz, rgb = rng.normal(size=(60, 3)).round(3), rng.integers(0, 256, (60, 3)).astype(np.uint8)
+    for name, kind, version in (("a.las", 3, "1.2"), ("a.laz", 3, "1.2"), ("new.laz", 7, "1.4")):
+        las = laspy.LasData(laspy.LasHeader(point_format=kind, version=version))
+        las.x, las.y, las.z = xyz.T
+        las.write(folder / name)
+    file = pye57.E57(str(folder / "a.e57"), mode="w")
+    file.write_scan_raw({f"cartesian{axis}": xyz[:, i].copy() for i, axis in enumerate("XYZ")})
+    file.close()
+    cloud = trimesh.PointCloud(xyz, colors=rgb)
+    cloud.export(folder / "cloud.ply")
+    cloud.export(folder / "text.ply", encoding="ascii")
+    cloud.export(folder / "a.glb")
+    np.savez(folder / "map.npz", xyz=xyz, rgb=rgb)
+    maps = {"pts3d": np.asfortranarray(xyz.reshape(6, 10, 3)), "conf": np.full((6, 10), 3.0)}
+    np.savez_compressed(folder / "packed.npz", **maps, rgb=rgb.reshape(6, 10, 3))
+    rows = np.zeros(60, [("xyz", "<f4", 3), ("rgb", "<u4")])
+    rows["xyz"], rows["rgb"] = xyz, rgb @ np.array([1 << 16, 1 << 8, 1], np.uint32)
+    (folder / "a.pcd").write_bytes(f"{PCD}binary\n".encode() + rows.tobytes())
+    lines = "\n".join(f"{p[0]:.3f} {p[1]:.3f} {p[2]:.3f} {c}" for p, c in rows.tolist())
+    (folder / "text.pcd").write_text(f"{PCD}ascii\n{lines}\n")
+    columns = np.ascontiguousarray(rows["xyz"].T).tobytes() + rows["rgb"].tobytes()
+    runs = (columns[at : at + 32] for at in range(0, len(columns), 32))
+    packed = b"".join(bytes([len(run) - 1]) + run for run in runs)  # LZF of literal runs
+    body = struct.pack("<II", len(packed), len(columns)) + packed
+    (folder / "packed.pcd").write_bytes(f"{PCD}binary_compressed\n".encode() + body)
+    table, kinds = np.hstack([xyz, rgb]), ["%.3f"] * 3 + ["%d"] * 3
+    np.savetxt(folder / "a.xyz", table, kinds)
+    np.savetxt(folder / "a.csv", table, kinds, ",", header="X,Y,Z,R,G,B", comments="")
+    with_intensity = np.insert(table, 3, -900, axis=1)
+    np.savetxt(folder / "a.pts", with_intensity, [*kinds, "%d"], header="60", comments="")
+    return CloudFiles(folder, xyz, rgb)

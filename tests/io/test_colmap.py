@@ -18,7 +18,7 @@ from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Observations, Tracks
 
 from .checks import assert_same_images, assert_same_points, little_memory
-from .conftest import Model
+from .conftest import Model, written
 
 REAL_MODELS = [
     f"{scene}/sparse/0" for scene in ("fern", "fox", "treehill", "bonsai", "mipnerf360_sfm/stump")
@@ -29,13 +29,6 @@ READERS = {
     "images": lambda path: colmap.read_images(path, CAMERAS),
     "points": colmap.read_points3d,
 }
-
-
-def written(folder, model):
-    colmap.write_cameras(folder / "cameras.bin", model.intrinsics)
-    colmap.write_images(folder / "images.bin", model.images)
-    colmap.write_points3d(folder / "points3D.bin", model.points, model.tracks)
-    return folder
 
 
 def read(folder, suffix="bin"):

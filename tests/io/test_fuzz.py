@@ -24,6 +24,7 @@ from splatseed.io.ply import read_ply, write_ply
 from splatseed.io.rgbd import _read_list, _read_track
 
 from .checks import assert_only_our_errors
+from .conftest import CLOUDS
 
 CAMERAS = (Intrinsics(7, "PINHOLE", 64, 48, (50.0, 50.0, 32.0, 24.0)),)
 
@@ -57,10 +58,6 @@ WORDS = st.sampled_from(
     + ["\n"] * 6
     + ["\r\n", "\t", "\0", "\x1c", "\u2028", "\u0663", "PINHOLE", "OPENCV", "a b.jpg", '"']
 )
-CLOUDS = (
-    *("a.las", "a.laz", "new.laz", "a.e57", "cloud.ply", "text.ply", "a.glb", "map.npz"),
-    *("packed.npz", "a.pcd", "text.pcd", "packed.pcd", "a.xyz", "a.csv", "a.pts"),
-)
 HEADERS = st.sampled_from(
     [
         *(b"", b"4&3&1&", b"Pf\n4 3\n-1\n", b"\x93NUMPY\x01\x00", b"PK\x03\x04"),
@@ -90,7 +87,6 @@ property list uchar int vertex_indices
 end_header
 """
 ROW = np.dtype([("x", ">f4"), ("y", ">f4"), ("z", ">f8"), ("r", ">u2"), ("g", ">f4"), ("b", ">i4")])
-PCD = "FIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F U\nCOUNT 1 1 1 1\nWIDTH 60\nHEIGHT 1\nDATA "
 
 
 @pytest.fixture(scope="module")
@@ -129,42 +125,11 @@ def valid(tmp_path_factory) -> dict[str, bytes]:
 
 
 @pytest.fixture(scope="module")
-def clouds(tmp_path_factory) -> dict[str, bytes]:
+def clouds(cloud_files) -> dict[str, bytes]:
     """The same of clouds."""
-    pye57, trimesh = pytest.importorskip("pye57"), pytest.importorskip("trimesh")
-    laspy = pytest.importorskip("laspy")
-    folder, rng = tmp_path_factory.mktemp("clouds"), np.random.default_rng(0)
-    xyz, rgb = rng.normal(size=(60, 3)), rng.integers(0, 256, (60, 3)).astype(np.uint8)
-    for name, kind, version in (("a.las", 3, "1.2"), ("a.laz", 3, "1.2"), ("new.laz", 7, "1.4")):
-        las = laspy.LasData(laspy.LasHeader(point_format=kind, version=version))
-        las.x, las.y, las.z = xyz.T
-        las.write(folder / name)
-    file = pye57.E57(str(folder / "a.e57"), mode="w")
-    file.write_scan_raw({f"cartesian{axis}": xyz[:, i].copy() for i, axis in enumerate("XYZ")})
-    file.close()
-    cloud = trimesh.PointCloud(xyz, colors=rgb)
-    cloud.export(folder / "cloud.ply")
-    cloud.export(folder / "text.ply", encoding="ascii")
-    cloud.export(folder / "a.glb")
-    np.savez(folder / "map.npz", xyz=xyz, rgb=rgb)
-    maps = {"pts3d": np.asfortranarray(xyz.reshape(6, 10, 3)), "conf": np.ones((6, 10))}
-    np.savez_compressed(folder / "packed.npz", **maps)
-    rows = np.zeros(60, [("xyz", "<f4", 3), ("rgb", "<u4")])
-    rows["xyz"] = xyz
-    (folder / "a.pcd").write_bytes(f"{PCD}binary\n".encode() + rows.tobytes())
-    lines = "\n".join("{:.4f} {:.4f} {:.4f} 0".format(*row) for row in xyz)
-    (folder / "text.pcd").write_text(f"{PCD}ascii\n{lines}\n")
-    columns = np.ascontiguousarray(rows["xyz"].T).tobytes() + rows["rgb"].tobytes()
-    runs = (columns[at : at + 32] for at in range(0, len(columns), 32))
-    packed = b"".join(bytes([len(run) - 1]) + run for run in runs)  # LZF of literal runs
-    body = struct.pack("<II", len(packed), len(columns)) + packed
-    (folder / "packed.pcd").write_bytes(f"{PCD}binary_compressed\n".encode() + body)
-    np.savetxt(folder / "a.xyz", xyz)
-    np.savetxt(folder / "a.csv", xyz, delimiter=",", header="x,y,z", comments="")
-    np.savetxt(folder / "a.pts", np.hstack([xyz, rgb]), header="60", comments="")
     for name in CLOUDS:
-        drain(folder / name)
-    return {name: (folder / name).read_bytes() for name in CLOUDS}
+        drain(cloud_files.folder / name)
+    return {name: (cloud_files.folder / name).read_bytes() for name in CLOUDS}
 
 
 @st.composite

@@ -58,18 +58,6 @@ def assert_same(actual: PointCloud, expected: PointCloud) -> None:
         np.testing.assert_allclose(now, then, rtol=0, atol=step)
 
 
-@settings(deadline=None, max_examples=50)
-@given(clouds())
-def test_all_that_is_known_comes_back(tmp_path_factory, cloud):
-    folder = tmp_path_factory.mktemp("seeds")
-    write_seeds(folder, cloud)
-    bare = PointCloud(cloud.xyz, cloud.rgb)
-    known, warnings = _read_seeds(folder, bare)
-    assert warnings == ()
-    assert "source" in known or set(cloud.source) <= {0, 255}
-    assert_same(bare.replace(**known), cloud if "source" in known else cloud.replace(source=None))
-
-
 @settings(deadline=None, max_examples=20)
 @given(cloud=clouds(), layout=st.sampled_from(["colmap", "transforms"]))
 def test_a_scene_keeps_what_is_known_of_its_seeds(scene, tmp_path_factory, cloud, layout):
