@@ -16,8 +16,7 @@ COEFFICIENTS = (-0.12, 0.02, 0.002, -0.003)
 
 
 def bend(capture):
-    """The capture with photographs, features and cameras of a lens; depths stay the pinhole
-    camera's."""
+    """The capture through a lens; depths stay the pinhole camera's."""
     images = [_bent(image) for image in capture.scene.images]
     pictures = [_photograph(p, i.intrinsics) for p, i in zip(capture.images, images, strict=True)]
     lenses = {image.intrinsics.camera_id: image.intrinsics for image in images}

@@ -12,8 +12,7 @@ NUM_SOURCES = 4
 
 
 def true_maps(capture, factor):
-    """A map of every image, ``factor`` times smaller; remaining pixels are cut off, as blocks
-    are."""
+    """A map of every image, ``factor`` times smaller; remaining pixels are cut off."""
     images = capture.scene.images
     return tuple(_true_map(capture, i, factor) for i in range(len(images)))
 

@@ -167,20 +167,8 @@ def test_visible_text_has_nothing_that_acts(text):
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="needs a shell")
 def test_a_shell_reads_quoted_names_back():
-    names = [
-        EVIL,
-        "a b",
-        "$(touch x)",
-        "`x`",
-        "~",
-        "*",
-        "it's",
-        "-rf",
-        "a\udcffb",
-        "\x01",
-        "é\n",
-        "x\\'\n",
-    ]
+    names = ["a b", "$(touch x)", "`x`", "~", "*", "it's", "-rf"]
+    names += [EVIL, "a\udcffb", "\x01", "é\n", "x\\'\n"]
     words = " ".join(map(quoted, names))
     done = subprocess.run(
         ["bash", "-c", f"printf '%s\\0' {words}".encode("utf-8", "surrogateescape")],

@@ -9,17 +9,14 @@ from splatseed.camera import CAMERA_MODELS, Intrinsics
 from splatseed.lens import image_points, rays_through
 
 
-def make_lens(model, rng, size=0.03):
-    """A lens of a model with moderate distortion."""
-    info = CAMERA_MODELS[model]
-    pinhole = ((50.0, 55.0) if info.num_focal == 2 else (50.0,)) + (32.0, 24.0)
-    rest = rng.normal(scale=size, size=info.num_params - len(pinhole))
-    return Intrinsics(1, model, 64, 48, (*pinhole, *((0.7,) if model == "FOV" else rest)))
-
-
 @pytest.fixture(params=CAMERA_MODELS)
 def lens(request, rng):
-    return make_lens(request.param, rng)
+    """A lens of each model with moderate distortion."""
+    info = CAMERA_MODELS[request.param]
+    pinhole = ((50.0, 55.0) if info.num_focal == 2 else (50.0,)) + (32.0, 24.0)
+    rest = rng.normal(scale=0.03, size=info.num_params - len(pinhole))
+    params = (*pinhole, *((0.7,) if request.param == "FOV" else rest))
+    return Intrinsics(1, request.param, 64, 48, params)
 
 
 @pytest.fixture

@@ -59,8 +59,7 @@ LAZY = re.compile(r"[a-z_]+(\.[a-z_]+)+:[A-Z]\w+")
 
 
 def _imports(path):
-    """The modules that a file imports anywhere, also within functions, or names as
-    "module:Class"."""
+    """What a file imports anywhere, also within functions, or names as "module:Class"."""
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)

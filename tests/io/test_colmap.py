@@ -1,5 +1,4 @@
-"""COLMAP's files in both forms: read, written back byte for byte, judged by pycolmap, and one error
-with the place for whatever is malformed."""
+"""COLMAP's files in both forms: byte for byte, judged by pycolmap, and errors with their place."""
 
 from __future__ import annotations
 

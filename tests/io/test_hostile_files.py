@@ -1,5 +1,4 @@
-"""Files that a scene names and that are none: pipes, devices, links into themselves, archives that
-burst."""
+"""What a scene names and is no file: pipes, devices, endless links, archives that burst."""
 
 from __future__ import annotations
 

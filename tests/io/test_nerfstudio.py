@@ -136,8 +136,7 @@ def test_cameras_tell_how_colmaps_points_are_brought_over(content, scene_dir, mo
 
 
 def test_instant_ngps_recentred_poses_are_fitted(content, scene_dir, model, rng):
-    """Its converter turns the up axis, moves what cameras look at to 0, and scales by one
-    number."""
+    """Its converter turns the up axis, moves what cameras look at to 0, and scales."""
     del content["applied_transform"]
     rotation = rotation_from_quat(rng.normal(size=4))
     moved = Similarity(0.37, rotation, rng.normal(size=3))
@@ -264,8 +263,7 @@ def test_malformed_files_and_frames_are_named(content, tmp_path, change, frame):
 
 @pytest.mark.parametrize("layout", ["auto", "colmap"])
 def test_blenders_files_are_one_scene_and_so_is_its_output(layout, tmp_path, rng):
-    """As NeRF's data set has it: paths without suffix, one angle of view, names alike in each
-    part."""
+    """As in NeRF's data set: paths without suffix, one angle of view, names alike in each part."""
     root, counts = tmp_path / "lego", {"train": 5, "val": 2, "test": 3}
     for part, count in counts.items():
         (root / part).mkdir(parents=True)

@@ -73,8 +73,7 @@ def test_grey_of_16_bits_becomes_the_nearest_of_8(name, tmp_path):
 
 
 def test_grey_of_16_bits_that_pillow_opens_as_32_is_the_same(monkeypatch, tmp_path):
-    """As before Pillow 11: its own conversion from I;16, and the format, stand in for the older
-    reader."""
+    """As before Pillow 11, whose reader its own conversion from I;16 stands in for."""
     (tmp_path / "a.png").write_bytes(_png16(ALL16[..., None]))
     real = PilImage.open
 

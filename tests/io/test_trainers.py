@@ -1,8 +1,4 @@
-"""What each trainer's loader demands of a scene folder, checked on what we write.
-
-Each test does in a few lines what that loader does with the files, with the strictness it has; the
-table of these rules is in docs/formats.md.
-"""
+"""What we write passes what each trainer's loader demands, done as strictly (docs/formats.md)."""
 
 from __future__ import annotations
 
