@@ -14,7 +14,6 @@ from rich.console import Console
 import splatseed
 from splatseed import console
 from splatseed.console import (
-    LiteralConsole,
     StageClock,
     print_note,
     print_pairs,
@@ -110,38 +109,17 @@ def test_the_bars_go_away_when_the_work_fails(terminal):
     assert terminal.getvalue() == drawn
 
 
-@pytest.mark.parametrize("text", [LONG, "[bold]no markup[/bold]", "a [3, 4] b", "3 x 4 = 12.5"])
-def test_text_is_printed_as_it_is_on_one_line(text, capsys):
+LITERAL = (LONG, "[bold]no markup[/bold]", "a [3, 4] b", "3 x 4 = 12.5")
+
+
+@pytest.mark.parametrize(("text", "shown"), [*zip(LITERAL, LITERAL, strict=True), (EVIL, SHOWN)])
+def test_text_is_printed_as_it_is_on_one_line(text, shown, capsys):
     print_pairs(text, [("label", text), ("", text)])
     print_note(text)
     print_table(text, ("image", *(f"column {i}" for i in range(8))), [(text, *"12345678")])
     out = capsys.readouterr().out
-    assert sum(text in line for line in out.splitlines()) == 6  # also in a table in a file
+    assert sum(shown in line for line in out.splitlines()) == 6  # also in a table in a file
     assert "\x1b" not in out
-
-
-@pytest.fixture
-def out(monkeypatch):
-    """What goes to a terminal of 400 columns."""
-    written = io.StringIO()
-    screen = LiteralConsole(file=written, force_terminal=True, width=400, color_system=None)
-    monkeypatch.setattr(console, "OUT", screen)
-    return written
-
-
-@pytest.mark.parametrize(
-    "show",
-    [
-        lambda: print_note(EVIL),
-        lambda: print_pairs(EVIL, [("what", "")]),
-        lambda: print_pairs("", [("what", EVIL)]),
-        lambda: print_table("", ("what",), [(EVIL,)]),
-    ],
-)
-def test_what_is_printed_is_literal(show, out):
-    show()
-    assert SHOWN in out.getvalue()
-    assert "\x1b" not in out.getvalue().replace("\x1b[0m", "")
 
 
 def test_all_that_is_printed_goes_through_the_literal_console():

@@ -13,12 +13,6 @@ from splatseed.errors import PointCloudError
 from splatseed.pointcloud import ATTRIBUTES, PointCloud
 
 
-@pytest.fixture
-def cloud(rng):
-    rgb = rng.integers(0, 256, (6, 3)).astype(np.uint8)
-    return PointCloud(rng.normal(size=(6, 3)), rgb, np.array([0, 0, 4, 0, 4, 1], np.uint8))
-
-
 def test_arrays_are_read_only_and_the_callers_stay_writable():
     xyz, rgb = np.zeros((3, 3), np.float32), np.zeros((3, 3), np.uint8)
     cloud = PointCloud(xyz, rgb)
@@ -28,22 +22,6 @@ def test_arrays_are_read_only_and_the_callers_stay_writable():
     with pytest.raises(dataclasses.FrozenInstanceError):
         cloud.xyz = xyz
     xyz[0], rgb[0] = 1, 1
-
-
-def test_originals_and_new_points_are_told_apart(cloud):
-    assert cloud.num_original == 3
-    np.testing.assert_array_equal(cloud.originals.xyz, cloud.xyz[[0, 1, 3]])
-    assert not cloud.originals.source.any()
-
-
-def test_finite_needs_all_three():
-    xyz = np.array([[0, 0, 0], [0, np.nan, 0], [np.inf, 0, 0], [0, 0, -np.inf]])
-    assert PointCloud(xyz, np.zeros((4, 3), np.uint8)).finite.tolist() == [
-        True,
-        False,
-        False,
-        False,
-    ]
 
 
 @pytest.mark.parametrize(
@@ -72,6 +50,7 @@ def test_distinct_points_are_finite_and_the_first_at_their_position(rng):
     xyz[::50, 0] = np.nan
     xyz[::70, 2] = np.inf
     cloud = PointCloud(xyz, np.zeros((500, 3), np.uint8))
+    np.testing.assert_array_equal(cloud.finite, np.isfinite(xyz).all(axis=1))
     seen: set[tuple[float, ...]] = set()
     for i, row in enumerate(map(tuple, xyz.tolist())):
         assert cloud.distinct[i] == (np.isfinite(row).all() and row not in seen)
@@ -115,6 +94,8 @@ def test_what_is_known_of_a_point_goes_where_it_goes(first, second, data):
     assert set(both.attributes) == set(first.attributes) | set(second.attributes)
     which = data.draw(hnp.arrays(bool, len(both)))
     kept = both.select(which)
+    assert kept.num_original == len(kept.originals) == np.count_nonzero(both.source[which] == 0)
+    assert not kept.originals.source.any()
     for part in (
         kept,
         kept.originals,
