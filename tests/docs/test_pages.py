@@ -1,7 +1,8 @@
-"""Every command in the documentation is one that the command line takes."""
+"""What the pages say holds: commands, options and links; and so do the docstrings' examples."""
 
 from __future__ import annotations
 
+import doctest
 import re
 import shlex
 from contextlib import suppress
@@ -18,9 +19,12 @@ from splatseed.commands.upsample import full_options
 from splatseed.errors import SceneNotFoundError
 
 from ..command_line import options_of
+from ..test_package import MODULES
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+MEASURED = sorted((ROOT / "benchmarks").rglob("*.md"))
+LINKED = dict.fromkeys([*PAGES, *ROOT.glob("*.md"), *MEASURED])
 OWN_METHOD = "jitter"
 """Of an example, which has to be installed first."""
 OTHERS = {"--max-2D-matches-per-3D-point"}
@@ -42,7 +46,7 @@ def _blocks(page):
 
 def _commands():
     """The words of each whole command in a page's blocks, after ``splatseed``."""
-    for page in (*PAGES, *sorted((ROOT / "benchmarks").rglob("*.md"))):
+    for page in (*PAGES, *MEASURED):
         for line in "".join(_blocks(page)).replace("\\\n", " ").splitlines():
             words = shlex.split(line.partition(">")[0], comments=True)
             if words and Path(words[0]).name == "splatseed" and OWN_METHOD not in words:
@@ -75,8 +79,7 @@ def _options(verb):
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_options_in_the_text_are_there(page):
-    text = re.sub(r"```.*?```", "", page.read_text("utf-8"), flags=re.DOTALL)
-    for code in re.findall(r"`([^`]+)`", text):
+    for code in re.findall(r"`([^`]+)`", _without_blocks(page)):
         named = re.match(r"\s*splatseed\s+([a-z]+)\b", code)
         if named:
             assert named[1] in VERBS, code
@@ -86,3 +89,38 @@ def test_options_in_the_text_are_there(page):
         for option in re.findall(r"(?<![\w-])--[a-z][\w.-]*", code):
             everywhere = OTHERS | {"--help", "--version", COMPLETION}
             assert any(option in each for each in known) or option in everywhere, code
+
+
+def _without_blocks(page):
+    return re.sub(r"```.*?```", "", page.read_text("utf-8"), flags=re.DOTALL)
+
+
+def _anchors(page):
+    """As GitHub makes them of headings, a repeated one with a number; and those set by hand."""
+    text = _without_blocks(page)
+    anchors = re.findall(r'<a id="(.*?)">', text)
+    for heading in re.findall(r"^#+ (.*)$", text, re.MULTILINE):
+        anchor = re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
+        again = sum(
+            re.fullmatch(rf"{re.escape(anchor)}(-\d+)?", each) is not None for each in anchors
+        )
+        anchors.append(f"{anchor}-{again}" if again else anchor)
+    return anchors
+
+
+@pytest.mark.parametrize("page", LINKED, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_lead_somewhere(page):
+    text = re.sub(r"`[^`]*`", "", _without_blocks(page))
+    for target in re.findall(r"\]\(([^)\s]+)\)", text):
+        if re.match(r"[a-z]+:", target):
+            continue  # elsewhere
+        path, _, anchor = target.partition("#")
+        other = (page.parent / path).resolve() if path else page
+        assert other.exists(), target
+        assert not anchor or anchor in _anchors(other), target
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_docstrings_examples_give_what_they_say(name):
+    result = doctest.testmod(import_module(name), optionflags=doctest.ELLIPSIS)
+    assert result.failed == 0
