@@ -44,12 +44,6 @@ def test_a_surface_hides_what_shows_between_its_points(rng):
     assert covered_share([view], np.float32(lattice(view, CELLS, depth))) == 1.0
 
 
-def test_a_point_that_hangs_before_a_surface_does_not_hide_it(rng):
-    view = slow.make_view(rng, 80, 80, 80, eye=(0, -1, 0))
-    points = [*(4 * lattice(view, CELLS, 4.0)), slow.lift(view, 8, 5, 5, 0.1)]
-    np.testing.assert_allclose(cell_depths(view, np.float32(points), 8), 4.0, rtol=1e-5)
-
-
 def sheet(rng, num):
     """Points on a bent sheet about 2 wide, dense on its left."""
     u, v = rng.random((2, num)) ** [[3], [1]] * 2 - 1
@@ -86,14 +80,6 @@ def test_exactly_so_many_are_kept(seed, num, first, num_views):
     finite = np.isfinite(xyz[:, 0])
     if num_views == 0 and num <= finite.sum():
         assert finite[kept].all()  # what is nowhere comes last
-
-
-def test_thinning_leaves_the_picture_covered(rng):
-    xyz, views = sheet(rng, 20_000), views_of(rng, 6)
-    chance = rng.choice(len(xyz), 1200, replace=False)
-    ours, whole = covered_share(views, xyz[thin(xyz, views, 1200)], 3), covered_share(views, xyz, 3)
-    assert ours > 0.85 * whole
-    assert ours > covered_share(views, xyz[chance], 3) + 0.1 * whole
 
 
 def test_the_only_seed_of_a_cell_stays_before_the_second_of_another(rng):

@@ -73,15 +73,12 @@ def test_a_lattice_gives_finite_points_near_it(kind, dimension):
 
 
 @every_kind
-@pytest.mark.parametrize("gap", [1e-7, 1e-30], ids=["one last place", "below float64"])
-def test_points_that_nearly_coincide_do_no_harm(kind, gap, wavy):
-    xyz = wavy.xyz.copy()
-    xyz[0], xyz[1] = (0.0, 0.0, 0.0), (gap, 0.0, 0.0)
-    assert kind(wavy.replace(xyz=xyz), ratio=20).finite.all()
-
-
-@every_kind
-@pytest.mark.parametrize("scale", [1e-30, 1e14])  # beyond 1e15, coordinates are no places
-def test_extreme_units_are_no_obstacle(kind, scale, wavy):
-    xyz = (wavy.xyz.astype(np.float64) * scale).astype(np.float32)
-    assert kind(wavy.replace(xyz=xyz)).finite.all()
+@pytest.mark.parametrize(
+    ("scale", "gap", "ratio"),
+    [(1e-30, None, 4), (1e14, None, 4), (1, 1e-7, 20), (1, 1e-30, 20)],
+)
+def test_extreme_units_and_points_that_nearly_coincide_do_no_harm(kind, scale, gap, ratio, wavy):
+    xyz = wavy.xyz.astype(np.float64) * scale  # beyond 1e15, coordinates are no places
+    if gap is not None:
+        xyz[:2] = np.outer([0.0, gap], [1.0, 0.0, 0.0])
+    assert kind(wavy.replace(xyz=xyz.astype(np.float32)), ratio=ratio).finite.all()

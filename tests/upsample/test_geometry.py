@@ -14,9 +14,9 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 import splatseed as ss
+from splatseed.seeding.diagnostics import far_share, spacing
 from splatseed.synthetic import SHAPES
 from splatseed.synthetic.surfaces import parallel_plates, plane
-from splatseed.upsample.neighbors import prepare, sound_bases
 from splatseed.upsample.patches import local_frames
 
 from . import references as slow
@@ -26,8 +26,8 @@ NOISE = 0.1
 CURVED = ["plane", "sphere", "cylinder", "sine sheet"]
 
 
-def spacings(xyz):
-    return cKDTree(xyz).query(xyz, 7)[0][:, 1:].mean(axis=1)
+def far(cloud, **options):
+    return far_share(cloud.xyz, ss.upsample(cloud, ratio=8, **options).xyz[len(cloud) :])
 
 
 @functools.cache
@@ -35,7 +35,7 @@ def scanned(shape, noise=NOISE):
     """Noisy samples of a surface, and their mean spacing."""
     rng = np.random.default_rng(3)
     xyz = SHAPES[shape]().sample(NUM, rng)
-    h = spacings(xyz).mean()
+    h = spacing(xyz)
     xyz += noise * h * rng.normal(size=xyz.shape)
     return ss.PointCloud(xyz.astype(np.float32), np.full((NUM, 3), 128, np.uint8)), h
 
@@ -48,13 +48,6 @@ def measured(shape, method):
     seeds = ss.upsample(cloud, method, ratio=8).xyz
     dense = surface.sample(20_000, np.random.default_rng(4))
     return surface.distance(seeds[NUM:]).mean() / h, cKDTree(seeds).query(dense)[0].mean() / h
-
-
-def far_share(cloud, **options):
-    """Share of new points more than 3 h from every original."""
-    new = ss.upsample(cloud, ratio=8, **options).xyz[len(cloud) :]
-    distance, nearest = cKDTree(cloud.xyz).query(new)
-    return np.mean(distance > 3.0 * spacings(cloud.xyz)[nearest])
 
 
 @pytest.mark.parametrize("method", ["mls", "spline"])
@@ -84,15 +77,15 @@ def test_walls_are_as_good_as_floors_but_for_the_papers_spline(tilt):
     rng = np.random.default_rng(5)
     xyz = plane(tilt).sample(NUM, rng) + 0.005 * rng.normal(size=(NUM, 3))
     wall = ss.PointCloud(xyz.astype(np.float32), np.full((NUM, 3), 128, np.uint8))
-    assert far_share(wall, method="mls") < 0.01
-    assert far_share(wall, method="spline") < 0.01
-    assert (far_share(wall, method="spline", profile="paper") > 0.05) == (tilt == 90)
+    assert far(wall, method="mls") < 0.01
+    assert far(wall, method="spline") < 0.01
+    assert (far(wall, method="spline", profile="paper") > 0.05) == (tilt == 90)
 
 
 def test_clamped_cells_stay_near_and_boxed_ones_do_not():
     cloud, _ = scanned("sphere")
-    assert far_share(cloud, method="voronoi") < 0.01
-    assert far_share(cloud, method="voronoi", profile="paper") > 0.3
+    assert far(cloud, method="voronoi") < 0.01
+    assert far(cloud, method="voronoi", profile="paper") > 0.3
 
 
 @pytest.mark.parametrize("method", ["linear", "triangle", "mls", "spline"])
@@ -103,16 +96,6 @@ def test_few_bridges_between_plates(method, gap, bridging):
     new = ss.upsample(cloud, method, ratio=8).xyz[NUM:]
     height = new @ plane().frame[2]  # 0 on one plate, the gap on the other
     assert np.mean(np.minimum(np.abs(height), np.abs(height - gap)) > 0.1 * gap) <= bridging
-
-
-def test_the_isolated_rule_finds_outliers_and_spares_the_rest():
-    strewn = np.random.default_rng(7).uniform(-1.5, 1.5, (60, 3)).astype(np.float32)
-    xyz = np.concatenate([scanned("sphere")[0].xyz, strewn])
-    cloud = prepare(ss.PointCloud(xyz, np.zeros(xyz.shape, np.uint8)))
-    lonely = np.empty(len(cloud), bool)
-    lonely[cloud.rank] = sound_bases(cloud, cloud.neighbors(16)) == 0
-    assert lonely[NUM:].mean() > 0.5
-    assert lonely[:NUM].mean() < 0.01
 
 
 STRETCHES = [
