@@ -148,14 +148,6 @@ def test_help_names_every_verb_and_the_version(splatseed):
         assert splatseed(option).out == f"splatseed {version('splatseed')}\n"
 
 
-@pytest.mark.parametrize("verb", VERBS)
-def test_every_verb_explains_itself(verb, splatseed):
-    run = splatseed(verb, "--help")
-    assert (run.code, run.err) == (0, "")
-    assert f"splatseed {verb}" in run.out
-    assert "-h, --help" in run.out
-
-
 def test_help_of_a_method_lists_its_options_alone(splatseed):
     plain, one = splatseed("upsample", "--help"), splatseed("upsample", "--method", "mls", "--help")
     assert "--mls.k" not in plain.out

@@ -24,26 +24,6 @@ def test_arrays_are_read_only_and_the_callers_stay_writable():
     xyz[0], rgb[0] = 1, 1
 
 
-@pytest.mark.parametrize(
-    ("xyz", "rgb", "source", "says"),
-    [
-        (np.zeros((4, 2)), np.zeros((4, 2), np.uint8), None, r"\[4, 2\]"),
-        (np.zeros(3), np.zeros(3, np.uint8), None, r"\[3\]"),
-        (np.zeros((4, 3), complex), np.zeros((4, 3), np.uint8), None, "complex"),
-        (np.zeros((4, 3), bool), np.zeros((4, 3), np.uint8), None, "bool"),
-        (np.full((4, 3), "a"), np.zeros((4, 3), np.uint8), None, "xyz as numbers"),
-        (np.zeros((4, 3)), np.zeros((4, 3)), None, "float64"),
-        (np.zeros((4, 3)), None, None, "found None"),
-        (None, np.zeros((4, 3), np.uint8), None, "found None"),
-        (np.zeros((4, 3)), np.zeros((3, 3), np.uint8), None, r"found uint8 \[3, 3\]"),
-        (np.zeros((4, 3)), np.zeros((4, 3), np.uint8), np.zeros(3, np.uint8), "one code per point"),
-    ],
-)
-def test_arrays_that_do_not_fit(xyz, rgb, source, says):
-    with pytest.raises(PointCloudError, match=says):
-        PointCloud(xyz, rgb, source)
-
-
 def test_distinct_points_are_finite_and_the_first_at_their_position(rng):
     xyz = rng.integers(-2, 3, (500, 3)).astype(np.float32)
     xyz[xyz == 0] *= rng.choice(np.array([1, -1], np.float32), np.count_nonzero(xyz == 0))
@@ -109,6 +89,15 @@ def test_what_is_known_of_a_point_goes_where_it_goes(first, second, data):
 @pytest.mark.parametrize(
     ("name", "values", "says"),
     [
+        ("xyz", np.zeros((4, 2)), r"\[4, 2\]"),
+        ("xyz", np.zeros(3), r"\[3\]"),
+        ("xyz", np.zeros((4, 3), complex), "complex"),
+        ("xyz", np.zeros((4, 3), bool), "bool"),
+        ("xyz", np.full((4, 3), "a"), "xyz as numbers"),
+        *((name, None, "found None") for name in ("xyz", "rgb")),
+        ("rgb", np.zeros((4, 3)), "float64"),
+        ("rgb", np.zeros((3, 3), np.uint8), r"found uint8 \[3, 3\]"),
+        ("source", np.zeros(3, np.uint8), "one code per point"),
         ("normals", np.zeros(4), r"normals as numbers of shape \[4, 3\]; found float64 \[4\]"),
         ("sizes", np.ones(3), r"sizes as numbers of shape \[4\]; found float64 \[3\]"),
         ("confidence", np.full(4, "1"), "confidence as numbers"),
@@ -121,7 +110,7 @@ def test_what_is_known_of_a_point_goes_where_it_goes(first, second, data):
         ("confidence", np.array([0, 1, 1.01, -1]), "from 0 to 1.*1.01 at point 2 and 1 more"),
     ],
 )
-def test_attributes_that_do_not_fit(name, values, says):
-    cloud = PointCloud(np.zeros((4, 3)), np.zeros((4, 3), np.uint8))
+def test_arrays_that_do_not_fit(name, values, says):
+    fit = {"xyz": np.zeros((4, 3)), "rgb": np.zeros((4, 3), np.uint8)}
     with pytest.raises(PointCloudError, match=says):
-        cloud.replace(**{name: values})
+        PointCloud(**fit | {name: values})
