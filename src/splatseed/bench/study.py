@@ -188,8 +188,8 @@ def _study(settings: Mapping[str, object], runs: Sequence[Run]) -> Study:
         label = _label(spec, with_maps=several_maps)
         variants.setdefault(label, arm)
         factors[scene] = min(spec.training.data_factor, factors.get(scene, 10**9))
-        row = zip(_COLUMNS, (arm.strategy, scene, label, spec.repeat, spec, result), strict=True)
-        rows.append({**dict(row), **_measures(result)})
+        row: tuple[object, ...] = (arm.strategy, scene, label, spec.repeat, spec, result)
+        rows.append({**dict(zip(_COLUMNS, row, strict=True)), **_measures(result)})
     same_size = len(set(factors.values())) == 1
     factor = next(iter(factors.values())) if same_size else dict(sorted(factors.items()))
     return Study(
