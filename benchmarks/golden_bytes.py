@@ -98,10 +98,7 @@ def cases(scenes: Path) -> Iterator[tuple[str, Callable[[], str]]]:
             ),
         )
     room = load_scene(scenes / "replica" / "room0", require_points=False)
-    yield (
-        "points/room0/auto",
-        lambda: of_cloud(ss.upsample(room, budget=8_000, seed=0)),
-    )
+    yield ("points/room0/auto", lambda: of_cloud(ss.upsample(room, budget=8_000, seed=0)))
     yield "stereo/fern", lambda: of_maps(fern)
     bare = without_points(fern)
     yield "stereo/fern-without-points", lambda: of_maps(bare)

@@ -19,7 +19,7 @@ ROOT = Path(__file__).parents[1]
 
 MOST_OPTIONS = 140
 MOST_FILES = 260
-MOST_LINES = {"src": 51_000, "tests": 30_000}
+MOST_LINES = {"src": 42_750, "tests": 24_400}
 """On the way to 42,000 and 22,000: these numbers only fall."""
 
 

@@ -13,13 +13,7 @@ from rich.console import Console
 
 import splatseed
 from splatseed import console
-from splatseed.console import (
-    StageClock,
-    print_note,
-    print_pairs,
-    print_table,
-    stage_display,
-)
+from splatseed.console import StageClock, print_note, print_pairs, print_table, stage_display
 from splatseed.literal import quoted, visible
 from splatseed.runtime import compilation
 

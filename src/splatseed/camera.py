@@ -187,12 +187,7 @@ def quat_from_rotation(rotation: Float[np.ndarray, "3 3"]) -> Float64[np.ndarray
             [m[0, 0] + m[1, 1] + m[2, 2], 0, 0, 0],
             [m[2, 1] - m[1, 2], m[0, 0] - m[1, 1] - m[2, 2], 0, 0],
             [m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], m[1, 1] - m[0, 0] - m[2, 2], 0],
-            [
-                m[1, 0] - m[0, 1],
-                m[0, 2] + m[2, 0],
-                m[1, 2] + m[2, 1],
-                m[2, 2] - m[0, 0] - m[1, 1],
-            ],
+            [m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], m[2, 2] - m[0, 0] - m[1, 1]],
         ]
     )
     quat = np.linalg.eigh(form)[1][:, -1]  # eigh reads the lower triangle

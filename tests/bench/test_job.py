@@ -16,14 +16,7 @@ pytest.importorskip("torch", reason="training needs PyTorch")
 pytest.importorskip("gsplat", reason="training needs gsplat's strategies")
 
 from splatseed.bench import job
-from splatseed.bench.job import (
-    JobOptions,
-    do_runs,
-    make_seeds,
-    open_unchanged,
-    run_away,
-    run_job,
-)
+from splatseed.bench.job import JobOptions, do_runs, make_seeds, open_unchanged, run_away, run_job
 from splatseed.bench.plan import plan_runs
 from splatseed.bench.runs import package_version, read_run, read_runs, run_folder
 from splatseed.cli import main

@@ -46,12 +46,7 @@ from splatseed.bench.study_tables import (
     scene_arm_table,
     seconds_table,
 )
-from splatseed.bench.tables import (
-    Number,
-    Table,
-    to_markdown,
-    write_table,
-)
+from splatseed.bench.tables import Number, Table, to_markdown, write_table
 
 from .planted import GAINS, result, runs, spec
 

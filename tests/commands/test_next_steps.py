@@ -48,10 +48,7 @@ def follow(out: str, splatseed) -> list[str]:
 
 @pytest.mark.parametrize(
     ("kind", "verbs"),
-    [
-        ("room", ["upsample", "train", "tune"]),
-        ("bent", ["undistort", "upsample", "train", "tune"]),
-    ],
+    [("room", ["upsample", "train", "tune"]), ("bent", ["undistort", "upsample", "train", "tune"])],
 )
 def test_what_info_advises_works(kind, verbs, request, tmp_path, monkeypatch, splatseed):
     pytest.importorskip("torch", reason="trains")

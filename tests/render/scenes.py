@@ -113,11 +113,7 @@ def _shades(
 
 
 def gradients(
-    scene: Scene,
-    *,
-    slow: bool = False,
-    of: Iterable[str] = DIFFERENTIABLE,
-    **options: Any,
+    scene: Scene, *, slow: bool = False, of: Iterable[str] = DIFFERENTIABLE, **options: Any
 ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
     """Image, alpha and the gradient of each input, the loss being a fixed random weighting of both.
 

@@ -17,14 +17,7 @@ from splatseed.progress import silent
 from splatseed.splat.gaussians import initial_gaussians
 from splatseed.train.parameters import make_optimizers, make_parameters, optimize
 from splatseed.train.schedule import make_schedule
-from splatseed.train.seeds import (
-    MARGIN,
-    NEAREST,
-    near_depths,
-    seeded,
-    seeds_digest,
-    usable_seeds,
-)
+from splatseed.train.seeds import MARGIN, NEAREST, near_depths, seeded, seeds_digest, usable_seeds
 from splatseed.train.settings import TrainSettings
 from splatseed.views.view import View, load_split
 

@@ -74,8 +74,7 @@ def test_a_lattice_gives_finite_points_near_it(kind, dimension):
 
 @every_kind
 @pytest.mark.parametrize(
-    ("scale", "gap", "ratio"),
-    [(1e-30, None, 4), (1e14, None, 4), (1, 1e-7, 20), (1, 1e-30, 20)],
+    ("scale", "gap", "ratio"), [(1e-30, None, 4), (1e14, None, 4), (1, 1e-7, 20), (1, 1e-30, 20)]
 )
 def test_extreme_units_and_points_that_nearly_coincide_do_no_harm(kind, scale, gap, ratio, wavy):
     xyz = wavy.xyz.astype(np.float64) * scale  # beyond 1e15, coordinates are no places

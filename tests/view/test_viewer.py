@@ -27,14 +27,7 @@ from splatseed.train.run import prepare_run
 from splatseed.train.settings import TrainSettings
 from splatseed.view import pictures, session as session_module
 from splatseed.view.models import open_shown, stage_frame
-from splatseed.view.pictures import (
-    Entry,
-    canvas_view,
-    clouds_of,
-    fitted_fov,
-    laid_onto,
-    stage_pose,
-)
+from splatseed.view.pictures import Entry, canvas_view, clouds_of, fitted_fov, laid_onto, stage_pose
 from splatseed.view.server import TrainingViewer, Viewer, free_port
 
 from ..bench import browser
@@ -211,10 +204,7 @@ def test_switches_act_and_a_browser_gets_as_many_points_as_it_draws(entry, tmp_p
     monkeypatch.setattr(session_module, "FIRST_POINTS", 100)
     monkeypatch.setattr(session_module.Session, "_affordable_points", lambda _: 10**6)
     other, total = _entry(replace(entry.shown, name="other")), len(entry.shown.scene.points)
-    with (
-        _served(entry, other, beside=other) as viewer,
-        served_page(tmp_path, viewer.url) as page,
-    ):
+    with _served(entry, other, beside=other) as viewer, served_page(tmp_path, viewer.url) as page:
         session = _session(viewer)
         assert (session._second.value, session._split.visible) == ("other: Gaussians", True)
         assert waits_for(lambda: f"original: {total:,}" in text(page))

@@ -365,11 +365,7 @@ def _job_options(plan: Plan) -> JobOptions:
 
 
 def _bench(
-    options: Options,
-    plan: Plan,
-    missing: Sequence[str],
-    machine: Machine,
-    arguments: Sequence[str],
+    options: Options, plan: Plan, missing: Sequence[str], machine: Machine, arguments: Sequence[str]
 ) -> None:
     """Run a plan; or print it as TOML with all else in comments, so that both can be saved."""
     bench = options.output

@@ -32,13 +32,7 @@ from splatseed.scores import TrainingResult
 from splatseed.seeding.upsampling import parse_budget
 from splatseed.train.folder import RunFolder
 from splatseed.train.seeds import why_not_seeded
-from splatseed.train.settings import (
-    BUDGET,
-    LEAST_GAUSSIANS,
-    Seeding,
-    StrategyName,
-    TrainSettings,
-)
+from splatseed.train.settings import BUDGET, LEAST_GAUSSIANS, Seeding, StrategyName, TrainSettings
 from splatseed.upsample.method import fits
 from splatseed.views.view import poses_of, user_cache_dir
 

@@ -43,12 +43,7 @@ _UNUSED = re.compile(r"fusion_stage\.layers\.0\.residual_layer1\.")
 _ZOE_MARGIN = 3
 """ZoeDepth pads a photograph by mirroring this times the square root of half a side's pixels."""
 _LOCAL = {"local_files_only": True, "trust_remote_code": False}
-_METRIC = {
-    "depth_pro": "Depth Pro",
-    "glpn": "GLPN",
-    "tipsv2_dpt": "TIPSv2",
-    "zoedepth": "ZoeDepth",
-}
+_METRIC = {"depth_pro": "Depth Pro", "glpn": "GLPN", "tipsv2_dpt": "TIPSv2", "zoedepth": "ZoeDepth"}
 """Model types that always predict metres, and their common names."""
 
 Size = tuple[int, int]

@@ -19,12 +19,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt8
 
 from splatseed.camera import CAMERA_MODELS, Intrinsics, quat_from_rotation
-from splatseed.errors import (
-    OutputError,
-    PointCloudError,
-    SceneFormatError,
-    SceneNotFoundError,
-)
+from splatseed.errors import OutputError, PointCloudError, SceneFormatError, SceneNotFoundError
 from splatseed.io.files import COPY_AGAIN, ByteReader, numbered_lines
 from splatseed.io.photograph import image_warnings, lens_warnings
 from splatseed.io.ply import read_ply
@@ -474,9 +469,7 @@ def read_colmap_scene(model_dir: Path) -> Scene:
     return Scene(points, images, intrinsics, tracks, source, tuple(warnings))
 
 
-def read_model_cameras(
-    model_dir: Path,
-) -> tuple[tuple[Intrinsics, ...], tuple[Image, ...]]:
+def read_model_cameras(model_dir: Path) -> tuple[tuple[Intrinsics, ...], tuple[Image, ...]]:
     """The camera and the image records of a model."""
     cameras_path, images_path = _model_file(model_dir, "cameras"), _model_file(model_dir, "images")
     if cameras_path is None and images_path is not None:

@@ -163,11 +163,7 @@ def _reconstruct(
 
 
 def undistort(
-    scene: Scene,
-    output: Path | str,
-    *,
-    overwrite: bool = False,
-    on_progress: Progress = silent,
+    scene: Scene, output: Path | str, *, overwrite: bool = False, on_progress: Progress = silent
 ) -> SfmReport:
     """Write a scene with undistorted photographs and PINHOLE cameras.
 

@@ -33,9 +33,7 @@ NEAR_DEPTHS = "near_depths"
 
 
 def make_parameters(
-    gaussians: Gaussians,
-    device: torch.device,
-    near_depths: Float32[np.ndarray, " N"] | None = None,
+    gaussians: Gaussians, device: torch.device, near_depths: Float32[np.ndarray, " N"] | None = None
 ) -> Parameters:
     """Trainable copies of the Gaussians' arrays on a device.
 

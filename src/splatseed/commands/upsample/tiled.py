@@ -13,13 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from splatseed.commands.next_steps import tell_training
 from splatseed.commands.upsample.output import method_words
-from splatseed.console import (
-    OUT,
-    StageClock,
-    print_note,
-    print_pairs,
-    stage_display,
-)
+from splatseed.console import OUT, StageClock, print_note, print_pairs, stage_display
 from splatseed.errors import OutputError, ParameterError, PointCloudError, SceneFormatError
 from splatseed.io import WriteReport, load_originals, load_scene, write_scene
 from splatseed.io.clouds import open_cloud

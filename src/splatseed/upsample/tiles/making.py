@@ -195,12 +195,7 @@ class Tiled:
 
 
 def make_tiled(
-    work: Path,
-    source: Source,
-    request: Request,
-    plan: TilePlan,
-    tasks: Tasks,
-    progress: Progress,
+    work: Path, source: Source, request: Request, plan: TilePlan, tasks: Tasks, progress: Progress
 ) -> Tiled:
     """Make the new points of a cloud, tile by tile.
 
