@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import re
 import tempfile
 from collections.abc import Iterator, Mapping
@@ -76,8 +77,10 @@ def scene_pictures(bench: Path, study: Study, progress: Progress = silent) -> Sc
             pictures.notes.append(f"{scene}: its points are not shown or described: {error}")
         if digest in kept:
             pictures.described[scene] = kept[digest]
-    if kept:
-        write_json(bench / _DESCRIPTORS, kept)
+    if kept:  # JSON has no NaN: what is unknown is null
+        described = {digest: {k: None if math.isnan(v) else v for k, v in each.items()}
+                     for digest, each in kept.items()}  # fmt: skip
+        write_json(bench / _DESCRIPTORS, described)
     return pictures
 
 
@@ -85,7 +88,8 @@ def _kept_descriptors(bench: Path) -> dict[str, Descriptors]:
     """The descriptors of an earlier report, by fingerprint; empty if there are none."""
     with suppress(OSError, ValueError, TypeError, AttributeError):
         content = json.loads(read_text(bench / _DESCRIPTORS))
-        return {digest: {k: float(v) for k, v in each.items()} for digest, each in content.items()}
+        return {digest: {k: math.nan if v is None else float(v) for k, v in each.items()}
+                for digest, each in content.items()}  # fmt: skip
     return {}
 
 
