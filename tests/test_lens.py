@@ -6,17 +6,20 @@ import numpy as np
 import pytest
 
 from splatseed.camera import CAMERA_MODELS, Intrinsics
-from splatseed.lens import image_points, rays_through
+from splatseed.lens import distort, fold_radius, image_points, rays_through
+
+
+def make_lens(model, rng, size=0.03):
+    """A lens of a model with moderate distortion."""
+    info = CAMERA_MODELS[model]
+    pinhole = ((50.0, 55.0) if info.num_focal == 2 else (50.0,)) + (32.0, 24.0)
+    rest = rng.normal(scale=size, size=info.num_params - len(pinhole))
+    return Intrinsics(1, model, 64, 48, (*pinhole, *((0.7,) if model == "FOV" else rest)))
 
 
 @pytest.fixture(params=CAMERA_MODELS)
 def lens(request, rng):
-    """A lens of each model with moderate distortion."""
-    info = CAMERA_MODELS[request.param]
-    pinhole = ((50.0, 55.0) if info.num_focal == 2 else (50.0,)) + (32.0, 24.0)
-    rest = rng.normal(scale=0.03, size=info.num_params - len(pinhole))
-    params = (*pinhole, *((0.7,) if request.param == "FOV" else rest))
-    return Intrinsics(1, request.param, 64, 48, params)
+    return make_lens(request.param, rng)
 
 
 @pytest.fixture
@@ -50,3 +53,22 @@ def test_no_ray_leads_to_pixels_beyond_the_fold():
     assert (x[:3] < 1.83).all()
     np.testing.assert_allclose(y[:3], 0, atol=1e-9)
     assert np.isnan(x[3:]).all()
+
+
+@pytest.mark.parametrize("model", [name for name in CAMERA_MODELS if "FISHEYE" not in name])
+def test_without_coefficients_a_lens_is_a_pinhole(model, rng, rays):
+    lens = make_lens(model, rng)
+    zeros = len(lens.params) - CAMERA_MODELS[model].num_focal - 2
+    straight = Intrinsics(1, model, 64, 48, (*lens.params[: -zeros or None], *[0.0] * zeros))
+    np.testing.assert_array_equal(distort(straight, rays), rays)
+    assert not straight.has_distortion
+    assert lens.has_distortion == (zeros > 0)
+
+
+def test_a_lens_folds_where_its_radius_is_largest():
+    """r (1 + k r^2) turns back at r = sqrt(-1 / 3k)."""
+    lens = Intrinsics(1, "SIMPLE_RADIAL", 64, 48, (50.0, 32.0, 24.0, -0.3))
+    assert fold_radius(lens, 2.0) == pytest.approx(np.sqrt(1 / 0.9), abs=2.0 / 500)
+    assert fold_radius(lens, 1.0) == 1.0
+    opening = Intrinsics(1, "SIMPLE_RADIAL", 64, 48, (50.0, 32.0, 24.0, 0.3))
+    assert fold_radius(opening, 5.0) == 5.0

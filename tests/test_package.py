@@ -148,6 +148,19 @@ def test_rooms_of_a_part_import_each_other_in_no_circle(part):
     TopologicalSorter(rooms).prepare()  # raises CycleError, which names the circle
 
 
+@pytest.mark.parametrize("part", ["views", "depth", "upsample", "seeding"])
+def test_what_makes_seeds_needs_little(part):
+    """Beside the standard library; networks may need more."""
+    allowed = {"splatseed", "numpy", "jaxtyping", "numba", "scipy"}
+    allowed |= {"views": {"PIL"}, "depth": {"PIL", "llvmlite"}, "upsample": {"filelock"}}.get(
+        part, set()
+    )
+    for path in _files(part):
+        tops = {name.split(".")[0] for name in _imports(path)}
+        if path.name != "monocular.py":
+            assert tops <= {*allowed, *sys.stdlib_module_names}, path.name
+
+
 def test_an_import_loads_nothing_heavy():
     code = "import sys, splatseed, splatseed.io; print(*sys.modules)"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, text=True)

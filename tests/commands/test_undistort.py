@@ -101,10 +101,21 @@ def test_an_upsampled_scene_keeps_what_is_known_of_its_points(
     assert saw_all_photographs(load_scene(out))
 
 
+def test_train_prints_the_command_that_mends_the_scene(distorted, tmp_path, splatseed, monkeypatch):
+    pytest.importorskip("gsplat", reason="training needs PyTorch and gsplat's strategies")
+    shutil.copytree(distorted, tmp_path / "my scene", symlinks=True)
+    monkeypatch.chdir(tmp_path)
+    run = splatseed("train", "my scene", "-o", "run", "--max-steps", 2)
+    command = "splatseed undistort 'my scene' -o 'my scene_undistorted'"
+    assert (run.code, command in run.err) == (2, True), run.err
+    assert not (tmp_path / "run").exists()
+
+
 def test_a_scene_that_lacks_something_is_refused(distorted, tmp_path, splatseed):
     path = write_scene(load_scene(distorted), tmp_path / "own", copy_images=True).path
-    (path / "images/view_003.png").unlink()
-    run = splatseed("undistort", path, "-o", tmp_path / "out")
-    assert (run.code, run.err.count("\n")) == (2, 1)
-    assert "view_003.png" in run.err
-    assert not (tmp_path / "out").exists()
+    for gone in ("images/view_003.png", "sparse/0/images.bin"):
+        (path / gone).unlink()
+        run = splatseed("undistort", path, "-o", tmp_path / "out")
+        assert (run.code, run.err.count("\n")) == (2, 1)
+        assert gone.rpartition("/")[2] in run.err
+        assert not (tmp_path / "out").exists()

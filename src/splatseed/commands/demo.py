@@ -73,7 +73,7 @@ EXPLANATION = [
     ("seconds", "of training and making the seeds; the last column is during training,"),
     ("", "before the mean that a run ends with is taken"),
     ("limits", "a synthetic room, one run each, no error bars; strategy grow, which"),
-    ("", "splatseed train takes for short runs, gains more, and needs seeds less"),
+    ("", "splatseed train takes for short runs, is not tried here"),
 ]
 
 

@@ -41,7 +41,8 @@ def photograph_folder(scene: Scene) -> Path:
         raise SceneNotFoundError(
             "a scene with photographs",
             found="no images" if folder else "no folder of images",
-            fix="Name a scene with cameras, and put its photographs into a folder named images.",
+            fix="Name a scene with poses (a COLMAP model has them in images.bin), and put its "
+            "photographs into a folder named images.",
         )
     return folder
 

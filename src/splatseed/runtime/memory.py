@@ -17,6 +17,8 @@ from pathlib import Path
 from splatseed.errors import ParameterError
 
 CGROUP = Path("/sys/fs/cgroup")
+PROCESS = 300 << 20
+"""Bytes of a process before it holds any points: libraries, compiled kernels, and their slack."""
 UNITS = {"K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
 
 

@@ -53,9 +53,9 @@ ALLOWED: dict[str, int | Sequence[object]] = {
 class TrainSettings:
     """How to train.
 
-    A setting is declared only here, besides the code that uses it: the options of ``train`` and
-    ``bench``, plans and ``config.json`` take these fields, defaults and docstrings as they are.
-    Suppressed ones are no options: a file of ``train --config`` or a plan sets them.
+    A setting is declared only here, besides the code that uses it: the options of ``train``, the
+    plans of ``bench`` and ``config.json`` take these fields as they are, with defaults and
+    docstrings. Suppressed ones are no options: a file of ``train --config`` or a plan sets them.
 
     Raises:
         ParameterError: A value is out of its range.

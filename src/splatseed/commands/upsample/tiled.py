@@ -22,7 +22,7 @@ from splatseed.io.write import PointStream
 from splatseed.literal import counted, visible
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress
-from splatseed.runtime.memory import free_memory, option_of, words_of
+from splatseed.runtime.memory import PROCESS, free_memory, option_of, words_of
 from splatseed.scene import Scene
 from splatseed.seeding.advice import DEFAULT_METHOD, method_for
 from splatseed.upsample import BYTES_EACH, Upsampler, planned_size, source_code, traits_of
@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 
 CLOUDS = (".las", ".laz", ".e57", ".pcd", ".xyz", ".csv", ".asc", ".pts", ".npz", ".glb")
 """Files of points that only ``open_cloud`` reads."""
-PROCESS, PER_POINT, PER_NEIGHBOR = 300 << 20, 120, 20
-"""Bytes that the process takes, a cloud in memory for each original, and for each neighbour."""
+PER_POINT, PER_NEIGHBOR = 120, 20
+"""Bytes that a cloud in memory takes for each original, and for each neighbour of it."""
 MEMORY = 4 << 30
 """Bytes that may be used where neither user nor system says."""
 READ = 2.5

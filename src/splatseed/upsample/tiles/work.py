@@ -25,11 +25,9 @@ from splatseed.errors import OutputError, ParameterError
 from splatseed.io.files import read_text
 from splatseed.io.staging import oserror_as_output_error, staged, write_json
 from splatseed.literal import visible
-from splatseed.runtime.memory import option_of, words_of
+from splatseed.runtime.memory import PROCESS, option_of, words_of
 from splatseed.upsample.nearest import NearestMethod
 
-PROCESS = 300 << 20
-"""Memory of a process before it holds any points: libraries, compiled kernels, and their slack."""
 PER_POINT, PER_NEIGHBOR, PER_NEW = 200, 20, 100
 """Bytes that a tile takes for each point, for each neighbour of each, and for each new point."""
 MOST, LEAST = 1 << 20, 1 << 13
