@@ -28,11 +28,9 @@ def _untold_compilation(monkeypatch):
 def pytest_collection_modifyitems(items) -> None:
     """Slow tests last: what fails is known before they begin.
 
-    First two long files that compile or train in processes of their own, so that no process is left
-    alone with one.
+    First a long file that trains in processes of its own, so that no process is left alone with it.
     """
-    long = {"test_determinism.py", "test_examples.py"}
-    items.sort(key=lambda item: long.isdisjoint(item.path.parts))
+    items.sort(key=lambda item: item.path.name != "test_examples.py")
     items.sort(key=lambda item: item.get_closest_marker("slow") is not None)
 
 

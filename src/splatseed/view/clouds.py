@@ -19,20 +19,7 @@ from splatseed.camera import Camera
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
 from splatseed.upsample import origin_name
-from splatseed.view.page import (
-    GRID_SIDE,
-    INK,
-    PAPER,
-    STRIP_HEIGHT,
-    Tile,
-    color_bar,
-    fitted,
-    font,
-    map_colors,
-    photograph_at,
-    resized,
-    write_grid,
-)
+from splatseed.view import page
 from splatseed.view.points import origin_colors, points_over, render_points
 from splatseed.views.visibility import choose_camera, choose_image
 
@@ -46,14 +33,11 @@ DIM = 0.75  # the photograph under cells
 
 
 class CoveredView(NamedTuple):
-    """A view's name and photograph, and which of its cells held a seed before and after.
-
-    ``cell`` is the side of one in pixels of the photograph.
-    """
+    """A view's name and photograph, and which of its cells held a seed before and after."""
 
     name: str
     photograph: UInt8[np.ndarray, "H W 3"]
-    cell: int
+    cell: int  # its side, in pixels of the photograph
     before: Bool[np.ndarray, "rows columns"]
     after: Bool[np.ndarray, "rows columns"]
 
@@ -67,7 +51,7 @@ def preview_pair(
         PointCloudError: The scene has no finite points.
     """
     clouds = {"original": scene.points, title: upsampled}
-    return write_grid(_cloud_tiles(clouds, choose_camera(scene), PAIR_SIDE), path, columns=2)
+    return page.write_grid(_cloud_tiles(clouds, choose_camera(scene), PAIR_SIDE), path, columns=2)
 
 
 def preview_methods(scene: Scene, clouds: Mapping[str, PointCloud], path: Path | str) -> Path:
@@ -76,9 +60,9 @@ def preview_methods(scene: Scene, clouds: Mapping[str, PointCloud], path: Path |
     Raises:
         PointCloudError: The scene has no finite points.
     """
-    clouds = {"original": scene.points, **clouds}
-    tiles = _photograph(scene, GRID_SIDE, "photograph")
-    return write_grid([*tiles, *_cloud_tiles(clouds, choose_camera(scene), GRID_SIDE)], path)
+    clouds, side = {"original": scene.points, **clouds}, page.GRID_SIDE
+    tiles = _photograph(scene, side, "photograph")
+    return page.write_grid([*tiles, *_cloud_tiles(clouds, choose_camera(scene), side)], path)
 
 
 def preview_errors(
@@ -93,12 +77,13 @@ def preview_errors(
     """
     colored = {
         f"{label}   {len(cloud):,} points: mean error {distances[label].mean():.2f} spacings": (
-            cloud.replace(rgb=map_colors(distances[label], 0.0, 1.0, "plasma"))
+            cloud.replace(rgb=page.map_colors(distances[label], 0.0, 1.0, "plasma"))
         )
         for label, cloud in clouds.items()
     }
-    bar = color_bar("0 spacings", "1 spacings or more from the surface")
-    return write_grid(_cloud_tiles(colored, camera, GRID_SIDE, counted=False), path, footer=bar)
+    tiles = _cloud_tiles(colored, camera, page.GRID_SIDE, counted=False)
+    bar = page.color_bar("0 spacings", "1 spacings or more from the surface")
+    return page.write_grid(tiles, path, footer=bar)
 
 
 def preview_origins(scene: Scene, points: PointCloud, path: Path | str) -> Path:
@@ -109,23 +94,23 @@ def preview_origins(scene: Scene, points: PointCloud, path: Path | str) -> Path:
     """
     camera = choose_camera(scene)
     scale = PAIR_SIDE / max(camera.width, camera.height)
-    size = fitted(camera.width, camera.height, PAIR_SIDE)
-    photograph = photograph_at(scene, choose_image(scene), size)
+    size = page.fitted(camera.width, camera.height, PAIR_SIDE)
+    photograph = page.photograph_at(scene, choose_image(scene), size)
     colored = points.replace(rgb=origin_colors(points.source))
     tiles = [
-        Tile(f"{len(points):,} seeds", render_points(points, camera, scale=scale)),
-        Tile("by origin", points_over(colored, camera, photograph, scale=scale)),
+        page.Tile(f"{len(points):,} seeds", render_points(points, camera, scale=scale)),
+        page.Tile("by origin", points_over(colored, camera, photograph, scale=scale)),
     ]
     # Below them, the name of each origin after a dot of its colour.
-    strip = PillowImage.new("RGB", (2 * size[0], STRIP_HEIGHT), PAPER)
-    draw, letters, x = ImageDraw.Draw(strip), font(18), 8.0
+    strip = PillowImage.new("RGB", (2 * size[0], page.STRIP_HEIGHT), page.PAPER)
+    draw, letters, x = ImageDraw.Draw(strip), page.font(18), 8.0
     codes, counts = np.unique(points.source, return_counts=True)
     for code, count, color in zip(codes, counts, origin_colors(codes).tolist(), strict=True):
         words = f"{origin_name(int(code))} {count:,}"
         draw.ellipse((x, 14, x + 16, 30), fill=tuple(color))
-        draw.text((x + 24, 22), words, fill=INK, font=letters, anchor="lm")
+        draw.text((x + 24, 22), words, fill=page.INK, font=letters, anchor="lm")
         x += 24 + letters.getlength(words) + 28
-    return write_grid(tiles, path, columns=2, footer=np.asarray(strip))
+    return page.write_grid(tiles, path, columns=2, footer=np.asarray(strip))
 
 
 def preview_alignment(
@@ -138,13 +123,8 @@ def preview_alignment(
 ) -> Path:
     """Write a page of photograph, aligned cloud and residuals, side by side.
 
-    Args:
-        scene: One of its cameras is chosen.
-        cloud: A sample of the cloud in the scene's frame.
-        rgb: Its colours; grey without.
-        marks: The scene's points that it was aligned with.
-        share: For each, 0 on the cloud to 1 where it does not count.
-        path: The PNG to write.
+    The cloud is a sample in the scene's frame, grey without colours; ``marks`` are the scene's
+    points that it was aligned with, ``share`` of each 0 on the cloud to 1 where it does not count.
     """
     blend = np.clip(share, 0, 1)[:, None]
     shades = np.rint((1 - blend) * NEAR + blend * FAR).astype(np.uint8)
@@ -156,21 +136,21 @@ def preview_alignment(
     }
     drawn = _cloud_tiles(clouds, choose_camera(scene), PAIR_SIDE, counted=False)
     tiles = [*_photograph(scene, PAIR_SIDE, "a photograph"), *drawn]
-    return write_grid(tiles, path, columns=len(tiles))
+    return page.write_grid(tiles, path, columns=len(tiles))
 
 
 def preview_cells(views: Sequence[CoveredView], path: Path | str) -> Path:
     """Write a page: for each view, the cells covered by the originals, and by all seeds."""
     tiles = []
     for view in views:
-        size = fitted(view.photograph.shape[1], view.photograph.shape[0])
+        size = page.fitted(view.photograph.shape[1], view.photograph.shape[0])
         for label, covered in (
             (f"{view.name[-28:]}: {view.before.mean():.1%} covered", view.before),
             (f"with new points: {view.after.mean():.1%}", view.after),
         ):
             picture = cell_picture(view.photograph, covered, view.cell)
-            tiles.append(Tile(label, resized(picture, size)))
-    return write_grid(tiles, path, columns=2 if len(views) == 1 else 4)
+            tiles.append(page.Tile(label, page.resized(picture, size)))
+    return page.write_grid(tiles, path, columns=2 if len(views) == 1 else 4)
 
 
 def cell_picture(
@@ -185,20 +165,20 @@ def cell_picture(
     return np.asarray(np.round(picture), np.uint8)
 
 
-def _photograph(scene: Scene, side: int, label: str) -> list[Tile]:
+def _photograph(scene: Scene, side: int, label: str) -> list[page.Tile]:
     """The photograph of the camera that ``choose_camera`` takes, if it can be read."""
     camera = choose_camera(scene)
-    size = fitted(camera.width, camera.height, side)
-    photograph = photograph_at(scene, choose_image(scene), size)
-    return [] if photograph is None else [Tile(label, photograph)]
+    size = page.fitted(camera.width, camera.height, side)
+    photograph = page.photograph_at(scene, choose_image(scene), size)
+    return [] if photograph is None else [page.Tile(label, photograph)]
 
 
 def _cloud_tiles(
     clouds: Mapping[str, PointCloud], camera: Camera, side: int, *, counted: bool = True
-) -> list[Tile]:
+) -> list[page.Tile]:
     scale = side / max(camera.width, camera.height)
     return [
-        Tile(
+        page.Tile(
             f"{label}   {len(cloud):,} points" if counted else label,
             render_points(cloud, camera, scale=scale),
         )

@@ -126,10 +126,8 @@ def path_of_file(
 ) -> tuple[list[View], float | None]:
     """The views of a camera path in nerfstudio's JSON, and its frame rate if the file gives one.
 
-    Args:
-        path: The file.
-        size: Width and height of the views; fields of view are vertical, in degrees.
-        world: From the model's world to the file's; None if they are one.
+    ``world`` is from the model's world to the file's, None if they are one. Fields of view are
+    vertical, in degrees.
 
     Raises:
         SceneNotFoundError: There is no such file.
@@ -266,13 +264,9 @@ def even_size(width: int, height: int, most: int | None = None) -> tuple[int, in
 def write_video(
     path: Path, frames: Iterable[UInt8[np.ndarray, "H W 3"]], size: tuple[int, int], fps: float
 ) -> None:
-    """Write frames as H.264 by imageio-ffmpeg's ffmpeg, replacing a file at ``path``.
+    """Write frames as H.264 by imageio-ffmpeg's ffmpeg to a .mp4, .mkv or .mov; replaces a file.
 
-    Args:
-        path: Its suffix is .mp4, .mkv or .mov.
-        frames: One after the other, all of one size.
-        size: Their width and height, both even.
-        fps: Frames per second.
+    Width and height, of all frames, are even.
 
     Raises:
         MissingDependencyError: imageio-ffmpeg is absent.
@@ -283,14 +277,9 @@ def write_video(
 
     with atomic_file(path) as partial:
         writer = imageio_ffmpeg.write_frames(
-            str(partial),
-            size,
-            fps=fps,
-            quality=QUALITY,
-            macro_block_size=2,
-            ffmpeg_log_level="error",
-            output_params=["-movflags", "+faststart"],
-        )
+            str(partial), size, fps=fps, quality=QUALITY, macro_block_size=2,
+            ffmpeg_log_level="error", output_params=["-movflags", "+faststart"],
+        )  # fmt: skip
         try:
             with closing(writer):  # also when stopped: ffmpeg must end before its file is removed
                 writer.send(None)

@@ -60,12 +60,9 @@ class Shown:
 
 
 def open_shown(path: Path, scene_path: Path | None = None) -> Shown:
-    """Read what a user names.
+    """Read what a user names: a scene, a run folder, or a file of Gaussians or points.
 
-    Args:
-        path: A scene, a run folder, or a file of Gaussians or points.
-        scene_path: The scene that a model belongs to; by default the one named by its run, if that
-            exists.
+    A model's scene is that at ``scene_path``, by default the one that its run names, if it exists.
 
     Raises:
         SceneNotFoundError: ``path``, or the scene that the user names, does not exist.
@@ -144,13 +141,7 @@ def stage_frame(shown: Shown) -> TrainingFrame:
 def pinhole_view(
     size: tuple[int, int], fov: float, cam_from_world: Float64[np.ndarray, "4 4"]
 ) -> View:
-    """A view without pixels.
-
-    Args:
-        size: Its width and height.
-        fov: Its vertical field of view, radians.
-        cam_from_world: Its pose.
-    """
+    """A view without pixels, of this width and height; the field of view is vertical, radians."""
     width, height = size
     focal = height / 2 / np.tan(fov / 2)
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])

@@ -31,7 +31,7 @@ RANGE = (2, 98)
 
 
 class Tile(NamedTuple):
-    """A picture and its label."""
+    """One of a page's pictures."""
 
     label: str
     picture: UInt8[np.ndarray, "H W 3"]
@@ -60,13 +60,10 @@ def write_grid(
     columns: int | None = None,
     footer: UInt8[np.ndarray, "H W 3"] | None = None,
 ) -> Path:
-    """Arrange pictures in rows, each with its label above, and write the PNG.
+    """Arrange one or more pictures in rows, each with its label above, and write the PNG.
 
-    Args:
-        tiles: At least one, placed row by row; smaller pictures are centred.
-        path: The PNG to write.
-        columns: Tiles per row; three or four when left out, whichever leaves fewer gaps.
-        footer: A strip below all, no wider than the page.
+    Without ``columns`` a row has three or four, whichever leaves fewer gaps; smaller pictures are
+    centred. The footer, no wider than the page, is below all.
 
     Raises:
         OutputError: The file cannot be written.
@@ -138,11 +135,9 @@ def nearness(depth: Float[np.ndarray, "*S"]) -> Float[np.ndarray, "*S"]:
 def depth_picture(
     depth: Float[np.ndarray, "H W"], limits: tuple[float, float] | None = None
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Depth in colours: near is yellow, far is violet, 0 and NaN are grey.
+    """Planar depth in colours: near is yellow, far is violet, 0 and NaN are grey.
 
-    Args:
-        depth: Planar depth.
-        limits: Of its ``nearness``; by default ``usual_range``.
+    ``limits`` are of its ``nearness``, by default ``usual_range``.
     """
     near = nearness(depth)
     return map_colors(near, *(limits or usual_range(near)))

@@ -93,13 +93,9 @@ def laid_onto(
     K = np.diag([width / camera.width, height / camera.height, 1.0]) @ camera.K
     picture_from_canvas = K @ np.linalg.inv(canvas.K)
     how = PillowImage.Resampling.BILINEAR if smooth else PillowImage.Resampling.NEAREST
-    laid = PillowImage.fromarray(picture).transform(
-        (canvas.width, canvas.height),
-        PillowImage.Transform.AFFINE,
-        tuple(picture_from_canvas[:2].reshape(-1).tolist()),
-        how,
-    )
-    return np.asarray(laid)
+    size, rows = (canvas.width, canvas.height), tuple(picture_from_canvas[:2].ravel().tolist())
+    affine = PillowImage.Transform.AFFINE
+    return np.asarray(PillowImage.fromarray(picture).transform(size, affine, rows, how))
 
 
 # Pictures -----------------------------------------------------------------------------------------
@@ -232,10 +228,7 @@ def _photograph_of(scene: Scene, image: Image, side: int) -> UInt8[np.ndarray, "
 
 @dataclass(frozen=True, eq=False)
 class StageCloud:
-    """Points of one origin on the stage, photographed and own colours, and how many there are.
-
-    ``xyz`` may hold only some of them.
-    """
+    """Points of one origin on the stage: some of ``count``, their colours and the origin's."""
 
     name: str
     xyz: Float32[np.ndarray, "N 3"]
@@ -270,10 +263,7 @@ def point_size(
 def add_cameras(
     gui_scene: Any, shown: Shown, frame: TrainingFrame, fly: Callable[[Image], None]
 ) -> list[tuple[Image, Any]]:
-    """Add a frustum for each camera of the images, test views in another colour.
-
-    A click on one calls ``fly`` with its image.
-    """
+    """Add a frustum for each image's camera, test views in another colour; a click flies there."""
     assert shown.scene is not None  # noqa: S101  (see above)
     tested = {image.name for image in shown.scene.split(shown.test_every)[1]}
     images = shown.scene.images[:: max(1, -(-len(shown.scene.images) // MOST_CAMERAS))]
@@ -286,17 +276,12 @@ def add_cameras(
     handles = []
     for i, (image, (wxyz, position)) in enumerate(zip(images, poses, strict=True)):
         camera = image.camera
+        fov = 2 * float(np.arctan(camera.height / 2 / camera.K[1, 1]))
+        color = TEST_COLOR if image.name in tested else TRAIN_COLOR
         handle = gui_scene.add_camera_frustum(
-            f"/cameras/{i}",
-            fov=2 * float(np.arctan(camera.height / 2 / camera.K[1, 1])),
-            aspect=camera.width / camera.height,
-            scale=size,
-            thickness=1.5,
-            thickness_units="screen",
-            color=TEST_COLOR if image.name in tested else TRAIN_COLOR,
-            wxyz=wxyz,
-            position=position,
-        )
+            f"/cameras/{i}", fov, camera.width / camera.height, scale=size, thickness=1.5,
+            thickness_units="screen", color=color, wxyz=wxyz, position=position,
+        )  # fmt: skip
         handle.on_click(lambda _, image=image: fly(image))
         handles.append((image, handle))
     return handles

@@ -197,10 +197,8 @@ class TrainingViewer(Viewer):
     """Serves a run of a scene while it trains, under a name; else as ``Viewer``."""
 
     def __init__(self, run: TrainingRun, scene: Scene, name: str, host: str, port: int) -> None:
-        settings = run.settings
-        shown = Shown(name, scene, None, settings.data_factor, settings.test_every)
-        self._run = run
-        self._live = _LiveEntry(shown, run)
+        shown = Shown(name, scene, None, run.settings.data_factor, run.settings.test_every)
+        self._run, self._live = run, _LiveEntry(shown, run)
         self._paused, self.kept = False, False
         self._panels: list[tuple[Session, Any, Any]] = []
         self._next = 0.0

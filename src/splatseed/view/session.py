@@ -20,18 +20,10 @@ from PIL import Image as PillowImage
 
 from splatseed.literal import visible
 from splatseed.scene import Image, Scene
+from splatseed.view import pictures
 from splatseed.view.models import split_picture
 from splatseed.view.page import fitted, photograph_at
-from splatseed.view.pictures import (
-    Drawn,
-    Entry,
-    add_cameras,
-    canvas_view,
-    clouds_of,
-    fitted_fov,
-    point_size,
-    stage_pose,
-)
+from splatseed.view.pictures import Entry
 from splatseed.views.view import View
 
 MOVING_SECONDS, STILL_AFTER = 0.12, 0.2
@@ -143,9 +135,8 @@ class Session:
         first = self._entries[names[0]]
         self._what = gui.add_dropdown("Show", names, visible=len(names) > 1)
         kinds = (NOTHING, *first.kinds)
-        self._kind = gui.add_dropdown(
-            "Picture", kinds, initial_value=kinds[1 if first.has_model else 0]
-        )
+        kind = kinds[1 if first.has_model else 0]
+        self._kind = gui.add_dropdown("Picture", kinds, initial_value=kind)
         self._seconds = {
             f"{entry.name}: {kind}" if len(names) > 1 else kind: (entry, kind)
             for entry in self._entries.values()
@@ -154,10 +145,8 @@ class Session:
         second = NO_SECOND
         if self._beside is not None and self._beside.has_model:
             second = f"{self._beside.name}: {self._beside.kinds[0]}"
-        self._second = gui.add_dropdown(
-            "Beside it", (NO_SECOND, *self._seconds), initial_value=second
-        )
-        shown = second != NO_SECOND
+        seconds, shown = (NO_SECOND, *self._seconds), second != NO_SECOND
+        self._second = gui.add_dropdown("Beside it", seconds, initial_value=second)
         border = CLEAR_OF_CONTROLS if shown else 0.5
         self._split = gui.add_slider("Border at", 0.05, 0.95, 0.01, border, visible=shown)
         self._note = gui.add_markdown("", visible=False)
@@ -211,7 +200,7 @@ class Session:
         if shown.scene is None:
             return
         if shown.scene.images:
-            self._cameras = add_cameras(self._client.scene, shown, frame, self._fly)
+            self._cameras = pictures.add_cameras(self._client.scene, shown, frame, self._fly)
             self._go.options = ("-", *(image.name for image, _ in self._cameras))
         self._send_points(shown.scene, FIRST_POINTS)
         with self._origin_folder:
@@ -223,10 +212,10 @@ class Session:
 
     def _send_points(self, scene: Scene, most: int) -> None:
         """Send the browser at most ``most`` points, in place of those it has."""
-        clouds = clouds_of(scene.points, self._entry.frame, most)
+        clouds = pictures.clouds_of(scene.points, self._entry.frame, most)
         if clouds:
             self._clouds = {cloud.name: cloud for cloud in clouds}
-            self._base_size = point_size(clouds, scene.images, self._entry.frame)
+            self._base_size = pictures.point_size(clouds, scene.images, self._entry.frame)
             self._nodes = {
                 cloud.name: self._client.scene.add_point_cloud(
                     f"/points/{cloud.name}",
@@ -311,11 +300,11 @@ class Session:
     def _fly(self, image: Image) -> None:
         """Move to where an image was taken, in half a second."""
         camera = self._client.camera
-        wxyz, position = stage_pose(image.camera, self._entry.frame)
+        wxyz, position = pictures.stage_pose(image.camera, self._entry.frame)
         start, origin = np.array(camera.wxyz), np.array(camera.position)
         # q and -q are one rotation: the nearer one gives the shorter turn.
         wxyz = wxyz * (1 if wxyz @ start >= 0 else -1)
-        fov, first = fitted_fov(image.camera, camera.aspect), camera.fov
+        fov, first = pictures.fitted_fov(image.camera, camera.aspect), camera.fov
         self._goal = image
         for step in range(1, FLIGHT_STEPS + 1):
             part = step / FLIGHT_STEPS
@@ -335,7 +324,7 @@ class Session:
         if self._goal is None:
             return None
         camera = self._client.camera
-        wxyz, position = stage_pose(self._goal.camera, self._entry.frame)
+        wxyz, position = pictures.stage_pose(self._goal.camera, self._entry.frame)
         apart = np.abs(np.asarray(camera.position) - position).max()
         there = apart < ARRIVED and abs(wxyz @ np.asarray(camera.wxyz)) > 1 - ARRIVED**2
         return self._goal if there else None
@@ -372,10 +361,13 @@ class Session:
         camera = self._client.camera
         width, height = camera.image_width, camera.image_height
         scale *= min(1.0, np.sqrt(MOST_PIXELS / (width * height)))
-        size = (max(8, round(scale * width)), max(8, round(scale * height)))
-        return canvas_view(camera.wxyz, camera.position, camera.fov, size, self._entry.frame)
+        size, frame = (
+            tuple(max(8, round(scale * side)) for side in (width, height)),
+            self._entry.frame,
+        )
+        return pictures.canvas_view(camera.wxyz, camera.position, camera.fov, size, frame)
 
-    def _joined(self, drawn: list[Drawn], canvas: View, *, named: bool) -> np.ndarray:
+    def _joined(self, drawn: list[pictures.Drawn], canvas: View, *, named: bool) -> np.ndarray:
         white = np.full((canvas.height, canvas.width, 3), 255, np.uint8)
         left, right = (white if picture is None else picture for picture, _ in drawn)
         names = (self._kind.value, self._second.value)
