@@ -29,16 +29,9 @@ RGB = 3
 
 @kernel
 def mark_visible(radii, opacities, colors, least, visible):
-    """Which Gaussians are drawn.
+    """Which Gaussians are drawn, bool [N]: not culled (radii 0), opacity ``least`` or more.
 
     A colour that is not finite is left out: 0 times NaN would spread it to every pixel of a tile.
-
-    Args:
-        radii: int32 [N, 2]; 0 = culled.
-        opacities: [N].
-        colors: [N, D].
-        least: Opacities below this are left out.
-        visible: Written, bool [N].
     """
     for i in parallel_range(len(radii)):
         # Branch-free: the processor would mispredict half of the time.
@@ -87,17 +80,9 @@ def scatter(
 ):
     """Sums by depth rank to gradients by index; those of invisible Gaussians stay.
 
-    Args:
-        order: Depth rank to index.
-        totals: ``blending_vjp``'s sums over each Gaussian's spans, [G, 16].
-        first: First channel.
-        conics: [N, 3].
-        opacities: [N].
-        d_means2d: Added to, [N, 2], like the following two.
-        d_conics: [N, 3].
-        d_opacities: [N].
-        d_colors: Written in this pass's channels, [N, D].
-        d_absolute: Written, the absolute gradients of the 2D means, [N, 2], or empty.
+    ``totals`` [G, 16] are ``blending_vjp``'s sums over each Gaussian's spans. They are added to the
+    gradients of means, conics and opacities, and written to those of this pass's channels and to
+    ``d_absolute``, the absolute gradients of the 2D means [N, 2], unless that is empty.
     """
     wide = min(CHANNELS, d_colors.shape[1] - first)
     for g in parallel_range(len(order)):
@@ -174,17 +159,17 @@ def to_blocks(d_image, image, d_alphas, transmittance, columns, first, gradient,
         for x in range(0, TILE * columns, 4):
             lane, at = _first_lane(x, y, columns), y * width + x
             gradients, after = gradient[_color(lane) :], behind[lane : lane + 4]
+            d_row, row, d_T, row_T = (
+                d_pixels[depth * at :],
+                pixels[depth * at :],
+                d_alpha[at:],
+                T[at:],
+            )
             if depth == RGB and x + 4 <= width and y < height:
-                _to_lanes(
-                    d_pixels[depth * at :], pixels[depth * at :], d_alpha[at:], T[at:],
-                    0, 4, RGB, gradients, after,
-                )  # fmt: skip
+                _to_lanes(d_row, row, d_T, row_T, 0, 4, RGB, gradients, after)
             else:
                 count = min(4, max(width - x, 0)) if y < height else 0
-                _to_lanes(
-                    d_pixels[depth * at :], pixels[depth * at :], d_alpha[at:], T[at:],
-                    first, count, depth, gradients, after,
-                )  # fmt: skip
+                _to_lanes(d_row, row, d_T, row_T, first, count, depth, gradients, after)
 
 
 @always_inline

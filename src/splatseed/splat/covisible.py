@@ -64,10 +64,8 @@ def find_covisible(
             progress(_STAGE, 0.5 * len(depths) / len(views))
         # At an edge both surfaces count as seen: each cell's depth is its neighbours' largest.
         farthest = (maximum_filter(grid, size=3, mode="nearest") for grid in depths)
-        seen = list(zip(train, farthest, strict=False))
-        grids = pool.map(
-            lambda view, grid: _covisible(view, grid, seen), test, depths[len(train) :]
-        )
+        seen, own = list(zip(train, farthest, strict=False)), depths[len(train) :]
+        grids = pool.map(lambda view, grid: _covisible(view, grid, seen), test, own)
         for view, grid in zip(test, grids, strict=True):
             by_view[view.name] = grid
             progress(_STAGE, 0.5 + 0.5 * len(by_view) / len(test))

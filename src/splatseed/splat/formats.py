@@ -106,10 +106,8 @@ class Format(NamedTuple):
 
 FORMATS = {
     "compressed-ply": Format(
-        ".compressed.ply",
-        "all but fine detail; PlayCanvas, SuperSplat",
-        packed.encode_compressed_ply,
-        packed.decode_compressed_ply,
+        ".compressed.ply", "all but fine detail; PlayCanvas, SuperSplat",
+        packed.encode_compressed_ply, packed.decode_compressed_ply,
     ),
     "ply": Format(
         ".ply", "everything, as 3DGS writes it; every tool reads it", _encode_ply, _decode_ply
@@ -118,13 +116,11 @@ FORMATS = {
         ".splat", "no view-dependent colour; web viewers", packed.encode_splat, packed.decode_splat
     ),
     "spz": Format(
-        ".spz",
-        "all but fine detail; Niantic, three.js viewers, glTF tools",
-        packed.encode_spz,
-        packed.decode_spz,
+        ".spz", "all but fine detail; Niantic, three.js viewers, glTF tools",
+        packed.encode_spz, packed.decode_spz,
     ),
     "sog": Format(".sog", "all but fine detail; PlayCanvas, SuperSplat", sog.encode, sog.decode),
-}
+}  # fmt: skip
 """The formats by name; of two suffixes that a file name ends in, the longer comes first."""
 SUFFIXES = {each.suffix: name for name, each in FORMATS.items()}
 """The formats' names by file name suffix."""
@@ -238,12 +234,7 @@ def parse_crop(text: str) -> Float64[np.ndarray, "2 3"]:
 def keep_gaussians(
     gaussians: Gaussians, crop: Float64[np.ndarray, "2 3"] | None = None, min_opacity: float = 0.0
 ) -> Gaussians:
-    """The Gaussians whose centres lie in a box and that are opaque enough, in their order.
-
-    Args:
-        gaussians: The model's.
-        crop: Minimum and maximum corner of the box, in the model's world; no limit when left out.
-        min_opacity: Lowest opacity kept, 0 to 1.
+    """The Gaussians with centres in the box of ``parse_crop`` that are opaque enough, in order.
 
     Raises:
         ParameterError: The opacity is out of range, or no Gaussian is left.

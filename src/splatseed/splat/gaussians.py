@@ -86,16 +86,9 @@ def initial_gaussians(
 ) -> Gaussians:
     """One Gaussian per seed, as large as the seed or, if that is unknown, the gap to 3 neighbours.
 
-    It is round, or a disc perpendicular to the seed's normal if that is known.
-
-    Args:
-        seeds: Finite points; known sizes and normals are used.
-        sh_degree: Highest degree of the spherical harmonics.
-        opacity: Initial opacity, between 0 and 1.
-        scale_factor: Multiplies the size.
-        largest: Upper bound of each size, [N]; unbounded when left out.
-        flatness: Thickness of a disc, as a fraction of its size.
-        harmonics: Coefficients up to degree 1; the seed's constant colour when left out.
+    It is round, or a disc perpendicular to the seed's normal if that is known, ``flatness`` of its
+    size thick. Sizes are multiplied by ``scale_factor`` and bounded by ``largest``. Seeds are
+    finite; ``harmonics`` of degree 1 replace their constant colours.
 
     Raises:
         PointCloudError: Fewer than two distinct finite points.
@@ -171,11 +164,7 @@ def fit_harmonics(seeds: PointCloud, views: Sequence[View]) -> Float32[np.ndarra
     spherical harmonics up to degree 1 in 3DGS's order and signs, y = (C0, -C1 d_y, C1 d_z, -C1
     d_x). With the colours p_v seen along d_v, and the seed's own colour p, h is the least of
     sum_v |1/2 + y(d_v) h - p_v|^2 + OWN |1/2 + C0 h_0 - p|^2 + EVEN |C1 h_1..3|^2 in each colour
-    channel. A seed that no view sees keeps its colour.
-
-    Args:
-        seeds: N points and their colours.
-        views: Photographs with their cameras, in the points' frame.
+    channel. A seed that no view sees keeps its colour. Views are in the seeds' frame.
     """
     xyz = np.ascontiguousarray(seeds.xyz, np.float32)
     # Normal equations; OWN and EVEN make them regular even for a seed that no view sees.
@@ -220,15 +209,10 @@ def _shown(xyz: Float32[np.ndarray, "N 3"], view: View) -> Int64[np.ndarray, "3 
 
 @dataclass(frozen=True, eq=False)
 class TrainingFrame:
-    """A similarity without rotation.
+    """A similarity without rotation."""
 
-    Args:
-        origin: World point that becomes 0, float64 [3].
-        scale: Training units per world unit.
-    """
-
-    origin: Float64[np.ndarray, " 3"]
-    scale: float
+    origin: Float64[np.ndarray, " 3"]  # the point of the world that becomes 0
+    scale: float  # training units per world unit
 
     def points_from_world(self, xyz: Float[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N 3"]:
         """World points in the training frame."""

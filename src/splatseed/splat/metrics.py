@@ -59,12 +59,7 @@ def l1_and_ssim_by_convolution(
     l1_weight: float,
     ssim_weight: float,
 ) -> tuple[Float[Tensor, ""], Float[Tensor, ""], Float[Tensor, "H W 3"]]:
-    """``splat.ssim.l1_and_ssim`` on any device, by convolutions; its header has the equations.
-
-    Returns:
-        Mean |x - y|, mean SSIM where the window fits entirely, and
-        d(l1_weight L1 + ssim_weight (1 - SSIM)) / dx, with the render x and the photograph y.
-    """
+    """``splat.ssim.l1_and_ssim`` on any device, by convolutions; its header has the equations."""
     x, y = render.permute(2, 0, 1), photograph.permute(2, 0, 1)
     c1, c2 = float(C1), float(C2)
     # cuDNN's TF32 would round inputs to ten bits, and E[x^2] - E[x]^2 cancel.
@@ -129,15 +124,10 @@ def ssim_of_all(render: Float[Tensor, "H W 3"], photograph: Float[Tensor, "H W 3
 
 @dataclass(frozen=True, eq=False)
 class Lpips:
-    """LPIPS with its weights, ready to compare images.
+    """LPIPS with its weights, ready to compare images."""
 
-    Args:
-        features: The network's convolutions, in torchvision's order.
-        heads: w_l of each stage, [1, C_l, 1, 1].
-    """
-
-    features: nn.Sequential
-    heads: list[Tensor]
+    features: nn.Sequential  # the network's convolutions, in torchvision's order
+    heads: list[Tensor]  # w_l of each stage, [1, C_l, 1, 1]
 
     @torch.no_grad()
     def __call__(self, render: Float[Tensor, "H W 3"], photograph: Float[Tensor, "H W 3"]) -> float:

@@ -85,22 +85,12 @@ def _rasterize(
     else:  # unused coefficients would cost copies and optimiser steps for nothing
         colors = (params["sh0"], params["shN"]) if shown else params["sh0"]
         degree = shown
-    means = params["means"]
-    camera = camera_of(view, means.device)
+    camera = camera_of(view, params["means"].device)
     images, alphas, info = rasterization(
-        means=means,
-        quats=params["quats"],
-        scales=torch.exp(params["scales"]),
-        opacities=torch.sigmoid(params["opacities"]),
-        colors=colors,
-        viewmats=camera.viewmats,
-        Ks=camera.Ks,
-        width=view.width,
-        height=view.height,
-        sh_degree=degree,
-        packed=False,
-        render_mode=mode,
-    )
+        params["means"], params["quats"], torch.exp(params["scales"]),
+        torch.sigmoid(params["opacities"]), colors, camera.viewmats, camera.Ks,
+        view.width, view.height, sh_degree=degree, packed=False, render_mode=mode,
+    )  # fmt: skip
     # Unlike indexing, squeeze's backward allocates no image of zeros.
     return images.squeeze(0), alphas.squeeze(0), info
 

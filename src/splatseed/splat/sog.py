@@ -55,9 +55,8 @@ def encode(gaussians: Gaussians, progress: Progress = silent) -> list[bytes]:
     positions = positions.astype(np.int64)
     largest, three = packed.smallest_three(gaussians.quats[order])
     # The three smaller components in RGB, 252 + the index of the largest in A.
-    quats = np.column_stack(
-        [packed.rounded_bytes(three * np.sqrt(0.5) * 255 + 127.5), _QUAT_MARK + largest]
-    )
+    smaller = packed.rounded_bytes(three * np.sqrt(0.5) * 255 + 127.5)
+    quats = np.column_stack([smaller, _QUAT_MARK + largest])
     scales, sh0 = codebook(gaussians.scales), codebook(gaussians.sh0)
     colors = codes(gaussians.sh0[order, 0], sh0)
     opacity = packed.opacity_bytes(gaussians.opacities[order])
@@ -137,6 +136,8 @@ def decode(path: Path) -> Gaussians:
         least, most = (np.array(meta["means"][end], np.float64) for end in ("mins", "maxs"))
         curved = least + (low | high << 8) / 65535 * (most - least)
         quats, sh0 = pixels("quats"), pixels("sh0")
+        largest = np.clip(quats[:, 3].astype(np.int64) - _QUAT_MARK, 0, 3)
+        three = (quats[:, :3] / 255 - 0.5) * np.sqrt(2)
         centers = {part: np.array(meta[part]["codebook"], np.float32) for part in ("scales", "sh0")}
         shN = np.zeros((count, 0, 3), np.float32)
         if "shN" in meta:
@@ -147,10 +148,7 @@ def decode(path: Path) -> Gaussians:
         return Gaussians(
             means=np.asarray(np.sign(curved) * np.expm1(np.abs(curved)), np.float32),
             scales=centers["scales"][pixels("scales")[:, :3]],
-            quats=packed.from_smallest_three(
-                np.clip(quats[:, 3].astype(np.int64) - _QUAT_MARK, 0, 3),
-                ((quats[:, :3] / 255 - 0.5) * np.sqrt(2)).astype(np.float32),
-            ),
+            quats=packed.from_smallest_three(largest, three.astype(np.float32)),
             opacities=packed.opacity_logits(sh0[:, 3]),
             sh0=centers["sh0"][sh0[:, None, :3]],
             shN=shN,

@@ -40,24 +40,16 @@ from splatseed.runtime.simd import (
     subtract,
 )
 
-WINDOW = 11
-"""Side of the Gaussian window."""
-SIGMA = 1.5
-"""Its standard deviation, in pixels."""
-C1 = np.float32(0.01**2)
-"""(K1 L)^2 of the paper, with L = 1 the range of values."""
-C2 = np.float32(0.03**2)
-"""(K2 L)^2."""
+WINDOW, SIGMA = 11, 1.5
+"""Side of the Gaussian window and its standard deviation, in pixels."""
+C1, C2 = np.float32(0.01**2), np.float32(0.03**2)
+"""(K1 L)^2 and (K2 L)^2 of the paper, with L = 1 the range of values."""
 HALF = WINDOW // 2
-MARGIN = WINDOW - 1
-"""Rows and columns that a valid window loses."""
+MARGIN = WINDOW - 1  # rows and columns that a valid window loses
 CHANNELS = 3
-REACH = MARGIN * CHANNELS
-"""Values from the first tap of a row to the last."""
-STRIP = 16
-"""Rows per task; fixed, so that sums do not depend on the threads."""
-TALL = STRIP + MARGIN
-"""Rows that a strip reads."""
+REACH = MARGIN * CHANNELS  # values from the first tap of a row to the last
+STRIP = 16  # rows per task; fixed, so that sums do not depend on the threads
+TALL = STRIP + MARGIN  # rows that a strip reads
 BLOCK = 480
 """Values of a row that are processed at once, up to twice as many at its end: their working set
 stays in the nearer caches."""
@@ -79,16 +71,9 @@ def l1_and_ssim(
     l1_weight: float,
     ssim_weight: float,
 ) -> tuple[float, float, Float32[np.ndarray, "H W 3"]]:
-    """Mean |x - y|, mean SSIM, and the gradient of a mixture of the two.
+    """Mean |x - y|, mean SSIM, and d(l1_weight L1 + ssim_weight (1 - SSIM)) / dx.
 
-    Args:
-        render: x, values about 0..1, contiguous; at least 11 pixels a side.
-        photograph: y, likewise.
-        l1_weight: Weight of the mean absolute difference.
-        ssim_weight: Weight of 1 - SSIM.
-
-    Returns:
-        The two means, and d(l1_weight L1 + ssim_weight (1 - SSIM)) / dx.
+    Render x and photograph y are contiguous, about 0..1, and at least 11 pixels a side.
     """
     height, width = len(render), render.shape[1] * CHANNELS
     x, y = render.reshape(-1), photograph.reshape(-1)
@@ -182,11 +167,8 @@ def _similarity(means, at, columns, weights, partials, to, scores):
         by_x = multiply(multiply(ssim, mx), subtract(b1, b2))
         store(by_mean, to + i, multiply(twice, fma(my, subtract(a2, a1), by_x)))
         store(by_xy, to + i, multiply(twice, a1))
-        store(
-            by_2,
-            to + i,
-            subtract(broadcast(np.float32(0.0)), multiply(ssim, multiply(inverse, b1))),
-        )
+        by_e2 = multiply(ssim, multiply(inverse, b1))
+        store(by_2, to + i, subtract(broadcast(np.float32(0.0)), by_e2))
         store(scores, i, ssim)
 
 

@@ -17,9 +17,7 @@ from splatseed.train.settings import BYTES_EACH, Backend
 def pick_device(backend: Backend, progress: Progress = silent) -> torch.device:
     """The device that a backend stands for, ready to render; ``auto`` takes a GPU if there is one.
 
-    Args:
-        backend: The user's choice.
-        progress: Called with the stage in which gsplat's kernels are built, the first time.
+    The first time gsplat's kernels are built, which ``progress`` is told.
 
     Raises:
         ParameterError: CUDA is asked for and there is none.

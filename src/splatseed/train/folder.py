@@ -42,11 +42,7 @@ class RunFolder:
         return (self.path / MANIFEST).is_file() and self.config.is_file()
 
     def check(self, *, overwrite: bool, resume: bool, protect: Sequence[Path]) -> None:
-        """Refuse a folder that must not be written to, before any work is done.
-
-        Raises:
-            OutputError: It is taken or protected.
-        """
+        """Refuse a folder that is taken or protected, before any work is done."""
         ended = self.metrics.is_file()
         if resume and ended:
             raise OutputError(
@@ -69,14 +65,9 @@ class RunFolder:
             )
 
     def begin(self, config: Mapping[str, object], refined: Scene | None = None) -> None:
-        """Make the folder, empty but for the config; removes what ``check`` allowed to replace.
+        """Make the folder, empty but for the config, and the scene if its poses were refined.
 
-        Args:
-            config: What to record of the run.
-            refined: The scene at refined poses, if they were refined: the folder keeps it.
-
-        Raises:
-            OutputError: It cannot be written.
+        Removes what ``check`` allowed to replace.
         """
         # The manifest first: a run that is interrupted here can be replaced.
         files = [self.config, self.checkpoint, self.metrics, self.gaussians, self.curve_csv]
@@ -91,11 +82,7 @@ class RunFolder:
         write_json(self.config, config)
 
     def claim(self, paths: Iterable[Path]) -> None:
-        """List files in the folder as the run's own, before or after they are written.
-
-        Raises:
-            OutputError: The list cannot be written.
-        """
+        """List files in the folder as the run's own, before or after they are written."""
         staging.add_files(self.path, [path.relative_to(self.path).as_posix() for path in paths])
 
     def read_config(self) -> dict[str, Any]:

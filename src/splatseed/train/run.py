@@ -30,6 +30,7 @@ from splatseed.errors import (
 from splatseed.io import load_scene
 from splatseed.io.seeds import was_upsampled
 from splatseed.io.staging import write_json
+from splatseed.literal import counted
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.requirements import require
@@ -284,8 +285,7 @@ def _another_scene(folder: RunFolder, begun: Mapping[str, Any], found: str) -> P
 def _name(device: torch.device) -> str:
     if device.type == "cuda":
         return torch.cuda.get_device_name(device)
-    threads = torch.get_num_threads()
-    return f"CPU, {threads} thread{'s' * (threads > 1)}"
+    return f"CPU, {counted(torch.get_num_threads(), 'thread')}"
 
 
 class TrainingRun:
@@ -302,13 +302,9 @@ class TrainingRun:
         state: TrainState,
         views: tuple[Sequence[View], Sequence[View]],
     ) -> None:
-        self.folder = folder
-        self.settings = settings
-        self.state = state
-        self._frame = frame
+        self.folder, self.settings, self.state, self._frame = folder, settings, state, frame
         self._board: Any = None  # TensorBoard's writer, if asked for
-        self._saved = time.monotonic()
-        self._saved_step = state.step or None
+        self._saved, self._saved_step = time.monotonic(), state.step or None
         train, test = ([frame.view(view) for view in part] for part in views)
         self.trainer = Trainer(state, settings, train, test, self._on_record)
 
@@ -339,11 +335,8 @@ class TrainingRun:
     def train(self, on_step: Callable[[int], None] = lambda _: None) -> bool:
         """Train to the end, or until the user interrupts; a checkpoint is saved.
 
-        Args:
-            on_step: Called with the number of steps done, after each.
-
-        Returns:
-            Whether the last step is done.
+        ``on_step`` is called with the number of steps done, after each. Returns whether the last is
+        done.
 
         Raises:
             OutputError: The checkpoint or the curve cannot be written.
@@ -367,12 +360,7 @@ class TrainingRun:
     def finish(self, score: Score, progress: Progress = silent) -> TrainingResult:
         """Score the test views and write the results; the checkpoint, no longer needed, is removed.
 
-        Args:
-            score: Scores the test views.
-            progress: Called with the stage and the fraction done.
-
-        Returns:
-            What is written to metrics.json.
+        Returns what is written to metrics.json.
 
         Raises:
             OutputError: A result cannot be written.

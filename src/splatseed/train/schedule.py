@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Literal
 
@@ -66,52 +66,31 @@ them are wide, and a Gaussian that fills one hides all that lies behind it."""
 
 @dataclass(frozen=True)
 class Schedule:
-    """The hyperparameters of a run.
+    """The hyperparameters of a run."""
 
-    Args:
-        max_steps: T.
-        near_depths: Whether each Gaussian's near depth is its length unit; the cameras' extent if
-            not.
-        learning_rates: Initial rate of each parameter; for positions in length units.
-        decays: Final fraction of those rates that decay.
-        beta2: Adam's: the fraction of the mean squared gradient kept at each step.
-        sh_every: Steps between degrees of the spherical harmonics.
-        refine_start: Densification begins after this step.
-        refine_stop: Densification ends before this step.
-        refine_every: Steps between densifications.
-        reset_every: Steps between resets of the opacities, if enabled; also the step after which
-            Gaussians that are too large are pruned.
-        prune_size: The size that is too large, in length units.
-        growth: Factor by which MCMC grows the number of Gaussians at a time.
-        noise: Factor on 3DGS's learning rate of positions, for MCMC's noise.
-        penalty: Weight of mean opacity and of mean size in MCMC's loss.
-        opacity: Initial opacity.
-        scale_factor: Initial size, as a multiple of the gap between Gaussians.
-        largest: Upper bound of the initial size, in near depths.
-        flatness: Initial thickness of Gaussians with normals, as a fraction of their size.
-        mean_from: Step after which the mean of the Gaussians is taken as the run's result; None to
-            end with the last step's.
-    """
-
-    max_steps: int
-    near_depths: bool
-    learning_rates: Mapping[str, float]
-    decays: Mapping[str, float]
-    beta2: float
-    sh_every: int
-    refine_start: int
-    refine_stop: int
-    refine_every: int
+    max_steps: int  # T
+    near_depths: bool  # are the length units, not the cameras' extent
+    learning_rates: Mapping[str, float]  # initial ones; for positions in length units
+    decays: Mapping[str, float]  # final fraction of those rates that decay
+    beta2: float  # Adam's: the fraction of the mean squared gradient kept at each step
+    sh_every: int  # steps between degrees of the spherical harmonics
+    refine_start: int  # densification begins after this step,
+    refine_stop: int  # ends before this step,
+    refine_every: int  # and comes every so many steps
     reset_every: int
-    prune_size: float = 0.1
-    growth: float = GROWTH
-    noise: float = 5e5
-    penalty: float = 0.01
-    opacity: float = 0.1
-    scale_factor: float = 1.0
-    largest: float = math.inf
-    flatness: float = 0.1
+    """Steps between resets of the opacities, if enabled; also the step after which Gaussians that
+    are too large are pruned."""
+    prune_size: float = 0.1  # that is too large, in length units
+    growth: float = GROWTH  # factor by which MCMC grows the number of Gaussians at a time
+    noise: float = 5e5  # factor on 3DGS's learning rate of positions, for MCMC's noise
+    penalty: float = 0.01  # weight of mean opacity and of mean size in MCMC's loss
+    opacity: float = 0.1  # initial one
+    scale_factor: float = 1.0  # initial size, as a multiple of the gap between Gaussians
+    largest: float = math.inf  # upper bound of the initial size, in near depths
+    flatness: float = 0.1  # initial thickness of Gaussians with normals, relative to their size
     mean_from: int | None = None
+    """Step after which the mean of the Gaussians is taken as the run's result; None to end with the
+    last step's."""
 
     def sh_degree(self, step: int, highest: int) -> int:
         """The degree of spherical harmonics in use."""
@@ -127,20 +106,13 @@ class Schedule:
 
 
 def make_schedule(densification: Densification, max_steps: int, *, as_3dgs: bool) -> Schedule:
-    """The schedule of a run.
+    """The schedule of a run of T steps.
 
-    Args:
-        densification: How Gaussians are added and removed.
-        max_steps: T.
-        as_3dgs: Whether to use 3DGS's conventions, as gsplat's trainer with its ``steps_scaler``:
-            every step number shrinks with T, no other number does.
+    In 3DGS's conventions it is as of gsplat's trainer with its ``steps_scaler``: every step number
+    shrinks with T, no other number does.
     """
-    return (_as_3dgs if as_3dgs else _own)(densification, max_steps)
-
-
-def _as_3dgs(densification: Densification, max_steps: int) -> Schedule:
     mcmc = densification == "mcmc"
-    return Schedule(
+    schedule = Schedule(
         max_steps=max_steps,
         near_depths=False,
         learning_rates=LEARNING_RATES,
@@ -154,38 +126,32 @@ def _as_3dgs(densification: Densification, max_steps: int) -> Schedule:
         opacity=0.5 if mcmc else 0.1,
         scale_factor=0.1 if mcmc else 1.0,
     )
+    return schedule if as_3dgs else _own(schedule, densification)
 
 
-def _own(densification: Densification, max_steps: int) -> Schedule:
-    mcmc = densification == "mcmc"
-    speedup = max(FULL_RUN / max_steps, 1.0)
-    stop = _scaled(25_000 if mcmc else 15_000, max_steps)
+def _own(theirs: Schedule, densification: Densification) -> Schedule:
+    """Splatseed's schedule: where it departs from 3DGS's."""
+    speedup, stop = max(FULL_RUN / theirs.max_steps, 1.0), theirs.refine_stop
     # 3DGS densifies every 100 steps of 30,000.
-    shrunk = 100 * max_steps / FULL_RUN
+    shrunk, start = 100 * theirs.max_steps / FULL_RUN, theirs.refine_start
     every = max(1, round(shrunk), min(100, stop // LEAST_ROUNDS[densification]))
-    start = _scaled(500, max_steps)
     if densification == "grow":
-        every = start = max(LEAST_ROUND, _scaled(GROW_EVERY, max_steps))
-    return Schedule(
-        max_steps=max_steps,
+        every = start = max(LEAST_ROUND, _scaled(GROW_EVERY, theirs.max_steps))
+    rates = {n: rate * min(speedup, MOST_SPEEDUP[n]) for n, rate in LEARNING_RATES.items()}
+    return replace(
+        theirs,
         near_depths=True,
-        learning_rates={
-            n: rate * min(speedup, MOST_SPEEDUP[n]) for n, rate in LEARNING_RATES.items()
-        },
-        decays=DECAYS,
+        learning_rates=rates,
         # 0.999 in a full run, 0.99 from a tenth of it down.
         beta2=1 - min(FORGETTING * speedup, MOST_FORGETTING),
-        sh_every=_scaled(1000, max_steps),
         refine_start=start,
-        refine_stop=stop,
         refine_every=every,
-        reset_every=_scaled(3000, max_steps),
         # Fewer rounds than 3DGS has grow by more each, so that the cap is reached as early.
         growth=GROWTH ** (every / shrunk),
-        opacity=0.5 if mcmc else 0.1,
+        scale_factor=1.0,
         largest=LARGEST,
         # Only once the number of Gaussians no longer changes.
-        mean_from=max(stop, round(MEAN_FROM * max_steps)),
+        mean_from=max(stop, round(MEAN_FROM * theirs.max_steps)),
     )
 
 

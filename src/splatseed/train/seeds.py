@@ -121,15 +121,9 @@ def usable_seeds(
 ) -> PointCloud:
     """The finite points that a run begins with, thinned if there are more than the cap.
 
-    Points in crowded parts of the views are dropped first, and new points before originals. For a
-    strategy that adds Gaussians, thinning leaves it the room for them (``SEEDS_SHARE``).
-
-    Args:
-        points: The scene's points.
-        settings: Provide the cap, and say whether sizes and normals are used.
-        note: Called with what was left out, and what was requested but unknown.
-        views: The training views, for their cameras and sizes; when left out, crowding is measured
-            in space.
+    Points in crowded parts of the training views (without these, of space) are dropped first, and
+    new points before originals. For a strategy that adds Gaussians, thinning leaves it the room for
+    them (``SEEDS_SHARE``). ``note`` is told what was left out, and what was asked for but unknown.
     """
     seeds, cap = points.select(points.finite), settings.cap
     if len(seeds) < len(points):
@@ -174,9 +168,6 @@ def first_gaussians(
     seeds = frame.cloud_from_world(seeds)
     views = [frame.view(view) for view in views if view.name not in strays]
     lengths, schedule = near_depths(seeds.xyz, views), settings.schedule
-    harmonics = None
-    if settings.seed_colors:
-        harmonics = fit_harmonics(seeds, views)
     gaussians = initial_gaussians(
         seeds,
         sh_degree=settings.sh_degree,
@@ -184,7 +175,7 @@ def first_gaussians(
         scale_factor=schedule.scale_factor,
         largest=schedule.largest * lengths,
         flatness=schedule.flatness,
-        harmonics=harmonics,
+        harmonics=fit_harmonics(seeds, views) if settings.seed_colors else None,
     )
     return gaussians, lengths
 

@@ -152,16 +152,10 @@ def load_checkpoint(
                 optimizer.load_state_dict(content["optimizers"][name])
             strategy.state = content["strategy"]
             strategy.capacity.held_at = content["held_at"]
-            return TrainState(
-                params,
-                optimizers,
-                strategy,
-                step=int(content["step"]),
-                records=[Record(*row) for row in content["records"]],
-                watch=Stopwatch(float(content["seconds"])),
-                losses=list(content["losses"]),
-                mean=content["mean"],
-            )
+            records = [Record(*row) for row in content["records"]]
+            watch, losses = Stopwatch(float(content["seconds"])), list(content["losses"])
+            run, step = (params, optimizers, strategy), int(content["step"])
+            return TrainState(*run, step, records, watch, losses, content["mean"])
     except Exception as error:  # noqa: BLE001  (PyTorch raises anything for a damaged file)
         found = f"a damaged file ({type(error).__name__})"
     raise SceneFormatError(

@@ -29,26 +29,13 @@ from splatseed.train.settings import TrainSettings
 from splatseed.train.state import TrainState
 from splatseed.views.view import View
 
-RECORDS = 200
-"""Number of records in the curve of a run."""
-TESTS = 20
-"""Number of times the test views are rendered during a run."""
+RECORDS, TESTS = 200, 20
+"""How many records the curve of a run has, and how often the test views are rendered for it."""
 SSIM_WEIGHT = 0.2
 
 
 class Trainer:
-    """Trains a state, which is changed in place, on views in the training frame.
-
-    Args:
-        state: The run, at any step.
-        settings: Its settings.
-        train_views: The views to learn from.
-        test_views: The views to evaluate on.
-        on_record: Called with each record.
-
-    Attributes:
-        is_whole: Whether the state is that between two steps, which a checkpoint may keep.
-    """
+    """Trains a state, which is changed in place, on views in the training frame."""
 
     def __init__(
         self,
@@ -63,7 +50,7 @@ class Trainer:
         self.train_views = train_views
         self.test_views = test_views
         self.on_record = on_record
-        self.is_whole = True
+        self.is_whole = True  # the state is one between two steps, which a checkpoint may keep
         self._photographs = Photographs(train_views, self.device)
         keep_freed_memory()
 
