@@ -69,6 +69,7 @@ DEPTH = ("depth", "ROOM", *OUT)
 SFM = ("sfm", "ROOM/images", *OUT)
 QUICK = ("bench", "--preset", "quick", *OUT)
 EVALUATE = ("evaluate", "model.ply", "--scene", "ROOM")
+FLIGHT = ("flight", "model.ply", "-o", "a.mp4")
 
 WORDS = [
     (("--no-such-verb",), "--no-such-verb"),
@@ -123,6 +124,7 @@ WORDS = [
     ((*TRAIN, "--strategy", "defalt"), "--strategy"),
     ((*TRAIN, "--data-factor", "1000"), "--data-factor"),
     ((*TRAIN, "--long-side", "5"), "--long-side"),
+    ((*TRAIN, "--long-side", "48", "--data-factor", "2"), "--long-side or --data-factor"),
     ((*TRAIN, "--budget", "1"), "--budget"),
     ((*TRAIN, "--budget", "many"), "many"),
     ((*TRAIN, "--config", "nowhere.toml"), "nowhere.toml"),
@@ -174,6 +176,18 @@ WORDS = [
     ((*EVALUATE, "--lpips-weights", "nowhere"), "nowhere"),
     (("evaluate", "junk.ply", "--scene", "ROOM"), "junk.ply"),
     (("evaluate", "nothing", "--scene", "ROOM"), "nothing"),
+    (("view", "nowhere"), "nowhere"),
+    (("view", "ROOM", "--host", "256.0.0.1"), "--host"),
+    (("view", "ROOM", "--port", "99999"), "--port"),
+    (("view", "ROOM", "--compare", "nowhere", "--port", "0"), "nowhere"),
+    (("flight", "ROOM", "-o", "a.mp4"), "found a scene"),
+    (("flight", "model.ply", "-o", "a.avi"), ".mp4"),
+    (("flight", "model.ply", "-o", "x" * 300 + ".mp4"), "name too long"),
+    ((*FLIGHT, "--size", "0x9"), "--size"),
+    ((*FLIGHT, "--seconds", "0"), "--seconds"),
+    ((*FLIGHT, "--path", "none.json"), "none.json"),
+    ((*FLIGHT, "--transform", "gsplat"), "--path"),
+    ((*FLIGHT, "--compare", "nowhere"), "nowhere"),
     (("export", "nowhere", "-o", "a.spz"), "nothing there"),
     (("export", "model.ply", "-o", "a.glb"), "splat-transform"),
     (("export", "model.ply", "-o", "a.spz", "--crop", "1,2"), "--crop"),
@@ -213,8 +227,13 @@ def refused(room, tmp_path, monkeypatch, splatseed):
     ids=lambda each: each if isinstance(each, str) else " ".join(each)[-40:],
 )
 def test_what_makes_no_sense_is_refused_by_name(words, named, refused):
-    needed = {"sfm": "pycolmap", "depth": "transformers"}.get(words[0])
-    if needed:
+    extra = {
+        "sfm": "pycolmap",
+        "depth": "transformers",
+        "view": "viser",
+        "flight": "imageio_ffmpeg",
+    }
+    if needed := extra.get(words[0]):
         pytest.importorskip(needed)
     assert named in refused(*words)
 
