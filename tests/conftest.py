@@ -12,7 +12,7 @@ import pytest
 
 from splatseed.io import load_scene
 from splatseed.scene import Scene
-from splatseed.synthetic import make_capture, write_capture
+from splatseed.synthetic import Capture, make_capture, write_capture
 
 from .command_line import Run, exit_code
 
@@ -65,6 +65,13 @@ def larger_room_path(tmp_path_factory) -> Path:
     """The room in 12 views of 120 x 90, with about 460 points. Not to be written to."""
     capture = make_capture(0, num_views=12, width=120, height=90)
     return write_capture(capture, tmp_path_factory.mktemp("room") / "room")
+
+
+@pytest.fixture(scope="session")
+def sixteen_views(tmp_path_factory) -> tuple[Capture, Scene]:
+    """The room in 16 views of 160 x 120: as it was made, with its true depth, and as it is read."""
+    capture = make_capture(0, num_views=16, width=160, height=120)
+    return capture, load_scene(write_capture(capture, tmp_path_factory.mktemp("room") / "room"))
 
 
 @pytest.fixture

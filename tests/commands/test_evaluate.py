@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import json
 
-import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch", reason="evaluation needs PyTorch")
 pytest.importorskip("gsplat", reason="training needs gsplat's strategies")
 
 from splatseed.io import load_scene
-from splatseed.io.ply import write_ply
 from splatseed.splat.evaluate import evaluate_views
 from splatseed.splat.formats import write_model
 from splatseed.splat.gaussians import initial_gaussians
@@ -70,21 +68,6 @@ def _says(run, *texts):
     assert run.err.count("\n") == 1
     for text in texts:
         assert str(text) in run.err
-
-
-def test_what_cannot_be_scored_is_refused(model, room, run_folder, splatseed, tmp_path):
-    for name in ("config.json", "metrics.json", "curve.csv"):
-        _says(splatseed("evaluate", run_folder / name), run_folder)
-    write_ply(tmp_path / "seeds.ply", load_scene(room).points)
-    gaussians = initial_gaussians(load_scene(room).points)
-    gaussians.means[3] = np.nan
-    write_model(tmp_path / "nan.ply", gaussians)
-    for name in ("seeds.ply", "nan.ply"):
-        _says(splatseed("evaluate", tmp_path / name, "--scene", room), tmp_path / name)
-    words = ("evaluate", model, "--scene", room)
-    _says(splatseed(*words, "--data-factor", 40), "smaller --data-factor")
-    if not torch.cuda.is_available():
-        _says(splatseed(*words, "--backend", "cuda"), "GPU")
 
 
 def test_a_run_that_is_not_whole_is_refused(run_folder, splatseed, tmp_path):

@@ -178,14 +178,3 @@ def test_what_refining_does_not_go_with(room, refining, splatseed, tmp_path):
     assert (other.code, other.err.count("error:")) == (2, 1)
     assert "upsample SCENE --refine-poses -o OUT" in other.err
     assert not refining
-
-
-def test_poses_are_refined_by_pycolmap(sharp_bare, splatseed, tmp_path):
-    pytest.importorskip("pycolmap", reason="poses are refined by pycolmap")
-    words = ("--max-steps", "3", "--data-factor", "4", "--refine-poses", "-o", tmp_path / "run")
-    run = splatseed("train", sharp_bare, *words)
-    assert run.code == 0, run.err
-    assert "note: Refined poses lower the mean reprojection error from" in run.out
-    scene = load_scene(tmp_path / "run/scene")
-    assert _poses(scene) != _poses(load_scene(sharp_bare, require_points=False))
-    assert len(scene.points) > 100

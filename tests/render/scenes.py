@@ -18,8 +18,6 @@ from torch import Tensor
 from splatseed.render import rasterization
 from splatseed.render.reference import rasterize_reference
 
-__all__ = ["DIFFERENTIABLE", "PER_GAUSSIAN", "gradients", "random_scene", "slow_rasterization"]
-
 DIFFERENTIABLE = ("means", "quats", "scales", "opacities", "colors", "viewmats", "backgrounds")
 PER_GAUSSIAN = ("means", "quats", "scales", "opacities", "colors")
 Scene = dict[str, Any]

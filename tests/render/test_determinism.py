@@ -20,25 +20,19 @@ from torch import Tensor
 
 from splatseed.render.autograd import Harmonics
 
-MODES = (
-    {},
-    {"rasterize_mode": "antialiased", "packed": False},
-    {"render_mode": "RGB+ED", "sh_degree": 3},
-)
+from .scenes import gradients, random_scene
+
+MODES = ({}, {"rasterize_mode": "antialiased", "packed": False},
+         {"render_mode": "RGB+ED", "sh_degree": 3})  # fmt: skip
 
 
 def digest(tensors: Iterable[Tensor]) -> str:
     """SHA-256 of their bytes."""
-    total = hashlib.sha256()
-    for each in tensors:
-        total.update(each.detach().numpy().tobytes())
-    return total.hexdigest()
+    return hashlib.sha256(b"".join(each.detach().numpy().tobytes() for each in tensors)).hexdigest()
 
 
 def renders() -> list[Tensor]:
     """Images, alphas and all gradients of a crowd in two cameras."""
-    from .scenes import gradients, random_scene
-
     results: list[Tensor] = []
     for options in MODES:
         rng, coefficients = np.random.default_rng(0), 16 if "sh_degree" in options else None
@@ -63,9 +57,8 @@ def test_any_number_of_threads() -> None:
 def colors() -> list[Tensor]:
     """Colours by harmonics and their gradients: vector code of four files, compiled in seconds."""
     rng, shapes = np.random.default_rng(0), ((3000, 3), (3,), (3000, 16, 3))
-    inputs = [torch.tensor(rng.normal(size=shape), dtype=torch.float32) for shape in shapes]
-    for each in inputs:
-        each.requires_grad_()
+    arrays = [rng.normal(size=shape).astype(np.float32) for shape in shapes]
+    inputs = [torch.tensor(each, requires_grad=True) for each in arrays]
     shades = Harmonics.apply(*inputs, None, torch.ones(3000, 2, dtype=torch.int32), 3)
     shades.square().sum().backward()
     return [shades, *(each.grad for each in inputs)]

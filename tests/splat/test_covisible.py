@@ -9,20 +9,8 @@ import pytest
 
 pytest.importorskip("torch", reason="scoring needs PyTorch")
 
-from splatseed.io import load_scene
 from splatseed.splat.covisible import find_covisible, pixel_masks, read_covisible, write_covisible
-from splatseed.synthetic import make_capture, write_capture
 from splatseed.views.view import poses_of
-
-
-@pytest.fixture(scope="module")
-def capture():
-    return make_capture(0, num_views=16, width=160, height=120)
-
-
-@pytest.fixture(scope="module")
-def scene(capture, tmp_path_factory):
-    return load_scene(write_capture(capture, tmp_path_factory.mktemp("made") / "room"))
 
 
 def _truth(depths, view, train):
@@ -38,7 +26,8 @@ def _truth(depths, view, train):
     return (count >= 2).reshape(view.height, view.width)
 
 
-def test_agrees_with_the_true_depth_and_is_kept(capture, scene, tmp_path):
+def test_agrees_with_the_true_depth_and_is_kept(sixteen_views, tmp_path):
+    capture, scene = sixteen_views
     train, test = (poses_of(part) for part in scene.split(8))
     depths = {i.name: depth for i, depth in zip(scene.images, capture.depths, strict=True)}
     write_covisible(tmp_path / "a.npz", find_covisible(scene, 8))
@@ -50,8 +39,9 @@ def test_agrees_with_the_true_depth_and_is_kept(capture, scene, tmp_path):
     assert read_covisible(tmp_path / "none.npz") is None
 
 
-def test_what_no_training_view_shows_is_left_out(scene):
+def test_what_no_training_view_shows_is_left_out(sixteen_views):
     """With the training cameras turned away nothing is co-visible."""
+    _, scene = sixteen_views
     train, test = scene.split(8)
     turned = []
     for image in train:  # half a turn about y, in camera axes

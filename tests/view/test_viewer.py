@@ -10,6 +10,7 @@ import threading
 import time
 from contextlib import contextmanager
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -35,8 +36,7 @@ from ..bench import browser
 
 needs_browser = pytest.mark.skipif(browser.CHROMIUM is None, reason="Chromium is not installed")
 
-BLANK = 15
-"""A picture whose values deviate by less shows nothing."""
+BLANK = 15  # a picture whose values deviate by less shows nothing
 
 
 def _entry(shown):
@@ -75,13 +75,11 @@ FLAGS = (
 @contextmanager
 def served_page(folder, url):
     """A page of a browser, with WebGL in software, at an address."""
-    before, browser.FLAGS = browser.FLAGS, FLAGS
-    try:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(browser, "FLAGS", FLAGS)
         with browser.chromium(folder) as page:
             page.open(url, 800, 600)
             yield page
-    finally:
-        browser.FLAGS = before
 
 
 def screenshot(page):
@@ -325,16 +323,6 @@ def test_points_of_several_origins_are_switched_apart(rng):
 STEPS = 40
 
 
-class _Onlooker:
-    """Stands for a browser: without one, nothing is drawn."""
-
-    def refresh(self):
-        pass
-
-    def close(self):
-        pass
-
-
 @pytest.fixture
 def watched(room, tmp_path):
     pytest.importorskip("gsplat", reason="training needs gsplat's strategies")
@@ -342,7 +330,7 @@ def watched(room, tmp_path):
     settings = TrainSettings(max_steps=STEPS, data_factor=2, test_every=4, strategy="none")
     run = prepare_run(scene, tmp_path / "run", settings)
     viewer = TrainingViewer(run, scene, "room", "127.0.0.1", free_port("127.0.0.1", 0))
-    viewer._sessions[0] = _Onlooker()
+    viewer._sessions[0] = Mock()  # stands for a browser: without one, nothing is drawn
     yield run, viewer, scene
     viewer.close()
 
