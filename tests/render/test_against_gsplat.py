@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
@@ -12,7 +10,6 @@ from gsplat.cuda._torch_impl import (
     _quat_scale_to_covar_preci,
     _spherical_harmonics,
 )
-from torch import Tensor
 
 from splatseed.render import rasterization
 from splatseed.render.autograd import Harmonics
@@ -22,7 +19,7 @@ from .scenes import random_scene
 NAMES = ("radii", "means2d", "depths", "conics", "compensations")
 
 
-def theirs(scene: dict[str, Any], **options: Any) -> dict[str, Tensor]:
+def theirs(scene, **options):
     """gsplat's projection, in float64, [C, N, ...] each."""
     covariances, _ = _quat_scale_to_covar_preci(
         scene["quats"].double(), scene["scales"].double(), compute_preci=False
@@ -34,7 +31,7 @@ def theirs(scene: dict[str, Any], **options: Any) -> dict[str, Tensor]:
     return dict(zip(NAMES, results, strict=True))
 
 
-def crowded(rng: np.random.Generator) -> dict[str, Any]:
+def crowded(rng):
     """Two cameras so close that some Gaussians lie behind them and many outside of the image."""
     scene = random_scene(rng, 400, cameras=2, size=(50, 37))
     scene["viewmats"][:, 2, 3] = 0.8
@@ -42,7 +39,7 @@ def crowded(rng: np.random.Generator) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("options", [{}, {"eps2d": 1.5}, {"near_plane": 0.5, "far_plane": 1.2}])
-def test_projection(rng, options: dict[str, float]) -> None:
+def test_projection(rng, options):
     scene = crowded(rng)
     scene["opacities"] = torch.ones(400)  # their PyTorch code has no opacity-aware bound
     _, _, info = rasterization(**scene, packed=False, **options)
@@ -58,7 +55,7 @@ def test_projection(rng, options: dict[str, float]) -> None:
         )
 
 
-def alone(count: int, size: int = 8, **change: Any) -> dict[str, Any]:
+def alone(count, size=8, **change):
     """White Gaussians two units in front of a camera at the origin, before black."""
     scene = random_scene(np.random.default_rng(0), count, size=(size, size))
     scene.update(viewmats=torch.eye(4)[None], backgrounds=None, colors=torch.ones(count, 3))
@@ -67,7 +64,7 @@ def alone(count: int, size: int = 8, **change: Any) -> dict[str, Any]:
     return {**scene, **change}
 
 
-def test_radii_know_the_opacity() -> None:
+def test_radii_know_the_opacity():
     """The box ends where alpha is 1/255: sigma = sqrt(2 log(255 opacity)) standard deviations."""
     opacities = [0.02, 0.3, 1.0]
     quats, scales = torch.tensor([[1.0, 0, 0, 0]] * 3), torch.tensor([[0.2, 0.1, 0.1]] * 3)
@@ -80,7 +77,7 @@ def test_radii_know_the_opacity() -> None:
 
 
 @pytest.mark.parametrize("degree", range(4))
-def test_harmonics(rng, degree: int) -> None:
+def test_harmonics(rng, degree):
     arrays = rng.normal(size=(200, 3)), rng.normal(size=3), rng.normal(size=(200, 16, 3))
     weights = torch.tensor(rng.normal(size=(200, 3)))
     ours = [torch.tensor(each, dtype=torch.float32).requires_grad_() for each in arrays]
@@ -98,7 +95,7 @@ def test_harmonics(rng, degree: int) -> None:
 
 
 @pytest.mark.parametrize("coefficients", [4, 9, 16, 25])
-def test_coefficients_that_take_no_part_do_not_matter(rng, coefficients: int) -> None:
+def test_coefficients_that_take_no_part_do_not_matter(rng, coefficients):
     scene = random_scene(rng, coefficients=coefficients)
     broken, few = {**scene, "colors": scene["colors"].clone()}, dict(scene)
     broken["colors"][:, 4:] = torch.nan
@@ -112,7 +109,7 @@ def test_coefficients_that_take_no_part_do_not_matter(rng, coefficients: int) ->
     assert not gradient[:, 4:].any()
 
 
-def wall(opacity: float, count: int = 1) -> dict[str, Any]:
+def wall(opacity, count=1):
     """Equal Gaussians at one place, wide enough that exp(-sigma) is 1 over the image."""
     sizes, opacities = torch.full((count, 3), 1000.0), torch.full((count,), opacity)
     return alone(count, scales=sizes, opacities=opacities)
@@ -121,20 +118,20 @@ def wall(opacity: float, count: int = 1) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("opacity", "alpha"), [(0.0, 0), (0.0039, 0), (0.00393, 0.00393), (0.5, 0.5), (1.0, 0.999)]
 )
-def test_alpha_is_cut_at_one_255th_and_held_at_0_999(opacity: float, alpha: float) -> None:
+def test_alpha_is_cut_at_one_255th_and_held_at_0_999(opacity, alpha):
     alphas = rasterization(**wall(opacity))[1]
     assert np.allclose(alphas.numpy(), alpha, rtol=2e-5, atol=0)
 
 
 @pytest.mark.parametrize(("opacity", "blended"), [(0.901, 3), (0.95, 3), (0.98, 2), (0.5, 13)])
-def test_blending_ends_before_a_ten_thousandth_passes(opacity: float, blended: int) -> None:
+def test_blending_ends_before_a_ten_thousandth_passes(opacity, blended):
     """The Gaussian that would bring T to 1e-4 or less is left out."""
     assert (1 - opacity) ** blended > 1e-4 > (1 - opacity) ** (blended + 1)
     alphas = rasterization(**wall(opacity, count=20))[1]
     assert np.allclose(1 - alphas.numpy(), (1 - opacity) ** blended, rtol=2e-2)
 
 
-def test_radius_clip() -> None:
+def test_radius_clip():
     scene = random_scene(np.random.default_rng(0), 200)
     radii = rasterization(**scene, packed=False)[2]["radii"][0]
     clipped = rasterization(**scene, packed=False, radius_clip=4.0)[2]["radii"][0]

@@ -6,7 +6,6 @@ import sys
 from enum import Enum
 from importlib import import_module
 from inspect import signature
-from typing import Any
 
 import gsplat
 import numpy as np
@@ -30,15 +29,15 @@ class Shutter(Enum):
     ROLLING = 1
 
 
-def zeros(*shape: int) -> torch.Tensor:
+def zeros(*shape):
     return torch.zeros(shape)
 
 
-def pair(*rest: int) -> tuple[torch.Tensor, torch.Tensor]:
+def pair(*rest):
     return zeros(N, 1, 3), zeros(*rest)
 
 
-REFUSED: list[dict[str, Any]] = [
+REFUSED = [
     {"camera_model": "fisheye"},
     {"covars": torch.eye(3).repeat(N, 1, 1)},
     {"rolling_shutter": Shutter.ROLLING},
@@ -74,7 +73,7 @@ REFUSED: list[dict[str, Any]] = [
 ]
 
 
-def refuse(scene: dict[str, Any], change: dict[str, Any]) -> None:
+def refuse(scene, change):
     name, value = next(iter(change.items()))
     with pytest.raises(ParameterError, match=f"{value}\\." if "mode" in name else name) as caught:
         rasterization(**{**scene, **change})
@@ -82,11 +81,11 @@ def refuse(scene: dict[str, Any], change: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("change", REFUSED)
-def test_refused_in_one_line_that_names_the_argument(change: dict[str, Any]) -> None:
+def test_refused_in_one_line_that_names_the_argument(change):
     refuse(random_scene(np.random.default_rng(0), N, cameras=C), change)
 
 
-BATCHED: list[dict[str, Any]] = [
+BATCHED = [
     {"viewmats": torch.eye(4).repeat(C, 1, 1)},
     {"Ks": torch.eye(3).repeat(C, 1, 1)},
     {"colors": zeros(N, 3)},
@@ -99,7 +98,7 @@ BATCHED: list[dict[str, Any]] = [
 
 
 @pytest.mark.parametrize("change", BATCHED)
-def test_what_lacks_the_batch_is_refused(change: dict[str, Any]) -> None:
+def test_what_lacks_the_batch_is_refused(change):
     scene = random_scene(np.random.default_rng(0), N, cameras=C)
     wide = {
         name: each.expand(1, 2, *each.shape) if isinstance(each, torch.Tensor) else each
@@ -108,21 +107,21 @@ def test_what_lacks_the_batch_is_refused(change: dict[str, Any]) -> None:
     refuse(wide, change)
 
 
-def test_defaults_of_gsplats_further_arguments_pass() -> None:
+def test_defaults_of_gsplats_further_arguments_pass():
     scene = random_scene(np.random.default_rng(0), N, cameras=C)
     defaults = {**CUDA_ONLY, "rolling_shutter": Shutter.GLOBAL, "tile_size": 16}
     assert torch.equal(rasterization(**scene, **defaults)[0], rasterization(**scene)[0])
 
 
 @pytest.mark.parametrize("count", [1, 2])
-def test_axes_of_equal_sizes_are_not_taken_for_one_another(count: int) -> None:
+def test_axes_of_equal_sizes_are_not_taken_for_one_another(count):
     scene = random_scene(np.random.default_rng(0), count, cameras=count, coefficients=count)
     shared = rasterization(**scene, sh_degree=0)[0]
     scene["colors"] = scene["colors"].expand(count, -1, -1, -1)
     assert torch.equal(shared, rasterization(**scene, sh_degree=0)[0])
 
 
-def test_names_and_defaults_are_gsplats() -> None:
+def test_names_and_defaults_are_gsplats():
     ours, theirs = (signature(each).parameters for each in (rasterization, gsplat.rasterization))
     named = [name for name in ours if name != "unsupported"]
     assert named == list(theirs)[: len(named)]
@@ -131,9 +130,7 @@ def test_names_and_defaults_are_gsplats() -> None:
 
 
 @pytest.mark.parametrize("package", ["torch", "gsplat"])
-def test_a_missing_package_is_named_with_what_to_install(
-    package: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_missing_package_is_named_with_what_to_install(package, monkeypatch):
     monkeypatch.setattr(splatseed, "render", None)
     for name in [name for name in sys.modules if name.startswith("splatseed.render")]:
         monkeypatch.delitem(sys.modules, name)

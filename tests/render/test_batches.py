@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
@@ -15,14 +13,14 @@ from .scenes import random_scene
 
 CAMERAS, N = 2, 40
 BATCHES = [(2,), (2, 1, 2), (1,)]
-MODELS: dict[str, dict[str, Any]] = {
+MODELS = {
     "colors": {},
     "harmonics": {"sh_degree": 1},
     "antialiased, depth": {"rasterize_mode": "antialiased", "render_mode": "RGB+ED"},
 }
 
 
-def scenes_of(batch: tuple[int, ...], sh: bool, per_camera: bool = False) -> list[dict[str, Any]]:
+def scenes_of(batch, sh, per_camera=False):
     """Unlike scenes, some of whose Gaussians no camera sees."""
     scenes = []
     for seed in range(int(np.prod(batch))):
@@ -35,7 +33,7 @@ def scenes_of(batch: tuple[int, ...], sh: bool, per_camera: bool = False) -> lis
     return scenes
 
 
-def joined(scenes: list[dict[str, Any]], batch: tuple[int, ...]) -> dict[str, Any]:
+def joined(scenes, batch):
     return {
         name: stacked([scene[name] for scene in scenes], batch) if isinstance(value, Tensor)
         else value
@@ -43,11 +41,11 @@ def joined(scenes: list[dict[str, Any]], batch: tuple[int, ...]) -> dict[str, An
     }  # fmt: skip
 
 
-def stacked(tensors: list[Tensor], batch: tuple[int, ...]) -> Tensor:
+def stacked(tensors, batch):
     return torch.stack(tensors).reshape(*batch, *tensors[0].shape)
 
 
-def rendered(scene: dict[str, Any], options: dict[str, Any]) -> tuple[Tensor, ...]:
+def rendered(scene, options):
     """Image, alpha and the gradients of a loss that weights the last scene alone."""
     inputs = {k: v.clone().requires_grad_() for k, v in scene.items() if isinstance(v, Tensor)}
     image, alpha, info = rasterization(**{**scene, **inputs}, absgrad=True, **options)
@@ -59,9 +57,7 @@ def rendered(scene: dict[str, Any], options: dict[str, Any]) -> tuple[Tensor, ..
 @pytest.mark.parametrize("batch", BATCHES)
 @pytest.mark.parametrize(("packed", "per_camera"), [(True, False), (False, True)])
 @pytest.mark.parametrize("model", MODELS)
-def test_batches_are_rendered_as_alone(
-    batch: tuple[int, ...], packed: bool, per_camera: bool, model: str
-) -> None:
+def test_batches_are_rendered_as_alone(batch, packed, per_camera, model):
     options = {"packed": packed, **MODELS[model]}
     scenes = scenes_of(batch, "sh_degree" in options, per_camera)
     image, alpha, *gradients = rendered(joined(scenes, batch), options)
@@ -76,7 +72,7 @@ def test_batches_are_rendered_as_alone(
 
 
 @pytest.mark.parametrize("batch", BATCHES)
-def test_info_is_stacked_and_packed_info_names_the_batch(batch: tuple[int, ...]) -> None:
+def test_info_is_stacked_and_packed_info_names_the_batch(batch):
     scenes = scenes_of(batch, sh=False)
     packed, info = (rasterization(**joined(scenes, batch), packed=p)[2] for p in (True, False))
     alone = [rasterization(**scene, packed=False)[2] for scene in scenes]

@@ -7,14 +7,12 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from splatseed.render import binning
-from splatseed.render.binning import TILE, TileLists, depth_order, list_tiles
+from splatseed.render.binning import TILE, depth_order, list_tiles
 
 View = tuple[np.ndarray, np.ndarray, np.ndarray, int, int]
 
 
-def lists_of(
-    means2d: np.ndarray, conics: np.ndarray, reach: np.ndarray, width: int, height: int
-) -> TileLists:
+def lists_of(means2d, conics, reach, width, height):
     """The lists of Gaussians whose alpha reaches 1/255 where sigma is ``reach``."""
     records = np.zeros((len(reach), binning.RECORD), np.float32)
     records[:, :2], records[:, 2:5] = means2d, conics * np.float32([-1 / 16, -1 / 8, -1 / 16])
@@ -22,7 +20,7 @@ def lists_of(
     return list_tiles(records.ravel(), width, height)
 
 
-def random_view(rng: np.random.Generator, n: int, width: int, height: int) -> View:
+def random_view(rng, n, width, height):
     """Ellipses of all sizes and shapes in and around an image, some of one pixel, some of a
     thousand."""
     axes = np.exp(rng.uniform(np.log(0.55), np.log(300.0), (n, 2)))
@@ -37,7 +35,7 @@ def random_view(rng: np.random.Generator, n: int, width: int, height: int) -> Vi
     return *(each.astype(np.float32) for each in (means2d, conics, reach)), width, height
 
 
-def touched(view: View, slack: float) -> np.ndarray:
+def touched(view, slack):
     """Which Gaussian has a pixel of which tile with sigma <= reach + slack: bool [G, rows,
     columns]."""
     means2d, conics, reach, width, height = view
@@ -50,7 +48,7 @@ def touched(view: View, slack: float) -> np.ndarray:
     return inside.reshape(-1, rows, TILE, columns, TILE).any(axis=(2, 4))
 
 
-def listed(lists: TileLists, view: View) -> np.ndarray:
+def listed(lists, view):
     """The same, of the lists."""
     columns, rows = -(-view[3] // TILE), -(-view[4] // TILE)
     counts = np.zeros((len(view[2]), rows * columns), int)
@@ -61,7 +59,7 @@ def listed(lists: TileLists, view: View) -> np.ndarray:
 
 
 @pytest.mark.parametrize("size", [(40, 33), (8, 8), (3, 5), (1, 1), (200, 9)])
-def test_no_pair_is_missing_and_few_are_in_vain(rng, size: tuple[int, int]) -> None:
+def test_no_pair_is_missing_and_few_are_in_vain(rng, size):
     view = random_view(rng, 300, *size)
     lists = lists_of(*view)
     owner = np.repeat(np.arange(len(view[2])), np.diff(lists.span_start))
@@ -76,7 +74,7 @@ def test_no_pair_is_missing_and_few_are_in_vain(rng, size: tuple[int, int]) -> N
 @pytest.mark.parametrize("conic", [(1e-12, 0.0, 1e-12), (1e-38, 0.0, 1e-38), (0.0, 0.0, 0.0),
                                    (1e-40, 0.0, 1e-40), (1.0, 1.0, 1.0),
                                    (1.0, -1.0001, 1.0)])  # fmt: skip
-def test_giants_and_broken_needles_are_listed_everywhere(conic: tuple[float, ...]) -> None:
+def test_giants_and_broken_needles_are_listed_everywhere(conic):
     lists = lists_of(
         np.array([[5.0, 7.0]], np.float32), np.array([conic], np.float32),
         np.array([3.0], np.float32), 40, 24,
@@ -90,7 +88,7 @@ def test_giants_and_broken_needles_are_listed_everywhere(conic: tuple[float, ...
     st.lists(st.floats(0.0, 2.0**127, width=32, allow_subnormal=True), max_size=40),
     st.integers(0, 2**31),
 )
-def test_depth_order_is_a_stable_sort(depths: list[float], seed: int) -> None:
+def test_depth_order_is_a_stable_sort(depths, seed):
     values = np.array(depths + depths[::2], np.float32)
     visible = np.random.default_rng(seed).random(len(values)) < 0.7
     expected = [i for i in np.argsort(values, kind="stable") if visible[i]]

@@ -9,14 +9,12 @@ import hashlib
 import os
 import subprocess
 import sys
-from collections.abc import Iterable
 from pathlib import Path
 
 import numba
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from splatseed.render.autograd import Harmonics
 
@@ -26,14 +24,14 @@ MODES = ({}, {"rasterize_mode": "antialiased", "packed": False},
          {"render_mode": "RGB+ED", "sh_degree": 3})  # fmt: skip
 
 
-def digest(tensors: Iterable[Tensor]) -> str:
+def digest(tensors):
     """SHA-256 of their bytes."""
     return hashlib.sha256(b"".join(each.detach().numpy().tobytes() for each in tensors)).hexdigest()
 
 
-def renders() -> list[Tensor]:
+def renders():
     """Images, alphas and all gradients of a crowd in two cameras."""
-    results: list[Tensor] = []
+    results = []
     for options in MODES:
         rng, coefficients = np.random.default_rng(0), 16 if "sh_degree" in options else None
         scene = random_scene(rng, 3000, cameras=2, size=(77, 59), coefficients=coefficients)
@@ -43,7 +41,7 @@ def renders() -> list[Tensor]:
 
 
 @pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="this machine has one thread")
-def test_any_number_of_threads() -> None:
+def test_any_number_of_threads():
     before, digests = numba.get_num_threads(), set()
     try:
         for threads in (before, 1, 2):
@@ -54,7 +52,7 @@ def test_any_number_of_threads() -> None:
     assert len(digests) == 1
 
 
-def colors() -> list[Tensor]:
+def colors():
     """Colours by harmonics and their gradients: vector code of four files, compiled in seconds."""
     rng, shapes = np.random.default_rng(0), ((3000, 3), (3,), (3000, 16, 3))
     arrays = [rng.normal(size=shape).astype(np.float32) for shape in shapes]
@@ -64,7 +62,7 @@ def colors() -> list[Tensor]:
     return [shades, *(each.grad for each in inputs)]
 
 
-def test_freshly_compiled_and_loaded_from_the_cache(tmp_path: Path) -> None:
+def test_freshly_compiled_and_loaded_from_the_cache(tmp_path):
     """A new process with an empty cache compiles; a second one loads what the first has left."""
     expected = digest(colors())
     assert _in_new_process(tmp_path) == expected
@@ -74,7 +72,7 @@ def test_freshly_compiled_and_loaded_from_the_cache(tmp_path: Path) -> None:
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.nbc")} == compiled
 
 
-def _in_new_process(cache: Path) -> str:
+def _in_new_process(cache):
     run = subprocess.run(
         [sys.executable, "-m", "tests.render.test_determinism"], cwd=Path(__file__).parents[2],
         env={**os.environ, "NUMBA_CACHE_DIR": str(cache)}, capture_output=True, text=True,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tracemalloc
-from typing import Any
 
 import numpy as np
 import pytest
@@ -29,7 +28,7 @@ QUICK = settings(
 
 
 @st.composite
-def replacements(draw: st.DrawFn, broken: bool) -> list[tuple[str, int, int, float]]:
+def replacements(draw, broken):
     """Numbers to put into a scene: (parameter, Gaussian, component, value)."""
     changes = []
     for _ in range(draw(st.integers(1, 8))):
@@ -39,13 +38,13 @@ def replacements(draw: st.DrawFn, broken: bool) -> list[tuple[str, int, int, flo
     return changes
 
 
-def with_replacements(scene: dict[str, Any], changes: list[tuple[str, int, int, float]]) -> None:
+def with_replacements(scene, changes):
     for name, gaussian, component, value in changes:
         row = scene[name].view(len(scene[name]), -1)[gaussian]
         row[component % len(row)] = value
 
 
-def scene_of(seed: int, options: int) -> tuple[dict[str, Any], dict[str, Any]]:
+def scene_of(seed, options):
     """Twelve Gaussians before two cameras, and one of the modes."""
     scene = random_scene(np.random.default_rng(seed), 12, cameras=2, size=(21, 13))
     return scene, [
@@ -53,7 +52,7 @@ def scene_of(seed: int, options: int) -> tuple[dict[str, Any], dict[str, Any]]:
     ][options]  # fmt: skip
 
 
-def assert_finite(scene: dict[str, Any], **options: Any) -> None:
+def assert_finite(scene, **options):
     image, alpha, grads = gradients(scene, **options)
     assert image.isfinite().all()
     assert ((alpha >= 0) & (alpha <= 1)).all()
@@ -63,9 +62,7 @@ def assert_finite(scene: dict[str, Any], **options: Any) -> None:
 
 @QUICK
 @given(replacements(broken=False), st.integers(0, 9), st.integers(0, 3))
-def test_extreme_numbers_stay_finite(
-    changes: list[tuple[str, int, int, float]], seed: int, options: int
-) -> None:
+def test_extreme_numbers_stay_finite(changes, seed, options):
     scene, chosen = scene_of(seed, options)
     with_replacements(scene, changes)
     assert_finite(scene, **chosen)
@@ -73,9 +70,7 @@ def test_extreme_numbers_stay_finite(
 
 @QUICK
 @given(replacements(broken=True), st.integers(0, 9), st.integers(0, 3))
-def test_broken_gaussians_are_as_if_absent(
-    changes: list[tuple[str, int, int, float]], seed: int, options: int
-) -> None:
+def test_broken_gaussians_are_as_if_absent(changes, seed, options):
     scene, chosen = scene_of(seed, options)
     with_replacements(scene, changes)
     broken = sorted({gaussian for _, gaussian, _, _ in changes})
@@ -92,7 +87,7 @@ def test_broken_gaussians_are_as_if_absent(
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("degree", [1, 3])
-def test_broken_coefficients(seed: int, degree: int) -> None:
+def test_broken_coefficients(seed, degree):
     scene = random_scene(np.random.default_rng(seed), 12, coefficients=16)
     scene["colors"][3, 2, 1] = np.nan
     kept = [i for i in range(12) if i != 3]
@@ -102,7 +97,7 @@ def test_broken_coefficients(seed: int, degree: int) -> None:
 
 
 @pytest.mark.parametrize("options", [{}, {"packed": False}, {"render_mode": "RGB+ED"}])
-def test_none_visible(options: dict[str, Any]) -> None:
+def test_none_visible(options):
     """Behind the camera, or none at all."""
     scene = random_scene(np.random.default_rng(0), 20)
     scene["viewmats"][:, 2, 3] = -10.0
@@ -115,7 +110,7 @@ def test_none_visible(options: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("scale", [1e2, 1e8, 1e15, 1e19])
-def test_a_giant_covers_everything_and_takes_little_memory(scale: float) -> None:
+def test_a_giant_covers_everything_and_takes_little_memory(scale):
     scene = random_scene(np.random.default_rng(0), 1, size=(320, 200))
     scene.update(means=torch.tensor([[0.1, 0.2, 1.0]]), scales=torch.full((1, 3), scale))
     scene.update(opacities=torch.tensor([0.5]), viewmats=torch.eye(4)[None])
@@ -129,7 +124,7 @@ def test_a_giant_covers_everything_and_takes_little_memory(scale: float) -> None
     assert grads["opacities"].isfinite().all()
 
 
-def test_inputs_are_left_alone(rng) -> None:
+def test_inputs_are_left_alone(rng):
     scene = random_scene(rng, 20, coefficients=4)
     before = {k: v.clone() for k, v in scene.items() if isinstance(v, Tensor)}
     gradients(scene, sh_degree=1)
@@ -137,7 +132,7 @@ def test_inputs_are_left_alone(rng) -> None:
     assert all(torch.equal(before[name], scene[name]) for name in before)
 
 
-def test_inputs_need_not_be_contiguous(rng) -> None:
+def test_inputs_need_not_be_contiguous(rng):
     scene = random_scene(rng, 20)
     strided = {**scene, "means": scene["means"].T.contiguous().T}
     strided["colors"] = torch.cat([scene["colors"], scene["colors"]], dim=1)[:, :3]

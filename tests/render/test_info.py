@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import inspect
 import re
-from typing import Any
 
 import gsplat
 import numpy as np
 import pytest
 import torch
 from gsplat.cuda._torch_impl import _isect_offset_encode, _isect_tiles
-from torch import Tensor
 
 from splatseed.render import rasterization
 from splatseed.render.rasterize import LISTS
@@ -19,14 +17,14 @@ from splatseed.render.rasterize import LISTS
 from .scenes import PER_GAUSSIAN, random_scene
 
 
-def scene_of(cameras: int, count: int = 50) -> dict[str, Any]:
+def scene_of(cameras, count=50):
     """Gaussians of which some are culled, over tiles that the image does not fill."""
     scene = random_scene(np.random.default_rng(3), 50, cameras=cameras, size=(75, 41))
     scene["viewmats"][:, 2, 3] = 0.7
     return {**scene, **{name: scene[name][:count] for name in PER_GAUSSIAN}}
 
 
-def theirs(info: dict[str, Any]) -> dict[str, Tensor]:
+def theirs(info):
     """gsplat's lists of what is not packed."""
     grid = info["tile_width"], info["tile_height"]
     lists = _isect_tiles(info["means2d"], info["radii"], info["depths"], info["tile_size"], *grid)
@@ -34,13 +32,13 @@ def theirs(info: dict[str, Any]) -> dict[str, Tensor]:
     return dict(zip(LISTS, (*lists, offsets), strict=True))
 
 
-def assert_same(ours: Tensor, expected: Tensor) -> None:
+def assert_same(ours, expected):
     assert ours.dtype == expected.dtype
     assert torch.equal(ours, expected)
 
 
 @pytest.mark.parametrize(("cameras", "tile_size", "count"), [(1, 16, 50), (3, 7, 50), (3, 16, 0)])
-def test_lists_are_gsplats(cameras: int, tile_size: int, count: int) -> None:
+def test_lists_are_gsplats(cameras, tile_size, count):
     scene = scene_of(cameras, count)
     info, packed = (
         rasterization(**scene, packed=each, tile_size=tile_size)[2] for each in (False, True)
@@ -61,7 +59,7 @@ def test_lists_are_gsplats(cameras: int, tile_size: int, count: int) -> None:
 
 
 @pytest.mark.parametrize("packed", [True, False])
-def test_names_are_gsplats(packed: bool) -> None:
+def test_names_are_gsplats(packed):
     code = inspect.getsource(gsplat.rasterization)
     info = rasterization(**scene_of(2), packed=packed)[2]
     assert {*info, *LISTS} == set(re.findall(r'"(\w+)": ', code))
@@ -77,7 +75,7 @@ def test_names_are_gsplats(packed: bool) -> None:
     assert not packed or not info["batch_ids"].any()
 
 
-def test_a_step_of_training_makes_no_lists() -> None:
+def test_a_step_of_training_makes_no_lists():
     scene = scene_of(2)
     means = scene["means"].requires_grad_()
     params, strategy = {"means": means}, gsplat.DefaultStrategy()

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import math
 from contextlib import nullcontext, suppress
-from typing import Any
 
 import gsplat
 import numpy as np
 import pytest
 import torch
 from gsplat.strategy import ops
-from torch import Tensor
 
 from splatseed.render import MCMCStrategy, mcmc_on_cpu, rasterization
 from splatseed.render.mcmc import compute_relocation, covariances
@@ -21,9 +19,7 @@ from .scenes import gradients, random_scene
 SPARSE = ("means", "quats", "scales")
 
 
-def train(
-    strategy: Any, start: dict[str, Any], steps: int, post: dict[str, Any], *, packed: bool = True
-) -> tuple[list[float], list[int], torch.nn.ParameterDict, dict[str, Any]]:
+def train(strategy, start, steps, post, *, packed=True):
     """Fit a target as gsplat's example does: losses and counts by step, parameters, state."""
     torch.manual_seed(0)
     views = random_scene(np.random.default_rng(0), 60, cameras=2)
@@ -47,7 +43,7 @@ def train(
             absgrad=getattr(strategy, "absgrad", False),
         )  # fmt: skip
         strategy.step_pre_backward(params, optimizers, state, step, info)
-        loss: Tensor = (image - target).abs().mean()
+        loss = (image - target).abs().mean()
         loss.backward()
         for optimizer in optimizers.values():
             optimizer.step()
@@ -59,12 +55,12 @@ def train(
     return losses, counts, params, state
 
 
-def few() -> dict[str, Any]:
+def few():
     return random_scene(np.random.default_rng(1), 25, cameras=2)
 
 
 @pytest.mark.parametrize(("packed", "absgrad"), [(True, True), (False, False)])
-def test_default_strategy_densifies(packed: bool, absgrad: bool) -> None:
+def test_default_strategy_densifies(packed, absgrad):
     strategy = gsplat.DefaultStrategy(
         refine_start_iter=5, refine_every=10, grow_grad2d=1e-4, absgrad=absgrad, reset_every=1000
     )
@@ -78,7 +74,7 @@ def test_default_strategy_densifies(packed: bool, absgrad: bool) -> None:
 SCHEDULE = {"refine_start_iter": 2, "refine_every": 5, "cap_max": 54}
 
 
-def test_mcmc_relocates_adds_and_learns(capsys: Any) -> None:
+def test_mcmc_relocates_adds_and_learns(capsys):
     """Of ours, and of gsplat's own class within the block, to the same bytes."""
     results = []
     for make, block in ((MCMCStrategy, nullcontext), (gsplat.MCMCStrategy, mcmc_on_cpu)):
@@ -141,7 +137,7 @@ def test_gsplat_gets_its_own_functions_back_whatever_blocks_overlap():
     assert functions() == before
 
 
-def partly_seen(cameras: int, **more: Any) -> dict[str, Any]:
+def partly_seen(cameras, **more):
     """Some Gaussians lie behind a camera or beside its image."""
     scene = random_scene(np.random.default_rng(0), 80, cameras=cameras, **more)
     scene["viewmats"][:, 2, 3] = 0.6
@@ -152,9 +148,7 @@ def partly_seen(cameras: int, **more: Any) -> dict[str, Any]:
 @pytest.mark.parametrize(
     "options", [{}, {"rasterize_mode": "antialiased", "render_mode": "RGB+ED"}]
 )
-def test_sparse_gradients_are_the_dense_ones_of_the_seen(
-    cameras: int, options: dict[str, Any]
-) -> None:
+def test_sparse_gradients_are_the_dense_ones_of_the_seen(cameras, options):
     scene = partly_seen(cameras)
     *picture, dense = gradients(scene, **options)
     *same, grads = gradients(scene, sparse_grad=True, **options)

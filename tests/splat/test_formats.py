@@ -17,14 +17,8 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError, SplatseedError
-from splatseed.splat.formats import (
-    FORMATS,
-    format_of_name,
-    keep_gaussians,
-    parse_crop,
-    read_model,
-    write_model,
-)
+from splatseed.splat import formats
+from splatseed.splat.formats import FORMATS, read_model, write_model
 from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.sog import _MOST_META
 
@@ -194,10 +188,10 @@ def test_notes_that_would_burst_are_refused_unread(tmp_path, monkeypatch):
 
 
 def test_names_choose_the_format_and_others_have_a_tool():
-    assert format_of_name(Path("A.COMPRESSED.PLY")) == "compressed-ply"
+    assert formats.format_of_name(Path("A.COMPRESSED.PLY")) == "compressed-ply"
     for name, word in (("a.glb", "splat-transform"), ("a.sogg", r"mean \.sog"), ("a", "none")):
         with pytest.raises(ParameterError, match=word):
-            format_of_name(Path(name))
+            formats.format_of_name(Path(name))
 
 
 def test_an_unpacked_sog_is_read(files, tmp_path):
@@ -215,21 +209,21 @@ def test_an_unpacked_sog_is_read(files, tmp_path):
 
 def test_a_box_and_an_opacity_keep_what_they_say():
     model = _gaussians()
-    kept = keep_gaussians(model, parse_crop("-1,-2,-3,1,2,3"), 0.25)
+    kept = formats.keep_gaussians(model, formats.parse_crop("-1,-2,-3,1,2,3"), 0.25)
     inside = (np.abs(model.means) <= [1, 2, 3]).all(axis=1)
     opaque = 1 / (1 + np.exp(-model.opacities)) >= 0.25
     np.testing.assert_array_equal(kept.means, model.means[inside & opaque])
-    assert keep_gaussians(model) is model
+    assert formats.keep_gaussians(model) is model
 
 
 def test_what_leaves_nothing_or_is_no_box_is_refused():
     for text in ("", "1,2,3", "0,0,0,1,1,0", "a,b,c,d,e,f", "0,0,0,1,1,nan"):
         with pytest.raises(ParameterError, match="--crop"):
-            parse_crop(text)
+            formats.parse_crop(text)
     with pytest.raises(ParameterError, match="none of 700"):
-        keep_gaussians(_gaussians(), parse_crop("90,90,90,91,91,91"))
+        formats.keep_gaussians(_gaussians(), formats.parse_crop("90,90,90,91,91,91"))
     with pytest.raises(ParameterError, match="min-opacity"):
-        keep_gaussians(_gaussians(), min_opacity=1.0)
+        formats.keep_gaussians(_gaussians(), min_opacity=1.0)
 
 
 # The formats' own tool ---------------------------------------------------------------------------

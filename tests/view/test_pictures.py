@@ -14,15 +14,7 @@ from splatseed.errors import OutputError
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene, SceneSource
 from splatseed.upsample import SOURCE_CODES
-from splatseed.view.clouds import (
-    CoveredView,
-    cell_picture,
-    preview_cells,
-    preview_errors,
-    preview_methods,
-    preview_origins,
-    preview_pair,
-)
+from splatseed.view import clouds as pages
 from splatseed.view.maps import map_tiles, normal_picture, preview_maps
 from splatseed.view.page import UNKNOWN, Tile, depth_picture, write_grid
 from splatseed.view.points import COLORS, origin_colors, points_over, render_points
@@ -115,7 +107,7 @@ def test_every_origin_has_a_colour_of_its_own(seeds):
 
 
 def test_a_page_of_origins_has_both_pictures_and_names_what_is_there(seeds, tmp_path):
-    picture = _read(preview_origins(Scene(seeds), seeds, tmp_path / "origins.png"))
+    picture = _read(pages.preview_origins(Scene(seeds), seeds, tmp_path / "origins.png"))
     left, right = np.array_split(picture[40:-44], 2, axis=1)
     stereo = COLORS[SOURCE_CODES["stereo"]]
     assert not (left == stereo).all(axis=2).any()
@@ -128,33 +120,35 @@ def test_a_page_of_origins_has_both_pictures_and_names_what_is_there(seeds, tmp_
 def test_a_pair_shows_both_clouds(scene, tmp_path):
     moved = scene.points.replace(xyz=scene.points.xyz + np.float32(0.03))
     dense = PointCloud.concatenate(scene.points, moved)
-    path = preview_pair(scene, dense, tmp_path / "out" / "pair.png", title="twice")
+    path = pages.preview_pair(scene, dense, tmp_path / "out" / "pair.png", title="twice")
     picture = _read(path)
     left, right = np.array_split(picture[60:], 2, axis=1)
     assert picture.shape[1] > 2 * picture.shape[0] > 600
     assert 0 < (left < 100).mean() < (right < 100).mean()
     assert [p.name for p in (tmp_path / "out").iterdir()] == ["pair.png"]
-    again = preview_pair(scene, dense, tmp_path / "again.png", title="twice")
+    again = pages.preview_pair(scene, dense, tmp_path / "again.png", title="twice")
     assert path.read_bytes() == again.read_bytes()
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(OutputError):
-        preview_pair(scene, dense, tmp_path / "file" / "pair.png")
+        pages.preview_pair(scene, dense, tmp_path / "file" / "pair.png")
 
 
 def test_the_grid_starts_with_the_photograph_where_there_is_one(scene, tmp_path):
     clouds = {"one": scene.points, "two": scene.points}
-    with_photo = _read(preview_methods(scene, clouds, tmp_path / "with.png"))
+    with_photo = _read(pages.preview_methods(scene, clouds, tmp_path / "with.png"))
     green = (with_photo == PHOTOGRAPH).all(axis=2)
     assert green.sum() == 600 * 450
     assert not green[:, 615:].any()
-    bare = _read(preview_methods(scene.replace(source=None), clouds, tmp_path / "without.png"))
+    bare = _read(
+        pages.preview_methods(scene.replace(source=None), clouds, tmp_path / "without.png")
+    )
     assert not (bare == PHOTOGRAPH).all(axis=2).any()
 
 
 def test_errors_are_coloured_by_distance(scene, tmp_path):
     def picture(value):
         errors = {"new": np.full(len(scene.points), value)}
-        path = preview_errors({"new": scene.points}, errors, CAMERA, tmp_path / "errors.png")
+        path = pages.preview_errors({"new": scene.points}, errors, CAMERA, tmp_path / "errors.png")
         return _read(path)[40:480, 12:600]
 
     good, bad, worse = picture(0.0), picture(1.0), picture(70.0)
@@ -168,7 +162,9 @@ def test_errors_are_coloured_by_distance(scene, tmp_path):
 @given(data=st.data(), height=st.integers(1, 20), width=st.integers(1, 20), cell=st.integers(1, 9))
 def test_a_pixel_is_dimmed_or_tinted_as_its_cell_is(data, height, width, cell):
     covered = data.draw(hnp.arrays(bool, (-(-height // cell), -(-width // cell))))
-    picture = cell_picture(np.full((height, width, 3), 200, np.uint8), covered, cell).astype(int)
+    picture = pages.cell_picture(np.full((height, width, 3), 200, np.uint8), covered, cell).astype(
+        int
+    )
     seeded = covered.repeat(cell, axis=0).repeat(cell, axis=1)[:height, :width]
     assert (picture[seeded] == 150).all()
     assert (picture[~seeded][:, [0, 2]] > picture[~seeded][:, [1]] + 50).all()
@@ -176,9 +172,9 @@ def test_a_pixel_is_dimmed_or_tinted_as_its_cell_is(data, height, width, cell):
 
 def test_a_page_shows_the_cells_before_and_after(tmp_path):
     before, after = np.zeros((3, 4), bool), np.ones((3, 4), bool)
-    view = CoveredView("a.png", np.full((24, 32, 3), 200, np.uint8), 8, before, after)
+    view = pages.CoveredView("a.png", np.full((24, 32, 3), 200, np.uint8), 8, before, after)
     for count in (1, 3):
-        picture = _read(preview_cells([view] * count, tmp_path / "cells.png"))
+        picture = _read(pages.preview_cells([view] * count, tmp_path / "cells.png"))
         tinted = (picture[..., [0, 2]] - picture[..., [1]] > 50).all(axis=2)
         assert tinted.sum() == count * 600 * 450
         dimmed = (picture == 150).all(axis=2).sum()  # labels have a few grey pixels too
