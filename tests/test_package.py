@@ -257,7 +257,7 @@ def _own_public(module):
 
 
 def _assert_explained(each, where):
-    """A docstring on a function, or on a class and all its public methods."""
+    """A docstring on a function, or on a class and all its public methods, inherited or own."""
     if not (inspect.isfunction(each) or inspect.isclass(each)):
         return
     assert each.__doc__, where
@@ -265,7 +265,7 @@ def _assert_explained(each, where):
         function = member.fget if isinstance(member, property) else member
         function = getattr(function, "__func__", function)
         if inspect.isfunction(function) and not name.startswith("_"):
-            assert function.__doc__, f"{where}.{name}"
+            assert inspect.getdoc(getattr(each, name)), f"{where}.{name}"
 
 
 def test_the_front_door_lists_what_the_packages_promise():

@@ -45,23 +45,18 @@ class Surface(Protocol):
     @property
     def area(self) -> float:
         """Area in squared scene units, each side of a sheet counted once."""
-        ...
 
     def distance(self, xyz: Points) -> Numbers:
         """Unsigned distance of each point to the nearest point of the surface, [N]."""
-        ...
 
     def sample(self, num: int, rng: np.random.Generator) -> Points:
         """Points drawn uniformly by area, [num, 3]."""
-        ...
 
     def intersect(self, origin: Vector, directions: Points) -> Numbers:
         """The smallest t > 0 at which each ray meets the surface, [N]; inf where it misses."""
-        ...
 
     def normals(self, xyz: Points) -> Points:
         """Unit normals at points on the surface, [N, 3], of either sign."""
-        ...
 
 
 def yaw_frame(degrees: float) -> Frame:
@@ -71,7 +66,7 @@ def yaw_frame(degrees: float) -> Frame:
 
 
 @dataclass(frozen=True, eq=False)
-class Rectangle:
+class Rectangle(Surface):
     """A flat rectangle.
 
     Args:
@@ -97,22 +92,18 @@ class Rectangle:
 
     @property
     def area(self) -> float:
-        """See ``Surface.area``."""
         return float(self.size.prod())
 
     def distance(self, xyz: Points) -> Numbers:
-        """See ``Surface.distance``."""
         local = (np.asarray(xyz, np.float64) - self.corner) @ self.frame.T
         local[:, :2] -= np.clip(local[:, :2], 0.0, self.size)
         return np.asarray(np.linalg.norm(local, axis=1))
 
     def sample(self, num: int, rng: np.random.Generator) -> Points:
-        """See ``Surface.sample``."""
         local = rng.random((num, 2)) * self.size
         return np.asarray(self.corner + local @ self.frame[:2])
 
     def intersect(self, origin: Vector, directions: Points) -> Numbers:
-        """See ``Surface.intersect``."""
         offset = self.frame @ (origin - self.corner)
         local = directions @ self.frame.T
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -122,12 +113,11 @@ class Rectangle:
         return _first_hit((t, inside))
 
     def normals(self, xyz: Points) -> Points:
-        """See ``Surface.normals``."""
         return np.broadcast_to(self.frame[2], np.shape(xyz))
 
 
 @dataclass(frozen=True, eq=False)
-class Box:
+class Box(Surface):
     """The six faces of a box.
 
     Args:
@@ -142,18 +132,15 @@ class Box:
 
     @property
     def area(self) -> float:
-        """See ``Surface.area``."""
         return float(8.0 * (self.half.prod() / self.half).sum())
 
     def distance(self, xyz: Points) -> Numbers:
-        """See ``Surface.distance``."""
         local = (np.asarray(xyz, np.float64) - self.center) @ self.frame.T
         beyond = np.abs(local) - self.half
         outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=1)
         return np.asarray(outside + np.maximum(-beyond.max(axis=1), 0.0))
 
     def sample(self, num: int, rng: np.random.Generator) -> Points:
-        """See ``Surface.sample``."""
         faces = 4.0 * self.half.prod() / self.half  # normal to each axis
         axis = rng.choice(3, num, p=faces / faces.sum())
         local = rng.uniform(-1.0, 1.0, (num, 3))
@@ -161,7 +148,6 @@ class Box:
         return np.asarray(self.center + (local * self.half) @ self.frame)
 
     def intersect(self, origin: Vector, directions: Points) -> Numbers:
-        """See ``Surface.intersect``."""
         near, far = _slab_interval(
             self.frame @ (origin - self.center), directions @ self.frame.T, -self.half, self.half
         )
@@ -169,14 +155,13 @@ class Box:
         return _first_hit((near, meets), (far, meets))
 
     def normals(self, xyz: Points) -> Points:
-        """See ``Surface.normals``."""
         local = (xyz - self.center) @ self.frame.T
         axis = (np.abs(local) - self.half).argmax(axis=1)
         return np.asarray(np.sign(local)[np.arange(len(xyz)), axis, None] * self.frame[axis])
 
 
 @dataclass(frozen=True, eq=False)
-class Sphere:
+class Sphere(Surface):
     """A sphere.
 
     Args:
@@ -189,34 +174,29 @@ class Sphere:
 
     @property
     def area(self) -> float:
-        """See ``Surface.area``."""
         return float(4.0 * np.pi * self.radius**2)
 
     def distance(self, xyz: Points) -> Numbers:
-        """See ``Surface.distance``."""
         to_center = np.linalg.norm(np.asarray(xyz, np.float64) - self.center, axis=1)
         return np.asarray(np.abs(to_center - self.radius))
 
     def sample(self, num: int, rng: np.random.Generator) -> Points:
-        """See ``Surface.sample``."""
         ray = rng.normal(size=(num, 3))
         unit = ray / np.linalg.norm(ray, axis=1, keepdims=True)
         return np.asarray(self.center + self.radius * unit)
 
     def intersect(self, origin: Vector, directions: Points) -> Numbers:
-        """See ``Surface.intersect``."""
         offset = origin - self.center
         a = np.einsum("ij,ij->i", directions, directions)
         t0, t1, real = _roots(a, directions @ offset, offset @ offset - self.radius**2)
         return _first_hit((t0, real), (t1, real))
 
     def normals(self, xyz: Points) -> Points:
-        """See ``Surface.normals``."""
         return np.asarray((xyz - self.center) / self.radius)
 
 
 @dataclass(frozen=True, eq=False)
-class Cylinder:
+class Cylinder(Surface):
     """The side of a cylinder, open at both ends.
 
     Args:
@@ -233,25 +213,21 @@ class Cylinder:
 
     @property
     def area(self) -> float:
-        """See ``Surface.area``."""
         return float(2.0 * np.pi * self.radius * self.height)
 
     def distance(self, xyz: Points) -> Numbers:
-        """See ``Surface.distance``."""
         local = (np.asarray(xyz, np.float64) - self.center) @ self.frame.T
         radial = np.hypot(local[:, 0], local[:, 1]) - self.radius
         beyond = np.maximum(np.abs(local[:, 2]) - self.height / 2, 0.0)
         return np.asarray(np.hypot(radial, beyond))
 
     def sample(self, num: int, rng: np.random.Generator) -> Points:
-        """See ``Surface.sample``."""
         angle = rng.uniform(0.0, 2.0 * np.pi, num)
         along = rng.uniform(-0.5, 0.5, num) * self.height
         local = np.stack([np.cos(angle) * self.radius, np.sin(angle) * self.radius, along], axis=1)
         return np.asarray(self.center + local @ self.frame)
 
     def intersect(self, origin: Vector, directions: Points) -> Numbers:
-        """See ``Surface.intersect``."""
         offset = self.frame @ (origin - self.center)
         local = directions @ self.frame.T
         across = local[:, :2]
@@ -263,13 +239,12 @@ class Cylinder:
         return _first_hit((t0, on_side[0]), (t1, on_side[1]))
 
     def normals(self, xyz: Points) -> Points:
-        """See ``Surface.normals``."""
         across = ((xyz - self.center) @ self.frame.T)[:, :2]
         return np.asarray(across @ self.frame[:2] / self.radius)
 
 
 @dataclass(frozen=True)
-class Union:
+class Union(Surface):
     """Several surfaces taken as one.
 
     Args:
@@ -280,25 +255,21 @@ class Union:
 
     @property
     def area(self) -> float:
-        """See ``Surface.area``."""
         return sum(part.area for part in self.parts)
 
     def distance(self, xyz: Points) -> Numbers:
-        """See ``Surface.distance``."""
         nearest = np.full(len(xyz), np.inf)
         for part in self.parts:
             np.minimum(nearest, part.distance(xyz), out=nearest)
         return nearest
 
     def sample(self, num: int, rng: np.random.Generator) -> Points:
-        """See ``Surface.sample``."""
         areas = np.array([part.area for part in self.parts])
         counts = rng.multinomial(num, areas / areas.sum())
         pieces = [part.sample(int(n), rng) for part, n in zip(self.parts, counts, strict=True)]
         return np.concatenate(pieces)
 
     def intersect(self, origin: Vector, directions: Points) -> Numbers:
-        """See ``Surface.intersect``."""
         return self.intersect_parts(origin, directions)[0]
 
     def intersect_parts(
@@ -314,7 +285,6 @@ class Union:
         return nearest, which
 
     def normals(self, xyz: Points) -> Points:
-        """See ``Surface.normals``."""
         nearest = np.stack([part.distance(xyz) for part in self.parts]).argmin(axis=0)
         normals = np.empty(np.shape(xyz))
         for i, part in enumerate(self.parts):
@@ -323,7 +293,7 @@ class Union:
 
 
 @dataclass(frozen=True, eq=False)
-class SineSheet:
+class SineSheet(Surface):
     """A rectangle bent into a sine wave along its first axis.
 
     In its frame a point is (u, v, w), and the sheet is w = A sin(2 pi u / wavelength) for
@@ -359,11 +329,9 @@ class SineSheet:
 
     @property
     def area(self) -> float:
-        """See ``Surface.area``."""
         return float(self._arc_length()[1][-1] * self.size[1])
 
     def distance(self, xyz: Points) -> Numbers:
-        """See ``Surface.distance``."""
         local = (np.asarray(xyz, np.float64) - self.corner) @ self.frame.T
         across = local[:, 1] - np.clip(local[:, 1], 0.0, self.size[1])
         in_profile = np.empty(len(local))
@@ -388,14 +356,12 @@ class SineSheet:
         return np.asarray(np.hypot(u - high, w - self._height(high)))
 
     def sample(self, num: int, rng: np.random.Generator) -> Points:
-        """See ``Surface.sample``."""
         table_u, table_length = self._arc_length()
         u = np.interp(rng.random(num) * table_length[-1], table_length, table_u)
         local = np.stack([u, rng.random(num) * self.size[1], self._height(u)], axis=1)
         return np.asarray(self.corner + local @ self.frame)
 
     def intersect(self, origin: Vector, directions: Points) -> Numbers:
-        """See ``Surface.intersect``."""
         start = self.frame @ (origin - self.corner)
         local = directions @ self.frame.T
         low = np.array([0.0, 0.0, -self.amplitude])
@@ -439,14 +405,13 @@ class SineSheet:
         return np.asarray(w > self._height(u))
 
     def normals(self, xyz: Points) -> Points:
-        """See ``Surface.normals``."""
         slope = self._slope((xyz - self.corner) @ self.frame[0])
         normal = self.frame[2] - slope[:, None] * self.frame[0]
         return np.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))
 
 
 @dataclass(frozen=True, eq=False)
-class Discs:
+class Discs(Surface):
     """Flat round leaves.
 
     Args:
@@ -461,7 +426,6 @@ class Discs:
 
     @property
     def area(self) -> float:
-        """See ``Surface.area``."""
         return float(np.pi * (self.radii**2).sum())
 
     @cached_property
@@ -472,7 +436,6 @@ class Discs:
         return Sphere(center, float(reach.max()) * (1 + 1e-9))
 
     def distance(self, xyz: Points) -> Numbers:
-        """See ``Surface.distance``."""
         return np.asarray(self._nearest(xyz)[0])
 
     def _nearest(self, xyz: np.ndarray) -> Any:
@@ -480,7 +443,6 @@ class Discs:
         return _nearest_disc(points, self.centers, self.axes, self.radii)
 
     def sample(self, num: int, rng: np.random.Generator) -> Points:
-        """See ``Surface.sample``."""
         leaf = rng.choice(len(self.radii), num, p=self.radii**2 / (self.radii**2).sum())
         axis = self.axes[leaf]
         # Any direction in the leaf's plane will do; one from a random vector is uniform in angle.
@@ -490,14 +452,12 @@ class Discs:
         return np.asarray(self.centers[leaf] + radius[:, None] * across)
 
     def intersect(self, origin: Vector, directions: Points) -> Numbers:
-        """See ``Surface.intersect``."""
         t = np.full(len(directions), np.inf)
         near = np.flatnonzero(np.isfinite(self._bound.intersect(origin, directions)))
         t[near] = _first_disc(origin, directions[near], self.centers, self.axes, self.radii)
         return t
 
     def normals(self, xyz: Points) -> Points:
-        """See ``Surface.normals``."""
         return np.asarray(self.axes[self._nearest(xyz)[1]])
 
 
