@@ -28,15 +28,10 @@ SceneFormat = Literal["colmap", "transforms", "ply", "rgbd"]
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """The features of one image.
+    """The features of one image."""
 
-    Args:
-        xy: Pixel coordinates, float64 [M, 2].
-        point_ids: Id of the 3D point each feature belongs to, int64 [M]; ``NO_POINT`` = none.
-    """
-
-    xy: Float64[np.ndarray, "M 2"]
-    point_ids: Int64[np.ndarray, " M"]
+    xy: Float64[np.ndarray, "M 2"]  # pixel coordinates
+    point_ids: Int64[np.ndarray, " M"]  # of the 3D point each belongs to; ``NO_POINT`` = none
 
     def __len__(self) -> int:
         return len(self.point_ids)
@@ -87,21 +82,12 @@ class Tracks:
 
     The observations of point i are ``image_ids[offsets[i]:offsets[i + 1]]`` and the features
     ``point2d_idx`` of those images.
-
-    Args:
-        point_ids: The file's point ids, int64 [N].
-        xyz: The file's float64 positions, [N, 3]: a PointCloud holds float32, and the originals
-            are written back exactly.
-        errors: Mean reprojection error in px, float64 [N]; -1 where unknown.
-        offsets: int64 [N + 1], rising from 0 to T.
-        image_ids: uint32 [T].
-        point2d_idx: uint32 [T].
     """
 
     point_ids: Int64[np.ndarray, " N"]
-    xyz: Float64[np.ndarray, "N 3"]
-    errors: Float64[np.ndarray, " N"]
-    offsets: Int64[np.ndarray, " N+1"]
+    xyz: Float64[np.ndarray, "N 3"]  # the file's, as originals are written back exactly
+    errors: Float64[np.ndarray, " N"]  # mean reprojection error, px; -1 where unknown
+    offsets: Int64[np.ndarray, " N+1"]  # rising from 0 to T
     image_ids: UInt32[np.ndarray, " T"]
     point2d_idx: UInt32[np.ndarray, " T"]
 
@@ -128,24 +114,14 @@ class Tracks:
 
 @dataclass(frozen=True)
 class SceneSource:
-    """Where a scene was read from.
-
-    Args:
-        format: Which reader read it.
-        root: The scene's folder (for a bare PLY, the folder it lies in).
-        points_path: The file the points came from; for an RGB-D capture, which has none, the
-            trajectory.
-        model_dir: The COLMAP model folder, if there is one.
-        image_dir: The folder that ``Image.name`` is relative to, if there is one.
-        transforms_path: The ``transforms.json`` that was read, if it was one.
-    """
+    """Where a scene was read from."""
 
     format: SceneFormat
-    root: Path
-    points_path: Path
-    model_dir: Path | None = None
-    image_dir: Path | None = None
-    transforms_path: Path | None = None
+    root: Path  # the scene's folder; of a bare PLY, the one it lies in
+    points_path: Path  # of the points; of an RGB-D capture, which has none, the trajectory
+    model_dir: Path | None = None  # COLMAP's, if there is one
+    image_dir: Path | None = None  # that ``Image.name`` is relative to, if there is one
+    transforms_path: Path | None = None  # if it was read
 
     @property
     def inputs(self) -> tuple[Path, ...]:
@@ -162,17 +138,11 @@ class SceneSource:
 
 @dataclass(frozen=True)
 class Split:
-    """Which images train and which test, from a list that came with the scene.
+    """Which images train and which test, from a list that came with the scene."""
 
-    Args:
-        train: Names of the images to train on.
-        test: Names of the images to test; an image may be in neither.
-        origin: The list, in words.
-    """
-
-    train: frozenset[str]
-    test: frozenset[str]
-    origin: str
+    train: frozenset[str]  # names of the images to train on
+    test: frozenset[str]  # names of the images to test; an image may be in neither
+    origin: str  # the list, in words
 
     @property
     def sentence(self) -> str:
@@ -182,15 +152,10 @@ class Split:
 
 
 class LeftOut(NamedTuple):
-    """How many points of its files a scene leaves out.
+    """How many points of its files a scene leaves out."""
 
-    Args:
-        non_finite: Points without three finite coordinates, or beyond 1e15.
-        duplicates: Points at exactly the position of an earlier one.
-    """
-
-    non_finite: int = 0
-    duplicates: int = 0
+    non_finite: int = 0  # without three finite coordinates, or beyond 1e15
+    duplicates: int = 0  # at exactly the position of an earlier one
 
 
 @dataclass(frozen=True, eq=False)

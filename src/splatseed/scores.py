@@ -17,45 +17,26 @@ NOT_ASKED = "not asked for"
 
 @dataclass(frozen=True)
 class ViewScore:
-    """One view's scores.
+    """One view's scores."""
 
-    Args:
-        name: The image's name in its scene.
-        psnr: Peak signal-to-noise ratio in dB; higher is better, infinite for equal images.
-        ssim: Structural similarity, 1 for equal images.
-        lpips: Perceptual distance, 0 for equal images; None if not measured.
-        seconds: Time to render it.
-        covisible_psnr: PSNR over the pixels that at least two training views see; None if unknown,
-            or if there are none.
-        covisible_share: The share of such pixels; None if unknown.
-    """
-
-    name: str
-    psnr: float
-    ssim: float
-    lpips: float | None
-    seconds: float
-    covisible_psnr: float | None = None
-    covisible_share: float | None = None
+    name: str  # the image's, in its scene
+    psnr: float  # dB, infinite for equal images
+    ssim: float  # 1 for equal images
+    lpips: float | None  # 0 for equal images; None if not measured
+    seconds: float  # time to render it
+    covisible_psnr: float | None = None  # over what two training views see; None if unknown
+    covisible_share: float | None = None  # of such pixels; likewise
 
 
 @dataclass(frozen=True)
 class EvalResult:
-    """Scores over test views.
+    """Scores over test views."""
 
-    Args:
-        per_image: One score per view, in the views' order; at least one.
-        lpips_net: The network of LPIPS; None if not measured.
-        lpips_reason: Why LPIPS was not measured; empty if it was.
-        num_gaussians: How many Gaussians were rendered; None if the renderer is a black box.
-        model_bytes: Bytes of their parameters as float32; None likewise.
-    """
-
-    per_image: tuple[ViewScore, ...]
-    lpips_net: str | None = None
-    lpips_reason: str = NOT_ASKED
-    num_gaussians: int | None = None
-    model_bytes: int | None = None
+    per_image: tuple[ViewScore, ...]  # in the views' order; at least one
+    lpips_net: str | None = None  # None if not measured
+    lpips_reason: str = NOT_ASKED  # why LPIPS was not measured; empty if it was
+    num_gaussians: int | None = None  # that were rendered; None if the renderer is a black box
+    model_bytes: int | None = None  # of their parameters as float32; None likewise
 
     @property
     def psnr(self) -> float:
@@ -109,42 +90,25 @@ class EvalResult:
 
 @dataclass(frozen=True)
 class CurvePoint:
-    """Scores of the test views during training.
+    """Scores of the test views during training."""
 
-    Args:
-        step: Steps done.
-        seconds: Seconds of training so far.
-        psnr: Mean PSNR in dB.
-        num_gaussians: Number of Gaussians.
-        ssim: Mean SSIM; None in results of versions that did not measure it.
-    """
-
-    step: int
-    seconds: float
-    psnr: float
+    step: int  # steps done
+    seconds: float  # of training so far
+    psnr: float  # mean, dB
     num_gaussians: int
-    ssim: float | None = None
+    ssim: float | None = None  # mean; None in results of versions that did not measure it
 
 
 @dataclass(frozen=True)
 class TrainingResult:
-    """The result of a training run.
+    """The result of a training run."""
 
-    Args:
-        scores: Scores of the test views at the end.
-        curve: Scores of the test views during training, in order of steps.
-        steps: Steps done.
-        train_seconds: Wall time of the training steps, and of finding the depth that growth needs.
-        num_seeds: Points that training began with.
-        held_by_memory_at: Gaussians at which a lack of memory ended growth; None if it did not.
-    """
-
-    scores: EvalResult
-    curve: tuple[CurvePoint, ...]
+    scores: EvalResult  # of the test views at the end
+    curve: tuple[CurvePoint, ...]  # of the test views during training, in order of steps
     steps: int
-    train_seconds: float
-    num_seeds: int
-    held_by_memory_at: int | None = None
+    train_seconds: float  # of the steps, and of finding the depth that growth needs
+    num_seeds: int  # points that training began with
+    held_by_memory_at: int | None = None  # Gaussians at which memory ended growth
 
     def to_dict(self) -> dict[str, Any]:
         """The content of ``metrics.json``: the scores' values and the others side by side."""

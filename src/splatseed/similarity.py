@@ -17,17 +17,11 @@ _TOLERANCE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Similarity:
-    """A map between two frames.
+    """A map between two frames."""
 
-    Args:
-        scale: Above 0.
-        rotation: float64 [3, 3].
-        translation: float64 [3], in the target's units.
-    """
-
-    scale: float
+    scale: float  # above 0
     rotation: Float64[np.ndarray, "3 3"]
-    translation: Float64[np.ndarray, " 3"]
+    translation: Float64[np.ndarray, " 3"]  # in the target's units
 
     def points(self, xyz: Float[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
         """Points of the source in the target."""

@@ -23,7 +23,7 @@ from dataclasses import astuple, dataclass
 from importlib import invalidate_caches
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 import tyro
@@ -57,8 +57,9 @@ SAMPLES = 20_000
 """Samples of the surfaces at which coverage is measured."""
 PICTURES = ("preview.png", "preview_methods.png", "preview_errors.png")
 TABLE, TRAINED_PICTURE = "geometry.csv", "preview_trained.png"
-POSES_ALONE = {"random start": "random", f"{SHOWN}, poses alone": f"poses_{SHOWN}"}
-"""Arms that know no points, and how their folders end."""
+RANDOM, POSES, SFM = "random", f"poses_{SHOWN}", "sfm"
+ARMS = {RANDOM: "random start", POSES: f"{SHOWN}, poses alone", SFM: "SfM seeds", SHOWN: SHOWN}
+"""What is trained, by the end of its folders' names; the first two know no points."""
 TRAINING = "training"
 AHEAD = (SHOWN, TRAINING, "voronoi", "spline")
 """What the second process compiles, in this order; training as early as possible after the
@@ -184,7 +185,7 @@ def _compile(part: str, scene: Scene, folder: Path) -> None:
         from splatseed.train.settings import TrainSettings  # noqa: PLC0415  (loads with its use)
 
         settings = TrainSettings(cap_max=2000, max_steps=4)
-        _train_arm(_Arm("", folder / "scene", folder / "run"), settings, StageClock())
+        _train_arm(folder, SFM, settings, StageClock())
         return
     cloud = _upsample_by(part, scene, 2.0)
     if part == SHOWN:
@@ -256,15 +257,14 @@ def _make_points(options: Options) -> None:
         with atomic_file(out / TABLE) as path, path.open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)  # in units of the originals' spacing
             writer.writerow(["method", "error_h", "median_h", "p95_h", "coverage_h", "share_far"])
-            for name, score in scores.items():
-                writer.writerow([name, *(f"{x:.4f}" for x in astuple(score))])
+            writer.writerows([k, *(f"{x:.4f}" for x in astuple(s))] for k, s in scores.items())
         clock("pictures", 0.0)
         pictures.preview_methods(scene, clouds, out / PICTURES[1])
         clock("pictures", 0.6)
         errors = {name: surfaces.distance(cloud.xyz) / h for name, cloud in new.items()}
         pictures.preview_errors(new, errors, choose_camera(scene), out / PICTURES[2])
         clock("pictures", 1.0)
-    _summarise(options, scene, scores, clock.seconds())
+    _summarise(out, len(xyz), scores, clock.seconds())
 
 
 def _load(folder: Path) -> Scene:
@@ -273,40 +273,27 @@ def _load(folder: Path) -> Scene:
 
 
 def _summarise(
-    options: Options,
-    scene: Scene,
-    scores: Mapping[str, GeometryScore],
-    seconds: Mapping[str, float],
+    out: Path, number: int, scores: Mapping[str, GeometryScore], seconds: Mapping[str, float]
 ) -> None:
     numbers = {name: [f"{x:.3f}" for x in astuple(s)[:4]] for name, s in scores.items()}
     print_table(
-        f"{len(scene.points):,} points, {RATIO:g}x where the method has a ratio; distances "
+        f"{number:,} points, {RATIO:g}x where the method has a ratio; distances "
         "in units of the originals' spacing, lower is better",
         ("method", "error", "median", "95%", "coverage", "far"),
         [(name, *numbers[name], f"{s.share_far:.2%}") for name, s in scores.items()],
     )
-    error = "mean distance of new points to the true surfaces; its median and 95th percentile"
     rows = [
-        ("error", error),
+        ("error", "mean distance of new points to the true surfaces; median, 95th percentile"),
         ("coverage", "mean distance of the surfaces that cameras see to the nearest point"),
         ("far", "share of new points over 3 spacings from any original"),
         ("seconds", ", ".join(f"{stage} {time:.1f}" for stage, time in seconds.items())),
-        ("scene", f"{options.output / 'scene'} (COLMAP, with images and depths)"),
-        *(("pictures" if not i else "", str(options.output / n)) for i, n in enumerate(PICTURES)),
+        ("scene", f"{out / 'scene'} (COLMAP, with images and depths)"),
+        *(("pictures" if not i else "", str(out / n)) for i, n in enumerate(PICTURES)),
     ]
     print_pairs("splatseed demo", rows)
 
 
 # Training -----------------------------------------------------------------------------------------
-
-
-class _Arm(NamedTuple):
-    """A run: its seeds' name, the folders of its scene and of itself, and its seeds' seconds."""
-
-    label: str
-    scene: Path
-    output: Path
-    seconds: float = 0.0
 
 
 def _train(options: Options) -> bool:
@@ -320,49 +307,44 @@ def _train(options: Options) -> bool:
     from splatseed.view.page import write_grid  # noqa: PLC0415  (likewise)
 
     folder = options.output
-    names = ["sfm", SHOWN, *POSES_ALONE.values()]
-    alone = [f"scene_{name}" for name in POSES_ALONE.values()]
-    add_files(folder, [*(f"run_{name}" for name in names), *alone, TRAINED_PICTURE])
+    scenes = [f"scene_{name}" for name in (RANDOM, POSES)]
+    add_files(folder, [*(f"run_{name}" for name in ARMS), *scenes, TRAINED_PICTURE])
     seeded = read_manifest(folder / f"scene_{SHOWN}")
-    arms = [
-        _Arm("SfM seeds", folder / "scene", folder / "run_sfm"),
-        _Arm(SHOWN, folder / f"scene_{SHOWN}", folder / f"run_{SHOWN}", seeded["seconds"]),
-    ]
     settings = TrainSettings(
         strategy="default", cap_max=seeded["num_points"], max_steps=options.train_steps, seed=SEED
     )
     with stage_display() as clock:
-        arms = [*_seed_poses_alone(folder, clock), *arms]
-        results, shown = zip(*(_train_arm(arm, settings, clock) for arm in arms), strict=True)
+        seconds = {**_seed_poses_alone(folder, clock), SFM: 0.0, SHOWN: seeded["seconds"]}
+        arms = [_train_arm(folder, name, settings, clock) for name in ARMS]
+        results, shown = zip(*arms, strict=True)
         photographs, renders, errors = zip(*shown, strict=True)
         blank = photographs[0]._replace(label="", picture=np.full_like(photographs[0].picture, 255))
         tiles = [photographs[0], *renders, blank, *errors]
         write_grid(tiles, folder / TRAINED_PICTURE, columns=1 + len(arms))
-    _summarise_training(options, arms, results)
+    _summarise_training(options, seconds, results)
     return True
 
 
-def _seed_poses_alone(folder: Path, clock: StageClock) -> list[_Arm]:
-    """Scenes in the demo's folder whose seeds come from poses and photographs, not from points."""
+def _seed_poses_alone(folder: Path, clock: StageClock) -> dict[str, float]:
+    """Write scenes whose seeds come from poses and photographs alone; how long each took."""
     from splatseed.seeding.poses import random_start  # noqa: PLC0415  (loads with its use)
 
     scene = load_scene(folder / "scene").replace(points=PointCloud.empty(), tracks=None)
-    arms: list[_Arm] = []
-    for label, name in POSES_ALONE.items():
-        clock("seed poses alone", len(arms) / len(POSES_ALONE))
+    seconds = {}
+    for i, name in enumerate((RANDOM, POSES)):
+        clock("seed poses alone", i / 2)
         begun = time.perf_counter()
-        if name == "random":
+        if name == RANDOM:
             points = random_start(scene, np.random.default_rng(SEED))
         else:
             points = _upsample_by(SHOWN, scene)
-        seconds, path = time.perf_counter() - begun, folder / f"scene_{name}"
-        write_scene(scene.replace(points=points), path, provenance={"method": label})
-        arms.append(_Arm(label, path, folder / f"run_{name}", seconds))
-    return arms
+        seconds[name], seeded = time.perf_counter() - begun, scene.replace(points=points)
+        write_scene(seeded, folder / f"scene_{name}", provenance={"method": ARMS[name]})
+    return seconds
 
 
 def _train_arm(
-    arm: _Arm, settings: TrainSettings, clock: StageClock
+    folder: Path, name: str, settings: TrainSettings, clock: StageClock
 ) -> tuple[TrainingResult, tuple[Tile, ...]]:
     """Train from an arm's seeds, and score; also a test view's photograph, render and errors."""
     from splatseed.splat.evaluate import evaluate_views  # noqa: PLC0415  (imports PyTorch)
@@ -370,15 +352,16 @@ def _train_arm(
     from splatseed.train.run import prepare_run  # noqa: PLC0415  (likewise)
     from splatseed.view.page import Tile  # noqa: PLC0415  (likewise)
 
-    stage = f"train {arm.label}"
-    run = prepare_run(load_scene(arm.scene), arm.output, settings, overwrite=True, progress=clock)
+    stage = f"train {ARMS[name]}"
+    scene = load_scene(folder / ("scene" if name == SFM else f"scene_{name}"))
+    run = prepare_run(scene, folder / f"run_{name}", settings, overwrite=True, progress=clock)
     clock(stage, 0.0)
     if not run.train(lambda step: clock(stage, step / settings.max_steps)):
         raise KeyboardInterrupt
     result = run.finish(evaluate_views, clock)
     shown = run.trainer.test_views[len(run.trainer.test_views) // 2]
     render = np.asarray(run.trainer.render(shown).cpu().numpy(), np.float32)
-    score = f"{arm.label}: {result.scores.psnr:.2f} dB over all test views"
+    score = f"{ARMS[name]}: {result.scores.psnr:.2f} dB over all test views"
     error = f"error: black 0, bright {FULL_ERROR:g} or more"
     return result, (
         Tile("photograph, not trained on", shown.photograph),
@@ -388,19 +371,19 @@ def _train_arm(
 
 
 def _summarise_training(
-    options: Options, arms: Sequence[_Arm], results: Sequence[TrainingResult]
+    options: Options, seeding: Mapping[str, float], results: Sequence[TrainingResult]
 ) -> None:
     """The runs side by side, and what they do and do not show."""
-    runs = list(zip(arms, results, strict=True))
-    least = min(arm.seconds + result.train_seconds for arm, result in runs)
+    runs = [(name, seeding[name], each) for name, each in zip(ARMS, results, strict=True)]
+    least = min(before + result.train_seconds for _, before, result in runs)
     rows = []
-    for arm, result in runs:
+    for name, before, result in runs:
         # The curve's end is of the mean that a run ends with, which one in training has not yet.
-        during = [t.psnr for t in result.curve[:-1] if arm.seconds + t.seconds <= least]
-        scores, seconds = result.scores, arm.seconds + result.train_seconds
+        during = [t.psnr for t in result.curve[:-1] if before + t.seconds <= least]
+        scores, seconds = result.scores, f"{before + result.train_seconds:.1f}"
         then = f"{during[-1]:.2f}" if during else "not begun"
         quality = f"{scores.psnr:.2f}", f"{scores.ssim:.4f}"
-        rows.append((arm.label, f"{scores.num_gaussians:,}", f"{seconds:.1f}", *quality, then))
+        rows.append((ARMS[name], f"{scores.num_gaussians:,}", seconds, *quality, then))
     print_table(
         f"{options.train_steps:,} training steps, {len(results[0].scores.per_image)} test views",
         ("seeds", "Gaussians", "seconds", "PSNR, dB", "SSIM", f"dB after {least:.0f} s"),

@@ -190,19 +190,12 @@ def ray_length(
 
 @dataclass(frozen=True, eq=False)
 class PlanarDepth:
-    """A map whose planar depth is computed only at the few pixels that need it.
+    """A map whose planar depth is computed only at the few pixels that need it."""
 
-    Args:
-        values: float32 [H, W]; NaN, or not above 0, where depth is unknown.
-        scale: Scene units per unit of ``values``.
-        along_ray: Whether values are distances along the ray.
-        camera: The image's camera in pixels of the map.
-    """
-
-    values: Float32[np.ndarray, "H W"]
-    scale: float
-    along_ray: bool
-    camera: Camera
+    values: Float32[np.ndarray, "H W"]  # NaN, or not above 0, where depth is unknown
+    scale: float  # scene units per unit of ``values``
+    along_ray: bool  # whether values are distances along the ray
+    camera: Camera  # the image's, in pixels of the map
 
     @classmethod
     def of(
@@ -264,22 +257,13 @@ def lift_pixels(
 
 @dataclass(frozen=True)
 class Alignment:
-    """How an image's depth map is taken to scene units.
+    """How an image's depth map is taken to scene units."""
 
-    Args:
-        scale: Scene units per unit of the map; for inverse depth, inverse scene units per unit.
-        shift: Added after scaling; 0 except for inverse depth.
-        num_points: SfM points that see depth.
-        residual: Median of the points' |aligned depth / depth of the point - 1|; NaN without
-            points.
-        rejected: Why the image is left out, in one sentence; None = it is used.
-    """
-
-    scale: float
-    shift: float
-    num_points: int
-    residual: float
-    rejected: str | None = None
+    scale: float  # scene units per unit of the map; of inverse depth, inverse ones
+    shift: float  # added after scaling; 0 except for inverse depth
+    num_points: int  # SfM points that see depth
+    residual: float  # median of their |aligned depth / depth of the point - 1|; NaN without any
+    rejected: str | None = None  # why the image is left out, in one sentence; None = it is used
 
 
 def align(

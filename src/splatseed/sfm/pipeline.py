@@ -42,30 +42,17 @@ _REASON = re.compile(r"what\(\):\s*(.*)|^[EF]\d{8}\s.*?\]\s*(.*)", re.MULTILINE)
 
 @dataclass(frozen=True)
 class SfmReport:
-    """The outcome of ``reconstruct`` or ``undistort``.
+    """The outcome of ``reconstruct`` or ``undistort``."""
 
-    Args:
-        path: The scene folder that was written.
-        registered: Images with a pose in the scene.
-        total: Images that were given.
-        unregistered: Names of the images without a pose, sorted; they are not in the scene.
-        num_points: Points in the scene.
-        mean_track_length: Observations per point.
-        mean_reprojection_error: Mean over points of their mean reprojection error, px of the
-            scene's (undistorted) images.
-        seconds: Wall time of each stage, in the order in which they ran.
-        refinement: What refinement changed; None where it was not asked for.
-    """
-
-    path: Path
-    registered: int
-    total: int
-    unregistered: tuple[str, ...]
+    path: Path  # the scene folder that was written
+    registered: int  # images with a pose in the scene
+    total: int  # images that were given
+    unregistered: tuple[str, ...]  # names without a pose, sorted; not in the scene
     num_points: int
-    mean_track_length: float
-    mean_reprojection_error: float
-    seconds: Mapping[str, float]
-    refinement: Refinement | None = None
+    mean_track_length: float  # observations per point
+    mean_reprojection_error: float  # over points, of their means; px, undistorted
+    seconds: Mapping[str, float]  # wall time of each stage, in the order in which they ran
+    refinement: Refinement | None = None  # what it changed; None where it was not asked for
 
 
 Job: TypeAlias = Callable[..., SfmReport]

@@ -57,24 +57,15 @@ _TYPICAL = 1.54  # median length of a 3-vector of standard normal numbers
 class Refinement:
     """What the refinement of given poses changed.
 
-    Args:
-        kept: The given poses were good: refined ones would have lowered the error by less than
-            0.1 px, so none was changed.
-        error_before: Mean over points of their mean reprojection error at the given poses, px of
-            the photographs, for the observations that fit refined poses.
-        error_after: The same at the scene's poses.
-        median_shift: Over the cameras, how far each moved, scene units.
-        largest_shift: Likewise.
-        median_turn: Likewise, the angle by which each turned, degrees.
-        largest_turn: Likewise.
+    Errors are in px of the photographs, for the observations that fit refined poses.
     """
 
-    kept: bool
-    error_before: float
-    error_after: float
-    median_shift: float = 0.0
+    kept: bool  # refined ones would have lowered the error by less than 0.1 px: none changed
+    error_before: float  # mean over points of their mean reprojection error at the given poses
+    error_after: float  # the same at the scene's poses
+    median_shift: float = 0.0  # over the cameras, how far each moved, scene units
     largest_shift: float = 0.0
-    median_turn: float = 0.0
+    median_turn: float = 0.0  # over the cameras, the angle by which each turned, degrees
     largest_turn: float = 0.0
 
 

@@ -32,21 +32,13 @@ DEPTH_SCALE = 5000
 
 @dataclass(frozen=True, eq=False)
 class Capture:
-    """A synthetic capture and its ground truth.
+    """A synthetic capture and its ground truth."""
 
-    Args:
-        scene: Cameras, images with their features, points and tracks; ``source`` is None.
-        images: The photographs, uint8 sRGB [V, H, W, 3].
-        depths: Planar z-depth in metres, float32 [V, H, W]; 0 = nothing there.
-        room: The surfaces and their textures.
-        outliers: Which of the scene's points are mismatches, bool [N].
-    """
-
-    scene: Scene
-    images: UInt8[np.ndarray, "V H W 3"]
-    depths: Float32[np.ndarray, "V H W"]
+    scene: Scene  # with features and tracks; ``source`` is None
+    images: UInt8[np.ndarray, "V H W 3"]  # sRGB
+    depths: Float32[np.ndarray, "V H W"]  # planar z in metres; 0 = nothing there
     room: Room
-    outliers: Bool[np.ndarray, " N"]
+    outliers: Bool[np.ndarray, " N"]  # which of the scene's points are mismatches
 
     @property
     def surfaces(self) -> Union:

@@ -62,17 +62,11 @@ threads, which would compete with ours."""
 
 @dataclass(frozen=True)
 class Room:
-    """Surfaces and, for each, its texture.
+    """Surfaces and, for each, its texture."""
 
-    Args:
-        names: A name for each surface, such as ``"bare wall"``.
-        surfaces: The surfaces.
-        textures: Their textures, in the same order.
-    """
-
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # of the surfaces, such as "bare wall"
     surfaces: Union
-    textures: tuple[Texture, ...]
+    textures: tuple[Texture, ...]  # of the surfaces, in their order
 
     def part(self, name: str) -> Surface:
         """The surface of that name."""

@@ -67,17 +67,11 @@ def yaw_frame(degrees: float) -> Frame:
 
 @dataclass(frozen=True, eq=False)
 class Rectangle(Surface):
-    """A flat rectangle.
+    """A flat rectangle."""
 
-    Args:
-        corner: One of its corners, [3].
-        edge_u: First edge, from the corner, [3].
-        edge_v: Second edge, from the corner, [3]; orthogonal to the first.
-    """
-
-    corner: Vector
-    edge_u: Vector
-    edge_v: Vector
+    corner: Vector  # one of the four
+    edge_u: Vector  # from the corner
+    edge_v: Vector  # likewise, orthogonal to the first
 
     @cached_property
     def size(self) -> Float64[np.ndarray, " 2"]:
@@ -118,16 +112,10 @@ class Rectangle(Surface):
 
 @dataclass(frozen=True, eq=False)
 class Box(Surface):
-    """The six faces of a box.
-
-    Args:
-        center: Its centre, [3].
-        half: Half of its extent along each axis of the frame, [3].
-        frame: Its axes as rows, [3, 3].
-    """
+    """The six faces of a box."""
 
     center: Vector
-    half: Vector
+    half: Vector  # half of its extent along each axis of the frame
     frame: Frame
 
     @property
@@ -162,12 +150,7 @@ class Box(Surface):
 
 @dataclass(frozen=True, eq=False)
 class Sphere(Surface):
-    """A sphere.
-
-    Args:
-        center: Its centre, [3].
-        radius: Its radius.
-    """
+    """A sphere."""
 
     center: Vector
     radius: float
@@ -197,17 +180,10 @@ class Sphere(Surface):
 
 @dataclass(frozen=True, eq=False)
 class Cylinder(Surface):
-    """The side of a cylinder, open at both ends.
+    """The side of a cylinder, open at both ends."""
 
-    Args:
-        center: The middle of its axis, [3].
-        frame: Its axes as rows, the third along the cylinder, [3, 3].
-        radius: Its radius.
-        height: Its length.
-    """
-
-    center: Vector
-    frame: Frame
+    center: Vector  # the middle of its axis
+    frame: Frame  # the third axis along the cylinder
     radius: float
     height: float
 
@@ -245,11 +221,7 @@ class Cylinder(Surface):
 
 @dataclass(frozen=True)
 class Union(Surface):
-    """Several surfaces taken as one.
-
-    Args:
-        parts: The surfaces, at least one.
-    """
+    """Several surfaces taken as one."""
 
     parts: tuple[Surface, ...]
 
@@ -299,19 +271,12 @@ class SineSheet(Surface):
     In its frame a point is (u, v, w), and the sheet is w = A sin(2 pi u / wavelength) for
     0 <= u <= size[0], 0 <= v <= size[1]. A ray that only grazes a crest, entering and leaving
     within a 48th of a wave, may count as a miss.
-
-    Args:
-        corner: The point u = v = w = 0, [3].
-        frame: The directions of u, v and w as rows, [3, 3].
-        size: Extent in u and v, [2].
-        amplitude: A, in scene units.
-        wavelength: In scene units.
     """
 
-    corner: Vector
-    frame: Frame
-    size: Float64[np.ndarray, " 2"]
-    amplitude: float
+    corner: Vector  # the point u = v = w = 0
+    frame: Frame  # the directions of u, v and w
+    size: Float64[np.ndarray, " 2"]  # extent in u and v
+    amplitude: float  # A
     wavelength: float
 
     def _height(self, u: np.ndarray) -> np.ndarray:
@@ -412,16 +377,10 @@ class SineSheet(Surface):
 
 @dataclass(frozen=True, eq=False)
 class Discs(Surface):
-    """Flat round leaves.
-
-    Args:
-        centers: Their centres, float64 [L, 3].
-        axes: Their unit normals, float64 [L, 3].
-        radii: Their radii, float64 [L].
-    """
+    """Flat round leaves."""
 
     centers: Float64[np.ndarray, "L 3"]
-    axes: Float64[np.ndarray, "L 3"]
+    axes: Float64[np.ndarray, "L 3"]  # unit normals
     radii: Float64[np.ndarray, " L"]
 
     @property

@@ -26,63 +26,40 @@ Texture = Callable[[Points], Points]
 
 @dataclass(frozen=True)
 class Plain:
-    """One colour everywhere: no feature can be detected on it.
-
-    Args:
-        color: The colour, 0..1.
-    """
+    """One colour everywhere: no feature can be detected on it."""
 
     color: Color
 
     def __call__(self, xyz: Points) -> Points:
-        """Colours in 0..1 of points, [N, 3]."""
         return np.broadcast_to(np.array(self.color), np.shape(xyz))
 
 
 @dataclass(frozen=True)
 class Mottled:
-    """Noise of several octaves, through a palette.
+    """Noise of several octaves, through a palette."""
 
-    Args:
-        palette: Colours for noise from low to high, each 0..1.
-        frequency: Cells per scene unit of the coarsest octave along x, y and z.
-        octaves: How many octaves, each twice as fine and 0.7 times as strong as the one before.
-        contrast: Noise is scaled by this factor about its mean before the palette is read.
-        seed: Selects the noise.
-    """
-
-    palette: tuple[Color, ...]
-    frequency: Color
-    octaves: int = 4
-    contrast: float = 2.2
-    seed: int = 0
+    palette: tuple[Color, ...]  # for noise from low to high
+    frequency: Color  # cells per scene unit of the coarsest octave along x, y and z
+    octaves: int = 4  # each twice as fine and 0.7 times as strong as the one before
+    contrast: float = 2.2  # scales noise about its mean before the palette is read
+    seed: int = 0  # selects the noise
 
     def __call__(self, xyz: Points) -> Points:
-        """Colours in 0..1 of points, [N, 3]."""
         noise = value_noise(xyz * np.array(self.frequency), self.octaves, self.seed)
         return _read_palette(self.palette, (noise - 0.5) * self.contrast + 0.5)
 
 
 @dataclass(frozen=True)
 class Tiles:
-    """Bricks, boards or checks: cells of one colour each, joints between them, grain on top.
+    """Bricks, boards or checks: cells of one colour each, joints between them, grain on top."""
 
-    Args:
-        palette: Each cell's colour is drawn from it, 0..1.
-        cell: Size of a cell along x, y and z in scene units.
-        grain: Noise that darkens and lightens the cells; its palette is a factor on the colour.
-        joint: Width of the dark joints in scene units.
-        seed: Selects the colours.
-    """
-
-    palette: tuple[Color, ...]
-    cell: Color
-    grain: Mottled
-    joint: float = 0.0
-    seed: int = 0
+    palette: tuple[Color, ...]  # each cell's colour is drawn from it
+    cell: Color  # size along x, y and z in scene units
+    grain: Mottled  # its palette is a factor on the colour
+    joint: float = 0.0  # width of the dark joints in scene units
+    seed: int = 0  # selects the colours
 
     def __call__(self, xyz: Points) -> Points:
-        """Colours in 0..1 of points, [N, 3]."""
         size = np.array(self.cell)
         # Offset by a fraction of a cell, so that no wall at a round coordinate lies on a joint.
         position = xyz / size + 0.37

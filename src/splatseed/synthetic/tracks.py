@@ -49,23 +49,14 @@ MIN_TRACK = 3
 
 @dataclass(frozen=True, eq=False)
 class TrackedPoints:
-    """Triangulated points and the observations they come from.
-
-    Args:
-        xyz: Positions, float64 [N, 3].
-        errors: Mean reprojection error of each point in px, float64 [N].
-        outliers: Which points are mismatches, bool [N].
-        point_idx: Point of each observation, ascending, int64 [T].
-        view_idx: View of each observation, int64 [T].
-        uv: Pixel of each observation, float64 [T, 2].
-    """
+    """Triangulated points and the observations they come from."""
 
     xyz: Points
-    errors: Float64[np.ndarray, " N"]
-    outliers: Bool[np.ndarray, " N"]
-    point_idx: Indices
-    view_idx: Indices
-    uv: Pixels
+    errors: Float64[np.ndarray, " N"]  # mean reprojection error of each point, px
+    outliers: Bool[np.ndarray, " N"]  # which points are mismatches
+    point_idx: Indices  # point of each observation, ascending
+    view_idx: Indices  # view of each observation
+    uv: Pixels  # pixel of each observation
 
 
 def _corner_strength(image: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W"]:
