@@ -25,10 +25,7 @@ TRIES, DIFFERENCE, ARRIVED = 30, 1e-6, 1e-9
 
 
 def undistort_first(scene: Path | None) -> str:
-    """Advice for the user whose scene must not have distortion.
-
-    Args:
-        scene: Its folder; None if that is not known.
+    """Advice for the user whose scene must not have distortion; its folder, if that is known.
 
     Example:
         >>> undistort_first(Path("my scene"))
@@ -50,23 +47,15 @@ def undistorted(scene: Path) -> Path:
 
 
 def image_points(lens: Intrinsics, xy: Float64[np.ndarray, "*B 2"]) -> Float64[np.ndarray, "*B 2"]:
-    """Pixel coordinates of rays (x, y, 1), float64 [*B, 2]; the first pixel's centre is (0.5, 0.5).
-
-    Args:
-        lens: The camera.
-        xy: Places on the plane at depth 1.
-    """
+    """Pixel coordinates of rays (x, y, 1); the first pixel's centre is (0.5, 0.5)."""
     K = lens.K
     return np.asarray(distort(lens, xy) * K[[0, 1], [0, 1]] + K[:2, 2])
 
 
 def distort(lens: Intrinsics, xy: Float64[np.ndarray, "*B 2"]) -> Float64[np.ndarray, "*B 2"]:
-    """Where the lens moves points on the plane at depth 1, float64 [*B, 2].
+    """Where the lens, but for its focal length and centre, moves points on the plane at depth 1.
 
-    Args:
-        lens: The camera; its focal length and centre are not used.
-        xy: Points on the plane; far out, where the polynomial has lost its meaning, the result is
-            meaningless too.
+    Far out, where the polynomial has lost its meaning, the result is meaningless too.
     """
     x, y = xy[..., 0], xy[..., 1]
     k = lens.params[CAMERA_MODELS[lens.model].num_focal + 2 :]
@@ -83,13 +72,7 @@ def distort(lens: Intrinsics, xy: Float64[np.ndarray, "*B 2"]) -> Float64[np.nda
 def rays_through(lens: Intrinsics, uv: Float64[np.ndarray, "*B 2"]) -> Float64[np.ndarray, "*B 2"]:
     """The rays (x, y, 1) that a lens maps to pixels: ``image_points`` inverted by Newton's method.
 
-    Args:
-        lens: The camera.
-        uv: Pixel coordinates; the first pixel's centre is (0.5, 0.5).
-
-    Returns:
-        Points on the plane at depth 1, float64 [*B, 2]; NaN where no ray within the lens's fold
-        leads there.
+    Points on the plane at depth 1; NaN where no ray within the lens's fold leads there.
     """
     K = lens.K
     goal = (np.asarray(uv, np.float64) - K[:2, 2]) / K[[0, 1], [0, 1]]
@@ -111,11 +94,7 @@ def fold_radius(lens: Intrinsics, most: float) -> float:
     """The distance from (0, 0) at which the lens folds: rays farther out would land nearer again.
 
     Polynomials are fitted within the image; beyond it they turn back sooner or later, and would
-    show the image a second time.
-
-    Args:
-        lens: The camera.
-        most: How far to search on the plane at depth 1; returned if there is no fold up to there.
+    show the image a second time. ``most`` if there is no fold up to there.
     """
     radius = np.linspace(0.0, most, STEPS + 1)
     angle = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)

@@ -74,11 +74,9 @@ def similarity_of(matrix: np.ndarray) -> Similarity | None:
 def fit_similarity(
     source: Float64[np.ndarray, "N 3"], target: Float64[np.ndarray, "N 3"]
 ) -> Similarity | None:
-    """The least-squares similarity that maps points to their partners; None if undetermined.
+    """The least-squares similarity that maps points to their partners.
 
-    Args:
-        source: At least three points, not collinear.
-        target: The partner of each point.
+    None if there are fewer than three, or all on a line.
     """
     if len(source) < 3:
         return None
@@ -86,9 +84,7 @@ def fit_similarity(
     around, wanted = source - center, target - goal
     left, stretch, right = np.linalg.svd(wanted.T @ around)
     spread = float((around**2).sum())
-    if (
-        spread == 0 or stretch[1] <= 1e-9 * stretch[0]
-    ):  # collinear: the rotation about the line is free
+    if spread == 0 or stretch[1] <= 1e-9 * stretch[0]:  # the rotation about the line is free
         return None
     signs = np.array([1.0, 1.0, np.sign(np.linalg.det(left) * np.linalg.det(right))])
     rotation = (left * signs) @ right

@@ -267,27 +267,11 @@ class Alignment:
 
 
 def align(
-    scene: Scene,
-    *,
-    fit: Fit = "robust",
-    min_points: int = 20,
-    max_residual_ratio: float | None = 3.0,
-    progress: Progress = silent,
+    scene: Scene, *, max_residual_ratio: float | None = 3.0, progress: Progress = silent
 ) -> dict[str, Alignment]:
-    """Align every depth map of a scene.
+    """How the depth map of each image that has one fits its SfM points, by name; rejected ones too.
 
-    Args:
-        scene: A scene with ``depths``, images and SfM points.
-        fit: "robust": the median of z / value, or a line by reweighted least squares for inverse
-            depth. "least-squares": the paper's equation 7.
-        min_points: Images with fewer points that see depth are rejected.
-        max_residual_ratio: Images whose residual exceeds this many times the median image's, and
-            1%, are rejected; None keeps all.
-        progress: Called with the stage and the fraction done.
-
-    Returns:
-        The alignments of all images that have a map, by name, in the order of ``scene.images``;
-        rejected images are included.
+    ``max_residual_ratio`` is as in ``Settings``.
 
     Raises:
         SceneNotFoundError: The scene has no maps, or a map's file is gone.
@@ -306,14 +290,18 @@ def align(
             depth = depths.read(image.name)
             camera = map_camera(depth, image)
             points = camera_points(camera, visibility.of(image))
-            found[image.name] = align_map(depth, camera, points, fit, min_points)
+            found[image.name] = align_map(depth, camera, points)
 
     in_threads(work, len(images), 1, "align depth", progress)
     return reject_outliers({image.name: found[image.name] for image in images}, max_residual_ratio)
 
 
 def align_map(
-    depth: DepthMap, camera: Camera, points: SeenPoints, fit: Fit, min_points: int
+    depth: DepthMap,
+    camera: Camera,
+    points: SeenPoints,
+    fit: Fit = Settings.fit,
+    min_points: int = Settings.min_points,
 ) -> Alignment:
     """Align one map, whose camera is in its own pixels, with the SfM points that its image sees."""
     value, z = _values_at(depth, camera, points)

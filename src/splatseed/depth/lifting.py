@@ -74,17 +74,8 @@ def lift(
     """Lift ``num`` pixels of a scene's images into its world.
 
     Each image and its map are read once, and again only if too few of the candidates are sound.
-
-    Args:
-        scene: A scene with images in a folder, and depth maps.
-        num: How many points.
-        settings: The method's choices.
-        rng: The source of all random numbers.
-        progress: Called with the stage and the fraction done.
-
-    Returns:
-        World positions and colours, image after image, and what was left out or replaced, one
-        sentence each.
+    Returns world positions and colours, image after image, and what was left out or replaced, one
+    sentence each.
 
     Raises:
         SceneNotFoundError: There are no maps or no photographs, or a file is gone.

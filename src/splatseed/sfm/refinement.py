@@ -112,11 +112,7 @@ def align(moved: Poses, given: Poses) -> Poses:
 
     Rotations count as well as centres: cameras along a line say nothing of the roll about it.
     Each is weighed by its noise, which is estimated from the residuals, and a camera far from its
-    given pose counts little.
-
-    Args:
-        moved: Poses in a frame of their own.
-        given: The same cameras' poses in the wanted frame, not all in one place.
+    given pose counts little. Given cameras must not all be in one place.
     """
     from scipy.optimize import least_squares  # noqa: PLC0415  (slow to import)
     from scipy.spatial.transform import Rotation  # noqa: PLC0415  (slow to import)
@@ -158,9 +154,7 @@ def refine(run: Run, given: Sequence[Image]) -> tuple[list[Image], Refinement]:
     Cameras that see fewer than 10 points stay where they are; all do, exactly, where the mean
     reprojection error would fall by less than 0.1 px.
 
-    Args:
-        run: The run, with verified matches of ``posed_model(given)``.
-        given: The images at their given poses.
+    The run has verified matches of ``posed_model(given)``.
 
     Raises:
         ReconstructionError: Fewer than half of the photographs see points, or the poses drifted:

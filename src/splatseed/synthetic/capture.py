@@ -50,13 +50,9 @@ class Capture:
     ) -> Float64[np.ndarray, "num 3"]:
         """Points uniform by area on the parts of the surfaces that some camera sees, [num, 3].
 
-        Coverage is measured on these alone: no method can know the inside of the flower pot.
-
-        Args:
-            num: How many.
-            rng: Draws them.
-            bare: Whether the bare wall is included. It has no points to upsample, so it would
-                outweigh everything else, and a method that scatters points at random would win.
+        Coverage is measured on these alone: no method can know the inside of the flower pot. On the
+        ``bare`` wall there are no points to upsample, so it would outweigh everything else, and a
+        method that scatters points at random would win.
         """
         surfaces = self.surfaces if bare else self.room.without(BARE)
         batches: list[np.ndarray] = []
@@ -79,14 +75,8 @@ def make_capture(
 ) -> Capture:
     """Build the demo room, photograph it, and find points in the photographs.
 
-    Args:
-        seed: Places the leaves and draws the points' noise.
-        num_views: Photographs, at least 3.
-        width: Their width in pixels, at least 32.
-        height: Their height in pixels, at least 32.
-
-    Raises:
-        ParameterError: Too few views or pixels.
+    ``seed`` places the leaves and draws the points' noise. There are at least 3 photographs of
+    32 x 32 pixels, else ParameterError.
     """
     if num_views < 3 or min(width, height) < 32:
         raise ParameterError(
@@ -106,18 +96,7 @@ def write_capture(capture: Capture, path: Path | str, *, overwrite: bool = False
     """Write a COLMAP scene: ``images/*.png``, ``sparse/0`` and, extra, ``depths/*.png``.
 
     A depth PNG has 16 bits and holds metres times ``DEPTH_SCALE``, as ``depths/depths.json`` says;
-    0 = none.
-
-    Args:
-        capture: What to write.
-        path: The folder to make.
-        overwrite: Whether to replace a folder that splatseed wrote before.
-
-    Returns:
-        The folder.
-
-    Raises:
-        OutputError: The folder cannot or must not be written.
+    0 = none. Returns the folder; OutputError where it cannot or must not be written.
     """
     with output_folder(Path(path), kind="capture", overwrite=overwrite) as partial:
         write_scene(capture.scene, partial / "scene")

@@ -89,12 +89,7 @@ def track_points(
 ) -> TrackedPoints:
     """Find corners, follow them through the views, and triangulate them.
 
-    Args:
-        surfaces: What the images show, for exact occlusion.
-        cameras: The V cameras.
-        images: The photographs, uint8 [V, H, W, 3].
-        depths: Their planar z-depths, float32 [V, H, W]; 0 = none.
-        rng: Decides which views see a corner, the noise and the mismatches.
+    ``rng`` decides which views see a corner, the noise and the mismatches; depths of 0 are none.
     """
     strengths = np.stack([_corner_strength(image) for image in images])
     truth = _candidates(cameras, strengths, depths, rng)
