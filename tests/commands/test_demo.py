@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import csv
 import json
+from functools import partial
 
 import numpy as np
 import pycolmap
 import pytest
 from PIL import Image as PilImage
 
+from splatseed import synthetic
 from splatseed.commands import demo
 from splatseed.errors import MissingDependencyError
 from splatseed.io import load_scene
@@ -20,13 +22,15 @@ from splatseed.upsample import METHODS
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
     monkeypatch.setattr(demo, "RATIO", 2.0)
+    small = partial(synthetic.make_capture, width=160, height=120)
+    monkeypatch.setattr(synthetic, "make_capture", lambda *a, **o: small(*a, **o))
 
 
 @pytest.mark.slow
 def test_the_demo_leaves_a_scene_scores_pictures_and_runs(tmp_path, splatseed):
     pytest.importorskip("gsplat", reason="training needs PyTorch and gsplat's strategies")
     out = tmp_path / "demo"
-    run = splatseed("demo", "--views", 6, "--train-steps", 44, "-o", out)
+    run = splatseed("demo", "--views", 6, "--train-steps", 12, "-o", out)
     assert run.code == 0, run
     for name in ("preview.png", "preview_methods.png", "preview_errors.png", "preview_trained.png"):
         assert str(out / name) in run.out
@@ -47,7 +51,7 @@ def test_the_demo_leaves_a_scene_scores_pictures_and_runs(tmp_path, splatseed):
     for name in ("random", "poses_auto", "sfm", "auto"):
         metrics[name] = json.loads((out / f"run_{name}/metrics.json").read_text())
         config = json.loads((out / f"run_{name}/config.json").read_text())
-        assert (metrics[name]["steps"], config["strategy"]) == (44, "default")
+        assert (metrics[name]["steps"], config["strategy"]) == (12, "default")
         assert config["cap_max"] == len(after.points)
         assert f"{metrics[name]['psnr']:.2f}" in run.out
     assert metrics["auto"]["num_gaussians"] == len(after.points)
