@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
 
@@ -37,6 +38,19 @@ def pytest_collection_modifyitems(items) -> None:
 @pytest.fixture
 def rng() -> np.random.Generator:
     return np.random.default_rng(0)
+
+
+@pytest.fixture
+def set_threads(monkeypatch) -> Iterator[Callable[[int], None]]:
+    """Sets Numba's threads and ours until the test ends."""
+    available = numba.get_num_threads()
+
+    def set_to(num: int) -> None:
+        numba.set_num_threads(min(num, available))
+        monkeypatch.setattr(os, "cpu_count", lambda: num)
+
+    yield set_to
+    numba.set_num_threads(available)
 
 
 @pytest.fixture(scope="session")

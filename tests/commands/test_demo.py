@@ -23,7 +23,7 @@ from splatseed.upsample import METHODS
 def quick(monkeypatch):
     monkeypatch.setattr(demo, "RATIO", 2.0)
     small = partial(synthetic.make_capture, width=160, height=120)
-    monkeypatch.setattr(synthetic, "make_capture", lambda *a, **o: small(*a, **o))
+    monkeypatch.setattr(synthetic, "make_capture", small)
 
 
 @pytest.mark.slow

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import os
 import shutil
 import socket
-import subprocess
-import sys
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -203,19 +200,13 @@ def test_a_network_that_is_not_here_is_never_looked_for_elsewhere(model, monkeyp
     assert f"hf download {name} --local-dir {name.partition('/')[2]} " in str(caught.value)
 
 
-def test_an_id_is_found_in_the_cache(saved, tmp_path):
-    """In a process of its own: where the cache is, is settled as Hugging Face's package loads."""
-    entry = tmp_path / "hub" / "models--me--tiny"
+def test_an_id_is_found_in_the_cache(saved, tmp_path, monkeypatch):
+    entry = tmp_path / "models--me--tiny"
     shutil.copytree(saved["dpt"], entry / "snapshots" / ("0" * 40))
     (entry / "refs").mkdir()
     (entry / "refs" / "main").write_text("0" * 40)
-    code = "from splatseed.depth.monocular import load_network as load"
-    code += "; print(load('me/tiny').meaning.kind)"
-    environment = {**os.environ, "HF_HOME": str(tmp_path), "HF_HUB_CACHE": str(tmp_path / "hub")}
-    run = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, check=True, text=True, env=environment
-    )
-    assert run.stdout.strip() == "inverse"
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
+    assert load_network("me/tiny", device="cpu").meaning.kind == "inverse"
 
 
 @pytest.mark.skipif(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
@@ -98,16 +97,6 @@ def test_originals_come_first_among_equals(rng):
     assert (thin(twice, (), 100, first=500) < 500).all()
     assert (thin(twice, views, 100, priority=high) >= 500).all()
     assert (thin(twice, views, 100, first=500, priority=high) < 500).all()
-
-
-def test_threads_change_nothing(rng):
-    xyz, views = sheet(rng, 3000), views_of(rng, 5)
-    most, found = numba.get_num_threads(), []
-    for threads in (1, most):
-        numba.set_num_threads(threads)
-        found.append(thin(xyz, views, 700, first=1000).tolist())
-    numba.set_num_threads(most)
-    assert found[0] == found[1]
 
 
 ONE = [slow.make_view(np.random.default_rng(0))]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 import pytest
 
@@ -46,14 +45,21 @@ def test_the_maps_are_those_that_seeds_are_made_of(room, seeds):
     assert close > 50
 
 
-@by_photographs
-def test_the_same_seed_gives_the_same_bytes_on_any_number_of_threads(method, room):
-    first, threads = ss.upsample(room, method, seed=3), numba.get_num_threads()
-    numba.set_num_threads(1)
-    try:
-        second = ss.upsample(room, method, seed=3)
-    finally:
-        numba.set_num_threads(threads)
+@pytest.mark.parametrize(
+    ("method", "options"),
+    [
+        ("stereo", {}),
+        ("cover", {}),
+        ("auto", {"budget": 600}),
+        ("mls", {"ratio": 4, "verify": True}),
+    ],
+)
+def test_the_same_seed_gives_the_same_bytes_on_any_number_of_threads(
+    method, options, room, set_threads
+):
+    first = ss.upsample(room, method, seed=3, **options)
+    set_threads(1)
+    second = ss.upsample(room, method, seed=3, **options)
     for name in ("xyz", "rgb", "source"):
         assert getattr(first, name).tobytes() == getattr(second, name).tobytes()
 

@@ -9,9 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import os
 
-import numba
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
@@ -157,20 +155,6 @@ def test_of_a_photograph_only_what_it_shows_judges(places):
     assert black[left].sum() == black.sum()
     assert np.isnan(kept.confidence[black[left]]).all()
     assert lit[left].sum() < 0.1 * lit.sum()
-
-
-def test_one_and_two_threads_give_the_same_bytes(places, rng, monkeypatch):
-    new = shifted(places, rng.uniform(-3, 3, len(places)))
-    first, threads = hold(VIEWS, KNOWN, new), numba.get_num_threads()
-    monkeypatch.setattr(os, "cpu_count", lambda: 1)
-    numba.set_num_threads(1)
-    try:
-        second = hold(VIEWS, KNOWN, new)
-    finally:
-        numba.set_num_threads(threads)
-    assert 0 < len(first.xyz) < len(new)
-    for one, other in zip(first, second, strict=True):
-        np.testing.assert_array_equal(one, other)
 
 
 SHAPES = {"apart": [1, 1, 1], "at one place": 0, "on a line": [1, 0, 0], "on a plane": [1, 1, 0]}

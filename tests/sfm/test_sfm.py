@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -53,12 +51,6 @@ def photos(posed, room, tmp_path_factory):
 
 def files_below(folder):
     return {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
-
-
-def add_noise_images(folder, num):
-    for i in range(num):
-        noise = gaussian_filter(np.random.default_rng(i).normal(128, 200, (240, 320)), 2)
-        PilImage.fromarray(noise.clip(0, 255).astype(np.uint8)).save(folder / f"other{i}.png")
 
 
 def test_reconstruct_finds_the_cameras(posed, photos, tmp_path):
@@ -119,28 +111,22 @@ def test_known_poses_are_kept_and_surfaces_found(capture, posed, photos, tmp_pat
     assert np.median(capture.surfaces.distance(xyz)) < 0.01
 
 
-def test_triangulation_repeats_itself_and_undistorts(posed, photos, tmp_path):
-    radial = Intrinsics(1, "SIMPLE_RADIAL", 320, 240, (304.0, 160.0, 120.0, 0.01))
-    images = tuple(replace(image, intrinsics=radial) for image in posed.images[:3])
-    scene, settings = Scene(EMPTY, images, (radial,)), Settings(seed=3, max_image_size=240)
-    first, second = (
-        reconstruct(photos, tmp_path / name, settings, poses_from=scene).path
-        for name in ("first", "second")
-    )
-    model = pycolmap.Reconstruction(first / "sparse" / "0")
-    assert {camera.model.name for camera in model.cameras.values()} == {"PINHOLE"}
-    for name in files_below(first) - {"splatseed.json"}:
-        assert (first / name).read_bytes() == (second / name).read_bytes(), name
-
-
-def test_a_known_lens_is_believed(posed, photos, tmp_path):
+def test_a_known_lens_is_believed_and_triangulation_repeats_itself(posed, photos, tmp_path):
     """Coefficients above 1, as a Kinect's, which COLMAP takes for a calibration gone wrong."""
     cancel = (0.0, 0.0, 0.0, 0.0, 1.2, 0.0, 0.0, 1.2)  # the rational model's k3 = k6
     lens = Intrinsics(7, "FULL_OPENCV", 320, 240, (*posed.intrinsics[0].params, *cancel))
-    images = tuple(replace(image, intrinsics=lens) for image in posed.images)
-    report = reconstruct(photos, tmp_path / "scene", poses_from=posed.replace(images=images))
-    assert report.num_points > 100
-    assert report.mean_reprojection_error < 1
+    images = tuple(replace(image, intrinsics=lens) for image in posed.images[:4])
+    scene, settings = Scene(EMPTY, images, (lens,)), Settings(seed=3, max_image_size=240)
+    first, second = (
+        reconstruct(photos, tmp_path / name, settings, poses_from=scene)
+        for name in ("first", "second")
+    )
+    assert first.num_points > 50
+    assert first.mean_reprojection_error < 1
+    model = pycolmap.Reconstruction(first.path / "sparse" / "0")
+    assert {camera.model.name for camera in model.cameras.values()} == {"PINHOLE"}
+    for name in files_below(first.path) - {"splatseed.json"}:
+        assert (first.path / name).read_bytes() == (second.path / name).read_bytes(), name
 
 
 @pytest.mark.parametrize("num", [8, 3])
@@ -151,7 +137,9 @@ def test_too_few_registered_is_an_error_that_names_them(num, photos, tmp_path, m
         shutil.copytree(photos, mixed)
     for folder in (mixed, tmp_path / "temporary"):
         folder.mkdir(exist_ok=True)
-    add_noise_images(mixed, num)
+    for i in range(num):
+        noise = gaussian_filter(np.random.default_rng(i).normal(128, 200, (120, 160)), 2)
+        PilImage.fromarray(noise.clip(0, 255).astype(np.uint8)).save(mixed / f"other{i}.png")
     monkeypatch.setenv("TMPDIR", str(tmp_path / "temporary"))
     with pytest.raises(ReconstructionError) as caught:
         reconstruct(mixed, tmp_path / "scene", camera_model="SIMPLE_RADIAL")
@@ -278,15 +266,13 @@ def test_what_cannot_be_done_is_refused_and_nothing_written(posed, photos, tmp_p
     assert len(files_below(photos)) == 6
 
 
-def test_pycolmap_is_asked_for_and_never_imported_here(photos, tmp_path, monkeypatch):
+def test_pycolmap_is_asked_for(photos, tmp_path, monkeypatch):
     if not pycolmap.has_cuda:
         with pytest.raises(MissingDependencyError, match="built for the CPU"):
             reconstruct(photos, tmp_path / "scene", Settings(device="cuda"))
     monkeypatch.setattr("splatseed.requirements.find_spec", lambda _: None)
     with pytest.raises(MissingDependencyError, match=r"-m pip install .*'pycolmap>=4\.0'"):
         reconstruct(photos, tmp_path / "scene")
-    code = "import sys, splatseed.sfm; sys.exit('pycolmap' in sys.modules)"
-    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_of_points_at_one_place_the_longest_track_stays(room_path):
