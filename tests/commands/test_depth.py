@@ -15,38 +15,47 @@ from splatseed.io import find_depths, load_scene
 from splatseed.synthetic import make_capture, write_capture
 
 from ..bent import bend
-from ..networks import save_network
 from ..stereo_maps import true_maps
 
+CAPTURE = make_capture(0, num_views=12, width=120, height=90)
+"""The room of these commands."""
 
-@pytest.fixture(scope="module")
-def model(tmp_path_factory):
+
+@pytest.fixture
+def network(monkeypatch):
+    """A network that takes bright for near; ``asked`` is how it was to be loaded."""
+    monocular = pytest.importorskip("splatseed.depth.monocular", reason="needs PyTorch")
     pytest.importorskip("transformers", reason="needs splatseed[depth]")
-    return save_network("depth_anything", tmp_path_factory.mktemp("model") / "tiny")
+
+    class Network:
+        meaning, device, blind = monocular.Meaning("inverse", "made"), "here", False
+
+        def __call__(self, image):
+            return image.mean(axis=2).astype(np.float32) * (not self.blind)
+
+    network = Network()
+    network.asked = []
+    load = lambda *words, **options: network.asked.append((*words, options)) or network
+    monkeypatch.setattr(monocular, "load_network", load)
+    return network
 
 
-def test_a_network_of_transformers(room, model, tmp_path, splatseed):
-    words = ("depth", room, "--model", model, "-o", tmp_path / "d")
+def test_a_network(room, network, tmp_path, splatseed):
+    words = ("depth", room, "--model", "tiny", "-o", tmp_path / "d")
     run = splatseed(*words, "--device", "cpu", "--max-size", 100)
     assert (run.code, run.err) == (0, "")
+    assert network.asked == [("tiny", {"kind": None, "device": "cpu"})]
     for text in ("inverse", "12 of 100 x 75", f"splatseed info {room} --depth {tmp_path / 'd'}"):
         assert text in run.out
     depths = find_depths(load_scene(room), tmp_path / "d")
     assert {depths.read(name).kind for name in depths} == {"inverse"}
     assert len(depths) == 12
     manifest = json.loads((tmp_path / "d" / "splatseed.json").read_text())
-    assert manifest["options"]["model"] == str(model)
+    assert manifest["options"]["model"] == "tiny"
     assert manifest["kind"] == "inverse"
     assert splatseed(*words).code == 2  # it is there
-    assert splatseed(*words, "--overwrite").code == 0
-
-
-def test_a_blind_network_is_told_of(room, model, tmp_path, splatseed, monkeypatch):
-    from splatseed.depth.monocular import DepthNetwork
-
-    predict = DepthNetwork.__call__
-    monkeypatch.setattr(DepthNetwork, "__call__", lambda *a: 0 * predict(*a))
-    run = splatseed("depth", room, "--model", model, "--depth-kind", "z", "-o", tmp_path / "d")
+    network.blind = True
+    run = splatseed(*words, "--overwrite")
     assert run.code == 0
     assert "predicted no depth" in run.out
     assert "and 7 more" in run.out
@@ -56,8 +65,7 @@ def test_a_blind_network_is_told_of(room, model, tmp_path, splatseed, monkeypatc
 def stereo(monkeypatch):
     """Stereo that knows the truth; ``calls`` notes how it was asked, ``maps`` is what it
     answers."""
-    maps = true_maps(make_capture(0, num_views=12, width=120, height=90), 2)
-    known = SimpleNamespace(calls=[], maps=maps)
+    known = SimpleNamespace(calls=[], maps=true_maps(CAPTURE, 2))
 
     def stereo_depths(scene, *, max_size=800, grid=4, seed=0, progress=None):
         known.calls.append((len(scene.images), max_size, grid, seed))
@@ -104,26 +112,17 @@ def test_a_distorted_capture_becomes_a_cloud_on_its_surfaces(tmp_path, splatseed
 
 @pytest.mark.usefixtures("stereo")
 def test_a_plain_folder_of_a_distorted_capture_says_what_it_fits(tmp_path, splatseed):
-    capture = make_capture(0, num_views=12, width=120, height=90)
-    scene = write_capture(bend(capture), tmp_path / "bent")
+    scene = write_capture(bend(CAPTURE), tmp_path / "bent")
     run = splatseed("depth", scene, "--stereo", "-o", tmp_path / "maps")
     assert "--colmap writes both" in run.out
     assert "--method depth" not in run.out
 
 
-@pytest.mark.parametrize("words", [("--stereo", "--colmap"), ("--model",)])
-def test_a_photograph_that_is_not_whole_is_found_before_any_work(
-    words, own_room, model, tmp_path, splatseed, stereo
-):
+def test_a_missing_photograph_is_found_before_any_work(own_room, tmp_path, splatseed, stereo):
     scene = load_scene(own_room)
     path = scene.source.image_dir / scene.images[-1].name
-    if "--stereo" in words:
-        path.unlink()
-    else:
-        path.write_bytes(path.read_bytes()[:-200])
-        words = (*words, model)
-    run = splatseed("depth", own_room, *words, "-o", tmp_path / "d")
-    assert run.code == 2
-    assert path.name in run.err
+    path.unlink()
+    run = splatseed("depth", own_room, "--stereo", "--colmap", "-o", tmp_path / "d")
+    assert (run.code, path.name in run.err) == (2, True)
     assert not (tmp_path / "d").exists()
     assert not stereo.calls

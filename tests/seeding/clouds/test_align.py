@@ -119,7 +119,8 @@ def degrees_between(first, second):
     return np.degrees(np.arccos(np.clip(cosines, -1, 1)))
 
 
-def test_orientations_between_those_spread_are_tried(made):
+def test_orientations_between_those_spread_are_tried(made, monkeypatch):
+    monkeypatch.setattr(module, "SCALES", (1.0,))
     marks, dense = made[0], made[1][::8]
     spread = spread_rotations(module.ROTATIONS)
     some = Rotation.random(1000, random_state=0).as_matrix()
