@@ -33,7 +33,7 @@ def poses(room):
     return np.array([image.camera.cam_from_world for image in room.images])
 
 
-@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
+@pytest.mark.parametrize("unit", [1e-3, 1e3])
 def test_sound_poses_pass_in_any_unit_at_the_first_look(unit, room, poses, monkeypatch):
     looks = []
     plain = module._look
@@ -68,8 +68,6 @@ def _in_place(poses, place):
         (lambda poses: YZ @ poses, SceneFormatError, f"once {PLAIN_YZ}.*with OpenCV's"),
         (lambda poses: XY @ poses, SceneFormatError, f"once {PLAIN_XY}"),
         (np.linalg.inv, SceneFormatError, f"once {INVERTED}"),
-        # It differs from the inverse by a turn of the world.
-        (lambda poses: YZ @ np.linalg.inv(poses), SceneFormatError, f"once {INVERTED}"),
         (lambda poses: np.linalg.inv(poses) @ YZ, SceneFormatError, f"once {INVERTED_YZ}"),
         (np.random.default_rng(0).permutation, SceneFormatError, "agree.*names of the images"),
         (lambda poses: _in_place(poses, (0.0, 0, 0)), SceneFormatError, "all 16 cameras in one"),

@@ -58,7 +58,7 @@ def test_voxels_hold_the_means_of_their_points(rng):
     assert voxels.unseen == len(xyz) - count.sum() > 0
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(size=st.integers(1, 3000), capacity=st.integers(20, 2000))
 def test_chunks_do_not_matter_and_no_point_is_lost(size, capacity):
     rng = np.random.default_rng(1)
