@@ -54,41 +54,37 @@ def test_features_and_tracks_name_each_other(capture):
     assert sum(len(image.observations) for image in scene.images) == len(tracks.image_ids)
 
 
+def residuals(scene, xyz):
+    """How far each observation is from where its point is seen, and the point of each."""
+    tracks = scene.tracks
+    point_idx = np.repeat(np.arange(len(tracks)), tracks.lengths)
+    off = np.empty(len(point_idx))
+    for image in scene.images:
+        mine = tracks.image_ids == image.image_id
+        uv, depth = image.camera.project(xyz[point_idx[mine]])
+        assert (depth > 0).all()
+        off[mine] = np.linalg.norm(uv - image.observations.xy[tracks.point2d_idx[mine]], axis=1)
+    return off, point_idx
+
+
 def test_reprojection_errors_are_those_of_the_observations(capture):
     tracks = capture.scene.tracks
-    point_idx = np.repeat(np.arange(len(tracks)), tracks.lengths)
-    residual = np.empty(len(point_idx))
-    for image in capture.scene.images:
-        mine = tracks.image_ids == image.image_id
-        uv, depth = image.camera.project(tracks.xyz[point_idx[mine]])
-        assert (depth > 0).all()
-        observed = image.observations.xy[tracks.point2d_idx[mine]]
-        residual[mine] = np.linalg.norm(uv - observed, axis=1)
-    mean = np.bincount(point_idx, residual) / tracks.lengths
+    off, point_idx = residuals(capture.scene, tracks.xyz)
+    mean = np.bincount(point_idx, off) / tracks.lengths
     np.testing.assert_allclose(mean, tracks.errors, atol=1e-9)
     assert 0.3 < np.median(mean) < 0.9
 
 
 def test_points_are_least_squares_solutions(capture):
     tracks = capture.scene.tracks
-    long_enough = np.flatnonzero(tracks.lengths >= 4)[:50]
-    for i in long_enough:
-        span = slice(tracks.offsets[i], tracks.offsets[i + 1])
-        images = [capture.scene.images[j - 1] for j in tracks.image_ids[span]]
-        seen = [
-            image.observations.xy[k]
-            for image, k in zip(images, tracks.point2d_idx[span], strict=True)
-        ]
 
-        def cost(xyz, images=images, seen=seen):
-            return sum(
-                ((image.camera.project(xyz[None])[0][0] - uv) ** 2).sum()
-                for image, uv in zip(images, seen, strict=True)
-            )
+    def cost(xyz):
+        off, point_idx = residuals(capture.scene, xyz)
+        return np.bincount(point_idx, off**2)[tracks.lengths >= 4]
 
-        best = cost(tracks.xyz[i])
-        for axis in np.eye(3) * 1e-3:
-            assert best <= min(cost(tracks.xyz[i] + axis), cost(tracks.xyz[i] - axis)) + 1e-9
+    best = cost(tracks.xyz)
+    for move in np.concatenate([np.eye(3), -np.eye(3)]):
+        assert (best <= cost(tracks.xyz + 1e-3 * move) + 1e-9).all()
 
 
 def test_inliers_are_near_the_surfaces_and_mismatches_are_not(capture):
