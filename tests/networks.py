@@ -23,11 +23,6 @@ BY_14 = {
 }  # fmt: skip
 SAVED = {
     "depth_anything": ("DepthAnything", ANYTHING, BY_14),
-    "depth_anything_metric": (
-        "DepthAnything",
-        {**ANYTHING, "depth_estimation_type": "metric", "max_depth": 20},
-        BY_14,
-    ),
     "dpt": (
         "DPT",
         {

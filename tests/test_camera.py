@@ -67,16 +67,12 @@ def test_what_is_not_in_front_has_no_pixel():
 def test_models_are_colmaps(name):
     model = CAMERA_MODELS[name]
     theirs = pycolmap.Camera.create_from_model_name(1, name, 500.0, 640, 480)
-    assert int(theirs.model) == model.model_id
-    assert len(theirs.params) == model.num_params
-    assert len(theirs.focal_length_idxs()) == model.num_focal
-    assert list(theirs.principal_point_idxs()) == [model.num_focal, model.num_focal + 1]
-    theirs.params = [
-        *theirs.params[: model.num_focal + 2],
-        *[0.01] * len(theirs.extra_params_idxs()),
-    ]
-    ours = Intrinsics(1, name, 640, 480, tuple(theirs.params))
+    numbers = len(theirs.params), len(theirs.focal_length_idxs())
+    assert model == (int(theirs.model), name, *numbers)
+    params = [*theirs.params[: model.num_focal + 2], *[0.01] * len(theirs.extra_params_idxs())]
+    ours = Intrinsics(1, name, 640, 480, tuple(params))
     np.testing.assert_allclose(ours.K, theirs.calibration_matrix())
+    theirs.params = params
     assert ours.is_pinhole == theirs.is_undistorted()
 
 

@@ -91,13 +91,17 @@ def test_a_plain_folder(room, tmp_path, splatseed, stereo):
     assert stereo.calls == [(12, 800, 4, 0), (12, 500, 2, 0)]
 
 
-def test_a_distorted_capture_becomes_a_cloud_on_its_surfaces(tmp_path, splatseed):
+@pytest.fixture(scope="module")
+def bent(tmp_path_factory):
+    """The room through a lens with distortion."""
+    return write_capture(bend(CAPTURE), tmp_path_factory.mktemp("bent") / "room")
+
+
+def test_a_distorted_capture_becomes_a_cloud_on_its_surfaces(bent, tmp_path, splatseed):
     """From its own stereo to COLMAP's fusion."""
-    capture = make_capture(0, num_views=16, width=160, height=120)
-    scene = write_capture(bend(capture), tmp_path / "bent")
     out = tmp_path / "dense"
     words = ("--stereo", "--colmap", "--grid", 2, "--preview")
-    run = splatseed("depth", scene, *words, "-o", out)
+    run = splatseed("depth", bent, *words, "-o", out)
     assert (run.code, run.err) == (0, "")
     assert f"splatseed info {out} --depth {out}" in run.out
     assert splatseed("info", out, "--depth", out).code == 0
@@ -107,13 +111,12 @@ def test_a_distorted_capture_becomes_a_cloud_on_its_surfaces(tmp_path, splatseed
     subprocess.run(line.split()[1:], check=True, capture_output=True)
     xyz = load_scene(out / "fused.ply").points.xyz
     assert len(xyz) > 1_000
-    assert np.median(capture.surfaces.distance(xyz.astype(float))) < 0.01  # metres
+    assert np.median(CAPTURE.surfaces.distance(xyz.astype(float))) < 0.01  # metres
 
 
 @pytest.mark.usefixtures("stereo")
-def test_a_plain_folder_of_a_distorted_capture_says_what_it_fits(tmp_path, splatseed):
-    scene = write_capture(bend(CAPTURE), tmp_path / "bent")
-    run = splatseed("depth", scene, "--stereo", "-o", tmp_path / "maps")
+def test_a_plain_folder_of_a_distorted_capture_says_what_it_fits(bent, tmp_path, splatseed):
+    run = splatseed("depth", bent, "--stereo", "-o", tmp_path / "maps")
     assert "--colmap writes both" in run.out
     assert "--method depth" not in run.out
 

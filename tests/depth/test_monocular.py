@@ -22,7 +22,6 @@ from safetensors.torch import load_file, save_file
 
 from splatseed.depth.monocular import DepthNetwork, Meaning, estimate_depths, load_network
 from splatseed.errors import (
-    InputError,
     MissingDependencyError,
     OutputError,
     ParameterError,
@@ -33,14 +32,9 @@ from splatseed.io import find_depths, load_scene
 
 from ..networks import SAVED, save_network
 
-KINDS = {
-    "depth_anything": "inverse",
-    "depth_anything_metric": "z",
-    "dpt": "inverse",
-    "dpt_on_dinov2": "z",
-    "glpn": "z",
-    "zoedepth": "z",
-}
+KINDS = {"depth_anything": "inverse", "dpt": "inverse"} | dict.fromkeys(
+    ("dpt_on_dinov2", "glpn", "zoedepth"), "z"
+)
 CPU = torch.device("cpu")
 
 
@@ -74,13 +68,16 @@ def test_what_a_network_predicts_is_read_from_its_config_or_asked_for(saved, tmp
     assert load_network(str(saved["dpt"]), kind="ray", device="cpu").meaning.kind == "ray"
     folder = shutil.copytree(saved["depth_anything"], tmp_path / "copy")
     config = json.loads((folder / "config.json").read_text())
-    config["model_type"] = "prompt_depth_anything"
-    (folder / "config.json").write_text(json.dumps(config))
+    metric = {**config, "depth_estimation_type": "metric", "max_depth": 20}
+    (folder / "config.json").write_text(json.dumps(metric))
+    assert load_network(str(folder), device="cpu").meaning.kind == "z"
+    unknown = {**config, "model_type": "prompt_depth_anything"}
+    (folder / "config.json").write_text(json.dumps(unknown))
     with pytest.raises(ParameterError, match="--depth-kind"):
         load_network(str(folder), device="cpu")
 
 
-@pytest.mark.parametrize("name", ["depth_anything", "depth_anything_metric", "dpt", "glpn"])
+@pytest.mark.parametrize("name", ["depth_anything", "dpt", "glpn"])
 def test_predictions_are_those_of_transformers_and_silent(name, saved, photographs, capfd):
     network = transformers.AutoModelForDepthEstimation.from_pretrained(saved[name])
     with torch.no_grad():
@@ -312,16 +309,9 @@ def test_a_bad_photograph_stops_before_the_network_is_run(damage, own, tmp_path)
     assert not (tmp_path / "maps").exists()
 
 
-def test_what_cannot_be_done_is_refused(exact, tmp_path):
+def test_maps_are_never_written_among_what_is_read(exact):
     folder, network = exact.source.image_dir.parent, Brightness()
-    nowhere = exact.replace(source=replace(exact.source, image_dir=None))
-    for scene, output, error in (
-        (exact, folder, OutputError),
-        (exact, folder / "images" / "maps", OutputError),
-        (exact.replace(images=()), tmp_path / "maps", SceneNotFoundError),
-        (nowhere, tmp_path / "maps", SceneNotFoundError),
-    ):
-        with pytest.raises(InputError) as caught:
-            estimate_depths(scene, network, output)
-        assert type(caught.value) is error
+    for output in (folder, folder / "images" / "maps"):
+        with pytest.raises(OutputError):
+            estimate_depths(exact, network, output)
     assert not network.asked
