@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import dataclasses
 import io
 import math
 import re
@@ -14,38 +13,12 @@ from scipy import stats
 
 pytest.importorskip("pandas", reason="tables need pandas")
 
-from splatseed.bench.comparisons import (
-    DATASETS,
-    baseline_of,
-    compare,
-    compared_arms,
-    dataset_of,
-    gains,
-    paper_costs,
-    paper_gains,
-    paper_psnr,
-    psnr_at,
-    reach,
-    score_advice,
-)
+from splatseed.bench import comparisons, study_tables
+from splatseed.bench.comparisons import baseline_of, compare, compared_arms, gains
 from splatseed.bench.plan import SFM
-from splatseed.bench.report import answer_at_equal_cost, unequal_numbers
+from splatseed.bench.report import answer, unequal_numbers
 from splatseed.bench.runs import Run
 from splatseed.bench.study import studies
-from splatseed.bench.study_tables import (
-    advice_table,
-    arm_table,
-    comparison_tables,
-    convergence_table,
-    cost_table,
-    equal_count_table,
-    gain_table,
-    mean_gain_table,
-    psnr_tables,
-    quality_table,
-    scene_arm_table,
-    seconds_table,
-)
 from splatseed.bench.tables import Number, Table, to_markdown, write_table
 
 from .planted import GAINS, result, runs, spec
@@ -65,17 +38,16 @@ def column(table, name):
 
 def test_the_papers_tables_are_whole():
     sizes = {"mipnerf360": (9, 16), "replica": (8, 13)}
-    for key in DATASETS:
-        assert paper_psnr(key).shape == sizes[key]
-        assert paper_psnr(key).notna().all(axis=None)
-        assert set(paper_costs(key).index) >= {("sfm", 1.0), ("mls", 8.0)}
-    assert paper_gains("replica").loc["room0", ("mls", 16.0)] == pytest.approx(0.283)
-    assert (dataset_of("bonsai"), dataset_of("my kitchen")) == ("mipnerf360", "")
+    for key in comparisons.DATASETS:
+        assert comparisons.paper_psnr(key).shape == sizes[key]
+        assert comparisons.paper_psnr(key).notna().all(axis=None)
+        assert set(comparisons.paper_costs(key).index) >= {("sfm", 1.0), ("mls", 8.0)}
+    assert comparisons.paper_gains("replica").loc["room0", ("mls", 16.0)] == pytest.approx(0.283)
 
 
 def test_the_papers_three_mean_gains():
     """As recomputed from its tables by hand, see docs/paper.md."""
-    table = mean_gain_table(one(runs()))
+    table = study_tables.mean_gain_table(one(runs()))
     for name, *expected in (
         ("paper, Mip-NeRF360", 0.117, 0.202, 0.258), ("paper, Replica", 0.343, 0.507, 0.646)
     ):  # fmt: skip
@@ -86,7 +58,7 @@ def test_the_papers_three_mean_gains():
 
 def test_cells_are_means_and_standard_errors_over_repeats():
     finished = runs(scenes=("fox",))
-    (table,) = psnr_tables(one(finished), "none")
+    (table,) = study_tables.psnr_tables(one(finished), "none")
     values = [r.result.psnr for r in finished if r.spec.arm.label == MLS8]
     cell = column(table, MLS8)["fox"]
     assert cell.value == pytest.approx(np.mean(values))
@@ -94,12 +66,12 @@ def test_cells_are_means_and_standard_errors_over_repeats():
     assert (cell.bold, cell.mark) == (True, "†")  # the best that was planted
     assert not column(table, "mls 4x")["fox"].bold
     worse = {(SFM, 1): 0.0, ("mls", 4): -0.5, ("random", 8): -0.9}
-    (table,) = psnr_tables(one(runs(scenes=("fox",), gains=worse)), "none")
+    (table,) = study_tables.psnr_tables(one(runs(scenes=("fox",), gains=worse)), "none")
     assert column(table, "sfm")["fox"].bold
 
 
 def test_scenes_of_the_paper_have_its_numbers_below():
-    tables = psnr_tables(one(runs()), "none")
+    tables = study_tables.psnr_tables(one(runs()), "none")
     assert [table.name for table in tables] == ["table1_none", "table2_none", "table_scenes_none"]
     assert column(tables[0], MLS8)["bonsai (paper)"].value == 32.572
     assert math.isnan(column(tables[1], MLS8)["room0 (paper)"].value)
@@ -111,7 +83,9 @@ def test_noise_is_not_marked_as_best():
     bold = [
         cell.bold
         for seed in range(20)
-        for table in psnr_tables(one(runs(scenes=("fox",), gains=null, seed=seed)), "none")
+        for table in study_tables.psnr_tables(
+            one(runs(scenes=("fox",), gains=null, seed=seed)), "none"
+        )
         for row in table.rows
         for cell in row[1:]
     ]
@@ -119,20 +93,20 @@ def test_noise_is_not_marked_as_best():
 
 
 def test_planted_gains_come_back():
-    table = gain_table(one(runs()), "none")
+    table = study_tables.gain_table(one(runs()), "none")
     for (method, ratio), gain in list(GAINS.items())[1:]:
         cells = column(table, f"{method} {ratio}x")
         for mean in ("mean, these scenes", "mean, scenes like these"):
             assert cells[mean].value == pytest.approx(gain, abs=0.04)
             assert cells[mean].mark == ""
-    theirs = paper_gains("mipnerf360").loc[["bonsai", "treehill"], ("mls", 8.0)]
+    theirs = comparisons.paper_gains("mipnerf360").loc[["bonsai", "treehill"], ("mls", 8.0)]
     shown = column(table, MLS8)["paper, 2 of 9 Mip-NeRF360 scenes"]
     assert shown.value == pytest.approx(np.mean(theirs))
 
 
 def test_one_repeat_says_so():
     study = one(runs(repeats=1))
-    shown = to_markdown(psnr_tables(study, "none")[0])
+    shown = to_markdown(study_tables.psnr_tables(study, "none")[0])
     assert shown.count("(1 run)") == 2 * 5 + 1  # and in the notes
     assert "**2" not in shown
     verdicts = {each.verdict for each in gains(study, "none").on_scene.values()}
@@ -143,10 +117,10 @@ def test_one_repeat_says_so():
 def test_runs_without_a_baseline_gain_nothing():
     study = one([r for r in runs() if r.spec.arm.method != SFM or r.spec.scene.name != "fox"])
     assert gains(study, "none").scenes == ("bonsai", "room0", "treehill")
-    (own,) = [table for table in psnr_tables(study, "none") if "scenes" in table.name]
+    (own,) = [table for table in study_tables.psnr_tables(study, "none") if "scenes" in table.name]
     assert (column(own, "sfm")["fox"], bool(column(own, MLS8)["fox"])) == ("", True)
     alone = one(runs(gains={("mls", 8): 0.5}))
-    assert (baseline_of(alone), compared_arms(alone), answer_at_equal_cost(alone)) == (None, (), ())
+    assert (baseline_of(alone), compared_arms(alone), len(answer(alone))) == (None, (), 1)
 
 
 def test_runs_of_other_settings_are_never_paired():
@@ -182,47 +156,21 @@ def test_parameters_and_profiles_are_variants_of_their_own():
 
 
 def test_costs_are_means_over_scenes_and_the_papers_stand_beside():
-    table = cost_table(one(runs(scenes=("bonsai", "fox"))), "none")
+    table = study_tables.cost_table(one(runs(scenes=("bonsai", "fox"))), "none")
     assert column(table, "Gaussians")["mls 4x"].value == 10_000
     assert column(table, "model, MB")["sfm"].value == pytest.approx(5000 * 59 * 4 / 1e6)
     assert "peak GPU memory, MB" not in table.header
     assert column(table, "paper, training, s (Mip-NeRF360)")[MLS8].value == 1503
 
 
-def test_quality_is_told_as_far_as_it_was_measured():
-    table = quality_table(one(runs(scenes=("fox", "room0"))), "none")
-    assert table.header == ("method", "PSNR, dB", "co-visible PSNR, dB", "SSIM", "scenes")
-    assert column(table, "SSIM")[MLS8].value == pytest.approx(0.8)
-    measured = one([dataclasses.replace(r, result=result(20.0, lpips=0.25)) for r in runs()])
-    assert column(quality_table(measured, "none"), "LPIPS")["sfm"].value == pytest.approx(0.25)
-    assert "LPIPS" in arm_table(measured).header
-
-
 def test_reaching_a_target_is_interpolated():
     run = result(30.0)  # rises by 1 dB every 100 steps and 2 s, from 21 at 100
-    assert reach(run, 24.5) == pytest.approx((450, 9.0 + 0.5))
-    assert reach(run, 10.0)[0] == 100
-    assert reach(run, 30.01) == pytest.approx((math.nan, math.nan), nan_ok=True)
+    assert comparisons.reach(run, 24.5) == pytest.approx((450, 9.0 + 0.5))
+    assert comparisons.reach(run, 10.0)[0] == 100
+    assert comparisons.reach(run, 30.01) == pytest.approx((math.nan, math.nan), nan_ok=True)
     run = result(30.0, upsample_seconds=1.0)  # tests at 2, 4, ... 20 s; 21 dB, 22 dB, ... 30 dB
-    scores = [psnr_at(run, seconds) for seconds in (2.9, 3.0, 4.0, 99.0)]
+    scores = [comparisons.psnr_at(run, seconds) for seconds in (2.9, 3.0, 4.0, 99.0)]
     assert scores == pytest.approx([math.nan, 21.0, 21.5, 30.0], nan_ok=True)
-
-
-def test_convergence_counts_those_that_never_arrive():
-    table = convergence_table(one(runs()), "none")
-    assert column(table, "reached")["random 8x"] == "0 of 12"
-    assert column(table, "steps ratio")["random 8x"] == ""
-    # 0.5 dB more, rising in 900 steps instead of 1000: the target is 9.5 of 10 dB up.
-    ratio = column(table, "steps ratio")[MLS8]
-    assert (ratio.value, ratio.mark) == (pytest.approx(0.95 * 0.9, abs=0.01), "")
-
-
-def test_equal_counts_are_looked_up():
-    study = one(runs(strategies=("mcmc", "none")))
-    assert {row[0] for row in equal_count_table(study).rows} == {"mcmc"}
-    none = equal_count_table(one(runs(strategies=("none",))))
-    assert not none.rows
-    assert "None qualifies" in none.notes[0]
 
 
 ODD = Table(
@@ -255,16 +203,14 @@ def test_tables_are_written_in_four_kinds(tmp_path):
 def _study(noise=0.02, plain=5000, **changes):
     """Two strategies under one budget, of which ``sfm`` makes ``plain``: ``grow`` has 0.3 dB more,
     its seeds take 4 s."""
-    finished = []
-    for row in runs(strategies=("default", "grow"), noise=noise, seed=3, **changes):
-        arm = dataclasses.replace(row.spec.arm, budget="5000", ratio=row.spec.arm.ratio)
-        run = dataclasses.replace(row.spec, arm=arm)
-        more = 0.3 if arm.strategy == "grow" else 0.0
-        seconds, count = (0.0, plain) if arm.method == "sfm" else (4.0, 5000)
-        made = result(row.result.psnr + more, upsample_seconds=seconds, num_gaussians=count)
-        finished.append(Run(run, made))
-    (study,) = studies(finished)
-    return study
+    strategies, finished = ("default", "grow"), []
+    for row in runs(strategies=strategies, noise=noise, seed=3, budget="5000", **changes):
+        more = 0.3 if row.spec.arm.strategy == "grow" else 0.0
+        seconds, count = (0.0, plain) if row.spec.arm.method == SFM else (4.0, 5000)
+        psnr = row.result.psnr + more
+        made = result(psnr, upsample_seconds=seconds, num_gaussians=count, lpips=0.25)
+        finished.append(Run(row.spec, made))
+    return one(finished)
 
 
 def test_every_arm_stands_beside_one_baseline():
@@ -277,29 +223,38 @@ def test_every_arm_stands_beside_one_baseline():
     assert within.gain.mean == pytest.approx(0.5, abs=0.05)
     assert within.gain.verdict == "better"
     assert within.gains["covisible"].mean == pytest.approx(within.gain.mean)
+    assert (within.means["lpips"], within.gains["lpips"].mean) == (0.25, 0.0)
     assert (within.runs, within.scenes, within.means["gaussians"]) == (12, study.scenes, 5000)
     assert by_label["random 8x + default"].gain.mean == pytest.approx(-0.4, abs=0.05)
     order = [each.gain.mean for each in compared]
     assert order == sorted(order, reverse=True)
+    by_scene = study_tables.scene_arm_table(study, baseline_of(study)).rows
+    shown = np.mean([cell.value for cell in dict(zip(by_label, by_scene, strict=True))[
+        "mls 8x + default"][2:]])  # fmt: skip
+    assert shown == pytest.approx(within.gain.mean)
 
 
-def test_time_counts_seeding():
+def test_time_counts_seeding_and_steps_do_not():
     by_label = {each.arm.label: each for each in compared_arms(_study(noise=0.0))}
     base, slower = by_label["sfm + default"], by_label["mls 8x + default"]
-    assert base.gains["sooner"].mean == pytest.approx(0.0)
-    assert base.gains["in_time"].mean == pytest.approx(0.0)
+    assert [base.gains[name].mean for name in ("in_time", "steps", "seconds")] == [0.0, 0.0, 0.0]
     assert slower.means["seeding"] == 4.0
     assert slower.gains["in_time"].mean < slower.gain.mean
+    # The target is 9.5 of 10 dB up.
+    assert math.exp(slower.gains["steps"].mean) == pytest.approx(0.95)
+    assert math.exp(slower.gains["seconds"].mean) == pytest.approx((0.95 * 20 + 4) / 20)
     assert slower.reached == slower.runs
+    never = by_label["random 8x + default"]
+    assert (never.gains["steps"], never.gains["seconds"], never.reached) == (None, None, 0)
 
 
 def test_tables_and_sentences_can_be_read():
     study = _study()
     base = baseline_of(study)
-    tables = arm_table(study), scene_arm_table(study, base), seconds_table(study, base)
+    tables = study_tables.arm_table(study), study_tables.seconds_table(study, base)
     text = "".join(map(to_markdown, tables))
-    assert {"co-visible", "baseline", "90%"} <= set(re.findall(r"[\w-]+%?", text))
-    said = " ".join(answer_at_equal_cost(study))
+    assert {"co-visible", "LPIPS", "baseline", "90%"} <= set(re.findall(r"[\w-]+%?", text))
+    said = " ".join(answer(study))
     for part in ("comes out best", "sfm + default", "seeding counted", "with equal numbers of"):
         assert part in said
     assert "at most 5,000 Gaussians" in study.description
@@ -307,7 +262,7 @@ def test_tables_and_sentences_can_be_read():
     study = _study(plain=3000)
     assert "3,000 to 5,000 Gaussians" in unequal_numbers(study)
     assert "--budgets" not in unequal_numbers(study)
-    assert "under one budget of Gaussians" in answer_at_equal_cost(study)[0]
+    assert "under one budget of Gaussians" in answer(study)[0]
 
 
 @pytest.mark.parametrize(
@@ -320,14 +275,13 @@ def test_tables_and_sentences_can_be_read():
 )
 def test_only_a_gain_is_called_best(gain, says):
     gains = {("sfm", 1): 0.0, ("mls", 8): gain}
-    (study,) = studies(runs(gains=gains, noise=0.0, strategies=("default",)))
-    assert says in answer_at_equal_cost(study)[0]
+    assert says in answer(one(runs(gains=gains, noise=0.0, strategies=("default",))))[0]
 
 
 def test_a_few_repeats_of_one_scene_are_not_called_chance():
     """Beside it stands the test by the noise of all variants, which two repeats may pass."""
-    (study,) = studies(runs(scenes=("fox",), strategies=("default",), repeats=2, noise=0.3))
-    assert "these two arms' 2 repeats alone do not confirm" in answer_at_equal_cost(study)[0]
+    study = one(runs(scenes=("fox",), strategies=("default",), repeats=2, noise=0.3))
+    assert "these two arms' 2 repeats alone do not confirm" in answer(study)[0]
 
 
 def _advised(room):
@@ -348,10 +302,10 @@ SPARSE_GAIN = {"fern": (0.5, 2_000), "fox": (0.3, 4_000), "bonsai": (-0.3, 10_00
 
 def test_advice_that_holds_is_right_everywhere():
     study = _advised(SPARSE_GAIN)
-    assert score_advice(study, "none")["advice"].to_dict() == {
+    assert comparisons.score_advice(study, "none")["advice"].to_dict() == {
         "fern": "auto", "fox": "auto", "bonsai": "sfm", "treehill": "sfm",
     }  # fmt: skip
-    table = advice_table(study, "none")
+    table = study_tables.advice_table(study, "none")
     mean = dict(zip(table.header, table.rows[-1], strict=True))
     assert mean["gain over always sfm"].value == pytest.approx(0.2)
     assert mean["gain over always auto"].value == pytest.approx(0.1)
@@ -361,7 +315,9 @@ def test_advice_that_holds_is_right_everywhere():
 
 def test_a_scene_does_not_advise_itself():
     """The one whose points should be left, though there is room, is advised as the others are."""
-    odd = score_advice(_advised({**SPARSE_GAIN, "odd": (-1.0, 2_000)}), "none").loc["odd"]
+    odd = comparisons.score_advice(_advised({**SPARSE_GAIN, "odd": (-1.0, 2_000)}), "none").loc[
+        "odd"
+    ]
     assert odd["advice"] == "auto"
     assert odd["auto"] - odd["sfm"] == pytest.approx(-1.0)
 
@@ -382,7 +338,7 @@ def test_a_planted_change_is_found_and_nothing_else():
     verdicts = {arm.seeds: each.verdict for arm, each in comparison.means.items()}
     assert verdicts.pop(MLS8) == "better"
     assert set(verdicts.values()) == {"within noise"}
-    _, changes, _ = comparison_tables(comparison)
+    _, changes, _ = study_tables.comparison_tables(comparison)
     assert [row[1] for row in changes.rows if row[-1].mark == "*"] == [MLS8]
 
 
@@ -411,7 +367,7 @@ def test_no_change_is_claimed_at_most_at_the_stated_rate():
 def test_single_runs_claim_nothing():
     comparison = compare(runs(repeats=1), runs(repeats=1, seed=1))
     assert {each.verdict for each in comparison.changes.values()} == {"unknown"}
-    assert comparison_tables(comparison)[1].rows[0][2].text == "(1 run)"
+    assert study_tables.comparison_tables(comparison)[1].rows[0][2].text == "(1 run)"
 
 
 def test_changed_files_and_nothing_finished():

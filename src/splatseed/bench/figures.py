@@ -1,4 +1,4 @@
-"""Figures: PSNR over steps and seconds, gains by scene and ratio, arms at equal cost.
+"""Figures: PSNR over steps and seconds, gains by scene, arms at equal cost.
 
 In all of them a colour is a method, a mark's shape a ratio, a dashed line or a hollow mark the
 profile "paper"; the baseline is thick and black. Equal data give equal bytes.
@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from splatseed.bench.comparisons import ArmKey, baseline_of, compared_arms, gains
-from splatseed.bench.plan import SFM, Arm, RunResult
+from splatseed.bench.plan import SFM, Arm
 from splatseed.bench.statistics import Difference
 from splatseed.bench.study import Study
 from splatseed.train.settings import StrategyName
@@ -91,18 +91,16 @@ def _style(study: Study, label: str, *, line: bool = True, mark: bool = True) ->
     return {**style, "marker": shape, "markersize": 5.0, "markerfacecolor": hollow}
 
 
-def curve_figure(study: Study, strategy: StrategyName, by: str) -> Plot | None:
-    """Test PSNR over "steps" or "seconds", a panel per scene; None where there are no curves."""
+def curve_figure(study: Study, strategy: StrategyName) -> Plot | None:
+    """Test PSNR of a strategy over steps, a panel per scene; None where there are no curves."""
     seeds = study.seeded_under(strategy)
     shown = (SFM, *shown_seeds(study, seeds))
-    styles = {label: _style(study, label) for label in shown}
-    arms = {label: ArmKey(strategy, label) for label in shown}
-    figure = _draw_curves(study, study.scenes_under(strategy), arms, styles, by)
+    arms = {label: (ArmKey(strategy, label), _style(study, label)) for label in shown}
     caption = (
-        f"Test PSNR (dB) over {by}, strategy {strategy}: mean over repeats, and a band from the "
+        f"Test PSNR (dB) over steps, strategy {strategy}: mean over repeats, and a band from the "
         f"lowest to the highest.{_HIGHEST * (len(shown) <= len(seeds))}"
     )
-    return _plot(f"psnr_{by}_{strategy}", caption, figure, styles) if figure else None
+    return _draw_curves(study, arms, f"psnr_steps_{strategy}", caption, by="steps")
 
 
 def seconds_figure(study: Study) -> Plot | None:
@@ -110,39 +108,34 @@ def seconds_figure(study: Study) -> Plot | None:
     base, compared = baseline_of(study), compared_arms(study)
     if base is None or len(compared) < 2:
         return None
-    arms = {arm.label: arm for arm in (base, *(each.arm for each in compared if each.arm != base))}
-    arms = dict(list(arms.items())[:_MANY])
-    styles = {}
-    for label, arm in arms.items():
+    shown = [base, *(each.arm for each in compared if each.arm != base)][:_MANY]
+    arms = {}
+    for arm in shown:
         dashes = _DASHES.get(arm.strategy, _AS_3DGS if arm.strategy.endswith("-3dgs") else "-")
-        styles[label] = {**_style(study, arm.seeds, mark=False), "linestyle": dashes}
-    figure = _draw_curves(study, study.scenes, arms, styles, "seconds")
+        style = {**_style(study, arm.seeds, mark=False), "linestyle": dashes}
+        arms[arm.label] = arm, style
     more = f" Of {len(compared)} arms, those with the highest mean gain."
     caption = (
         "Test PSNR (dB) over wall seconds, those of making the seeds included; mean over repeats, "
         f"and a band from the lowest to the highest. The thick line is {base.label}."
-        f"{more * (len(compared) > len(arms))}"
+        f"{more * (len(compared) > len(shown))}"
     )
-    return _plot("psnr_seconds_arms", caption, figure, styles) if figure else None
+    return _draw_curves(study, arms, "psnr_seconds_arms", caption, by="seconds")
 
 
 def _draw_curves(
-    study: Study,
-    scenes: Sequence[str],
-    arms: Mapping[str, ArmKey],
-    styles: Mapping[str, Style],
-    by: str,
-) -> Figure | None:
+    study: Study, arms: Mapping[str, tuple[ArmKey, Style]], file: str, caption: str, *, by: str
+) -> Plot | None:
     """A panel per scene with curves of PSNR by name; the first arm is the baseline."""
     drawn = {}
-    for scene in scenes:
-        runs = {name: study.results(arm.strategy, scene, arm.seeds) for name, arm in arms.items()}
-        curves = {name: _curve(list(each.values()), by) for name, each in runs.items()}
+    for scene in study.scenes:
+        curves = {name: _curve(study, scene, arm, by) for name, (arm, _) in arms.items()}
         if known := {name: curve for name, curve in curves.items() if curve is not None}:
             drawn[scene] = known
     if not drawn:
         return None
     figure, panels = _new_figure(3.6, 2.9, len(drawn))
+    styles = {name: style for name, (_, style) in arms.items()}
     baseline = next(iter(arms))
     for (scene, each), axes in zip(drawn.items(), panels, strict=True):
         end = each.get(baseline, next(iter(each.values())))[0][-1]
@@ -162,11 +155,12 @@ def _draw_curves(
         axes.set_xlabel(by if by == "steps" else "seconds, seeding included")
         axes.set_ylabel("PSNR, dB")
         axes.grid(visible=True, alpha=0.25)
-    return figure
+    return _plot(file, caption, figure, styles)
 
 
-def _curve(runs: Sequence[RunResult], by: str) -> tuple[np.ndarray, np.ndarray] | None:
+def _curve(study: Study, scene: str, arm: ArmKey, by: str) -> tuple[np.ndarray, np.ndarray] | None:
     """Mean abscissa [K] and PSNR [R, K] over the tests that all repeats took."""
+    runs = list(study.results(arm.strategy, scene, arm.seeds).values())
     curves = [{p.step: p for p in run.curve if math.isfinite(p.psnr)} for run in runs]
     steps = sorted(set.intersection(*map(set, curves))) if curves else []
     if not steps:
@@ -214,40 +208,6 @@ def _finish_rows(axes: Axes, names: Sequence[str], base: str) -> None:
     axes.set_ylim(len(names) - 0.5, -0.5)
     axes.set_xlabel(f"gain over {base}, dB")
     axes.grid(visible=True, axis="x", alpha=0.25)
-
-
-def ratio_figure(study: Study) -> Plot | None:
-    """Mean gain over the ratio, one panel per strategy; None if there is only one ratio."""
-    families: dict[str, dict[str, float]] = {}  # ratios by label
-    for label in study.seeded:
-        if ratio := study.variants[label].ratio:
-            families.setdefault(study.family(label), {})[label] = ratio
-    ratios = sorted({ratio for each in families.values() for ratio in each.values()})
-    if len(ratios) < 2:
-        return None
-    styles = {f: _style(study, next(iter(each)), mark=False) for f, each in families.items()}
-    figure, panels = _new_figure(3.6, 2.9, len(study.strategies))
-    for strategy, axes in zip(study.strategies, panels, strict=True):
-        on_these = gains(study, strategy).on_these
-        for family, each in families.items():
-            known = {label: on_these[label] for label in each if label in on_these}
-            means = [gain.mean for gain in known.values()]
-            axes.plot([each[label] for label in known], means, **styles[family])
-            for label, gain in known.items():
-                style = _style(study, label, line=False)
-                axes.errorbar(each[label], gain.mean, yerr=_interval(gain), **style)
-        axes.set_xscale("log", base=2)
-        axes.set_xticks(ratios, [f"{ratio:g}x" for ratio in ratios])
-        axes.set_xticks([], minor=True)
-        axes.axhline(0.0, color=_BLACK, linewidth=1)
-        axes.set_title(f"strategy {strategy}")
-        axes.set_xlabel("points, per original")
-        axes.set_ylabel("gain over sfm, dB")
-        axes.grid(visible=True, alpha=0.25)
-    caption = (
-        "Mean gain over sfm (dB) on these scenes by ratio, with 95% interval of training again."
-    )
-    return _plot("gain_by_ratio", caption, figure, styles)
 
 
 def arm_figure(study: Study) -> Plot | None:

@@ -17,6 +17,7 @@ import pandas as pd
 from scipy.stats import rankdata, spearmanr
 
 from splatseed.bench.comparisons import Gains
+from splatseed.bench.plan import SFM
 from splatseed.bench.statistics import LEVEL, holm
 from splatseed.bench.study import Study
 from splatseed.bench.tables import Number, Table, make_table
@@ -190,11 +191,11 @@ def winner_table(gained: Gains, described: Mapping[str, Descriptors]) -> Table:
     """Which method won on each scene, beside what kind of scene it is."""
     rows = []
     for scene in gained.scenes:
-        best = gained.best(scene)
-        gain = gained.on_scene[scene, best] if best else None
+        best = gained.top(scene)
+        gain = gained.on_scene[scene, best]
         kind = [Number(described.get(scene, {}).get(name, math.nan), 3) for name in DESCRIPTIONS]
-        won = Number(gain.mean, 3, gain.se, signed=True) if gain else ""
-        sure = gain.verdict.replace("unknown", "1 run") if gain else ""
-        rows.append((scene, best or "sfm", won, sure, *kind))
+        won = Number(gain.mean, 3, gain.se, signed=True)
+        told = (best, won, gain.verdict.replace("unknown", "1 run"))
+        rows.append((scene, *(told if gain.mean > 0 else (SFM, "", "")), *kind))
     header = ("scene", "best", "gain over sfm, dB", "verdict", *DESCRIPTIONS)
     return make_table("winners", header, rows, strategy=gained.strategy)

@@ -150,7 +150,7 @@ def compared_views(study: Study, strategy: StrategyName, bench: Path) -> Iterato
     most = 2 if len(study.strategies) == 1 else 1
     specs = part.set_index(["scene", "seeds", "repeat"])["spec"].to_dict()
     for scene in gained.scenes:
-        best = gained.top(scene) or SFM
+        best = gained.top(scene)
         for repeat in sorted(part["repeat"].unique()):
             both = [specs.get((scene, label, repeat)) for label in (SFM, best)]
             folders = [run_folder(bench, spec) / "renders" for spec in both if spec is not None]

@@ -14,39 +14,29 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from importlib.resources import files
 from pathlib import Path
-from statistics import fmean
 from typing import Any, TypeAlias
 
 import jinja2
 
 from splatseed.bench import figures, pictures, study_tables
-from splatseed.bench.comparisons import (
-    ArmKey,
-    ComparedArm,
-    Gains,
-    baseline_of,
-    compared_arms,
-    gains,
-    paired_runs,
-    speeds,
-)
+from splatseed.bench.comparisons import ArmKey, ComparedArm, baseline_of, compared_arms, gains
 from splatseed.bench.guidelines import guideline_table, guidelines, winner_table
 from splatseed.bench.plan import SFM
 from splatseed.bench.plan_file import PLAN
 from splatseed.bench.runs import Run, counts, read_calls, read_runs
-from splatseed.bench.statistics import LEVEL, Difference
 from splatseed.bench.study import Study, studies
 from splatseed.bench.tables import Table, to_html, write_table
 from splatseed.io.files import read_text
 from splatseed.io.staging import atomic_file, output_folder
 from splatseed.literal import counted
 from splatseed.progress import Progress, silent
-from splatseed.train.settings import StrategyName
 
 REPORT, TABLES = "report.html", "tables"
 _KIND = "bench report"
 _SHOWN = 0.005
 """The least gain in dB that does not read 0.00."""
+_EQUAL = 0.01
+"""Numbers of Gaussians that differ by no more than this share count as equal."""
 _LISTED = 200
 """Runs listed in a table; of a large plan that has just begun, nearly all are missing."""
 _DOUBTS = {
@@ -77,7 +67,16 @@ def write_report(bench: Path, progress: Progress = silent) -> Report:
     """
     runs = read_runs(bench)
     found, page, notes = studies(runs), _Page(), dict[str, None]()
-    page.add("summary", "Summary", *_summary_parts(found))
+    said, summary, several = list[str](), list[Part](), len(found) > 1
+    for number, study in enumerate(found, start=1):
+        answers, name = answer(study), f"Set {number}" if several else "All runs"
+        of = f"{name}: {study.description}."
+        said += [of, *answers] if several else answers
+        summary += [{"kind": "answer", "texts": answers}, _text(of, mark="note")]
+    if several:
+        apart = "Runs of different settings or versions are never compared: they are in sets."
+        summary.insert(0, _text(apart, mark="note"))
+    page.add("summary", "Summary", *summary)
     for number, study in enumerate(found, start=1):
         drawn = pictures.scene_pictures(bench, study, progress)
         progress("tables and figures", 0.0)
@@ -101,8 +100,7 @@ def write_report(bench: Path, progress: Progress = silent) -> Report:
         partial.write_text(page.html(runs), "utf-8", errors="backslashreplace")
     left = f"Not all runs are done, and the rest can change what is said: {counts(runs)}."
     told = [left] if any(run.result is None for run in runs) else []
-    said = tuple(_said(found)) or ("No run is done yet.",)
-    return Report(bench / REPORT, written, len(page.images), said, (*told, *notes))
+    return Report(bench / REPORT, written, len(page.images), tuple(said), (*told, *notes))
 
 
 @dataclass
@@ -156,20 +154,10 @@ class _Page:
         )
 
 
-def _said(found: Sequence[Study]) -> Iterator[str]:
-    """The answers of all studies, each behind what its runs have in common if there are more."""
-    for number, study in enumerate(found, start=1):
-        if len(found) > 1:
-            yield f"Set {number}: {study.description}."
-        yield from answer_at_equal_cost(study)
-        for strategy in study.strategies:
-            yield from summary(study, strategy)
-
-
 def unequal_numbers(study: Study) -> str | None:
     """A warning that the arms end with different numbers of Gaussians; None if they do not."""
     numbers = [each.means["gaussians"] for each in compared_arms(study)]
-    if not numbers or max(numbers) <= min(numbers) * (1 + study_tables.EQUAL):
+    if not numbers or max(numbers) <= min(numbers) * (1 + _EQUAL):
         return None
     hint = "" if study.settings["budget"] else ": --budgets bounds every arm alike"
     return (
@@ -178,12 +166,12 @@ def unequal_numbers(study: Study) -> str | None:
     )
 
 
-def answer_at_equal_cost(study: Study) -> tuple[str, ...]:
-    """The conclusions on the arms, for a reader who has not seen the tables."""
+def answer(study: Study) -> tuple[str, ...]:
+    """The conclusions on a study, for a reader who has not seen the tables."""
     base = baseline_of(study)
     others = [each for each in compared_arms(study) if each.arm != base]
     if base is None or not others:
-        return ()
+        return (f"Nothing can be compared yet: runs of {SFM} are missing, or all others.",)
     best = others[0]
     at = " under one budget of Gaussians" if study.settings["budget"] else ""
     at = at if unequal_numbers(study) else " with equal numbers of Gaussians"
@@ -196,7 +184,7 @@ def answer_at_equal_cost(study: Study) -> tuple[str, ...]:
     if rest:
         kind = "Of other seeds" if own else "Without new points"
         said.append(f"{kind}, {rest[0].arm.label} does best: {_against(rest[0], base)}.")
-    lead, sooner = best.gains["in_time"], best.gains["sooner"]
+    lead, sooner = best.gains["in_time"], best.gains["seconds"]
     if lead is not None:
         place = "ahead" if lead.mean >= 0 else "behind"
         said.append(
@@ -212,6 +200,14 @@ def answer_at_equal_cost(study: Study) -> tuple[str, ...]:
         )
     elif best.reached < best.runs:
         said.append(f"{best.reached} of its {best.runs} runs reach {base.label}'s final PSNR.")
+    for strategy in study.strategies:
+        verdicts = [each.verdict for each in gains(study, strategy).on_these.values()]
+        if verdicts and set(verdicts) != {"unknown"}:
+            said.append(
+                f"Beyond the noise of training again, {verdicts.count('better')} of "
+                f"{counted(len(verdicts), 'variant')} under {strategy} are better than {SFM}, and "
+                f"{verdicts.count('worse')} worse."
+            )
     return tuple(said)
 
 
@@ -224,162 +220,46 @@ def _against(each: ComparedArm, base: ArmKey) -> str:
     spread = "" if math.isnan(gain.se) else f" (± {gain.se:.2f} over {over})"
     doubt = _DOUBTS.get(gain.verdict, "")
     if gain.verdict == "within noise" and len(each.scenes) == 1:
-        # The noise of all variants together, which other sentences go by, may tell more.
+        # The noise of all variants together, which the last sentences go by, may tell more.
         doubt = f", which these two arms' {each.runs} repeats alone do not confirm"
     return f"{abs(gain.mean):.2f} dB{spread} {more} than {base.label}{doubt}"
-
-
-def summary(study: Study, strategy: StrategyName) -> tuple[str, ...]:
-    """The conclusions on a strategy, a sentence or two each."""
-    gained = gains(study, strategy)
-    if not gained.seeds:
-        return (f"Strategy {strategy}: nothing can be compared with {SFM} yet.",)
-    best = max(gained.seeds, key=lambda each: gained.on_these[each].mean)
-    told = (_answer(gained, best), _by_scene(gained, best), _elsewhere(gained.on_like[best]),
-            _cost(study, strategy, best))  # fmt: skip
-    return tuple(each for each in told if each)
-
-
-def _answer(gained: Gains, best: str) -> str:
-    lead = f"Strategy {gained.strategy}, {counted(len(gained.scenes), 'scene')}:"
-    top, of = gained.on_these[best], counted(len(gained.seeds), "variant")
-    spread = "" if math.isnan(top.se) else f", ± {top.se:.2f} by the repeats of all variants"
-    decibels = f"{top.mean:+.2f} dB{spread}"
-    if top.verdict == "unknown":
-        return (
-            f"{lead} with one run of each nothing is known of the noise, so no gain can be claimed."
-            f" The highest is that of {best}, {decibels}."
-        )
-    those = {kind: [each for each in gained.seeds if gained.on_these[each].verdict == kind]
-             for kind in ("better", "worse")}  # fmt: skip
-    worse = " and ".join(filter(None, [", ".join(those["worse"][:-1]), *those["worse"][-1:]]))
-    loses = f" Beyond noise, {worse} lose{'s' * (len(those['worse']) == 1)}." if worse else ""
-    if those["better"]:
-        gain = f"yes, {len(those['better'])} of {of} gain more than noise"
-        return f"{lead} {gain}, {best} most ({decibels}).{loses}"
-    return (
-        f"{lead} no gain beyond noise was found among {of}; the highest is that of {best}, "
-        f"{decibels}.{loses}"
-    )
-
-
-def _by_scene(gained: Gains, best: str) -> str:
-    known = [each.verdict for (_, of), each in gained.on_scene.items() if of == best]
-    if len(known) < 2 or set(known) == {"unknown"}:
-        return ""
-    return (
-        f"On single scenes {best} is better on {known.count('better')}, worse on "
-        f"{known.count('worse')} and within noise on {known.count('within noise')} of {len(known)}."
-    )
-
-
-def _elsewhere(like: Difference) -> str:
-    if like.verdict == "unknown":
-        return "One scene says nothing about others."
-    low, high = like.interval()
-    span = f"95% interval {low:+.2f} to {high:+.2f} dB"
-    if like.verdict == "within noise":
-        return f"For scenes like these it is not shown to gain: {span} before adjusting."
-    gain = "a gain" if like.mean > 0 else "a loss"
-    return f"For scenes like these {gain} is shown too: {span}."
-
-
-def _cost(study: Study, strategy: StrategyName, best: str) -> str:
-    """What the best variant costs beside the baseline, and how soon it is as good."""
-    part = study.under(strategy)
-    pairs = paired_runs(study, part[part["seeds"] == best], strategy)
-
-    def times(name: str) -> float:
-        """Geometric mean over pairs of runs of how many times the baseline's measure it is."""
-        both = zip(pairs[name], pairs[f"{name}_base"], strict=True)
-        return math.exp(fmean(math.log(max(a, 1e-9) / max(b, 1e-9)) for a, b in both))
-
-    text = (
-        f"{best} costs {pairs['seeding'].mean():.1f} s of upsampling per scene, trains "
-        f"{times('training'):.2f} times as long as {SFM} and ends with {times('gaussians'):.2f} "
-        "times as many Gaussians."
-    )
-    known = speeds(study, strategy)
-    if best not in known.index:
-        return text
-    speed = known.loc[best]
-    if speed.log_steps is None or speed.log_seconds is None:
-        return f"{text} {speed.reached} of {speed.pairs} runs reach {SFM}'s final PSNR."
-    both = {"steps": speed.log_steps, "seconds": speed.log_seconds}
-    if not any(each.p <= LEVEL for each in both.values()):  # a single pair's NaN counts as unsure
-        return f"{text} Whether it reaches {SFM}'s final PSNR sooner cannot be told from noise."
-    share = " and ".join(
-        f"{math.exp(each.mean):.0%} of the {unit}" + ("" if each.p <= LEVEL else " (may be chance)")
-        for unit, each in both.items()
-    )
-    return f"{text} To reach {SFM}'s final PSNR it takes {share} that {SFM} takes."
 
 
 def _study_sections(
     study: Study, drawn: pictures.ScenePictures, bench: Path
 ) -> Iterator[tuple[str, str, Sequence[Part]]]:
     """A study's sections: key, title and parts. The page shows exactly what is written to files."""
-    each, tables = study.strategies, study_tables
-    base = baseline_of(study)
-    if base is not None and len(compared_arms(study)) > 1:
+    base, each, tables = baseline_of(study), study.strategies, study_tables
+    if base is not None:
         title = "At equal cost" if study.settings["budget"] else "All arms"
         yield "cost", title, [
             unequal_numbers(study), tables.arm_table(study), figures.arm_figure(study),
             tables.scene_arm_table(study, base), figures.seconds_figure(study),
             tables.seconds_table(study, base),
         ]  # fmt: skip
-    scores: list[Part] = []
-    for s in each:
-        scores += [*tables.psnr_tables(study, s), tables.quality_table(study, s)]
-    yield "scores", "Scores", scores
+    yield "scores", "Scores", [table for s in each for table in tables.psnr_tables(study, s)]
     gained: list[Part] = []
-    for s in each if study.seeded else ():
-        gained += [tables.gain_table(study, s), figures.scene_figure(study, s)]
-    nothing = "There is nothing to compare with yet: runs of sfm are missing, or all others."
-    yield "gains", "Gains", [
-        *gained, tables.mean_gain_table(study), figures.ratio_figure(study),
-        tables.strategy_table(study), tables.equal_count_table(study),
-    ] if gained else [nothing]  # fmt: skip
-    for s in each:
-        yield f"convergence_{s}", f"Convergence, strategy {s}", [
-            figures.curve_figure(study, s, "steps"), figures.curve_figure(study, s, "seconds"),
-            tables.convergence_table(study, s) if study.seeded_under(s) else None,
-        ]  # fmt: skip
-    yield "resources", "Time and memory", [tables.cost_table(study, s) for s in each]
-    yield "pictures", "Pictures", [
-        *(_figure(pictures.cloud_jpeg(png), f"{scene}: what training begins with.", "image/jpeg")
-          for scene, (_, png) in drawn.clouds.items()),
-        *(_folded(f"Test views, strategy {s}",
-                  [_views(view) for view in pictures.compared_views(study, s, bench)],
-                  is_open=i == 0) for i, s in enumerate(each)),
-        _text(*drawn.notes, mark="note"),
-    ]  # fmt: skip
     guided: list[Part] = []
-    for s in each if study.seeded else ():
+    for s in each:
         known = gains(study, s)
-        derived = guidelines(study, known, drawn.described)
-        guided += [winner_table(known, drawn.described), guideline_table(derived, s)]
-        guided.append(tables.advice_table(study, s) if study.settings["budget"] else None)
+        if known.seeds:
+            gained += [tables.gain_table(study, s), figures.scene_figure(study, s)]
+            derived = guidelines(study, known, drawn.described)
+            guided += [winner_table(known, drawn.described), guideline_table(derived, s)]
+            guided.append(tables.advice_table(study, s) if study.settings["budget"] else None)
+    yield "gains", "Gains", [*gained, tables.mean_gain_table(study)] if gained else []
+    yield "curves", "Curves", [figures.curve_figure(study, s) for s in each]
+    yield "resources", "Time and memory", [tables.cost_table(study, s) for s in each]
+    seen: list[Part] = [
+        _figure(pictures.cloud_jpeg(png), f"{scene}: what training begins with.", "image/jpeg")
+        for scene, (_, png) in drawn.clouds.items()
+    ]
+    for s in each:
+        views = [_views(view) for view in pictures.compared_views(study, s, bench)]
+        folded = {"title": f"Test views, strategy {s}", "parts": views, "open": s == each[0]}
+        seen.append({"kind": "folded", **folded} if views else None)
+    yield "pictures", "Pictures", [*seen, _text(*drawn.notes, mark="note")]
     yield "guidelines", "Guidelines", guided
-
-
-def _summary_parts(found: Sequence[Study]) -> Iterator[Part]:
-    """The answer, set by set where runs differ in more than what is compared."""
-    if not found:
-        yield _answer_block(["No run is done yet."])
-    if len(found) > 1:
-        said = "Runs of different settings or versions are never compared: they are in sets."
-        yield _text(said, mark="note")
-    for number, study in enumerate(found, start=1):
-        name = f"Set {number}" if len(found) > 1 else "All runs"
-        of_all = answer_at_equal_cost(study)
-        yield _answer_block(of_all)
-        yield _text(f"{name}: {study.description}.", mark="note")
-        by_strategy = [_answer_block(summary(study, each)) for each in study.strategies]
-        if of_all:
-            yield _folded("Strategy by strategy", by_strategy, is_open=False)
-        else:
-            yield from by_strategy
 
 
 def _run_parts(runs: Sequence[Run], found: Sequence[Study]) -> Iterator[Part]:
@@ -428,14 +308,6 @@ def _setup_parts(bench: Path, runs: Sequence[Run]) -> Iterator[Part]:
 def _text(*texts: str, mark: str = "") -> Part:
     """Paragraphs, of a class in the style sheet."""
     return {"kind": "text", "texts": texts, "mark": mark} if texts else None
-
-
-def _answer_block(sentences: Sequence[str]) -> Part:
-    return {"kind": "answer", "texts": sentences} if sentences else None
-
-
-def _folded(title: str, parts: Sequence[Part], *, is_open: bool) -> Part:
-    return {"kind": "folded", "title": title, "parts": parts, "open": is_open} if parts else None
 
 
 def _figure(content: bytes, caption: str, kind: str = "image/png") -> Part:

@@ -1,4 +1,4 @@
-"""The tables of a study: scores, gains, costs, convergence, arms at equal cost; and of comparisons.
+"""The tables of a study: scores, gains, costs, arms at equal cost, advice; and of comparisons.
 
 Means are over runs within a scene first, then over scenes; the paper's numbers have rows or columns
 of their own where a scene's name is one of its scenes; nothing is best that could be noise.
@@ -7,39 +7,37 @@ of their own where a scene's name is one of its scenes; nothing is best that cou
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from statistics import fmean
 
 import pandas as pd
 from scipy.stats import sem
 
-from splatseed.bench.comparisons import (
-    DATASETS,
-    ArmKey,
-    Comparison,
-    baseline_of,
-    clear_best,
-    compared_arms,
-    dataset_of,
-    gains,
-    paper_costs,
-    paper_gains,
-    paper_psnr,
-    score_advice,
-    speeds,
-)
+from splatseed.bench import comparisons
+from splatseed.bench.comparisons import DATASETS, PAPER_TABLES, ArmKey, compared_arms, gains
 from splatseed.bench.plan import SFM
 from splatseed.bench.statistics import Difference
-from splatseed.bench.study import Study, budget_words
+from splatseed.bench.study import Study
 from splatseed.bench.tables import Cell, Number, Table, make_table
 from splatseed.train.settings import StrategyName
 
 NOISE, CLEAR, ONE_RUN = "~", "†", "(1 run)"
-EQUAL = 0.01
-"""Numbers of Gaussians that differ by no more than this share count as equal."""
 _FEWEST = 3
 """Scenes from which on advice is scored."""
 _PAPER_STEPS = 30_000
+_COSTS = {
+    "num_seeds": ("seeds", 0), "seeding": ("upsampling, s", 2), "training": ("training, s", 1),
+    "memory": ("peak memory, MB", 0), "gpu_memory": ("peak GPU memory, MB", 0),
+    "gaussians": ("Gaussians", 0), "model": ("model, MB", 1), "render": ("render a view, ms", 1),
+}  # fmt: skip
+"""Heading and digits by measure."""
+_ARM_COLUMNS = {
+    "psnr": ("PSNR, dB", "gain, dB", 2, 3), "covisible": ("co-visible, dB", "its gain, dB", 2, 3),
+    "ssim": ("SSIM", "its gain", 4, 4), "lpips": ("LPIPS", "its gain", 4, 4),
+}  # fmt: skip
+"""Headings of a score and its gain, and the digits of both."""
+
+Rows = list[tuple[Cell, ...]]
 
 
 def _gain_cell(gain: Difference | None, digits: int = 3) -> Cell:
@@ -51,22 +49,21 @@ def _gain_cell(gain: Difference | None, digits: int = 3) -> Cell:
     return Number(gain.mean, digits, gain.se, signed=True, mark=mark, text=text)
 
 
-def _ratio_cell(log: Difference | None, *, alone: str = "") -> Cell:
+def _ratio_cell(log: Difference | None) -> Cell:
     if log is None:
         return ""
-    mark = NOISE if log.verdict == "within noise" else ""
-    return Number(math.exp(log.mean), mark=mark, text=alone if math.isnan(log.se) else "")
-
-
-Rows = list[tuple[Cell, ...]]
+    return Number(math.exp(log.mean), mark=NOISE if log.verdict == "within noise" else "")
 
 
 def psnr_tables(study: Study, strategy: StrategyName) -> list[Table]:
     """PSNR by scene and variant: a table per dataset of the paper, and one for other scenes."""
-    by_dataset: dict[str, list[str]] = {key: [] for key in (*DATASETS, "")}
-    for scene in study.scenes_under(strategy):
-        by_dataset[dataset_of(scene)].append(scene)
-    return [_psnr_table(study, strategy, key, s) for key, s in by_dataset.items() if s]
+    left, tables = study.scenes_under(strategy), []
+    for key in (*DATASETS, ""):
+        scenes = [each for each in left if not key or each in comparisons.paper_psnr(key).index]
+        left = tuple(each for each in left if each not in scenes)
+        if scenes:
+            tables.append(_psnr_table(study, strategy, key, scenes))
+    return tables
 
 
 def _psnr_table(study: Study, strategy: StrategyName, key: str, scenes: Sequence[str]) -> Table:
@@ -74,7 +71,7 @@ def _psnr_table(study: Study, strategy: StrategyName, key: str, scenes: Sequence
     for scene in scenes:
         rows.append(_psnr_row(study, strategy, scene, columns))
         if key:
-            printed = paper_psnr(key).loc[scene].reindex(_entries(study, columns))
+            printed = comparisons.paper_psnr(key).loc[scene].reindex(_entries(study, columns))
             rows.append((f"{scene} (paper)", *map(Number, printed)))
     steps, printed_note = study.settings["max_steps"], ""
     if key:
@@ -86,8 +83,8 @@ def _psnr_table(study: Study, strategy: StrategyName, key: str, scenes: Sequence
             printed_note += f" Ours are of {steps:,} steps: compare gains, not levels."
     return make_table(
         "table_scenes", ("scene", *columns), rows, strategy=strategy, printed=printed_note,
-        name={"mipnerf360": "table1", "replica": "table2"}.get(key, ""),
-        dataset=DATASETS.get(key, "other scenes"), description=study.description,
+        name=PAPER_TABLES.get(key, ""), dataset=DATASETS.get(key, "other scenes"),
+        description=study.description,
     )  # fmt: skip
 
 
@@ -102,7 +99,7 @@ def _psnr_row(
 ) -> tuple[Cell, ...]:
     gained = gains(study, strategy)
     verdicts = {v: each.verdict for v in labels if (each := gained.on_scene.get((scene, v)))}
-    best, clear = gained.best(scene), clear_best(study, strategy, scene)
+    best, clear = gained.top(scene), comparisons.clear_best(study, strategy, scene)
 
     def cell(label: str) -> Cell:
         values = [run.psnr for run in study.results(strategy, scene, label).values()]
@@ -120,61 +117,29 @@ def _psnr_row(
     return scene, *map(cell, labels)
 
 
-Columns = Mapping[str, tuple[str, int]]
-"""Heading and digits by measure."""
-_QUALITY: Columns = {
-    "psnr": ("PSNR, dB", 2), "covisible": ("co-visible PSNR, dB", 2), "ssim": ("SSIM", 4),
-    "lpips": ("LPIPS", 4),
-}  # fmt: skip
-_COSTS: Columns = {
-    "num_seeds": ("seeds", 0), "seeding": ("upsampling, s", 2), "training": ("training, s", 1),
-    "memory": ("peak memory, MB", 0), "gpu_memory": ("peak GPU memory, MB", 0),
-    "gaussians": ("Gaussians", 0), "model": ("model, MB", 1), "render": ("render a view, ms", 1),
-}  # fmt: skip
-
-
-def quality_table(study: Study, strategy: StrategyName) -> Table:
-    """PSNR, co-visible PSNR, SSIM and, if measured, LPIPS by variant."""
-    header, rows = _mean_rows(study, strategy, _QUALITY)
-    scenes = _with_baseline(study, strategy).groupby("seeds")["scene"].nunique()
-    counted = [(*row, Number(scenes.get(row[0], 0), 0)) for row in rows]
-    words = {"strategy": strategy, "description": study.description}
-    return make_table("quality", (*header, "scenes"), counted, **words)
-
-
 def cost_table(study: Study, strategy: StrategyName) -> Table:
-    """Time, memory and size by variant, the paper's table 3 beside."""
-    header, rows = _mean_rows(study, strategy, _COSTS)
-    scenes = study.scenes_under(strategy)
+    """Time, memory and size by variant, over the scenes that sfm has too; the paper's beside."""
+    part = study.under(strategy)
+    part = part[part["scene"].isin(part.loc[part["seeds"] == SFM, "scene"])]
+    means = part.groupby(["seeds", "scene"])[list(_COSTS)].mean().groupby("seeds").mean()
+    means = means.reindex([SFM, *study.seeded_under(strategy)]).dropna(axis=1, how="all")
+    columns = {
+        heading: [Number(each, digits) for each in means[name]]
+        for name, (heading, digits) in _COSTS.items()
+        if name in means
+    }
+    labels, scenes = list(means.index), study.scenes_under(strategy)
     for key, title in DATASETS.items():
-        if set(scenes) & set(paper_psnr(key).index):
-            header += [f"paper, {what} ({title})" for what in ("training, s", "model, MB")]
-            entries = _entries(study, [str(row[0]) for row in rows])
-            printed = paper_costs(key).reindex(entries)[["train_time_s", "model_size_mb"]]
-            both = zip(rows, printed.itertuples(index=False), strict=True)
-            rows = [(*row, *(Number(each, 0) for each in costs)) for row, costs in both]
+        if set(scenes) & set(comparisons.paper_psnr(key).index):
+            printed = comparisons.paper_costs(key).reindex(_entries(study, labels))
+            for name, what in (("train_time_s", "training, s"), ("model_size_mb", "model, MB")):
+                columns[f"paper, {what} ({title})"] = [Number(each, 0) for each in printed[name]]
     devices = sorted({result.device for result in study.under(strategy)["result"]})
     return make_table(
-        "table3", header, rows, strategy=strategy, count=len(scenes), scenes=", ".join(scenes),
+        "table3", ("method", *columns), list(zip(labels, *columns.values(), strict=True)),
+        strategy=strategy, count=len(scenes), scenes=", ".join(scenes),
         devices=", ".join(devices), description=study.description,
     )  # fmt: skip
-
-
-def _with_baseline(study: Study, strategy: StrategyName) -> pd.DataFrame:
-    part = study.under(strategy)
-    return part[part["scene"].isin(part.loc[part["seeds"] == SFM, "scene"])]
-
-
-def _mean_rows(study: Study, strategy: StrategyName, columns: Columns) -> tuple[list[str], Rows]:
-    """Means over runs within a scene, then over scenes that sfm has too; of what is known."""
-    part = _with_baseline(study, strategy)
-    means = part.groupby(["seeds", "scene"])[list(columns)].mean().groupby("seeds").mean()
-    means = means.reindex([SFM, *study.seeded_under(strategy)]).dropna(axis=1, how="all")
-    rows: Rows = [
-        (str(label), *(Number(row[name], columns[name][1]) for name in means.columns))
-        for label, row in means.iterrows()
-    ]
-    return ["method", *(columns[name][0] for name in means.columns)], rows
 
 
 def gain_table(study: Study, strategy: StrategyName) -> Table:
@@ -188,7 +153,7 @@ def gain_table(study: Study, strategy: StrategyName) -> Table:
     if len(gained.scenes) > 1:
         rows.append(("mean, scenes like these", *map(_gain_cell, gained.on_like.values())))
     for key, title in DATASETS.items():
-        printed = paper_gains(key)
+        printed = comparisons.paper_gains(key)
         scenes = [scene for scene in gained.scenes if scene in printed.index]
         means = printed.loc[scenes].mean().reindex(_entries(study, gained.seeds))
         if means.notna().any():
@@ -206,7 +171,7 @@ def mean_gain_table(study: Study) -> Table:
         by_scene = {scene: gained.means(scene) for scene in gained.scenes}
         known[f"ours, {strategy}"] = pd.DataFrame.from_dict(by_scene, orient="index")
     for key, title in DATASETS.items():
-        printed = paper_gains(key)
+        printed = comparisons.paper_gains(key)
         labels = [f"{method} {ratio:g}x" for method, ratio in printed.columns]
         known[f"paper, {title}"] = printed.set_axis(labels, axis=1)
     rows = Rows()
@@ -225,66 +190,9 @@ def mean_gain_table(study: Study) -> Table:
     return make_table("mean_gains", header, rows)
 
 
-def strategy_table(study: Study) -> Table:
-    """Mean gain by variant, one column per strategy."""
-    gained = [gains(study, strategy).on_these for strategy in study.strategies]
-    rows = [(label, *(_gain_cell(each.get(label)) for each in gained)) for label in study.seeded]
-    header = ("method", *study.strategies)
-    return make_table("gain_by_strategy", header, rows, description=study.description)
-
-
-def equal_count_table(study: Study) -> Table:
-    """Gains of the variants whose runs end with as many Gaussians as the baseline's.
-
-    Counts are equal if they differ by at most 1% in every pair; this is checked, not assumed.
-    """
-    rows, none = Rows(), ""
-    for strategy in study.strategies:
-        gained = gains(study, strategy)
-        wide = study.under(strategy).pivot_table(
-            index=["scene", "repeat"], columns="seeds", values="gaussians"
-        )
-        for label in gained.seeds:
-            both = wide[[SFM, label]].dropna()
-            if ((both[label] - both[SFM]).abs() <= EQUAL * both[SFM]).all():
-                means = _gain_cell(gained.on_these[label]), _gain_cell(gained.on_like[label])
-                rows.append((strategy, label, Number(float(both[label].mean()), 0), *means))
-    if not rows:
-        cap, budget = study.settings["cap_max"], study.settings["budget"]
-        capped = f"a cap of {cap:,}" if cap else budget_words(str(budget)) if budget else "no cap"
-        none = (
-            f"None qualifies (strategies {', '.join(study.strategies)}, {capped}): gains may come "
-            "from the mere number of Gaussians. "
-        )
-    header = ("strategy", "method", "Gaussians", "gain, these scenes", "gain, scenes like these")
-    return make_table("equal_count", header, rows, none=none, description=study.description)
-
-
-def convergence_table(study: Study, strategy: StrategyName) -> Table:
-    """Steps and seconds to the baseline's last PSNR, by variant."""
-    rows = Rows()
-    for label, each in speeds(study, strategy).iterrows():
-        cells: list[Cell] = []
-        for kind, digits in (("steps", 0), ("seconds", 1)):
-            cells += [Number(each[kind], digits), Number(each[f"base_{kind}"], digits)]
-            cells.append(_ratio_cell(each[f"log_{kind}"], alone="(no spread)"))
-        rows.append((str(label), f"{each['reached']} of {each['pairs']}", *cells))
-    header = ("method", "reached", "steps", "sfm's steps", "steps ratio", "seconds",
-              "sfm's seconds", "seconds ratio")  # fmt: skip
-    words = {"strategy": strategy, "description": study.description}
-    return make_table("convergence", header, rows, **words)
-
-
-_ARM_COLUMNS = {
-    "psnr": ("PSNR, dB", "gain, dB", 2, 3), "covisible": ("co-visible, dB", "its gain, dB", 2, 3),
-    "ssim": ("SSIM", "its gain", 4, 4), "lpips": ("LPIPS", "its gain", 4, 4),
-}  # fmt: skip
-"""Headings of a score and its gain, and the digits of both."""
-
-
 def arm_table(study: Study) -> Table:
     """Every arm's scores, cost and gain over the baseline, the highest gain first."""
-    base, compared, rows = baseline_of(study), compared_arms(study), Rows()
+    base, compared, rows = comparisons.baseline_of(study), compared_arms(study), Rows()
     shown = {
         name: columns
         for name, columns in _ARM_COLUMNS.items()
@@ -304,16 +212,13 @@ def arm_table(study: Study) -> Table:
         f"({share:.0%} of them here). PSNR and SSIM are better when higher, LPIPS when lower. "
         "Seconds are wall time, of making the seeds and of training."
     )
-    header = [word for columns in shown.values() for word in columns[:2]]
+    header = ("seeds", "strategy", *(word for columns in shown.values() for word in columns[:2]),
+              "Gaussians", "seeding, s", "training, s", "scenes")  # fmt: skip
     return make_table(
-        "arms",
-        ("seeds", "strategy", *header, "Gaussians", "seeding, s", "training, s", "scenes"),
-        rows,
+        "arms", header, rows, base=base.label if base else "the baseline",
         budget=", under one budget of Gaussians" if study.settings["budget"] else "",
-        base=base.label if base else "the baseline",
-        scores="" if math.isnan(share) else scores,
-        description=study.description,
-    )
+        scores="" if math.isnan(share) else scores, description=study.description,
+    )  # fmt: skip
 
 
 def scene_arm_table(study: Study, base: ArmKey) -> Table:
@@ -337,7 +242,7 @@ def scene_arm_table(study: Study, base: ArmKey) -> Table:
 
 
 def seconds_table(study: Study, base: ArmKey) -> Table:
-    """Quality at the baseline's seconds, and seconds to the baseline's quality."""
+    """Quality at the baseline's seconds, and steps and seconds to the baseline's quality."""
     rows = [
         (
             each.arm.seeds,
@@ -345,18 +250,19 @@ def seconds_table(study: Study, base: ArmKey) -> Table:
             Number(each.means["seeding"] + each.means["training"], 1),
             _gain_cell(each.gains["in_time"]) if each.arm != base else "baseline",
             f"{each.reached} of {each.runs}",
-            _ratio_cell(each.gains["sooner"]),
+            _ratio_cell(each.gains["seconds"]),
+            _ratio_cell(each.gains["steps"]),
         )
         for each in compared_arms(study)
     ]
     header = ("seeds", "strategy", "seconds in all", f"gain at {base.label}'s seconds, dB",
-              f"runs that reach {base.label}'s PSNR", "time to it")  # fmt: skip
+              f"runs that reach {base.label}'s PSNR", "time to it", "steps to it")  # fmt: skip
     return make_table("seconds", header, rows, base=base.label)
 
 
 def advice_table(study: Study, strategy: StrategyName) -> Table | None:
     """The advice for each scene, and its worth; None for too few scenes."""
-    scores = score_advice(study, strategy)
+    scores = comparisons.score_advice(study, strategy)
     left_out = scores.index[scores["advice"].isna()]
     scores = scores.drop(left_out).dropna(axis=1, how="all")
     if len(scores) < _FEWEST:
@@ -381,7 +287,7 @@ def advice_table(study: Study, strategy: StrategyName) -> Table | None:
     )  # fmt: skip
 
 
-def comparison_tables(comparison: Comparison) -> tuple[Table, Table, Table]:
+def comparison_tables(comparison: comparisons.Comparison) -> tuple[Table, Table, Table]:
     """The settings of two benchmarks that differ, the changes, and what only one of them has."""
     scenes = sorted({scene for _, _, scene in comparison.changes})
     changes = [
