@@ -10,7 +10,6 @@ import math
 from collections.abc import Mapping
 from contextlib import suppress
 from itertools import count as count_from, permutations, product
-from statistics import fmean
 
 import numpy as np
 import pandas as pd
@@ -122,16 +121,14 @@ def guidelines(study: Study, gained: Gains, described: Mapping[str, Descriptors]
     ``rho`` over so many ``scenes``, its two-sided ``p``, the same after Holm (``adjusted``), how
     many scenes ``agree``, and the guideline as a ``sentence``.
     """
-    means = {scene: gained.means(scene) for scene in gained.scenes if scene in described}
-    methods: dict[str, dict[str, float]] = {}
-    for family in dict.fromkeys(map(study.family, gained.seeds)):
-        labels = [label for label in gained.seeds if study.family(label) == family]
-        known = {s: each for s, each in means.items() if all(v in each for v in labels)}
-        methods[family] = {s: fmean(each[v] for v in labels) for s, each in known.items()}
+    scenes = [scene for scene in gained.scenes if scene in described]
+    means = pd.DataFrame([gained.means(s) for s in scenes], columns=list(gained.seeds), dtype=float)
+    kinds = pd.DataFrame([described[s] for s in scenes], columns=list(DESCRIPTIONS), dtype=float)
     rows = []
-    for descriptor, (method, gains) in product(DESCRIPTIONS, methods.items()):
-        pairs = [(described[scene][descriptor], gain) for scene, gain in gains.items()]
-        x, y = np.array([pair for pair in pairs if not math.isnan(pair[0])]).reshape(-1, 2).T
+    for descriptor, method in product(DESCRIPTIONS, dict.fromkeys(map(study.family, means))):
+        labels = [label for label in means if study.family(label) == method]
+        both = np.stack([kinds[descriptor], means[labels].mean(axis=1, skipna=False)])
+        x, y = both[:, np.isfinite(both).all(axis=0)]
         if len(x) >= _FEWEST and len(set(x)) > 1 and len(set(y)) > 1:
             rho, p = rank_correlation(x, y)
             side = np.sign(x - np.median(x)) * np.sign(y - np.median(y))

@@ -173,13 +173,8 @@ def _pictures(base: Path, own: Path, best: str) -> tuple[dict[str, bytes], float
     if parts[0].shape != parts[1].shape:
         return None
     (photograph, base_render, base_error), (_, own_render, own_error) = parts
-    shown = {
-        SFM: base_render,
-        best: own_render,
-        "photograph": photograph,
-        f"error of {SFM}": base_error,
-        f"error of {best}": own_error,
-    }
+    shown = {SFM: base_render, best: own_render, "photograph": photograph,
+             f"error of {SFM}": base_error, f"error of {best}": own_error}  # fmt: skip
     height, width = photograph.shape[:2]
     return {label: _jpeg(pixels, _SIDE) for label, pixels in shown.items()}, width / height
 

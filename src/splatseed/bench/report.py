@@ -141,17 +141,10 @@ class _Page:
         page, style, script = (
             (data / f"report.{kind}").read_text("utf-8") for kind in ("html", "css", "js")
         )
-        return (
-            jinja2.Environment(autoescape=True, keep_trailing_newline=True)
-            .from_string(page)
-            .render(
-                title=f"Benchmark of {scenes}" if scenes else "Benchmark without runs",
-                subtitle=f"{question} {counts(runs)}.",
-                sections=self.sections,
-                style=style,
-                script=script,
-            )
-        )
+        template = jinja2.Environment(autoescape=True, keep_trailing_newline=True).from_string(page)
+        title = f"Benchmark of {scenes}" if scenes else "Benchmark without runs"
+        return template.render(title=title, subtitle=f"{question} {counts(runs)}.",
+                               sections=self.sections, style=style, script=script)  # fmt: skip
 
 
 def unequal_numbers(study: Study) -> str | None:

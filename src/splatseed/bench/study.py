@@ -91,21 +91,22 @@ class Study:
     @property
     def description(self) -> str:
         """The settings in words."""
-        told, factor = self.settings, self.settings["data_factor"]
-        size = (
-            ", ".join(f"{scene} {_size(each)}" for scene, each in factor.items())
-            if isinstance(factor, Mapping)
-            else f"photographs {_size(factor)}"
-        )
+        told, factors = self.settings, self.settings["data_factor"]
+        if not isinstance(factors, Mapping):
+            factors = {"photographs": factors}
+        sizes = {of: f"1/{each} of their" if each != 1 else "full" for of, each in factors.items()}
+        budget, is_share = str(told["budget"]), str(told["budget"]).endswith("rho")
+        share = f"{budget.removesuffix('rho')} Gaussians per pixel of a photograph"
+        most = share if is_share else f"{int(budget or 0):,} Gaussians"
         counts = self.runs.groupby(["strategy", "scene", "seeds"]).size()
         low, high = counts.min(), counts.max()
         repeats = f"{high}" if low == high else f"{low} to {high}"
         words = [
             f"{told['max_steps']:,} steps",
-            size,
+            *(f"{of} at {size} size" for of, size in sizes.items()),
             f"every {told['test_every']}th view tested",
             f"at most {told['cap_max']:,} Gaussians" if told["cap_max"] else "",
-            budget_words(str(told["budget"])) if told["budget"] else "",
+            f"at most {most}" if budget else "",
             f"spherical harmonics of degree {told['sh_degree']}" if told["sh_degree"] != 3 else "",
             "opacities reset" if told["opacity_reset"] else "",
             *(name.replace("_", " ") for name in SHARED if name.startswith("seed_") and told[name]),
@@ -113,23 +114,7 @@ class Study:
             f"splatseed {told['version']}" if told["version"] else "",
             f"{repeats} repeat{'' if high == 1 else 's'}" if len(counts) else "",
         ]
-        return ", ".join(word for word in words if word)
-
-
-def budget_words(budget: str) -> str:
-    """A budget in words.
-
-    Example:
-        >>> budget_words("0.25rho")
-        'at most 0.25 Gaussians per pixel of a photograph'
-    """
-    if budget.endswith("rho"):
-        return f"at most {budget.removesuffix('rho')} Gaussians per pixel of a photograph"
-    return f"at most {int(budget):,} Gaussians"
-
-
-def _size(factor: object) -> str:
-    return "at full size" if factor == 1 else f"at 1/{factor} of their size"
+        return ", ".join(filter(None, words))
 
 
 def variant_order(variant: tuple[str, Arm]) -> tuple[object, ...]:
@@ -188,16 +173,13 @@ def _study(settings: Mapping[str, object], runs: Sequence[Run]) -> Study:
         label = _label(spec, with_maps=several_maps)
         variants.setdefault(label, arm)
         factors[scene] = min(spec.training.data_factor, factors.get(scene, 10**9))
-        row: tuple[object, ...] = (arm.strategy, scene, label, spec.repeat, spec, result)
-        rows.append({**dict(zip(_COLUMNS, row, strict=True)), **_measures(result)})
-    same_size = len(set(factors.values())) == 1
-    factor = next(iter(factors.values())) if same_size else dict(sorted(factors.items()))
-    return Study(
-        {**settings, "data_factor": factor},
-        pd.DataFrame(rows, columns=None if rows else _COLUMNS),
-        dict(sorted(variants.items(), key=variant_order)),
-        tuple(odd),
-    )
+        told = (arm.strategy, scene, label, spec.repeat, spec, result)
+        rows.append(dict(zip(_COLUMNS, told, strict=True)) | _measures(result))
+    sizes = set(factors.values())
+    factor = sizes.pop() if len(sizes) == 1 else dict(sorted(factors.items()))
+    frame = pd.DataFrame(rows, columns=None if rows else _COLUMNS)
+    ordered = dict(sorted(variants.items(), key=variant_order))
+    return Study({**settings, "data_factor": factor}, frame, ordered, tuple(odd))
 
 
 def _measures(result: RunResult) -> dict[str, float]:

@@ -24,7 +24,6 @@ from splatseed.train.settings import StrategyName
 NOISE, CLEAR, ONE_RUN = "~", "†", "(1 run)"
 _FEWEST = 3
 """Scenes from which on advice is scored."""
-_PAPER_STEPS = 30_000
 _COSTS = {
     "num_seeds": ("seeds", 0), "seeding": ("upsampling, s", 2), "training": ("training, s", 1),
     "memory": ("peak memory, MB", 0), "gpu_memory": ("peak GPU memory, MB", 0),
@@ -73,18 +72,14 @@ def _psnr_table(study: Study, strategy: StrategyName, key: str, scenes: Sequence
         if key:
             printed = comparisons.paper_psnr(key).loc[scene].reindex(_entries(study, columns))
             rows.append((f"{scene} (paper)", *map(Number, printed)))
-    steps, printed_note = study.settings["max_steps"], ""
-    if key:
-        printed_note = (
-            "Rows '(paper)' are the numbers printed there: 30,000 steps, a quarter (outdoors) or "
-            "half (indoors) of the size of Mip-NeRF360's photographs."
-        )
-        if steps != _PAPER_STEPS:
-            printed_note += f" Ours are of {steps:,} steps: compare gains, not levels."
+    printed_note = (
+        "Rows '(paper)' are the numbers printed there: 30,000 steps, a quarter (outdoors) or half "
+        "(indoors) of the size of Mip-NeRF360's photographs. Compare gains, not levels."
+    )
     return make_table(
-        "table_scenes", ("scene", *columns), rows, strategy=strategy, printed=printed_note,
+        "table_scenes", ("scene", *columns), rows, strategy=strategy, description=study.description,
         name=PAPER_TABLES.get(key, ""), dataset=DATASETS.get(key, "other scenes"),
-        description=study.description,
+        printed=printed_note if key else "",
     )  # fmt: skip
 
 
@@ -159,8 +154,8 @@ def gain_table(study: Study, strategy: StrategyName) -> Table:
         if means.notna().any():
             name = f"paper, {len(scenes)} of {len(printed)} {title} scenes"
             rows.append((name, *(Number(mean, 3, signed=True) for mean in means)))
-    words = {"strategy": strategy, "description": study.description}
-    return make_table("gains", ("scene", *gained.seeds), rows, **words)
+    return make_table("gains", ("scene", *gained.seeds), rows, strategy=strategy,
+                      description=study.description)  # fmt: skip
 
 
 def mean_gain_table(study: Study) -> Table:
@@ -244,17 +239,13 @@ def scene_arm_table(study: Study, base: ArmKey) -> Table:
 def seconds_table(study: Study, base: ArmKey) -> Table:
     """Quality at the baseline's seconds, and steps and seconds to the baseline's quality."""
     rows = [
-        (
-            each.arm.seeds,
-            each.arm.strategy,
-            Number(each.means["seeding"] + each.means["training"], 1),
-            _gain_cell(each.gains["in_time"]) if each.arm != base else "baseline",
-            f"{each.reached} of {each.runs}",
-            _ratio_cell(each.gains["seconds"]),
-            _ratio_cell(each.gains["steps"]),
-        )
+        (each.arm.seeds, each.arm.strategy,
+         Number(each.means["seeding"] + each.means["training"], 1),
+         _gain_cell(each.gains["in_time"]) if each.arm != base else "baseline",
+         f"{each.reached} of {each.runs}",
+         *(_ratio_cell(each.gains[name]) for name in ("seconds", "steps")))
         for each in compared_arms(study)
-    ]
+    ]  # fmt: skip
     header = ("seeds", "strategy", "seconds in all", f"gain at {base.label}'s seconds, dB",
               f"runs that reach {base.label}'s PSNR", "time to it", "steps to it")  # fmt: skip
     return make_table("seconds", header, rows, base=base.label)
@@ -295,11 +286,10 @@ def comparison_tables(comparison: comparisons.Comparison) -> tuple[Table, Table,
          _change_cell(mean))
         for arm, mean in comparison.means.items()
     ]  # fmt: skip
-    return (
-        make_table("settings", ("setting", "A", "B"), comparison.settings),
-        make_table("changes", ("strategy", "method", *scenes, "mean"), changes),
-        make_table("only_one", ("in", "strategy", "scene", "method"), comparison.only),
-    )
+    settings = make_table("settings", ("setting", "A", "B"), comparison.settings)
+    changed = make_table("changes", ("strategy", "method", *scenes, "mean"), changes)
+    only = make_table("only_one", ("in", "strategy", "scene", "method"), comparison.only)
+    return settings, changed, only
 
 
 def _change_cell(change: Difference | None) -> Cell:
