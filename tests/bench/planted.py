@@ -19,26 +19,18 @@ GAINS = {(SFM, 1): 0.0, ("linear", 8): 0.3, ("mls", 4): 0.2, ("mls", 8): 0.5, ("
 NOISE = 0.02
 
 
-def result(psnr, *, steps=1000, points=10, num_gaussians=5000, early=0.0, **changes):
+def result(psnr, *, steps=1000, points=10, num_gaussians=5000, early=0.0, lpips=None, **changes):
     """A result whose curve rises to ``psnr`` in a straight line, ``early`` of the way sooner."""
     rise = [min(1.0, (i + 1) / points / (1 - early)) for i in range(points)]
     curve = tuple(
-        CurvePoint(
-            steps * (i + 1) // points, 2.0 * (i + 1), psnr - 10 + 10 * rise[i], num_gaussians
-        )
-        for i in range(points)
+        CurvePoint(steps * (i + 1) // points, 2.0 * (i + 1), psnr - 10 + 10 * part, num_gaussians)
+        for i, part in enumerate(rise)
     )
-    view = ViewScore("a.png", psnr, 0.8, changes.pop("lpips", None), 0.01, psnr + 0.5, 0.9)
-    values = {
-        "scores": EvalResult((view,), num_gaussians=num_gaussians, model_bytes=num_gaussians * 236),
-        "curve": curve,
-        "num_seeds": num_gaussians,
-        "upsample_seconds": 0.5,
-        "train_seconds": 20.0,
-        "peak_bytes": 5 * 10**8,
-        "device": "CPU",
-        "wall_seconds": 25.0,
-    }
+    view = ViewScore("a.png", psnr, 0.8, lpips, 0.01, psnr + 0.5, 0.9)
+    scores = EvalResult((view,), num_gaussians=num_gaussians, model_bytes=num_gaussians * 236)
+    values = {"scores": scores, "curve": curve, "num_seeds": num_gaussians, "device": "CPU",
+              "upsample_seconds": 0.5, "train_seconds": 20.0, "peak_bytes": 5 * 10**8,
+              "wall_seconds": 25.0}  # fmt: skip
     return RunResult(**{**values, **changes})
 
 
@@ -61,8 +53,7 @@ def spec(
 def runs(
     scenes=SCENES, gains=GAINS, strategies=("none",), repeats=3, noise=NOISE, seed=0, **changes
 ):
-    """All runs of a plan, done; every scene has its level, every repeat its own, every run
-    noise."""
+    """All runs of a plan, done; scenes and repeats have levels of their own, runs have noise."""
     rng = np.random.default_rng(seed)
     finished = []
     for strategy in strategies:
@@ -71,8 +62,8 @@ def runs(
             for (method, ratio), gain in gains.items():
                 for repeat in range(repeats):
                     psnr = level[repeat] + gain + noise * rng.standard_normal()
-                    count = 5000 if strategy == "mcmc" else int(5000 * math.sqrt(ratio))
-                    made = result(float(psnr), num_gaussians=count, early=0.1 if gain > 0 else 0.0)
+                    count, early = int(5000 * math.sqrt(ratio)), 0.1 if gain > 0 else 0.0
+                    made = result(float(psnr), num_gaussians=count, early=early)
                     told = {"strategy": strategy, "repeat": repeat, **changes}
                     finished.append(Run(spec(scene, method, ratio, **told), made))
     return finished
