@@ -191,27 +191,20 @@ def compared_arms(study: Study) -> tuple[ComparedArm, ...]:
     pairs[[f"{name}_gain" for name in _TIMED]] = [_timed(*each) for each in both]
     for name in SCORES:
         pairs[f"{name}_gain"] = pairs[name] - pairs[f"{name}_base"]
-    by_arm = {
-        ArmKey(strategy, label): part
-        for (strategy, label), part in pairs.groupby(["strategy", "seeds"], sort=False)
-    }
+    groups = pairs.groupby(["strategy", "seeds"], sort=False)
+    by_arm = {ArmKey(strategy, label): part for (strategy, label), part in groups}
     gained = {}
     for name in (*SCORES, *_TIMED):
         known = {arm: _over_scenes(part, f"{name}_gain") for arm, part in by_arm.items()}
         own = known.pop(base)  # no comparison
         gained[name] = {base: own, **_adjusted(known)}
     columns = [*SCORES, "gaussians", "seeding", "training"]
-    compared = [
-        ComparedArm(
-            arm,
-            scenes=tuple(sorted(set(part["scene"]))),
-            runs=len(part),
-            means=dict(part.groupby("scene")[columns].mean().mean(skipna=False)),
-            gains={name: each.get(arm) for name, each in gained.items()},
-            reached=int(part["seconds_gain"].count()),
-        )
-        for arm, part in by_arm.items()
-    ]
+    compared = []
+    for arm, part in by_arm.items():
+        scenes, reached = tuple(sorted(set(part["scene"]))), int(part["seconds_gain"].count())
+        means = dict(part.groupby("scene")[columns].mean().mean(skipna=False))
+        of_arm = {name: each.get(arm) for name, each in gained.items()}
+        compared.append(ComparedArm(arm, scenes, len(part), means, of_arm, reached))
     return tuple(sorted(compared, key=lambda each: -each.gain.mean))
 
 

@@ -160,25 +160,22 @@ def gain_table(study: Study, strategy: StrategyName) -> Table:
 
 def mean_gain_table(study: Study) -> Table:
     """The three kinds of mean gain, ours by strategy and the paper's."""
-    known = {}
+    known, rows = {}, Rows()
     for strategy in study.strategies:
         gained = gains(study, strategy)
-        by_scene = {scene: gained.means(scene) for scene in gained.scenes}
-        known[f"ours, {strategy}"] = pd.DataFrame.from_dict(by_scene, orient="index")
+        known[f"ours, {strategy}"] = pd.DataFrame([gained.means(s) for s in gained.scenes])
     for key, title in DATASETS.items():
         printed = comparisons.paper_gains(key)
         labels = [f"{method} {ratio:g}x" for method, ratio in printed.columns]
         known[f"paper, {title}"] = printed.set_axis(labels, axis=1)
-    rows = Rows()
     for name, table in known.items():
         complete = table.dropna(axis=1)  # the variants that every scene has
         if not complete.empty:
             means = complete.mean()
-            best, unfair = str(means.idxmax()), complete.max(axis=1).mean()
-            whole = [Number(size, 0) for size in complete.shape]
-            over_all, over_best, over_each = (
-                Number(each, 3, signed=True) for each in (means.mean(), means[best], unfair)
-            )
+            best = str(means.idxmax())
+            kinds = means.mean(), means[best], complete.max(axis=1).mean()
+            over_all, over_best, over_each = (Number(each, 3, signed=True) for each in kinds)
+            whole = (Number(size, 0) for size in complete.shape)
             rows.append((name, over_all, over_best, best, over_each, *whole))
     header = ("", "all variants together", "best single variant", "which",
               "best of each scene (unfair)", "scenes", "variants")  # fmt: skip

@@ -9,7 +9,7 @@ import html
 import math
 import re
 import tomllib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
@@ -118,23 +118,19 @@ def _rounded(value: float, digits: int, *, signed: bool = False) -> str:
 
 
 def to_csv(table: Table) -> str:
-    """The table as CSV, numbers in full."""
-    columns = [part for i, name in enumerate(table.header)
-               for part in _csv_columns(name, [row[i] for row in table.rows])]  # fmt: skip
+    """The table as CSV: numbers in full, and columns for standard errors and marks, if any."""
+    columns: list[tuple[str, list[str]]] = []
+    for i, name in enumerate(table.header):
+        cells = [row[i] for row in table.rows]
+        numbers = [each if isinstance(each, Number) else Number(math.nan) for each in cells]
+        columns.append((name, [c if isinstance(c, str) else _full(c.value) for c in cells]))
+        if any(each.se is not None for each in numbers):
+            columns.append((f"{name} se", [_full(each.se) for each in numbers]))
+        marks = [" ".join(filter(None, ("best" * n.bold, n.mark, n.text))) for n in numbers]
+        if any(marks):
+            columns.append((f"{name} mark", marks))
     frame = pd.DataFrame(dict(enumerate(values for _, values in columns)))
     return str(frame.to_csv(index=False, header=[name for name, _ in columns], lineterminator="\n"))
-
-
-def _csv_columns(name: str, cells: Sequence[Cell]) -> Iterator[tuple[str, list[str]]]:
-    """A column, and where any cell has them one for standard errors and one for marks."""
-    numbers = [each if isinstance(each, Number) else Number(math.nan) for each in cells]
-    full = [_full(number.value) for number in numbers]
-    yield name, [c if isinstance(c, str) else n for c, n in zip(cells, full, strict=True)]
-    if any(each.se is not None for each in numbers):
-        yield f"{name} se", [_full(each.se) for each in numbers]
-    marks = [" ".join(filter(None, ("best" * each.bold, each.mark, each.text))) for each in numbers]
-    if any(marks):
-        yield f"{name} mark", marks
 
 
 def _full(value: float | None) -> str:
