@@ -56,13 +56,16 @@ def scene_pictures(bench: Path, study: Study, progress: Progress = silent) -> Sc
     """Descriptors and pictures of a study's scenes, kept or new."""
     pictures, kept = ScenePictures(), _kept_descriptors(bench)
     for scene in study.scenes:
-        specs = _seed_specs(study, scene)
-        any_run = study.runs.loc[study.runs["scene"] == scene, "spec"].iloc[0]
+        runs = study.runs[study.runs["scene"] == scene].sort_values("repeat", kind="stable")
+        first = runs.drop_duplicates("seeds").set_index("seeds")["spec"].to_dict()
+        shown = shown_seeds(study, [label for label in study.seeded if label in first])
+        specs: dict[str, RunSpec] = {label: first[label] for label in shown[:_MOST]}
+        any_run: RunSpec = runs["spec"].iloc[0]
         digest = any_run.scene.digest
         told = [digest, *((name, each.repeat, each.scene.depth_digest, each.version)
                           for name, each in specs.items())]  # fmt: skip
         key = hashlib.blake2b(json.dumps(told).encode(), digest_size=8).hexdigest()
-        name = f"clouds_{safe_name(scene)}_{key}"
+        name = re.sub(r"[^\w.-]+", "_", f"clouds_{scene}_{key}")  # a scene's can have slashes
         with suppress(OSError):
             pictures.clouds[scene] = name, read_file(bench / FIGURES / f"{name}.png")
         try:
@@ -93,15 +96,6 @@ def _kept_descriptors(bench: Path) -> dict[str, Descriptors]:
     return {}
 
 
-def _seed_specs(study: Study, scene: str) -> dict[str, RunSpec]:
-    """A run of each variant of a scene whose seeds to show: the one with the lowest repeat."""
-    runs = study.runs[(study.runs["scene"] == scene) & (study.runs["seeds"] != SFM)]
-    first = runs.sort_values("repeat", kind="stable").drop_duplicates("seeds")
-    specs = dict(zip(first["seeds"], first["spec"], strict=True))
-    shown = shown_seeds(study, [label for label in study.seeded if label in specs])
-    return {label: specs[label] for label in shown[:_MOST]}
-
-
 def _draw_seeds(
     scene: Scene, specs: Mapping[str, RunSpec], progress: Progress, bench: Path
 ) -> bytes:
@@ -109,16 +103,6 @@ def _draw_seeds(
     progress("draw points", 0.0)
     with tempfile.TemporaryDirectory() as folder:
         return preview_methods(scene, seeds, Path(folder) / "clouds.png").read_bytes()
-
-
-def safe_name(text: str) -> str:
-    """A name as a part of a file's: letters, digits, dots, hyphens and underscores.
-
-    Example:
-        >>> safe_name("my kitchen/(ab12)")
-        'my_kitchen_ab12_'
-    """
-    return re.sub(r"[^\w.-]+", "_", text)
 
 
 def cloud_jpeg(png: bytes) -> bytes:
