@@ -12,7 +12,6 @@ from base64 import b64encode
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from importlib.resources import files
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -137,14 +136,11 @@ class _Page:
     def html(self, runs: Sequence[Run]) -> str:
         scenes = ", ".join(dict.fromkeys(run.spec.scene.name for run in runs))
         question = "Does upsampling help on these scenes, by which method, at what cost?"
-        data = files("splatseed.bench") / "data"
-        page, style, script = (
-            (data / f"report.{kind}").read_text("utf-8") for kind in ("html", "css", "js")
-        )
-        template = jinja2.Environment(autoescape=True, keep_trailing_newline=True).from_string(page)
+        loader = jinja2.PackageLoader("splatseed.bench", "data")
+        page = jinja2.Environment(loader=loader, autoescape=True).get_template("report.html")
         title = f"Benchmark of {scenes}" if scenes else "Benchmark without runs"
-        return template.render(title=title, subtitle=f"{question} {counts(runs)}.",
-                               sections=self.sections, style=style, script=script)  # fmt: skip
+        told = f"{question} {counts(runs)}."
+        return page.render(title=title, subtitle=told, sections=self.sections) + "\n"
 
 
 def unequal_numbers(study: Study) -> str | None:

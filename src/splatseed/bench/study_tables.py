@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from statistics import fmean
 
 import pandas as pd
@@ -18,7 +19,7 @@ from splatseed.bench.comparisons import DATASETS, PAPER_TABLES, ArmKey, compared
 from splatseed.bench.plan import SFM
 from splatseed.bench.statistics import Difference
 from splatseed.bench.study import Study
-from splatseed.bench.tables import Cell, Number, Table, make_table
+from splatseed.bench.tables import Cell, Number, Row, Table, make_table
 from splatseed.train.settings import StrategyName
 
 NOISE, CLEAR, ONE_RUN = "~", "†", "(1 run)"
@@ -36,7 +37,7 @@ _ARM_COLUMNS = {
 }  # fmt: skip
 """Headings of a score and its gain, and the digits of both."""
 
-Rows = list[tuple[Cell, ...]]
+Rows = list[Row]
 
 
 def _gain_cell(gain: Difference | None, digits: int = 3) -> Cell:
@@ -76,11 +77,11 @@ def _psnr_table(study: Study, strategy: StrategyName, key: str, scenes: Sequence
         "Rows '(paper)' are the numbers printed there: 30,000 steps, a quarter (outdoors) or half "
         "(indoors) of the size of Mip-NeRF360's photographs. Compare gains, not levels."
     )
-    return make_table(
+    table = make_table(
         "table_scenes", ("scene", *columns), rows, strategy=strategy, description=study.description,
-        name=PAPER_TABLES.get(key, ""), dataset=DATASETS.get(key, "other scenes"),
-        printed=printed_note if key else "",
+        dataset=DATASETS.get(key, "other scenes"), printed=printed_note if key else "",
     )  # fmt: skip
+    return replace(table, name=f"{PAPER_TABLES[key]}_{strategy}") if key else table
 
 
 def _entries(study: Study, labels: Sequence[str]) -> list[tuple[str, float]]:
@@ -89,9 +90,7 @@ def _entries(study: Study, labels: Sequence[str]) -> list[tuple[str, float]]:
     return [(arm.method, arm.ratio) if arm else (SFM, 1.0) for arm in arms]
 
 
-def _psnr_row(
-    study: Study, strategy: StrategyName, scene: str, labels: Sequence[str]
-) -> tuple[Cell, ...]:
+def _psnr_row(study: Study, strategy: StrategyName, scene: str, labels: Sequence[str]) -> Row:
     gained = gains(study, strategy)
     verdicts = {v: each.verdict for v in labels if (each := gained.on_scene.get((scene, v)))}
     best, clear = gained.top(scene), comparisons.clear_best(study, strategy, scene)

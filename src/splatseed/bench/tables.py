@@ -43,8 +43,18 @@ class Number:
     mark: str = ""
     bold: bool = False
 
+    def __str__(self) -> str:
+        """Without the mark."""
+        if math.isnan(self.value):
+            return ""
+        shown = _rounded(self.value, self.digits, signed=self.signed)
+        if self.se is not None and not math.isnan(self.se):
+            shown += f" ± {_rounded(self.se, self.digits)}"
+        return f"{shown} {self.text}".strip()
+
 
 Cell: TypeAlias = Number | str
+Row: TypeAlias = tuple[Cell, ...]
 
 
 @dataclass(frozen=True)
@@ -54,7 +64,7 @@ class Table:
     name: str
     title: str
     header: Sequence[str]
-    rows: Sequence[tuple[Cell, ...]]
+    rows: Sequence[Row]
     notes: Sequence[str] = ()
 
     def shown(
@@ -63,7 +73,7 @@ class Table:
         """The cells as text, with templates for bold ones and for marks."""
 
         def text_of(cell: Cell) -> str:
-            text = escape(_cell_text(cell))
+            text = escape(str(cell))
             if isinstance(cell, str) or not text:
                 return text
             text = bold.format(text) if cell.bold else text
@@ -74,39 +84,21 @@ class Table:
 
 
 def make_table(
-    kind: str,
-    header: Sequence[str],
-    rows: Sequence[tuple[Cell, ...]],
-    *,
-    name: str = "",
-    strategy: str = "",
-    **words: object,
+    kind: str, header: Sequence[str], rows: Sequence[Row], *, strategy: str = "", **words: object
 ) -> Table:
-    """A table with its kind's title and notes, in which ``words`` take the place of braces.
+    """A table named by its kind and the strategy, if any, with its kind's title and notes.
 
-    Its name is the kind, unless it has another one, and the strategy, if any.
+    In these, ``words`` take the place of braces; what they leave empty is left out.
     """
-    spec = _texts()[kind]
-    texts = [spec["title"], *spec["notes"]]
+    texts = [_texts()[kind]["title"], *_texts()[kind]["notes"]]
     title, *notes = (text.format(strategy=strategy, **words) for text in texts)
-    full = "_".join(filter(None, (name or kind, strategy)))
-    return Table(full, title, header, rows, list(filter(None, notes)))
+    name = f"{kind}_{strategy}" if strategy else kind
+    return Table(name, title, header, rows, list(filter(None, notes)))
 
 
 @cache
 def _texts() -> dict[str, Any]:
     return tomllib.loads((files("splatseed.bench") / "data" / "tables.toml").read_text("utf-8"))
-
-
-def _cell_text(cell: Cell) -> str:
-    if isinstance(cell, str):
-        return cell
-    if math.isnan(cell.value):
-        return ""
-    shown = _rounded(cell.value, cell.digits, signed=cell.signed)
-    if cell.se is not None and not math.isnan(cell.se):
-        shown += f" ± {_rounded(cell.se, cell.digits)}"
-    return f"{shown} {cell.text}".strip()
 
 
 def _rounded(value: float, digits: int, *, signed: bool = False) -> str:
