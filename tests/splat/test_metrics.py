@@ -131,14 +131,6 @@ def test_lpips_with_the_published_weights_is_that_of_its_authors():
     assert metric(*pair) == pytest.approx(0.3332108, abs=1e-6)
 
 
-def test_absent_weights_are_named_with_where_to_get_and_put_them(tmp_path, monkeypatch):
-    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
-    with pytest.raises(SceneNotFoundError) as caught:
-        load_lpips()
-    for text in ("https://", LPIPS_FILE, f"{tmp_path}/checkpoints", "--lpips-weights"):
-        assert text in str(caught.value)
-
-
 @pytest.mark.parametrize("content", [{}, [torch.zeros(1)], b"", b"text", b"PK\x03\x04 cut"])
 def test_a_file_of_something_else_is_refused(content, tmp_path):
     path = tmp_path / "weights.pth"

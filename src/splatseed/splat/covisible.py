@@ -140,11 +140,7 @@ def _covisible(
 
 
 def write_covisible(path: Path, grids: Grids) -> None:
-    """Store cells for the next run.
-
-    Raises:
-        OutputError: The file cannot be written.
-    """
+    """Store cells for the next run."""
     names = np.array(list(grids), dtype=np.str_)
     arrays: dict[str, Any] = {f"cells_{i}": grid for i, grid in enumerate(grids.values())}
     path.parent.mkdir(parents=True, exist_ok=True)

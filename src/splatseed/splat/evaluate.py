@@ -196,11 +196,7 @@ def load_model(
 
 
 def evaluate_model(model: TrainedModel, **options: Any) -> EvalResult:
-    """Score a model on its test views, and count its Gaussians; options as of ``evaluate_views``.
-
-    Raises:
-        ParameterError: A render is not finite.
-    """
+    """Score a model on its test views and count its Gaussians; as of ``evaluate_views``."""
     result = evaluate_views(model.render, model.views, **options)
     return dataclasses.replace(
         result, num_gaussians=len(model.gaussians), model_bytes=model.gaussians.num_bytes

@@ -134,11 +134,7 @@ def _quats_to(normals: Float32[np.ndarray, "M 3"]) -> Float64[np.ndarray, "M 4"]
 
 
 def neighbor_distances(xyz: Float[np.ndarray, "N 3"]) -> Float64[np.ndarray, " N"]:
-    """Root mean square distance to the 3 nearest others as in 3DGS, bounded relative to the median.
-
-    Raises:
-        PointCloudError: Fewer than two distinct finite points.
-    """
+    """Root mean square distance to the 3 nearest as in 3DGS, bounded relative to the median."""
     from scipy.spatial import cKDTree  # noqa: PLC0415  (slow to import)
 
     squares = np.zeros(len(xyz))

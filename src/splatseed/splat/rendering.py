@@ -195,11 +195,7 @@ def write_render(
     photograph: UInt8[np.ndarray, "H W 3"],
     render: Float[Tensor, "H W 3"] | Float32[np.ndarray, "H W 3"],
 ) -> None:
-    """Write a PNG of photograph, render and error map in a row.
-
-    Raises:
-        OutputError: The file cannot be written.
-    """
+    """Write a PNG of photograph, render and error map in a row."""
     from PIL import Image  # noqa: PLC0415  (slow to import)
 
     pixels = render.cpu().numpy() if isinstance(render, Tensor) else render

@@ -70,13 +70,8 @@ def check_world(
 ) -> str:
     """Refuse a model, read from a path, that is not in the world of the scene's points.
 
-    With ``given``, the transform that the user named, it must be in that world.
-
-    Returns:
-        Why it is doubtful that it is, in a sentence; empty if it is not, or without points.
-
-    Raises:
-        SceneFormatError: It is in another world.
+    With ``given``, the transform that the user named, it must be in that world. Returns why it is
+    doubtful that it is, in a sentence; empty if it is not, or without points.
     """
     apart = _measure(scene, gaussians)
     if apart is None or (ratio := apart(given)) <= DOUBTFUL:

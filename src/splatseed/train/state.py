@@ -136,11 +136,7 @@ def save_checkpoint(path: Path, state: TrainState) -> None:
 def load_checkpoint(
     path: Path, strategy: Strategy, schedule: Schedule, device: torch.device
 ) -> TrainState:
-    """The state that ``save_checkpoint`` wrote, on a device; replaces that of a new strategy.
-
-    Raises:
-        SceneFormatError: The file is no checkpoint of this version.
-    """
+    """The state that ``save_checkpoint`` wrote, on a device; replaces that of a new strategy."""
     found = "another kind or version of file"
     try:
         with warnings.catch_warnings(action="ignore"):  # about what a foreign file might be

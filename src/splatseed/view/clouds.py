@@ -2,7 +2,8 @@
 
 Notation: cell (i, j) of a ``covered`` grid [rows, columns] starts at pixel (``cell i``, ``cell j``)
 and has ``cell`` px a side; the last row and column may reach beyond the photograph. Promise: files
-appear whole or not at all, else ``OutputError`` is raised; cells are coloured exactly.
+appear whole or not at all, else ``OutputError`` is raised; ``PointCloudError`` if a scene that is
+to be looked at has no finite points; cells are coloured exactly.
 """
 
 from __future__ import annotations
@@ -45,21 +46,13 @@ class CoveredView(NamedTuple):
 def preview_pair(
     scene: Scene, upsampled: PointCloud, path: Path | str, *, title: str = "upsampled"
 ) -> Path:
-    """Write a picture of the scene's points beside the upsampled ones, described by a title.
-
-    Raises:
-        PointCloudError: The scene has no finite points.
-    """
+    """Write a picture of the scene's points beside the upsampled ones, described by a title."""
     clouds = {"original": scene.points, title: upsampled}
     return page.write_grid(_cloud_tiles(clouds, choose_camera(scene), PAIR_SIDE), path, columns=2)
 
 
 def preview_methods(scene: Scene, clouds: Mapping[str, PointCloud], path: Path | str) -> Path:
-    """Write a grid: the photograph if there is one, the scene's points, and clouds by label.
-
-    Raises:
-        PointCloudError: The scene has no finite points.
-    """
+    """Write a grid: the photograph if there is one, the scene's points, and clouds by label."""
     clouds, side = {"original": scene.points, **clouds}, page.GRID_SIDE
     tiles = _photograph(scene, side, "photograph")
     return page.write_grid([*tiles, *_cloud_tiles(clouds, choose_camera(scene), side)], path)
@@ -87,11 +80,7 @@ def preview_errors(
 
 
 def preview_origins(scene: Scene, points: PointCloud, path: Path | str) -> Path:
-    """Write a page: the seeds in their own colours, and by origin over the photograph.
-
-    Raises:
-        PointCloudError: The scene has no finite points.
-    """
+    """Write a page: the seeds in their own colours, and by origin over the photograph."""
     camera = choose_camera(scene)
     scale = PAIR_SIDE / max(camera.width, camera.height)
     size = page.fitted(camera.width, camera.height, PAIR_SIDE)

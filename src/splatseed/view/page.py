@@ -1,8 +1,9 @@
 """Pages of labelled pictures, colours for numbers, and the photographs beside them.
 
 Notation: a picture is uint8 [H, W, 3]; a tile is a picture with its label; a page is tiles in rows.
-Promise: the same input gives the same bytes; files appear whole or not at all; unknown values are
-grey; an unreadable photograph is no error, as a scene without photographs still has much to show.
+Promise: the same input gives the same bytes; files appear whole, or ``OutputError`` is raised;
+unknown values are grey; an unreadable photograph is no error, as a scene without photographs still
+has much to show.
 """
 
 from __future__ import annotations
@@ -64,9 +65,6 @@ def write_grid(
 
     Without ``columns`` a row has three or four, whichever leaves fewer gaps; smaller pictures are
     centred. The footer, no wider than the page, is below all.
-
-    Raises:
-        OutputError: The file cannot be written.
     """
     if columns is None:
         columns = min(len(tiles), min((3, 4), key=lambda count: -len(tiles) % count))
