@@ -28,7 +28,7 @@ from splatseed.pointcloud import ATTRIBUTES, GENERATED, ORIGINAL, PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.runtime.memory import check_memory
 from splatseed.scene import Scene
-from splatseed.upsample.method import Need, NewPoints, Traits, Upsampler, traits_of
+from splatseed.upsample.method import Need, NewPoints, Traits, Upsampler, nothing_finite, traits_of
 
 __all__ = [
     "DEFAULT_RATIO",
@@ -216,11 +216,7 @@ def upsample(
     if num_new == 0 and len(originals) > 0:
         return originals
     if "points" in traits_of(chosen).needs and not originals.finite.any():
-        raise PointCloudError(
-            "at least one original point with finite coordinates",
-            found=f"{len(originals)} points, none of them finite and original",
-            fix="Check that the scene holds the point cloud you meant.",
-        )
+        raise nothing_finite(len(originals))
     new = NewPoints(*chosen(whole, num_new or 0, rng, progress))  # a plain tuple will do
     for sentence in new.notes:
         note(sentence)

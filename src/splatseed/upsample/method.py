@@ -17,7 +17,7 @@ from typing import Any, Literal, NamedTuple, Protocol, Union, runtime_checkable
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from splatseed.errors import ParameterError
+from splatseed.errors import ParameterError, PointCloudError
 from splatseed.progress import Progress
 from splatseed.scene import Scene
 
@@ -71,6 +71,15 @@ def traits_of(method: Upsampler) -> Traits:
     """The method's traits, or the default ones."""
     traits: Traits = getattr(method, "traits", Traits())
     return traits
+
+
+def nothing_finite(number: int) -> PointCloudError:
+    """What a cloud of so many points is refused with, if new points can begin from none of them."""
+    return PointCloudError(
+        "at least one original point with finite coordinates",
+        found=f"{number} points, none of them finite and original",
+        fix="Check that the scene holds the point cloud you meant.",
+    )
 
 
 def require(condition: bool, expected: str, found: object) -> None:

@@ -26,6 +26,7 @@ from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.progress import Progress, in_threads, silent
 from splatseed.runtime.memory import check_memory
 from splatseed.scene import Scene
+from splatseed.upsample.method import nothing_finite
 
 SPACING_NEIGHBORS = 6  # nearest points over which the spacing h is averaged
 OUTLIER_NEIGHBORS = 16  # neighbours that a point's spacing is compared with
@@ -91,9 +92,7 @@ class PreparedCloud:
     def neighbors(self, k: int) -> Neighbors:
         """The ``k`` nearest other rows of every row (all of them if there are fewer).
 
-        Raises:
-            PointCloudError: There is only one point, which has no neighbour.
-            ParameterError: They do not fit into memory.
+        A lone point is a ``PointCloudError``, too many for the memory a ``ParameterError``.
         """
         k = min(k, len(self) - 1)
         if k < 1:
@@ -131,24 +130,15 @@ def least_distance(farthest: float) -> float:
 def prepare(
     points: PointCloud, trusted: Bool[np.ndarray, " N"] | None = None, progress: Progress = silent
 ) -> PreparedCloud:
-    """Mask, de-duplicate, centre and sort the originals of a cloud.
+    """Mask, de-duplicate, centre and sort the originals of a cloud (``source`` 0).
 
-    Args:
-        points: The cloud; only points with ``source`` 0 take part.
-        trusted: Which of the N points may serve as bases; all when left out.
-        progress: Called with the stage "neighbours" during the neighbour query.
-
-    Raises:
-        PointCloudError: No finite original is left.
+    ``trusted`` tells which of the N points may serve as bases: all when left out. The query for
+    neighbours tells ``progress``. Raises a ``PointCloudError`` where no finite original is left.
     """
     originals = np.flatnonzero(points.source == ORIGINAL)
     keep_idx = originals[points.select(originals).distinct]
     if len(keep_idx) == 0:
-        raise PointCloudError(
-            "at least one original point with finite coordinates",
-            found=f"{len(points)} points, none of them finite and original",
-            fix="Check that the scene holds the point cloud you meant.",
-        )
+        raise nothing_finite(len(points))
     # In float64 about the centroid: UTM coordinates lose nothing.
     center = points.xyz[keep_idx].sum(axis=0, dtype=np.float64) / len(keep_idx)
     xyz = points.xyz[keep_idx].astype(np.float64) - center

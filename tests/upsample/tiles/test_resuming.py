@@ -16,7 +16,7 @@ import pytest
 from splatseed.errors import OutputError, ParameterError, PointCloudError
 from splatseed.pointcloud import PointCloud
 from splatseed.upsample import configure, upsample
-from splatseed.upsample.tiles import check_disk, check_tileable, making, plan_tiles
+from splatseed.upsample.tiles import check_disk, making, plan_tiles
 from splatseed.upsample.tiles.cutting import origin_of
 
 LINEAR = configure("linear")
@@ -151,10 +151,6 @@ def test_what_cannot_be_made_is_refused(tiles):
     tiles.path = tiles.path.with_name("other")
     with pytest.raises(PointCloudError, match="at least 3 distinct"):
         tiles(PointCloud(np.eye(3)[:2], nothing.rgb[:2]), "triangle", configure("triangle"))
-    for name, method in (("auto", configure("auto")), ("voronoi", configure("voronoi", "paper"))):
-        with pytest.raises(ParameterError, match=name):
-            check_tileable(name, method)
-    check_tileable("random", configure("random"))
 
 
 def test_too_little_memory_names_what_is_needed(tmp_path):

@@ -178,7 +178,7 @@ def run(arguments: list[str]) -> None:
         open_cloud(file)  # reads headers only: what is wrong is told before work begins
     source = find_source(options, methods)
     if source is not None:
-        run_tiled(options, methods, source, _provenance)
+        run_tiled(options, methods, source)
     else:
         _run_in_memory(options, methods)
 
@@ -266,7 +266,7 @@ def _run_in_memory(options: Options, methods: dict[str, Any]) -> None:
         layout = "colmap" if options.recenter else options.format
         report = write_scene(
             seeded, options.output, format=layout, overwrite=options.overwrite,
-            copy_images=options.copy_images, provenance=_provenance(options, method),
+            copy_images=options.copy_images, provenance=output.provenance(options, method),
         )  # fmt: skip
         if cloud is not None:
             cloud.write(options.output)
@@ -276,7 +276,8 @@ def _run_in_memory(options: Options, methods: dict[str, Any]) -> None:
         if options.preview:
             output.write_previews(options, scene, seeds, method, clock)
         seconds = clock.seconds()
-    output.summarise(options, scene, seeds, report, seconds, findings)
+    origins = output.origins_of(seeds, report.num_points)
+    output.summarise(options, scene, len(scene.points), origins, report, seconds, findings)
     for sentence in notes:
         print_note(sentence)
 
@@ -318,32 +319,3 @@ def _announce(
         f"-> {visible(options.output)} ({number}, seed {options.seed}){takes}",
         soft_wrap=True,
     )
-
-
-def _provenance(options: Options, method: Upsampler) -> dict[str, object]:
-    """How the output was made, for ``splatseed.json``."""
-
-    def full(path: Path | None) -> str | None:
-        return None if path is None else str(path.resolve())
-
-    cloud = {
-        "files": [full(path) for path in options.cloud_files],
-        "transform": full(options.cloud_transform),
-        "align": options.align,
-        "recenter": options.recenter,
-        "memory": options.memory_bytes,
-    }
-    return {
-        "command": "upsample",
-        "method": options.method,
-        "profile": options.profile,
-        "parameters": output.parameters_of(method),
-        "cloud": cloud if options.cloud_files else None,
-        "depth": full(options.depth_maps),
-        "ratio": options.ratio,
-        "num_points_asked": options.num_points,
-        "budget": options.budget,
-        "cover": options.cover_cell,
-        "verify": options.verify,
-        "seed": options.seed,
-    }

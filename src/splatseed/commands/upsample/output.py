@@ -45,6 +45,35 @@ def parameters_of(method: Upsampler) -> dict[str, object]:
     return {name: value for name, value in given.items() if name not in TOLD_ELSEWHERE}
 
 
+def provenance(options: Options, method: Upsampler) -> dict[str, object]:
+    """How the output was made, for ``splatseed.json``."""
+
+    def full(path: Path | None) -> str | None:
+        return None if path is None else str(path.resolve())
+
+    cloud = {
+        "files": [full(path) for path in options.cloud_files],
+        "transform": full(options.cloud_transform),
+        "align": options.align,
+        "recenter": options.recenter,
+        "memory": options.memory_bytes,
+    }
+    return {
+        "command": "upsample",
+        "method": options.method,
+        "profile": options.profile,
+        "parameters": parameters_of(method),
+        "cloud": cloud if options.cloud_files else None,
+        "depth": full(options.depth_maps),
+        "ratio": options.ratio,
+        "num_points_asked": options.num_points,
+        "budget": options.budget,
+        "cover": options.cover_cell,
+        "verify": options.verify,
+        "seed": options.seed,
+    }
+
+
 def method_words(name: str, method: Upsampler, profile: Profile) -> str:
     """A method with what the user changed about it.
 
@@ -135,24 +164,35 @@ def findings(scene: Scene, seeds: PointCloud, method: Upsampler) -> list[tuple[s
     return rows
 
 
+def origins_of(seeds: PointCloud, written: int) -> dict[str, int]:
+    """How many of the points have each origin, of those that were ``written``."""
+    if len(seeds) > written:
+        seeds = seeds.select(seeds.distinct)
+    codes, counts = np.unique(seeds.source, return_counts=True)
+    return dict(zip(map(origin_name, codes.tolist()), counts.tolist(), strict=True))
+
+
 def summarise(
     options: Options,
     scene: Scene,
-    seeds: PointCloud,
+    num_read: int,
+    origins: Mapping[str, int],
     report: WriteReport,
     seconds: Mapping[str, float],
     found: Sequence[tuple[str, str]],
 ) -> None:
     """Print the final table and the commands to run next."""
-    output = options.output
-    written = seeds if len(seeds) == report.num_points else seeds.select(seeds.distinct)
-    codes, counts = np.unique(written.source, return_counts=True)
-    origins = zip(counts, map(origin_name, codes.tolist()), strict=True)
-    made = ", ".join(f"{count:,} {name}" for count, name in origins)
+    output, left_out = options.output, []
+    if report.dropped_nonfinite + report.dropped_duplicates:
+        left_out += [f"{report.dropped_nonfinite:,} not finite"]
+        left_out += [f"{report.dropped_duplicates:,} duplicate"]
+    if thinned := num_read - report.num_original:
+        left_out += [f"{thinned:,} originals, for the budget, where they crowd"]
+    made = ", ".join(f"{count:,} {name}" for name, count in origins.items())
     rows = [
-        ("points in", f"{len(scene.points):,}"),
+        ("points in", f"{num_read:,}"),
         ("points out", f"{report.num_points:,} ({made})"),
-        *([("left out", left_out)] if (left_out := _left_out(scene, report)) else []),
+        *([("left out", ", ".join(left_out))] if left_out else []),
         *found,
         ("seconds", ", ".join(f"{stage} {time:.2f}" for stage, time in seconds.items())),
         ("output", str(output)),
@@ -175,15 +215,3 @@ def summarise(
             "layout: --format colmap."
         )
     tell_training(options.scene, scene, output, report.layout)
-
-
-def _left_out(scene: Scene, report: WriteReport) -> str:
-    """How many points of the input the output lacks, and why; empty if it has all."""
-    thinned = scene.points.num_original - report.num_original
-    parts = []
-    if report.dropped_nonfinite + report.dropped_duplicates:
-        parts += [f"{report.dropped_nonfinite:,} not finite"]
-        parts += [f"{report.dropped_duplicates:,} duplicate"]
-    if thinned > 0:
-        parts += [f"{thinned:,} originals, for the budget, where they crowd"]
-    return ", ".join(parts)

@@ -3,27 +3,24 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from splatseed.commands.next_steps import tell_training
-from splatseed.commands.upsample.output import method_words
-from splatseed.console import OUT, StageClock, print_note, print_pairs, stage_display
+from splatseed.commands.upsample import output
+from splatseed.console import OUT, StageClock, print_note, stage_display
 from splatseed.errors import OutputError, ParameterError, PointCloudError, SceneFormatError
-from splatseed.io import WriteReport, load_originals, load_scene, write_scene
+from splatseed.io import WriteReport, load_originals, write_scene
 from splatseed.io.clouds import open_cloud
 from splatseed.io.colmap import find_model
 from splatseed.io.write import PointStream
 from splatseed.literal import counted, visible
-from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress
 from splatseed.runtime.memory import PROCESS, free_memory, option_of, words_of
-from splatseed.scene import Scene
 from splatseed.seeding.advice import DEFAULT_METHOD, method_for
 from splatseed.upsample import BYTES_EACH, Upsampler, planned_size, source_code, traits_of
 
@@ -52,43 +49,34 @@ NOT_IN_TILES = {
 """Options that need all points in memory, by field."""
 
 
-def asks_for_tiles(options: Options) -> tuple[str, ...]:
-    """The options that ask for tiles, whatever the memory."""
-    asks = {
-        "--executor": options.executor == "ray",
-        "--jobs": (options.jobs or 1) > 1,
-        "--tile-points": options.tile_points is not None,
-    }
-    return tuple(name for name, asked in asks.items() if asked)
+def _asks_for_tiles(options: Options) -> bool:
+    """Whether the options ask for tiles, whatever the memory."""
+    apart = options.executor == "ray" or (options.jobs or 1) > 1
+    return apart or options.tile_points is not None
 
 
 def find_source(options: Options, methods: Mapping[str, Upsampler]) -> Source | None:
-    """What to cut into tiles; None if all fits into memory.
-
-    Raises:
-        SceneNotFoundError: There is no scene.
-        SceneFormatError: It is not what its name says.
-        OutputError: It has attributes that tiles do not.
-    """
-    asked, path, method = asks_for_tiles(options), options.scene, methods[options.method]
+    """What to cut into tiles; None if all fits into memory."""
+    asked, path, method = _asks_for_tiles(options), options.scene, methods[options.method]
     if not asked and (options.cloud_files or (path.is_dir() and options.memory is None)):
         return None
     from splatseed.upsample.tiles import file_source, scene_source  # noqa: PLC0415  (Numba)
 
-    def is_large(count: int) -> bool:
-        bound = _bound(options)
-        return bound is not None and _needed(options, method, count) > bound
+    bound, suffix = _bound(options), path.suffix.lower() if path.is_file() else ""
 
-    if path.is_file() and path.suffix.lower() in CLOUDS and find_model(path.parent) is None:
+    def is_large(count: int) -> bool:
+        return asked or (bound is not None and _needed(options, method, count) > bound)
+
+    if suffix in CLOUDS and find_model(path.parent) is None:
         return file_source(open_cloud(path))
-    if path.is_file() and path.suffix.lower() == ".ply":
+    if suffix == ".ply":
         file = file_source(open_cloud(path))
-        return file if asked or is_large(file.count or 0) else None
+        return file if is_large(file.count or 0) else None
     if not asked and options.memory is None:  # a file that holds no cloud alone
         return None
-    _check_model(path, _bound(options))
+    _check_model(path, bound)
     scene = load_originals(path)
-    return scene_source(scene) if asked or is_large(len(scene.points)) else None
+    return scene_source(scene) if is_large(len(scene.points)) else None
 
 
 def _bound(options: Options) -> int | None:
@@ -98,11 +86,7 @@ def _bound(options: Options) -> int | None:
 
 
 def _check_model(path: Path, bound: int | None) -> None:
-    """Refuse a scene whose own points and tracks do not fit into memory, before it is read.
-
-    Raises:
-        ParameterError: They do not.
-    """
+    """Refuse a scene whose own points and tracks do not fit into memory, before it is read."""
     places = (path / "sparse" / "0", path / "sparse", path, path / "0")
     model = find_model(*places) if path.is_dir() else None
     if model is None or bound is None:
@@ -128,32 +112,14 @@ def _needed(options: Options, method: Upsampler, count: int) -> int:
     return PROCESS + total * BYTES_EACH + count * (PER_POINT + PER_NEIGHBOR * neighbors)
 
 
-def run_tiled(
-    options: Options,
-    methods: Mapping[str, Upsampler],
-    source: Source,
-    provenance: Callable[[Options, Upsampler], dict[str, object]],
-) -> None:
-    """Upsample a cloud tile by tile, write it, and say so.
-
-    Args:
-        options: The command's options.
-        methods: All methods with their parameters.
-        source: The cloud.
-        provenance: What ``splatseed.json`` is to say, from the options and the method.
-
-    Raises:
-        ParameterError: An option or the method needs all points in memory, or the memory is not
-            enough for tiles.
-        OutputError: The disk is too small, or an earlier run's folder belongs to another command.
-    """
+def run_tiled(options: Options, methods: Mapping[str, Upsampler], source: Source) -> None:
+    """Upsample a cloud tile by tile, write it, and say so."""
     from splatseed.runtime import tasks  # noqa: PLC0415  (processes)
     from splatseed.runtime.ray_tasks import RayTasks, ray_cluster  # noqa: PLC0415  (an extra)
     from splatseed.upsample import tiles  # noqa: PLC0415  (Numba)
 
     if options.method == DEFAULT_METHOD:
-        chosen = method_for(source.scene or PointCloud.empty(), note=print_note)
-        options = replace(options, method=str(chosen))
+        options = replace(options, method=str(method_for(source.scene, note=print_note)))
     method = methods[options.method]
     _check_tileable(options, method, source)
     request = tiles.Request(options.method, method, options.ratio, options.num_points, options.seed)
@@ -180,9 +146,10 @@ def run_tiled(
             workers = tasks.ProcessTasks([share] * plan.jobs)
         with _kept(path), tiles.open_work(path, request.job(source)) as resumed:
             points = "unknown" if count is None else f"{count:,}"
+            how = output.method_words(options.method, method, options.profile)
             OUT.print(
                 f"{visible(options.scene)} ({points} points)\n"
-                f"  -> {method_words(options.method, method, options.profile)}, in {plan.words}\n"
+                f"  -> {how}, in {plan.words}\n"
                 f"  -> {visible(options.output)} (seed {options.seed}, {workers.words})",
                 soft_wrap=True,
             )
@@ -191,20 +158,31 @@ def run_tiled(
                 print_note(f"Going on with the work in {visible(path)}: {done} done.")
             with stage_display(clock, remaining=True):
                 tiled = tiles.make_tiled(path, source, request, plan, workers, clock)
-                report = _write(options, source, tiled, clock, provenance(options, method))
+                report = _write(options, method, source, tiled, clock)
     shutil.rmtree(path)
-    _summarise(options, tiled, report, clock.seconds())
+    made = {"original": tiled.num_original, options.method: report.num_points - tiled.num_original}
+    number = [("tiles", f"{tiled.tiles:,}")]
+    output.summarise(
+        options, source.scene, tiled.num_original, made, report, clock.seconds(), number
+    )
+    if any(tiled.origin):
+        place = ", ".join(f"{each:,.0f}" for each in tiled.origin)
+        print_note(
+            f"The cloud lies far from zero, where float32 is coarse: ({place}) was subtracted from"
+            " all points. splatseed.json has it as origin."
+        )
 
 
 def _check_tileable(options: Options, method: Upsampler, source: Source) -> None:
     """Refuse what needs all points in memory, before any work."""
-    from splatseed.upsample.tiles import check_tileable  # noqa: PLC0415  (Numba)
+    from splatseed.upsample.methods.bounding_box import BoundingBox  # noqa: PLC0415  (Numba)
+    from splatseed.upsample.nearest import NearestMethod  # noqa: PLC0415  (Numba)
 
     in_memory = "leave out --memory, --jobs, --executor and --tile-points to work in memory"
-    scene, looks = source.scene, traits_of(method).needs - {"points"}
-    if scene is None and (options.scene.suffix.lower() in CLOUDS or looks):
+    bare, looks = source.path is not None, traits_of(method).needs - {"points"}
+    if bare and (options.scene.suffix.lower() in CLOUDS or looks):
         in_memory = "bring the scan to its photographs with splatseed upsample SCENE --cloud SCAN"
-    elif not asks_for_tiles(options) and options.memory is None:
+    elif not _asks_for_tiles(options) and options.memory is None:
         needed = words_of(_needed(options, method, source.count or 0), up=True)
         in_memory = f"use a machine with {needed} of free memory"
     if given := [flag for name, flag in NOT_IN_TILES.items() if getattr(options, name)]:
@@ -213,69 +191,46 @@ def _check_tileable(options: Options, method: Upsampler, source: Source) -> None
             found=", ".join(given),
             fix=f"Leave it out (fewer points: --ratio or --num-points), or {in_memory}.",
         )
-    read = scene.source.format if scene is not None and scene.source is not None else "ply"
+    read = source.scene.source.format if source.scene.source is not None else "ply"
     if options.format == "transforms" and read != "transforms":
         raise ParameterError(
             "--format colmap or auto for a cloud in tiles, whose points are not turned",
             found="transforms",
             fix="Leave --format out.",
         )
-    check_tileable(options.method, method, in_memory)
+    if not isinstance(method, NearestMethod | BoundingBox):
+        found = "which needs the whole scene at once"
+    elif isinstance(method, NearestMethod) and (reason := method.untileable_reason):
+        found = f"with {reason}, which needs all points at once"
+    else:
+        return
+    raise ParameterError(
+        "a method that works tile by tile: linear, triangle, spline, mls, random, or voronoi "
+        "with --profile default",
+        found=f"{options.method}, {found}",
+        fix=f"Choose one of these, or {in_memory}.",
+    )
 
 
 def _write(
-    options: Options,
-    source: Source,
-    tiled: Tiled,
-    progress: Progress,
-    provenance: Mapping[str, object],
+    options: Options, method: Upsampler, source: Source, tiled: Tiled, progress: Progress
 ) -> WriteReport:
     """Write the scene, its points a piece at a time."""
-    about: dict[str, Any] = {**provenance, "tiles": tiled.tiles, "origin": tiled.origin}
+    about = output.provenance(options, method)
+    about |= {"tiles": tiled.tiles, "origin": tiled.origin}
     repeated, new = tiled.num_repeated, partial(tiled.new_distinct, progress)
     num_new, code = tiled.num_new - repeated, source_code(options.method)
-    scene, stream = source.scene, PointStream(0, num_new, code, new, (), (0, repeated))
-    if scene is None:
-        assert source.path is not None  # noqa: S101  (a cloud is one or the other)
-        scene, about["source"] = Scene(PointCloud.empty()), str(source.path)
+    stream = PointStream(0, num_new, code, new, (), (0, repeated))
+    if source.path is not None:
+        about["source"] = str(source.path)
         stream = PointStream(
             tiled.num_original, num_new, code, lambda: chain(tiled.originals(progress), new()),
             (source.path,), (tiled.non_finite, tiled.repeats + repeated),
         )  # fmt: skip
     return write_scene(
-        scene, options.output, format=options.format, overwrite=options.overwrite,
+        source.scene, options.output, format=options.format, overwrite=options.overwrite,
         copy_images=options.copy_images, provenance=about, stream=stream,
     )  # fmt: skip
-
-
-def _summarise(
-    options: Options, tiled: Tiled, report: WriteReport, seconds: Mapping[str, float]
-) -> None:
-    """Print the final table."""
-    new = report.num_points - tiled.num_original
-    made = f"{tiled.num_original:,} original, {new:,} {options.method}"
-    rows = [
-        ("points in", f"{tiled.num_original:,}"),
-        ("points out", f"{report.num_points:,} ({made})"),
-        ("tiles", f"{tiled.tiles:,}"),
-        ("seconds", ", ".join(f"{stage} {time:.2f}" for stage, time in seconds.items())),
-        ("output", str(options.output)),
-    ]
-    if report.dropped_nonfinite + report.dropped_duplicates:
-        out = f"{report.dropped_nonfinite:,} not finite, {report.dropped_duplicates:,} duplicate"
-        rows.insert(2, ("left out", out))
-    print_pairs("splatseed upsample", rows)
-    if any(tiled.origin):
-        away = ", ".join(f"{each:,.0f}" for each in tiled.origin)
-        print_note(
-            f"The cloud lies far from zero, where float32 is coarse: ({away}) was subtracted from"
-            " all points. splatseed.json has it as origin."
-        )
-    for note in report.notes:
-        print_note(note)
-    if not any(tiled.origin) and options.scene.is_dir():
-        scene = load_scene(options.scene, require_points=False)
-        tell_training(options.scene, scene, options.output, report.layout)
 
 
 @contextmanager

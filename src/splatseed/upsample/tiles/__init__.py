@@ -7,7 +7,7 @@ same bytes as in memory, whatever the size of the tiles and wherever they are wo
 """
 
 from splatseed.upsample.tiles.cutting import Source, file_source, scene_source
-from splatseed.upsample.tiles.making import Request, Tiled, check_tileable, make_tiled
+from splatseed.upsample.tiles.making import Request, Tiled, make_tiled
 from splatseed.upsample.tiles.work import TilePlan, check_disk, open_work, plan_tiles, work_path
 
 __all__ = [
@@ -16,7 +16,6 @@ __all__ = [
     "TilePlan",
     "Tiled",
     "check_disk",
-    "check_tileable",
     "file_source",
     "make_tiled",
     "open_work",

@@ -21,13 +21,14 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64
 from scipy.spatial import cKDTree
 
-from splatseed.errors import OutputError, ParameterError, PointCloudError
+from splatseed.errors import OutputError, ParameterError
 from splatseed.io.clouds import CloudChunk, CloudFile
 from splatseed.io.seeds import number_of_originals
 from splatseed.io.staging import staged
 from splatseed.pointcloud import FARTHEST, PointCloud
 from splatseed.progress import Progress, blocks
 from splatseed.scene import Scene
+from splatseed.upsample.method import nothing_finite
 from splatseed.upsample.neighbors import least_distance, trusted_originals
 from splatseed.upsample.tiles.work import facts_of, finish
 
@@ -49,32 +50,19 @@ factor to it after each try that fails, and the tries."""
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """Points that may be too many for memory, in the order of the cloud in memory.
+    """Points that may be too many for memory, in the order of the cloud in memory."""
 
-    Args:
-        chunks: Gives them in order, at most so many at a time.
-        count: How many there are; None if only reading tells.
-        fingerprint: What tells one input from another, as JSON has it.
-        path: The file that they are in, if it holds nothing else.
-        scene: The scene whose originals they are, otherwise.
-        trusted: Which of them may be bases; None if all may.
-        held: Bytes that they keep in memory.
-    """
-
-    chunks: Callable[[int], Iterator[CloudChunk]]
-    count: int | None
-    fingerprint: Mapping[str, object]
-    path: Path | None = None
-    scene: Scene | None = None
-    trusted: Bool[np.ndarray, " n"] | None = None
-    held: int = 0
+    chunks: Callable[[int], Iterator[CloudChunk]]  # gives at most so many at a time
+    count: int | None  # None if only reading tells
+    fingerprint: Mapping[str, object]  # what tells one input from another, as JSON has it
+    scene: Scene  # whose originals they are; an empty one around points of a file
+    path: Path | None = None  # that file
+    trusted: Bool[np.ndarray, " n"] | None = None  # which of them may be bases; None if all may
+    held: int = 0  # bytes that they keep in memory
 
 
 def file_source(cloud: CloudFile) -> Source:
-    """The points of a file, told by its name, size and time of change.
-
-    Those that splatseed added to it before are left out.
-    """
+    """The points of a file, told by its name, size and time of change; originals alone."""
     path, count = cloud.path.resolve(), cloud.count
     if count is not None:
         count = number_of_originals(cloud.path.parent, count)
@@ -89,15 +77,11 @@ def file_source(cloud: CloudFile) -> Source:
 
     known = path.stat()
     told = {"path": str(path), "bytes": known.st_size, "changed": known.st_mtime_ns}
-    return Source(chunks, count, told, path=cloud.path)
+    return Source(chunks, count, told, Scene(PointCloud.empty()), cloud.path)
 
 
 def scene_source(scene: Scene) -> Source:
-    """The originals of a scene, told by a hash.
-
-    Raises:
-        OutputError: They have attributes that tiles do not.
-    """
+    """The originals of a scene, told by a hash; attributes, which tiles lack, are refused."""
     points, trusted = scene.points.originals, trusted_originals(scene)
     if points.attributes:
         raise OutputError(
@@ -116,24 +100,13 @@ def scene_source(scene: Scene) -> Source:
         digest.update(np.ascontiguousarray(array).data)
     parts = [scene.points, scene.tracks, *(image.observations for image in scene.images)]
     values = [each for part in parts if part is not None for each in vars(part).values()]
-    return Source(
-        chunks, len(points), {"points": len(points), "digest": digest.hexdigest()}, scene=scene,
-        trusted=trusted, held=sum(each.nbytes for each in values if isinstance(each, np.ndarray)),
-    )  # fmt: skip
+    held = sum(each.nbytes for each in values if isinstance(each, np.ndarray))
+    told = {"points": len(points), "digest": digest.hexdigest()}
+    return Source(chunks, len(points), told, scene, trusted=trusted, held=held)
 
 
 def read_rows(work: Path, source: Source, at_once: int, progress: Progress) -> None:
-    """Copy a cloud to disk.
-
-    Args:
-        work: The folder.
-        source: The cloud.
-        at_once: Rows in memory at a time.
-        progress: Told the stage.
-
-    Raises:
-        OutputError: The disk is full.
-    """
+    """Copy a cloud to disk, ``at_once`` rows at a time."""
     low, high, exact = np.full(3, np.inf), np.full(3, -np.inf), True
     sample, share, count, rng = np.empty((0, 3)), 1.0, 0, np.random.default_rng(0)
     with staged(work / "rows", folder=False) as partial, partial.open("wb") as file:
@@ -174,36 +147,25 @@ def _without_origin(xyz: np.ndarray, origin: np.ndarray) -> Float32[np.ndarray, 
 
 
 class Rows:
-    """The copied rows, read a piece at a time.
-
-    Args:
-        work: The folder, in which the rows are read.
-    """
+    """The copied rows, read a piece at a time."""
 
     def __init__(self, work: Path) -> None:
-        facts = facts_of(work, "read") or {}
-        self._work = work
-        self.count = int(facts["rows"])
+        facts = facts_of(work, "read")
+        self.work, self.count = work, int(facts["rows"])
         self.origin: Float64[np.ndarray, " 3"] = np.array(facts["origin"], np.float64)
 
     def cloud(self, first: int, last: int) -> PointCloud:
         """Rows, relative to the origin."""
-        path = self._work / "rows"
-        rows = np.fromfile(path, ROW, last - first, offset=ROW.itemsize * first)
+        rows = np.fromfile(self.work / "rows", ROW, last - first, offset=ROW.itemsize * first)
         return PointCloud(_without_origin(rows["xyz"], self.origin), rows["rgb"].copy())
 
     def tiles(self, first: int, last: int) -> Int32[np.ndarray, " n"]:
         """The tiles of rows, -1 where one drops out."""
-        return np.fromfile(self._work / "tile_of_row", np.int32, last - first, offset=4 * first)
+        return np.fromfile(self.work / "tile_of_row", np.int32, last - first, offset=4 * first)
 
 
 class Cuts:
-    """A kd-tree of a sample whose leaves are tiles.
-
-    Args:
-        sample: Finite positions.
-        most: Most of them in a tile, unless they coincide.
-    """
+    """A kd-tree of a sample of finite positions; its leaves are tiles of at most ``most``."""
 
     def __init__(self, sample: Float32[np.ndarray, "s 3"], most: int) -> None:
         self.walls: list[Float64[np.ndarray, "2 3"]] = []
@@ -254,26 +216,10 @@ def append_by_tile(folder: Path, tiles: Int32[np.ndarray, " n"], records: np.nda
             records[places].tofile(file)
 
 
-def split(
-    work: Path,
-    trusted: Bool[np.ndarray, " rows"] | None,
-    most: int,
-    at_once: int,
-    progress: Progress,
-) -> None:
-    """Sort the rows into tiles; what is not finite or repeats drops out.
+def split(work: Path, source: Source, most: int, at_once: int, progress: Progress) -> None:
+    """Sort the rows into tiles of at most ``most``; what is not finite or repeats drops out.
 
-    Args:
-        work: The folder, in which the rows are read.
-        trusted: Which rows may be bases; all when left out.
-        most: Most points in a tile.
-        at_once: Rows in memory at a time.
-        progress: Told the stage.
-
-    Raises:
-        PointCloudError: No row is finite.
-        ParameterError: More points than fit into memory lie so close that no cut divides them.
-        OutputError: The disk is full.
+    Refused is a cloud without a finite row, or with too many points that no cut divides.
     """
     rows, sample = Rows(work), np.load(work / "sample.npy")
     sample = sample[np.isfinite(sample).all(axis=1)]
@@ -281,13 +227,9 @@ def split(
     wanted = share * most * (MARGIN if share < 1 else 1.0)
     for _ in range(TRIES):
         cuts = Cuts(sample, int(wanted))
-        counts, non_finite = _distribute(work, rows, cuts, trusted, at_once, progress)
+        counts, non_finite = _distribute(rows, cuts, source.trusted, at_once, progress)
         if non_finite == rows.count:
-            raise PointCloudError(
-                "at least one original point with finite coordinates",
-                found=f"{rows.count} points, none of them finite and original",
-                fix="Check that the scene holds the point cloud you meant.",
-            )
+            raise nothing_finite(rows.count)
         if counts.max() <= max(most, -(-rows.count // at_once)):  # one of each piece
             break
         wanted *= SMALLER
@@ -312,7 +254,6 @@ def split(
 
 
 def _distribute(
-    work: Path,
     rows: Rows,
     cuts: Cuts,
     trusted: Bool[np.ndarray, " rows"] | None,
@@ -322,8 +263,8 @@ def _distribute(
     """Write each row to its tile's file; returns the points of each and how many are not finite."""
     counts, non_finite = np.zeros(len(cuts.walls), np.int64), 0
     with (
-        staged(work / "tiles", folder=True) as folder,
-        staged(work / "tile_of_row", folder=False) as partial,
+        staged(rows.work / "tiles", folder=True) as folder,
+        staged(rows.work / "tile_of_row", folder=False) as partial,
         partial.open("wb") as file,
     ):
         for first, last in blocks(rows.count, at_once, "tiles", progress):
@@ -367,20 +308,11 @@ def _drop_repeats(
 class TileStore:
     """The tiles of a cloud, read one at a time.
 
-    Args:
-        work: The folder, in which the rows are split.
-
-    Attributes:
-        count: Points in all.
-        center: Their centroid, float64 [3].
-        counts: Points of each tile, int64 [t].
-        walls: The boxes that space is divided into, relative to the centroid, float64 [t, 2, 3].
-        bounds: Those of each tile's points, likewise; NaN where it has none.
-        least: The least distance of two points.
+    ``walls`` and ``bounds`` are relative to the centroid; a tile without points has bounds of NaN.
     """
 
     def __init__(self, work: Path) -> None:
-        facts = facts_of(work, "split") or {}
+        facts = facts_of(work, "split")
         self.work = work
         self.count = int(facts["points"])
         self.center: Float64[np.ndarray, " 3"] = np.array(facts["center"], np.float64)
@@ -390,12 +322,7 @@ class TileStore:
         self.least = least_distance(float(np.nanmax(np.abs(self.bounds))))
 
     def points(self, tile: int, within: Float64[np.ndarray, "2 3"] | None = None) -> np.ndarray:
-        """The points of a tile that has some, ``POINT`` [n].
-
-        Args:
-            tile: Its number.
-            within: Only those in this box, relative to the centroid; all when left out.
-        """
+        """The points of a tile that has some, or those in a box, ``POINT`` [n]."""
         points = np.fromfile(self.work / "tiles" / tile_name(tile), RECORD).astype(POINT)
         points["xyz"] -= self.center
         if within is None:

@@ -58,20 +58,12 @@ STREAM_BLOCK = 1 << 14
 
 @dataclass(frozen=True)
 class Request:
-    """What to make.
+    """What to make."""
 
-    Args:
-        name: The method's name.
-        method: The method.
-        ratio: Points in all, as a multiple of the originals.
-        num_points: Points in all, instead.
-        seed: The seed.
-    """
-
-    name: str
+    name: str  # the method's
     method: Upsampler
-    ratio: float | None = None
-    num_points: int | None = None
+    ratio: float | None = None  # points in all, as a multiple of the originals
+    num_points: int | None = None  # points in all, instead
     seed: int = 0
 
     def job(self, source: Source) -> dict[str, object]:
@@ -87,55 +79,18 @@ class Request:
         }
 
 
-def check_tileable(name: str, method: object, in_memory: str = "work in memory") -> None:
-    """Refuse a method that needs more than a point's surroundings.
-
-    Args:
-        name: Its name.
-        method: The method.
-        in_memory: What the user may do instead, for the error.
-
-    Raises:
-        ParameterError: It does.
-    """
-    if isinstance(method, BoundingBox):
-        return
-    found = f"{name}, which needs the whole scene at once"
-    if isinstance(method, NearestMethod):
-        found = f"{name} with {method.untileable_reason}, which needs all points at once"
-    if not isinstance(method, NearestMethod) or method.untileable_reason:
-        raise ParameterError(
-            "a method that works tile by tile: linear, triangle, spline, mls, random, or voronoi "
-            "with --profile default",
-            found=found,
-            fix=f"Choose one of these, or {in_memory}.",
-        )
-
-
 @dataclass(frozen=True)
 class Tiled:
-    """Points that lie in a folder.
-
-    Args:
-        work: The folder.
-        num_original: Originals.
-        num_new: New points.
-        non_finite: Rows that were left out because a coordinate is not finite.
-        repeats: Rows that were left out because they repeat a position.
-        origin: What was subtracted from all positions, [3].
-        tiles: The number of tiles.
-        at_once: Points to give at a time.
-        request: What was made.
-    """
+    """Points that lie in a folder."""
 
     work: Path
     num_original: int
     num_new: int
-    non_finite: int
-    repeats: int
-    origin: tuple[float, float, float]
+    non_finite: int  # rows that were left out because a coordinate is not finite
+    repeats: int  # rows that were left out because they repeat a position
+    origin: tuple[float, float, float]  # what was subtracted from all positions
     tiles: int
-    at_once: int
+    at_once: int  # points to give at a time
     request: Request
 
     def originals(self, progress: Progress) -> Iterator[Piece]:
@@ -181,7 +136,7 @@ class Tiled:
     @property
     def num_repeated(self) -> int:
         """New points that repeat a position, which scenes are written without."""
-        return int((facts_of(self.work, "repeats") or {"count": 0})["count"])
+        return int(facts_of(self.work, "repeats").get("count", 0))
 
     def new_distinct(self, progress: Progress) -> Iterator[Piece]:
         """The new points but for those."""
@@ -197,7 +152,7 @@ class Tiled:
 def make_tiled(
     work: Path, source: Source, request: Request, plan: TilePlan, tasks: Tasks, progress: Progress
 ) -> Tiled:
-    """Make the new points of a cloud, tile by tile.
+    """Make the new points of a cloud, tile by tile, by ``random`` or a ``NearestMethod`` that can.
 
     Args:
         work: The folder, which may hold finished steps of the same job.
@@ -208,19 +163,17 @@ def make_tiled(
         progress: Told the stages.
 
     Raises:
-        ParameterError: The method does not work tile by tile, or the number of points is out of
-            range.
+        ParameterError: The number of points is out of range.
         PointCloudError: Too few distinct finite points for the method.
         OutputError: The disk is full.
     """
     from splatseed.upsample import planned_size  # noqa: PLC0415  (the package that this is in)
 
-    check_tileable(request.name, request.method)
-    if facts_of(work, "read") is None:
+    if not facts_of(work, "read"):
         read_rows(work, source, plan.at_once, progress)
-    if facts_of(work, "split") is None:
-        split(work, source.trusted, plan.tile_points, plan.at_once, progress)
-    facts, store = facts_of(work, "split") or {}, TileStore(work)
+    if not facts_of(work, "split"):
+        split(work, source, plan.tile_points, plan.at_once, progress)
+    facts, store = facts_of(work, "split"), TileStore(work)
     if facts["most"] > plan.tile_points and store.counts.max() > plan.tile_points:
         raise ParameterError(
             f"memory for tiles of {facts['most']:,} points, as they were cut",
@@ -237,13 +190,13 @@ def make_tiled(
         return tiled
     method.check_enough(store.count)
     tiles = [tile_name(tile) for tile in np.flatnonzero(store.counts)]
-    if facts_of(work, "drawn") is None:
+    if not facts_of(work, "drawn"):
         left = [(work, method, each) for each in tiles if not (work / "weighed" / each).exists()]
         tasks.run_all(weigh, left, "neighbours", progress)
         _draw(work, num_new, request.seed, progress)
     left = [(work, method, each) for each in tiles if not (work / "made" / each).exists()]
     tasks.run_all(place, left, "new points", progress)
-    if facts_of(work, "repeats") is None:
+    if not facts_of(work, "repeats"):
         _find_repeats(tiled, plan.tile_points, progress)
     for name in ("tiles", "weighed", "drawn"):  # the output needs the space
         remove(work / name)
@@ -255,11 +208,6 @@ def weigh(work: Path, method: NearestMethod, tile: str) -> None:
 
     Saved are ``weight`` float64 [n] by position; and for ``place`` the ``order`` of own points, the
     places of neighbours ``idx`` int32 [n, k], the ``ring``, and what the method has found.
-
-    Args:
-        work: The folder, in which the rows are split.
-        method: The method.
-        tile: The tile's name.
     """
     store = TileStore(work)
     k = min(method.num_queried, store.count - 1)
@@ -267,16 +215,11 @@ def weigh(work: Path, method: NearestMethod, tile: str) -> None:
     weight, known = method.weigh(*_prepared(store, points, len(order), idx), silent)
     by_position = np.empty(len(order))
     by_position[order] = weight
-    save_arrays(
-        work / "weighed" / tile,
-        {
-            "weight": by_position,
-            "order": order,
-            "idx": idx[: len(order), : method.num_neighbors],
-            "ring": points[len(order) : len(idx)],
-            **{f"{KNOWN}{name}": values for name, values in known.items()},
-        },
-    )
+    save_arrays(work / "weighed" / tile, {
+        "weight": by_position, "order": order, "idx": idx[: len(order), : method.num_neighbors],
+        "ring": points[len(order) : len(idx)],
+        **{f"{KNOWN}{name}": values for name, values in known.items()},
+    })  # fmt: skip
 
 
 def _prepared(
@@ -335,16 +278,8 @@ def place(work: Path, method: NearestMethod, tile: str) -> None:
 
     Saved are the new points' ``number`` int64 [m], ascending, ``xyz`` float32 [m, 3] and ``rgb``
     uint8 [m, 3].
-
-    Args:
-        work: The folder, in which the bases are drawn.
-        method: The method.
-        tile: The tile's name.
-
-    Raises:
-        PointCloudError: A new point is not finite.
     """
-    store, drawn = TileStore(work), facts_of(work, "drawn") or {}
+    store, drawn = TileStore(work), facts_of(work, "drawn")
     weighed, bases = load_arrays(work / "weighed" / tile), np.fromfile(work / "drawn" / tile, DRAWN)
     order = weighed["order"]
     points = np.concatenate([store.points(int(tile))[order], weighed["ring"]])
@@ -352,18 +287,11 @@ def place(work: Path, method: NearestMethod, tile: str) -> None:
     count = bases["count"].astype(np.int64)
     first = np.cumsum(count) - count
     number = np.repeat(bases["start"] - first, count) + np.arange(count.sum())
-    new = method.place(
-        cloud,
-        near,
-        {
-            key.removeprefix(KNOWN): np.array(weighed[key])
-            for key in weighed
-            if key.startswith(KNOWN)
-        },
-        neighbors.Bases(first[order], count[order], len(number)),
-        TileDraws(drawn["stream"], drawn["total"], number),
-        silent,
-    )
+    found = [key for key in weighed if key.startswith(KNOWN)]
+    known = {key.removeprefix(KNOWN): np.array(weighed[key]) for key in found}
+    own = neighbors.Bases(first[order], count[order], len(number))
+    draws = TileDraws(drawn["stream"], drawn["total"], number)
+    new = method.place(cloud, near, known, own, draws, silent)
     if not np.isfinite(new.xyz).all():
         raise PointCloudError(
             "finite new points",
@@ -378,12 +306,8 @@ class TileDraws:
     """Draws for a tile's new points; stands in for a generator in ``place``.
 
     In memory, a method draws ``rng.random((M, c), dtype=float32)``, a row for each of the M new
-    points; here those rows of the same stream that belong to the tile.
-
-    Args:
-        stream: Where NumPy's PCG64 is when the first new point of all draws.
-        total: New points of all tiles, M.
-        number: Numbers of the tile's new points, ascending, int64 [m].
+    points; here those rows of the same stream that belong to the tile, whose points have the
+    numbers ``number``. ``stream`` is where NumPy's PCG64 is when the first new point of all draws.
     """
 
     def __init__(self, stream: dict[str, str], total: int, number: Int64[np.ndarray, " m"]) -> None:

@@ -26,12 +26,7 @@ SLACK = 1.0 + 1e-9
 def find_neighborhood(
     store: TileStore, tile: int, k: int
 ) -> tuple[np.ndarray, Int32[np.ndarray, " own"], Int32[np.ndarray, "m k"]]:
-    """The neighbours of a tile's points and of all their neighbours.
-
-    Args:
-        store: The tiles.
-        tile: The tile, which has points.
-        k: Neighbours of each; the cloud has more points than that.
+    """The k neighbours of the points of a tile, which has some, and of all their neighbours.
 
     Returns:
         Own points in leaf order, then the ring, then the rim, both in file order, ``POINT``; the
@@ -67,16 +62,9 @@ def _look_around(
 ) -> tuple[np.ndarray, list[np.ndarray]]:
     """Look for nearer neighbours in all other tiles that the balls of points meet, near ones first.
 
-    Args:
-        store: The tiles.
-        tile: The tile that was looked in.
-        points: The points that search, ``POINT`` [q].
-        distance: Distances to the k nearest so far, nearest first, infinite where nobody was found,
-            float64 [q, k]; changed in place.
-        row: Their rows, int64 [q, k]; changed in place.
-
-    Returns:
-        The rows, and points of other tiles that are or were among them.
+    ``distance`` to the k nearest so far, those of ``tile``, is infinite where nobody was found; it
+    and ``row``, both [q, k], nearest first, are changed in place. Returned are the rows, and points
+    of other tiles that are or were among them.
     """
     k, met, low, high = distance.shape[1], [], store.bounds[:, 0], store.bounds[:, 1]
     xyz = np.ascontiguousarray(points["xyz"].T)  # NumPy is slow along short axes

@@ -48,14 +48,11 @@ def work_path(output: Path) -> Path:
 
 @contextmanager
 def open_work(path: Path, job: Mapping[str, object]) -> Iterator[bool]:
-    """Hold the folder for a job while the block runs; it is made unless it is there.
+    """Hold the folder for a job while the block runs; yields whether earlier work is there.
 
     Args:
-        path: Where it is, or is to be.
+        path: Where it is, or is to be made.
         job: All that determines the result, as JSON has it.
-
-    Yields:
-        Whether it goes on with an earlier run's work.
 
     Raises:
         OutputError: It belongs to another job or to a process that is running, it is damaged, or it
@@ -65,7 +62,7 @@ def open_work(path: Path, job: Mapping[str, object]) -> Iterator[bool]:
         path.mkdir(parents=True, exist_ok=True)
         there = any(not each.name.startswith(".") for each in path.iterdir())
     known, asked = facts_of(path, "job"), json.loads(json.dumps(job))
-    if there and known is None:
+    if there and not known:
         raise OutputError(
             f"no folder, or one with tiles, at {path}",
             found="a folder without job.json",
@@ -73,7 +70,7 @@ def open_work(path: Path, job: Mapping[str, object]) -> Iterator[bool]:
         )
     try:
         with FileLock(path / ".lock", timeout=0):
-            if known is None:
+            if not known:
                 finish(path, "job", job)
                 known = asked
             for name in sorted({*known, *asked}):
@@ -98,26 +95,19 @@ def finish(work: Path, step: str, facts: Mapping[str, object]) -> None:
     write_json(work / f"{step}.json", facts)
 
 
-def facts_of(work: Path, step: str) -> dict[str, Any] | None:
-    """What a finished step found; None if it is not finished.
-
-    Raises:
-        OutputError: The note is damaged.
-    """
+def facts_of(work: Path, step: str) -> dict[str, Any]:
+    """What a finished step found; nothing if it is not finished. A damaged note is refused."""
     path = work / f"{step}.json"
     if not path.is_file():
-        return None
+        return {}
     try:
-        content = json.loads(read_text(path))
-    except (OSError, ValueError):
-        content = None
-    if not isinstance(content, dict):
+        return dict(json.loads(read_text(path)))
+    except (OSError, TypeError, ValueError):
         raise OutputError(
             f"{path} as an earlier run wrote it",
             found="a damaged file",
             fix=f"Remove the folder {work} to begin anew.",
-        )
-    return content
+        ) from None
 
 
 def save_arrays(folder: Path, arrays: Mapping[str, np.ndarray]) -> None:
@@ -135,23 +125,14 @@ def load_arrays(folder: Path) -> dict[str, np.ndarray]:
 
 @dataclass(frozen=True)
 class TilePlan:
-    """What the work will take.
+    """What the work will take."""
 
-    Args:
-        tile_points: Most points in a tile.
-        at_once: Rows in memory at a time in passes over the disk.
-        tiles: About how many tiles; None if the number of points is unknown.
-        disk: Bytes on disk, the output included; None likewise.
-        memory: Most bytes of memory.
-        jobs: Processes that work on tiles.
-    """
-
-    tile_points: int
-    at_once: int
-    tiles: int | None
-    disk: int | None
-    memory: int
-    jobs: int = 1
+    tile_points: int  # at most, in a tile
+    at_once: int  # rows in memory at a time in passes over the disk
+    tiles: int | None  # about so many; None if the number of points is unknown
+    disk: int | None  # bytes, those of the output included; None likewise
+    memory: int  # bytes at most
+    jobs: int = 1  # processes that work on tiles
 
     @property
     def words(self) -> str:
@@ -174,7 +155,7 @@ def plan_tiles(
     tile_points: int | None = None,
     held: int = 0,
 ) -> TilePlan:
-    """Choose the size of tiles.
+    """Choose the size of tiles, and refuse too little memory.
 
     Args:
         method: The method.
@@ -182,13 +163,10 @@ def plan_tiles(
         num_new: New points, if known.
         memory: Bytes that all processes may take together.
         jobs: Processes that work on tiles, beside the one that hands out unless it does so itself;
-            None for one a core, if each gets several full tiles.
-        cores: Most processes then.
+            None for one a core, ``cores`` at most, if each gets several full tiles.
+        cores: See ``jobs``.
         tile_points: Most points in a tile, if the user says so.
         held: Bytes that the source keeps in memory all the while.
-
-    Raises:
-        ParameterError: The memory is not enough.
     """
     near = method if isinstance(method, NearestMethod) else None
     ratio = 4.0 if count is None or num_new is None else num_new / max(count, 1)
@@ -215,29 +193,16 @@ def plan_tiles(
     tiles, disk = None, None
     if count is not None:
         tiles = 1 << max(-(-count // most) - 1, 0).bit_length()  # cut in half again and again
-        disk = _disk(near.num_neighbors if near else 0, count, num_new or 0)
+        neighbors, new = near.num_neighbors if near else 0, num_new or 0
+        at_work = count * (31 + 24 + 16 + 12 + 32 + 4 * neighbors)  # rows, tiles, draw, neighbours
+        for_repeats = count * (31 + 24 + 12 + 20) + new * 20
+        in_the_end = count * 31 + (count + new) * (27 + 43)
+        disk = max(at_work, for_repeats, in_the_end) + new * 24
     return TilePlan(int(most), int(at_once), tiles, disk, min(int(peak), memory), jobs)
 
 
-def _disk(neighbors: int, count: int, num_new: int) -> int:
-    """Bytes at most on disk at a time: rows, tiles, what the draw needs, new points, output."""
-    made = num_new * 24
-    at_work = count * (31 + 24 + 16 + 12 + 32 + 4 * neighbors) + made
-    for_repeats = count * (31 + 24 + 12 + 20) + num_new * 20 + made
-    in_the_end = count * 31 + made + (count + num_new) * (27 + 43)
-    return max(at_work, for_repeats, in_the_end)
-
-
 def check_disk(path: Path, needed: int | None) -> None:
-    """Refuse a disk that is too small.
-
-    Args:
-        path: The folder; what an earlier run left there counts as free.
-        needed: Bytes that the work takes; None if unknown.
-
-    Raises:
-        OutputError: There are fewer.
-    """
+    """Refuse a disk that is too small; what an earlier run left in the folder counts as free."""
     there = sum(each.stat().st_size for each in path.rglob("*") if each.is_file())
     above = next(each for each in path.parents if each.exists())
     free = shutil.disk_usage(above).free + there
