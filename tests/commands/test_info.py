@@ -7,12 +7,10 @@ import re
 import shlex
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image as PilImage
-from scipy.spatial.transform import Rotation
 
 from splatseed.commands.next_steps import number_for
 from splatseed.depth.alignment import align
@@ -44,7 +42,8 @@ def test_a_colmap_scene(room, splatseed):
     assert rows["reprojection error, px"].startswith(f"mean {scene.tracks.errors.mean():.3f},")
     low = [float(x) for x in rows["bounding box"].split()[:3]]
     np.testing.assert_allclose(low, scene.points.xyz.min(axis=0), rtol=1e-3)
-    assert run.out.partition("\nnext\n")[2].split()[1:3] == ["splatseed", "upsample"]
+    advised = run.out.partition("\nnext\n")[2]
+    assert re.findall(r"splatseed (\w+)", advised) == ["upsample", "train", "tune"]
 
 
 def test_for_scripts_it_is_json_alone(room, splatseed):
@@ -93,18 +92,6 @@ def test_photographs_that_cannot_be_compared(rgbd, splatseed):
     assert "  seeds" not in run.out
 
 
-def test_poses_without_points_ask_for_triangulation(room, tmp_path, splatseed):
-    write_scene(load_scene(room), tmp_path / "nerf", format="transforms")
-    for path in (tmp_path / "nerf").glob("*.ply"):
-        path.unlink()
-    run = splatseed("info", tmp_path / "nerf")
-    assert run.code == 0
-    assert _pairs(run.out)["points"] == "none"
-    assert "there are no points" in run.out
-    assert f"--poses-from {tmp_path / 'nerf'}" in run.out
-    assert "nan" not in run.out
-
-
 @pytest.mark.parametrize(
     ("xyz", "points", "finite"),
     [(np.zeros((0, 3)), "none", True), (np.full((4, 3), np.nan), "4", False)],
@@ -148,17 +135,6 @@ def tour(tmp_path_factory):
     return write_capture(make_capture(0, num_views=15, width=96, height=72), path)
 
 
-def _rewrite(path, output, change, kind="z", names=None):
-    """Depth maps of a capture, each made another one by ``change(index, values)``."""
-    scene = load_scene(path)
-    depths = find_depths(scene, path / "depths")
-    with depth_folder(output, kind) as writer:
-        for i, name in enumerate(sorted(depths)):
-            if names is None or name in names:
-                writer.write(name, np.float32(change(i, depths.read(name).values)))
-    return output
-
-
 def test_nothing_follows_from_maps_that_do_not_fit(room, splatseed):
     run = splatseed("info", room, "--depth", room / "depths", "--depth-kind", "inverse")
     assert "12 of 12 depth maps cannot be aligned" in run.out
@@ -185,30 +161,39 @@ def test_true_depth_fits(room, splatseed):
 
 
 def test_the_worst_are_listed_first_and_the_rest_on_demand(tour, tmp_path, splatseed):
-    def spoil(i, z):
-        return np.where(np.random.default_rng(i).random(z.shape) < 0.4, z * 1.3, z) if i == 4 else z
-
-    maps = _rewrite(tour, tmp_path / "maps", spoil)
-    short = splatseed("info", tour, "--depth", maps).out
-    assert "the 12 worst; --json has all" in short
-    assert len(_rows(short)) == 12
-    assert next(iter(_rows(short))) == sorted(find_depths(load_scene(tour), maps))[4]
-    assert len(json.loads(splatseed("info", tour, "--depth", maps, "--json").out)["depth"]) == 15
-
-
-def test_why_an_image_is_left_out(tour, tmp_path, splatseed):
-    names = sorted(image.name for image in load_scene(tour).images)[:8]
-    blind = lambda i, z: z * np.nan if i == 2 else z
-    maps = _rewrite(tour, tmp_path / "maps", blind, names=names)
-    out = splatseed("info", tour, "--depth", maps).out
-    pairs = _pairs(out)
-    assert pairs["maps"].startswith("8 of 15 images")
+    depths, maps = find_depths(load_scene(tour), tour / "depths"), tmp_path / "maps"
+    names, rng = sorted(depths)[:14], np.random.default_rng(4)
+    with depth_folder(maps, "z") as writer:
+        for i, name in enumerate(names):
+            z = np.float32(depths.read(name).values)
+            if i in {2, 4}:  # nothing in one, much that is wrong in the other
+                z[rng.random(z.shape) < {2: 1.0, 4: 0.2}[i]] *= {2: np.nan, 4: 1.3}[i]
+            writer.write(name, z)
+    out = splatseed("info", tour, "--depth", maps, "--picture", tmp_path / "a.png").out
+    pairs, rows = _pairs(out), _rows(out)
+    assert pairs["maps"].startswith("14 of 15 images")
     assert pairs["left out"] == "1"
+    assert "the 12 worst; --json has all" in out
+    assert list(rows)[:2] == [names[2], names[4]]
+    assert (len(rows), rows[names[2]]) == (12, ("0", "-", "", "-"))
     assert f"- {names[2]}: the map has no depth at any pixel" in out
-    assert "- 1 of 8 depth maps cannot be aligned with the points" in out.partition("problems")[2]
-    assert "no problems" not in out
-    assert _rows(out)[names[2]] == ("0", "-", "", "-")
-    assert next(iter(_rows(out))) == names[2]
+    assert "- 1 of 14 depth maps cannot be aligned with the points" in out.partition("problems")[2]
+    assert len(json.loads(splatseed("info", tour, "--depth", maps, "--json").out)["depth"]) == 14
+    _assert_drawn(tmp_path / "a.png")
+
+
+def _assert_drawn(path):
+    """Photographs, depth and points of three images, and of the one whose map has nothing."""
+    page = np.asarray(PilImage.open(path)).astype(int)
+    assert page.shape == (4 * (360 + 34) + 12 + 44, 3 * (480 + 12) + 12, 3)
+    rows = [page[34 + r * 394 : 394 + r * 394] for r in range(4)]
+    tiles = [[row[:, 12 + c * 492 : 492 + c * 492] for c in range(3)] for row in rows]
+    for photograph, depth, points in tiles[:3]:
+        assert len(np.unique(photograph.reshape(-1, 3), axis=0)) > 500
+        assert not (depth == 150).all()
+        assert 0.5 < (np.ptp(points, axis=2) == 0).mean() < 0.999  # grey but for the points
+    assert (tiles[3][1] == 150).all()
+    assert (np.ptp(tiles[3][2], axis=2) == 0).all()
 
 
 @pytest.mark.parametrize(
@@ -223,22 +208,6 @@ def test_why_an_image_is_left_out(tour, tmp_path, splatseed):
 )
 def test_no_more_points_are_asked_for_than_there_is_room_for(points, known, most, said):
     assert number_for(points, known, most) == said
-
-
-def test_the_picture_shows_photographs_depth_and_points(tour, tmp_path, splatseed):
-    blind = lambda i, z: z * np.nan if i == 2 else z
-    maps = _rewrite(tour, tmp_path / "maps", blind)
-    assert splatseed("info", tour, "--depth", maps, "--picture", tmp_path / "a.png").code == 0
-    page = np.asarray(PilImage.open(tmp_path / "a.png")).astype(int)
-    assert page.shape == (4 * (360 + 34) + 12 + 44, 3 * (480 + 12) + 12, 3)
-    rows = [page[34 + r * 394 : 394 + r * 394] for r in range(4)]
-    tiles = [[row[:, 12 + c * 492 : 492 + c * 492] for c in range(3)] for row in rows]
-    for photograph, depth, points in tiles[:3]:
-        assert len(np.unique(photograph.reshape(-1, 3), axis=0)) > 500
-        assert not (depth == 150).all()
-        assert 0.5 < (np.ptp(points, axis=2) == 0).mean() < 0.999  # grey but for the points
-    assert (tiles[3][1] == 150).all()
-    assert (np.ptp(tiles[3][2], axis=2) == 0).all()
 
 
 def test_a_scenes_own_maps_are_counted_and_can_be_lifted(rgbd, tmp_path, splatseed):
@@ -296,56 +265,31 @@ def test_a_seeded_scene_is_to_be_trained_and_not_seeded_again(room, tmp_path, sp
 # Poses --------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def large(tmp_path_factory) -> Path:
-    """The room in photographs that are large enough for corners to be found again."""
-    capture = make_capture(0, num_views=16, width=240, height=180)
-    return write_capture(capture, tmp_path_factory.mktemp("large") / "room")
-
-
-@pytest.fixture
-def bare(large, tmp_path) -> Path:
-    """The same in nerfstudio's layout, without its points."""
-    folder = tmp_path / "bare"
-    write_scene(load_scene(large), folder, format="transforms")
-    for path in folder.glob("*.ply"):
-        path.unlink()
-    content = json.loads((folder / "transforms.json").read_text())
-    del content["ply_file_path"]
-    (folder / "transforms.json").write_text(json.dumps(content))
-    return folder
-
-
-def _turn(folder: Path, turn_of: object) -> None:
-    """Turn each camera about its own axes."""
-    path = folder / "transforms.json"
-    content = json.loads(path.read_text())
-    for number, frame in enumerate(content["frames"]):
-        pose = np.array(frame["transform_matrix"])
-        pose[:3, :3] @= turn_of(number)  # type: ignore[operator]
-        frame["transform_matrix"] = pose.tolist()
-    path.write_text(json.dumps(content))
-
-
-def test_sound_poses_and_those_of_a_device(bare, splatseed):
-    facts = json.loads(splatseed("info", bare, "--json").out)
-    assert facts["poses"]["agreement"] > 0.3
-    assert facts["poses"]["error"]["exact"]
-    assert len(facts["problems"]) == 1  # that there are no points
-    rng = np.random.default_rng(0)
-    _turn(bare, lambda _: Rotation.from_rotvec(np.radians(0.8) * rng.normal(size=3)).as_matrix())
-    poses = json.loads(splatseed("info", bare, "--json").out)["poses"]
-    assert not poses["error"]["exact"]
-    assert 0.3 < poses["error"]["degrees"] < 2
-    told = splatseed("info", bare).out
-    assert "photographs miss each other by about" in told
-    assert f"splatseed upsample {bare} --budget" in told.partition("next")[2]
-    assert told.partition("next")[2].count("--refine-poses") == 2
-
-
-def test_wrong_axes_are_a_problem_not_an_error(bare, splatseed):
-    _turn(bare, lambda _: np.diag([1.0, -1.0, -1.0]))
-    run = splatseed("info", bare)
+def test_sound_poses_without_points_ask_for_some(room, tmp_path, splatseed):
+    scene = load_scene(room).replace(points=PointCloud.empty(), tracks=None, depths=None)
+    write_scene(scene, tmp_path / "nerf", format="transforms", require_points=False)
+    run = splatseed("info", tmp_path / "nerf")
     assert run.code == 0
-    assert "once the y and z axes of every camera are negated" in run.out
-    assert "splatseed upsample" not in run.out.partition("next")[2]
+    rows, advised = _pairs(run.out), run.out.partition("next")[2]
+    assert rows["points"] == "none"
+    assert rows["photographs agree"].startswith("at ")
+    assert "there are no points" in run.out
+    assert "splatseed upsample" in advised
+    assert f"--poses-from {tmp_path / 'nerf'}" in advised
+    assert "--refine-poses" not in advised
+    assert "nan" not in run.out
+
+
+def test_poses_of_a_device_are_to_be_refined(as_by_a_device, tmp_path, splatseed):
+    capture = make_capture(0, num_views=16, width=240, height=180)
+    scene = as_by_a_device(load_scene(write_capture(capture, tmp_path / "room")))
+    path = write_scene(scene, tmp_path / "bare", require_points=False).path
+    poses = json.loads(splatseed("info", path, "--json").out)["poses"]
+    assert poses["agreement"] > 0.3
+    assert not poses["error"]["exact"]
+    assert 0.1 < poses["error"]["degrees"] < 1
+    told = splatseed("info", path).out
+    assert "photographs miss each other by about" in told
+    advised = told.partition("next")[2]
+    assert f"splatseed upsample {path} --budget" in advised
+    assert advised.count("--refine-poses") == 2
