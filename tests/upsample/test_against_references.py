@@ -42,7 +42,7 @@ CASES = {
     "voronoi, paper": (partial(voronoi, box=True), {"profile": "paper"}),
 }
 
-NUM_NEW = 400
+NUM_NEW = 200
 SEED = 5
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import tempfile
 from pathlib import Path
 
@@ -101,11 +102,17 @@ def test_tracks_are_heeded(tiles):
 
 
 def dying(flag, function, *arguments):
-    """A task that ends its process the first time, as when memory is short."""
-    if not flag.exists():
-        flag.touch()
-        os._exit(9)
+    """A task whose process is killed the first time, in the middle of what it saves."""
+
+    def save(*given, **options):
+        real(*given, **options)
+        if not flag.exists():
+            flag.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    real, np.save = np.save, save
     function(*arguments)
+    np.save = real
 
 
 class DyingTasks(ProcessTasks):
@@ -124,6 +131,7 @@ def test_processes_give_the_same_bytes_though_one_is_killed(sheet, tiles, tmp_pa
     flag = tmp_path / "killed"
     found = tiles(sheet, "linear", configure("linear"), most=250, tasks=DyingTasks(flag))
     assert flag.exists()
+    assert not list(tiles.path.glob("*/.*"))  # what was half-written is gone
     assert_same(found, upsample(distinct(sheet), "linear", ratio=3))
 
 
