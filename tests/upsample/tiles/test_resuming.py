@@ -144,9 +144,9 @@ def test_the_memory_for_repeats_is_that_of_a_tile(tiles, tmp_path, monkeypatch):
         grid = np.stack(np.meshgrid(np.arange(length), np.arange(6), 0), axis=-1).reshape(-1, 3)
         cloud = PointCloud((grid + 2**24).astype(np.float32), np.zeros(grid.shape, np.uint8))
         tiles.path = tmp_path / f"{len(peaks)}.tiles"
-        tiles(cloud, "linear", LINEAR, most=40, ratio=40, at_once=125)
+        tiles(cloud, "linear", LINEAR, most=100, ratio=40, at_once=60)
         assert tiles.tiled.num_repeated > 0.9 * tiles.tiled.num_new
-    assert peaks[2] < 3 * peaks[1]  # for six times the points
+    assert peaks[2] < 2 * max(peaks[:2])  # for six times the points
 
 
 @pytest.mark.parametrize(
