@@ -1,4 +1,4 @@
-"""What several tests of the formats check."""
+"""What several tests of the formats read with, and check."""
 
 from __future__ import annotations
 
@@ -7,7 +7,43 @@ from contextlib import contextmanager
 
 import numpy as np
 
+from splatseed.camera import Intrinsics
 from splatseed.errors import SplatseedError
+from splatseed.io import colmap
+from splatseed.io.clouds import open_cloud
+from splatseed.io.depth_files import read_stored
+from splatseed.io.depth_maps import read_capture_scale, read_description
+from splatseed.io.ply import read_ply
+from splatseed.io.rgbd import _read_intrinsics, _read_list, _read_track
+
+CAMERAS = (Intrinsics(1, "PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0)),)
+
+
+def read_images(path):
+    return colmap.read_images(path, CAMERAS)
+
+
+def read_capture_camera(path):
+    return read_capture_scale(path), _read_intrinsics(path)
+
+
+READERS = {
+    **dict.fromkeys(("cameras.bin", "cameras.txt"), colmap.read_cameras),
+    **dict.fromkeys(("images.bin", "images.txt"), read_images),
+    **dict.fromkeys(("points3D.bin", "points3D.txt"), colmap.read_points3d),
+    **dict.fromkeys(("little.ply", "big.ply", "ascii.ply"), read_ply),
+    **dict.fromkeys(("a.bin", "a.npy", "a.npz", "a.pfm", "a.png", "a.tiff"), read_stored),
+    "depths.json": read_description,
+    "cam_params.json": read_capture_camera,
+    "rgb.txt": _read_list,
+    "groundtruth.txt": _read_track,
+}
+"""The reader of each small file."""
+
+
+def drain(path):
+    for chunk in open_cloud(path).chunks(50):
+        assert 0 < len(chunk) <= 50
 
 
 @contextmanager

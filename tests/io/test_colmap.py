@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from dataclasses import replace
 
 import numpy as np
@@ -11,25 +10,17 @@ from hypothesis import given, settings, strategies as st
 from hypothesis.extra import numpy as hnp
 
 from splatseed.camera import CAMERA_MODELS, Intrinsics
-from splatseed.errors import OutputError, PointCloudError, SceneFormatError
+from splatseed.errors import OutputError, PointCloudError
 from splatseed.io import colmap
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Observations, Tracks
 
-from .checks import assert_same_images, assert_same_points, little_memory
+from .checks import CAMERAS, assert_same_images, assert_same_points
 from .conftest import Model, written
 
 REAL_MODELS = [
     f"{scene}/sparse/0" for scene in ("fern", "fox", "treehill", "bonsai", "mipnerf360_sfm/stump")
 ]
-CAMERAS = (Intrinsics(1, "PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0)),)
-READERS = {
-    "cameras": colmap.read_cameras,
-    "images": lambda path: colmap.read_images(path, CAMERAS),
-    "points": colmap.read_points3d,
-}
-
-
 def read(folder, suffix="bin"):
     cameras = colmap.read_cameras(folder / f"cameras.{suffix}")
     images = colmap.read_images(folder / f"images.{suffix}", cameras)
@@ -123,91 +114,6 @@ def test_empty_models_are_models(tmp_path, name, data):
     points, tracks = colmap.read_points3d(path)
     assert len(points) == len(tracks) == 0
     assert (tracks.offsets.tolist(), tracks.image_ids.dtype) == ([0], np.uint32)
-
-
-CAMERA = struct.pack("<QIiQQ4d", 1, 1, 1, 640, 480, 500, 500, 320, 240)
-IMAGE = struct.pack("<QI7dI", 1, 1, 1, 0, 0, 0, 0, 0, 0, 1) + b"a.jpg\0" + struct.pack("<Q", 0)
-POINT = struct.pack("<Q3d3BdQ2I", 1, 0, 0, 0, 1, 2, 3, 0.5, 1, 1, 0)  # without the file's count
-TWO, MANY = struct.pack("<Q", 2), struct.pack("<Q", 2**60)
-
-
-def patched(data, at, layout, value):
-    """The bytes with one field changed."""
-    return data[:at] + struct.pack(layout, value) + data[at + struct.calcsize(layout) :]
-
-
-def points_of(*records):
-    return struct.pack("<Q", len(records)) + b"".join(records)
-
-
-def point(point_id=1, track_length=0):
-    return struct.pack("<Q3d3BdQ", point_id, 0, 0, 0, 1, 2, 3, 0.5, track_length)
-
-
-@pytest.mark.parametrize(
-    ("what", "data", "where"),
-    [
-        ("cameras", b"", "byte 0"),
-        ("cameras", CAMERA[:-1], "record 1"),
-        ("cameras", CAMERA + b"\0", "end"),
-        ("cameras", TWO + 2 * CAMERA[8:], "record 2"),
-        ("cameras", patched(CAMERA, 12, "<i", 99), "record 1"),
-        ("cameras", patched(CAMERA, 32, "<d", np.nan), "record 1"),
-        ("cameras", patched(CAMERA, 32, "<d", 0.0), "focal length above 0 .*record 1"),
-        ("images", TWO + 2 * IMAGE[8:], "image id once .*record 2"),
-        ("images", TWO + IMAGE[8:] + patched(IMAGE, 8, "<I", 3)[8:], "name once .*record 2"),
-        ("images", patched(IMAGE, 12, "<d", np.nan), "record 1"),
-        ("images", patched(IMAGE, 12, "<d", 0.0), "quaternion .*record 1"),
-        ("images", patched(IMAGE, 68, "<I", 8), "camera id 8"),
-        ("images", IMAGE[:72] + b"\xff.jpg\0" + IMAGE[-8:], "record 1"),
-        ("images", IMAGE[:72] + b"no end" + 20 * b"x", "record 1"),
-        ("images", IMAGE[:72] + b"\0" + IMAGE[-8:], "an image name .*record 1"),
-        ("images", IMAGE[:-8] + MANY, "at most 0 features"),
-        ("images", IMAGE[:-8] + struct.pack("<QddQ", 1, 0, 0, 2**63), "record 1"),
-        ("points", points_of(point(), POINT)[:-1], "record 2 of 2, byte 59; found 58 bytes"),
-        ("points", MANY + POINT, "at most 1 points"),
-        *(("points", points_of(point(track_length=2**n)), "record 1") for n in (60, 63)),
-        ("points", points_of(point(4), point(5), point(4)), "record 3; found 4"),
-        ("points", points_of(point(4), point(2**63)), "record 2"),
-    ],
-)
-def test_malformed_binary_records_are_named(tmp_path, what, data, where):
-    (tmp_path / "a.bin").write_bytes(data)
-    with little_memory(), pytest.raises(SceneFormatError, match=where) as caught:
-        READERS[what](tmp_path / "a.bin")
-    assert "a.bin" in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("what", "text", "where"),
-    [
-        ("cameras", "\n1 PINHOLE 640", "line 2; found '1 PINHOLE 640'"),
-        ("cameras", "1 LENS 640 480 1 2 3 4", "line 1; found 'LENS'"),
-        ("cameras", "1 PINHOLE 640 480 1 2 3", "line 1; found 3"),
-        ("cameras", "1 PINHOLE 640 480 1 2 3 nan", "line 1"),
-        ("cameras", "-1 PINHOLE 640 480 1 2 3 4", "line 1"),
-        ("cameras", "1 PINHOLE 6 4 1 2 3 4\n# c\n1 PINHOLE 6 4 1 2 3 4", "line 3"),
-        ("cameras", b"# one\n# caf\xe9\n", "line 2"),
-        ("images", "# c\n1 1 0 0 0 0 0 0 1\n\n", "line 2"),
-        ("images", "1 1 0 0 0 0 0 0 5 a.jpg\n\n", "line 1; found camera id 5"),
-        ("images", "4294967296 1 0 0 0 0 0 0 1 a.jpg\n\n", "line 1"),
-        ("images", "1 1 0 0 0 0 0 0 1 a.jpg\n1 2\n", "line 2; found '1 2'"),
-        ("images", "1 1 0 0 0 0 0 0 1 a.jpg\n1 2 9223372036854775808\n", "line 2"),
-        ("images", "1 1 0 0 0 0 0 0 1 a.jpg\n1 2 -2\n", "line 1"),
-        ("images", "1 1 0 0 0 0 0 0 1 a\n\n1 1 0 0 0 0 0 0 1 b\n", "line 3; found 1"),
-        ("points", "# c\n\n1 0 0 0 1 2 3", "line 3; found '1 0 0 0 1 2 3'"),
-        ("points", "1 0 0 0 1 2 3 .5\n2 0 x 0 1 2 3 .5", "line 2"),
-        ("points", "1 0 0 0 1 2 3 .5\n2 0 0 0 1 2 256 .5", "line 2"),
-        ("points", "1 0 0 0 1 2 3 .5 4 5\n2 0 0 0 1 2 3 .5 4 -1", "line 2"),
-        ("points", "1 0 0 0 1 2 3 .5\n9223372036854775808 0 0 0 1 2 3 .5", "line 2"),
-        ("points", "-1 0 0 0 1 2 3 .5", "line 1"),
-        ("points", "7 0 0 0 1 2 3 .5\n# c\n7 0 0 0 1 2 3 .5", "line 3; found 7"),
-    ],
-)
-def test_malformed_lines_are_named(tmp_path, what, text, where):
-    (tmp_path / "a.txt").write_bytes(text if isinstance(text, bytes) else text.encode())
-    with pytest.raises(SceneFormatError, match=rf"a\.txt, {where}"):
-        READERS[what](tmp_path / "a.txt")
 
 
 @pytest.mark.parametrize("change", [{"name": "a\0b"}, {"name": "\udcff"}, {"image_id": -1}])

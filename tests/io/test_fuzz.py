@@ -14,44 +14,14 @@ import pytest
 from hypothesis import HealthCheck, given, settings, strategies as st
 from PIL import Image as PilImage
 
-from splatseed.camera import Intrinsics
 from splatseed.errors import SceneFormatError, SplatseedError
 from splatseed.io import colmap
-from splatseed.io.clouds import open_cloud
 from splatseed.io.depth_files import read_stored
-from splatseed.io.depth_maps import read_capture_scale, read_description
-from splatseed.io.ply import read_ply, write_ply
-from splatseed.io.rgbd import _read_list, _read_track
+from splatseed.io.ply import write_ply
 
-from .checks import assert_only_our_errors
+from .checks import READERS, assert_only_our_errors, drain, read_images
 from .conftest import CLOUDS
 
-CAMERAS = (Intrinsics(7, "PINHOLE", 64, 48, (50.0, 50.0, 32.0, 24.0)),)
-
-
-def read_images(path):
-    return colmap.read_images(path, CAMERAS)
-
-
-def drain(path):
-    for chunk in open_cloud(path).chunks(50):
-        assert 0 < len(chunk) <= 50
-
-
-READERS = {
-    "cameras.bin": colmap.read_cameras,
-    "cameras.txt": colmap.read_cameras,
-    "images.bin": read_images,
-    "images.txt": read_images,
-    "points3D.bin": colmap.read_points3d,
-    "points3D.txt": colmap.read_points3d,
-    **dict.fromkeys(("little.ply", "big.ply", "ascii.ply"), read_ply),
-    **dict.fromkeys(("a.bin", "a.npy", "a.npz", "a.pfm", "a.png", "a.tiff"), read_stored),
-    "depths.json": read_description,
-    "cam_params.json": read_capture_scale,
-    "rgb.txt": _read_list,
-    "groundtruth.txt": _read_track,
-}
 TEXT = (".txt", "ascii.ply")
 WORDS = st.sampled_from(
     [*"0123456789", "-1", "255", "1e999", "nan", "-inf", "1_0", "0x1", "99999999999999999999", "#"]
@@ -68,7 +38,7 @@ HEADERS = st.sampled_from(
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning:PIL")
 
 fuzz = settings(
-    max_examples=60,
+    max_examples=40,
     deadline=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
@@ -93,8 +63,8 @@ ROW = np.dtype([("x", ">f4"), ("y", ">f4"), ("z", ">f8"), ("r", ">u2"), ("g", ">
 def valid(tmp_path_factory) -> dict[str, bytes]:
     """A small valid file of each kind; reading them also loads the compiled kernels."""
     folder = tmp_path_factory.mktemp("valid")
-    image = "3 1 0 0 0 0 0 1 7 a b.jpg\n1.5 2 -1 3 4 9\n4 .5 .5 .5 .5 0 0 1 7 c.jpg\n\n"
-    cameras = "7 PINHOLE 64 48 50 50 32 24\n8 OPENCV 6 4 1 2 3 4 5 6 7 8\n"
+    image = "3 1 0 0 0 0 0 1 1 a b.jpg\n1.5 2 -1 3 4 9\n4 .5 .5 .5 .5 0 0 1 1 c.jpg\n\n"
+    cameras = "1 PINHOLE 64 48 50 50 32 24\n8 OPENCV 6 4 1 2 3 4 5 6 7 8\n"
     (folder / "cameras.txt").write_text(cameras)
     (folder / "images.txt").write_text(image)
     (folder / "points3D.txt").write_text("9 1 2 3 4 5 6 .5 3 1\n12 1 nan 3 4 5 6 -1\n")
@@ -116,7 +86,8 @@ def valid(tmp_path_factory) -> dict[str, bytes]:
     PilImage.fromarray(array.astype(np.uint16)).save(folder / "a.png")
     PilImage.fromarray(array).save(folder / "a.tiff", compression="tiff_lzw")
     (folder / "depths.json").write_text('{"kind": "z", "scale": 2.5}')
-    (folder / "cam_params.json").write_text('{"camera": {"w": 4, "scale": 2.5}}')
+    camera = '"w": 4, "h": 3, "fx": 5.5, "fy": 5, "cx": 2, "cy": 1.5, "scale": 2.5'
+    (folder / "cam_params.json").write_text(f'{{"camera": {{{camera}}}}}')
     (folder / "rgb.txt").write_text("# time path\n1.5 rgb/a.png\n2.5 rgb/b.png\n")
     (folder / "groundtruth.txt").write_text("1.5 1 2 3 0 0 0 1\n2.5 1 2 3 0 0.6 0 0.8\n")
     for name, read in READERS.items():
@@ -153,23 +124,16 @@ def damages(draw, data: bytes) -> bytes:
 @pytest.mark.parametrize("name", READERS)
 @fuzz
 @given(data=st.data())
-def test_random_bytes_and_words(name, target, data, valid):
-    drawn, start = data.draw(st.binary(max_size=300)), valid[name].find(b"end_header\n") + 11
-    befores = [data.draw(HEADERS), valid[name][: len(drawn)]]
+def test_damaged_files_and_random_bytes_and_words(name, target, data, valid):
+    whole, drawn = valid[name], data.draw(st.binary(max_size=300))
+    start = whole.find(b"end_header\n") + 11
+    tried = [data.draw(HEADERS) + drawn, whole[: len(drawn)] + drawn]
     if name.endswith(TEXT) and data.draw(st.booleans()):
         words = data.draw(st.lists(WORDS | st.text(max_size=5), max_size=60))
         drawn = " ".join(words).encode("utf-8", errors="replace")
-        befores = [b"", valid[name], valid[name][:start]]
-    for before in befores:
-        assert_only_our_errors(READERS[name], target.with_name(name), before + drawn)
-
-
-@pytest.mark.parametrize("name", READERS)
-@fuzz
-@given(data=st.data())
-def test_damaged_files(name, target, data, valid):
-    target = target.with_name(name)
-    assert_only_our_errors(READERS[name], target, data.draw(damages(valid[name])))
+        tried = [drawn, whole + drawn, whole[:start] + drawn]
+    for each in (*tried, data.draw(damages(whole))):
+        assert_only_our_errors(READERS[name], target.with_name(name), each)
 
 
 @pytest.mark.parametrize("name", CLOUDS)
