@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-import io
 import json
 import os
 import re
 import socket
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -57,9 +55,7 @@ def test_what_is_no_file_is_not_called_missing(odd, name, is_, scene_dir, model)
     _rename(scene_dir, model, str(odd / name))
     scene = load_scene(scene_dir)
     assert f"{odd / name}, which is {is_}, not a file." in " ".join(scene.warnings)
-    assert untrainable(scene) == (
-        f"Training needs all {len(model.images)} photographs: {odd / name} is {is_}, not a file."
-    )
+    assert f"{odd / name} is {is_}, not a file." in untrainable(scene)
     inside = scene.replace(images=scene.images[1:])
     path = write_scene(inside, odd / "json", format="transforms").path
     content = json.loads((path / "transforms.json").read_text())
@@ -114,9 +110,7 @@ def _rename(scene_dir, model, name):
 def test_a_name_that_leads_out_of_the_scene_is_told(scene_dir, model, name):
     _rename(scene_dir, model, name)
     told = [each for each in load_scene(scene_dir).warnings if "outside of" in each]
-    inside = "left" in name
-    assert len(told) == (not inside)
-    assert inside or name in told[0]
+    assert [name in each for each in told] == ([] if "left" in name else [True])
 
 
 @pytest.mark.parametrize("target", ["/dev/zero", "../images"])
@@ -127,28 +121,12 @@ def test_copies_are_of_files_and_end(scene_dir, tmp_path, target):
     assert not (tmp_path / "out").exists()
 
 
-def _archive(path: Path, shape, name="depth"):
-    """An archive of zeros whose body is written without being held."""
-    header = io.BytesIO()
-    np.lib.format.write_array_header_1_0(
-        header, {"descr": "<f4", "fortran_order": False, "shape": shape}
-    )
-    with (
-        zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive,
-        archive.open(f"{name}.npy", "w") as file,
-    ):
-        file.write(header.getvalue())
-        for _ in range(shape[0]):
-            file.write(bytes(4 * shape[1]))
-
-
 def test_an_archive_that_would_burst_is_refused_by_its_header(tmp_path):
-    _archive(tmp_path / "bomb.npz", (6000, 6000))
+    np.savez_compressed(tmp_path / "bomb.npz", depth=np.zeros((5000, 5000), np.float32))
     assert (tmp_path / "bomb.npz").stat().st_size < 200_000
-    with little_memory(), pytest.raises(SceneFormatError, match=r"would become 144,000,"):
+    with little_memory(), pytest.raises(SceneFormatError, match=r"would become 100,000,"):
         read_stored(tmp_path / "bomb.npz")
-    _archive(tmp_path / "more.npz", (48, 64))  # of one value
-    with zipfile.ZipFile(tmp_path / "more.npz", "a", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("normals.npy", bytes(1 << 25))  # never looked at
+    constant, unread = np.zeros((48, 64), np.float32), np.zeros(1 << 22)
+    np.savez_compressed(tmp_path / "more.npz", depth=constant, normals=unread)
     with little_memory(1 << 20):
         assert read_stored(tmp_path / "more.npz").values.shape == (48, 64)

@@ -46,7 +46,7 @@ def test_real_clouds_are_written_back_byte_for_byte(scenes, scene, tmp_path):
     assert (tmp_path / "points.ply").read_bytes() == source.read_bytes()
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(xyz=hnp.arrays(np.float32, st.tuples(st.integers(0, 6), st.just(3))), data=st.data())
 def test_clouds_survive_a_round_trip(tmp_path_factory, xyz, data):
     path = tmp_path_factory.getbasetemp() / "round_trip.ply"

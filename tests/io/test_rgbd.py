@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from dataclasses import replace
 
 import numpy as np
@@ -21,6 +20,7 @@ from splatseed.scene import SceneSource
 
 START, PERIOD = 1305031102.175304, 1 / 30
 TIMES = START + PERIOD * np.arange(4)
+CAMERA = {"w": 40, "h": 30, "fx": 35.0, "fy": 36.0, "cx": 19.5, "cy": 14.5, "scale": 1000.0}
 
 
 def turn(angle):
@@ -78,23 +78,21 @@ def test_images_poses_and_depth_belong_together_by_time(capture):
 def test_camera_of_the_series_or_of_a_file(capture):
     lens = load_tum(capture).intrinsics[0]
     assert lens == Intrinsics(1, "PINHOLE", 640, 480, (535.4, 539.2, 320.6, 248.1))
-    for series, focal in ("1", 517.3), ("2", 520.9):
-        capture = capture.rename(capture.with_name(f"rgbd_dataset_freiburg{series}_xyz"))
-        scene = load_tum(capture)
-        assert scene.intrinsics[0].model == "FULL_OPENCV"
-        assert scene.intrinsics[0].params[0] == focal
-        assert len(scene.intrinsics[0].params) == 12
-        assert any("distortion" in text for text in scene.warnings)
-        assert scene.depths.lens is None  # the photographs have the same distortion
+    capture = capture.rename(capture.with_name("rgbd_dataset_freiburg2_xyz"))
+    scene = load_tum(capture)
+    (lens,) = scene.intrinsics
+    assert (lens.model, lens.params[0], len(lens.params)) == ("FULL_OPENCV", 520.9, 12)
+    assert any("distortion" in text for text in scene.warnings)
+    assert scene.depths.lens is None  # the photographs have the same distortion
     capture = capture.rename(capture.with_name("kitchen"))
     scene = load_tum(capture)
     assert scene.intrinsics[0].params == (525, 525, 320, 240)
     assert "focal length 525" in scene.warnings[0]
-    camera = {"w": 640, "h": 480, "fx": 500, "fy": 510, "cx": 319.5, "cy": 239.5, "scale": 1000}
     for folder in (capture.parent, capture):
+        camera = CAMERA | {"w": 640, "h": 480}
         (folder / "cam_params.json").write_text(json.dumps({"camera": camera}))
         scene = load_tum(capture)
-        assert scene.intrinsics[0].params == (500, 510, 319.5, 239.5)
+        assert scene.intrinsics[0].params == (35, 36, 19.5, 14.5)
         assert scene.depths.scale == find_depths(scene, capture).scale == 1000
         (folder / "cam_params.json").unlink()
 
@@ -131,15 +129,17 @@ def test_undistorted_map_has_the_value_that_the_lens_saw_along_each_ray():
     camera = Intrinsics(1, "PINHOLE", 600, 440, (520.0, 515.0, 300.0, 225.0))
     row, column = np.mgrid[:480, :640].astype(np.float32)
     values = column + 1000 * row  # which pixel it is
-    undistorted = Undistortion(lens, {"a.png": camera}).apply("a.png", values)
-    assert (undistorted.shape, undistorted.dtype) == ((440, 600), np.float32)
+    whole, half = (
+        Undistortion(lens, {"a.png": camera}).apply("a.png", values[::step, ::step])
+        for step in (1, 2)
+    )
+    assert (whole.shape, whole.dtype) == ((440, 600), np.float32)
     for u, v in [(0, 0), (300, 225), (10, 400), (599, 439), (450, 100)]:
         ray = np.array([(u + 0.5 - 300) / 520, (v + 0.5 - 225) / 515])
         x, y = np.floor(image_points(lens, ray))
         expected = x + 1000 * y if 0 <= x < 640 and 0 <= y < 480 else np.nan
-        np.testing.assert_equal(undistorted[v, u], np.float32(expected))
-    half = Undistortion(lens, {"a.png": camera}).apply("a.png", values[::2, ::2])
-    np.testing.assert_array_equal(half[225, 300] % 1000 // 2, undistorted[225, 300] % 1000 // 2)
+        np.testing.assert_equal(whole[v, u], np.float32(expected))
+    assert half[225, 300] % 1000 // 2 == whole[225, 300] % 1000 // 2
 
 
 def test_maps_are_undistorted_with_their_photographs(capture, tmp_path):
@@ -160,9 +160,6 @@ def test_maps_are_undistorted_with_their_photographs(capture, tmp_path):
     for image in images:
         (folder / image.name).write_bytes((capture / "rgb" / image.name).read_bytes())
     assert find_depths(undistorted, capture).lens is None
-
-
-CAMERA = {"w": 40, "h": 30, "fx": 35.0, "fy": 36.0, "cx": 19.5, "cy": 14.5, "scale": 1000.0}
 
 
 def pose(angle, center):
@@ -203,19 +200,15 @@ def test_frames_are_paired_with_poses_and_depth_by_number(room):
     assert len({image.image_id for image in scene.images}) == 3
     assert (len(scene.points), scene.warnings) == (0, ())
     assert (scene.source.format, scene.source.image_dir) == ("rgbd", room / "results")
-    assert list(scene.depths) == names[:2]
-    for name, depth in zip(names[:2], (0.5, 1.0), strict=True):
-        assert np.unique(scene.depths.read(name).values).tolist() == [depth]
+    depths = {name: np.unique(scene.depths.read(name).values).tolist() for name in scene.depths}
+    assert depths == {names[0]: [0.5], names[1]: [1.0]}
     for path in (room / "results").glob("depth*.png"):
         path.unlink()
     assert load_rgbd(room).depths is None
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_lost_frames_are_left_out_and_told(room, value):
-    lost = POSES[1].copy()
-    lost[0, 3] = value
-    write_poses(room, [POSES[0], lost, POSES[2]])
+def test_lost_frames_are_left_out_and_told(room):
+    write_poses(room, [POSES[0], np.full((4, 4), np.inf), POSES[2]])
     scene = load_rgbd(room)
     assert [image.name for image in scene.images] == ["frame000001.png", "frame10.jpg"]
     np.testing.assert_allclose(scene.images[1].camera.world_from_cam, POSES[2], atol=1e-12)
@@ -237,28 +230,20 @@ def test_missing_files_and_frames_of_another_size(room):
         load_rgbd(room)
 
 
-def lines_of(matrix):
-    return 3 * (" ".join(map(str, matrix.ravel())) + "\n")
+BAD_POSES = (np.zeros(16), np.full(16, 1e308), np.diag([1, 1, -1, 1]), pose(0.1, (1, 2, 3)).T)
 
 
 @pytest.mark.parametrize(
-    ("name", "text"),
+    "text",
     [
-        *(("traj.txt", text) for text in ("1 2 3\n", "\n\n" + "x " * 16, "0 " * 16 + "\n", "")),
-        ("traj.txt", lines_of(np.zeros((4, 4)))),
-        ("traj.txt", lines_of(np.full((4, 4), 1e308))),
-        ("traj.txt", lines_of(np.diag([1, 1, -1, 1]))),
-        ("traj.txt", lines_of(pose(0.1, (1, 2, 3)).T)),
-        *(("traj.txt", text) for text in ("\N{SNOWMAN}", b"\xff\xfe\x00")),
-        *(("cam_params.json", text) for text in ("", "[]", "{}", '{"camera": 3}')),
+        *(b"1 2 3\n", b"\n\n" + b"x " * 16, b"0 " * 16 + b"\n", b"", b"\xff\xfe\x00"),
+        *(3 * f"{' '.join(map(str, each.ravel()))}\n".encode() for each in BAD_POSES),
     ],
 )
-def test_bad_files_are_named(room, capture, name, text):
-    of_room = (room / name).exists()
-    path = (room if of_room else capture) / name
-    path.write_bytes(text if isinstance(text, bytes) else text.encode())
-    with pytest.raises(SceneFormatError, match=re.escape(name)):
-        (load_rgbd if of_room else load_tum)(path.parent)
+def test_bad_poses_are_named(room, text):
+    (room / "traj.txt").write_bytes(text)
+    with pytest.raises(SceneFormatError, match=r"traj\.txt"):
+        load_rgbd(room)
 
 
 def test_real_depth_agrees_best_at_the_principal_point(scenes):

@@ -8,9 +8,11 @@ from types import SimpleNamespace
 
 import pytest
 
-from splatseed.cli import VERBS, main
+from splatseed.cli import VERBS
 from splatseed.commands import bench, train, view
 from splatseed.runtime.interruption import Interruption, exit_code, interruption
+
+STOPS = pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 
 
 @pytest.fixture(autouse=True)
@@ -21,7 +23,12 @@ def _ctrl_c():
     signal.signal(signal.SIGINT, before)
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def _stop(number):
+    os.kill(os.getpid(), number)
+    pytest.fail("the signal had no effect")
+
+
+@STOPS
 def test_the_exit_code_is_that_of_the_signal(number, code):
     with interruption() as stop:
         os.kill(os.getpid(), number)
@@ -31,30 +38,33 @@ def test_the_exit_code_is_that_of_the_signal(number, code):
     assert exit_code() == code
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_train_exits_with_it(number, code, tmp_path, monkeypatch, capsys):
+@STOPS
+def test_what_trains_exits_with_it(number, code, room_path, tmp_path, monkeypatch, splatseed):
     class Stopped:
-        """A run that is told to stop in its first step."""
+        """Work that is told to stop while it is under way."""
 
-        state = type("State", (), {"step": 1})
+        state = SimpleNamespace(step=1)
+
+        def __init__(self, *_, **__):
+            pass
 
         def train(self, _show):
             with interruption():
                 os.kill(os.getpid(), number)
             return False
 
-    monkeypatch.setattr(train, "_prepare", lambda *_: Stopped())
+        def run(self, *_):
+            self.train(None)
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(bench, "ProcessTasks", Stopped)
+    monkeypatch.setattr(train, "_prepare", Stopped)
     monkeypatch.setattr(train, "_announce", lambda *_: None)
     monkeypatch.setattr(train, "require", lambda *_: None)
-    with pytest.raises(SystemExit) as stop:
-        main(["train", str(tmp_path), "-o", str(tmp_path / "run")])
-    assert stop.value.code == code
-    assert "--resume" in capsys.readouterr().err
-
-
-def _stop(number):
-    os.kill(os.getpid(), number)
-    pytest.fail("the signal had no effect")
+    for words in (("bench", "--scenes"), ("tune",), ("train",)):
+        run = splatseed(*words, room_path, "-o", tmp_path / words[0])
+        assert (run.code, "Traceback" in run.err) == (code, False)
+    assert "--resume" in run.err
 
 
 def test_a_viewer_is_ended_by_ctrl_c_and_told_of_sigterm(room_path, monkeypatch, splatseed):
@@ -65,38 +75,10 @@ def test_a_viewer_is_ended_by_ctrl_c_and_told_of_sigterm(room_path, monkeypatch,
         assert run.out.endswith("stopped\n")
 
 
-STOPS = [(signal.SIGINT, 130), (signal.SIGTERM, 143)]
-
-
-@pytest.mark.parametrize(("number", "code"), STOPS)
-@pytest.mark.parametrize("words", [("bench", "--scenes", "demo"), ("tune", "demo")])
-def test_what_trains_in_processes_exits_with_it(
-    words, number, code, room_path, tmp_path, monkeypatch, splatseed
-):
-    class Stopped:
-        """Runs that are told to stop while they are under way."""
-
-        def __init__(self, *_, **__):
-            pass
-
-        def run(self, *_):
-            with interruption():
-                os.kill(os.getpid(), number)
-            raise KeyboardInterrupt
-
-    monkeypatch.setattr(bench, "ProcessTasks", Stopped)
-    named = [room_path if word == "demo" else word for word in words]
-    run = splatseed(*named, "-o", tmp_path / "out")
-    assert (run.code, "Traceback" in run.err) == (code, False)
-
-
-@pytest.mark.parametrize(("number", "code"), STOPS)
+@STOPS
 @pytest.mark.parametrize("verb", VERBS)
 def test_every_verb_exits_with_it(verb, number, code, monkeypatch, splatseed):
-    def stopped(_words):
-        os.kill(os.getpid(), number)
-
-    monkeypatch.setattr(f"splatseed.commands.{verb}.run", stopped)
+    monkeypatch.setattr(f"splatseed.commands.{verb}.run", lambda _words: _stop(number))
     monkeypatch.setattr(Interruption, "last", signal.SIGINT)
     run = splatseed(verb)
     assert (run.code, run.err.split()[0]) == (code, "interrupted;")
