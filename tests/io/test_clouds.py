@@ -109,13 +109,11 @@ def test_glb_of_a_scene(tmp_path, points):
 def test_lzf_references(block, expected):
     from splatseed.io.clouds.pcd import _decompress
 
-    def decompress(block, size):
-        out = np.empty(size, np.uint8)
-        return out.tobytes() if _decompress(np.frombuffer(block, np.uint8), out) else None
-
-    assert decompress(block, len(expected)) == expected
-    assert decompress(block, len(expected) + 1) is None
-    assert decompress(block[:-1], len(expected)) is None
+    for cut, longer in ((0, 0), (0, 1), (1, 0)):
+        out = np.empty(len(expected) + longer, np.uint8)
+        complete = _decompress(np.frombuffer(block[: len(block) - cut], np.uint8), out)
+        assert complete == (not cut and not longer)
+        assert not complete or out.tobytes() == expected
 
 
 @pytest.mark.parametrize(

@@ -94,28 +94,15 @@ def test_model_without_images_keeps_cameras_and_drops_tracks(scene_dir, model):
     for name in ("cameras.bin", "points3D.bin"):
         (folder / name).unlink()
     assert warnings_of(scene_dir) == ""  # a cloud for a trainer, which is to have no poses
-    scene = load_scene(folder / "points3D.ply")
-    assert (scene.source.format, scene.images) == ("ply", ())
-    np.testing.assert_array_equal(scene.points.xyz, model.points.xyz)
+    assert load_scene(folder / "points3D.ply").source.format == "ply"
 
 
-@pytest.mark.parametrize(
-    ("other", "told"),
-    [
-        (str.upper, "names must be equal to the letter"),
-        (lambda name: f"{name}.jpeg", "1 of 4 images is missing"),
-        (None, "1 of 4 images is missing"),
-    ],
-)
-def test_missing_photographs_are_counted_and_the_first_is_named(other, told, scene_dir, model):
+def test_missing_photographs_are_counted_and_the_first_is_named(scene_dir, model):
     path = scene_dir / "images" / model.images[1].name
-    if other is None:
-        path.unlink()
-    else:
-        path.rename(path.with_name(other(path.stem) + path.suffix.upper()))
-    text = warnings_of(scene_dir)
-    assert f"the first is {model.images[1].name}" in text
-    assert told in text
+    path = path.rename(path.with_name(path.name.upper()))
+    assert f"the first is {model.images[1].name}; IMAGE001.JPG is there" in warnings_of(scene_dir)
+    path.unlink()
+    assert "1 of 4 images is missing" in warnings_of(scene_dir)
     first = scene_dir / "images" / model.images[0].name
     PilImage.new("RGB", (64, 48)).save(first)
     assert "64 x 48" in warnings_of(scene_dir)
@@ -135,24 +122,16 @@ def test_points_that_cannot_be_used_are_left_out_or_told(scene_dir, rng):
     text = " ".join(scene.warnings)
     assert "2 points are not finite" in text
     assert "1 point repeats" in text
-    room = rng.uniform(-5, 5, (100, 3))
+    room, notes = rng.uniform(-5, 5, (900, 3)), ("recentre", "1 point lies up to 1e+06 from the")
     for xyz, told in (
-        (room + np.array([500_000, 5_000_000, 100]), "recentre"),
-        (1000 * room + np.array([5000, 0, 0]), None),
-        (np.concatenate([room, [[1e6] * 3]]), "1 point lies up to 1e+06 from the middle"),
-        (
-            np.concatenate([np.tile(room, (9, 1)) + 1e-3 * rng.random((900, 3)), [[300.0] * 3]]),
-            None,
-        ),
+        (room + np.array([500_000, 5_000_000, 100]), [notes[0]]),
+        (1000 * room + np.array([5000, 0, 0]), []),
+        (np.concatenate([room, [[1e6] * 3]]), [notes[1]]),
+        (np.concatenate([room, [[300.0] * 3]]), []),
     ):
         rewrite_points(scene_dir, xyz)
         text = warnings_of(scene_dir)
-        found = [
-            each
-            for each in ("recentre", "1 point lies up to 1e+06 from the middle")
-            if each in text
-        ]
-        assert found == ([told] if told else [])
+        assert [note for note in notes if note in text] == told
 
 
 def test_scene_without_points_is_an_error_unless_allowed(scene_dir, scenes):

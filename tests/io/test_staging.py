@@ -170,11 +170,11 @@ def test_a_folder_without_a_list_is_somebody_elses(output, text):
     assert listing(output) == before
 
 
-MADE_AGAIN = {
-    "preview_methods.png", "images_2/left/a.png",  # nerfstudio's
+MADE_AGAIN = (
+    *("preview_methods.png", "images_2/left/a.png"),  # nerfstudio's
     "images_2_png/left/a.png",  # gsplat's
-    ".points.partial-0123abcd", ".a.partial-0123abcd.pt",
-}  # fmt: skip
+    *(".points.partial-0123abcd", ".a.partial-0123abcd.pt"),
+)
 
 
 @pytest.mark.parametrize("name", ["sparse/0/project.ini", "images_8", "sparse/1", *MADE_AGAIN])

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import errno
 import json
-import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -46,12 +46,7 @@ def check_consistent(folder, scene, num_points):
     cloud = read_ply(folder / "sparse/0/points3D.ply")
     np.testing.assert_array_equal(cloud.xyz, points.xyz)
     np.testing.assert_array_equal(cloud.rgb, points.rgb)
-    return reconstruction, tracks
-
-
-def track_set(tracks, i):
-    span = slice(tracks.offsets[i], tracks.offsets[i + 1])
-    return list(zip(tracks.image_ids[span], tracks.point2d_idx[span], strict=True))
+    return tracks
 
 
 def test_originals_keep_everything_but_their_ids(scene_dir, tmp_path, rng, model):
@@ -68,14 +63,12 @@ def test_originals_keep_everything_but_their_ids(scene_dir, tmp_path, rng, model
     assert {n for n in listed if not n.startswith("images")} == set(report.files) - {"images"}
     with pytest.raises(OutputError, match="apart from the input"):
         write_scene(scene, scene_dir / "out", overwrite=True)
-    _, tracks = check_consistent(tmp_path / "out", scene, 35)
-    np.testing.assert_array_equal(tracks.point_ids, np.arange(1, 36))
+    tracks = check_consistent(tmp_path / "out", scene, 35)
     np.testing.assert_array_equal(tracks.xyz[:10], model.tracks.xyz)
     np.testing.assert_array_equal(tracks.errors[:10], model.tracks.errors)
-    assert [track_set(tracks, i) for i in range(10)] == [
-        track_set(model.tracks, i) for i in range(10)
-    ]
-    assert not tracks.lengths[10:].any()
+    np.testing.assert_array_equal(tracks.offsets, np.append(model.tracks.offsets, [40] * 25))
+    np.testing.assert_array_equal(tracks.image_ids, model.tracks.image_ids)
+    np.testing.assert_array_equal(tracks.point2d_idx, model.tracks.point2d_idx)
     np.testing.assert_array_equal(tracks.xyz[10:].astype(np.float32), scene.points.xyz[10:])
     new_of_old = dict(zip(model.tracks.point_ids.tolist(), range(1, 11), strict=True)) | {-1: -1}
     for ours, theirs in zip(load_scene(tmp_path / "out").images, scene.images, strict=True):
@@ -84,20 +77,15 @@ def test_originals_keep_everything_but_their_ids(scene_dir, tmp_path, rng, model
         np.testing.assert_array_equal(ours.observations.xy, theirs.observations.xy)
     moved = scene.replace(points=scene.points.replace(xyz=scene.points.xyz + 1))
     write_scene(moved, tmp_path / "moved")
-    assert not check_consistent(tmp_path / "moved", moved, 35)[1].lengths.any()
+    assert not check_consistent(tmp_path / "moved", moved, 35).lengths.any()
 
 
 def test_contiguous_ids_are_written_back_byte_for_byte(scene_dir, tmp_path, rng):
-    write_scene(load_scene(scene_dir), tmp_path / "a")
-    write_scene(load_scene(tmp_path / "a"), tmp_path / "b")
-    for name in ("cameras.bin", "images.bin", "points3D.bin", "points3D.ply"):
-        first = (tmp_path / "a/sparse/0" / name).read_bytes()
-        assert (tmp_path / "b/sparse/0" / name).read_bytes() == first
-    write_scene(more_points(load_scene(tmp_path / "a"), rng), tmp_path / "c")
-    bytes_of = {x: (tmp_path / x / "sparse/0/points3D.bin").read_bytes() for x in "ac"}
-    assert bytes_of["c"][8:].startswith(bytes_of["a"][8:])
-    a, c = ((tmp_path / x / "sparse/0/images.bin").read_bytes() for x in "ac")
-    assert a == c
+    first = write_scene(load_scene(scene_dir), tmp_path / "a").path / "sparse/0"
+    more = write_scene(more_points(load_scene(tmp_path / "a"), rng), tmp_path / "b").path
+    for name, start in (("cameras.bin", 0), ("images.bin", 0), ("points3D.bin", 8)):
+        written = (more / "sparse/0" / name).read_bytes()[start:]
+        assert written.startswith((first / name).read_bytes()[start:])
 
 
 def test_unusable_points_are_dropped_with_their_observations(scene_dir, tmp_path, model, rng):
@@ -112,7 +100,7 @@ def test_unusable_points_are_dropped_with_their_observations(scene_dir, tmp_path
     assert (report.dropped_nonfinite, report.dropped_duplicates) == (2, 3)
     assert (report.num_points, report.num_original) == (10, 7)
     assert report.notes == ()
-    _, tracks = check_consistent(tmp_path / "out", scene, 10)
+    tracks = check_consistent(tmp_path / "out", scene, 10)
     np.testing.assert_array_equal(tracks.xyz[:7], xyz[[0, 1, 3, 4, 6, 8, 9]])
 
 
@@ -130,7 +118,7 @@ def test_references_that_nobody_confirms_are_taken_out(scene_dir, tmp_path, mode
         tracks=replace(tracks, image_ids=image_ids, point2d_idx=point2d_idx),
     )
     report = write_scene(scene, tmp_path / "out")
-    _, written = check_consistent(tmp_path / "out", scene, 10)
+    written = check_consistent(tmp_path / "out", scene, 10)
     assert written.lengths.sum() == model.tracks.lengths.sum() - 2
     assert "references" in " ".join(report.notes)
 
@@ -191,23 +179,17 @@ def test_image_folders_are_linked(scene_dir, tmp_path, monkeypatch):
     report = write_scene(load_scene("scene"), "out")
     out = tmp_path / "out"
     assert {"images", "images_4", "masks"} <= set(report.files)
-    assert not (out / "other").exists()
-    assert not (out / "images_backup").exists()
-    for name in ("images", "images_4", "masks"):
-        assert (out / name).is_symlink()
-        said = Path(os.readlink(out / name))  # noqa: PTH115  (3.11's returns str)
-        assert said == Path("..", scene_dir.name, name)
+    links = {path.name: str(path.readlink()) for path in out.iterdir() if path.is_symlink()}
+    assert links == {name: f"../scene/{name}" for name in ("images", "images_4", "masks")}
     shutil.move(out, tmp_path / "elsewhere")
     assert not any("missing" in w for w in load_scene(tmp_path / "elsewhere").warnings)
 
 
 @pytest.mark.parametrize("how", ["asked", "no links"])
 def test_images_are_copied_when_asked_or_when_links_fail(scene_dir, tmp_path, monkeypatch, how):
-    def refuse(*_args, **_options):
-        raise OSError(errno.EPERM, "Operation not permitted")
-
     if how == "no links":
-        monkeypatch.setattr(Path, "symlink_to", refuse)
+        refused = OSError(errno.EPERM, "Operation not permitted")
+        monkeypatch.setattr(Path, "symlink_to", Mock(side_effect=refused))
     else:  # images in the root are taken without the rest
         (scene_dir / "images/left").rename(scene_dir / "left")
         (scene_dir / "images").rmdir()
