@@ -44,7 +44,7 @@ def odd(tmp_path):
 def test_only_regular_files_are_opened(odd, name, says):
     with pytest.raises(OSError, match=says):
         open_file(odd / name)
-    with pytest.raises(SceneFormatError, match=f"{name} to be an image; found {says}"):
+    with pytest.raises(SceneFormatError, match=f"{name} to be a readable file; found {says}"):
         photograph_bytes(odd / name)
 
 

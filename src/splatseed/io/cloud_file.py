@@ -53,9 +53,8 @@ _TEXT_BYTES = 1 << 22
 class CloudChunk:
     """Consecutive rows of a file.
 
-    Args:
-        xyz: Positions in the file's coordinates, float64 [n, 3]; may hold NaN or infinity.
-        rgb: Colours, uint8 [n, 3], grey where the file has intensity only; None without either.
+    ``xyz`` are in the file's coordinates, and may hold NaN or infinity; ``rgb`` are grey where the
+    file has intensity only, None without either.
     """
 
     xyz: Float64[np.ndarray, "n 3"]
@@ -110,11 +109,6 @@ class CloudFile(ABC):
         """Where colours come from."""
         return "rgb" if self._rgb else "intensity" if self._intensity else "none"
 
-    @property
-    def has_color(self) -> bool:
-        """Whether its points have colours, rather than intensity or nothing."""
-        return self.colors == "rgb"
-
     def chunks(self, size: int = CHUNK) -> Iterator[CloudChunk]:
         """The rows in file order, at most ``size`` at a time; no chunk is empty.
 
@@ -132,7 +126,7 @@ class CloudFile(ABC):
         blocks = list(self._blocks(max(self.count or 0, 1)))  # one, or none of no rows
         if not blocks:
             return CloudChunk(np.empty((0, 3)))
-        return self._chunk(blocks[0], self._range_of(blocks[0]) if self.has_color else None)
+        return self._chunk(blocks[0], self._range_of(blocks[0]) if self._rgb else None)
 
     def _range_of(self, sample: Block) -> tuple[float, float]:
         """The values that become black and white."""

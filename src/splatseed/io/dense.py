@@ -58,15 +58,7 @@ _GREY = 128
 
 @dataclass(frozen=True)
 class DenseReport:
-    """What was written.
-
-    Args:
-        path: The output folder.
-        num_maps: How many maps.
-        num_pixels: Pixels of all maps.
-        num_known: Pixels with a depth.
-        empty: Names of images whose map has no depth at all.
-    """
+    """What was written: maps, their pixels, those with a depth, and images without any."""
 
     path: Path
     num_maps: int = 0
@@ -108,29 +100,26 @@ def write_dense_maps(
     """
     path, images = Path(path), {image.name: image for image in scene.images}
     protect = scene.source.inputs if scene.source else ()
-    with depth_folder(
-        path, "z", overwrite=overwrite, protect=protect, provenance=provenance
-    ) as writer:
+    folder = depth_folder(path, "z", overwrite=overwrite, protect=protect, provenance=provenance)
+    with folder as writer:
 
         def write(dense: DenseMap) -> None:
             height, width = dense.depth.shape
             K = scaled_K(images[dense.name].camera, width, height)  # as readers scale it
             writer.write(dense.name, depth_along(dense, K, 0.5))
-            rest = writer.folder.joinpath(*safe_parts(f"{dense.name}.stereo.npz"))
-            with rest.open("xb") as file:
-                np.savez(
-                    file,
-                    normal=np.asarray(dense.normal, np.float32),
-                    confidence=np.asarray(dense.confidence, np.float32),
-                    agreeing=np.asarray(dense.agreeing, np.uint8),
-                    sources=np.array(dense.sources, np.str_),
-                    K=np.asarray(dense.camera.K, np.float64),
-                )
+            np.savez(
+                writer.folder.joinpath(*safe_parts(f"{dense.name}.stereo.npz")),
+                normal=np.asarray(dense.normal, np.float32),
+                confidence=np.asarray(dense.confidence, np.float32),
+                agreeing=np.asarray(dense.agreeing, np.uint8),
+                sources=np.array(dense.sources, np.str_),
+                K=np.asarray(dense.camera.K, np.float64),
+            )
 
         return _write_each(maps, images, write, path, progress)
 
 
-def write_dense_workspace(
+def write_dense_workspace(  # noqa: D417  (the rest is as for maps)
     scene: Scene,
     maps: Iterable[DenseMap],
     path: str | Path,
@@ -148,15 +137,12 @@ def write_dense_workspace(
 
     Args:
         scene: A scene with photographs.
-        maps: As for ``write_dense_maps``, whose errors are raised here, too.
+        maps: As for ``write_dense_maps``, as are all arguments and errors not named here.
         path: The folder to make.
-        overwrite: Whether an earlier output of splatseed may be replaced.
         copy_images: Copy the photographs instead of linking them.
         undistort: Removes lens distortion from a photograph; the workspace then holds the
             undistorted photographs and pinhole cameras of the same matrix, which the maps belong
             to. Without it, distorted cameras are refused.
-        provenance: How the maps came about, for ``splatseed.json``.
-        progress: Called with the stage and the fraction done.
 
     Raises:
         InputError: What ``check_dense_scene`` refuses.
@@ -263,13 +249,9 @@ def _write_each(
         seen.add(dense.name)
         write(dense)
         known = int(np.count_nonzero(np.isfinite(dense.depth)))
-        report = DenseReport(
-            path,
-            len(seen),
-            report.num_pixels + dense.depth.size,
-            report.num_known + known,
-            report.empty if known else tuple(sorted((*report.empty, dense.name))),
-        )
+        empty = report.empty if known else tuple(sorted((*report.empty, dense.name)))
+        pixels = report.num_pixels + dense.depth.size
+        report = DenseReport(path, len(seen), pixels, report.num_known + known, empty)
         progress("write maps", min(len(seen) / total, 1.0))
     if not seen:
         raise ParameterError("at least one depth map", found="none", fix="Make some first.")
@@ -294,11 +276,8 @@ def _check_map(dense: DenseMap, images: Mapping[str, Image]) -> None:
         if np.allclose(dense.camera.cam_from_world, pose, atol=tolerance):
             return
         expected, found = "the pose of its image", "another"
-    raise ParameterError(
-        f"the map of {dense.name} to have {expected}",
-        found=found,
-        fix="Make the maps from this scene.",
-    )
+    expected = f"the map of {dense.name} to have {expected}"
+    raise ParameterError(expected, found=found, fix="Make the maps from this scene.")
 
 
 def scaled_K(camera: Camera, width: int, height: int) -> Float64[np.ndarray, "3 3"]:  # noqa: N802  (K is the field's name)
@@ -406,11 +385,9 @@ def _bring_photographs(
 
         for image in bent[start:stop]:
             path, target = source / image.name, folder / "images" / image.name
-            pixels = np.asarray(
-                photograph.decode_photograph(path, photograph.photograph_bytes(path))
-            )
-            height, width = pixels.shape[:2]
-            K = scaled_K(image.camera, width, height)
+            encoded = photograph.photograph_bytes(path)
+            pixels = np.asarray(photograph.decode_photograph(path, encoded))
+            K = scaled_K(image.camera, *pixels.shape[1::-1])
             straight = PilImage.fromarray(undistort(pixels, image.intrinsics, K)[0])
             target.parent.mkdir(parents=True, exist_ok=True)
             jpeg = PilImage.registered_extensions()[target.suffix.lower()] == "JPEG"
@@ -452,9 +429,8 @@ def _overlap_points(dense: DenseMap, views: Sequence[int]) -> tuple[np.ndarray, 
     rows, columns = np.nonzero(np.isfinite(dense.depth) & (dense.agreeing > 0))
     chosen = np.linspace(0, len(rows) - 1, min(_PER_MAP, len(rows))).astype(np.intp)
     rows, columns = rows[chosen], columns[chosen]
-    xyz = dense.camera.unproject(
-        np.stack([columns, rows], axis=1) + 0.5, dense.depth[rows, columns]
-    )
+    uv = np.stack([columns, rows], axis=1) + 0.5
+    xyz = dense.camera.unproject(uv, dense.depth[rows, columns])
     seen = [
         [views[0], *(view for k, view in enumerate(views[1:]) if bits >> k & 1)]
         for bits in dense.agreeing[rows, columns].tolist()

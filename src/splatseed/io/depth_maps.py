@@ -70,28 +70,25 @@ class Undistortion:
 class DepthFiles:
     """Depth maps in files; what ``Scene.depths`` holds for a scene that was read.
 
-    Args:
-        paths: The file of each image that has one, by the image's name.
-        kind: What the values are; None: what the file itself says, else planar z.
-        scale: Stored units per scene unit; None: 1000 for integers, 1 for floats.
-        lens: Moves the values to the pixels of undistorted photographs; None: no need to.
+    A collection of the names of images that have one, sorted.
     """
 
     paths: Mapping[str, Path]
+    """The file of each image that has one, by the image's name."""
     kind: DepthKind | None = None
+    """What the values are; None: what the file itself says, else planar z."""
     scale: float | None = None
+    """Stored units per scene unit; None: 1000 for integers, 1 for floats."""
     lens: Undistortion | None = None
+    """Moves the values to the pixels of undistorted photographs; None: no need to."""
 
     def __contains__(self, name: object) -> bool:
-        """Whether there is a file for the image of that name."""
         return name in self.paths
 
     def __iter__(self) -> Iterator[str]:
-        """The names of the images that have a file, sorted."""
         return iter(sorted(self.paths))
 
     def __len__(self) -> int:
-        """How many images have a file."""
         return len(self.paths)
 
     def read(self, name: str) -> DepthMap:
@@ -108,24 +105,19 @@ class DepthFiles:
         """
         path = self.paths.get(name)
         if path is None:
-            raise SceneNotFoundError(
-                f"a depth map of {name}", found="none", fix="Leave this image out."
-            )
+            fix = "Leave this image out."
+            raise SceneNotFoundError(f"a depth map of {name}", found="none", fix=fix)
         stored, said = read_stored(path)
-        kind = self.kind or said or "z"
-        is_integer = stored.dtype.kind in "ui"
+        kind, is_integer = self.kind or said or "z", stored.dtype.kind in "ui"
         divisor = self.scale or (_INTEGER_SCALE if is_integer else 1.0)
         with np.errstate(over="ignore", invalid="ignore"):  # becomes infinite, and so NaN
             values: np.ndarray = (stored / np.float64(divisor)).astype(np.float32)
-            if kind == "inverse":
-                unknown = ~(np.abs(values) < _NOTHING_HIT)
-            else:
-                unknown = ~((values > 0) & (values < _NOTHING_HIT))
+            known = (np.abs(values) < _NOTHING_HIT) & ((values > 0) | (kind == "inverse"))
         if is_integer and kind == "inverse":
-            unknown |= stored == 0
+            known &= stored != 0
         elif stored.dtype == np.uint16:
-            unknown |= stored == _SATURATED
-        values[unknown] = np.nan
+            known &= stored != _SATURATED
+        values[~known] = np.nan
         return DepthMap(values if self.lens is None else self.lens.apply(name, values), kind)
 
 
@@ -138,9 +130,8 @@ def match_by_name(scene: Scene, root: Path) -> DepthFiles | None:
             return DepthFiles(paths, *read_description(folder / DESCRIPTION))
         example, scale = next(iter(paths.values())), None
         if _CAPTURED.fullmatch(example.stem) and example.suffix.lower() == ".png":
-            near = (each / CAMERA_FILE for each in (folder, *folder.resolve().parents[:2]))
-            camera_file = next((path for path in near if path.is_file()), None)
-            scale = read_capture_scale(camera_file) if camera_file else None
+            camera = camera_file(folder, 2)
+            scale = read_capture_scale(camera) if camera else None
         return DepthFiles(paths, scale=scale)
     return None
 
@@ -207,6 +198,12 @@ def read_description(path: Path) -> tuple[DepthKind | None, float | None]:
         return kind, scale
 
 
+def camera_file(folder: Path, above: int = 1) -> Path | None:
+    """The file of a capture's camera in a folder, or in one of so many above it."""
+    places = (folder, *folder.resolve().parents[:above])
+    return next((path for each in places if (path := each / CAMERA_FILE).is_file()), None)
+
+
 def read_capture_scale(path: Path) -> float | None:
     """Stored units per metre that the ``cam_params.json`` of an RGB-D capture gives, if it does."""
     content = read_json(path)
@@ -232,14 +229,7 @@ def safe_parts(name: str) -> tuple[str, ...]:
 
 
 def write_description(folder: Path, kind: DepthKind, scale: float = 1.0, **more: object) -> None:
-    """Write a ``depths.json`` into a folder of maps.
-
-    Args:
-        folder: Where the maps are.
-        kind: What the values are.
-        scale: Stored units per scene unit.
-        more: How they were made; for people, never read back.
-    """
+    """Write a ``depths.json`` into a folder of maps; ``more``, for people, is never read back."""
     write_json(folder / DESCRIPTION, {"kind": kind, "scale": scale, **more})
 
 
@@ -270,17 +260,10 @@ def depth_folder(
     protect: tuple[Path, ...] = (),
     provenance: Mapping[str, object] | None = None,
 ) -> Iterator[DepthWriter]:
-    """A folder of depth maps, to write to, that appears when the block ends without an error.
+    """A folder of depth maps of a kind, to write to, that appears when the block ends well.
 
-    Args:
-        path: Where the maps should be.
-        kind: What their values are.
-        overwrite: Whether a folder that splatseed wrote may be replaced.
-        protect: Inputs that the folder must lie apart from.
-        provenance: How the maps were made, for ``splatseed.json``.
-
-    Raises:
-        OutputError: ``path`` is taken or protected, or writing failed.
+    ``provenance``, how they were made, is for ``splatseed.json``; all else is as for
+    ``output_folder``.
     """
     with output_folder(path, kind="depth", overwrite=overwrite, protect=protect) as partial:
         yield DepthWriter(partial)

@@ -19,7 +19,7 @@ import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any, BinaryIO
 
@@ -57,12 +57,10 @@ def is_video(path: Path) -> bool:
 
 def other_spelling(path: Path) -> str | None:
     """The name of a file beside a missing one that differs in its suffix or in case only."""
-    try:
-        near = sorted(each.name for each in path.parent.iterdir())
-    except OSError:
-        return None
-    stem = path.stem.casefold()
-    alike = [name for name in near if Path(name).stem.casefold() == stem and name != path.name]
+    near: list[str] = []
+    with suppress(OSError):
+        near = sorted(each.name for each in path.parent.iterdir() if each.name != path.name)
+    alike = [name for name in near if Path(name).stem.casefold() == path.stem.casefold()]
     return min(alike, key=lambda name: name.casefold() != path.name.casefold(), default=None)
 
 
@@ -108,19 +106,19 @@ def read_text(path: Path) -> str:
 
 
 def read_bytes(path: Path) -> bytes:
-    """The whole content of a regular file.
-
-    Raises:
-        SceneNotFoundError: There is no such file.
-        SceneFormatError: It cannot be read (a folder, no permission, a failing disk).
-    """
+    """The whole content of a regular file; errors as ``readable``'s."""
     with readable(path):
         return read_file(path)
 
 
 @contextmanager
 def readable(path: Path) -> Iterator[None]:
-    """Turn an ``OSError`` from reading a file into one of our errors, as ``read_bytes`` raises."""
+    """Turn an ``OSError`` from reading a file into one of our errors.
+
+    Raises:
+        SceneNotFoundError: There is no such file.
+        SceneFormatError: It cannot be read (a folder, no permission, a failing disk).
+    """
     try:
         yield
     except (FileNotFoundError, NotADirectoryError):
@@ -137,10 +135,7 @@ def readable(path: Path) -> Iterator[None]:
 def guarded(path: Path, expected: str, *, fix: str = COPY_AGAIN) -> Iterator[None]:
     """Turn whatever reading a bad file raises, in a package or here, into a ``SceneFormatError``.
 
-    Args:
-        path: The file.
-        expected: What it should be.
-        fix: What the error advises.
+    It says that the file at ``path`` should be what is ``expected``.
     """
     try:
         yield
@@ -196,12 +191,7 @@ def numbered_lines(path: Path) -> Iterator[tuple[str, str]]:
 
 
 def read_json(path: Path, expected: str = "JSON", *, fix: str = COPY_AGAIN) -> Any:
-    """The content of a JSON file, which errors say should be what is ``expected``.
-
-    Raises:
-        SceneNotFoundError: There is no such file.
-        SceneFormatError: It is no JSON.
-    """
+    """The content of a JSON file; errors as those of ``readable`` and ``guarded``."""
     data = read_bytes(path)
     with guarded(path, expected, fix=fix):
         if not data.strip():
@@ -212,20 +202,12 @@ def read_json(path: Path, expected: str = "JSON", *, fix: str = COPY_AGAIN) -> A
 class ByteReader:
     """Reads a little-endian binary file, whole in memory, from front to back.
 
-    What ends early, or cannot be, is a ``SceneFormatError`` that names file, record and byte.
-
-    Attributes:
-        data: Its bytes.
-        offset: The next byte to read.
-        record: What is being read, for errors ("header", "record 3").
+    What ends early, or cannot be, is a ``SceneFormatError`` that names file, byte and ``record``.
     """
 
     def __init__(self, path: Path, fix: str = COPY_AGAIN) -> None:
-        self.path = path
-        self.fix = fix
-        self.data = read_bytes(path)
-        self.offset = 0
-        self.record = "header"
+        self.path, self.fix, self.data = path, fix, read_bytes(path)
+        self.offset, self.record = 0, "header"
 
     @property
     def remaining(self) -> int:

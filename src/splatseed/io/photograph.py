@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
-from splatseed.io.files import guarded, odd_kind, open_file, other_spelling, read_file
+from splatseed.io.files import guarded, odd_kind, open_file, other_spelling, read_bytes
 from splatseed.literal import agreeing, describe_error
 from splatseed.scene import Image, Scene
 
@@ -48,22 +48,14 @@ def photograph_folder(scene: Scene) -> Path:
 
 
 def photograph_bytes(path: Path) -> bytes:
-    """The file's bytes.
-
-    Raises:
-        SceneNotFoundError: There is no such file.
-        SceneFormatError: It cannot be read.
-    """
+    """The file's bytes; errors as ``readable``'s."""
     try:
-        return read_file(path)
-    except FileNotFoundError:
+        return read_bytes(path)
+    except SceneNotFoundError:
         found, fix = "no such file", "Put it there, or drop it from the model."
         if near := other_spelling(path):
             found, fix = f"{near} in its place", "Name it as the model does, to the letter."
         raise SceneNotFoundError(f"the image {path}", found=found, fix=fix) from None
-    except OSError as error:
-        found = error.strerror or type(error).__name__
-        raise SceneFormatError(f"{path} to be an image", found=found, fix=_COPY_AGAIN) from None
 
 
 def open_photograph(path: Path, encoded: bytes) -> PilImage.Image:

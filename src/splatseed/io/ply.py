@@ -9,7 +9,7 @@ vertices is not read.
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,24 +24,11 @@ from splatseed.pointcloud import PointCloud
 
 EXPORT_PLY_AGAIN = "Copy the file again, or export it again as a binary little-endian PLY."
 
-_TYPES = {
-    "char": "i1",
-    "uchar": "u1",
-    "short": "i2",
-    "ushort": "u2",
-    "int": "i4",
-    "uint": "u4",
-    "int8": "i1",
-    "uint8": "u1",
-    "int16": "i2",
-    "uint16": "u2",
-    "int32": "i4",
-    "uint32": "u4",
-    "float": "f4",
-    "float32": "f4",
-    "double": "f8",
-    "float64": "f8",
-}
+_TYPES = (
+    {"char": "i1", "short": "i2", "int": "i4", "uchar": "u1", "ushort": "u2", "uint": "u4"}
+    | {"int8": "i1", "int16": "i2", "int32": "i4", "uint8": "u1", "uint16": "u2", "uint32": "u4"}
+    | {"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"}
+)
 _BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _END = re.compile(rb"^end_header[ \t]*(\r?\n|\Z)", re.MULTILINE)
 _COUNT = re.compile("[0-9]{1,19}")
@@ -68,17 +55,13 @@ class Element(NamedTuple):
 
 
 class Header(NamedTuple):
-    """What a PLY file promises to hold.
-
-    Args:
-        byte_order: NumPy's character for it; empty for an ascii body.
-        elements: The tables, in order.
-        size: Length of the header in bytes: the offset of the body.
-    """
+    """What a PLY file promises to hold."""
 
     byte_order: str
+    """NumPy's character for it; empty for an ascii body."""
     elements: tuple[Element, ...]
     size: int
+    """Length of the header in bytes: the offset of the body."""
 
     def dtype(self, element: Element) -> np.dtype[Any]:
         """The layout of a row of scalars."""
@@ -86,12 +69,7 @@ class Header(NamedTuple):
 
 
 def parse_header(path: Path, data: bytes) -> Header:
-    """The header at the start of a PLY file: known types, unique names, counts of zero or more.
-
-    Args:
-        path: The file, for errors.
-        data: Its bytes, or its first ones.
-    """
+    """The header in a file's first bytes: known types, unique names, counts of zero or more."""
     end = _END.search(data, 0, _MAX_HEADER)
     if not re.match(rb"ply[ \t]*\r?\n", data) or end is None:
         raise SceneFormatError(
@@ -133,8 +111,8 @@ def open_ply(path: Path) -> CloudFile:
     """Open a PLY file of points, of any size."""
     with open_file(path) as file:
         header = parse_header(path, file.read(_MAX_HEADER))
-    for each in header.elements:
-        refuse_packed(path, each.types)
+    if any("packed_position" in each.types for each in header.elements):
+        refuse_model(path, "Gaussians compressed as PlayCanvas's .compressed.ply")
     vertex = header.elements[0] if header.elements else Element("no element", 0, {})
     names = list(vertex.types)
     if vertex.name != "vertex" or not set(XYZ) <= set(names) or vertex.has_lists:
@@ -194,23 +172,13 @@ def ply_rows(xyz: Float32[np.ndarray, "n 3"], rgb: UInt8[np.ndarray, "n 3"]) -> 
     return rows.view(np.uint8).data
 
 
-def refuse_model(path: Path) -> None:
-    """Raise a ``SceneFormatError`` for a file named as a format of trained Gaussians is."""
-    kind = _MODELS.get(path.suffix.lower())
-    if kind is not None and path.is_file():
-        raise _is_model(path, kind)
-
-
-def refuse_packed(path: Path, properties: Collection[str]) -> None:
-    """Raise a ``SceneFormatError`` for a PLY whose properties are those of packed Gaussians."""
-    if "packed_position" in properties:
-        raise _is_model(path, "Gaussians compressed as PlayCanvas's .compressed.ply")
-
-
-def _is_model(path: Path, kind: str) -> SceneFormatError:
-    return SceneFormatError(
-        f"{path} to be a scene, or a .ply of points",
-        found=f"{kind}: a trained model",
-        fix="Score it with splatseed evaluate MODEL --scene SCENE, look at it with splatseed view "
-        "MODEL; a .ply of it, by splatseed export MODEL -o OUT.ply, is read as points too.",
-    )
+def refuse_model(path: Path, packed: str = "") -> None:
+    """Raise a ``SceneFormatError`` for trained Gaussians, by the file's name or as ``packed``."""
+    kind = packed or _MODELS.get(path.suffix.lower())
+    if kind and path.is_file():
+        raise SceneFormatError(
+            f"{path} to be a scene, or a .ply of points",
+            found=f"{kind}: a trained model",
+            fix="Score it with splatseed evaluate MODEL --scene SCENE, look at it with splatseed "
+            "view MODEL; a .ply, which splatseed export MODEL -o OUT.ply makes, is read as points.",
+        )

@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float64, Int64
 from splatseed.camera import Intrinsics, rotation_from_quat
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io import depth_maps
-from splatseed.io.colmap import rigid_pose
+from splatseed.io.colmap import make_intrinsics, rigid_pose
 from splatseed.io.files import guarded, numbered_lines, open_file, read_json
 from splatseed.io.photograph import lens_warnings
 from splatseed.literal import agreeing, counted
@@ -57,7 +57,7 @@ def load_rgbd(root: Path) -> Scene:
             found="none" if folder.is_dir() else f"no folder {folder}",
             fix="Give the folder that holds traj.txt and results/.",
         )
-    rows = [_numbers(where, words) for where, words in _records(track, 16, comments=False)]
+    rows = [_numbers(where, words) for where, words in _records(track, 16)]
     poses = np.array(rows).reshape(-1, 4, 4)
     if len(frames) != len(poses):
         raise SceneFormatError(
@@ -65,14 +65,14 @@ def load_rgbd(root: Path) -> Scene:
             found=f"{len(poses)} lines",
             fix="Put back the missing frames or lines.",
         )
-    camera_file = _camera_file(root)
-    if camera_file is None:
+    camera = depth_maps.camera_file(root)
+    if camera is None:
         raise SceneNotFoundError(
             f"{depth_maps.CAMERA_FILE} in {root} or the folder above it",
             found="neither",
             fix='Write {"camera": {"w": 9, "h": 9, "fx": 9, "fy": 9, "cx": 9, "cy": 9}}.',
         )
-    intrinsics = _read_intrinsics(camera_file)
+    intrinsics = _read_intrinsics(camera)
     tracked = np.isfinite(poses).all(axis=(1, 2))
     images = []
     for i in np.flatnonzero(tracked).tolist():
@@ -80,17 +80,15 @@ def load_rgbd(root: Path) -> Scene:
         _check_image(frames[i], intrinsics)
         images.append(Image(frames[i].name, i + 1, intrinsics, quat, translation))
     lost = [frames[i].name for i in np.flatnonzero(~tracked)]
-    warnings = _left_out("frame", "a finite pose", lost)
-    scene = _scene(track, folder, images, intrinsics, warnings)
+    scene = _scene(track, folder, images, intrinsics, *_left_out("frame", "a finite pose", lost))
     return scene.replace(depths=depth_maps.match_by_name(scene, folder))
 
 
 def _scene(
-    track: Path, folder: Path, images: Sequence[Image], lens: Intrinsics, warnings: Sequence[str]
+    track: Path, folder: Path, images: Sequence[Image], lens: Intrinsics, *warnings: str
 ) -> Scene:
     source = SceneSource("rgbd", track.parent, track, image_dir=folder)
-    points = PointCloud.empty()
-    return Scene(points, tuple(images), (lens,), source=source, warnings=tuple(warnings))
+    return Scene(PointCloud.empty(), tuple(images), (lens,), source=source, warnings=warnings)
 
 
 def is_tum(root: Path) -> bool:
@@ -128,13 +126,9 @@ def load_tum(root: Path) -> Scene:
         images.append(Image(name, i + 1, intrinsics, quat, translation))
     lost = [names[i] for i in np.flatnonzero(~near)]
     missing = [names[i] for i in np.flatnonzero(near & ~present)]
-    warnings = (
-        *guessed,
-        *_left_out("image", "a pose close in time", lost),
-        *_left_out("image", "a file", missing),
-        *lens_warnings(images),
-    )
-    scene = _scene(track, root / folder, images, intrinsics, warnings)
+    told = _left_out("image", "a pose close in time", lost) + _left_out("image", "a file", missing)
+    warnings = (*guessed, *told, *lens_warnings(images))
+    scene = _scene(track, root / folder, images, intrinsics, *warnings)
     return scene.replace(depths=find_tum_depths(scene, root))
 
 
@@ -158,8 +152,8 @@ def find_tum_depths(scene: Scene, root: Path) -> depth_maps.DepthFiles | None:
             paths[image.name], originals[image.name] = path, root / names[entry]
     if not paths:
         return None
-    camera_file = _camera_file(root)
-    scale = depth_maps.read_capture_scale(camera_file) if camera_file else None
+    camera = depth_maps.camera_file(root)
+    scale = depth_maps.read_capture_scale(camera) if camera else None
     posed = {image.name: image.intrinsics for image in scene.images if image.name in paths}
     lens = _tum_camera(root)[0]
     bent = not lens.is_pinhole and all(camera.is_pinhole for camera in posed.values())
@@ -178,8 +172,7 @@ def _tum_camera(root: Path) -> tuple[Intrinsics, tuple[str, ...]]:
     It is that of ``cam_params.json``, else the published one of the series in the folder's name,
     else ROS's default.
     """
-    path = _camera_file(root)
-    if path is not None:
+    if (path := depth_maps.camera_file(root)) is not None:
         return _read_intrinsics(path), ()
     series = _SERIES.search(root.name) or _SERIES.search(root.resolve().name)
     fx, fy, cx, cy, *distortion = _COLOR_CAMERAS[series[1]] if series else _DEFAULT_CAMERA
@@ -194,23 +187,13 @@ def _tum_camera(root: Path) -> tuple[Intrinsics, tuple[str, ...]]:
     return Intrinsics(1, "PINHOLE", *_SIZE, pinhole), () if series else (guess,)
 
 
-def _camera_file(root: Path) -> Path | None:
-    paths = (folder / depth_maps.CAMERA_FILE for folder in (root, root.resolve().parent))
-    return next((path for path in paths if path.is_file()), None)
-
-
 def _read_intrinsics(path: Path) -> Intrinsics:
     """The pinhole camera in a camera file, whose corner is at (0, 0), as in COLMAP."""
     content = read_json(path)
     with guarded(path, 'a file of {"camera": {w, h, fx, fy, cx, cy}}, as numbers in pixels'):
         camera = content["camera"]
-        width, height = int(camera["w"]), int(camera["h"])
-        fx, fy, cx, cy = (float(camera[key]) for key in ("fx", "fy", "cx", "cy"))
-        if not (np.isfinite([cx, cy]).all() and 0 < fx < np.inf and 0 < fy < np.inf):
-            raise ValueError(f"fx={fx} fy={fy} cx={cx} cy={cy}")
-        if min(width, height) <= 0:
-            raise ValueError(f"w={width} h={height}")
-        return Intrinsics(1, "PINHOLE", width, height, (fx, fy, cx, cy))
+        params = tuple(float(camera[key]) for key in ("fx", "fy", "cx", "cy"))
+        return make_intrinsics(f"{path}", 1, "PINHOLE", int(camera["w"]), int(camera["h"]), params)
 
 
 def _check_image(path: Path, intrinsics: Intrinsics) -> None:
@@ -295,11 +278,11 @@ def _poses_at(
     return quats, mixed[:, 1:4], nearest >= 0
 
 
-def _records(path: Path, count: int, *, comments: bool = True) -> Iterator[tuple[str, list[str]]]:
-    """The place and the ``count`` words of each line that has any."""
+def _records(path: Path, count: int) -> Iterator[tuple[str, list[str]]]:
+    """The place and the ``count`` words of each line that has any, and is no comment."""
     for where, line in numbered_lines(path):
         words = line.split()
-        if not words or (comments and words[0].startswith("#")):
+        if not words or words[0].startswith("#"):
             continue
         if len(words) != count:
             raise _bad(where, f"{count} words", f"{len(words)}")

@@ -19,7 +19,7 @@ import shutil
 import tempfile
 import time
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -44,9 +44,9 @@ _NOBODYS = re.compile(
     r"|images_\d+_png/.*\.png)",  # gsplat's copies of the photographs
     re.IGNORECASE,
 )
-_FULL = {errno.ENOSPC, errno.EDQUOT}
-_TRY_AGAIN = "Check the disk and try again."
-_FORBIDDEN = {errno.EACCES, errno.EPERM, errno.EROFS}
+_FULL = dict.fromkeys((errno.ENOSPC, errno.EDQUOT), "Free some space, or choose another disk.")
+_FORBIDDEN = (errno.EACCES, errno.EPERM, errno.EROFS)
+_FIXES = _FULL | dict.fromkeys(_FORBIDDEN, "Choose a folder that you may write to.")
 _LOG = logging.getLogger(__name__)
 
 
@@ -56,16 +56,9 @@ def output_folder(
 ) -> Iterator[Path]:
     """An empty folder to write into that appears at ``path`` when the block ends without an error.
 
-    Missing parents are made. The manifest is completed at the end.
-
-    Args:
-        path: Where the output should be.
-        kind: What writes it: the verb of the command line, if any.
-        overwrite: Whether an earlier output of this kind may be replaced.
-        protect: Files and folders that are read: the output may not be, lie inside or contain any.
-
-    Raises:
-        OutputError: ``path`` is taken or protected, or writing failed.
+    Missing parents are made. The manifest is completed at the end. ``overwrite`` allows to replace
+    an earlier output of this kind; ``protect`` are files and folders that the output may not be,
+    lie in or contain. An ``OutputError``: ``path`` is taken or protected, or writing failed.
     """
     check_apart(path, protect)
     target = _resolved(path)
@@ -93,12 +86,11 @@ def atomic_file(path: Path) -> Iterator[Path]:
 
 def write_json(path: Path, content: Mapping[str, object]) -> None:
     """Write readable JSON as an ``atomic_file``; NumPy scalars become numbers, paths text."""
-
-    def plain(value: object) -> object:
-        return value.item() if isinstance(value, np.generic) else str(value)
-
+    text = json.dumps(
+        content, indent=2, default=lambda v: v.item() if isinstance(v, np.generic) else str(v)
+    )
     with atomic_file(path) as partial:
-        partial.write_text(json.dumps(content, indent=2, default=plain) + "\n", encoding="utf-8")
+        partial.write_text(text + "\n", encoding="utf-8")
 
 
 @contextmanager
@@ -130,10 +122,9 @@ def staged(target: Path, *, folder: bool) -> Iterator[Path]:
                     each.rmdir()
             raise
         finally:
-            if (old / MANIFEST).is_file() and (names := unlisted_files(old)):
-                # Somebody has put files there while we worked.
+            if (old / MANIFEST).is_file() and (names := unlisted_files(old)):  # put there meanwhile
                 _LOG.warning("%s is complete; %s has what it held: %s.", target, old, names)
-            elif old.exists():
+            else:
                 remove(old)
 
 
@@ -143,12 +134,11 @@ def add_files(folder: Path, names: Iterable[str]) -> None:
     They are paths inside the folder, with forward slashes, which need not exist yet. A folder
     without a manifest stands for the files in it now.
     """
-    manifest = read_manifest(folder)
-    listed = _listed(manifest)
+    listed = _listed(folder)
     for name in names:
         plain = (folder / name).is_dir() and not (folder / name / MANIFEST).is_file()
         listed.update(_files(folder, prefix=f"{name}/") if plain else [name])
-    write_json(folder / MANIFEST, {**manifest, "files": sorted(listed)})
+    write_json(folder / MANIFEST, {**read_manifest(folder), "files": sorted(listed)})
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
@@ -166,7 +156,7 @@ def unlisted_files(folder: Path) -> list[str]:
     def is_copy(name: str) -> bool:  # nerfstudio's smaller photographs
         return bool(re.match("images_[248]/", name)) and (folder / f"images{name[8:]}").is_file()
 
-    names = _files(folder, {*_listed(read_manifest(folder)), MANIFEST})
+    names = _files(folder, {*_listed(folder), MANIFEST})
     return sorted(name for name in names if not (_NOBODYS.fullmatch(name) or is_copy(name)))
 
 
@@ -215,8 +205,7 @@ def oserror_as_output_error(target: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        fix = "Choose a folder that you may write to." if error.errno in _FORBIDDEN else _TRY_AGAIN
-        fix = "Free some space, or choose another disk." if error.errno in _FULL else fix
+        fix = _FIXES.get(error.errno or 0, "Check the disk and try again.")
         where = f" at {error.filename}" if error.filename else ""
         found = f"{error.strerror or type(error).__name__}{where}"
         raise OutputError(f"{target} to be written", found=found, fix=fix) from error
@@ -240,7 +229,7 @@ def _resolved(path: Path) -> Path:
 
 
 def _check_replaceable(target: Path, kind: str, *, overwrite: bool) -> None:
-    fix = "Choose another name, or move what is there elsewhere."
+    found, fix = "", "Choose another name, or move what is there elsewhere."
     with oserror_as_output_error(target):
         if not os.path.lexists(target) or (target.is_dir() and not any(target.iterdir())):
             return
@@ -254,16 +243,16 @@ def _check_replaceable(target: Path, kind: str, *, overwrite: bool) -> None:
         elif names := unlisted_files(target):
             more = f" and {len(names) - 3:,} more" if len(names) > 3 else ""
             found = f"an earlier output with {ours}: {', '.join(names[:3])}{more}"
-        elif overwrite:
-            return
-        else:
+        elif not overwrite:
             found = "an earlier output"
             fix = "Pass --overwrite (from Python, overwrite=True) to replace it, or choose another."
-    raise OutputError(f"no folder, or an empty one, at {target}", found=found, fix=fix)
+    if found:
+        raise OutputError(f"no folder, or an empty one, at {target}", found=found, fix=fix)
 
 
-def _listed(manifest: Mapping[str, Any]) -> set[str]:
-    files = manifest.get("files")
+def _listed(folder: Path) -> set[str]:
+    """What its manifest lists."""
+    files = read_manifest(folder).get("files")
     return {name for name in files if isinstance(name, str)} if isinstance(files, list) else set()
 
 
@@ -283,10 +272,10 @@ def _files(folder: Path, ours: Collection[str] = (), prefix: str = "") -> Iterat
 
 def _remove_leftovers(target: Path) -> None:
     """Remove, and log, the partials of processes that were killed while they wrote ``target``."""
-    start, end = re.escape(f".{target.name}.partial-"), re.escape(target.suffix)
-    name = re.compile(f"{start}[0-9a-f]{{8}}({end})?")
-    there = list(target.parent.iterdir()) if fcntl and target.parent.is_dir() else []
-    for path in there:
+    name = re.compile(
+        re.escape(f".{target.name}.partial-") + f"[0-9a-f]{{8}}({re.escape(target.suffix)})?"
+    )
+    for path in list(target.parent.iterdir()) if fcntl and target.parent.is_dir() else []:
         with suppress(OSError):  # another process writes to it, or has removed it
             if name.fullmatch(path.name) and time.time() - path.stat().st_mtime > _SETTLED:
                 with _held(path):
@@ -297,12 +286,9 @@ def _remove_leftovers(target: Path) -> None:
 @contextmanager
 def _held(path: Path) -> Iterator[None]:
     """Lock a file or folder while the block runs; an OSError if another process has."""
-    if fcntl is None:
+    with ExitStack() as stack:
+        if fcntl is not None:
+            descriptor = os.open(path, os.O_RDONLY)
+            stack.callback(os.close, descriptor)
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         yield
-        return
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        yield
-    finally:
-        os.close(descriptor)

@@ -61,23 +61,18 @@ _SIBLINGS = tuple(
 
 @dataclass(frozen=True)
 class PointStream:
-    """Points that follow those of a scene a piece at a time: more than memory holds.
-
-    Args:
-        num_original: How many of them come from the input; they come first.
-        num_new: How many were made.
-        code: ``PointCloud.source`` of the new ones.
-        pieces: Gives positions and colours, in order.
-        files: The input's files, which the output must stay apart from.
-        left_out: Rows of the input that are not finite, and that repeat a position.
-    """
+    """Points that follow those of a scene a piece at a time: more than memory holds."""
 
     num_original: int
+    """How many of them come from the input; they come first."""
     num_new: int
     code: int
+    """``PointCloud.source`` of the new ones."""
     pieces: Callable[[], Iterator[Piece]]
     files: tuple[Path, ...] = ()
+    """The input's, which the output must stay apart from."""
     left_out: tuple[int, int] = (0, 0)
+    """Rows of the input that are not finite, and that repeat a position."""
 
     def __len__(self) -> int:
         return self.num_original + self.num_new
@@ -175,16 +170,9 @@ def write_scene(
         if source is not None:
             bare = source.points_path if source.format == "ply" else source.root
             read = str(source.transforms_path or bare)
-        facts = {
-            "source": read,
-            **made,
-            "format": layout,
-            **counts,
-            "num_new": counts["num_points"] - counts["num_original"],
-            "notes": notes,
-            "versions": versions,
-        }
-        write_json(folder / MANIFEST, facts)
+        num_new = counts["num_points"] - counts["num_original"]
+        facts = {"source": read, **made, "format": layout, **counts, "num_new": num_new}
+        write_json(folder / MANIFEST, {**facts, "notes": notes, "versions": versions})
     return WriteReport(
         path, layout, **counts, files=tuple(sorted([*files, *linked, MANIFEST])), notes=tuple(notes)
     )
@@ -320,11 +308,9 @@ def _write_transforms(scene: Scene, folder: Path) -> tuple[list[str], dict[str, 
         A = None if source and source.format == "transforms" else _NERFSTUDIO_FROM_COLMAP
         content, folders = _new_json(scene, A), image_folders(scene)
         if A is not None:
-            points = points.replace(
-                xyz=nerfstudio.apply_transform(A, points.xyz).astype(np.float32)
-            )
-            if points.normals is not None:
-                points = points.replace(normals=points.normals @ A[:, :3].T)
+            xyz = nerfstudio.apply_transform(A, points.xyz).astype(np.float32)
+            normals = None if points.normals is None else points.normals @ A[:, :3].T
+            points = points.replace(xyz=xyz, normals=normals)
     write_json(folder / "transforms.json", {**content, "ply_file_path": "sparse_pc.ply"})
     write_ply(folder / "sparse_pc.ply", points)
     shutil.copyfile(folder / "sparse_pc.ply", folder / "pointcloud.ply")  # LichtFeld's name for it
@@ -346,14 +332,9 @@ def _new_json(scene: Scene, A: Float64[np.ndarray, "3 4"] | None) -> dict[str, A
         pose = image.camera.world_from_cam @ nerfstudio.OPENCV_FROM_OPENGL
         if A is not None:
             pose[:3] = A @ pose
-        frames.append(
-            {
-                "file_path": f"images/{image.name}",
-                "transform_matrix": pose.tolist(),
-                "colmap_im_id": image.image_id,
-                **({} if len(used) == 1 else cameras[image.intrinsics.camera_id]),
-            }
-        )
+        own = {} if len(used) == 1 else cameras[image.intrinsics.camera_id]
+        frame = {"file_path": f"images/{image.name}", "transform_matrix": pose.tolist()}
+        frames.append({**frame, "colmap_im_id": image.image_id, **own})
     content = {**shared, "frames": frames}
     if A is not None:
         content["applied_transform"] = A.tolist()
@@ -373,17 +354,10 @@ def _camera_fields(camera: Intrinsics) -> dict[str, Any]:
             fix="Undistort the scene first (splatseed undistort), or write the COLMAP layout.",
         )
     terms = camera.params[CAMERA_MODELS[camera.model].num_focal + 2 :]
-    fl_x, fl_y, cx, cy = camera.K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
-    size = {"w": camera.width, "h": camera.height}
-    return {
-        "camera_model": model,
-        **size,
-        "fl_x": fl_x,
-        "fl_y": fl_y,
-        "cx": cx,
-        "cy": cy,
-        **dict(zip(_TERMS[model], (*terms, 0.0, 0.0, 0.0, 0.0), strict=False)),
-    }
+    matrix = camera.K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+    fields = {"camera_model": model, "w": camera.width, "h": camera.height}
+    fields |= zip(("fl_x", "fl_y", "cx", "cy"), matrix, strict=True)
+    return fields | dict(zip(_TERMS[model], (*terms, 0.0, 0.0, 0.0, 0.0), strict=False))
 
 
 def _kept_json(transforms: nerfstudio.Transforms, names: Collection[str]) -> dict[str, Any]:
@@ -402,16 +376,11 @@ def _kept_json(transforms: nerfstudio.Transforms, names: Collection[str]) -> dic
             frames.append({**frame, **moved})
         else:
             gone.add(os.path.normpath(str(frame["file_path"])))
-    # Nerfstudio fails over names that no frame has.
-    lists = {
-        key: [
-            portable(name)
-            for name in content[key]
-            if isinstance(name, str) and os.path.normpath(name) not in gone
-        ]
-        for key in _LIST_KEYS
-        if isinstance(content.get(key), list)
-    }
+    lists: dict[str, list[Any]] = {}
+    for key in (key for key in _LIST_KEYS if isinstance(content.get(key), list)):
+        names = [name for name in content[key] if isinstance(name, str)]
+        # Nerfstudio fails over names that no frame has.
+        lists[key] = [portable(name) for name in names if os.path.normpath(name) not in gone]
     return {**content, **lists, "frames": frames}
 
 

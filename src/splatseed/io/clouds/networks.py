@@ -83,16 +83,16 @@ class NpzCloud(CloudFile):
     def _blocks(self, size: int) -> Iterator[Block]:
         points, color, mask, confidence = map(self._array, self._names)
         assert points is not None  # noqa: S101  (its name is known)
+        valid = np.ones(len(points), bool)
+        if mask is not None:
+            valid &= mask[:, 0] != 0
+        if confidence is not None:
+            valid &= confidence[:, 0] >= LEAST
         for start in range(0, len(points), size):
             part = slice(start, start + size)
-            valid = np.ones(len(points[part]), bool)
-            if mask is not None:
-                valid &= mask[part, 0] != 0
-            if confidence is not None:
-                valid &= confidence[part, 0] >= LEAST
-            block = dict(zip(XYZ, points[part][valid].T, strict=True))
+            block = dict(zip(XYZ, points[part][valid[part]].T, strict=True))
             if color is not None:
-                block |= zip(RGB, color[part][valid].T, strict=True)
+                block |= zip(RGB, color[part][valid[part]].T, strict=True)
             yield block
 
     def _array(self, name: str | None) -> np.ndarray | None:
@@ -150,11 +150,10 @@ class GlbCloud(CloudFile):
                         xyz = part.position.rows(start, size)["values"].astype(np.float64)
                         xyz = xyz @ part.matrix[:3, :3].T + part.matrix[:3, 3]
                     block = dict(zip(XYZ, xyz.T, strict=True))
-                    if part.color and self.has_color:
+                    if part.color and self._rgb:
                         values = part.color.rows(start, size)["values"][:, :3]
                         # Integers are normalised to their range, as glTF has them.
-                        is_float = values.dtype.kind == "f"
-                        full = 1 if is_float else np.iinfo(values.dtype).max
+                        full = 1 if values.dtype.kind == "f" else np.iinfo(values.dtype).max
                         block |= zip(RGB, color_bytes(values, full).T, strict=True)
                     yield block
 

@@ -43,10 +43,10 @@ class _ColumnCloud(CloudFile):
 
     def __init__(self, path: Path, columns: dict[str, np.ndarray], count: int) -> None:
         super().__init__(path, columns, count)
-        self._columns, self._num_rows = columns, count
+        self._columns = columns
 
     def _blocks(self, size: int) -> Iterator[Block]:
-        for start in range(0, self._num_rows, size):
+        for start in range(0, len(self._columns["x"]), size):
             yield {name: self._columns[name][start : start + size] for name in self.used}
 
     def _sample(self) -> Block:
@@ -68,15 +68,12 @@ def _parse_header(data: bytes) -> tuple[np.dtype[Any], int, str, int]:
     fields: list[Any] = []
     for i, (name, kind, size, count) in enumerate(zip(names, kinds, sizes, counts, strict=True)):
         known_as = f"pad {i}" if name == "_" else PACKED if (name, size) == (packed, "4") else name
-        several = () if count == 1 else ((count,),)
-        fields.append(
-            (f"{known_as}[]" if several else known_as, f"<{_KINDS[kind]}{int(size)}", *several)
-        )
+        known_as += "[]" * (count != 1)
+        fields.append((known_as, f"<{_KINDS[kind]}{int(size)}", *[(count,)] * (count != 1)))
     if missing := set(XYZ) - {name for name, *_ in fields}:
         raise ValueError(f"no fields {', '.join(sorted(missing))} of one value (COUNT 1)")
-    rows = math.prod(
-        int(known[key][0]) for key in (["POINTS"] if "POINTS" in known else ["WIDTH", "HEIGHT"])
-    )
+    size_keys = ["POINTS"] if "POINTS" in known else ["WIDTH", "HEIGHT"]
+    rows = math.prod(int(known[key][0]) for key in size_keys)
     (body,) = (word.lower() for word in known["DATA"])
     if body not in {"ascii", "binary", "binary_compressed"} or rows < 0:
         raise ValueError(f"{rows} points, DATA {body}")

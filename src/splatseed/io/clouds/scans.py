@@ -51,12 +51,12 @@ class LasCloud(CloudFile):
                     parts[name].append(np.asarray(points[name], np.uint16))
         self._known = {name: np.concatenate(each) for name, each in parts.items()}
         self._marks_withheld = "withheld" in names
-        unused = set[str]()
         if self._num_rows and not any(self._known[name].any() for name in set(RGB) & names):
-            unused |= set(RGB)
-        if not len(self._known.get("intensity", ())) or not np.ptp(self._known["intensity"]):
-            unused.add("intensity")
-        super().__init__(path, names - unused, self._num_rows)
+            names -= set(RGB)
+        intensity = self._known.get("intensity", np.empty(0))
+        if not len(intensity) or not np.ptp(intensity):
+            names.discard("intensity")
+        super().__init__(path, names, self._num_rows)
 
     def _sample(self) -> Block:
         return self._known
@@ -191,9 +191,8 @@ def _read_scan(image: Any, header: Any, size: int) -> Iterator[dict[str, np.ndar
     fields = (*place, *(name for name in optional if name in header.point_fields))
     room = min(size, max(count, 1))
     # Colours may be bytes, 16-bit or 0 to 1: the values tell.
-    arrays: dict[str, np.ndarray] = {
-        name: np.empty(room, np.int8 if name in _INVALID else np.float64) for name in fields
-    }
+    kinds = {name: np.int8 if name in _INVALID else np.float64 for name in fields}
+    arrays: dict[str, np.ndarray] = {name: np.empty(room, kind) for name, kind in kinds.items()}
     buffers = libe57.VectorSourceDestBuffer()
     for name, array in arrays.items():
         buffers.append(libe57.SourceDestBuffer(image, name, array, room, True, True))

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -20,20 +21,11 @@ from splatseed.errors import SceneFormatError
 from splatseed.io.cloud_file import RGB, SAMPLE_BYTES, XYZ, CloudFile, Dialect, LineCloud
 from splatseed.io.files import open_file
 
-_NAMES = {
-    "easting": "x",
-    "northing": "y",
-    "elevation": "z",
-    "height": "z",
-    "altitude": "z",
-    "rf": "red",
-    "gf": "green",
-    "bf": "blue",
-    "r": "red",
-    "g": "green",
-    "b": "blue",
-    "i": "intensity",
-}
+_NAMES = (
+    {"easting": "x", "northing": "y", "elevation": "z", "height": "z", "altitude": "z"}
+    | {"r": "red", "g": "green", "b": "blue", "rf": "red", "gf": "green", "bf": "blue"}
+    | {"i": "intensity"}
+)
 """What columns are called elsewhere, in lower case."""
 _MARKS = re.compile(r"^(//|#|%|;)+\s*")
 _UNIT = 1e-2
@@ -75,9 +67,9 @@ def _first_line(path: Path, lines: Sequence[str]) -> tuple[int, Dialect]:
     """The first line of at least three numbers, and how it is written."""
     for i, line in enumerate(lines):
         for dialect in _dialects(line):
-            words = _words(line, dialect)
-            if line.strip() and len(words) >= 3 and all(map(_is_number, words)):
-                return i, dialect
+            with suppress(ValueError):
+                if len([float(word) for word in _words(line, dialect)]) >= 3:
+                    return i, dialect
     found = next((repr(line.strip()[:60]) for line in lines if line.strip()), "an empty file")
     raise SceneFormatError(
         f"{path} to hold a point per line, x y z first or under a line of names",
@@ -99,14 +91,6 @@ def _dialects(line: str) -> Iterator[Dialect]:
 def _words(line: str, dialect: Dialect) -> list[str]:
     text = line.strip().replace(",", ".") if dialect.decimal_comma else line.strip()
     return [word.strip().strip('"') for word in text.split(dialect.delimiter)]
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
 
 
 def _named(lines: Sequence[str], dialect: Dialect, count: int) -> list[str] | None:

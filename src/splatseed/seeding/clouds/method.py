@@ -124,7 +124,7 @@ class GivenClouds(Cloud):
         visibility = find_visibility(scene)
         nothing = np.empty((0, 3))
         seen = [visibility.of(image) if len(visibility.xyz) else nothing for image in images]
-        colored = all(file.has_color for file in streamed.files)
+        colored = all(file.colors == "rgb" for file in streamed.files)
         own = voxels.rgb if any(file.colors != "none" for file in streamed.files) else None
         rays = _free_rays(scene, images, views, seen, rng, progress) if self.clean else None
         judged = judge(

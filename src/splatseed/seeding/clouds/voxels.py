@@ -336,7 +336,7 @@ def sample_cloud(
 ) -> tuple[Float64[np.ndarray, " 3"], Float64[np.ndarray, "N 3"], UInt8[np.ndarray, "N 3"] | None]:
     """An even sample of clouds of one frame: an offset, positions less it, and colours if known."""
     files = [open_cloud(path) for path in paths]
-    painted = all(file.has_color for file in files)
+    painted = all(file.colors == "rgb" for file in files)
     voxels, offset = Voxels(SAMPLE), np.zeros(3)
     for file in files:
         for chunk, _ in _finite_chunks(file, "look at", progress):
