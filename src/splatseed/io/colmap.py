@@ -55,7 +55,9 @@ _Points: TypeAlias = tuple[UInt8[np.ndarray, "N 3"], Tracks, Callable[[int], str
 def read_cameras(path: Path) -> tuple[Intrinsics, ...]:
     """The camera records of a ``cameras.bin`` or ``cameras.txt``, in file order."""
     cameras: dict[int, Intrinsics] = {}
-    for where, camera_id, *record in (_text_cameras if _is_text(path) else _binary_cameras)(path):
+    for where, camera_id, *record in (_text_cameras if path.suffix == ".txt" else _binary_cameras)(
+        path
+    ):
         _require(camera_id not in cameras, "each camera id once", where, f"{camera_id} again")
         cameras[camera_id] = make_intrinsics(where, camera_id, *record)
     return tuple(cameras.values())
@@ -85,7 +87,7 @@ def read_images(path: Path, intrinsics: Sequence[Intrinsics]) -> tuple[Image, ..
     cameras = {camera.camera_id: camera for camera in intrinsics}
     images: dict[int, Image] = {}
     names: set[str] = set()
-    for record in (_text_images if _is_text(path) else _binary_images)(path):
+    for record in (_text_images if path.suffix == ".txt" else _binary_images)(path):
         where, image_id, pose, camera_id, name, observations = record
         _require(0 <= image_id <= MAX_ID, f"an image id from 0 to {MAX_ID}", where, image_id)
         _require(image_id not in images, "each image id once", where, f"{image_id} again")
@@ -101,11 +103,10 @@ def read_images(path: Path, intrinsics: Sequence[Intrinsics]) -> tuple[Image, ..
         ids = observations.point_ids
         in_range = bool((ids >= NO_POINT).all())
         _require(in_range, f"point ids from -1 (none) to 2^63 - 1 {of}", where, "another")
-        quat, translation = np.array(pose[:4], np.float64), np.array(pose[4:], np.float64)
+        quat, translation = np.split(np.array(pose, np.float64), [4])
+        lens = cameras[camera_id]
         names.add(name)
-        images[image_id] = Image(
-            name, image_id, cameras[camera_id], quat, translation, observations
-        )
+        images[image_id] = Image(name, image_id, lens, quat, translation, observations)
     return tuple(images.values())
 
 
@@ -114,7 +115,7 @@ def read_points3d(path: Path) -> tuple[PointCloud, Tracks]:
 
     Nothing is repaired; what is beyond float32 is infinite in the cloud, to be seen and dropped.
     """
-    rgb, tracks, place = (_text_points if _is_text(path) else _binary_points)(path)
+    rgb, tracks, place = (_text_points if path.suffix == ".txt" else _binary_points)(path)
     ids = tracks.point_ids
     if (ids < 0).any():
         where = f"{path}, {place(int((ids < 0).argmax()))}"
@@ -139,11 +140,9 @@ def rigid_pose(
         proper = np.linalg.det(rotation) > 0
     affine = np.allclose(world_from_cam[3:], [[0, 0, 0, 1]], atol=_RIGID_TOLERANCE)
     if not (off <= _RIGID_TOLERANCE and proper and affine):
-        raise SceneFormatError(
-            f"a rotation and a translation as world_from_cam in {where}",
-            found="a scaled, sheared or mirrored one",
-            fix="Remove the scale from the poses (and from the points).",
-        )
+        expected = f"a rotation and a translation as world_from_cam in {where}"
+        fix = "Remove the scale from the poses (and from the points)."
+        raise SceneFormatError(expected, found="a scaled, sheared or mirrored one", fix=fix)
     return quat_from_rotation(rotation), -rotation @ world_from_cam[:3, 3]
 
 
@@ -328,10 +327,6 @@ def check_tracks(points: PointCloud, tracks: Tracks | None) -> None:
 # The text form
 
 
-def _is_text(path: Path) -> bool:
-    return path.suffix == ".txt"
-
-
 def _text_cameras(path: Path) -> Iterator[tuple[Any, ...]]:
     for where, line in _data_lines(path):
         row = line.split()
@@ -422,8 +417,7 @@ def _bad(expected: str, where: str, found: str) -> SceneFormatError:
 
 def find_model(*folders: Path) -> Path | None:
     """The first of the given folders that holds a model."""
-    holding = (f for f in folders if any(_model_file(f, name) for name in _MODEL_FILES))
-    return next(holding, None)
+    return next((f for f in folders if any(_model_file(f, name) for name in _MODEL_FILES)), None)
 
 
 def _model_file(model_dir: Path, name: str) -> Path | None:
@@ -473,11 +467,8 @@ def read_model_cameras(model_dir: Path) -> tuple[tuple[Intrinsics, ...], tuple[I
     """The camera and the image records of a model."""
     cameras_path, images_path = _model_file(model_dir, "cameras"), _model_file(model_dir, "images")
     if cameras_path is None and images_path is not None:
-        raise SceneNotFoundError(
-            f"cameras.bin or cameras.txt beside {images_path}",
-            found="neither",
-            fix="Copy the whole model.",
-        )
+        expected = f"cameras.bin or cameras.txt beside {images_path}"
+        raise SceneNotFoundError(expected, found="neither", fix="Copy the whole model.")
     intrinsics = read_cameras(cameras_path) if cameras_path else ()
     return intrinsics, read_images(images_path, intrinsics) if images_path else ()
 
@@ -487,6 +478,4 @@ def read_model_points(model_dir: Path) -> tuple[PointCloud, Tracks | None, Path]
     path = _model_file(model_dir, "points3D")
     if path is None:
         return PointCloud.empty(), None, model_dir / "points3D.bin"
-    if path.suffix == ".ply":
-        return read_ply(path), None, path
-    return *read_points3d(path), path
+    return (read_ply(path), None, path) if path.suffix == ".ply" else (*read_points3d(path), path)

@@ -57,8 +57,7 @@ def load_scene(path: str | Path, *, require_points: bool = True) -> Scene:
     """
     path = Path(path)
     try:
-        if not path.is_file():
-            check_there(path)
+        check_there(path)
         reader = partial(_read_file, path) if path.is_file() else _reader(path)
         if reader is None:
             raise _no_scene(path)
@@ -80,9 +79,7 @@ def load_scene(path: str | Path, *, require_points: bool = True) -> Scene:
 def load_originals(path: str | Path, *, require_points: bool = True) -> Scene:
     """As ``load_scene``, without the points that splatseed added before, of which a warning tells.
 
-    Raises:
-        SceneNotFoundError: There is no scene, or it has no originals.
-        SceneFormatError: A file is not what its format promises.
+    If no originals remain, it is a ``SceneNotFoundError``, too.
     """
     scene = load_scene(path, require_points=require_points)
     points = scene.points.originals
@@ -173,17 +170,15 @@ def _no_scene(path: Path) -> SceneNotFoundError:
     scenes = [each.name for each in sorted(path.iterdir()) if is_scene(each)]
     files = {each.name for suffix in ("*.json", "*.ply") for each in path.glob(suffix)}
     names = scenes or sorted(files - {MANIFEST})
-    more = f" and {len(names) - 5:,} more" if len(names) > 5 else ""
-    some = ", ".join(names[:5]) + more
+    some = ", ".join(names[:5]) + (f" and {len(names) - 5:,} more" if len(names) > 5 else "")
     found = f"scenes in it: {some}" if scenes else f"only {some}" if names else "none of them"
-    fix = (
-        "Name the scene's folder, or a .ply or .json file itself. For photographs alone, run:"
-        " splatseed sfm IMAGES -o SCENE."
-    )
     if scenes:
         fix = f"Name one of them: {path / scenes[0]}"
     elif (above := _scene_above(path)) is not None:
         fix = f"Name the scene's folder: {above}"
+    else:
+        fix = "Name the scene's folder, or a .ply or .json file itself. For photographs alone, "
+        fix += "run: splatseed sfm IMAGES -o SCENE."
     expected = f"sparse/0, sparse, colmap/sparse/0, {_TRANSFORMS}, traj.txt or groundtruth.txt"
     return SceneNotFoundError(f"{expected} in {path}", found=found, fix=fix)
 
@@ -216,26 +211,21 @@ def find_depths(
         SceneFormatError: Two images share a map, or the folder's description is damaged.
     """
     if kind is not None and kind not in KINDS:
-        raise ParameterError(
-            f"a kind of depth: {', '.join(KINDS)}", found=repr(kind), fix="Choose one of them."
-        )
-    if scale is not None and not (math.isfinite(scale) and scale > 0):
-        raise ParameterError(
-            "a scale of depth above 0", found=f"{scale}", fix="Give stored units per scene unit."
-        )
+        expected = f"a kind of depth: {', '.join(KINDS)}"
+        raise ParameterError(expected, found=repr(kind), fix="Choose one of them.")
+    if scale is not None and not 0 < scale < math.inf:
+        fix = "Give stored units per scene unit."
+        raise ParameterError("a scale of depth above 0", found=f"{scale}", fix=fix)
     root = Path(path)
     if not root.is_dir():
-        raise SceneNotFoundError(
-            f"a folder of depth maps at {root}",
-            found="a file" if root.exists() else "nothing",
-            fix="Name the folder that the maps lie in.",
-        )
+        found, fix = "a file" if root.exists() else "nothing", "Name the folder that maps lie in."
+        raise SceneNotFoundError(f"a folder of depth maps at {root}", found=found, fix=fix)
     maps = search_depths(scene, root)
     if maps is None:
         name = scene.images[0].name if scene.images else ""
+        such_as = f", such as {name}{SUFFIXES[0]} or {Path(name).stem}.png" if name else ""
         raise SceneNotFoundError(
-            f"depth maps of the scene's images in {root}"
-            + (f", such as {name}{SUFFIXES[0]} or {Path(name).stem}.png" if name else ""),
+            f"depth maps of the scene's images in {root}{such_as}",
             found="none" if name else "a scene without images",
             fix="Name maps as their images are, with subfolders and another suffix.",
         )

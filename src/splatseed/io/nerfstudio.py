@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
 from typing import Any
@@ -72,20 +73,12 @@ def read_transforms_scene(path: Path) -> Scene:
     transforms = read_transforms(path)
     points, points_path, notes = _find_points(transforms)
     images, folder = transforms.images, transforms.image_dir
-    return Scene(
-        points,
-        images,
-        transforms.intrinsics,
-        source=SceneSource(
-            "transforms", path.parent, points_path, image_dir=folder, transforms_path=path
-        ),
-        warnings=(
-            *transforms.warnings,
-            *notes,
-            *image_warnings(images, folder, path.parent),
-            *lens_warnings(images),
-        ),
+    source = SceneSource(
+        "transforms", path.parent, points_path, image_dir=folder, transforms_path=path
     )
+    notes = [*transforms.warnings, *notes, *image_warnings(images, folder, path.parent)]
+    warnings = (*notes, *lens_warnings(images))
+    return Scene(points, images, transforms.intrinsics, source=source, warnings=warnings)
 
 
 def is_blender(folder: Path) -> bool:
@@ -111,23 +104,16 @@ def read_blender(folder: Path) -> Scene:
             name = PurePath(name).as_posix()
             images.append(replace(image, name=name, image_id=len(images) + 1, intrinsics=shared))
     points, points_path, notes = _find_points(parts[0])
-    names = [image.name for image in images]
-    num_train = len(parts[0].images)
+    notes = list(dict.fromkeys((*parts[0].warnings, *parts[1].warnings, *notes)))
+    names, num_train = [image.name for image in images], len(parts[0].images)
+    train, test = frozenset(names[:num_train]), frozenset(names[num_train:])
     return Scene(
         points,
         tuple(images),
         tuple(cameras.values()),
         source=SceneSource("transforms", folder, points_path, image_dir=folder),
-        warnings=(
-            *dict.fromkeys((*parts[0].warnings, *parts[1].warnings, *notes)),
-            *image_warnings(images, folder, folder),
-            *lens_warnings(images),
-        ),
-        listed=Split(
-            frozenset(names[:num_train]),
-            frozenset(names[num_train:]),
-            f"pair of {_BLENDER[0]} and {_BLENDER[1]}",
-        ),
+        warnings=(*notes, *image_warnings(images, folder, folder), *lens_warnings(images)),
+        listed=Split(train, test, f"pair of {_BLENDER[0]} and {_BLENDER[1]}"),
     )
 
 
@@ -199,11 +185,9 @@ def _image_file(path: Path, idx: int, frame: Mapping[str, Any]) -> Path:
 
 
 def _number(where: str, values: Mapping[str, Any], key: str, default: float | None = None) -> float:
-    value = values.get(key, default)
-    try:
+    value, number = values.get(key, default), math.nan
+    with suppress(TypeError, ValueError, OverflowError):
         number = float(value) if not isinstance(value, bool) else math.nan
-    except (TypeError, ValueError, OverflowError):
-        number = math.nan
     if not math.isfinite(number):
         other = "none" if value is None else repr(value)
         raise SceneFormatError(f"a number {key} in {where}", found=other, fix=_FIX)
@@ -265,10 +249,9 @@ def _lens(where: str, values: Mapping[str, Any]) -> tuple[str, tuple[float, ...]
 
 def _matrix(where: str, value: Any) -> Float64[np.ndarray, "3 4"]:
     """The first three rows of a matrix."""
-    try:
+    matrix: np.ndarray = np.empty(0)
+    with suppress(TypeError, ValueError, OverflowError):
         matrix = np.array(value, np.float64)
-    except (TypeError, ValueError, OverflowError):
-        matrix = np.empty(0)
     if matrix.shape not in {(3, 4), (4, 4)} or not np.isfinite(matrix[:3]).all():
         found = "none" if value is None else "something else"
         raise SceneFormatError(f"a matrix of 3 x 4 numbers in {where}", found=found, fix=_FIX)
@@ -320,12 +303,9 @@ def _transform_of_model(
     maps: list[tuple[np.ndarray, list[str]]] = [(each, []) for each in candidates]
     fitted = fit_similarity(model_centers, centers)
     if fitted is not None and len(pairs) >= _FEWEST_FITTED:
-        note = (
-            f"The poses of {transforms.path.name} are those of {model_dir} turned, moved and "
-            f"scaled by {fitted.scale:.3g}, as instant-ngp writes them; its points were brought "
-            "there."
-        )
-        maps.append((fitted.matrix, [note]))
+        poses = f"The poses of {transforms.path.name} are those of {model_dir} turned, moved and"
+        by = f"scaled by {fitted.scale:.3g}, as instant-ngp writes them"
+        maps.append((fitted.matrix, [f"{poses} {by}; its points were brought there."]))
     for matrix, notes in maps:
         off = np.abs(apply_transform(matrix, model_centers) - centers).max(axis=1)
         if np.median(off) <= _POSE_TOLERANCE * extent:
@@ -343,28 +323,20 @@ def read_cloud_transform(path: Path, scene: Scene) -> Similarity:
     Nerfstudio's file leads from the scene to the world that it trains and exports in, so a cloud
     from there goes the other way.
     """
-    try:
+    with suppress(ValueError):  # not plain numbers
         rows = np.loadtxt(read_bytes(path).decode("utf-8").splitlines(), np.float64, ndmin=2)
         return similarity_in(path, rows.tolist(), scene, _MATRIX_FIX)
-    except (UnicodeDecodeError, ValueError):
-        pass  # not plain numbers
     content = read_json(path, "a transform, as text or JSON", fix=_MATRIX_FIX)
     found = similarity_in(path, content, scene, _MATRIX_FIX)
     return found.inverse if path.name == NERFSTUDIO else found
 
 
 def similarity_in(path: Path, content: Any, scene: Scene, fix: str) -> Similarity:
-    """The similarity that the content of a file is.
+    """The similarity that a file's content is, rows of a matrix or a mapping with them and a scale.
 
-    Args:
-        path: The file; nerfstudio's is recognised by its name.
-        content: Rows of a matrix, or a mapping with them and a scale.
-        scene: For nerfstudio's file, whose transform begins from COLMAP's own world: a scene read
-            from transforms.json is in that file's world, to which ``applied_transform`` leads.
-        fix: What errors advise.
-
-    Raises:
-        SceneFormatError: It is none.
+    The transform of nerfstudio's file, known by its name, begins from COLMAP's own world; a scene
+    read from transforms.json is in that file's world, to which ``applied_transform`` leads. A
+    ``SceneFormatError`` with this ``fix``: it is none.
     """
     scale, rows = 1.0, content
     if isinstance(content, dict):

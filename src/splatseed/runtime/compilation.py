@@ -13,11 +13,7 @@ _watchers: list[Callable[[bool], None]] = []
 
 @contextmanager
 def watched(watcher: Callable[[bool], None]) -> Iterator[None]:
-    """Tell ``watcher`` of every compilation while the block runs.
-
-    Args:
-        watcher: Called with True when one begins, with False when one ends; they can nest.
-    """
+    """Call ``watcher`` with True when a compilation begins, False when one ends; they can nest."""
     _watchers.append(watcher)
     try:
         yield

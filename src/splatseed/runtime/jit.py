@@ -103,11 +103,8 @@ def _key_on_sources(file: Any, module: str) -> None:
 def reached_files(module: str) -> dict[str, Path]:
     """The files that a module's kernels may be built from, by their modules' names.
 
-    Args:
-        module: A module that is loaded, or at least all that its first lines import.
-
-    Raises:
-        OSError: A file cannot be read.
+    The module is loaded, or at least all that its first lines import; an ``OSError`` for a file
+    that cannot be read.
     """
     packages, waiting = {"splatseed", module.partition(".")[0]}, [module]
     reached: dict[str, Path] = {}

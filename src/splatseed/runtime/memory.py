@@ -23,17 +23,14 @@ UNITS = {"K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
 
 
 def check_memory(count: int, bytes_each: int, what: str, *, found: str = "", fix: str) -> None:
-    """Refuse what does not fit into the free memory.
+    """Refuse, by a ``ParameterError``, things that do not fit into the free memory.
 
     Args:
-        count: How many things are wanted.
+        count: How many are wanted.
         bytes_each: What each takes.
         what: Their name.
         found: What was asked for, in words; the count when left out.
         fix: What the user can do; ``{most}`` in it becomes the number that fits.
-
-    Raises:
-        ParameterError: They do not fit.
     """
     free = free_memory()
     if free is None or count * bytes_each <= free:
@@ -47,11 +44,7 @@ def check_memory(count: int, bytes_each: int, what: str, *, found: str = "", fix
 
 
 def bytes_of(text: str) -> int:
-    """An amount of memory such as 4G, 500M or a number of bytes.
-
-    Raises:
-        ParameterError: It is none.
-    """
+    """An amount of memory such as 4G, 500M or a number of bytes; else a ``ParameterError``."""
     plain = text.strip().upper().removesuffix("B").removesuffix("I")
     number, unit = (plain[:-1], UNITS[plain[-1]]) if plain[-1:] in UNITS else (plain, 1)
     with suppress(ValueError):

@@ -38,11 +38,7 @@ MOST_THREADS = 8
 
 @contextmanager
 def ray_cluster(address: str | None) -> Iterator[None]:
-    """Connect to a cluster while the block runs.
-
-    Args:
-        address: The cluster's address, or "auto" on one of its nodes; None to start one on this
-            machine.
+    """Connect to a cluster while the block runs: "auto" on one of its nodes, None starts one here.
 
     Raises:
         MissingDependencyError: Ray is absent.
@@ -72,11 +68,7 @@ def ray_cluster(address: str | None) -> Iterator[None]:
 
 
 def _check_answers(address: str) -> None:
-    """Refuse an address at which nothing listens: Ray would go on trying for a quarter of an hour.
-
-    Raises:
-        ParameterError: Nothing does.
-    """
+    """Refuse an address at which nothing listens: Ray would try for a quarter of an hour."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if not (host and port.isdigit()):  # auto, or what Ray itself refuses at once
         return
@@ -102,10 +94,6 @@ class RayTasks(Tasks):
         threads: CPUs of each; left out, as many as let every node work on one for each of its GPUs.
         gpu: Whether each needs a GPU; None for yes if any node has one.
         jobs: Most tasks at a time; as many as fit, when left out.
-
-    Attributes:
-        threads: CPUs of each.
-        gpu: Whether each has a GPU.
 
     Raises:
         ParameterError: No node has enough.

@@ -51,9 +51,7 @@ def cores() -> int:
 def slot_environment(threads: int, gpu: str = "") -> dict[str, str]:
     """The variables that tell a process its share of the machine; results do not depend on it.
 
-    Args:
-        threads: Its threads.
-        gpu: Its GPU, as in ``CUDA_VISIBLE_DEVICES``; empty to leave the choice to PyTorch.
+    ``gpu`` is as in ``CUDA_VISIBLE_DEVICES``; empty to leave the choice to PyTorch.
     """
     libraries = ("NUMBA", "OMP", "MKL", "OPENBLAS")
     environment = {f"{library}_NUM_THREADS": str(threads) for library in libraries}
@@ -64,27 +62,19 @@ def slot_environment(threads: int, gpu: str = "") -> dict[str, str]:
 
 @dataclass(frozen=True)
 class Result:
-    """How a task ended.
-
-    Args:
-        index: Which of the calls it was.
-        value: What it returned.
-        error: What it raised; a ``TaskLostError`` if its process or node died.
-    """
+    """How a task, the call of this index, ended: what it returned or raised."""
 
     index: int
     value: Any = None
     error: Exception | None = None
+    """A ``TaskLostError`` if its process or node died."""
 
 
 class Tasks(ABC):
-    """Something that carries out tasks.
-
-    Attributes:
-        words: A description for the user.
-    """
+    """Something that carries out tasks."""
 
     words: str
+    """A description for the user."""
 
     @abstractmethod
     def run(
@@ -105,11 +95,7 @@ class Tasks(ABC):
     def run_all(
         self, function: Function, calls: Sequence[tuple[Any, ...]], stage: str, progress: Progress
     ) -> None:
-        """Call a function with each of some arguments, for what it leaves on the disk.
-
-        Raises:
-            Exception: The first that a task raised; it ends all.
-        """
+        """Call it for what it leaves on the disk; the first error that a task raises ends all."""
         progress(stage, 0.0)
         with closing(self.run(function, calls)) as results:  # type: ignore[type-var]  # a generator
             for done, result in enumerate(results, start=1):
@@ -245,27 +231,14 @@ class Child:
         )
 
     def start(self, function: Function, *arguments: object, reports: bool = False) -> None:
-        """Begin a call; ``wait`` gives its result.
-
-        Args:
-            function: At the top of a module.
-            arguments: Its arguments.
-            reports: Whether it is given a ``progress`` too.
-        """
+        """Begin a call, with a ``progress`` too if it ``reports``; ``wait`` gives its result."""
         commands = cast("IO[bytes]", self.process.stdin)
         with suppress(BrokenPipeError):  # it has died, as waiting will tell
             pickle.dump(pickle.dumps((function, arguments, reports)), commands)
             commands.flush()
 
     def wait(self, progress: Progress = silent) -> Any:
-        """What the function returns, or raises.
-
-        Args:
-            progress: Told what the function tells its own.
-
-        Raises:
-            TaskLostError: The process died.
-        """
+        """What the function returns, or raises; a ``TaskLostError``: the process died."""
         replies = cast("IO[bytes]", self.process.stdout)
         try:
             while (reply := pickle.load(replies))[0] == "told":  # noqa: S301  (our child)
@@ -291,16 +264,16 @@ class Child:
                     pipe.close()
 
     def _death(self) -> TaskLostError:
-        code, said = self.process.wait(), ""
-        how = (
-            f"killed by {signal.Signals(-code).name}" if code < 0 else f"ended by exit code {code}"
-        )
+        code = self.process.wait()
+        found = "one that "
+        found += f"killed by {signal.Signals(-code).name}" if code < 0 else f"ended by code {code}"
         if self._log is not None:
             self._log.seek(0)
-            said = " ".join(self._log.read().decode("utf-8", "replace").split()[-_LAST_WORDS:])
+            said = self._log.read().decode("utf-8", "replace").split()[-_LAST_WORDS:]
+            found += f": {' '.join(said)}" if said else ""
         return TaskLostError(
             "a process that lives until its work is done",
-            found=f"one that {how}{': ' if said else ''}{said}",
+            found=found,
             fix="Out of memory? Use fewer processes at a time (--jobs), or smaller settings.",
         )
 

@@ -38,12 +38,7 @@ BUILDING = "building gsplat's kernels, some minutes, once"
 def pick_torch_device(choice: DeviceName, option: str) -> torch.device:
     """The device of a choice; ``auto`` takes a GPU if PyTorch sees one.
 
-    Args:
-        choice: What the user says.
-        option: The option by which it was said, for errors.
-
-    Raises:
-        ParameterError: CUDA is requested and there is none.
+    A ``ParameterError``, which names the ``option``: CUDA is requested and there is none.
     """
     import torch  # noqa: PLC0415  (see the promise)
 
