@@ -6,6 +6,7 @@ import tracemalloc
 from contextlib import contextmanager
 
 import numpy as np
+from hypothesis import strategies as st
 
 from splatseed.camera import Intrinsics
 from splatseed.errors import SplatseedError
@@ -65,6 +66,24 @@ def assert_only_our_errors(read, target, data, limit=16 << 20):
             read(target)
         except SplatseedError as error:
             assert str(target) in str(error)  # noqa: PT017  (no error is as good as ours)
+
+
+@st.composite
+def damages(draw, data: bytes) -> bytes:
+    """The bytes with a few overwritten, cut out, put in or repeated, also at their end."""
+    damaged = bytearray(data)
+    for _ in range(draw(st.integers(1, 4))):
+        # Headers are where it hurts, and tables at the end.
+        at = draw(st.integers(0, min(len(damaged), draw(st.sampled_from([100, 400, 10**9])))))
+        if draw(st.booleans()):
+            at = len(damaged) - at
+        width = draw(st.sampled_from([1, 2, 4, 8]))
+        value = draw(st.integers(0, 2 ** (8 * width) - 1) | st.sampled_from([0, 1, 2**8 - 1]))
+        patch = value.to_bytes(width, draw(st.sampled_from(["little", "big"])))
+        patch = draw(st.sampled_from([patch, patch, b"", b"999999", bytes(damaged[at:])]))
+        cut = draw(st.sampled_from([len(patch), len(patch), 0, width, len(damaged)]))
+        damaged[at : at + cut] = patch
+    return bytes(damaged)
 
 
 def assert_same_images(actual, expected):

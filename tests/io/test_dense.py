@@ -58,9 +58,7 @@ def maps(capture):
 def workspaces(room, maps, tmp_path_factory):
     """By the same factors."""
     root = tmp_path_factory.mktemp("dense")
-    for factor in (1, 4):
-        write_dense_workspace(room, maps[factor], root / f"{factor}")
-    return {factor: root / f"{factor}" for factor in (1, 4)}
+    return {f: write_dense_workspace(room, maps[f], root / f"{f}").path for f in (1, 4)}
 
 
 def _mat(path):
@@ -121,13 +119,8 @@ def test_pycolmap_fuses_it(capture, workspaces, tmp_path):
     assert np.quantile(away, 0.95) < PIXEL * 2
 
 
-@pytest.fixture(scope="module")
-def bent_room(capture, tmp_path_factory):
-    """The same room through a lens with distortion."""
-    return load_scene(write_capture(bend(capture), tmp_path_factory.mktemp("bent") / "room"))
-
-
-def test_distorted_photographs_come_without_their_distortion(bent_room, room, maps, tmp_path):
+def test_distorted_photographs_come_without_their_distortion(capture, room, maps, tmp_path):
+    bent_room = load_scene(write_capture(bend(capture), tmp_path / "room"))
     mixed = bent_room.replace(images=(*bent_room.images[:6], *room.images[6:]))
     write_dense_workspace(mixed, maps[4], tmp_path / "w", undistort=undistort)
     scene = load_scene(tmp_path / "w")
@@ -210,19 +203,17 @@ def test_maps_that_do_not_belong_are_refused(write, maps, room, tmp_path):
 def test_scenes_that_cannot_be_fused_are_refused(maps, room, tmp_path):
     lens = room.images[0].intrinsics
     bent = replace(lens, model="SIMPLE_RADIAL", params=(100.0, 60.0, 45.0, 0.1))
-    for error, said, scene in (
-        (SceneFormatError, "distortion", _with_first(room, intrinsics=bent)),
-        (OutputError, "stay inside", _with_first(room, name="../view_000.png")),
-        (SceneNotFoundError, "gone.png", _with_first(room, name="gone.png")),
-        (SceneNotFoundError, "photographs", room.replace(source=None)),
+    for error, said, changes in (
+        (SceneFormatError, "distortion", {"intrinsics": bent}),
+        (OutputError, "stay inside", {"name": "../view_000.png"}),
+        (SceneNotFoundError, "gone.png", {"name": "gone.png"}),
     ):
+        scene = room.replace(images=(replace(room.images[0], **changes), *room.images[1:]))
         with pytest.raises(error, match=said):
             write_dense_workspace(scene, maps[4][:1], tmp_path / "w")
-        assert list(tmp_path.iterdir()) == []
-
-
-def _with_first(scene, **changes):
-    return scene.replace(images=(replace(scene.images[0], **changes), *scene.images[1:]))
+    with pytest.raises(SceneNotFoundError, match="photographs"):
+        write_dense_workspace(room.replace(source=None), maps[4][:1], tmp_path / "w")
+    assert list(tmp_path.iterdir()) == []
 
 
 @settings(max_examples=30, deadline=None)

@@ -19,7 +19,7 @@ from splatseed.io import colmap
 from splatseed.io.depth_files import read_stored
 from splatseed.io.ply import write_ply
 
-from .checks import READERS, assert_only_our_errors, drain, read_images
+from .checks import READERS, assert_only_our_errors, damages, drain, read_images
 from .conftest import CLOUDS
 
 TEXT = (".txt", "ascii.ply")
@@ -101,24 +101,6 @@ def clouds(cloud_files) -> dict[str, bytes]:
     for name in CLOUDS:
         drain(cloud_files.folder / name)
     return {name: (cloud_files.folder / name).read_bytes() for name in CLOUDS}
-
-
-@st.composite
-def damages(draw, data: bytes) -> bytes:
-    """The bytes with a few overwritten, cut out, put in or repeated, also at their end."""
-    damaged = bytearray(data)
-    for _ in range(draw(st.integers(1, 4))):
-        # Headers are where it hurts, and tables at the end.
-        at = draw(st.integers(0, min(len(damaged), draw(st.sampled_from([100, 400, 10**9])))))
-        if draw(st.booleans()):
-            at = len(damaged) - at
-        width = draw(st.sampled_from([1, 2, 4, 8]))
-        value = draw(st.integers(0, 2 ** (8 * width) - 1) | st.sampled_from([0, 1, 2**8 - 1]))
-        patch = value.to_bytes(width, draw(st.sampled_from(["little", "big"])))
-        patch = draw(st.sampled_from([patch, patch, b"", b"999999", bytes(damaged[at:])]))
-        cut = draw(st.sampled_from([len(patch), len(patch), 0, width, len(damaged)]))
-        damaged[at : at + cut] = patch
-    return bytes(damaged)
 
 
 @pytest.mark.parametrize("name", READERS)

@@ -29,8 +29,7 @@ def turn(angle):
 
 
 def write_list(path, rows):
-    lines = ["# a comment", "", *(" ".join(map(str, row)) for row in rows)]
-    path.write_text("\n".join(lines) + "\n")
+    np.savetxt(path, [list(map(str, row)) for row in rows], "%s", header="a comment\n")
 
 
 def write_track(root, times, angles, centers):
@@ -174,8 +173,7 @@ POSES = [pose(0.1 * i, (i, -i, 0.5)) for i in range(3)]
 
 
 def write_poses(folder, poses):
-    lines = (" ".join(repr(float(value)) for value in one.ravel()) for one in poses)
-    (folder / "traj.txt").write_text("\n".join(lines) + "\n")
+    np.savetxt(folder / "traj.txt", np.reshape(poses, (-1, 16)))
 
 
 @pytest.fixture
@@ -216,34 +214,30 @@ def test_lost_frames_are_left_out_and_told(room):
     assert "frame2.jpg" in told
 
 
-def test_missing_files_and_frames_of_another_size(room):
+def test_missing_files_frames_of_another_size_and_bad_poses_are_named(room):
     for name in ("cam_params.json", "traj.txt", "results"):
         (room / name).rename(room / "elsewhere")
         with pytest.raises(SceneNotFoundError, match=name):
             load_rgbd(room)
         (room / "elsewhere").rename(room / name)
-    PilImage.new("RGB", (20, 15)).save(room / "results" / "frame2.jpg")
-    with pytest.raises(SceneFormatError, match=r"frame2\.jpg .* found 20x15"):
-        load_rgbd(room)
-    (room / "results" / "frame2.jpg").write_bytes(b"no image")
-    with pytest.raises(SceneFormatError, match=r"frame2\.jpg to be a readable image"):
-        load_rgbd(room)
-
-
-BAD_POSES = (np.zeros(16), np.full(16, 1e308), np.diag([1, 1, -1, 1]), pose(0.1, (1, 2, 3)).T)
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        *(b"1 2 3\n", b"\n\n" + b"x " * 16, b"0 " * 16 + b"\n", b"", b"\xff\xfe\x00"),
-        *(3 * f"{' '.join(map(str, each.ravel()))}\n".encode() for each in BAD_POSES),
-    ],
-)
-def test_bad_poses_are_named(room, text):
-    (room / "traj.txt").write_bytes(text)
-    with pytest.raises(SceneFormatError, match=r"traj\.txt"):
-        load_rgbd(room)
+    frame = room / "results/frame2.jpg"
+    whole = frame.read_bytes()
+    for write, said in (
+        (PilImage.new("RGB", (20, 15)).save, r"frame2\.jpg .* found 20x15"),
+        (lambda path: path.write_bytes(b"no image"), r"frame2\.jpg to be a readable image"),
+    ):
+        write(frame)
+        with pytest.raises(SceneFormatError, match=said):
+            load_rgbd(room)
+    frame.write_bytes(whole)
+    for text in (b"1 2 3\n", b"\n\n" + b"x " * 16, b"0 " * 16 + b"\n", b"", b"\xff\xfe\x00"):
+        (room / "traj.txt").write_bytes(text)
+        with pytest.raises(SceneFormatError, match=r"traj\.txt"):
+            load_rgbd(room)
+    for bad in (np.zeros(16), np.full(16, 1e308), np.diag([1, 1, -1, 1]), POSES[1].T):
+        write_poses(room, [bad.reshape(4, 4)] * 3)
+        with pytest.raises(SceneFormatError, match=r"traj\.txt"):
+            load_rgbd(room)
 
 
 def test_real_depth_agrees_best_at_the_principal_point(scenes):

@@ -19,6 +19,8 @@ from splatseed.synthetic import make_capture
 from splatseed.train.seeds import seeded
 from splatseed.train.settings import TrainSettings
 
+from .checks import damages
+
 NORMAL_STEP, CONFIDENCE_STEP = 1e-3, 5e-4
 """Half precision: 11 bits."""
 
@@ -89,12 +91,16 @@ SPOILT = {
 }
 
 
+CLOUD = PointCloud(np.eye(3), np.zeros((3, 3), np.uint8), sizes=np.ones(3))
+
+
 @pytest.mark.parametrize(
     "how", [*SPOILT, b"", b"PK\x05\x06" + bytes(18), b"not an archive", "a lying header"]
 )
 def test_damaged_files_are_left_aside_and_told_of(tmp_path, how):
-    cloud = PointCloud(np.eye(3), np.zeros((3, 3), np.uint8), sizes=np.ones(3))
-    write_seeds(tmp_path, cloud)
+    write_seeds(tmp_path, CLOUD)
+    assert "other points" in _read_seeds(tmp_path, PointCloud(2 * CLOUD.xyz, CLOUD.rgb))[1][0]
+    assert _read_seeds(tmp_path, PointCloud(CLOUD.xyz, 255 - CLOUD.rgb))[0].keys() == {"sizes"}
     with np.load(tmp_path / SEEDS) as archive:
         arrays = dict(archive)
     if isinstance(how, bytes):
@@ -105,25 +111,18 @@ def test_damaged_files_are_left_aside_and_told_of(tmp_path, how):
         np.savez(tmp_path / SEEDS, digest=arrays["digest"])
         with zipfile.ZipFile(tmp_path / SEEDS, "a") as archive:
             archive.writestr("sizes.npy", LYING + bytes(12))
-    known, (told,) = _read_seeds(tmp_path, cloud.replace(sizes=None))
+    known, (told,) = _read_seeds(tmp_path, CLOUD.replace(sizes=None))
     assert known == {}
     assert f"{SEEDS} was ignored" in told
-    write_seeds(tmp_path, cloud)
-    assert "other points" in _read_seeds(tmp_path, PointCloud(2 * cloud.xyz, cloud.rgb))[1][0]
-    assert _read_seeds(tmp_path, PointCloud(cloud.xyz, 255 - cloud.rgb))[0].keys() == {"sizes"}
 
 
 @settings(deadline=None, max_examples=40)
 @given(st.data())
 def test_damage_anywhere_never_escapes(tmp_path_factory, data):
     folder = tmp_path_factory.mktemp("damage")
-    cloud = PointCloud(np.eye(3), np.zeros((3, 3), np.uint8), sizes=np.ones(3))
-    write_seeds(folder, cloud)
-    content = bytearray((folder / SEEDS).read_bytes())
-    for _ in range(data.draw(st.integers(1, 3))):
-        content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
-    (folder / SEEDS).write_bytes(content[: data.draw(st.integers(0, len(content)))])
-    sizes = _read_seeds(folder, cloud.replace(sizes=None))[0].get("sizes")
+    write_seeds(folder, CLOUD)
+    (folder / SEEDS).write_bytes(data.draw(damages((folder / SEEDS).read_bytes())))
+    sizes = _read_seeds(folder, CLOUD.replace(sizes=None))[0].get("sizes")
     assert sizes is None or np.array_equal(sizes, np.ones(3))  # a checksum guards each array
 
 
