@@ -16,6 +16,7 @@ from splatseed.commands import demo
 from splatseed.errors import MissingDependencyError
 from splatseed.io import load_scene
 from splatseed.runtime.compilation import tell
+from splatseed.synthetic import write_capture
 from splatseed.upsample import METHODS
 
 
@@ -99,18 +100,9 @@ def test_what_compiles_ahead_starts_with_the_first_compilation_and_ends(monkeypa
     assert child.process.poll() is not None
 
 
-def test_what_compiles_ahead_is_a_small_demo(tmp_path, monkeypatch):
+def test_what_compiles_ahead_is_a_small_demo(tmp_path):
     """A failure there would go unseen: the demo would compile by itself, and be slow."""
     pytest.importorskip("gsplat", reason="training needs PyTorch and gsplat's strategies")
-    real, failed = demo._compile, []
-
-    def compile_part(part, scene, folder):
-        try:
-            real(part, scene, folder)
-        except Exception as error:
-            failed.append(error)
-            raise
-
-    monkeypatch.setattr(demo, "_compile", compile_part)
-    demo.compile_ahead(demo.AHEAD)
-    assert not failed
+    write_capture(synthetic.make_capture(demo.SEED, **demo.SMALL), tmp_path / "scene")
+    for part in demo.AHEAD:
+        demo._compile(part, demo._load(tmp_path), tmp_path)

