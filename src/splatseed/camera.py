@@ -51,22 +51,15 @@ CAMERA_MODELS: dict[str, CameraModel] = {
 class Intrinsics:
     """A COLMAP camera record: everything but the pose.
 
-    Args:
-        camera_id: The id that images refer to.
-        model: A key of ``CAMERA_MODELS``.
-        width: Image width in pixels.
-        height: Image height in pixels.
-        params: The model's parameters in COLMAP's order, pixels for focal lengths and centre.
-
     Raises:
         SceneFormatError: The model is unknown, or the number of parameters is not the model's.
     """
 
-    camera_id: int
-    model: str
-    width: int
+    camera_id: int  # that images refer to
+    model: str  # a key of ``CAMERA_MODELS``
+    width: int  # pixels
     height: int
-    params: tuple[float, ...]
+    params: tuple[float, ...]  # in COLMAP's order; pixels for focal lengths and centre
 
     def __post_init__(self) -> None:
         model = CAMERA_MODELS.get(self.model)

@@ -30,14 +30,12 @@ ASPECT_SLACK = 0.02
 class DepthMap:
     """The depth that one image sees.
 
-    Args:
-        values: float32 [H, W]; NaN where unknown. For the kinds "z" and "ray", positive and in
-            scene units, or in a multiple of them that alignment determines.
-        kind: What a value is.
+    Values are NaN where unknown. Of the kinds "z" and "ray" they are positive, in scene units or in
+    a multiple of them that alignment determines.
     """
 
     values: Float32[np.ndarray, "H W"]
-    kind: DepthKind = "z"
+    kind: DepthKind = "z"  # what a value is
 
     @property
     def width(self) -> int:
@@ -71,15 +69,12 @@ class DepthMaps(Protocol):
 
     def __contains__(self, name: object) -> bool:
         """Whether the image of that name has a map."""
-        ...
 
     def __iter__(self) -> Iterator[str]:
         """The names of the images that have a map."""
-        ...
 
     def __len__(self) -> int:
         """How many images have a map."""
-        ...
 
     def read(self, name: str) -> DepthMap:
         """The map of an image; safe to call from several threads.
@@ -88,4 +83,3 @@ class DepthMaps(Protocol):
             SceneNotFoundError: The image has none, or its file is gone.
             SceneFormatError: The file is not what its format promises.
         """
-        ...

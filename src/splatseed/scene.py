@@ -48,22 +48,14 @@ class Image:
 
     The pose is kept as the quaternion and translation of the file, so that it is written back
     bit for bit.
-
-    Args:
-        name: Path relative to the images folder, with forward slashes.
-        image_id: The id that tracks refer to.
-        intrinsics: The camera record of the image.
-        quat: wxyz rotation of ``cam_from_world``, float64 [4], as in the file.
-        translation: Translation of ``cam_from_world``, float64 [3].
-        observations: Its features; None where the format has none.
     """
 
-    name: str
-    image_id: int
+    name: str  # path relative to the images folder, with forward slashes
+    image_id: int  # that tracks refer to
     intrinsics: Intrinsics
-    quat: Float64[np.ndarray, " 4"]
-    translation: Float64[np.ndarray, " 3"]
-    observations: Observations | None = None
+    quat: Float64[np.ndarray, " 4"]  # wxyz rotation of ``cam_from_world``, as in the file
+    translation: Float64[np.ndarray, " 3"]  # of ``cam_from_world``
+    observations: Observations | None = None  # None where the format has none
 
     @cached_property
     def camera(self) -> Camera:

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
-from splatseed.errors import InputError, ParameterError, SceneFormatError, SceneNotFoundError
+from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.io.files import is_video
 from splatseed.sfm.photos import choose_frames, pick_frames, shift
 from splatseed.view.flights import write_video
@@ -77,8 +77,7 @@ def test_what_cannot_be_used_is_told(wall, tmp_path):
         ("none.mp4", 10, SceneNotFoundError),
         ("still.mp4", 1, ParameterError),
     ):
-        with pytest.raises(InputError) as caught:
+        with pytest.raises(error):
             pick_frames(tmp_path / name, tmp_path, most)
-        assert type(caught.value) is error
     assert is_video(tmp_path / "still.mp4")
     assert not is_video(tmp_path)

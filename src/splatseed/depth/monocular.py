@@ -79,15 +79,9 @@ def estimate_depths(
 ) -> DepthReport:
     """Predict a depth map for every image of a scene; ``splatseed.io.find_depths`` reads them.
 
-    Args:
-        scene: A scene with photographs.
-        network: The network.
-        output: The folder to write, with one float32 ``.npy`` per image.
-        max_size: A photograph whose longer side has more pixels is reduced to this before the
-            network sees it, and its map has that size.
-        overwrite: Whether an earlier folder of maps may be replaced.
-        provenance: How the maps were made, for ``splatseed.json``.
-        progress: Called with the stage and the fraction done.
+    A photograph whose longer side has more than ``max_size`` pixels is reduced to this before the
+    network sees it, and its map, a float32 ``.npy``, has that size. ``provenance`` is how the maps
+    were made, for ``splatseed.json``.
 
     Raises:
         SceneNotFoundError: The scene has no images, or a photograph is missing.
@@ -132,14 +126,7 @@ def _sizes(scene: Scene, folder: Path, max_size: int, progress: Progress) -> dic
 
 
 class DepthNetwork:
-    """A network of transformers' auto class for depth, with its image processor.
-
-    Args:
-        processor: Makes the network's input.
-        network: A model whose output has ``predicted_depth``.
-        meaning: What it predicts.
-        device: Where to run it.
-    """
+    """A network of transformers' auto class for depth, with its image processor and its meaning."""
 
     def __init__(
         self, processor: Any, network: Any, meaning: Meaning, device: torch.device
@@ -215,11 +202,8 @@ def load_network(
 ) -> DepthNetwork:
     """Load a depth network that is on this machine; transformers keeps silent from then on.
 
-    Args:
-        model: A folder with ``config.json``, ``preprocessor_config.json`` and weights, or the id of
-            a model that Hugging Face's cache holds.
-        kind: What it predicts; None: what its configuration says.
-        device: Where to run it; auto takes a GPU if PyTorch sees one.
+    ``model`` is a folder with ``config.json``, ``preprocessor_config.json`` and weights, or the id
+    of one in Hugging Face's cache; ``kind`` what it predicts, if its configuration is not to say.
 
     Raises:
         MissingDependencyError: transformers, or torchvision where its image processor needs it, is

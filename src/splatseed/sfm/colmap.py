@@ -48,22 +48,13 @@ _MORE_PHOTOGRAPHS = (
 
 @dataclass(frozen=True)
 class Settings:
-    """How features are detected and matched, and how the scene is solved.
+    """How features are detected and matched, and how the scene is solved."""
 
-    Args:
-        matcher: ``exhaustive`` compares every pair of images; ``sequential`` each with its
-            successors in the order of names, for a video.
-        device: Where features are detected and matched; all else runs on the CPU.
-        max_image_size: Longer sides are reduced to this many pixels for feature detection.
-        seed: Seed of RANSAC and of the order of bundle adjustment.
-        threads: Worker threads; -1 = all cores.
-    """
-
-    matcher: MatcherName = "exhaustive"
-    device: DeviceName = "auto"
-    max_image_size: int = 1600
-    seed: int = 0
-    threads: int = -1
+    matcher: MatcherName = "exhaustive"  # sequential: each with its successors by name, for a video
+    device: DeviceName = "auto"  # where features are detected and matched; all else runs on the CPU
+    max_image_size: int = 1600  # longer sides are reduced to this many pixels for features
+    seed: int = 0  # of RANSAC and of the order of bundle adjustment
+    threads: int = -1  # -1 = all cores
 
     def __post_init__(self) -> None:
         check_choice("matcher", self.matcher, get_args(MatcherName))

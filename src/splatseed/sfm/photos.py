@@ -159,13 +159,7 @@ class PickedFrames(NamedTuple):
 def pick_frames(
     video: Path, folder: Path, most: int = 150, progress: Progress = silent
 ) -> PickedFrames:
-    """Write the best frames of a video as JPEGs; equal videos give equal frames.
-
-    Args:
-        video: The file.
-        folder: An existing folder for the frames.
-        most: The most frames to choose.
-        progress: Called with the stage and the fraction done.
+    """Write the best frames of a video, ``most`` at most, as JPEGs; equal videos give equal frames.
 
     Raises:
         MissingDependencyError: imageio-ffmpeg is absent.

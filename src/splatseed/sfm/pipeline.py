@@ -155,13 +155,7 @@ def undistort(
     """Write a scene with undistorted photographs and PINHOLE cameras.
 
     Poses, points, their origins and tracks stay; features move with the pixels. The size of
-    photographs changes a little.
-
-    Args:
-        scene: A scene with all its photographs.
-        output: The scene folder to write, in COLMAP's layout.
-        overwrite: Whether an earlier output of this function may be replaced.
-        on_progress: Called with the stage and the fraction done.
+    photographs changes a little. The output has COLMAP's layout.
 
     Raises:
         SceneNotFoundError: The scene has no photographs, or one is missing.
@@ -190,15 +184,8 @@ def _undistort(run: Run, staging: Path, model_dir: Path, names: Sequence[str]) -
 def refined(scene: Scene, seed: int, progress: Progress = silent) -> tuple[Scene, str]:
     """The scene at refined poses, with the points that its photographs' features give.
 
-    Its photographs, lenses and depth maps stay; its own points are replaced.
-
-    Args:
-        scene: A scene with photographs.
-        seed: Seed of every random choice.
-        progress: Called with the stage and the fraction done.
-
-    Returns:
-        The scene, and what was done in a sentence.
+    Its photographs, lenses and depth maps stay; its own points are replaced. Also what was done, in
+    a sentence.
 
     Raises:
         SceneNotFoundError: It has no photographs.
@@ -230,9 +217,7 @@ def refined(scene: Scene, seed: int, progress: Progress = silent) -> tuple[Scene
 def with_refined(scene: Scene, found: Scene) -> Scene:
     """The scene with the poses and the points of another of the same photographs.
 
-    Args:
-        scene: Images that the other scene lacks keep their poses.
-        found: Its points count as originals without tracks.
+    Images that the other lacks keep their poses; its points count as originals without tracks.
     """
     posed = {image.name: image for image in found.images}
     pairs = [(image, posed.get(image.name, image)) for image in scene.images]
