@@ -1,4 +1,4 @@
-"""``splatseed bench`` from its words to its exit code: real runs in real processes."""
+"""``splatseed bench`` from its words to its exit code, with real runs."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from functools import partial
 
@@ -22,7 +23,9 @@ from splatseed import synthetic
 from splatseed.bench.plan_file import plan_text, read_plan
 from splatseed.bench.runs import read_calls, read_runs
 from splatseed.bench.scenes import DEMO, PlannedScene, survey
+from splatseed.commands import bench as command
 from splatseed.io import load_scene
+from splatseed.runtime.tasks import HereTasks
 from splatseed.synthetic import make_capture
 
 COMMAND = (sys.executable, "-c", "from splatseed.cli import main; main()", "bench")
@@ -47,19 +50,18 @@ def bench(splatseed):
     return partial(splatseed, "bench")
 
 
-def _begin(*words):
-    return subprocess.Popen(
-        [*COMMAND, *map(str, words)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
+@pytest.fixture
+def here(monkeypatch):
+    """Runs that need no process, nor its import of PyTorch, are done in this one."""
+    monkeypatch.setattr(command, "ProcessTasks", lambda *_, **__: HereTasks())
 
 
-@pytest.mark.slow
-def test_runs_everything_once_and_a_failed_run_ends_nothing_else(bench, plan_path, tmp_path):
+def test_runs_everything_once_and_a_failed_run_ends_nothing_else(here, bench, plan_path, tmp_path):
     folder = tmp_path / "B"
     plan = plan_path(
         methods=("sfm", "linear", "depth"), repeats=1, parameters={"depth": {"min_points": 9999}}
     )
-    code, out, err = bench("--plan", plan, "-o", folder, "--jobs", 2)
+    code, out, err = bench("--plan", plan, "-o", folder)
     assert (code, err) == (1, "")
     assert len(re.findall(r"^\[\d/3\] room, ", out, re.MULTILINE)) == 3
     assert re.search(r"room, depth 2x, none, repeat 1 +expected .*9,?999", out)
@@ -83,29 +85,20 @@ def test_runs_everything_once_and_a_failed_run_ends_nothing_else(bench, plan_pat
 
 
 @pytest.mark.slow
-def test_killed_at_any_moment_it_goes_on(plan_path, tmp_path):
-    """SIGKILL in the middle of the second run's training."""
+def test_killed_in_training_it_goes_on(here, bench, plan_path, tmp_path):
     folder = tmp_path / "B"
-    plan = plan_path(repeats=1, max_steps=200)
-    process = _begin("--plan", plan, "-o", folder)
-    assert any(line.startswith("[1/2]") for line in process.stdout)
-    _wait_for_training(folder)
-    process.kill()
-    process.communicate()
-    first, second = read_runs(folder)
-    assert (first.result is None, second.result) == (False, None)
-    (result,) = folder.glob("runs/*/result.json")
-    before = result.read_bytes()
+    words = ("--plan", plan_path(repeats=1, methods=("sfm",), max_steps=300), "-o", folder)
+    with subprocess.Popen([*COMMAND, *map(str, words)]) as process:
+        _wait_for_training(folder)
+        process.kill()
+    (run,) = read_runs(folder)
+    assert (run.result, run.error) == (None, "")
     (left,) = folder.glob("runs/.*")
     os.utime(left, (0, 0))  # a fresh one may still be somebody's
-
-    again = _begin("-o", folder)
-    out, err = again.communicate(timeout=120)
-    assert again.returncode == 0, err
-    assert "2 runs, 1 done, 1 to do" in out
-    assert all(run.result for run in read_runs(folder))
-    assert result.read_bytes() == before
-    assert len(list((folder / "runs").iterdir())) == 2  # nothing half-written is left
+    run = bench("-o", folder)
+    assert (run.code, run.err) == (0, "")
+    assert [bool(run.result) for run in read_runs(folder)] == [True]
+    assert len(list((folder / "runs").iterdir())) == 1  # nothing half-written is left
 
 
 def _wait_for_training(folder):
@@ -116,15 +109,24 @@ def _wait_for_training(folder):
 
 
 @pytest.mark.slow
-def test_ctrl_c_stops_and_says_how_to_go_on(plan_path, tmp_path):
+def test_ctrl_c_stops_and_says_how_to_go_on(bench, plan_path, tmp_path):
+    """As a terminal sends it to this process, whose run is another."""
     folder = tmp_path / "B"
-    process = _begin("--plan", plan_path(repeats=1, methods=("sfm",), max_steps=5000), "-o", folder)
-    _wait_for_training(folder)
-    process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=60)
-    assert process.returncode == 130
-    assert "stopped" in err
-    assert "Traceback" not in err
+    plan = plan_path(repeats=1, methods=("sfm",), max_steps=5000)
+
+    def stop():
+        try:
+            _wait_for_training(folder)
+        finally:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    user = threading.Thread(target=stop)
+    user.start()
+    code, out, err = bench("--plan", plan, "-o", folder)
+    user.join()
+    signal.signal(signal.SIGINT, before)
+    assert (code, "stopped" in err) == (130, True)
     assert f"splatseed bench -o {folder}" in out
     (run,) = read_runs(folder)
     assert (run.result, run.error) == (None, "")

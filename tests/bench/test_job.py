@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
-import signal
 import tempfile
 
 import numpy as np
@@ -23,7 +21,7 @@ from splatseed.cli import main
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.io import load_scene, write_scene
 from splatseed.io.ply import write_ply
-from splatseed.runtime.tasks import HereTasks, ProcessTasks
+from splatseed.runtime.tasks import HereTasks
 from splatseed.splat.covisible import read_covisible
 from splatseed.synthetic import make_capture
 from splatseed.train.seeds import seeds_digest
@@ -178,20 +176,6 @@ def test_files_of_the_users_are_left_alone(specs, tmp_path):
     (failed,) = do_runs(tmp_path, [specs["sfm"]], HereTasks(), JobOptions())
     assert mine.parent.name in failed.error
     assert [path.name for path in mine.parent.iterdir()] == ["thesis.txt"]
-
-
-@pytest.mark.slow
-def test_a_process_that_dies_fails_its_run_alone(specs, tmp_path, monkeypatch):
-    """In its own process each; the folder of one run tells it to kill itself."""
-    monkeypatch.setattr(job, "run_job", _killed)
-    tasks = ProcessTasks([{}], fresh=True)
-    runs = list(do_runs(tmp_path, [specs["sfm"], specs["linear"]], tasks, JobOptions()))
-    assert sorted(run.spec.arm.method for run in runs) == ["linear", "sfm"]
-    assert all("SIGKILL" in run.error for run in runs)
-
-
-def _killed(*_, **__):
-    os.kill(os.getpid(), signal.SIGKILL)
 
 
 def test_a_run_elsewhere_comes_back_as_files_and_leaves_nothing(specs, tmp_path, monkeypatch):
