@@ -12,15 +12,14 @@ from collections.abc import Mapping
 from dataclasses import asdict, fields, replace
 from importlib.resources import files
 from pathlib import Path
-from types import UnionType
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from splatseed.bench.plan import SHARED, Plan
 from splatseed.bench.scenes import DEMO, PlannedScene
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.io.files import read_text
-from splatseed.literal import quoted
 from splatseed.train.settings import TrainSettings
+from splatseed.upsample.method import describe_type, fits
 
 PresetName = Literal["mipnerf360", "replica", "laptop", "quick"]
 PRESETS: tuple[PresetName, ...] = get_args(PresetName)
@@ -28,17 +27,17 @@ PLAN = "plan.toml"
 """The name of the plan in the folder of a benchmark."""
 _FILES = ("path", "depth", "cloud")
 """Keys of a scene that are paths, relative to the plan's file."""
-
-
-_HINTS = {**get_type_hints(Plan), **get_type_hints(TrainSettings)}
-KINDS: Mapping[str, object] = {
+_HINTS: dict[str, Any] = {
+    **get_type_hints(Plan), **get_type_hints(TrainSettings),
+    "scenes": tuple[dict, ...],  # type: ignore[type-arg]  # whose keys have their own check
+    "budgets": tuple[str | float, ...], "parameters": dict,
+}  # fmt: skip
+KINDS: Mapping[str, Any] = {
     name: _HINTS[name]
     for each in fields(Plan)
     for name in (SHARED if each.name == "training" else [each.name])
 }
 """The type of each key of a plan: those of ``Plan``, except that ``training`` is flat."""
-_WORDS = {str: "text", int: "a whole number", float: "a number", bool: "true or false",
-          dict: "a table"}  # fmt: skip
 
 
 def read_plan(path: Path, folder: Path | None = None) -> Plan:
@@ -52,19 +51,16 @@ def read_plan(path: Path, folder: Path | None = None) -> Plan:
     _check(path, content, KINDS)
     methods = content.get("parameters", {})
     _check(path, methods, dict.fromkeys(methods, dict), "parameters.")
-    values: dict[str, Any] = {
-        key: tuple(value) if isinstance(value, list) else value for key, value in content.items()
-    }
-    values["scenes"] = tuple(
-        _scene(path, folder or path.parent, each) for each in content.get("scenes", ())
-    )
+    values: dict[str, Any]
+    values = {key: tuple(v) if isinstance(v, list) else v for key, v in content.items()}
+    folder = folder or path.parent
+    values["scenes"] = tuple(_scene(path, folder, each) for each in content.get("scenes", ()))
     try:
         training = TrainSettings(**{name: values.pop(name) for name in SHARED if name in values})
         return Plan(**values, training=training)
     except ParameterError as error:
-        raise SceneFormatError(
-            f"{error.expected} in {path}", found=error.found, fix="Correct the plan."
-        ) from None
+        expected, fix = f"{error.expected} in {path}", "Correct the plan."
+        raise SceneFormatError(expected, found=error.found, fix=fix) from None
 
 
 def plan_text(plan: Plan) -> str:
@@ -88,68 +84,41 @@ def plan_text(plan: Plan) -> str:
 
 
 def _read_toml(path: Path) -> dict[str, Any]:
+    fix = "splatseed bench --scenes SCENE --dry-run prints one."
     try:
         return tomllib.loads(read_text(path))
     except FileNotFoundError:
-        raise SceneNotFoundError(
-            f"a plan at {path}",
-            found="no such file",
-            fix="Check the path, or have one written: splatseed bench --scenes SCENE --dry-run > "
-            f"{quoted(path)}",
-        ) from None
+        raise SceneNotFoundError(f"a plan at {path}", found="no such file", fix=fix) from None
     except (OSError, ValueError) as error:
         found = getattr(error, "strerror", None) or str(error)
-    raise SceneFormatError(
-        f"{path} to be a plan in TOML", found=found, fix="splatseed bench --dry-run prints one."
-    )
+    raise SceneFormatError(f"{path} to be a plan in TOML", found=found, fix=fix)
 
 
 def _check(
-    path: Path, content: Mapping[str, object], hints: Mapping[str, object], within: str = ""
+    path: Path, content: Mapping[str, object], hints: Mapping[str, Any], within: str = ""
 ) -> None:
-    """Refuse keys and values of other kinds than a plan's; true and false are no numbers."""
+    """Refuse keys and values of other kinds than a plan's."""
     for key, value in content.items():
         if key not in hints:
-            raise SceneFormatError(
-                f"a key of a plan in {path} ({', '.join(hints)})",
-                found=repr(within + key),
-                fix="Check its spelling.",
-            )
-        kind, listed = _kind(hints[key])
-        types: tuple[type, ...] = (int, float) if kind is float else (kind,)
-        types = (str, int, float) if key == "budgets" else types
+            known = f"a key of a plan in {path} ({', '.join(hints)})"
+            raise SceneFormatError(known, found=repr(within + key), fix="Check its spelling.")
+        hint, listed = hints[key], get_origin(hints[key]) is tuple
+        kind = get_args(hint)[0] if listed else hint
         parts = value if listed and isinstance(value, list) else [value]
-        if isinstance(value, list) != listed or any(type(part) not in types for part in parts):
-            words = f"a list, each {_WORDS[kind]}" if listed else _WORDS[kind]
+        if isinstance(value, list) != listed or not all(fits(part, kind) for part in parts):
+            words = f"{'a list, each ' if listed else ''}{describe_type(kind)}"
             raise SceneFormatError(
-                f"{within}{key} in {path} to be {words}",
-                found=f"{value!r}",
-                fix="Correct the plan.",
+                f"{within}{key} in {path} to be {words}", found=repr(value), fix="Correct the plan."
             )
-
-
-def _kind(hint: object) -> tuple[type, bool]:
-    """The type of a value of a field in TOML, and whether it is a list of these."""
-    origin, args = get_origin(hint), get_args(hint)
-    if origin in {tuple, UnionType}:  # such as tuple[str, ...], int | None
-        return _kind(args[0])[0], origin is tuple
-    if origin is Literal:
-        return str, False
-    return next((kind for kind in _WORDS if kind is hint), dict), False
 
 
 def _scene(path: Path, folder: Path, content: Mapping[str, Any]) -> PlannedScene:
     _check(path, content, get_type_hints(PlannedScene), "scenes.")
     if not content.get("path"):
-        raise SceneFormatError(
-            f"a path for each of the scenes in {path}", found="none", fix="Say where it lies."
-        )
-    beside = {
-        key: str(folder / content[key])
-        for key in _FILES
-        if content.get(key) and content[key] != DEMO
-    }
-    return PlannedScene(**{**content, **beside})
+        all_have = f"a path for each of the scenes in {path}"
+        raise SceneFormatError(all_have, found="none", fix="Say where it lies.")
+    named = {key: content[key] for key in _FILES if content.get(key) and content[key] != DEMO}
+    return PlannedScene(**{**content, **{key: str(folder / file) for key, file in named.items()}})
 
 
 def _value(value: object) -> str:
@@ -173,25 +142,12 @@ def preset_plan(name: PresetName, data: Path | None) -> tuple[Plan, tuple[str, .
     The presets are plans in ``data``; their scenes are those of the paper's tables 1 and 2.
 
     Raises:
-        ParameterError: The folder is not given, or given for ``quick``, which has its own scene.
         SceneNotFoundError: None of the scenes is in it.
     """
-    if name == "quick" and data is not None:
-        raise ParameterError(
-            "--scenes for the preset quick", found="--data", fix="Name scenes, or none."
-        )
-    if name != "quick" and data is None:
-        raise ParameterError(
-            f"--data DIR, the folder of the scenes of {name}", found="none", fix="Name it."
-        )
-    preset = files("splatseed.bench") / "data" / f"{name}.toml"
-    plan = read_plan(Path(str(preset)), data)
+    plan = read_plan(Path(str(files("splatseed.bench") / "data" / f"{name}.toml")), data)
     there = tuple(each for each in plan.scenes if each.is_demo or Path(each.path).is_dir())
     missing = tuple(each.label for each in plan.scenes if each not in there)
     if not there:
-        raise SceneNotFoundError(
-            f"scenes of {name} in {data}: {', '.join(missing)}",
-            found="none of them",
-            fix="Name the folder that holds them.",
-        )
+        named = f"scenes of {name} in {data}: {', '.join(missing)}"
+        raise SceneNotFoundError(named, found="none of them", fix="Name the folder with them.")
     return replace(plan, scenes=there), missing

@@ -102,7 +102,7 @@ def check_fields(method: Any) -> None:
     label = getattr(method, "name", type(method).__name__.lower())
     for field in dataclasses.fields(method):
         value, hint = getattr(method, field.name), hints[field.name]
-        require(fits(value, hint), f"{label}.{field.name} as {_describe(hint)}", value)
+        require(fits(value, hint), f"{label}.{field.name} as {describe_type(hint)}", value)
     held = getattr(method, "hold_out", 0)
     require(held == 0 or held >= 2, f"{label}.hold_out of 0 or 2 and more", held)
 
@@ -122,11 +122,12 @@ def fits(value: object, hint: Any) -> bool:
     return not isinstance(hint, type) or isinstance(value, hint)
 
 
-def _describe(hint: Any) -> str:
+def describe_type(hint: Any) -> str:
     """A type in words."""
     if typing.get_origin(hint) in {Literal, Union, types.UnionType}:
-        return " or ".join(_describe(choice) for choice in typing.get_args(hint))
-    plain = {int: "a whole number", float: "a finite number", bool: "true or false"}
+        return " or ".join(describe_type(choice) for choice in typing.get_args(hint))
+    plain = {int: "a whole number", float: "a finite number", bool: "true or false",
+             str: "text", dict: "a table", type(None): "none"}  # fmt: skip
     if isinstance(hint, type):
-        return "none" if hint is type(None) else plain.get(hint, hint.__name__)
+        return plain.get(hint, hint.__name__)
     return repr(hint)
