@@ -233,12 +233,7 @@ def test_what_would_fail_every_run_is_found_before(own_room):
 
 def test_the_published_results_tell_of_the_laptop_preset(tmp_path):
     told = (Path(__file__).parents[2] / "docs" / "results" / "README.md").read_text("utf-8")
-    for name in ("fern", "fox", "bonsai"):
-        (tmp_path / name).mkdir()
-    plan, missing = preset_plan("laptop", tmp_path)
-    assert ([each.label for each in plan.scenes], missing) == (
-        ["fern", "fox", "bonsai"], ("treehill",)
-    )  # fmt: skip
+    plan = preset_plan("laptop", tmp_path)
     assert "--preset laptop --data DIR" in told
     assert plan.repeats == 2
     assert f"{plan.training.max_steps:,} steps, twice" in told

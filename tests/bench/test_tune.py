@@ -143,7 +143,7 @@ def here(monkeypatch):
 
     @contextmanager
     def machine(options, backend):
-        yield Machine("this process", "cpu", 1, 1, Some())
+        yield Machine("cpu", 1, 1, Some())
 
     monkeypatch.setattr(bench, "open_machine", machine)
     monkeypatch.setattr(tuning, "LEAST_STEPS", 4)

@@ -10,14 +10,12 @@ import sys
 import numpy as np
 import pytest
 
-from splatseed.commands.bench import Machine, check_machine
 from splatseed.depth.stereo import StereoSettings, stereo_depths
 from splatseed.depth.stereo.matching import BYTES_A_DEPTH, check_stereo_memory
 from splatseed.errors import ParameterError
 from splatseed.io import load_scene
 from splatseed.pointcloud import PointCloud
 from splatseed.runtime import memory
-from splatseed.runtime.tasks import HereTasks
 from splatseed.synthetic import make_capture, write_capture
 from splatseed.train.device import BYTES_EACH as BYTES_TRAINED
 from splatseed.upsample import BYTES_EACH, number_of_new, upsample
@@ -79,13 +77,14 @@ def test_what_stereo_holds_beside_photographs(free, scene):
     check_stereo_memory(views, StereoSettings(grid=4))
 
 
-def test_the_runs_of_a_benchmark(free):
-    free(1000 * BYTES_TRAINED)
-    machine = Machine("this machine", "cpu", 2, 1, HereTasks())
-    check_machine(machine, 500)
-    with pytest.raises(ParameterError, match=r"at most 500 seeds per run with 2 at a time"):
-        check_machine(machine, 501)
-    check_machine(Machine("a cluster", "cpu", 2, 1, HereTasks(), away=True), 501)
+def test_the_runs_of_a_benchmark(free, scene, splatseed):
+    words = ("bench", "--scenes", scene.source.root, "--methods", "sfm", "--jobs", 2, "--dry-run")
+    points = len(scene.points)
+    free(points * 2 * BYTES_TRAINED)
+    assert splatseed(*words).code == 0
+    free(points * 2 * BYTES_TRAINED - 1)
+    run = splatseed(*words)
+    assert (run.code, f"at most {points - 1} seeds per run with 2" in run.err) == (2, True)
 
 
 def test_a_container_has_less_than_its_machine(monkeypatch, tmp_path):

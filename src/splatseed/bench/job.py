@@ -74,18 +74,13 @@ def do_runs(
     away: bool = False,
     report: Report | None = None,
 ) -> Iterator[Run]:
-    """Carry out runs; gives each as it ends. A failure is recorded, and ends no other run.
+    """Carry out unfinished runs; gives each as it ends. A failure is recorded, and ends no other.
 
-    Args:
-        bench: The benchmark's folder.
-        specs: The runs, none of them finished.
-        tasks: What carries them out.
-        options: Options of the runs.
-        away: Whether that is elsewhere, so that the folders come back as bytes.
-        report: Told how far each is, by its place in ``specs``.
+    ``away`` is whether ``tasks`` run elsewhere, so that folders come back as bytes; ``report`` is
+    told how far each is, by its place in ``specs``.
 
     Raises:
-        OutputError: The folder cannot be written.
+        OutputError: The benchmark's folder cannot be written.
         KeyboardInterrupt: The user stopped them.
     """
     function = run_away if away else run_job
@@ -107,11 +102,9 @@ def do_runs(
 
 
 def _keep_error(bench: Path, spec: RunSpec, error: Exception) -> str:
-    ours = isinstance(error, SplatseedError)
-    line = " ".join((str(error) if ours else f"{type(error).__name__}: {error}").split())
-    told = "".join(traceback.format_exception(error))
-    content = {"spec": spec.to_dict(), "error": line, "traceback": told}
-    text = json.dumps(content, indent=2) + "\n"
+    kind = "" if isinstance(error, SplatseedError) else f"{type(error).__name__}: "
+    line, told = " ".join(f"{kind}{error}".split()), "".join(traceback.format_exception(error))
+    text = json.dumps({"spec": spec.to_dict(), "error": line, "traceback": told}, indent=2) + "\n"
     with suppress(OutputError):  # as where the folder holds the user's files: the line tells
         _keep_files(bench, spec, {ERROR: text.encode("utf-8", "backslashreplace")})
     return line
@@ -168,17 +161,14 @@ def run_away(spec: RunSpec, options: JobOptions) -> tuple[RunResult, dict[str, b
     """Carry out a run on a node of a cluster, and return the files of its folder by name."""
     host, here = socket.gethostname(), package_version("splatseed")
     if here != spec.version:
-        raise ParameterError(
-            f"splatseed {spec.version} on the node {host}",
-            found=here or "none",
-            fix="Install the same version on every node.",
-        )
+        same, fix = f"splatseed {spec.version} on the node {host}", "Install it on every node."
+        raise ParameterError(same, found=here or "none", fix=fix)
     if not Path(spec.scene.path).exists():
-        raise SceneNotFoundError(
+        there, fix = (
             f"the scene {spec.scene.path} on the node {host}",
-            found="no such folder",
-            fix="Every node must have the scenes at the same path: share the disk, or copy them.",
+            "Share the disk, or copy it.",
         )
+        raise SceneNotFoundError(there, found="no such folder", fix=fix)
     with tempfile.TemporaryDirectory(prefix="splatseed-", ignore_cleanup_errors=True) as temporary:
         result = run_job(spec, options, Path(temporary))
         folder = run_folder(Path(temporary), spec)
@@ -210,21 +200,16 @@ def _score(
     These are computed once per scene; it is opened anew for that, so that an arm's depth maps make
     no difference.
     """
-    from splatseed.splat.covisible import (  # noqa: PLC0415  (PyTorch)
-        find_covisible,
-        pixel_masks,
-        read_covisible,
-        write_covisible,
-    )
+    from splatseed.splat import covisible  # noqa: PLC0415  (PyTorch)
     from splatseed.splat.evaluate import evaluate_views  # noqa: PLC0415  (PyTorch)
 
     every = spec.training.test_every
     kept = bench / "covisible" / f"{spec.scene.digest}_{every}.npz"
-    grids = read_covisible(kept)
+    grids = covisible.read_covisible(kept)
     if grids is None:
-        grids = find_covisible(open_scene(replace(spec.scene, depth="")), every, progress)
-        write_covisible(kept, grids)
-    seen = pixel_masks(grids, views)
+        grids = covisible.find_covisible(open_scene(replace(spec.scene, depth="")), every, progress)
+        covisible.write_covisible(kept, grids)
+    seen = covisible.pixel_masks(grids, views)
     return evaluate_views(render, views, lpips=lpips, covisible=seen, progress=progress)
 
 
@@ -258,7 +243,6 @@ def make_seeds(
     if arm.method == SFM and most is None:
         return scene.points, 0.0
     method, numbers = _asked(scene, spec)
-
     make = partial(_timed, upsample, scene, method, **numbers, seed=seed, progress=progress)
     looks = arm.method != SFM and chooses_number(plain(arm.method))
     if bench is None or not looks or _is_full(scene, spec):
@@ -330,17 +314,17 @@ def _asked(scene: Scene, spec: RunSpec) -> tuple[Upsampler, dict[str, Any]]:
 
 
 def _write_seeds(path: Path, cloud: PointCloud, seconds: float) -> None:
-    arrays: dict[str, Any] = {"xyz": cloud.xyz, "rgb": cloud.rgb, "source": cloud.source}
-    arrays |= cloud.attributes
+    own = {"xyz": cloud.xyz, "rgb": cloud.rgb, "source": cloud.source}
+    arrays: dict[str, Any] = {**own, **cloud.attributes, "seconds": np.float64(seconds)}
     with atomic_file(path) as partial, partial.open("wb") as file:
-        np.savez(file, seconds=np.float64(seconds), **arrays)
+        np.savez(file, **arrays)
 
 
 def _read_seeds(path: Path) -> tuple[PointCloud, float] | None:
     """The points that ``_write_seeds`` stored; None if nothing can be read."""
     try:
         with np.load(path, allow_pickle=False) as kept:
-            arrays = {name: kept[name] for name in kept.files}
+            arrays = dict(kept)
             seconds = float(arrays.pop("seconds"))
             return PointCloud(**arrays), seconds
     except (*ARCHIVE_FAILURES, PointCloudError):

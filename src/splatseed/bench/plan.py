@@ -11,7 +11,6 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
-from types import MappingProxyType
 from typing import Any, Self, get_args
 
 from splatseed.bench.scenes import PlannedScene, SceneFacts
@@ -251,9 +250,8 @@ class Plan:
         for name, choices in known.items():
             for each in getattr(self, name):
                 if each not in choices:
-                    see = did_you_mean(each, choices) or SEE
-                    expected = f"{name} among {', '.join(choices)}"
-                    raise ParameterError(expected, found=each, fix=see.strip())
+                    fix = did_you_mean(each, choices).strip() or SEE
+                    raise ParameterError(f"{name} among {', '.join(choices)}", found=each, fix=fix)
         for name in ("methods", "strategies", "profiles", "ratios", "budgets"):
             _check_distinct(name, getattr(self, name))
         _check_distinct("scenes", [each.label for each in self.scenes])
@@ -275,11 +273,17 @@ class Plan:
         for method, parameters in self.parameters.items():
             configure(method, **parameters)
 
-    def parameters_of(self, method: str) -> Mapping[str, Any]:
-        """Differences from the profile; no method sees the held-out test photographs."""
+    def parameters_of(self, method: str) -> dict[str, Any]:
+        """Differences from the profile; those of the scan beside a method begin with ``cloud.``."""
+        scan = self._own_parameters(CLOUD) if method in WITH_CLOUD else {}
+        beside = {f"{CLOUD}.{name}": value for name, value in scan.items()}
+        return {} if method == SFM else self._own_parameters(method) | beside
+
+    def _own_parameters(self, method: str) -> dict[str, Any]:
+        """With those that keep the test photographs from a method."""
         looks = hasattr(METHODS[plain(method)], "hold_out")
         held = {"hold_out": self.training.test_every} if looks else {}
-        return MappingProxyType({**held, **self.parameters.get(plain(method), {})})
+        return {**held, **self.parameters.get(plain(method), {})}
 
     def arms(self, strategy: StrategyName) -> tuple[Arm, ...]:
         """The arms of one strategy: for each budget, the original cloud first.
@@ -291,18 +295,17 @@ class Plan:
         for budget in self.budgets or ("",):
             if SFM in self.methods:
                 arms.append(Arm(SFM, "default", 1, strategy, budget))
-            for method in self.methods:
-                if method != SFM:
-                    any_ratio = chooses_number(plain(method)) or not self.ratios
-                    arms += [
-                        Arm(method, profile, ratio, strategy, budget)
-                        for profile in self._profiles_of(method)
-                        for ratio in ((ANY_RATIO,) if any_ratio else self.ratios)
-                    ]
+            for method in (each for each in self.methods if each != SFM):
+                ratios = () if chooses_number(plain(method)) else self.ratios
+                arms += [
+                    Arm(method, profile, ratio, strategy, budget)
+                    for profile in self._profiles_of(method)
+                    for ratio in ratios or (ANY_RATIO,)
+                ]
         return tuple(arms)
 
     def _profiles_of(self, method: str) -> list[Profile]:
-        named = self.parameters_of(method)
+        named = self._own_parameters(method)
         seen: list[Upsampler] = [configure(plain(method), p, **named) for p in self.profiles]
         return [p for i, p in enumerate(self.profiles) if seen[i] not in seen[:i]]
 
@@ -318,7 +321,7 @@ def plan_runs(
     return [
         RunSpec(
             _needed(scene, arm.method), arm, repeat, _training(plan, scene, arm, backend),
-            _parameters(plan, arm.method), version,
+            plan.parameters_of(arm.method), version,
         )
         for repeat in range(plan.repeats)
         for scene in scenes
@@ -336,16 +339,6 @@ def _needed(scene: SceneFacts, method: str) -> SceneFacts:
     if not needs_cloud(method):
         scene = replace(scene, cloud="", cloud_digest="")
     return replace(scene, warnings=())
-
-
-def _parameters(plan: Plan, method: str) -> dict[str, Any]:
-    """A method's parameters; those of the scan beside it begin with ``cloud.``."""
-    if method == SFM:
-        return {}
-    own = dict(plan.parameters_of(method))
-    if method not in WITH_CLOUD:
-        return own
-    return own | {f"{CLOUD}.{name}": value for name, value in plan.parameters_of(CLOUD).items()}
 
 
 def _training(plan: Plan, scene: SceneFacts, arm: Arm, backend: Backend) -> TrainSettings:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import tomllib
 from collections.abc import Mapping
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, fields
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
@@ -22,7 +22,6 @@ from splatseed.train.settings import TrainSettings
 from splatseed.upsample.method import describe_type, fits
 
 PresetName = Literal["mipnerf360", "replica", "laptop", "quick"]
-PRESETS: tuple[PresetName, ...] = get_args(PresetName)
 PLAN = "plan.toml"
 """The name of the plan in the folder of a benchmark."""
 _FILES = ("path", "depth", "cloud")
@@ -136,18 +135,6 @@ def _key(name: str) -> str:
     return name if name.replace("_", "").isalnum() and name.isascii() else _value(name)
 
 
-def preset_plan(name: PresetName, data: Path | None) -> tuple[Plan, tuple[str, ...]]:
-    """A preset's plan for the scenes that exist in a folder, and the missing ones' names.
-
-    The presets are plans in ``data``; their scenes are those of the paper's tables 1 and 2.
-
-    Raises:
-        SceneNotFoundError: None of the scenes is in it.
-    """
-    plan = read_plan(Path(str(files("splatseed.bench") / "data" / f"{name}.toml")), data)
-    there = tuple(each for each in plan.scenes if each.is_demo or Path(each.path).is_dir())
-    missing = tuple(each.label for each in plan.scenes if each not in there)
-    if not there:
-        named = f"scenes of {name} in {data}: {', '.join(missing)}"
-        raise SceneNotFoundError(named, found="none of them", fix="Name the folder with them.")
-    return replace(plan, scenes=there), missing
+def preset_plan(name: PresetName, data: Path | None) -> Plan:
+    """A preset's plan for the scenes in a folder, such as those of the paper's tables 1 and 2."""
+    return read_plan(Path(str(files("splatseed.bench") / "data" / f"{name}.toml")), data)

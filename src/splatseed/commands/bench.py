@@ -29,7 +29,7 @@ from splatseed.bench.runs import (
     read_runs,
 )
 from splatseed.bench.scenes import PlannedScene, SceneFacts, survey
-from splatseed.commands.options import check_least, parse_options
+from splatseed.commands.options import check_least, parse_options, refuse
 from splatseed.console import ERR, OUT, print_note, print_pairs, print_table, stage_display
 from splatseed.errors import ParameterError, SceneNotFoundError
 from splatseed.io.staging import atomic_file, check_output, output_folder
@@ -136,55 +136,49 @@ def run(arguments: list[str]) -> None:
         reporting[arguments[0]](arguments[1:])
         return
     if arguments and not arguments[0].startswith("-"):
-        meant = did_you_mean(arguments[0], reporting)
-        raise ParameterError(
-            f"{' or '.join(reporting)} after splatseed bench, or options",
-            found=repr(arguments[0]),
-            fix=f"{meant}Name scenes with --scenes; see splatseed bench --help.",
-        )
-    options, plan, missing = parse_plan(arguments)
+        fix = f"{did_you_mean(arguments[0], reporting)}Name scenes with --scenes."
+        expected = "report or compare after splatseed bench, or options"
+        raise ParameterError(expected, found=repr(arguments[0]), fix=fix)
+    options, plan = parse_plan(arguments)
     with open_machine(options, plan.training.backend) as machine:
-        _bench(options, plan, missing, machine, arguments)
+        _bench(options, plan, machine, arguments)
 
 
-def parse_plan(arguments: Sequence[str]) -> tuple[Options, Plan, tuple[str, ...]]:
-    """The options of a command line, the plan that they ask for, and a preset's missing scenes.
+def parse_plan(arguments: Sequence[str]) -> tuple[Options, Plan]:
+    """The options of a command line, and the plan that they ask for.
 
     An option that is not given leaves the plan unchanged: that of a preset, of a file, of the
     folder to resume, or the default one.
     """
     options = parse_options(Options, "bench", arguments)
     check_least(options, 1, "jobs", "repeats", "long_side", "max_steps", "data_factor")
-    for fits, expected, found, fix in (
-        (options.output or options.dry_run, "-o BENCH, the folder of the benchmark", "none",
+    output, preset, data = options.output, options.preset, options.data
+    named = preset not in {None, "quick"}
+    refuse(
+        (not (output or options.dry_run), "-o BENCH, the folder of the benchmark", "none",
          "Name one, or --dry-run."),
-        (not (options.plan and options.preset), "--plan or --preset", "both",
-         "Leave one of them out."),
-        (options.preset or not options.data, "--preset with --data", "none", "Name the preset."),
-        (options.preset in {None, "quick"} or not options.scenes,
-         f"the scenes of the preset {options.preset}", "--scenes",
+        (options.plan and preset, "--plan or --preset", "both", "Leave one of them out."),
+        (data and not preset, "--preset with --data", "none", "Name the preset."),
+        (data and preset == "quick", "--scenes for the preset quick", "--data",
+         "Name scenes, or none."),
+        (named and not data, f"--data DIR, the folder of the scenes of {preset}", "none",
+         "Name it."),
+        (named and options.scenes, f"the scenes of the preset {preset}", "--scenes",
          "Leave --scenes out, or take --plan: --dry-run prints the preset's."),
-        (not options.address or options.executor == "ray", "--executor ray with --address",
-         "local", "Add it."),
-    ):  # fmt: skip
-        if not fits:
-            raise ParameterError(expected, found=found, fix=fix)
-    plan, missing = _DEFAULT, tuple[str, ...]()
-    earlier = options.output / PLAN if options.output and not options.scenes else None
-    if options.preset is not None:
-        plan, missing = preset_plan(options.preset, options.data)
+        (options.address and options.executor != "ray", "--executor ray with --address", "local",
+         "Add it."),
+    )  # fmt: skip
+    plan = _DEFAULT
+    if preset is not None:
+        plan = preset_plan(preset, data)
     elif options.plan is not None:
         plan = read_plan(options.plan)
-    elif earlier is not None and earlier.is_file():
-        plan = read_plan(earlier)
+    elif output and not options.scenes and (output / PLAN).is_file():
+        plan = read_plan(output / PLAN)
     plan = _changed(plan, options)
-    if not plan.scenes:
-        raise ParameterError(
-            "--scenes DIR..., --preset or --plan",
-            found="none of them",
-            fix="splatseed bench --preset quick -o BENCH tries it on a synthetic room.",
-        )
-    return options, plan, missing
+    fix = "splatseed bench --preset quick -o BENCH tries it on a synthetic room."
+    refuse((not plan.scenes, "--scenes DIR..., --preset or --plan", "none of them", fix))
+    return options, plan
 
 
 def _changed(plan: Plan, options: Options) -> Plan:
@@ -202,22 +196,15 @@ def _changed(plan: Plan, options: Options) -> Plan:
     labels = Counter(scene.label for scene in scenes)
     for i, scene in enumerate(scenes):  # folders of the same name are told apart by their parents
         if labels[scene.label] > 1 and not scene.is_demo and not scene.name:
-            name = "_".join(Path(scene.path).resolve().parts[-2:])
-            scenes[i] = replace(scene, name=name)
-    maps = options.depth
-    if len(maps) == 1 and any((maps[0] / scene.label).is_dir() for scene in scenes):
-        below = [maps[0] / scene.label for scene in scenes]
-        scenes = [replace(scene, depth=str(folder) if folder.is_dir() else "")
-                  for scene, folder in zip(scenes, below, strict=True)]  # fmt: skip
-        maps = ()
-    for option, what, files in (("--depth", "depth", maps), ("--clouds", "cloud", options.clouds)):
-        if len(files) not in {0, len(scenes)}:
-            raise ParameterError(
-                f"{option} with one for each of {len(scenes)} scenes",
-                found=f"{len(files)}",
-                fix="See --dry-run for the scenes and their order; a plan may have one for some "
-                "only. --depth may be one folder with subfolders of the scenes' names.",
-            )
+            scenes[i] = replace(scene, name="_".join(Path(scene.path).resolve().parts[-2:]))
+    depth = [str(folder) for folder in options.depth]
+    if len(depth) == 1 and any(Path(depth[0], scene.label).is_dir() for scene in scenes):
+        below = [Path(depth[0], scene.label) for scene in scenes]
+        depth = [str(folder) if folder.is_dir() else "" for folder in below]
+    for option, what, files in (("--depth", "depth", depth), ("--clouds", "cloud", options.clouds)):
+        expected = f"{option} with one for each of {len(scenes)} scenes"
+        fix = "--dry-run has their order, and a plan may have one for some of them only."
+        refuse((len(files) not in {0, len(scenes)}, expected, len(files), fix))
         if files:
             pairs = zip(scenes, map(str, files), strict=True)
             scenes = [replace(scene, **{what: file}) for scene, file in pairs]
@@ -231,7 +218,6 @@ class Machine:
     ``backend`` is not "auto"; ``away`` is whether ``tasks`` are carried out on other machines.
     """
 
-    name: str
     backend: Backend
     jobs: int
     threads: int
@@ -241,8 +227,9 @@ class Machine:
     @property
     def words(self) -> str:
         """A description."""
+        where = "Ray" if self.away else "this machine"
         on = "on a GPU" if self.backend == "cuda" else "on the CPU"
-        return f"{self.name}, {self.jobs} at a time, {on}, {counted(self.threads, 'thread')} each"
+        return f"{where}, {self.jobs} at a time, {on}, {counted(self.threads, 'thread')} each"
 
 
 @contextmanager
@@ -257,7 +244,7 @@ def open_machine(options: Options, backend: Backend) -> Iterator[Machine]:
     with ray_cluster(options.address):
         tasks = RayTasks(gpu=None if backend == "auto" else backend == "cuda", jobs=options.jobs)
         on_gpu: Backend = "cuda" if tasks.gpu else "cpu"
-        yield Machine("Ray", on_gpu, tasks.jobs, tasks.threads, tasks, away=True)
+        yield Machine(on_gpu, tasks.jobs, tasks.threads, tasks, away=True)
 
 
 def _local_machine(jobs: int | None, backend: Backend) -> Machine:
@@ -277,55 +264,43 @@ def _local_machine(jobs: int | None, backend: Backend) -> Machine:
     jobs = jobs or len(gpus)
     threads = max(1, cores() // jobs)
     slots = [slot_environment(threads, gpus[slot % len(gpus)]) for slot in range(jobs)]
-    return Machine("this machine", chosen, jobs, threads, ProcessTasks(slots, fresh=True))
-
-
-def check_machine(machine: Machine, seeds: int) -> None:
-    """Refuse runs of so many seeds that do not fit into this machine, rather than have them killed.
-
-    The memory of a cluster's nodes is unknown.
-    """
-    if not machine.away and machine.backend == "cpu":
-        check_memory(
-            seeds,
-            BYTES_EACH * machine.jobs,
-            f"seeds per run with {machine.jobs} at a time",
-            fix="Pass smaller --ratios or --budgets, or fewer --jobs.",
-        )
+    return Machine(chosen, jobs, threads, ProcessTasks(slots, fresh=True))
 
 
 def _prepare(
-    options: Options, plan: Plan, missing: Sequence[str], machine: Machine, demo: Path | None
+    options: Options, plan: Plan, machine: Machine, demo: Path | None
 ) -> tuple[Plan, list[SceneFacts], list[RunSpec], list[str]]:
     """Check all scenes of a plan: the plan of those that can be used, these, its runs, and notes.
 
-    ``demo`` is where to put a synthetic scene; None to use its known facts without making it.
+    Some of a preset may be missing. ``demo`` is where to put a synthetic scene; None to use its
+    known facts without making it.
     """
-    notes = [f"not there: {', '.join(missing)}"] if missing else []
-    present: list[tuple[PlannedScene, SceneFacts]] = []
+    notes, present = list[str](), list[tuple[PlannedScene, SceneFacts]]()
     needs = {"with_depth": DEPTH in plan.methods, "with_cloud": any(map(needs_cloud, plan.methods))}
     with stage_display() as clock:
         for scene in plan.scenes:
             try:
                 present.append((scene, survey(scene, demo=demo, **needs, progress=clock)))
             except SceneNotFoundError as error:
-                if options.preset in {None, "quick"}:
+                if options.data is None:
                     raise
                 notes.append(f"{scene.label} is left out: {error}")
     if not present:
-        fix = "Name the folder that holds the preset's scenes with --data."
-        raise SceneNotFoundError("scenes to run", found=f"none; {'; '.join(notes)}", fix=fix)
+        expected, found = f"scenes of {options.preset} in {options.data}", "; ".join(notes)
+        raise SceneNotFoundError(expected, found=found, fix="Name the folder that holds them.")
     plan = replace(plan, scenes=tuple(scene for scene, _ in present))
     scenes = [facts for _, facts in present]
     specs = plan_runs(plan, scenes, machine.backend, package_version("splatseed"))
     notes += _notes(plan, scenes, specs)
-    if not specs:
-        raise ParameterError(
-            "a plan with runs",
-            found="; ".join(notes) or "none",
-            fix="Name other methods, or what these need.",
+    fix = "Name other methods, or what these need."
+    refuse((not specs, "a plan with runs", "; ".join(notes) or "none", fix))
+    if machine.backend == "cpu" and not machine.away:  # the memory of a cluster's nodes is unknown
+        check_memory(
+            int(max(spec.gaussians[0] for spec in specs)),
+            BYTES_EACH * machine.jobs,
+            f"seeds per run with {machine.jobs} at a time",
+            fix="Pass smaller --ratios or --budgets, or fewer --jobs.",
         )
-    check_machine(machine, int(max(spec.gaussians[0] for spec in specs)))
     return plan, scenes, specs, notes
 
 
@@ -352,37 +327,27 @@ def _notes(plan: Plan, scenes: Sequence[SceneFacts], specs: Sequence[RunSpec]) -
             )
 
 
-def _job_options(plan: Plan) -> JobOptions:
-    """Options of all runs: LPIPS is measured wherever its weights are available.
-
-    If LPIPS is requested, missing weights are reported now rather than in every run.
-    """
-    from splatseed.splat.metrics import load_lpips, lpips_is_here  # noqa: PLC0415  (PyTorch)
-
-    if plan.lpips:
-        load_lpips()
-    return JobOptions(keep_models=plan.keep_models, lpips=lpips_is_here())
-
-
-def _bench(
-    options: Options, plan: Plan, missing: Sequence[str], machine: Machine, arguments: Sequence[str]
-) -> None:
+def _bench(options: Options, plan: Plan, machine: Machine, arguments: Sequence[str]) -> None:
     """Run a plan; or print it as TOML with all else in comments, so that both can be saved."""
     bench = options.output
     demo = bench / "scenes" / "demo" if bench else None
+    if bench is not None and not options.dry_run:
+        check_bench_folder(bench, "bench", [Path(s.path) for s in plan.scenes if not s.is_demo])
+    if plan.lpips:
+        from splatseed.splat.metrics import load_lpips  # noqa: PLC0415  (PyTorch)
+
+        load_lpips()  # refuses now what every run would
     if bench is None or options.dry_run:
-        if plan.lpips:
-            _job_options(plan)  # refuses now what a run would
         demo = demo if demo and demo.is_dir() else None
-        plan, _, specs, notes = _prepare(options, plan, missing, machine, demo)
+        plan, _, specs, notes = _prepare(options, plan, machine, demo)
         runs = [read_run(bench, spec) if bench else Run(spec) for spec in specs]
         told = [*notes, *_announcement(plan, runs, machine)]
         comments = "".join(f"# {' '.join(line.split())}\n" for line in told)
         OUT.print(f"{plan_text(plan)}\n{comments}", end="", soft_wrap=True)
         return
-    check_bench_folder(bench, "bench", [Path(s.path) for s in plan.scenes if not s.is_demo])
-    job_options = _job_options(plan)
-    plan, scenes, specs, notes = _prepare(options, plan, missing, machine, demo)
+    from splatseed.splat.metrics import lpips_is_here  # noqa: PLC0415  (PyTorch)
+
+    plan, scenes, specs, notes = _prepare(options, plan, machine, demo)
     begin(bench, "bench", specs, arguments)
     with atomic_file(bench / PLAN) as partial:  # names that are no text are escaped
         partial.write_text(plan_text(plan), "utf-8", "backslashreplace")
@@ -392,7 +357,7 @@ def _bench(
     named = ", ".join(f"{visible(s.name)} ({s.num_points:,} points)" for s in scenes)
     told = [*_announcement(plan, runs, machine), visible(bench)]
     OUT.print("\n  -> ".join([named, *told]), soft_wrap=True)
-    ended = carry_out(bench, runs, machine, job_options)
+    ended = carry_out(bench, runs, machine, JobOptions(plan.keep_models, lpips_is_here()))
     runs = [read_run(bench, spec) for spec in specs]
     _print_summary(bench, runs)
     if not ended:
@@ -417,53 +382,40 @@ def _announcement(plan: Plan, runs: Sequence[Run], machine: Machine) -> Iterator
 
 
 def carry_out(bench: Path, runs: Sequence[Run], machine: Machine, options: JobOptions) -> bool:
-    """Carry out the unfinished ones among some runs; whether all ended, else the user stopped."""
-    left = [run.spec for run in runs if run.result is None]
-    if not left:
-        return True
-    display = _Display(left, len(runs))
-    ended = do_runs(bench, left, machine.tasks, options, machine.away, display.report)
+    """Carry out the unfinished ones among some runs; whether all ended, else the user stopped.
+
+    Shows bars where stderr is a terminal, and prints a line for each run that ended.
+    """
+    left, tasks = [run.spec for run in runs if run.result is None], dict[str, TaskID]()
+    columns = (BarColumn(20), TextColumn("{task.description}", markup=False), TimeRemainingColumn())
+    # What goes into a file on stdout must not end up on the terminal.
+    bar = Bar(*columns, console=ERR, transient=True, redirect_stdout=sys.stdout.isatty(),
+              disable=not ERR.is_terminal)  # fmt: skip
+    before = len(runs) - len(left)
+    whole = bar.add_task("runs", total=len(runs), completed=before)
+
+    def report(index: int, stage: str, fraction: float) -> None:
+        key, label = left[index].key, f"  {_describe(left[index])}: {stage}"
+        if key not in tasks:
+            tasks[key] = bar.add_task(label, total=1.0)
+        bar.update(tasks[key], completed=fraction, description=label)
+
+    ended = do_runs(bench, left, machine.tasks, options, machine.away, report)
     try:
-        with display.bar:
-            for run in ended:
-                display.ended(run)
+        with bar:
+            for number, run in enumerate(ended, start=before + 1):
+                if run.spec.key in tasks:
+                    bar.remove_task(tasks.pop(run.spec.key))
+                said = f" failed: {run.error}"
+                if run.result:
+                    count, seconds = run.result.num_gaussians, run.result.wall_seconds
+                    said = f": {run.result.psnr:.2f} dB, {count:,} Gaussians, {seconds:.0f} s"
+                OUT.print(f"[{number}/{len(runs)}] {_describe(run.spec)}{said}", soft_wrap=True)
+                bar.advance(whole)
     except KeyboardInterrupt:
         ERR.print("stopped: runs under way start anew next time")
         return False
     return True
-
-
-class _Display:
-    """The progress of runs: bars where stderr is a terminal, and a line per run that ended."""
-
-    def __init__(self, specs: Sequence[RunSpec], total: int) -> None:
-        self._specs, self._tasks = specs, dict[str, TaskID]()
-        self._total, self._ended = total, total - len(specs)
-        columns = (BarColumn(20), TextColumn("{task.description}", markup=False))
-        # What goes into a file on stdout must not end up on the terminal.
-        shared = sys.stdout.isatty()
-        self.bar = Bar(*columns, TimeRemainingColumn(), console=ERR, transient=True,
-                       redirect_stdout=shared, disable=not ERR.is_terminal)  # fmt: skip
-        self._whole = self.bar.add_task("runs", total=total, completed=self._ended)
-
-    def report(self, index: int, stage: str, fraction: float) -> None:
-        spec = self._specs[index]
-        label = f"  {_describe(spec)}: {stage}"
-        if spec.key not in self._tasks:
-            self._tasks[spec.key] = self.bar.add_task(label, total=1.0)
-        self.bar.update(self._tasks[spec.key], completed=fraction, description=label)
-
-    def ended(self, run: Run) -> None:
-        if (task := self._tasks.pop(run.spec.key, None)) is not None:
-            self.bar.remove_task(task)
-        self._ended += 1
-        said = f" failed: {run.error}"
-        if run.result:
-            count, seconds = run.result.num_gaussians, run.result.wall_seconds
-            said = f": {run.result.psnr:.2f} dB, {count:,} Gaussians, {seconds:.0f} s"
-        number = f"[{self._ended}/{self._total}]"
-        OUT.print(f"{number} {_describe(run.spec)}{said}", soft_wrap=True)
-        self.bar.advance(self._whole)
 
 
 def _describe(spec: RunSpec) -> str:
