@@ -81,11 +81,8 @@ def read_runs(bench: Path) -> list[Run]:
     """
     kind = read_manifest(bench).get("command")
     if kind not in {"bench", "tune"}:
-        raise SceneNotFoundError(
-            f"a benchmark at {bench}",
-            found=kind or "none",
-            fix="Name the folder that splatseed bench wrote.",
-        )
+        fix = "Name the folder that splatseed bench wrote."
+        raise SceneNotFoundError(f"a benchmark at {bench}", found=kind or "none", fix=fix)
     runs = [read_run(bench, RunSpec.from_dict(each)) for each in _planned(bench)["runs"]]
     known = {run_folder(bench, run.spec).name for run in runs}
     ended = {path.parent for name in (RESULT, ERROR) for path in bench.glob(f"runs/*/{name}")}
@@ -115,11 +112,9 @@ def check_bench_folder(folder: Path, verb: str, protect: Sequence[Path]) -> None
     elif kind is None:
         check_output(folder, kind=verb, protect=protect)
     else:
-        raise OutputError(
-            f"the folder of splatseed {verb}, or a new one, at {folder}",
-            found=f"what splatseed {kind} wrote",
-            fix="Choose another folder.",
-        )
+        expected = f"the folder of splatseed {verb}, or a new one, at {folder}"
+        found = f"what splatseed {kind} wrote"
+        raise OutputError(expected, found=found, fix="Choose another folder.")
 
 
 def begin(bench: Path, verb: str, specs: Iterable[RunSpec], words: Sequence[str]) -> None:

@@ -98,11 +98,8 @@ def open_scene(scene: PlannedScene) -> Scene:
     opened = load_originals(Path(scene.path))
     if scene.images:
         if opened.source is None or not (opened.source.root / scene.images).is_dir():
-            raise SceneNotFoundError(
-                f"the folder {scene.images} in {scene.path}",
-                found="no such folder",
-                fix="Name another folder of photographs, or none.",
-            )
+            expected = f"the folder {scene.images} of photographs in {scene.path}"
+            raise SceneNotFoundError(expected, found="none", fix="Name another, or none.")
         source = replace(opened.source, image_dir=opened.source.root / scene.images)
         opened = opened.replace(source=source)
     return opened.replace(depths=find_depths(opened, Path(scene.depth))) if scene.depth else opened
@@ -118,12 +115,8 @@ def survey(
 ) -> SceneFacts:
     """Check a scene and all files that a run on it reads.
 
-    Args:
-        planned: The scene.
-        demo: Where the synthetic room is, or is to be made; None for its known facts.
-        with_depth: Whether depth maps are needed; if none are named, they are looked for.
-        with_cloud: Whether its scan is needed.
-        progress: Told how far reading is.
+    ``demo`` is where the synthetic room is, or is to be made; None for its known facts. Depth maps
+    are looked for if they are needed and none are named.
 
     Raises:
         SceneNotFoundError: There is no scene, or a file is missing.
@@ -142,40 +135,26 @@ def survey(
     scene = open_scene(replace(planned, depth=""))
     folder = scene.source.image_dir if scene.source else None
     if scene.source is None or folder is None or not scene.images:
-        raise SceneNotFoundError(
-            f"photographs in {path}",
-            found="none",
-            fix="Name a scene with images: a point cloud alone cannot be trained.",
-        )
+        fix = "Name a scene with images: a point cloud alone cannot be trained."
+        raise SceneNotFoundError(f"photographs in {path}", found="none", fix=fix)
     for image in scene.images:
         check_lens(image, path)
     first = folder / scene.images[0].name
     size = open_photograph(first, photograph_bytes(first)).size
-    cloud = Path(planned.cloud) if with_cloud and planned.cloud else None
-    if cloud is not None:
-        open_cloud(cloud)  # a header that makes no sense is told now
+    maps = scan = ""
+    if with_cloud and planned.cloud:
+        scan = str(Path(planned.cloud).resolve())
+        open_cloud(Path(planned.cloud))  # a header that makes no sense is told now
     depth = Path(planned.depth) if planned.depth else scene.source.root
-    maps = ""
     if with_depth and (planned.depth or search_depths(scene, depth) is not None):
         maps, scene = str(depth.resolve()), scene.replace(depths=find_depths(scene, depth))
-    scan = "" if cloud is None else str(cloud.resolve())
+    told = [*scene.warnings, *([scene.listed.sentence] if scene.listed else [])]
+    told += map(stray_note, stray_views(poses_of(scene.images)))
     return SceneFacts(
-        path=str(path.resolve()),
-        name=planned.label,
-        images=planned.images,
-        depth=maps,
-        cloud=scan,
-        num_points=len(scene.points),
-        num_images=len(scene.images),
-        pixels=size[0] * size[1],
-        long_side=max(size),
-        **fingerprints(scene, maps, scan, progress),
-        warnings=(
-            *scene.warnings,
-            *([scene.listed.sentence] if scene.listed else []),
-            *map(stray_note, stray_views(poses_of(scene.images))),
-        ),
-    )
+        str(path.resolve()), planned.label, planned.images, maps, scan,
+        num_points=len(scene.points), num_images=len(scene.images), pixels=size[0] * size[1],
+        long_side=max(size), **fingerprints(scene, maps, scan, progress), warnings=tuple(told),
+    )  # fmt: skip
 
 
 def fingerprints(
@@ -250,12 +229,9 @@ def _add(digest: hashlib.blake2b, *values: object) -> None:
 
 
 def _with_files(
-    digest: hashlib.blake2b,
-    of_file: Callable[[int], bytes],
-    count: int,
-    stage: str,
+    digest: hashlib.blake2b, of_file: Callable[[int], bytes], count: int, stage: str,
     progress: Progress,
-) -> str:
+) -> str:  # fmt: skip
     """The fingerprint with those of files, which several threads read."""
     each = [b""] * count
 

@@ -97,12 +97,11 @@ def plan_rungs(
     if fitting:
         return rungs(longer[fitting - 1])
     if (needed := cost(rungs(low))) > _OVERTIME * seconds:
-        raise ParameterError(
-            f"--minutes {math.ceil(needed / 60)} or more: the shortest runs in which all arms come "
-            "to one number of Gaussians take that long",
-            found=f"--minutes {seconds / 60:g}",
-            fix="Give it more time, or name fewer --methods or --strategies.",
+        least = (
+            f"--minutes {math.ceil(needed / 60)} or more, for all arms to have as many Gaussians"
         )
+        fix = "Give it more time, or name fewer --methods or --strategies."
+        raise ParameterError(least, found=f"--minutes {seconds / 60:g}", fix=fix)
     return rungs(low)
 
 
@@ -186,11 +185,8 @@ def make_validation_scene(scene_path: Path, target: Path, test_every: int = 8) -
         check_lens(image, scene_path)
     train, _ = scene.split(test_every)
     if len(train) < _LEAST_VIEWS:
-        raise SceneNotFoundError(
-            f"at least {_LEAST_VIEWS} training views in {scene_path}, to hold some of them out",
-            found=f"{len(train)}",
-            fix="Tune a scene with more photographs.",
-        )
+        least = f"at least {_LEAST_VIEWS} training views in {scene_path}, to hold some of them out"
+        raise SceneNotFoundError(least, found=f"{len(train)}", fix="Tune a scene with more.")
     alone = scene.replace(images=train, listed=None)
     write_scene(alone, target, format="colmap", provenance={"command": "tune"})
     for folder, names in ((target, ROOT_LISTS), (target / "sparse" / "0", MODEL_LISTS)):

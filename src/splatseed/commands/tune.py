@@ -33,9 +33,10 @@ from splatseed.bench.tuning import (
     verdict,
 )
 from splatseed.commands import bench
-from splatseed.commands.options import check_least, parse_options
+from splatseed.commands.bench import Machine, carry_out, spoken_time
+from splatseed.commands.options import check_least, parse_options, refuse
 from splatseed.console import OUT, print_note, print_pairs, print_table, stage_display
-from splatseed.errors import ParameterError, SceneFormatError, SplatseedError
+from splatseed.errors import SceneFormatError, SplatseedError
 from splatseed.io.files import read_text
 from splatseed.io.staging import write_json
 from splatseed.literal import quoted, visible
@@ -80,15 +81,10 @@ def run(arguments: list[str]) -> None:
     """Run the verb with these arguments."""
     options = parse_options(Options, "tune", arguments)
     check_least(options, 1, "max_steps")
-    if not 0 < options.minutes < math.inf:
-        raise ParameterError("--minutes above 0", found=f"{options.minutes}", fix="Try 10.")
+    refuse((not 0 < options.minutes < math.inf, "--minutes above 0", options.minutes, "Try 10."))
     for name, needed in (("methods", SFM), ("strategies", "default")):
-        if needed not in getattr(options, name):
-            raise ParameterError(
-                f"{needed} among --{name}, with which all else is compared",
-                found=" ".join(getattr(options, name)),
-                fix="Add it.",
-            )
+        expected, given = f"{needed} among --{name}, the baseline", getattr(options, name)
+        refuse((needed not in given, expected, " ".join(given), "Add it."))
     folder = options.output or Path(f"tune_{options.scene.resolve().name}")
     check_bench_folder(folder, "tune", [options.scene])
     with bench.open_machine(bench.Options(), "auto") as machine:
@@ -106,21 +102,18 @@ def run(arguments: list[str]) -> None:
         sys.exit(exit_code())
 
 
-def _open(
-    options: Options, folder: Path, machine: bench.Machine, arguments: Sequence[str]
-) -> _Tuning:
+def _open(options: Options, folder: Path, machine: Machine, arguments: Sequence[str]) -> _Tuning:
     with stage_display() as clock:
         clock("read", 0.0)
         path = make_validation_scene(options.scene, folder / "scene", _TEST_EVERY)
         facts = survey(PlannedScene(str(path), options.scene.resolve().name), progress=clock)
     factor = max(1, -(-facts.long_side // _LONG_SIDE))
-    most = asked_for = parse_budget(options.budget, facts.pixels_at(factor))
-    least_steps = 0
+    budget, least_steps = options.budget, 0
     if "grow" in options.strategies:
-        grown = math.floor(facts.num_points * growth_within(options.max_steps))
-        most = min(asked_for, max(2, grown))
-        least_steps = steps_to_grow(most / max(1, facts.num_points))
-    budget = options.budget if most == asked_for else str(most)
+        grown = max(2, math.floor(facts.num_points * growth_within(options.max_steps)))
+        most = parse_budget(budget, facts.pixels_at(factor))
+        budget = budget if most <= grown else str(grown)
+        least_steps = steps_to_grow(min(most, grown) / max(1, facts.num_points))
     tuning = _Tuning(options, folder, facts, machine, budget, [])
     tuning.plan(least_steps)
     begin(folder, "tune", tuning.specs(tuning.rungs[0]), arguments)
@@ -134,21 +127,16 @@ class _Tuning:
     options: Options
     folder: Path
     facts: SceneFacts
-    machine: bench.Machine
+    machine: Machine
     budget: str
     rungs: list[Rung]
 
     def specs(self, rung: Rung, arms: Collection[Arm] | None = None) -> list[RunSpec]:
         plan = Plan(
-            scenes=(self.facts,),
-            methods=self.options.methods,
-            ratios=(),
-            budgets=(self.budget,),
-            strategies=self.options.strategies,
-            repeats=rung.repeats,
+            (self.facts,), self.options.methods, (), (self.budget,), self.options.strategies,
+            repeats=rung.repeats, long_side=_LONG_SIDE,
             training=TrainSettings(max_steps=rung.steps, test_every=_TEST_EVERY),
-            long_side=_LONG_SIDE,
-        )
+        )  # fmt: skip
         version = package_version("splatseed")
         runs = plan_runs(plan, [self.facts], self.machine.backend, version)
         return [spec for spec in runs if arms is None or spec.arm in arms]
@@ -170,18 +158,14 @@ class _Tuning:
             try:
                 kept = json.loads(read_text(path))
                 self.rungs.extend(Rung(**each) for each in kept["rungs"])
+                others = kept["asked"] != asked
             except (OSError, ValueError, KeyError, TypeError):
-                raise SceneFormatError(
-                    f"{path} as splatseed tune writes it", found="something else", fix="Remove it."
-                ) from None
-            if kept["asked"] != asked:
-                raise ParameterError(
-                    f"the options that {self.folder} was begun with",
-                    found="others",
-                    fix="Repeat those, or name another folder with -o.",
-                )
+                expected = f"{path} as splatseed tune writes it"
+                raise SceneFormatError(expected, found="something else", fix="Remove it.") from None
+            fix = "Repeat those, or name another folder with -o."
+            refuse((others, f"the options that {self.folder} was begun with", "others", fix))
             return
-        num_arms = len({spec.arm for spec in self.specs(Rung(100, 0, 1))})
+        num_arms = _num_arms(self.specs(Rung(100, 0, 1)))
         seconds, most = self.options.minutes * 60, self.options.max_steps
         self.rungs.extend(plan_rungs(num_arms, seconds, most, self.seconds, least_steps))
         write_json(path, {"asked": asked, "rungs": list(map(asdict, self.rungs))})
@@ -191,12 +175,11 @@ class _Tuning:
         total = 0.0
         for rung in rungs:
             specs = self.specs(rung)
-            share = rung.arms / len({spec.arm for spec in specs})
-            total += share * estimate(specs, (), self.machine.threads)
+            total += estimate(specs, (), self.machine.threads) * rung.arms / _num_arms(specs)
         return total / self.machine.jobs
 
     def announce(self) -> None:
-        facts, minutes = self.facts, bench.spoken_time(self.seconds(self.rungs))
+        facts, minutes = self.facts, spoken_time(self.seconds(self.rungs))
         steps = ", then ".join(f"{rung.arms} arms for {rung.steps:,} steps" for rung in self.rungs)
         OUT.print(
             f"{visible(facts.name)}: {facts.num_images} views that are not for the test, every "
@@ -215,9 +198,9 @@ class _Tuning:
         arms: Collection[Arm] | None = None
         for i, rung in enumerate(self.rungs):
             specs = self.specs(rung, arms)
-            OUT.print(f"\n{rung.steps:,} steps, {len({spec.arm for spec in specs})} arms")
+            OUT.print(f"\n{rung.steps:,} steps, {_num_arms(specs)} arms")
             runs = [read_run(self.folder, spec) for spec in specs]
-            if not bench.carry_out(self.folder, runs, self.machine, JobOptions()):
+            if not carry_out(self.folder, runs, self.machine, JobOptions()):
                 return False
             if i + 1 < len(self.rungs):
                 arms = best_arms(self.results(rung), self.rungs[i + 1].arms)
@@ -225,26 +208,19 @@ class _Tuning:
 
     def report(self, *, ended: bool) -> None:
         """Print the verdict of the longest finished runs, and the command that follows from it."""
-        rungs = [(self.results(rung), rung.steps) for rung in reversed(self.rungs)]
-        # The highest with two or more finished arms.
-        results, said = next(
-            ((each, said) for each, steps in rungs if (said := verdict(each, steps))), ({}, None)
-        )
-        if said is None:
+        for rung in reversed(self.rungs):  # the highest with two or more finished arms
+            results = self.results(rung)
+            if (said := verdict(results, rung.steps)) is not None:
+                break
+        else:
             print_note("Nothing can be said yet: repeat the command to continue.")
             return
         if not ended:
-            print_note(
-                "Stopped before the last run: this is so far. Repeat the command to continue."
-            )
-        numbers = {
-            arm: round(fmean(r.num_gaussians for r in results[arm].values()))
-            for arm, _ in said.ranking
-        }
-        rows = [
-            (arm.label, arm.strategy, f"{numbers[arm]:,}", f"{psnr:.2f}")
-            for arm, psnr in said.ranking
-        ]
+            print_note("Stopped before the last run: repeat the command to continue.")
+        numbers, rows = dict[Arm, int](), []
+        for arm, psnr in said.ranking:
+            numbers[arm] = round(fmean(each.num_gaussians for each in results[arm].values()))
+            rows.append((arm.label, arm.strategy, f"{numbers[arm]:,}", f"{psnr:.2f}"))
         title = f"{said.views} validation views, {said.steps:,} steps"
         print_table(title, ("seeds", "strategy", "Gaussians", "PSNR, dB"), rows)
         most = max(numbers.values())
@@ -275,6 +251,10 @@ class _Tuning:
             f"-o {quoted(f'run_{seeded}_{arm.strategy}')}"
         )
         return [*commands, ("training", training)]
+
+
+def _num_arms(specs: Sequence[RunSpec]) -> int:
+    return len({spec.arm for spec in specs})
 
 
 def sentence(said: Verdict) -> str:
