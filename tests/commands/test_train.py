@@ -135,45 +135,44 @@ def test_refined_poses_are_what_is_trained_scored_and_shown(
     assert not (moved / "scene").exists()
 
 
-def test_a_run_goes_on_at_the_poses_that_it_began_with(bare, refining, splatseed, tmp_path):
-    run = tmp_path / "run"
+@pytest.fixture
+def refused(splatseed):
+    """Checks that ``train`` refuses words in one sentence that says something."""
+
+    def check(said, *words):
+        run = splatseed("train", *words)
+        assert (run.code, run.err.count("error:")) == (2, 1)
+        assert said in run.err
+
+    return check
+
+
+def test_a_run_goes_on_at_the_poses_and_photographs_that_it_began_with(
+    bare, refining, splatseed, refused, tmp_path
+):
+    run, scene = tmp_path / "run", load_scene(bare, require_points=False)
     assert splatseed("train", bare, *SHORT, "--refine-poses", "-o", run).code == 0
-    kept = shutil.copytree(run, tmp_path / "kept", symlinks=True)
+    finished = _gaussians(run)
     _unfinish(run)
+    fewer = scene.replace(images=scene.images[1:])
+    write_scene(fewer, tmp_path / "fewer", require_points=False)
+    refused("found other images in", tmp_path / "fewer", "--resume", "-o", run)
     resumed = splatseed("train", bare, "--resume", "-o", run)
     assert (resumed.code, resumed.err) == (0, "")
     assert len(refining) == 1
-    assert _gaussians(run) == _gaussians(kept)
-
-
-def test_a_run_that_lost_its_poses_or_its_photographs_does_not_go_on(
-    bare, refining, splatseed, tmp_path
-):
-    run = tmp_path / "run"
-    assert splatseed("train", bare, *SHORT, "--refine-poses", "-o", run).code == 0
+    assert _gaussians(run) == finished
     _unfinish(run)
-    scene = load_scene(bare, require_points=False)
-    fewer = scene.replace(images=scene.images[1:])
-    write_scene(fewer, tmp_path / "fewer", require_points=False)
-    other = splatseed("train", tmp_path / "fewer", "--resume", "-o", run)
-    assert (other.code, other.err.count("error:")) == (2, 1)
-    assert f"found other images in {tmp_path / 'fewer'}" in other.err
     shutil.rmtree(run / "scene")
-    lost = splatseed("train", bare, "--resume", "-o", run)
-    assert (lost.code, lost.err.count("error:")) == (2, 1)
-    assert str(run / "scene") in lost.err
+    refused(str(run / "scene"), bare, "--resume", "-o", run)
 
 
-def test_what_refining_does_not_go_with(room, refining, splatseed, tmp_path):
-    run = tmp_path / "run"
+def test_what_refining_does_not_go_with(room, refining, splatseed, refused, tmp_path):
+    run, seeded = tmp_path / "run", tmp_path / "seeded"
     assert splatseed("train", room, *SHORT, "-o", run).code == 0
     _unfinish(run)
-    resumed = splatseed("train", room, "--refine-poses", "--resume", "-o", run)
-    assert (resumed.code, resumed.err.count("error:")) == (2, 1)
-    assert "--refine-poses False, as when the run began" in resumed.err
-    seeded = tmp_path / "seeded"  # whose seeds would be thrown away
+    refused("--refine-poses False, as when", room, "--refine-poses", "--resume", "-o", run)
+    # Seeds would be thrown away.
     assert splatseed("upsample", room, "--method", "linear", "-o", seeded).code == 0
-    other = splatseed("train", seeded, *SHORT, "--refine-poses", "-o", tmp_path / "other")
-    assert (other.code, other.err.count("error:")) == (2, 1)
-    assert "upsample SCENE --refine-poses -o OUT" in other.err
+    words = (seeded, *SHORT, "--refine-poses", "-o", tmp_path / "other")
+    refused("upsample SCENE --refine-poses -o OUT", *words)
     assert not refining

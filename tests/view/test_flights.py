@@ -79,19 +79,6 @@ def test_an_orbit_goes_around_what_the_cameras_look_at(run_folder):
     assert len(orbit([], gaussians, 7, (64, 48))) == 7  # a model alone has a way around it too
 
 
-def test_nerfstudios_paths_are_opengl_cameras(tmp_path):
-    world_from_gl = np.eye(4)
-    world_from_gl[:3, 3] = (1, 2, 3)
-    frame = {"camera_to_world": world_from_gl.reshape(-1).tolist(), "fov": 90.0, "aspect": 1.5}
-    path = tmp_path / "path.json"
-    path.write_text(json.dumps({"camera_path": [frame, frame], "fps": 24}))
-    (view, _), fps = path_of_file(path, (150, 100))
-    assert (fps, view.width, view.height) == (24, 150, 100)
-    np.testing.assert_allclose(view.K, [[50, 0, 75], [0, 50, 50], [0, 0, 1]], atol=1e-9)
-    # OpenGL looks along -z: what lies there is in front.
-    np.testing.assert_allclose(view.cam_from_world @ [1, 2, -7, 1], [0, 0, 10, 1], atol=1e-9)
-
-
 @pytest.mark.parametrize(
     "content",
     [
