@@ -263,19 +263,6 @@ def test_depth_maps_show_where_to_look(rgbd, tmp_path, splatseed):
     assert len(load_scene(tmp_path / "out").points) > 100
 
 
-def test_wrong_axes_are_named_before_the_search(bare, tmp_path, splatseed):
-    content = json.loads((bare / "transforms.json").read_text())
-    for frame in content["frames"]:
-        opengl = np.array(frame["transform_matrix"])
-        frame["transform_matrix"] = (opengl @ np.diag([1.0, -1.0, -1.0, 1.0])).tolist()
-    (bare / "transforms.json").write_text(json.dumps(content))
-    run = splatseed("upsample", bare, "-o", tmp_path / "out")
-    assert run.code == 2
-    assert "once the y and z axes of every camera are negated" in run.err
-    assert "transform_matrix is world_from_cam, with OpenGL's camera axes" in run.err
-    assert not (tmp_path / "out").exists()
-
-
 def test_photographs_without_points_are_seeded_and_drawn(bare, tmp_path, splatseed):
     out = tmp_path / "out"
     run = splatseed("upsample", bare, "--preview", "-o", out)

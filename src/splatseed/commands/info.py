@@ -107,7 +107,7 @@ def run(arguments: list[str]) -> None:
     rows += _advice_rows(advice, planned) if len(scene.points) else []
     print_pairs(str(options.scene), rows)
     if alignments is not None:
-        _print_depth(str(options.depth or "depth"), scene, alignments)
+        _print_depth(str(options.depth), scene, alignments)
     _print_list("problems" if problems else "no problems found", problems)
     if options.picture is not None:
         print_pairs("picture", [("of depth", str(options.picture))])
@@ -372,8 +372,5 @@ def _print_list(title: str, sentences: Sequence[str]) -> None:
 
 
 def _spread(values: Iterable[float], style: str) -> str:
-    known = np.array([value for value in values if not math.isnan(value)])
-    if not known.size:
-        return "unknown"
-    low, median, high = np.percentile(known, [5, 50, 95])
+    low, median, high = np.percentile(list(values), [5, 50, 95])
     return f"median {median:{style}}, 5/95% {low:{style}} {high:{style}}"

@@ -89,19 +89,13 @@ def advice_commands(
 
 
 def after_depth(path: Path, scene: Scene, maps: Path, known: int, *, aligned: bool) -> Commands:
-    """What to do with depth maps that were made of a scene's photographs.
+    """What to do with the depth maps that were made of the photographs of a scene at ``path``.
 
-    Args:
-        path: Where the scene lies.
-        scene: The scene.
-        maps: The folder of the maps.
-        known: Number of pixels with a depth, of all maps.
-        aligned: Whether they are in the scene's unit, as stereo's are and a network's are not.
+    ``known`` of their pixels have a depth; ``aligned``: they are in the scene's unit, as stereo's
+    are and a network's are not.
     """
-    looking, number = (
-        look(path, maps),
-        number_for(len(scene.points), known, Planned.of(scene).most_seeds),
-    )
+    looking = look(path, maps)
+    number = number_for(len(scene.points), known, Planned.of(scene).most_seeds)
     if is_distorted(scene):  # seeds are lifted along the rays of a pinhole camera
         begin = ("for seeds, begin with", undistort_command(path))
         return [looking] if aligned else [looking, begin]

@@ -229,9 +229,7 @@ def number_of_new(
 ) -> int | None:
     """How many points to make; None if the photographs determine it.
 
-    Raises:
-        ParameterError: A number is given though the photographs determine it, it is out of range,
-            or so many points do not fit into memory.
+    A ``ParameterError``: they do and a number is given, or it is out of range or beyond the memory.
     """
     if not chooses_number(method):
         total = planned_size(num_original, ratio, num_points)
@@ -272,12 +270,7 @@ def upsample_points(
 
 
 def planned_size(num_original: int, ratio: float | None, num_points: int | None) -> int:
-    """The number of points in all.
-
-    Raises:
-        ParameterError: Both are given, the ratio is below 1, or the number is not whole, below that
-            of the originals or absurdly large.
-    """
+    """The number of points in all; a ``ParameterError`` if it cannot be, or both are given."""
     if ratio is not None and num_points is not None:
         raise ParameterError(
             "either a ratio or a number of points", found="both", fix="Leave one of them out."
@@ -307,13 +300,9 @@ def planned_size(num_original: int, ratio: float | None, num_points: int | None)
 
 
 def as_cloud(new: NewPoints, num_new: int, code: int) -> PointCloud:
-    """What a method returned that was to make ``num_new`` points, checked.
+    """What a method returned that was to make ``num_new`` points, checked (``PointCloudError``).
 
     ``code`` is their ``source``, if the method gives none.
-
-    Raises:
-        PointCloudError: Points are not finite, arrays do not fit, or new points claim to be
-            originals.
     """
     if not np.isfinite(new.xyz).all():
         bad = int(np.flatnonzero(~np.isfinite(new.xyz).all(axis=1))[0])

@@ -83,21 +83,13 @@ def nothing_finite(number: int) -> PointCloudError:
 
 
 def require(condition: bool, expected: str, found: object) -> None:
-    """Check a method's parameter.
-
-    Raises:
-        ParameterError: ``condition`` does not hold.
-    """
+    """Refuse a method's parameter (``ParameterError``) unless ``condition`` holds."""
     if not condition:
         raise ParameterError(expected, found=repr(found), fix="Choose such a value.")
 
 
 def check_fields(method: Any) -> None:
-    """Check the fields of a method's dataclass against their annotations, to catch typos.
-
-    Raises:
-        ParameterError: A field is not of its type, or not one of its choices.
-    """
+    """Refuse fields of a method's dataclass that are not of their type or choices."""
     hints = typing.get_type_hints(type(method))
     label = getattr(method, "name", type(method).__name__.lower())
     for field in dataclasses.fields(method):

@@ -204,8 +204,7 @@ def plan_tiles(
 def check_disk(path: Path, needed: int | None) -> None:
     """Refuse a disk that is too small; what an earlier run left in the folder counts as free."""
     there = sum(each.stat().st_size for each in path.rglob("*") if each.is_file())
-    above = next(each for each in path.parents if each.exists())
-    free = shutil.disk_usage(above).free + there
+    free = there + shutil.disk_usage(next(each for each in path.parents if each.exists())).free
     if needed is not None and needed > free:
         raise OutputError(
             f"{words_of(needed, up=True)} of free disk at {path.parent}",
