@@ -152,16 +152,22 @@ def test_without_photographs_the_default_interpolates_and_says_so(own_room, tmp_
     assert "Without photographs" in run.out + run.err
 
 
-def test_the_origins_add_up_where_new_points_coincide(tmp_path, splatseed):
+def test_a_bare_ply_where_new_points_coincide(tmp_path, splatseed):
     coarse = np.float32(2**20)  # floats here are 1/8 apart: points between these fall together
     xyz = coarse + np.float32(np.random.default_rng(0).integers(0, 64, (300, 3))) / 8
     xyz = np.unique(xyz, axis=0).astype(np.float32)
-    write_ply(tmp_path / "cloud.ply", PointCloud(xyz, np.zeros(xyz.shape, np.uint8)))
-    run = splatseed("upsample", tmp_path / "cloud.ply", "--method", "linear", "-o", tmp_path / "o")
+    write_ply(tmp_path / "cloud.ply", PointCloud(xyz, np.full(xyz.shape, (200, 0, 0), np.uint8)))
+    words = ("upsample", tmp_path / "cloud.ply", "--method", "linear", "-o", tmp_path / "out")
+    run = splatseed(*words, "--preview")
     assert re.search(r"left out .* [1-9]\d* duplicate", run.out), run
     told = re.search(r"points out +([\d,]+) \(([\d,]+) original, ([\d,]+) linear\)", run.out)
     total, *parts = (int(number.replace(",", "")) for number in told.groups())
-    assert total == sum(parts)
+    assert total == sum(parts) == len(read_ply(tmp_path / "out/sparse/0/points3D.ply"))
+    assert "no images" in run.out
+    assert "train it with" not in run.out
+    with PilImage.open(tmp_path / "out/preview.png") as picture:
+        colored = np.ptp(np.asarray(picture.convert("RGB")).astype(int), axis=2) > 20
+    assert all(half.mean() > 0.002 for half in np.array_split(colored, 2, axis=1))
 
 
 def test_transforms_in_transforms_out(room, tmp_path, splatseed):
@@ -175,18 +181,6 @@ def test_transforms_in_transforms_out(room, tmp_path, splatseed):
     words = ("--format", "colmap", "--method", "mls", "-o", tmp_path / "third")
     assert splatseed("upsample", first, *words).code == 0
     assert pycolmap.Reconstruction(tmp_path / "third/sparse/0").num_images() == 12
-
-
-def test_a_bare_ply(room, tmp_path, splatseed):
-    write_ply(tmp_path / "cloud.ply", load_scene(room).points)
-    run = splatseed("upsample", tmp_path / "cloud.ply", "-o", tmp_path / "out", "--preview")
-    assert run.code == 0
-    assert "no images" in run.out
-    assert "train it with" not in run.out
-    assert len(read_ply(tmp_path / "out/sparse/0/points3D.ply")) > 0
-    with PilImage.open(tmp_path / "out/preview.png") as picture:
-        colored = np.ptp(np.asarray(picture.convert("RGB")).astype(int), axis=2) > 20
-    assert all(half.mean() > 0.002 for half in np.array_split(colored, 2, axis=1))
 
 
 def test_a_number_of_points_is_met_and_told(room, tmp_path, splatseed):

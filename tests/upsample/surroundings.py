@@ -17,19 +17,12 @@ from splatseed.camera import Camera, Intrinsics, quat_from_rotation
 from splatseed.depthmap import DepthMap
 from splatseed.scene import Image, Scene, SceneSource
 
-__all__ = ["MemoryMaps", "plane_depth", "scene_around"]
+from ..depth.conftest import MemoryMaps
 
 WIDTH, HEIGHT, FOCAL = 96, 72, 320.0
 HEIGHT_ABOVE = 8.0
 OFFSETS = [(-1.5, -1.0), (0.0, -1.0), (1.5, -1.0), (-1.5, 1.0), (0.0, 1.0), (1.5, 1.0)]
 FOLDER = tempfile.TemporaryDirectory(prefix="splatseed-photographs-")
-
-
-class MemoryMaps(dict):
-    """Depth maps in memory, by image name."""
-
-    def read(self, name):
-        return self[name]
 
 
 def scene_around(cloud):
@@ -46,13 +39,13 @@ def scene_around(cloud):
         center = middle + edge * np.array([dx, dy, HEIGHT_ABOVE])
         turn = _looking_at(center, middle, down)
         images.append(Image(f"{i}.png", i + 1, lens, quat_from_rotation(turn), -turn @ center))
-        maps[f"{i}.png"] = DepthMap(plane_depth(images[-1].camera, middle, [0.0, 0.0, 1.0]))
+        maps[f"{i}.png"] = DepthMap(_plane_depth(images[-1].camera, middle, [0.0, 0.0, 1.0]))
     folder = _photographs(cloud.rgb)
     source = SceneSource("colmap", folder, folder, image_dir=folder)
     return Scene(cloud, tuple(images), (lens,), source=source, depths=maps)
 
 
-def plane_depth(camera: Camera, point, normal):
+def _plane_depth(camera: Camera, point, normal):
     """Planar depth of a plane at the pixels' centres, float32 [H, W]."""
     u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     pixels = np.stack([u, v, np.ones_like(u)], axis=-1)
