@@ -162,16 +162,16 @@ def test_point_maps_of_networks(tmp_path, rng):
     check(tmp_path / "f.npz", xyz.reshape(-1, 3), rgb.reshape(-1, 3), 1e-6)
 
 
-@pytest.mark.parametrize("keep", [0.2, 0.98])
-def test_laz_that_is_cut_short(tmp_path, rng, keep):
+def test_laz_that_is_cut_short(tmp_path, rng):
     laspy = pytest.importorskip("laspy")
     las = laspy.LasData(laspy.LasHeader(point_format=3, version="1.2"))
     las.x, las.y, las.z = rng.normal(size=(3, 60000))
     path = tmp_path / "scan.laz"
     las.write(path)
-    path.write_bytes(path.read_bytes()[: int(keep * path.stat().st_size)])
-    with pytest.raises(SceneFormatError, match="complete LAS or LAZ file"):
-        whole(path, 1000)
+    for keep in (0.98, 0.2):
+        path.write_bytes(path.read_bytes()[: int(keep * path.stat().st_size)])
+        with pytest.raises(SceneFormatError, match="complete LAS or LAZ file"):
+            whole(path, 1000)
 
 
 def test_a_missing_file_and_a_missing_package_are_named(tmp_path, monkeypatch):

@@ -32,18 +32,14 @@ def scene_of(*names: str, image_dir: Path | None = None) -> Scene:
     return Scene(NO_POINTS, images, (LENS,), source=source)
 
 
-def put(path: Path, value: float = 1.0) -> Path:
+def put(path: Path, value: int = 1) -> Path:
     """A small map of one value; an empty file, if neither of NumPy nor PNG."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    array = np.full((3, 4), value, np.float32)
-    match path.suffix.lower():
-        case ".npy":
-            with path.open("wb") as file:
-                np.save(file, array)
-        case ".png":
-            PilImage.fromarray(array.astype(np.uint16)).save(path)
-        case _:
-            path.touch()
+    path.touch()
+    if path.suffix == ".npy":
+        np.save(path, np.full((3, 4), value))
+    elif path.suffix == ".png":
+        PilImage.new("I;16", (4, 3), value).save(path)
     return path
 
 
@@ -65,35 +61,35 @@ def test_the_first_of_several_candidates_is_taken(tmp_path):
         find_depths(scene, tmp_path)
 
 
+LEFT_RIGHT, DENSE = ["left/1.npy", "right/1.npy"], ["stereo/depth_maps/a.jpg.geometric.bin"]
+
+
 @pytest.mark.parametrize(
     ("files", "names", "found"),
     [
         (["c.npy", "a.npy", "stranger.npy"], ["d.jpg", "c.jpg", "a.jpg"], ["a.npy", "c.npy"]),
         (["images/a_depth.png", "images/a.png"], ["a.png"], ["images/a_depth.png"]),
-        (["left/1.npy", "right/1.npy"], ["x/left/1.jpg", "x/right/1.jpg"], None),
+        (LEFT_RIGHT, ["x/left/1.jpg", "x/right/1.jpg"], LEFT_RIGHT),
         (["frame-3.depth.png", "frame-3.color.png"], ["frame-3.color.png"], ["frame-3.depth.png"]),
         (["1.npy", "left/1.npy"], ["left/1.jpg", "right/1.jpg"], ["left/1.npy"]),
-        (["1.npy"], ["left/1.jpg", "right/1.jpg"], SceneFormatError),
-        (["stereo/depth_maps/a.jpg.geometric.bin"], ["a.jpg"], None),
-        *((["a.npy", "x/y/other.npy"], [name], []) for name in ("../a.jpg", "/a.jpg")),
+        (["1.npy"], ["left/1.jpg", "right/1.jpg"], r"1\.npy for left/1\.jpg and for right/1\.jpg"),
+        (DENSE, ["a.jpg"], DENSE),
+        *((["a.npy", "x/y/other.npy"], [name], "found none") for name in ("../a.jpg", "/a.jpg")),
     ],
 )
 def test_which_files_belong_to_which_images(tmp_path, files, names, found):
     """Not photographs in their own folder, nor what lies out of it; folders may be missing."""
-    paths = [put(tmp_path / name) for name in files]
+    for name in files:
+        put(tmp_path / name)
     inside = tmp_path / {"images/a.png": "images", "x/y/other.npy": "x/y"}.get(files[-1], "")
     scene = scene_of(*names, image_dir=inside)
-    if found == []:
-        with pytest.raises(SceneNotFoundError):
-            find_depths(scene, inside)
-    elif found is SceneFormatError:
-        with pytest.raises(SceneFormatError, match=r"1\.npy for left/1\.jpg and for right/1\.jpg"):
+    if isinstance(found, str):
+        with pytest.raises((SceneFormatError, SceneNotFoundError), match=found):
             find_depths(scene, inside)
     else:
         depths = find_depths(scene, inside)
-        expected = paths if found is None else [tmp_path / name for name in found]
-        assert [depths.paths[name] for name in depths] == expected
-        assert len(depths) == len(expected)
+        assert [depths.paths[name] for name in depths] == [tmp_path / name for name in found]
+        assert len(depths) == len(found)
 
 
 def test_images_without_a_map_and_damaged_maps_are_named(tmp_path):

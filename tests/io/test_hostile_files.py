@@ -104,9 +104,7 @@ def _rename(scene_dir, model, name):
     colmap.write_images(scene_dir / "sparse/0/images.bin", images)
 
 
-@pytest.mark.parametrize(
-    "name", ["../../x.jpg", "/dev/zero", "/etc/hostname", "../images/left/image000.jpg"]
-)
+@pytest.mark.parametrize("name", ["../../x.jpg", "/dev/zero", "../images/left/image000.jpg"])
 def test_a_name_that_leads_out_of_the_scene_is_told(scene_dir, model, name):
     _rename(scene_dir, model, name)
     told = [each for each in load_scene(scene_dir).warnings if "outside of" in each]

@@ -21,6 +21,7 @@ from splatseed.io.ply import read_ply, write_ply
 from splatseed.pointcloud import PointCloud
 from splatseed.similarity import Similarity
 
+FIELDS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 APPLIED = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]])
 LEGACY = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]])
@@ -64,10 +65,9 @@ def test_cloud_lands_on_the_same_pixels_through_nerfstudios_cameras(scene_dir, r
     cloud = read_ply(tmp_path / "out" / meta["ply_file_path"])
     for image, frame in zip(scene.images, meta["frames"], strict=True):
         expected_uv, expected_depth = image.camera.project(scene.points.xyz)
-        values = {**meta, **frame}
-        K = [[values["fl_x"], 0, values["cx"]], [0, values["fl_y"], values["cy"]], [0, 0, 1]]
+        fx, fy, cx, cy, *size = ({**meta, **frame}[key] for key in FIELDS)
         cam_from_world = np.linalg.inv(np.array(frame["transform_matrix"]) @ FLIP)
-        theirs = Camera(np.array(K), values["w"], values["h"], cam_from_world)
+        theirs = Camera(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), *size, cam_from_world)
         uv, depth = theirs.project(cloud.xyz)
         np.testing.assert_allclose(depth, expected_depth, rtol=1e-5, atol=1e-5)
         seen = expected_depth > 0.1

@@ -63,13 +63,11 @@ def test_outputs_are_hidden_until_the_end_and_their_parents_are_made(tmp_path):
     assert read_manifest(target) == {"command": "test", "files": ["file", MANIFEST]}
     picture = tmp_path / "deep" / "picture.png"
     with atomic_file(picture) as partial:
-        assert partial.suffix == ".png"
+        assert (partial.suffix, picture.exists()) == (".png", False)
         partial.write_text("first")
-        assert not picture.exists()
     with pytest.raises(UnicodeEncodeError), atomic_file(picture) as partial:
         partial.write_text("half, then \ud800", encoding="utf-8")
-    assert picture.read_text() == "first"
-    assert listing(picture.parent) == ["picture.png"]
+    assert (listing(picture.parent), picture.read_text()) == (["picture.png"], "first")
 
 
 PERMISSION = PermissionError(errno.EACCES, "Permission denied")
@@ -109,8 +107,7 @@ def test_an_interrupt_between_renames_hides_no_output(output, monkeypatch, metho
     with pytest.raises(KeyboardInterrupt):
         write_output(output, "second", overwrite=True)
     assert hidden(output.parent) == []
-    assert (output / MANIFEST).is_file()
-    assert (output / "text").read_text() == text
+    assert ((output / MANIFEST).is_file(), (output / "text").read_text()) == (True, text)
 
 
 def test_a_place_in_which_nothing_can_be_made_is_refused_beforehand(tmp_path, monkeypatch):
@@ -196,19 +193,17 @@ def test_what_somebody_puts_there_while_we_work_is_kept_aside(output, caplog):
 
 
 def test_an_output_in_an_output_has_its_own_list(output):
-    (output / "run").mkdir()
+    for name in ("run", "extra"):
+        (output / name).mkdir()
+        (output / name / "metrics.json").touch()
     (output / "run" / MANIFEST).write_text('{"command": "train", "files": ["metrics.json"]}')
-    (output / "run/metrics.json").touch()
     with pytest.raises(OutputError, match=r"run/metrics\.json"):
         write_output(output, overwrite=True)
-    add_files(output, ["run"])
+    add_files(output, ["run", "extra"])
     (output / "run/notes.txt").touch()
     with pytest.raises(OutputError, match=r"did not write: run/notes\.txt"):
         write_output(output, overwrite=True)
     (output / "run/notes.txt").unlink()
-    (output / "extra").mkdir()
-    (output / "extra/file").touch()
-    add_files(output, ["extra"])
     write_output(output, overwrite=True)
     assert listing(output) == [MANIFEST, "text"]
 
