@@ -80,7 +80,6 @@ class CloudFile(ABC):
         path: The file.
         count: Rows that its header promises; None where only reading tells. ``chunks`` may give
             fewer, as rows that the file itself marks as invalid are left out.
-        colors: Where the colours come from.
         warnings: What is odd about the file, one sentence each.
         used: The columns that are read, of those that are named: positions and colours.
     """

@@ -132,10 +132,8 @@ def saw_all_photographs(scene: Scene) -> bool:
 def carry_seeds(scene: Scene, written: Path, folder: Path) -> None:
     """Let an undistorted scene remember where its points come from, and what is known of them.
 
-    Args:
-        scene: The scene that is undistorted.
-        written: What ``write_scene`` made of it.
-        folder: The undistorted scene, with the same points in the same order.
+    ``written`` is what ``write_scene`` made of ``scene``; ``folder`` will be the undistorted scene,
+    with the same points in the same order.
     """
     if (written / SEEDS).is_file():
         shutil.copyfile(written / SEEDS, folder / SEEDS)

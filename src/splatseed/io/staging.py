@@ -124,7 +124,7 @@ def staged(target: Path, *, folder: bool) -> Iterator[Path]:
         finally:
             if (old / MANIFEST).is_file() and (names := unlisted_files(old)):  # put there meanwhile
                 _LOG.warning("%s is complete; %s has what it held: %s.", target, old, names)
-            else:
+            elif old.exists():
                 remove(old)
 
 

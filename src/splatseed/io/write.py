@@ -80,17 +80,10 @@ class PointStream:
 
 @dataclass(frozen=True)
 class WriteReport:
-    """What was written.
+    """What was written, and ``notes``: what the user should know, one sentence each.
 
-    Args:
-        path: The output folder.
-        layout: Which set of files it holds.
-        num_points: Points written.
-        num_original: How many of them were in the input.
-        dropped_nonfinite: Points left out, on reading or here, because a coordinate is not finite.
-        dropped_duplicates: Likewise, because an earlier one has the same position.
-        files: Paths inside the folder; an image folder is named, not listed.
-        notes: What the user should know, one sentence each.
+    Points are dropped, on reading or here, because a coordinate is not finite or an earlier one has
+    the same position. ``files`` are paths inside the folder; an image folder is named, not listed.
     """
 
     path: Path

@@ -68,8 +68,10 @@ def _parse_header(data: bytes) -> tuple[np.dtype[Any], int, str, int]:
     fields: list[Any] = []
     for i, (name, kind, size, count) in enumerate(zip(names, kinds, sizes, counts, strict=True)):
         known_as = f"pad {i}" if name == "_" else PACKED if (name, size) == (packed, "4") else name
-        known_as += "[]" * (count != 1)
-        fields.append((known_as, f"<{_KINDS[kind]}{int(size)}", *[(count,)] * (count != 1)))
+        shape = () if count == 1 else (count,)
+        fields.append(
+            (f"{known_as}[]" if shape else known_as, f"<{_KINDS[kind]}{int(size)}", shape)
+        )
     if missing := set(XYZ) - {name for name, *_ in fields}:
         raise ValueError(f"no fields {', '.join(sorted(missing))} of one value (COUNT 1)")
     size_keys = ["POINTS"] if "POINTS" in known else ["WIDTH", "HEIGHT"]
