@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-import os
-
-# Set before PyTorch loads its thread pool, as the command line does: see splatseed.cli.
-os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-
 import shutil
 
 import pytest

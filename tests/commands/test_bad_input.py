@@ -162,7 +162,7 @@ WORDS = [
     ((*MLS, "--refine-poses", "--depth-scale", "2"), "--depth DIR"),
     ((*LIFT, "--depth", "ROOM", "--depth-scale", "5", "--depth.no-align"), "scale"),
     ((*LIFT, "--depth", "ROOM", "--depth-kind", "inverse"), "depth"),
-    ((*LIFT, "--depth", "ROOM", "--ratio", "3000"), "points"),
+    ((*LIFT, "--depth", "ROOM", "--ratio", "300"), "points"),
     ((*UP, "--method", "cloud"), "--cloud FILE"),
     ((*UP, "--transform", "x.txt"), "--cloud FILE"),
     ((*UP, "--align"), "--cloud FILE"),
