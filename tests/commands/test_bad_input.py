@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import errno
-import os
 import re
 import shutil
-import struct
 import sys
 import warnings
 import zipfile
@@ -28,7 +26,6 @@ from splatseed.io.staging import MANIFEST, atomic_file, output_folder
 from splatseed.pointcloud import PointCloud
 from splatseed.splat.formats import write_model
 from splatseed.splat.gaussians import initial_gaussians
-from splatseed.splat.metrics import load_lpips
 from splatseed.train.folder import RunFolder
 from splatseed.train.settings import TrainSettings
 from splatseed.train.state import load_checkpoint, make_strategy
@@ -72,24 +69,18 @@ EVALUATE = ("evaluate", "model.ply", "--scene", "ROOM")
 FLIGHT = ("flight", "model.ply", "-o", "a.mp4")
 
 WORDS = [
-    (("--no-such-verb",), "--no-such-verb"),
     (("upsmaple",), "Did you mean upsample?"),
     (("Info",), "Did you mean info?"),
     (("--verison",), "Did you mean --version?"),
     (("info",), "PATH"),
     (("info", "nowhere"), "nowhere"),
     (("info", "nowhere", "--bogus"), "--bogus"),
-    (("info", "ROOM", "--max-steps", "0"), "--max-steps"),
     (("info", "ROOM", "b", "c"), "b, c"),
     (("info", "ROOM", "--picture", "a.png"), "--depth DIR"),
     (("info", "ROOM", "--depth-kind", "ray"), "--depth DIR"),
     (("info", "ROOM", "--depth-scale", "5"), "--depth DIR"),
-    (("info", "ROOM", "--depth", "gone"), "gone"),
     (("info", "ROOM", "--depth", "ROOM", "--depth-scale", "0"), "scale"),
-    (("info", "ROOM", "--depth", "ROOM", "--depth-kind", "up"), "--depth-kind"),
-    (("upsample",), "-o"),
     (("upsample", "ROOM"), "-o"),
-    (("upsample", "nowhere", *OUT), "nowhere"),
     (("upsample", "ROOM", "-o", "more.ply"), "-o more"),
     ((*UP, "--address", "auto"), "--executor ray"),
     ((*UP, "--jobs", "0"), "--jobs"),
@@ -97,21 +88,16 @@ WORDS = [
     ((*UP, "--cover", "8"), "--auto.cell"),
     ((*UP, "--auto.grid", "0"), "grid"),
     ((*UP, "--method", "magic"), "magic"),
-    ((*UP, "--profile", "papers"), "papers"),
     ((*UP, "--format", "nerf"), "nerf"),
     ((*UP, "--ratoi", "4"), "--ratio"),
-    ((*MLS, "another"), "another"),
     ((*MLS, "--seed", "-1"), "--seed"),
     ((*MLS, "--mls.k", "2"), "mls.k"),
-    ((*MLS, "--mls.k", "two"), "--mls.k"),
     ((*MLS, "--mls.frame", "up"), "--mls.frame"),
     ((*MLS, "--linear.k", "2"), "--linear.k"),
     ((*MLS, "--cover", "0"), "--cover"),
-    ((*MLS, "--ratio"), "--ratio"),
     ((*MLS, "--ratio", "0.5"), "ratio"),
     ((*MLS, "--ratio", "nan"), "ratio"),
     ((*MLS, "--ratio", "1e12"), "4,294,967,296"),
-    ((*MLS, "--ratio", "many"), "--ratio"),
     ((*MLS, "--num-points", "10"), "found 10"),
     ((*MLS, "--num-points", "500k"), "--num-points"),
     ((*MLS, "--ratio", "2", "--num-points", "5000"), "both"),
@@ -119,10 +105,7 @@ WORDS = [
     ((*LIFT, "--depth-kind", "ray"), "--depth DIR"),
     ((*LIFT, "--depth", "ROOM", "--depth-scale", "0"), "scale"),
     ((*LIFT, "--depth", "ROOM", "--depth.tolerance", "2"), "tolerance"),
-    (("train", "ROOM"), "-o"),
     ((*TRAIN, "--max-step", "4"), "--max-steps"),
-    ((*TRAIN, "--strategy", "defalt"), "--strategy"),
-    ((*TRAIN, "--data-factor", "1000"), "--data-factor"),
     ((*TRAIN, "--long-side", "5"), "--long-side"),
     ((*TRAIN, "--long-side", "48", "--data-factor", "2"), "--long-side or --data-factor"),
     ((*TRAIN, "--budget", "1"), "--budget"),
@@ -131,7 +114,6 @@ WORDS = [
     ((*TRAIN, "--config"), "--config"),
     ((*EVALUATE, "--data-factor", "0"), "--data-factor"),
     ((*EVALUATE, "--test-every", "1"), "--test-every"),
-    ((*EVALUATE, "--backend", "gpu"), "--backend"),
     (("evaluate", "model.ply"), "--scene"),
     (DEPTH, "--stereo"),
     ((*DEPTH, "--stereo", "--model", "some"), "--model"),
@@ -141,7 +123,6 @@ WORDS = [
     ((*DEPTH, "--model", "some", "--colmap"), "--colmap"),
     ((*DEPTH, "--model", "nobody/Depth-Nothing-hf"), "nobody/Depth-Nothing-hf"),
     ((*DEPTH, "--model", "gone.onnx"), "gone.onnx"),
-    (("sfm",), "-o"),
     (("sfm", "x", "-o"), "-o"),
     (("sfm", "nowhere", *OUT), "nowhere"),
     ((*SFM, "--frames", "5"), "--frames"),
@@ -152,7 +133,6 @@ WORDS = [
     (("bench", "reprot", "B"), "Did you mean report?"),
     ((*QUICK, "--repeats", "0"), "--repeats"),
     ((*QUICK, "--long-side", "0"), "--long-side"),
-    (("demo", "--views", "many"), "--views"),
     (("demo", "--views", "2"), "views"),
     (("demo", "--train-steps", "-1"), "--train-steps"),
     ((*MLS, "--cloud", "SCAN"), "with --cloud; found mls"),
@@ -196,7 +176,6 @@ WORDS = [
     ((*SFM, "--poses-from", "ROOM", "--no-shared-camera"), "shared"),
     (("sfm", "film.mp4", *OUT, "--poses-from", "ROOM"), "--poses-from"),
     (("sfm", "film.mp4", *OUT), "film.mp4"),
-    (("undistort", "nowhere", *OUT), "nowhere"),
     (("demo", *OUT, "--training", "only"), "splatseed demo"),
 ]
 
@@ -262,37 +241,12 @@ def test_no_number_is_below_its_least(verb, refused):
 # Scenes ------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("name", "data", "says"),
-    [
-        ("points3D.bin", struct.pack("<Q", 1 << 60) + bytes(50), "points3D.bin"),
-        ("cameras.txt", b"1 FISHEYE_9 120 90 1 6 4\n", "FISHEYE_9"),
-        ("", None, "splatseed sfm"),
-    ],
-)
-def test_a_damaged_scene(name, data, says, own_room, tmp_path, splatseed):
-    model = own_room / "sparse/0"
-    for path in sorted(model.glob(f"{name.partition('.')[0]}*")):
-        path.unlink()
-    if data is not None:
-        (model / name).write_bytes(data)
-    before = _contents(tmp_path)
-    _refused(splatseed("upsample", own_room, "-o", tmp_path / "out"), says)
-    _refused(splatseed("info", own_room), says)
-    assert _contents(tmp_path) == before
-
-
-def test_too_few_points_and_those_that_are_nowhere(rng, own_room, tmp_path, splatseed):
-    for path in (own_room / "sparse/0").glob("points3D.*"):
-        path.write_bytes(struct.pack("<Q", 0)) if path.suffix == ".bin" else path.unlink()
-    out = ("--method", "mls", "-o", tmp_path / "deep/out")
-    _refused(splatseed("upsample", own_room, *out), "--poses-from")
+def test_too_few_points_and_those_that_are_nowhere(rng, tmp_path, splatseed):
     xyz = rng.random((100, 3)).astype(np.float32)
     xyz[[3, 50]], xyz[60] = np.nan, xyz[61]
     for name, some in (("one", xyz[:1]), ("some", xyz)):
-        cloud = PointCloud(some, np.zeros(some.shape, np.uint8))
-        write_ply(tmp_path / f"{name}.ply", cloud)
-    _refused(splatseed("upsample", tmp_path / "one.ply", *out), "point")
+        write_ply(tmp_path / f"{name}.ply", PointCloud(some, np.zeros(some.shape, np.uint8)))
+    _refused(splatseed("upsample", tmp_path / "one.ply", "-o", tmp_path / "deep/out"), "point")
     assert not (tmp_path / "deep").exists()
     run = splatseed("upsample", tmp_path / "some.ply", "-o", tmp_path / "out", "--ratio", 2)
     assert run.code == 0
@@ -344,18 +298,10 @@ def test_junk_is_told_without_python(words, junk, own_room, tmp_path, monkeypatc
         assert not (tmp_path / "out").exists()
 
 
-def _load_checkpoint(path):
-    settings, cpu = TrainSettings(strategy="none", backend="cpu"), torch.device("cpu")
-    return load_checkpoint(path, make_strategy(settings, cpu), settings.schedule, cpu)
-
-
-READ = {"weights": load_lpips, "checkpoint": _load_checkpoint}
-
-
 @pytest.mark.parametrize("how", ["cut", "flipped", "text", "pickle", "zip"])
-@pytest.mark.parametrize("what", READ)
-def test_a_damaged_file_of_pytorchs(what, how, rng, tmp_path):
-    path, read = tmp_path / "file", READ[what]
+def test_a_damaged_checkpoint(how, rng, tmp_path):
+    settings, cpu = TrainSettings(strategy="none", backend="cpu"), torch.device("cpu")
+    strategy, path = make_strategy(settings, cpu), tmp_path / "file"
     torch.save({"format": 2, "params": {"means": torch.zeros(30, 3)}, "step": 3}, path)
     whole = path.read_bytes()
     for _ in range(20 if how == "flipped" else 1):
@@ -369,7 +315,7 @@ def test_a_damaged_file_of_pytorchs(what, how, rng, tmp_path):
             with zipfile.ZipFile(path, "w") as archive:
                 archive.writestr("archive/data.pkl", b"(")
         with pytest.raises(SceneFormatError), warnings.catch_warnings(action="error"):
-            read(path)
+            load_checkpoint(path, strategy, settings.schedule, cpu)
 
 
 # Outputs -----------------------------------------------------------------------------------------
@@ -383,18 +329,7 @@ def test_a_taken_output_is_refused(room, tmp_path, splatseed):
     assert _contents(tmp_path) == before
 
 
-@pytest.mark.parametrize("words", [[], ["--overwrite"]])
-def test_what_splatseed_did_not_write_is_never_replaced(words, room, tmp_path, splatseed):
-    thesis = tmp_path / "work" / "thesis.tex"
-    thesis.parent.mkdir()
-    thesis.write_text("years")
-    before = _contents(tmp_path)
-    _refused(splatseed("upsample", room, "-o", thesis.parent, *words), "did not write")
-    _refused(splatseed("upsample", room, "-o", thesis, *words), "a file")
-    assert _contents(tmp_path) == before
-
-
-@pytest.mark.parametrize("place", [".", "up", "sparse", "sparse/0/up", "..", "depths/up"])
+@pytest.mark.parametrize("place", [".", "sparse/0/up", "..", "depths/up"])
 def test_the_input_is_no_place_for_the_output(place, own_room, tmp_path, splatseed):
     before = _contents(tmp_path)
     for words in ([], ["--overwrite"], ["--method", "depth", "--depth", own_room / "depths"]):
@@ -403,24 +338,8 @@ def test_the_input_is_no_place_for_the_output(place, own_room, tmp_path, splatse
     assert _contents(tmp_path) == before
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere; simulated below")
-def test_no_permission_to_write(room, tmp_path, splatseed):
-    locked = tmp_path / "locked"
-    locked.mkdir(mode=0o500)
-    _refused(splatseed("upsample", room, "-o", locked / "out"), "write-protected")
-
-
-@pytest.mark.parametrize(
-    ("error", "code", "says"),
-    [
-        (OSError(errno.ENOSPC, "full"), 2, "Free some space"),
-        (OSError(errno.EACCES, "forbidden"), 2, "may write to"),
-        (MemoryError("none"), 2, "fewer points"),
-        (KeyboardInterrupt(), 130, "interrupted"),
-    ],
-)
 def test_what_fails_halfway_leaves_nothing_and_spares_the_earlier_output(
-    error, code, says, room, tmp_path, splatseed, monkeypatch
+    room, tmp_path, splatseed, monkeypatch
 ):
     out = tmp_path / "out"
     assert splatseed("upsample", room, "--method", "mls", "-o", out).code == 0
@@ -428,13 +347,11 @@ def test_what_fails_halfway_leaves_nothing_and_spares_the_earlier_output(
 
     def write(path, points, tracks=None):
         Path(path).write_bytes(b"half")
-        raise error
+        raise OSError(errno.ENOSPC, "full")
 
     monkeypatch.setattr(colmap, "write_points3d", write)
     for words in (["-o", out, "--overwrite"], ["-o", tmp_path / "deep/out"]):
-        run = splatseed("upsample", room, "--method", "linear", *words)
-        assert run.code == code
-        assert says in run.err
+        _refused(splatseed("upsample", room, "--method", "linear", *words), "Free some space")
         assert _contents(tmp_path) == before
 
 
