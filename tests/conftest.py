@@ -44,13 +44,25 @@ def pytest_collection():
     return found
 
 
-def pytest_collection_modifyitems(items) -> None:
-    """Slow tests last: what fails is known before they begin.
+LONG = {"test_bench_command.py", "test_determinism.py", "test_run.py"}
+"""Begun first, so that no process is left alone with one of them at the end."""
 
-    First a long file that trains in processes of its own, so that no process is left alone with it.
-    """
-    items.sort(key=lambda item: item.path.name != "test_examples.py")
-    items.sort(key=lambda item: item.get_closest_marker("slow") is not None)
+
+def pytest_configure(config) -> None:
+    """Files go to processes in this order; else those of few tests, often the longest, go last."""
+    config.option.loadscopereorder = False
+
+
+def pytest_collection_modifyitems(items) -> None:
+    """A file's slow tests last: what else fails in it is known before they begin."""
+    places = {path: place for place, path in enumerate(dict.fromkeys(i.path for i in items))}
+    items.sort(
+        key=lambda item: (
+            item.path.name not in LONG,
+            places[item.path],
+            item.get_closest_marker("slow") is not None,
+        )
+    )
 
 
 @pytest.fixture

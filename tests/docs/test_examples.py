@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import re
-import subprocess
-import sys
+import runpy
 from pathlib import Path
 
 import pytest
@@ -18,24 +17,23 @@ EXAMPLES = sorted(FOLDER.glob("*.py"))
 
 
 @pytest.fixture
-def run(tmp_path):
+def run(tmp_path, monkeypatch, capsys):
     """Runs an example in an empty folder and returns what it printed."""
 
     def go(name, *words):
-        command = [sys.executable, str(FOLDER / name), *map(str, words)]
-        done = subprocess.run(
-            command, cwd=tmp_path, capture_output=True, check=False, text=True, timeout=120
-        )
-        assert (done.returncode, done.stderr) == (0, "")
-        return done.stdout
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr("sys.argv", [name, *map(str, words)])
+        runpy.run_path(str(FOLDER / name), run_name="__main__")
+        out, err = capsys.readouterr()
+        assert not err
+        return out
 
     return go
 
 
 def test_they_are_numbered_short_and_tested_here():
-    assert [path.name[:3] for path in EXAMPLES] == [
-        f"{i:02d}_" for i in range(1, len(EXAMPLES) + 1)
-    ]
+    numbers = [f"{i:02d}_" for i in range(1, len(EXAMPLES) + 1)]
+    assert [path.name[:3] for path in EXAMPLES] == numbers
     tests = Path(__file__).read_text(encoding="utf-8")
     for path in EXAMPLES:
         text = path.read_text(encoding="utf-8")
@@ -45,12 +43,10 @@ def test_they_are_numbered_short_and_tested_here():
 
 
 def test_upsample_a_scene(run, tmp_path):
-    out = run("01_upsample_a_scene.py")
-    before, after = (load_scene(tmp_path / name) for name in ("example_room", "example_room_auto"))
+    out = run("01_upsample_a_scene.py", "mine")
+    before, after = (load_scene(tmp_path / name) for name in ("mine", "example_room_auto"))
     assert len(after.points) > 2 * len(before.points)
     assert f"{len(after.points):,}" in out
-    run("01_upsample_a_scene.py", "example_room", "mine")
-    assert len(load_scene(tmp_path / "mine").points) > 0
 
 
 def test_arrays_in_arrays_out(run):
@@ -79,16 +75,15 @@ def test_your_own_method(run):
 
 
 def test_render_on_a_cpu(run, tmp_path):
-    out = run("05_render_on_a_cpu.py", 40)
+    out = run("05_render_on_a_cpu.py", 20)
     first, *_, last = re.findall(r"([\d.]+) dB", out)
-    assert float(last) > float(first) + 3
+    assert float(last) > float(first) + 1
     with PillowImage.open(tmp_path / "fitted.png") as picture:
         assert picture.size == (320, 120)
 
 
-@pytest.mark.slow
 def test_train_and_score(run, tmp_path):
-    out = run("06_train_and_score.py", "example_room", 40)
+    out = run("06_train_and_score.py", "example_room", 4)
     counts = [int(n.replace(",", "")) for n in re.findall(r"([\d,]+) Gaussians", out)]
     assert counts[1] == 4 * counts[0]
     assert (tmp_path / "runs" / "mls_4x" / "point_cloud.ply").is_file()
