@@ -106,6 +106,8 @@ WORDS = [
     ((*LIFT, "--depth", "ROOM", "--depth-scale", "0"), "scale"),
     ((*LIFT, "--depth", "ROOM", "--depth.tolerance", "2"), "tolerance"),
     ((*TRAIN, "--max-step", "4"), "--max-steps"),
+    ((*TRAIN, "--strategy", "defalt"), "--strategy"),
+    ((*TRAIN, "--data-factor", "1000"), "--data-factor"),
     ((*TRAIN, "--long-side", "5"), "--long-side"),
     ((*TRAIN, "--long-side", "48", "--data-factor", "2"), "--long-side or --data-factor"),
     ((*TRAIN, "--budget", "1"), "--budget"),
