@@ -11,26 +11,22 @@ import pytest
 
 pytest.importorskip("pycolmap", reason="needs pycolmap")
 
-from splatseed.camera import Intrinsics
 from splatseed.errors import SceneFormatError
 from splatseed.io import load_scene, write_scene
 from splatseed.io.colmap import write_images
 from splatseed.io.seeds import saw_all_photographs, was_upsampled
+from splatseed.synthetic import make_capture, write_capture
 from splatseed.views.view import check_lens, load_views
+
+from ..bent import bend
 
 
 @pytest.fixture(scope="module")
-def distorted(room, tmp_path_factory):
-    """The room, its lens said to have distortion."""
-    scene = load_scene(room)
-    lens = scene.intrinsics[0]
-    bent = Intrinsics(
-        lens.camera_id, "OPENCV", lens.width, lens.height, (*lens.params, 0.06, 0.0, 0.0, 0.0)
-    )
-    images = tuple(dataclasses.replace(image, intrinsics=bent) for image in scene.images)
-    path = tmp_path_factory.mktemp("bent") / "scene"
-    write_scene(scene.replace(images=images, intrinsics=(bent,)), path)
-    names = [image.name for image in images]
+def distorted(tmp_path_factory):
+    """The room through a lens with distortion."""
+    capture = bend(make_capture(0, num_views=12, width=120, height=90))
+    path = write_capture(capture, tmp_path_factory.mktemp("bent") / "scene")
+    names = [image.name for image in capture.scene.images]
     (path / "test_list.txt").write_text("\n".join(names[:2]))
     return path
 

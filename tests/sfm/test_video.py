@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter
 
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.io.files import is_video
-from splatseed.sfm.photos import choose_frames, pick_frames, shift
+from splatseed.sfm.photos import pick_frames
 from splatseed.view.flights import write_video
 
 HEIGHT, WIDTH = 120, 160
@@ -21,25 +21,6 @@ def wall():
     """A long textured wall to film along."""
     wall = gaussian_filter(np.random.default_rng(0).random((HEIGHT, 1200, 3)), (1.5, 1.5, 0))
     return (255 * (wall - wall.min()) / np.ptp(wall)).astype(np.uint8)
-
-
-def test_the_shift_of_a_picture_is_found(wall):
-    grey = wall.astype(np.float32).mean(axis=2)
-    pieces = [grey[:, at : at + WIDTH] for at in (100, 100, 107)]
-    assert shift(pieces[0], pieces[1]) == 0
-    assert shift(pieces[0], pieces[2]) == pytest.approx(7, abs=0.5)
-
-
-def test_the_sharpest_of_each_stretch_is_taken():
-    way = np.concatenate([np.zeros(50), np.linspace(0, 1, 101)[1:]])
-    sharpness = np.ones(150)
-    sharpness[[20, 77, 130]] = 2
-    taken = choose_frames(sharpness, way, 4)
-    assert len(taken) == 4
-    assert {20, 77, 130} <= set(taken.tolist())
-    assert np.all(np.diff(taken) > 0)
-    assert len(choose_frames(sharpness, np.zeros(150), 10)) == 1
-    assert len(choose_frames(np.ones(0), np.zeros(0), 10)) == 0
 
 
 def test_frames_are_sharp_spread_and_not_of_standing_still(wall, tmp_path):

@@ -14,30 +14,11 @@ from splatseed.synthetic.room import visible
 
 def test_depth_unprojects_onto_the_surfaces(capture):
     for image, depth in zip(capture.scene.images, capture.depths, strict=True):
-        row, column = np.nonzero(depth)
+        row, column = (each[::5] for each in np.nonzero(depth))
         uv = np.stack([column, row], axis=1) + 0.5
         z = depth[row, column].astype(np.float64)
         distance = capture.surfaces.distance(image.camera.unproject(uv, z))
         assert (distance / z).max() < 1e-6
-
-
-def test_pictures_show_texture_everywhere_but_on_the_bare_wall(capture):
-    wall = capture.room.part("bare wall")
-    contrast = {True: [], False: []}
-    for image, picture, depth in zip(
-        capture.scene.images, capture.images, capture.depths, strict=True
-    ):
-        row, column = np.nonzero(depth[1:-1, 1:-1])
-        xyz = image.camera.unproject(
-            np.stack([column, row], axis=1) + 1.5, depth[1:-1, 1:-1][row, column]
-        )
-        bare = wall.distance(xyz) < 1e-4
-        grey = picture.astype(float).mean(axis=2)
-        step = np.abs(np.diff(grey, axis=1))[1:-1, :-1][row, column]
-        contrast[True].append(step[bare])
-        contrast[False].append(step[~bare])
-    assert np.median(np.concatenate(contrast[True])) == 0
-    assert np.mean(np.concatenate(contrast[False])) > 5
 
 
 def test_features_and_tracks_name_each_other(capture):

@@ -63,7 +63,8 @@ def aligned(folder, marks, xyz, **arrays):
 
 
 @pytest.mark.slow
-def test_a_cloud_that_is_shifted_scaled_and_turned(made, tmp_path):
+def test_a_cloud_that_is_shifted_scaled_and_turned(made, tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "SCALES", module.SCALES[1:4])
     marks, dense = made
     found = aligned(tmp_path, marks, MOVE.points(dense), rgb=shades(dense))
     back = found.scene_from_cloud.points(MOVE.points(dense))
