@@ -26,7 +26,7 @@ from splatseed.depthmap import DepthKind
 from splatseed.io import dense, load_scene
 from splatseed.io.photograph import warnings_but_lens
 from splatseed.io.staging import check_output
-from splatseed.literal import quoted, visible
+from splatseed.literal import name_some, quoted, visible
 from splatseed.requirements import require
 from splatseed.runtime.torch_device import DeviceName
 from splatseed.scene import Scene
@@ -148,15 +148,10 @@ def _run_network(options: Options) -> None:
     for warning in scene.warnings:
         print_note(warning)
     if report.flat:
-        flat = _some(report.flat)
+        flat = name_some(report.flat, NAMES_SHOWN)
         print_note(f"the network predicted no depth (a constant map, or none) for: {flat}")
     known = num * math.prod(ordered[0])
     print_pairs("next", after_depth(options.scene, scene, options.output, known, aligned=False))
-
-
-def _some(names: Sequence[str]) -> str:
-    more = len(names) - NAMES_SHOWN
-    return ", ".join(names[:NAMES_SHOWN]) + (f" and {more} more" if more > 0 else "")
 
 
 def _run_stereo(options: Options) -> None:
@@ -207,7 +202,7 @@ def _summarise_stereo(
     for warning in warnings_but_lens(scene):
         print_note(warning)
     if report.empty:
-        print_note(f"no other view confirms any pixel of: {_some(report.empty)}")
+        print_note(f"no other view confirms any pixel of: {name_some(report.empty, NAMES_SHOWN)}")
     if is_distorted(scene) and not options.colmap:
         print_note(
             "the cameras have lens distortion, and these maps belong to the undistorted "

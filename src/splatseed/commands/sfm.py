@@ -17,10 +17,10 @@ from splatseed.console import ERR, StageClock, print_note, print_pairs, stage_di
 from splatseed.io import load_scene
 from splatseed.io.files import is_video
 from splatseed.io.staging import check_output
-from splatseed.literal import counted, quoted, visible
+from splatseed.literal import counted, name_some, quoted, visible
 from splatseed.runtime.torch_device import DeviceName
 from splatseed.sfm import MatcherName, Settings, SfmReport, reconstruct
-from splatseed.sfm.photos import name_some, pick_frames
+from splatseed.sfm.photos import pick_frames
 
 
 @dataclass(frozen=True)

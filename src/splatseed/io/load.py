@@ -24,7 +24,7 @@ from splatseed.io.rgbd import find_tum_depths, is_tum, load_rgbd, load_tum
 from splatseed.io.seeds import recall_seeds
 from splatseed.io.split import follow_lists
 from splatseed.io.staging import MANIFEST, read_manifest
-from splatseed.literal import quoted
+from splatseed.literal import name_some, quoted
 from splatseed.scene import Scene, SceneSource
 
 _TRANSFORMS = "transforms.json"
@@ -170,7 +170,7 @@ def _no_scene(path: Path) -> SceneNotFoundError:
     scenes = [each.name for each in sorted(path.iterdir()) if is_scene(each)]
     files = {each.name for suffix in ("*.json", "*.ply") for each in path.glob(suffix)}
     names = scenes or sorted(files - {MANIFEST})
-    some = ", ".join(names[:5]) + (f" and {len(names) - 5:,} more" if len(names) > 5 else "")
+    some = name_some(names, 5)
     found = f"scenes in it: {some}" if scenes else f"only {some}" if names else "none of them"
     if scenes:
         fix = f"Name one of them: {path / scenes[0]}"

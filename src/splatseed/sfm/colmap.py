@@ -25,11 +25,12 @@ import numpy as np
 from PIL import Image as PilImage
 
 from splatseed import errors
+from splatseed.literal import name_some
 from splatseed.progress import Progress
 from splatseed.requirements import install_command
 from splatseed.runtime.torch_device import DeviceName
 from splatseed.scene import Image
-from splatseed.sfm.photos import Size, name_some
+from splatseed.sfm.photos import Size
 
 MatcherName: TypeAlias = Literal["exhaustive", "sequential"]
 T = TypeVar("T")

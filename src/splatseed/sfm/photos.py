@@ -12,7 +12,7 @@ correlation (Kuglin and Hines 1975). A frame's *sharpness* is the variance of it
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -27,7 +27,7 @@ from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundErro
 from splatseed.io.files import VIDEO_SUFFIXES
 from splatseed.io.photograph import check_photograph, open_photograph, photograph_bytes
 from splatseed.io.staging import read_manifest
-from splatseed.literal import quoted
+from splatseed.literal import name_some, quoted
 from splatseed.progress import Progress, silent
 from splatseed.requirements import require
 from splatseed.scene import Image, Scene
@@ -43,7 +43,6 @@ _FOREIGN_SUFFIXES = frozenset(
 _GREY = "of 16-bit or floating-point grey, as depth maps are"
 _FOREIGN = "of a format that is not read"
 _DEPTH_MODES = ("I", "F")  # Pillow's names for 16- and 32-bit grey
-_SHOWN = 8
 
 _LOOK_WIDTH, _BLOCK = 256, 64
 """Width at which frames are analysed, and the side of the blocks whose shifts are measured, px."""
@@ -139,13 +138,6 @@ def match_poses(photos: Mapping[str, Size], scene: Scene, image_dir: Path) -> tu
                 fix="Give the images that the poses were made for, at the same scale.",
             )
     return images
-
-
-def name_some(names: Sequence[str]) -> str:
-    """The first few of ``names``, and how many more there are."""
-    shown = ", ".join(names[:_SHOWN])
-    more = len(names) - _SHOWN
-    return f"{shown} and {more} more" if more > 0 else shown
 
 
 class PickedFrames(NamedTuple):
