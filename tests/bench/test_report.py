@@ -242,6 +242,7 @@ def test_a_changed_scene_costs_its_pictures_alone_and_losers_are_not_called_the_
     path, digest = capture
     bench = with_capture(tmp_path / "b", path, digest[::-1], (("mls", 3), -0.1), noise=0.0)
     assert "expected the files of" in write_report(bench).notes[0]
+    assert "sfm,,," in (bench / "tables" / "winners_none.csv").read_text("utf-8")
     said = text_of(bench)
     assert "view0: mls 3x, the best of the others on this scene, though it loses (-0.10" in said
 

@@ -11,7 +11,6 @@ from scipy import stats
 from splatseed.bench.statistics import (
     Difference,
     adjusted,
-    difference,
     holm,
     over_scenes,
     over_views_and_repeats,
@@ -22,8 +21,7 @@ from splatseed.bench.statistics import (
 
 
 def plant(rng, *, scenes, arms, repeats, gain=0.0, noise=0.06, spread=0.0):
-    """Scores [scene, arm, repeat]: scenes and repeats differ, arm 1 gains, its gain varies by
-    scene."""
+    """Scores [scene, arm, repeat]: scenes and repeats differ, arm 1 gains, more or less by scene."""
     level = rng.uniform(20, 35, (scenes, 1, 1))
     repeat = 0.05 * rng.standard_normal((scenes, 1, repeats))
     effect = np.zeros((scenes, arms, 1))
@@ -83,20 +81,6 @@ def test_over_scenes_is_scipys_one_sample_t_test(rng):
     assert math.isnan(over_scenes([0.3]).p)
 
 
-def test_these_scenes_is_welchs_test(rng):
-    """Two scenes with the second's sign turned: their sum is a difference of two means."""
-    a, b = rng.standard_normal(4), 3 * rng.standard_normal(6)
-    parts = [
-        difference(float(a.mean()), stats.sem(a), 3, 4),
-        difference(-float(b.mean()), stats.sem(b), 5, 6),
-    ]
-    expected = stats.ttest_ind(a, b, equal_var=False)
-    ours = these_scenes(parts)
-    assert ours.p == pytest.approx(expected.pvalue)
-    assert ours.df == pytest.approx(expected.df)
-    assert 2 * ours.mean == pytest.approx(a.mean() - b.mean())
-
-
 def test_views_and_repeats_are_both_samples(rng):
     """The stated variance is, on average, that of means of new views and new repeats."""
     views, repeats, noise = 2.0, 1.0, 0.5
@@ -125,12 +109,10 @@ def test_holm_step_by_step(rng):
 
 
 def test_verdicts():
-    def verdict(mean, p):
-        return adjusted([Difference(mean, 0.1, 3, 4, p)])[0].verdict
-
-    assert verdict(1.0, 0.01) == "better"
-    assert verdict(-1.0, 0.01) == "worse"
-    assert verdict(1.0, 0.2) == "within noise"
+    for mean, p, expected in (
+        (1.0, 0.01, "better"), (-1.0, 0.01, "worse"), (1.0, 0.2, "within noise")
+    ):  # fmt: skip
+        assert adjusted([Difference(mean, 0.1, 3, 4, p)])[0].verdict == expected
     assert adjusted([None]) == (None,)
 
 
@@ -156,15 +138,12 @@ def rates(rng, judged, **planted):
 
 
 def test_a_null_is_claimed_at_most_at_the_stated_rate(rng):
-    """5% of tables may claim anything at all; 300 tables stray by 1.3 points, hence 9% is 3
-    sigma."""
-    claimed = rates(rng, any, scenes=5, arms=6, repeats=3)
-    assert max(claimed) < 0.09
+    """5% of tables may claim anything at all; 300 tables stray by 1.3 points: 9% is 3 sigma."""
+    assert max(rates(rng, any, scenes=5, arms=6, repeats=3)) < 0.09
 
 
 def test_gains_that_only_vary_by_scene_are_not_claimed_for_scenes_like_these(rng):
-    """The mean gain is 0 but each scene has its own: runs as samples would claim it far too
-    often."""
+    """The mean gain is 0 but each scene has its own: runs as samples claim it far too often."""
     planted = {"scenes": 5, "arms": 2, "repeats": 4, "noise": 0.05, "spread": 0.3}
     assert rates(rng, any, **planted)[2] < 0.09
     runs = [
@@ -176,14 +155,11 @@ def test_gains_that_only_vary_by_scene_are_not_claimed_for_scenes_like_these(rng
 
 def test_a_planted_tenth_of_a_decibel_is_found(rng):
     """Noise of 0.06 dB a run, three repeats, five scenes, among five methods."""
-    _, these, like = rates(
-        rng, lambda family: family[0], scenes=5, arms=6, repeats=3, gain=0.1, spread=0.01
-    )
+    planted = {"arms": 6, "repeats": 3, "gain": 0.1, "spread": 0.01}
+    _, these, like = rates(rng, lambda family: family[0], scenes=5, **planted)
     assert these > 0.9
     assert like > 0.4  # four degrees of freedom, five comparisons
-    assert rates(
-        rng, lambda family: family[0], scenes=9, arms=6, repeats=3, gain=0.1, spread=0.01
-    )[2] > 0.9  # fmt: skip
+    assert rates(rng, lambda family: family[0], scenes=9, **planted)[2] > 0.9
 
 
 def test_a_noisier_arm_alone_strays_little(rng):
