@@ -21,7 +21,7 @@ from splatseed.bench.statistics import (
 
 
 def plant(rng, *, scenes, arms, repeats, gain=0.0, noise=0.06, spread=0.0):
-    """Scores [scene, arm, repeat]: scenes and repeats differ, arm 1 gains, more or less by scene."""
+    """Scores [scene, arm, repeat]: scenes and repeats differ, arm 1 gains, not alike on scenes."""
     level = rng.uniform(20, 35, (scenes, 1, 1))
     repeat = 0.05 * rng.standard_normal((scenes, 1, repeats))
     effect = np.zeros((scenes, arms, 1))

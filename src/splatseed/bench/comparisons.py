@@ -143,14 +143,11 @@ _TIMED = ("in_time", "steps", "seconds")
 class ComparedArm:
     """An arm compared with the baseline, over the scenes and the pairs of runs that both have.
 
-    Args:
-        means: Mean scores (``SCORES``), numbers of Gaussians and seconds of seeding and training;
-            NaN if unknown on some scene.
-        gains: Differences of the scores; ``in_time``: PSNR at the seconds at which the baseline
-            ends, less the baseline's final PSNR, dB; ``steps`` and ``seconds``: mean logarithm of
-            those to the baseline's final PSNR, relative to the baseline's total. None unless all
-            of its runs tell.
-        reached: Pairs whose arm reaches the baseline's final PSNR.
+    ``means``: scores (``SCORES``), numbers of Gaussians and seconds of seeding and training; NaN if
+    unknown on some scene. ``gains``: differences of the scores; ``in_time``: PSNR at the seconds at
+    which the baseline ends, less its final PSNR, dB; ``steps`` and ``seconds``: mean logarithm of
+    those to that PSNR, relative to the baseline's total; None unless all runs tell. ``reached``:
+    pairs whose arm reaches that PSNR.
     """
 
     arm: ArmKey
@@ -313,18 +310,12 @@ Place = tuple[StrategyName, str, str]
 
 @dataclass(frozen=True)
 class Comparison:
-    """The comparison of two benchmarks, A and B.
+    """What changed from benchmark A to B, dB: by place, and by arm over the scenes of both.
 
     Runs of the two are not paired, as a seed need not mean the same in another version: the noise
     of each is taken from what its own repeats do (of all arms of a scene together), and the test is
-    Welch's, adjusted after Holm over all changes.
-
-    Args:
-        settings: Settings that differ, with A's value and B's.
-        changes: B less A of each arm on each scene that both have, dB.
-        means: The mean change of each arm over these scenes.
-        only: Arms on scenes that only one has: "A" or "B", strategy, scene and label.
-        notes: What else there is to say, a sentence each.
+    Welch's, adjusted after Holm over all changes. ``settings`` are those that differ, with both
+    values; ``only`` are places of "A" or "B" alone; ``notes`` say the rest.
     """
 
     settings: tuple[tuple[str, str, str], ...]

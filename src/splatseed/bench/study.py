@@ -28,12 +28,10 @@ _COLUMNS = ("strategy", "scene", "seeds", "repeat", "spec", "result")
 class Study:
     """Runs that can be compared: with the same training settings, budget and version.
 
-    Args:
-        settings: These, by name.
-        runs: A row for each run, with the columns strategy, scene, seeds (the variant's label),
-            repeat, spec, result, and those of ``_measures``; NaN where it was not measured.
-        variants: One of each variant's arms by its label, in order, the baseline first.
-        not_finite: Finished runs whose PSNR is infinite or NaN, in words.
+    ``runs`` has a row for each, with the columns strategy, scene, seeds (the variant's label),
+    repeat, spec, result, and those of ``_measures``, NaN where it was not measured; ``variants``
+    one of each variant's arms by its label, in order, the baseline first. ``not_finite``: finished
+    runs whose PSNR is infinite or NaN, in words.
     """
 
     settings: Mapping[str, object]
