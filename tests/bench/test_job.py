@@ -19,7 +19,7 @@ from splatseed.bench.plan import plan_runs
 from splatseed.bench.runs import package_version, read_run, read_runs, run_folder
 from splatseed.cli import main
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
-from splatseed.io import load_scene, write_scene
+from splatseed.io import load_scene
 from splatseed.io.ply import write_ply
 from splatseed.runtime.tasks import HereTasks
 from splatseed.splat.covisible import read_covisible
@@ -72,49 +72,39 @@ def _moved(spec, **changes):
     return dataclasses.replace(spec, scene=dataclasses.replace(spec.scene, **changes))
 
 
-@pytest.mark.parametrize("method", ["sfm", "linear", "depth"])
-def test_seeds_are_those_that_the_command_writes(specs, own_room, tmp_path, method):
+COMMANDS = {
+    "sfm": ["--method", "linear", "--ratio", "1"],
+    "linear": ["--method", "linear", "--ratio", "2"],
+    "depth": ["--method", "depth", "--ratio", "2", "--depth", "DEPTH", "--depth.hold-out", "4"],
+    "cloud": ["--method", "cloud", "--cloud", "SCAN", "--cloud.hold-out", "4"],
+    "cloud+cover": ["--method", "cover", "--cloud", "SCAN", "--cloud.hold-out", "4",
+                    "--cover.hold-out", "4"],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("method", COMMANDS)
+def test_seeds_are_those_that_the_command_writes(small_plan, own_room, tmp_path, method):
     """Also where the cloud has points that are not finite, or twice at one place."""
-    scene = load_scene(own_room)
-    xyz = scene.points.xyz.copy()
+    points, model = load_scene(own_room).points, own_room / "sparse" / "0"
+    xyz = points.xyz.copy()
     xyz[3], xyz[5] = np.nan, xyz[6]
-    spoilt = tmp_path / "spoilt"
-    write_scene(scene, spoilt)
-    for path in (spoilt / "sparse" / "0").glob("points3D.*"):
+    for path in model.glob("points3D.*"):
         path.unlink()
-    write_ply(spoilt / "sparse" / "0" / "points3D.ply", scene.points.replace(xyz=xyz))
-    digest = surveyed(spoilt).digest
-    spec = _moved(specs[method], path=str(spoilt), digest=digest)
-    seeds, seconds = make_seeds(open_unchanged(spec.scene), spec)
-    ratio = "1" if method == "sfm" else "2"
-    words = ["--method", "linear"] if method == "sfm" else ["--method", method]
-    words += ["--depth", str(spec.scene.depth), "--depth.hold-out", "4"] * (method == "depth")
-    main(["upsample", str(spoilt), "-o", str(tmp_path / "out"), "--ratio", ratio, *words])
-    written = load_scene(tmp_path / "out").points
-    assert seeds_digest(seeds) == seeds_digest(written)
-    assert len(seeds) == int(ratio) * (len(xyz) - 2)
-    assert (seconds == 0.0) == (method == "sfm")
-
-
-@pytest.mark.parametrize("method", ["cloud", "cloud+cover"])
-def test_seeds_from_a_scan_are_those_that_the_command_writes(
-    small_plan, room_path, tmp_path, method
-):
-    scan, out = tmp_path / "scan.npz", tmp_path / "out"
-    surfaces = make_capture(0, 3, 32, 32).surfaces
+    write_ply(model / "points3D.ply", points.replace(xyz=xyz))
+    scan, surfaces = tmp_path / "scan.npz", make_capture(0, 3, 32, 32).surfaces
     np.savez(scan, xyz=surfaces.sample(20_000, np.random.default_rng(2)))
+    facts = surveyed(own_room, cloud=scan, with_depth=True)
     plan = dataclasses.replace(small_plan, methods=(method,), repeats=1)
-    (spec,) = plan_runs(plan, [surveyed(room_path, cloud=scan)], "cpu", "1")
-    first, seconds = make_seeds(open_unchanged(spec.scene), spec, bench=tmp_path)
-    again, known = make_seeds(open_unchanged(spec.scene), spec, bench=tmp_path)
-    assert seeds_digest(first) == seeds_digest(again)
-    assert min(seconds, known) > 0
-    words = ["--method", method.removeprefix("cloud+"), "--cloud.hold-out", "4"]
-    words += ["--cover.hold-out", "4"] * (method != "cloud")
-    main(["upsample", str(room_path), "--cloud", str(scan), "-o", str(out), *words])
-    written = load_scene(out).points
-    np.testing.assert_array_equal(first.xyz, written.xyz)
-    np.testing.assert_array_equal(first.rgb, written.rgb)
+    (spec,) = plan_runs(plan, [facts], "cpu", "1")
+    seeds, seconds = make_seeds(open_unchanged(spec.scene), spec)
+    files = {"DEPTH": spec.scene.depth, "SCAN": str(scan)}
+    words = [files.get(word, word) for word in COMMANDS[method]]
+    main(["upsample", str(own_room), "-o", str(tmp_path / "out"), *words])
+    written = load_scene(tmp_path / "out").points
+    np.testing.assert_array_equal(seeds.xyz, written.xyz)
+    np.testing.assert_array_equal(seeds.rgb, written.rgb)
+    assert (seconds == 0.0) == (method == "sfm")
+    assert "cloud" in method or len(seeds) == (1 + (method != "sfm")) * (len(xyz) - 2)
 
 
 def _budgeted(small_plan, room_path, method, budget, strategy="none"):

@@ -58,8 +58,8 @@ def read_plan(path: Path, folder: Path | None = None) -> Plan:
         training = TrainSettings(**{name: values.pop(name) for name in SHARED if name in values})
         return Plan(**values, training=training)
     except ParameterError as error:
-        expected, fix = f"{error.expected} in {path}", "Correct the plan."
-        raise SceneFormatError(expected, found=error.found, fix=fix) from None
+        expected = f"{error.expected} in {path}"
+        raise SceneFormatError(expected, found=error.found, fix=error.fix) from None
 
 
 def plan_text(plan: Plan) -> str:
