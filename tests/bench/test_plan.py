@@ -261,6 +261,7 @@ def test_a_budget_is_the_same_number_for_every_arm_of_a_scene():
         strategies=("default", "grow"), repeats=1, long_side=400,
     )  # fmt: skip
     assert plan.budgets == ("0.25rho", "20000")
+    assert Plan(ratios=(), budgets=("50k", "0.5M", " 1 rho")).budgets == ("50000", "500000", "1rho")
     runs = plan_runs(plan, [FERN, BONSAI], "cpu", "1")
     assert len(runs) == len({run.key for run in runs}) == 2 * 3 * 2 * 2
     numbers = {(run.scene.name, run.arm.budget): run.settings.cap for run in runs}
@@ -271,10 +272,6 @@ def test_a_budget_is_the_same_number_for_every_arm_of_a_scene():
     assert {run.training.data_factor for run in runs} == {2}  # 533 rows become 266
     seeds = {(r.arm.strategy, r.most_seeds) for r in runs if r.scene.name == "fern"}
     assert seeds == {("default", 21_000), ("default", 14_000), ("grow", 30_000), ("grow", 20_000)}
-
-
-def test_budgets_are_told_as_everywhere_else():
-    assert Plan(ratios=(), budgets=("50k", "0.5M", " 1 rho")).budgets == ("50000", "500000", "1rho")
 
 
 ARM = Arm("mls", "default", 8, "none")

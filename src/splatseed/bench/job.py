@@ -164,10 +164,8 @@ def run_away(spec: RunSpec, options: JobOptions) -> tuple[RunResult, dict[str, b
         same, fix = f"splatseed {spec.version} on the node {host}", "Install it on every node."
         raise ParameterError(same, found=here or "none", fix=fix)
     if not Path(spec.scene.path).exists():
-        there, fix = (
-            f"the scene {spec.scene.path} on the node {host}",
-            "Share the disk, or copy it.",
-        )
+        fix = "Every node must have the scenes at the same path: share the disk, or copy them."
+        there = f"the scene {spec.scene.path} on the node {host}"
         raise SceneNotFoundError(there, found="no such folder", fix=fix)
     with tempfile.TemporaryDirectory(prefix="splatseed-", ignore_cleanup_errors=True) as temporary:
         result = run_job(spec, options, Path(temporary))
@@ -223,11 +221,9 @@ def open_unchanged(facts: SceneFacts) -> Scene:
     scene = open_scene(facts)
     now = fingerprints(scene, facts.depth, facts.cloud)
     if now != {name: getattr(facts, name) for name in now}:
-        raise SceneFormatError(
-            f"the files of {facts.path} as they were when the benchmark was planned",
-            found="other points, cameras, photographs, depth maps or scan",
-            fix="Start the benchmark again, which plans anew; or put them back.",
-        )
+        expected = f"the files of {facts.path} as they were when the benchmark was planned"
+        fix = "Start the benchmark again, which plans anew; or put them back."
+        raise SceneFormatError(expected, found="others", fix=fix)
     return scene
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any, Self, get_args
@@ -37,6 +38,7 @@ SHARED = tuple(
 """Settings that all runs of a plan share; arms and repeats determine the others."""
 _WHAT = ("name", "digest", "depth_digest", "cloud_digest")
 """What of a scene determines results; the rest says where it lies, or follows from it."""
+_LISTS = ("methods", "strategies", "profiles", "ratios", "budgets")
 _DEFAULT = TrainSettings()
 _GROWTH = 3.0
 """Gaussians at the end of a run per seed, with densification and without a cap: a guess."""
@@ -252,13 +254,15 @@ class Plan:
                 if each not in choices:
                     fix = did_you_mean(each, choices).strip() or SEE
                     raise ParameterError(f"{name} among {', '.join(choices)}", found=each, fix=fix)
-        for name in ("methods", "strategies", "profiles", "ratios", "budgets"):
-            _check_distinct(name, getattr(self, name))
-        _check_distinct("scenes", [each.label for each in self.scenes])
+        lists: dict[str, Any] = {name: getattr(self, name) for name in _LISTS}
+        for name, given in {**lists, "scenes": [each.label for each in self.scenes]}.items():
+            for each, times in Counter(given).items():
+                if times > 1:
+                    fix = "Drop one, or give scenes names in a plan (see --dry-run)."
+                    raise ParameterError(f"{name} that differ", found=f"{each} twice", fix=fix)
         training, long_side = self.training, self.long_side
         for fits, expected, found in (
-            *((getattr(self, name), f"{name} of at least one", "none")
-              for name in ("methods", "strategies", "profiles")),
+            *((lists[name], f"{name} of at least one", "none") for name in _LISTS[:3]),
             (self.ratios or self.budgets, "ratios of at least one", "none"),
             (all(1 < each < math.inf for each in self.ratios),
              "ratios above 1 (points in all, per original)", self.ratios),
@@ -361,10 +365,3 @@ def _budget(given: object) -> str:
     if number < 2:
         raise ParameterError("budgets of at least 2 Gaussians", found=f"{given}", fix=SEE)
     return f"{number}"
-
-
-def _check_distinct(name: str, given: Sequence[object]) -> None:
-    twice = next((each for i, each in enumerate(given) if each in given[:i]), None)
-    if twice is not None:
-        fix = "Give names to scenes in a plan (see --dry-run)." if name == "scenes" else "Drop one."
-        raise ParameterError(f"{name} that differ", found=f"{twice} twice", fix=fix)

@@ -63,11 +63,10 @@ def _read(folder: Path, spec: RunSpec | None = None) -> Run:
                     return Run(own, error=str(content["error"]))
                 return Run(own, RunResult.from_dict(content["result"]))
             except (ValueError, KeyError, TypeError, AttributeError) as error:
-                raise SceneFormatError(
-                    f"{folder / name} as this version of splatseed writes it",
-                    found=f"another layout ({type(error).__name__}: {error})",
-                    fix="Remove that folder to have its run repeated, or begin a new benchmark.",
-                ) from None
+                expected = f"{folder / name} as this version of splatseed writes it"
+                found = f"another layout ({type(error).__name__}: {error})"
+                fix = "Remove that folder to have its run repeated, or begin a new benchmark."
+                raise SceneFormatError(expected, found=found, fix=fix) from None
     assert spec is not None  # noqa: S101  (folders are listed by these files)
     return Run(spec)
 
@@ -95,9 +94,8 @@ def counts(runs: Sequence[Run]) -> str:
     failed = sum(bool(run.error) for run in runs)
     left = len(runs) - done - failed
     kinds = {"done": done, "failed": failed, "to do": left if done or failed else 0}
-    return ", ".join(
-        [counted(len(runs), "run"), *(f"{n:,} {kind}" for kind, n in kinds.items() if n)]
-    )
+    told = [f"{number:,} {kind}" for kind, number in kinds.items() if number]
+    return ", ".join([counted(len(runs), "run"), *told])
 
 
 def check_bench_folder(folder: Path, verb: str, protect: Sequence[Path]) -> None:
@@ -169,13 +167,5 @@ def package_version(package: str) -> str:
 
 def estimate(specs: Sequence[RunSpec], runs: Iterable[Run], threads: int) -> float:
     """Seconds of runs one after another, each on so many threads, at the pace of finished ones."""
-    paces: dict[tuple[str, str], list[float]] = {}
-    for run in runs:
-        if run.result is not None:
-            pace = run.result.wall_seconds / run.spec.seconds(threads)
-            paces.setdefault((run.spec.scene.digest, run.spec.arm.strategy), []).append(pace)
-    whole = [pace for each in paces.values() for pace in each] or [1.0]
-    return sum(
-        median(paces.get((spec.scene.digest, spec.arm.strategy), whole)) * spec.seconds(threads)
-        for spec in specs
-    )
+    paces = [run.result.wall_seconds / run.spec.seconds(threads) for run in runs if run.result]
+    return median(paces or [1.0]) * sum(spec.seconds(threads) for spec in specs)

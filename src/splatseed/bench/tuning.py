@@ -97,9 +97,7 @@ def plan_rungs(
     if fitting:
         return rungs(longer[fitting - 1])
     if (needed := cost(rungs(low))) > _OVERTIME * seconds:
-        least = (
-            f"--minutes {math.ceil(needed / 60)} or more, for all arms to have as many Gaussians"
-        )
+        least = f"--minutes {math.ceil(needed / 60)} or more, as fewer steps cannot be compared"
         fix = "Give it more time, or name fewer --methods or --strategies."
         raise ParameterError(least, found=f"--minutes {seconds / 60:g}", fix=fix)
     return rungs(low)

@@ -187,11 +187,9 @@ def _changed(plan: Plan, options: Options) -> Plan:
         return {n: value for n in names if (value := getattr(options, n)) not in (None, ())}
 
     training = replace(plan.training, **given("max_steps", "data_factor"))
-    changes = given(
-        "methods", "ratios", "budgets", "strategies", "profiles", "repeats", "long_side"
-    )
-    if options.budgets and not options.ratios:
-        changes["ratios"] = ()
+    changes = given("methods", "budgets", "strategies", "profiles", "repeats", "long_side")
+    if options.budgets or options.ratios:
+        changes["ratios"] = options.ratios
     scenes = [PlannedScene(path) for path in options.scenes] or list(plan.scenes)
     labels = Counter(scene.label for scene in scenes)
     for i, scene in enumerate(scenes):  # folders of the same name are told apart by their parents
@@ -295,12 +293,9 @@ def _prepare(
     fix = "Name other methods, or what these need."
     refuse((not specs, "a plan with runs", "; ".join(notes) or "none", fix))
     if machine.backend == "cpu" and not machine.away:  # the memory of a cluster's nodes is unknown
-        check_memory(
-            int(max(spec.gaussians[0] for spec in specs)),
-            BYTES_EACH * machine.jobs,
-            f"seeds per run with {machine.jobs} at a time",
-            fix="Pass smaller --ratios or --budgets, or fewer --jobs.",
-        )
+        most, jobs = int(max(spec.gaussians[0] for spec in specs)), machine.jobs
+        fix = "Pass smaller --ratios or --budgets, or fewer --jobs."
+        check_memory(most, BYTES_EACH * jobs, f"seeds per run with {jobs} at a time", fix=fix)
     return plan, scenes, specs, notes
 
 
@@ -479,11 +474,9 @@ def _compare(arguments: list[str]) -> None:
         check_output(options.output, **written)
     comparison = compare(read_runs(options.a), read_runs(options.b))
     if comparison is None:
-        raise SceneNotFoundError(
-            f"finished runs in both {options.a} and {options.b}",
-            found="none in one of them",
-            fix="Let splatseed bench finish some.",
-        )
+        expected = f"finished runs in both {options.a} and {options.b}"
+        fix = "Let splatseed bench finish some."
+        raise SceneNotFoundError(expected, found="none in one of them", fix=fix)
     tables = comparison_tables(comparison)
     for table in tables:
         if table.rows:
