@@ -22,7 +22,12 @@ from jaxtyping import Bool, Float64, UInt8
 
 from splatseed.camera import Camera
 from splatseed.errors import OutputError, ParameterError, SceneFormatError, SceneNotFoundError
-from splatseed.io.photograph import decode_photograph, open_photograph, photograph_bytes
+from splatseed.io.photograph import (
+    decode_photograph,
+    open_photograph,
+    photograph_bytes,
+    photograph_folder,
+)
 from splatseed.io.staging import atomic_file
 from splatseed.lens import undistort_first
 from splatseed.progress import Progress, silent
@@ -128,13 +133,7 @@ def load_views(
         SceneNotFoundError: An image is missing.
         SceneFormatError: A camera has distortion that is not removed, or an image is unusable.
     """
-    folder = scene.source.image_dir if scene.source else None
-    if folder is None:
-        raise SceneNotFoundError(
-            "a folder with the scene's photographs",
-            found="none",
-            fix="Put them beside the model in a folder named images.",
-        )
+    folder = photograph_folder(scene)
     for image in images if not undistort else ():
         check_lens(image, scene.source.root if scene.source else None)
     if images:
