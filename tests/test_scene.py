@@ -33,7 +33,7 @@ def scene(rng):
 def test_the_split_takes_every_eighth_name(count, rng):
     names = [f"{i:03d}.jpg" for i in range(count)]
     images = tuple(_image(names[i]) for i in rng.permutation(count))
-    train, test = Scene(PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.uint8)), images).split()
+    train, test = Scene(PointCloud.empty(), images).split()
     assert [image.name for image in test] == names[::8]
     assert sorted(image.name for image in train + test) == names
     assert [image.name for image in train] == sorted(image.name for image in train)

@@ -101,12 +101,6 @@ class Intrinsics:
 class Camera:
     """A pinhole camera with its pose.
 
-    Args:
-        K: Pinhole matrix in pixels, [3, 3].
-        width: Image width in pixels.
-        height: Image height in pixels.
-        cam_from_world: World to OpenCV camera axes, [4, 4].
-
     Example:
         >>> import numpy as np
         >>> K = np.array([[100.0, 0, 50], [0, 100.0, 40], [0, 0, 1]])
@@ -116,10 +110,10 @@ class Camera:
         ([[50.0, 40.0]], [2.0])
     """
 
-    K: Float64[np.ndarray, "3 3"]
-    width: int
+    K: Float64[np.ndarray, "3 3"]  # in pixels
+    width: int  # pixels
     height: int
-    cam_from_world: Float64[np.ndarray, "4 4"]
+    cam_from_world: Float64[np.ndarray, "4 4"]  # world to OpenCV camera axes
 
     @property
     def world_from_cam(self) -> Float64[np.ndarray, "4 4"]:

@@ -119,9 +119,8 @@ def stage_display(
 ) -> Iterator[StageClock]:
     """Show progress bars on stderr while the block runs; print to stdout only outside the block.
 
-    Args:
-        clock: A clock that was shown before, to resume; a new one when left out.
-        remaining: Whether to show the time left too, for stages that take minutes.
+    A ``clock`` that was shown before goes on; ``remaining`` shows the time left, too, for stages
+    that take minutes.
     """
     clock = StageClock() if clock is None else clock
     named, left = (

@@ -152,29 +152,17 @@ class LeftOut(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A capture: points, and the images and cameras that saw them.
-
-    Args:
-        points: The cloud.
-        images: The posed images, in file order; empty for a bare cloud.
-        intrinsics: All camera records of the file, including unused ones.
-        tracks: Tracks of the first ``len(tracks)`` points, which are the originals.
-        source: Where it was read from; None for a scene made in memory.
-        warnings: What the reader repaired or found odd, one sentence each.
-        depths: Depth maps of some images, read on demand; None if there are none.
-        listed: The split given by lists beside the scene; None without such lists.
-        left_out: How many points of its files were left out.
-    """
+    """A capture: points, and the images and cameras that saw them."""
 
     points: PointCloud
-    images: tuple[Image, ...] = ()
-    intrinsics: tuple[Intrinsics, ...] = ()
-    tracks: Tracks | None = None
-    source: SceneSource | None = None
-    warnings: tuple[str, ...] = field(default=())
-    depths: DepthMaps | None = None
-    listed: Split | None = None
-    left_out: LeftOut = field(default_factory=LeftOut)
+    images: tuple[Image, ...] = ()  # in file order; none for a bare cloud
+    intrinsics: tuple[Intrinsics, ...] = ()  # all camera records of the file, including unused ones
+    tracks: Tracks | None = None  # of the first ``len(tracks)`` points, which are the originals
+    source: SceneSource | None = None  # where it was read from; None for a scene made in memory
+    warnings: tuple[str, ...] = ()  # what the reader repaired or found odd, one sentence each
+    depths: DepthMaps | None = None  # of some images, read on demand
+    listed: Split | None = None  # the split given by lists beside the scene
+    left_out: LeftOut = field(default_factory=LeftOut)  # how many points of its files were
 
     def replace(self, **changes: Any) -> Scene:
         """A copy with some fields replaced.

@@ -30,13 +30,11 @@ from splatseed.similarity import fit_similarity
 
 pycolmap = pytest.importorskip("pycolmap")
 
-EMPTY = PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
-
 
 @pytest.fixture(scope="module")
 def posed(room):
     """Six neighbouring views of the room, without points."""
-    return Scene(EMPTY, room.images[:6], room.intrinsics)
+    return Scene(PointCloud.empty(), room.images[:6], room.intrinsics)
 
 
 @pytest.fixture(scope="module")
@@ -115,7 +113,10 @@ def test_a_known_lens_is_believed_and_triangulation_repeats_itself(posed, photos
     cancel = (0.0, 0.0, 0.0, 0.0, 1.2, 0.0, 0.0, 1.2)  # the rational model's k3 = k6
     lens = Intrinsics(7, "FULL_OPENCV", 320, 240, (*posed.intrinsics[0].params, *cancel))
     images = tuple(replace(image, intrinsics=lens) for image in posed.images[:4])
-    scene, settings = Scene(EMPTY, images, (lens,)), Settings(seed=3, max_image_size=240)
+    scene, settings = (
+        Scene(PointCloud.empty(), images, (lens,)),
+        Settings(seed=3, max_image_size=240),
+    )
     first, second = (
         reconstruct(photos, tmp_path / name, settings, poses_from=scene)
         for name in ("first", "second")

@@ -227,14 +227,10 @@ def measure(
     surface_samples: Float[np.ndarray, "S 3"],
     h: float,
 ) -> GeometryScore:
-    """Compare points with known surfaces.
+    """Compare new points with known surfaces, which have ``distance(xyz)``.
 
-    Args:
-        new_xyz: The new points; the originals, to score only these.
-        all_xyz: The whole cloud: originals first, the new points last.
-        surfaces: The ground truth: anything with ``distance(xyz)``.
-        surface_samples: Points spread evenly on the surfaces.
-        h: The unit of the result, usually ``spacing(originals)``.
+    The whole cloud has originals first, the new points last; to score originals alone, pass them as
+    new. Samples lie evenly on the surfaces. The unit h is usually ``spacing(originals)``.
 
     Raises:
         PointCloudError: There are no points, or ``h`` is not positive.

@@ -119,14 +119,9 @@ def load_views(
 ) -> tuple[View, ...]:
     """The views of some of a scene's images, in their order.
 
-    Args:
-        scene: Their scene, for its folder.
-        images: The images.
-        data_factor: The factor by which photographs are downsampled.
-        min_side: The least number of pixels of a view's shorter side.
-        undistort: Remove lens distortion instead of refusing it.
-        cache_dir: Where smaller copies are kept for the next run, if anywhere.
-        progress: Called with the stage and the fraction done.
+    Photographs are downsampled by ``data_factor``, to ``min_side`` pixels a side at least, and
+    smaller copies kept in ``cache_dir``, if there is one. ``undistort`` removes lens distortion
+    instead of refusing it.
 
     Raises:
         ParameterError: They do not fit into memory all together.

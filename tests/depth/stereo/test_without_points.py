@@ -24,8 +24,7 @@ from .made import arc, photograph, relative_error, tilted_plane, true_depth
 
 
 def bare(scene):
-    none = PointCloud(np.empty((0, 3), np.float32), np.empty((0, 3), np.uint8))
-    return scene.replace(points=none, tracks=None)
+    return scene.replace(points=PointCloud.empty(), tracks=None)
 
 
 def test_coarse_stereo_finds_points_on_the_surface(ball):
