@@ -42,19 +42,12 @@ def model(rng) -> Model:
     )
     images = []
     for i, (image_id, slot) in enumerate(zip(image_ids.tolist(), slots, strict=True)):
-        observed = np.full(12, -1)
-        observed[slot] = point_ids
-        quat = rng.normal(size=4)
-        images.append(
-            Image(
-                name=f"left/image{i:03d}.jpg",
-                image_id=image_id,
-                intrinsics=intrinsics[i % 2],
-                quat=quat / np.linalg.norm(quat),
-                translation=rng.normal(size=3),
-                observations=Observations(640 * rng.random((12, 2)), observed),
-            )
-        )
+        name, lens = f"left/image{i:03d}.jpg", intrinsics[i % 2]
+        seen = Observations(640 * rng.random((12, 2)), np.full(12, -1))
+        seen.point_ids[slot] = point_ids
+        quat, translation = rng.normal(size=4), rng.normal(size=3)
+        quat /= np.linalg.norm(quat)
+        images.append(Image(name, image_id, lens, quat, translation, seen))
     points = PointCloud(tracks.xyz, rng.integers(0, 256, (10, 3)).astype(np.uint8))
     return Model(intrinsics, tuple(images), points, tracks)
 
@@ -73,11 +66,10 @@ def scene_dir(tmp_path, model) -> Path:
     root = tmp_path / "scene"
     (root / "sparse" / "0").mkdir(parents=True)
     written(root / "sparse/0", model)
+    (root / "images/left").mkdir(parents=True)
     for image in model.images:
-        path = root / "images" / image.name
-        path.parent.mkdir(parents=True, exist_ok=True)
         size = (image.intrinsics.width, image.intrinsics.height)
-        PilImage.new("RGB", size, "teal").save(path)
+        PilImage.new("RGB", size, "teal").save(root / "images" / image.name)
     return root
 
 
@@ -89,8 +81,7 @@ def target(tmp_path_factory) -> Path:
 
 class CloudFiles(NamedTuple):
     folder: Path
-    xyz: np.ndarray
-    """[60, 3], of 3 decimals."""
+    xyz: np.ndarray  # [60, 3], of 3 decimals
     rgb: np.ndarray
 
 

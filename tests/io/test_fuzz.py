@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import struct
 from contextlib import suppress
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -15,12 +16,11 @@ from hypothesis import HealthCheck, given, settings, strategies as st
 from PIL import Image as PilImage
 
 from splatseed.errors import SceneFormatError, SplatseedError
-from splatseed.io import colmap
 from splatseed.io.depth_files import read_stored
 from splatseed.io.ply import write_ply
 
-from .checks import READERS, assert_only_our_errors, damages, drain, read_images
-from .conftest import CLOUDS
+from .checks import READERS, assert_only_our_errors, damages, drain
+from .conftest import CLOUDS, Model, written
 
 TEXT = (".txt", "ascii.ply")
 WORDS = st.sampled_from(
@@ -68,11 +68,10 @@ def valid(tmp_path_factory) -> dict[str, bytes]:
     (folder / "cameras.txt").write_text(cameras)
     (folder / "images.txt").write_text(image)
     (folder / "points3D.txt").write_text("9 1 2 3 4 5 6 .5 3 1\n12 1 nan 3 4 5 6 -1\n")
-    points, tracks = colmap.read_points3d(folder / "points3D.txt")
-    colmap.write_cameras(folder / "cameras.bin", colmap.read_cameras(folder / "cameras.txt"))
-    colmap.write_images(folder / "images.bin", read_images(folder / "images.txt"))
-    colmap.write_points3d(folder / "points3D.bin", points, tracks)
-    write_ply(folder / "little.ply", points)
+    names = ("cameras.txt", "images.txt", "points3D.txt")
+    cameras, images, points = (READERS[name](folder / name) for name in names)
+    written(folder, Model(cameras, images, *points))
+    write_ply(folder / "little.ply", points[0])
     faces = b"\x03" + np.array([0, 1, 1], ">i4").tobytes()
     head = MESH.format(form="binary_big_endian").encode()
     body = np.array([(1, 2, 3, 200, 3, 4)] * 2, ROW).tobytes()
@@ -183,17 +182,9 @@ def test_a_header_of_a_cloud_is_not_believed(name, lie, clouds, tmp_path):
         drain(tmp_path / name)
 
 
-def test_a_panic_of_lazrs_is_an_error_of_ours(clouds, tmp_path, monkeypatch):
+def test_a_panic_of_lazrs_is_an_error_of_ours(cloud_files, monkeypatch):
     """pyo3 raises what is no Exception."""
-    import laspy
-
-    panic = type("PanicException", (BaseException,), {})
-
-    def panicked(*_):
-        raise panic("index out of bounds")
-
-    monkeypatch.setattr(laspy.LasReader, "read_points", panicked)
-    path = tmp_path / "a.laz"
-    path.write_bytes(clouds["a.laz"])
+    panic = type("PanicException", (BaseException,), {})("index out of bounds")
+    monkeypatch.setattr("laspy.LasReader.read_points", Mock(side_effect=panic))
     with pytest.raises(SplatseedError, match="index out of bounds"):
-        drain(path)
+        drain(cloud_files.folder / "a.laz")

@@ -24,12 +24,10 @@ def test_where_nothing_answers_is_no_cluster(address, monkeypatch):
         with pytest.raises(ParameterError, match="no answer there") as caught:
             ray_cluster(address).__enter__()
     assert address in str(caught.value)
-
-
-@pytest.mark.parametrize("address", ["nonsense", "host:port"])
-def test_what_is_no_address_is_said_by_ray(address):
-    with pytest.raises(ParameterError, match="a Ray cluster at"), ray_cluster(address):
-        pass
+    monkeypatch.undo()
+    for word in ("nonsense", "host:port"):  # Ray itself says that these are none
+        with pytest.raises(ParameterError, match="a Ray cluster at"):
+            ray_cluster(word).__enter__()
 
 
 @pytest.mark.slow
