@@ -194,7 +194,7 @@ def test_a_path_through_nerfstudios_world_needs_its_transform(
     renderer = ModelRenderer(gaussians, stage_frame(Shown("", None, gaussians)))
     wanted = renderer.color(poses_of([load_scene(room).images[3]])[0])
     shown = _frames(tmp_path / "flight.mp4")[0][0] / 255
-    assert np.abs(shown - wanted).mean() < 0.03
+    assert np.abs(shown - wanted).mean() < 0.01  # mirrored, it would be 0.02
     said = splatseed(*words, "--transform", "none", "--depth", "--overwrite")
     assert said.code == 0, said.err
     depth, fps = _frames(tmp_path / "flight.mp4")
