@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import fcntl
-import json
 import os
 import re
 import shutil
@@ -22,7 +21,7 @@ pytest.importorskip("gsplat", reason="training needs gsplat's strategies")
 
 from splatseed import synthetic
 from splatseed.bench.plan_file import plan_text, read_plan
-from splatseed.bench.runs import read_calls, read_runs
+from splatseed.bench.runs import begin, read_calls, read_runs
 from splatseed.bench.scenes import DEMO, PlannedScene, survey
 from splatseed.commands import bench as command
 from splatseed.io import load_scene
@@ -183,12 +182,9 @@ def test_the_quick_preset_makes_its_own_scene_once(bench, tmp_path, monkeypatch)
 
 def test_a_dry_run_of_the_quick_preset_loads_nothing_heavy():
     """It takes a second; to make the room and to import PyTorch took over a minute."""
-    code = (
-        "import sys; from splatseed.cli import main; main(['bench', '--preset', 'quick', "
-        "'--dry-run']);"
-        "print(*sys.modules)"
-    )
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    code = f"{COMMAND[2]}; print(*sys.modules)"
+    words = [sys.executable, "-c", f"import sys; {code}", "bench", "--preset", "quick", "--dry-run"]
+    run = subprocess.run(words, capture_output=True, text=True, check=True)
     loaded = set(run.stdout.splitlines()[-1].split())
     assert "# 12 runs" in run.stdout
     assert not {"torch", "matplotlib", "splatseed.synthetic"} & loaded
@@ -204,14 +200,11 @@ def test_a_dry_run_of_the_quick_preset_loads_nothing_heavy():
         (("-o", "B", "--scenes", "ROOM", "--address", "auto"), "--executor ray"),
         (("-o", "B", "--scenes", "ROOM", "--methods", "depth", "--depth", "a", "b"), "--depth"),
         (("-o", "ROOM/B", "--scenes", "ROOM"), "apart from the input"),
-        (("-o", "FULL", "--scenes", "ROOM"), "did not write"),
-        (("-o", "ROOM", "--scenes", "demo:"), "ROOM"),
         (("-o", "B", "--preset", "mipnerf360"), "--data"),
-        (("-o", "B", "--preset", "replica", "--data", "FULL"), "office0 is left out"),
-        (("-o", "B", "--preset", "replica", "--data", "FULL", "--scenes", "ROOM"), "--scenes"),
+        (("-o", "B", "--preset", "replica", "--data", "TUNED"), "office0 is left out"),
+        (("-o", "B", "--preset", "replica", "--data", "TUNED", "--scenes", "ROOM"), "--scenes"),
         (("-o", "B", "--preset", "quick", "--plan", "x.toml"), "both"),
-        (("-o", "B", "--data", "FULL"), "--preset"),
-        (("-o", "B", "--plan", "lpips.toml"), "checkpoints"),
+        (("-o", "B", "--data", "TUNED"), "--preset"),
         (("--dry-run", "--plan", "lpips.toml"), "LPIPS"),
         (("-o", "TUNED", "--scenes", "ROOM"), "splatseed tune wrote"),
     ],
@@ -220,12 +213,9 @@ def test_bad_words_are_refused_and_nothing_is_written(
     bench, room_path, tmp_path, monkeypatch, words, said
 ):
     monkeypatch.chdir(tmp_path)
-    for name in ("FULL", "TUNED"):
-        (tmp_path / name).mkdir()
-    (tmp_path / "FULL" / "thesis.txt").write_text("keep")
-    (tmp_path / "TUNED" / "splatseed.json").write_text(json.dumps({"command": "tune"}))
+    begin(tmp_path / "TUNED", "tune", [], [])
     (tmp_path / "lpips.toml").write_text(f"lpips = true\n[[scenes]]\npath = '{room_path}'\n")
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "FULL"))
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     before = sorted(tmp_path.rglob("*"))
     words = [word.replace("ROOM", str(room_path)) for word in words]
     code, out, err = bench(*words)
