@@ -47,17 +47,11 @@ def test_from_end_to_end(ply, tmp_path):
     assert (run.returncode, said) == (0, [])
     assert "600" in run.stdout
     assert (tmp_path / "out/sparse/0/points3D.bin").is_file()
-    run = _run("info", tmp_path / "out", text=True)
-    assert (run.returncode, run.stderr) == (0, "")
-    assert re.search(r"points +600\n", run.stdout)
-    run = _run("upsample", ply, "-o", tmp_path / "more", "--ratio", "0.5", text=True)
-    assert (run.returncode, run.stdout) == (2, "")
-    assert re.fullmatch(r"error: expected .*; found .*\n", run.stderr)
 
 
 def test_a_terminal_sees_progress_and_stdout_does_not(ply, tmp_path):
     master, terminal = pty.openpty()
-    words = [*COMMAND, "upsample", str(ply), "-o", str(tmp_path / "out"), "--ratio", "500"]
+    words = [*COMMAND, "upsample", str(ply), "-o", str(tmp_path / "out"), "--ratio", "100"]
     # A bar needs a terminal that can move its cursor, which the test's own may not be.
     environment = os.environ | {"TERM": "xterm"}
     with subprocess.Popen(

@@ -72,22 +72,16 @@ def _start(environment):
 
 def test_processes_that_come_at_once_build_once(machine, tmp_path):
     _stand_in(tmp_path)
-    ended = [each.communicate() for each in [_start(machine) for _ in range(3)]]
+    ended = [each.communicate() for each in [_start(machine) for _ in range(2)]]
     assert not any(err for _, err in ended), ended
     assert len(list((tmp_path / "built/gsplat_cuda").glob("built-by-*"))) == 1
     said = [out.strip() for out, _ in ended]
-    assert sorted(said) == ["", "", "building gsplat's kernels, some minutes, once"]
+    assert sorted(said) == ["", "building gsplat's kernels, some minutes, once"]
 
 
-@pytest.mark.parametrize(
-    ("nvcc", "said"), [(True, "nvcc fatal : no such thing"), (False, "found no nvcc")]
-)
-def test_a_build_that_cannot_be_is_one_sentence(machine, tmp_path, nvcc, said):
+def test_a_build_that_fails_is_one_sentence(machine, tmp_path):
     _stand_in(tmp_path, fails=True)
-    if not nvcc:
-        (tmp_path / "tools/nvcc").unlink()
     out, err = _start(machine).communicate()
     assert not err
-    assert said in out
+    assert "nvcc fatal : no such thing" in out
     assert "--backend cpu" in out
-    assert (tmp_path / "built").exists() == nvcc
