@@ -11,9 +11,10 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from splatseed.commands.options import refuse
 from splatseed.commands.upsample import output
 from splatseed.console import OUT, StageClock, print_note, stage_display
-from splatseed.errors import OutputError, ParameterError, PointCloudError, SceneFormatError
+from splatseed.errors import OutputError, PointCloudError, SceneFormatError
 from splatseed.io import WriteReport, load_originals, write_scene
 from splatseed.io.clouds import open_cloud
 from splatseed.io.colmap import find_model
@@ -36,16 +37,13 @@ MEMORY = 4 << 30
 """Bytes that may be used where neither user nor system says."""
 READ = 2.5
 """Bytes that a scene takes for each byte of COLMAP's files."""
+IN_TILES = "linear, triangle, spline, mls, random"
+"""Methods that need a point's surroundings alone, or none."""
 NOT_IN_TILES = {
-    "budget": "--budget",
-    "cover_cell": "--cover",
-    "verify": "--verify",
-    "refine_poses": "--refine-poses",
-    "preview": "--preview",
-    "gaussians": "--gaussians",
-    "depth_maps": "--depth",
+    "budget": "--budget", "cover_cell": "--cover", "verify": "--verify", "preview": "--preview",
+    "refine_poses": "--refine-poses", "gaussians": "--gaussians", "depth_maps": "--depth",
     "cloud_files": "--cloud",
-}
+}  # fmt: skip
 """Options that need all points in memory, by field."""
 
 
@@ -93,14 +91,13 @@ def _check_model(path: Path, bound: int | None) -> None:
         return
     files = [model / f"{each}{end}" for each in ("images", "points3D") for end in (".bin", ".txt")]
     needed = PROCESS + round(READ * sum(each.stat().st_size for each in files if each.is_file()))
-    if needed > bound:
-        raise ParameterError(
-            f"at least {words_of(needed, up=True)} of memory for the points and tracks of {path}, "
-            "which are read whole",
-            found=words_of(bound),
-            fix=f"Pass {option_of(needed)}; or name a file of its points alone, such as "
-            "points3D.ply.",
-        )
+    least = words_of(needed, up=True)
+    refuse(
+        (needed > bound,
+         f"at least {least} of memory for the points and tracks of {path}, which are read whole",
+         words_of(bound),
+         f"Pass {option_of(needed)}; or name a file of its points alone, such as points3D.ply."),
+    )  # fmt: skip
 
 
 def _needed(options: Options, method: Upsampler, count: int) -> int:
@@ -185,31 +182,24 @@ def _check_tileable(options: Options, method: Upsampler, source: Source) -> None
     elif not _asks_for_tiles(options) and options.memory is None:
         needed = words_of(_needed(options, method, source.count or 0), up=True)
         in_memory = f"use a machine with {needed} of free memory"
-    if given := [flag for name, flag in NOT_IN_TILES.items() if getattr(options, name)]:
-        raise ParameterError(
-            "no option that looks at all points at once while a cloud is worked on in tiles",
-            found=", ".join(given),
-            fix=f"Leave it out (fewer points: --ratio or --num-points), or {in_memory}.",
-        )
+    given = [flag for name, flag in NOT_IN_TILES.items() if getattr(options, name)]
     read = source.scene.source.format if source.scene.source is not None else "ply"
-    if options.format == "transforms" and read != "transforms":
-        raise ParameterError(
-            "--format colmap or auto for a cloud in tiles, whose points are not turned",
-            found="transforms",
-            fix="Leave --format out.",
-        )
-    if not isinstance(method, NearestMethod | BoundingBox):
-        found = "which needs the whole scene at once"
-    elif isinstance(method, NearestMethod) and (reason := method.untileable_reason):
-        found = f"with {reason}, which needs all points at once"
-    else:
-        return
-    raise ParameterError(
-        "a method that works tile by tile: linear, triangle, spline, mls, random, or voronoi "
-        "with --profile default",
-        found=f"{options.method}, {found}",
-        fix=f"Choose one of these, or {in_memory}.",
-    )
+    needs = "" if isinstance(method, BoundingBox) else ", which needs the whole scene at once"
+    if isinstance(method, NearestMethod):
+        reason = method.untileable_reason
+        needs = f" with {reason}, which needs all points at once" if reason else ""
+    refuse(
+        (given, "no option that looks at all points at once while a cloud is worked on in tiles",
+         ", ".join(given),
+         f"Leave it out (fewer points: --ratio or --num-points), or {in_memory}."),
+        (options.format == "transforms" and read != "transforms",
+         "--format colmap or auto for a cloud in tiles, whose points are not turned",
+         "transforms", "Leave --format out."),
+        (needs,
+         f"a method that works tile by tile: {IN_TILES}, or voronoi with --profile default",
+         f"{options.method}{needs}",
+         f"Choose one of these, or {in_memory}."),
+    )  # fmt: skip
 
 
 def _write(
