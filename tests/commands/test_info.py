@@ -228,18 +228,6 @@ def test_a_scenes_own_maps_are_counted_and_can_be_lifted(rgbd, tmp_path, splatse
 # What splatseed wrote -----------------------------------------------------------------------------
 
 
-def test_points_of_a_seeded_scene_are_no_problem_for_being_isolated(room, tmp_path, splatseed):
-    scene = load_scene(room)
-    far = scene.points.xyz.copy()
-    far[:40] += 100 * np.arange(1, 41)[:, None]
-    scene = scene.replace(points=scene.points.replace(xyz=far), tracks=None)
-    write_scene(scene, tmp_path / "plain", provenance={})
-    assert "are isolated" in splatseed("info", tmp_path / "plain").out
-    seeds = upsample(scene, "linear", ratio=2)
-    write_scene(scene.replace(points=seeds), tmp_path / "out", provenance={"command": "upsample"})
-    assert "are isolated" not in splatseed("info", tmp_path / "out").out
-
-
 def test_a_run_is_told_from_a_scene(tmp_path, splatseed):
     RunFolder(tmp_path / "run").begin({"splatseed": "1", "scene": "/data/fox"})
     run = splatseed("info", tmp_path / "run")
@@ -251,15 +239,21 @@ def test_a_run_is_told_from_a_scene(tmp_path, splatseed):
 
 def test_a_seeded_scene_is_to_be_trained_and_not_seeded_again(room, tmp_path, splatseed):
     scene, path = load_scene(room), tmp_path / "my seeds"
+    far = scene.points.xyz.copy()
+    far[:40] += 100 * np.arange(1, 41)[:, None]
+    scene = scene.replace(points=scene.points.replace(xyz=far), tracks=None)
+    write_scene(scene, tmp_path / "plain", provenance={})
+    plain = splatseed("info", tmp_path / "plain").out
+    assert "are isolated" in plain
     seeds = upsample(scene, "linear", ratio=4)
     write_scene(scene.replace(points=seeds), path, provenance={"command": "upsample"})
     run = splatseed("info", path)
     assert (run.code, run.err) == (0, "")
-    assert "train it" in run.out
+    assert "are isolated" not in run.out
+    assert _pairs(run.out)["isolated"] == _pairs(plain)["isolated"]
     assert "made 1,392 of its points and kept 464" in run.out
     assert run.out.rstrip().endswith(f"splatseed train '{path}' -o RUN")
     assert "upsampl" not in run.out.replace("splatseed upsample made", "")
-    assert _pairs(run.out)["isolated"] == _pairs(splatseed("info", room).out)["isolated"]
 
 
 # Poses --------------------------------------------------------------------------------------------

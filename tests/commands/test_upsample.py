@@ -430,7 +430,6 @@ def test_recentring_moves_scene_and_cloud_alike(splatseed, room, xyz, surfaces, 
 
 SPOILT = {
     r"scan\.npz to be an archive of NumPy arrays": lambda xyz: xyz,  # cut short
-    "points with finite coordinates in .*found none": lambda xyz: xyz[:0],
     "found 9 that are not finite": lambda xyz: np.full_like(xyz[:9], np.nan),
     r"none of 60,000, .* \(56\d{4}, 59\d{5}, .*--align.*--recenter would": lambda xyz: np.add(
         xyz, (564_000, 5_932_000, 87)

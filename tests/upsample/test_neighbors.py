@@ -10,7 +10,7 @@ from splatseed import PointCloud, Scene
 from splatseed.progress import silent
 from splatseed.scene import Tracks
 from splatseed.upsample import configure
-from splatseed.upsample.neighbors import draw_bases, prepare, sound_bases, trusted_originals
+from splatseed.upsample.neighbors import draw_bases, prepare, trusted_originals
 
 from . import references as slow
 
@@ -48,14 +48,6 @@ def test_neighbors_are_those_of_brute_force(wavy_exact, prepared, k):
         np.testing.assert_array_equal(prepared.rank[found.idx[row]], rows)
     first = found.nearest(4)
     np.testing.assert_array_equal(first.idx, found.idx[:, :4])
-
-
-@pytest.mark.parametrize("k", [8, 16, 25])
-def test_isolated_points_are_those_of_the_rule(wavy_exact, prepared, k):
-    fast = in_file_order(prepared, sound_bases(prepared, prepared.neighbors(k)))
-    expected = slow.base_weights(wavy_exact.xyz, k, reject_isolated=True)
-    np.testing.assert_array_equal(fast, expected)
-    assert 0 < np.count_nonzero(expected == 0) < 10  # the planted outliers
 
 
 def test_bases_are_drawn_by_weight(prepared, rng):

@@ -18,7 +18,6 @@ from splatseed.scene import Scene, Tracks
 from splatseed.upsample import configure, neighbors, upsample
 from splatseed.upsample.neighbors import trusted_originals
 from splatseed.upsample.tiles import making
-from splatseed.upsample.tiles.cutting import Cuts
 from splatseed.upsample.tiles.making import TileDraws
 
 from .conftest import Tiles
@@ -147,15 +146,3 @@ def test_a_tile_draws_its_part_of_the_stream(columns, monkeypatch):
     draws = TileDraws(stream, 301, rows)
     for whole in (first, second):
         np.testing.assert_array_equal(draws.random((46, *shape[1:]), np.float32), whole[rows])
-
-
-def test_every_point_is_in_one_tile_within_its_walls(rng):
-    xyz = rng.integers(0, 9, (3000, 3)).astype(np.float32)
-    cuts = Cuts(xyz, 75)
-    number = cuts.tiles_of(xyz)
-    low, high = np.stack(cuts.walls)[number].transpose(1, 0, 2)
-    assert ((low <= xyz) & (xyz < high)).all()
-    assert np.bincount(number).max() <= 75
-    for each in range(len(cuts.walls)):  # no point of another tile lies within the walls
-        inside = ((cuts.walls[each][0] <= xyz) & (xyz < cuts.walls[each][1])).all(axis=1)
-        np.testing.assert_array_equal(inside, number == each)
