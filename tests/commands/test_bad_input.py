@@ -156,6 +156,8 @@ WORDS = [
     ((*UP, "--cloud", "SCAN", "--recenter", "--format", "transforms"), "--format colmap"),
     (("evaluate", "ROOM"), "splatseed train ROOM"),
     ((*EVALUATE, "--lpips-weights", "nowhere"), "nowhere"),
+    ((*EVALUATE, "--data-factor", "40"), "smaller --data-factor"),
+    (("evaluate", "scan.npz", "--scene", "ROOM"), "scan.npz"),
     (("evaluate", "junk.ply", "--scene", "ROOM"), "junk.ply"),
     (("evaluate", "nothing", "--scene", "ROOM"), "nothing"),
     (("view", "nowhere"), "nowhere"),

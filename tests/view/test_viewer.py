@@ -365,21 +365,21 @@ def test_renders_come_between_steps_and_change_nothing(watched, room, tmp_path):
 def test_a_pause_holds_and_a_stop_keeps(watched):
     run, viewer, _ = watched
     viewer.pause(on=True)
-    seen = []
+    waited = []
 
-    def release():
-        seen.append(run.state.step)
-        viewer.pause(on=False)
+    def serve(wait=0.0):
+        waited.extend([run.state.step] if wait else [])
+        if len(waited) == 3:
+            viewer.pause(on=False)
 
     def on_step(step):
-        if step == 1:
-            threading.Timer(0.3, release).start()
         viewer.on_step(step)
         if step == 5:
             viewer.stop_and_keep()
 
+    viewer._live.serve = serve
     assert not run.train(on_step)
-    assert (seen, viewer.kept, run.state.step) == ([1], True, 6)
+    assert (waited, viewer.kept, run.state.step) == ([1, 1, 1], True, 6)
     assert run.finish(evaluate_views).steps == 6
     assert run.folder.gaussians.is_file()
     assert not run.folder.checkpoint.exists()
