@@ -113,10 +113,8 @@ def test_a_known_lens_is_believed_and_triangulation_repeats_itself(posed, photos
     cancel = (0.0, 0.0, 0.0, 0.0, 1.2, 0.0, 0.0, 1.2)  # the rational model's k3 = k6
     lens = Intrinsics(7, "FULL_OPENCV", 320, 240, (*posed.intrinsics[0].params, *cancel))
     images = tuple(replace(image, intrinsics=lens) for image in posed.images[:4])
-    scene, settings = (
-        Scene(PointCloud.empty(), images, (lens,)),
-        Settings(seed=3, max_image_size=240),
-    )
+    scene = Scene(PointCloud.empty(), images, (lens,))
+    settings = Settings(seed=3, max_image_size=240)
     first, second = (
         reconstruct(photos, tmp_path / name, settings, poses_from=scene)
         for name in ("first", "second")
