@@ -174,7 +174,7 @@ def test_photographs_are_told_first_and_an_interrupt_leaves_nothing(photos, tmp_
     ("child", "told"),
     [
         ("import os; os.write(2, b'  what():  disk full'); os.abort()", "SIGABRT: disk full"),
-        ("raise SystemExit('gone')", "exit code 1: gone"),
+        ("raise SystemExit('gone')", "code 1: gone"),
     ],
 )
 def test_a_dying_process_is_one_clear_error(photos, tmp_path, monkeypatch, child, told):
