@@ -20,7 +20,6 @@ from splatseed.io.depth_maps import depth_folder
 from splatseed.io.ply import write_ply
 from splatseed.pointcloud import PointCloud
 from splatseed.synthetic import make_capture, write_capture
-from splatseed.train.folder import RunFolder
 from splatseed.upsample import upsample
 
 
@@ -226,15 +225,6 @@ def test_a_scenes_own_maps_are_counted_and_can_be_lifted(rgbd, tmp_path, splatse
 
 
 # What splatseed wrote -----------------------------------------------------------------------------
-
-
-def test_a_run_is_told_from_a_scene(tmp_path, splatseed):
-    RunFolder(tmp_path / "run").begin({"splatseed": "1", "scene": "/data/fox"})
-    run = splatseed("info", tmp_path / "run")
-    assert (run.code, run.out) == (2, "")
-    assert "a run of splatseed train" in run.err
-    assert f"splatseed view {tmp_path / 'run'}" in run.err
-    assert f"splatseed evaluate {tmp_path / 'run'}" in run.err
 
 
 def test_a_seeded_scene_is_to_be_trained_and_not_seeded_again(room, tmp_path, splatseed):

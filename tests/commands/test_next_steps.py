@@ -77,6 +77,9 @@ def test_nothing_is_to_be_trained_without_its_photographs(kept, own_room, tmp_pa
         assert "splatseed train" not in run.out
         assert "splatseed tune" not in run.out
         assert "gsplat" not in run.out
+    if kept == "no folder":  # so that there is nothing to look at
+        assert "-> mls" in run.out
+        assert "Without photographs" in run.out
     advised = lines_of(splatseed("info", own_room).out)
     assert [words[0] for words in advised] == ["upsample"]
 

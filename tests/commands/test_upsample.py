@@ -144,14 +144,6 @@ def test_the_plan_has_the_number_and_what_was_changed(
     assert "as the photographs need" not in run.out
 
 
-def test_without_photographs_the_default_interpolates_and_says_so(own_room, tmp_path, splatseed):
-    shutil.rmtree(own_room / "images")
-    run = splatseed("upsample", own_room, "-o", tmp_path / "out")
-    assert run.code == 0
-    assert "-> mls" in run.out
-    assert "Without photographs" in run.out + run.err
-
-
 def test_a_bare_ply_where_new_points_coincide(tmp_path, splatseed):
     coarse = np.float32(2**20)  # floats here are 1/8 apart: points between these fall together
     xyz = coarse + np.float32(np.random.default_rng(0).integers(0, 64, (300, 3))) / 8
