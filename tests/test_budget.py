@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import subprocess
 from importlib import import_module
-from pathlib import Path
 
 import pytest
 
@@ -14,8 +12,7 @@ from splatseed.cli import VERBS
 from splatseed.commands.bench import CompareOptions, ReportOptions
 
 from .command_line import options_of
-
-ROOT = Path(__file__).parents[1]
+from .test_package import tracked_files
 
 MOST_OPTIONS = 140
 MOST_FILES = 260
@@ -27,27 +24,16 @@ def test_options_over_all_verbs():
     """Methods' own parameters are not counted, nor are positional words and ``--help``."""
     kinds = [import_module(f"splatseed.commands.{verb}").Options for verb in VERBS]
     counts = {each.__module__: len(options_of(each)) for each in kinds}
-    counts["bench report and compare"] = len(options_of(ReportOptions)) + len(
-        options_of(CompareOptions)
-    )
+    counts |= {each.__name__: len(options_of(each)) for each in (ReportOptions, CompareOptions)}
     assert sum(counts.values()) <= MOST_OPTIONS, counts
 
 
 @pytest.mark.parametrize("top", ["src", "tests"])
 def test_lines(top):
-    assert sum(path.read_bytes().count(b"\n") for path in _python_files(top)) <= MOST_LINES[top]
+    assert (
+        sum(path.read_bytes().count(b"\n") for path in tracked_files(top, ".py")) <= MOST_LINES[top]
+    )
 
 
 def test_files():
-    assert len(_python_files("src")) <= MOST_FILES
-
-
-def _python_files(top):
-    """Those under version control."""
-    run = subprocess.run(
-        ["git", "ls-files", "-z", top], cwd=ROOT, capture_output=True, check=False, text=True
-    )
-    if run.returncode:
-        pytest.skip("not a git checkout")
-    paths = [ROOT / name for name in run.stdout.split("\0") if name.endswith(".py")]
-    return [path for path in paths if path.is_file()]
+    assert len(tracked_files("src", ".py")) <= MOST_FILES

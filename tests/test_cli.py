@@ -25,9 +25,8 @@ def ply(rng, tmp_path):
     """A wavy sheet of 300 points."""
     xyz = rng.random((300, 3))
     xyz[:, 2] = 0.1 * np.sin(9 * xyz[:, 0])
-    write_ply(
-        tmp_path / "cloud.ply", PointCloud(xyz, (255 * rng.random(xyz.shape)).astype(np.uint8))
-    )
+    rgb = (255 * rng.random(xyz.shape)).astype(np.uint8)
+    write_ply(tmp_path / "cloud.ply", PointCloud(xyz, rgb))
     return tmp_path / "cloud.ply"
 
 

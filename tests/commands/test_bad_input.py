@@ -50,9 +50,7 @@ def _refused(run, *says):
 
 
 def _contents(folder):
-    return {
-        path: path.read_bytes() if path.is_file() else b"" for path in sorted(folder.rglob("*"))
-    }
+    return {path: path.is_file() and path.read_bytes() for path in folder.rglob("*")}
 
 
 # Words -------------------------------------------------------------------------------------------
@@ -184,6 +182,9 @@ WORDS = [
 ]
 
 
+NEEDED = {"sfm": "pycolmap", "depth": "transformers", "view": "viser", "flight": "imageio_ffmpeg"}
+
+
 @pytest.fixture
 def refused(room, tmp_path, monkeypatch, splatseed):
     """Checks that words are refused, where ROOM is a scene and SCAN a cloud."""
@@ -210,14 +211,8 @@ def refused(room, tmp_path, monkeypatch, splatseed):
     ids=lambda each: each if isinstance(each, str) else " ".join(each)[-40:],
 )
 def test_what_makes_no_sense_is_refused_by_name(words, named, refused):
-    extra = {
-        "sfm": "pycolmap",
-        "depth": "transformers",
-        "view": "viser",
-        "flight": "imageio_ffmpeg",
-    }
-    if needed := extra.get(words[0]):
-        pytest.importorskip(needed)
+    if words[0] in NEEDED:
+        pytest.importorskip(NEEDED[words[0]])
     assert named in refused(*words)
 
 
@@ -285,7 +280,7 @@ JUNK = {"bytes": bytes([137, 3, 0, 255, 13]) * 40, "text": b"some words\n" * 9, 
 )
 def test_junk_is_told_without_python(words, junk, own_room, tmp_path, monkeypatch, splatseed):
     if words.startswith("sfm"):
-        pytest.importorskip("pycolmap", reason="sfm needs pycolmap")
+        pytest.importorskip("pycolmap")
     monkeypatch.chdir(tmp_path)
     own_room.rename("room")
     (tmp_path / "maps").mkdir()

@@ -9,10 +9,8 @@ import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch", reason="scoring needs PyTorch")
-reference = pytest.importorskip("torchmetrics.functional.image.lpips")
 
 from torch import nn
-from torchmetrics.functional.image import structural_similarity_index_measure
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.splat.metrics import LPIPS_FILE, l1_and_ssim_by_convolution, load_lpips
@@ -40,9 +38,15 @@ def test_ssim_is_torchmetrics_where_the_window_fits(rng, height, width):
 
 
 def _torchmetrics_ssim(x, y):
-    """Mean SSIM where the window fits entirely, differentiable."""
+    """Mean SSIM where the window fits entirely, differentiable.
+
+    Collecting tests does not wait for torchmetrics, which imports transformers.
+    """
+    theirs = pytest.importorskip("torchmetrics.functional.image")
     images = (image.permute(2, 0, 1)[None] for image in (x, y))
-    _, full = structural_similarity_index_measure(*images, data_range=1.0, return_full_image=True)
+    _, full = theirs.structural_similarity_index_measure(
+        *images, data_range=1.0, return_full_image=True
+    )
     return full[..., 5:-5, 5:-5].mean()
 
 
@@ -105,6 +109,7 @@ def network(tmp_path_factory):
 
 def test_lpips_is_that_of_torchmetrics(network, rng, monkeypatch):
     folder, features = network
+    reference = pytest.importorskip("torchmetrics.functional.image.lpips")
     monkeypatch.setattr(reference, "_get_tv_model_features", lambda *_: features)
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(folder.parent))
     image, photo = torch.from_numpy(rng.random((2, 48, 64, 3), np.float32))
