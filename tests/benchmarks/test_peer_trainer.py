@@ -13,7 +13,6 @@ from splatseed.splat.metrics import l1_and_ssim_by_convolution
 from splatseed.synthetic import make_capture, write_capture
 from splatseed.views.view import load_split
 
-ROOT = Path(__file__).parents[2]
 MODULES = (
     "common.children",
     "training.peer_trainer",

@@ -15,17 +15,10 @@ import torch
 from splatseed.io import load_scene
 from splatseed.splat.formats import read_model
 
-ROOT = Path(__file__).parents[2]
 MODULES = (
-    "rendering.splats",
-    "common.children",
-    "common.clocks",
-    "rendering.stopwatch",
-    "rendering.torch_rasterizer",
-    "rendering.opensplat",
-    "rendering.render",
-    "rendering.train_step",
-)
+    "rendering.splats", "common.children", "common.clocks", "rendering.stopwatch",
+    "rendering.torch_rasterizer", "rendering.opensplat", "rendering.render", "rendering.train_step",
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -84,10 +77,8 @@ def _pairs_of_pixel(means2d, inverse, opacities, depths, drawn, pixel):
 
 def test_the_peer_in_pytorch_draws_the_same_picture_with_the_same_gradients(bench, workload):
     renders = {}
-    for name, rasterize in (
-        ("peer", bench.torch_rasterizer.rasterize),
-        ("ours", bench.render.rasterization),
-    ):
+    both = {"peer": bench.torch_rasterizer.rasterize, "ours": bench.render.rasterization}
+    for name, rasterize in both.items():
         inputs = bench.render._inputs(workload)
         image, alphas, _ = rasterize(**inputs)
         weights = torch.from_numpy(np.random.default_rng(2).normal(size=(1, 48, 64, 4))).float()

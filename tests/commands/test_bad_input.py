@@ -88,7 +88,6 @@ WORDS = [
     ((*UP, "--method", "magic"), "magic"),
     ((*UP, "--format", "nerf"), "nerf"),
     ((*UP, "--ratoi", "4"), "--ratio"),
-    ((*MLS, "--seed", "-1"), "--seed"),
     ((*MLS, "--mls.k", "2"), "mls.k"),
     ((*MLS, "--mls.frame", "up"), "--mls.frame"),
     ((*MLS, "--linear.k", "2"), "--linear.k"),
