@@ -5,7 +5,6 @@ from __future__ import annotations
 import tracemalloc
 from contextlib import contextmanager
 
-import numpy as np
 from hypothesis import strategies as st
 
 from splatseed.camera import Intrinsics
@@ -84,25 +83,3 @@ def damages(draw, data: bytes) -> bytes:
         cut = draw(st.sampled_from([len(patch), len(patch), 0, width, len(damaged)]))
         damaged[at : at + cut] = patch
     return bytes(damaged)
-
-
-def assert_same_images(actual, expected):
-    keys = [(im.name, im.image_id, im.intrinsics) for im in expected]
-    assert [(im.name, im.image_id, im.intrinsics) for im in actual] == keys
-    for a, b in zip(actual, expected, strict=True):
-        np.testing.assert_array_equal(a.quat, b.quat)
-        np.testing.assert_array_equal(a.translation, b.translation)
-        np.testing.assert_array_equal(a.observations.xy, b.observations.xy)
-        np.testing.assert_array_equal(a.observations.point_ids, b.observations.point_ids)
-        assert a.observations.point_ids.dtype == np.int64
-
-
-def assert_same_points(actual, expected):
-    (points, tracks), (expected_points, expected_tracks) = actual, expected
-    np.testing.assert_array_equal(points.xyz, expected_points.xyz)
-    np.testing.assert_array_equal(points.rgb, expected_points.rgb)
-    types = {"image_ids": np.uint32, "point2d_idx": np.uint32, "point_ids": np.int64}
-    types |= {"offsets": np.int64, "xyz": np.float64, "errors": np.float64}
-    for name, dtype in types.items():
-        assert getattr(tracks, name).dtype == dtype, name
-        np.testing.assert_array_equal(getattr(tracks, name), getattr(expected_tracks, name))

@@ -30,7 +30,8 @@ def model(rng) -> Model:
         Intrinsics(7, "PINHOLE", 640, 480, (500.0, 510.0, 320.0, 240.0)),
         Intrinsics(9, "OPENCV", 800, 600, (700.0, 700.0, 400.0, 300.0, 0.1, 0.01, 1e-3, 1e-4)),
     )
-    image_ids, point_ids = np.array([2, 3, 5, 11]), 3 * np.arange(1, 11)
+    image_ids, point_ids = np.array([2, 3, 5, 2**32 - 2]), 3 * np.arange(1, 11)
+    point_ids[-1] = 2**62
     slots = np.stack([rng.permutation(10) for _ in image_ids])  # feature of each point
     tracks = Tracks(
         point_ids=point_ids,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from splatseed.errors import MissingDependencyError, SceneFormatError, SceneNotFoundError
+from splatseed.errors import SceneFormatError
 from splatseed.io.clouds import open_cloud
 
 from .conftest import TABLES
@@ -172,12 +172,3 @@ def test_laz_that_is_cut_short(tmp_path, rng):
         path.write_bytes(path.read_bytes()[: int(keep * path.stat().st_size)])
         with pytest.raises(SceneFormatError, match="complete LAS or LAZ file"):
             whole(path, 1000)
-
-
-def test_a_missing_file_and_a_missing_package_are_named(tmp_path, monkeypatch):
-    with pytest.raises(SceneNotFoundError, match=r"none\.las"):
-        open_cloud(tmp_path / "none.las")
-    monkeypatch.setattr("splatseed.requirements.find_spec", lambda _: None)
-    (tmp_path / "a.laz").write_bytes(b"LASF")
-    with pytest.raises(MissingDependencyError, match=r"pip install .*'laspy"):
-        open_cloud(tmp_path / "a.laz")

@@ -6,16 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings, strategies as st
-from hypothesis.extra import numpy as hnp
 
-from splatseed.camera import CAMERA_MODELS, Intrinsics
-from splatseed.errors import OutputError, PointCloudError
+from splatseed.errors import OutputError
 from splatseed.io import colmap
-from splatseed.pointcloud import PointCloud
-from splatseed.scene import Image, Observations, Tracks
 
-from .checks import CAMERAS, assert_same_images, assert_same_points
+from .checks import CAMERAS
 from .conftest import Model, written
 
 REAL_MODELS = [
@@ -38,71 +33,6 @@ def test_real_models_are_written_back_byte_for_byte(scenes, model_dir, tmp_path)
     written(tmp_path, Model(cameras, images, *colmap.read_points3d(source / "points3D.bin")))
     for path in source.glob("*.bin"):
         assert path.read_bytes() == (tmp_path / path.name).read_bytes(), path.name
-
-
-U32 = st.integers(0, 2**32 - 1)
-FINITE = st.floats(allow_nan=False, allow_infinity=False)
-UNIQUE = {"min_size": 1, "max_size": 3, "unique": True}
-NAMES = st.text(st.characters(categories=("L", "N", "P", "S")), min_size=1)
-
-
-@settings(max_examples=30, deadline=None)
-@given(data=st.data())
-def test_models_survive_a_round_trip(tmp_path_factory, data):
-    """Any model that the formats can hold, also one whose ids refer to nothing."""
-
-    def array(dtype, shape, elements=None):
-        return data.draw(hnp.arrays(dtype, shape, elements=elements))
-
-    cameras, images = [], []
-    for camera_id in data.draw(st.lists(U32, **UNIQUE)):
-        kind = data.draw(st.sampled_from(list(CAMERA_MODELS.values())))
-        params = array(np.float64, kind.num_params, FINITE)
-        params[: kind.num_focal] = np.abs(params[: kind.num_focal]) + 1
-        size = data.draw(st.tuples(*[st.integers(1, 2**31 - 1)] * 2))
-        cameras.append(Intrinsics(camera_id, kind.name, *size, tuple(params.tolist())))
-    names = data.draw(st.lists(NAMES, min_size=3, max_size=3, unique=True))
-    for name, image_id in zip(names, data.draw(st.lists(U32, **UNIQUE)), strict=False):
-        count = data.draw(st.integers(0, 4))
-        ids = array(np.int64, count, st.integers(-1, 2**63 - 1))
-        seen = Observations(array(np.float64, (count, 2)), ids)
-        quat = array(np.float64, 4, st.floats(0.1, 1))
-        images.append(Image(name, image_id, cameras[0], quat, array(np.float64, 3, FINITE), seen))
-    ids = data.draw(st.lists(st.integers(0, 2**63 - 1), max_size=6, unique=True))
-    offsets = np.concatenate([[0], np.cumsum(array(np.int64, len(ids), st.integers(0, 5)))])
-    xyz, errors = array(np.float64, (len(ids), 3)), array(np.float64, len(ids))
-    pairs = (array(np.uint32, int(offsets[-1])), array(np.uint32, int(offsets[-1])))
-    tracks = Tracks(np.array(ids, np.int64), xyz, errors, offsets, *pairs)
-    with np.errstate(over="ignore"):
-        points = PointCloud(xyz.astype(np.float32), array(np.uint8, xyz.shape))
-    folder = written(
-        tmp_path_factory.mktemp("model"), Model(tuple(cameras), images, points, tracks)
-    )
-    again, again_images, *again_points = read(folder)
-    assert again == tuple(cameras)
-    assert_same_images(again_images, images)
-    assert_same_points(again_points, (points, tracks))
-
-
-def test_new_points_follow_the_tracked_ones(model, rng, tmp_path):
-    path = tmp_path / "points3D.bin"
-    new = PointCloud(rng.normal(size=(3, 3)), np.full((3, 3), 9, np.uint8))
-    points = PointCloud.concatenate(model.points, new)
-    colmap.write_points3d(path, points, model.tracks)
-    grown = replace(
-        model.tracks,
-        point_ids=np.append(model.tracks.point_ids, [31, 32, 33]),
-        xyz=np.concatenate([model.tracks.xyz, new.xyz]),
-        errors=np.append(model.tracks.errors, [-1.0] * 3),
-        offsets=np.append(model.tracks.offsets, [40] * 3),
-    )
-    assert_same_points(colmap.read_points3d(path), (points, grown))
-    colmap.write_points3d(path, points, None)
-    _, tracks = colmap.read_points3d(path)
-    assert tracks.point_ids.tolist() == list(range(1, 14))
-    assert (set(tracks.errors), tracks.lengths.any()) == ({-1.0}, False)
-    with pytest.raises(PointCloudError, match="10 tracks for 4 points"):
-        colmap.write_points3d(path, points.select(slice(4)), model.tracks)
 
 
 @pytest.mark.parametrize(("name", "data"), [("a.bin", bytes(8)), ("a.txt", b"# nothing\n")])
@@ -166,6 +96,8 @@ def assert_agree(reconstruction, cameras, images, points, tracks):
 
 def test_pycolmap_reads_what_we_write_and_we_what_it_writes(model, tmp_path):
     pycolmap = pytest.importorskip("pycolmap")
+    first, *rest = model.images
+    model = model._replace(images=(replace(first, name="an été.jpg"), *rest))
     reconstruction = pycolmap.Reconstruction(written(tmp_path, model))
     assert_agree(reconstruction, *model)
     (tmp_path / "theirs").mkdir()

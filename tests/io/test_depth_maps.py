@@ -12,7 +12,7 @@ from hypothesis.extra import numpy as hnp
 from PIL import Image as PilImage
 
 from splatseed.camera import Intrinsics
-from splatseed.errors import OutputError, ParameterError, SceneFormatError, SceneNotFoundError
+from splatseed.errors import OutputError, SceneFormatError, SceneNotFoundError
 from splatseed.io import find_depths
 from splatseed.io.depth_maps import DESCRIPTION, depth_folder
 from splatseed.io.staging import MANIFEST
@@ -126,15 +126,6 @@ def test_description_beside_the_maps(tmp_path):
     ):
         read = find_depths(scene, folder, **options).read("a.jpg")
         assert (read.kind, read.values[0, 0]) == expected
-
-
-@pytest.mark.parametrize(
-    "option", [*({"scale": value} for value in (0.0, -1.0, np.nan, np.inf)), {"kind": "metric"}]
-)
-def test_options_that_make_no_sense_are_named(tmp_path, option):
-    put(tmp_path / "a.png")
-    with pytest.raises(ParameterError, match=r"scale|kind"):
-        find_depths(scene_of("a.jpg"), tmp_path, **option)
 
 
 NAN, INF = np.nan, np.inf

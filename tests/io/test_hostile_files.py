@@ -5,14 +5,11 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-import re
 import socket
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-import splatseed
 from splatseed.bench.plan_file import read_plan
 from splatseed.commands.train import parse
 from splatseed.errors import OutputError, SceneFormatError, SceneNotFoundError
@@ -71,24 +68,6 @@ def test_notes_beside_a_scene_are_not_read_without_end(kind, odd, scene_dir):
     for read in (read_plan, lambda path: parse(["--config", str(path)])):
         with pytest.raises(SceneFormatError, match=r"a pipe|a device"):
             read(odd / kind)
-
-
-READ_WHOLE = {
-    "runtime/memory.py", "bench/runs.py",  # the system's own files
-    "bench/tables.py", "runtime/jit.py",  # the package's own
-    "sfm/colmap.py", "sfm/pipeline.py", "bench/job.py", "bench/pictures.py",  # this command's own
-    "io/rgbd.py",  # after is_file
-}  # fmt: skip
-
-
-def test_all_else_is_read_by_what_refuses_pipes_and_devices():
-    folder = Path(splatseed.__file__).parent
-    reads = {
-        path.relative_to(folder).as_posix()
-        for path in folder.rglob("*.py")
-        if re.search(r"\.read_(text|bytes)\(", path.read_text())
-    }
-    assert reads <= READ_WHOLE
 
 
 def test_a_file_larger_than_the_memory_is_not_read(tmp_path, monkeypatch):

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from splatseed.cli import VERBS
-from splatseed.commands import bench, train, view
+from splatseed.commands import view
 from splatseed.runtime.interruption import Interruption, exit_code, interruption
 
 STOPS = pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
@@ -36,35 +36,6 @@ def test_the_exit_code_is_that_of_the_signal(number, code):
         with pytest.raises(KeyboardInterrupt):
             os.kill(os.getpid(), number)
     assert exit_code() == code
-
-
-@STOPS
-def test_what_trains_exits_with_it(number, code, room_path, tmp_path, monkeypatch, splatseed):
-    class Stopped:
-        """Work that is told to stop while it is under way."""
-
-        state = SimpleNamespace(step=1)
-
-        def __init__(self, *_, **__):
-            pass
-
-        def train(self, _show):
-            with interruption():
-                os.kill(os.getpid(), number)
-            return False
-
-        def run(self, *_):
-            self.train(None)
-            raise KeyboardInterrupt
-
-    monkeypatch.setattr(bench, "ProcessTasks", Stopped)
-    monkeypatch.setattr(train, "_prepare", Stopped)
-    monkeypatch.setattr(train, "_announce", lambda *_: None)
-    monkeypatch.setattr(train, "require", lambda *_: None)
-    for words in (("bench", "--scenes"), ("tune",), ("train",)):
-        run = splatseed(*words, room_path, "-o", tmp_path / words[0])
-        assert (run.code, "Traceback" in run.err) == (code, False)
-    assert "--resume" in run.err
 
 
 def test_a_viewer_is_ended_by_ctrl_c_and_told_of_sigterm(room_path, monkeypatch, splatseed):

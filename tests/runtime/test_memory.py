@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import os
-import platform
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -90,27 +87,3 @@ def test_amounts_of_memory():
     bytes_of = memory.bytes_of
     assert bytes_of("4G") == bytes_of("4GB") == bytes_of(" 4gib ") == 4 << 30
     assert (bytes_of("500M"), bytes_of("123"), bytes_of("1.5K")) == (500 << 20, 123, 1536)
-
-
-FAULTS = """
-import resource
-from splatseed.runtime.memory import keep_freed_memory
-
-def faults():
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-    bytearray(64 << 20)
-    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
-
-faults()
-freed = faults()
-keep_freed_memory()
-faults()
-print(freed, faults())
-"""
-
-
-@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="glibc's option")
-def test_what_is_freed_is_used_again():
-    command = [sys.executable, "-c", FAULTS]  # of its own: the option holds until it ends
-    freed, kept = map(int, subprocess.check_output(command, text=True).split())
-    assert kept < freed / 10

@@ -112,12 +112,3 @@ def test_children_import_nothing_of_the_working_directory(tmp_path, monkeypatch)
             child.call(importlib.import_module, "math")
         with pytest.raises(TaskLostError):
             child.call(raise_unpicklable)
-
-
-def test_no_other_module_starts_a_process():
-    folder = Path(splatseed.__file__).parent
-    texts = {path.name: path.read_text("utf-8") for path in folder.rglob("*.py")}
-    # Some name it in what they tell users to install, and start nothing.
-    starts = {name for name, text in texts.items() if "[sys.executable" in text}
-    assert starts <= {"tasks.py", "child.py"}
-    assert not any("multiprocessing" in text for text in texts.values())
