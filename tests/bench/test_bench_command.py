@@ -7,10 +7,8 @@ import fcntl
 import os
 import re
 import shutil
-import signal
 import subprocess
 import sys
-import threading
 import time
 from functools import partial
 
@@ -111,31 +109,6 @@ def _wait_for_training(folder):
         time.sleep(0.05)
 
 
-@pytest.mark.slow
-def test_ctrl_c_stops_and_says_how_to_go_on(bench, plan_path, tmp_path):
-    """As a terminal sends it to this process, whose run is another."""
-    folder = tmp_path / "B"
-    plan = plan_path(repeats=1, methods=("sfm",), max_steps=5000)
-
-    def stop():
-        try:
-            _wait_for_training(folder)
-        finally:
-            os.kill(os.getpid(), signal.SIGINT)
-
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    user = threading.Thread(target=stop)
-    user.start()
-    code, out, err = bench("--plan", plan, "-o", folder)
-    user.join()
-    signal.signal(signal.SIGINT, before)
-    assert (code, "stopped" in err) == (130, True)
-    assert f"splatseed bench -o {folder}" in out
-    (run,) = read_runs(folder)
-    assert (run.result, run.error) == (None, "")
-    assert not list(folder.glob("runs/*"))
-
-
 def test_a_dry_run_prints_a_plan_and_writes_nothing(bench, plan_path, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     plan = plan_path(profiles=("default", "paper"), methods=("sfm", "linear", "random"))
@@ -164,11 +137,6 @@ def test_presets_leave_out_what_is_not_there(bench, own_room, tmp_path):
         PlannedScene(str(data / "bonsai"), "bonsai", "images_2"),
         PlannedScene(str(data / "garden"), "garden", "images_4"),
     )
-    for name in ("garden", "bonsai"):
-        shutil.rmtree(data / name)
-    code, out, err = bench("--preset", "mipnerf360", "--data", data, "--dry-run")
-    assert (code, out) == (2, "")
-    assert "images_2" in err
 
 
 def test_the_quick_preset_makes_its_own_scene_once(bench, tmp_path, monkeypatch):
@@ -195,8 +163,7 @@ def test_a_dry_run_of_the_quick_preset_loads_nothing_heavy():
     [
         ((), "-o BENCH"),
         (("-o", "B"), "--scenes"),
-        (("-o", "B", "--scenes", "nowhere"), "nowhere"),
-        (("-o", "B", "--scenes", "ROOM", "--jobs", "0"), "--jobs"),
+        (("-o", "B", "--scenes", "ROOM", "--methods", "cloud"), "without a scan"),
         (("-o", "B", "--scenes", "ROOM", "--address", "auto"), "--executor ray"),
         (("-o", "B", "--scenes", "ROOM", "--methods", "depth", "--depth", "a", "b"), "--depth"),
         (("-o", "ROOM/B", "--scenes", "ROOM"), "apart from the input"),
@@ -204,7 +171,6 @@ def test_a_dry_run_of_the_quick_preset_loads_nothing_heavy():
         (("-o", "B", "--preset", "replica", "--data", "TUNED"), "office0 is left out"),
         (("-o", "B", "--preset", "replica", "--data", "TUNED", "--scenes", "ROOM"), "--scenes"),
         (("-o", "B", "--preset", "quick", "--plan", "x.toml"), "both"),
-        (("-o", "B", "--data", "TUNED"), "--preset"),
         (("--dry-run", "--plan", "lpips.toml"), "LPIPS"),
         (("-o", "TUNED", "--scenes", "ROOM"), "splatseed tune wrote"),
     ],
@@ -225,12 +191,7 @@ def test_bad_words_are_refused_and_nothing_is_written(
 
 
 def test_a_plan_that_makes_no_difference_is_told(plan_path, bench, tmp_path):
-    out = tmp_path / "out"
     for budget, full in (("50", True), ("100k", False)):
         plan = plan_path(methods=("sfm", "mls"), ratios=(), budgets=(budget,))
-        run = bench("--plan", plan, "-o", out, "--dry-run")
+        run = bench("--plan", plan, "--dry-run")
         assert (run.code, "add none" in run.out) == (0, full)
-    run = bench("--plan", plan_path(methods=("cloud",)), "-o", out)
-    assert run.code == 2
-    assert "without a scan" in run.err
-    assert not out.exists()
