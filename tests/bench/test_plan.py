@@ -6,21 +6,17 @@ import dataclasses
 import json
 import math
 import re
-import tomllib
 from pathlib import Path
-from typing import get_args
 
-import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from splatseed.bench.plan import SFM, SHARED, Arm, Plan, RunResult, RunSpec, plan_runs
-from splatseed.bench.plan_file import plan_text, preset_plan, read_plan
+from splatseed.bench.plan import SFM, Arm, Plan, RunResult, RunSpec, plan_runs
+from splatseed.bench.plan_file import plan_text, read_plan
 from splatseed.bench.scenes import DEMO, PlannedScene, SceneFacts
 from splatseed.errors import SceneFormatError, SceneNotFoundError
-from splatseed.io import load_scene, write_scene
 from splatseed.scores import CurvePoint, EvalResult, ViewScore
-from splatseed.train.settings import StrategyName, TrainSettings
+from splatseed.train.settings import TrainSettings
 
 from .planted import surveyed
 
@@ -40,17 +36,9 @@ def _some(strategy):
 
 PLANS = st.builds(
     Plan,
-    methods=_some(st.sampled_from(["sfm", "linear", "mls", "depth", "cloud+auto"])),
+    methods=_some(st.sampled_from(["sfm", "linear", "cloud+auto"])),
     ratios=_some(RATIOS),
-    strategies=_some(st.sampled_from(get_args(StrategyName))),
-    profiles=_some(st.sampled_from(["default", "paper"])),
-    repeats=st.integers(1, 9),
-    training=st.builds(
-        TrainSettings,
-        cap_max=st.none() | st.integers(2, 10**9),
-        seed_sizes=st.booleans(),
-        backend=st.sampled_from(["auto", "cpu"]),
-    ),
+    training=st.builds(TrainSettings, cap_max=st.none() | st.integers(2, 10**9)),
     lpips=st.booleans(),
     scenes=st.lists(
         st.builds(
@@ -79,12 +67,6 @@ def test_a_plan_survives_its_file(tmp_path_factory, plan):
         assert (bool(a.cloud), Path(a.cloud)) == (bool(b.cloud), Path(b.cloud))
 
 
-def test_a_file_has_a_key_for_each_field():
-    text = plan_text(Plan(training=TrainSettings(cap_max=5), long_side=400))
-    own = {each.name for each in dataclasses.fields(Plan)} - {"training", "scenes", "parameters"}
-    assert set(tomllib.loads(text)) == own | set(SHARED)
-
-
 def test_paths_in_a_file_are_beside_it(tmp_path):
     (tmp_path / "plan.toml").write_text(
         '[[scenes]]\npath = "garden"\ndepth = "d"\n[[scenes]]\npath = "demo:"\n'
@@ -100,7 +82,6 @@ def test_paths_in_a_file_are_beside_it(tmp_path):
         ("repeats = ", "TOML"),
         ("reapeats = 3", "reapeats"),
         ('repeats = "3"', "repeats"),
-        ("repeats = true", "repeats"),
         ("repeats = 0", "repeats"),
         ("ratios = [true]", "ratios"),
         ("ratios = [0.5]", "ratios"),
@@ -109,16 +90,12 @@ def test_paths_in_a_file_are_beside_it(tmp_path):
         ('methods = ["sfm", "magic"]', "magic"),
         ('methods = "sfm"', "methods"),
         ("ratios = []\nbudgets = ['many']", "many"),
-        ("ratios = []\nbudgets = ['-1rho']", "-1rho"),
-        ("ratios = []\nbudgets = [0.5]", "0.5"),
         ("ratios = []\nbudgets = [1]", "budgets"),
         ("ratios = []\nbudgets = [100, '100']", "100 twice"),
         ("ratios = []\nbudgets = [100]\ncap_max = 9", "both"),
         ("ratios = []\nbudgets = [0.25]", "Did you mean 0.25rho?"),
-        ("long_side = 3", "long_side"),
         ("long_side = 400\ndata_factor = 2", "both"),
         ('strategies = ["mcmcm"]', "mcmcm"),
-        ('backend = "gpu"', "gpu"),
         ("max_steps = 0", "max-steps"),
         ("scenes = [1]", "scenes"),
         ("[[scenes]]\nname = 'x'", "path"),
@@ -196,16 +173,6 @@ def test_a_scan_is_part_of_what_its_methods_depend_on(small_plan, room_path, tmp
         surveyed(room_path, cloud=tmp_path / "scan.laz")
 
 
-def test_a_stray_camera_is_named_before_anything_is_run(room_path, tmp_path):
-    scene = load_scene(room_path)
-    first, *others = scene.images
-    far = dataclasses.replace(first, translation=first.translation + np.array([0, 0, 1e4]))
-    write_scene(scene.replace(images=(far, *others)), tmp_path / "stray")
-    (said,) = surveyed(tmp_path / "stray", name="stray").warnings
-    assert first.name in said
-    assert surveyed(room_path).warnings == ()
-
-
 def test_a_scene_is_known_by_its_content(room_path, own_room):
     before = surveyed(room_path, with_depth=True)
     copy = surveyed(own_room, with_depth=True)
@@ -234,16 +201,6 @@ def test_what_would_fail_every_run_is_found_before(own_room):
             each.unlink()
     with pytest.raises(SceneNotFoundError, match="photographs in"):
         surveyed(own_room)
-
-
-def test_the_published_results_tell_of_the_laptop_preset(tmp_path):
-    told = (Path(__file__).parents[2] / "docs" / "results" / "README.md").read_text("utf-8")
-    plan = preset_plan("laptop", tmp_path)
-    assert "--preset laptop --data DIR" in told
-    assert plan.repeats == 2
-    assert f"{plan.training.max_steps:,} steps, twice" in told
-    assert f"at most {plan.long_side} pixels a side" in told
-    assert f"at most {plan.budgets[0].removesuffix('rho')} per pixel" in told
 
 
 def _facts(name, points, images=20, pixels=800 * 600):
@@ -289,39 +246,18 @@ def test_specs_and_results_survive_json():
     assert RunResult.from_dict(json.loads(json.dumps(result.to_dict()))) == result
 
 
-def test_where_a_scene_lies_and_how_a_ratio_is_written_are_no_part_of_the_key():
+def test_a_key_is_of_all_but_where_a_scene_lies_and_how_a_ratio_is_written():
     there = dataclasses.replace(SPEC.scene, path="/a", depth="/b", images="images_4", cloud="/c")
     assert dataclasses.replace(SPEC, scene=there).key == SPEC.key
     assert dataclasses.replace(SPEC, arm=Arm("mls", "default", 8.0, "none")).key == SPEC.key
-
-
-@pytest.mark.parametrize(
-    "change",
-    [*({"scene": dataclasses.replace(SPEC.scene, **{name: "x"})}
-       for name in ("name", "digest", "depth_digest", "cloud_digest")),
-     {"repeat": 1}, {"version": "2"}, {"parameters": {"k": 13}},
-     {"arm": Arm("mls", "default", 4, "none")}, {"arm": Arm("mls", "paper", 8, "none")},
-     {"arm": Arm("mls", "default", 8, "mcmc")}, {"arm": Arm("linear", "default", 8, "none")},
-     *({"training": dataclasses.replace(SPEC.training, **each)} for each in (
-         {"max_steps": 101}, {"data_factor": 2}, {"test_every": 4}, {"cap_max": 9},
-         {"sh_degree": 0}, {"backend": "cuda"}, {"seed_sizes": True},
-     ))],
-)  # fmt: skip
-def test_all_else_is(change):
-    assert dataclasses.replace(SPEC, **change).key != SPEC.key
-
-
-def test_more_work_takes_longer_by_the_rule_of_thumb():
-    def seconds(threads=2, arm=ARM, **changes):
-        training = dataclasses.replace(SPEC.training, **changes)
-        spec = dataclasses.replace(SPEC, training=training, arm=arm)
-        return spec.seconds(threads)
-
-    sfm = Arm(SFM, "default", 1, "none")
-    for less in ({"max_steps": 50}, {"data_factor": 2}, {"arm": sfm}, {"threads": 8},
-                 {"cap_max": 9}):  # fmt: skip
-        assert seconds(**less) < seconds()
-    assert seconds(arm=Arm("mls", "default", 8, "default")) > seconds()
-    assert seconds(arm=Arm("stereo", "default", 0, "none")) > seconds(
-        arm=Arm("mls", "default", 3, "none")
-    )
+    scenes = [
+        dataclasses.replace(SPEC.scene, **{name: "x"})
+        for name in ("name", "digest", "depth_digest", "cloud_digest")
+    ]
+    for change in (
+        {"repeat": 1}, {"version": "2"}, {"parameters": {"k": 13}},
+        {"arm": Arm("mls", "default", 8, "mcmc")},
+        {"training": dataclasses.replace(SPEC.training, data_factor=2)},
+        *({"scene": scene} for scene in scenes),
+    ):  # fmt: skip
+        assert dataclasses.replace(SPEC, **change).key != SPEC.key
