@@ -161,18 +161,6 @@ def test_pixels_are_known_and_distinct(placement, num, rng):
     assert (values.ravel()[pixel] > 0).all()
 
 
-@pytest.mark.parametrize("region", [0.5, 0.2])
-def test_the_region_is_that_share_of_each_dimension(region, rng):
-    values = slanted(rng, holes=0.0)
-    settings = Settings(placement="uniform", edge_tolerance=None, region=region)
-    pixel = sample_pixels(values, 10_000, NOWHERE, settings, rng)[0]
-    row, column = np.divmod(pixel, SHAPE[1])
-    assert len(pixel) == round(region * SHAPE[0]) * round(region * SHAPE[1])
-    assert np.ptp(row) + 1 == round(region * SHAPE[0])
-    assert row.min() + row.max() == SHAPE[0] - 1
-    assert column.min() + column.max() == SHAPE[1] - 1
-
-
 def test_pixels_go_where_points_are_far(rng):
     values = slanted(rng, holes=0.0)
     points = np.stack([rng.uniform(0, 40, 500), rng.uniform(0, 60, 500)], axis=1)  # the left half

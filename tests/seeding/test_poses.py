@@ -114,17 +114,6 @@ def test_noise_is_measured(room, poses):
     assert "--refine-poses may mend that" in found[-1].warning
 
 
-def test_masked_corners_do_not_count(room, monkeypatch):
-    plain = module.load_views
-
-    def masked(*arguments, **options):
-        views = plain(*arguments, **options)
-        return [replace(v, mask=np.zeros((v.height, v.width), np.bool_)) for v in views]
-
-    monkeypatch.setattr(module, "load_views", masked)
-    assert pose_error(room, room.images) is None
-
-
 @pytest.mark.parametrize(("trainer", "num"), [("gsplat", 100_000), ("nerfstudio", 50_000)])
 def test_points_fill_a_cube_around_the_cameras(room, trainer, num):
     points = random_start(room, np.random.default_rng(0), trainer)

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from splatseed.synthetic import SHAPES
-from splatseed.synthetic.surfaces import Box, Discs, SineSheet, Sphere, Union, yaw_frame
+from splatseed.synthetic.surfaces import Box, Discs, SineSheet, yaw_frame
 
 
 def _discs() -> Discs:
@@ -74,24 +74,3 @@ def test_normals_are_unit_and_across_the_surface(surface, rng):
         surface.distance(points + step * normals), surface.distance(points - step * normals)
     )
     assert np.median(rise) == pytest.approx(step, rel=1e-2)
-
-
-def test_sine_sheet_distance_matches_a_fine_search(rng):
-    sheet = SineSheet(np.zeros(3), np.eye(3), np.array([2.0, 1.0]), 0.3, 0.5)  # steep: slope 3.8
-    points = np.stack(
-        [rng.uniform(-0.3, 2.3, 300), np.full(300, 0.5), rng.uniform(-0.6, 0.6, 300)], axis=1
-    )
-    u = np.linspace(0, 2, 200_001)
-    curve = np.stack([u, 0.3 * np.sin(2 * np.pi * u / 0.5)], axis=1)
-    brute, _ = cKDTree(curve).query(points[:, [0, 2]])
-    np.testing.assert_allclose(sheet.distance(points), brute, atol=3e-5)
-
-
-def test_union_takes_the_nearest_part_and_says_which():
-    near, far = Sphere(np.array([0, 0, 3.0]), 1.0), Sphere(np.array([0, 0, 8.0]), 2.0)
-    both = Union((far, near))
-    t, which = both.intersect_parts(np.zeros(3), np.array([[0, 0, 1.0], [0, 1.0, 0]]))
-    assert t.tolist() == [2.0, np.inf]
-    assert which.tolist() == [1, -1]
-    np.testing.assert_allclose(both.distance(np.array([[0, 0, 5.0]])), [1.0])
-    assert both.area == pytest.approx(4 * np.pi * 5)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from splatseed.camera import Camera, Intrinsics, rotation_from_quat
+from splatseed.camera import Intrinsics
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Observations, Scene
-from splatseed.views.projection import FULL, LEAST, MOST, WIDE, choose_sources, place
-from splatseed.views.visibility import choose_camera, choose_image, look_at
+from splatseed.views.projection import FULL, LEAST, MOST, WIDE, choose_sources
+from splatseed.views.visibility import choose_camera, choose_image
 
 
 def worth(seen, xyz, centers, i: int, j: int) -> float:
@@ -44,22 +44,6 @@ def test_nobody_is_paired_without_a_common_point():
         np.testing.assert_array_equal(chosen, np.full((num, 5), -1))
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_places_are_those_of_the_camera(rng, dtype):
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation_from_quat(rng.normal(size=4)), rng.normal(size=3)
-    camera = Camera(np.array([[50.0, 0, 20], [0, 60.0, 15], [0, 0, 1]]), 40, 30, pose)
-    xyz = rng.normal(size=(50, 3)).astype(dtype)
-    placed = np.array([place(point, camera.K @ pose[:3]) for point in xyz])
-    uv, depth = camera.project(xyz)
-    assert np.allclose(placed[:, 2], depth, rtol=1e-12, atol=1e-14)
-    assert 10 < (depth > 0).sum() < 50
-    assert np.allclose(placed[depth > 0, :2], uv[depth > 0], rtol=1e-9)
-    column, row, depth = place(np.array([1.0, 0.0, 0.0]), np.eye(3, 4))  # in the camera's plane
-    assert depth == 0
-    assert not np.isfinite([column, row]).any()
-
-
 LENS = Intrinsics(1, "PINHOLE", 160, 120, (150.0, 150.0, 80.0, 60.0))
 
 
@@ -75,16 +59,6 @@ def image(number, translation=(0.0, 0.0, 0.0), observations=None):
 def in_frame(camera, xyz):
     uv, _ = camera.project(xyz)
     return ((uv >= 0) & (uv < [camera.width, camera.height])).all(axis=1)
-
-
-def test_look_at_centres_the_target_with_up_upward():
-    eye, target = np.array([3.0, -2, 1]), np.array([0.2, 0.1, 0.4])
-    pose = look_at(eye, target, np.array([0, 0, 1.0]))
-    np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
-    assert np.linalg.det(pose[:3, :3]) == pytest.approx(1)
-    expected = [0, 0, np.linalg.norm(eye - target), 1]
-    np.testing.assert_allclose(pose @ [*target, 1], expected, atol=1e-12)
-    assert (pose[:3, :3] @ [0, 0, 1.0])[1] < 0  # y points down in the image
 
 
 def test_the_image_with_the_fullest_frame_is_chosen(rng):

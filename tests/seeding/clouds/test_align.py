@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from splatseed.errors import PointCloudError
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
 from splatseed.seeding.clouds import align as module
-from splatseed.seeding.clouds.align import align, find_starts, spread_rotations, to_unit_size
+from splatseed.seeding.clouds.align import align, spread_rotations
 from splatseed.similarity import Similarity
 
 MOVE = Similarity(0.37, spread_rotations(500)[321], np.array([5.6e5, 5.9e6, -80.0]))
@@ -113,22 +112,3 @@ def test_what_is_not_sure_is_refused(case, says, made, rng, tmp_path, monkeypatc
         marks = marks[:50]
     with pytest.raises(PointCloudError, match=says):
         aligned(tmp_path, marks, dense)
-
-
-def degrees_between(first, second):
-    cosines = (np.einsum("nij,ij->n", first, second) - 1) / 2
-    return np.degrees(np.arccos(np.clip(cosines, -1, 1)))
-
-
-def test_orientations_between_those_spread_are_tried(made, monkeypatch):
-    monkeypatch.setattr(module, "SCALES", (1.0,))
-    marks, dense = made[0], made[1][::8]
-    spread = spread_rotations(module.ROTATIONS)
-    some = Rotation.random(1000, random_state=0).as_matrix()
-    farthest = max(some, key=lambda each: degrees_between(spread, each).min())
-    assert degrees_between(spread, farthest).min() > 13
-    np.testing.assert_allclose(np.linalg.det(spread), 1.0)
-    turned = dense @ farthest.T
-    starts = find_starts(to_unit_size(turned).points(turned), to_unit_size(marks).points(marks), 5)
-    found = np.array([start.rotation for start in starts])
-    assert degrees_between(found, farthest).min() < 8
