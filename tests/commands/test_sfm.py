@@ -45,19 +45,6 @@ def test_words_reach_the_reconstruction_and_its_report_the_user(called, tmp_path
     assert f"splatseed upsample {tmp_path / 'out'} " in run.out
 
 
-def test_the_photographs_are_counted_by_folder_first(called, tmp_path, splatseed, capsys):
-    splatseed("sfm", tmp_path, "-o", tmp_path / "out")
-    tell = called["on_photos"]
-    tell(["a.png", "b.png"], {})
-    tell(["scene/images/a.png", "run/render.png", "scene/images/b.png"], {"of grey": ["run/d.png"]})
-    told = capsys.readouterr()
-    assert told.out == "note: Left out: 1 image of grey, run/d.png.\n"
-    assert told.err.splitlines() == [
-        f"2 photographs in {tmp_path}",
-        f"3 photographs in {tmp_path}: 2 in scene/images, 1 in run",
-    ]
-
-
 def test_known_poses_are_triangulated_and_refined_when_asked(called, room, tmp_path, splatseed):
     words = ("sfm", room / "images", "--poses-from", room, "-o", tmp_path / "out")
     assert splatseed(*words).code == 0

@@ -119,31 +119,6 @@ def test_the_commands_to_train_with_name_what_is_there(seeded):
     assert words[words.index("--downscale-factor") + 1] == "1"
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        ("--method mls --budget 1k", "at most 1,000 points, seed 0"),
-        ("--method mls --budget 9k", "-> mls ->"),
-        ("--method mls --mls.k 12 --budget 300", "-> mls (k=12) ->"),
-        (
-            "--method linear --ratio 2 --verify --cover 8",
-            "(928 points before --verify and --cover, seed 0)",
-        ),
-        ("--method linear --ratio 2 --profile paper", "-> linear (profile paper) ->"),
-    ],
-)
-def test_the_plan_has_the_number_and_what_was_changed(
-    words, said, room, tmp_path, splatseed, monkeypatch
-):
-    def leave(*_, **__):
-        raise SystemExit(0)
-
-    monkeypatch.setattr("splatseed.commands.upsample.command.upsample", leave)  # only the plan
-    run = splatseed("upsample", room, "-o", tmp_path / "out", *words.split())
-    assert said in " ".join(run.out.split())
-    assert "as the photographs need" not in run.out
-
-
 def test_a_bare_ply_where_new_points_coincide(tmp_path, splatseed):
     coarse = np.float32(2**20)  # floats here are 1/8 apart: points between these fall together
     xyz = coarse + np.float32(np.random.default_rng(0).integers(0, 64, (300, 3))) / 8
@@ -173,18 +148,6 @@ def test_transforms_in_transforms_out(room, tmp_path, splatseed):
     words = ("--format", "colmap", "--method", "mls", "-o", tmp_path / "third")
     assert splatseed("upsample", first, *words).code == 0
     assert pycolmap.Reconstruction(tmp_path / "third/sparse/0").num_images() == 12
-
-
-def test_a_number_of_points_is_met_and_told(room, tmp_path, splatseed):
-    out, words = tmp_path / "out", ("--method", "mls", "--num-points", 1234)
-    run = splatseed("upsample", room, *words, "-o", out)
-    before, _, after = run.out.partition("\nsplatseed upsample\n")
-    assert "1,234 points" in before  # said before it is done
-    for text in ("1,234", "464", "read ", "write ", "far from any", "train it with", str(out)):
-        assert text in after
-    assert len(load_scene(out).points) == 1234
-    told = _manifest(out)
-    assert (told["ratio"], told["num_points_asked"], told["num_points"]) == (None, 1234, 1234)
 
 
 @pytest.mark.parametrize(
@@ -224,11 +187,6 @@ def test_the_first_gaussians_stand_where_the_seeds_are(room, tmp_path, splatseed
     gaussians, seeds = read_model(start), load_scene(out).points
     extent = np.ptp(seeds.xyz, axis=0).max()
     np.testing.assert_allclose(gaussians.means, seeds.xyz, atol=1e-6 * extent)
-    sizes = np.exp(gaussians.scales)
-    assert (sizes > 0).all()
-    assert (sizes < extent).all()
-    fitted = 0.5 + 0.28209479 * gaussians.sh0[:, 0]
-    assert 0 < np.abs(fitted - seeds.rgb / 255.0).mean() < 0.2  # near the seeds' own
 
 
 # Without points, or with wrong poses --------------------------------------------------------------

@@ -1,8 +1,8 @@
 """A made scene around any cloud: cameras, photographs and depth maps, for methods that need them.
 
 Notation: e is the longest edge of the cloud's bounding box. Cameras stand 8 e above the middle of
-the box and look down on a plane through it, in the world's axes. Whatever moves or scales the cloud
-moves or scales all of it.
+the box and look straight down, in the world's axes, on a plane z = -0.1 x through it. Whatever
+moves or scales the cloud moves or scales all of it.
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ from pathlib import Path
 import numpy as np
 from PIL import Image as PilImage
 
-from splatseed.camera import Camera, Intrinsics, quat_from_rotation
+from splatseed.camera import Intrinsics, quat_from_rotation
 from splatseed.depthmap import DepthMap
 from splatseed.scene import Image, Scene, SceneSource
 
 from ..depth.conftest import MemoryMaps
 
 WIDTH, HEIGHT, FOCAL = 96, 72, 320.0
-HEIGHT_ABOVE = 8.0
-OFFSETS = [(-1.5, -1.0), (0.0, -1.0), (1.5, -1.0), (-1.5, 1.0), (0.0, 1.0), (1.5, 1.0)]
+HEIGHT_ABOVE, SLOPE = 8.0, 0.1
+OFFSETS = [(-0.4, -0.2), (0.0, -0.2), (0.4, -0.2), (-0.4, 0.2), (0.0, 0.2), (0.4, 0.2)]
 FOLDER = tempfile.TemporaryDirectory(prefix="splatseed-photographs-")
 
 
@@ -34,32 +34,16 @@ def scene_around(cloud):
     edge = np.ptp(xyz, axis=0).max() or 1.0
     lens = Intrinsics(1, "PINHOLE", WIDTH, HEIGHT, (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2))
     down = np.diag([1.0, -1.0, -1.0])
+    ray_x = (np.arange(WIDTH) + 0.5 - WIDTH / 2) / FOCAL
     images, maps = [], MemoryMaps()
     for i, (dx, dy) in enumerate(OFFSETS):
         center = middle + edge * np.array([dx, dy, HEIGHT_ABOVE])
-        turn = _looking_at(center, middle, down)
-        images.append(Image(f"{i}.png", i + 1, lens, quat_from_rotation(turn), -turn @ center))
-        maps[f"{i}.png"] = DepthMap(_plane_depth(images[-1].camera, middle, [0.0, 0.0, 1.0]))
+        images.append(Image(f"{i}.png", i + 1, lens, quat_from_rotation(down), -down @ center))
+        depth = edge * (HEIGHT_ABOVE + SLOPE * dx) / (1 - SLOPE * ray_x)
+        maps[f"{i}.png"] = DepthMap(np.tile(depth, (HEIGHT, 1)).astype(np.float32))
     folder = _photographs(cloud.rgb)
     source = SceneSource("colmap", folder, folder, image_dir=folder)
     return Scene(cloud, tuple(images), (lens,), source=source, depths=maps)
-
-
-def _plane_depth(camera: Camera, point, normal):
-    """Planar depth of a plane at the pixels' centres, float32 [H, W]."""
-    u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    pixels = np.stack([u, v, np.ones_like(u)], axis=-1)
-    rays = pixels @ np.linalg.inv(camera.K).T @ camera.cam_from_world[:3, :3]
-    z = (np.asarray(point) - camera.center) @ np.asarray(normal) / (rays @ np.asarray(normal))
-    return np.where(z > 0, z, np.nan).astype(np.float32)
-
-
-def _looking_at(center, target, down):
-    """The rotation of a camera that looks at a target, near to a given one."""
-    forward = (target - center) / np.linalg.norm(target - center)
-    right = np.cross(down[1], forward)
-    right /= np.linalg.norm(right)
-    return np.stack([right, np.cross(forward, right), forward])
 
 
 def _photographs(rgb):

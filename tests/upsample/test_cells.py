@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.spatial import QhullError
 
 from splatseed import PointCloud
-from splatseed.errors import PointCloudError
 from splatseed.progress import silent
-from splatseed.upsample import cells as module
 from splatseed.upsample.cells import MAX_NEIGHBORS, Cells, box_cells, build_cells
 from splatseed.upsample.neighbors import prepare
 from splatseed.upsample.patches import local_frames
@@ -84,12 +81,3 @@ def test_boxed_cells_are_scipys(rng):
         np.testing.assert_allclose(cloud.xyz[row] + center[row], c, rtol=0, atol=1e-7 * r)
         assert radius[row] == pytest.approx(r, rel=1e-7)
         assert volume[row] == pytest.approx(v, rel=1e-7)
-
-
-def test_qhulls_failure_is_told_with_a_way_out(monkeypatch, wavy):
-    def fail(_sites):
-        raise QhullError("QH6154 initial simplex is flat\n\nWhile executing: ...")
-
-    monkeypatch.setattr(module, "Delaunay", fail)
-    with pytest.raises(PointCloudError, match=r'QH6154.*"clamped"'):
-        box_cells(prepare(wavy), silent)

@@ -8,10 +8,9 @@ import re
 import numpy as np
 import pytest
 
-from splatseed.io.ply import read_ply, write_ply
+from splatseed.io.ply import write_ply
 from splatseed.pointcloud import PointCloud
-from splatseed.runtime import tasks
-from splatseed.upsample.tiles import making, work
+from splatseed.upsample.tiles import making
 
 
 def files(folder):
@@ -47,34 +46,6 @@ def test_a_bare_cloud_in_tiles_gives_the_files_of_memory(cloud, tmp_path, splats
     assert (told["num_points"], told["num_original"]) == (900, 300)
     assert (told["tiles"], told["source"]) == (4, str(cloud))
     assert not (tmp_path / "out.tiles").exists()
-
-
-def test_large_clouds_are_shared_among_processes(cloud, tmp_path, splatseed, monkeypatch):
-    class Processes(tasks.HereTasks):
-        """As many as asked for, all of them this one."""
-
-        def __init__(self, environments):
-            self.words = f"{len(environments)} processes"
-
-    monkeypatch.setattr(tasks, "ProcessTasks", Processes)
-    monkeypatch.setattr(tasks, "cores", lambda: 2)
-    monkeypatch.setattr(work, "MOST", 30)  # a large cloud has at least 8 tiles of this size
-    words = ("upsample", npz(cloud), "--method", "linear", "--ratio", 3)
-    for given, told in (
-        ((), "2 processes"),
-        (("--jobs", 1), "this process"),
-        (("--tile-points", 30), "this process"),
-    ):
-        run = splatseed(*words, "-o", tmp_path / "out", "--overwrite", *given)
-        assert (run.code, run.err) == (0, "")
-        assert f"(seed 0, {told})" in run.out
-
-
-def npz(cloud):
-    """The same as .npz, which is always cut into tiles."""
-    points = read_ply(cloud)
-    np.savez(cloud.with_suffix(".npz"), xyz=points.xyz, rgb=points.rgb)
-    return cloud.with_suffix(".npz")
 
 
 @pytest.mark.parametrize("kind", ["scene", "coarse cloud"])
@@ -132,7 +103,8 @@ REFUSED = [
 def test_what_cannot_be_is_refused(
     given, words, told, cloud, room, tmp_path, splatseed, monkeypatch
 ):
-    path = room if given == "room" else npz(cloud) if given == "npz" else cloud
+    np.savez(cloud.with_suffix(".npz"), xyz=np.eye(3))  # such are always cut into tiles
+    path = {"room": room, "npz": cloud.with_suffix(".npz")}.get(given, cloud)
     if "little" in given:
         monkeypatch.setattr("splatseed.commands.upsample.tiled.free_memory", lambda: 200 << 20)
     words = words if "--method" in words else f"{words} --method mls"
