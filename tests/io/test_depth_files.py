@@ -9,8 +9,8 @@ from hypothesis.extra import numpy as hnp
 from PIL import Image as PilImage
 
 from splatseed import requirements
-from splatseed.errors import MissingDependencyError, SceneFormatError, SceneNotFoundError
-from splatseed.io.depth_files import SUFFIXES, read_stored
+from splatseed.errors import MissingDependencyError, SceneFormatError
+from splatseed.io.depth_files import read_stored
 
 SHAPES = hnp.array_shapes(min_dims=2, max_dims=2, max_side=9)
 FLOATS = hnp.arrays(np.float32, SHAPES)
@@ -88,18 +88,11 @@ def test_pictures(tmp_path, narrow, wide, compression):
         assert_read(tmp_path / "a.tiff", array)
 
 
-@pytest.mark.parametrize("suffix", SUFFIXES)
-def test_missing_files_and_packages(tmp_path, suffix, monkeypatch):
-    with pytest.raises(SceneNotFoundError, match="gone"):
-        read_stored(tmp_path / f"gone{suffix}")
-    (tmp_path / f"folder{suffix}").mkdir()
-    with pytest.raises(SceneFormatError, match="readable file"):
-        read_stored(tmp_path / f"folder{suffix}")
-    if suffix == ".exr":
-        monkeypatch.setattr(requirements, "find_spec", lambda _: None)
-        (tmp_path / "a.exr").touch()
-        with pytest.raises(MissingDependencyError, match=r"pip install .*'OpenEXR>=3.3'"):
-            read_stored(tmp_path / "a.exr")
+def test_a_missing_package_is_named(tmp_path, monkeypatch):
+    monkeypatch.setattr(requirements, "find_spec", lambda _: None)
+    (tmp_path / "a.exr").touch()
+    with pytest.raises(MissingDependencyError, match=r"pip install .*'OpenEXR>=3.3'"):
+        read_stored(tmp_path / "a.exr")
 
 
 def write_exr(path, channels, **header):

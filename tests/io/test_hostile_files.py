@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import os
 import socket
 
@@ -53,11 +52,6 @@ def test_what_is_no_file_is_not_called_missing(odd, name, is_, scene_dir, model)
     scene = load_scene(scene_dir)
     assert f"{odd / name}, which is {is_}, not a file." in " ".join(scene.warnings)
     assert f"{odd / name} is {is_}, not a file." in untrainable(scene)
-    inside = scene.replace(images=scene.images[1:])
-    path = write_scene(inside, odd / "json", format="transforms").path
-    content = json.loads((path / "transforms.json").read_text())
-    (path / "transforms.json").write_text(json.dumps(content | {"ply_file_path": f"../{name}"}))
-    assert f"ply_file_path ../{name} is {is_}, not a file." in load_scene(path).warnings
 
 
 @pytest.mark.parametrize("kind", ["pipe", "link"])

@@ -84,10 +84,8 @@ LYING = b"\x93NUMPY\x01\x00v\x00" + (
 SPOILT = {
     "short": {"sizes": np.ones(2, np.float32)},
     "wide": {"sizes": np.ones((3, 2), np.float32)},
-    "type": {"sizes": np.ones(3)},
     "objects": {"sizes": np.array([None] * 3)},
     "negative": {"sizes": -np.ones(3, np.float32)},
-    "long normals": {"normals": np.full((3, 3), 2.0, np.float16)},
 }
 
 
