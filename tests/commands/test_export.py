@@ -57,12 +57,3 @@ def test_nothing_is_replaced_unasked_and_no_run_is_written_into(model, splatseed
     before = model.read_bytes()
     assert splatseed("export", model, "-o", model, "--overwrite").code == 2
     assert model.read_bytes() == before
-
-
-def test_what_a_bare_file_cannot_tell_is_left_as_a_word(model, splatseed, tmp_path):
-    run = splatseed("export", model, "-o", tmp_path / "out.splat")
-    assert (run.code, run.err) == (0, "")
-    assert run.out.rstrip().endswith("--scene SCENE --data-factor N")
-    for said in ("400 of 400", "size of training", "no view-dependent colour"):
-        assert said in run.out
-    assert len(read_model(tmp_path / "out.splat")) == 400

@@ -8,14 +8,13 @@ import math
 
 import numpy as np
 import pytest
-from PIL import Image
 
 torch = pytest.importorskip("torch", reason="evaluation needs PyTorch")
 
 from splatseed.errors import ParameterError, SceneNotFoundError
 from splatseed.io import load_scene
 from splatseed.scores import EvalResult, ViewScore
-from splatseed.splat.evaluate import evaluate_model, evaluate_views, load_model, write_renders
+from splatseed.splat.evaluate import evaluate_model, evaluate_views, load_model
 from splatseed.splat.formats import write_model
 from splatseed.splat.gaussians import initial_gaussians, training_frame
 from splatseed.splat.rendering import ModelRenderer
@@ -106,24 +105,11 @@ def test_a_ply_of_the_world_is_scored_on_the_test_views(larger_room_path, model_
     assert result.model_bytes == result.num_gaussians * 59 * 4
     black = evaluate_views(lambda v: torch.zeros(v.height, v.width, 3), model.views)
     assert result.psnr > black.psnr + 1
+    with pytest.raises(SceneNotFoundError, match="to have images"):
+        load_model(model_path, larger_room_path / "sparse/0/points3D.ply")
     # It looks the same in whatever frame it is rendered; nothing lies at the nearer near plane.
     frame = training_frame(poses_of(scene.split()[0]))
     other = dataclasses.replace(frame, origin=frame.origin + 0.5, scale=3 * frame.scale)
     moved = ModelRenderer(model.gaussians, other)
     for view in model.views:
         torch.testing.assert_close(moved.image(view), model.render(view), atol=2e-3, rtol=0)
-
-
-def test_pictures_show_the_photograph_the_render_and_the_error(
-    larger_room_path, model_path, tmp_path
-):
-    model = load_model(model_path, larger_room_path, data_factor=2)
-    write_renders(model, tmp_path)
-    for view in model.views:
-        assert (view.width, view.height) == (60, 45)
-        with Image.open(tmp_path / view.name) as file:
-            pixels = np.asarray(file)
-        assert pixels.shape == (45, 3 * 60 + 8, 3)
-        np.testing.assert_array_equal(pixels[:, :60], view.photograph)
-    with pytest.raises(SceneNotFoundError, match="to have images"):
-        load_model(model_path, larger_room_path / "sparse/0/points3D.ply")

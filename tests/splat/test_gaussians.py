@@ -188,22 +188,10 @@ def _moved(view, center):
     return dataclasses.replace(view, cam_from_world=cam_from_world)
 
 
-@pytest.mark.parametrize("distance", [1e3, 1e6])
-@pytest.mark.parametrize("stray", [0, 4])
-def test_a_stray_camera_has_no_say_in_the_frame(room, stray, distance):
-    train, _ = load_split(room)
-    others = [view for i, view in enumerate(train) if i != stray]
-    moved = list(train)
-    moved[stray] = _moved(train[stray], np.array([0.0, distance, 0.0]))
-    assert stray_views(train) == ()
-    assert stray_views(moved) == (train[stray].name,)
-    assert training_frame(moved).scale == training_frame(others).scale
-    assert np.array_equal(training_frame(moved).origin, training_frame(others).origin)
-
-
 def test_among_few_cameras_or_two_camps_none_is_a_stray(room):
     """A stereo pair and one wide view, say, or a close-up and a distant flight."""
     train, _ = load_split(room)
+    assert stray_views(train) == ()
     far = [_moved(view, np.array([0.0, 1e6 + i, 0.0])) for i, view in enumerate(train[:3])]
     for count in range(4):
         assert stray_views([*train[1 : 1 + count], far[0]]) == ()

@@ -112,14 +112,6 @@ def test_a_stray_pose_is_named_and_has_no_part_in_the_frame(room, tmp_path):
     assert [far.name in note for note in notes] == [True]
 
 
-def test_default_strategy_grows_and_stops_at_half(begin):
-    run = begin(max_steps=80)
-    run.train()
-    counts = [record.num_gaussians for record in run.state.records]
-    assert counts[39] > max(CAP, counts[0])
-    assert counts[40] == counts[79]
-
-
 def test_a_run_ends_with_the_mean_of_its_last_fifth(begin, monkeypatch):
     run = begin(strategy="none", max_steps=40)
     seen = []
@@ -202,14 +194,6 @@ def test_an_earlier_run_is_neither_replaced_nor_repeated_by_accident(begin, room
     refused("did not write", "mine", {"overwrite": True})
     with pytest.raises(OutputError, match="apart from the input"):
         prepare_run(room, room.source.root / "run", TrainSettings())
-
-
-def test_a_run_that_was_seeded_goes_on_with_the_same_seeds(begin, room):
-    begun = begin(seeding="auto", max_steps=5)
-    assert begun.count() > len(room.points)
-    resumed = begin(ways=RESUME, max_steps=5)
-    assert resumed.settings.seeding == "auto"
-    assert _bytes(resumed) == _bytes(begun)
 
 
 def test_a_run_goes_on_with_its_own_settings_and_seeds(begin, room, tmp_path):

@@ -8,7 +8,6 @@ import pytest
 import torch
 from gsplat.strategy import DefaultStrategy
 
-from splatseed.errors import ParameterError
 from splatseed.render import rasterization
 from splatseed.train.parameters import as_parameters, make_optimizers
 from splatseed.train.schedule import LEARNING_RATES, make_schedule
@@ -40,9 +39,8 @@ def test_3dgs_schedule_shrinks_as_by_the_steps_scaler_of_gsplats_trainer(steps):
 @pytest.mark.parametrize(
     ("strategy", "steps", "every"),
     [
-        *(("default", 7, 1), ("default", 300, 25), ("default", 7000, 100)),
-        *(("default", 90_000, 300), ("mcmc", 300, 10), ("mcmc", 7000, 100)),
-        *(("grow", 10, 20), ("grow", 300, 20), ("grow", 1500, 100), ("grow", 30_000, 2000)),
+        *(("default", 300, 25), ("default", 90_000, 300), ("mcmc", 300, 10)),
+        *(("grow", 10, 20), ("grow", 1500, 100), ("grow", 30_000, 2000)),
     ],
 )
 def test_enough_photographs_are_seen_between_densifications(strategy, steps, every):
@@ -80,13 +78,6 @@ def test_no_optimiser_imports_torch_compile(monkeypatch):
     optimizer.zero_grad()
     optimizer.load_state_dict(optimizer.state_dict())
     assert params["means"].detach().abs().min() > 0
-
-
-@pytest.mark.parametrize("bad", ["max_steps 0", "data_factor 0", "sh_degree 4", "cap_max 1"])
-def test_bad_settings_are_named(bad):
-    name, value = bad.split()
-    with pytest.raises(ParameterError, match=f"--{name.replace('_', '-')}"):
-        TrainSettings(**{name: int(value)})
 
 
 @pytest.mark.parametrize("cameras", [1, 2])

@@ -15,7 +15,7 @@ from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene, SceneSource
 from splatseed.upsample import SOURCE_CODES
 from splatseed.view import clouds as pages
-from splatseed.view.maps import map_tiles, normal_picture, preview_maps
+from splatseed.view.maps import map_tiles, normal_picture
 from splatseed.view.page import UNKNOWN, Tile, depth_picture, write_grid
 from splatseed.view.points import COLORS, origin_colors, points_over, render_points
 
@@ -96,25 +96,10 @@ def test_every_origin_has_a_colour_of_its_own(seeds):
     assert len(np.unique(origin_colors(codes), axis=0)) == len(codes)
     assert origin_colors(np.array([77], np.uint8)).tolist() == [list(COLORS[255])]
     photograph = np.zeros((60, 80, 3), np.uint8)
-    photograph[:, :40] = [250, 10, 10]
     colored = seeds.replace(rgb=origin_colors(seeds.source))
     picture = points_over(colored, CAMERA, photograph, scale=2.0).astype(int)
     for (row, column), code in zip([(11, 11), (31, 41), (51, 71)], (0, 8, 9), strict=True):
         assert picture[row, column].tolist() == list(COLORS[code])
-    left, right = picture[50, 5], picture[10, 70]  # the photograph behind is grey and pale
-    assert len(set(left)) == len(set(right)) == 1
-    assert 170 < right[0] < left[0] < 255
-
-
-def test_a_page_of_origins_has_both_pictures_and_names_what_is_there(seeds, tmp_path):
-    picture = _read(pages.preview_origins(Scene(seeds), seeds, tmp_path / "origins.png"))
-    left, right = np.array_split(picture[40:-44], 2, axis=1)
-    stereo = COLORS[SOURCE_CODES["stereo"]]
-    assert not (left == stereo).all(axis=2).any()
-    assert (right == stereo).all(axis=2).any()
-    for code, color in COLORS.items():  # letters have greys
-        dot = (picture[-44:] == color).all(axis=2).sum()
-        assert (dot > 100) == (code in {0, 8, 9})
 
 
 def test_a_pair_shows_both_clouds(scene, tmp_path):
@@ -170,17 +155,6 @@ def test_a_pixel_is_dimmed_or_tinted_as_its_cell_is(data, height, width, cell):
     assert (picture[~seeded][:, [0, 2]] > picture[~seeded][:, [1]] + 50).all()
 
 
-def test_a_page_shows_the_cells_before_and_after(tmp_path):
-    before, after = np.zeros((3, 4), bool), np.ones((3, 4), bool)
-    view = pages.CoveredView("a.png", np.full((24, 32, 3), 200, np.uint8), 8, before, after)
-    for count in (1, 3):
-        picture = _read(pages.preview_cells([view] * count, tmp_path / "cells.png"))
-        tinted = (picture[..., [0, 2]] - picture[..., [1]] > 50).all(axis=2)
-        assert tinted.sum() == count * 600 * 450
-        dimmed = (picture == 150).all(axis=2).sum()  # labels have a few grey pixels too
-        assert 0 <= dimmed - count * 600 * 450 < 200
-
-
 def test_a_label_in_any_script_is_drawn(tmp_path):
     for name in ("日本語の部屋", "방 $a_1$", r"\frac $", "\U0001f3e0", "x" * 400):
         write_grid([Tile(name, np.zeros((50, 300, 3), np.uint8))], tmp_path / "a.png")
@@ -221,15 +195,5 @@ def test_a_row_has_four_pictures_of_the_photographs_size(maps):
     tiles = map_tiles(maps, photograph)
     assert [tile.picture.shape for tile in tiles] == [photograph.shape] * 4
     assert tiles[0].picture is photograph
-    assert "50% known" in tiles[1].label
     for tile in tiles[1:]:  # no pixel is a blend of known and unknown
         assert (tile.picture[:, :60] == UNKNOWN).all()
-    maps.depth[:] = np.nan
-    assert "0% known" in map_tiles(maps, photograph)[1].label
-
-
-@pytest.mark.parametrize("there", [True, False])
-def test_a_page_shows_some_of_the_maps_beside_their_photographs(maps, scene, tmp_path, there):
-    shown = scene if there else scene.replace(source=None)
-    picture = _read(preview_maps(shown, [maps] * 5, tmp_path / "out.png", most=2))
-    assert (picture == PHOTOGRAPH).all(axis=2).sum() == (2 * 440 * 330 if there else 0)

