@@ -71,21 +71,6 @@ def test_radii_know_the_opacity():
     assert np.array_equal(info["radii"][0].numpy(), expected)
 
 
-@pytest.mark.parametrize("coefficients", [4, 9, 16, 25])
-def test_coefficients_that_take_no_part_do_not_matter(rng, coefficients):
-    scene = random_scene(rng, coefficients=coefficients)
-    broken, few = {**scene, "colors": scene["colors"].clone()}, dict(scene)
-    broken["colors"][:, 4:] = torch.nan
-    few["colors"] = scene["colors"][:, :4]
-    rendered, expected = (rasterization(**each, sh_degree=1)[0] for each in (broken, few))
-    assert torch.equal(rendered, expected)
-    broken["colors"].requires_grad_()
-    rasterization(**broken, sh_degree=1)[0].sum().backward()
-    gradient = broken["colors"].grad
-    assert bool(gradient[:, :4].any())
-    assert not gradient[:, 4:].any()
-
-
 def wall(opacity, count=1):
     """Equal Gaussians at one place, wide enough that exp(-sigma) is 1 over the image."""
     sizes, opacities = torch.full((count, 3), 1000.0), torch.full((count,), opacity)

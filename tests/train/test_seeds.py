@@ -47,15 +47,6 @@ def test_more_than_the_cap_are_thinned_and_told_of(points):
         assert thinned(mixed, 70, strategy=strategy)[0].num_original == seeds.num_original
 
 
-def test_what_crowds_goes_first(points):
-    """Of pairs a hair apart one stays each, the original."""
-    xyz = np.concatenate([points.xyz[:ORIGINALS], points.xyz[:ORIGINALS] + np.float32(1e-4)])
-    source = np.repeat([0, 4], ORIGINALS).astype(np.uint8)
-    pairs = PointCloud(xyz, np.zeros((2 * ORIGINALS, 3), np.uint8), source)
-    seeds, _ = thinned(pairs, ORIGINALS, strategy="none")
-    assert np.array_equal(seeds.xyz, points.xyz[:ORIGINALS])
-
-
 def test_points_that_are_not_finite_and_wishes_without_effect_are_told_of(points):
     xyz = points.xyz.copy()
     xyz[3] = np.nan
