@@ -78,15 +78,13 @@ class Page:
         if kind == "Page.loadEventFired":
             self._events.append(kind)
 
-    def open(self, path, width, height=900, *, dark=False):
+    def open(self, path, width, height=900):
         """Load a file in a window of a size; a narrow one is a phone's."""
         self.requests.clear()
         self._events.clear()
         phone = width < 600
         self.call("Emulation.setDeviceMetricsOverride", width=width, height=height,
                   deviceScaleFactor=1, mobile=phone)  # fmt: skip
-        scheme = [{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}]
-        self.call("Emulation.setEmulatedMedia", features=scheme)
         url = path if str(path).startswith("http") else Path(path).resolve().as_uri()
         self.call("Page.navigate", url=url)
         while not self._events:

@@ -87,7 +87,10 @@ def test_killed_in_training_it_goes_on(here, bench, plan_path, tmp_path):
     folder = tmp_path / "B"
     words = ("--plan", plan_path(repeats=1, methods=("sfm",), max_steps=300), "-o", folder)
     with subprocess.Popen([*COMMAND, *map(str, words)]) as process:
-        _wait_for_training(folder)
+        until = time.monotonic() + 60
+        while not list(folder.glob("runs/.*/*/config.json")):
+            assert time.monotonic() < until, "the run did not begin"
+            time.sleep(0.05)
         process.kill()
     (run,) = read_runs(folder)
     assert (run.result, run.error) == (None, "")
@@ -100,13 +103,6 @@ def test_killed_in_training_it_goes_on(here, bench, plan_path, tmp_path):
     assert (run.code, run.err) == (0, "")
     assert [bool(run.result) for run in read_runs(folder)] == [True]
     assert len(list((folder / "runs").iterdir())) == 1  # nothing half-written is left
-
-
-def _wait_for_training(folder):
-    until = time.monotonic() + 60
-    while not list(folder.glob("runs/.*/*/config.json")):
-        assert time.monotonic() < until, "the run did not begin"
-        time.sleep(0.05)
 
 
 def test_a_dry_run_prints_a_plan_and_writes_nothing(bench, plan_path, tmp_path, monkeypatch):

@@ -16,7 +16,7 @@ pytest.importorskip("gsplat", reason="training needs gsplat's strategies")
 from splatseed.bench import job
 from splatseed.bench.job import JobOptions, do_runs, make_seeds, open_unchanged, run_away, run_job
 from splatseed.bench.plan import plan_runs
-from splatseed.bench.runs import package_version, read_run, read_runs, run_folder
+from splatseed.bench.runs import package_version, read_run, run_folder
 from splatseed.cli import main
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.io import load_scene
@@ -58,12 +58,10 @@ def test_a_result_says_what_was_measured_and_a_little_is_kept(specs, tmp_path):
     assert read_run(tmp_path, spec).result == result
     pictures = sorted((kept / "renders").iterdir())
     assert [PilImage.open(path).size for path in pictures] == [(3 * 64 + 8, 48)] * 3
-    names = {path.name for path in kept.iterdir()}
-    assert names == {"metrics.json", "config.json", "curve.csv", "result.json", "renders",
-                     "splatseed.json"}  # fmt: skip
     seen = read_covisible(next((tmp_path / "covisible").iterdir()))
     assert set(seen) == {view.name for view in result.scores.per_image}
     assert 0.3 < result.scores.covisible_share <= 1
+    assert not (kept / "point_cloud.ply").exists()
     run_job(spec, JobOptions(keep_models=True), tmp_path)
     assert (kept / "point_cloud.ply").stat().st_size > 1000
 
@@ -155,8 +153,6 @@ def test_a_scene_that_has_changed_fails_its_run_alone_and_is_recorded(specs, own
     assert "open_unchanged" in error["traceback"]
     (done,) = do_runs(tmp_path, [specs["sfm"]], HereTasks(), JobOptions())
     assert read_run(tmp_path, broken).result == done.result  # which takes the error's place
-    with pytest.raises(SceneNotFoundError):
-        read_runs(tmp_path)  # never begun by a command
 
 
 def test_files_of_the_users_are_left_alone(specs, tmp_path):
@@ -175,7 +171,6 @@ def test_a_run_elsewhere_comes_back_as_files_and_leaves_nothing(specs, tmp_path,
     (run,) = do_runs(tmp_path, [specs["sfm"]], HereTasks(), JobOptions(), away=True)
     assert read_run(tmp_path, specs["sfm"]) == run
     assert list(nodes.iterdir()) == []
-    assert len(list((run_folder(tmp_path, specs["sfm"]) / "renders").iterdir())) == 3
     far = _moved(specs["sfm"], path="elsewhere/room")
     with pytest.raises(SceneNotFoundError, match="elsewhere/room"):
         run_away(far, JobOptions())

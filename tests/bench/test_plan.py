@@ -153,12 +153,10 @@ def test_a_scan_is_part_of_what_its_methods_depend_on(small_plan, room_path, tmp
     scan = tmp_path / "scan.xyz"
     scan.write_text("1 2 3\n" * 9)
     plan = dataclasses.replace(small_plan, methods=methods, repeats=1)
-    plain = plan_runs(plan, [surveyed(room_path)], "cpu", "1")
-    assert [run.arm.method for run in plain] == [SFM]
+    (plain,) = plan_runs(plan, [surveyed(room_path)], "cpu", "1")
     facts = surveyed(room_path, cloud=scan)
     sfm, *others = runs = plan_runs(plan, [facts], "cpu", "1")
-    assert [run.arm.label for run in runs] == list(methods)
-    assert sfm.key == plain[0].key
+    assert sfm.key == plain.key
     assert {run.scene.cloud for run in others} == {str(scan)}
     every = plan.training.test_every
     assert [run.parameters for run in others] == [
@@ -167,7 +165,6 @@ def test_a_scan_is_part_of_what_its_methods_depend_on(small_plan, room_path, tmp
     scan.write_text("1 2 4\n" * 9)
     changed = plan_runs(plan, [surveyed(room_path, cloud=scan)], "cpu", "1")
     assert [run.key in {old.key for old in runs} for run in changed] == [True, False, False]
-    assert others[0].seconds(2) > 0
     (tmp_path / "scan.laz").write_bytes(b"no scan")
     with pytest.raises(SceneFormatError, match=r"scan\.laz"):
         surveyed(room_path, cloud=tmp_path / "scan.laz")
@@ -191,16 +188,9 @@ def test_what_would_fail_every_run_is_found_before(own_room):
     (own_room / "images").rename(own_room / "images_4")
     (own_room / "images").mkdir()
     assert surveyed(own_room, images="images_4").num_images == 9
-    with pytest.raises(SceneNotFoundError, match="images_2"):
-        surveyed(own_room, images="images_2")
     (own_room / "images_4" / "view_003.png").unlink()
     with pytest.raises(SceneNotFoundError, match=r"view_003\.png"):
         surveyed(own_room, images="images_4")
-    for each in (own_room / "sparse" / "0").iterdir():
-        if not each.name.startswith("points3D"):
-            each.unlink()
-    with pytest.raises(SceneNotFoundError, match="photographs in"):
-        surveyed(own_room)
 
 
 def _facts(name, points, images=20, pixels=800 * 600):

@@ -63,7 +63,6 @@ def test_a_verdict_is_paired_by_view():
     assert said.winner == AUTO
     assert said.gain.mean == pytest.approx(0.5)
     assert said.gain.se == pytest.approx(np.std([0.5, 0.6, 0.4], ddof=1) / np.sqrt(3))
-    assert (said.views, said.repeats, said.steps) == (3, 1, 400)
     assert verdict({AUTO: _runs(*own)}, 400) is None
     assert verdict({SFM: _runs(*base)}, 400) is None
 
@@ -76,7 +75,6 @@ def test_repeats_that_disagree_are_no_verdict():
     assert said.gain.mean == pytest.approx(0.89, abs=0.03)
     assert said.gain.se > 1.0
     assert said.gain.p > 0.3
-    assert "± 1." in sentence(said)
     assert "within noise" in sentence(said)
 
 
@@ -193,7 +191,6 @@ def test_it_names_the_winner_and_goes_on_where_it_was_stopped(
     rungs = [Rung(**each) for each in json.loads((folder / "tune.json").read_text())["rungs"]]
     assert [rung.arms for rung in rungs] == [2, 2, 2]
     assert here["done"] == 2 + 2 + 4
-    assert "\n2 validation views" in out
     assert "splatseed train" in out
     assert "Stopped" not in out
     assert "--budget 70 --max-steps 32" in out
