@@ -179,7 +179,6 @@ def test_what_cannot_be_lifted_is_refused(own, make_maps):
     for scene, write, error, said in (
         (own.points, None, SceneNotFoundError, "--depth DIR"),
         (own.replace(depths=None), None, SceneNotFoundError, "--depth DIR"),
-        (own.replace(depths={}), None, SceneNotFoundError, "--depth DIR"),
         (own.replace(images=()), None, SceneNotFoundError, "--depth DIR"),
         (own.replace(source=None), None, SceneNotFoundError, "photographs"),
         (with_bend(0.1), None, SceneFormatError, "SIMPLE_RADIAL for view_000"),

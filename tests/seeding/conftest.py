@@ -1,25 +1,22 @@
-"""A made room, on disk and in memory, with photographs large enough to be compared."""
+"""A made room with photographs large enough to be compared."""
 
 from __future__ import annotations
 
 import pytest
 
-from splatseed.io import load_scene
-from splatseed.scene import Scene
-from splatseed.synthetic import make_capture, write_capture
 from splatseed.views.view import load_views
 
 
 @pytest.fixture(scope="session")
-def room_capture():
+def room_capture(sixteen_views):
     """16 photographs of 160 x 120, and the surfaces they show."""
-    return make_capture(0, num_views=16, width=160, height=120)
+    return sixteen_views[0]
 
 
 @pytest.fixture(scope="session")
-def room(tmp_path_factory, room_capture) -> Scene:
+def room(sixteen_views):
     """The same, read from disk."""
-    return load_scene(write_capture(room_capture, tmp_path_factory.mktemp("room") / "room"))
+    return sixteen_views[1]
 
 
 @pytest.fixture(scope="session")

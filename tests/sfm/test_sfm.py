@@ -170,16 +170,10 @@ def test_photographs_are_told_first_and_an_interrupt_leaves_nothing(photos, tmp_
     assert list(tmp_path.iterdir()) == [folder]
 
 
-@pytest.mark.parametrize(
-    ("child", "told"),
-    [
-        ("import os; os.write(2, b'  what():  disk full'); os.abort()", "SIGABRT: disk full"),
-        ("raise SystemExit('gone')", "code 1: gone"),
-    ],
-)
-def test_a_dying_process_is_one_clear_error(photos, tmp_path, monkeypatch, child, told):
+def test_a_dying_process_is_one_clear_error(photos, tmp_path, monkeypatch):
+    child = "import os; os.write(2, b'  what():  disk full'); os.abort()"
     monkeypatch.setattr(tasks, "_PROGRAM", child)
-    with pytest.raises(ReconstructionError, match=told):
+    with pytest.raises(ReconstructionError, match="SIGABRT: disk full"):
         reconstruct(photos, tmp_path / "scene")
     assert not list(tmp_path.iterdir())
 

@@ -12,6 +12,11 @@ from splatseed.synthetic import DEPTH_SCALE, make_capture, write_capture
 from splatseed.synthetic.room import visible
 
 
+@pytest.fixture(scope="module")
+def capture():
+    return make_capture(seed=0, num_views=14, width=200, height=150)
+
+
 def test_depth_unprojects_onto_the_surfaces(capture):
     for image, depth in zip(capture.scene.images, capture.depths, strict=True):
         row, column = (each[::5] for each in np.nonzero(depth))
