@@ -45,17 +45,6 @@ def test_a_colmap_scene(room, splatseed):
     assert re.findall(r"splatseed (\w+)", advised) == ["upsample", "train", "tune"]
 
 
-def test_for_scripts_it_is_json_alone(room, splatseed):
-    run = splatseed("info", room, "--json")
-    assert (run.code, run.err) == (0, "")
-    facts = json.loads(run.out)
-    assert (facts["images"], facts["train_images"] + facts["test_images"]) == (12, 12)
-    assert facts["points"]["num_points"] > 400
-    assert len(facts["points"]["spacing"]) == 5
-    assert isinstance(facts["problems"], list)
-    assert facts["poses"] is None  # points vouch for them
-
-
 def test_the_advice_depends_on_the_plan(room, splatseed):
     full = splatseed("info", room, "--budget", 60, "--max-steps", 500).out
     assert "leave the points as they are" in full

@@ -338,18 +338,12 @@ def test_a_scan_in_the_scenes_frame(splatseed, room, scan, tmp_path):
     assert len(told["cloud"]["files"]) == 2
 
 
-@pytest.mark.parametrize("name", ["t.txt", "t.json", "dataparser_transforms.json"])
-def test_transforms_from_files(name, room, tmp_path):
-    back, path = MOVE.inverse, tmp_path / name
-    if name == "t.txt":
-        np.savetxt(path, np.vstack([back.matrix, [0, 0, 0, 1]]))
-    elif name == "t.json":
-        path.write_text(json.dumps({"matrix": [*back.matrix.tolist(), [0, 0, 0, 1]]}))
-    else:  # from the scene to nerfstudio's world: scale after rotation and translation
-        rows = np.column_stack([MOVE.rotation, MOVE.translation / MOVE.scale])
-        path.write_text(json.dumps({"transform": rows.tolist(), "scale": MOVE.scale}))
+def test_nerfstudios_transform_leads_from_the_scene_to_the_cloud(room, tmp_path):
+    path = tmp_path / "dataparser_transforms.json"  # the scale after rotation and translation
+    rows = np.column_stack([MOVE.rotation, MOVE.translation / MOVE.scale])
+    path.write_text(json.dumps({"transform": rows.tolist(), "scale": MOVE.scale}))
     found = read_cloud_transform(path, load_scene(room))
-    np.testing.assert_allclose(found.matrix, back.matrix, rtol=1e-12)
+    np.testing.assert_allclose(found.matrix, MOVE.inverse.matrix, rtol=1e-12)
 
 
 def test_recentring_moves_scene_and_cloud_alike(splatseed, room, xyz, surfaces, tmp_path):

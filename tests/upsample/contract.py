@@ -12,8 +12,6 @@ from splatseed.upsample.neighbors import prepare_scene
 
 from .surroundings import scene_around
 
-__all__ = ["KINDS", "Copies", "Kind", "named"]
-
 
 @dataclass(frozen=True)
 class Copies:

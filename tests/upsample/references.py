@@ -16,25 +16,6 @@ from typing import NamedTuple
 import numpy as np
 from scipy.interpolate import BSpline, SmoothBivariateSpline
 
-__all__ = [
-    "Cloud",
-    "Patch",
-    "base_weights",
-    "bicubic_surface",
-    "color_at",
-    "draw_bases",
-    "frame_at",
-    "gcv_surface",
-    "is_isolated",
-    "linear",
-    "mls_surface",
-    "neighbors",
-    "on_patches",
-    "pspline_surface",
-    "spacing",
-    "triangle",
-]
-
 
 class Cloud(NamedTuple):
     """Originals: xyz float64 [n, 3], rgb uint8 [n, 3]."""

@@ -13,8 +13,6 @@ from scipy.spatial import ConvexHull, HalfspaceIntersection, Voronoi
 
 from .references import base_weights, color_at, draw_bases, frame_at, neighbors
 
-__all__ = ["box_cells", "clamped_cell", "true_cells", "voronoi"]
-
 
 def clamped_cell(xyz, i, k):
     """A cube of half-side d_k / 2 cut by the bisectors, its vertices drawn in to d_k / 2."""
