@@ -82,12 +82,6 @@ def test_model_without_images_keeps_cameras_and_drops_tracks(scene_dir, model):
     assert (scene.images, scene.tracks, scene.intrinsics) == ((), None, model.intrinsics)
     np.testing.assert_array_equal(scene.points.xyz, model.points.xyz)
     assert f"{folder} has no images.bin or images.txt" in " ".join(scene.warnings)
-    shutil.rmtree(scene_dir / "images")
-    write_ply(folder / "points3D.ply", model.points)
-    for name in ("cameras.bin", "points3D.bin"):
-        (folder / name).unlink()
-    assert warnings_of(scene_dir) == ""  # a cloud for a trainer, which is to have no poses
-    assert load_scene(folder / "points3D.ply").source.format == "ply"
 
 
 def test_missing_photographs_are_counted_and_the_first_is_named(scene_dir, model):
@@ -150,7 +144,6 @@ def test_scene_without_points_is_an_error_unless_allowed(scene_dir, scenes):
         (".", SceneNotFoundError, r"Name one of them: \S+scene$"),
         ("scene/images", SceneNotFoundError, r"Name the scene's folder: \S+scene$"),
         ("scene/images/left/view.png", SceneFormatError, r"Name the scene's folder: \S+scene$"),
-        ("scene/splatseed.json", SceneFormatError, r"Name the scene's folder: \S+scene$"),
         ("run", SceneNotFoundError, "a run of splatseed train"),
     ],
 )
@@ -160,7 +153,6 @@ def test_what_is_no_scene_is_one_error(tmp_path, scene_dir, name, error, names):
     for file in ("notes.txt", "hall.laz", "a walk.mp4", "half/transforms_train.json"):
         (tmp_path / file).touch()
     (scene_dir / "images/left/view.png").touch()
-    (scene_dir / "splatseed.json").write_text('{"command": "upsample"}')
     (tmp_path / "run/splatseed.json").write_text('{"command": "train"}')
     with pytest.raises(error, match=names):
         load_scene(tmp_path / name)
