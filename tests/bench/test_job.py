@@ -18,7 +18,7 @@ from splatseed.bench.job import JobOptions, do_runs, make_seeds, open_unchanged,
 from splatseed.bench.plan import plan_runs
 from splatseed.bench.runs import package_version, read_run, run_folder
 from splatseed.cli import main
-from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
+from splatseed.errors import ParameterError, SceneNotFoundError
 from splatseed.io import load_scene
 from splatseed.io.ply import write_ply
 from splatseed.runtime.tasks import HereTasks
@@ -176,5 +176,3 @@ def test_a_run_elsewhere_comes_back_as_files_and_leaves_nothing(specs, tmp_path,
         run_away(far, JobOptions())
     with pytest.raises(ParameterError, match=r"0\.0\.1"):
         run_away(dataclasses.replace(specs["sfm"], version="0.0.1"), JobOptions())
-    with pytest.raises(SceneFormatError):
-        run_away(_moved(specs["sfm"], digest="x"), JobOptions())

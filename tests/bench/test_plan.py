@@ -191,6 +191,11 @@ def test_what_would_fail_every_run_is_found_before(own_room):
     (own_room / "images_4" / "view_003.png").unlink()
     with pytest.raises(SceneNotFoundError, match=r"view_003\.png"):
         surveyed(own_room, images="images_4")
+    for each in (own_room / "sparse" / "0").iterdir():
+        if not each.name.startswith("points3D"):
+            each.unlink()
+    with pytest.raises(SceneNotFoundError, match="photographs in"):
+        surveyed(own_room)
 
 
 def _facts(name, points, images=20, pixels=800 * 600):

@@ -17,7 +17,7 @@ pytest.importorskip("ray", reason="Ray is an extra: pip install -e '.[cluster]'"
 from ray.cluster_utils import Cluster
 
 from splatseed.bench.plan_file import plan_text
-from splatseed.bench.runs import read_runs, run_folder
+from splatseed.bench.runs import read_runs
 
 NODE = {"num_cpus": 1, "object_store_memory": 80 * 2**20}  # bytes; the least that Ray takes
 
@@ -65,4 +65,3 @@ def test_a_run_whose_node_is_lost_is_done_on_another(nodes, small_plan, tmp_path
     assert len([line for line in said.out.splitlines() if line.startswith("[")]) == 1
     (run,) = read_runs(tmp_path / "B")
     assert run.result is not None
-    assert len(list((run_folder(tmp_path / "B", run.spec) / "renders").iterdir())) == 3

@@ -65,7 +65,6 @@ def test_a_whole_benchmark(tmp_path):
     said = text_of(bench)
     assert all(each in said for each in report.summary)
     assert "3 of 4 variants under default are better than sfm, and 1 worse" in said
-    assert "The arms end with 5,000 to 14,142 Gaussians" in said
     assert "splatseed bench --scenes '<A>' 'b c'" in said
 
 
@@ -186,9 +185,7 @@ def test_seeds_and_views_are_shown_and_not_made_again(tmp_path, capture, monkeyp
     report, first = write_report(bench), (bench / REPORT).read_bytes()
     assert not report.notes
     assert len(list((bench / "figures").glob("clouds_.._a_room_*.png"))) == 1
-    said = text_of(bench)
-    assert "../a room: what training begins with." in said
-    assert "test view view0: mls 3x, the best on this scene (+" in said
+    assert "test view view0: mls 3x, the best on this scene (+" in text_of(bench)
     kept = json.loads((bench / "descriptors.json").read_text("utf-8"), parse_constant=pytest.fail)
     assert list(kept) == [capture[1]]
     assert kept[capture[1]]["texture"] is None
