@@ -16,8 +16,7 @@ from .test_package import tracked_files
 
 MOST_OPTIONS = 140
 MOST_FILES = 260
-MOST_LINES = {"src": 42_750, "tests": 24_400}
-"""On the way to 42,000 and 22,000: these numbers only fall."""
+MOST_LINES = {"src": 42_000, "tests": 22_000}
 
 
 def test_options_over_all_verbs():
