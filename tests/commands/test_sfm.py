@@ -45,6 +45,14 @@ def test_words_reach_the_reconstruction_and_its_report_the_user(called, tmp_path
     assert f"splatseed upsample {tmp_path / 'out'} " in run.out
 
 
+def test_the_photographs_are_counted_by_folder(called, tmp_path, splatseed, capsys):
+    splatseed("sfm", tmp_path, "-o", tmp_path / "out")
+    called["on_photos"](["scene/a.png", "run/b.png", "scene/c.png"], {"of grey": ["run/d.png"]})
+    told = capsys.readouterr()
+    assert told.err == f"3 photographs in {tmp_path}: 2 in scene, 1 in run\n"
+    assert "1 image of grey, run/d.png" in told.out
+
+
 def test_known_poses_are_triangulated_and_refined_when_asked(called, room, tmp_path, splatseed):
     words = ("sfm", room / "images", "--poses-from", room, "-o", tmp_path / "out")
     assert splatseed(*words).code == 0

@@ -140,19 +140,23 @@ def test_scene_without_points_is_an_error_unless_allowed(scene_dir, scenes):
         ("notes.txt", SceneFormatError, r"notes\.txt"),
         ("hall.laz", SceneFormatError, r"--cloud \S+hall\.laz"),
         ("a walk.mp4", SceneFormatError, r"splatseed sfm '.*/a walk\.mp4'"),
+        ("empty", SceneNotFoundError, "empty"),
         ("half", SceneNotFoundError, r"transforms_train\.json"),
         (".", SceneNotFoundError, r"Name one of them: \S+scene$"),
         ("scene/images", SceneNotFoundError, r"Name the scene's folder: \S+scene$"),
+        ("scene/sparse/0/points3D.bin", SceneFormatError, r"Name the scene's folder: \S+scene$"),
+        ("scene/splatseed.json", SceneFormatError, r"Name the scene's folder: \S+scene$"),
         ("scene/images/left/view.png", SceneFormatError, r"Name the scene's folder: \S+scene$"),
-        ("run", SceneNotFoundError, "a run of splatseed train"),
+        *((name, SceneNotFoundError, "a run of splatseed train") for name in ("run", "run/a.json")),
     ],
 )
 def test_what_is_no_scene_is_one_error(tmp_path, scene_dir, name, error, names):
-    for folder in ("half", "run"):
+    for folder in ("empty", "half", "run"):
         (tmp_path / folder).mkdir()
-    for file in ("notes.txt", "hall.laz", "a walk.mp4", "half/transforms_train.json"):
+    for file in ("notes.txt", "hall.laz", "a walk.mp4", "half/transforms_train.json", "run/a.json"):
         (tmp_path / file).touch()
     (scene_dir / "images/left/view.png").touch()
+    (scene_dir / "splatseed.json").write_text('{"command": "upsample"}')
     (tmp_path / "run/splatseed.json").write_text('{"command": "train"}')
     with pytest.raises(error, match=names):
         load_scene(tmp_path / name)
