@@ -284,7 +284,7 @@ class Plan:
         return {} if method == SFM else self._own_parameters(method) | beside
 
     def _own_parameters(self, method: str) -> dict[str, Any]:
-        """With those that keep the test photographs from a method."""
+        """A method's own parameters, and what keeps the test photographs from it."""
         looks = hasattr(METHODS[plain(method)], "hold_out")
         held = {"hold_out": self.training.test_every} if looks else {}
         return {**held, **self.parameters.get(plain(method), {})}

@@ -96,7 +96,7 @@ def _read_toml(path: Path) -> dict[str, Any]:
 def _check(
     path: Path, content: Mapping[str, object], hints: Mapping[str, Any], within: str = ""
 ) -> None:
-    """Refuse keys and values of other kinds than a plan's."""
+    """Refuse unknown keys, and values of the wrong type."""
     for key, value in content.items():
         if key not in hints:
             known = f"a key of a plan in {path} ({', '.join(hints)})"

@@ -59,7 +59,7 @@ PICTURES = ("preview.png", "preview_methods.png", "preview_errors.png")
 TABLE, TRAINED_PICTURE = "geometry.csv", "preview_trained.png"
 RANDOM, POSES, SFM = "random", f"poses_{SHOWN}", "sfm"
 ARMS = {RANDOM: "random start", POSES: f"{SHOWN}, poses alone", SFM: "SfM seeds", SHOWN: SHOWN}
-"""What is trained, by the end of its folders' names; the first two know no points."""
+"""The trained arms, by the suffix of their folders; the first two start without SfM's points."""
 TRAINING = "training"
 AHEAD = (SHOWN, TRAINING, "voronoi", "spline")
 """What the second process compiles, in this order; training as early as possible after the

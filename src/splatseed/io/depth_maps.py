@@ -199,7 +199,7 @@ def read_description(path: Path) -> tuple[DepthKind | None, float | None]:
 
 
 def camera_file(folder: Path, above: int = 1) -> Path | None:
-    """The file of a capture's camera in a folder, or in one of so many above it."""
+    """The file of a capture's camera in a folder or in the ``above`` folders that hold it."""
     places = (folder, *folder.resolve().parents[:above])
     return next((path for each in places if (path := each / CAMERA_FILE).is_file()), None)
 

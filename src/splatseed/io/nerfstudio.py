@@ -332,11 +332,11 @@ def read_cloud_transform(path: Path, scene: Scene) -> Similarity:
 
 
 def similarity_in(path: Path, content: Any, scene: Scene, fix: str) -> Similarity:
-    """The similarity that a file's content is, rows of a matrix or a mapping with them and a scale.
+    """The similarity in a file: the rows of a matrix, or a mapping with these and a scale.
 
     The transform of nerfstudio's file, known by its name, begins from COLMAP's own world; a scene
     read from transforms.json is in that file's world, to which ``applied_transform`` leads. A
-    ``SceneFormatError`` with this ``fix``: it is none.
+    ``SceneFormatError`` with this ``fix``: the file holds none.
     """
     scale, rows = 1.0, content
     if isinstance(content, dict):

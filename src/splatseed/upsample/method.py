@@ -74,7 +74,7 @@ def traits_of(method: Upsampler) -> Traits:
 
 
 def nothing_finite(number: int) -> PointCloudError:
-    """What a cloud of so many points is refused with, if new points can begin from none of them."""
+    """The error for a cloud of so many points, none of them both finite and original."""
     return PointCloudError(
         "at least one original point with finite coordinates",
         found=f"{number} points, none of them finite and original",

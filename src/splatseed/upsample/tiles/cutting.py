@@ -62,7 +62,7 @@ class Source:
 
 
 def file_source(cloud: CloudFile) -> Source:
-    """The points of a file, told by its name, size and time of change; originals alone."""
+    """The originals in a file, which its name, size and modification time identify."""
     path, count = cloud.path.resolve(), cloud.count
     if count is not None:
         count = number_of_originals(cloud.path.parent, count)
@@ -81,7 +81,7 @@ def file_source(cloud: CloudFile) -> Source:
 
 
 def scene_source(scene: Scene) -> Source:
-    """The originals of a scene, told by a hash; attributes, which tiles lack, are refused."""
+    """The originals of a scene, which a hash identifies; refuses attributes: tiles have none."""
     points, trusted = scene.points.originals, trusted_originals(scene)
     if points.attributes:
         raise OutputError(

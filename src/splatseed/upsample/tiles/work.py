@@ -125,7 +125,7 @@ def load_arrays(folder: Path) -> dict[str, np.ndarray]:
 
 @dataclass(frozen=True)
 class TilePlan:
-    """What the work will take."""
+    """The size of tiles, and the memory and disk that the work needs."""
 
     tile_points: int  # at most, in a tile
     at_once: int  # rows in memory at a time in passes over the disk
