@@ -124,6 +124,16 @@ def test_a_full_budget_is_spent_again(view):
     assert int((across > 0).sum()) == 12
 
 
+def test_a_budget_that_growth_filled_is_not_spent_again(view):
+    means = []
+    for last in (601, 701):  # the budget is full at step 600
+        params = planted(row(12), [0.06] * 12)
+        grow(params, view, torch.ones((SIDE, SIDE, 3)), budget=15, steps=range(last))
+        means.append(params["means"].detach())
+    assert len(means[0]) == 15
+    torch.testing.assert_close(*means)
+
+
 @settings(deadline=None)
 @given(count=st.integers(2, 12), budget=st.integers(2, 40))
 def test_the_budget_is_never_exceeded(count, budget):

@@ -40,11 +40,12 @@ LEAST_ROUNDS: Mapping[Densification, int] = MappingProxyType(
 """Number of densifications in a short run, which may come more often than every 100 steps, but not
 too often: gradients averaged over few photographs are noise."""
 MOST_SPEEDUP: Mapping[str, float] = MappingProxyType(
-    {"means": 20.0, "scales": 4.0, "quats": 4.0, "opacities": 1.0, "sh0": 4.0, "shN": 4.0}
+    {"means": 20.0, "scales": 4.0, "quats": 4.0, "opacities": 1.0, "sh0": 4.0, "shN": 16.0}
 )
 """A short run's learning rates are multiplied by how many times shorter it is than a full one, but
-at most by this. Positions have as far to go in a short run as in a long one; with a higher rate of
-opacities, Gaussians die that are needed later."""
+at most by this. Positions have as far to go in a short run as in a long one, and 3DGS's rate of
+higher harmonics is a twentieth of the colour's; with a higher rate of opacities, Gaussians die that
+are needed later."""
 FORGETTING = 1e-3
 """1 - beta2 of Adam, the fraction of the squared gradients forgotten per step, as in 3DGS."""
 MOST_FORGETTING = 1e-2
