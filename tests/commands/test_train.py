@@ -105,7 +105,7 @@ def test_refined_poses_are_what_is_trained_scored_and_shown(
     run = splatseed("train", bare, *SHORT, "--refine-poses", "-o", tmp_path / "run")
     assert (run.code, run.err) == (0, "")
     assert "note: Refined poses lower the mean reprojection error from 9.00 to 0.50 px" in run.out
-    assert "Seeds by method auto: " in run.out
+    assert "Seeds: leave the points as they are." in run.out
     config = json.loads((tmp_path / "run/config.json").read_text())
     assert (config["scene"], config["refine_poses"]) == (str(bare), True)
     moved = (tmp_path / "run").rename(tmp_path / "moved")

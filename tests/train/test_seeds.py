@@ -87,6 +87,20 @@ def test_a_plain_scene_is_seeded_on_request_and_the_user_told(room):
     assert "--seeds scene" not in notes[-1]  # there are none to begin with
 
 
+@pytest.mark.parametrize(("strategy", "points", "added"), [
+    ("grow", slice(None), False),
+    ("grow", slice(0), True),
+    ("default", slice(None), True),
+])  # fmt: skip
+def test_seeds_are_added_where_that_is_advised(strategy, points, added, room):
+    scene = room.replace(points=room.points.select(points), tracks=None)
+    asked = TrainSettings(seeding="advised", strategy=strategy, cap_max=2000)
+    notes: list[str] = []
+    made, _ = seeded(scene, asked, "cpu", notes.append, silent)
+    assert (len(made.points) > len(scene.points)) == added
+    assert notes[-1].startswith("Seeds by method auto:" if added else "Seeds: leave the points")
+
+
 @pytest.mark.parametrize("why", ["as it is", "3dgs", "added to", "thinned"])
 def test_other_points_are_left_alone(why, room, tmp_path):
     """Those that are to stay, of 3DGS's conventions, and those that splatseed made."""

@@ -69,8 +69,9 @@ class Options:
     """Instead of --data-factor: downsample by the least whole factor that leaves at most this many
     pixels on a photograph's longer side."""
     seeds: Seeding | None = None
-    """Start from the points that method auto makes of the training photographs (the default, if
-    splatseed has not added any to the scene), or from the scene's points as they are."""
+    """Start from the scene's points as they are (scene), from those that method auto adds by the
+    training photographs (auto), or as splatseed info advises for this strategy and budget (advised,
+    the default)."""
     refine_poses: bool = False
     """Refine poses of a phone or SLAM first, and triangulate points; they replace the scene's."""
     resume: bool = False
@@ -89,7 +90,7 @@ class Options:
         """The options that make up the training settings."""
         # A resumed run knows its own settings.
         goes_on = self.resume and RunFolder(self.output).is_run
-        seeding = self.seeds or (DEFAULT.seeding if goes_on else "auto")
+        seeding = self.seeds or (DEFAULT.seeding if goes_on else "advised")
         named = self.training.strategy
         strategy = DEFAULT.strategy if goes_on and named == BEST else named
         return replace(self.training, seeding=seeding, strategy=strategy)

@@ -45,9 +45,9 @@ LEAST_PIXELS, LEAST_PART = 0.5, 0.1
 pixel, and less than this fraction of the average contribution: where there are more Gaussians than
 pixels, all contribute little."""
 RECYCLED = 0.1
-"""Where seeds fill the budget: the fraction of it that each round takes from the Gaussians with the
-fewest pixels, and spends again. Where growth itself filled it, the wrong pixels had their share, and
-taking more cost 0.4 dB in a bare room."""
+"""Fraction of a budget that seeds filled which each round takes from the Gaussians with the fewest
+pixels, and spends again. Where growth filled it, wrong pixels have had their share, and taking more
+cost 0.45 dB in a bare room."""
 FULL = 0.95
 """Fraction of the budget from which on it counts as full."""
 FULL_AT = 0.35

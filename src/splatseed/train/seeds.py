@@ -28,6 +28,7 @@ from splatseed.io.staging import atomic_file
 from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
+from splatseed.seeding.advice import AS_IT_IS, advice_for
 from splatseed.splat.gaussians import (
     Gaussians,
     fit_harmonics,
@@ -35,7 +36,7 @@ from splatseed.splat.gaussians import (
     stray_views,
     training_frame,
 )
-from splatseed.train.settings import AS_3DGS, TrainSettings
+from splatseed.train.settings import AS_3DGS, BUDGET, TrainSettings
 from splatseed.views.view import View
 
 SEEDS_SHARE = {"default": 0.7, "mcmc": 0.7}
@@ -72,7 +73,7 @@ def seeded(
     note: Callable[[str], None],
     progress: Progress,
 ) -> tuple[Scene, StereoResult | None]:
-    """The scene with the points that method ``auto`` makes, if the settings ask for them.
+    """The scene with the points that method ``auto`` makes, if the settings or the advice say so.
 
     Also returns the depth maps that it computed, if any: growth uses them too. The settings' cap
     limits the points; ``note`` is called with what was made, and how to do without.
@@ -84,6 +85,12 @@ def seeded(
         )
     if settings.seeding == "scene" or why_not_seeded(scene, settings):
         return scene, None
+    if settings.seeding == "advised":
+        most = most_seeds(settings, settings.cap or BUDGET)
+        advice = advice_for(scene, most, strategy=settings.densification)
+        if advice.method == AS_IT_IS:
+            note(f"Seeds: {advice.sentence}. {advice.reasons[-1]}")
+            return scene, None
     from splatseed.seeding.photographs import Auto  # noqa: PLC0415  (loads with its use)
     from splatseed.seeding.upsampling import upsample_with_stereo  # noqa: PLC0415  (kernels load with use)
 

@@ -20,7 +20,7 @@ StrategyName = Literal[
 ]
 Backend = Literal["auto", "cpu", "cuda"]
 Placing = Literal["stereo", "none"]
-Seeding = Literal["auto", "scene"]
+Seeding = Literal["advised", "auto", "scene"]
 
 LEAST_GAUSSIANS = 2
 BUDGET = 1_000_000
@@ -94,10 +94,10 @@ class TrainSettings:
     """Start with flat discs where the scene's seeds.npz has normals."""
     seed_colors: tyro.conf.Suppress[bool] = False
     """Start with the colours that the training photographs show for each seed, by direction."""
-    seeding: tyro.conf.Suppress[Seeding] = "scene"  # the option is --seeds: its default is "auto"
-    """Start from the scene's points as they are, or let method ``auto`` add the points that the
-    training photographs need. Points that splatseed has added already, and 3DGS's conventions, are
-    left alone."""
+    seeding: tyro.conf.Suppress[Seeding] = "scene"  # the option is --seeds, "advised" by default
+    """Start from the scene's points as they are, let method ``auto`` add the points that the
+    training photographs need, or do what ``splatseed info`` advises. Points that splatseed has
+    added already, and 3DGS's conventions, are left alone."""
 
     def __post_init__(self) -> None:
         for name, allowed in ALLOWED.items():
