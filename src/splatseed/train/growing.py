@@ -31,7 +31,7 @@ from torch import Tensor
 from splatseed.splat.gaussians import SH_C0
 from splatseed.splat.rendering import camera_of, render_features
 from splatseed.train.device import Capacity
-from splatseed.train.parameters import NEAR_DEPTHS, Optimizers, Parameters, length_units
+from splatseed.train.parameters import NEAR_DEPTHS, Optimizers, Parameters
 from splatseed.train.settings import TrainSettings
 from splatseed.train.strategies import Strategy
 from splatseed.views.view import View
@@ -157,14 +157,11 @@ class Growing(Strategy):
         return self.state
 
     def _needless(self, params: Parameters) -> Bool[Tensor, " N"]:
-        """Which Gaussians are removed: faint, too large, or with the least contribution."""
+        """Which Gaussians are removed: faint, or with the least contribution."""
         sums, count = self._sums(params), len(params["means"])
-        sizes = torch.exp(params["scales"].detach()).amax(dim=-1) / length_units(params)
         shown = sums["views"] >= LEAST_VIEWS
         # Nearly transparent, ...
         needless = torch.sigmoid(params["opacities"].detach()) < FAINT
-        # ... or larger than 0.1 of its near depth, ...
-        needless |= sizes > self.schedule.prune_size
         # ... or worth less than half a pixel in every view that showed it.
         needless |= shown & (sums["most_pixels"] < _least(sums["most_pixels"][shown]))
         more = self._recycled(count) - int(needless.sum())

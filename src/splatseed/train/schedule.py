@@ -4,8 +4,8 @@ Notation: a *full* run has 30,000 steps, for which all of 3DGS's numbers are sta
 of steps of the run at hand. Lengths, and so the rates of positions, are in *length units*: a
 Gaussian's near depth (``near_depths``) in splatseed's conventions, the cameras' extent in 3DGS's.
 Promise: a full run of splatseed's differs from 3DGS's in the length unit, the bound on initial
-sizes and MCMC's start; these and each departure in short runs were chosen on held-out training
-views: see benchmarks/training/README.md.
+sizes, that on later ones, which it lacks, and MCMC's start; these and each departure in short runs
+were chosen on held-out training views: see benchmarks/training/README.md.
 """
 
 from __future__ import annotations
@@ -81,7 +81,9 @@ class Schedule:
     reset_every: int
     """Steps between resets of the opacities, if enabled; also the step after which Gaussians that
     are too large are pruned."""
-    prune_size: float = 0.1  # that is too large, in length units
+    prune_size: float = 0.1
+    """That is too large, in length units. Never, in splatseed's conventions: a bare wall or the sky
+    is best shown by large Gaussians, and taking them away cost 2.8 dB in a room."""
     growth: float = GROWTH  # factor by which MCMC grows the number of Gaussians at a time
     noise: float = 5e5  # factor on 3DGS's learning rate of positions, for MCMC's noise
     penalty: float = 0.01  # weight of mean opacity and of mean size in MCMC's loss
@@ -147,6 +149,7 @@ def _own(theirs: Schedule, densification: Densification) -> Schedule:
         beta2=1 - min(FORGETTING * speedup, MOST_FORGETTING),
         refine_start=start,
         refine_every=every,
+        prune_size=math.inf,
         # Fewer rounds than 3DGS has grow by more each, so that the cap is reached as early.
         growth=GROWTH ** (every / shrunk),
         scale_factor=1.0,
