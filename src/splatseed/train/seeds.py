@@ -62,7 +62,7 @@ either, which on a GPU is the photographs' own."""
 
 SWEEPS = 2
 """PatchMatch iterations for growth. Two more take 1.6 times as long, know the depth of 1% more of
-the pixels (bonsai, treehill, fox), and gain nothing."""
+the pixels (bonsai, treehill, fox), and gain nothing beyond noise."""
 
 
 def most_seeds(settings: TrainSettings, cap: int) -> int:
