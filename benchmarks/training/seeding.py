@@ -1,8 +1,8 @@
 """What seeds are worth: trained from, on held-out training views, at equal numbers of Gaussians.
 
 The test views (names sorted, every 8th) are taken out of a capture first; of the rest every 8th is
-held out and scored. Runs have a process of their own each; those that are in the ledger are not run
-again. Prints Markdown; see README.md.
+held out and scored, another eighth with each seed. Runs have a process of their own each; those
+that are in the ledger are not run again. Prints Markdown; see README.md.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from splatseed.errors import SplatseedError
 __all__: list[str] = []
 
 Key = tuple[str, str, str, float, int, int, int, int]
-"""Capture, arm, strategy, rho, steps, data factor, seed, training views."""
+"""Capture, arm, strategy, rho, steps, data factor, seed, and ``every``."""
 
 
 @dataclass(frozen=True)
@@ -48,8 +48,8 @@ class Settings:
     """Runs of each arm on each capture, with seeds 0, 1, ..."""
     data_factor: int = 2
     """By how much photographs are made smaller."""
-    views: int = 0
-    """Training photographs, evenly chosen by name; 0 = all."""
+    every: int = 1
+    """Train on every so-manieth of the training photographs, by name."""
     jobs: int = os.cpu_count() or 1
     """Runs at a time, on one thread each."""
     ledger: Path = Path("seeding.jsonl")
@@ -58,13 +58,12 @@ class Settings:
 
 def run(key: Key, scenes: Path, ledger: Path) -> None:
     """One run, and its line in the ledger."""
-    scene, arm, strategy, rho, max_steps, data_factor, seed, views = key
+    scene, arm, strategy, rho, max_steps, data_factor, seed, every = key
     say(f"{scene}, {arm}, {strategy}, rho {rho:g}, seed {seed} ...")
     result = call(
         "benchmarks.training.seeding_arms:train", threads=1, scene=str(scenes / scene), arm=arm,
-        strategy=strategy,
-        rho=rho, max_steps=max_steps, data_factor=data_factor, seed=seed,
-        views=views,
+        strategy=strategy, rho=rho, max_steps=max_steps, data_factor=data_factor, seed=seed,
+        every=every,
     )  # fmt: skip
     write_line(ledger, key, result)
     say(f"  {scene}, {arm}, {strategy}: {result['psnr']:.2f} dB")
@@ -78,7 +77,7 @@ def wanted(settings: Settings) -> Iterable[Key]:
                 for arm in settings.arms:
                     for scene in settings.scenes:
                         steps, factor = settings.max_steps, settings.data_factor
-                        yield scene, arm, strategy, rho, steps, factor, seed, settings.views
+                        yield scene, arm, strategy, rho, steps, factor, seed, settings.every
 
 
 def rows(results: Mapping[Any, Mapping[str, Any]], settings: Settings) -> Iterable[list[str]]:
@@ -101,7 +100,7 @@ def _means(
 ) -> list[float]:
     """The means over the seeds; empty until all have been run."""
     rest = (settings.max_steps, settings.data_factor)
-    runs = [results.get((*arm, *rest, seed, settings.views)) for seed in range(settings.seeds)]
+    runs = [results.get((*arm, *rest, seed, settings.every)) for seed in range(settings.seeds)]
     names = ("psnr", "ssim", "gaussians", "seeds", "seeding", "seconds")
     known = [each for each in runs if each]
     if len(known) < len(runs):

@@ -7,6 +7,7 @@ no method looks at them.
 
 from __future__ import annotations
 
+import dataclasses
 import tempfile
 import time
 from collections.abc import Mapping
@@ -22,7 +23,7 @@ from splatseed.seeding.poses import random_start
 from splatseed.sfm import refined
 from splatseed.splat.evaluate import evaluate_views
 from splatseed.train import TrainSettings, prepare_run
-from splatseed.train.seeds import SEEDS_SHARE
+from splatseed.train.seeds import most_seeds, stereo_size
 from splatseed.upsample import configure
 
 __all__ = ["ARMS", "TEST_EVERY", "train", "triangulated"]
@@ -44,28 +45,30 @@ and without points these are taken away first; *refined* is with ``--refine-pose
 triangulates some again. SfM's points were made from all photographs, those held out too;
 *triangulated* are only those of the features of the training photographs."""
 TEST_EVERY = 8
+HELD_STEP = 3
+"""Runs of seed s hold out every eighth view from the one of number 3 s (mod 8) on."""
 
 
 def train(
     scene: str, arm: str, strategy: str, rho: float, max_steps: int, data_factor: int, seed: int,
-    views: int,
+    every: int,
 ) -> dict[str, float]:  # fmt: skip
-    """One run, from so many of the training photographs, evenly chosen by name; 0 = all.
+    """One run, from every so-manieth of the training photographs by name; 1 = all.
 
     Scores, Gaussians, seeds, and seconds: of seeding and of training by the clock, of training by
     the processor, and ``whole_processor``, from the scene in memory to the last step.
     """
     whole = ss.load_scene(Path(scene))
-    validation = _validation(whole, views)
+    validation = _validation(whole, every, HELD_STEP * seed % TEST_EVERY)
     camera = validation.images[0].camera
     cap = round(rho * (camera.width // data_factor) * (camera.height // data_factor))
-    start, begun = time.perf_counter(), time.process_time()
-    points = _seeds(validation, arm, round(SEEDS_SHARE.get(strategy, 1.0) * cap), seed)
-    seeding = time.perf_counter() - start
     settings = TrainSettings(
         strategy=strategy, max_steps=max_steps, data_factor=data_factor, seed=seed,
-        cap_max=cap, test_every=TEST_EVERY, backend="cpu",
+        cap_max=cap, test_every=TEST_EVERY, backend="cpu", seeding="scene",
     )  # fmt: skip
+    start, begun = time.perf_counter(), time.process_time()
+    points = _seeds(validation, arm, settings)
+    seeding = time.perf_counter() - start
     with tempfile.TemporaryDirectory() as folder:
         run = prepare_run(validation.replace(points=points), Path(folder) / "run", settings)
         before = time.process_time()
@@ -84,30 +87,35 @@ def train(
     }
 
 
-def _validation(whole: Scene, views: int) -> Scene:
-    """The training views, of which some are held out; of the others only so many are left."""
+def _validation(whole: Scene, every: int, first: int) -> Scene:
+    """The training views; every eighth from ``first`` on is held out, the others are thinned."""
     validation = whole.replace(images=whole.split(TEST_EVERY)[0])
-    shown, held = validation.split(TEST_EVERY)
-    if views:
-        places = np.linspace(0, len(shown) - 1, views).round().astype(int)
-        shown = tuple(shown[i] for i in np.unique(places))
+    images = sorted(validation.images, key=lambda image: image.name)
+    held = tuple(images[first::TEST_EVERY])
+    del images[first::TEST_EVERY]
+    shown = tuple(images[::every])
     split = Split(*(frozenset(each.name for each in part) for part in (shown, held)), "benchmark")
     return validation.replace(images=(*shown, *held), listed=split)
 
 
-def _seeds(scene: Scene, arm: str, most: int, seed: int) -> PointCloud:
-    """The points that a run begins with, thinned where there are more than may be trained."""
+def _seeds(scene: Scene, arm: str, settings: TrainSettings) -> PointCloud:
+    """The points that a run begins with, thinned where there are more than may be trained.
+
+    Photographs are compared at the size at which ``splatseed train`` compares them.
+    """
     chosen = dict(ARMS[arm])
     if "random" in chosen:
-        return random_start(scene, np.random.default_rng(seed), chosen["random"])
+        return random_start(scene, np.random.default_rng(settings.seed), chosen["random"])
     if not chosen.pop("points", True):
         scene = scene.replace(points=PointCloud.empty(), tracks=None)
     if chosen.pop("refined", False):
-        scene = triangulated(scene, seed)
+        scene = triangulated(scene, settings.seed)
     name = chosen.pop("method")
-    looks = hasattr(ss.METHODS[name], "hold_out")
-    method = configure(name, hold_out=TEST_EVERY) if looks else configure(name)
-    points = ss.upsample(scene, method, budget=most, **chosen)
+    size = stereo_size(scene.split(TEST_EVERY)[0], settings, "cpu")
+    known = {field.name for field in dataclasses.fields(ss.METHODS[name])}
+    given = {"hold_out": TEST_EVERY, "max_size": size}
+    method = configure(name, **{option: given[option] for option in known & given.keys()})
+    points = ss.upsample(scene, method, budget=most_seeds(settings, settings.cap or 0), **chosen)
     return points.select(points.distinct)
 
 

@@ -12,7 +12,13 @@ from splatseed.camera import Intrinsics
 from splatseed.depth.stereo.depths import find_stereo
 from splatseed.scene import Image
 from splatseed.train.run import prepare_run
-from splatseed.train.seeds import PER_RENDERED, known_depths, stereo_size
+from splatseed.train.seeds import (
+    LEAST_COMPARED,
+    PER_RENDERED,
+    compared_images,
+    known_depths,
+    stereo_size,
+)
 from splatseed.train.settings import TrainSettings
 
 SCALE = 0.25
@@ -77,7 +83,7 @@ def test_photographs_are_compared_once_for_seeds_and_growth(room, tmp_path, monk
     factor=st.integers(1, 8),
     device=st.sampled_from(["cpu", "cuda"]),
 )
-def test_comparing_takes_a_part_of_training_unless_it_is_at_the_trained_size(
+def test_comparing_takes_a_part_of_training_unless_few_views_are_compared_at_its_size(
     steps, count, width, factor, device
 ):
     lens = Intrinsics(1, "PINHOLE", width, width * 3 // 4, (width, width, width / 2, width / 3))
@@ -86,9 +92,11 @@ def test_comparing_takes_a_part_of_training_unless_it_is_at_the_trained_size(
     longer = dataclasses.replace(asked, max_steps=steps + 1)
     size = stereo_size([image] * count, asked, device)
     assert 64 <= size <= stereo_size([image] * count, longer, device) <= 800
-    compared = count * min(size, width) ** 2 * 3 / 4
+    chosen = compared_images([image] * count, asked, device)
+    compared = len(chosen) * min(size, width) ** 2 * 3 / 4
     rendered = steps * (width / factor) ** 2 * 3 / 4
     least = max(64, width // factor) if device == "cpu" else 200
     fits = compared <= 1.05 * PER_RENDERED[device] * rendered
-    assert fits or size <= least
+    assert fits or (size <= least and len(chosen) == min(count, LEAST_COMPARED))
+    assert len(chosen) == count or size <= least
     assert count or size == 800

@@ -46,7 +46,7 @@ from splatseed.scores import EvalResult
 from splatseed.seeding.advice import DEFAULT_METHOD
 from splatseed.seeding.clouds.method import Cloud
 from splatseed.seeding.upsampling import CELL, thin_to, upsample
-from splatseed.train.seeds import stereo_size
+from splatseed.train.seeds import compared_images, stereo_size
 from splatseed.train.settings import TrainSettings
 from splatseed.upsample import Upsampler, chooses_number, configure
 from splatseed.views.view import user_cache_dir
@@ -131,7 +131,9 @@ def run_job(
         lpips = load_lpips() if options.lpips else None
         seeds, seeding = make_seeds(scene, spec, progress, bench)
         every = spec.training.test_every
-        size = stereo_size(scene.split(every)[0], spec.settings, spec.settings.backend)
+        images, backend = scene.split(every)[0], spec.settings.backend
+        size = stereo_size(images, spec.settings, backend)
+        count = len(compared_images(images, spec.settings, backend))
         # What stereo knows, for growth, is found once for all runs of a repeat, and its time counts
         # in each; not where seeds by auto have paid for it, as splatseed train shares the two.
         run = prepare_run(
@@ -139,7 +141,9 @@ def run_job(
             folder / "work",
             spec.settings,
             cache_dir=user_cache_dir(),
-            depths=bench / "depths" / f"{spec.scene.digest}_{every}_{size}_{spec.repeat}.npz",
+            depths=bench
+            / "depths"
+            / f"{spec.scene.digest}_{every}_{size}_{count}_{spec.repeat}.npz",
             seeding_knew=plain(spec.arm.method) == DEFAULT_METHOD and not _is_full(scene, spec),
             progress=progress,
         )

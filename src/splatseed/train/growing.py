@@ -77,8 +77,9 @@ class Growing(Strategy):
     Args:
         settings: How to train.
         capacity: The budget.
-        depths: Of each training view, by its name, planar depth in training units, 0 where it is
+        depths: Of training views, by their names, planar depth in training units, 0 where it is
             unknown. Without them growth only splits.
+        share: The fraction of the training views that have depths.
     """
 
     capacity: Capacity
@@ -88,10 +89,11 @@ class Growing(Strategy):
         settings: TrainSettings,
         capacity: Capacity,
         depths: Mapping[str, Float[Tensor, "h w"]] = NOWHERE,
+        share: float = 1.0,
     ) -> None:
         super().__init__(capacity)
         self.schedule = settings.schedule
-        self.depths = depths
+        self.depths, self.share = depths, share
 
     def observe(
         self,
@@ -190,13 +192,13 @@ class Growing(Strategy):
             split(params, optimizers, {}, chosen, revised_opacity=True)
 
     def _drawn_each(self, count: int, step: int) -> int:
-        """Candidates to draw in a look: what the next round may ask for, shared by its looks."""
+        """Candidates to draw: what the next round may ask for, shared by its looks with depths."""
         every = self.schedule.refine_every
         # The step at which this round ends.
         end = max(self.schedule.refine_start, math.ceil(step / every) * every)
         growth = min(self._target(count, end) - count, round(FASTEST * count))
         wanted = growth + self._recycled(count)
-        return math.ceil(PLACED * wanted / max(1, every // LOOK_EVERY))
+        return math.ceil(PLACED * wanted / max(1.0, self.share * (every // LOOK_EVERY)))
 
     def _target(self, count: int, step: int) -> int:
         """How many there should be after this round: the budget at ``FULL_AT`` of the run."""

@@ -148,7 +148,7 @@ def prepare_run(
         scene, frame.scale, settings, device.type,
         stereo=stereo, kept=depths, note=note, progress=progress,
     )  # fmt: skip
-    strategy = make_strategy(settings, device, known)
+    strategy = make_strategy(settings, device, known, len(known) / max(1, len(views[0])))
     if begun and folder.checkpoint.is_file():
         state = load_checkpoint(folder.checkpoint, strategy, settings.schedule, device)
     else:

@@ -50,15 +50,17 @@ MARGIN = 0.1
 Gaussian there reaches in."""
 NEAREST = 0.01
 """The rasteriser's near plane: nothing nearer is drawn."""
-PER_RENDERED = {"cpu": 0.13, "cuda": 0.01}
-"""Most pixels compared per pixel rendered in training, by the device that renders: stereo then
-takes about a quarter of training's seconds (on the CPU: fern, 0.045: 5 of 47 s; bonsai at 1,500
-steps, 0.68: 83 of 64 s). Comparing always runs on the CPU, some 0.7 million pixels a second and
-core. The number for a GPU is an estimate: 150 million pixels rendered a second, beside 8 cores;
-benchmarks/gpu measures both."""
+PER_RENDERED = {"cpu": 0.06, "cuda": 0.01}
+"""Most pixels compared per pixel rendered in training, by the device that renders: on the CPU,
+stereo then takes about 7% of training's seconds. Comparing always runs on the CPU, some 0.7 million
+pixels a second and core. The number for a GPU is an estimate: 150 million pixels rendered a second,
+beside 8 cores; benchmarks/gpu measures both."""
 LEAST_SIZE = {"cpu": 64, "cuda": 200}
 """Smallest size that is returned, in pixels; on the CPU it is not below the size that is trained
 either, which on a GPU is the photographs' own."""
+LEAST_COMPARED = 48
+"""Growth has this many views compared, if there are as many, however short the run: fewer may not
+overlap."""
 
 SWEEPS = 2
 """PatchMatch iterations for growth. Two more take 1.6 times as long, know the depth of 1% more of
@@ -262,6 +264,23 @@ def stereo_size(images: Sequence[Image], settings: TrainSettings, device: str) -
     return min(full, max(least, affordable))
 
 
+def compared_images(
+    images: Sequence[Image], settings: TrainSettings, device: str
+) -> Sequence[Image]:
+    """The training photographs that growth has compared: all, or as many as a short run affords.
+
+    ``images`` are in the order of their names; evenly spaced ones are chosen.
+    """
+    size = stereo_size(images, settings, device)
+    # In pixels of the photographs, at the size that is compared and at the one that is trained.
+    each = [size / max(image.camera.width, image.camera.height) for image in images]
+    scale = min(1.0, float(np.median(each))) if each else 1.0
+    affordable = PER_RENDERED[device] * settings.max_steps / (scale * settings.data_factor) ** 2
+    count = min(len(images), max(LEAST_COMPARED, int(affordable)))
+    places = np.linspace(0, len(images) - 1, count).round().astype(int)
+    return [images[i] for i in places]
+
+
 def known_depths(
     scene: Scene,
     scale: float,
@@ -275,10 +294,10 @@ def known_depths(
 ) -> tuple[DepthMaps, float]:
     """Depth maps of the training views, in training units, ``scale`` per unit of the world.
 
-    They are 0 where other views do not confirm any; none are made if the settings do not use them,
-    or seeding has made ``stereo``. ``kept`` is a file with the maps of the same photographs and
-    seed, or a path at which to keep them for the next run. Also returns the seconds that it took to
-    find them, here or in the run that kept them.
+    They are those of ``compared_images``, and 0 where other views do not confirm any; none are made
+    if the settings do not use them, or seeding has made ``stereo``. ``kept`` is a file with the
+    maps of the same photographs and seed, or a path at which to keep them for the next run. Also
+    returns the seconds that it took to find them, here or in the run that kept them.
     """
     images = scene.split(settings.test_every)[0]
     wanted = settings.densification == "grow" and settings.placing == "stereo"
@@ -290,7 +309,7 @@ def known_depths(
         if stereo:
             maps = tuple(stereo.map(i) for i in range(len(stereo.views)))
         else:
-            compared = scene.replace(images=images)
+            compared = scene.replace(images=compared_images(images, settings, device))
             size = stereo_size(images, settings, device)
             maps = stereo_depths(
                 compared, seed=settings.seed, progress=progress, max_size=size, sweeps=SWEEPS

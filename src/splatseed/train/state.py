@@ -82,10 +82,12 @@ def make_strategy(
     settings: TrainSettings,
     device: torch.device | None = None,
     depths: Mapping[str, Float32[np.ndarray, "h w"]] = MappingProxyType({}),
+    share: float = 1.0,
 ) -> Strategy:
     """The strategy named by the settings, on their schedule.
 
-    The memory of ``device``, by default the CPU, limits it; ``depths``: see ``Growing``.
+    The memory of ``device``, by default the CPU, limits it; ``depths`` and ``share`` are
+    ``Growing``'s.
     """
     device = device or torch.device("cpu")
     capacity = Capacity(settings.cap, device)
@@ -96,7 +98,7 @@ def make_strategy(
             return Mcmc(settings, capacity)
         case "grow":
             maps = {name: torch.as_tensor(each).to(device) for name, each in depths.items()}
-            return Growing(settings, capacity, maps)
+            return Growing(settings, capacity, maps, share)
         case "none":
             return Strategy(capacity)
 
