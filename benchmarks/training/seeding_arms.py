@@ -80,6 +80,8 @@ def train(
         "ssim": scores.ssim,
         "gaussians": len(run.state.params["means"]),
         "seeds": len(points),
+        "cap": cap,
+        "points": int(validation.points.distinct.sum()),
         "seeding": seeding,
         "seconds": run.state.watch.seconds,
         "processor": processor,
