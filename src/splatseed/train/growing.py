@@ -32,7 +32,7 @@ from splatseed.splat.gaussians import SH_C0
 from splatseed.splat.rendering import camera_of, render_features
 from splatseed.train.device import Capacity
 from splatseed.train.parameters import NEAR_DEPTHS, Optimizers, Parameters
-from splatseed.train.settings import TrainSettings
+from splatseed.train.schedule import Schedule
 from splatseed.train.strategies import Strategy
 from splatseed.views.view import View
 
@@ -58,6 +58,8 @@ PLACED = 0.75
 """Fraction of the added Gaussians that goes to wrong pixels of known depth."""
 NOWHERE: Mapping[str, Tensor] = MappingProxyType({})
 """No view's depth is known."""
+SUMS = ("errors", "pixels", "most_pixels", "views")
+"""What the state holds of each Gaussian, since the last round."""
 LEAST_VIEWS = 2
 """Minimum observations before a Gaussian is removed for its contribution."""
 
@@ -69,13 +71,15 @@ OPACITY = 0.6
 show."""
 SIZE = 1.0
 """Standard deviation of a new Gaussian, in pixels of its view."""
+BASES, HARMONICS = ("sh0", "features_dc"), ("shN", "features_rest")
+"""What gsplat and nerfstudio call the harmonics of degree 0, and those of the others."""
 
 
 class Growing(Strategy):
     """Remove Gaussians that contribute little, split those with wrong pixels, within a budget.
 
     Args:
-        settings: How to train.
+        schedule: When.
         capacity: The budget.
         depths: Of training views, by their names, planar depth in training units, 0 where it is
             unknown. Without them growth only splits.
@@ -86,14 +90,24 @@ class Growing(Strategy):
 
     def __init__(
         self,
-        settings: TrainSettings,
+        schedule: Schedule,
         capacity: Capacity,
         depths: Mapping[str, Float[Tensor, "h w"]] = NOWHERE,
         share: float = 1.0,
     ) -> None:
         super().__init__(capacity)
-        self.schedule = settings.schedule
+        self.schedule = schedule
         self.depths, self.share = depths, share
+
+    def looks(self, step: int) -> bool:
+        """Whether contributions are measured at this step."""
+        return step % LOOK_EVERY == 0 and step <= self.schedule.refine_stop
+
+    def ends_round(self, step: int) -> bool:
+        """Whether Gaussians are changed after this step."""
+        schedule = self.schedule
+        in_time = schedule.refine_start <= step <= schedule.refine_stop
+        return in_time and step % schedule.refine_every == 0
 
     def observe(
         self,
@@ -104,7 +118,7 @@ class Growing(Strategy):
         step: int,
     ) -> None:
         """Add this view's measurements of each Gaussian to the sums."""
-        if step % LOOK_EVERY or step > self.schedule.refine_stop:
+        if not self.looks(step):
             return
         error = (render.detach() - photograph).abs().mean(dim=-1)
         pixels, errors = contributions(params, view, error)
@@ -128,11 +142,7 @@ class Growing(Strategy):
         info: Any,  # noqa: ARG002  (gsplat's own strategies need it)
     ) -> None:
         """At the end of a round, change the Gaussians and begin the next round."""
-        schedule = self.schedule
-        if (
-            not schedule.refine_start <= step <= schedule.refine_stop
-            or step % schedule.refine_every
-        ):
+        if not self.ends_round(step):
             return
         needless = self._needless(params)
         if bool(needless.all()):
@@ -148,14 +158,15 @@ class Growing(Strategy):
         self._split(params, optimizers, wanted - placed)
         if candidates:
             add_candidates(params, optimizers, candidates, placed)
-        self.state = {"first": self.state["first"]}
+        for name in SUMS:
+            del self.state[name]
 
     def _sums(self, params: Parameters) -> dict[str, Any]:
         """The sums of this round, [N] each, in the state."""
         self.state.setdefault("first", len(params["means"]))
         if "errors" not in self.state:
-            for name in ("errors", "pixels", "most_pixels", "views"):
-                self.state[name] = torch.zeros_like(params["opacities"].detach())
+            for name in SUMS:
+                self.state[name] = torch.zeros_like(params["opacities"].detach().flatten())
         return self.state
 
     def _needless(self, params: Parameters) -> Bool[Tensor, " N"]:
@@ -163,7 +174,7 @@ class Growing(Strategy):
         sums, count = self._sums(params), len(params["means"])
         shown = sums["views"] >= LEAST_VIEWS
         # Nearly transparent, ...
-        needless = torch.sigmoid(params["opacities"].detach()) < FAINT
+        needless = torch.sigmoid(params["opacities"].detach().flatten()) < FAINT
         # ... or worth less than half a pixel in every view that showed it.
         needless |= shown & (sums["most_pixels"] < _least(sums["most_pixels"][shown]))
         more = self._recycled(count) - int(needless.sum())
@@ -198,7 +209,8 @@ class Growing(Strategy):
         end = max(self.schedule.refine_start, math.ceil(step / every) * every)
         growth = min(self._target(count, end) - count, round(FASTEST * count))
         wanted = growth + self._recycled(count)
-        return math.ceil(PLACED * wanted / max(1.0, self.share * (every // LOOK_EVERY)))
+        # Less than none where another trainer begins with more than the budget.
+        return max(0, math.ceil(PLACED * wanted / max(1.0, self.share * (every // LOOK_EVERY))))
 
     def _target(self, count: int, step: int) -> int:
         """How many there should be after this round: the budget at ``FULL_AT`` of the run."""
@@ -240,6 +252,7 @@ def contributions(
         # Two channels of ones: their gradients are sum_p w_ip, plain or weighted by e_p.
         colors = means.new_ones((len(means), 2)).requires_grad_()
         frozen = {name: value.detach() for name, value in params.items()}
+        frozen["opacities"] = frozen["opacities"].flatten()  # nerfstudio's are [N, 1]
         plain, weighted = render_features(frozen, view, colors).unbind(-1)
         (plain.sum() + (weighted * error).sum()).backward()
     assert colors.grad is not None  # noqa: S101  (backward made it)
@@ -328,16 +341,20 @@ def add_candidates(
     copied = torch.zeros(number, dtype=torch.bool, device=device)
     copied[:count] = True
     duplicate(params, optimizers, {}, copied)
+    # colour = 1/2 + C0 sh0
+    base = (chosen["colors"] - 0.5) / SH_C0
     new = {
         "means": chosen["means"],
         "scales": torch.log(chosen["sizes"])[:, None].expand(-1, 3),
         "quats": torch.tensor([1.0, 0.0, 0.0, 0.0], device=device).expand(count, 4),
         "opacities": torch.logit(torch.full((count,), OPACITY, device=device)),
-        # colour = 1/2 + C0 sh0
-        "sh0": ((chosen["colors"] - 0.5) / SH_C0)[:, None],
-        "shN": torch.zeros_like(params["shN"][:count]),
         NEAR_DEPTHS: chosen["depths"],
+        **dict.fromkeys(BASES, base),
     }
     for name, value in params.items():
-        value[number:] = new[name]
+        rows = value[number:]
+        if name in new:
+            rows.copy_(new[name].reshape(rows.shape))
+        elif name in HARMONICS:
+            rows.zero_()
     return count

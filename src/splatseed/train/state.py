@@ -98,7 +98,7 @@ def make_strategy(
             return Mcmc(settings, capacity)
         case "grow":
             maps = {name: torch.as_tensor(each).to(device) for name, each in depths.items()}
-            return Growing(settings, capacity, maps, share)
+            return Growing(settings.schedule, capacity, maps, share)
         case "none":
             return Strategy(capacity)
 

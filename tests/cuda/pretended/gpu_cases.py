@@ -27,13 +27,16 @@ import torch
 from splatseed.errors import MissingDependencyError, PointCloudError
 from splatseed.splat.evaluate import evaluate_views
 from splatseed.splat.metrics import ssim_of_all
+from splatseed.gsplat import GrowStrategy
 from splatseed.io import load_scene
+from splatseed.io.depth_maps import depth_folder
 from splatseed.runtime import torch_device
 from splatseed.splat import rendering
 from splatseed.splat.gaussians import initial_gaussians
 from splatseed.synthetic import make_capture, write_capture
 from splatseed.train import TrainSettings, prepare_run, trainer
 from splatseed.train.device import Capacity
+from splatseed.train.parameters import as_parameters
 from splatseed.view import pictures
 from splatseed.view.models import Shown, stage_frame
 from splatseed.views.view import load_split
@@ -84,6 +87,27 @@ def test_a_run_on_cuda_takes_the_steps_of_the_cpu(room, tmp_path, strategy):
         ours, theirs = ([getattr(r, name) for r in run.state.records] for run in (gpu, cpu))
         np.testing.assert_allclose(ours, theirs, rtol=tolerance)
     assert scores.psnr == pytest.approx(cpu.finish(evaluate_views).scores.psnr, abs=0.1)
+
+
+def test_growth_in_another_trainers_loop_stays_on_the_gpu(room, tmp_path):
+    view = load_split(room)[0][0]
+    with depth_folder(tmp_path / "maps", "z") as writer:
+        writer.write(view.name, np.full((6, 8), 2.0, np.float32))
+    with pc.pretended_gpu():
+        device = torch.device("cuda")
+        first = initial_gaussians(room.points).arrays()
+        params = as_parameters({n: torch.tensor(v, device=device) for n, v in first.items()})
+        optimizers = {name: torch.optim.Adam([value]) for name, value in params.items()}
+        camera = rendering.camera_of(view, device)
+        truth = rendering.photograph_of(view, device)[None]
+        strategy = GrowStrategy(2000, 12, 60, 12, depths=tmp_path / "maps", depth_scale=1.0)
+        state = strategy.initialize_state()
+        for step in range(13):
+            seen = camera.viewmats, camera.Ks, torch.zeros_like(truth), truth
+            strategy.observe(params, state, step, *seen, [view.name])
+            strategy.step_post_backward(params, optimizers, state, step, {}, lr=0.1)
+        assert len(room.points) < len(params["means"]) <= 2000
+        assert all(value.is_cuda for value in params.values())
 
 
 @pytest.mark.parametrize("strategy", ["default", "mcmc", "grow", "none"])
