@@ -22,13 +22,14 @@ from torch import Tensor
 
 from splatseed import Scene, load_scene
 from splatseed.errors import SceneFormatError
+from splatseed.io.depth_maps import depth_folder
 from splatseed.render import mcmc_on_cpu
 from splatseed.runtime.memory import keep_freed_memory
 from splatseed.splat.evaluate import Render, evaluate_views
 from splatseed.train import TrainSettings, prepare_run
 from splatseed.train.device import Capacity
 from splatseed.train.schedule import FULL_RUN
-from splatseed.train.seeds import usable_seeds
+from splatseed.train.seeds import known_depths, usable_seeds
 from splatseed.train.strategies import Capped
 from splatseed.views.view import View, load_split
 
@@ -82,12 +83,26 @@ def train_peer(
     whole = read_scene(Path(scene), split)
     train, held_out = load_split(whole, data_factor=ours.data_factor, test_every=TEST_EVERY)
     capture = Capture((*train, *held_out), usable_seeds(whole.points, ours, print))
-    with tempfile.TemporaryDirectory() as folder:
-        peer = load_peer(Path(examples), capture, Path(folder), _options(ours))
+    comparing, options = 0.0, _options(ours)
+    with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryDirectory() as maps:
+        if ours.strategy == "grow":
+            comparing = _write_depths(whole, ours, Path(maps) / "maps")
+            options += ["--strategy.depths", f"{maps}/maps"]
+        peer = load_peer(Path(examples), capture, Path(folder), options)
         _adjust(peer.config, ours, capped=capped)
         runner = _ready(peer, ours.seed, train)
         seconds = _train(runner, mcmc_on_cpu() if ours.strategy == "mcmc" else nullcontext())
-    return _result(_renderer(runner), held_out, len(runner.splats["means"]), seconds)
+    count = len(runner.splats["means"])
+    return _result(_renderer(runner), held_out, count, seconds + comparing)
+
+
+def _write_depths(scene: Scene, settings: TrainSettings, folder: Path) -> float:
+    """Write the depth maps of the training views that ours grows by; returns the seconds."""
+    depths, seconds = known_depths(scene, 1.0, settings, "cpu")
+    with depth_folder(folder, "z") as writer:
+        for name, depth in depths.items():
+            writer.write(name, depth)
+    return seconds
 
 
 def _options(settings: TrainSettings) -> list[str]:
@@ -95,7 +110,7 @@ def _options(settings: TrainSettings) -> list[str]:
     options: list[Any] = [settings.strategy, "--disable-viewer", "--disable-video"]
     options += ["--tb-every", 0, "--eval-steps", -1, "--save-steps", -1, "--test-every", TEST_EVERY]
     options += ["--steps-scaler", settings.max_steps / FULL_RUN]
-    if settings.strategy == "mcmc":
+    if settings.strategy != "default":
         options += ["--strategy.cap-max", settings.cap]
     return [str(option) for option in options]
 

@@ -1,7 +1,8 @@
 """gsplat's own trainer on a machine without CUDA: what its file asks for, and what it gets instead.
 
 Promise: nothing of gsplat's examples is kept here. The file is the user's, and it is run as its
-users run it: with its own command line, presets, schedules and losses. What it gets from here are
+users run it: with its own command line, presets, schedules and losses; for strategy grow with our
+patch, in a copy. What it gets from here are
 the views and points of a capture in memory, our rasteriser, our SSIM (both compute what gsplat's
 CUDA code does), and things that do nothing in place of a viewer, logs and files that are never
 asked for.
@@ -14,6 +15,7 @@ from __future__ import annotations
 
 import hashlib
 import runpy
+import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -48,6 +50,8 @@ DIGESTS = MappingProxyType(
 )
 """SHA-256 of the files of the version, line ends as in its repository."""
 SCRIPT = "simple_trainer.py"
+PATCH = Path(__file__).parents[2] / "examples" / "gsplat_grow.patch"
+"""Ours, which users apply to it for strategy grow."""
 FETCH = (
     f"Fetch it with git clone --depth 1 --branch {VERSION} "
     "https://github.com/nerfstudio-project/gsplat, and name its folder examples."
@@ -132,9 +136,19 @@ def load_peer(examples: Path, capture: Capture, folder: Path, options: Sequence[
     places = ["--data-dir", folder, "--result-dir", folder / "result", "--data-factor", 1]
     sys.argv = [SCRIPT, *map(str, options), *map(str, places)]
     sys.path.insert(0, str(examples))
+    script = examples / SCRIPT if options[0] != "grow" else _patched(examples, folder)
     with _standing_in(_modules(examples, capture, folder)):
-        runpy.run_path(str(examples / SCRIPT), run_name="__main__")
+        runpy.run_path(str(script), run_name="__main__")
     return Peer(caught["config"], partial(_make_runner, caught["main"], caught["config"]))
+
+
+def _patched(examples: Path, folder: Path) -> Path:
+    """A copy of the trainer's file with our patch, in a folder ``examples``."""
+    script = folder / "examples" / SCRIPT
+    script.parent.mkdir()
+    script.write_bytes((examples / SCRIPT).read_bytes().replace(b"\r\n", b"\n"))
+    subprocess.run(["git", "apply", "--unidiff-zero", str(PATCH)], cwd=folder, check=True)
+    return script
 
 
 def _make_runner(main: Any, config: Any, seed: int) -> Any:

@@ -32,14 +32,14 @@ from splatseed.views.view import load_split
 
 __all__: list[str] = []
 
-STRATEGIES = ("default", "mcmc")
+STRATEGIES = ("default", "grow", "mcmc")
 PEER = {f"gsplat-{strategy}": strategy for strategy in STRATEGIES}
 OURS = {
     f"splatseed-{name}": name
     for name in get_args(StrategyName)
     if name.partition("-")[0] in STRATEGIES
 }
-"""The peer's strategies, in splatseed's conventions and in 3DGS's."""
+"""The same strategies, in splatseed's conventions and in 3DGS's."""
 ARMS = tuple(sorted((*PEER, *OURS), key=lambda name: name.split("-")[1:]))
 
 
@@ -56,7 +56,7 @@ class Settings:
     max_steps: int = 7000
     """Training steps; both trainers shrink their schedules from 30,000."""
     cap_max: int | None = None
-    """Most Gaussians of strategy mcmc (default: 1,000,000)."""
+    """Most Gaussians of strategies mcmc and grow (default: 1,000,000)."""
     cap_default: bool = False
     """Hold strategy default to --cap-max as well, by our rule in both trainers."""
     repeats: int = 1
@@ -99,7 +99,7 @@ def run_arm(arm: str, seed: int, scene: Path, settings: Settings) -> dict[str, f
 def train_settings(arm: str, seed: int, settings: Settings) -> dict[str, Any]:
     """Fields of ``TrainSettings`` for a run of either trainer."""
     strategy = OURS.get(arm) or PEER[arm]
-    capped = strategy.startswith("mcmc") or settings.cap_default
+    capped = not strategy.startswith("default") or settings.cap_default
     return {
         "strategy": strategy,
         "max_steps": settings.max_steps,
@@ -158,7 +158,7 @@ def heading(path: Path, settings: Settings) -> str:
     """
     scene = read_scene(path, settings.split)
     train, held_out = load_split(scene, data_factor=settings.data_factor)
-    cap = f"{settings.cap_max or BUDGET:,}{'' if settings.cap_default else ' for mcmc'}"
+    cap = f"{settings.cap_max or BUDGET:,}{'' if settings.cap_default else ' for mcmc and grow'}"
     return (
         f"### Peer: gsplat's trainer, {path.name}, {settings.max_steps:,} steps\n\n"
         f"{len(train)} training and {len(held_out)} {settings.split} views of {train[0].width} x "
