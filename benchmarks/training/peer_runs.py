@@ -3,7 +3,7 @@
 Notation: *held out* are the views that a run is scored on: of the capture's test views, or without
 these of every eighth of the rest (*validation*). Promise: both trainers are given the same pixels,
 cameras and points, and their renders are scored by the same function; seconds are those of
-training, without reading, compiling, tests and scores.
+training and of finding depth for growth, without reading, compiling, tests and scores.
 """
 
 from __future__ import annotations
