@@ -75,7 +75,10 @@ def test_what_to_install_is_for_this_python_and_for_the_whole_extra(monkeypatch,
     start = r"'/my venv/python' -m pip install"
     with pytest.raises(MissingDependencyError, match="the package torch; found no torch") as caught:
         require("torch")
-    wanted = "'torch>=2.4' 'gsplat>=1.5.3,<1.6' 'torchmetrics>=1.4' 'pandas>=2.2' 'jinja2>=3.1'"
+    wanted = (
+        "'torch>=2.4' 'gsplat>=1.5.3,<1.6' 'torchmetrics>=1.4' 'flip-evaluator>=1.7' 'pandas>=2.2' "
+        "'jinja2>=3.1'"
+    )
     assert caught.value.fix.startswith(f"Install it (extra train): {start} {wanted}.")
     tested.touch()
     upgraded = install_command("pycolmap", upgrade=True)
@@ -268,6 +271,7 @@ def test_dependencies_are_those_that_are_imported():
     names = {e: {re.split(r"[><=\[;]", line)[0] for line in extras[e]} for e in extras}
     more = names["train"] | names["tensorboard"]
     called = {"PIL": "pillow", "imageio_ffmpeg": "imageio-ffmpeg"}
+    called["flip_evaluator"] = "flip-evaluator"
     for path in SOURCE.rglob("*.py"):
         imported = {name.split(".")[0] for name in _imports(path)}
         needed = imported - set(sys.stdlib_module_names) - {"splatseed", "pycolmap"}

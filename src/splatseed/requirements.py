@@ -16,6 +16,7 @@ EXTRAS = {
         "torch>=2.4",
         "gsplat>=1.5.3,<1.6",
         "torchmetrics>=1.4",
+        "flip-evaluator>=1.7",
         "pandas>=2.2",
         "jinja2>=3.1",
     ),

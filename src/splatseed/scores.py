@@ -1,8 +1,8 @@
 """Scores: how well test views were rendered, during a run and at its end.
 
-Notation: PSNR in dB, SSIM and LPIPS without unit; seconds are wall time. Promise: results have
-these types from evaluation through training to a benchmark's ledger; means are means over images of
-per-image values; what was not measured is None, with the reason beside it.
+Notation: PSNR in dB, SSIM, FLIP and LPIPS without unit; seconds are wall time. Promise: results
+have these types from evaluation through training to a benchmark's ledger; means are means over
+images of per-image values; what was not measured is None, with the reason beside it.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ class ViewScore:
     seconds: float  # time to render it
     covisible_psnr: float | None = None  # over what two training views see; None if unknown
     covisible_share: float | None = None  # of such pixels; likewise
+    flip: float | None = None  # 0 for equal images; None in results of versions without it
 
 
 @dataclass(frozen=True)
@@ -49,6 +50,11 @@ class EvalResult:
         return _mean(score.ssim for score in self.per_image)
 
     @property
+    def flip(self) -> float | None:
+        """Mean FLIP; None where it was not measured."""
+        return _mean_known(score.flip for score in self.per_image)
+
+    @property
     def lpips(self) -> float | None:
         """Mean LPIPS; None where it was not measured."""
         return _mean_known(score.lpips for score in self.per_image)
@@ -70,7 +76,8 @@ class EvalResult:
 
     def to_dict(self) -> dict[str, Any]:
         """The result as plain values; infinity, which JSON lacks, becomes None."""
-        means = ("psnr", "ssim", "lpips", "covisible_psnr", "covisible_share", "render_seconds")
+        names = ("psnr", "ssim", "flip", "lpips", "covisible_psnr", "covisible_share")
+        means = (*names, "render_seconds")
         return {
             **_finite({name: getattr(self, name) for name in means}),
             **{key: value for key, value in asdict(self).items() if key != "per_image"},

@@ -19,14 +19,16 @@ GAINS = {(SFM, 1): 0.0, ("linear", 8): 0.3, ("mls", 4): 0.2, ("mls", 8): 0.5, ("
 NOISE = 0.02
 
 
-def result(psnr, *, steps=1000, points=10, num_gaussians=5000, early=0.0, lpips=None, **changes):
+def result(
+    psnr, *, steps=1000, points=10, num_gaussians=5000, early=0.0, lpips=None, flip=None, **changes
+):
     """A result whose curve rises to ``psnr`` in a straight line, ``early`` of the way sooner."""
     rise = [min(1.0, (i + 1) / points / (1 - early)) for i in range(points)]
     curve = tuple(
         CurvePoint(steps * (i + 1) // points, 2.0 * (i + 1), psnr - 10 + 10 * part, num_gaussians)
         for i, part in enumerate(rise)
     )
-    view = ViewScore("a.png", psnr, 0.8, lpips, 0.01, psnr + 0.5, 0.9)
+    view = ViewScore("a.png", psnr, 0.8, lpips, 0.01, psnr + 0.5, 0.9, flip)
     scores = EvalResult((view,), num_gaussians=num_gaussians, model_bytes=num_gaussians * 236)
     values = {"scores": scores, "curve": curve, "num_seeds": num_gaussians, "device": "CPU",
               "upsample_seconds": 0.5, "train_seconds": 20.0, "peak_bytes": 5 * 10**8,

@@ -171,7 +171,7 @@ def with_capture(bench, path, digest, *gains, **changes):
         for name in ("view0.png", "view1.png"):
             noise = 40 * rng.standard_normal(truth.shape)
             render = np.clip(truth + noise, 0, 255).astype(np.float32) / 255
-            write_render(folder / name, truth, render)
+            write_render(folder / name, truth, render, np.abs(render - truth / 255).mean(axis=2))
     return write_bench(bench, finished)
 
 

@@ -154,7 +154,7 @@ def budgeted(noise=0.02, plain=5000):
     finished = []
     for row in runs(strategies=("default", "grow"), noise=noise, seed=3, budget="5000"):
         seconds, count = (1.0, plain) if row.spec.arm.method == SFM else (4.0, 5000)
-        changes = {"upsample_seconds": seconds, "num_gaussians": count, "lpips": 0.25}
+        changes = {"upsample_seconds": seconds, "num_gaussians": count, "lpips": 0.25, "flip": 0.5}
         finished.append(Run(row.spec, result(row.result.psnr, **changes)))
     return one(finished)
 
@@ -170,6 +170,7 @@ def test_every_arm_stands_beside_one_baseline():
     assert within.gain.verdict == "better"
     assert within.gains["covisible"].mean == pytest.approx(within.gain.mean)
     assert (within.means["lpips"], within.gains["lpips"].mean) == (0.25, 0.0)
+    assert (within.means["flip"], within.gains["flip"].mean) == (0.5, 0.0)
     assert (within.runs, within.scenes, within.means["gaussians"]) == (12, study.scenes, 5000)
     assert by_label["random 8x + default"].gain.mean == pytest.approx(-0.4, abs=0.05)
     order = [each.gain.mean for each in compared]

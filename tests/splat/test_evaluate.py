@@ -53,16 +53,24 @@ def test_the_mean_psnr_is_that_of_the_images_not_of_the_mean_error():
     assert [s.name for s in result.per_image] == ["a.png", "b.png"]
 
 
-def test_scores_over_a_mask_and_lpips_are_in_the_result_where_asked_for():
+def test_scores_over_a_mask_and_lpips_where_asked_for_and_what_is_drawn():
     view = _view(np.full((16, 16, 3), 100, np.uint8))
     image = torch.full((16, 16, 3), 100 / 255)
     image[:8] += 0.1
+    drawn = []
     mask = np.zeros((16, 16), bool)
     mask[4:] = True  # a third of it is wrong by 0.1
     metric = {"lpips": lambda *_: 0.25, "covisible": {"a.png": mask}}
-    result = evaluate_views(lambda _: image, [view], **metric)
+    result = evaluate_views(
+        lambda _: image, [view], on_view=lambda *one: drawn.append(one), **metric
+    )
     assert (result.lpips, result.lpips_net, result.lpips_reason) == (0.25, "vgg", "")
     assert result.covisible_share == 0.75
+    ((seen, render, errors),) = drawn
+    assert seen is view
+    np.testing.assert_array_equal(render, image.numpy())
+    assert result.flip == pytest.approx(errors.mean())
+    assert errors[:4].mean() > 4 * errors[-4:].mean()
     assert result.covisible_psnr == pytest.approx(-10 * np.log10(0.01 / 3), abs=1e-3)
     plain = evaluate_views(lambda _: image, [view], lpips_reason="no weights").to_dict()
     assert (plain["lpips"], plain["lpips_reason"]) == (None, "no weights")

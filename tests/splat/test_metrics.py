@@ -9,10 +9,11 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="scoring needs PyTorch")
 
+from PIL import Image as PillowImage
 from torch import nn
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
-from splatseed.splat.metrics import LPIPS_FILE, l1_and_ssim_by_convolution, load_lpips
+from splatseed.splat.metrics import LPIPS_FILE, flip_map, l1_and_ssim_by_convolution, load_lpips
 from splatseed.splat.ssim import l1_and_ssim
 from splatseed.train.trainer import photometric_loss
 
@@ -66,6 +67,33 @@ def test_gradient_is_autograds(rng, compute):
     (3 * expected).backward()
     assert loss.item() == pytest.approx(expected.item(), rel=1e-5)
     torch.testing.assert_close(ours.grad.double(), theirs.grad, rtol=1e-3, atol=1e-8)
+
+
+# FLIP ---------------------------------------------------------------------------------------------
+
+
+def test_flip_is_that_of_its_authors_tool_on_files(rng, tmp_path):
+    """The tool reads PNG by itself, so channels, range and orientation must agree."""
+    theirs = pytest.importorskip("flip_evaluator", reason="FLIP needs its package")
+    photograph, render = rng.integers(0, 256, (2, 24, 40, 3), np.uint8)
+    paths = [str(tmp_path / name) for name in ("photograph.png", "render.png")]
+    for path, image in zip(paths, (photograph, render), strict=True):
+        PillowImage.fromarray(image).save(path)
+    expected, mean, _ = theirs.evaluate(*paths, "LDR", applyMagma=False)
+    ours = flip_map(*(torch.from_numpy(image / np.float32(255)) for image in (render, photograph)))
+    np.testing.assert_allclose(ours, expected[..., 0], atol=1e-5)
+    assert ours.mean() == pytest.approx(mean, abs=1e-5)
+
+
+def test_flip_is_0_where_images_are_equal_and_clamps(rng):
+    photograph = torch.from_numpy(rng.random((60, 90, 3), np.float32))
+    render = photograph.clone()
+    render[:, :30] = 5.0
+    errors = flip_map(render, photograph)
+    assert errors.shape == (60, 90)
+    assert errors[:, 60:].max() == 0.0  # beyond the reach of its filters
+    assert 0.1 < errors[:, :30].mean() < errors.max() <= 1.0
+    np.testing.assert_array_equal(errors, flip_map(render.clamp(0, 1), photograph))
 
 
 # LPIPS --------------------------------------------------------------------------------------------

@@ -195,7 +195,13 @@ def _keep(run: TrainingRun, folder: Path, *, models: bool) -> None:
 
 
 def _score(
-    spec: RunSpec, bench: Path, lpips: Any, progress: Progress, render: Any, views: Sequence[Any]
+    spec: RunSpec,
+    bench: Path,
+    lpips: Any,
+    progress: Progress,
+    render: Any,
+    views: Sequence[Any],
+    on_view: Any,
 ) -> EvalResult:
     """Score test views, also over the pixels that two training views see.
 
@@ -212,7 +218,9 @@ def _score(
         grids = covisible.find_covisible(open_scene(replace(spec.scene, depth="")), every, progress)
         covisible.write_covisible(kept, grids)
     seen = covisible.pixel_masks(grids, views)
-    return evaluate_views(render, views, lpips=lpips, covisible=seen, progress=progress)
+    return evaluate_views(
+        render, views, lpips=lpips, covisible=seen, on_view=on_view, progress=progress
+    )
 
 
 def open_unchanged(facts: SceneFacts) -> Scene:

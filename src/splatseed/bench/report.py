@@ -315,7 +315,7 @@ def _views(view: pictures.ComparedView) -> Part:
         chosen = f"the best of the others on this scene, {lost}"
     caption = (
         f"{view.scene}, test view {view.name}: {view.best}, {chosen} ({view.gain:+.2f} dB over all "
-        "its test views). Error maps: black is none, the brightest 0.25 or more."
+        "its test views). Error maps: FLIP, black is 0, the brightest 1."
     )
     urls = {name: _url(content, "image/jpeg") for name, content in view.pictures.items()}
     return {"kind": "views", "shape": f"{view.shape:.4f}", "caption": caption, "urls": urls}

@@ -188,6 +188,7 @@ def _measures(result: RunResult) -> dict[str, float]:
         "covisible": scores.covisible_psnr,
         "share": scores.covisible_share,
         "ssim": scores.ssim,
+        "flip": scores.flip,
         "lpips": scores.lpips,
         "num_seeds": result.num_seeds,
         "seeding": result.upsample_seconds,

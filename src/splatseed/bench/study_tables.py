@@ -33,7 +33,8 @@ _COSTS = {
 """Heading and digits by measure."""
 _ARM_COLUMNS = {
     "psnr": ("PSNR, dB", "gain, dB", 2, 3), "covisible": ("co-visible, dB", "its gain, dB", 2, 3),
-    "ssim": ("SSIM", "its gain", 4, 4), "lpips": ("LPIPS", "its gain", 4, 4),
+    "ssim": ("SSIM", "its gain", 4, 4), "flip": ("FLIP", "its gain", 4, 4),
+    "lpips": ("LPIPS", "its gain", 4, 4),
 }  # fmt: skip
 """Headings of a score and its gain, and the digits of both."""
 
@@ -200,7 +201,8 @@ def arm_table(study: Study) -> Table:
     share = study.runs.dropna(subset="share").drop_duplicates("scene")["share"].mean()
     scores = (
         "Co-visible PSNR counts the pixels that at least two training views see "
-        f"({share:.0%} of them here). PSNR and SSIM are better when higher, LPIPS when lower. "
+        f"({share:.0%} of them here). PSNR and SSIM are better when higher, FLIP and "
+        "LPIPS when lower. "
         "Seconds are wall time, of making the seeds and of training."
     )
     header = ("seeds", "strategy", *(word for columns in shown.values() for word in columns[:2]),

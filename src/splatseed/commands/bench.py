@@ -233,7 +233,7 @@ class Machine:
 @contextmanager
 def open_machine(options: Options, backend: Backend) -> Iterator[Machine]:
     """The machine to run on, for a plan's backend, while the block runs."""
-    require("torch", "gsplat", "pandas")
+    require("torch", "gsplat", "flip_evaluator", "pandas")
     if options.executor == "local":
         yield _local_machine(options.jobs, backend)
         return

@@ -197,7 +197,7 @@ def _has_pytorch() -> bool:
     """Whether training's packages are completely installed."""
     invalidate_caches()
     try:
-        for package in ("torch", "gsplat", "torchmetrics"):
+        for package in ("torch", "gsplat", "torchmetrics", "flip-evaluator"):
             version(package)  # from what pip writes last
     except PackageNotFoundError:
         return False
@@ -299,7 +299,7 @@ def _summarise(
 def _train(options: Options) -> bool:
     """Train from each set of seeds and compare, if the required packages are installed."""
     try:
-        require("torch", "gsplat")
+        require("torch", "gsplat", "flip_evaluator")
     except MissingDependencyError as error:
         print_note(f"not trained: {error.found} installed. {error.fix}")
         return False
@@ -348,7 +348,8 @@ def _train_arm(
 ) -> tuple[TrainingResult, tuple[Tile, ...]]:
     """Train from an arm's seeds, and score; also a test view's photograph, render and errors."""
     from splatseed.splat.evaluate import evaluate_views  # noqa: PLC0415  (imports PyTorch)
-    from splatseed.splat.rendering import FULL_ERROR, as_bytes, error_map  # noqa: PLC0415  (likewise)
+    from splatseed.splat.metrics import flip_map  # noqa: PLC0415  (likewise)
+    from splatseed.splat.rendering import as_bytes, error_picture, photograph_of  # noqa: PLC0415  (likewise)
     from splatseed.train.run import prepare_run  # noqa: PLC0415  (likewise)
     from splatseed.view.page import Tile  # noqa: PLC0415  (likewise)
 
@@ -362,11 +363,11 @@ def _train_arm(
     shown = run.trainer.test_views[len(run.trainer.test_views) // 2]
     render = np.asarray(run.trainer.render(shown).cpu().numpy(), np.float32)
     score = f"{ARMS[name]}: {result.scores.psnr:.2f} dB over all test views"
-    error = f"error: black 0, bright {FULL_ERROR:g} or more"
+    errors = flip_map(run.trainer.render(shown), photograph_of(shown, run.trainer.device))
     return result, (
         Tile("photograph, not trained on", shown.photograph),
         Tile(score, as_bytes(render)),
-        Tile(error, error_map(shown.photograph, render)),
+        Tile("FLIP: black 0, brightest 1", error_picture(errors)),
     )
 
 

@@ -17,7 +17,7 @@ from splatseed.io.staging import check_output, output_folder, write_json
 from splatseed.literal import counted
 from splatseed.requirements import require
 from splatseed.train.settings import Backend, TrainSettings
-from splatseed.views.view import user_cache_dir
+from splatseed.views.view import View, user_cache_dir
 
 if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
     from splatseed.scores import EvalResult, ViewScore
@@ -28,7 +28,7 @@ LEAST = {"data_factor": 1, "test_every": 2}
 
 @dataclass(frozen=True)
 class Options:
-    """Score a trained model on the test views of its scene: PSNR, SSIM, LPIPS.
+    """Score a trained model on the test views of its scene: PSNR, SSIM, FLIP, LPIPS.
 
     PSNR is given twice: over all pixels, and over those that at least two training views see, by
     the scene's points or its own depth maps; errors elsewhere are a matter of luck.
@@ -54,7 +54,7 @@ class Options:
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """A JSON file to write the scores to."""
     renders: Path | None = None
-    """A folder for pictures: photograph, render, and error map of each test view."""
+    """A folder for pictures: photograph, render, and FLIP of each test view."""
     overwrite: bool = False
     """Replace existing files and folders."""
 
@@ -62,7 +62,7 @@ class Options:
 def run(arguments: list[str]) -> None:
     """Run the verb with these arguments."""
     options = parse_options(Options, "evaluate", arguments)
-    require("torch")
+    require("torch", "flip_evaluator")
     gaussians, config = model_file(options.model), config_of(options.model)
     scene = options.scene or config.get("scene")
     numbers: dict[str, Any] = {
@@ -92,7 +92,7 @@ def run(arguments: list[str]) -> None:
     ]
     print_table(
         f"{counted(len(rows), 'test view')} of {scene}",
-        ("image", "PSNR, dB", "co-visible, dB", "of pixels", "SSIM", "LPIPS", "render, ms"),
+        ("image", "PSNR, dB", "co-visible, dB", "of pixels", "SSIM", "FLIP", "LPIPS", "render, ms"),
         [*rows, ("mean", *_numbers(result), f"{1e3 * result.render_seconds:.1f}")],
     )
     facts = [
@@ -114,8 +114,9 @@ def _evaluate(
 ) -> tuple[EvalResult, str]:
     """Score the test views, write what was asked for, and say why it may be another's scene."""
     from splatseed.splat.covisible import find_covisible, pixel_masks  # noqa: PLC0415  (kernels)
-    from splatseed.splat.evaluate import evaluate_model, load_model, write_renders  # noqa: PLC0415  (PyTorch)
+    from splatseed.splat.evaluate import evaluate_model, load_model  # noqa: PLC0415  (PyTorch)
     from splatseed.splat.metrics import load_lpips  # noqa: PLC0415  (PyTorch)
+    from splatseed.splat.rendering import picture_name, write_render  # noqa: PLC0415  (PyTorch)
     from splatseed.train.device import pick_device  # noqa: PLC0415  (PyTorch)
 
     clock("read", 0.0)
@@ -131,10 +132,17 @@ def _evaluate(
         device=pick_device(options.backend, clock), cache_dir=user_cache_dir(), progress=clock,
     )  # fmt: skip
     seen = pixel_masks(find_covisible(model.scene, numbers["test_every"], clock), model.views)
-    result = evaluate_model(model, lpips=lpips, lpips_reason=reason, covisible=seen, progress=clock)
-    if options.renders is not None:
+    asked: dict[str, Any] = {"lpips": lpips, "lpips_reason": reason, "covisible": seen}
+    asked["progress"] = clock
+    if options.renders is None:
+        result = evaluate_model(model, **asked)
+    else:
         with output_folder(options.renders, kind="evaluate", overwrite=options.overwrite) as folder:
-            write_renders(model, folder, clock)
+
+            def draw(view: View, render: Any, errors: Any) -> None:
+                write_render(folder / picture_name(view.name), view.photograph, render, errors)
+
+            result = evaluate_model(model, on_view=draw, **asked)
     if options.output is not None:
         named = {"model": options.model, "scene": scene}
         write_json(options.output, {**named, **numbers, **result.to_dict()})
@@ -146,4 +154,5 @@ def _numbers(scores: EvalResult | ViewScore) -> tuple[str, ...]:
         return "-" if value is None else format(value, form)
 
     covisible = told(scores.covisible_psnr, ".2f"), told(scores.covisible_share, ".0%")
-    return f"{scores.psnr:.2f}", *covisible, f"{scores.ssim:.4f}", told(scores.lpips, ".4f")
+    perceived = told(scores.flip, ".4f"), told(scores.lpips, ".4f")
+    return f"{scores.psnr:.2f}", *covisible, f"{scores.ssim:.4f}", *perceived

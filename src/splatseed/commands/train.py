@@ -159,7 +159,7 @@ def run(arguments: list[str]) -> None:
     """Run the verb with these arguments."""
     options = parse(arguments)
     settings = options.settings
-    require("torch", "gsplat", *(["viser"] if options.view else []))
+    require("torch", "gsplat", "flip_evaluator", *(["viser"] if options.view else []))
     notes: list[str] = []
     if options.resume and not RunFolder(options.output).is_run:
         notes.append(f"There is no run to resume in {options.output}: a new one begins.")
@@ -343,7 +343,7 @@ def _summarise(options: Options, result: TrainingResult) -> None:
     psnr = f"{scores.psnr:.2f} dB" if math.isfinite(scores.psnr) else "infinite"
     rows = [
         ("test PSNR", psnr),
-        ("test SSIM", f"{scores.ssim:.4f}"),
+        ("test SSIM, FLIP", f"{scores.ssim:.4f}, {scores.flip or 0.0:.4f}"),
         ("Gaussians", f"{scores.num_gaussians:,} from {result.num_seeds:,} seeds"),
         ("training", f"{seconds:.1f} s, {1e3 * seconds / result.steps:.1f} ms per step"),
         ("Gaussians in", str(output / "point_cloud.ply")),

@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float32
 
 from splatseed.requirements import require
 
-require("torch")  # before what loads it, for one clear error
+require("torch", "flip_evaluator")  # before what loads it, for one clear error
 
 import torch
 from torch import Tensor
@@ -32,8 +32,8 @@ from splatseed.scene import Scene
 from splatseed.scores import NOT_ASKED, EvalResult, ViewScore
 from splatseed.splat.formats import read_model
 from splatseed.splat.gaussians import Gaussians, training_frame
-from splatseed.splat.metrics import LPIPS_NET, Lpips, psnr, ssim_of_all
-from splatseed.splat.rendering import ModelRenderer, photograph_of, picture_name, write_render
+from splatseed.splat.metrics import LPIPS_NET, Lpips, flip_map, psnr, ssim_of_all
+from splatseed.splat.rendering import ModelRenderer, photograph_of
 from splatseed.splat.ssim import WINDOW
 from splatseed.splat.world import NO_TRANSFORM, check_world, find_transform, view_in
 from splatseed.views.view import View, load_views, poses_of
@@ -41,6 +41,8 @@ from splatseed.views.view import View, load_views, poses_of
 Covisible: TypeAlias = Mapping[str, Bool[np.ndarray, "H W"]]
 """Which pixels of each test view at least two training views see, by the view's name."""
 Render: TypeAlias = Callable[[View], Float[Tensor, "H W 3"]]
+OnView: TypeAlias = Callable[[View, Float32[np.ndarray, "H W 3"], Float32[np.ndarray, "H W"]], None]
+"""Called with each view scored, its render clamped to [0, 1], and FLIP of each pixel."""
 
 
 @torch.no_grad()
@@ -51,6 +53,7 @@ def evaluate_views(
     lpips: Lpips | None = None,
     lpips_reason: str = NOT_ASKED,
     covisible: Covisible | None = None,
+    on_view: OnView = lambda *_: None,
     progress: Progress = silent,
 ) -> EvalResult:
     """Score renders of views against their photographs.
@@ -63,6 +66,7 @@ def evaluate_views(
         lpips: The LPIPS metric; LPIPS is not measured when left out.
         lpips_reason: Why it is left out, for the reader of the result.
         covisible: The pixels over which PSNR is also computed, for the views it contains.
+        on_view: Called with each view, its render and FLIP, to draw them.
         progress: Called with the stage and the fraction done.
 
     Raises:
@@ -83,7 +87,7 @@ def evaluate_views(
     render(views[0])
     scores = []
     for view in views:
-        scores.append(_score(render, view, lpips, (covisible or {}).get(view.name)))
+        scores.append(_score(render, view, lpips, (covisible or {}).get(view.name), on_view))
         progress("score", len(scores) / len(views))
     return EvalResult(
         tuple(scores),
@@ -93,7 +97,11 @@ def evaluate_views(
 
 
 def _score(
-    render: Render, view: View, lpips: Lpips | None, seen: Bool[np.ndarray, "H W"] | None
+    render: Render,
+    view: View,
+    lpips: Lpips | None,
+    seen: Bool[np.ndarray, "H W"] | None,
+    on_view: OnView,
 ) -> ViewScore:
     start = _now()
     image = render(view)
@@ -109,6 +117,8 @@ def _score(
     within = None
     if seen is not None and seen.any():
         within = psnr(image, photograph, torch.from_numpy(seen).to(image.device))
+    errors = flip_map(image, photograph)
+    on_view(view, image.cpu().numpy(), errors)
     return ViewScore(
         view.name,
         psnr=psnr(image, photograph),
@@ -117,6 +127,7 @@ def _score(
         seconds=seconds,
         covisible_psnr=within,
         covisible_share=None if seen is None else float(seen.mean()),
+        flip=float(errors.mean(dtype=np.float64)),
     )
 
 
@@ -201,14 +212,3 @@ def evaluate_model(model: TrainedModel, **options: Any) -> EvalResult:
     return dataclasses.replace(
         result, num_gaussians=len(model.gaussians), model_bytes=model.gaussians.num_bytes
     )
-
-
-def write_renders(model: TrainedModel, folder: Path, progress: Progress = silent) -> None:
-    """Write a picture of each test view: photograph, render, error map.
-
-    Raises:
-        OutputError: A file cannot be written.
-    """
-    for done, view in enumerate(model.views):
-        write_render(folder / picture_name(view.name), view.photograph, model.render(view))
-        progress("write", (done + 1) / len(model.views))

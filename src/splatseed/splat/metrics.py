@@ -1,4 +1,4 @@
-"""Metrics of two images [H, W, 3], values about 0..1, in PyTorch: PSNR, SSIM and LPIPS.
+"""Metrics of two images [H, W, 3], values about 0..1, in PyTorch: PSNR, SSIM, FLIP and LPIPS.
 
 LPIPS, version 0.1, is the distance of two images in the features of a network: f_l is the output of
 its l-th of 5 stages, scaled to unit length over its channels; w_l >= 0 are learnt from human
@@ -16,8 +16,9 @@ from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
 
+import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float32
 from torch import Tensor, nn
 from torch.nn.functional import conv2d, conv_transpose2d, pad
 
@@ -120,6 +121,26 @@ def ssim_of_all(render: Float[Tensor, "H W 3"], photograph: Float[Tensor, "H W 3
     if render.device.type != "cpu":
         return float(l1_and_ssim_by_convolution(x, y, 0.0, 1.0)[1])
     return float(l1_and_ssim(x.contiguous().numpy(), y.contiguous().numpy(), 0.0, 1.0)[1])
+
+
+@torch.no_grad()
+def flip_map(
+    render: Float[Tensor, "H W 3"], photograph: Float[Tensor, "H W 3"]
+) -> Float32[np.ndarray, "H W"]:
+    """FLIP of each pixel: how different two images look when one replaces the other, 0 to 1.
+
+    It is LDR-FLIP for a screen with 67 pixels per degree of the eye's field, computed on the CPU
+    by its authors' package (Andersson et al. 2020). Images are sRGB, clamped to [0, 1].
+
+    Raises:
+        MissingDependencyError: flip-evaluator is absent.
+    """
+    require("flip_evaluator")
+    from flip_evaluator import evaluate  # noqa: PLC0415  (only FLIP needs it)
+
+    images = (each.clamp(0, 1).cpu().contiguous().numpy() for each in (photograph, render))
+    errors, _, _ = evaluate(*images, "LDR", applyMagma=False, computeMeanError=False)
+    return np.asarray(errors[..., 0])
 
 
 @dataclass(frozen=True, eq=False)

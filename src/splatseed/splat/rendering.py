@@ -26,8 +26,6 @@ from splatseed.views.view import View
 
 SHARE = 0.25  # most of a GPU's free memory that photographs may take
 LEAST_ALPHA = 0.05  # below which a pixel has no depth
-FULL_ERROR = 0.25
-"""The error that is drawn brightest, in all pictures, so that they can be compared."""
 GAP = 4  # white columns between the pictures of a row
 
 
@@ -171,18 +169,11 @@ def _bytes_of(view: View, device: torch.device) -> UInt8[Tensor, "H W 3"]:
 # Pictures -----------------------------------------------------------------------------------------
 
 
-def error_map(
-    photograph: UInt8[np.ndarray, "H W 3"], render: Float32[np.ndarray, "H W 3"]
-) -> UInt8[np.ndarray, "H W 3"]:
-    """The error of each pixel as a colour: black is none, ``FULL_ERROR`` or more the brightest.
-
-    It is the mean over the channels of |render - photograph|, 0 to 1; the render is clamped.
-    """
+def error_picture(errors: Float32[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W 3"]:
+    """FLIP of each pixel in the colours of its authors: black is 0, the brightest 1."""
     from matplotlib import colormaps  # noqa: PLC0415  (slow to import)
 
-    error = np.abs(np.clip(render, 0.0, 1.0) - photograph / np.float32(255)).mean(axis=2)
-    colors = colormaps["inferno"](np.minimum(error / FULL_ERROR, 1.0), bytes=True)
-    return np.asarray(colors[..., :3], np.uint8)
+    return np.asarray(colormaps["magma"](errors, bytes=True)[..., :3], np.uint8)
 
 
 def as_bytes(image: Float32[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
@@ -193,14 +184,14 @@ def as_bytes(image: Float32[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
 def write_render(
     path: Path,
     photograph: UInt8[np.ndarray, "H W 3"],
-    render: Float[Tensor, "H W 3"] | Float32[np.ndarray, "H W 3"],
+    render: Float32[np.ndarray, "H W 3"],
+    errors: Float32[np.ndarray, "H W"],
 ) -> None:
-    """Write a PNG of photograph, render and error map in a row."""
+    """Write a PNG of photograph, render and FLIP in a row."""
     from PIL import Image  # noqa: PLC0415  (slow to import)
 
-    pixels = render.cpu().numpy() if isinstance(render, Tensor) else render
     gap = np.full((len(photograph), GAP, 3), 255, np.uint8)
-    row = [photograph, gap, as_bytes(pixels), gap, error_map(photograph, pixels)]
+    row = [photograph, gap, as_bytes(render), gap, error_picture(errors)]
     with atomic_file(path) as partial:
         Image.fromarray(np.concatenate(row, axis=1)).save(partial)
 

@@ -23,9 +23,9 @@ def __getattr__(name: str) -> Any:
     """The parts that need PyTorch and gsplat.
 
     Raises:
-        MissingDependencyError: One of them is absent.
+        MissingDependencyError: One of them, or flip-evaluator, is absent.
     """
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    require("torch", "gsplat")
+    require("torch", "gsplat", "flip_evaluator")
     return getattr(import_module("splatseed.train.run"), name)

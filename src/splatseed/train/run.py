@@ -16,9 +16,9 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
+from jaxtyping import Float32
 
 from splatseed.errors import (
     OutputError,
@@ -55,9 +55,8 @@ from splatseed.train.state import (
 from splatseed.train.trainer import Trainer
 from splatseed.views.view import View, check_lens, load_split, poses_of
 
-Render = Callable[[View], Float[Tensor, "H W 3"]]
-Score = Callable[[Render, Sequence[View]], EvalResult]
-"""Scores renders against views, as ``evaluate.evaluate_views`` does."""
+Score = Callable[..., EvalResult]
+"""Scores renders against views, and calls ``on_view``, as ``evaluate.evaluate_views`` does."""
 
 SAVE_EVERY = 60.0
 """Least seconds between checkpoints, so that saving stays a small part of the time."""
@@ -369,7 +368,8 @@ class TrainingRun:
         state, folder, views = self.state, self.folder, self.trainer.test_views
         with self.told():
             progress("score", 0.0)
-            scores = score(self.trainer.render, views)
+            folder.claim([folder.renders / picture_name(view.name) for view in views])
+            scores = score(self.trainer.render, views, on_view=self._draw)
             world = self._frame.gaussians_to_world(gaussians_of(state.params))
             result = TrainingResult(
                 dataclasses.replace(scores, num_gaussians=len(world), model_bytes=world.num_bytes),
@@ -386,14 +386,15 @@ class TrainingRun:
             write_model(folder.gaussians, world)
             write_curve_csv(folder.curve_csv, state.records)
             write_curve_png(folder.curve_png, state.records)
-            pictures = [folder.renders / picture_name(view.name) for view in views]
-            folder.claim(pictures)
-            for i, (view, path) in enumerate(zip(views, pictures, strict=True)):
-                write_render(path, view.photograph, self.trainer.render(view))
-                progress("write", (i + 1) / len(views))
             write_json(folder.metrics, result.to_dict())  # last: the run has finished
             folder.checkpoint.unlink(missing_ok=True)
         return result
+
+    def _draw(
+        self, view: View, render: Float32[np.ndarray, "H W 3"], errors: Float32[np.ndarray, "H W"]
+    ) -> None:
+        path = self.folder.renders / picture_name(view.name)
+        write_render(path, view.photograph, render, errors)
 
     def _on_record(self, record: Record) -> None:
         if self._board:

@@ -26,7 +26,8 @@ from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene
 from splatseed.seeding.coverage import covered_cells
 from splatseed.splat.gaussians import Gaussians, TrainingFrame
-from splatseed.splat.rendering import ModelRenderer, as_bytes, error_map
+from splatseed.splat.metrics import flip_map
+from splatseed.splat.rendering import ModelRenderer, as_bytes, error_picture
 from splatseed.upsample import origin_name
 from splatseed.view.clouds import cell_picture
 from splatseed.view.models import Shown, pinhole_view
@@ -41,7 +42,7 @@ MOST_MOVING = 250_000
 """Gaussians rendered while a camera moves, on the CPU: projecting a million takes longer there than
 all pixels. A GPU, which projects millions in milliseconds, renders all."""
 CELL = 8  # side in pixels of the cells that are tested for seeds
-PHOTOGRAPH_SIDE, CELLS_SIDE = 1600, 800
+PHOTOGRAPH_SIDE, CELLS_SIDE, ERROR_SIDE = 1600, 800, 640  # FLIP takes 1.6 s a megapixel on a core
 AT_A_CAMERA = {"photograph", "error", "depth map", "uncovered cells"}
 GO = "Click a camera to stand where a photograph was taken."
 MOST_CAMERAS = 400  # that are drawn; of more, an even subset
@@ -176,12 +177,12 @@ class Entry:
         return laid_onto(canvas, photograph, at.camera)
 
     def _error(self, canvas: View, at: Image) -> Picture | str:
-        photograph = self._photograph(canvas, at)
-        if isinstance(photograph, str):
-            return photograph
-        white = np.full((2, 2, 3), 255, np.uint8)
-        inside = laid_onto(canvas, white, at.camera, smooth=False) > 0
-        return np.where(inside, error_map(photograph, self.renderer.color(canvas)), 0)
+        side = min(ERROR_SIDE, max(canvas.width, canvas.height))
+        view, photograph = _sized(at, side), _photograph_of(self._scene, at, side)
+        if photograph is None:
+            return f"The photograph {at.name} cannot be read."
+        images = torch.from_numpy(self.renderer.color(view)), torch.from_numpy(photograph) / 255
+        return laid_onto(canvas, error_picture(flip_map(*images)), at.camera)
 
     def _depth_map(self, canvas: View, at: Image) -> Picture | str:
         maps = self._scene.depths
