@@ -27,6 +27,7 @@ class ViewScore:
     covisible_psnr: float | None = None  # over what two training views see; None if unknown
     covisible_share: float | None = None  # of such pixels; likewise
     flip: float | None = None  # 0 for equal images; None in results of versions without it
+    cc_psnr: float | None = None  # PSNR after correcting the render's colours, dB; likewise
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,11 @@ class EvalResult:
     def ssim(self) -> float:
         """Mean SSIM."""
         return _mean(score.ssim for score in self.per_image)
+
+    @property
+    def cc_psnr(self) -> float | None:
+        """Mean colour-corrected PSNR in dB; None where it was not measured."""
+        return _mean_known(score.cc_psnr for score in self.per_image)
 
     @property
     def flip(self) -> float | None:
@@ -76,7 +82,7 @@ class EvalResult:
 
     def to_dict(self) -> dict[str, Any]:
         """The result as plain values; infinity, which JSON lacks, becomes None."""
-        names = ("psnr", "ssim", "flip", "lpips", "covisible_psnr", "covisible_share")
+        names = ("psnr", "cc_psnr", "ssim", "flip", "lpips", "covisible_psnr", "covisible_share")
         means = (*names, "render_seconds")
         return {
             **_finite({name: getattr(self, name) for name in means}),

@@ -43,6 +43,7 @@ def test_a_run_scores_as_it_did_when_it_was_trained(run_folder, splatseed, tmp_p
     # What was written is in the world, in single precision: the training frame must be undone.
     assert scores["psnr"] == pytest.approx(metrics["psnr"], abs=0.01)
     assert scores["ssim"] == pytest.approx(metrics["ssim"], abs=1e-3)
+    assert scores["cc_psnr"] == pytest.approx(metrics["cc_psnr"], abs=0.01)
     assert scores["flip"] == pytest.approx(metrics["flip"], abs=1e-3)
     assert scores["num_gaussians"] == metrics["num_gaussians"]
     assert (scores["data_factor"], scores["test_every"]) == (2, 4)

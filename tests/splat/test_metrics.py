@@ -13,7 +13,14 @@ from PIL import Image as PillowImage
 from torch import nn
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
-from splatseed.splat.metrics import LPIPS_FILE, flip_map, l1_and_ssim_by_convolution, load_lpips
+from splatseed.splat.metrics import (
+    LPIPS_FILE,
+    color_corrected,
+    flip_map,
+    l1_and_ssim_by_convolution,
+    load_lpips,
+    psnr,
+)
 from splatseed.splat.ssim import l1_and_ssim
 from splatseed.train.trainer import photometric_loss
 
@@ -94,6 +101,41 @@ def test_flip_is_0_where_images_are_equal_and_clamps(rng):
     assert errors[:, 60:].max() == 0.0  # beyond the reach of its filters
     assert 0.1 < errors[:, :30].mean() < errors.max() <= 1.0
     np.testing.assert_array_equal(errors, flip_map(render.clamp(0, 1), photograph))
+
+
+# Colours ------------------------------------------------------------------------------------------
+
+
+def _corrected_slowly(render, photograph):
+    """multinerf's ``color_correct``, a pixel a row of the system."""
+    x, y, eps = render.reshape(-1, 3).astype(float), photograph.reshape(-1, 3), 0.5 / 255
+    inside = lambda values: (values >= eps) & (values <= 1 - eps)
+    first = inside(x)
+    for _ in range(5):
+        squares = [x[:, i] * x[:, j] for i in range(3) for j in range(i, 3)]
+        terms = np.stack([*squares, *x.T, np.ones(len(x))], axis=1)
+        masks = (first & inside(x) & inside(y)).T
+        fits = [np.linalg.lstsq(terms[m], y[m, c])[0] for c, m in enumerate(masks)]
+        x = np.clip(terms @ np.stack(fits, axis=1), 0, 1)
+    return x.reshape(render.shape)
+
+
+def test_colors_are_corrected_as_by_multinerf_and_gsplat(rng):
+    photograph = rng.random((40, 30, 3)).astype(np.float32)
+    mixed = photograph @ np.array([[0.8, 0.1, 0], [0, 0.6, 0], [0, 0.1, 1.4]], np.float32)
+    render = np.clip(mixed**1.1 + 0.03 * rng.standard_normal(mixed.shape), 0, 1).astype(np.float32)
+    corrected = color_corrected(torch.from_numpy(render), torch.from_numpy(photograph))
+    np.testing.assert_allclose(corrected, _corrected_slowly(render, photograph), atol=1e-5)
+
+
+def test_a_change_of_exposure_costs_nothing_once_corrected_but_another_content_does(rng):
+    photograph = torch.from_numpy(rng.random((40, 30, 3), np.float32))
+    dark = 0.6 * photograph + 0.05
+    assert psnr(dark, photograph) < 20
+    assert psnr(color_corrected(dark, photograph), photograph) > 60
+    assert psnr(color_corrected(dark.flip(0), photograph), photograph) < 15
+    for value in (0.0, 0.5, 1.0):  # nothing to fit, or the same everywhere
+        assert bool(color_corrected(torch.full_like(dark, value), photograph).isfinite().all())
 
 
 # LPIPS --------------------------------------------------------------------------------------------

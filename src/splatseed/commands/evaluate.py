@@ -92,7 +92,17 @@ def run(arguments: list[str]) -> None:
     ]
     print_table(
         f"{counted(len(rows), 'test view')} of {scene}",
-        ("image", "PSNR, dB", "co-visible, dB", "of pixels", "SSIM", "FLIP", "LPIPS", "render, ms"),
+        (
+            "image",
+            "PSNR, dB",
+            "cc, dB",
+            "co-visible, dB",
+            "of pixels",
+            "SSIM",
+            "FLIP",
+            "LPIPS",
+            "render, ms",
+        ),
         [*rows, ("mean", *_numbers(result), f"{1e3 * result.render_seconds:.1f}")],
     )
     facts = [
@@ -155,4 +165,5 @@ def _numbers(scores: EvalResult | ViewScore) -> tuple[str, ...]:
 
     covisible = told(scores.covisible_psnr, ".2f"), told(scores.covisible_share, ".0%")
     perceived = told(scores.flip, ".4f"), told(scores.lpips, ".4f")
-    return f"{scores.psnr:.2f}", *covisible, f"{scores.ssim:.4f}", *perceived
+    level = f"{scores.psnr:.2f}", told(scores.cc_psnr, ".2f")
+    return *level, *covisible, f"{scores.ssim:.4f}", *perceived

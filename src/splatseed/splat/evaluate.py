@@ -32,7 +32,7 @@ from splatseed.scene import Scene
 from splatseed.scores import NOT_ASKED, EvalResult, ViewScore
 from splatseed.splat.formats import read_model
 from splatseed.splat.gaussians import Gaussians, training_frame
-from splatseed.splat.metrics import LPIPS_NET, Lpips, flip_map, psnr, ssim_of_all
+from splatseed.splat.metrics import LPIPS_NET, Lpips, color_corrected, flip_map, psnr, ssim_of_all
 from splatseed.splat.rendering import ModelRenderer, photograph_of
 from splatseed.splat.ssim import WINDOW
 from splatseed.splat.world import NO_TRANSFORM, check_world, find_transform, view_in
@@ -128,6 +128,7 @@ def _score(
         covisible_psnr=within,
         covisible_share=None if seen is None else float(seen.mean()),
         flip=float(errors.mean(dtype=np.float64)),
+        cc_psnr=psnr(color_corrected(image, photograph), photograph),
     )
 
 

@@ -34,6 +34,10 @@ _TAPS = (3, 8, 15, 22, 29)  # the layers whose output is compared
 # Each channel of an image in [-1, 1] becomes (value - SHIFT) / SCALE, as in the metric's code.
 _SHIFT = (-0.030, -0.088, -0.188)
 _SCALE = (0.458, 0.448, 0.450)
+_UNSATURATED = 0.5 / 255
+"""Least distance of a value from 0 and from 1 at which a camera has not cut it off."""
+_CORRECTIONS = 5
+"""Fits of a render's colours to a photograph's: after each, other pixels are saturated."""
 _EPSILON = 1e-8
 """Added to the squared length, so that features that are all 0 can be scaled."""
 
@@ -51,6 +55,36 @@ def psnr(
     error = (render.clamp(0, 1) - photograph).square()
     error = error if mask is None else error[mask]
     return float(-10 * torch.log10(error.mean(dtype=torch.float64)))
+
+
+@torch.no_grad()
+def color_corrected(
+    render: Float[Tensor, "H W 3"], photograph: Float[Tensor, "H W 3"]
+) -> Float[Tensor, "H W 3"]:
+    """A render in [0, 1] with the change of its colours that brings it closest to a photograph.
+
+    Each channel becomes the quadratic polynomial of the render's three that fits best in least
+    squares, over the pixels whose channel is saturated in neither image; this is repeated on the
+    result. It is multinerf's ``color_correct`` (Barron et al. 2022), which nerfstudio has too, and
+    gsplat's ``color_correct_quadratic``, in double precision; of equally good polynomials the one
+    of least norm is taken, so that a render of one colour has one.
+    """
+    x, y = (image.reshape(-1, 3).T.double() for image in (render.clamp(0, 1), photograph))
+    usable = _unsaturated(x) & _unsaturated(y)
+    for _ in range(_CORRECTIONS):
+        r, g, b = x
+        terms = torch.stack([r * r, r * g, r * b, g * g, g * b, b * b, r, g, b, torch.ones_like(r)])
+        fits = []
+        for target, valid in zip(y, usable & _unsaturated(x), strict=True):
+            known = terms * valid
+            inverse = torch.linalg.pinv(known @ terms.T, rtol=1e-12, hermitian=True)
+            fits.append(inverse @ (known @ target))
+        x = (torch.stack(fits) @ terms).clamp(0, 1)
+    return x.T.reshape(render.shape).to(render.dtype)
+
+
+def _unsaturated(values: Float[Tensor, "3 P"]) -> Bool[Tensor, "3 P"]:
+    return (values >= _UNSATURATED) & (values <= 1 - _UNSATURATED)
 
 
 @torch.no_grad()
