@@ -68,10 +68,17 @@ def single_threaded():
 
 # While Gaussians are added, and while the mean is taken.
 @pytest.mark.parametrize(
-    ("strategy", "stop"), [("default", 17), ("grow", 17), ("mcmc", 17), ("none", 17), ("grow", 55)]
+    ("strategy", "stop", "exposure"),
+    [
+        *((each, 17, "none") for each in ("default", "grow", "mcmc", "none")),
+        ("grow", 55, "none"),
+        ("grow", 17, "affine"),
+    ],
 )
-def test_a_run_goes_on_to_the_byte_whatever_the_threads(begin, strategy, stop, single_threaded):
-    settings = {"strategy": strategy, "cap_max": CAP}
+def test_a_run_goes_on_to_the_byte_whatever_the_threads(
+    begin, strategy, stop, exposure, single_threaded
+):
+    settings = {"strategy": strategy, "cap_max": CAP, "exposure": exposure}
     straight = begin("straight", **settings)
     before = torch.get_rng_state()
     assert straight.train()

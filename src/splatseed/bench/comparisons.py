@@ -135,7 +135,7 @@ class ArmKey(NamedTuple):
         return f"{self.seeds} + {self.strategy}"
 
 
-SCORES = ("psnr", "covisible", "ssim", "flip", "lpips")
+SCORES = ("psnr", "cc_psnr", "covisible", "ssim", "flip", "lpips")
 _TIMED = ("in_time", "steps", "seconds")
 
 

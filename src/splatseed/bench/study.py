@@ -185,6 +185,7 @@ def _measures(result: RunResult) -> dict[str, float]:
     scores = result.scores
     measures = {
         "psnr": scores.psnr,
+        "cc_psnr": scores.cc_psnr,
         "covisible": scores.covisible_psnr,
         "share": scores.covisible_share,
         "ssim": scores.ssim,

@@ -32,7 +32,9 @@ _COSTS = {
 }  # fmt: skip
 """Heading and digits by measure."""
 _ARM_COLUMNS = {
-    "psnr": ("PSNR, dB", "gain, dB", 2, 3), "covisible": ("co-visible, dB", "its gain, dB", 2, 3),
+    "psnr": ("PSNR, dB", "gain, dB", 2, 3),
+    "cc_psnr": ("colour-corrected, dB", "its gain, dB", 2, 3),
+    "covisible": ("co-visible, dB", "its gain, dB", 2, 3),
     "ssim": ("SSIM", "its gain", 4, 4), "flip": ("FLIP", "its gain", 4, 4),
     "lpips": ("LPIPS", "its gain", 4, 4),
 }  # fmt: skip
@@ -189,6 +191,7 @@ def arm_table(study: Study) -> Table:
         name: columns
         for name, columns in _ARM_COLUMNS.items()
         if any(not math.isnan(each.means[name]) for each in compared)
+        and (name != "cc_psnr" or study.settings["exposure"] != "none")
     }
     for each in compared:
         cells: list[Cell] = []

@@ -185,7 +185,7 @@ def run(arguments: list[str]) -> None:
 
     with stage_display(clock):
         result = training.finish(partial(evaluate_views, progress=clock), clock)
-    _summarise(options, result)
+    _summarise(options, training, result)
 
 
 def _prepare(
@@ -337,12 +337,14 @@ def _line(training: TrainingRun, steps_per_second: float | None) -> str:
     )
 
 
-def _summarise(options: Options, result: TrainingResult) -> None:
+def _summarise(options: Options, training: TrainingRun, result: TrainingResult) -> None:
     """Print the final table and the commands to run next."""
     scores, seconds, output = result.scores, result.train_seconds, options.output
+    exposed = training.settings.exposure != "none"
     psnr = f"{scores.psnr:.2f} dB" if math.isfinite(scores.psnr) else "infinite"
     rows = [
         ("test PSNR", psnr),
+        *[("colour-corrected", f"{scores.cc_psnr or 0.0:.2f} dB")] * exposed,
         ("test SSIM, FLIP", f"{scores.ssim:.4f}, {scores.flip or 0.0:.4f}"),
         ("Gaussians", f"{scores.num_gaussians:,} from {result.num_seeds:,} seeds"),
         ("training", f"{seconds:.1f} s, {1e3 * seconds / result.steps:.1f} ms per step"),

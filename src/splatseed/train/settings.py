@@ -21,6 +21,7 @@ StrategyName = Literal[
 Backend = Literal["auto", "cpu", "cuda"]
 Placing = Literal["stereo", "none"]
 Seeding = Literal["advised", "auto", "scene"]
+Exposure = Literal["none", "affine"]
 
 LEAST_GAUSSIANS = 2
 BUDGET = 1_000_000
@@ -39,6 +40,7 @@ ALLOWED: dict[str, int | Sequence[object]] = {
     "backend": get_args(Backend),
     "placing": get_args(Placing),
     "seeding": get_args(Seeding),
+    "exposure": get_args(Exposure),
     "sh_degree": range(4),
     "max_steps": 1,
     "data_factor": 1,
@@ -82,6 +84,9 @@ class TrainSettings:
     3."""
     test_every: int = 8
     """Keep every n-th image, sorted by name, for testing."""
+    exposure: Exposure = "none"
+    """Colour transform of each training photograph, learnt with the Gaussians, for photographs of
+    changing exposure or white balance: affine, or none. Judge by the colour-corrected PSNR."""
     placing: tyro.conf.Suppress[Placing] = "stereo"
     """Strategy grow: put most of the new Gaussians on wrong pixels, at the depth that stereo finds
     there (stereo), or only split Gaussians (none)."""

@@ -24,6 +24,7 @@ from splatseed.errors import SceneFormatError
 from splatseed.io.staging import atomic_file
 from splatseed.pointcloud import PointCloud
 from splatseed.train.device import Capacity
+from splatseed.train.exposure import Exposures
 from splatseed.train.folder import Record
 from splatseed.train.growing import Growing
 from splatseed.train.parameters import (
@@ -76,6 +77,8 @@ class TrainState:
     """Of the steps since the last record."""
     mean: dict[str, Any] = field(default_factory=dict)
     """Of the Gaussians over the end of the run; see ``add_to_mean``."""
+    exposures: Exposures | None = None
+    """Of the training photographs, if they are learnt."""
 
 
 def make_strategy(
@@ -114,7 +117,10 @@ def first_state(
     gaussians, lengths = first_gaussians(seeds, views, settings)
     schedule = settings.schedule
     params = make_parameters(gaussians, device, lengths if schedule.near_depths else None)
-    return TrainState(params, make_optimizers(params, schedule), strategy)
+    state = TrainState(params, make_optimizers(params, schedule), strategy)
+    if settings.exposure == "affine":
+        state.exposures = Exposures.unchanged(len(views), device)
+    return state
 
 
 def save_checkpoint(path: Path, state: TrainState) -> None:
@@ -131,6 +137,8 @@ def save_checkpoint(path: Path, state: TrainState) -> None:
         "held_at": state.strategy.capacity.held_at,
         "mean": state.mean,
     }
+    if state.exposures is not None:
+        content["exposures"] = state.exposures.transforms
     with atomic_file(path) as partial:
         torch.save(content, partial)
 
@@ -153,7 +161,8 @@ def load_checkpoint(
             records = [Record(*row) for row in content["records"]]
             watch, losses = Stopwatch(float(content["seconds"])), list(content["losses"])
             run, step = (params, optimizers, strategy), int(content["step"])
-            return TrainState(*run, step, records, watch, losses, content["mean"])
+            exposures = Exposures(content["exposures"]) if "exposures" in content else None
+            return TrainState(*run, step, records, watch, losses, content["mean"], exposures)
     except Exception as error:  # noqa: BLE001  (PyTorch raises anything for a damaged file)
         found = f"a damaged file ({type(error).__name__})"
     raise SceneFormatError(

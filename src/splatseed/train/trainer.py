@@ -91,16 +91,21 @@ class Trainer:
         return render_view(self.state.params, view, degree)[0]
 
     def _advance(self, step: int) -> tuple[Float[Tensor, "H W 3"], Float[Tensor, "H W 3"]]:
-        """Take one step; returns the render and the photograph."""
+        """Take one step; returns the render, at the photograph's exposure, and the photograph."""
         state, schedule = self.state, self.settings.schedule
         params, optimizers, strategy = state.params, state.optimizers, state.strategy
         words = np.random.SeedSequence([self.settings.seed, step]).generate_state(1, np.uint64)
         torch.manual_seed(int(words[0] >> 1))  # 63 bits: PyTorch's seeds are signed
         epoch, position = divmod(step, len(self.train_views))
         order = _epoch_order(self.settings.seed, epoch, len(self.train_views))
-        view = self.train_views[order[position]]
+        index = int(order[position])
+        view = self.train_views[index]
         photograph = self._photographs.of(view)
-        render, info = render_view(params, view, schedule.sh_degree(step, self.settings.sh_degree))
+        plain, info = render_view(params, view, schedule.sh_degree(step, self.settings.sh_degree))
+        render = plain
+        if state.exposures is not None:
+            state.exposures.fit(index, plain, photograph)
+            render = state.exposures.applied(index, plain)
         # gsplat's strategies ask PyTorch to retain the gradient of the 2D means here.
         strategy.before(params, optimizers, step, info)
         loss = photometric_loss(render, photograph)
@@ -110,7 +115,11 @@ class Trainer:
         (loss if penalty is None else loss + penalty).backward()
         self.is_whole = False
         optimize(params, optimizers, schedule.rates(step))
-        strategy.observe(params, view, render, photograph, step)
+        if state.exposures is None:
+            strategy.observe(params, view, render, photograph, step)
+        else:  # at the mean exposure, which is that of the Gaussians it may add
+            undone = state.exposures.undone(index, photograph)
+            strategy.observe(params, view, plain, undone, step)
         strategy.after(params, optimizers, step, info)
         if schedule.mean_from is not None and step >= schedule.mean_from:
             add_to_mean(state.mean, params)
