@@ -31,7 +31,8 @@ class Options:
     """Score a trained model on the test views of its scene: PSNR, SSIM, FLIP, LPIPS.
 
     PSNR is given twice: over all pixels, and over those that at least two training views see, by
-    the scene's points or its own depth maps; errors elsewhere are a matter of luck.
+    the scene's points or its own depth maps; errors elsewhere are a matter of luck. cc is
+    PSNR after correcting the colours of each render, for photographs of changing exposure.
     """
 
     model: Annotated[Path, tyro.conf.Positional]
