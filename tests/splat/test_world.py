@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip("torch")
 
-from splatseed.camera import quat_from_rotation, rotation_from_quat
+from splatseed.camera import rotation_from_quat
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.io import load_scene, write_scene
 from splatseed.io.cleaning import recentred
@@ -18,7 +18,7 @@ from splatseed.similarity import Similarity, fit_similarity
 from splatseed.splat.evaluate import evaluate_model, load_model
 from splatseed.splat.formats import write_model
 from splatseed.splat.gaussians import initial_gaussians
-from splatseed.splat.world import check_world, find_transform
+from splatseed.splat.world import check_world, find_transform, moved
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +28,15 @@ def room(larger_room_path):
 
 @pytest.fixture(scope="module")
 def gaussians(room):
-    return initial_gaussians(load_scene(room).points, opacity=0.9)
+    """Flat ones in every direction, of colours that depend on it."""
+    round_ones = initial_gaussians(load_scene(room).points, opacity=0.9)
+    rng = np.random.default_rng(0)
+    return replace(
+        round_ones,
+        scales=round_ones.scales - np.float32([0, 0, 1]),
+        quats=rng.normal(size=round_ones.quats.shape).astype(np.float32),
+        shN=0.2 * rng.normal(size=round_ones.shN.shape).astype(np.float32),
+    )
 
 
 @pytest.fixture(scope="module")
@@ -36,17 +44,6 @@ def psnr(room, gaussians, tmp_path_factory):
     path = tmp_path_factory.mktemp("world") / "model.ply"
     write_model(path, gaussians)
     return evaluate_model(load_model(path, room)).psnr
-
-
-def moved(gaussians, world):
-    """The same Gaussians in another world; of one colour each, as harmonics would turn too."""
-    rotations = [world.rotation @ rotation_from_quat(quat) for quat in gaussians.quats]
-    return replace(
-        gaussians,
-        means=world.points(gaussians.means).astype(np.float32),
-        scales=gaussians.scales + np.float32(np.log(world.scale)),
-        quats=np.array([quat_from_rotation(each) for each in rotations], np.float32),
-    )
 
 
 @pytest.fixture

@@ -19,7 +19,7 @@ from splatseed.io.ply import write_ply
 from splatseed.pointcloud import PointCloud
 from splatseed.train.folder import RunFolder
 from splatseed.train.run import make_config, resumed
-from splatseed.train.seeds import usable_seeds
+from splatseed.train.seeds import seeds_facts, usable_seeds
 from splatseed.train.settings import TrainSettings
 from splatseed.train.trainer import Trainer
 
@@ -96,7 +96,8 @@ def begun(room_path, tmp_path_factory):
     run = tmp_path_factory.mktemp("old") / "run"
     settings = TrainSettings(strategy="none", max_steps=3, data_factor=2)
     scene = load_scene(room_path)
-    config = make_config(scene, usable_seeds(scene.points, settings, print), settings, "cpu")
+    seeds = seeds_facts(usable_seeds(scene.points, settings, print))
+    config = make_config(scene, seeds, settings, "cpu")
     for name in ("placing", "seed_sizes", "seed_normals", "seed_colors", "seeding"):
         del config[name]
     RunFolder(run).begin(config)

@@ -33,7 +33,9 @@ WITH_CLOUD = ("cloud+auto", "cloud+stereo", "cloud+cover")
 """A scan's seeds, and those that another method puts where it has none."""
 SEE = "See splatseed bench --help."
 SHARED = tuple(
-    each.name for each in fields(TrainSettings) if each.name not in {"strategy", "seed", "seeding"}
+    each.name
+    for each in fields(TrainSettings)
+    if each.name not in {"strategy", "seed", "seeding", "start"}
 )
 """Settings that all runs of a plan share; arms and repeats determine the others."""
 _WHAT = ("name", "digest", "depth_digest", "cloud_digest")

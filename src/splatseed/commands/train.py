@@ -18,6 +18,7 @@ import tyro
 from rich import progress as rich_progress
 from rich.table import Column
 
+from splatseed.commands.models import model_file
 from splatseed.commands.options import parse_options, refuse
 from splatseed.console import ERR, OUT, print_note, print_pairs, stage_display
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
@@ -93,7 +94,8 @@ class Options:
         seeding = self.seeds or (DEFAULT.seeding if goes_on else "advised")
         named = self.training.strategy
         strategy = DEFAULT.strategy if goes_on and named == BEST else named
-        return replace(self.training, seeding=seeding, strategy=strategy)
+        start = self.training.start and str(model_file(Path(self.training.start)).resolve())
+        return replace(self.training, seeding=seeding, strategy=strategy, start=start)
 
 
 def parse(arguments: list[str]) -> Options:
@@ -195,12 +197,17 @@ def _prepare(
 
     clock("read", 0.0)
     has_points = options.seeds == "scene" and not options.refine_poses
-    scene = load_scene(options.scene, require_points=has_points)
+    scene = load_scene(options.scene, require_points=has_points and not settings.start)
     for warning in scene.warnings:
         note(warning)
     if scene.listed is not None:
         note(scene.listed.sentence)
     settings = _within_budget(options, _sized(options, settings, scene), scene, note)
+    seeds, refines = bool(options.seeds), options.refine_poses
+    refuse(
+        (settings.start and seeds, "--start or --seeds", "both", "Leave one out."),
+        (settings.start and refines, "--start or --refine-poses", "both", "Leave one out."),
+    )
     if options.seeds == "auto" and (why := why_not_seeded(scene, settings)):
         note(f"--seeds auto has no effect: {why}.")
     return prepare_run(
@@ -244,6 +251,11 @@ def _within_budget(
     if options.budget is None:
         cap = max(2, min(BUDGET, round(pixels)))
         each = "one for each pixel of a photograph; --budget sets another"
+        if settings.start:  # a merge of two may be larger, and must not be thinned unasked
+            from splatseed.splat.formats import read_model  # noqa: PLC0415  (loads with its use)
+
+            cap = max(cap, len(read_model(Path(settings.start))))
+            each = "one for each pixel of a photograph, or as many as it starts with"
         note(f"At most {cap:,} Gaussians, {each}.")
         return replace(settings, cap_max=cap)
     cap = parse_budget(options.budget, pixels)

@@ -16,7 +16,9 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float64
 
+from splatseed.camera import quat_from_rotation
 from splatseed.errors import ParameterError, SceneFormatError
 from splatseed.io.files import read_json
 from splatseed.io.nerfstudio import NERFSTUDIO, similarity_in
@@ -96,6 +98,70 @@ def check_world(
         "other: another frame, or another scene",
         fix=fix,
     )
+
+
+def in_scene_world(path: Path, scene: Scene, gaussians: Gaussians) -> tuple[Gaussians, str]:
+    """Gaussians, read from a path, brought into the scene's world, and what there is to say.
+
+    They are moved if a transform that their trainer may have applied puts them where the scene's
+    points are, and they are not there already.
+
+    Raises:
+        SceneFormatError: They are in no known world of the scene.
+    """
+    apart = _measure(scene, gaussians)
+    if apart is None or apart(None) <= DOUBTFUL:
+        return gaussians, ""
+    ratios = {word: apart(world) for word, world in _candidates(path, scene).items()}
+    word = min(ratios, key=ratios.__getitem__)
+    if word == NO_TRANSFORM or ratios[word] > min(DOUBTFUL, ratios[NO_TRANSFORM] / CLOSER):
+        return gaussians, check_world(path, scene, gaussians)
+    world = find_transform(word, scene)
+    assert world is not None  # noqa: S101  (only the word none has no transform)
+    return moved(gaussians, world.inverse), (
+        f"The Gaussians of {path} are in their trainer's own world ({word}) and were moved into "
+        "the scene's."
+    )
+
+
+def moved(gaussians: Gaussians, similarity: Similarity) -> Gaussians:
+    """The Gaussians in the similarity's target; their harmonics turn with them."""
+    turn = quat_from_rotation(similarity.rotation)
+    w, x, y, z = gaussians.quats.astype(np.float64).T
+    a, b, c, d = turn
+    # The product of quaternions: first the Gaussian's rotation, then the similarity's.
+    quats = np.stack(
+        [
+            a * w - b * x - c * y - d * z,
+            a * x + b * w + c * z - d * y,
+            a * y - b * z + c * w + d * x,
+            a * z + b * y - c * x + d * w,
+        ],
+        axis=1,
+    )
+    harmonics = np.concatenate([gaussians.sh0, gaussians.shN], axis=1)
+    turned = np.einsum("jk,nkc->njc", _turning(similarity.rotation, harmonics.shape[1]), harmonics)
+    return dataclasses.replace(
+        gaussians,
+        means=similarity.points(gaussians.means).astype(np.float32),
+        scales=gaussians.scales + np.float32(np.log(similarity.scale)),
+        quats=quats.astype(np.float32),
+        shN=turned[:, 1:].astype(np.float32),
+    )
+
+
+def _turning(rotation: Float64[np.ndarray, "3 3"], terms: int) -> Float64[np.ndarray, "K K"]:
+    """The matrix that turns coefficients: y(d) M h = y(R' d) h for every direction d."""
+    import torch  # noqa: PLC0415  (takes a while)
+    from gsplat.cuda._torch_impl import _eval_sh_bases_fast  # noqa: PLC0415
+
+    directions = np.random.default_rng(0).normal(size=(8 * terms, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    here, there = (
+        _eval_sh_bases_fast(terms, torch.from_numpy(np.ascontiguousarray(each))).numpy()
+        for each in (directions, directions @ rotation)
+    )
+    return np.asarray(np.linalg.lstsq(here, there, rcond=None)[0])
 
 
 def _measure(scene: Scene, gaussians: Gaussians) -> Callable[[Similarity | None], float] | None:

@@ -186,7 +186,12 @@ class Growing(Strategy):
         return needless
 
     def _recycled(self, count: int) -> int:
-        """How many make room in a round: a budget that seeds fill moves on only so."""
+        """How many make room in a round: a budget that seeds fill moves on only so.
+
+        Trained Gaussians that a run goes on from have earned their places.
+        """
+        if not self.schedule.recycles:
+            return 0
         filled = FULL * self.capacity.cap if self.capacity.cap else math.inf
         return round(RECYCLED * count) if min(self.state["first"], count) >= filled else 0
 

@@ -31,7 +31,6 @@ from splatseed.io import load_scene
 from splatseed.io.seeds import was_upsampled
 from splatseed.io.staging import write_json
 from splatseed.literal import counted
-from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.requirements import require
 from splatseed.scene import Scene
@@ -43,8 +42,9 @@ from splatseed.splat.ssim import WINDOW
 from splatseed.train.device import check_fits, pick_device
 from splatseed.train.folder import Record, RunFolder, write_curve_csv, write_curve_png
 from splatseed.train.parameters import gaussians_of
-from splatseed.train.seeds import known_depths, seeded, seeds_digest, usable_seeds
+from splatseed.train.seeds import first_gaussians, known_depths, seeded, seeds_facts, usable_seeds
 from splatseed.train.settings import TrainSettings
+from splatseed.train.start import read_start, start_facts, started_gaussians
 from splatseed.train.state import (
     TrainState,
     first_state,
@@ -116,7 +116,8 @@ def prepare_run(
     if tensorboard:
         require("tensorboard")
     folder = RunFolder(Path(output))
-    protect = scene.source.inputs if scene.source else ()
+    protect = [*(scene.source.inputs if scene.source else ())]
+    protect += [Path(settings.start)] if settings.start else []
     folder.check(overwrite=overwrite, resume=resume, protect=protect)
     begun = folder.read_config() if resume and folder.is_run else None
     if begun:
@@ -124,14 +125,16 @@ def prepare_run(
     device = pick_device(settings.backend, progress)
     if refine_poses:
         scene = _at_refined_poses(scene, folder, begun, settings.seed, note, progress)
-    posed = scene
-    scene, stereo = seeded(scene, settings, device.type, note, progress)
-    trained = scene.split(settings.test_every)[0]
-    seeds = usable_seeds(scene.points, settings, note, poses_of(trained, settings.data_factor))
-    check_fits(len(seeds), device)
-    config = make_config(scene, seeds, settings, _name(device), refine_poses=refine_poses)
-    if begun and begun.get("seeds") != config["seeds"]:
-        raise _another_scene(folder, begun, f"points in {config['scene']}")
+    posed, stereo = scene, None
+    start = read_start(Path(settings.start), scene, note) if settings.start else None
+    if start is None:
+        scene, stereo = seeded(scene, settings, device.type, note, progress)
+        trained = scene.split(settings.test_every)[0]
+        seeds = usable_seeds(scene.points, settings, note, poses_of(trained, settings.data_factor))
+        check_fits(len(seeds), device)
+    began = seeds_facts(seeds) if start is None else start_facts(start)
+    config = make_config(scene, began, settings, _name(device), refine_poses=refine_poses)
+    _check_begun(folder, begun, config)
     views = load_split(
         scene,
         data_factor=settings.data_factor,
@@ -151,7 +154,12 @@ def prepare_run(
     if begun and folder.checkpoint.is_file():
         state = load_checkpoint(folder.checkpoint, strategy, settings.schedule, device)
     else:
-        state = first_state(seeds, views[0], settings, strategy, device)
+        gaussians, lengths = (
+            first_gaussians(seeds, views[0], settings)
+            if start is None
+            else started_gaussians(start, views[0], frame, settings, device, note)
+        )
+        state = first_state(gaussians, lengths, settings.schedule, strategy, device)
     if state.step:
         note(f"Resuming after step {state.step:,} of {settings.max_steps:,}.")
     run = TrainingRun(folder, settings, frame, state, views)
@@ -212,13 +220,13 @@ def _at_refined_poses(
 
 def make_config(
     scene: Scene,
-    seeds: PointCloud,
+    seeds: Mapping[str, Any],
     settings: TrainSettings,
     device: str,
     *,
     refine_poses: bool = False,
 ) -> dict[str, Any]:
-    """The content of config.json."""
+    """The content of config.json; ``seeds`` are the facts of what the run begins with."""
     source = scene.source
     points = source.points_path if source and not refine_poses else None
     return {
@@ -228,7 +236,7 @@ def make_config(
         "refine_poses": refine_poses,
         **dataclasses.asdict(settings),
         "device": device,
-        "seeds": {"count": len(seeds), "digest": seeds_digest(seeds)},
+        "seeds": dict(seeds),
         "versions": {
             "python": platform.python_version(),
             **{name: _version(name) for name in ("torch", "gsplat", "numba", "numpy")},
@@ -271,6 +279,15 @@ def resumed(
             found="a text instead of a number",
             fix="Start again with --overwrite.",
         ) from None
+
+
+def _check_begun(
+    folder: RunFolder, begun: Mapping[str, Any] | None, config: Mapping[str, Any]
+) -> None:
+    """Refuse to resume from other seeds, or another start, than the run began with."""
+    if begun and begun.get("seeds") != config["seeds"]:
+        which = f"Gaussians in {config['start']}" if config["start"] else ""
+        raise _another_scene(folder, begun, which or f"points in {config['scene']}")
 
 
 def _another_scene(folder: RunFolder, begun: Mapping[str, Any], found: str) -> ParameterError:

@@ -63,6 +63,8 @@ MEAN_FROM = 0.8
 LARGEST = 0.05
 """Largest initial size of a Gaussian, in near depths. Where SfM has few points the gaps between
 them are wide, and a Gaussian that fills one hides all that lies behind it."""
+START_RATE = 0.25
+"""Learning rates of a run that goes on from trained Gaussians, as a fraction of a new run's."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +76,7 @@ class Schedule:
     learning_rates: Mapping[str, float]  # initial ones; for positions in length units
     decays: Mapping[str, float]  # final fraction of those rates that decay
     beta2: float  # Adam's: the fraction of the mean squared gradient kept at each step
-    sh_every: int  # steps between degrees of the spherical harmonics
+    sh_every: int  # steps between degrees of the spherical harmonics; 0: all at once
     refine_start: int  # densification begins after this step,
     refine_stop: int  # ends before this step,
     refine_every: int  # and comes every so many steps
@@ -91,13 +93,14 @@ class Schedule:
     scale_factor: float = 1.0  # initial size, as a multiple of the gap between Gaussians
     largest: float = math.inf  # upper bound of the initial size, in near depths
     flatness: float = 0.1  # initial thickness of Gaussians with normals, relative to their size
+    recycles: bool = True  # strategy grow takes Gaussians from a budget that seeds filled
     mean_from: int | None = None
     """Step after which the mean of the Gaussians is taken as the run's result; None to end with the
     last step's."""
 
     def sh_degree(self, step: int, highest: int) -> int:
         """The degree of spherical harmonics in use."""
-        return min(step // self.sh_every, highest)
+        return min(step // self.sh_every, highest) if self.sh_every else highest
 
     def rates(self, step: int) -> dict[str, float]:
         """The learning rate of each parameter; positions' in length units."""
@@ -130,6 +133,12 @@ def make_schedule(densification: Densification, max_steps: int, *, as_3dgs: bool
         scale_factor=0.1 if mcmc else 1.0,
     )
     return schedule if as_3dgs else _own(schedule, densification)
+
+
+def started(schedule: Schedule) -> Schedule:
+    """The schedule of a run that goes on from trained Gaussians: lower rates, all harmonics."""
+    rates = {name: START_RATE * rate for name, rate in schedule.learning_rates.items()}
+    return replace(schedule, learning_rates=rates, sh_every=0, recycles=False)
 
 
 def _own(theirs: Schedule, densification: Densification) -> Schedule:

@@ -161,6 +161,11 @@ def usable_seeds(
     return seeds.replace(**dict.fromkeys(n for n in seeds.attributes if not used.get(n)))
 
 
+def seeds_facts(seeds: PointCloud) -> dict[str, Any]:
+    """What a run's config says of its seeds."""
+    return {"count": len(seeds), "digest": seeds_digest(seeds)}
+
+
 def seeds_digest(seeds: PointCloud) -> str:
     """A fingerprint of positions, colours and attributes."""
     digest = hashlib.blake2b(seeds.xyz.tobytes(), digest_size=16)

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, cast, get_args
+from typing import Annotated, Literal, cast, get_args
 
 import tyro
 
 from splatseed.errors import ParameterError
-from splatseed.train.schedule import FULL_RUN, Densification, Schedule, make_schedule
+from splatseed.train.schedule import FULL_RUN, Densification, Schedule, make_schedule, started
 
 StrategyName = Literal[
     "auto", "default", "grow", "mcmc", "none", "default-3dgs", "mcmc-3dgs", "none-3dgs"
@@ -99,6 +99,10 @@ class TrainSettings:
     """Start with flat discs where the scene's seeds.npz has normals."""
     seed_colors: tyro.conf.Suppress[bool] = False
     """Start with the colours that the training photographs show for each seed, by direction."""
+    start: Annotated[str | None, tyro.conf.arg(metavar="MODEL|RUN")] = None
+    """Go on from trained Gaussians instead of points: a run, or a file of any trainer, edited or
+    not, of this scene. Learning rates are lower, and holes are filled where the strategy adds
+    Gaussians."""
     seeding: tyro.conf.Suppress[Seeding] = "scene"  # the option is --seeds, "advised" by default
     """Start from the scene's points as they are, let method ``auto`` add the points that the
     training photographs need, or do what ``splatseed info`` advises. Points that splatseed has
@@ -138,7 +142,8 @@ class TrainSettings:
     def schedule(self) -> Schedule:
         """The run's hyperparameters and their timing."""
         as_3dgs = self.strategy.endswith(AS_3DGS)
-        return make_schedule(self.densification, self.max_steps, as_3dgs=as_3dgs)
+        schedule = make_schedule(self.densification, self.max_steps, as_3dgs=as_3dgs)
+        return started(schedule) if self.start else schedule
 
     @property
     def cap(self) -> int | None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
@@ -22,7 +22,7 @@ from torch import Tensor
 
 from splatseed.errors import SceneFormatError
 from splatseed.io.staging import atomic_file
-from splatseed.pointcloud import PointCloud
+from splatseed.splat.gaussians import Gaussians
 from splatseed.train.device import Capacity
 from splatseed.train.exposure import Exposures
 from splatseed.train.folder import Record
@@ -35,10 +35,8 @@ from splatseed.train.parameters import (
     make_parameters,
 )
 from splatseed.train.schedule import Schedule
-from splatseed.train.seeds import first_gaussians
 from splatseed.train.settings import TrainSettings
 from splatseed.train.strategies import Default, Mcmc, Strategy
-from splatseed.views.view import View
 
 FORMAT = 4
 """Version of the checkpoint's content."""
@@ -107,15 +105,13 @@ def make_strategy(
 
 
 def first_state(
-    seeds: PointCloud,
-    views: Sequence[View],
-    settings: TrainSettings,
+    gaussians: Gaussians,
+    lengths: Float32[np.ndarray, " N"],
+    schedule: Schedule,
     strategy: Strategy,
     device: torch.device,
 ) -> TrainState:
-    """The state before the first step; seeds and training views are in the world."""
-    gaussians, lengths = first_gaussians(seeds, views, settings)
-    schedule = settings.schedule
+    """The state before the first step: Gaussians in the training frame, and their near depths."""
     params = make_parameters(gaussians, device, lengths if schedule.near_depths else None)
     state = TrainState(params, make_optimizers(params, schedule), strategy)
     if settings.exposure == "affine":

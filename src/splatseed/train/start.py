@@ -1,0 +1,98 @@
+"""A run that goes on from trained Gaussians instead of points (``train --start``).
+
+Notation: the *start* is a model, of any trainer, that belongs to the scene: trained on it, edited,
+cropped, or merged from several. Promise: its file is only read; a start in the world of gsplat's
+examples, nerfstudio or graphdeco is brought into the scene's, and that is told; one that has more
+Gaussians than the budget keeps those that contribute most to the training photographs.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float32
+
+from splatseed.scene import Scene
+from splatseed.splat.formats import read_model
+from splatseed.splat.gaussians import Gaussians, TrainingFrame
+from splatseed.splat.world import in_scene_world
+from splatseed.train.growing import contributions
+from splatseed.train.parameters import make_parameters
+from splatseed.train.seeds import near_depths
+from splatseed.train.settings import TrainSettings
+from splatseed.views.view import View
+
+ABSENT = -20.0
+"""Logit of an opacity that renders nothing, for those that a file gives as 0; 20 is opaque."""
+
+
+def read_start(path: Path, scene: Scene, note: Callable[[str], None]) -> Gaussians:
+    """The Gaussians of a file, in the scene's world.
+
+    Raises:
+        SceneNotFoundError: There is no such file.
+        SceneFormatError: It holds no Gaussians, or they belong to another scene.
+    """
+    gaussians, told = in_scene_world(path, scene, read_model(path))
+    if told:
+        note(told)
+    # Some trainers write opacities of 0 and 1, whose logits are infinite.
+    return dataclasses.replace(gaussians, opacities=gaussians.opacities.clip(ABSENT, -ABSENT))
+
+
+def start_facts(gaussians: Gaussians) -> dict[str, Any]:
+    """What a run's config says of its start, in place of its seeds."""
+    digest = hashlib.blake2b(digest_size=16)
+    for array in gaussians.arrays().values():
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return {"count": len(gaussians), "digest": digest.hexdigest()}
+
+
+def started_gaussians(
+    gaussians: Gaussians,
+    views: Sequence[View],
+    frame: TrainingFrame,
+    settings: TrainSettings,
+    device: torch.device,
+    note: Callable[[str], None],
+) -> tuple[Gaussians, Float32[np.ndarray, " N"]]:
+    """The Gaussians that a run begins with, in the training frame, and their near depths [N].
+
+    ``gaussians`` and training views are in the world.
+    """
+    gaussians = frame.gaussians_from_world(_of_degree(gaussians, settings.sh_degree))
+    views = [frame.view(view) for view in views]
+    cap, count = settings.cap, len(gaussians)
+    if cap is not None and count > cap:
+        gaussians = gaussians.select(_contributing_most(gaussians, views, cap, device))
+        note(
+            f"Of {count:,} Gaussians the {cap:,} that contribute most are kept: there may be no "
+            "more under the budget."
+        )
+    return gaussians, near_depths(gaussians.means, views)
+
+
+def _of_degree(gaussians: Gaussians, degree: int) -> Gaussians:
+    """With harmonics of exactly this degree; coefficients that are missing are 0."""
+    wanted = (degree + 1) ** 2 - 1
+    harmonics = np.zeros((len(gaussians), wanted, 3), np.float32)
+    known = min(wanted, gaussians.shN.shape[1])
+    harmonics[:, :known] = gaussians.shN[:, :known]
+    return dataclasses.replace(gaussians, shN=harmonics)
+
+
+def _contributing_most(
+    gaussians: Gaussians, views: Sequence[View], cap: int, device: torch.device
+) -> np.ndarray:
+    """Indices of the ``cap`` Gaussians with the most pixels over the views, ascending."""
+    params = make_parameters(gaussians, device)
+    total = torch.zeros_like(params["opacities"].detach())
+    for view in views:
+        total += contributions(params, view, total.new_zeros((view.height, view.width)))[0]
+    return np.sort(total.topk(cap).indices.cpu().numpy())
