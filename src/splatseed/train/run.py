@@ -154,12 +154,12 @@ def prepare_run(
     if begun and folder.checkpoint.is_file():
         state = load_checkpoint(folder.checkpoint, strategy, settings.schedule, device)
     else:
-        gaussians, lengths = (
+        first = (
             first_gaussians(seeds, views[0], settings)
             if start is None
             else started_gaussians(start, views[0], frame, settings, device, note)
         )
-        state = first_state(gaussians, lengths, settings.schedule, strategy, device)
+        state = first_state(first, len(views[0]), settings, strategy, device)
     if state.step:
         note(f"Resuming after step {state.step:,} of {settings.max_steps:,}.")
     run = TrainingRun(folder, settings, frame, state, views)

@@ -105,17 +105,23 @@ def make_strategy(
 
 
 def first_state(
-    gaussians: Gaussians,
-    lengths: Float32[np.ndarray, " N"],
-    schedule: Schedule,
+    first: tuple[Gaussians, Float32[np.ndarray, " N"]],
+    num_views: int,
+    settings: TrainSettings,
     strategy: Strategy,
     device: torch.device,
 ) -> TrainState:
-    """The state before the first step: Gaussians in the training frame, and their near depths."""
+    """The state before the first step.
+
+    ``first`` are Gaussians in the training frame and their near depths; there are ``num_views``
+    training views.
+    """
+    gaussians, lengths = first
+    schedule = settings.schedule
     params = make_parameters(gaussians, device, lengths if schedule.near_depths else None)
     state = TrainState(params, make_optimizers(params, schedule), strategy)
     if settings.exposure == "affine":
-        state.exposures = Exposures.unchanged(len(views), device)
+        state.exposures = Exposures.unchanged(num_views, device)
     return state
 
 
