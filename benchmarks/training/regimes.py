@@ -1,8 +1,9 @@
 """When do seeds help? The ledger of ``seeding.py``, as gains by budget, steps and photographs.
 
-Three tables: ``auto`` and the other methods over SfM's points, strategies over 3DGS's densification
-from SfM's points, and, without points, seeds over the random start; then what `splatseed info`'s
-advice is worth, with its threshold chosen on the other captures. Prints Markdown.
+``auto`` and the other methods over SfM's points; strategies over 3DGS's densification from SfM's
+points; seeds over points of the same photographs alone, and over the random start; and what
+`splatseed info`'s advice is worth, with its threshold chosen on the other captures. Prints
+Markdown.
 """
 
 from __future__ import annotations
@@ -165,10 +166,15 @@ def main(settings: Settings) -> None:
     print("\n### Strategies over default, from SfM's points\n")
     pairs = [((SFM, each), (SFM, "default")) for each in ("none", "mcmc", "grow")]
     print(table([*plan, "none", "mcmc", "grow"], compared(ledger, pairs)))
+    print("\n### Over points triangulated from the same photographs, with default\n")
+    base = ("triangulated", "default")
+    pairs = [((arm, s), base) for arm, s in (("auto, refined", "default"), (NO_POINTS, "grow"))]
+    header = ["auto adds to them, default", "auto without them, grow"]
+    print(table([*plan, *header], compared(ledger, pairs)))
     print("\n### Without points, over the random start with default\n")
     pairs = [((NO_POINTS, each), (RANDOM, "default")) for each in ("default", "grow")]
     pairs += [((NO_POINTS, "grow"), (SFM, "grow"))]
-    header = ["auto, default", "auto, grow", "auto over SfM's points, grow"]
+    header = ["auto, default", "auto, grow", "auto, grow, over SfM's points, grow"]
     print(table([*plan, *header], compared(ledger, pairs)))
     print("\n### The advice over SfM's points\n")
     header = ["threshold from the others", "in use", "always auto", "captures"]
