@@ -8,6 +8,7 @@ Markdown.
 
 from __future__ import annotations
 
+import csv
 import statistics
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -26,6 +27,8 @@ from splatseed.train.seeds import SEEDS_SHARE
 __all__: list[str] = []
 
 SFM, RANDOM, NO_POINTS = "sfm", "random as gsplat", "auto, no points"
+PLAN = ("rho", "steps", "photographs")
+FACTS = ("psnr", "ssim", "gaussians", "seeds")
 ROOMS = (1.0, 1.1, 1.3, 1.5, 2.0, 3.0, 4.0, inf)
 """Thresholds of the advice that are compared; above the last, nothing is ever added."""
 
@@ -50,11 +53,8 @@ class Ledger:
 
     @property
     def plans(self) -> list[Plan]:
-        """All plans, the one with most runs first."""
-        counts: dict[Plan, int] = {}
-        for *_, plan in self.runs:
-            counts[plan] = counts.get(plan, 0) + 1
-        return sorted(counts, key=lambda plan: (-counts[plan], plan))
+        """All plans."""
+        return sorted({plan for *_, plan in self.runs})
 
     def gains(
         self, plan: Plan, arm: tuple[str, str], over: tuple[str, str]
@@ -92,14 +92,20 @@ def cell(gains: Mapping[str, tuple[float, float]]) -> str:
 
 
 def compared(
-    ledger: Ledger, arms: Iterable[tuple[tuple[str, str], tuple[str, str]]]
-) -> Iterable[list[str]]:
-    """A row for each plan, a cell for each arm over its baseline; empty rows are left out."""
-    arms = list(arms)
-    for plan in ledger.plans:
-        cells = [cell(ledger.gains(plan, arm, over)) for arm, over in arms]
-        if any(cells):
-            yield [*str(plan).split(" | "), *cells]
+    ledger: Ledger, title: str, arms: Mapping[str, tuple[tuple[str, str], tuple[str, str]]]
+) -> None:
+    """Print a row for each plan, a column for each arm over its baseline; but no empty ones."""
+    cells = {
+        (plan, name): cell(ledger.gains(plan, *pair))
+        for plan in ledger.plans
+        for name, pair in arms.items()
+    }
+    plans = [plan for plan in ledger.plans if any(cells[plan, name] for name in arms)]
+    names = [name for name in arms if any(cells[plan, name] for plan in plans)]
+    rows = [[*str(plan).split(" | "), *(cells[plan, name] for name in names)] for plan in plans]
+    if not names:
+        return
+    print(f"### {title}\n\n{table([*PLAN, *names], rows)}\n")
 
 
 def advice(ledger: Ledger, strategy: str) -> Iterable[list[str]]:
@@ -149,37 +155,44 @@ class Settings:
 
     ledger: Path = Path("seeding.jsonl")
     """The ledger of ``benchmarks.training.seeding``."""
+    csv: Path | None = None
+    """Where to write the runs as CSV."""
 
 
 def main(settings: Settings) -> None:
     """Print the tables."""
     ledger = read(settings.ledger)
-    plan = ["rho", "steps", "photographs"]
-    strategies = ("none", "default", "mcmc", "grow")
-    print("### auto over SfM's points\n")
-    pairs = [(("auto", each), (SFM, each)) for each in strategies]
-    print(table([*plan, *strategies], compared(ledger, pairs)))
-    print("\n### Other methods over SfM's points\n")
+    if settings.csv is not None:
+        write_csv(settings.csv, ledger)
+    over_sfm = {each: (("auto", each), (SFM, each)) for each in ("none", "default", "mcmc", "grow")}
+    compared(ledger, "auto over SfM's points", over_sfm)
     methods = [(m, s) for s in ("none", "default") for m in ("mls", "cover", "stereo")]
-    pairs = [((m, s), (SFM, s)) for m, s in methods]
-    print(table([*plan, *(f"{m}, {s}" for m, s in methods)], compared(ledger, pairs)))
-    print("\n### Strategies over default, from SfM's points\n")
-    pairs = [((SFM, each), (SFM, "default")) for each in ("none", "mcmc", "grow")]
-    print(table([*plan, "none", "mcmc", "grow"], compared(ledger, pairs)))
-    print("\n### Over points triangulated from the same photographs, with default\n")
+    others = {f"{m}, {s}": ((m, s), (SFM, s)) for m, s in methods}
+    compared(ledger, "Other methods over SfM's points", others)
+    strategies = {s: ((SFM, s), (SFM, "default")) for s in ("none", "mcmc", "grow")}
+    compared(ledger, "Strategies over default, from SfM's points", strategies)
+    few = {"auto adds to them, default": ("auto, refined", "default")}
+    few |= {"auto without them, grow": (NO_POINTS, "grow")}
     base = ("triangulated", "default")
-    pairs = [((arm, s), base) for arm, s in (("auto, refined", "default"), (NO_POINTS, "grow"))]
-    header = ["auto adds to them, default", "auto without them, grow"]
-    print(table([*plan, *header], compared(ledger, pairs)))
-    print("\n### Without points, over the random start with default\n")
-    pairs = [((NO_POINTS, each), (RANDOM, "default")) for each in ("default", "grow")]
-    pairs += [((NO_POINTS, "grow"), (SFM, "grow"))]
-    header = ["auto, default", "auto, grow", "auto, grow, over SfM's points, grow"]
-    print(table([*plan, *header], compared(ledger, pairs)))
-    print("\n### The advice over SfM's points\n")
+    title = "Over points triangulated from the same photographs, with default"
+    compared(ledger, title, {name: (arm, base) for name, arm in few.items()})
+    absent = {f"auto, {s}": ((NO_POINTS, s), (RANDOM, "default")) for s in ("default", "grow")}
+    absent["auto, grow, over SfM's points, grow"] = ((NO_POINTS, "grow"), (SFM, "grow"))
+    compared(ledger, "Without points, over the random start with default", absent)
+    print("### The advice over SfM's points\n")
     header = ["threshold from the others", "in use", "always auto", "captures"]
     rows = [row for each in ("default", "mcmc") for row in advice(ledger, each)]
-    print(table(["strategy", *plan, *header], rows))
+    print(table(["strategy", *PLAN, *header], rows))
+
+
+def write_csv(path: Path, ledger: Ledger) -> None:
+    """Write a line for each run."""
+    with path.open("w", encoding="utf-8", newline="") as file:
+        lines = csv.writer(file, lineterminator="\n")
+        lines.writerow(["capture", "arm", "strategy", *Plan._fields, "seed", *FACTS])
+        for (*words, plan), runs in sorted(ledger.runs.items()):
+            for seed, run in sorted(runs.items()):
+                lines.writerow([*words, *plan, seed, *(round(run[name], 4) for name in FACTS)])
 
 
 if __name__ == "__main__":
