@@ -8,6 +8,7 @@ is frozen; ``replace`` returns a copy; nothing here reads or writes files, but
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace as dataclass_replace
 from functools import cached_property
 from pathlib import Path
@@ -143,6 +144,16 @@ class Split:
         return f"The split is that of the scene's {self.origin}: {count}; --test-every is ignored."
 
 
+@dataclass(frozen=True)
+class Masks:
+    """Which pixels of photographs do not count: where an image's mask file is 0."""
+
+    files: Mapping[str, Path]  # by the image's name; an image without one is used whole
+    inverted: bool = False  # whether pixels where the file is not 0 are masked instead
+    alpha: bool = True  # whether pixels of a photograph that are not opaque are masked, too
+    choice: str | None = None  # what the user asked for, to be asked for again; None: the default
+
+
 class LeftOut(NamedTuple):
     """How many points of its files a scene leaves out."""
 
@@ -163,6 +174,7 @@ class Scene:
     depths: DepthMaps | None = None  # of some images, read on demand
     listed: Split | None = None  # the split given by lists beside the scene
     left_out: LeftOut = field(default_factory=LeftOut)  # how many points of its files were
+    masks: Masks | None = None  # which pixels of its photographs do not count; None: all count
 
     def replace(self, **changes: Any) -> Scene:
         """A copy with some fields replaced.

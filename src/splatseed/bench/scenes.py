@@ -18,7 +18,7 @@ from splatseed.depthmap import DepthMaps
 from splatseed.errors import SceneNotFoundError
 from splatseed.io import find_depths, load_originals
 from splatseed.io.clouds import open_cloud
-from splatseed.io.files import open_file
+from splatseed.io.files import open_file, read_bytes
 from splatseed.io.load import search_depths
 from splatseed.io.photograph import open_photograph, photograph_bytes
 from splatseed.progress import Progress, in_threads, silent
@@ -171,7 +171,7 @@ def fingerprints(
 
 
 def scene_digest(scene: Scene, folder: Path, progress: Progress = silent) -> str:
-    """Fingerprint of a scene's points, tracks, cameras and photographs: 32 hexadecimal digits."""
+    """Fingerprint of points, tracks, cameras, photographs and masks: 32 hexadecimal digits."""
     digest = hashlib.blake2b(digest_size=_SIZE)
     _add(digest, scene.points.xyz, scene.points.rgb)
     if scene.tracks is not None:
@@ -188,7 +188,10 @@ def scene_digest(scene: Scene, folder: Path, progress: Progress = silent) -> str
         _add(digest, (sorted(scene.listed.train), sorted(scene.listed.test)))
 
     def of_file(i: int) -> bytes:
-        content = photograph_bytes(folder / images[i].name)
+        name = images[i].name
+        content = photograph_bytes(folder / name)
+        if scene.masks is not None and name in scene.masks.files:
+            content += read_bytes(scene.masks.files[name])
         return hashlib.blake2b(content, digest_size=_SIZE).digest()
 
     return _with_files(digest, of_file, len(images), "fingerprint photographs", progress)

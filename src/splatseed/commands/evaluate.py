@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from splatseed.commands.models import check_free, config_of, model_file
-from splatseed.commands.options import parse_options, refuse
+from splatseed.commands.options import MaskChoice, parse_options, refuse
 from splatseed.console import StageClock, print_note, print_pairs, print_table, stage_display
 from splatseed.errors import MissingDependencyError, SceneNotFoundError
 from splatseed.io.staging import check_output, output_folder, write_json
@@ -48,6 +48,9 @@ class Options:
     """From the scene's world to the model's, if its trainer normalised the scene: a JSON file with
     a matrix, nerfstudio's dataparser_transforms.json, graphdeco's cameras.json, or gsplat for its
     examples' normalisation; none: score the model where it is, unchanged."""
+    masks: MaskChoice = None
+    """A folder of masks, whose pixels of 0 do not count, or none; inverted: those alone count. By
+    default the run's, else those in masks beside the photographs, and transparency."""
     lpips_weights: Path | None = None
     """The file of VGG's weights for LPIPS, or its folder; by default PyTorch's cache."""
     backend: Backend = "auto"
@@ -65,7 +68,7 @@ def run(arguments: list[str]) -> None:
     options = parse_options(Options, "evaluate", arguments)
     require("torch", "flip_evaluator")
     gaussians, config = model_file(options.model), config_of(options.model)
-    scene = options.scene or config.get("scene")
+    scene, masks = options.scene or config.get("scene"), options.masks or config.get("masks")
     numbers: dict[str, Any] = {
         name: config.get(name, getattr(TrainSettings, name)) if given is None else given
         for name in LEAST
@@ -87,7 +90,7 @@ def run(arguments: list[str]) -> None:
     if options.output is not None:
         check_free(options.output, overwrite=options.overwrite)
     with stage_display() as clock:
-        result, doubt = _evaluate(options, gaussians, scene, numbers, clock)
+        result, doubt = _evaluate(options, gaussians, scene, numbers, masks, clock)
     rows = [
         (score.name, *_numbers(score), f"{1e3 * score.seconds:.1f}") for score in result.per_image
     ]
@@ -121,7 +124,12 @@ def run(arguments: list[str]) -> None:
 
 
 def _evaluate(
-    options: Options, gaussians: Path, scene: Path, numbers: Mapping[str, int], clock: StageClock
+    options: Options,
+    gaussians: Path,
+    scene: Path,
+    numbers: Mapping[str, int],
+    masks: str | None,
+    clock: StageClock,
 ) -> tuple[EvalResult, str]:
     """Score the test views, write what was asked for, and say why it may be another's scene."""
     from splatseed.splat.covisible import find_covisible, pixel_masks  # noqa: PLC0415  (kernels)
@@ -139,7 +147,7 @@ def _evaluate(
             raise
         reason = str(error)
     model = load_model(
-        gaussians, scene, **numbers, transform=options.transform,
+        gaussians, scene, **numbers, transform=options.transform, masks=masks,
         device=pick_device(options.backend, clock), cache_dir=user_cache_dir(), progress=clock,
     )  # fmt: skip
     seen = pixel_masks(find_covisible(model.scene, numbers["test_every"], clock), model.views)

@@ -28,7 +28,7 @@ from splatseed.errors import SplatseedError
 from splatseed.io import find_depths, load_scene
 from splatseed.io.seeds import was_upsampled
 from splatseed.io.staging import check_parents
-from splatseed.literal import quoted, visible
+from splatseed.literal import counted, quoted, visible
 from splatseed.progress import Progress
 from splatseed.scene import Scene
 from splatseed.seeding import diagnostics
@@ -86,11 +86,13 @@ def run(arguments: list[str]) -> None:
         alignments = None if options.depth is None else _alignments(options, scene, clock)
         known = _known_depths(scene.depths, clock) if options.depth and scene.depths else 0
         poses = _look_at_poses(scene, clock)
+        masks = diagnostics.mask_statistics(scene, clock)
     doubt = poses["problem"] if poses else ""
+    problems += [masks.problem] if masks.problem else []
     problems += [*_unfit_maps(scene, alignments or {}), *([doubt] if doubt else [])]
     if options.json:
         facts = {
-            "points": cloud, "tracks": tracks, "empty": regions, "poses": poses,
+            "points": cloud, "tracks": tracks, "empty": regions, "poses": poses, "masks": masks,
             "depth": alignments, "problems": problems,
         }  # fmt: skip
         facts = _plain({**_facts_of(scene), **facts})
@@ -103,7 +105,7 @@ def run(arguments: list[str]) -> None:
     share = None if regions is None else regions.mean
     advice = advice_for(usable, planned.most_seeds, strategy=planned.strategy, empty=share)
     rows = [*_source_rows(scene), *_cloud_rows(cloud), *_track_rows(tracks)]
-    rows += _photograph_rows(regions, poses)
+    rows += _photograph_rows(regions, poses, masks)
     rows += _advice_rows(advice, planned) if len(scene.points) else []
     print_pairs(str(options.scene), rows)
     if alignments is not None:
@@ -295,9 +297,14 @@ def _track_rows(tracks: diagnostics.TrackStatistics | None) -> list[tuple[str, s
 
 
 def _photograph_rows(
-    regions: diagnostics.EmptyRegions | None, poses: Mapping[str, Any] | None
+    regions: diagnostics.EmptyRegions | None,
+    poses: Mapping[str, Any] | None,
+    masks: diagnostics.MaskStatistics,
 ) -> list[tuple[str, str]]:
     rows = []
+    if masks.images:
+        share = f"{masks.share:.0%} of their pixels, on average, do not count"
+        rows.append(("masks", f"of {counted(masks.images, 'photograph')}; {share}"))
     if regions is not None:
         worst = f"{regions.worst:.0%} in {regions.worst_name}"
         grid = f"(of cells, {diagnostics.EMPTY_CELLS} along the longer side)"

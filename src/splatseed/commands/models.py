@@ -9,6 +9,7 @@ from typing import Any
 from splatseed.errors import OutputError, SceneNotFoundError
 from splatseed.io.files import odd_kind
 from splatseed.io.load import is_scene
+from splatseed.io.masks import NONE
 from splatseed.io.staging import check_parents
 from splatseed.literal import quoted
 from splatseed.train.folder import RunFolder
@@ -46,10 +47,13 @@ def check_free(path: Path, *, overwrite: bool) -> None:
 def config_of(path: Path) -> Mapping[str, Any]:
     """The config of a run, named by its folder or its result; empty for what belongs to no run.
 
-    Its scene is the one that was trained.
+    Its scene is the one that was trained, and its masks are those of that scene.
     """
     folder = RunFolder(path if path.is_dir() else path.parent)
     if path not in (folder.path, folder.gaussians) or not folder.is_run:
         return {}
     config = folder.read_config()
-    return {**config, "scene": folder.scene_of(config)}
+    masks = config.get("masks")
+    if config.get("refine_poses") is True and masks != NONE:
+        masks = None  # the scene with refined poses has the chosen ones
+    return {**config, "scene": folder.scene_of(config), "masks": masks}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import tyro
 
@@ -13,6 +13,10 @@ Options = TypeVar("Options")
 
 CONFIG = (tyro.conf.DisallowNone, tyro.conf.FlagCreatePairsOff)
 """An option that can be left out takes no None, and a switch only changes its default."""
+
+
+MaskChoice = Annotated[str | None, tyro.conf.arg(metavar="DIR|none|inverted[:DIR]")]
+"""Which masks: see ``io.masks.with_masks``."""
 
 
 def parse_options(

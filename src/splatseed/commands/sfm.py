@@ -16,6 +16,7 @@ from splatseed.commands.options import parse_options, refuse
 from splatseed.console import ERR, StageClock, print_note, print_pairs, stage_display
 from splatseed.io import load_scene
 from splatseed.io.files import is_video
+from splatseed.io.masks import masks_beside
 from splatseed.io.staging import check_output
 from splatseed.literal import counted, name_some, quoted, visible
 from splatseed.runtime.torch_device import DeviceName
@@ -28,7 +29,8 @@ class Options:
     """Make a scene from photographs: poses and points, undistorted, ready to upsample."""
 
     images: Annotated[Path, tyro.conf.Positional]
-    """The folder of photographs, or a video, from which sharp, evenly spread frames are taken."""
+    """The folder of photographs, or a video, from which sharp, evenly spread frames are taken. No
+    features are looked for where their masks, in a folder masks beside theirs, are 0."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """The scene folder to write."""
     poses_from: Path | None = None
@@ -109,10 +111,14 @@ def _from_photographs(options: Options, images: Path, clock: StageClock) -> SfmR
         poses = load_scene(options.poses_from, require_points=False)
         how = {"poses_from": poses, "refine_poses": options.refine_poses}
     clock.expect("features", "matching", *stages, "undistortion")
+    masks, notes = masks_beside(images)
+    for note in notes:
+        print_note(note)
     return reconstruct(
         images,
         options.output,
         settings,
+        masks=masks,
         overwrite=options.overwrite,
         on_progress=clock,
         on_photos=None if video else partial(_tell_photographs, images),

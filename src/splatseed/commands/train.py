@@ -19,11 +19,12 @@ from rich import progress as rich_progress
 from rich.table import Column
 
 from splatseed.commands.models import model_file
-from splatseed.commands.options import parse_options, refuse
+from splatseed.commands.options import MaskChoice, parse_options, refuse
 from splatseed.console import ERR, OUT, print_note, print_pairs, stage_display
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.io import load_scene
 from splatseed.io.files import read_text
+from splatseed.io.masks import with_masks
 from splatseed.literal import did_you_mean, quoted, visible
 from splatseed.progress import Progress
 from splatseed.requirements import require
@@ -73,6 +74,9 @@ class Options:
     """Start from the scene's points as they are (scene), from those that method auto adds by the
     training photographs (auto), or as splatseed info advises for this strategy and budget (advised,
     the default)."""
+    masks: MaskChoice = None
+    """A folder of masks, whose pixels of 0 do not count, or none; inverted: those alone count. By
+    default those in masks beside the photographs, and transparency."""
     refine_poses: bool = False
     """Refine poses of a phone or SLAM first, and triangulate points; they replace the scene's."""
     resume: bool = False
@@ -197,7 +201,8 @@ def _prepare(
 
     clock("read", 0.0)
     has_points = options.seeds == "scene" and not options.refine_poses
-    scene = load_scene(options.scene, require_points=has_points and not settings.start)
+    required = has_points and not settings.start
+    scene = with_masks(load_scene(options.scene, require_points=required), options.masks)
     for warning in scene.warnings:
         note(warning)
     if scene.listed is not None:

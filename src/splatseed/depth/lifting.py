@@ -106,7 +106,9 @@ def lift(
         def work(start: int, stop: int) -> None:
             for i in range(start, stop):
                 own, share = np.random.default_rng(seeds[i]), math.ceil(num / len(images))
-                views[i] = read_view(images[i], folder, depths, visibility, settings, share, own)
+                views[i] = read_view(
+                    images[i], folder, scene.masks, depths, visibility, settings, share, own
+                )
 
         in_threads(work, len(images), 1, "read images", progress)
         return [views[i] for i in range(len(images))]

@@ -29,10 +29,11 @@ from splatseed.depth.alignment import (
     map_camera,
     trust_units,
 )
-from splatseed.depthmap import DepthMaps
+from splatseed.depthmap import DepthMap, DepthMaps
+from splatseed.io.masks import read_mask
 from splatseed.io.photograph import decode_photograph, photograph_bytes
 from splatseed.runtime.jit import inline
-from splatseed.scene import Image
+from splatseed.scene import Image, Masks
 from splatseed.views.view import check_lens, file_from_camera
 from splatseed.views.visibility import Visibility, camera_points
 
@@ -93,6 +94,7 @@ class DepthView:
 def read_view(
     image: Image,
     folder: Path,
+    masks: Masks | None,
     depths: DepthMaps,
     visibility: Visibility,
     settings: Settings,
@@ -102,6 +104,11 @@ def read_view(
     """Read an image from the photographs' folder and its map, and draw about ``num`` candidates."""
     check_lens(image, reason="along whose rays pixels are lifted")
     depth = depths.read(image.name)
+    if (mask := read_mask(masks, image.name, folder / image.name)) is not None:
+        row = np.arange(depth.height)[:, None] * mask.shape[0] // depth.height
+        column = np.arange(depth.width) * mask.shape[1] // depth.width
+        values = np.where(mask[row, column], depth.values, np.float32(np.nan))
+        depth = DepthMap(values, depth.kind)
     camera = map_camera(depth, image)
     points = camera_points(camera, visibility.of(image))
     if settings.align:

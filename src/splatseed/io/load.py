@@ -18,6 +18,7 @@ from splatseed.io.colmap import find_model, read_colmap_scene, scene_root
 from splatseed.io.depth_files import KINDS, SUFFIXES
 from splatseed.io.depth_maps import DepthFiles, match_by_name
 from splatseed.io.files import is_video, odd_kind
+from splatseed.io.masks import with_own_masks
 from splatseed.io.nerfstudio import is_blender, read_blender, read_transforms_scene
 from splatseed.io.ply import read_ply, refuse_model
 from splatseed.io.rgbd import find_tum_depths, is_tum, load_rgbd, load_tum
@@ -72,7 +73,7 @@ def load_scene(path: str | Path, *, require_points: bool = True) -> Scene:
         fix = _TRIANGULATE if scene.images else "Name a scene or a PLY that has points."
         raise SceneNotFoundError(f"points in {path}", found="none", fix=fix)
     # seeds.npz and the manifest count the points as the files have them, so this comes first.
-    scene = clean_scene(follow_lists(recall_seeds(scene)))
+    scene = with_own_masks(clean_scene(follow_lists(recall_seeds(scene))))
     return scene.replace(warnings=(*scene.warnings, *cloud_warnings(scene.points)))
 
 

@@ -33,7 +33,7 @@ from splatseed.io.files import guarded, odd_kind, open_file, read_bytes, read_js
 from splatseed.io.photograph import image_warnings, lens_warnings
 from splatseed.io.ply import read_ply
 from splatseed.pointcloud import PointCloud
-from splatseed.scene import Image, Scene, SceneSource, Split
+from splatseed.scene import Image, Masks, Scene, SceneSource, Split
 from splatseed.similarity import Similarity, fit_similarity, similarity_of
 
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -78,7 +78,16 @@ def read_transforms_scene(path: Path) -> Scene:
     )
     notes = [*transforms.warnings, *notes, *image_warnings(images, folder, path.parent)]
     warnings = (*notes, *lens_warnings(images))
-    return Scene(points, images, transforms.intrinsics, source=source, warnings=warnings)
+    named = (frame.get("mask_path") for frame in transforms.json["frames"])
+    files = {
+        image.name: path.parent / mask
+        for image, mask in zip(images, named, strict=True)
+        if isinstance(mask, str)
+    }
+    return Scene(
+        points, images, transforms.intrinsics, source=source, warnings=warnings,
+        masks=Masks(files) if files else None,
+    )  # fmt: skip
 
 
 def is_blender(folder: Path) -> bool:
@@ -114,6 +123,7 @@ def read_blender(folder: Path) -> Scene:
         source=SceneSource("transforms", folder, points_path, image_dir=folder),
         warnings=(*notes, *image_warnings(images, folder, folder), *lens_warnings(images)),
         listed=Split(train, test, f"pair of {_BLENDER[0]} and {_BLENDER[1]}"),
+        masks=Masks({}, alpha=False),  # what is transparent is empty, and black
     )
 
 

@@ -83,12 +83,17 @@ def decode_photograph(path: Path, encoded: bytes) -> PilImage.Image:
     if photograph.mode.startswith(_WIDE_GREY):
         return _eight_bits(path, photograph).convert("RGB")
     with guarded(path, _WHOLE, fix=_COPY_AGAIN):
-        if "A" in photograph.getbands() or "transparency" in photograph.info:
+        if has_alpha(photograph):
             from PIL import Image as PilImage  # noqa: PLC0415  (slow to import)
 
             black = PilImage.new("RGBA", photograph.size, (0, 0, 0, 255))
             return PilImage.alpha_composite(black, photograph.convert("RGBA")).convert("RGB")
         return photograph.convert("RGB")
+
+
+def has_alpha(photograph: PilImage.Image) -> bool:
+    """Whether pixels may be transparent."""
+    return "A" in photograph.getbands() or "transparency" in photograph.info
 
 
 def check_photograph(path: Path) -> tuple[int, int]:

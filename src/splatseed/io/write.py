@@ -15,7 +15,7 @@ import platform
 import shutil
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path, PurePath
 from typing import Any, Literal
@@ -28,6 +28,7 @@ from splatseed.errors import OutputError, PointCloudError
 from splatseed.io import colmap, nerfstudio
 from splatseed.io.cleaning import clean_scene, renumber
 from splatseed.io.files import open_file
+from splatseed.io.masks import FOLDER as MASKS, write_masks
 from splatseed.io.ply import ply_header, ply_rows, write_ply
 from splatseed.io.seeds import SEEDS, PositionDigest, write_origins, write_seeds
 from splatseed.io.split import MODEL_LISTS, ROOT_LISTS
@@ -143,6 +144,12 @@ def write_scene(
     with output_folder(path, kind=kind, overwrite=overwrite, protect=inputs) as folder:
         write_layout = _write_colmap if layout == "colmap" else _write_transforms
         notes, image_sources = write_layout(clean, folder)
+        masks, photographs = clean.masks, source.image_dir if source else None
+        if masks and photographs and _rewrites_masks(clean, layout):
+            image_sources.pop(MASKS, None)
+            alone = replace(masks, alpha=False)  # photographs keep their transparency
+            names = [im.name for im in clean.images if (photographs / im.name).is_file()]
+            write_masks(alone, photographs, names, folder / MASKS)
         if stream is not None:
             _append_points(folder, clean.points, stream)
         linked = bring(image_sources, folder, copy=copy_images)
@@ -169,6 +176,30 @@ def write_scene(
     return WriteReport(
         path, layout, **counts, files=tuple(sorted([*files, *linked, MANIFEST])), notes=tuple(notes)
     )
+
+
+def _rewrites_masks(scene: Scene, layout: Layout) -> bool:
+    """Whether masks must be written because linking the scene's own folder would not do."""
+    masks, source = scene.masks, scene.source
+    if masks is None or source is None or not masks.files:
+        return False
+    named = layout == "transforms" and source.transforms_path and masks.choice is None
+    inside = all((source.root / MASKS) in path.parents for path in masks.files.values())
+    return masks.inverted or not (inside or named)
+
+
+def _name_masks(scene: Scene, frames: Sequence[dict[str, Any]], names: Sequence[str]) -> None:
+    """Give each frame its ``mask_path``, if all have one: nerfstudio takes masks of all or none."""
+    if scene.masks is None or scene.source is None:
+        return
+    files, root = scene.masks.files, scene.source.root
+    rewrites = _rewrites_masks(scene, "transforms")
+    for frame, name in zip(frames, names, strict=True):
+        frame.pop("mask_path", None)
+        if rewrites:
+            frame["mask_path"] = f"{MASKS}/{name}.png"
+        elif all(each in files for each in names):
+            frame["mask_path"] = Path(os.path.relpath(files[name], root)).as_posix()
 
 
 def _choose_layout(scene: Scene, wanted: str) -> Layout:
@@ -289,7 +320,11 @@ def _write_transforms(scene: Scene, folder: Path) -> tuple[list[str], dict[str, 
     source, points = scene.source, scene.points
     if source is not None and source.transforms_path is not None:
         names = {image.name for image in scene.images}
-        content = _kept_json(nerfstudio.read_transforms(source.transforms_path), names)
+        transforms = nerfstudio.read_transforms(source.transforms_path)
+        content = _kept_json(transforms, names)
+        if scene.masks is not None and scene.masks.choice is not None:
+            kept = [image.name for image in transforms.images if image.name in names]
+            _name_masks(scene, content["frames"], kept)
         found = (frame.get(key) for frame in content["frames"] for key in _PATH_KEYS)
         paths = [each for each in found if isinstance(each, str) and not Path(each).is_absolute()]
         if source.image_dir is not None and source.image_dir.resolve() == source.root.resolve():
@@ -300,6 +335,7 @@ def _write_transforms(scene: Scene, folder: Path) -> tuple[list[str], dict[str, 
     else:
         A = None if source and source.format == "transforms" else _NERFSTUDIO_FROM_COLMAP
         content, folders = _new_json(scene, A), image_folders(scene)
+        _name_masks(scene, content["frames"], [image.name for image in scene.images])
         if A is not None:
             xyz = nerfstudio.apply_transform(A, points.xyz).astype(np.float32)
             normals = None if points.normals is None else points.normals @ A[:, :3].T

@@ -4,7 +4,7 @@ Notation: the spacing of a point is its mean distance to its 6 nearest others, i
 a cloud's: the mean over its points. Scores are in units of h of the *originals*, so that scenes of
 any size compare. Track lengths count images, reprojection errors are in px. Five numbers are the
 percentiles 5, 25, 50, 75, 95. Promise: exact duplicates and non-finite points do not count as
-neighbours; nothing is random; no photograph is opened.
+neighbours; nothing is random; photographs are opened only for their masks.
 """
 
 from __future__ import annotations
@@ -17,8 +17,9 @@ import numpy as np
 from jaxtyping import Float, Float64
 from scipy.spatial import cKDTree
 
-from splatseed.errors import PointCloudError
+from splatseed.errors import PointCloudError, SplatseedError
 from splatseed.io.files import odd_kind
+from splatseed.io.masks import read_mask
 from splatseed.literal import agreeing, visible
 from splatseed.progress import Progress, silent
 from splatseed.scene import NO_POINT, Image, Scene
@@ -30,6 +31,8 @@ FAR_SPACINGS, FAR_SAMPLE = 3.0, 50_000
 many new points that is asked, at most."""
 EMPTY_CELLS = 32
 """Empty regions are counted on a grid with this many cells along an image's longer side."""
+MASKS_READ = 32
+"""Most photographs whose masks are read."""
 MANY_ISOLATED, MANY_EMPTY = 0.02, 0.5
 """Shares of isolated points, and of the images' area without points, that are worth a warning."""
 
@@ -175,6 +178,38 @@ def _empty_share(image: Image, xyz: Float64[np.ndarray, "3 N"]) -> float:
     row = np.minimum((v[inside] * scale).astype(int), rows - 1)  # rounding may reach the border
     seen[row, np.minimum((u[inside] * scale).astype(int), columns - 1)] = True
     return 1.0 - np.count_nonzero(seen) / seen.size
+
+
+@dataclass(frozen=True)
+class MaskStatistics:
+    """Which photographs have pixels that do not count."""
+
+    images: int  # how many; of those looked at, where transparency alone tells
+    share: float  # the mean share of such pixels in some of them; 0 without any
+    problem: str  # why a mask cannot be used; empty if none of those looked at
+
+
+def mask_statistics(scene: Scene, progress: Progress = silent) -> MaskStatistics:
+    """Count masks, and measure up to ``MASKS_READ`` of them, evenly spread."""
+    folder = scene.source.image_dir if scene.source else None
+    if folder is None or scene.masks is None:
+        return MaskStatistics(0, 0.0, "")
+    files = scene.masks.files
+    images = [im for im in scene.images if (im.name in files or not files)]
+    images = [im for im in images if (folder / im.name).is_file()]
+    asked = images[:: -(-len(images) // MASKS_READ) or 1]
+    shares, problem = [], ""
+    for i, image in enumerate(asked):
+        try:
+            counts = read_mask(scene.masks, image.name, folder / image.name)
+        except SplatseedError as error:
+            problem = problem or str(error)
+            continue
+        if image.name in files or counts is not None:
+            shares.append(0.0 if counts is None else 1.0 - float(counts.mean()))
+        progress("read masks", (i + 1) / len(asked))
+    images_with = len(files) or len(shares)
+    return MaskStatistics(images_with, float(np.mean(shares)) if shares else 0.0, problem)
 
 
 def _five(values: np.ndarray) -> Five:

@@ -25,11 +25,12 @@ import numpy as np
 from PIL import Image as PilImage
 
 from splatseed import errors
+from splatseed.io.masks import write_masks
 from splatseed.literal import name_some
 from splatseed.progress import Progress
 from splatseed.requirements import install_command
 from splatseed.runtime.torch_device import DeviceName
-from splatseed.scene import Image
+from splatseed.scene import Image, Masks
 from splatseed.sfm.photos import Size
 
 MatcherName: TypeAlias = Literal["exhaustive", "sequential"]
@@ -193,11 +194,14 @@ def rigid(pycolmap: Any, image: Image) -> Any:
     return pycolmap.Rigid3d(rotation, image.translation)
 
 
-def match_photographs(run: Run, model: Any) -> None:
+def match_photographs(run: Run, model: Any, masks: Masks | None = None) -> None:
     """Create the database of a model's images, with their features and verified matches."""
     pycolmap, settings = run.pycolmap, run.settings
     device = getattr(pycolmap.Device, settings.device)
     names = {image_id: image.name for image_id, image in sorted(model.images.items())}
+    folder = run.work / "masks"
+    write_masks(masks, run.image_dir, names.values(), folder)
+    masked = {"mask_path": str(folder)} if folder.is_dir() else {}
     with pycolmap.Database.open(run.database) as database:
         for camera_id, camera in sorted(model.cameras.items()):
             database.write_camera(camera, use_camera_id=True)
@@ -212,6 +216,7 @@ def match_photographs(run: Run, model: Any) -> None:
             "features",
             lambda: pycolmap.extract_features(
                 *(run.database, run.image_dir, list(names.values())),
+                reader_options=pycolmap.ImageReaderOptions(**masked),
                 extraction_options=extraction,
                 device=device,
             ),

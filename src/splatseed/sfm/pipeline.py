@@ -21,6 +21,8 @@ from typing import Any, TypeAlias
 from splatseed import errors
 from splatseed.camera import CAMERA_MODELS
 from splatseed.io import load_scene, write_scene
+from splatseed.io.colmap import read_model_cameras
+from splatseed.io.masks import FOLDER as MASKS, write_masks
 from splatseed.io.photograph import photograph_folder
 from splatseed.io.seeds import carry_seeds
 from splatseed.io.staging import MANIFEST, output_folder, write_json
@@ -29,7 +31,7 @@ from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.requirements import require
 from splatseed.runtime.tasks import Child
-from splatseed.scene import Image, Scene
+from splatseed.scene import Image, Masks, Scene
 from splatseed.sfm import colmap
 from splatseed.sfm.colmap import Run, Settings
 from splatseed.sfm.photos import Size, find_photos, match_poses
@@ -68,6 +70,7 @@ def reconstruct(
     shared_camera: bool = True,
     poses_from: Scene | None = None,
     refine_poses: bool = False,
+    masks: Masks | None = None,
     overwrite: bool = False,
     on_progress: Progress = silent,
     on_photos: OnPhotos | None = None,
@@ -91,6 +94,7 @@ def reconstruct(
         refine_poses: Refine these poses, if they are off by a few degrees or per cent of the
             cameras' extent, as those of phones and SLAM are. They stay exactly as given where
             refinement would lower the mean reprojection error by less than 0.1 px.
+        masks: Where no features are looked for; the scene gets them, undistorted.
         overwrite: Replace ``output`` if it exists.
         on_progress: Called with the stage and the fraction done.
         on_photos: Called before work begins with the photographs' names, and with those of other
@@ -112,7 +116,7 @@ def reconstruct(
         if on_photos is not None:
             on_photos(list(photos), left_out)
         how = (images, staging, settings, on_progress, _reconstruct)
-        report = _call(*how, photos, camera_model, shared_camera, poses, refine_poses)
+        report = _call(*how, photos, camera_model, shared_camera, poses, refine_poses, masks)
         if poses_from is not None:
             write_split(poses_from, staging)
         manifest = {
@@ -133,20 +137,35 @@ def _reconstruct(
     shared_camera: bool,
     poses: Sequence[Image] | None,
     refine_poses: bool,
+    masks: Masks | None,
 ) -> SfmReport:
     refinement = None
     if poses is None:
-        colmap.match_photographs(
-            run, colmap.guessed_model(run, photos, camera_model, shared=shared_camera)
-        )
+        model = colmap.guessed_model(run, photos, camera_model, shared=shared_camera)
+        colmap.match_photographs(run, model, masks)
         model_dir = colmap.map_images(run, list(photos))
     else:
-        colmap.match_photographs(run, colmap.posed_model(run.pycolmap, poses))
+        colmap.match_photographs(run, colmap.posed_model(run.pycolmap, poses), masks)
         if refine_poses:
             poses, refinement = refine(run, poses)
         model_dir = colmap.triangulate_points(run, poses)
-    colmap.export_scene(run, model_dir, staging)
+    _export(run, model_dir, staging, masks)
     return replace(_report(run, staging, list(photos)), refinement=refinement)
+
+
+def _export(
+    run: Run, model_dir: Path, staging: Path, masks: Masks | None, *, distinct: bool = True
+) -> None:
+    """Write a model's photographs, their masks and its points without distortion."""
+    colmap.export_scene(run, model_dir, staging, distinct=distinct)
+    if masks is None:
+        return
+    before, after = (
+        {image.name: image.intrinsics for image in read_model_cameras(folder)[1]}
+        for folder in (model_dir, staging / "sparse" / "0")
+    )
+    lenses = {name: (before[name], pinhole) for name, pinhole in after.items()}
+    write_masks(masks, run.image_dir, lenses, staging / MASKS, lenses)
 
 
 def undistort(
@@ -170,14 +189,17 @@ def undistort(
         work = staging / ".work" / "distorted"
         distorted = write_scene(scene, work, format="colmap", require_points=False).path
         names, how = sorted(image.name for image in scene.images), (images, staging, _DEFAULT)
-        report = _call(*how, on_progress, _undistort, distorted / "sparse" / "0", names)
+        model_dir = distorted / "sparse" / "0"
+        report = _call(*how, on_progress, _undistort, model_dir, names, scene.masks)
         carry_seeds(scene, distorted, staging)
         write_split(scene, staging)
     return replace(report, path=Path(output))
 
 
-def _undistort(run: Run, staging: Path, model_dir: Path, names: Sequence[str]) -> SfmReport:
-    colmap.export_scene(run, model_dir, staging, distinct=False)
+def _undistort(
+    run: Run, staging: Path, model_dir: Path, names: Sequence[str], masks: Masks | None
+) -> SfmReport:
+    _export(run, model_dir, staging, masks, distinct=False)
     return _report(run, staging, names)
 
 
@@ -198,6 +220,7 @@ def refined(scene: Scene, seed: int, progress: Progress = silent) -> tuple[Scene
             *(folder, Path(name) / "scene", Settings(seed=seed)),
             poses_from=scene,
             refine_poses=True,
+            masks=scene.masks,
             on_progress=progress,
         )
         found = load_scene(report.path)

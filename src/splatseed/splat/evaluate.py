@@ -27,13 +27,14 @@ from torch import Tensor
 
 from splatseed.errors import ParameterError, SceneNotFoundError
 from splatseed.io import load_scene
+from splatseed.io.masks import with_masks
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 from splatseed.scores import NOT_ASKED, EvalResult, ViewScore
 from splatseed.splat.formats import read_model
 from splatseed.splat.gaussians import Gaussians, training_frame
 from splatseed.splat.metrics import LPIPS_NET, Lpips, color_corrected, flip_map, psnr, ssim_of_all
-from splatseed.splat.rendering import ModelRenderer, photograph_of
+from splatseed.splat.rendering import ModelRenderer, fill_masked, mask_of, photograph_of
 from splatseed.splat.ssim import WINDOW
 from splatseed.splat.world import NO_TRANSFORM, check_world, find_transform, view_in
 from splatseed.views.view import View, load_views, poses_of
@@ -56,9 +57,10 @@ def evaluate_views(
     on_view: OnView = lambda *_: None,
     progress: Progress = silent,
 ) -> EvalResult:
-    """Score renders of views against their photographs.
+    """Score renders of views against their photographs, where pixels are not masked.
 
-    The first view is rendered once more beforehand, untimed, because a first call may compile.
+    FLIP and LPIPS take the photograph for the render where they are. The first view is rendered
+    once more beforehand, untimed, because a first call may compile.
 
     Args:
         render: Renders a view as float [H, W, 3], values about 0..1, on any device.
@@ -113,22 +115,27 @@ def _score(
             found="NaN or infinity" if list(image.shape) == shape else f"{list(image.shape)}",
             fix="Render views at their own width and height, of a model whose values are finite.",
         )
-    image, photograph = image.clamp(0.0, 1.0), photograph_of(view, image.device)
-    within = None
-    if seen is not None and seen.any():
-        within = psnr(image, photograph, torch.from_numpy(seen).to(image.device))
+    photograph, mask = photograph_of(view, image.device), mask_of(view, image.device)
+    shown = image.clamp(0.0, 1.0)
+    image = fill_masked(shown, photograph, mask)
     errors = flip_map(image, photograph)
-    on_view(view, image.cpu().numpy(), errors)
+    within, share, flips = None, None, errors if view.mask is None else errors[view.mask]
+    if seen is not None:
+        share = float(seen.mean() if view.mask is None else seen[view.mask].mean())
+        seen = seen if view.mask is None else seen & view.mask
+        if seen.any():
+            within = psnr(image, photograph, torch.from_numpy(seen).to(image.device))
+    on_view(view, shown.cpu().numpy(), errors)
     return ViewScore(
         view.name,
-        psnr=psnr(image, photograph),
-        ssim=ssim_of_all(image, photograph),
+        psnr=psnr(image, photograph, mask),
+        ssim=ssim_of_all(image, photograph, mask),
         lpips=None if lpips is None else lpips(image, photograph),
         seconds=seconds,
         covisible_psnr=within,
-        covisible_share=None if seen is None else float(seen.mean()),
-        flip=float(errors.mean(dtype=np.float64)),
-        cc_psnr=psnr(color_corrected(image, photograph), photograph),
+        covisible_share=share,
+        flip=float(flips.mean(dtype=np.float64)),
+        cc_psnr=psnr(color_corrected(image, photograph, mask), photograph, mask),
     )
 
 
@@ -160,6 +167,7 @@ def load_model(
     data_factor: int = 1,
     test_every: int = 8,
     transform: str | None = None,
+    masks: str | None = None,
     device: torch.device | None = None,
     cache_dir: Path | None = None,
     progress: Progress = silent,
@@ -173,6 +181,7 @@ def load_model(
         test_every: Every n-th image, sorted by name, is a test view.
         transform: From the scene's world to the model's, as for ``find_transform``; when left out,
             they must be the same.
+        masks: Which masks, as for ``io.masks.with_masks``.
         device: Where to render; the CPU when left out.
         cache_dir: Where smaller photographs are cached; nowhere when left out.
         progress: Told how far it is.
@@ -184,7 +193,7 @@ def load_model(
         ParameterError: The transform cannot be computed.
     """
     gaussians = read_model(path)
-    scene = load_scene(scene_path, require_points=False)
+    scene = with_masks(load_scene(scene_path, require_points=False), masks)
     train, test = scene.split(test_every)
     if not train or not test:
         raise SceneNotFoundError(

@@ -198,6 +198,8 @@ def _shown(xyz: Float32[np.ndarray, "N 3"], view: View) -> Int64[np.ndarray, "3 
     column, row = column[index].astype(np.int64), row[index].astype(np.int64)
     (rows, cols), depths = grid_of(view, CELL), cell_depths(view, xyz, CELL)
     nearest = depths[row * rows // view.height, column * cols // view.width]
+    if view.mask is not None:
+        nearest = np.where(view.mask[row, column], nearest, np.inf)
     # A tenth behind the cell's depth still counts as its surface.
     seen = (depth[index] <= nearest * (1 + NEARER)) & np.isfinite(nearest)
     return np.stack([index, column, row])[:, seen]

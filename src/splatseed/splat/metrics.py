@@ -59,18 +59,22 @@ def psnr(
 
 @torch.no_grad()
 def color_corrected(
-    render: Float[Tensor, "H W 3"], photograph: Float[Tensor, "H W 3"]
+    render: Float[Tensor, "H W 3"],
+    photograph: Float[Tensor, "H W 3"],
+    mask: Bool[Tensor, "H W"] | None = None,
 ) -> Float[Tensor, "H W 3"]:
     """A render in [0, 1] with the change of its colours that brings it closest to a photograph.
 
     Each channel becomes the quadratic polynomial of the render's three that fits best in least
-    squares, over the pixels whose channel is saturated in neither image; this is repeated on the
-    result. It is multinerf's ``color_correct`` (Barron et al. 2022), which nerfstudio has too, and
-    gsplat's ``color_correct_quadratic``, in double precision; of equally good polynomials the one
-    of least norm is taken, so that a render of one colour has one.
+    squares, over the pixels of the mask whose channel is saturated in neither image; this is
+    repeated on the result. It is multinerf's ``color_correct`` (Barron et al. 2022), which
+    nerfstudio has too, and gsplat's ``color_correct_quadratic``, in double precision; of equally
+    good polynomials the one of least norm is taken, so that a render of one colour has one.
     """
     x, y = (image.reshape(-1, 3).T.double() for image in (render.clamp(0, 1), photograph))
     usable = _unsaturated(x) & _unsaturated(y)
+    if mask is not None:
+        usable &= mask.reshape(-1)
     for _ in range(_CORRECTIONS):
         r, g, b = x
         terms = torch.stack([r * r, r * g, r * b, g * g, g * b, b * b, r, g, b, torch.ones_like(r)])
@@ -123,6 +127,18 @@ def l1_and_ssim_by_convolution(
     return difference.abs_().mean(), similarity.mean(), gradient.permute(1, 2, 0)
 
 
+def _ssim_map(x: Float[Tensor, "H W 3"], y: Float[Tensor, "H W 3"]) -> Float[Tensor, "3 H-10 W-10"]:
+    """SSIM wherever the window fits, as in ``splat.ssim``'s header."""
+    x, y = x.permute(2, 0, 1), y.permute(2, 0, 1)
+    with torch.backends.cudnn.flags(enabled=True, allow_tf32=False):
+        mean_x, mean_y, e_xy, e_2 = _blur(torch.stack([x, y, x * y, x * x + y * y]))
+    product, squares = mean_x * mean_y, mean_x**2 + mean_y**2
+    c1, c2 = float(C1), float(C2)
+    upper = (2 * product + c1) * (2 * (e_xy - product) + c2)
+    ssim: Tensor = upper / ((squares + c1) * (e_2 - squares + c2))
+    return ssim
+
+
 def _blur(planes: Float[Tensor, "P 3 H W"]) -> Float[Tensor, "P 3 H-10 W-10"]:
     """Windowed means where the window fits entirely."""
     across, down = _window(planes.device)
@@ -145,13 +161,22 @@ def _window(device: torch.device) -> tuple[Float[Tensor, "1 1 1 11"], Float[Tens
 
 
 @torch.no_grad()
-def ssim_of_all(render: Float[Tensor, "H W 3"], photograph: Float[Tensor, "H W 3"]) -> float:
-    """SSIM averaged over all pixels; a mirrored margin lets the window fit everywhere."""
+def ssim_of_all(
+    render: Float[Tensor, "H W 3"],
+    photograph: Float[Tensor, "H W 3"],
+    mask: Bool[Tensor, "H W"] | None = None,
+) -> float:
+    """SSIM averaged over all pixels, or those of a mask; a mirrored margin lets the window fit.
+
+    Where masked, the render should have the photograph's pixels (``rendering.fill_masked``).
+    """
     margin = [WINDOW // 2] * 4
     x, y = (
         pad(image.clamp(0, 1).permute(2, 0, 1), margin, mode="reflect").permute(1, 2, 0)
         for image in (render, photograph)
     )
+    if mask is not None:
+        return float(_ssim_map(x, y)[:, mask].mean())
     if render.device.type != "cpu":
         return float(l1_and_ssim_by_convolution(x, y, 0.0, 1.0)[1])
     return float(l1_and_ssim(x.contiguous().numpy(), y.contiguous().numpy(), 0.0, 1.0)[1])

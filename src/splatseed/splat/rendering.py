@@ -15,7 +15,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Bool, Float, Float32, UInt8
 from torch import Tensor
 
 from splatseed.io.staging import atomic_file
@@ -164,6 +164,31 @@ def _bytes_of(view: View, device: torch.device) -> UInt8[Tensor, "H W 3"]:
     if device.type == "cuda":  # from pinned memory a GPU fetches it while it works on earlier steps
         pixels = pixels.pin_memory()
     return pixels.to(device, non_blocking=True)
+
+
+_MASKS: WeakKeyDictionary[View, dict[torch.device, Bool[Tensor, "H W"]]] = WeakKeyDictionary()
+
+
+def mask_of(view: View, device: torch.device) -> Bool[Tensor, "H W"] | None:
+    """The view's pixels that count, None: all; copied to the device once as long as it lives."""
+    if view.mask is None:
+        return None
+    kept = _MASKS.setdefault(view, {})
+    if device not in kept:
+        kept[device] = torch.tensor(view.mask).to(device)
+    return kept[device]
+
+
+def fill_masked(
+    render: Float[Tensor, "H W 3"],
+    photograph: Float[Tensor, "H W 3"],
+    mask: Bool[Tensor, "H W"] | None,
+) -> Float[Tensor, "H W 3"]:
+    """The render with the photograph's own pixels where these do not count: no error, no gradient.
+
+    Without a mask it is the render itself.
+    """
+    return render if mask is None else torch.where(mask[..., None], render, photograph)
 
 
 # Pictures -----------------------------------------------------------------------------------------

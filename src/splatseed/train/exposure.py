@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 from torch.nn.functional import linear
 
@@ -41,13 +41,19 @@ class Exposures:
 
     @torch.no_grad()
     def fit(
-        self, index: int, render: Float[Tensor, "H W 3"], photograph: Float[Tensor, "H W 3"]
+        self,
+        index: int,
+        render: Float[Tensor, "H W 3"],
+        photograph: Float[Tensor, "H W 3"],
+        mask: Bool[Tensor, "H W"] | None = None,
     ) -> None:
         """Move a photograph's transform towards what its render needs, and all back to the mean."""
         height, width = photograph.shape[:2]
         step = max(1, round(math.sqrt(height * width / PIXELS)))
         x, y = (each[::step, ::step].reshape(-1, 3).T.double() for each in (render, photograph))
         known = ((y > SATURATED) & (y < 1 - SATURATED)).all(dim=0)
+        if mask is not None:
+            known &= mask[::step, ::step].reshape(-1)
         x = torch.cat([x, torch.ones_like(x[:1])]) * known
         weight, unchanged = RIDGE * len(known), _unchanged(x.device)
         # (X X^T + w I) E^T = X Y^T + w E_0^T; by sums, as BLAS's order depends on threads.

@@ -29,7 +29,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from splatseed.splat.gaussians import SH_C0
-from splatseed.splat.rendering import camera_of, render_features
+from splatseed.splat.rendering import camera_of, fill_masked, mask_of, render_features
 from splatseed.train.device import Capacity
 from splatseed.train.parameters import NEAR_DEPTHS, Optimizers, Parameters
 from splatseed.train.schedule import Schedule
@@ -120,7 +120,8 @@ class Growing(Strategy):
         """Add this view's measurements of each Gaussian to the sums."""
         if not self.looks(step):
             return
-        error = (render.detach() - photograph).abs().mean(dim=-1)
+        render = fill_masked(render.detach(), photograph, mask_of(view, photograph.device))
+        error = (render - photograph).abs().mean(dim=-1)
         pixels, errors = contributions(params, view, error)
         sums = self._sums(params)
         sums["errors"] += errors
@@ -239,7 +240,7 @@ def _least(most_pixels: Float[Tensor, " M"]) -> float:
 def contributions(
     params: Parameters, view: View, error: Float[Tensor, "H W"]
 ) -> tuple[Float[Tensor, " N"], Float[Tensor, " N"]]:
-    """Each Gaussian's pixels, sum_p w_ip, and the error in them, sum_p w_ip e_p.
+    """Each Gaussian's pixels, sum_p w_ip, and the error in them, sum_p w_ip e_p, where they count.
 
     Any rasteriser gives sums of weights as a gradient: of sum_p f_p sum_i w_ip c_i with respect to
     c_i. The Gaussians and their gradients are left unchanged.
@@ -259,6 +260,8 @@ def contributions(
         frozen = {name: value.detach() for name, value in params.items()}
         frozen["opacities"] = frozen["opacities"].flatten()  # nerfstudio's are [N, 1]
         plain, weighted = render_features(frozen, view, colors).unbind(-1)
+        if (mask := mask_of(view, means.device)) is not None:
+            plain, weighted = plain * mask, weighted * mask
         (plain.sum() + (weighted * error).sum()).backward()
     assert colors.grad is not None  # noqa: S101  (backward made it)
     pixels, errors = colors.grad.unbind(-1)

@@ -28,6 +28,7 @@ from splatseed.errors import (
     SceneNotFoundError,
 )
 from splatseed.io import load_scene
+from splatseed.io.masks import mask_choice, with_masks
 from splatseed.io.seeds import was_upsampled
 from splatseed.io.staging import write_json
 from splatseed.literal import counted
@@ -122,6 +123,7 @@ def prepare_run(
     begun = folder.read_config() if resume and folder.is_run else None
     if begun:
         settings, refine_poses = resumed(begun, settings, refine_poses=refine_poses)
+        scene = _as_masked(scene, begun)
     device = pick_device(settings.backend, progress)
     if refine_poses:
         scene = _at_refined_poses(scene, folder, begun, settings.seed, note, progress)
@@ -234,6 +236,7 @@ def make_config(
         "scene": str(source.root.resolve()) if source else None,
         "points": str(points.resolve()) if points else None,
         "refine_poses": refine_poses,
+        "masks": mask_choice(scene),
         **dataclasses.asdict(settings),
         "device": device,
         "seeds": dict(seeds),
@@ -288,6 +291,20 @@ def _check_begun(
     if begun and begun.get("seeds") != config["seeds"]:
         which = f"Gaussians in {config['start']}" if config["start"] else ""
         raise _another_scene(folder, begun, which or f"points in {config['scene']}")
+
+
+def _as_masked(scene: Scene, begun: Mapping[str, Any]) -> Scene:
+    """The scene with the masks of a run that has begun; a choice of its own must be the same."""
+    now, then = mask_choice(scene), begun.get("masks")
+    if now is None and isinstance(then, str):
+        return with_masks(scene, then)
+    if now != then:
+        raise ParameterError(
+            f"--masks {then or 'left out'}, as when the run began",
+            found=str(now),
+            fix="Leave the option out to resume, or start again with --overwrite.",
+        )
+    return scene
 
 
 def _another_scene(folder: RunFolder, begun: Mapping[str, Any], found: str) -> ParameterError:

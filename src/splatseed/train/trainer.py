@@ -21,7 +21,7 @@ from torch import Tensor
 from splatseed.runtime.interruption import interruption
 from splatseed.runtime.memory import keep_freed_memory
 from splatseed.splat.metrics import l1_and_ssim_by_convolution, psnr, ssim_of_all
-from splatseed.splat.rendering import Photographs, photograph_of, render_view
+from splatseed.splat.rendering import Photographs, fill_masked, mask_of, photograph_of, render_view
 from splatseed.splat.ssim import l1_and_ssim
 from splatseed.train.folder import Record
 from splatseed.train.parameters import add_to_mean, optimize, take_mean
@@ -64,11 +64,11 @@ class Trainer:
         with interruption() as stop, torch.random.fork_rng(gpus):
             state.watch.start()
             while state.step < self.settings.max_steps and not stop.requested:
-                render, photograph = self._advance(state.step)
+                shown = self._advance(state.step)
                 state.step += 1
                 on_step(state.step)
                 if self._is_due(RECORDS) or self._is_due(TESTS):
-                    self._record(render, photograph)
+                    self._record(*shown)
             state.watch.stop()
         return state.step >= self.settings.max_steps
 
@@ -90,8 +90,8 @@ class Trainer:
         degree = self.settings.schedule.sh_degree(self.state.step, self.settings.sh_degree)
         return render_view(self.state.params, view, degree)[0]
 
-    def _advance(self, step: int) -> tuple[Float[Tensor, "H W 3"], Float[Tensor, "H W 3"]]:
-        """Take one step; returns the render, at the photograph's exposure, and the photograph."""
+    def _advance(self, step: int) -> tuple[View, Float[Tensor, "H W 3"], Float[Tensor, "H W 3"]]:
+        """Take one step; returns the view, its render at its exposure, and its photograph."""
         state, schedule = self.state, self.settings.schedule
         params, optimizers, strategy = state.params, state.optimizers, state.strategy
         words = np.random.SeedSequence([self.settings.seed, step]).generate_state(1, np.uint64)
@@ -102,13 +102,13 @@ class Trainer:
         view = self.train_views[index]
         photograph = self._photographs.of(view)
         plain, info = render_view(params, view, schedule.sh_degree(step, self.settings.sh_degree))
-        render = plain
+        render, mask = plain, mask_of(view, self.device)
         if state.exposures is not None:
-            state.exposures.fit(index, plain, photograph)
+            state.exposures.fit(index, plain, photograph, mask)
             render = state.exposures.applied(index, plain)
         # gsplat's strategies ask PyTorch to retain the gradient of the 2D means here.
         strategy.before(params, optimizers, step, info)
-        loss = photometric_loss(render, photograph)
+        loss = photometric_loss(fill_masked(render, photograph, mask), photograph)
         state.losses.append(loss.detach())
         penalty = strategy.regularization(params)
         # The recorded loss is without the penalty, so that strategies can be compared.
@@ -126,16 +126,19 @@ class Trainer:
             if step + 1 == self.settings.max_steps:
                 take_mean(params, state.mean)
         self.is_whole = True
-        return render.detach(), photograph
+        return view, render.detach(), photograph
 
-    def _record(self, render: Float[Tensor, "H W 3"], photograph: Float[Tensor, "H W 3"]) -> None:
+    def _record(
+        self, view: View, render: Float[Tensor, "H W 3"], photograph: Float[Tensor, "H W 3"]
+    ) -> None:
         """Note how far the run is; the clock stands still meanwhile."""
         state = self.state
         loss = float(torch.stack(state.losses).mean(dtype=torch.float64))
         state.watch.stop()
         state.losses.clear()
         tested_psnr, tested_ssim = self.test_scores() if self._is_due(TESTS) else (None, None)
-        seconds, shown = round(state.watch.seconds, 3), round(psnr(render, photograph), 4)
+        seconds = round(state.watch.seconds, 3)
+        shown = round(psnr(render, photograph, mask_of(view, self.device)), 4)
         count = len(state.params["means"])
         record = Record(state.step, seconds, loss, shown, tested_psnr, count, tested_ssim)
         state.records.append(record)
@@ -146,8 +149,9 @@ class Trainer:
         """Means over the test views of each one's PSNR, dB, and SSIM."""
         scores = []
         for view in self.test_views:
-            render, photograph = self.render(view), photograph_of(view, self.device)
-            scores.append((psnr(render, photograph), ssim_of_all(render, photograph)))
+            photograph, mask = photograph_of(view, self.device), mask_of(view, self.device)
+            render = fill_masked(self.render(view), photograph, mask)
+            scores.append((psnr(render, photograph, mask), ssim_of_all(render, photograph, mask)))
         psnrs, ssims = zip(*scores, strict=True)
         return round(sum(psnrs) / len(psnrs), 4), round(sum(ssims) / len(ssims), 5)
 

@@ -22,6 +22,7 @@ from jaxtyping import Bool, Float64, UInt8
 
 from splatseed.camera import Camera
 from splatseed.errors import OutputError, ParameterError, SceneFormatError, SceneNotFoundError
+from splatseed.io.masks import read_mask
 from splatseed.io.photograph import (
     decode_photograph,
     open_photograph,
@@ -32,7 +33,7 @@ from splatseed.io.staging import atomic_file
 from splatseed.lens import undistort_first
 from splatseed.progress import Progress, silent
 from splatseed.runtime.memory import check_memory
-from splatseed.scene import Image, Scene
+from splatseed.scene import Image, Masks, Scene
 
 ASPECT_SLACK = 0.02
 """By how much a file's aspect ratio may differ from its camera's: the rounding of a copy."""
@@ -49,7 +50,7 @@ class View:
     width: int
     height: int
     cam_from_world: Float64[np.ndarray, "4 4"]
-    mask: Bool[np.ndarray, "H W"] | None = None  # pixels it shows, the others are black; None: all
+    mask: Bool[np.ndarray, "H W"] | None = None  # pixels that count; None: all
 
     @property
     def camera(self) -> Camera:
@@ -121,12 +122,13 @@ def load_views(
 
     Photographs are downsampled by ``data_factor``, to ``min_side`` pixels a side at least, and
     smaller copies kept in ``cache_dir``, if there is one. ``undistort`` removes lens distortion
-    instead of refusing it.
+    instead of refusing it. Pixels that the scene's masks leave out do not count.
 
     Raises:
         ParameterError: They do not fit into memory all together.
-        SceneNotFoundError: An image is missing.
-        SceneFormatError: A camera has distortion that is not removed, or an image is unusable.
+        SceneNotFoundError: An image or a mask is missing.
+        SceneFormatError: A camera has distortion that is not removed, or an image or a mask is
+            unusable.
     """
     folder = photograph_folder(scene)
     for image in images if not undistort else ():
@@ -142,7 +144,8 @@ def load_views(
     views = []
     with ThreadPoolExecutor(READERS) as pool:
         for view in pool.map(
-            lambda image: _load_view(image, folder, data_factor, min_side, cache_dir), images
+            lambda image: _load_view(image, folder, data_factor, min_side, cache_dir, scene.masks),
+            images,
         ):
             views.append(view)
             progress("read images", len(views) / len(images))
@@ -165,7 +168,12 @@ def check_lens(
 
 
 def _load_view(
-    image: Image, folder: Path, data_factor: int, min_side: int, cache_dir: Path | None
+    image: Image,
+    folder: Path,
+    data_factor: int,
+    min_side: int,
+    cache_dir: Path | None,
+    masks: Masks | None,
 ) -> View:
     path = folder / image.name
     photograph, file_size = load_photograph(path, data_factor, cache_dir)
@@ -175,11 +183,15 @@ def _load_view(
     camera = image.camera
     scale = file_from_camera(path, file_size, (camera.width, camera.height)) / data_factor
     K = np.diag([*scale, 1.0]) @ camera.K
+    mask = read_mask(masks, image.name, path, data_factor)
     if not image.intrinsics.has_distortion:
-        return View(image.name, photograph, K, width, height, camera.cam_from_world)
+        return View(image.name, photograph, K, width, height, camera.cam_from_world, mask)
     from splatseed.views.projection import undistort  # noqa: PLC0415  (loads Numba)
 
     photograph, known = undistort(photograph, image.intrinsics, K)
+    if mask is not None:
+        white = np.repeat(np.where(mask, 255, 0).astype(np.uint8)[..., None], 3, axis=2)
+        known &= undistort(white, image.intrinsics, K)[0][..., 0] == 255
     return View(image.name, photograph, K, width, height, camera.cam_from_world, known)
 
 

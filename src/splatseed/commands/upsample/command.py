@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, get_args
 
 import tyro
 
-from splatseed.commands.options import check_least, parse_options, refuse
+from splatseed.commands.options import MaskChoice, check_least, parse_options, refuse
 from splatseed.commands.upsample import output
 from splatseed.commands.upsample.cloud import load_cloud
 from splatseed.commands.upsample.tiled import find_source, run_tiled
@@ -20,6 +20,7 @@ from splatseed.depthmap import DepthKind
 from splatseed.io import find_depths, load_originals, write_scene
 from splatseed.io.clouds import open_cloud
 from splatseed.io.load import with_own_depths
+from splatseed.io.masks import with_masks
 from splatseed.io.staging import check_output, check_parents
 from splatseed.literal import counted, quoted, visible
 from splatseed.runtime.memory import bytes_of
@@ -82,6 +83,9 @@ class Options:
     depth_scale: float | None = None
     """Stored units per unit of depth: 1000 for millimetres in a scene in metres; by default what
     the folder says."""
+    masks: MaskChoice = None
+    """A folder of masks, whose pixels of 0 do not count, or none; inverted: those alone count. By
+    default those in masks beside the photographs, and transparency."""
     refine_poses: bool = False
     """Refine poses of a phone or SLAM first, and triangulate points; they replace the scene's."""
     cloud_files: Annotated[
@@ -284,7 +288,8 @@ def _run_in_memory(options: Options, methods: dict[str, Any]) -> None:
 
 def _read(options: Options, method: Upsampler) -> Scene:
     """The scene's originals, and its depth maps if their folder is named."""
-    scene = load_originals(options.scene, require_points="points" in traits_of(method).needs)
+    needed = "points" in traits_of(method).needs
+    scene = with_masks(load_originals(options.scene, require_points=needed), options.masks)
     if options.depth_maps is not None:
         kind, scale = options.depth_kind, options.depth_scale
         return scene.replace(depths=find_depths(scene, options.depth_maps, kind=kind, scale=scale))

@@ -42,7 +42,7 @@ IN_TILES = "linear, triangle, spline, mls, random"
 NOT_IN_TILES = {
     "budget": "--budget", "cover_cell": "--cover", "verify": "--verify", "preview": "--preview",
     "refine_poses": "--refine-poses", "gaussians": "--gaussians", "depth_maps": "--depth",
-    "cloud_files": "--cloud",
+    "cloud_files": "--cloud", "masks": "--masks",
 }  # fmt: skip
 """Options that need all points in memory, by field."""
 

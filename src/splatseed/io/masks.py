@@ -1,0 +1,209 @@
+"""Masks: which pixels of photographs count; finding their files, reading and writing them.
+
+A mask is an image of its photograph's size, 0 where a pixel is masked, as COLMAP, nerfstudio, Brush
+and LichtFeld Studio take it. The mask of ``a/b.jpg`` is ``a/b.jpg.png`` (COLMAP's name) or
+``a/b.png`` in a folder of masks. Pixels of a photograph that are not opaque are masked, too.
+Promise: a pixel of a smaller copy, or of an undistorted one, counts only if all that it was made
+from count.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool
+
+from splatseed.camera import Intrinsics
+from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.io.depth_maps import Undistortion
+from splatseed.io.files import guarded, read_bytes
+from splatseed.io.photograph import has_alpha, open_photograph, photograph_bytes
+from splatseed.literal import agreeing, counted
+from splatseed.scene import Masks, Scene
+
+NONE, INVERTED = "none", "inverted"
+"""Choices of masks besides a folder; ``inverted:DIR`` inverts those of a folder."""
+FOLDER = "masks"
+_LISTED = "masks of the scene's images, named a.jpg.png or a.png for a.jpg,"
+
+
+def with_masks(scene: Scene, choice: str | None) -> Scene:
+    """The scene with the masks of a choice, as ``--masks`` takes it; None: as it is.
+
+    Raises:
+        SceneNotFoundError: There are no such masks.
+    """
+    if choice is None or choice == NONE:
+        return scene if choice is None else scene.replace(masks=None)
+    inverted = choice == INVERTED or choice.startswith(f"{INVERTED}:")
+    place = choice.removeprefix(INVERTED).removeprefix(":") if inverted else choice
+    own, notes = scene.masks or Masks({}), list[str]()
+    files: Mapping[str, Path] = own.files
+    folder = Path(place).absolute() if place else None
+    if folder is not None:
+        files, notes = find_masks([image.name for image in scene.images], folder)
+        choice = f"{INVERTED}:{folder}" if inverted else str(folder)
+    if not files:
+        where = f"in {folder}" if folder else "beside its photographs"
+        found = "none" if folder is None or folder.is_dir() else "no such folder"
+        fix = "Name the folder that masks lie in, or leave --masks out."
+        raise SceneNotFoundError(f"{_LISTED} {where}", found=found, fix=fix)
+    masks = replace(own, files=files, inverted=inverted, choice=choice)
+    return scene.replace(masks=masks, warnings=(*scene.warnings, *notes))
+
+
+def mask_choice(scene: Scene) -> str | None:
+    """The choice with which ``with_masks`` gives a scene read anew the masks of this one."""
+    return NONE if scene.masks is None else scene.masks.choice
+
+
+def with_own_masks(scene: Scene) -> Scene:
+    """A scene that was just read, with the masks beside its photographs."""
+    folder = scene.source.image_dir if scene.source else None
+    if scene.source is None or folder is None or scene.masks is not None:
+        return scene
+    beside = folder.with_name(FOLDER) if folder != scene.source.root else folder / FOLDER
+    found = [each for each in (beside, scene.source.root / FOLDER) if each.is_dir()]
+    files, notes = find_masks([i.name for i in scene.images], found[0]) if found else ({}, [])
+    return scene.replace(masks=Masks(files), warnings=(*scene.warnings, *notes))
+
+
+def masks_beside(photographs: Path) -> tuple[Masks, list[str]]:
+    """The masks of a folder of photographs, in ``masks`` beside it, and notes for the user."""
+    folder = photographs.absolute().with_name(FOLDER)
+    if not folder.is_dir() or not photographs.is_dir():
+        return Masks({}), []
+    names = (path.relative_to(photographs).as_posix() for path in photographs.rglob("*"))
+    files, notes = find_masks(sorted(names), folder)
+    return Masks(files), [f"{counted(len(files), 'photograph')} with a mask in {folder}.", *notes]
+
+
+def find_masks(names: Collection[str], folder: Path) -> tuple[dict[str, Path], list[str]]:
+    """The masks in a folder by the names of their images, and a note on those without one."""
+    there = {path.relative_to(folder).as_posix(): path for path in sorted(folder.rglob("*.png"))}
+    files, used = {}, set()
+    for name in names:
+        short = name.removeprefix("images/")  # where photographs are named from the scene's folder
+        for each in (f"{short}.png", Path(short).with_suffix(".png").as_posix()):
+            if each in there:
+                files[name] = there[each]
+                used.add(each)
+                break
+    left = [name for name in there if name not in used]
+    if not left:
+        return files, []
+    belong = f"{agreeing(len(left), 'belongs', 'belong')} to no image of the scene"
+    return files, [f"{counted(len(left), 'mask')} in {folder} {belong}, such as {left[0]}."]
+
+
+def read_mask(
+    masks: Masks | None, name: str, photograph: Path, factor: int = 1
+) -> Bool[np.ndarray, "h w"] | None:
+    """Which pixels of a photograph, reduced by a whole factor, count; None: all.
+
+    Args:
+        masks: The scene's.
+        name: The image's name.
+        photograph: Its file.
+        factor: Each pixel is a block of ``factor``^2 of the file.
+
+    Raises:
+        SceneNotFoundError: The mask's file is gone.
+        SceneFormatError: It is no image, has another size than the photograph, or masks all of it.
+    """
+    if masks is None:
+        return None
+    path, parts = masks.files.get(name), []
+    if path is not None:
+        with guarded(path, "a mask, an image of one channel"):
+            picture = open_photograph(path, read_bytes(path))
+            wide = picture.mode.startswith(("I", "F"))  # which Pillow's conversion clips
+            values = np.asarray(picture if wide else picture.convert("L"))
+            parts.append((values > 0) != masks.inverted)
+        size = open_photograph(photograph, photograph_bytes(photograph)).size
+        if picture.size != size:
+            raise SceneFormatError(
+                f"the mask {path} to have the size of {name}, {size[0]} x {size[1]}",
+                found=f"{picture.size[0]} x {picture.size[1]}",
+                fix="Make it from that photograph, without resizing.",
+            )
+    if masks.alpha and (opaque := _opaque(photograph)) is not None:
+        parts.append(opaque)
+    if not parts:
+        return None
+    counts = np.logical_and.reduce(parts)
+    rows, columns = counts.shape[0] // factor, counts.shape[1] // factor
+    blocks = counts[: rows * factor, : columns * factor].reshape(rows, factor, columns, factor)
+    counts = blocks.all(axis=(1, 3))
+    if counts.size and not counts.any():
+        reduced = "" if factor == 1 else f", reduced by a factor of {factor}"
+        raise SceneFormatError(
+            f"pixels of {name} that count by its mask, {path or photograph}{reduced}",
+            found="none",
+            fix="Correct the mask, or take the photograph out of the scene. If 0 is what counts, "
+            f"pass --masks {INVERTED}.",
+        )
+    return None if counts.all() else np.asarray(counts)
+
+
+def _opaque(photograph: Path) -> Bool[np.ndarray, "H W"] | None:
+    """Which pixels are fully opaque; None where none can be otherwise."""
+    if photograph.suffix.lower() in {".jpg", ".jpeg"}:  # not worth reading
+        return None
+    picture = open_photograph(photograph, photograph_bytes(photograph))
+    if not has_alpha(picture) or picture.mode.startswith(("I", "F")):
+        return None
+    with guarded(photograph, "an image, neither cut short nor damaged"):
+        return np.asarray(np.asarray(picture.convert("RGBA").getchannel("A")) == 255)
+
+
+def write_masks(
+    masks: Masks | None,
+    image_dir: Path,
+    names: Iterable[str],
+    folder: Path,
+    lenses: Mapping[str, tuple[Intrinsics, Intrinsics]] | None = None,
+) -> None:
+    """Write the masks of some images as COLMAP names them, 0 or 255.
+
+    If any has pixels that do not count, all get a mask: COLMAP fails and nerfstudio stops where one
+    is missing. With ``lenses``, that of each photograph and that of its undistorted copy, they fit
+    the copies.
+    """
+    whole = []
+    for name in names:
+        counts = read_mask(masks, name, image_dir / name)
+        if counts is None:
+            whole.append(name)
+        else:
+            fitting = _undistorted(counts, *lenses[name]) if lenses else counts
+            _write(folder / f"{name}.png", fitting)
+    for name in whole if folder.is_dir() else ():
+        width, height = open_photograph(image_dir / name, photograph_bytes(image_dir / name)).size
+        if lenses:
+            width, height = lenses[name][1].width, lenses[name][1].height
+        _write(folder / f"{name}.png", np.ones((height, width), np.bool_))
+
+
+def _write(path: Path, counts: Bool[np.ndarray, "H W"]) -> None:
+    from PIL import Image as PilImage  # noqa: PLC0415  (slow to import)
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    PilImage.fromarray(np.where(counts, 255, 0).astype(np.uint8)).save(path)
+
+
+def _undistorted(
+    counts: Bool[np.ndarray, "H W"], lens: Intrinsics, pinhole: Intrinsics
+) -> Bool[np.ndarray, "h w"]:
+    """A mask in the pixels of an undistorted photograph."""
+    from scipy.ndimage import binary_erosion  # noqa: PLC0415  (slow to import)
+
+    if lens == pinhole:  # the photograph is a copy
+        return counts
+    # Colours come from the four pixels around a place, which lie within one pixel of the nearest.
+    sure = binary_erosion(counts, np.ones((3, 3)), border_value=True)
+    moved = Undistortion(lens, {"": pinhole}).apply("", sure.astype(np.float32))
+    return np.asarray(moved == 1)  # NaN beyond the image, where the copy is black

@@ -1,0 +1,162 @@
+"""Masks: which file belongs to which photograph, what counts, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from PIL import Image as PilImage
+
+from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.io import load_scene, write_scene
+from splatseed.io.load import with_own_depths
+from splatseed.io.masks import with_masks
+from splatseed.synthetic import write_capture
+from splatseed.upsample import upsample
+from splatseed.views.view import load_views
+
+from ..bent import bend
+
+BOX = np.s_[20:40, 30:60]
+
+
+def paint(path, size=(96, 72), box=BOX, *, inside=0):
+    """Write a mask of a box."""
+    values = np.full(size[::-1], 255 - inside, np.uint8)
+    values[box] = inside
+    path.parent.mkdir(parents=True, exist_ok=True)
+    PilImage.fromarray(values).save(path)
+    return values > 0
+
+
+@pytest.fixture
+def scene_path(room_path, tmp_path):
+    """A copy of the room, to which masks can be added."""
+    return shutil.copytree(room_path, tmp_path / "scene")
+
+
+def masks_of(scene, **options):
+    return [view.mask for view in load_views(scene, scene.images, **options)]
+
+
+@pytest.mark.parametrize("name", ["view_003.png.png", "view_003.png"])
+def test_a_mask_belongs_to_the_photograph_of_its_name(scene_path, name):
+    counts = paint(scene_path / "masks" / name)
+    paint(scene_path / "masks" / "other.png")
+    scene = load_scene(scene_path)
+    masks = masks_of(scene)
+    assert np.array_equal(masks[3], counts)
+    assert [mask is None for mask in masks] == [i != 3 for i in range(9)]
+    assert sum("other.png" in warning for warning in scene.warnings) == 1
+
+
+def test_a_smaller_pixel_counts_only_if_all_of_its_pixels_count(scene_path):
+    counts = paint(scene_path / "masks/view_000.png", box=np.s_[21:22, 30:33])
+    mask = masks_of(load_scene(scene_path), data_factor=4)[0]
+    assert np.array_equal(mask, counts.reshape(18, 4, 24, 4).all(axis=(1, 3)))
+    assert np.count_nonzero(~mask) == 2
+
+
+def test_transparent_pixels_do_not_count(scene_path):
+    path = scene_path / "images/view_000.png"
+    with PilImage.open(path) as photograph:
+        photograph.putalpha(PilImage.fromarray(np.full((72, 96), 255, np.uint8)))
+        photograph.save(path)
+        assert masks_of(load_scene(scene_path))[0] is None
+        photograph.putpixel((5, 7), (1, 2, 3, 254))
+        photograph.save(path)
+    mask = masks_of(load_scene(scene_path))[0]
+    assert np.argwhere(~mask).tolist() == [[7, 5]]
+
+
+def test_a_folder_none_and_inverted_can_be_chosen(scene_path, tmp_path):
+    counts = paint(scene_path / "masks/view_000.png")
+    other = paint(tmp_path / "other/view_000.png.png", box=np.s_[:9, :9])
+    scene = load_scene(scene_path)
+    assert masks_of(with_masks(scene, "none"))[0] is None
+    assert np.array_equal(masks_of(with_masks(scene, "inverted"))[0], ~counts)
+    assert np.array_equal(masks_of(with_masks(scene, str(tmp_path / "other")))[0], other)
+    inverted = with_masks(scene, f"inverted:{tmp_path / 'other'}")
+    assert np.array_equal(masks_of(inverted)[0], ~other)
+    for choice in (str(tmp_path / "nowhere"), str(scene_path / "sparse")):
+        with pytest.raises(SceneNotFoundError, match="masks of the scene's images"):
+            with_masks(scene, choice)
+
+
+def test_what_cannot_be_a_mask_is_named(scene_path):
+    path = scene_path / "masks/view_000.png"
+    paint(path, size=(48, 36), box=np.s_[:5, :5])
+    with pytest.raises(SceneFormatError, match=r"view_000.png.* 96 x 72; found 48 x 36"):
+        masks_of(load_scene(scene_path))
+    paint(path, box=np.s_[:, :])
+    with pytest.raises(SceneFormatError, match=r"view_000.png that count.*found none"):
+        masks_of(load_scene(scene_path))
+    path.write_bytes(b"no image")
+    with pytest.raises(SceneFormatError, match=r"view_000.png to be an image"):
+        masks_of(load_scene(scene_path))
+
+
+def test_transforms_name_masks(scene_path, tmp_path):
+    """Their ``mask_path`` is read, and a new file has one for each frame."""
+    scene = load_scene(scene_path)
+    for i in range(9):
+        paint(tmp_path / f"other/view_{i:03}.png.png")
+    chosen = with_masks(scene, str(tmp_path / "other"))
+    write_scene(chosen, tmp_path / "out", format="transforms")
+    frames = json.loads((tmp_path / "out/transforms.json").read_text("utf-8"))["frames"]
+    assert [frame["mask_path"] for frame in frames] == [
+        f"masks/{image.name}.png" for image in scene.images
+    ]
+    (tmp_path / "out/masks").rename(tmp_path / "out/elsewhere")
+    for frame in frames:
+        frame["mask_path"] = frame["mask_path"].replace("masks/", "elsewhere/")
+    text = json.loads((tmp_path / "out/transforms.json").read_text("utf-8"))
+    (tmp_path / "out/transforms.json").write_text(json.dumps({**text, "frames": frames}), "utf-8")
+    again = load_scene(tmp_path / "out")
+    assert all(np.array_equal(m, masks_of(chosen)[0]) for m in masks_of(again))
+    for layout in ("colmap", "transforms"):
+        write_scene(again, tmp_path / f"as_{layout}", format=layout)
+        assert np.array_equal(
+            masks_of(load_scene(tmp_path / f"as_{layout}"))[4], masks_of(chosen)[4]
+        )
+
+
+def test_inverted_masks_are_written_as_others_read_them(scene_path, tmp_path):
+    counts = paint(scene_path / "masks/view_000.png")
+    write_scene(with_masks(load_scene(scene_path), "inverted"), tmp_path / "out")
+    masks = masks_of(load_scene(tmp_path / "out"))
+    assert np.array_equal(masks[0], ~counts)
+    assert len(list((tmp_path / "out/masks").iterdir())) == 9  # of all, or COLMAP fails
+
+
+def test_depth_is_lifted_where_pixels_count(scene_path):
+    counts = paint(scene_path / "masks/view_000.png", box=np.s_[:, :50])
+    scene = with_own_depths(load_scene(scene_path))
+    scene = scene.replace(images=scene.images[:1])
+    points = upsample(scene, "depth", num_points=len(scene.points) + 200)
+    uv = scene.images[0].camera.project(points.xyz[len(scene.points) :])[0].astype(int)
+    assert counts[uv[:, 1], uv[:, 0]].all()
+
+
+def test_undistortion_carries_masks_along(sixteen_views, tmp_path):
+    """By our own and by pycolmap's, the box covers the same part of the photographs."""
+    pytest.importorskip("pycolmap", reason="pycolmap undistorts")
+    from splatseed.sfm import undistort
+
+    path = write_capture(bend(sixteen_views[0]), tmp_path / "bent")
+    photograph = np.asarray(PilImage.open(path / "images/view_000.png")).copy()
+    photograph[BOX] = (255, 0, 255)
+    PilImage.fromarray(photograph).save(path / "images/view_000.png")
+    paint(path / "masks/view_000.png", size=(160, 120))
+    scene = load_scene(path)
+    undistort(scene, tmp_path / "flat")
+    flat = load_scene(tmp_path / "flat")
+    for view in (
+        load_views(scene, scene.images[:1], undistort=True)[0],
+        load_views(flat, flat.images[:1])[0],
+    ):
+        painted = (view.photograph == (255, 0, 255)).all(axis=2)
+        assert not (painted & view.mask).any()
+        assert np.count_nonzero(~view.mask) < 1.35 * np.count_nonzero(painted) + 400
