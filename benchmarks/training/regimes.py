@@ -28,7 +28,7 @@ __all__: list[str] = []
 
 SFM, RANDOM, NO_POINTS = "sfm", "random as gsplat", "auto, no points"
 PLAN = ("rho", "steps", "photographs")
-FACTS = ("psnr", "ssim", "gaussians", "seeds")
+FACTS = ("psnr", "ssim", "gaussians", "seeds", "cap", "points")
 ROOMS = (1.0, 1.1, 1.3, 1.5, 2.0, 3.0, 4.0, inf)
 """Thresholds of the advice that are compared; above the last, nothing is ever added."""
 
