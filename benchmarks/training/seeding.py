@@ -49,7 +49,7 @@ class Settings:
     data_factor: int = 2
     """By how much photographs are made smaller."""
     every: int = 1
-    """Train on every so-manieth of the training photographs, by name."""
+    """Train on every n-th of the training photographs, by name."""
     jobs: int = os.cpu_count() or 1
     """Runs at a time, on one thread each."""
     ledger: Path = Path("seeding.jsonl")

@@ -53,7 +53,7 @@ def train(
     scene: str, arm: str, strategy: str, rho: float, max_steps: int, data_factor: int, seed: int,
     every: int,
 ) -> dict[str, float]:  # fmt: skip
-    """One run, from every so-manieth of the training photographs by name; 1 = all.
+    """One run, from every ``every``-th of the training photographs by name.
 
     Scores, Gaussians, seeds, and seconds: of seeding and of training by the clock, of training by
     the processor, and ``whole_processor``, from the scene in memory to the last step.

@@ -361,12 +361,12 @@ def _train_arm(
         raise KeyboardInterrupt
     result = run.finish(evaluate_views, clock)
     shown = run.trainer.test_views[len(run.trainer.test_views) // 2]
-    render = np.asarray(run.trainer.render(shown).cpu().numpy(), np.float32)
+    render = run.trainer.render(shown)
     score = f"{ARMS[name]}: {result.scores.psnr:.2f} dB over all test views"
-    errors = flip_map(run.trainer.render(shown), photograph_of(shown, run.trainer.device))
+    errors = flip_map(render, photograph_of(shown, run.trainer.device))
     return result, (
         Tile("photograph, not trained on", shown.photograph),
-        Tile(score, as_bytes(render)),
+        Tile(score, as_bytes(render.cpu().numpy())),
         Tile("FLIP: black 0, brightest 1", error_picture(errors)),
     )
 

@@ -1,7 +1,7 @@
 """Masks: which pixels of photographs count; finding their files, reading and writing them.
 
-A mask is an image of its photograph's size, 0 where a pixel is masked, as COLMAP, nerfstudio, Brush
-and LichtFeld Studio take it. The mask of ``a/b.jpg`` is ``a/b.jpg.png`` (COLMAP's name) or
+A mask is an image of its photograph's size, 0 where a pixel is masked, as COLMAP and
+nerfstudio take it. The mask of ``a/b.jpg`` is ``a/b.jpg.png`` (COLMAP's name) or
 ``a/b.png`` in a folder of masks. Pixels of a photograph that are not opaque are masked, too.
 Promise: a pixel of a smaller copy, or of an undistorted one, counts only if all that it was made
 from count.

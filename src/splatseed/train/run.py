@@ -133,7 +133,7 @@ def prepare_run(
         scene, stereo = seeded(scene, settings, device.type, note, progress)
         trained = scene.split(settings.test_every)[0]
         seeds = usable_seeds(scene.points, settings, note, poses_of(trained, settings.data_factor))
-        check_fits(len(seeds), device)
+    check_fits(len(seeds if start is None else start), device)
     began = seeds_facts(seeds) if start is None else start_facts(start)
     config = make_config(scene, began, settings, _name(device), refine_poses=refine_poses)
     _check_begun(folder, begun, config)

@@ -64,7 +64,8 @@ LARGEST = 0.05
 """Largest initial size of a Gaussian, in near depths. Where SfM has few points the gaps between
 them are wide, and a Gaussian that fills one hides all that lies behind it."""
 START_RATE = 0.25
-"""Learning rates of a run that goes on from trained Gaussians, as a fraction of a new run's."""
+"""Learning rates of a run that goes on from trained Gaussians, as a fraction of a new run's. It was
+tried on one capture only."""
 
 
 @dataclass(frozen=True)

@@ -52,9 +52,9 @@ NEAREST = 0.01
 """The rasteriser's near plane: nothing nearer is drawn."""
 PER_RENDERED = {"cpu": 0.06, "cuda": 0.01}
 """Most pixels compared per pixel rendered in training, by the device that renders: on the CPU,
-stereo then takes about 7% of training's seconds. Comparing always runs on the CPU, some 0.7 million
-pixels a second and core. The number for a GPU is an estimate: 150 million pixels rendered a second,
-beside 8 cores; benchmarks/gpu measures both."""
+stereo then takes at most a tenth of training's seconds (bonsai and treehill at 1,500 steps: 7%).
+Comparing always runs on the CPU, some 0.7 million pixels a second and core. The number for a GPU is
+an estimate: 150 million pixels rendered a second, beside 8 cores; benchmarks/gpu measures both."""
 LEAST_SIZE = {"cpu": 64, "cuda": 200}
 """Smallest size that is returned, in pixels; on the CPU it is not below the size that is trained
 either, which on a GPU is the photographs' own."""
