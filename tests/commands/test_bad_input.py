@@ -118,6 +118,7 @@ WORDS = [
     ((*DEPTH, "--stereo", "--model", "some"), "--model"),
     ((*DEPTH, "--stereo", "--max-size", "5"), "--max-size"),
     ((*DEPTH, "--stereo", "--grid", "99"), "--grid"),
+    ((*DEPTH, "--stereo", "--hold-out", "1"), "--hold-out"),
     ((*DEPTH, "--stereo", "--depth-kind", "z"), "--depth-kind"),
     ((*DEPTH, "--model", "some", "--colmap"), "--colmap"),
     ((*DEPTH, "--model", "nobody/Depth-Nothing-hf"), "nobody/Depth-Nothing-hf"),

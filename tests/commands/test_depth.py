@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import subprocess
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -70,7 +71,13 @@ def stereo(monkeypatch):
     def stereo_depths(scene, *, max_size=800, grid=4, seed=0, progress=None):
         known.calls.append((len(scene.images), max_size, grid, seed))
         progress("stereo", 1.0)
-        return known.maps
+        names = [image.name for image in scene.images]
+        # Any images may be named as those that were compared: nothing here looks at which.
+        return [
+            replace(m, sources=tuple(names[: len(m.sources)]))
+            for m in known.maps
+            if m.name in names
+        ]
 
     monkeypatch.setattr(splatseed.depth.stereo, "stereo_depths", stereo_depths, raising=False)
     return known
@@ -89,6 +96,15 @@ def test_a_plain_folder(room, tmp_path, splatseed, stereo):
     assert splatseed(*words).code == 2  # it is there
     assert splatseed(*words, "--overwrite", "--max-size", 500, "--grid", 2).code == 0
     assert stereo.calls == [(12, 800, 4, 0), (12, 500, 2, 0)]
+
+
+@pytest.mark.usefixtures("stereo")
+def test_test_photographs_are_held_out_of_the_maps(room, tmp_path, splatseed):
+    assert splatseed("depth", room, "--stereo", "--hold-out", 8, "-o", tmp_path / "maps").code == 0
+    train, test = load_scene(room).split(8)
+    depths = find_depths(load_scene(room), tmp_path / "maps")
+    assert sorted(depths) == [each.name for each in train]
+    assert len(test) == 2
 
 
 @pytest.fixture(scope="module")

@@ -41,7 +41,7 @@ MAX_SIZE = 1600
 PICTURE = "preview_maps.png"
 PACKAGES = ("splatseed", "transformers", "torch", "numba", "numpy", "pillow", "scipy")
 OF_NETWORK = ("device", "depth_kind")
-OF_STEREO = ("colmap", "grid", "preview")
+OF_STEREO = ("colmap", "grid", "preview", "hold_out")
 MIN_PIXELS = 3
 """Photographs that must confirm a point fused by COLMAP. Its default of 5 suits unconfirmed maps;
 our pixels are confirmed already, and few views see the borders."""
@@ -69,6 +69,9 @@ class Options:
     grid: int | None = None
     """With --stereo: one pixel of the map per block of GRID x GRID pixels of the photograph; 4 by
     default."""
+    hold_out: int | None = None
+    """With --stereo: leave out every n-th image by name; 8 leaves out those that trainers test
+    on."""
     preview: bool = False
     """With --stereo: also write preview_maps.png, some photographs beside their maps."""
     device: DeviceName = "auto"
@@ -87,6 +90,7 @@ def run(arguments: list[str]) -> None:
     """Run the verb with these arguments."""
     options = parse_options(Options, "depth", arguments)
     check_least(options, 1, "grid")
+    check_least(options, 2, "hold_out")
     check_least(options, LEAST_SIZE if options.stereo else 1, "max_size")
     foreign = OF_NETWORK if options.stereo else OF_STEREO
     idle = [name for name in foreign if getattr(options, name) != getattr(Options, name)]
@@ -161,6 +165,8 @@ def _run_stereo(options: Options) -> None:
     with stage_display() as clock:
         clock("read", 0.0)
         scene = load_scene(options.scene, require_points=False)
+        if options.hold_out:
+            scene = scene.replace(images=scene.split(options.hold_out)[0])
         if options.colmap:
             dense.check_dense_scene(scene, undistorts=True)
         given = {name: getattr(options, name) for name in ("max_size", "grid")}
