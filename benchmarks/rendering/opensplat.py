@@ -2,14 +2,18 @@
 
 Promise: nothing of OpenSplat is imported or linked; it is run as a user runs it, on a COLMAP scene
 in a temporary folder. It goes on from a .ply with our Gaussians, at a step where it uses harmonics
-of degree 3 and does not densify. What it takes to start is left out: the time is the difference of
-a short and a longer run over the difference of their steps. Options are those of its version 1.1.5.
+of degree 3 and does not densify, but gathers what densification needs, as ours does. What it takes
+to start is left out: the time is the difference of a short and a longer run over the difference of
+their steps. Options are those of its version 1.2.0.
 
-Compare speed, not quality: the CPU build of that version sorts by a depth that it reads wrongly.
+It has no option for its threads: its rasteriser and its loss start as many as the machine has
+cores, allowed or not. So it is held to cores (Linux), and PyTorch to as many threads, which sleep
+when idle, as ours do: awake they would take the cores from its own.
 """
 
 from __future__ import annotations
 
+import os
 import subprocess
 import tempfile
 from collections.abc import Sequence
@@ -34,8 +38,10 @@ __all__ = ["seconds_per_step"]
 
 FIRST_STEP = 3001
 """Its own schedule has all harmonics in use from step 3000 on."""
-SHORT, LONG = 2, 8
-NEVER = 1_000_000
+SHORT, LONG = 8, 24
+"""Steps of the two runs: 16 apart, as higher harmonics are updated at every 16th step only."""
+LAST_DENSIFICATION = 15_000
+"""Its own default in a run of 30,000 steps."""
 
 
 def seconds_per_step(
@@ -46,7 +52,7 @@ def seconds_per_step(
     Args:
         program: OpenSplat's executable.
         workload: What to train on what.
-        threads: How many PyTorch's C++ library may use.
+        threads: How many cores it may use, and how many threads PyTorch's C++ library.
         clock: Whose seconds; of ``cpu``, those of all threads over their number, in its favour.
 
     Raises:
@@ -97,17 +103,17 @@ def _write_gaussians(workload: Workload, path: Path) -> None:
 def _command(program: Path, scene: Path, gaussians: Path, steps: int) -> list[str]:
     """A run that takes so many steps."""
     last, result = FIRST_STEP - 1 + steps, scene.with_name("result.ply")
-    options = ["--cpu", "-n", last, "-d", 1, "--num-downscales", 0, "--warmup-length", NEVER]
-    options += ["--resume", gaussians, "--keep-crs", "-o", result]
+    options = ["--cpu", "-n", last, "--densify-until", LAST_DENSIFICATION]
+    options += ["--resume", gaussians, "-o", result]
     return [str(program), str(scene), *map(str, options)]
 
 
 def _seconds(command: Sequence[str], threads: int, clock: Clock) -> float:
     """How long a run takes."""
+    allowed = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, sorted(allowed)[:threads])  # inherited by what starts here
     try:
-        return seconds_of(
-            command, clock, threads=threads, environment=thread_settings(threads, awake=True)
-        )
+        return seconds_of(command, clock, threads=threads, environment=thread_settings(threads))
     except (OSError, subprocess.CalledProcessError) as error:
         said = getattr(error, "stderr", None) or getattr(error, "stdout", None) or str(error)
         raise MissingDependencyError(
@@ -115,3 +121,5 @@ def _seconds(command: Sequence[str], threads: int, clock: Clock) -> float:
             found=said.strip()[-500:],
             fix="Build it for the CPU from its repository, or leave out --opensplat.",
         ) from error
+    finally:
+        os.sched_setaffinity(0, allowed)

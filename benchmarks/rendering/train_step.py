@@ -81,7 +81,7 @@ class Settings:
     start_up: bool = True
     """Also the time to import, and to the first step with and without compiled kernels on disk."""
     opensplat: Path | None = None
-    """OpenSplat's program, to be timed on the same Gaussians and photographs."""
+    """OpenSplat's program, to be timed on the same Gaussians and photographs (Linux)."""
     clock: Clock = "wall"
     """On a machine that is not idle, cpu: the busiest thread's time on a core, stage by stage."""
 

@@ -139,19 +139,20 @@ def test_a_child_has_its_threads_and_says_what_went_wrong(bench):
         bench.children.call("os:getenv", threads=1, no_such=1)
 
 
-@pytest.mark.skipif(os.name == "nt", reason="a script stands in for the program")
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="programs are held to cores")
 def test_opensplat_gets_our_scene_and_its_start_is_left_out(bench, workload, tmp_path, monkeypatch):
     """The stand-in keeps its inputs; its clock says 7 seconds to start and 0.05 a step."""
     program, kept = tmp_path / "opensplat", tmp_path / "kept"
     program.write_text(
         f"""#!{sys.executable}
-import shutil, sys
+import os, shutil, sys
+assert len(os.sched_getaffinity(0)) == 1, "more cores than asked for"
 shutil.copytree(sys.argv[1], {str(kept)!r}, dirs_exist_ok=True)
 shutil.copy(sys.argv[1 + sys.argv[1:].index("--resume") + 1], {str(kept / "gaussians.ply")!r})
 """
     )
     program.chmod(program.stat().st_mode | stat.S_IXUSR)
-    run = bench.opensplat._seconds
+    run, cores = bench.opensplat._seconds, os.sched_getaffinity(0)
 
     def pretend(command, threads, clock):
         assert run(command, threads, clock) > 0
@@ -159,6 +160,7 @@ shutil.copy(sys.argv[1 + sys.argv[1:].index("--resume") + 1], {str(kept / "gauss
 
     monkeypatch.setattr(bench.opensplat, "_seconds", pretend)
     assert bench.opensplat.seconds_per_step(program, workload, 1) == pytest.approx(0.05)
+    assert os.sched_getaffinity(0) == cores
     scene = load_scene(kept)
     assert len(scene.images) == len(workload.views)
     np.testing.assert_allclose(
