@@ -26,7 +26,7 @@ from splatseed.train import TrainSettings, prepare_run
 from splatseed.train.seeds import most_seeds, stereo_size
 from splatseed.upsample import configure
 
-__all__ = ["ARMS", "TEST_EVERY", "train", "triangulated"]
+__all__ = ["ARMS", "TEST_EVERY", "train", "triangulated", "validation_split"]
 
 ARMS: Mapping[str, Mapping[str, Any]] = {
     "sfm": {"method": "linear", "ratio": 1},
@@ -59,7 +59,7 @@ def train(
     the processor, and ``whole_processor``, from the scene in memory to the last step.
     """
     whole = ss.load_scene(Path(scene))
-    validation = _validation(whole, every, HELD_STEP * seed % TEST_EVERY)
+    validation = validation_split(whole, every, HELD_STEP * seed % TEST_EVERY)
     camera = validation.images[0].camera
     cap = round(rho * (camera.width // data_factor) * (camera.height // data_factor))
     settings = TrainSettings(
@@ -89,7 +89,7 @@ def train(
     }
 
 
-def _validation(whole: Scene, every: int, first: int) -> Scene:
+def validation_split(whole: Scene, every: int, first: int) -> Scene:
     """The training views; every eighth from ``first`` on is held out, the others are thinned."""
     validation = whole.replace(images=whole.split(TEST_EVERY)[0])
     images = sorted(validation.images, key=lambda image: image.name)

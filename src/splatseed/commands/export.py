@@ -6,12 +6,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import tyro
 
 from splatseed.commands.models import check_free, config_of, model_file
 from splatseed.commands.options import parse_options, refuse
 from splatseed.console import print_note, print_pairs, stage_display
 from splatseed.literal import quoted
+from splatseed.requirements import require
 from splatseed.splat.formats import (
     FORMATS,
     format_of_name,
@@ -39,6 +41,11 @@ class Options:
     if the first number is negative."""
     min_opacity: float = 0.0
     """Leave out Gaussians whose opacity is lower, 0 to 1."""
+    clean: bool = False
+    """Leave out floaters: Gaussians in space that the scene's photographs see through, and do not
+    need."""
+    scene: Path | None = None
+    """The scene of the photographs, for --clean; a run knows its own."""
     overwrite: bool = False
     """Replace an existing file."""
 
@@ -50,20 +57,41 @@ def run(arguments: list[str]) -> None:
     crop = None if options.crop is None else parse_crop(options.crop)
     path, target = model_file(options.model), options.output
     check_free(target, overwrite=options.overwrite)
+    config = config_of(options.model) if options.clean else {}
+    scene = options.scene or config.get("scene")
     refuse(
+        (options.scene and not options.clean, "--clean, with --scene", "--scene alone",
+         "Add --clean, or leave --scene out."),
+        (options.clean and not isinstance(scene, str | Path),
+         f"--scene, as {options.model} does not name its scene", "none",
+         "Pass --scene SCENE: the scene that it was trained on."),
         (target.exists() and target.samefile(path), f"another file than {target}", "the model's",
          "Choose another name."),
         (RunFolder(target.resolve().parent).is_run, f"a file outside training runs, not {target}",
          "the folder of a run", "Choose a place beside the run."),
     )  # fmt: skip
+    if options.clean:
+        require("torch")
     with stage_display() as clock:
         clock("read", 0.0)
         gaussians = read_model(path)
         kept = keep_gaussians(gaussians, crop, options.min_opacity)
+        floaters = np.zeros(len(gaussians), bool)
+        if options.clean:
+            from splatseed.train.floaters import floaters_of_model  # noqa: PLC0415  (imports PyTorch)
+
+            asked = ("data_factor", "test_every")
+            numbers = {n: value for n in asked if isinstance(value := config.get(n), int)}
+            masks = config.get("masks")
+            floaters = floaters_of_model(
+                path, Path(str(scene)), masks=masks, progress=clock, **numbers
+            )
+            kept = keep_gaussians(gaussians.select(~floaters), crop, options.min_opacity)
         write_model(target, kept, clock)
     before, after = path.stat().st_size, target.stat().st_size
     rows = [
         ("Gaussians", f"{len(kept):,} of {len(gaussians):,}"),
+        *[("floaters", f"{np.count_nonzero(floaters):,} left out")] * options.clean,
         ("format", f"{name}: {FORMATS[name].about}"),
         ("size", f"{after / 1e6:.2f} MB, of {before / 1e6:.2f} MB read"),
         ("output", str(target)),

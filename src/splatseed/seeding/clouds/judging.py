@@ -122,6 +122,11 @@ class Evidence(NamedTuple):
     through: UInt16[np.ndarray, " N"]  # how many views see through it
     confirmed: UInt16[np.ndarray, " N"]  # how many views confirm it
 
+    @property
+    def seen_past(self) -> Bool[np.ndarray, " N"]:
+        """Where rays are free: enough views see through a point, and more than confirm it."""
+        return np.asarray((self.through >= THROUGH) & (self.through > self.confirmed))
+
     def select(self, which: Bool[np.ndarray, " N"]) -> Evidence:
         """That on some of the points."""
         return Evidence(*(values[which] for values in self))
@@ -358,7 +363,7 @@ def _against(
     evidence: Evidence, colors: UInt8[np.ndarray, "N 3"] | None
 ) -> tuple[Bool[np.ndarray, " N"], dict[str, int]]:
     """Which voxels are contradicted, and how many by reason; the first counts."""
-    past = (evidence.through >= THROUGH) & (evidence.through > evidence.confirmed)
+    past = evidence.seen_past
     torn = (evidence.seen >= ASKED) & (evidence.agreement < AGREES)  # NaN compares false
     torn &= evidence.confirmed < CONFIRMED  # what shines looks different from all sides
     other = np.zeros_like(past)
