@@ -125,7 +125,7 @@ def psnr(path, scene):
 def test_export_finds_floaters_in_a_room(sixteen_views, floating, splatseed, tmp_path):
     root, (path, count) = sixteen_views[1].source.root, floating
     before, out = path.read_bytes(), tmp_path / "clean.ply"
-    done = splatseed("export", path, "-o", out, "--clean", "--scene", root)
+    done = splatseed("export", path, "-o", out, "--clean", root)
     assert done.code == 0, done.err
     kept, model = read_model(out).means, read_model(path).means
     stays = np.isin(model[:, 0], kept[:, 0])
@@ -138,25 +138,24 @@ def test_export_finds_floaters_in_a_room(sixteen_views, floating, splatseed, tmp
     # A model in its trainer's own world is cleaned there.
     world = find_transform("gsplat", sixteen_views[1])
     write_model(tmp_path / "theirs.ply", moved(read_model(path), world))
-    words = ("-o", tmp_path / "again.ply", "--clean", "--scene", root)
+    words = ("-o", tmp_path / "again.ply", "--clean", root)
     assert splatseed("export", tmp_path / "theirs.ply", *words).code == 0
     again = read_model(tmp_path / "again.ply")
     assert abs(len(again) - len(kept)) <= 0.01 * len(kept)
 
 
-def test_bad_input_leaves_no_file(sixteen_views, floating, room, splatseed, tmp_path):
+def test_bad_input_leaves_no_file(floating, room, splatseed, tmp_path):
     (path, _), out = floating, tmp_path / "out.ply"
     other = room.replace(points=PointCloud(room.points.xyz + 50, room.points.rgb), tracks=None)
     write_scene(other, tmp_path / "other")
     write_scene(room.replace(images=(), tracks=None), tmp_path / "points")
-    for words, said in (
-        (["--clean"], "--scene"),
-        (["--scene", sixteen_views[1].source.root], "--clean"),
-        (["--clean", "--scene", tmp_path / "none"], "none"),
-        (["--clean", "--scene", tmp_path / "other"], "another scene"),
-        (["--clean", "--scene", tmp_path / "points"], "photographs"),
+    for scene, said in (
+        ("own", "--clean SCENE"),
+        (tmp_path / "none", "none"),
+        (tmp_path / "other", "another scene"),
+        (tmp_path / "points", "photographs"),
     ):
-        failed = splatseed("export", path, "-o", out, *words)
+        failed = splatseed("export", path, "-o", out, "--clean", scene)
         assert failed.code == 2, failed
         assert said in " ".join(failed.err.split())
         assert not out.exists()

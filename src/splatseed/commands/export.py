@@ -25,6 +25,9 @@ from splatseed.splat.formats import (
 from splatseed.train.folder import RunFolder
 from splatseed.train.settings import TrainSettings
 
+OWN = "own"
+"""For --clean: the scene that the run names."""
+
 
 @dataclass(frozen=True)
 class Options:
@@ -41,11 +44,9 @@ class Options:
     if the first number is negative."""
     min_opacity: float = 0.0
     """Leave out Gaussians whose opacity is lower, 0 to 1."""
-    clean: bool = False
-    """Leave out floaters: Gaussians in space that the scene's photographs see through, and do not
-    need."""
-    scene: Path | None = None
-    """The scene of the photographs, for --clean; a run knows its own."""
+    clean: Annotated[str | None, tyro.conf.arg(metavar="SCENE|own")] = None
+    """Leave out floaters: Gaussians in space that the photographs of this scene see through, and do
+    not need; own: the scene of the run."""
     overwrite: bool = False
     """Replace an existing file."""
 
@@ -57,27 +58,26 @@ def run(arguments: list[str]) -> None:
     crop = None if options.crop is None else parse_crop(options.crop)
     path, target = model_file(options.model), options.output
     check_free(target, overwrite=options.overwrite)
-    config = config_of(options.model) if options.clean else {}
-    scene = options.scene or config.get("scene")
+    cleans = options.clean is not None
+    config = config_of(options.model) if cleans else {}
+    scene = config.get("scene") if options.clean == OWN else options.clean
     refuse(
-        (options.scene and not options.clean, "--clean, with --scene", "--scene alone",
-         "Add --clean, or leave --scene out."),
-        (options.clean and not isinstance(scene, str | Path),
-         f"--scene, as {options.model} does not name its scene", "none",
-         "Pass --scene SCENE: the scene that it was trained on."),
+        (options.clean == OWN and not isinstance(scene, str),
+         f"--clean SCENE, as {options.model} does not name its scene", OWN,
+         "Name the scene that it was trained on."),
         (target.exists() and target.samefile(path), f"another file than {target}", "the model's",
          "Choose another name."),
         (RunFolder(target.resolve().parent).is_run, f"a file outside training runs, not {target}",
          "the folder of a run", "Choose a place beside the run."),
     )  # fmt: skip
-    if options.clean:
+    if cleans:
         require("torch")
     with stage_display() as clock:
         clock("read", 0.0)
         gaussians = read_model(path)
         kept = keep_gaussians(gaussians, crop, options.min_opacity)
         floaters = np.zeros(len(gaussians), bool)
-        if options.clean:
+        if cleans:
             from splatseed.train.floaters import floaters_of_model  # noqa: PLC0415  (imports PyTorch)
 
             asked = ("data_factor", "test_every")
@@ -91,7 +91,7 @@ def run(arguments: list[str]) -> None:
     before, after = path.stat().st_size, target.stat().st_size
     rows = [
         ("Gaussians", f"{len(kept):,} of {len(gaussians):,}"),
-        *[("floaters", f"{np.count_nonzero(floaters):,} left out")] * options.clean,
+        *[("floaters", f"{np.count_nonzero(floaters):,} left out")] * cleans,
         ("format", f"{name}: {FORMATS[name].about}"),
         ("size", f"{after / 1e6:.2f} MB, of {before / 1e6:.2f} MB read"),
         ("output", str(target)),

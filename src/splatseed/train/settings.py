@@ -79,7 +79,7 @@ class TrainSettings:
     thinned."""
     backend: Backend = "auto"
     """Where to train; auto takes a GPU if PyTorch sees one."""
-    sh_degree: int = 3
+    sh_degree: tyro.conf.Suppress[int] = 3
     """Degree of the spherical harmonics: how finely colours depend on the viewing direction, 0 to
     3."""
     test_every: int = 8
