@@ -1,11 +1,11 @@
 """Floaters: Gaussians that stand in space that views see through, and that no photograph needs.
 
-Notation: a *suspect* is a Gaussian that is seen past at its centre: at least two training views,
-and more than confirm it, know by stereo that the surface there lies clearly behind
-(``seeding.clouds.judging``). E is the sum over the training views' squared errors, a the opacity of
-a suspect. Promise: a Gaussian that is no suspect stays, and so does a suspect that the photographs
-need, as thin, soft and transparent things are: with every suspect at a quarter of its opacity, so
-that one hardly hides another, dE/da is negative. Test views have no part.
+Notation: a *suspect* is a Gaussian that at least two training views see past at its centre, and
+more than confirm it: stereo finds the surface there clearly behind
+(``seeding.clouds.judging``). E is the sum of the training views' squared errors, a the opacity of a
+suspect. Promise: only suspects go, and only those that the photographs do not need: thin, soft and
+transparent things stay. With every suspect at a quarter of its opacity, so that one hardly hides
+another, the photographs need it if dE/da is negative. Test views have no part.
 """
 
 from __future__ import annotations
