@@ -158,4 +158,5 @@ def test_bad_input_leaves_no_file(floating, room, splatseed, tmp_path):
         failed = splatseed("export", path, "-o", out, "--clean", scene)
         assert failed.code == 2, failed
         assert said in " ".join(failed.err.split())
+        assert "--transform" not in failed.err
         assert not out.exists()

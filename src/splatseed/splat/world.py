@@ -115,7 +115,11 @@ def in_scene_world(path: Path, scene: Scene, gaussians: Gaussians) -> tuple[Gaus
     ratios = {word: apart(world) for word, world in _candidates(path, scene).items()}
     word = min(ratios, key=ratios.__getitem__)
     if word == NO_TRANSFORM or ratios[word] > min(DOUBTFUL, ratios[NO_TRANSFORM] / CLOSER):
-        return gaussians, check_world(path, scene, gaussians)
+        try:
+            return gaussians, check_world(path, scene, gaussians)
+        except SceneFormatError as error:
+            fix = "Name the scene that they were trained on, or move them into its world."
+            raise SceneFormatError(error.expected, found=error.found, fix=fix) from None
     world = find_transform(word, scene)
     assert world is not None  # noqa: S101  (only the word none has no transform)
     return moved(gaussians, world.inverse), (
