@@ -185,17 +185,20 @@ def test_seeds_and_views_are_shown_and_not_made_again(tmp_path, capture, monkeyp
     report, first = write_report(bench), (bench / REPORT).read_bytes()
     assert not report.notes
     assert len(list((bench / "figures").glob("clouds_.._a_room_*.png"))) == 1
-    assert "test view view0: mls 3x, the best on this scene (+" in text_of(bench)
+    # The middle one of the views, with its error maps.
+    shown = r"test view view1: sfm \+ none on the left, mls 3x \+ none on the right \(\+0\.\d\d dB"
+    assert re.search(shown, text_of(bench))
+    assert "FLIP of sfm + none FLIP of mls 3x + none" in text_of(bench)
     kept = json.loads((bench / "descriptors.json").read_text("utf-8"), parse_constant=pytest.fail)
     assert list(kept) == [capture[1]]
     assert kept[capture[1]]["texture"] is None
     monkeypatch.setattr(pictures_module, "open_unchanged", pytest.fail)
     write_report(bench)
     assert (bench / REPORT).read_bytes() == first
-    for picture in bench.glob("runs/*/renders/view0.png"):
+    for picture in bench.glob("runs/*/renders/view1.png"):
         picture.write_bytes(b"damaged")
     write_report(bench)
-    assert ("view view0:" in text_of(bench), "view view1:" in text_of(bench)) == (False, True)
+    assert ("view view0:" in text_of(bench), "view view1:" in text_of(bench)) == (True, False)
 
 
 def test_a_changed_scene_costs_its_pictures_alone_and_losers_are_not_called_the_best(
@@ -206,7 +209,7 @@ def test_a_changed_scene_costs_its_pictures_alone_and_losers_are_not_called_the_
     assert "expected the files of" in write_report(bench).notes[0]
     assert "sfm,,," in (bench / "tables" / "winners_none.csv").read_text("utf-8")
     said = text_of(bench)
-    assert "view0: mls 3x, the best of the others on this scene, though it loses (-0.10" in said
+    assert "view1: sfm + none on the left, mls 3x + none on the right (-0.10 dB" in said
 
 
 @pytest.fixture(scope="module")
@@ -230,6 +233,8 @@ def test_the_page_opens_alone_and_fits(opened, width):
     assert not page.errors
     assert page.run("document.documentElement.scrollWidth") == width
     assert page.run("[...document.images].every(i => i.complete && i.naturalWidth > 0)")
+    inside = "[...document.images].every(i => i.getBoundingClientRect().right <= innerWidth)"
+    assert page.run(inside)  # scrolled sideways, half of a figure would be missed
     # No text runs out of its own block, except where the block scrolls.
     wide = "[...document.querySelectorAll('h1,h2,h3,p,figcaption,summary')]"
     assert page.run(f"{wide}.filter(e => e.scrollWidth > e.clientWidth + 1).length") == 0
@@ -251,12 +256,12 @@ def test_any_two_pictures_can_be_compared(opened):
         "['left', 'right'].map(c =>"
         " document.querySelector('.stage').querySelector('.' + c)?.alt.split(',')[0])"
     )
-    assert page.run(shown) == ["sfm", "mls 3x"]
+    assert page.run(shown) == ["sfm + none", "mls 3x + none"]
     choose = (
         "(s => { s.selectedIndex = %d; s.dispatchEvent(new Event('change')); })"
         "(document.querySelectorAll('.compare select')[%d])"
     )
     page.run(choose % (2, 0))
-    assert page.run(shown) == ["photograph", "mls 3x"]
+    assert page.run(shown) == ["photograph", "mls 3x + none"]
     page.run(choose % (2, 1))
     assert page.run(shown) == [None, "photograph"]

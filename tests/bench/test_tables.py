@@ -206,6 +206,16 @@ def test_only_a_gain_is_called_best_and_a_few_repeats_are_not_called_chance(gain
     assert says in answer(one(runs(gains={(SFM, 1): 0.0, ("mls", 8): gain}, **changes)))[0]
 
 
+def test_the_answer_names_the_worst_scene_and_the_seconds():
+    planted = {"fox": 0.5, "fern": -0.25, "bonsai": 0.1}
+    finished = [
+        run
+        for scene, gain in planted.items()
+        for run in runs(scenes=(scene,), gains={(SFM, 1): 0.0, ("mls", 8): gain}, noise=0.0)
+    ]
+    assert "; on fern, its worst scene, 0.25 dB less. A run takes 20 s" in answer(one(finished))[0]
+
+
 def advised(**room):
     """Scenes by what auto gains on them, and how many seeds a run of sfm begins with of 10,000."""
     finished = []

@@ -146,8 +146,9 @@ class ComparedArm:
     ``means``: scores (``SCORES``), numbers of Gaussians and seconds of seeding and training; NaN if
     unknown on some scene. ``gains``: differences of the scores; ``in_time``: PSNR at the seconds at
     which the baseline ends, less its final PSNR, dB; ``steps`` and ``seconds``: mean logarithm of
-    those to that PSNR, relative to the baseline's total; None unless all runs tell. ``reached``:
-    pairs whose arm reaches that PSNR.
+    those to that PSNR, relative to the baseline's total; None unless all runs tell. ``on_scene``:
+    mean difference of PSNR by scene, dB, the lowest first. ``reached``: pairs whose arm reaches
+    that PSNR.
     """
 
     arm: ArmKey
@@ -155,6 +156,7 @@ class ComparedArm:
     runs: int
     means: Mapping[str, float]
     gains: Mapping[str, Difference | None]
+    on_scene: Mapping[str, float]
     reached: int
 
     @property
@@ -201,7 +203,8 @@ def compared_arms(study: Study) -> tuple[ComparedArm, ...]:
         scenes, reached = tuple(sorted(set(part["scene"]))), int(part["seconds_gain"].count())
         means = dict(part.groupby("scene")[columns].mean().mean(skipna=False))
         of_arm = {name: each.get(arm) for name, each in gained.items()}
-        compared.append(ComparedArm(arm, scenes, len(part), means, of_arm, reached))
+        on_scene = dict(part.groupby("scene")["psnr_gain"].mean().sort_values(kind="stable"))
+        compared.append(ComparedArm(arm, scenes, len(part), means, of_arm, on_scene, reached))
     return tuple(sorted(compared, key=lambda each: -each.gain.mean))
 
 

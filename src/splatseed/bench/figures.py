@@ -56,8 +56,11 @@ def shown_seeds(study: Study, seeds: Sequence[str]) -> tuple[str, ...]:
 
 
 def _new_figure(width: float, height: float, count: int = 1) -> tuple[Figure, list[Axes]]:
-    """A figure of ``count`` panels, up to three per row, of a size in inches each."""
-    columns = min(count, 3)
+    """A figure of ``count`` panels, up to two per row, of a size in inches each.
+
+    Three would be illegible on a phone.
+    """
+    columns = min(count, 2)
     rows = -(-count // columns)
     size = max(width * columns, 5.0), height * rows + 0.4
     figure = Figure(figsize=size, layout="constrained")
@@ -72,7 +75,8 @@ def _plot(name: str, caption: str, figure: Figure, named: Mapping[str, Style]) -
     """The finished figure, with names above its panels at the left."""
     if named:
         handles = [Line2D([], [], label=name, **style) for name, style in named.items()]
-        columns = min(4, len(handles))
+        longest = 0.5 + 0.08 * max(map(len, named))  # inches
+        columns = min(max(int(figure.get_figwidth() / longest), 1), len(handles))
         figure.legend(handles=handles, loc="outside upper left", ncols=columns,
                       fontsize="small", frameon=False)  # fmt: skip
     out = BytesIO()

@@ -1,4 +1,4 @@
-"""Pictures of a report: each method's seeds from one camera, and test views of the best variant.
+"""Pictures of a report: each method's seeds from one camera, and test views of the best arm.
 
 Seeds are made exactly as in the runs, and only if the scene's files are unchanged; a scene is
 opened only for what an earlier report has not kept; if it is gone, only its pictures are missing.
@@ -11,7 +11,7 @@ import json
 import math
 import re
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from io import BytesIO
@@ -21,11 +21,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import UInt8
 
-from splatseed.bench.comparisons import gains
+from splatseed.bench.comparisons import baseline_of, compared_arms
 from splatseed.bench.figures import shown_seeds
 from splatseed.bench.guidelines import Descriptors, describe
 from splatseed.bench.job import make_seeds, open_unchanged
-from splatseed.bench.plan import SFM, RunSpec
+from splatseed.bench.plan import RunSpec
 from splatseed.bench.runs import run_folder
 from splatseed.bench.study import Study
 from splatseed.errors import SplatseedError
@@ -34,7 +34,6 @@ from splatseed.io.photograph import decode_photograph, photograph_bytes
 from splatseed.io.staging import write_json
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
-from splatseed.train.settings import StrategyName
 from splatseed.view.clouds import preview_methods
 
 FIGURES = "figures"
@@ -114,53 +113,56 @@ def cloud_jpeg(png: bytes) -> bytes:
 
 
 class ComparedView(NamedTuple):
-    """A test view and its renders by baseline and best variant.
+    """A test view of a scene, rendered by the baseline and by the arm with the highest gain.
 
-    Pictures are JPEG by name, ordered so that neighbours are worth comparing; ``shape`` is their
-    width over their height, ``gain`` the best variant's on the scene, dB.
+    ``gain`` is that arm's on the scene, dB. ``pictures`` and ``errors`` (maps of FLIP) are JPEG by
+    name; ``shape`` is their width over their height.
     """
 
     scene: str
     name: str
-    best: str
     gain: float
     pictures: Mapping[str, bytes]
+    errors: Mapping[str, bytes]
     shape: float
 
 
-def compared_views(study: Study, strategy: StrategyName, bench: Path) -> Iterator[ComparedView]:
-    """The views that can be shown of each scene; none where the runs' pictures are gone."""
-    gained, part = gains(study, strategy), study.under(strategy)
-    most = 2 if len(study.strategies) == 1 else 1
-    specs = part.set_index(["scene", "seeds", "repeat"])["spec"].to_dict()
-    for scene in gained.scenes:
-        best = gained.top(scene)
-        for repeat in sorted(part["repeat"].unique()):
-            both = [specs.get((scene, label, repeat)) for label in (SFM, best)]
+def compared_views(study: Study, bench: Path) -> list[ComparedView]:
+    """A view of each scene, the lowest gain first; none where the runs' pictures are gone."""
+    base, views = baseline_of(study), []
+    best = next((each for each in compared_arms(study) if each.arm != base), None)
+    if base is None or best is None:
+        return []
+    specs = study.runs.set_index(["strategy", "seeds", "scene", "repeat"])["spec"].to_dict()
+    for scene, gain in best.on_scene.items():
+        for repeat in sorted(study.runs["repeat"].unique()):
+            both = [specs.get((*arm, scene, repeat)) for arm in (base, best.arm)]
             folders = [run_folder(bench, spec) / "renders" for spec in both if spec is not None]
             names = [{path.name for path in folder.glob("*.png")} for folder in folders]
-            if len(folders) == 2 and set.intersection(*names):
-                gain = gained.on_scene[scene, best].mean
-                for name in sorted(set.intersection(*names))[:most]:
-                    pictures = _pictures(folders[0] / name, folders[1] / name, best)
-                    if pictures is not None:
-                        yield ComparedView(scene, Path(name).stem, best, gain, *pictures)
+            if len(folders) == 2 and (shared := sorted(set.intersection(*names))):
+                middle = len(shared) // 2
+                for name in shared[middle:] + shared[:middle]:
+                    paths = {base.label: folders[0] / name, best.arm.label: folders[1] / name}
+                    if (drawn := _pictures(paths)) is not None:
+                        views.append(ComparedView(scene, Path(name).stem, gain, *drawn))
+                        break
                 break
+    return views
 
 
-def _pictures(base: Path, own: Path, best: str) -> tuple[dict[str, bytes], float] | None:
-    """The pictures of a view and their shape; None where they cannot be read or do not fit."""
+def _pictures(paths: Mapping[str, Path]) -> tuple[dict[str, bytes], dict[str, bytes], float] | None:
+    """A view's pictures, error maps and shape; None where they cannot be read or do not fit."""
     try:
-        parts = [_apart(path) for path in (base, own)]
+        parts = {label: _apart(path) for label, path in paths.items()}
     except SplatseedError:
         return None
-    if parts[0].shape != parts[1].shape:
+    if len({part.shape for part in parts.values()}) > 1:
         return None
-    (photograph, base_render, base_error), (_, own_render, own_error) = parts
-    shown = {SFM: base_render, best: own_render, "photograph": photograph,
-             f"error of {SFM}": base_error, f"error of {best}": own_error}  # fmt: skip
-    height, width = photograph.shape[:2]
-    return {label: _jpeg(pixels, _SIDE) for label, pixels in shown.items()}, width / height
+    photograph = next(iter(parts.values()))[0]
+    shown = {label: part[1] for label, part in parts.items()} | {"photograph": photograph}
+    pictures = {label: _jpeg(pixels, _SIDE) for label, pixels in shown.items()}
+    errors = {label: _jpeg(part[2], _SIDE // 2) for label, part in parts.items()}
+    return pictures, errors, photograph.shape[1] / photograph.shape[0]
 
 
 def _apart(path: Path) -> UInt8[np.ndarray, "3 H W 3"]:

@@ -168,6 +168,10 @@ def answer(study: Study) -> tuple[str, ...]:
     if best.gain.mean < _SHOWN:
         first = f"nothing beats {base.label}: {best.arm.label} comes closest, "
     said = [f"On {counted(len(best.scenes), 'scene')}{at}, {first}{_against(best, base)}."]
+    means = {e.arm: e.means for e in compared_arms(study) if e.scenes == best.scenes}
+    if base in means:
+        own, other = (means[arm]["seeding"] + means[arm]["training"] for arm in (best.arm, base))
+        said[0] += f" A run takes {own:.0f} s, seeding counted; of {base.label} {other:.0f} s."
     own = best.arm.seeds == SFM
     rest = [each for each in others if (each.arm.seeds == SFM) != own]
     if rest:
@@ -204,14 +208,21 @@ def _against(each: ComparedArm, base: ArmKey) -> str:
     gain = each.gain
     if abs(gain.mean) < _SHOWN:
         return f"level with {base.label}"
-    more = "more" if gain.mean > 0 else "less"
     over = "scenes" if len(each.scenes) > 1 else "repeats"
     spread = "" if math.isnan(gain.se) else f" (± {gain.se:.2f} over {over})"
     doubt = _DOUBTS.get(gain.verdict, "")
     if gain.verdict == "within noise" and len(each.scenes) == 1:
         # The noise of all variants together, which the last sentences go by, may tell more.
         doubt = f", which these two arms' {each.runs} repeats alone do not confirm"
-    return f"{abs(gain.mean):.2f} dB{spread} {more} than {base.label}{doubt}"
+    worst = ""
+    if len(each.on_scene) > 1:
+        scene, least = next(iter(each.on_scene.items()))
+        worst = f"; on {scene}, its worst scene, {_difference(least)}"
+    return f"{_difference(gain.mean, spread)} than {base.label}{doubt}{worst}"
+
+
+def _difference(gain: float, spread: str = "") -> str:
+    return f"{abs(gain):.2f} dB{spread} {'less' if gain < 0 else 'more'}"
 
 
 def _study_sections(
@@ -219,6 +230,17 @@ def _study_sections(
 ) -> Iterator[tuple[str, str, Sequence[Part]]]:
     """A study's sections: key, title and parts. The page shows exactly what is written to files."""
     base, each, tables = baseline_of(study), study.strategies, study_tables
+    seen: list[Part] = []
+    if views := pictures.compared_views(study, bench):
+        median = views.pop(len(views) // 2)  # of an even number the higher
+        seen.append(_views(median))
+        others = {"title": "The other scenes, the lowest gain first", "open": False}
+        seen.append({"kind": "folded", **others, "parts": [_views(view) for view in views]})
+    seen += [
+        _figure(pictures.cloud_jpeg(png), f"{scene}: what training begins with.", "image/jpeg")
+        for scene, (_, png) in drawn.clouds.items()
+    ]
+    yield "pictures", "Pictures", [*seen, _text(*drawn.notes, mark="note")]
     if base is not None:
         title = "At equal cost" if study.settings["budget"] else "All arms"
         yield "cost", title, [
@@ -239,15 +261,6 @@ def _study_sections(
     yield "gains", "Gains", [*gained, tables.mean_gain_table(study)] if gained else []
     yield "curves", "Curves", [figures.curve_figure(study, s) for s in each]
     yield "resources", "Time and memory", [tables.cost_table(study, s) for s in each]
-    seen: list[Part] = [
-        _figure(pictures.cloud_jpeg(png), f"{scene}: what training begins with.", "image/jpeg")
-        for scene, (_, png) in drawn.clouds.items()
-    ]
-    for s in each:
-        views = [_views(view) for view in pictures.compared_views(study, s, bench)]
-        folded = {"title": f"Test views, strategy {s}", "parts": views, "open": s == each[0]}
-        seen.append({"kind": "folded", **folded} if views else None)
-    yield "pictures", "Pictures", [*seen, _text(*drawn.notes, mark="note")]
     yield "guidelines", "Guidelines", guided
 
 
@@ -308,14 +321,15 @@ def _url(content: bytes, kind: str) -> str:
 
 
 def _views(view: pictures.ComparedView) -> Part:
-    """Pictures of one size stacked on each other, with a slider between any two of them."""
-    chosen = "the best on this scene"
-    if view.gain < _SHOWN:
-        lost = "level with sfm" if view.gain > -_SHOWN else "though it loses"
-        chosen = f"the best of the others on this scene, {lost}"
+    """Pictures of one size stacked on each other, with a slider, and the error maps below."""
+    base, best, _ = view.pictures
     caption = (
-        f"{view.scene}, test view {view.name}: {view.best}, {chosen} ({view.gain:+.2f} dB over all "
-        "its test views). Error maps: FLIP, black is 0, the brightest 1."
+        f"{view.scene}, test view {view.name}: {base} on the left, {best} on the right "
+        f"({view.gain:+.2f} dB over all test views of this scene)."
     )
-    urls = {name: _url(content, "image/jpeg") for name, content in view.pictures.items()}
-    return {"kind": "views", "shape": f"{view.shape:.4f}", "caption": caption, "urls": urls}
+    urls, errors = (
+        {name: _url(content, "image/jpeg") for name, content in each.items()}
+        for each in (view.pictures, view.errors)
+    )
+    shape = f"{view.shape:.4f}"
+    return {"kind": "views", "shape": shape, "caption": caption, "urls": urls, "errors": errors}
