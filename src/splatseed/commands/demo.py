@@ -2,13 +2,15 @@
 
 It photographs a synthetic room, finds points as Structure-from-Motion would, upsamples them by
 every method, and measures how far the new points lie from the true surfaces and how well they cover
-them. Then, if PyTorch and gsplat are installed, it trains briefly and compares: from poses alone,
-and from the points as they are and upsampled. A second process compiles kernels ahead of the first.
+them. Then, if PyTorch and gsplat are installed, it takes the points away and asks what seeds gain
+where only poses are known: it trains briefly from the default method's seeds, from a random start
+for as many steps and for as many seconds, and, to compare, from the points. A second process
+compiles kernels ahead of the first.
 
 Promise: the default method's picture comes first, when its folder is already in place; later files
-are added one by one, each whole. Runs differ only in their seeds, and have the same number of
-Gaussians at most; the time to make seeds is counted; the view that is shown is chosen before any is
-rendered.
+are added one by one, each whole. Runs differ only in their seeds and their steps, and have the same
+number of Gaussians at most; the time to make seeds is counted; the view that is shown is chosen
+before any is rendered; what is said of the runs is computed from them.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 from importlib import invalidate_caches
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -57,9 +59,16 @@ SAMPLES = 20_000
 """Samples of the surfaces at which coverage is measured."""
 PICTURES = ("preview.png", "preview_methods.png", "preview_errors.png")
 TABLE, TRAINED_PICTURE = "geometry.csv", "preview_trained.png"
-RANDOM, POSES, SFM = "random", f"poses_{SHOWN}", "sfm"
-ARMS = {RANDOM: "random start", POSES: f"{SHOWN}, poses alone", SFM: "SfM seeds", SHOWN: SHOWN}
-"""The trained arms, by the suffix of their folders; the first two start without SfM's points."""
+RANDOM, LONGER, POSES, SFM = "random", "random_longer", "poses", "sfm"
+ARMS = {
+    RANDOM: "random start",
+    LONGER: "random start, for longer",
+    POSES: f"{SHOWN}, poses alone",
+    SFM: "SfM's points",
+}
+"""The trained arms, by the suffix of their folders; all but the last start without SfM's points."""
+SCENES = {LONGER: f"scene_{RANDOM}", SFM: "scene"}
+"""The scenes of arms that have none of their own name."""
 TRAINING = "training"
 AHEAD = (SHOWN, TRAINING, "voronoi", "spline")
 """What the second process compiles, in this order; training as early as possible after the
@@ -68,14 +77,6 @@ SMALL = {"num_views": 8, "width": 96, "height": 72}
 """The capture on which it does."""
 POLL = 0.5
 """Seconds between its checks whether PyTorch has been installed."""
-EXPLANATION = [
-    ("poses alone", "the first two rows know no points: trainers then start at random"),
-    ("fixed", "3DGS's densification, and the most Gaussians"),
-    ("seconds", "of training and making the seeds; the last column is during training,"),
-    ("", "before the mean that a run ends with is taken"),
-    ("limits", "a synthetic room, one run each, no error bars; strategy grow, which"),
-    ("", "splatseed train takes for short runs, is not tried here"),
-]
 
 
 @dataclass(frozen=True)
@@ -87,7 +88,8 @@ class Options:
     views: int = 40
     """Photographs of the synthetic room."""
     train_steps: int = 500
-    """Training steps from each of four sets of seeds; 0 for no training."""
+    """Training steps from seeds, from points and from a random start, which also gets as many
+    seconds; 0 for no training."""
     training: Literal["now", "later", "only"] = "now"
     """When to train: now, at the end; later, while PyTorch is being installed; only, in a
     demo folder that was made with later."""
@@ -118,7 +120,7 @@ def run(arguments: list[str]) -> None:
         trained = _train(options) if options.train_steps else False
     another = f"splatseed upsample {quoted(out / 'scene')} --method spline --ratio 16 -o OUT"
     longer = f"splatseed train {quoted(out / f'scene_{SHOWN}')} --max-steps 3000 -o RUN"
-    score = ("the scores again", f"splatseed evaluate {quoted(out / f'run_{SHOWN}')}")
+    score = ("the scores again", f"splatseed evaluate {quoted(out / f'run_{POSES}')}")
     commands = [("another method", another), ("a longer run", longer)]
     print_pairs("next", [*commands, *([score] if trained else [])])
 
@@ -306,39 +308,45 @@ def _train(options: Options) -> bool:
     from splatseed.train.settings import TrainSettings  # noqa: PLC0415  (loads with its use)
     from splatseed.view.page import write_grid  # noqa: PLC0415  (likewise)
 
-    folder = options.output
+    folder, steps = options.output, options.train_steps
     scenes = [f"scene_{name}" for name in (RANDOM, POSES)]
     add_files(folder, [*(f"run_{name}" for name in ARMS), *scenes, TRAINED_PICTURE])
-    seeded = read_manifest(folder / f"scene_{SHOWN}")
     settings = TrainSettings(
-        strategy="default", cap_max=seeded["num_points"], max_steps=options.train_steps, seed=SEED
+        strategy="default",
+        cap_max=read_manifest(folder / f"scene_{SHOWN}")["num_points"],
+        max_steps=steps,
+        seed=SEED,
     )
     with stage_display() as clock:
-        seconds = {**_seed_poses_alone(folder, clock), SFM: 0.0, SHOWN: seeded["seconds"]}
-        arms = [_train_arm(folder, name, settings, clock) for name in ARMS]
-        results, shown = zip(*arms, strict=True)
-        photographs, renders, errors = zip(*shown, strict=True)
+        seconds = _seed_poses_alone(folder, clock)
+        # Seeds are trained first: if kernels are still to be compiled, it counts against them.
+        arms = {name: _train_arm(folder, name, settings, clock) for name in (POSES, RANDOM)}
+        ours, base = (arms[name][0].train_seconds for name in (POSES, RANDOM))
+        longer = replace(settings, max_steps=max(round(steps * (seconds + ours) / base), steps))
+        arms[LONGER] = _train_arm(folder, LONGER, longer, clock)
+        arms[SFM] = _train_arm(folder, SFM, settings, clock)
+        shown = {name: arms[name][1] for name in (LONGER, POSES, SFM)}
+        photographs, renders, errors = zip(*shown.values(), strict=True)
         blank = photographs[0]._replace(label="", picture=np.full_like(photographs[0].picture, 255))
         tiles = [photographs[0], *renders, blank, *errors]
-        write_grid(tiles, folder / TRAINED_PICTURE, columns=1 + len(arms))
-    _summarise_training(options, seconds, results)
+        write_grid(tiles, folder / TRAINED_PICTURE, columns=1 + len(shown))
+    results = {name: arms[name][0] for name in ARMS}
+    _summarise_training(folder / TRAINED_PICTURE, {POSES: seconds}, results)
     return True
 
 
-def _seed_poses_alone(folder: Path, clock: StageClock) -> dict[str, float]:
-    """Write scenes whose seeds come from poses and photographs alone; how long each took."""
+def _seed_poses_alone(folder: Path, clock: StageClock) -> float:
+    """Write scenes whose seeds come from poses and photographs alone; the seconds of the method."""
     from splatseed.seeding.poses import random_start  # noqa: PLC0415  (loads with its use)
 
     scene = load_scene(folder / "scene").replace(points=PointCloud.empty(), tracks=None)
-    seconds = {}
-    for i, name in enumerate((RANDOM, POSES)):
-        clock("seed poses alone", i / 2)
-        begun = time.perf_counter()
-        if name == RANDOM:
-            points = random_start(scene, np.random.default_rng(SEED))
-        else:
-            points = _upsample_by(SHOWN, scene)
-        seconds[name], seeded = time.perf_counter() - begun, scene.replace(points=points)
+    clock("seed poses alone", 0.0)
+    begun = time.perf_counter()
+    seeds = _upsample_by(SHOWN, scene)
+    seconds = time.perf_counter() - begun
+    dice = random_start(scene, np.random.default_rng(SEED))
+    for name, points in ((POSES, seeds), (RANDOM, dice)):
+        seeded = scene.replace(points=points)
         write_scene(seeded, folder / f"scene_{name}", provenance={"method": ARMS[name]})
     return seconds
 
@@ -354,7 +362,7 @@ def _train_arm(
     from splatseed.view.page import Tile  # noqa: PLC0415  (likewise)
 
     stage = f"train {ARMS[name]}"
-    scene = load_scene(folder / ("scene" if name == SFM else f"scene_{name}"))
+    scene = load_scene(folder / SCENES.get(name, f"scene_{name}"))
     run = prepare_run(scene, folder / f"run_{name}", settings, overwrite=True, progress=clock)
     clock(stage, 0.0)
     if not run.train(lambda step: clock(stage, step / settings.max_steps)):
@@ -362,7 +370,7 @@ def _train_arm(
     result = run.finish(evaluate_views, clock)
     shown = run.trainer.test_views[len(run.trainer.test_views) // 2]
     render = run.trainer.render(shown)
-    score = f"{ARMS[name]}: {result.scores.psnr:.2f} dB over all test views"
+    score = f"{ARMS[name]}: {result.scores.psnr:.1f} dB over all test views"
     errors = flip_map(render, photograph_of(shown, run.trainer.device))
     return result, (
         Tile("photograph, not trained on", shown.photograph),
@@ -372,23 +380,40 @@ def _train_arm(
 
 
 def _summarise_training(
-    options: Options, seeding: Mapping[str, float], results: Sequence[TrainingResult]
+    picture: Path, seeding: Mapping[str, float], results: Mapping[str, TrainingResult]
 ) -> None:
-    """The runs side by side, and what they do and do not show."""
-    runs = [(name, seeding[name], each) for name, each in zip(ARMS, results, strict=True)]
-    least = min(before + result.train_seconds for _, before, result in runs)
-    rows = []
-    for name, before, result in runs:
-        # The curve's end is of the mean that a run ends with, which one in training has not yet.
-        during = [t.psnr for t in result.curve[:-1] if before + t.seconds <= least]
-        scores, seconds = result.scores, f"{before + result.train_seconds:.1f}"
-        then = f"{during[-1]:.2f}" if during else "not begun"
-        quality = f"{scores.psnr:.2f}", f"{scores.ssim:.4f}"
-        rows.append((ARMS[name], f"{scores.num_gaussians:,}", seconds, *quality, then))
+    """The runs side by side, and what seeds gain."""
+    seconds = {name: seeding.get(name, 0.0) + each.train_seconds for name, each in results.items()}
+    rows = [
+        (ARMS[name], f"{each.steps:,}", f"{seconds[name]:.1f}", f"{each.scores.num_gaussians:,}",
+         f"{each.scores.psnr:.2f}", f"{each.scores.ssim:.4f}")
+        for name, each in results.items()
+    ]  # fmt: skip
     print_table(
-        f"{options.train_steps:,} training steps, {len(results[0].scores.per_image)} test views",
-        ("seeds", "Gaussians", "seconds", "PSNR, dB", "SSIM", f"dB after {least:.0f} s"),
+        "trained from poses without points, and from SfM's points",
+        ("seeds", "steps", "seconds", "Gaussians", "PSNR, dB", "SSIM"),
         rows,
     )
-    picture = ("pictures", str(options.output / TRAINED_PICTURE))
-    print_pairs("what this shows", [*EXPLANATION, picture])
+    ours, base, points = (results[name].scores for name in (POSES, LONGER, SFM))
+    gain, beyond = ours.psnr - base.psnr, points.psnr - ours.psnr
+    views = [
+        one.psnr - other.psnr for one, other in zip(ours.per_image, base.per_image, strict=True)
+    ]
+    than = "a random start that trains for as many seconds"
+    answer = f"without points, {SHOWN}'s seeds gain {gain:.2f} dB over {than}"
+    if gain <= 0:
+        answer = f"no gain: without points, {SHOWN}'s seeds end {-gain:.2f} dB behind {than}"
+    better, more = sum(each > 0 for each in views), "better" if beyond > 0 else "worse"
+    facts = {
+        "answer": answer,
+        "test views": f"{better} of {len(views)} are better: {min(views):+.2f} to "
+        f"{max(views):+.2f} dB",
+        "seconds": f"{seconds[POSES]:.0f}, of which seeds took {seeding[POSES]:.0f}, against "
+        f"{seconds[LONGER]:.0f}",
+        "SfM's points": f"{abs(beyond):.2f} dB {more} than the seeds, after {seconds[SFM]:.0f} s; "
+        "they were found in the test views, too",
+        "fixed": "3DGS's densification, and the most Gaussians",
+        "limits": "a synthetic room, one run each, no error bars",
+        "picture": str(picture),
+    }
+    print_pairs("what this shows", list(facts.items()))
