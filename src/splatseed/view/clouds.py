@@ -75,7 +75,7 @@ def preview_errors(
         for label, cloud in clouds.items()
     }
     tiles = _cloud_tiles(colored, camera, page.GRID_SIDE, counted=False)
-    bar = page.color_bar("0 spacings", "1 spacings or more from the surface")
+    bar = page.color_bar("0", "1 spacing or more from the surface")
     return page.write_grid(tiles, path, footer=bar)
 
 

@@ -143,12 +143,14 @@ def depth_picture(
 
 def color_bar(low: str, high: str, colormap: str = "plasma") -> UInt8[np.ndarray, "H W 3"]:
     """A strip of colours with labels at its ends."""
-    strip = map_colors(np.tile(np.linspace(0.0, 1.0, 240), (20, 1)), 0.0, 1.0, colormap)
+    letters = font(18)
+    left, right = (round(letters.getlength(label)) + 24 for label in (low, high))
+    values = np.tile(np.linspace(0.0, 1.0, GRID_SIDE - left - right), (20, 1))
     bar = PillowImage.new("RGB", (GRID_SIDE, STRIP_HEIGHT), PAPER)
-    bar.paste(PillowImage.fromarray(strip), (70, 12))
+    bar.paste(PillowImage.fromarray(map_colors(values, 0.0, 1.0, colormap)), (left, 12))
     draw = ImageDraw.Draw(bar)
-    draw.text((58, 22), low, fill=INK, font=font(18), anchor="rm")
-    draw.text((322, 22), high, fill=INK, font=font(18), anchor="lm")
+    draw.text((12, 22), low, fill=INK, font=letters, anchor="lm")
+    draw.text((GRID_SIDE - right + 12, 22), high, fill=INK, font=letters, anchor="lm")
     return np.asarray(bar)
 
 
