@@ -56,11 +56,8 @@ def shown_seeds(study: Study, seeds: Sequence[str]) -> tuple[str, ...]:
 
 
 def _new_figure(width: float, height: float, count: int = 1) -> tuple[Figure, list[Axes]]:
-    """A figure of ``count`` panels, up to two per row, of a size in inches each.
-
-    Three would be illegible on a phone.
-    """
-    columns = min(count, 2)
+    """A figure of ``count`` panels, up to two per row, of a size in inches each."""
+    columns = min(count, 2)  # three would be illegible on a phone
     rows = -(-count // columns)
     size = max(width * columns, 5.0), height * rows + 0.4
     figure = Figure(figsize=size, layout="constrained")

@@ -140,12 +140,10 @@ def compared_views(study: Study, bench: Path) -> list[ComparedView]:
             folders = [run_folder(bench, spec) / "renders" for spec in both if spec is not None]
             names = [{path.name for path in folder.glob("*.png")} for folder in folders]
             if len(folders) == 2 and (shared := sorted(set.intersection(*names))):
-                middle = len(shared) // 2
-                for name in shared[middle:] + shared[:middle]:
-                    paths = {base.label: folders[0] / name, best.arm.label: folders[1] / name}
-                    if (drawn := _pictures(paths)) is not None:
-                        views.append(ComparedView(scene, Path(name).stem, gain, *drawn))
-                        break
+                name = shared[len(shared) // 2]
+                paths = {base.label: folders[0] / name, best.arm.label: folders[1] / name}
+                if (drawn := _pictures(paths)) is not None:
+                    views.append(ComparedView(scene, Path(name).stem, gain, *drawn))
                 break
     return views
 

@@ -171,7 +171,9 @@ def answer(study: Study) -> tuple[str, ...]:
     means = {e.arm: e.means for e in compared_arms(study) if e.scenes == best.scenes}
     if base in means:
         own, other = (means[arm]["seeding"] + means[arm]["training"] for arm in (best.arm, base))
-        said[0] += f" A run takes {own:.0f} s, seeding counted; of {base.label} {other:.0f} s."
+        said[0] += (
+            f" A run takes {own:.0f} s, seeding counted, and {other:.0f} s with {base.label}."
+        )
     own = best.arm.seeds == SFM
     rest = [each for each in others if (each.arm.seeds == SFM) != own]
     if rest:
@@ -205,19 +207,18 @@ def answer(study: Study) -> tuple[str, ...]:
 
 
 def _against(each: ComparedArm, base: ArmKey) -> str:
-    gain = each.gain
+    gain, worst = each.gain, ""
+    if len(each.on_scene) > 1:
+        scene, least = next(iter(each.on_scene.items()))
+        worst = f"; on {scene}, its worst scene, {_difference(least)}"
     if abs(gain.mean) < _SHOWN:
-        return f"level with {base.label}"
+        return f"level with {base.label}{worst}"
     over = "scenes" if len(each.scenes) > 1 else "repeats"
     spread = "" if math.isnan(gain.se) else f" (± {gain.se:.2f} over {over})"
     doubt = _DOUBTS.get(gain.verdict, "")
     if gain.verdict == "within noise" and len(each.scenes) == 1:
         # The noise of all variants together, which the last sentences go by, may tell more.
         doubt = f", which these two arms' {each.runs} repeats alone do not confirm"
-    worst = ""
-    if len(each.on_scene) > 1:
-        scene, least = next(iter(each.on_scene.items()))
-        worst = f"; on {scene}, its worst scene, {_difference(least)}"
     return f"{_difference(gain.mean, spread)} than {base.label}{doubt}{worst}"
 
 
@@ -234,8 +235,8 @@ def _study_sections(
     if views := pictures.compared_views(study, bench):
         median = views.pop(len(views) // 2)  # of an even number the higher
         seen.append(_views(median))
-        others = {"title": "The other scenes, the lowest gain first", "open": False}
-        seen.append({"kind": "folded", **others, "parts": [_views(view) for view in views]})
+        folded = {"kind": "folded", "title": "The other scenes, the lowest gain first"}
+        seen.append({**folded, "parts": [_views(view) for view in views]})
     seen += [
         _figure(pictures.cloud_jpeg(png), f"{scene}: what training begins with.", "image/jpeg")
         for scene, (_, png) in drawn.clouds.items()
