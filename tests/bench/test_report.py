@@ -198,7 +198,7 @@ def test_seeds_and_views_are_shown_and_not_made_again(tmp_path, capture, monkeyp
     for picture in bench.glob("runs/*/renders/view1.png"):
         picture.write_bytes(b"damaged")
     write_report(bench)
-    assert "test view" not in text_of(bench)
+    assert "test view view1" not in text_of(bench)
 
 
 def test_a_changed_scene_costs_its_pictures_alone_and_losers_are_not_called_the_best(

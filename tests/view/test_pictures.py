@@ -16,7 +16,7 @@ from splatseed.scene import Image, Scene, SceneSource
 from splatseed.upsample import SOURCE_CODES
 from splatseed.view import clouds as pages
 from splatseed.view.maps import map_tiles, normal_picture
-from splatseed.view.page import UNKNOWN, Tile, depth_picture, write_grid
+from splatseed.view.page import UNKNOWN, Tile, color_bar, depth_picture, write_grid
 from splatseed.view.points import COLORS, origin_colors, points_over, render_points
 
 K = np.array([[50.0, 0, 20], [0, 50.0, 15], [0, 0, 1]])
@@ -154,6 +154,13 @@ def test_unknown_is_grey_and_near_is_brighter_than_far(maps):
     assert brightness[-1] > brightness[0] + 200
     for value in (np.nan, 3.0, np.inf, 0.0, -1.0):
         assert depth_picture(np.full((3, 4), value)).shape == (3, 4, 3)
+
+
+def test_labels_at_the_ends_of_a_colour_bar_are_whole():
+    bar = color_bar("0 spacings", "1 spacing or more from the surface")
+    assert bar.min() < 50
+    assert (bar[:, :8] == 255).all()
+    assert (bar[:, -8:] == 255).all()
 
 
 def test_normals_have_the_colours_of_their_axes():
