@@ -76,6 +76,17 @@ def test_the_only_seed_of_a_cell_stays_before_the_second_of_another(rng):
     assert set(range(500, 530)) <= set(kept.tolist())
 
 
+def test_originals_alone_stay_dense_where_they_are_dense(rng):
+    """A tenth of each part stays, in whatever order the parts come; what no view sees goes first."""
+    view = slow.make_view(rng, 640, 480, 600, eye=(0, -1, 0))
+    crowd = lattice(view, rng.uniform(0, 6, (900, 2)), 3.0)
+    lone = lattice(view, rng.uniform(8, 60, (100, 2)), 3.0)
+    behind = np.full((500, 3), -1e3)
+    kept = thin(np.float32([*behind, *crowd, *lone]), [view], 100, first=1500)
+    assert kept.min() >= 500
+    assert np.count_nonzero(kept >= 1400) == 10
+
+
 def test_originals_come_first_among_equals(rng):
     xyz = sheet(rng, 500)
     twice, views, high = np.concatenate([xyz, xyz]), views_of(rng, 3), np.arange(1000) >= 500

@@ -237,18 +237,18 @@ def thin_to(
 
     Cover, whose cells are ``cell`` pixels wide at least, is recomputed for what thinning leaves: a
     guess fills a gap, and must not replace a measured point. If there are at least ``num``
-    originals, only originals stay: they are dense where there is detail, which is where few
-    Gaussians are needed most. But a scan's points are thinned together with them.
+    originals, only originals stay: they are dense where there is detail, which is where Gaussians
+    are needed most. But a scan's points are thinned together with them.
     """
     if len(cloud) <= num:
         return cloud
     points = cloud.select(cloud.distinct)
+    if points.num_original >= num and not (points.source == CLOUD).any():
+        return _keep(scene, points.originals, num)
     guessed = points.source == COVER
     if not guessed.any() or guessed.all():
         return _keep(scene, points, num)
     known = points.select(~guessed)
-    if known.num_original >= num and not (known.source == CLOUD).any():
-        return _keep(scene, known.originals, num)
     views = read_views(scene, photographed(scene, hold_out), MAX_SIZE, progress)
     # Guesses get what the measured points leave, and a tenth at least.
     room = max(num - len(known), round(MOST_COVER * num))
