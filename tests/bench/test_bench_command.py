@@ -133,6 +133,19 @@ def test_presets_leave_out_what_is_not_there(bench, own_room, tmp_path):
     )
 
 
+def test_options_make_a_preset_smaller(bench, own_room, tmp_path):
+    for name in ("fern", "desk"):
+        shutil.copytree(own_room, tmp_path / "data" / name)
+    words = ("--preset", "paper-small", "--data", tmp_path / "data", "--scenes", "desk", "fern")
+    code, out, err = bench(*words, "--budgets", "9rho", "--repeats", 1, "--dry-run")
+    assert (code, err) == (0, "")
+    (tmp_path / "plan.toml").write_text(out)
+    plan = read_plan(tmp_path / "plan.toml")
+    assert [scene.name for scene in plan.scenes] == ["desk", "fern"]
+    assert (plan.ratios, plan.budgets, plan.repeats) == ((4, 8, 16), ("9rho",), 1)
+    assert "# 136 runs" in out
+
+
 def test_the_quick_preset_makes_its_own_scene_once(bench, tmp_path, monkeypatch):
     monkeypatch.setattr(synthetic, "make_capture", partial(make_capture, 0, 9, 64, 48))
     facts = survey(PlannedScene(DEMO), demo=tmp_path / "B" / "scenes" / "demo")
@@ -162,7 +175,10 @@ def test_a_dry_run_of_the_quick_preset_loads_nothing_heavy():
         (("-o", "ROOM/B", "--scenes", "ROOM"), "apart from the input"),
         (("-o", "B", "--preset", "mipnerf360"), "--data"),
         (("-o", "B", "--preset", "replica", "--data", "TUNED"), "office0 is left out"),
-        (("-o", "B", "--preset", "replica", "--data", "TUNED", "--scenes", "ROOM"), "--scenes"),
+        (
+            ("-o", "B", "--preset", "replica", "--data", "TUNED", "--scenes", "ROOM"),
+            "--scenes among",
+        ),
         (("-o", "B", "--preset", "quick", "--plan", "x.toml"), "both"),
         (("--dry-run", "--plan", "lpips.toml"), "LPIPS"),
         (("-o", "TUNED", "--scenes", "ROOM"), "splatseed tune wrote"),

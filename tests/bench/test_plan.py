@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from splatseed.bench.plan import SFM, Arm, Plan, RunResult, RunSpec, plan_runs
-from splatseed.bench.plan_file import plan_text, read_plan
+from splatseed.bench.plan_file import plan_text, preset_plan, read_plan
 from splatseed.bench.scenes import DEMO, PlannedScene, SceneFacts
-from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.scores import CurvePoint, EvalResult, ViewScore
 from splatseed.train.settings import TrainSettings
 
@@ -260,3 +260,13 @@ def test_a_key_is_of_all_but_where_a_scene_lies_and_how_a_ratio_is_written():
         *({"scene": scene} for scene in scenes),
     ):  # fmt: skip
         assert dataclasses.replace(SPEC, **change).key != SPEC.key
+
+
+def test_budgets_leave_uncapped_strategies_alone():
+    plan = preset_plan("paper-small", Path("DIR"))
+    free, equal = map(plan.arms, plan.strategies)
+    assert {arm.budget for arm in free} == {""}
+    assert {arm.budget for arm in equal} == set(plan.budgets)
+    assert len(free) == len(equal) == 1 + 5 * 3 * 2 + 3  # sfm, methods, and random's one profile
+    with pytest.raises(ParameterError, match="ratios of at least one"):
+        dataclasses.replace(plan, ratios=())

@@ -1,4 +1,4 @@
-"""Plans as TOML files, and ready-made ones: the paper's data sets, and two that a laptop can run.
+"""Plans as TOML files, and ready-made ones: the paper's tables, and two that a laptop can run.
 
 ``read_plan`` reads what ``plan_text`` writes back as the same plan; a misspelt key, or a value of
 the wrong kind, is an error. Paths in a file are relative to it.
@@ -21,7 +21,7 @@ from splatseed.io.files import read_text
 from splatseed.train.settings import TrainSettings
 from splatseed.upsample.method import describe_type, fits
 
-PresetName = Literal["mipnerf360", "replica", "laptop", "quick"]
+PresetName = Literal["mipnerf360", "replica", "paper-small", "paper-depth", "laptop", "quick"]
 PLAN = "plan.toml"
 """The name of the plan in the folder of a benchmark."""
 _FILES = ("path", "depth", "cloud")

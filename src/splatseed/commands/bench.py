@@ -66,7 +66,7 @@ class Options:
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="DIR")] = None
     """The folder of the benchmark, new or to be resumed."""
     scenes: tuple[str, ...] = ()
-    """Scenes with photographs; demo: is a synthetic room."""
+    """Scenes with photographs; demo: is a synthetic room. With --data, names of the preset's."""
     methods: Annotated[tuple[str, ...], _default(_DEFAULT.methods)] = ()
     """Upsampling methods; sfm is the original cloud, with which the others are compared."""
     ratios: Annotated[tuple[float, ...], _default([f"{r:g}" for r in _DEFAULT.ratios])] = ()
@@ -93,8 +93,9 @@ class Options:
     clouds: tuple[Path, ...] = ()
     """For methods cloud and cloud+auto: the scan of each scene, in its frame (docs/scans.md)."""
     preset: PresetName | None = None
-    """A ready-made plan: the paper's data sets, laptop (four real scenes, on one core), both
-    with --data; or quick, on a synthetic room."""
+    """A ready-made plan: the paper's data sets; its tables at a quarter of the size (paper-small,
+    paper-depth); laptop, four real scenes on one core; all with --data. Or quick, on a synthetic
+    room."""
     data: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """The folder of a preset's scenes."""
     plan: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
@@ -163,8 +164,6 @@ def parse_plan(arguments: Sequence[str]) -> tuple[Options, Plan]:
          "Name scenes, or none."),
         (named and not data, f"--data DIR, the folder of the scenes of {preset}", "none",
          "Name it."),
-        (named and options.scenes, f"the scenes of the preset {preset}", "--scenes",
-         "Leave --scenes out, or take --plan: --dry-run prints the preset's."),
         (options.address and options.executor != "ray", "--executor ray with --address", "local",
          "Add it."),
     )  # fmt: skip
@@ -188,9 +187,9 @@ def _changed(plan: Plan, options: Options) -> Plan:
 
     training = replace(plan.training, **given("max_steps", "data_factor"))
     changes = given("methods", "budgets", "strategies", "profiles", "repeats", "long_side")
-    if options.budgets or options.ratios:
+    if options.ratios or (options.budgets and not plan.budgets):
         changes["ratios"] = options.ratios
-    scenes = [PlannedScene(path) for path in options.scenes] or list(plan.scenes)
+    scenes = _scenes(plan, options)
     labels = Counter(scene.label for scene in scenes)
     for i, scene in enumerate(scenes):  # folders of the same name are told apart by their parents
         if labels[scene.label] > 1 and not scene.is_demo and not scene.name:
@@ -207,6 +206,17 @@ def _changed(plan: Plan, options: Options) -> Plan:
             pairs = zip(scenes, map(str, files), strict=True)
             scenes = [replace(scene, **{what: file}) for scene, file in pairs]
     return replace(plan, training=training, scenes=tuple(scenes), **changes)
+
+
+def _scenes(plan: Plan, options: Options) -> list[PlannedScene]:
+    """The folders that are named, or with ``--data`` those of the preset's scenes; else all."""
+    if not (options.data and options.scenes):
+        return [PlannedScene(path) for path in options.scenes] or list(plan.scenes)
+    own = {scene.label: scene for scene in plan.scenes}
+    known = f"--scenes among {', '.join(own)}"
+    for name in options.scenes:
+        refuse((name not in own, known, name, f"{did_you_mean(name, own)}See docs/bench.md."))
+    return [own[name] for name in options.scenes]
 
 
 @dataclass(frozen=True)

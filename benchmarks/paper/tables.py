@@ -1,0 +1,287 @@
+"""The paper's tables in its own layout, from the folders of benchmarks, complete or not.
+
+Notation: a *way* is as in ``gained``; each table of a page stands between its own two marks, and
+nothing else of the page is touched. A cell without a finished run is blank.
+
+    python -m benchmarks.paper.tables BENCH BENCH_DEPTH
+
+It fills ``docs/results/paper.md``, and writes every finished run to ``tables/paper_runs.csv``.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, TypeAlias
+
+import pandas as pd
+import tyro
+from benchmarks.paper.gained import LAYOUT, RANDOM, Results, Way, read_results
+from benchmarks.paper.guidelines import at_ratio, verdict_table
+
+from splatseed.bench.comparisons import paper_costs, paper_gains, paper_psnr
+from splatseed.bench.plan import SFM
+from splatseed.bench.statistics import Difference, adjusted, over_scenes
+from splatseed.bench.study_tables import NOISE
+from splatseed.bench.tables import Cell, Number, Row, Table, to_markdown
+from splatseed.errors import SceneFormatError, SplatseedError
+from splatseed.io.staging import atomic_file
+
+__all__ = ["fill", "page_tables", "run_frame"]
+
+RESULTS = Path(__file__).parents[2] / "docs" / "results"
+MEASURES = {
+    "psnr": "PSNR, dB", "ssim": "SSIM", "flip": "FLIP", "lpips": "LPIPS", "num_seeds": "seeds",
+    "gaussians": "Gaussians", "seeding": "upsampling, s", "training": "training, s",
+    "model": "model, MB",
+}  # fmt: skip
+COSTS = ("seeding", "training", "gaussians", "model")
+PRINTED = {"train_time_s": "paper: training, s", "model_size_mb": "paper: model, MB"}
+DIGITS = {**dict(zip(COSTS, (2, 0, 0, 1), strict=True)), **dict.fromkeys(PRINTED, 0)}
+"""Of table 3."""
+GAIN_NOTE = (
+    "dB ± standard error: of a scene over repeats, of a mean over scenes. ~: within noise (Holm "
+    "over all cells of scenes, and over each row of means)."
+)
+SCORE_NOTE = (
+    "PSNR in dB / SSIM / LPIPS where its weights are there, then what PSNR gains; means over "
+    "repeats. Bold: the highest PSNR of a row, be it by chance."
+)
+Kinds: TypeAlias = Sequence[tuple[str, float]]
+"""Methods with ratios."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Write the paper's tables, and the runs that they are of."""
+
+    benches: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Folders of ``splatseed bench``: of the presets paper-small and paper-depth, and others."""
+    output: Annotated[Path, tyro.conf.arg(aliases=("-o",))] = RESULTS
+    """The folder of paper.md, whose tables are replaced."""
+
+
+def main(options: Options) -> None:
+    """Read the benchmarks, fill the page, and write the runs."""
+    results, page = read_results(options.benches), options.output / "paper.md"
+    text = page.read_text("utf-8")
+    for name, tables in page_tables(results).items():
+        text = fill(text, name, "\n".join(map(to_markdown, tables)))
+    runs = options.output / "tables" / "paper_runs.csv"
+    runs.parent.mkdir(exist_ok=True)
+    with atomic_file(runs) as partial:
+        run_frame(results).to_csv(partial, index=False, float_format="%.6g", lineterminator="\n")
+    with atomic_file(page) as partial:
+        partial.write_text(text, "utf-8")
+    done = sum(run.result is not None for run in results.runs)
+    print(f"{page}, {runs}: {done} of {len(results.runs)} runs have finished.")
+
+
+def fill(text: str, name: str, content: str) -> str:
+    """The text of a page with other content between the two marks of a name.
+
+    Raises:
+        SceneFormatError: The page does not have these marks, once each.
+    """
+    marks = [f"<!-- {name}:{end} -->" for end in ("begin", "end")]
+    between = re.compile(rf"(?<={re.escape(marks[0])}\n).*?(?={re.escape(marks[1])})", re.DOTALL)
+    if [text.count(mark) for mark in marks] != [1, 1] or not between.search(text):
+        raise SceneFormatError(f"a page with {' and '.join(marks)}", found="none", fix="Add them.")
+    return between.sub(lambda _: f"\n{content}\n" if content else "", text)
+
+
+def page_tables(results: Results) -> dict[str, list[Table]]:
+    """The tables of each part of the page by its name, as far as there are finished runs."""
+    finished = [way for way in results.ways() if results.study(way.strategy)]
+    first = finished[:1]
+    points, deep = (results.scenes(with_depth=each) for each in (False, True))
+    kinds = (("mipnerf360", points), ("replica", deep))
+    return {
+        **{
+            f"table{number}": [
+                _by_ratio(results, way, key, scenes, full=way in first)
+                for way in finished
+                if scenes
+            ]
+            for number, (key, scenes) in enumerate(kinds, start=1)
+        },
+        "table3": [
+            _costs(results, way, key, scenes) for way in first for key, scenes in kinds if scenes
+        ],
+        "random": list(_ablation(results, finished, points)),
+        "guidelines": [verdict_table(results)] if finished else [],
+        "conditions": [_conditions(results, finished)] if finished else [],
+    }
+
+
+def _columns(results: Results, scenes: Iterable[str]) -> tuple[str, ...]:
+    """The methods that are planned on some scenes, in the paper's order."""
+    names = set(scenes)
+    planned = {run.spec.arm.method for run in results.runs if run.spec.scene.name in names}
+    return tuple(name for name in LAYOUT if name in planned)
+
+
+def _by_ratio(
+    results: Results, way: Way, key: str, scenes: Sequence[str], *, full: bool = False
+) -> Table:
+    """Gains by ratio and scene, and in full the scores too; with their means, and the paper's."""
+    methods, rows = _columns(results, scenes), list[Row]()
+    theirs, printed = paper_psnr(key), paper_gains(key)
+    for ratio in results.ratios(scenes):
+        shown, kinds = f"{ratio:g}x", [(method, ratio) for method in methods]
+        for scene in (each for each in scenes if ratio in results.ratios([each])):
+            gained = [results.gain(way, scene, *kind) for kind in kinds]
+            if not full:
+                rows.append((scene, shown, *map(_gain_cell, gained)))
+                continue
+            labels = [SFM, *(results.label(way, *kind) for kind in kinds)]
+            scored = [_score(results, way, scene, label) for label in labels]
+            rows.append((scene, shown, *_marked(scored, [None, *gained])))
+            if scene in theirs.index and any(kind in theirs for kind in kinds):
+                own = [Number(theirs.loc[scene].get(kind, math.nan)) for kind in _with_sfm(kinds)]
+                more = [replace(e, text=f"({e.value - own[0].value:+.2f})") for e in own[1:]]
+                rows.append((f"{scene}, paper", shown, *_marked([own[0], *more])))
+        blank = ("",) if full else ()
+        rows.append(("mean", shown, *blank, *_mean_gains(results, way, scenes, kinds)))
+        if any(kind in printed for kind in kinds):
+            means = [printed[kind].mean() if kind in printed else math.nan for kind in kinds]
+            name = f"mean of the paper's {len(printed)} scenes"
+            rows.append((name, shown, *blank, *(Number(each, signed=True) for each in means)))
+    header = ("scene", "ratio", *([SFM] if full else []), *methods)
+    notes = (SCORE_NOTE, GAIN_NOTE) if full else (GAIN_NOTE,)
+    title = f"{'Scores and gains' if full else 'Gains'} over sfm, {way.label}"
+    return Table("gains", title, header, rows, notes)
+
+
+def _with_sfm(kinds: Kinds) -> Kinds:
+    return [(SFM, 1.0), *kinds]
+
+
+def _score(results: Results, way: Way, scene: str, label: str) -> Number:
+    means = {n: results.mean(way, scene, label, n) for n in ("psnr", "ssim", "lpips")}
+    others = [f"/ {means[n]:.3f}" for n in ("ssim", "lpips") if not math.isnan(means[n])]
+    return Number(means["psnr"], text=" ".join(others).replace("/ 0.", "/ ."))
+
+
+def _marked(cells: Sequence[Number], gained: Sequence[Difference | None] = ()) -> list[Number]:
+    """The cells with their gains behind them, and the highest in bold."""
+    most = max((cell.value for cell in cells if not math.isnan(cell.value)), default=math.nan)
+    told = [_gain_cell(each) for each in gained] or [""] * len(cells)
+    return [
+        replace(
+            cell,
+            text=f"{cell.text} ({gain})" if str(gain) else cell.text,
+            mark="" if isinstance(gain, str) else gain.mark,
+            bold=cell.value == most,
+        )
+        for cell, gain in zip(cells, told, strict=True)
+    ]
+
+
+def _gain_cell(gain: Difference | None) -> Cell:
+    if gain is None:
+        return ""
+    mark = NOISE if gain.verdict == "within noise" else ""
+    return Number(gain.mean, se=gain.se, signed=True, mark=mark)
+
+
+def _mean_gains(results: Results, way: Way, scenes: Sequence[str], kinds: Kinds) -> list[Cell]:
+    """The mean gain over scenes of some methods and ratios, tested together."""
+    frame = results.gains(way)
+    own = [at_ratio(frame[method], ratio).reindex(scenes).dropna() for method, ratio in kinds]
+    return list(map(_gain_cell, adjusted([over_scenes(e) if len(e) else None for e in own])))
+
+
+def _costs(results: Results, way: Way, key: str, scenes: Sequence[str]) -> Table:
+    """Seconds, Gaussians and size by ratio and method, and what a ratio multiplies them by."""
+    ratios = [r for r in results.ratios(scenes) if all(r in results.ratios([s]) for s in scenes)]
+    kinds = _with_sfm([(m, r) for r in ratios for m in _columns(results, scenes)])
+    labels = [results.label(way, *kind) for kind in kinds]
+    means = {
+        name: pd.DataFrame(
+            [[results.mean(way, scene, label, name) for label in labels] for scene in scenes],
+            index=scenes, columns=pd.MultiIndex.from_tuples(kinds),
+        ).dropna().mean()
+        for name in COSTS
+    }  # fmt: skip
+    printed = paper_costs(key).reindex(kinds)
+    means |= {name: printed[name] for name in PRINTED}
+    rows = list[Row]()
+    for ratio in (1.0, *ratios):
+        own = [kind for kind in kinds if kind[1] == ratio]
+        for kind in own:
+            cells = (Number(means[name][kind], digits) for name, digits in DIGITS.items())
+            rows.append((kind[0], f"{ratio:g}x", *cells))
+        if ratio > 1:
+            times = {n: means[n][own].mean() / means[n][SFM, 1.0] for n in DIGITS if n != "seeding"}
+            shown = (Number(times.get(name, math.nan), text="x") for name in DIGITS)
+            rows.append(("mean, of sfm's", f"{ratio:g}x", *shown))
+    done = [
+        s for s in scenes if not any(math.isnan(results.mean(way, s, x, "model")) for x in labels)
+    ]
+    note = (
+        f"Means over the {len(done)} scenes that have all of these runs. Seconds are of the clock, "
+        "and upsampling is not part of training. MB are of a million bytes. The paper's are of its "
+        "own machine, at 30,000 steps."
+    )
+    header = ("method", "ratio", *(MEASURES[name] for name in COSTS), *PRINTED.values())
+    return Table("costs", f"Time and size, {way.label}", header, rows, (note,))
+
+
+def _ablation(results: Results, ways: Sequence[Way], scenes: Sequence[str]) -> Iterator[Table]:
+    """What random points gain, by scene, ratio and strategy."""
+    ratios = [arm.ratio for arm in results.arms if arm.method == RANDOM]
+    kinds = [(RANDOM, ratio) for ratio in dict.fromkeys(ratios)]
+    by_strategy = {way.strategy: way for way in ways}.values()  # random has one profile
+    rows = [
+        (scene, *(_gain_cell(results.gain(w, scene, *kind)) for w in by_strategy for kind in kinds))
+        for scene in scenes
+    ]
+    means = (_mean_gains(results, way, scenes, kinds) for way in by_strategy)
+    rows.append(("mean", *(cell for each in means for cell in each)))
+    header = ("scene", *(f"{r:g}x, {w.strategy}" for w in by_strategy for _, r in kinds))
+    if kinds and rows[:-1]:
+        yield Table("random", "Random points: gain over sfm", header, rows, (GAIN_NOTE,))
+
+
+def _conditions(results: Results, ways: Sequence[Way]) -> Table:
+    """How the runs were made, by strategy."""
+    rows = list[Row]()
+    for strategy in dict.fromkeys(way.strategy for way in ways):
+        study = results.study(strategy)
+        assert study is not None  # noqa: S101  (of finished ways only)
+        left_out = sum(s is not study and strategy in s.strategies for s in results.found)
+        devices = ", ".join(sorted({each.device for each in study.under(strategy)["result"]}))
+        more = f"; {left_out} sets of other settings are left out" if left_out else ""
+        rows.append((strategy, f"{study.description}{more}", devices))
+    return Table("conditions", "Conditions", ("strategy", "settings", "device"), rows)
+
+
+def run_frame(results: Results) -> pd.DataFrame:
+    """A row for each finished run: scene, arm, repeat and settings, then what was measured."""
+    frames = []
+    for study in results.found:
+        arms = [(spec.arm, spec) for spec in study.runs["spec"]]
+        told = {
+            "method": [arm.method for arm, _ in arms],
+            "profile": [arm.profile for arm, _ in arms],
+            "ratio": [arm.ratio for arm, _ in arms],
+            "budget": [arm.budget for arm, _ in arms],
+            "steps": [spec.training.max_steps for _, spec in arms],
+            "data factor": [spec.training.data_factor for _, spec in arms],
+            "version": [spec.version for _, spec in arms],
+        }
+        own = study.runs[["scene", "strategy", "repeat"]].assign(**told)
+        frames.append(pd.concat([own, study.runs[list(MEASURES)].rename(columns=MEASURES)], axis=1))
+    every = pd.concat(frames) if frames else pd.DataFrame(columns=["scene"])
+    return every.sort_values(list(every.columns[:10]), ignore_index=True)
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Options))
+    except SplatseedError as error:
+        raise SystemExit(f"error: {error}") from None

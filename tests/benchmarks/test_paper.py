@@ -1,0 +1,114 @@
+"""The paper's tables hold what the runs say, blank where there is none; planted effects decide."""
+
+from __future__ import annotations
+
+from importlib import import_module
+
+import numpy as np
+import pandas as pd
+import pytest
+
+pytest.importorskip("pandas", reason="tables need pandas")
+
+from splatseed.bench.comparisons import paper_psnr
+from splatseed.bench.runs import Run
+from splatseed.bench.tables import to_markdown
+from splatseed.errors import SceneFormatError
+
+from ..bench.planted import runs, spec, write_bench
+from .conftest import ROOT
+
+POINTS = ("linear", "triangle", "spline", "mls", "voronoi")
+GAINS = {("sfm", 1): 0.0, ("random", 4): -0.5, ("random", 16): -0.5}
+GAINS |= {(name, ratio): 0.1 for name in POINTS for ratio in (4, 16)}
+GAINS |= {("mls", 4): 0.6, ("mls", 16): 0.6}
+SCENES = ("bonsai", "treehill", "fern", "fox", "stone_horse", "face", "dorm", "desk")
+PAGE = ROOT / "docs" / "results" / "paper.md"
+
+
+@pytest.fixture
+def paper(monkeypatch):
+    """A module of ``benchmarks.paper`` by name."""
+    monkeypatch.syspath_prepend(ROOT)
+    return lambda name: import_module(f"benchmarks.paper.{name}")
+
+
+def planned(scenes=SCENES, **changes):
+    """All runs of the paper's profile, finished; the baseline's profile is the default one."""
+    finished = runs(scenes, GAINS, ("default-3dgs",), noise=0.01, **changes)
+    return [
+        Run(spec(r.spec.scene.name, r.spec.arm.method, r.spec.arm.ratio, repeat=r.spec.repeat,
+                 strategy="default-3dgs", profile="default" if r.spec.arm.method == "sfm" else
+                 "paper"), r.result)
+        for r in finished
+    ]  # fmt: skip
+
+
+def row(text, *cells):
+    (line,) = [each for each in text.splitlines() if each.startswith(f"| {' | '.join(cells)} |")]
+    return [cell.strip() for cell in line.split("|")[1:-1]]
+
+
+def test_a_benchmark_that_was_killed_fills_the_page_and_blanks_the_rest(paper, tmp_path):
+    all_runs, missing = planned(), ("face", "voronoi", 16.0)
+    kept = [
+        Run(run.spec) if (run.spec.scene.name, run.spec.arm.method, run.spec.arm.ratio) == missing
+        else run
+        for run in all_runs
+    ]  # fmt: skip
+    (tmp_path / "paper.md").write_bytes(PAGE.read_bytes())
+    options = paper("tables").Options((write_bench(tmp_path / "B", kept),), tmp_path)
+    paper("tables").main(options)
+    text = (tmp_path / "paper.md").read_text("utf-8")
+    face = row(text, "face", "16x")
+    mls = [r.result.psnr for r in all_runs if (r.spec.scene.name, r.spec.arm.label) ==
+           ("face", "mls 16x (paper)")]  # fmt: skip
+    assert face[-1] == ""
+    assert face[-2].startswith(f"**{np.mean(mls):.2f} / .800, +0.")
+    theirs = row(text, "bonsai, paper", "16x")
+    assert theirs[2] == f"{paper_psnr('mipnerf360').loc['bonsai', ('sfm', 1.0)]:.2f}"
+    assert row(text, "mean", "4x")[-2].startswith("+0.6")
+
+    ledger = pd.read_csv(tmp_path / "tables" / "paper_runs.csv")
+    assert len(ledger) == sum(run.result is not None for run in kept)
+    again = (tmp_path / "paper.md").read_bytes()
+    paper("tables").main(options)
+    assert (tmp_path / "paper.md").read_bytes() == again
+
+
+def test_guidelines_are_decided_by_what_was_planted(paper, tmp_path):
+    guidelines = paper("guidelines")
+    results = paper("gained").read_results([write_bench(tmp_path / "B", planned())])
+    (way,) = results.ways()
+    told = dict(zip(guidelines.GUIDELINES, guidelines.verdicts(results.gains(way)), strict=True))
+    by_text = {each.text: verdict for each, verdict in told.items()}
+    assert by_text["MLS is most often best"].startswith("holds: +0.50 ± 0.00 dB, 8 scenes, p < ")
+    assert by_text["Voronoi suits planar scenes"].startswith("fails: -0.1")
+    assert by_text["Simple methods at low ratios suffice"].startswith("fails: -0.1")
+    assert by_text["Benefits rise to 32x indoors"] == "not decided here: not run"
+    assert "mls 8" in to_markdown(guidelines.verdict_table(results))
+
+
+def test_noise_and_a_single_scene_decide_nothing(paper):
+    guidelines = paper("guidelines")
+    rng = np.random.default_rng(0)
+    index = pd.MultiIndex.from_product([SCENES, (4.0, 16.0)], names=["scene", "ratio"])
+    methods = (*POINTS, "depth", "random")
+    gains = pd.DataFrame(rng.normal(0, 0.3, (len(index), 7)), index, columns=list(methods))
+    gains["depth"] = np.nan
+    assert all("not decided" in each for each in guidelines.verdicts(gains))
+    assert all("not decided" in each for each in guidelines.verdicts(gains.loc[["fern"]]))
+
+
+@pytest.mark.parametrize("text", ["", "<!-- a:begin -->", "<!-- a:end -->\n<!-- a:begin -->\n"])
+def test_a_page_without_marks_is_refused(paper, text):
+    with pytest.raises(SceneFormatError, match="a:begin"):
+        paper("tables").fill(text, "a", "x")
+
+
+def test_the_page_has_a_place_for_every_table(paper, tmp_path):
+    results = paper("gained").read_results([write_bench(tmp_path / "B", [])])
+    text = PAGE.read_text("utf-8")
+    for name, tables in paper("tables").page_tables(results).items():
+        assert tables == []
+        assert f"<!-- {name}:begin -->" in text
