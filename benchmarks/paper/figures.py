@@ -1,7 +1,7 @@
 """The paper's figures 1 and 2 from a capture: its points, and those that the methods add.
 
-    python -m benchmarks.paper.figures DIR/bonsai -o docs/pictures/paper_methods.png
-    python -m benchmarks.paper.figures DIR/room0 --depth CAPTURE -o docs/pictures/paper_depth.png
+    python -m benchmarks.paper.figures DIR/bonsai -o PICTURE.png
+    python -m benchmarks.paper.figures DIR/room0 --depth CAPTURE -o PICTURE.png
 
 With depth maps it is figure 2. The camera is ``choose_camera``'s; a point is a disc of the same
 size in every panel.

@@ -43,8 +43,8 @@ PRINTED = {"train_time_s": "paper: training, s", "model_size_mb": "paper: model,
 DIGITS = {**dict(zip(COSTS, (2, 0, 0, 1), strict=True)), **dict.fromkeys(PRINTED, 0)}
 """Of table 3."""
 GAIN_NOTE = (
-    "dB ± standard error: of a scene over repeats, of a mean over scenes. ~: within noise (Holm "
-    "over all cells of scenes, and over each row of means)."
+    "dB ± standard error: of a scene over repeats (none of one), of a mean over scenes. ~: within "
+    "noise (Holm over all cells of scenes, and over each row of means)."
 )
 SCORE_NOTE = (
     "PSNR in dB / SSIM / LPIPS where its weights are there, then what PSNR gains; means over "

@@ -64,7 +64,7 @@ def test_a_benchmark_that_was_killed_fills_the_page_and_blanks_the_rest(paper, t
     mls = [r.result.psnr for r in all_runs if (r.spec.scene.name, r.spec.arm.label) ==
            ("face", "mls 16x (paper)")]  # fmt: skip
     assert face[-1] == ""
-    assert face[-2].startswith(f"**{np.mean(mls):.2f} / .800, +0.")
+    assert face[-2].startswith(f"**{np.mean(mls):.2f} / .800 (+0.")
     theirs = row(text, "bonsai, paper", "16x")
     assert theirs[2] == f"{paper_psnr('mipnerf360').loc['bonsai', ('sfm', 1.0)]:.2f}"
     assert row(text, "mean", "4x")[-2].startswith("+0.6")
