@@ -77,7 +77,7 @@ def test_the_only_seed_of_a_cell_stays_before_the_second_of_another(rng):
 
 
 def test_originals_alone_stay_dense_where_they_are_dense(rng):
-    """A tenth of each part stays, in whatever order the parts come; what no view sees goes first."""
+    """A tenth of each part stays; what no view sees goes first."""
     view = slow.make_view(rng, 640, 480, 600, eye=(0, -1, 0))
     crowd = lattice(view, rng.uniform(0, 6, (900, 2)), 3.0)
     lone = lattice(view, rng.uniform(8, 60, (100, 2)), 3.0)
