@@ -63,9 +63,6 @@ MEAN_FROM = 0.8
 LARGEST = 0.05
 """Largest initial size of a Gaussian, in near depths. Where SfM has few points the gaps between
 them are wide, and a Gaussian that fills one hides all that lies behind it."""
-START_RATE = 0.25
-"""Learning rates of a run that goes on from trained Gaussians, as a fraction of a new run's. It was
-tried on one capture only."""
 
 
 @dataclass(frozen=True)
@@ -137,9 +134,11 @@ def make_schedule(densification: Densification, max_steps: int, *, as_3dgs: bool
 
 
 def started(schedule: Schedule) -> Schedule:
-    """The schedule of a run that goes on from trained Gaussians: lower rates, all harmonics."""
-    rates = {name: START_RATE * rate for name, rate in schedule.learning_rates.items()}
-    return replace(schedule, learning_rates=rates, sh_every=0, recycles=False)
+    """The schedule of a run that goes on from trained Gaussians: all harmonics from the first step.
+
+    Rates are a new run's: lower ones lose (benchmarks/training/README.md).
+    """
+    return replace(schedule, sh_every=0, recycles=False)
 
 
 def _own(theirs: Schedule, densification: Densification) -> Schedule:

@@ -135,9 +135,9 @@ def usable_seeds(
     """The finite points that a run begins with, thinned if there are more than the cap.
 
     Points in crowded parts of the training views (without these, of space) are dropped first, and
-    new points before originals; of originals alone every n-th is kept. For a strategy that adds
-    Gaussians, thinning leaves it the room for them (``SEEDS_SHARE``). ``note`` is told what was left
-    out, and what was asked for but unknown.
+    new points before originals; of originals alone every n-th is kept. A strategy that adds
+    Gaussians is left room for them (``SEEDS_SHARE``). ``note`` is told what was left out, and what
+    was asked for but unknown.
     """
     seeds, cap = points.select(points.finite), settings.cap
     if len(seeds) < len(points):
