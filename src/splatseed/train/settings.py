@@ -101,8 +101,7 @@ class TrainSettings:
     """Start with the colours that the training photographs show for each seed, by direction."""
     start: Annotated[str | None, tyro.conf.arg(metavar="MODEL|RUN")] = None
     """Go on from trained Gaussians instead of points: a run, or a file of any trainer, edited or
-    not, of this scene. Learning rates are lower, and holes are filled where the strategy adds
-    Gaussians."""
+    not, of this scene. Holes are filled where the strategy adds Gaussians."""
     seeding: tyro.conf.Suppress[Seeding] = "scene"  # the option is --seeds, "advised" by default
     """Start from the scene's points as they are, let method ``auto`` add the points that the
     training photographs need, or do what ``splatseed info`` advises. Points that splatseed has
