@@ -9,8 +9,8 @@ Promise: points are visited in order, the originals first and then by priority; 
 is needed, at the smallest spacing that keeps no more than ``num``; the remainder is filled up at
 smaller spacings. So the only point of a cell is kept before the second of any. But where views see
 originals alone, every n-th is kept: Structure-from-Motion finds them in proportion to detail, which
-is where Gaussians are needed, and to thin them evenly over the pictures costs up to 0.4 dB and .05
-SSIM (benchmarks/training/README.md). Nothing is random, and the bytes do not depend on the threads.
+is where Gaussians are needed; kept evenly over the pictures they train to a lower SSIM
+(benchmarks/training/README.md). Nothing is random, and the bytes do not depend on the threads.
 """
 
 from __future__ import annotations
