@@ -75,6 +75,7 @@ def run(arguments: list[str]) -> None:
     with stage_display() as clock:
         clock("read", 0.0)
         gaussians = read_model(path)
+        # What leaves nothing is refused before photographs are compared.
         kept = keep_gaussians(gaussians, crop, options.min_opacity)
         floaters = np.zeros(len(gaussians), bool)
         if cleans:
