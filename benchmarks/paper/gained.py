@@ -62,10 +62,9 @@ class Results:
     def ways(self) -> tuple[Way, ...]:
         """The ways of the paper's methods; first those of the paper itself."""
         known = (Way(a.strategy, a.profile) for a in self.arms if a.method in LAYOUT)
+        own = dict.fromkeys(known)  # in the plans' order, where they are equally near to the paper
         return tuple(
-            sorted(
-                set(known), key=lambda w: (not w.strategy.endswith("-3dgs"), w.profile == "default")
-            )
+            sorted(own, key=lambda w: (not w.strategy.endswith("-3dgs"), w.profile == "default"))
         )
 
     def scenes(self, *, with_depth: bool) -> tuple[str, ...]:

@@ -223,7 +223,7 @@ def _costs(results: Results, way: Way, key: str, scenes: Sequence[str]) -> Table
         s for s in scenes if not any(math.isnan(results.mean(way, s, x, "model")) for x in labels)
     ]
     note = (
-        f"Means over the {len(done)} scenes that have all of these runs. Seconds are of the clock, "
+        f"Means over {', '.join(done)}, which have all of these runs. Seconds are of the clock, "
         "and upsampling is not part of training. MB are of a million bytes. The paper's are of its "
         "own machine, at 30,000 steps."
     )

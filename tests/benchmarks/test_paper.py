@@ -100,6 +100,13 @@ def test_noise_and_a_single_scene_decide_nothing(paper):
     assert all("not decided" in each for each in guidelines.verdicts(gains.loc[["fern"]]))
 
 
+def test_ways_are_the_papers_own_first_and_then_in_the_plans_order(paper, tmp_path):
+    names = ("mcmc", "none", "grow", "default", "default-3dgs")
+    own = [run for name in names for run in runs(["fern"], {("sfm", 1): 0, ("mls", 4): 0}, (name,))]
+    results = paper("gained").read_results([write_bench(tmp_path / "B", own)])
+    assert [way.strategy for way in results.ways()] == ["default-3dgs", *names[:-1]]
+
+
 @pytest.mark.parametrize("text", ["", "<!-- a:begin -->", "<!-- a:end -->\n<!-- a:begin -->\n"])
 def test_a_page_without_marks_is_refused(paper, text):
     with pytest.raises(SceneFormatError, match="a:begin"):
