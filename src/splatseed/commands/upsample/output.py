@@ -187,7 +187,7 @@ def summarise(
         left_out += [f"{report.dropped_nonfinite:,} not finite"]
         left_out += [f"{report.dropped_duplicates:,} duplicate"]
     if thinned := num_read - report.num_original:
-        left_out += [f"{thinned:,} originals, for the budget, where they crowd"]
+        left_out += [f"{thinned:,} originals, for the budget"]
     made = ", ".join(f"{count:,} {name}" for name, count in origins.items())
     rows = [
         ("points in", f"{num_read:,}"),
