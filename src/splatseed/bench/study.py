@@ -92,7 +92,9 @@ class Study:
         told, factors = self.settings, self.settings["data_factor"]
         if not isinstance(factors, Mapping):
             factors = {"photographs": factors}
-        sizes = {of: f"1/{each} of their" if each != 1 else "full" for of, each in factors.items()}
+        sized: dict[str, list[str]] = defaultdict(list)
+        for of, each in factors.items():
+            sized[f"1/{each} of their" if each != 1 else "full"].append(of)
         budget, is_share = str(told["budget"]), str(told["budget"]).endswith("rho")
         share = f"{budget.removesuffix('rho')} Gaussians per pixel of a photograph"
         most = share if is_share else f"{int(budget or 0):,} Gaussians"
@@ -101,7 +103,7 @@ class Study:
         repeats = f"{high}" if low == high else f"{low} to {high}"
         words = [
             f"{told['max_steps']:,} steps",
-            *(f"{of} at {size} size" for of, size in sizes.items()),
+            *(f"{', '.join(names)} at {size} size" for size, names in sized.items()),
             f"every {told['test_every']}th view tested",
             f"at most {told['cap_max']:,} Gaussians" if told["cap_max"] else "",
             f"at most {most}" if budget else "",
