@@ -233,8 +233,8 @@ def _costs(results: Results, way: Way, key: str, scenes: Sequence[str]) -> Table
 
 def _ablation(results: Results, ways: Sequence[Way], scenes: Sequence[str]) -> Iterator[Table]:
     """What random points gain, by scene, ratio and strategy."""
-    ratios = [arm.ratio for arm in results.arms if arm.method == RANDOM]
-    kinds = [(RANDOM, ratio) for ratio in dict.fromkeys(ratios)]
+    ratios = {arm.ratio for arm in results.arms if arm.method == RANDOM}
+    kinds = [(RANDOM, ratio) for ratio in sorted(ratios)]
     by_strategy = {way.strategy: way for way in ways}.values()  # random has one profile
     rows = [
         (scene, *(_gain_cell(results.gain(w, scene, *kind)) for w in by_strategy for kind in kinds))
