@@ -223,9 +223,9 @@ def _costs(results: Results, way: Way, key: str, scenes: Sequence[str]) -> Table
         s for s in scenes if not any(math.isnan(results.mean(way, s, x, "model")) for x in labels)
     ]
     note = (
-        f"Means over the scenes that have all of these runs: {', '.join(done) or 'none yet'}. Seconds "
-        "are of the clock, and upsampling is not part of training. MB are of a million bytes. The "
-        "paper's are of its own machine, at 30,000 steps."
+        f"Means over the scenes that have all of these runs: {', '.join(done) or 'none yet'}. "
+        "Seconds are of the clock, and upsampling is not part of training. MB are of a million "
+        "bytes. The paper's are of its own machine, at 30,000 steps."
     )
     header = ("method", "ratio", *(MEASURES[name] for name in COSTS), *PRINTED.values())
     return Table("costs", f"Time and size, {way.label}", header, rows, (note,))
