@@ -87,8 +87,8 @@ class Options:
     """Gaussians per pixel of a photograph at the size that is trained."""
     max_steps: int = 1500
     """Steps of all but the random start at equal seconds."""
-    data_factor: int = 2
-    """By how much photographs are made smaller."""
+    long_side: int = 400
+    """Photographs are made smaller by a whole factor, until no side is longer."""
     jobs: int = os.cpu_count() or 1
     """Captures at a time, on one thread each."""
     cache: Path = user_cache_dir().parent / "benchmarks" / "front_page"
@@ -145,7 +145,7 @@ def main(options: Options) -> None:
 
 
 def _kept(name: str, options: Options) -> Path:
-    part = f"{name}_{options.rho:g}_{options.max_steps}_{options.data_factor}"
+    part = f"{name}_{options.rho:g}_{options.max_steps}_{options.long_side}"
     return options.cache / f"{part}.json"
 
 
@@ -156,7 +156,7 @@ def _result(name: str, options: Options) -> dict[str, Any]:
         told = call(
             "benchmarks.training.front_page:train_all", threads=1,
             scene=str(find_scenes() / name), pictures=str(path.with_suffix(".npz")),
-            rho=options.rho, max_steps=options.max_steps, data_factor=options.data_factor,
+            rho=options.rho, max_steps=options.max_steps, long_side=options.long_side,
         )  # fmt: skip
         path.write_text(json.dumps(told))
         say(f"  {name}: {_gain(told):+.2f} dB")
@@ -177,13 +177,14 @@ def _cell(told: dict[str, float] | None) -> str:
 
 
 def train_all(
-    scene: str, pictures: str, rho: float, max_steps: int, data_factor: int
+    scene: str, pictures: str, rho: float, max_steps: int, long_side: int
 ) -> dict[str, dict[str, float]]:
     """All runs of one capture; the renders of its median view go into ``pictures``, an .npz."""
     whole = ss.load_scene(Path(scene))
     bare = whole.replace(points=PointCloud.empty(), tracks=None)
     dice = bare.replace(points=random_start(bare, np.random.default_rng(0)))
     camera = whole.images[0].camera
+    data_factor = max(1, -(-max(camera.width, camera.height) // long_side))
     cap = round(rho * (camera.width // data_factor) * (camera.height // data_factor))
 
     def train(
