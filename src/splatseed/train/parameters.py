@@ -30,6 +30,8 @@ ADAM_BETA1 = 0.9
 ADAM_EPSILON = 1e-15
 """3DGS's: far below any gradient, so that rarely seen Gaussians take full steps too."""
 NEAR_DEPTHS = "near_depths"
+LEFT_OUT, MOST_OPAQUE = -20.0, 0.995
+"""The logit of an opacity that nothing shows, and the highest opacity of one that is raised."""
 
 
 def make_parameters(
@@ -108,6 +110,20 @@ def optimize(params: Parameters, optimizers: Optimizers, rates: Mapping[str, flo
     for axis in range(3):
         positions[:, axis].addcmul_(means.data[:, axis], lengths)
     means.data = positions
+
+
+def without_some(params: Parameters, fraction: float) -> Mapping[str, Tensor]:
+    """The parameters with a random ``fraction`` of the Gaussians left out, by PyTorch's generator.
+
+    The opacities of the others rise by 1 / (1 - fraction), so that on average a pixel's stay the
+    same; gradients reach only these.
+    """
+    if fraction <= 0:
+        return params
+    opacities = torch.sigmoid(params["opacities"])
+    kept = torch.rand_like(opacities) >= fraction
+    raised = torch.logit((opacities / (1 - fraction)).clamp(max=MOST_OPAQUE))
+    return {**params, "opacities": torch.where(kept, raised, LEFT_OUT)}
 
 
 @torch.no_grad()

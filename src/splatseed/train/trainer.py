@@ -24,7 +24,8 @@ from splatseed.splat.metrics import l1_and_ssim_by_convolution, psnr, ssim_of_al
 from splatseed.splat.rendering import Photographs, fill_masked, mask_of, photograph_of, render_view
 from splatseed.splat.ssim import l1_and_ssim
 from splatseed.train.folder import Record
-from splatseed.train.parameters import add_to_mean, optimize, take_mean
+from splatseed.train.parameters import add_to_mean, optimize, take_mean, without_some
+from splatseed.train.schedule import FEW
 from splatseed.train.settings import TrainSettings
 from splatseed.train.state import TrainState
 from splatseed.views.view import View
@@ -51,6 +52,7 @@ class Trainer:
         self.test_views = test_views
         self.on_record = on_record
         self.is_whole = True  # the state is one between two steps, which a checkpoint may keep
+        self._is_sparse = len(train_views) <= FEW
         self._photographs = Photographs(train_views, self.device)
         keep_freed_memory()
 
@@ -101,7 +103,8 @@ class Trainer:
         index = int(order[position])
         view = self.train_views[index]
         photograph = self._photographs.of(view)
-        plain, info = render_view(params, view, schedule.sh_degree(step, self.settings.sh_degree))
+        shown = without_some(params, schedule.left_out(step)) if self._is_sparse else params
+        plain, info = render_view(shown, view, schedule.sh_degree(step, self.settings.sh_degree))
         render, mask = plain, mask_of(view, self.device)
         if state.exposures is not None:
             state.exposures.fit(index, plain, photograph, mask)
