@@ -112,7 +112,7 @@ def optimize(params: Parameters, optimizers: Optimizers, rates: Mapping[str, flo
     means.data = positions
 
 
-def without_some(params: Parameters, fraction: float) -> Mapping[str, Tensor]:
+def without_some(params: Parameters, fraction: float) -> Parameters | Mapping[str, Tensor]:
     """The parameters with a random ``fraction`` of the Gaussians left out, by PyTorch's generator.
 
     The opacities of the others rise by 1 / (1 - fraction), so that on average a pixel's stay the
