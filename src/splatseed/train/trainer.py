@@ -103,6 +103,7 @@ class Trainer:
         index = int(order[position])
         view = self.train_views[index]
         photograph = self._photographs.of(view)
+        # The recorded loss and PSNR are of what is left.
         shown = without_some(params, schedule.left_out(step)) if self._is_sparse else params
         plain, info = render_view(shown, view, schedule.sh_degree(step, self.settings.sh_degree))
         render, mask = plain, mask_of(view, self.device)
