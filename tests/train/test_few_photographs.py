@@ -1,4 +1,4 @@
-"""With few photographs each step leaves out some Gaussians."""
+"""With few photographs each step drops some Gaussians."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ import pytest
 import torch
 
 from splatseed.train import trainer
-from splatseed.train.parameters import LEFT_OUT, as_parameters, without_some
+from splatseed.train.parameters import DROPPED, as_parameters, with_dropout
 from splatseed.train.schedule import make_schedule
 
 
-def test_some_are_left_out_and_the_others_make_up_for_them():
+def test_some_are_dropped_and_the_others_make_up_for_them():
     params = as_parameters({"means": torch.zeros(4000, 3), "opacities": torch.zeros(4000)})
-    assert without_some(params, 0.0) is params
+    assert with_dropout(params, 0.0) is params
     torch.manual_seed(0)
-    shown = without_some(params, 0.2)
-    out = shown["opacities"] == LEFT_OUT
+    shown = with_dropout(params, 0.2)
+    out = shown["opacities"] == DROPPED
     assert 0.17 < out.float().mean() < 0.23
     opacities = torch.sigmoid(shown["opacities"])
     torch.testing.assert_close(opacities[~out], torch.full((int((~out).sum()),), 0.5 / 0.8))
@@ -29,13 +29,13 @@ def test_some_are_left_out_and_the_others_make_up_for_them():
 def test_raised_opacities_stay_below_one():
     params = as_parameters({"opacities": torch.tensor([2.0, 30.0])})
     torch.manual_seed(1)
-    assert torch.isfinite(without_some(params, 0.01)["opacities"]).all()
+    assert torch.isfinite(with_dropout(params, 0.01)["opacities"]).all()
 
 
-def test_the_share_rises_and_3dgs_leaves_out_none():
+def test_dropout_rises_and_3dgs_has_none():
     schedule = make_schedule("grow", 1500, as_3dgs=False)
-    assert [schedule.left_out(step) for step in (0, 750, 1500)] == [0, 0.1, 0.2]
-    assert make_schedule("default", 1500, as_3dgs=True).left_out(1500) == 0
+    assert [schedule.dropout_at(step) for step in (0, 750, 1500)] == [0, 0.1, 0.2]
+    assert make_schedule("default", 1500, as_3dgs=True).dropout_at(1500) == 0
 
 
 @pytest.mark.parametrize(("few", "differs"), [(7, True), (6, False)])

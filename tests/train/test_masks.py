@@ -43,7 +43,7 @@ def test_masks_keep_an_occluder_out(larger_room_path, occluded_path, splatseed, 
 
     def score(name, path, *options):
         run = splatseed(
-            "train", path, "-o", tmp_path / name, "--max-steps", 110, "--seeds", "scene",
+            "train", path, "-o", tmp_path / name, "--max-steps", 150, "--seeds", "scene",
             "--strategy", "none", *options,
         )  # fmt: skip
         assert run.code == 0, run.err
@@ -51,7 +51,7 @@ def test_masks_keep_an_occluder_out(larger_room_path, occluded_path, splatseed, 
 
     clean, masked = score("clean", larger_room_path), score("masked", occluded_path)
     whole = score("whole", occluded_path, "--masks", "none")
-    assert masked > whole + 0.4
+    assert masked > whole + 1
     assert masked - whole > 2 * (clean - masked)
     again = splatseed("evaluate", tmp_path / "whole", "-o", tmp_path / "scores.json")
     assert again.code == 0

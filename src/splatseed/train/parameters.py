@@ -30,8 +30,8 @@ ADAM_BETA1 = 0.9
 ADAM_EPSILON = 1e-15
 """3DGS's: far below any gradient, so that rarely seen Gaussians take full steps too."""
 NEAR_DEPTHS = "near_depths"
-LEFT_OUT, MOST_OPAQUE = -20.0, 0.995
-"""The logit of an opacity that nothing shows, and the highest opacity of one that is raised."""
+DROPPED, MOST_OPAQUE = -20.0, 0.995
+"""The logit of an opacity that no pixel shows, and the highest opacity of a Gaussian that stays."""
 
 
 def make_parameters(
@@ -112,18 +112,18 @@ def optimize(params: Parameters, optimizers: Optimizers, rates: Mapping[str, flo
     means.data = positions
 
 
-def without_some(params: Parameters, fraction: float) -> Parameters | Mapping[str, Tensor]:
-    """The parameters with a random ``fraction`` of the Gaussians left out, by PyTorch's generator.
+def with_dropout(params: Parameters, fraction: float) -> Parameters | Mapping[str, Tensor]:
+    """The parameters with a random ``fraction`` of the Gaussians dropped, by PyTorch's generator.
 
-    The opacities of the others rise by 1 / (1 - fraction), so that on average a pixel's stay the
-    same; gradients reach only these.
+    The other opacities are multiplied by 1 / (1 - fraction), which keeps their mean; only they
+    receive gradients (H. Park et al., "DropGaussian", 2025).
     """
     if fraction <= 0:
         return params
     opacities = torch.sigmoid(params["opacities"])
     kept = torch.rand_like(opacities) >= fraction
     raised = torch.logit((opacities / (1 - fraction)).clamp(max=MOST_OPAQUE))
-    return {**params, "opacities": torch.where(kept, raised, LEFT_OUT)}
+    return {**params, "opacities": torch.where(kept, raised, DROPPED)}
 
 
 @torch.no_grad()

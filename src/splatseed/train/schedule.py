@@ -60,12 +60,12 @@ LEAST_ROUND = 20
 their places is noise."""
 MEAN_FROM = 0.8
 """Fraction of a run after which the mean of the Gaussians is taken."""
-DROPPED = 0.2
-"""Fraction of the Gaussians that a step leaves out at the end of a run; linear from 0 at its
-beginning (H. Park et al., "DropGaussian", 2025)."""
+DROPOUT = 0.2
+"""Fraction of the Gaussians that the last step of a run with few photographs drops, as in
+DropGaussian (H. Park et al., 2025); linear from 0 at its first."""
 FEW = 16
-"""Most training photographs with which Gaussians are left out. A few photographs are fitted by
-Gaussians that no other view confirms; with more, close to each other, leaving out loses."""
+"""Most training photographs with which Gaussians are dropped. A few photographs are fitted by
+Gaussians that no other view confirms; with more, close to each other, dropout loses."""
 LARGEST = 0.05
 """Largest initial size of a Gaussian, in near depths. Where SfM has few points the gaps between
 them are wide, and a Gaussian that fills one hides all that lies behind it."""
@@ -98,7 +98,7 @@ class Schedule:
     largest: float = math.inf  # upper bound of the initial size, in near depths
     flatness: float = 0.1  # initial thickness of Gaussians with normals, relative to their size
     recycles: bool = True  # strategy grow takes Gaussians from a budget that seeds filled
-    dropped: float = 0.0  # fraction of the Gaussians that the last step leaves out
+    dropout: float = 0.0  # fraction of the Gaussians that the last step drops, if views are few
     mean_from: int | None = None
     """Step after which the mean of the Gaussians is taken as the run's result; None to end with the
     last step's."""
@@ -107,9 +107,9 @@ class Schedule:
         """The degree of spherical harmonics in use."""
         return min(step // self.sh_every, highest) if self.sh_every else highest
 
-    def left_out(self, step: int) -> float:
-        """The fraction of the Gaussians that a step leaves out."""
-        return self.dropped * step / self.max_steps
+    def dropout_at(self, step: int) -> float:
+        """The fraction of the Gaussians that a step drops."""
+        return self.dropout * step / self.max_steps
 
     def rates(self, step: int) -> dict[str, float]:
         """The learning rate of each parameter; positions' in length units."""
@@ -174,7 +174,7 @@ def _own(theirs: Schedule, densification: Densification) -> Schedule:
         growth=GROWTH ** (every / shrunk),
         scale_factor=1.0,
         largest=LARGEST,
-        dropped=DROPPED,
+        dropout=DROPOUT,
         # Only once the number of Gaussians no longer changes.
         mean_from=max(stop, round(MEAN_FROM * theirs.max_steps)),
     )

@@ -24,7 +24,7 @@ from splatseed.splat.metrics import l1_and_ssim_by_convolution, psnr, ssim_of_al
 from splatseed.splat.rendering import Photographs, fill_masked, mask_of, photograph_of, render_view
 from splatseed.splat.ssim import l1_and_ssim
 from splatseed.train.folder import Record
-from splatseed.train.parameters import add_to_mean, optimize, take_mean, without_some
+from splatseed.train.parameters import add_to_mean, optimize, take_mean, with_dropout
 from splatseed.train.schedule import FEW
 from splatseed.train.settings import TrainSettings
 from splatseed.train.state import TrainState
@@ -52,7 +52,6 @@ class Trainer:
         self.test_views = test_views
         self.on_record = on_record
         self.is_whole = True  # the state is one between two steps, which a checkpoint may keep
-        self._is_sparse = len(train_views) <= FEW
         self._photographs = Photographs(train_views, self.device)
         keep_freed_memory()
 
@@ -103,8 +102,9 @@ class Trainer:
         index = int(order[position])
         view = self.train_views[index]
         photograph = self._photographs.of(view)
-        # The recorded loss and PSNR are of what is left.
-        shown = without_some(params, schedule.left_out(step)) if self._is_sparse else params
+        # The recorded loss and PSNR are with dropout.
+        sparse = len(self.train_views) <= FEW
+        shown = with_dropout(params, schedule.dropout_at(step)) if sparse else params
         plain, info = render_view(shown, view, schedule.sh_degree(step, self.settings.sh_degree))
         render, mask = plain, mask_of(view, self.device)
         if state.exposures is not None:
