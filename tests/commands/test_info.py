@@ -42,16 +42,17 @@ def test_a_colmap_scene(room, splatseed):
     low = [float(x) for x in rows["bounding box"].split()[:3]]
     np.testing.assert_allclose(low, scene.points.xyz.min(axis=0), rtol=1e-3)
     advised = run.out.partition("\nnext\n")[2]
-    assert re.findall(r"splatseed (\w+)", advised) == ["upsample", "train", "tune"]
+    assert re.findall(r"splatseed (\w+)", advised) == ["train", "tune"]
 
 
 def test_the_advice_depends_on_the_plan(room, splatseed):
     full = splatseed("info", room, "--budget", 60, "--max-steps", 500).out
-    assert "leave the points as they are" in full
+    assert "there is no room for more" in full
     assert "--seeds scene --budget 60 --max-steps 500" in full.partition("\nnext\n")[2]
     sparse = splatseed("info", room, "--budget", 5400, "--max-steps", 20000).out
-    assert "add points by method auto" in sparse
-    assert f"splatseed upsample {room} --budget" in sparse
+    assert "leave the points as they are" in sparse
+    assert "Strategy grow puts new Gaussians" in " ".join(sparse.split())
+    assert "--seeds scene --budget 5400 --max-steps 20000" in sparse
     assert "--minutes 30 --budget 0.5rho --max-steps 20000\n" in sparse
 
 

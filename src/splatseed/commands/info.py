@@ -66,7 +66,7 @@ class Options:
     """Gaussians that you plan to end with: a number, or per pixel of a photograph; by default as
     splatseed train's. The advice depends on it."""
     max_steps: int = FULL_RUN
-    """Steps that you plan to train; the advice depends on them."""
+    """Steps that you plan to train, for the commands that are printed."""
     json: bool = False
     """Print one JSON object instead, for scripts."""
 

