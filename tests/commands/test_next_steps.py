@@ -11,6 +11,7 @@ import pytest
 
 from splatseed.camera import Intrinsics
 from splatseed.io import load_scene, write_scene
+from splatseed.pointcloud import PointCloud
 
 
 def lines_of(out: str) -> list[list[str]]:
@@ -46,15 +47,19 @@ def follow(out: str, splatseed) -> list[str]:
     return verbs
 
 
-def test_what_info_advises_works(bent, tmp_path, monkeypatch, splatseed):
+@pytest.mark.parametrize("points", [True, False])
+def test_what_info_advises_works(points, bent, tmp_path, monkeypatch, splatseed):
     pytest.importorskip("torch", reason="trains")
     pytest.importorskip("pycolmap", reason="undistorts")
-    scene = bent.rename(tmp_path / "my scene")
+    scene, whole = tmp_path / "my scene", load_scene(bent)
+    kept = whole if points else whole.replace(points=PointCloud.empty(), tracks=None)
+    write_scene(kept, scene, copy_images=True, require_points=False)
     monkeypatch.chdir(tmp_path)
     run = splatseed("info", scene)
     assert run.code == 0, run.err
-    assert follow(run.out, splatseed) == ["undistort", "upsample", "train", "tune"]
-    assert len(load_scene("OUT").points) > 500
+    wanted = ["train", "tune"] if points else ["upsample", "train", "sfm"]
+    assert follow(run.out, splatseed) == ["undistort", *wanted]
+    assert points or len(load_scene("OUT").points) > 500
 
 
 @pytest.mark.parametrize("kept", ["some", "no folder"])
@@ -75,7 +80,7 @@ def test_nothing_is_to_be_trained_without_its_photographs(kept, own_room, tmp_pa
         assert "-> mls" in run.out
         assert "Without photographs" in run.out
     advised = lines_of(splatseed("info", own_room).out)
-    assert [words[0] for words in advised] == ["upsample"]
+    assert [words[0] for words in advised] == ["upsample" if kept == "no folder" else "view"]
 
 
 def test_a_cloud_alone_is_advised(room, tmp_path, monkeypatch, splatseed):
