@@ -120,8 +120,8 @@ def advise(
         places_itself = (
             "Strategy grow puts new Gaussians at the depth that stereo finds; points that method "
             "auto added before it gained up to 0.3 dB on some of the captures measured, cost as "
-            "much on others, and nothing on average. In a trainer that densifies as 3DGS does "
-            "they gained 0.2 dB on average: splatseed upsample adds them."
+            "much on others, and nothing on average. Under 3DGS's densification, which other "
+            "trainers use, they gained 0.2 dB on average: splatseed upsample adds them."
         )
         return Advice(AS_IT_IS, (f"It has {per_pixel}.", places_itself), measured)
     reasons = [f"It has {per_pixel}, and room for {has:.1f} times as many seeds."]
