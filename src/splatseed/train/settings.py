@@ -61,7 +61,7 @@ class TrainSettings:
 
     strategy: StrategyName = "default"
     """Densify as 3DGS does (default), grow within a budget where renders are wrong, densify as MCMC
-    does up to a cap, keep the number of seeds, or do what scored best in our measurements, which is
+    does up to a cap, keep the number of seeds, or do what did best in our measurements, which is
     grow (auto); -3dgs: in 3DGS's own conventions for rates, sizes and schedules, to compare with
     published numbers."""
     max_steps: int = FULL_RUN
@@ -119,7 +119,7 @@ class TrainSettings:
 
     @property
     def densification(self) -> Densification:
-        """The strategy, whatever the conventions; for ``auto`` the one that scored best."""
+        """The strategy, whatever the conventions; for ``auto`` the one that did best."""
         if self.strategy == "auto":
             return "grow"
         return cast("Densification", self.strategy.removesuffix(AS_3DGS))
