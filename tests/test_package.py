@@ -112,17 +112,17 @@ def test_imports_run_one_way(part):
 
 
 @pytest.mark.parametrize("part", [part for part in ORDER if (SOURCE / part).is_dir()])
-def test_rooms_of_a_part_import_each_other_in_no_circle(part):
-    """A room is a folder of the part, or a file that stands in none."""
-    rooms = {}
+def test_modules_of_a_part_import_each_other_in_no_circle(part):
+    """A module is a folder of the part, or a file that is in none."""
+    modules = {}
     for path in _files(part):
         place = path.relative_to(SOURCE / part)
-        if place.name != "__init__.py" or len(place.parts) > 1:  # a part's door opens on all rooms
+        if place.name != "__init__.py" or len(place.parts) > 1:  # it imports all modules
             names = [name.split(".") for name in _imports(path)]
             ours = {name[2] for name in names if name[:2] == ["splatseed", part] and len(name) > 2}
-            room = place.parts[0].removesuffix(".py")
-            rooms[room] = rooms.get(room, set()) | ours - {room}
-    TopologicalSorter(rooms).prepare()  # raises CycleError, which names the circle
+            module = place.parts[0].removesuffix(".py")
+            modules[module] = modules.get(module, set()) | ours - {module}
+    TopologicalSorter(modules).prepare()  # raises CycleError, which names the circle
 
 
 @pytest.mark.parametrize("part", ["views", "depth", "upsample", "seeding"])
@@ -213,7 +213,7 @@ def _run_on_loading(node):
 
 @pytest.mark.parametrize("name", MODULES)
 def test_public_names_are_explained(name):
-    """Only packages list names; in a module, what has no underscore is for other rooms."""
+    """Only packages list names; in a module, what has no underscore is for others."""
     module = importlib.import_module(name)
     assert module.__doc__
     assert hasattr(module, "__path__") or "__all__" not in vars(module)
@@ -278,7 +278,7 @@ def test_dependencies_are_those_that_are_imported():
         needed -= {"fused_ssim"} if path.name == "trainer.py" else set()  # taken where it is there
         part = path.relative_to(SOURCE).parts[0]
         trains = part in {"render", "splat", "train", "view", "bench", "commands"}
-        # One loads torch, and gsplat's kernels, for those rooms; one is a strategy of gsplat's.
+        # One loads torch, and gsplat's kernels, for those parts; one is a strategy of gsplat's.
         trains = trains or path.name in {"torch_device.py", "gsplat.py"}
         allowed = base | more if trains else base
         allowed = base | names["depth"] if path.name == "monocular.py" else allowed
