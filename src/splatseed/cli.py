@@ -55,6 +55,14 @@ def main(arguments: list[str] | None = None) -> None:
             f"expected enough memory; found {str(error) or 'none left'}. "
             "Ask for fewer points, or close other programs."
         )
+    except RuntimeError as error:
+        if not _ends_gpu_memory(error):
+            raise
+        _fail(
+            "expected enough memory on the GPU; found none left. Take smaller photographs "
+            "(--data-factor) or fewer Gaussians, end other programs on the GPU, or pass "
+            "--backend cpu where the verb has it."
+        )
     except BrokenPipeError:  # who reads the output has read enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # or Python reports it once more at exit
         sys.exit(1)
@@ -110,6 +118,11 @@ def _termination_raised() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+def _ends_gpu_memory(error: RuntimeError) -> bool:
+    torch = sys.modules.get("torch")  # loaded, if it raised the error
+    return torch is not None and isinstance(error, torch.cuda.OutOfMemoryError)
 
 
 def _fail(message: str) -> NoReturn:

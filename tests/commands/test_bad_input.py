@@ -358,6 +358,7 @@ def test_memory_that_ran_out_is_said_so_whatever_the_error_says(splatseed, monke
     for error, says in (
         (MemoryError(), "found none left."),
         (MemoryError("a lot"), "found a lot."),
+        (torch.cuda.OutOfMemoryError("CUDA"), "on the GPU; found none left."),
     ):
         monkeypatch.setattr(info, "run", lambda _, error=error: (_ for _ in ()).throw(error))
         _refused(splatseed("info", "somewhere"), says)

@@ -52,7 +52,7 @@ def test_the_demo_leaves_a_scene_scores_pictures_and_runs(tmp_path, splatseed):
     for name in ("random", "poses", "sfm"):
         metrics[name] = json.loads((out / f"run_{name}/metrics.json").read_text())
         config = json.loads((out / f"run_{name}/config.json").read_text())
-        assert config["strategy"] == "default"
+        assert (config["strategy"], config["backend"]) == ("default", "cpu")
         # A random start also has steps for the seconds that seeds take.
         assert (metrics[name]["steps"] > 12) == (name == "random")
         assert config["cap_max"] == len(after.points)

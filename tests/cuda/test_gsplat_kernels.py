@@ -43,10 +43,10 @@ print(*stages)
 
 @pytest.fixture
 def machine(tmp_path):
-    """The environment of a machine with nvcc and g++, but ninja only beside Python."""
+    """The environment of a machine with nvcc and a compiler, but ninja only beside Python."""
     tools = tmp_path / "tools"
     tools.mkdir()
-    for name, said in {"nvcc": "Cuda compilation tools, release 12.8, V12.8.93", "g++": ""}.items():
+    for name, said in {"nvcc": "Cuda compilation tools, release 12.8, V12.8.93", "c++": ""}.items():
         (tools / name).write_text(f"#!/bin/sh\necho '{said}'\n")
         (tools / name).chmod(0o755)
     return {

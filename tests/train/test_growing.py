@@ -73,14 +73,16 @@ def test_contributions_are_sums_of_blending_weights(view):
     assert all(value.grad is None for value in params.values())
 
 
-def test_the_gaussian_in_wrong_pixels_is_split(view):
-    params = planted(row(4), [0.06] * 4)
+@pytest.mark.parametrize("opacity", [0.9, 1 - 1e-9])  # the sigmoid of the second's logit is 1
+def test_the_gaussian_in_wrong_pixels_is_split(view, opacity):
+    params = planted(row(4), [0.06] * 4, opacity)
     truth = torch.full((SIDE, SIDE, 3), 0.5)
     truth[:, : SIDE // 4] = 1.0  # where the first one is
     grow(params, view, truth, budget=8)
     near_first = params["means"].detach()[:, 0] < -0.6
     assert len(params["means"]) == 5
     assert int(near_first.sum()) == 2
+    assert params["opacities"].isfinite().all()
 
 
 def test_nothing_is_split_where_nothing_is_wrong(view):

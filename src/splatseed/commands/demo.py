@@ -178,7 +178,7 @@ def _compile(part: str, scene: Scene, folder: Path) -> None:
     if part == TRAINING:
         from splatseed.train.settings import TrainSettings  # noqa: PLC0415  (loads with its use)
 
-        settings = TrainSettings(cap_max=2000, max_steps=4)
+        settings = TrainSettings(cap_max=2000, max_steps=4, backend="cpu")
         _train_arm(folder, SFM, settings, StageClock())
         return
     cloud = _upsample_by(part, scene, 2.0)
@@ -304,7 +304,10 @@ def _train(options: Options) -> bool:
     scenes = [f"scene_{name}" for name in (RANDOM, POSES)]
     add_files(folder, [*(f"run_{name}" for name in ARMS), *scenes, TRAINED_PICTURE])
     most = read_manifest(folder / f"scene_{SHOWN}")["num_points"]
-    settings = TrainSettings(strategy="default", cap_max=most, max_steps=steps, seed=SEED)
+    # On the CPU also where there is a GPU, for which gsplat's kernels would be built first.
+    settings = TrainSettings(
+        strategy="default", cap_max=most, max_steps=steps, seed=SEED, backend="cpu"
+    )
     with stage_display() as clock:
         seconds = _seed_poses_alone(folder, clock)
         arms = {POSES: _train_arm(folder, POSES, settings, clock)}

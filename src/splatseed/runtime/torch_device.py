@@ -87,10 +87,10 @@ def load_kernels(option: str, progress: Progress = silent) -> None:
     # Ninja, which gsplat brings, is off the path of a venv's command called without activation.
     os.environ["PATH"] = f"{os.environ.get('PATH', '')}{os.pathsep}{sysconfig.get_path('scripts')}"
     home = cpp_extension.CUDA_HOME or os.environ.get("CUDA_HOME")
-    compiler = os.environ.get("CXX", "cl" if os.name == "nt" else "g++")
+    compiler = os.environ.get("CXX") or ("cl" if os.name == "nt" else "c++")  # as PyTorch does
     tools = {
         "nvcc": (home and shutil.which("nvcc", path=Path(home, "bin"))) or shutil.which("nvcc"),
-        compiler: shutil.which(compiler),
+        compiler: shutil.which(compiler) or shutil.which(compiler.split()[0]),  # "ccache g++"
         "ninja": shutil.which("ninja"),
     }
     missing = [f"no {name}" for name, path in tools.items() if path is None]

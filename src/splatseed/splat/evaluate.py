@@ -141,7 +141,7 @@ def _score(
 
 def _now() -> float:
     """The time, once the GPU, if one is in use, has finished its work."""
-    if torch.cuda.is_available():
+    if torch.cuda.is_initialized():  # type: ignore[no-untyped-call]  # PyTorch gives no types
         torch.cuda.synchronize()
     return time.perf_counter()
 

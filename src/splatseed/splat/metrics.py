@@ -210,6 +210,7 @@ class Lpips:
     heads: list[Tensor]  # w_l of each stage, [1, C_l, 1, 1]
 
     @torch.no_grad()
+    @torch.backends.cudnn.flags(enabled=True, allow_tf32=False)  # the score of any other device
     def __call__(self, render: Float[Tensor, "H W 3"], photograph: Float[Tensor, "H W 3"]) -> float:
         """The distance of two images of values 0..1; 0 where they are equal."""
         pair = torch.stack([render, photograph]).permute(0, 3, 1, 2)

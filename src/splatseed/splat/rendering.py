@@ -140,7 +140,8 @@ class Photographs:
         self._held: dict[View, UInt8[Tensor, "H W 3"]] | None = None
         if device.type == "cuda":
             free = free_bytes(device)
-            total = sum(view.photograph.nbytes for view in views)
+            held = [each for view in views for each in (view.photograph, view.mask)]
+            total = sum(each.nbytes for each in held if each is not None)
             if free is None or total <= SHARE * free:
                 self._held = {}
 

@@ -21,7 +21,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from torch import Tensor
 
 from splatseed.depth.stereo.maps import StereoSettings
-from splatseed.errors import SceneFormatError
+from splatseed.errors import MissingDependencyError, SceneFormatError
 from splatseed.io import load_scene
 from splatseed.io.masks import with_masks
 from splatseed.progress import Progress, silent
@@ -82,10 +82,18 @@ def floaters_of_model(
         settings = replace(settings, data_factor=factor_for(images, StereoSettings.max_size))
     factor, cache = settings.data_factor, user_cache_dir()
     views = load_views(scene, images, data_factor=factor, cache_dir=cache, progress=progress)
-    frame, device = training_frame(views), pick_device(settings.backend, progress)
+    frame, device = training_frame(views), _device(progress)
     depths, _ = known_depths(scene, frame.scale, settings, device.type, progress=progress)
     views = tuple(frame.view(view) for view in views)
     return find_floaters(frame.gaussians_from_world(gaussians), views, depths, device, progress)
+
+
+def _device(progress: Progress) -> torch.device:
+    """A GPU, if gsplat's kernels are there or can be built; the CPU finds the same floaters."""
+    try:
+        return pick_device("auto", progress)
+    except MissingDependencyError:
+        return torch.device("cpu")
 
 
 def find_floaters(

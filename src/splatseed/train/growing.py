@@ -69,6 +69,9 @@ Candidates = Mapping[str, Tensor]
 OPACITY = 0.6
 """Opacity of a new Gaussian. It stands on a surface; a fainter one takes the rest of the run to
 show."""
+OPAQUE = 15.0
+"""Largest logit of an opacity that is split: from 17 on its sigmoid is 1 in float32, and the
+logits of the halves infinite."""
 SIZE = 1.0
 """Standard deviation of a new Gaussian, in pixels of its view."""
 BASES, HARMONICS = ("sh0", "features_dc"), ("shN", "features_rest")
@@ -205,6 +208,7 @@ class Growing(Strategy):
         if number > 0:
             chosen = torch.zeros(len(scores), dtype=torch.bool, device=scores.device)
             chosen[torch.topk(scores, number).indices] = True
+            params["opacities"].data.clamp_(max=OPAQUE)
             # Both halves together are as opaque as the whole.
             split(params, optimizers, {}, chosen, revised_opacity=True)
 

@@ -22,14 +22,14 @@ from splatseed.scene import Scene
 from splatseed.splat.formats import read_model
 from splatseed.splat.gaussians import Gaussians, TrainingFrame
 from splatseed.splat.world import in_scene_world
-from splatseed.train.growing import contributions
+from splatseed.train.growing import OPAQUE, contributions
 from splatseed.train.parameters import make_parameters
 from splatseed.train.seeds import near_depths
 from splatseed.train.settings import TrainSettings
 from splatseed.views.view import View
 
 ABSENT = -20.0
-"""Logit of an opacity that renders nothing, for those that a file gives as 0; 20 is opaque."""
+"""Logit of an opacity that renders nothing, for those that a file gives as 0."""
 
 
 def read_start(path: Path, scene: Scene, note: Callable[[str], None]) -> Gaussians:
@@ -43,7 +43,7 @@ def read_start(path: Path, scene: Scene, note: Callable[[str], None]) -> Gaussia
     if told:
         note(told)
     # Some trainers write opacities of 0 and 1, whose logits are infinite.
-    return dataclasses.replace(gaussians, opacities=gaussians.opacities.clip(ABSENT, -ABSENT))
+    return dataclasses.replace(gaussians, opacities=gaussians.opacities.clip(ABSENT, OPAQUE))
 
 
 def start_facts(gaussians: Gaussians) -> dict[str, Any]:

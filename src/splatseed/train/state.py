@@ -148,7 +148,12 @@ def save_checkpoint(path: Path, state: TrainState) -> None:
 def load_checkpoint(
     path: Path, strategy: Strategy, schedule: Schedule, device: torch.device
 ) -> TrainState:
-    """The state that ``save_checkpoint`` wrote, on a device; replaces that of a new strategy."""
+    """The state that ``save_checkpoint`` wrote, on a device; replaces that of a new strategy.
+
+    Raises:
+        SceneFormatError: The file is damaged, or of another version.
+        torch.cuda.OutOfMemoryError: It does not fit on the GPU.
+    """
     found = "another kind or version of file"
     try:
         with warnings.catch_warnings(action="ignore"):  # about what a foreign file might be
@@ -165,6 +170,8 @@ def load_checkpoint(
             run, step = (params, optimizers, strategy), int(content["step"])
             exposures = Exposures(content["exposures"]) if "exposures" in content else None
             return TrainState(*run, step, records, watch, losses, content["mean"], exposures)
+    except torch.cuda.OutOfMemoryError:
+        raise
     except Exception as error:  # noqa: BLE001  (PyTorch raises anything for a damaged file)
         found = f"a damaged file ({type(error).__name__})"
     raise SceneFormatError(

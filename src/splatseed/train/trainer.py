@@ -96,7 +96,11 @@ class Trainer:
         state, schedule = self.state, self.settings.schedule
         params, optimizers, strategy = state.params, state.optimizers, state.strategy
         words = np.random.SeedSequence([self.settings.seed, step]).generate_state(1, np.uint64)
-        torch.manual_seed(int(words[0] >> 1))  # 63 bits: PyTorch's seeds are signed
+        random = int(words[0] >> 1)  # 63 bits: PyTorch's seeds are signed
+        # torch.manual_seed would also note a stack trace for each kind of device that is not here.
+        torch.default_generator.manual_seed(random)
+        if self.device.type == "cuda":
+            torch.cuda.manual_seed(random)
         epoch, position = divmod(step, len(self.train_views))
         order = _epoch_order(self.settings.seed, epoch, len(self.train_views))
         index = int(order[position])

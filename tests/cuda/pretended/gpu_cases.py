@@ -34,7 +34,7 @@ from splatseed.runtime import torch_device
 from splatseed.splat import rendering
 from splatseed.splat.gaussians import initial_gaussians
 from splatseed.synthetic import make_capture, write_capture
-from splatseed.train import TrainSettings, prepare_run, trainer
+from splatseed.train import TrainSettings, prepare_run, state, trainer
 from splatseed.train.device import Capacity
 from splatseed.train.parameters import as_parameters
 from splatseed.view import pictures
@@ -177,6 +177,10 @@ def test_the_end_of_memory_is_told_and_keeps_the_last_whole_step(
             run.train()
         assert f"--budget {round(0.8 * run.count())}" in caught.value.fix
         monkeypatch.undo()
+        monkeypatch.setattr(state, "as_parameters", _ends)
+        with pytest.raises(torch.cuda.OutOfMemoryError):  # not a damaged checkpoint
+            _begin(room, tmp_path / "run", "default", "cuda", resume=True)
+        monkeypatch.undo()
         monkeypatch.setattr(trainer, "TESTS", 1)
         again = _begin(room, tmp_path / "run", "default", "cuda", resume=True)
         assert again.state.step == kept
@@ -199,7 +203,7 @@ def test_without_a_toolkit_one_error_comes_before_any_work(room, tmp_path, monke
     settings = TrainSettings(backend="cuda", max_steps=STEPS, seeding="auto")
     with pc.pretended_gpu(), pytest.raises(MissingDependencyError) as caught:
         prepare_run(room, tmp_path / "run", settings, progress=lambda s, _: stages.append(s))
-    assert all(tool in caught.value.found for tool in ("g++", "nvcc"))
+    assert all(tool in caught.value.found for tool in ("c++", "nvcc"))
     assert "ninja" not in caught.value.found  # it lies beside this Python, not on the path
     assert "--backend cpu" in caught.value.fix
     assert not stages
