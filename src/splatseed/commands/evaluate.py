@@ -16,6 +16,7 @@ from splatseed.errors import MissingDependencyError, SceneNotFoundError
 from splatseed.io.staging import check_output, output_folder, write_json
 from splatseed.literal import counted
 from splatseed.requirements import require
+from splatseed.train.folder import RunFolder
 from splatseed.train.settings import Backend, TrainSettings
 from splatseed.views.view import View, user_cache_dir
 
@@ -88,7 +89,9 @@ def run(arguments: list[str]) -> None:
             protect=[scene, options.model],
         )  # fmt: skip
     if options.output is not None:
-        check_free(options.output, overwrite=options.overwrite)
+        trained = RunFolder(gaussians.parent)
+        inputs = [scene, gaussians, trained.config, trained.metrics]
+        check_free(options.output, overwrite=options.overwrite, protect=inputs)
     with stage_display() as clock:
         result, doubt = _evaluate(options, gaussians, scene, numbers, masks, clock)
     rows = [
@@ -135,7 +138,7 @@ def _evaluate(
     from splatseed.splat.covisible import find_covisible, pixel_masks  # noqa: PLC0415  (kernels)
     from splatseed.splat.evaluate import evaluate_model, load_model  # noqa: PLC0415  (PyTorch)
     from splatseed.splat.metrics import load_lpips  # noqa: PLC0415  (PyTorch)
-    from splatseed.splat.rendering import picture_name, write_render  # noqa: PLC0415  (PyTorch)
+    from splatseed.splat.rendering import picture_names, write_render  # noqa: PLC0415  (PyTorch)
     from splatseed.train.device import pick_device  # noqa: PLC0415  (PyTorch)
 
     clock("read", 0.0)
@@ -157,9 +160,10 @@ def _evaluate(
         result = evaluate_model(model, **asked)
     else:
         with output_folder(options.renders, kind="evaluate", overwrite=options.overwrite) as folder:
+            names = picture_names(view.name for view in model.views)
 
             def draw(view: View, render: Any, errors: Any) -> None:
-                write_render(folder / picture_name(view.name), view.photograph, render, errors)
+                write_render(folder / names[view.name], view.photograph, render, errors)
 
             result = evaluate_model(model, on_view=draw, **asked)
     if options.output is not None:

@@ -57,10 +57,11 @@ def run(arguments: list[str]) -> None:
     name = format_of_name(options.output)
     crop = None if options.crop is None else parse_crop(options.crop)
     path, target = model_file(options.model), options.output
-    check_free(target, overwrite=options.overwrite)
     cleans = options.clean is not None
     config = config_of(options.model) if cleans else {}
     scene = config.get("scene") if options.clean == OWN else options.clean
+    inputs = [Path(scene)] if isinstance(scene, str) else []
+    check_free(target, overwrite=options.overwrite, protect=inputs)
     refuse(
         (options.clean == OWN and not isinstance(scene, str),
          f"--clean SCENE, as {options.model} does not name its scene", OWN,

@@ -77,9 +77,9 @@ def run(arguments: list[str]) -> None:
          f"--seconds from {1 / FPS:.2g} to {MOST_FRAMES / FPS:.0f}", f"{options.seconds:g}",
          "Try 10."),
     )  # fmt: skip
-    check_free(options.output, overwrite=options.overwrite)
-    for each in filter(None, (options.model, options.compare)):
-        model_file(each)
+    inputs = [model_file(each) for each in (options.model, options.compare) if each is not None]
+    inputs += [Path(each) for each in (options.scene, options.path) if each not in (None, ORBIT)]
+    check_free(options.output, overwrite=options.overwrite, protect=inputs)
     require("torch", "imageio_ffmpeg")
     # These import PyTorch.
     from splatseed.splat.rendering import ModelRenderer  # noqa: PLC0415  (likewise)

@@ -20,6 +20,7 @@ import numpy as np
 import tyro
 
 from splatseed.commands import next_steps
+from splatseed.commands.models import check_free
 from splatseed.commands.next_steps import Commands, Planned
 from splatseed.commands.options import parse_options, refuse
 from splatseed.console import OUT, StageClock, print_note, print_pairs, print_table, stage_display
@@ -27,7 +28,6 @@ from splatseed.depthmap import DepthKind, DepthMaps
 from splatseed.errors import SplatseedError
 from splatseed.io import find_depths, load_scene
 from splatseed.io.seeds import was_upsampled
-from splatseed.io.staging import check_parents
 from splatseed.literal import counted, quoted, visible
 from splatseed.progress import Progress
 from splatseed.scene import Scene
@@ -132,7 +132,8 @@ def _read(options: Options) -> Scene:
         fix = f"Try {quoted(f'{options.picture.stem}.png')}."
         wrong = options.picture.suffix.lower() != ".png"
         refuse((wrong, "a file that ends in .png, for --picture", visible(name), fix))
-        check_parents(options.picture)
+        inputs = [each for each in (options.scene, options.depth) if each is not None]
+        check_free(options.picture, protect=inputs, fix="Choose another name, or remove it.")
     scene = load_scene(options.scene, require_points=False)
     if options.depth is None:
         return scene

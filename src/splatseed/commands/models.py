@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from splatseed.errors import OutputError, SceneNotFoundError
+from splatseed.errors import OutputError, SceneFormatError, SceneNotFoundError
 from splatseed.io.files import odd_kind
 from splatseed.io.load import is_scene
 from splatseed.io.masks import NONE
-from splatseed.io.staging import check_parents
+from splatseed.io.staging import check_apart, check_parents
 from splatseed.literal import quoted
 from splatseed.train.folder import RunFolder
 
@@ -36,11 +36,23 @@ def model_file(path: Path) -> Path:
     )
 
 
-def check_free(path: Path, *, overwrite: bool) -> None:
-    """Refuse a file that may not be written, before any work is done."""
+def check_free(
+    path: Path,
+    *,
+    overwrite: bool = False,
+    protect: Sequence[Path] = (),
+    fix: str = "Pass --overwrite to replace it, or choose another name.",
+) -> None:
+    """Refuse a file that may not be written, before any work is done.
+
+    It may not be one of ``protect`` or lie in one. ``fix`` is told where a file is there.
+    """
+    check_apart(path, protect)
     check_parents(path)
+    if path.exists() and not path.is_file():
+        found = "a folder" if path.is_dir() else "no regular file"
+        raise OutputError(f"a file name at {path}", found=found, fix="Choose another name.")
     if path.exists() and not overwrite:
-        fix = "Pass --overwrite to replace it, or choose another name."
         raise OutputError(f"no file at {path}", found="one", fix=fix)
 
 
@@ -54,6 +66,9 @@ def config_of(path: Path) -> Mapping[str, Any]:
         return {}
     config = folder.read_config()
     masks = config.get("masks")
+    if not isinstance(masks, str | None):
+        expected = f"masks of {folder.config} to name a folder"
+        raise SceneFormatError(expected, found=str(masks), fix="Train again with --overwrite.")
     if config.get("refine_poses") is True and masks != NONE:
         masks = None  # the scene with refined poses has the chosen ones
     return {**config, "scene": folder.scene_of(config), "masks": masks}

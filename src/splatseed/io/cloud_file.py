@@ -291,6 +291,13 @@ class LineCloud(CloudFile):
             for name in block.keys() & self._types.keys():
                 kind = self._types[name]
                 values = block[name] if kind.kind == "f" else block[name].astype(np.int64)
+                if kind == np.uint8 and (values != values.astype(kind)).any():
+                    wrong = int((values != values.astype(kind)).argmax())
+                    raise SceneFormatError(
+                        f"{name} from 0 to 255 in row {given + wrong + 1:,} of {self.path}",
+                        found=f"{values[wrong]}",
+                        fix="Correct the row, or export the cloud again.",
+                    )
                 block[name] = values.astype(kind)
         return block
 

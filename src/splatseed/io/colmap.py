@@ -348,7 +348,7 @@ def _text_images(path: Path) -> Iterator[tuple[Any, ...]]:
         # The last image of a file cut by an editor may lack its empty feature line.
         below, features = next(lines, (where, ""))
         fields = features.split()
-        with _parsed(below, "X Y POINT3D_ID triples", fields):
+        with _parsed(below, "X Y POINT3D_ID triples, or a blank line, after an image", fields):
             triples = np.array(fields, object).reshape(-1, 3)
             xy, ids = triples[:, :2].astype(np.float64), triples[:, 2].astype(np.int64)
         yield where, image_id, pose, camera_id, name, Observations(xy, ids)

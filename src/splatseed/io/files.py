@@ -70,6 +70,8 @@ def odd_kind(path: Path) -> str:
         mode = path.stat().st_mode
     except OSError as error:
         return "a link that leads back to itself" if error.errno == errno.ELOOP else ""
+    except ValueError:  # a NUL, or half a character
+        return "a name that no file can have"
     return "" if stat.S_ISREG(mode) or stat.S_ISDIR(mode) else _kind(mode)
 
 

@@ -357,16 +357,19 @@ def similarity_in(path: Path, content: Any, scene: Scene, fix: str) -> Similarit
         matrix = np.concatenate([matrix[:3] * float(scale), np.eye(4)[3:]])
         transforms = scene.source.transforms_path if scene.source else None
         if path.name == NERFSTUDIO and transforms is not None:
-            applied = read_json(transforms, fix=fix).get("applied_transform", np.eye(4)[:3])
-            applied = np.vstack([np.array(applied, np.float64)[:3], np.eye(4)[3:]])
+            applied = read_json(transforms, fix=fix).get("applied_transform")
+            applied = np.eye(4) if applied is None else np.array(applied, np.float64)
+            applied = np.vstack([applied[:3], np.eye(4)[3:]])
             matrix = matrix @ np.linalg.inv(applied)
         world = similarity_of(matrix)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         world = None
     if world is None:
         expected = (
             f"{path} to hold a similarity (rotation, shift and one scale; no shear, no mirror): 3"
             " or 4 rows of 4 numbers, by themselves or as transform, with a scale beside them"
         )
-        raise SceneFormatError(expected, found=repr(rows)[:80], fix=fix)
+        found = repr(rows)
+        found = found if len(found) <= 80 else f"{found[:77]}..."
+        raise SceneFormatError(expected, found=found, fix=fix)
     return world

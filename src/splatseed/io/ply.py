@@ -124,7 +124,12 @@ def open_ply(path: Path) -> CloudFile:
     dtype = header.dtype(vertex)
     if header.byte_order:
         return RowCloud(path, dtype, header.size, vertex.num_rows)
-    whole = {n: np.dtype(np.int64) for n in names if dtype[n].kind in "iu" and n not in XYZ}
+    # Bytes stay so; what is declared wider may hold any range.
+    whole = {
+        n: dtype[n] if dtype[n] == np.uint8 else np.dtype(np.int64)
+        for n in names
+        if dtype[n].kind in "iu" and n not in XYZ
+    }
     return LineCloud(path, names, header.size, vertex.num_rows, types=whole)
 
 

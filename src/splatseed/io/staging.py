@@ -47,6 +47,7 @@ _NOBODYS = re.compile(
 _FULL = dict.fromkeys((errno.ENOSPC, errno.EDQUOT), "Free some space, or choose another disk.")
 _FORBIDDEN = (errno.EACCES, errno.EPERM, errno.EROFS)
 _FIXES = _FULL | dict.fromkeys(_FORBIDDEN, "Choose a folder that you may write to.")
+_FIXES[errno.ENAMETOOLONG] = "Choose a shorter name."
 _LOG = logging.getLogger(__name__)
 
 
@@ -176,7 +177,7 @@ def check_apart(path: Path, protect: Sequence[Path]) -> None:
         held = target == source or target in source.parents
         if held or (source in target.parents and source != here):
             raise OutputError(
-                "an output folder apart from the input and the working directory",
+                "an output apart from the input and the working directory",
                 found=f"{target}, which {'holds or is' if held else 'lies in'} {source}",
                 fix="Choose a folder beside it.",
             )

@@ -346,11 +346,13 @@ def export_scene(run: Run, model_dir: Path, staging: Path, *, distinct: bool = T
         num_written,
         num_images,
     )
-    if num_written() != num_images:  # pycolmap only logs an image that it could not write
+    if num_written() != num_images:  # pycolmap only logs an image that it could not read or write
+        names = [image.name for image in pycolmap.Reconstruction(model_dir).images.values()]
+        missing = sorted(name for name in names if not (dense / "images" / name).is_file())
         raise errors.OutputError(
             f"{num_images} undistorted images to be written",
-            found=f"{num_written()}",
-            fix="Free some space on the output's disk, or choose another.",
+            found=f"{num_written()}, without {', '.join(missing[:3])}",
+            fix="Check that these photographs open, and that there is space on the output's disk.",
         )
     (staging / "sparse").mkdir()
     (dense / "sparse").rename(staging / "sparse" / "0")

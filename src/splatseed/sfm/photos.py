@@ -245,6 +245,6 @@ def _frames(
         said = " ".join(str(error).split())
         raise SceneFormatError(
             f"{video} to be a video that ffmpeg reads",
-            found=said[-120:] or type(error).__name__,
+            found=(said if len(said) <= 120 else f"...{said[-117:]}") or type(error).__name__,
             fix="Convert it to .mp4 (H.264), or pass a folder of photographs.",
         ) from None

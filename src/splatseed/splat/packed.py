@@ -323,8 +323,9 @@ def decode_spz(path: Path) -> Gaussians:
             body = _zstd_body(data, count, [size for size in sizes if size])
         else:  # up to the size in the header: no zip bomb is unpacked
             body = stream.decompress(stream.unconsumed_tail, wanted)
-        complete = in_zstd or stream.eof or stream.decompress(stream.unconsumed_tail, 1)
-        if len(body) != wanted or not complete:
+        if not (in_zstd or stream.eof):  # to its checksum, and past what a newer version may add
+            stream.decompress(stream.unconsumed_tail, wanted)
+        if len(body) != wanted or not (in_zstd or stream.eof):
             raise ValueError(f"a stream that ends after {len(body):,} of {wanted:,} bytes")
         parts = np.split(np.frombuffer(body, np.uint8), count * np.cumsum(sizes)[:-1])
         position, opacity, color, scale, turn, sh = (part.reshape(count, -1) for part in parts)

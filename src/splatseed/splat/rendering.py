@@ -8,7 +8,7 @@ viewing on CPU and CUDA alike; no step waits for what is copied to a GPU.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 from weakref import WeakKeyDictionary
@@ -222,6 +222,17 @@ def write_render(
         Image.fromarray(np.concatenate(row, axis=1)).save(partial)
 
 
-def picture_name(image_name: str) -> str:
-    """The file name of an image's picture; folders in the name become part of it."""
-    return Path(image_name).with_suffix("").as_posix().replace("/", "_") + ".png"
+def picture_names(image_names: Iterable[str]) -> dict[str, str]:
+    """The file name of each image's picture; folders in an image's name become part of it.
+
+    Where a.jpg and a.jpeg would have the same, the later one becomes a-2.png.
+    """
+    pictures: dict[str, str] = {}  # the image of each picture
+    for name in image_names:
+        stem = Path(name).with_suffix("").as_posix().replace("/", "_")
+        picture, number = f"{stem}.png", 1
+        while picture in pictures:
+            number += 1
+            picture = f"{stem}-{number}.png"
+        pictures[picture] = name
+    return {name: picture for picture, name in pictures.items()}

@@ -94,7 +94,7 @@ class RunFolder:
         try:
             config = json.loads(read_text(self.config))
             found = type(config).__name__
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, RecursionError) as error:
             config, found = None, type(error).__name__
         if not isinstance(config, dict):
             raise SceneFormatError(

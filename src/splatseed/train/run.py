@@ -38,7 +38,7 @@ from splatseed.scene import Scene
 from splatseed.scores import CurvePoint, EvalResult, TrainingResult
 from splatseed.splat.formats import write_model
 from splatseed.splat.gaussians import TrainingFrame, stray_note, stray_views, training_frame
-from splatseed.splat.rendering import picture_name, write_render
+from splatseed.splat.rendering import picture_names, write_render
 from splatseed.splat.ssim import WINDOW
 from splatseed.train.device import check_fits, pick_device
 from splatseed.train.folder import Record, RunFolder, write_curve_csv, write_curve_png
@@ -339,6 +339,7 @@ class TrainingRun:
         self._board: Any = None  # TensorBoard's writer, if asked for
         self._saved, self._saved_step = time.monotonic(), state.step or None
         train, test = ([frame.view(view) for view in part] for part in views)
+        self._pictures = picture_names(view.name for view in test)
         self.trainer = Trainer(state, settings, train, test, self._on_record)
 
     def log_to_tensorboard(self) -> None:
@@ -402,7 +403,7 @@ class TrainingRun:
         state, folder, views = self.state, self.folder, self.trainer.test_views
         with self.told():
             progress("score", 0.0)
-            folder.claim([folder.renders / picture_name(view.name) for view in views])
+            folder.claim([folder.renders / name for name in self._pictures.values()])
             scores = score(self.trainer.render, views, on_view=self._draw)
             world = self._frame.gaussians_to_world(gaussians_of(state.params))
             result = TrainingResult(
@@ -427,7 +428,7 @@ class TrainingRun:
     def _draw(
         self, view: View, render: Float32[np.ndarray, "H W 3"], errors: Float32[np.ndarray, "H W"]
     ) -> None:
-        path = self.folder.renders / picture_name(view.name)
+        path = self.folder.renders / self._pictures[view.name]
         write_render(path, view.photograph, render, errors)
 
     def _on_record(self, record: Record) -> None:

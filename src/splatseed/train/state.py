@@ -141,8 +141,9 @@ def save_checkpoint(path: Path, state: TrainState) -> None:
     }
     if state.exposures is not None:
         content["exposures"] = state.exposures.transforms
-    with atomic_file(path) as partial:
-        torch.save(content, partial)
+    # Given a file, PyTorch passes on what the disk says; given a name, only that it failed.
+    with atomic_file(path) as partial, partial.open("wb") as file:
+        torch.save(content, file)
 
 
 def load_checkpoint(

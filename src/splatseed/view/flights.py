@@ -142,9 +142,10 @@ def path_of_file(
         for i, frame in enumerate(content["camera_path"]):
             world_from_gl = np.array(frame["camera_to_world"], np.float64).reshape(4, 4)
             fov, rotation = np.radians(float(frame.get("fov", 50))), world_from_gl[:3, :3]
-            if not np.isfinite(world_from_gl).all() or not 0 < fov < np.pi:
+            if not 0 < fov < np.pi:
                 raise ValueError(f"camera {i} with a field of view of {frame.get('fov')}")
-            if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3:
+            skewed = np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3
+            if skewed or not np.isfinite(world_from_gl).all():
                 raise ValueError(f"camera {i}, whose matrix is no rotation")
             pose = np.linalg.inv(world_from_gl @ OPENCV_FROM_OPENGL)
             views.append(pinhole_view(size, fov, world.inverse.camera(pose) if world else pose))
@@ -280,11 +281,15 @@ def write_video(
             str(partial), size, fps=fps, quality=QUALITY, macro_block_size=2,
             ffmpeg_log_level="error", output_params=["-movflags", "+faststart"],
         )  # fmt: skip
+        sent = 0
         try:
             with closing(writer):  # also when stopped: ffmpeg must end before its file is removed
                 writer.send(None)
-                for frame in frames:
+                for sent, frame in enumerate(frames, 1):  # noqa: B007  (the last number counts)
                     writer.send(np.ascontiguousarray(frame))
+            # Whether ffmpeg could write the end of the file, imageio-ffmpeg does not tell.
+            if (whole := imageio_ffmpeg.count_frames_and_secs(str(partial))[0]) != sent:
+                raise RuntimeError(f"{whole} of {sent} frames written")  # noqa: TRY301
         except (OSError, RuntimeError) as error:  # ffmpeg ended early
             raise OutputError(
                 f"{path} to be written",

@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal, get_args
 
 import tyro
 
+from splatseed.commands.models import check_free
 from splatseed.commands.options import MaskChoice, check_least, parse_options, refuse
 from splatseed.commands.upsample import output
 from splatseed.commands.upsample.cloud import load_cloud
@@ -21,7 +22,7 @@ from splatseed.io import find_depths, load_originals, write_scene
 from splatseed.io.clouds import open_cloud
 from splatseed.io.load import with_own_depths
 from splatseed.io.masks import with_masks
-from splatseed.io.staging import check_output, check_parents
+from splatseed.io.staging import check_output
 from splatseed.literal import counted, quoted, visible
 from splatseed.runtime.memory import bytes_of
 from splatseed.scene import Scene
@@ -177,7 +178,7 @@ def run(arguments: list[str]) -> None:
     protect = [path for path in inputs if path is not None]
     check_output(options.output, kind="upsample", overwrite=options.overwrite, protect=protect)
     if options.gaussians is not None:
-        check_parents(options.gaussians)
+        check_free(options.gaussians, overwrite=options.overwrite, protect=protect)
     for file in options.cloud_files:
         open_cloud(file)  # reads headers only: what is wrong is told before work begins
     source = find_source(options, methods)
@@ -222,8 +223,6 @@ def _check(options: Options) -> None:
             (inside, "a file outside the scene that is written, for the initial Gaussians",
              f"{start} in {folder}, where some trainers read any .ply as points",
              "Name a file beside the folder."),
-            (start.exists() and not options.overwrite, f"no file at {start}", "one",
-             "Choose another name, or pass --overwrite."),
         )  # fmt: skip
 
 
