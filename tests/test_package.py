@@ -76,7 +76,7 @@ def test_what_to_install_is_for_this_python_and_for_the_whole_extra(monkeypatch,
     with pytest.raises(MissingDependencyError, match="the package torch; found no torch") as caught:
         require("torch")
     wanted = (
-        "'torch>=2.4' 'gsplat>=1.5.3,<1.6' 'torchmetrics>=1.4' 'flip-evaluator>=1.7' 'pandas>=2.2' "
+        "'torch>=2.5' 'gsplat>=1.5.3,<1.6' 'torchmetrics>=1.4' 'flip-evaluator>=1.7' 'pandas>=2.2' "
         "'jinja2>=3.1'"
     )
     assert caught.value.fix.startswith(f"Install it (extra train): {start} {wanted}.")

@@ -59,9 +59,9 @@ def main(arguments: list[str] | None = None) -> None:
         if not _ends_gpu_memory(error):
             raise
         _fail(
-            "expected enough memory on the GPU; found none left. Take smaller photographs "
-            "(--data-factor) or fewer Gaussians, end other programs on the GPU, or pass "
-            "--backend cpu where the verb has it."
+            "expected enough memory on the GPU; found none left. Use smaller photographs "
+            "(--data-factor) or fewer Gaussians, close other programs on the GPU, or pass "
+            "--backend cpu if the verb has it."
         )
     except BrokenPipeError:  # who reads the output has read enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # or Python reports it once more at exit

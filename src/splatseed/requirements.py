@@ -13,14 +13,14 @@ from splatseed.literal import quoted
 
 EXTRAS = {
     "train": (
-        "torch>=2.4",
+        "torch>=2.5",
         "gsplat>=1.5.3,<1.6",
         "torchmetrics>=1.4",
         "flip-evaluator>=1.7",
         "pandas>=2.2",
         "jinja2>=3.1",
     ),
-    "depth": ("torch>=2.4", "transformers>=5.18"),
+    "depth": ("torch>=2.5", "transformers>=5.18"),
     "view": ("viser>=1.1", "zstandard>=0.22", "imageio-ffmpeg>=0.6"),
     "scan": ("laspy>=2.5", "lazrs>=0.6", "pye57>=0.4.13"),
     "sfm": ("pycolmap>=4.0", "imageio-ffmpeg>=0.6"),

@@ -80,7 +80,7 @@ ONE = {"scenes": ("fox",), "gains": {(SFM, 1): 0.0, ("mls", 8): 0.5}, "repeats":
         ([], "0 runs"),
         ([*runs(**ONE), *runs(**ONE, max_steps=2000)], "Set 2: 2,000 steps"),
         ([*runs(**ONE), Run(spec("fox", "mls", 8, repeat=7, **GONE), result(math.inf))],
-         "fox, mls 8x, none, 7"),
+         "fox, mls 8x, none, repeat 8"),
         ([*runs(**ONE), Run(spec("fox", SFM, 1, repeat=8, **GONE), result(25.0, curve=()))],
          "2 to 3 repeats"),
         ([*runs(**ONE), Run(spec("fox", "mls", 8, repeat=6, **GONE))], "Runs still missing: 1"),

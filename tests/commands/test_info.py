@@ -243,7 +243,7 @@ def test_poses_of_a_device_are_to_be_refined(as_by_a_device, tmp_path, splatseed
     assert not poses["error"]["exact"]
     assert 0.1 < poses["error"]["degrees"] < 1
     told = splatseed("info", path).out
-    assert "photographs miss each other by about" in told
+    assert "photographs are misaligned by about" in told
     advised = told.partition("next")[2]
     assert f"splatseed upsample {path} --budget" in advised
     assert advised.count("--refine-poses") == 2

@@ -271,7 +271,7 @@ def test_a_capture_has_its_own_maps_and_needs_no_points(rgbd, surfaces, tmp_path
     maps = ("--depth", rgbd / "results", "--depth-scale", 5000)
     run = splatseed("upsample", out, *lift, 9, *maps, "-o", tmp_path / "again")
     assert run.code == 0, run.err
-    assert "None is an original: the 700 points that splatseed added" in run.out
+    assert "No original points: the 700 points that splatseed added" in run.out
     assert len(load_scene(tmp_path / "again").points) == 9
     mls, none = ("upsample", out, "--method", "mls"), "found none: it made all 700"
     for words, says in (

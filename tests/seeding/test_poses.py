@@ -111,7 +111,7 @@ def test_noise_is_measured(room, poses):
     for error, degrees in zip(found, (1.0, 4.0), strict=True):
         assert 0.3 * degrees < error.degrees < 1.3 * degrees
         assert error.px == pytest.approx(focal * np.tan(np.radians(error.degrees)), rel=0.1)
-    assert "--refine-poses may mend that" in found[-1].warning
+    assert "--refine-poses may fix that" in found[-1].warning
 
 
 @pytest.mark.parametrize(("trainer", "num"), [("gsplat", 100_000), ("nerfstudio", 50_000)])

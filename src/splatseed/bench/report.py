@@ -172,7 +172,7 @@ def answer(study: Study) -> tuple[str, ...]:
     if base in means:
         own, other = (means[arm]["seeding"] + means[arm]["training"] for arm in (best.arm, base))
         said[0] += (
-            f" A run takes {own:.0f} s, seeding counted, and {other:.0f} s with {base.label}."
+            f" A run takes {own:.0f} s, seeding included, and {other:.0f} s with {base.label}."
         )
     own = best.arm.seeds == SFM
     rest = [each for each in others if (each.arm.seeds == SFM) != own]
@@ -183,15 +183,15 @@ def answer(study: Study) -> tuple[str, ...]:
     if lead is not None:
         place = "ahead" if lead.mean >= 0 else "behind"
         said.append(
-            f"When {base.label} has finished, seeding counted, {best.arm.label} is "
+            f"Once {base.label} is done, seeding included, {best.arm.label} is "
             f"{abs(lead.mean):.2f} dB {place}{_DOUBTS.get(lead.verdict, '')}."
         )
     if sooner is not None:
         share = math.exp(sooner.mean)
         time = f"{share:.0%} of the time" if share < 1 else f"{share:.2f} times the time"
         said.append(
-            f"It reaches {base.label}'s final PSNR after {time} of the whole run of {base.label}, "
-            f"seeding counted{_DOUBTS.get(sooner.verdict, '')}."
+            f"It reaches {base.label}'s final PSNR in {time} of {base.label}'s whole run, "
+            f"seeding included{_DOUBTS.get(sooner.verdict, '')}."
         )
     elif best.reached < best.runs:
         said.append(f"{best.reached} of its {best.runs} runs reach {base.label}'s final PSNR.")
@@ -273,8 +273,8 @@ def _run_parts(runs: Sequence[Run], found: Sequence[Study]) -> Iterator[Part]:
         ("failed", "Failed runs", failed), ("missing", "Runs still missing", missing)
     ):  # fmt: skip
         rows = [
-            (run.spec.scene.name, run.spec.arm.label, run.spec.arm.strategy, f"{run.spec.repeat}",
-             run.error)
+            (run.spec.scene.name, run.spec.arm.label, run.spec.arm.strategy,
+             f"{run.spec.repeat + 1}", run.error)
             for run in listed[:_LISTED]
         ]  # fmt: skip
         more = len(listed) - len(rows)

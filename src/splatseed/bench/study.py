@@ -168,7 +168,7 @@ def _study(settings: Mapping[str, object], runs: Sequence[Run]) -> Study:
         arm, of = spec.arm, spec.scene
         scene = f"{of.name} ({of.digest[:4]})" if len(digests[of.name]) > 1 else of.name
         if not math.isfinite(result.psnr):
-            odd.append(f"{scene}, {arm.label}, {arm.strategy}, {spec.repeat}")
+            odd.append(f"{scene}, {arm.label}, {arm.strategy}, repeat {spec.repeat + 1}")
             continue
         label = _label(spec, with_maps=several_maps)
         variants.setdefault(label, arm)

@@ -70,9 +70,9 @@ class Options:
     methods: Annotated[tuple[str, ...], _default(_DEFAULT.methods)] = ()
     """Upsampling methods; sfm is the original cloud, with which the others are compared."""
     ratios: Annotated[tuple[float, ...], _default([f"{r:g}" for r in _DEFAULT.ratios])] = ()
-    """Points in all, per original."""
+    """Total points per original."""
     budgets: tuple[str, ...] = ()
-    """Most Gaussians at the end, the same for every arm: such as 50k, or 0.25rho, per pixel of a
+    """Maximum Gaussians at the end, the same for every arm: 50k, or 0.25rho: 0.25 per pixel of a
     photograph at training size. Methods then fill the budget, unless --ratios are given too."""
     strategies: Annotated[tuple[StrategyName, ...], _default(_DEFAULT.strategies)] = ()
     """Densification strategies; -3dgs: in 3DGS's own conventions of rates and schedules."""
@@ -105,7 +105,7 @@ class Options:
     executor: Literal["local", "ray"] = "local"
     """Processes on this machine, or tasks on a Ray cluster (extra cluster)."""
     address: str | None = None
-    """The Ray cluster's, such as auto on its head node; one on this machine alone by default."""
+    """The cluster's address, or auto on its head node; by default a cluster on this machine."""
     jobs: int | None = None
     """Runs at a time: by default one per GPU, else 1; on Ray what fits."""
 
@@ -165,7 +165,7 @@ def parse_plan(arguments: Sequence[str]) -> tuple[Options, Plan]:
         (named and not data, f"--data DIR, the folder of the scenes of {preset}", "none",
          "Name it."),
         (options.address and options.executor != "ray", "--executor ray with --address", "local",
-         "Add it."),
+         "Add --executor ray."),
     )  # fmt: skip
     plan = _DEFAULT
     if preset is not None:

@@ -83,8 +83,8 @@ class Options:
     train_steps: int = 500
     """Training steps; 0 for no training. A random start gets more, for the time of seeding."""
     training: Literal["now", "later", "only"] = "now"
-    """When to train: now, at the end; later, while PyTorch is being installed; only, in a
-    demo folder that was made with later."""
+    """When to train: now, at the end; later, not yet (while PyTorch installs); only, in a
+    demo folder made with later."""
     overwrite: bool = False
     """Replace an output folder that splatseed wrote before."""
 

@@ -77,8 +77,8 @@ class Options:
     device: DeviceName = "auto"
     """Where to run the network; auto takes a usable GPU if there is one."""
     max_size: int | None = None
-    """Photographs with a longer side are reduced to this many pixels, and so are their maps; by
-    default 1600, or 800 with --stereo."""
+    """Maximum pixels on the longer side of photographs, and so of their maps; by default 1600, or
+    800 with --stereo, which divides by a whole number."""
     depth_kind: DepthKind | None = None
     """What the network predicts: planar depth, distance along the ray, or inverse depth; by default
     what its config.json says."""

@@ -50,8 +50,8 @@ class Options:
     a matrix, nerfstudio's dataparser_transforms.json, graphdeco's cameras.json, or gsplat for its
     examples' normalisation; none: score the model where it is, unchanged."""
     masks: MaskChoice = None
-    """A folder of masks, whose pixels of 0 do not count, or none; inverted: those alone count. By
-    default the run's, else those in masks beside the photographs, and transparency."""
+    """A folder of masks, where pixels of 0 do not count, or none; inverted: only they count. By
+    default the run's, else the folder masks beside the photographs, and transparency."""
     lpips_weights: Path | None = None
     """The file of VGG's weights for LPIPS, or its folder; by default PyTorch's cache."""
     backend: Backend = "auto"

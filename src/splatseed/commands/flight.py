@@ -44,8 +44,8 @@ class Options:
     """The scene a file of Gaussians belongs to, for its cameras; a run knows its own. Without
     cameras, the video circles around the Gaussians."""
     path: Annotated[Path | None, tyro.conf.arg(metavar="FILE|orbit")] = None
-    """Instead of past the cameras: a camera path in nerfstudio's JSON, in the model's world or that
-    of --transform; or orbit, to circle around what the cameras look at."""
+    """A camera path to fly instead: nerfstudio's JSON, in the model's world or that of --transform;
+    or orbit, to circle around what the cameras look at."""
     transform: Annotated[str | None, tyro.conf.arg(metavar="FILE|gsplat|none")] = None
     """From the model's world to the path's, by default the same: the dataparser_transforms.json of
     nerfstudio's run, or anything else that evaluate --transform takes."""
@@ -72,7 +72,7 @@ def run(arguments: list[str]) -> None:
         (suffix.lower() not in VIDEO_SUFFIXES, f"the name of a video: {', '.join(VIDEO_SUFFIXES)}",
          suffix or "no suffix", "Name it flight.mp4."),
         (options.path in (None, ORBIT) and options.transform is not None,
-         "--path with --transform", "none", "Leave it out."),
+         "--path with --transform", "none", "Leave --transform out."),
         (not 1 <= options.seconds * FPS <= MOST_FRAMES,
          f"--seconds from {1 / FPS:.2g} to {MOST_FRAMES / FPS:.0f}", f"{options.seconds:g}",
          "Try 10."),

@@ -55,7 +55,7 @@ class Options:
     """Also compare a folder of depth maps, in any layout of docs/formats.md, with the SfM
     points."""
     depth_kind: DepthKind | None = None
-    """What their values are: planar depth, distance along the ray, or inverse depth; by default
+    """What the maps hold: planar depth, distance along the ray, or inverse depth; by default
     what the folder says, else z."""
     depth_scale: float | None = None
     """Stored units per unit of depth: 1000 for millimetres in a scene in metres; by default what
@@ -313,7 +313,7 @@ def _photograph_rows(
     if poses and (poses["error"] is not None or not poses["problem"]):
         agreed = f"at {poses['agreement']:.0%} of the pixels looked at"
         miss = "cannot be told" if poses["error"] is None else f"{poses['error']}"
-        rows += [("photographs agree", agreed), ("they miss by", miss)]
+        rows += [("photographs agree", agreed), ("pose error", miss)]
     return rows
 
 

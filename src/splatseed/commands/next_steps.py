@@ -84,7 +84,7 @@ def advice_commands(
         return first or [("look", f"splatseed view {source}")]
     if advice.method in (AS_IT_IS, "auto") and len(scene.points):
         tune = f"splatseed tune {source} --minutes 30{planned.tuning}"
-        return [*first, ("train", train), ("or ask by experiment", tune)]
+        return [*first, ("train", train), ("or by experiment", tune)]
     return [*first, ("train", train)]
 
 

@@ -30,7 +30,7 @@ class Options:
 
     images: Annotated[Path, tyro.conf.Positional]
     """The folder of photographs, or a video, from which sharp, evenly spread frames are taken. No
-    features are looked for where their masks, in a folder masks beside theirs, are 0."""
+    features are detected where masks (folder masks beside the photographs) are 0."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """The scene folder to write."""
     poses_from: Path | None = None
@@ -41,7 +41,7 @@ class Options:
     """Compare every pair of images (the default for photographs), or each with its successors (for
     a video)."""
     frames: int = 150
-    """Most frames to take from a video."""
+    """Maximum frames from a video."""
     camera_model: str = "OPENCV"
     """COLMAP's model of the lens; not used with --poses-from."""
     shared_camera: bool = True

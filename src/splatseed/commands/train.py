@@ -64,21 +64,21 @@ class Options:
     training: Annotated[TrainSettings, tyro.conf.arg(name="")] = BEST_SETTINGS
     """The settings; its fields are options of their own."""
     budget: Annotated[str | None, tyro.conf.arg(metavar="N|Xrho")] = None
-    """Most Gaussians: a number, or 0.25rho for a quarter of the pixels of a photograph at training
+    """Maximum Gaussians: a number, or 0.25rho for a quarter of a photograph's pixels at training
     size; by default 1rho for strategy auto and 1000000 for grow and mcmc. If there are more seeds,
     they are thinned."""
     long_side: int | None = None
     """Instead of --data-factor: downsample by the least whole factor that leaves at most this many
     pixels on a photograph's longer side."""
     seeds: Seeding | None = None
-    """Start from the scene's points as they are (scene), from those that method auto adds by the
-    training photographs (auto), or as splatseed info advises for this strategy and budget (advised,
-    the default)."""
+    """Start from the scene's points as they are (scene), with those that method auto adds from the
+    training photographs (auto), or as splatseed info advises for this strategy and budget (advised;
+    default)."""
     masks: MaskChoice = None
-    """A folder of masks, whose pixels of 0 do not count, or none; inverted: those alone count. By
-    default those in masks beside the photographs, and transparency."""
+    """A folder of masks, where pixels of 0 do not count, or none; inverted: only they count. By
+    default the folder masks beside the photographs, and transparency."""
     refine_poses: bool = False
-    """Refine poses of a phone or SLAM first, and triangulate points; they replace the scene's."""
+    """First refine a phone's or SLAM's poses and triangulate points; both replace the scene's."""
     resume: bool = False
     """Resume the run in the output folder, with its own settings; begin it if there is none."""
     tensorboard: bool = False
@@ -371,7 +371,7 @@ def _summarise(options: Options, training: TrainingRun, result: TrainingResult) 
     print_pairs("splatseed train", rows)
     if held := result.held_by_memory_at:
         print_note(
-            f"memory held the run at {held:,} Gaussians; results may differ on another machine. "
+            f"memory limited the run to {held:,} Gaussians; results may vary between machines. "
             f"Pass --budget {held} for the same result everywhere."
         )
     print_pairs("next", _next_commands(output))

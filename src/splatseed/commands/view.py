@@ -36,7 +36,7 @@ class Options:
     """A scene, a run folder, a file of Gaussians or points, or a folder that holds several of
     these."""
     compare: Path | None = None
-    """Another to show beside it, from the same camera."""
+    """Show this one beside it, from the same camera."""
     scene: Path | None = None
     """The scene a file of Gaussians belongs to; a run knows its own."""
     host: str = "127.0.0.1"

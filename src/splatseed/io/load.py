@@ -93,7 +93,7 @@ def load_originals(path: str | Path, *, require_points: bool = True) -> Scene:
             found=f"none: it made all {added:,}",
             fix=_TRIANGULATE if scene.images else "Name a scene or a PLY that has other points.",
         )
-    which = f"Only the {len(points):,} originals are used" if len(points) else "None is an original"
+    which = f"Only the {len(points):,} originals are used" if len(points) else "No original points"
     note = f"{which}: the {added:,} points that splatseed added before are replaced."
     return scene.replace(points=points, warnings=(*scene.warnings, note))
 

@@ -141,7 +141,7 @@ def image_warnings(images: Sequence[Image], image_dir: Path | None, root: Path) 
         near, kind = other_spelling(image_dir / first), odd_kind(image_dir / first)
         hint = f"; {near} is there, but names must be equal to the letter" if near else ""
         hint = f", which is {kind}" if kind else hint
-        hint = "; folders are parted by /, as on Linux, not by \\" if "\\" in first else hint
+        hint = "; folders are separated by /, as on Linux, not by \\" if "\\" in first else hint
         warnings.append(
             f"{len(missing)} of {count} images {are} missing in {image_dir}, the first is "
             f"{first}{hint}."

@@ -136,7 +136,7 @@ def find_problems(
     if not added and cloud.isolated > MANY_ISOLATED * max(used, 1):
         problems.append(
             f"{cloud.isolated:,} points ({cloud.isolated / used:.1%}) are isolated: "
-            "outliers or a sparse background; methods that interpolate start nothing from them"
+            "outliers or a sparse background; methods that interpolate never start from them"
         )
     if cloud.num_points == 0:
         problems.append(
@@ -156,8 +156,8 @@ def find_problems(
         if astray:
             problems.append(
                 f"{astray:,} features of the photographs name points, but no point has a track: "
-                "the points were put in later, and a trainer that reads features takes wrong ones "
-                "for them; what splatseed upsample writes of this scene is free of that"
+                "the points were added later, and a trainer that reads features gets wrong ones; "
+                "what splatseed upsample writes of this scene is free of that"
             )
     return tuple(problems)
 

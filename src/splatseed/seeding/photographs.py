@@ -110,10 +110,10 @@ class Stereo(PhotographMethod):
 
 @dataclass(frozen=True)
 class Cover(PhotographMethod):
-    """A seed for every part of every photograph that no point falls in."""
+    """A seed for every cell of every photograph that no point falls in."""
 
     cell: int = 8
-    """Side of such a part, in pixels."""
+    """Side of such a cell, in pixels."""
 
     name: ClassVar[str] = "cover"
 
@@ -134,10 +134,10 @@ class Cover(PhotographMethod):
 
 @dataclass(frozen=True)
 class Auto(Stereo):
-    """Stereo, then cover: a seed for every part of every photograph, on surfaces where possible."""
+    """Stereo, then cover: a seed for every cell of every photograph, on surfaces where possible."""
 
     cell: int = 8
-    """Side in pixels of the parts that get a seed if no point falls in."""
+    """Side of a cell in pixels; a cell without points gets a seed."""
 
     name: ClassVar[str] = "auto"
 

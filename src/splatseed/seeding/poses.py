@@ -72,8 +72,8 @@ class PoseError:
         if self.exact:
             return ""
         return (
-            f"The photographs miss each other by about {self} at these poses, and comparing them "
-            "needs half a pixel: --refine-poses may mend that."
+            f"The photographs are misaligned by about {self} at these poses, and comparing them "
+            "needs half a pixel: --refine-poses may fix that."
         )
 
 

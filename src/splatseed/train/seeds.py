@@ -87,7 +87,7 @@ def seeded(
     if saw_all_photographs(scene):
         note(
             "The seeds were made from all photographs, test views included, which may flatter the "
-            "score: train the scene itself, or hold views out of them, as by --auto.hold-out 8."
+            "score: train the scene itself, or seed without test views: --auto.hold-out 8."
         )
     if settings.seeding == "scene" or why_not_seeded(scene, settings):
         return scene, None
@@ -152,7 +152,7 @@ def usable_seeds(
         kept = f", {seeds.num_original:,} of them originals" if first else ""
         room = "" if most == cap else f"; strategy {settings.densification} adds the rest"
         note(
-            f"{len(crowd):,} seeds were thinned to {most:,}{kept}: there may be {cap:,} Gaussians"
+            f"{len(crowd):,} seeds were thinned to {most:,}{kept}: the limit is {cap:,} Gaussians"
             f"{room}."
         )
     used = {"sizes": settings.seed_sizes, "normals": settings.seed_normals}
@@ -330,8 +330,8 @@ def known_depths(
     share = np.mean([np.isfinite(depth).mean() for depth in known.values()])
     took = "" if stereo else f" ({seconds:.0f} s)"
     note(
-        f"Stereo knows the depth of {share:.0%} of the pixels{took}: strategy grow places most of "
-        "what it adds there. placing = none only splits."
+        f"Stereo found the depth of {share:.0%} of the pixels{took}: strategy grow puts most of "
+        'what it adds there. placing = "none" only splits.'
     )
     # Stereo's depths are in world units; unknown ones, NaN, become 0.
     return {

@@ -69,7 +69,7 @@ class TrainSettings:
     data_factor: int = 1
     """Divide the width and height of the photographs by this whole number."""
     seed: int = 0
-    """On the CPU the same seed gives the same bytes."""
+    """Random seed; on the CPU, runs repeat exactly."""
     cap_max: tyro.conf.Suppress[int | None] = None  # the option is --budget
     """Most Gaussians, by default 1000000 for grow and mcmc; if there are more seeds, they are
     thinned."""
@@ -96,8 +96,8 @@ class TrainSettings:
     seed_colors: tyro.conf.Suppress[bool] = False
     """Start with the colours that the training photographs show for each seed, by direction."""
     start: Annotated[str | None, tyro.conf.arg(metavar="MODEL|RUN")] = None
-    """Go on from trained Gaussians instead of points: a run, or a file of any trainer, edited or
-    not, of this scene. Holes are filled where the strategy adds Gaussians."""
+    """Continue from trained Gaussians instead of points: a run, or any trainer's file of this
+    scene, edited or not. Holes are filled where the strategy adds Gaussians."""
     seeding: tyro.conf.Suppress[Seeding] = "scene"  # the option is --seeds, "advised" by default
     """Start from the scene's points as they are, let method ``auto`` add the points that the
     training photographs need, or do what ``splatseed info`` advises. Points that splatseed has

@@ -72,8 +72,8 @@ def started_gaussians(
     if cap is not None and count > cap:
         gaussians = gaussians.select(_contributing_most(gaussians, views, cap, device))
         note(
-            f"Of {count:,} Gaussians the {cap:,} that contribute most are kept: there may be no "
-            "more under the budget."
+            f"Of {count:,} Gaussians the {cap:,} that contribute most are kept: the budget allows "
+            "no more."
         )
     return gaussians, near_depths(gaussians.means, views)
 

@@ -141,9 +141,12 @@ def save_checkpoint(path: Path, state: TrainState) -> None:
     }
     if state.exposures is not None:
         content["exposures"] = state.exposures.transforms
-    # Given a file, PyTorch passes on what the disk says; given a name, only that it failed.
     with atomic_file(path) as partial, partial.open("wb") as file:
-        torch.save(content, file)
+        try:
+            torch.save(content, file)
+        except RuntimeError as error:  # PyTorch's own, that its file is cut off, hides the disk's
+            disk = error.__context__
+            raise (disk if isinstance(disk, OSError) else error) from None
 
 
 def load_checkpoint(

@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from itertools import pairwise
 from pathlib import Path
 
@@ -287,9 +287,12 @@ def write_video(
                 writer.send(None)
                 for sent, frame in enumerate(frames, 1):  # noqa: B007  (the last number counts)
                     writer.send(np.ascontiguousarray(frame))
-            # Whether ffmpeg could write the end of the file, imageio-ffmpeg does not tell.
-            if (whole := imageio_ffmpeg.count_frames_and_secs(str(partial))[0]) != sent:
-                raise RuntimeError(f"{whole} of {sent} frames written")  # noqa: TRY301
+            # imageio-ffmpeg does not tell whether ffmpeg could write the end of the file.
+            whole = 0
+            with suppress(RuntimeError):
+                whole, _ = imageio_ffmpeg.count_frames_and_secs(str(partial))
+            if whole != sent:
+                raise RuntimeError(f"{whole} of {sent} frames")  # noqa: TRY301
         except (OSError, RuntimeError) as error:  # ffmpeg ended early
             raise OutputError(
                 f"{path} to be written",

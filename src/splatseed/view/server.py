@@ -171,7 +171,7 @@ class _LiveEntry(Entry):
         try:
             return future.result(PATIENCE)
         except (TimeoutError, CancelledError):
-            return None, ENDED if not self._open else "The current step takes long."
+            return None, ENDED if not self._open else "The current step is slow."
 
     def serve(self, wait: float = 0.0) -> None:
         """Draw what was asked for, waiting up to ``wait`` seconds for the first request."""

@@ -135,4 +135,4 @@ def test_interrupted_it_says_what_is_kept_and_goes_on(cloud, tmp_path, splatseed
     assert run.err.strip().startswith(f"interrupted. {told}")
     assert "half-written" not in run.err
     run = splatseed(*words)
-    assert f"Going on with the work in {tmp_path / 'out.tiles'}" in run.out
+    assert f"Resuming the work in {tmp_path / 'out.tiles'}" in run.out

@@ -90,7 +90,7 @@ def box(num, rng):
 @pytest.mark.parametrize(
     ("case", "says"),
     [
-        ("another place", "one alignment of the cloud that is sure"),
+        ("another place", "one reliable alignment of the cloud"),
         ("a box that looks alike from several sides", "several that fit"),
         ("few points of a cloud", "at least 1,000 points apart"),
         ("few points of a scene", "at least 200 points of the scene's own"),

@@ -63,7 +63,7 @@ def test_points_on_surfaces_stay_and_ghosts_go(room, room_capture, seeds):
     assert np.mean(off > 0.05) < 0.002
     near = np.linalg.norm(new.xyz - (0.6, -0.6, 0.9), axis=1) < 0.1
     assert np.count_nonzero(near) <= 3
-    assert any("have another colour" in note and "lie alone" in note for note in notes)
+    assert any("differ in colour" in note and "lie alone" in note for note in notes)
 
 
 def test_without_colours_ghosts_are_told_by_what_lies_behind(room, room_capture, scan, tmp_path):

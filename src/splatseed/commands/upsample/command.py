@@ -60,51 +60,51 @@ class Options:
     method: str = DEFAULT_METHOD
     """The method that makes new points; --method NAME --help shows its own options."""
     ratio: float | None = None
-    """Points in all over originals, for methods that interpolate: 4, unless --num-points says how
-    many."""
+    """Total points per original point, for methods that interpolate; 4 unless --num-points is
+    given."""
     num_points: int | None = None
-    """Points in all, not a ratio."""
+    """Total points, not a ratio."""
     budget: Annotated[str | None, tyro.conf.arg(metavar="N|Xrho")] = None
-    """Most points in all: a number, or 0.25rho for a quarter of a full photograph's pixels."""
+    """Maximum points: a number, or 0.25rho for a quarter of a full-size photograph's pixels."""
     cover_cell: Annotated[int | None, tyro.conf.arg(name="cover")] = None
-    """Side in pixels of the parts of the photographs that get a seed if no point falls in; auto and
+    """Cell side in pixels: each cell of a photograph that no point falls in gets a seed; auto and
     cover have --auto.cell and --cover.cell instead."""
     verify: bool = False
-    """Slide interpolated points to where the photographs agree, and drop those that fit none."""
+    """Move interpolated points to where the photographs agree; drop those that fit nowhere."""
     seed: int = 0
-    """The same seed gives the same bytes."""
+    """Random seed: same seed, same bytes."""
     profile: Profile = "default"
     """Defaults of the methods' options: improved ones, or those of the paper's text."""
     depth_maps: Annotated[Path | None, tyro.conf.arg(name="depth", metavar="DIR")] = None
     """For --method depth: a folder of maps, as docs/formats.md lists them; by default the
     scene's own."""
     depth_kind: DepthKind | None = None
-    """What their values are: planar depth, distance along the ray, or inverse depth; by default
+    """What the maps hold: planar depth, distance along the ray, or inverse depth; by default
     what the folder says, else z."""
     depth_scale: float | None = None
     """Stored units per unit of depth: 1000 for millimetres in a scene in metres; by default what
     the folder says."""
     masks: MaskChoice = None
-    """A folder of masks, whose pixels of 0 do not count, or none; inverted: those alone count. By
-    default those in masks beside the photographs, and transparency."""
+    """A folder of masks, where pixels of 0 do not count, or none; inverted: only they count. By
+    default the folder masks beside the photographs, and transparency."""
     refine_poses: bool = False
-    """Refine poses of a phone or SLAM first, and triangulate points; they replace the scene's."""
+    """First refine a phone's or SLAM's poses and triangulate points; both replace the scene's."""
     cloud_files: Annotated[
         tyro.conf.UseAppendAction[tuple[Path, ...]],
         tyro.conf.arg(name="cloud", metavar="FILE", help_behavior_hint="(repeatable)"),
     ] = ()
-    """Seeds from a scan or dense cloud (docs/scans.md), alone or beside
+    """Seeds from a scan or dense cloud (docs/scans.md), alone or with
     auto, stereo, cover or depth."""
     cloud_transform: Annotated[Path | None, tyro.conf.arg(name="transform")] = None
     """For --cloud: a 4x4 matrix from its frame to the scene's, as text or JSON, or nerfstudio's
     dataparser_transforms.json."""
     align: bool = False
-    """For --cloud: find that matrix, by the scene's own points."""
+    """For --cloud: find --transform from the scene's points."""
     recenter: bool = False
     """Write scene and cloud around 0, with the offset in recenter.json: for national grids."""
     memory: Annotated[str | None, tyro.conf.arg(metavar="BYTES|4G")] = None
-    """Most memory, by default what is free: larger clouds are upsampled in tiles on disk; --cloud
-    merges more points (in at most 4G by default)."""
+    """Memory limit, by default what is free: larger clouds are upsampled in tiles on disk; --cloud
+    merges within it (at most 4G by default)."""
     jobs: int | None = None
     """Tiles at a time, each in a process of its own; by default as many as cores and memory
     allow."""
@@ -113,7 +113,7 @@ class Options:
     address: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT|auto")] = None
     """The cluster's address, or auto on one of its nodes; by default a cluster on this machine."""
     tile_points: int | None = None
-    """Most points in a tile; by default what the memory allows."""
+    """Maximum points per tile; by default what memory allows."""
     preview: bool = False
     """Also write pictures: before and after, origins, cells covered, the method's stereo maps."""
     gaussians: Path | None = None
@@ -123,7 +123,7 @@ class Options:
     copy_images: bool = False
     """Copy images, do not link them."""
     overwrite: bool = False
-    """Replace an output of splatseed's."""
+    """Replace an earlier output."""
 
     @property
     def memory_bytes(self) -> int | None:
@@ -198,14 +198,14 @@ def _check(options: Options) -> None:
     framed = moved or options.align or options.recenter or method == CLOUD
     refuse(
         (folder.suffix.lower() in FILES and not folder.is_dir(),
-         "a folder after -o, as a whole scene is written", f"{folder}, the name of a file",
-         f"Pass -o {quoted(folder.parent / folder.stem)}: the points lie there as a .ply too."),
+         "a folder for -o, as a whole scene is written", f"{folder}, the name of a file",
+         f"Pass -o {quoted(folder.parent / folder.stem)}: a .ply of the points is included."),
         (options.address is not None and options.executor != "ray",
-         "--executor ray with --address", "local", "Add it."),
+         "--executor ray with --address", "local", "Add --executor ray."),
         (cell is not None and cell < 1, "--cover of 1 or more", cell, "Try --cover 8."),
         (cell is not None and method in COVERING,
-         f"--{method}.cell for method {method}, which covers by itself", f"--cover {cell}",
-         f"Say --{method}.cell {cell} instead."),
+         f"--{method}.cell for method {method}, which already covers", f"--cover {cell}",
+         f"Use --{method}.cell {cell} instead."),
         (maps and options.depth_maps is None,
          "--depth DIR, which --depth-kind and --depth-scale refer to", "none", "Name the folder."),
         (framed and not options.cloud_files, "--cloud FILE", "none", "Name the scan."),

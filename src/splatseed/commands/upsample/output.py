@@ -211,7 +211,7 @@ def summarise(
         print_note(note)
     if report.layout == "transforms":
         print_note(
-            "The commands of gsplat's examples, graphdeco's code and LichtFeld are for COLMAP's "
+            "The commands for gsplat's examples, graphdeco's code and LichtFeld need COLMAP's "
             "layout: --format colmap."
         )
     tell_training(options.scene, scene, output, report.layout)

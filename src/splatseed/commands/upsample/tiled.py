@@ -152,7 +152,7 @@ def run_tiled(options: Options, methods: Mapping[str, Upsampler], source: Source
             )
             if resumed:
                 done = counted(len(list((path / "made").glob("*[0-9]"))), "tile")
-                print_note(f"Going on with the work in {visible(path)}: {done} done.")
+                print_note(f"Resuming the work in {visible(path)}: {done} done.")
             with stage_display(clock, remaining=True):
                 tiled = tiles.make_tiled(path, source, request, plan, workers, clock)
                 report = _write(options, method, source, tiled, clock)

@@ -147,10 +147,10 @@ def align(scene: Scene, paths: Sequence[Path], progress: Progress = silent) -> C
                 "another"
             )
     if polished is None:
-        raise _unsure("it free to slide: there is little but one plane")
+        raise _unsure("one free to slide: the scene is nearly planar")
     if (error := _error(polished, small.xyz)) > SURE:
         raise _unsure(
-            f"it free to slide by {error:.2%} of the scene's extent: there is little but one plane"
+            f"one free to slide by {error:.2%} of the scene's extent: the scene is nearly planar"
         )
     # The offset in double precision, then to unit size.
     centred = Similarity(1.0, np.eye(3), -offset).then(unit_of_cloud)
@@ -166,8 +166,8 @@ def align(scene: Scene, paths: Sequence[Path], progress: Progress = silent) -> C
 
 
 def _unsure(found: str) -> PointCloudError:
-    fix = "Give the transform with --transform FILE, or bring more of the scene in both."
-    return PointCloudError("one alignment of the cloud that is sure", found=found, fix=fix)
+    fix = "Give the transform with --transform FILE, or cover more of the scene in both."
+    return PointCloudError("one reliable alignment of the cloud", found=found, fix=fix)
 
 
 def _candidates(surface: Surface, marks: Points, progress: Progress) -> list[Fitted]:

@@ -374,8 +374,8 @@ def _against(
     against = np.zeros_like(past)
     counts = {}
     named = {
-        "are seen past": past,
-        "have another colour than the photographs": other,
+        "are seen through": past,
+        "differ in colour from the photographs": other,
         "look different in every photograph": torn,
     }
     for reason, which in named.items():

@@ -142,7 +142,7 @@ class GivenClouds(Cloud):
             notes.append(f"The cloud has {lacks}: colours are those of the photographs.")
         share = covered_share(frames, xyz, CELL, silent)
         if share < CORNER:
-            hint = ": --method auto beside --cloud seeds the rest" if self.alone else ""
+            hint = ": --method auto with --cloud seeds the rest" if self.alone else ""
             notes.append(f"The cloud covers {share:.0%} of the photographs{hint}.")
         return NewPoints(
             xyz, rgb, tuple(notes),
