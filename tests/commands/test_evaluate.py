@@ -77,7 +77,8 @@ def test_a_run_that_is_not_whole_is_refused(run_folder, splatseed, tmp_path):
         (tmp_path / name).write_bytes((run_folder / name).read_bytes())
     _says(splatseed("evaluate", tmp_path), f"-o {tmp_path} --resume")
     (tmp_path / "point_cloud.ply").write_bytes((run_folder / "point_cloud.ply").read_bytes())
-    for content in ("[]", "{", '{"scene": 7}', '{"scene": "x", "data_factor": "two"}'):
+    deep, masks = 9**6 * "[", '{"scene": "x", "masks": 5}'
+    for content in ("[]", "{", '{"scene": 7}', '{"scene": "x", "data_factor": "two"}', deep, masks):
         (tmp_path / "config.json").write_text(content)
         _says(splatseed("evaluate", tmp_path))
 
@@ -94,3 +95,6 @@ def test_outputs_are_not_overwritten_unless_told_to(model, room, splatseed, tmp_
     assert splatseed(*words, "--overwrite").code == 0
     names = [s["name"] for s in json.loads(scores.read_text())["per_image"]]
     assert names == [s["name"] for s in json.loads(before)["per_image"]]
+    for taken in (model, room / "images" / names[0], room / "scores.json"):
+        run = splatseed("evaluate", model, "--scene", room, "-o", taken, "--overwrite")
+        _says(run, "apart from the input")

@@ -73,6 +73,7 @@ HEAD = (
     "ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nproperty float y\n"
     "property float z\nend_header\n"
 )
+BYTES = "property uchar red\nproperty uchar green\nproperty uchar blue\nend_"
 ASCII = HEAD.replace("binary_little_endian", "ascii").replace("vertex 1", "vertex 2") + "1 2 3\n"
 
 # Captures
@@ -152,6 +153,7 @@ BAD = {
         HEAD.replace("vertex 1", f"vertex {2**60}") + 24 * "x",
         HEAD.replace("end_header", "property uint packed_position\nend_header") + 99 * "x",
         *(ASCII + rest for rest in ("", "1 2\n", "1 2 x\n")),
+        ASCII.replace("3\n", "3 4 5 300\n").replace("vertex 2", "vertex 1").replace("end_", BYTES),
     ],
     "a.pfm": [
         *(b"Pf\n" + rest for rest in (b"", b"0 1\n-1\n", b"999999999 999999999\n-1\n")),

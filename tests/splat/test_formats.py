@@ -157,6 +157,8 @@ def test_what_is_no_model_is_named(files, tmp_path):
     bare = b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nend_header\n"
     many = bytearray(gzip.decompress(files[".spz"]))
     many[8:12] = b"\xff\xff\xff\x7f"
+    turned = bytearray(files[".spz"])
+    turned[len(turned) // 3] ^= 255  # what is unpacked may be longer
     broken = _gaussians(9)
     broken.means[3, 1] = np.nan
     write_model(tmp_path / "nan.ply", broken)
@@ -169,6 +171,7 @@ def test_what_is_no_model_is_named(files, tmp_path):
         *((f"cut{suffix}", files[suffix][:-7], "cut") for suffix in SUFFIXES),
         ("m.ply", files[".compressed.ply"].replace(b" min_g", b" mim_g"), "min_g"),
         ("many.spz", gzip.compress(bytes(many)), "memory|ends"),
+        ("turned.spz", bytes(turned), "whole"),
         ("b.ply", files[".ply"].replace(b"f_dc_1", b"f_dc_9"), "f_dc_1"),
         ("c.ply", bare + bytes(4), "trained Gaussians"),
         ("nan.ply", (tmp_path / "nan.ply").read_bytes(), "Gaussian 3"),

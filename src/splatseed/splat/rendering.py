@@ -226,6 +226,10 @@ def picture_names(image_names: Iterable[str]) -> dict[str, str]:
     """The file name of each image's picture; folders in an image's name become part of it.
 
     Where a.jpg and a.jpeg would have the same, the later one becomes a-2.png.
+
+    Example:
+        >>> picture_names(["a/b.jpg", "a_b.jpg", "a/c.jpg"])
+        {'a/b.jpg': 'a_b.png', 'a_b.jpg': 'a_b-2.png', 'a/c.jpg': 'a_c.png'}
     """
     pictures: dict[str, str] = {}  # the image of each picture
     for name in image_names:
