@@ -118,6 +118,7 @@ def test_a_run_of_an_older_version_resumes_with_its_own_settings(room_path, begu
         ({"strategy": "absgrad"}, "--strategy"),
         ({"max_steps": "3"}, "config.json"),
         ({"seeds": {"count": 1, "digest": "0"}}, "the scene that the run began with"),
+        ({"photographs": "0"}, "photographs or poses"),
         (None, "checkpoint.pt"),
     ],
 )

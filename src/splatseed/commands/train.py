@@ -48,7 +48,7 @@ BEST: StrategyName = "auto"
 """The default strategy."""
 HOST, PORT = "127.0.0.1", 8080
 """Where browsers watch, if the port is free."""
-RUN_NOTES = {"splatseed", "points", "device", "versions"}
+RUN_NOTES = {"splatseed", "points", "photographs", "device", "versions"}
 """What config.json records besides options."""
 BEST_SETTINGS = replace(DEFAULT, strategy=BEST)
 

@@ -8,6 +8,7 @@ scene's world; the end of a GPU's memory is told in a sentence, with a number to
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import platform
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -240,11 +241,24 @@ def make_config(
         **dataclasses.asdict(settings),
         "device": device,
         "seeds": dict(seeds),
+        "photographs": _photographs_digest(scene),
         "versions": {
             "python": platform.python_version(),
             **{name: _version(name) for name in ("torch", "gsplat", "numba", "numpy")},
         },
     }
+
+
+def _photographs_digest(scene: Scene) -> str:
+    """A fingerprint of lenses, poses and the sizes of the files, which a resumed run must find."""
+    digest = hashlib.blake2b(digest_size=16)
+    folder = scene.source.image_dir if scene.source else None
+    for image in scene.images:
+        lens, path = image.intrinsics, folder and folder / image.name
+        size = path.stat().st_size if path and path.is_file() else None
+        digest.update(f"{image.name} {lens.params} {lens.width} {lens.height} {size}".encode())
+        digest.update(image.quat.tobytes() + image.translation.tobytes())
+    return digest.hexdigest()
 
 
 def _version(package: str) -> str | None:
@@ -291,6 +305,8 @@ def _check_begun(
     if begun and begun.get("seeds") != config["seeds"]:
         which = f"Gaussians in {config['start']}" if config["start"] else ""
         raise _another_scene(folder, begun, which or f"points in {config['scene']}")
+    if begun and begun.get("photographs") != config["photographs"]:
+        raise _another_scene(folder, begun, f"photographs or poses in {config['scene']}")
 
 
 def _as_masked(scene: Scene, begun: Mapping[str, Any]) -> Scene:
