@@ -256,7 +256,8 @@ def _photographs_digest(scene: Scene) -> str:
     for image in scene.images:
         lens, path = image.intrinsics, folder and folder / image.name
         size = path.stat().st_size if path and path.is_file() else None
-        digest.update(f"{image.name} {lens.params} {lens.width} {lens.height} {size}".encode())
+        facts = f"{image.name!r} {lens.params} {lens.width} {lens.height} {size}"
+        digest.update(facts.encode())  # repr escapes what is no UTF-8 in a name
         digest.update(image.quat.tobytes() + image.translation.tobytes())
     return digest.hexdigest()
 
