@@ -294,7 +294,8 @@ def _prepare(
                     raise
                 notes.append(f"{scene.label} is left out: {error}")
     if not present:
-        expected, found = f"scenes of {options.preset} in {options.data}", "; ".join(notes)
+        expected = f"scenes of {options.preset} in {options.data}"
+        found = f"none of {', '.join(scene.label for scene in plan.scenes)}"
         raise SceneNotFoundError(expected, found=found, fix="Name the folder that holds them.")
     plan = replace(plan, scenes=tuple(scene for scene, _ in present))
     scenes = [facts for _, facts in present]

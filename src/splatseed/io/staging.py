@@ -222,6 +222,11 @@ def remove(path: Path) -> None:
         for child in (Path(parent, name) for name in names):
             if not child.is_symlink():  # what a link names is the user's
                 child.chmod(0o700)
+    for child in path.iterdir():  # the manifest last: what a kill leaves can still be replaced
+        if child.is_dir() and not child.is_symlink():
+            shutil.rmtree(child)
+        elif child.name != MANIFEST:
+            child.unlink()
     shutil.rmtree(path)
 
 

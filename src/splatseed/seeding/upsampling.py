@@ -295,9 +295,12 @@ def parse_budget(budget: str | float, pixels: float) -> int:
     except ValueError:
         number = math.nan
     if not (0.5 < number <= MOST) or (not unit and number < 1):
+        fix = f"Did you mean {text}rho?" if not unit and 0 < number < 1 else "Give 1 or more."
+        if unit == RHO and not pixels:
+            fix = "Give a number of points: there are no photographs whose pixels could be counted."
         raise ParameterError(
             "a budget such as 50000, 50k, or 0.25rho (a quarter of the pixels of an image)",
-            found=f"{budget!r}, of {pixels:,.6g} pixels" if unit == RHO else repr(budget),
-            fix=f"Did you mean {text}rho?" if not unit and 0 < number < 1 else "Give 1 or more.",
+            found=repr(budget),
+            fix=fix,
         )
     return round(number)
