@@ -102,13 +102,13 @@ class Results:
         index = pd.MultiIndex.from_tuples(places, names=["scene", "ratio"])
         return pd.DataFrame(rows, index=index, columns=list(methods), dtype=float)
 
-    def mean(self, way: Way, scene: str, label: str, measure: str) -> float:
-        """Mean over repeats of a column of ``Study.runs``; NaN without runs."""
+    def repeats(self, way: Way, scene: str, label: str, measure: str) -> pd.Series[float]:
+        """A column of ``Study.runs`` by repeat; empty without runs."""
         study = self.study(way.strategy)
         if study is None:
-            return math.nan
+            return pd.Series(dtype=float)
         part = study.under(way.strategy)
-        return float(part.loc[(part["scene"] == scene) & (part["seeds"] == label), measure].mean())
+        return part.loc[(part["scene"] == scene) & (part["seeds"] == label), measure]
 
 
 def read_results(benches: Iterable[Path]) -> Results:
