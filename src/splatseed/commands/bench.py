@@ -72,8 +72,9 @@ class Options:
     ratios: Annotated[tuple[float, ...], _default([f"{r:g}" for r in _DEFAULT.ratios])] = ()
     """Total points per original."""
     budgets: tuple[str, ...] = ()
-    """Maximum Gaussians at the end, the same for every arm: 50k, or 0.25rho: 0.25 per pixel of a
-    photograph at training size. Methods then fill the budget, unless --ratios are given too."""
+    """Maximum Gaussians at the end, the same for every arm: 50k, or 0.25rho for a quarter of a
+    photograph's pixels at training size. Methods then fill the budget, unless --ratios are given
+    too."""
     strategies: Annotated[tuple[StrategyName, ...], _default(_DEFAULT.strategies)] = ()
     """Densification strategies; -3dgs: in 3DGS's own conventions of rates and schedules."""
     profiles: Annotated[tuple[Profile, ...], _default(_DEFAULT.profiles)] = ()

@@ -179,7 +179,7 @@ def check_apart(path: Path, protect: Sequence[Path]) -> None:
             raise OutputError(
                 "an output apart from the input and the working directory",
                 found=f"{target}, which {'holds or is' if held else 'lies in'} {source}",
-                fix="Choose a folder beside it.",
+                fix="Choose a place outside of it.",
             )
 
 

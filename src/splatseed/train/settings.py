@@ -71,7 +71,7 @@ class TrainSettings:
     seed: int = 0
     """Random seed; on the CPU, runs repeat exactly."""
     cap_max: tyro.conf.Suppress[int | None] = None  # the option is --budget
-    """Most Gaussians, by default 1000000 for grow and mcmc; if there are more seeds, they are
+    """Maximum Gaussians, by default 1000000 for grow and mcmc; if there are more seeds, they are
     thinned."""
     backend: Backend = "auto"
     """Where to train; auto takes a GPU if PyTorch sees one."""
