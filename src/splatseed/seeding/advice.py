@@ -4,7 +4,7 @@
 scene. ``advise`` depends only on the measurements and the plan, so that it can be tested against a
 benchmark's runs. The rules rest on validation views of eight captures at 1,500 steps
 (benchmarks/README.md): where Structure-from-Motion left room, on six, ``auto`` gained -0.12 to 0.50
-dB under 3DGS's densification, 0.23 on average, and -0.36 to 0.28 under strategy ``grow``, -0.06 on
+dB under 3DGS's densification, 0.24 on average, and -0.30 to 0.28 under strategy ``grow``, -0.02 on
 average; where its points alone filled the budget (bonsai, treehill), adding points cost up to 0.4
 dB.
 """
