@@ -17,7 +17,7 @@ from typing import NamedTuple
 import pandas as pd
 
 from splatseed.bench.comparisons import gains
-from splatseed.bench.plan import DEPTH, Arm
+from splatseed.bench.plan import ANY_RATIO, DEPTH, Arm
 from splatseed.bench.runs import Run, read_runs
 from splatseed.bench.statistics import Difference
 from splatseed.bench.study import Study, studies
@@ -77,7 +77,7 @@ class Results:
         """The ratios that are planned on some scenes."""
         names = set(scenes)
         known = {run.spec.arm.ratio for run in self.runs if run.spec.scene.name in names}
-        return tuple(sorted(known - {1.0}))
+        return tuple(sorted(known - {1.0, ANY_RATIO}))
 
     def label(self, way: Way, method: str, ratio: float) -> str:
         """The label in a study of a way's arm; a method whose profiles are the same has one arm."""
@@ -117,5 +117,5 @@ def read_results(benches: Iterable[Path]) -> Results:
     Raises:
         SceneNotFoundError: One of them is not a benchmark's.
     """
-    runs = [run for bench in benches for run in read_runs(bench)]
+    runs = list({run.spec.key: run for bench in benches for run in read_runs(bench)}.values())
     return Results(runs, studies(runs))

@@ -19,7 +19,7 @@ from benchmarks.paper.gained import Results
 
 from splatseed.bench.plan import DEPTH
 from splatseed.bench.statistics import Difference, adjusted, over_scenes
-from splatseed.bench.tables import Row, Table
+from splatseed.bench.tables import Number, Row, Table
 
 __all__ = ["GUIDELINES", "Guideline", "at_ratio", "verdict_table", "verdicts"]
 
@@ -139,7 +139,7 @@ def _told(guideline: Guideline, test: Difference | None) -> str:
     exact = f"= {test.adjusted:.3f}" if test.adjusted >= 0.001 else "< 0.001"
     p = "" if math.isnan(test.adjusted) else f", p {exact}"
     scenes = f"{test.n} scene{'s' if test.n > 1 else ''}"
-    return f"{verdict}: {test.mean - guideline.margin:+.2f}{spread} dB, {scenes}{p}"
+    return f"{verdict}: {Number(test.mean - guideline.margin, signed=True)}{spread} dB, {scenes}{p}"
 
 
 def verdict_table(results: Results) -> Table:

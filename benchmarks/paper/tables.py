@@ -44,8 +44,8 @@ PRINTED = {"train_time_s": "paper: training, s", "model_size_mb": "paper: model,
 DIGITS = {**dict(zip(COSTS, (2, 0, 0, 1), strict=True)), **dict.fromkeys(PRINTED, 0)}
 """Of table 3."""
 GAIN_NOTE = (
-    "dB ± standard error: of a scene over repeats (none of one), of a mean over scenes. ~: within "
-    "noise (Holm over all cells of scenes, and over each row of means)."
+    "dB ± standard error: of a scene over repeats (none of one), of a mean over its column's "
+    "scenes. ~: within noise (Holm over all cells of scenes, and over a strategy's means in a row)."
 )
 SCORE_NOTE = (
     "PSNR in dB / SSIM / LPIPS where its weights are there, then what PSNR gains; means over "
@@ -143,7 +143,10 @@ def _by_ratio(
             rows.append((scene, shown, *_marked(scored, [None, *gained])))
             if scene in theirs.index and any(kind in theirs for kind in kinds):
                 own = [Number(theirs.loc[scene].get(kind, math.nan)) for kind in _with_sfm(kinds)]
-                more = [replace(e, text=f"({e.value - own[0].value:+.2f})") for e in own[1:]]
+                more = [
+                    replace(e, text=f"({Number(e.value - own[0].value, signed=True)})")
+                    for e in own[1:]
+                ]
                 rows.append((f"{scene}, paper", shown, *_marked([own[0], *more])))
         blank = ("",) if full else ()
         rows.append(("mean", shown, *blank, *_mean_gains(results, way, scenes, kinds)))

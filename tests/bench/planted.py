@@ -47,7 +47,8 @@ def spec(
 ):
     values = {"max_steps": 1000, "backend": "cpu", "data_factor": 4, **changes}
     own = {name: values.pop(name) for name in set(values) - set(SHARED)}
-    facts = SceneFacts(own.pop("path", ""), scene, digest=own.pop("digest", f"{scene}0123"))
+    facts = SceneFacts(own.pop("path", ""), scene, digest=own.pop("digest", f"{scene}0123"),
+                       cloud_digest=own.pop("scan", ""))  # fmt: skip
     arm, training = Arm(method, profile, ratio, strategy, budget), TrainSettings(**values)
     return RunSpec(facts, arm, repeat, training, **{"version": "0.1.0", **own})
 

@@ -19,7 +19,7 @@ from splatseed.bench import pictures as pictures_module
 from splatseed.bench.figures import arm_figure, curve_figure, scene_figure, seconds_figure
 from splatseed.bench.plan import SFM
 from splatseed.bench.report import REPORT, write_report
-from splatseed.bench.runs import Run, run_folder
+from splatseed.bench.runs import Run, alone_in, run_folder
 from splatseed.bench.scenes import scene_digest
 from splatseed.bench.study import studies
 from splatseed.cli import main
@@ -108,6 +108,11 @@ def test_others_files_are_not_replaced_and_bad_folders_are_one_error(tmp_path):
     next(tmp_path.glob("c/runs/*/result.json")).write_text("{}")
     with pytest.raises(SceneFormatError, match=r"result\.json"):
         write_report(tmp_path / "c")
+    (bench / "planned.json").write_text('{"calls": [], "runs": [{}]}')
+    with pytest.raises(SceneFormatError, match=r"planned\.json"):
+        write_report(bench)
+    with alone_in(bench), pytest.raises(OutputError, match="no other process"), alone_in(bench):
+        pass
 
 
 def test_the_commands_say_what_they_found(tmp_path, capsys):

@@ -95,6 +95,8 @@ def test_runs_of_other_settings_are_never_paired():
     assert sizes["data_factor"] == {"bonsai": 2, "fox": 4}
     both = one([*fox, *runs(scenes=FOX, digest="zz99")])
     assert both.scenes == ("fox (fox0)", "fox (zz99)")
+    renamed = one([*fox, *runs(scenes=("a/fox",), digest="fox0123")])
+    assert (renamed.scenes, len(renamed.runs)) == (FOX, len(fox))
 
 
 def test_parameters_and_profiles_are_variants_of_their_own():
@@ -105,13 +107,14 @@ def test_parameters_and_profiles_are_variants_of_their_own():
             ("mls", {"parameters": {"k": 12}}), ("mls", {"profile": "paper"}),
             ("depth", {"parameters": {"hold_out": 8, "cloud.hold_out": 8}}),
             ("depth", {"parameters": {"hold_out": 4}}),
+            ("cloud", {"scan": "aaaa1"}), ("cloud", {"scan": "bbbb2"}),
         )
         for run in runs(scenes=FOX, gains={(method, 8): 0.1}, **changes)
     ]  # fmt: skip
     study = one([*runs(scenes=FOX, repeats=2), *more])
     assert list(study.seeded) == [
         "linear 8x", "mls 4x", "mls 8x", "mls 8x k=12", "mls 8x (paper)", "depth 8x",
-        "depth 8x hold_out=4", "random 8x",
+        "depth 8x hold_out=4", "random 8x", "cloud 8x scan=aaaa", "cloud 8x scan=bbbb",
     ]  # fmt: skip
     assert study.description.endswith("splatseed 0.1.0, 2 to 3 repeats")
 
@@ -177,6 +180,10 @@ def test_every_arm_stands_beside_one_baseline():
     assert order == sorted(order, reverse=True)
     assert unequal_numbers(study) is None
     assert "3,000 to 5,000 Gaussians" in unequal_numbers(budgeted(plain=3000))
+    base = {(SFM, 1): 0.0}
+    numbers = [(runs(scenes=FOX), 5000), (runs(scenes=("big",), gains=base), 9000)]
+    equal = [Run(r.spec, result(9.0, num_gaussians=n)) for each, n in numbers for r in each]
+    assert unequal_numbers(one(equal)) is None
 
 
 def test_time_counts_seeding_and_steps_do_not():
@@ -214,6 +221,8 @@ def test_the_answer_names_the_worst_scene_and_the_seconds():
         for run in runs(scenes=(scene,), gains={(SFM, 1): 0.0, ("mls", 8): gain}, noise=0.0)
     ]
     assert "; on fern, its worst scene, 0.25 dB less. A run takes 20 s" in answer(one(finished))[0]
+    easy = runs(scenes=FOX, gains={("depth", 8): 0.9}, noise=0.0)  # on one scene only
+    assert answer(one([*finished, *easy]))[0] == answer(one(finished))[0]
 
 
 def advised(**room):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
+import shutil
 from contextlib import contextmanager
 
 import numpy as np
@@ -195,6 +196,8 @@ def test_it_names_the_winner_and_goes_on_where_it_was_stopped(
     assert "--budget 70 --max-steps 32" in out
     main(words)
     assert here["done"] == 8  # nothing is done twice
-    with pytest.raises(SystemExit):
-        main([*words, "--budget", "80"])
-    assert "was begun with" in capsys.readouterr().err
+    other = shutil.copytree(scene_path, tmp_path / "other" / scene_path.name)
+    for others in ([*words, "--budget", "80"], ["tune", str(other), *words[2:]]):
+        with pytest.raises(SystemExit):
+            main(others)
+        assert "was begun with" in capsys.readouterr().err

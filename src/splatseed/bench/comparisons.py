@@ -8,7 +8,7 @@ equals it; seconds count making the seeds. Runs that never do are counted, as a 
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from importlib.resources import files
@@ -86,11 +86,14 @@ def _adjusted(family: Mapping[Key, Difference | None]) -> dict[Key, Difference]:
 
 
 def clear_best(study: Study, strategy: StrategyName, scene: str) -> bool:
-    """Whether a scene's best arm is better than every other one beyond noise."""
+    """Whether a scene's best arm is better than every other one beyond noise.
+
+    Not while runs of one are missing.
+    """
     scores = study.scores(strategy, scene)
     noise, df = statistics.pooled_noise(scores.to_numpy())
     complete = scores.dropna()
-    if len(complete) < 2:
+    if len(complete) < max(2, len(scores.dropna(how="all"))):
         return False
     second, first = complete.mean(axis=1).sort_values().iloc[-2:]
     lead = difference(first - second, noise * math.sqrt(2 / complete.shape[1]), df, 1)
@@ -206,6 +209,16 @@ def compared_arms(study: Study) -> tuple[ComparedArm, ...]:
         on_scene = dict(part.groupby("scene")["psnr_gain"].mean().sort_values(kind="stable"))
         compared.append(ComparedArm(arm, scenes, len(part), means, of_arm, on_scene, reached))
     return tuple(sorted(compared, key=lambda each: -each.gain.mean))
+
+
+def rivals(study: Study) -> list[ComparedArm]:
+    """The arms but the baseline that were run on as many scenes as any, the best first.
+
+    The mean of an arm that was run on some scenes only says nothing about it beside the others.
+    """
+    others = [each for each in compared_arms(study) if each.arm != baseline_of(study)]
+    widest = max(others, key=lambda each: len(each.scenes), default=None)
+    return [each for each in others if widest and each.scenes == widest.scenes]
 
 
 def _timed(base: RunResult, own: RunResult, spec: RunSpec) -> tuple[float, float, float]:
@@ -340,6 +353,7 @@ def compare(a: Sequence[Run], b: Sequence[Run]) -> Comparison | None:
     first, second = both = min(
         pairs, key=lambda pair: (len(_differing(*pair)), -len(_places(pair[0]) & _places(pair[1])))
     )
+    apart = [len({id(pair[i]) for pair in pairs}) - 1 for i in (0, 1)]
     variants = {**first.variants, **second.variants}
 
     def ordered(places: set[Place]) -> list[Place]:
@@ -353,17 +367,21 @@ def compare(a: Sequence[Run], b: Sequence[Run]) -> Comparison | None:
     settings = _differing(*both)
     scores = [{(r.spec.key, r.result.psnr) for r in runs if r.result} for runs in (a, b)]
     same = len(scores[0] & scores[1])
-    digests = [
-        {scene: spec.scene.digest for scene, spec in each.runs[["scene", "spec"]].to_numpy()}
-        for each in both
-    ]
-    shared = sorted(digests[0].keys() & digests[1].keys())
+    digests, beside = [dict[str, str](), dict[str, str]()], [dict[str, str](), dict[str, str]()]
+    for i, study in enumerate(both):
+        for scene, label, spec in study.runs[["scene", "seeds", "spec"]].to_numpy():
+            digests[i][scene] = spec.scene.digest
+            beside[i][f"{scene}, {label}"] = spec.scene.depth_digest + spec.scene.cloud_digest
     notes = [
         "" if settings else "All settings are the same.",
         "" if changes else "They have no scene and method in common.",
         f"{counted(same, 'run')} in both, with the same key and score." if same else "",
         *(f"{scene} is not the same in both: its points, cameras or photographs differ."
-          for scene in shared if digests[0][scene] != digests[1][scene]),
+          for scene in _unequal(*digests)),
+        *(f"{place}: its depth maps or its scan are not the same in both."
+          for place in _unequal(*beside)),
+        f"Other sets of runs are not compared: {apart[0]} of A, {apart[1]} of B." if any(apart)
+        else "",
     ]  # fmt: skip
     return Comparison(
         settings,
@@ -375,14 +393,27 @@ def compare(a: Sequence[Run], b: Sequence[Run]) -> Comparison | None:
     )  # fmt: skip
 
 
+def _unequal(a: Mapping[str, str], b: Mapping[str, str]) -> list[str]:
+    return sorted(name for name in a.keys() & b.keys() if a[name] != b[name])
+
+
 def _places(study: Study) -> set[Place]:
     return set(study.runs[["strategy", "seeds", "scene"]].itertuples(index=False, name=None))
 
 
 def _differing(a: Study, b: Study) -> tuple[tuple[str, str, str], ...]:
-    names = dict.fromkeys([*a.settings, *b.settings])
-    values = ((name, a.settings.get(name), b.settings.get(name)) for name in names)
+    one, other = (_settings(each, {*a.scenes} & {*b.scenes}) for each in (a, b))
+    values = ((name, one.get(name), other.get(name)) for name in one | other)
     return tuple((name, str(x), str(y)) for name, x, y in values if x != y)
+
+
+def _settings(study: Study, scenes: Iterable[str]) -> dict[str, object]:
+    """A study's settings, with the sizes of some scenes alone."""
+    told, factors = dict(study.settings), study.settings["data_factor"]
+    if isinstance(factors, Mapping):
+        sizes = {scene: factors[scene] for scene in sorted(scenes)}
+        told["data_factor"] = sizes if len(set(sizes.values())) != 1 else min(sizes.values())
+    return told
 
 
 def _change(a: Study, b: Study, place: Place) -> Difference:

@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import UInt8
 
-from splatseed.bench.comparisons import baseline_of, compared_arms
+from splatseed.bench.comparisons import baseline_of, rivals
 from splatseed.bench.figures import shown_seeds
 from splatseed.bench.guidelines import Descriptors, describe
 from splatseed.bench.job import make_seeds, open_unchanged
@@ -61,8 +61,7 @@ def scene_pictures(bench: Path, study: Study, progress: Progress = silent) -> Sc
         specs: dict[str, RunSpec] = {label: first[label] for label in shown[:_MOST]}
         any_run: RunSpec = runs["spec"].iloc[0]
         digest = any_run.scene.digest
-        told = [digest, *((name, each.repeat, each.scene.depth_digest, each.version)
-                          for name, each in specs.items())]  # fmt: skip
+        told = [digest, *((name, each.key) for name, each in specs.items())]
         key = hashlib.blake2b(json.dumps(told).encode(), digest_size=8).hexdigest()
         name = re.sub(r"[^\w.-]+", "_", f"clouds_{scene}_{key}")  # a scene's can have slashes
         with suppress(OSError):
@@ -130,7 +129,7 @@ class ComparedView(NamedTuple):
 def compared_views(study: Study, bench: Path) -> list[ComparedView]:
     """A view of each scene, the lowest gain first; none where the runs' pictures are gone."""
     base, views = baseline_of(study), []
-    best = next((each for each in compared_arms(study) if each.arm != base), None)
+    best = next(iter(rivals(study)), None)
     if base is None or best is None:
         return []
     specs = study.runs.set_index(["strategy", "seeds", "scene", "repeat"])["spec"].to_dict()

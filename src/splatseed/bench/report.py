@@ -18,13 +18,20 @@ from typing import Any, TypeAlias
 import jinja2
 
 from splatseed.bench import figures, pictures, study_tables
-from splatseed.bench.comparisons import ArmKey, ComparedArm, baseline_of, compared_arms, gains
+from splatseed.bench.comparisons import (
+    ArmKey,
+    ComparedArm,
+    baseline_of,
+    compared_arms,
+    gains,
+    rivals,
+)
 from splatseed.bench.guidelines import guideline_table, guidelines, winner_table
 from splatseed.bench.plan import SFM
 from splatseed.bench.plan_file import PLAN
 from splatseed.bench.runs import Run, counts, read_calls, read_runs
 from splatseed.bench.study import Study, studies
-from splatseed.bench.tables import Table, to_html, write_table
+from splatseed.bench.tables import Number, Table, to_html, write_table
 from splatseed.io.files import read_text
 from splatseed.io.staging import atomic_file, output_folder
 from splatseed.literal import counted
@@ -145,20 +152,22 @@ class _Page:
 
 def unequal_numbers(study: Study) -> str | None:
     """A warning that the arms end with different numbers of Gaussians; None if they do not."""
-    numbers = [each.means["gaussians"] for each in compared_arms(study)]
-    if not numbers or max(numbers) <= min(numbers) * (1 + _EQUAL):
+    numbers = study.runs.groupby(["scene", "strategy", "seeds"])["gaussians"].mean()
+    ends = numbers.groupby("scene").agg(["min", "max"])
+    scene = (ends["max"] / ends["min"]).idxmax() if len(ends) else ""
+    if not scene or ends["max"][scene] <= ends["min"][scene] * (1 + _EQUAL):
         return None
     hint = "" if study.settings["budget"] else ": --budgets bounds every arm alike"
     return (
-        f"The arms end with {min(numbers):,.0f} to {max(numbers):,.0f} Gaussians, and more of them "
-        f"alone can bring a gain{hint}."
+        f"On {scene} the arms end with {ends['min'][scene]:,.0f} to {ends['max'][scene]:,.0f} "
+        f"Gaussians, and more of them alone can bring a gain{hint}."
     )
 
 
 def answer(study: Study) -> tuple[str, ...]:
     """The conclusions on a study, for a reader who has not seen the tables."""
     base = baseline_of(study)
-    others = [each for each in compared_arms(study) if each.arm != base]
+    others = rivals(study)
     if base is None or not others:
         return (f"Nothing can be compared yet: runs of {SFM} are missing, or all others.",)
     best = others[0]
@@ -181,10 +190,11 @@ def answer(study: Study) -> tuple[str, ...]:
         said.append(f"{kind}, {rest[0].arm.label} does best: {_against(rest[0], base)}.")
     lead, sooner = best.gains["in_time"], best.gains["seconds"]
     if lead is not None:
-        place = "ahead" if lead.mean >= 0 else "behind"
+        place = f"{abs(lead.mean):.2f} dB {'ahead' if lead.mean > 0 else 'behind'}"
+        place = place if abs(lead.mean) >= _SHOWN else "level with it"
         said.append(
-            f"Once {base.label} is done, seeding included, {best.arm.label} is "
-            f"{abs(lead.mean):.2f} dB {place}{_DOUBTS.get(lead.verdict, '')}."
+            f"Once {base.label} is done, seeding included, {best.arm.label} is {place}"
+            f"{_DOUBTS.get(lead.verdict, '')}."
         )
     if sooner is not None:
         share = math.exp(sooner.mean)
@@ -326,7 +336,7 @@ def _views(view: pictures.ComparedView) -> Part:
     base, best, _ = view.pictures
     caption = (
         f"{view.scene}, test view {view.name}: {base} on the left, {best} on the right "
-        f"({view.gain:+.2f} dB over all test views of this scene)."
+        f"({Number(view.gain, signed=True)} dB over all test views of this scene)."
     )
     urls, errors = (
         {name: _url(content, "image/jpeg") for name, content in each.items()}

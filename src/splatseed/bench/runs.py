@@ -12,8 +12,8 @@ import os
 import platform
 import shlex
 import socket
-from collections.abc import Iterable, Sequence
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
@@ -24,11 +24,20 @@ from typing import Any
 from splatseed.bench.plan import RunResult, RunSpec
 from splatseed.errors import OutputError, SceneFormatError, SceneNotFoundError
 from splatseed.io.files import read_text
-from splatseed.io.staging import MANIFEST, check_apart, check_output, read_manifest, write_json
+from splatseed.io.staging import (
+    MANIFEST,
+    check_apart,
+    check_output,
+    held,
+    read_manifest,
+    write_json,
+)
 from splatseed.literal import counted
 
 RESULT, ERROR = "result.json", "error.json"
 _PLANNED = "planned.json"
+_OTHER_LAYOUT = (ValueError, KeyError, TypeError, AttributeError)
+"""What reading JSON of another version raises."""
 _PACKAGES = ("splatseed", "torch", "gsplat", "torchmetrics", "numpy", "scipy", "numba", "ray")
 
 
@@ -62,17 +71,30 @@ def _read(folder: Path, spec: RunSpec | None = None) -> Run:
                 if name == ERROR:
                     return Run(own, error=str(content["error"]))
                 return Run(own, RunResult.from_dict(content["result"]))
-            except (ValueError, KeyError, TypeError, AttributeError) as error:
-                expected = f"{folder / name} as this version of splatseed writes it"
-                found = f"another layout ({type(error).__name__}: {error})"
+            except _OTHER_LAYOUT as error:
                 fix = "Remove that folder to have its run repeated, or begin a new benchmark."
-                raise SceneFormatError(expected, found=found, fix=fix) from None
+                raise _not_ours(folder / name, error, fix) from None
     assert spec is not None  # noqa: S101  (folders are listed by these files)
     return Run(spec)
 
 
+def _not_ours(path: Path, error: Exception, fix: str) -> SceneFormatError:
+    expected = f"{path} as this version of splatseed writes it"
+    return SceneFormatError(
+        expected, found=f"another layout ({type(error).__name__}: {error})", fix=fix
+    )
+
+
+def _planned_runs(bench: Path) -> list[RunSpec]:
+    try:
+        return [RunSpec.from_dict(each) for each in _planned(bench)["runs"]]
+    except _OTHER_LAYOUT as error:
+        fix = "Plan it again with splatseed bench, or begin a new one."
+        raise _not_ours(bench / _PLANNED, error, fix) from None
+
+
 def read_runs(bench: Path) -> list[Run]:
-    """All runs of a benchmark: those of the last plan, in its order, then others that have ended.
+    """All runs of a benchmark: those of the last plan, in its order, then others that are finished.
 
     Raises:
         SceneNotFoundError: There is no benchmark.
@@ -82,9 +104,11 @@ def read_runs(bench: Path) -> list[Run]:
     if kind not in {"bench", "tune"}:
         fix = "Name the folder that splatseed bench wrote."
         raise SceneNotFoundError(f"a benchmark at {bench}", found=kind or "none", fix=fix)
-    runs = [read_run(bench, RunSpec.from_dict(each)) for each in _planned(bench)["runs"]]
+    runs = [read_run(bench, spec) for spec in _planned_runs(bench)]
     known = {run_folder(bench, run.spec).name for run in runs}
-    ended = {path.parent for name in (RESULT, ERROR) for path in bench.glob(f"runs/*/{name}")}
+    # A tuning has runs that no plan lists; else what failed in an earlier plan is no longer asked.
+    told = (RESULT, ERROR) if kind == "tune" else (RESULT,)
+    ended = {path.parent for name in told for path in bench.glob(f"runs/*/{name}")}
     return [*runs, *(_read(each) for each in sorted(ended) if each.name not in known)]
 
 
@@ -113,6 +137,23 @@ def check_bench_folder(folder: Path, verb: str, protect: Sequence[Path]) -> None
         expected = f"the folder of splatseed {verb}, or a new one, at {folder}"
         found = f"what splatseed {kind} wrote"
         raise OutputError(expected, found=found, fix="Choose another folder.")
+
+
+@contextmanager
+def alone_in(bench: Path) -> Iterator[None]:
+    """Keep other processes from carrying out runs of a benchmark's folder while the block runs.
+
+    Raises:
+        OutputError: Another process is at it.
+    """
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(held(bench))
+        except BlockingIOError:
+            fix = "Wait until it ends, stop it, or name another folder."
+            expected = f"no other process that carries out runs in {bench}"
+            raise OutputError(expected, found="one", fix=fix) from None
+        yield
 
 
 def begin(bench: Path, verb: str, specs: Iterable[RunSpec], words: Sequence[str]) -> None:

@@ -18,10 +18,15 @@ import pandas as pd
 
 from splatseed.bench.plan import SFM, SHARED, Arm, RunResult, RunSpec
 from splatseed.bench.runs import Run
-from splatseed.train.settings import StrategyName
+from splatseed.train.settings import StrategyName, TrainSettings
 from splatseed.upsample import METHODS
 
 _COLUMNS = ("strategy", "scene", "seeds", "repeat", "spec", "result")
+_BESIDE = {"maps": "depth_digest", "scan": "cloud_digest"}
+"""What a scene can have beside its photographs, and its fingerprint in ``SceneFacts``."""
+_DEFAULT = TrainSettings()
+_NAMED = ("exposure", "placing")
+"""Settings that are told by their names, where they are not the default."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,8 +80,8 @@ class Study:
     def results(self, strategy: StrategyName, scene: str, label: str) -> dict[int, RunResult]:
         """The results of a variant on a scene by repeat; empty where there are none."""
         part = self.under(strategy)
-        part = part[(part["scene"] == scene) & (part["seeds"] == label)]
-        return dict(sorted(zip(part["repeat"], part["result"], strict=True)))
+        part = part[(part["scene"] == scene) & (part["seeds"] == label)].sort_values("repeat")
+        return dict(zip(part["repeat"], part["result"], strict=True))
 
     def scores(self, strategy: StrategyName, scene: str) -> pd.DataFrame:
         """PSNR of a scene, [A, R]: a row per variant, the baseline first, NaN without a run."""
@@ -96,20 +101,21 @@ class Study:
         for of, each in factors.items():
             sized[f"1/{each} of their" if each != 1 else "full"].append(of)
         budget, is_share = str(told["budget"]), str(told["budget"]).endswith("rho")
-        share = f"{budget.removesuffix('rho')} Gaussians per pixel of a photograph"
-        most = share if is_share else f"{int(budget or 0):,} Gaussians"
+        share = f"{budget.removesuffix('rho')} for each pixel of a photograph"
+        most = share if is_share else f"{int(budget or 0):,}"
         counts = self.runs.groupby(["strategy", "scene", "seeds"]).size()
         low, high = counts.min(), counts.max()
         repeats = f"{high}" if low == high else f"{low} to {high}"
         words = [
             f"{told['max_steps']:,} steps",
             *(f"{', '.join(names)} at {size} size" for size, names in sized.items()),
-            f"every {told['test_every']}th view tested",
-            f"at most {told['cap_max']:,} Gaussians" if told["cap_max"] else "",
-            f"at most {most}" if budget else "",
+            f"one view in {told['test_every']} tested",
+            f"Gaussians: at most {told['cap_max']:,}" if told["cap_max"] else "",
+            f"Gaussians: at most {most}" if budget else "",
             f"spherical harmonics of degree {told['sh_degree']}" if told["sh_degree"] != 3 else "",
             "opacities reset" if told["opacity_reset"] else "",
             *(name.replace("_", " ") for name in SHARED if name.startswith("seed_") and told[name]),
+            *(f"{name} {told[name]}" for name in _NAMED if told[name] != getattr(_DEFAULT, name)),
             f"backend {told['backend']}",
             f"splatseed {told['version']}" if told["version"] else "",
             f"{repeats} repeat{'' if high == 1 else 's'}" if len(counts) else "",
@@ -128,7 +134,8 @@ def studies(runs: Iterable[Run]) -> tuple[Study, ...]:
     """The studies in some runs, those that are finished; the one with the most runs first.
 
     Scenes may differ in size; only where one scene was run at several ``data_factor`` are these
-    kept apart. If a scene's name stands for different content, its label says which.
+    kept apart. If a scene's name stands for different content, its label says which; content that
+    has had several names is one scene, and a run that is there twice counts once.
     """
     groups: dict[tuple[tuple[str, object], ...], list[Run]] = defaultdict(list)
     for run in runs:
@@ -154,11 +161,14 @@ def _common(spec: RunSpec) -> dict[str, object]:
 
 
 def _study(settings: Mapping[str, object], runs: Sequence[Run]) -> Study:
-    digests, maps = defaultdict(set), defaultdict(set)
+    names: dict[str, str] = {}
+    digests = defaultdict[str, set[str]](set)
+    beside = {kind: defaultdict[str, set[str]](set) for kind in _BESIDE}
     for of in (run.spec.scene for run in runs):
-        digests[of.name].add(of.digest)
-        maps[of.digest].add(of.depth_digest)
-    several_maps = any(len(each - {""}) > 1 for each in maps.values())
+        digests[names.setdefault(of.digest, of.name)].add(of.digest)
+        for kind, found in beside.items():
+            found[of.digest].add(getattr(of, _BESIDE[kind]))
+    several = [kind for kind in beside if any(len(e - {""}) > 1 for e in beside[kind].values())]
     variants: dict[str, Arm] = {}
     factors: dict[str, int] = {}
     rows, odd = [], []
@@ -166,11 +176,12 @@ def _study(settings: Mapping[str, object], runs: Sequence[Run]) -> Study:
         spec, result = run.spec, run.result
         assert result is not None  # noqa: S101  (only finished runs are grouped)
         arm, of = spec.arm, spec.scene
-        scene = f"{of.name} ({of.digest[:4]})" if len(digests[of.name]) > 1 else of.name
+        name = names[of.digest]
+        scene = f"{name} ({of.digest[:4]})" if len(digests[name]) > 1 else name
         if not math.isfinite(result.psnr):
             odd.append(f"{scene}, {arm.label}, {arm.strategy}, repeat {spec.repeat + 1}")
             continue
-        label = _label(spec, with_maps=several_maps)
+        label = _label(spec, several)
         variants.setdefault(label, arm)
         factors[scene] = min(spec.training.data_factor, factors.get(scene, 10**9))
         told: tuple[object, ...] = (arm.strategy, scene, label, spec.repeat, spec, result)
@@ -178,6 +189,7 @@ def _study(settings: Mapping[str, object], runs: Sequence[Run]) -> Study:
     sizes = set(factors.values())
     factor = sizes.pop() if len(sizes) == 1 else dict(sorted(factors.items()))
     frame = pd.DataFrame(rows, columns=None if rows else _COLUMNS)
+    frame = frame.drop_duplicates(list(_COLUMNS[:4]), ignore_index=True)
     ordered = dict(sorted(variants.items(), key=variant_order))
     return Study({**settings, "data_factor": factor}, frame, ordered, tuple(odd))
 
@@ -205,12 +217,13 @@ def _measures(result: RunResult) -> dict[str, float]:
     return {name: math.nan if value is None else float(value) for name, value in measures.items()}
 
 
-def _label(spec: RunSpec, *, with_maps: bool) -> str:
-    """A variant's label; it names the depth maps if a scene has several sets of them."""
+def _label(spec: RunSpec, several: Sequence[str]) -> str:
+    """A variant's label; it tells depth maps or scans apart where a scene has several."""
     if spec.arm.method == SFM:
         return SFM
     # A plan asks every method that looks at photographs to hold out the test views.
     usual = [("hold_out", spec.training.test_every), ("cloud.hold_out", spec.training.test_every)]
     told = [f"{k}={v}" for k, v in sorted(spec.parameters.items()) if (k, v) not in usual]
-    maps = [f"maps={spec.scene.depth_digest[:4]}"] if with_maps and spec.scene.depth_digest else []
-    return " ".join([spec.arm.label, *told, *maps])
+    digests = {kind: getattr(spec.scene, _BESIDE[kind])[:4] for kind in several}
+    told += [f"{kind}={digest}" for kind, digest in digests.items() if digest]
+    return " ".join([spec.arm.label, *told])

@@ -43,12 +43,12 @@ _ARM_COLUMNS = {
 Rows = list[Row]
 
 
-def _gain_cell(gain: Difference | None, digits: int = 3) -> Cell:
-    """A gain with its standard error, and whether it is within noise."""
+def _gain_cell(gain: Difference | None, digits: int = 3, alone: str = "") -> Cell:
+    """A gain with its standard error, or what it is of alone, and whether it is within noise."""
     if gain is None:
         return ""
     mark = NOISE if gain.verdict == "within noise" else ""
-    text = ONE_RUN if math.isnan(gain.se) and gain.n == 1 and digits == 3 else ""
+    text = alone if math.isnan(gain.se) and gain.n == 1 else ""
     return Number(gain.mean, digits, gain.se, signed=True, mark=mark, text=text)
 
 
@@ -125,7 +125,9 @@ def cost_table(study: Study, strategy: StrategyName) -> Table:
         for name, (heading, digits) in _COSTS.items()
         if name in means
     }
-    labels, scenes = list(means.index), study.scenes_under(strategy)
+    counts = part.groupby("seeds")["scene"].nunique().reindex(means.index)
+    columns["scenes"] = [Number(each, 0) for each in counts]
+    labels, scenes = list(means.index), tuple(sorted(set(part["scene"])))
     for key, title in DATASETS.items():
         if set(scenes) & set(comparisons.paper_psnr(key).index):
             printed = comparisons.paper_costs(key).reindex(_entries(study, labels))
@@ -143,12 +145,19 @@ def gain_table(study: Study, strategy: StrategyName) -> Table:
     """What each variant gains: on each scene, on these, on scenes like these, and in the paper."""
     gained = gains(study, strategy)
     rows: Rows = [
-        (scene, *(_gain_cell(gained.on_scene.get((scene, label))) for label in gained.seeds))
+        (
+            scene,
+            *(
+                _gain_cell(gained.on_scene.get((scene, label)), alone=ONE_RUN)
+                for label in gained.seeds
+            ),
+        )
         for scene in gained.scenes
     ]
     rows.append(("mean, these scenes", *map(_gain_cell, gained.on_these.values())))
     if len(gained.scenes) > 1:
-        rows.append(("mean, scenes like these", *map(_gain_cell, gained.on_like.values())))
+        like = (_gain_cell(each, alone="(1 scene)") for each in gained.on_like.values())
+        rows.append(("mean, scenes like these", *like))
     for key, title in DATASETS.items():
         printed = comparisons.paper_gains(key)
         scenes = [scene for scene in gained.scenes if scene in printed.index]
@@ -228,7 +237,8 @@ def scene_arm_table(study: Study, base: ArmKey) -> Table:
             return ""
         if arm == base:
             return Number(fmean(run.psnr for run in own.values()))
-        span = f"({min(gained):+.2f} to {max(gained):+.2f})" if len(gained) > 1 else ""
+        low, high = (Number(end, signed=True) for end in (min(gained), max(gained)))
+        span = f"({low} to {high})" if len(gained) > 1 else ""
         return Number(fmean(gained), signed=True, text=span)
 
     arms = [each.arm for each in compared_arms(study)]
@@ -283,7 +293,7 @@ def comparison_tables(comparison: comparisons.Comparison) -> tuple[Table, Table,
     """The settings of two benchmarks that differ, the changes, and what only one of them has."""
     scenes = sorted({scene for _, _, scene in comparison.changes})
     changes = [
-        (*arm, *(_change_cell(comparison.changes.get((*arm, scene))) for scene in scenes),
+        (*arm, *(_change_cell(comparison.changes.get((*arm, scene)), ONE_RUN) for scene in scenes),
          _change_cell(mean))
         for arm, mean in comparison.means.items()
     ]  # fmt: skip
@@ -293,9 +303,9 @@ def comparison_tables(comparison: comparisons.Comparison) -> tuple[Table, Table,
     return settings, changed, only
 
 
-def _change_cell(change: Difference | None) -> Cell:
+def _change_cell(change: Difference | None, alone: str = "") -> Cell:
     if change is None:
         return ""
     mark = {"within noise": NOISE, "unknown": ""}.get(change.verdict, "*")
-    text = ONE_RUN if change.verdict == "unknown" else ""
+    text = alone if change.verdict == "unknown" else ""
     return Number(change.mean, 3, change.se, signed=True, mark=mark, text=text, bold=mark == "*")

@@ -133,7 +133,7 @@ def to_markdown(table: Table) -> str:
     """The table in Markdown, with its title above and its notes below."""
     shown = table.shown(_escape_markdown, "**{}**")
     right = ["---", *(["---:"] * (len(table.header) - 1))]
-    lines = [table.header, right, *shown.itertuples(index=False, name=None)]
+    lines = [list(shown.columns), right, *shown.itertuples(index=False, name=None)]
     notes = "".join(f"\n{_escape_markdown(note)}\n" for note in table.notes)
     rows = "\n".join(f"| {' | '.join(line)} |" for line in lines)
     return f"**{_escape_markdown(table.title)}**\n\n{rows}\n{notes}"
@@ -164,7 +164,8 @@ def to_html(table: Table) -> str:
     """The table in HTML, without title and notes; the first column heads the rows."""
     mark = ' <span class="mark">{}</span>'
     shown = table.shown(html.escape, "<strong>{}</strong>", mark)
-    shown = shown.set_index(shown.columns[0]).rename_axis(index=None, columns=shown.columns[0])
+    first = shown.columns[0]  # by place, as a scene may have its name
+    shown = shown.iloc[:, 1:].set_axis(shown.iloc[:, 0]).rename_axis(index=None, columns=first)
     return str(shown.to_html(escape=False, border=0, justify="right"))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -20,6 +20,7 @@ from splatseed.bench.plan import DEPTH, SFM, Plan, RunSpec, needs_cloud, plan_ru
 from splatseed.bench.plan_file import PLAN, PresetName, plan_text, preset_plan, read_plan
 from splatseed.bench.runs import (
     Run,
+    alone_in,
     begin,
     check_bench_folder,
     counts,
@@ -325,12 +326,17 @@ def _notes(plan: Plan, scenes: Sequence[SceneFacts], specs: Sequence[RunSpec]) -
         yield "No method needs the scans: name cloud or cloud+auto among --methods."
     if SFM not in plan.methods:
         yield "Without sfm among the methods there is nothing to compare with."
-    most = {(s.scene.name, s.arm.budget): (s.most_seeds, s.scene.num_points) for s in specs}
-    for (name, budget), (number, there) in most.items():
-        if number is not None and number <= there and set(plan.methods) != {SFM}:
+    begins = defaultdict[tuple[str, str, int, int], dict[str, None]](dict)
+    for spec in specs:
+        if spec.most_seeds is not None and spec.most_seeds <= spec.scene.num_points:
+            key = spec.scene.name, spec.arm.budget, spec.most_seeds, spec.scene.num_points
+            begins[key][spec.arm.strategy] = None
+    for (name, budget, most, there), strategies in begins.items():
+        if set(plan.methods) != {SFM}:
             yield (
-                f"{name}: under {budget} a run begins with {number:,} seeds at most, and it has "
-                f"{there:,} points: auto and the methods that interpolate add none."
+                f"{name}: under {budget} runs with {', '.join(strategies)} begin with {most:,} "
+                f"seeds at most, and it has {there:,} points: auto and the methods that "
+                "interpolate add none."
             )
 
 
@@ -364,7 +370,8 @@ def _bench(options: Options, plan: Plan, machine: Machine, arguments: Sequence[s
     named = ", ".join(f"{visible(s.name)} ({s.num_points:,} points)" for s in scenes)
     told = [*_announcement(plan, runs, machine), visible(bench)]
     OUT.print("\n  -> ".join([named, *told]), soft_wrap=True)
-    ended = carry_out(bench, runs, machine, JobOptions(plan.keep_models, lpips_is_here()))
+    with alone_in(bench):
+        ended = carry_out(bench, runs, machine, JobOptions(plan.keep_models, lpips_is_here()))
     runs = [read_run(bench, spec) for spec in specs]
     _print_summary(bench, runs)
     if not ended:
@@ -444,15 +451,20 @@ def _print_summary(bench: Path, runs: Sequence[Run]) -> None:
 
     for study in studies(runs):
         _print_table(arm_table(study))
+    print_failures(bench, runs)
+    left = sum(run.result is None for run in runs)
+    again = [(f"the other {counted(left, 'run')}", f"splatseed bench -o {quoted(bench)}")]
+    report = ("tables and pictures", f"splatseed bench report {quoted(bench)}")
+    print_pairs("next", [*(again if left else []), report])
+
+
+def print_failures(bench: Path, runs: Sequence[Run]) -> None:
+    """Print the errors of failed runs, if there are any."""
     failed = [run for run in runs if run.error]
     if failed:
         shown = [(_describe(run.spec), run.error) for run in failed[:_FAILURES_SHOWN]]
         print_pairs(f"failed: {len(failed)}", shown)
         print_note(f"Errors in full: {bench / 'runs' / failed[0].spec.key / 'error.json'}")
-    left = sum(run.result is None for run in runs)
-    again = [(f"the other {counted(left, 'run')}", f"splatseed bench -o {quoted(bench)}")]
-    report = ("tables and pictures", f"splatseed bench report {quoted(bench)}")
-    print_pairs("next", [*(again if left else []), report])
 
 
 def _report(arguments: list[str]) -> None:

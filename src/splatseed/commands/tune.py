@@ -17,7 +17,14 @@ import tyro
 
 from splatseed.bench.job import JobOptions
 from splatseed.bench.plan import SFM, Arm, Plan, RunResult, RunSpec, plan_runs
-from splatseed.bench.runs import begin, check_bench_folder, estimate, package_version, read_run
+from splatseed.bench.runs import (
+    alone_in,
+    begin,
+    check_bench_folder,
+    estimate,
+    package_version,
+    read_run,
+)
 from splatseed.bench.scenes import PlannedScene, SceneFacts, survey
 from splatseed.bench.statistics import LEVEL
 from splatseed.bench.tuning import (
@@ -33,7 +40,7 @@ from splatseed.bench.tuning import (
     verdict,
 )
 from splatseed.commands import bench
-from splatseed.commands.bench import Machine, carry_out, spoken_time
+from splatseed.commands.bench import Machine, carry_out, print_failures, spoken_time
 from splatseed.commands.options import check_least, parse_options, refuse
 from splatseed.console import OUT, print_note, print_pairs, print_table, stage_display
 from splatseed.errors import SceneFormatError, SplatseedError
@@ -47,6 +54,7 @@ from splatseed.train.settings import StrategyName, TrainSettings
 _TEST_EVERY = 8
 _LONG_SIDE = 400
 """Most pixels of photographs' longer side: they are reduced by a whole factor."""
+_ALL_FAILED = 1
 _EQUAL = 0.99
 """Least part of the most Gaussians that counts as as many."""
 
@@ -96,7 +104,8 @@ def run(arguments: list[str]) -> None:
                 shutil.rmtree(folder, ignore_errors=True)
             raise
         tuning.announce()
-        ended = tuning.climb()
+        with alone_in(folder):
+            ended = tuning.climb()
     tuning.report(ended=ended)
     if not ended:
         sys.exit(exit_code())
@@ -153,6 +162,7 @@ class _Tuning:
         """Take the rungs that were planned when the folder was begun, or plan new ones."""
         path, decisive = self.folder / "tune.json", ("minutes", "budget", "max_steps")
         asked: dict[str, Any] = {name: getattr(self.options, name) for name in decisive}
+        asked |= {"scene": str(self.options.scene.resolve())}
         asked |= {name: list(getattr(self.options, name)) for name in ("methods", "strategies")}
         if path.is_file():
             try:
@@ -163,7 +173,8 @@ class _Tuning:
                 expected = f"{path} as splatseed tune writes it"
                 raise SceneFormatError(expected, found="something else", fix="Remove it.") from None
             fix = "Repeat those, or name another folder with -o."
-            refuse((others, f"the options that {self.folder} was begun with", "others", fix))
+            began = f"the scene and the options that {self.folder} was begun with"
+            refuse((others, began, "others", fix))
             return
         num_arms = _num_arms(self.specs(Rung(100, 0, 1)))
         seconds, most = self.options.minutes * 60, self.options.max_steps
@@ -202,6 +213,8 @@ class _Tuning:
             runs = [read_run(self.folder, spec) for spec in specs]
             if not carry_out(self.folder, runs, self.machine, JobOptions()):
                 return False
+            if verdict(self.results(rung), rung.steps) is None:  # nothing to choose from
+                break
             if i + 1 < len(self.rungs):
                 arms = best_arms(self.results(rung), self.rungs[i + 1].arms)
         return True
@@ -214,6 +227,11 @@ class _Tuning:
                 break
         else:
             print_note("Nothing can be said yet: repeat the command to continue.")
+            if ended:
+                print_failures(
+                    self.folder, [read_run(self.folder, s) for s in self.specs(self.rungs[0])]
+                )
+                sys.exit(_ALL_FAILED)
             return
         if not ended:
             print_note("Stopped before the last run: repeat the command to continue.")
@@ -264,6 +282,10 @@ def sentence(said: Verdict) -> str:
         return "The scene's own points with strategy default are best: leave them as they are."
     over = "views and repeats" if said.repeats > 1 else "views"
     spread = f" ± {gain.se:.2f} (standard error over {over})" if not math.isnan(gain.se) else ""
-    doubt = " That is within noise: sfm + default may do as well." if not gain.p <= LEVEL else ""
+    doubt = ""
+    if said.repeats == 1:
+        doubt = " One run of each cannot tell: sfm + default may do as well."
+    elif not gain.p * (len(said.ranking) - 1) <= LEVEL:  # Holm's smallest step: the best of all
+        doubt = " That is within noise: sfm + default may do as well."
     name = f"{arm.label} + {arm.strategy}"
     return f"Best is {name}: {gain.mean:+.2f} dB{spread} over sfm + default.{doubt}"

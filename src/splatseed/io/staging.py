@@ -109,7 +109,7 @@ def staged(target: Path, *, folder: bool) -> Iterator[Path]:
         try:
             target.parent.mkdir(parents=True, exist_ok=True)
             partial.mkdir() if folder else partial.touch()
-            with _held(partial):
+            with held(partial):
                 yield partial
                 if folder and target.exists():
                     target.rename(old)
@@ -284,13 +284,13 @@ def _remove_leftovers(target: Path) -> None:
     for path in list(target.parent.iterdir()) if fcntl and target.parent.is_dir() else []:
         with suppress(OSError):  # another process writes to it, or has removed it
             if name.fullmatch(path.name) and time.time() - path.stat().st_mtime > _SETTLED:
-                with _held(path):
+                with held(path):
                     remove(path)
                 _LOG.warning("Removed %s, left by a run that was killed.", path)
 
 
 @contextmanager
-def _held(path: Path) -> Iterator[None]:
+def held(path: Path) -> Iterator[None]:
     """Lock a file or folder while the block runs; an OSError if another process has."""
     with ExitStack() as stack:
         if fcntl is not None:
