@@ -8,7 +8,7 @@ rounding; lens distortion is kept in ``Intrinsics.params`` for writing but ignor
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -95,6 +95,14 @@ class Intrinsics:
         fx, fy = self.params[0], self.params[num_focal - 1]
         cx, cy = self.params[num_focal : num_focal + 2]
         return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+    def resized(self, width: int, height: int) -> Intrinsics:
+        """The lens of a resized copy of the photographs."""
+        num_focal = CAMERA_MODELS[self.model].num_focal
+        x, y = width / self.width, height / self.height
+        pixels = zip(self.params, (*(x, y)[:num_focal], x, y), strict=False)
+        params = (*(each * scale for each, scale in pixels), *self.params[num_focal + 2 :])
+        return replace(self, width=width, height=height, params=params)
 
 
 @dataclass(frozen=True, eq=False)

@@ -44,6 +44,10 @@ def main(arguments: list[str] | None = None) -> None:
     # has its own pool: spinning, they take the cores from each other, and on a busy machine a
     # training step took 5 to 20 times as long.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    # Who limits PyTorch's threads means Numba's too; each reads its own variable on loading.
+    threads = os.environ.get("OMP_NUM_THREADS", "")
+    if threads.isdigit() and "numba" not in sys.modules:
+        os.environ.setdefault("NUMBA_NUM_THREADS", threads)
     try:
         with _termination_raised():
             _act(words)

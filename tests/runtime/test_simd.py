@@ -29,39 +29,24 @@ def applied(function, *arrays: np.ndarray) -> np.ndarray:
     return out
 
 
-@njit
-def _add(a, b, out):
-    simd.store(out, 0, simd.add(simd.load(a, 0), simd.load(b, 0)))
+def of_two(operation):
+    """An operation on the lanes of two arrays, compiled."""
+
+    @njit
+    def run(a, b, out):
+        simd.store(out, 0, operation(simd.load(a, 0), simd.load(b, 0)))
+
+    return run
 
 
-@njit
-def _subtract(a, b, out):
-    simd.store(out, 0, simd.subtract(simd.load(a, 0), simd.load(b, 0)))
+def of_three(operation):
+    """An operation on the lanes of three arrays, compiled."""
 
+    @njit
+    def run(a, b, c, out):
+        simd.store(out, 0, operation(simd.load(a, 0), simd.load(b, 0), simd.load(c, 0)))
 
-@njit
-def _multiply(a, b, out):
-    simd.store(out, 0, simd.multiply(simd.load(a, 0), simd.load(b, 0)))
-
-
-@njit
-def _divide(a, b, out):
-    simd.store(out, 0, simd.divide(simd.load(a, 0), simd.load(b, 0)))
-
-
-@njit
-def _minimum(a, b, out):
-    simd.store(out, 0, simd.minimum(simd.load(a, 0), simd.load(b, 0)))
-
-
-@njit
-def _fma(a, b, c, out):
-    simd.store(out, 0, simd.fma(simd.load(a, 0), simd.load(b, 0), simd.load(c, 0)))
-
-
-@njit
-def _fnma(a, b, c, out):
-    simd.store(out, 0, simd.fnma(simd.load(a, 0), simd.load(b, 0), simd.load(c, 0)))
+    return run
 
 
 @njit
@@ -136,13 +121,13 @@ def _broadcast(x, out):
 
 @pytest.mark.parametrize(
     ("ours", "numpys"),
-    [(_add, np.add), (_subtract, np.subtract), (_multiply, np.multiply), (_divide, np.divide),
-     (_minimum, np.fmin)],
+    [(simd.add, np.add), (simd.subtract, np.subtract), (simd.multiply, np.multiply),
+     (simd.divide, np.divide), (simd.minimum, np.fmin)],
 )  # fmt: skip
 def test_arithmetic_is_float32s(lanes, ours, numpys) -> None:
     for a, b, _ in lanes:
         with np.errstate(all="ignore"):
-            np.testing.assert_array_equal(applied(ours, a, b), numpys(a, b))
+            np.testing.assert_array_equal(applied(of_two(ours), a, b), numpys(a, b))
 
 
 def test_fma_rounds_once(lanes) -> None:
@@ -151,15 +136,15 @@ def test_fma_rounds_once(lanes) -> None:
     c = -(a * b)  # what is left is the rounding error of the product, all of which fma keeps
     exact = a.astype(np.float64) * b + c
     assert exact.any()
-    np.testing.assert_array_equal(applied(_fma, a, b, c), exact.astype(np.float32))
-    np.testing.assert_array_equal(applied(_fnma, a, b, -c), -exact.astype(np.float32))
+    np.testing.assert_array_equal(applied(of_three(simd.fma), a, b, c), exact.astype(np.float32))
+    np.testing.assert_array_equal(applied(of_three(simd.fnma), a, b, -c), -exact.astype(np.float32))
 
 
 def test_fma_of_special_numbers(lanes) -> None:
     a, b, c = lanes[1]
     with np.errstate(all="ignore"):
         expected = (a.astype(np.float64) * b + c).astype(np.float32)
-    np.testing.assert_array_equal(applied(_fma, a, b, c), expected)
+    np.testing.assert_array_equal(applied(of_three(simd.fma), a, b, c), expected)
 
 
 def test_comparisons_are_false_for_nan(lanes) -> None:

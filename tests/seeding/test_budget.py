@@ -87,6 +87,12 @@ def test_originals_alone_stay_dense_where_they_are_dense(rng):
     assert np.count_nonzero(kept >= 1400) == 10
 
 
+def test_one_point_far_away_does_not_thin_all_others_by_their_order(rng):
+    xyz = np.sort(rng.random((5000, 3)).astype(np.float32), axis=0)
+    xyz[0] = 1e9
+    assert np.median(xyz[thin(xyz, (), 500)], axis=0) == pytest.approx(0.5, abs=0.1)
+
+
 def test_originals_come_first_among_equals(rng):
     xyz = sheet(rng, 500)
     twice, views, high = np.concatenate([xyz, xyz]), views_of(rng, 3), np.arange(1000) >= 500

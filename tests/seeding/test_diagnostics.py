@@ -121,6 +121,8 @@ def test_spacing_is_the_mean_over_six_neighbours_in_any_unit(scale, rng):
     assert module.spacing(scale * xyz) == pytest.approx(scale * _brute_spacing(xyz).mean())
     twice = np.array([[0.0, 0, 0], [scale, 0, 0], [0, 0, 0], [scale, 0, 0], [np.nan, 0, 0]])
     assert module.spacing(twice) == scale
+    often = scale * np.repeat(xyz, 8, axis=0)
+    assert module.spacing(often) == pytest.approx(module.spacing(scale * xyz))
 
 
 def test_points_beside_a_plane_and_beyond_a_sphere_are_measured(rng):

@@ -111,6 +111,13 @@ def test_a_budget_is_met_and_keeps_the_pictures_covered(method, room, seeds):
     assert share_covered(room, thinned) > share_covered(room, at_random)
 
 
+def test_a_budget_covers_in_the_cells_that_the_method_has(room):
+    whole = ss.upsample(room, "cover", cell=24)
+    thinned = ss.upsample(room, "cover", cell=24, budget=len(whole) - 1)
+    guesses = [np.count_nonzero(each.source == COVER) for each in (whole, thinned)]
+    assert guesses[1] <= guesses[0] + 1
+
+
 def test_a_budget_may_be_below_the_originals(room):
     """The default then makes nothing, as if new points had been thinned away, and says so."""
     num, notes = room.points.num_original // 2, []
@@ -119,6 +126,9 @@ def test_a_budget_may_be_below_the_originals(room):
     thinned = ss.upsample(room, budget=num, note=notes.append)
     assert len(thinned) == thinned.num_original == num
     assert "are thinned, and none are added" in notes[-1]
+    for odd in ({"bogus": 3}, {"cell": -5}, {"profile": "zzz"}, {"seed": -1}):
+        with pytest.raises(ParameterError):
+            ss.upsample(room, budget=num, **odd)
     made = ss.upsample(room, cover=8, budget=num)  # the long way
     np.testing.assert_array_equal(made.xyz, thinned.xyz)
 
@@ -131,7 +141,7 @@ def test_a_small_budget_keeps_a_part_of_a_scan(room):
     )
     cloud = PointCloud.concatenate(PointCloud.concatenate(own, scan), guesses)
     num = len(own) // 2
-    kept = thin_to(room, cloud, num, 8, 0, 0, silent)
+    kept = thin_to(room, cloud, num, None, 0, silent)
     assert len(kept) == num
     assert np.count_nonzero(kept.source == CLOUD) > num // 10
 

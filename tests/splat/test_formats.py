@@ -116,6 +116,16 @@ def test_one_gaussian_equal_ones_and_far_off_ones_are_models_too(suffix, tmp_pat
     np.testing.assert_allclose(found, np.sort(far.means, axis=0), atol=0.02)
 
 
+def test_what_a_format_cannot_hold_is_told_or_harms_nothing_else(tmp_path):
+    near = _gaussians()
+    with pytest.raises(ParameterError, match="of the origin"):
+        write_model(tmp_path / "m.spz", replace(near, means=near.means + np.float32(9e6)))
+    scales = near.scales.copy()
+    scales[5, 0] = -np.inf
+    write_model(tmp_path / "m.sog", replace(near, scales=scales))
+    assert np.isfinite(read_model(tmp_path / "m.sog").scales).all()
+
+
 def test_opacities_of_0_and_1_stay_finite(tmp_path):
     sure = replace(_gaussians(), opacities=np.full(700, np.inf, np.float32))
     for suffix in SUFFIXES[:1] + SUFFIXES[2:]:

@@ -14,6 +14,7 @@ import pytest
 import torch
 
 from splatseed.commands.train import Options
+from splatseed.errors import ParameterError
 from splatseed.io import load_scene
 from splatseed.io.ply import write_ply
 from splatseed.pointcloud import PointCloud
@@ -62,6 +63,8 @@ def test_trains_by_the_best_strategy_and_says_what_and_where(room_path, tmp_path
     again = replace(asked, max_steps=3, data_factor=2)
     begun = replace(again, strategy="none", seeding="advised", cap_max=quarter)
     assert resumed(config, again, refine_poses=False) == (begun, False)
+    with pytest.raises(ParameterError, match="--max-steps 3, as when"):
+        resumed(config, asked, {"max_steps"}, refine_poses=False)
 
 
 def test_interrupted_it_saves_and_says_how_to_go_on(room_path, tmp_path, capsys, monkeypatch):

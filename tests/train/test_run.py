@@ -17,6 +17,7 @@ from PIL import Image as PilImage
 from splatseed.errors import OutputError, ParameterError, PointCloudError, SceneFormatError
 from splatseed.splat.evaluate import evaluate_views
 from splatseed.splat.formats import read_model
+from splatseed.splat.rendering import opacities_of
 from splatseed.train import device, run as run_module, trainer
 from splatseed.train.parameters import add_to_mean, gaussians_of, length_units
 from splatseed.train.run import prepare_run
@@ -64,6 +65,20 @@ def single_threaded():
     yield lambda: (torch.set_num_threads(1), numba.set_num_threads(1))
     torch.set_num_threads(before[0])
     numba.set_num_threads(before[1])
+
+
+def test_opacities_are_the_same_whatever_the_threads(single_threaded):
+    def of_logits():
+        logits = torch.linspace(-9, 9, 100_003, requires_grad=True)  # more than one thread takes
+        opacities = opacities_of(logits)
+        opacities.backward(torch.ones_like(logits))
+        return opacities, logits.grad
+
+    torch.set_num_threads(3)
+    several = of_logits()
+    single_threaded()
+    assert all(map(torch.equal, several, of_logits()))
+    assert torch.allclose(several[0], torch.linspace(-9, 9, 100_003).sigmoid())
 
 
 # While Gaussians are added, and while the mean is taken.

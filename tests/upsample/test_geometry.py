@@ -82,6 +82,14 @@ def test_walls_are_as_good_as_floors_but_for_the_papers_spline(tilt):
     assert (far(wall, method="spline", profile="paper") > 0.05) == (tilt == 90)
 
 
+def test_no_spline_of_a_lattice_leaves_it():
+    """Most of its patches do not determine a bicubic surface."""
+    lattice = np.indices((12, 12, 3)).reshape(3, -1).T.astype(np.float32)
+    cloud = ss.PointCloud(lattice, np.zeros(lattice.shape, np.uint8))
+    for profile in ("default", "paper"):
+        assert np.abs(ss.upsample(cloud, "spline", ratio=8, profile=profile).xyz).max() < 100
+
+
 def test_clamped_cells_stay_near_and_boxed_ones_do_not():
     cloud, _ = scanned("sphere")
     assert far(cloud, method="voronoi") < 0.01

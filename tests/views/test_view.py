@@ -13,8 +13,9 @@ from splatseed.camera import Intrinsics
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.io import load_scene
 from splatseed.lens import image_points
+from splatseed.seeding.upsampling import frames_of, points_within
 from splatseed.views.projection import undistort
-from splatseed.views.view import load_photograph, load_split, load_views
+from splatseed.views.view import at_file_size, load_photograph, load_split, load_views
 
 
 @pytest.fixture
@@ -70,6 +71,12 @@ def test_files_resized_beforehand_scale_the_intrinsics(copied):
     PilImage.open(path).resize((48, 36)).save(path)
     (view,) = load_views(copied, [image])
     assert np.allclose(view.K[:2], image.camera.K[:2] / 2)
+    small = at_file_size(copied)
+    assert np.allclose(small.images[-1].camera.K[:2], image.camera.K[:2] / 2)
+    assert np.allclose(small.images[1].observations.xy, copied.images[1].observations.xy / 2)
+    assert points_within(copied, "1rho") == 48 * 36
+    assert {(each.width, each.height) for each in frames_of(copied)} == {(48, 36)}
+    assert at_file_size(small) is small
     PilImage.open(path).resize((48, 48)).save(path)
     with pytest.raises(SceneFormatError, match="aspect ratio of its camera"):
         load_views(copied, [image])

@@ -45,7 +45,7 @@ from splatseed.scene import Scene
 from splatseed.scores import EvalResult
 from splatseed.seeding.advice import DEFAULT_METHOD
 from splatseed.seeding.clouds.method import Cloud
-from splatseed.seeding.upsampling import CELL, thin_to, upsample
+from splatseed.seeding.upsampling import thin_to, upsample
 from splatseed.train.seeds import compared_images, stereo_size
 from splatseed.train.settings import TrainSettings
 from splatseed.upsample import Upsampler, chooses_number, configure
@@ -264,8 +264,7 @@ def make_seeds(
         _write_seeds(path, *made)
     seeds, seconds = made
     if most is not None:
-        held = getattr(method, "hold_out", 0)
-        seeds, more = _timed(thin_to, scene, seeds, most, CELL, held, seed, progress)
+        seeds, more = _timed(thin_to, scene, seeds, most, method, seed, progress)
         seconds += more
     return seeds.select(seeds.distinct), seconds
 

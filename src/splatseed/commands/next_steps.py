@@ -16,6 +16,7 @@ from splatseed.seeding.diagnostics import is_distorted, untrainable
 from splatseed.train.schedule import FULL_RUN
 from splatseed.train.seeds import most_seeds
 from splatseed.train.settings import BUDGET, TrainSettings
+from splatseed.views.view import at_file_size
 
 RATIO = 16
 PER_POINT = 8
@@ -44,7 +45,8 @@ class Planned(NamedTuple):
     @classmethod
     def of(cls, scene: Scene, budget: str | None = None, max_steps: int = FULL_RUN) -> Planned:
         """A scene's plan, from the options."""
-        sizes = [image.intrinsics.width * image.intrinsics.height for image in scene.images]
+        images = at_file_size(scene).images
+        sizes = [image.intrinsics.width * image.intrinsics.height for image in images]
         pixels = round(float(np.median(sizes))) if sizes else BUDGET
         number, flags, tuning = max(2, min(BUDGET, pixels)), "", ""
         if budget is not None:

@@ -7,7 +7,7 @@ import math
 import sys
 import tomllib
 from argparse import ArgumentParser
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -36,7 +36,7 @@ from splatseed.train.folder import RunFolder
 from splatseed.train.seeds import why_not_seeded
 from splatseed.train.settings import BUDGET, LEAST_GAUSSIANS, Seeding, StrategyName, TrainSettings
 from splatseed.upsample.method import fits
-from splatseed.views.view import poses_of, user_cache_dir
+from splatseed.views.view import at_file_size, poses_of, user_cache_dir
 
 if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
     from splatseed.train.run import TrainingRun
@@ -50,6 +50,8 @@ HOST, PORT = "127.0.0.1", 8080
 """Where browsers watch, if the port is free."""
 RUN_NOTES = {"splatseed", "points", "photographs", "device", "versions"}
 """What config.json records besides options."""
+_SETTINGS = {"seeds": "seeding", "budget": "cap_max", "long_side": "data_factor"}
+"""Settings by the options that stand for them, where these have other names."""
 BEST_SETTINGS = replace(DEFAULT, strategy=BEST)
 
 
@@ -161,16 +163,26 @@ def _read_config(path: Path) -> dict[str, Any]:
     return {k: v for k, v in content.items() if k not in RUN_NOTES and v is not None}
 
 
+def _named(arguments: Sequence[str], config: Path | None) -> set[str]:
+    """The settings that are given on the command line or in a file, whatever their values."""
+    options = {each.partition("=")[0] for each in arguments if each.startswith("--")}
+    words = {option.removeprefix("--").replace("-", "_") for option in options}
+    words |= set(() if config is None else _read_config(config))
+    return {_SETTINGS.get(word, word) for word in words}
+
+
 def run(arguments: list[str]) -> None:
     """Run the verb with these arguments."""
     options = parse(arguments)
-    settings = options.settings
+    settings, named = options.settings, _named(arguments, options.config)
+    if "strategy" in named:  # a resumed run's must be that
+        settings = replace(settings, strategy=options.training.strategy)
     require("torch", "gsplat", "flip_evaluator", *(["viser"] if options.view else []))
     notes: list[str] = []
     if options.resume and not RunFolder(options.output).is_run:
         notes.append(f"There is no run to resume in {options.output}: a new one begins.")
     with stage_display() as clock:
-        training = _prepare(options, settings, notes.append, clock)
+        training = _prepare(options, settings, named, notes.append, clock)
     for note in notes:
         print_note(note)
     _announce(options, training)
@@ -195,14 +207,19 @@ def run(arguments: list[str]) -> None:
 
 
 def _prepare(
-    options: Options, settings: TrainSettings, note: Callable[[str], None], clock: Progress
+    options: Options,
+    settings: TrainSettings,
+    named: Collection[str],
+    note: Callable[[str], None],
+    clock: Progress,
 ) -> TrainingRun:
     from splatseed.train.run import prepare_run  # noqa: PLC0415  (imports PyTorch)
 
     clock("read", 0.0)
     has_points = options.seeds == "scene" and not options.refine_poses
     required = has_points and not settings.start
-    scene = with_masks(load_scene(options.scene, require_points=required), options.masks)
+    scene = load_scene(options.scene, require_points=required)
+    scene = at_file_size(with_masks(scene, options.masks))
     for warning in scene.warnings:
         note(warning)
     if scene.listed is not None:
@@ -220,6 +237,7 @@ def _prepare(
         options.output,
         settings,
         resume=options.resume,
+        named=named,
         overwrite=options.overwrite,
         refine_poses=options.refine_poses,
         tensorboard=options.tensorboard,
@@ -364,7 +382,7 @@ def _summarise(options: Options, training: TrainingRun, result: TrainingResult) 
         *[("colour-corrected", f"{scores.cc_psnr or 0.0:.2f} dB")] * exposed,
         ("test SSIM, FLIP", f"{scores.ssim:.4f}, {scores.flip or 0.0:.4f}"),
         ("Gaussians", f"{scores.num_gaussians:,} from {result.num_seeds:,} seeds"),
-        ("training", f"{seconds:.1f} s, {1e3 * seconds / result.steps:.1f} ms per step"),
+        ("training", f"{seconds:.1f} s for {result.steps:,} steps"),
         ("Gaussians in", str(output / "point_cloud.ply")),
         ("pictures", f"{output / 'renders'}, {output / 'curve.png'}"),
     ]

@@ -40,6 +40,7 @@ STEPS = 24
 LEAST_POWER = 0.2
 """Least exponent e assumed in: number kept ~ (1 / spacing)^e; bounds a step. On surfaces e is 2."""
 ACROSS = 4096.0  # nominal width in pixels of a cloud without views
+MIDDLE, FARTHEST = 0.01, 2.0**30  # the share beyond that width on either side; how far it counts
 
 
 def median_pixels(views: Sequence[View]) -> float:
@@ -162,13 +163,15 @@ def _keep_at_one_spacing(
 
 
 def _places_in_space(xyz: Float32[np.ndarray, "N 3"]) -> _Places:
-    """Places without views: the cloud counts as about a thousand pixels across."""
+    """Places without views: the cloud, but for a few outliers, is ``ACROSS`` pixels wide."""
     finite = np.isfinite(xyz).all(axis=1)
     inside = xyz[finite].astype(np.float64)
-    low = inside.min(axis=0, initial=np.inf)
-    extent = (inside - low).max(initial=0.0) or 1.0
     place = np.zeros((len(xyz), 1, 3), np.float32)
-    place[finite, 0] = (inside - low) * (ACROSS / extent)
+    if len(inside):
+        # Between its hundredths: one point far away must not put all others into one cell.
+        low, high = np.quantile(inside, [MIDDLE, 1 - MIDDLE], axis=0)
+        extent = (high - low).max() or np.ptp(inside, axis=0).max() or 1.0
+        place[finite, 0] = np.clip((inside - low) * (ACROSS / extent), -FARTHEST, FARTHEST)
     return _Places(np.where(finite, 0, -1).astype(np.int32)[:, None], place)
 
 

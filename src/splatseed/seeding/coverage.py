@@ -14,15 +14,13 @@ to 16%.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 
 from splatseed.errors import ParameterError, PointCloudError
-from splatseed.progress import Progress, silent
+from splatseed.progress import Progress, in_threads, silent
 from splatseed.runtime.jit import inline
 from splatseed.views.projection import place
 from splatseed.views.view import View
@@ -72,11 +70,12 @@ def depths_of_views(
     stage: str,
 ) -> list[Float32[np.ndarray, "rows cols"]]:
     """``cell_depths`` of each view, on all threads."""
-    found: list[Float32[np.ndarray, "rows cols"]] = []
-    with ThreadPoolExecutor(os.cpu_count()) as pool:  # the kernels release the GIL
-        for depths in pool.map(lambda view: cell_depths(view, xyz, cell), views):
-            found.append(depths)
-            progress(stage, len(found) / len(views))
+    found = [np.empty((0, 0), np.float32)] * len(views)
+
+    def work(start: int, _stop: int) -> None:
+        found[start] = cell_depths(views[start], xyz, cell)
+
+    in_threads(work, len(views), 1, stage, progress)
     return found
 
 

@@ -290,21 +290,28 @@ def spacing(xyz: Float[np.ndarray, "N 3"]) -> float:
     Raises:
         PointCloudError: Fewer than two distinct finite points.
     """
-    finite = xyz[np.isfinite(xyz).all(axis=1)]
+    finite = _distinct(xyz)
     h = float(_spacing(cKDTree(finite), finite).mean()) if len(finite) else 0.0
     if not h > 0:
         raise PointCloudError(
             "at least two distinct finite points to take a spacing of",
-            found=f"{len(xyz)} points, {len(finite)} of them finite",
+            found=f"{len(xyz)} points, {len(finite)} of them distinct and finite",
             fix="Check that the cloud was read correctly.",
         )
     return h
 
 
+def _distinct(xyz: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "M 3"]:
+    """The finite points, each once; in their order if none is there twice."""
+    finite = xyz[np.isfinite(xyz).all(axis=1)]
+    once = np.unique(finite, axis=0)
+    return once if len(once) < len(finite) else finite
+
+
 def _spacing(tree: cKDTree, xyz: Float[np.ndarray, "M 3"]) -> Float64[np.ndarray, " M"]:
     """The spacing of some of a tree's points, [M]; 0 if there are no others."""
     distances, _ = tree.query(xyz, k=NEIGHBORS + 1)
-    # The point itself and exact duplicates have distance 0, missing neighbours inf.
+    # The point itself has distance 0, missing neighbours inf.
     counts = (distances > 0) & np.isfinite(distances)
     total = np.where(counts, distances, 0.0).sum(axis=1)
     return np.asarray(total / np.maximum(counts.sum(axis=1), 1))
@@ -320,7 +327,7 @@ def far_share(originals_xyz: Float[np.ndarray, "N 3"], new_xyz: Float[np.ndarray
     """
     if len(new_xyz) == 0:
         return 0.0
-    originals = originals_xyz[np.isfinite(originals_xyz).all(axis=1)]
+    originals = _distinct(originals_xyz)
     if len(originals) == 0:
         raise PointCloudError(
             "finite original points to compare the new ones with",

@@ -20,7 +20,7 @@ from splatseed.progress import Progress
 from splatseed.scene import Image, Scene
 from splatseed.upsample import as_cloud, source_code
 from splatseed.upsample.method import NewPoints, Traits, check_fields, require
-from splatseed.views.view import View, data_factor, load_views
+from splatseed.views.view import View, at_file_size, data_factor, load_views
 
 if TYPE_CHECKING:
     from splatseed.depth.stereo.maps import StereoMap, StereoResult
@@ -202,7 +202,8 @@ def read_views(
     scene: Scene, images: Sequence[Image], max_size: int, progress: Progress
 ) -> tuple[View, ...]:
     """The photographs of some images, undistorted, at most ``max_size`` pixels a side."""
-    factor = data_factor(images, max_size)
+    sized = at_file_size(scene.replace(images=tuple(images))).images
+    factor = data_factor(sized, max_size)
     return load_views(scene, images, data_factor=factor, undistort=True, progress=progress)
 
 

@@ -18,9 +18,17 @@ from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 from splatseed.seeding.advice import DEFAULT_METHOD, method_for
 from splatseed.seeding.photographs import MAX_SIZE, Stereo, photographed, read_views, with_cover
-from splatseed.upsample import Profile, Upsampler, as_cloud, source_code, upsample as add_points
+from splatseed.upsample import (
+    Profile,
+    Upsampler,
+    as_cloud,
+    check_seed,
+    configure,
+    source_code,
+    upsample as add_points,
+)
 from splatseed.upsample.method import NewPoints
-from splatseed.views.view import View, data_factor, poses_of
+from splatseed.views.view import View, at_file_size, data_factor, poses_of
 
 if TYPE_CHECKING:
     from splatseed.depth.stereo.maps import StereoResult
@@ -96,14 +104,19 @@ def upsample(
         >>> len(seeds), seeds.num_original
         (800, 100)
     """
+    if isinstance(scene, Scene):
+        scene = at_file_size(scene)
     whole = scene if isinstance(scene, Scene) else Scene(scene)
+    check_seed(seed)
     most = None if budget is None else points_within(whole, budget)
     if extra_method is None and DEFAULT_METHOD in {method, getattr(method, "name", None)}:
         method = method_for(scene, method, note)
-        if ratio is None and num_points is None and cover is None:
-            full = _full_already(whole, most, seed, progress, note)
-            if full is not None:
-                return full
+    made = configure(method, profile, **parameters) if isinstance(method, str) else method
+    fills = extra_method is None and getattr(made, "name", None) == DEFAULT_METHOD
+    if fills and ratio is None and num_points is None and cover is None:
+        full = _full_already(whole, most, seed, progress, note)
+        if full is not None:
+            return full
     options: dict[str, Any] = {"seed": seed, "progress": progress, "note": note}
     # Measured points come first, so that the method fills what they leave.
     first = None if extra_method is None else add_points(whole, extra_method, **options)
@@ -118,8 +131,7 @@ def upsample(
     if cover is not None:
         cloud = add_cover(whole, cloud, cell=cover, seed=seed, progress=progress)
     if most is not None:
-        hold_out = getattr(method, "hold_out", parameters.get("hold_out", 0))
-        cloud = thin_to(whole, cloud, most, cover or CELL, hold_out, seed, progress)
+        cloud = thin_to(whole, cloud, most, made, seed, progress, cell=cover)
     return cloud
 
 
@@ -132,6 +144,7 @@ def upsample_with_stereo(
     note: Note = lambda _: None,
 ) -> tuple[PointCloud, StereoResult | None]:
     """``upsample`` with seed 0, and its stereo; None where the originals fill the budget."""
+    scene = at_file_size(scene)
     full = _full_already(scene, budget, 0, progress, note)
     if full is not None:
         return full, None
@@ -141,7 +154,7 @@ def upsample_with_stereo(
     made = as_cloud(new, len(new.xyz), source_code(method.name))
     cloud = PointCloud.concatenate(scene.points.originals, made)
     if budget is not None:
-        cloud = thin_to(scene, cloud, budget, CELL, method.hold_out, 0, progress)
+        cloud = thin_to(scene, cloud, budget, method, 0, progress)
     return cloud, stereo
 
 
@@ -157,7 +170,7 @@ def _full_already(
         f"There is room for {most:,} points, and there are {len(originals):,} already: "
         "they are thinned, and none are added."
     )
-    return thin_to(scene, originals, most, CELL, 0, seed, progress)
+    return thin_to(scene, originals, most, None, seed, progress)
 
 
 def _with(scene: Scene, points: PointCloud, method: str | Upsampler) -> Scene:
@@ -220,7 +233,7 @@ def points_within(scene: Scene, budget: int | str) -> int:
     """``parse_budget`` with the photographs of a scene."""
     from splatseed.seeding.budget import median_pixels  # noqa: PLC0415  (loads Numba)
 
-    photographs = poses_of(scene.images)
+    photographs = poses_of(at_file_size(scene).images)
     return parse_budget(budget, median_pixels(photographs) if photographs else 0)
 
 
@@ -228,17 +241,18 @@ def thin_to(
     scene: Scene,
     cloud: PointCloud,
     num: int,
-    cell: int,
-    hold_out: int,
+    method: Upsampler | None,
     seed: int,
     progress: Progress,
+    *,
+    cell: int | None = None,
 ) -> PointCloud:
-    """At most ``num`` of a cloud's points, originals before others of equal use.
+    """At most ``num`` of the points that a method has made, originals before others of equal use.
 
-    Cover, whose cells are ``cell`` pixels wide at least, is recomputed for what thinning leaves: a
-    guess fills a gap, and must not replace a measured point. If there are at least ``num``
-    originals, only originals stay: they are dense where there is detail, which is where Gaussians
-    are needed most. But a scan's points are thinned together with them.
+    Cover, whose cells are ``cell`` pixels wide at least (by default the method's own), is made
+    again for what thinning leaves: a guess fills a gap, and must not replace a measured point. If
+    there are at least ``num`` originals, only originals stay: they are dense where there is detail,
+    which is where Gaussians are needed most. But a scan's points are thinned together with them.
     """
     if len(cloud) <= num:
         return cloud
@@ -249,7 +263,9 @@ def thin_to(
     if not guessed.any() or guessed.all():
         return _keep(scene, points, num)
     known = points.select(~guessed)
-    views = read_views(scene, photographed(scene, hold_out), MAX_SIZE, progress)
+    images = photographed(scene, getattr(method, "hold_out", 0))
+    views = read_views(scene, images, getattr(method, "max_size", MAX_SIZE), progress)
+    cell = cell or int(getattr(method, "cell", CELL))
     # Guesses get what the measured points leave, and a tenth at least.
     room = max(num - len(known), round(MOST_COVER * num))
     kept = _keep(scene, known, num - room)
@@ -263,7 +279,8 @@ def thin_to(
 
 def frames_of(scene: Scene) -> tuple[View, ...]:
     """The views of a scene without their pixels, at the size that methods use."""
-    return poses_of(scene.images, data_factor(scene.images, MAX_SIZE)) if scene.images else ()
+    images = at_file_size(scene).images
+    return poses_of(images, data_factor(images, MAX_SIZE)) if images else ()
 
 
 def _keep(scene: Scene, points: PointCloud, num: int) -> PointCloud:

@@ -10,6 +10,7 @@ downloaded. Promise: on a GPU only what returns a Python number waits for it.
 
 from __future__ import annotations
 
+import math
 import warnings
 from dataclasses import dataclass
 from functools import lru_cache
@@ -54,7 +55,13 @@ def psnr(
     """
     error = (render.clamp(0, 1) - photograph).square()
     error = error if mask is None else error[mask]
-    return float(-10 * torch.log10(error.mean(dtype=torch.float64)))
+    if not error.numel():
+        return math.nan
+    if error.device.type == "cpu":  # the last digits of PyTorch's depend on the number of threads
+        mean = float(np.mean(error.numpy(), dtype=np.float64))
+    else:
+        mean = float(error.mean(dtype=torch.float64))
+    return -10 * math.log10(mean) if mean else math.inf
 
 
 @torch.no_grad()

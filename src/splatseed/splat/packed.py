@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Float32, Int64, UInt8, UInt32
 from numpy.lib.recfunctions import structured_to_unstructured
 
+from splatseed.errors import ParameterError
 from splatseed.io.files import COPY_AGAIN, ByteReader, guarded, read_bytes
 from splatseed.io.ply import parse_header
 from splatseed.requirements import require
@@ -36,7 +37,7 @@ SPZ_MAGIC = b"NGSP"
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 """The components that remain, by the index of the largest."""
 _MORTON_BITS = 16
-_CHUNK, _MOST_LOG_SCALE, _SH_RANGE = 256, 20.0, 8.0
+_CHUNK, MOST_LOG_SCALE, _SH_RANGE = 256, 20.0, 8.0
 _BOUNDS = [
     [f"{end}_{name}" for name in names]
     for names in (("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b"))
@@ -176,7 +177,7 @@ def encode_compressed_ply(gaussians: Gaussians) -> list[bytes]:
     """In Z-curve order."""
     order = morton_order(gaussians.means)
     count, rest = len(order), 3 * gaussians.shN.shape[1]
-    scales = np.clip(gaussians.scales[order], -_MOST_LOG_SCALE, _MOST_LOG_SCALE)
+    scales = np.clip(gaussians.scales[order], -MOST_LOG_SCALE, MOST_LOG_SCALE)
     colors = gaussians.sh0[order, 0] * np.float32(SH_C0) + np.float32(0.5)
     chunk, starts = np.arange(count) // _CHUNK, np.arange(0, count, _CHUNK)
     tables, units = [], []
@@ -277,6 +278,12 @@ def encode_spz(gaussians: Gaussians) -> list[bytes]:
     order = morton_order(gaussians.means)
     rest = gaussians.shN.shape[1]
     farthest = float(np.abs(gaussians.means).max())
+    if farthest > _SPZ_MOST:
+        raise ParameterError(
+            f"positions within {_SPZ_MOST:,} of the origin, which is all that .spz can hold",
+            found=f"one at {farthest:.3g}",
+            fix="Export another format, or crop the model.",
+        )
     bits = int(np.clip(np.log2(_SPZ_MOST / max(farthest, 1e-9)), 0, _SPZ_FRACTION))
     # A position in units of 2^-f; a coefficient c beyond the first as 128 c + 128.
     fixed = np.rint(gaussians.means[order] * _SPZ_AXES * np.float64(2**bits)).astype("<i4")

@@ -70,6 +70,28 @@ def render_features(
     return _rasterize(params, view, features)[0]
 
 
+class _Opacity(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, logits: Tensor) -> Tensor:
+        opacities = logits.neg().exp_().add_(1.0).reciprocal_()
+        ctx.save_for_backward(opacities)
+        return opacities
+
+    @staticmethod
+    def backward(ctx: Any, *upstream: Tensor) -> Tensor:
+        opacities: Tensor = ctx.saved_tensors[0]
+        return upstream[0] * opacities * (1.0 - opacities)
+
+
+def opacities_of(logits: Float[Tensor, "*N"]) -> Float[Tensor, "*N"]:
+    """1 / (1 + exp(-x)), differentiable, and the same whatever the number of threads.
+
+    On the CPU ``torch.sigmoid`` is not: it rounds differently at the ends of each thread's part.
+    """
+    opacities: Tensor = _Opacity.apply(logits)  # type: ignore[no-untyped-call]
+    return opacities
+
+
 def _rasterize(
     params: Mapping[str, Tensor] | torch.nn.ParameterDict,
     view: View,
@@ -86,7 +108,7 @@ def _rasterize(
     camera = camera_of(view, params["means"].device)
     images, alphas, info = rasterization(
         params["means"], params["quats"], torch.exp(params["scales"]),
-        torch.sigmoid(params["opacities"]), colors, camera.viewmats, camera.Ks,
+        opacities_of(params["opacities"]), colors, camera.viewmats, camera.Ks,
         view.width, view.height, sh_degree=degree, packed=False, render_mode=mode,
     )  # fmt: skip
     # Unlike indexing, squeeze's backward allocates no image of zeros.

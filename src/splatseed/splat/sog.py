@@ -57,14 +57,16 @@ def encode(gaussians: Gaussians, progress: Progress = silent) -> list[bytes]:
     # The three smaller components in RGB, 252 + the index of the largest in A.
     smaller = packed.rounded_bytes(three * np.sqrt(0.5) * 255 + 127.5)
     quats = np.column_stack([smaller, _QUAT_MARK + largest])
-    scales, sh0 = codebook(gaussians.scales), codebook(gaussians.sh0)
+    most = packed.MOST_LOG_SCALE  # an infinite one would make all means of its cluster infinite
+    logs = np.clip(gaussians.scales, -most, most)
+    scales, sh0 = codebook(logs), codebook(gaussians.sh0)
     colors = codes(gaussians.sh0[order, 0], sh0)
     opacity = packed.opacity_bytes(gaussians.opacities[order])
     pictures = {
         "means_l.webp": _grid(positions & 255),  # 16 bits: low bytes, then high ones
         "means_u.webp": _grid(positions >> 8),
         "quats.webp": _grid(quats),
-        "scales.webp": _grid(codes(gaussians.scales[order], scales)),
+        "scales.webp": _grid(codes(logs[order], scales)),
         "sh0.webp": _grid(np.column_stack([colors, opacity])),
     }
     files = ["means_l.webp", "means_u.webp"]

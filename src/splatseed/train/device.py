@@ -6,6 +6,9 @@ refused before the first step, with the number that fits, and a growing one is h
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import torch
 
 from splatseed.errors import PointCloudError
@@ -39,6 +42,21 @@ def check_fits(count: int, device: torch.device) -> None:
             found=f"{count:,}",
             fix=f"Pass --budget {most}, upsample less, or free some memory.",
         )
+
+
+@contextmanager
+def on_one_thread(device: torch.device) -> Iterator[None]:
+    """Let PyTorch compute on one thread of the CPU while the block runs.
+
+    For functions of gsplat's whose last digits depend on the number of threads, as sigmoid's do.
+    """
+    threads = torch.get_num_threads()
+    if device.type == "cpu":
+        torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 class Capacity:

@@ -34,7 +34,13 @@ from splatseed.train.parameters import make_parameters
 from splatseed.train.seeds import DepthMaps, known_depths
 from splatseed.train.settings import TrainSettings
 from splatseed.train.start import read_start
-from splatseed.views.view import View, data_factor as factor_for, load_views, user_cache_dir
+from splatseed.views.view import (
+    View,
+    at_file_size,
+    data_factor as factor_for,
+    load_views,
+    user_cache_dir,
+)
 
 FADED = 0.25
 """Part of its opacity that a suspect is judged at. At half, 101 of 4,000 Gaussians of the synthetic
@@ -75,7 +81,7 @@ def floaters_of_model(
         ParameterError: A number is out of range.
     """
     settings = TrainSettings(strategy="grow", data_factor=data_factor or 1, test_every=test_every)
-    scene = with_masks(load_scene(scene_path, require_points=False), masks)
+    scene = at_file_size(with_masks(load_scene(scene_path, require_points=False), masks))
     images = photographed(scene, test_every, without="leave --clean out")
     gaussians = read_start(path, scene, lambda _: None)
     if data_factor is None:

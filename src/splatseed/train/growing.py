@@ -29,8 +29,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from splatseed.splat.gaussians import SH_C0
-from splatseed.splat.rendering import camera_of, fill_masked, mask_of, render_features
-from splatseed.train.device import Capacity
+from splatseed.splat.rendering import camera_of, fill_masked, mask_of, opacities_of, render_features
+from splatseed.train.device import Capacity, on_one_thread
 from splatseed.train.parameters import NEAR_DEPTHS, Optimizers, Parameters
 from splatseed.train.schedule import Schedule
 from splatseed.train.strategies import Strategy
@@ -178,7 +178,7 @@ class Growing(Strategy):
         sums, count = self._sums(params), len(params["means"])
         shown = sums["views"] >= LEAST_VIEWS
         # Nearly transparent, ...
-        needless = torch.sigmoid(params["opacities"].detach().flatten()) < FAINT
+        needless = opacities_of(params["opacities"].detach().flatten()) < FAINT
         # ... or worth less than half a pixel in every view that showed it.
         needless |= shown & (sums["most_pixels"] < _least(sums["most_pixels"][shown]))
         more = self._recycled(count) - int(needless.sum())
@@ -209,8 +209,9 @@ class Growing(Strategy):
             chosen = torch.zeros(len(scores), dtype=torch.bool, device=scores.device)
             chosen[torch.topk(scores, number).indices] = True
             params["opacities"].data.clamp_(max=OPAQUE)
-            # Both halves together are as opaque as the whole.
-            split(params, optimizers, {}, chosen, revised_opacity=True)
+            with on_one_thread(scores.device):
+                # Both halves together are as opaque as the whole.
+                split(params, optimizers, {}, chosen, revised_opacity=True)
 
     def _drawn_each(self, count: int, step: int) -> int:
         """Candidates to draw: what the next round may ask for, shared by its looks with depths."""
@@ -238,7 +239,10 @@ class Growing(Strategy):
 
 def _least(most_pixels: Float[Tensor, " M"]) -> float:
     """The fewest pixels that are worth a Gaussian, given those of the Gaussians shown."""
-    return min(LEAST_PIXELS, LEAST_PART * float(most_pixels.mean())) if len(most_pixels) else 0.0
+    if not len(most_pixels):
+        return 0.0
+    # NumPy's: the last digits of PyTorch's mean depend on the number of threads.
+    return min(LEAST_PIXELS, LEAST_PART * float(most_pixels.cpu().numpy().mean()))
 
 
 def contributions(

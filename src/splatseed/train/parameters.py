@@ -20,6 +20,7 @@ from jaxtyping import Float, Float32
 from torch import Tensor
 
 from splatseed.splat.gaussians import SCENE_SCALE, Gaussians
+from splatseed.splat.rendering import opacities_of
 from splatseed.train.schedule import Schedule
 
 Parameters = torch.nn.ParameterDict
@@ -120,7 +121,7 @@ def with_dropout(params: Parameters, fraction: float) -> Parameters | Mapping[st
     """
     if fraction <= 0:
         return params
-    opacities = torch.sigmoid(params["opacities"])
+    opacities = opacities_of(params["opacities"])
     kept = torch.rand_like(opacities) >= fraction
     raised = torch.logit((opacities / (1 - fraction)).clamp(max=MOST_OPAQUE))
     return {**params, "opacities": torch.where(kept, raised, DROPPED)}

@@ -11,7 +11,7 @@ import dataclasses
 import hashlib
 import platform
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -43,7 +43,7 @@ from splatseed.splat.rendering import picture_names, write_render
 from splatseed.splat.ssim import WINDOW
 from splatseed.train.device import check_fits, pick_device
 from splatseed.train.folder import Record, RunFolder, write_curve_csv, write_curve_png
-from splatseed.train.parameters import gaussians_of
+from splatseed.train.parameters import gaussians_of, take_mean
 from splatseed.train.seeds import first_gaussians, known_depths, seeded, seeds_facts, usable_seeds
 from splatseed.train.settings import TrainSettings
 from splatseed.train.start import read_start, start_facts, started_gaussians
@@ -55,7 +55,7 @@ from splatseed.train.state import (
     save_checkpoint,
 )
 from splatseed.train.trainer import Trainer
-from splatseed.views.view import View, check_lens, load_split, poses_of
+from splatseed.views.view import View, at_file_size, check_lens, load_split, poses_of
 
 Score = Callable[..., EvalResult]
 """Scores renders against views, and calls ``on_view``, as ``evaluate.evaluate_views`` does."""
@@ -76,6 +76,7 @@ def prepare_run(
     settings: TrainSettings,
     *,
     resume: bool = False,
+    named: Collection[str] = (),
     overwrite: bool = False,
     refine_poses: bool = False,
     tensorboard: bool = False,
@@ -92,6 +93,8 @@ def prepare_run(
         output: The folder of the run.
         settings: How to train.
         resume: Resume the run in the folder, if there is one, with its own settings.
+        named: The settings that the user gave, which a run to resume must have; others need not be
+            its own where they are the defaults.
         overwrite: Replace an earlier run in the folder.
         refine_poses: Refine poses of a phone or SLAM first, and triangulate points, which replace
             the scene's.
@@ -115,6 +118,7 @@ def prepare_run(
         MissingDependencyError: TensorBoard or pycolmap is needed and absent.
     """
     _check_images(scene)  # before the folder is looked at, which may be a cloud's own
+    scene = at_file_size(scene)
     if tensorboard:
         require("tensorboard")
     folder = RunFolder(Path(output))
@@ -123,7 +127,7 @@ def prepare_run(
     folder.check(overwrite=overwrite, resume=resume, protect=protect)
     begun = folder.read_config() if resume and folder.is_run else None
     if begun:
-        settings, refine_poses = resumed(begun, settings, refine_poses=refine_poses)
+        settings, refine_poses = resumed(begun, settings, named, refine_poses=refine_poses)
         scene = _as_masked(scene, begun)
     device = pick_device(settings.backend, progress)
     if refine_poses:
@@ -271,18 +275,22 @@ def _version(package: str) -> str | None:
 
 
 def resumed(
-    begun: Mapping[str, Any], asked: TrainSettings, *, refine_poses: bool
+    begun: Mapping[str, Any],
+    asked: TrainSettings,
+    named: Collection[str] = (),
+    *,
+    refine_poses: bool,
 ) -> tuple[TrainSettings, bool]:
     """The settings of a resumed run, and whether it refined poses, by the config it began with.
 
-    What the user leaves at its default is as the run has it, but for the backend, which may change;
-    anything else must be the run's own. An older version's config may lack a setting.
+    What is not ``named`` and has its default is as the run has it, but for the backend, which may
+    change; anything else must be the run's own. An older version's config may lack a setting.
     """
     default = {**dataclasses.asdict(TrainSettings()), "refine_poses": False}
     now = {**dataclasses.asdict(asked), "refine_poses": refine_poses}
     then = {name: begun.get(name, each) for name, each in default.items() if name != "backend"}
     for name, value in then.items():
-        if now[name] not in (value, default[name]):
+        if now[name] != value and (name in named or now[name] != default[name]):
             raise ParameterError(
                 f"--{OPTIONS.get(name, name.replace('_', '-'))} {value}, as when the run began",
                 found=f"{now[name]}",
@@ -418,6 +426,8 @@ class TrainingRun:
             PointCloudError: The GPU's memory does not suffice.
         """
         state, folder, views = self.state, self.folder, self.trainer.test_views
+        if state.step < self.settings.max_steps:  # at its last step training has taken it
+            take_mean(state.params, state.mean)
         with self.told():
             progress("score", 0.0)
             folder.claim([folder.renders / name for name in self._pictures.values()])

@@ -19,7 +19,8 @@ from torch import Tensor
 
 from splatseed.render import MCMCStrategy
 from splatseed.splat.gaussians import SCENE_SCALE
-from splatseed.train.device import Capacity
+from splatseed.splat.rendering import opacities_of
+from splatseed.train.device import Capacity, on_one_thread
 from splatseed.train.parameters import NEAR_DEPTHS, Optimizers, Parameters, length_units
 from splatseed.train.schedule import LEARNING_RATES, Schedule
 from splatseed.train.settings import TrainSettings
@@ -125,7 +126,8 @@ class Default(Strategy):
         """Clone, split, prune, and reset opacities if enabled."""
         # gsplat takes one number here, or one per Gaussian like the rest of its state.
         self.state["scene_scale"] = length_units(params) if NEAR_DEPTHS in params else SCENE_SCALE
-        self.inner.step_post_backward(params, optimizers, self.state, step, info)
+        with on_one_thread(params["means"].device):
+            self.inner.step_post_backward(params, optimizers, self.state, step, info)
         while_refining = self.resets and 0 < step < self.inner.refine_stop_iter
         if while_refining and step % self.inner.reset_every == 0:
             # Twice the opacity at which Gaussians are pruned: those that matter recover, others go.
@@ -176,7 +178,7 @@ class Mcmc(Strategy):
 
     def regularization(self, params: Parameters) -> Float[Tensor, ""]:
         """Mean opacity and mean size, weighted."""
-        opacities, sizes = torch.sigmoid(params["opacities"]), torch.exp(params["scales"])
+        opacities, sizes = opacities_of(params["opacities"]), torch.exp(params["scales"])
         if NEAR_DEPTHS in params:
             sizes = sizes / length_units(params)[:, None]
         # 0.01 (mean opacity + mean size): needless Gaussians fade, and are relocated.
@@ -188,4 +190,5 @@ class Mcmc(Strategy):
         # 3DGS's rate of positions, however fast they move here: the noise must not grow with it.
         lr = LEARNING_RATES["means"] * self.schedule.decay("means", step)
         unit = 1.0 if NEAR_DEPTHS in params else SCENE_SCALE
-        self.inner.step_post_backward(params, optimizers, self.state, step, info, lr=lr * unit)
+        with on_one_thread(params["means"].device):
+            self.inner.step_post_backward(params, optimizers, self.state, step, info, lr=lr * unit)

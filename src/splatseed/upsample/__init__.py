@@ -38,6 +38,7 @@ __all__ = [
     "Traits",
     "Upsampler",
     "as_cloud",
+    "check_seed",
     "chooses_number",
     "configure",
     "methods_for",
@@ -208,10 +209,7 @@ def upsample(
         chosen, kind = method, type(method)
         name = next((each for each in METHODS if METHODS[each] is kind), kind.__name__)
     num_new = number_of_new(chosen, name, len(originals), ratio, num_points)
-    if not isinstance(seed, (int, np.integer)) or seed < 0:
-        raise ParameterError(
-            "a seed that is a whole number from 0", found=repr(seed), fix="Choose such a seed."
-        )
+    check_seed(seed)
     rng = np.random.default_rng(seed)
     if num_new == 0 and len(originals) > 0:
         return originals
@@ -267,6 +265,14 @@ def upsample_points(
     """
     seeds = upsample(PointCloud(xyz, rgb), method, **options)
     return seeds.xyz, seeds.rgb
+
+
+def check_seed(seed: int) -> None:
+    """Refuse what seeds no generator."""
+    if not isinstance(seed, (int, np.integer)) or seed < 0:
+        raise ParameterError(
+            "a seed that is a whole number from 0", found=repr(seed), fix="Choose such a seed."
+        )
 
 
 def planned_size(num_original: int, ratio: float | None, num_points: int | None) -> int:

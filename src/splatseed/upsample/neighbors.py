@@ -31,7 +31,7 @@ from splatseed.upsample.method import nothing_finite
 SPACING_NEIGHBORS = 6  # nearest points over which the spacing h is averaged
 OUTLIER_NEIGHBORS = 16  # neighbours that a point's spacing is compared with
 OUTLIER_FACTOR = 3.0
-"""Times their lower quartile, at which a point is isolated: catches 62% of planted outliers."""
+"""Times their lower quartile, at which a point is isolated: catches 55% of planted outliers."""
 NEIGHBOR_BYTES = 12
 """What is held of each neighbour of each point: its row, int32, and its distance, float64."""
 QUERY_BLOCK = 1 << 13  # rows per task of a thread

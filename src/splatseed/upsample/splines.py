@@ -340,6 +340,9 @@ def _score(diagonal, beside, y, smoothing):  # type: ignore[no-untyped-def]  # N
     return squared / (trace * trace)
 
 
+NO_RANK = 1e-10
+"""Singular values below this part of the largest count as 0, as those of a lattice's points are but
+for rounding: their inverses would put points at any distance."""
 DEGREE = 3
 BICUBIC_TERMS = (DEGREE + 1) * (DEGREE + 1)
 
@@ -360,7 +363,7 @@ def _bicubic_heights(xyz, idx, distance, frames, start, count, uv, first, last, 
         if count[i] > 0:
             reach = distance[i, -1]
             design, z = _design(xyz, i, idx[i], frames[i], reach)
-            coefficients = np.linalg.lstsq(design, z)[0]
+            coefficients = np.linalg.lstsq(design, z, NO_RANK)[0]
             term = np.empty(BICUBIC_TERMS)
             for m in range(start[i], start[i] + count[i]):
                 _terms(uv[m, 0] / reach, uv[m, 1] / reach, term)

@@ -14,7 +14,7 @@ import sys
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -69,6 +69,34 @@ def poses_of(images: Sequence[Image], data_factor: int = 1) -> tuple[View, ...]:
             raise _too_small(image.name, 1, data_factor, sides)
         views.append(View(image.name, unseen, shrink @ camera.K, *sides, camera.cam_from_world))
     return tuple(views)
+
+
+def at_file_size(scene: Scene) -> Scene:
+    """The scene with its cameras in pixels of the files.
+
+    These may be resized copies of what the model was made from; the first photograph stands for
+    all, and without it nothing changes.
+    """
+    folder = scene.source.image_dir if scene.source else None
+    paths = ((image, folder / image.name) for image in scene.images if folder)
+    image, path = next((each for each in paths if each[1].is_file()), (None, Path()))
+    if image is None:
+        return scene
+    try:
+        width, height = open_photograph(path, photograph_bytes(path)).size
+    except SceneFormatError:  # whoever needs its pixels tells
+        return scene
+    own = image.intrinsics
+    if (width, height) == (own.width, own.height):
+        return scene
+    scale = np.array([width / own.width, height / own.height])
+    images = []
+    for each in scene.images:
+        lens, found = each.intrinsics, each.observations
+        sides = np.maximum(np.rint(scale * [lens.width, lens.height]), 1).astype(int).tolist()
+        moved = found and replace(found, xy=found.xy * scale)
+        images.append(replace(each, intrinsics=lens.resized(*sides), observations=moved))
+    return scene.replace(images=tuple(images))
 
 
 def data_factor(images: Sequence[Image], max_size: int) -> int:

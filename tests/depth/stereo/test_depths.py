@@ -38,10 +38,8 @@ def maps_of(planted):
 
 def test_a_tilted_plane(plane):
     for stereo_map in maps_of(plane):
-        error, angle = (
-            relative_error(plane.surfaces, stereo_map),
-            degrees_off(plane.surfaces, stereo_map),
-        )
+        error = relative_error(plane.surfaces, stereo_map)
+        angle = degrees_off(plane.surfaces, stereo_map)
         assert stereo_map.known_share > 0.7
         assert (error < 0.01).mean() > 0.95
         assert np.median(error) < 0.003
@@ -51,10 +49,8 @@ def test_a_tilted_plane(plane):
 
 def test_a_ball_before_a_wall(ball):
     for stereo_map in maps_of(ball):
-        error, angle = (
-            relative_error(ball.surfaces, stereo_map),
-            degrees_off(ball.surfaces, stereo_map),
-        )
+        error = relative_error(ball.surfaces, stereo_map)
+        angle = degrees_off(ball.surfaces, stereo_map)
         assert stereo_map.known_share > 0.55
         assert (error < 0.01).mean() > 0.9
         assert np.median(angle) < 10

@@ -183,7 +183,7 @@ def stereo_depths(
         SceneFormatError: A photograph cannot be used.
     """
     from splatseed.depth.stereo.depths import find_stereo, known_visibility  # noqa: PLC0415  (loads Numba)
-    from splatseed.views.view import data_factor, load_views  # noqa: PLC0415  (loads with its use)
+    from splatseed.views.view import at_file_size, data_factor, load_views  # noqa: PLC0415  (loads with its use)
 
     settings = replace(settings or StereoSettings(), **choices)
     if len(scene.images) < 2:
@@ -192,6 +192,7 @@ def stereo_depths(
             found=f"{len(scene.images)}",
             fix="Name a scene with photographs: depth comes from comparing them.",
         )
+    scene = at_file_size(scene)
     views = load_views(
         scene,
         scene.images,
