@@ -17,12 +17,12 @@ from typing import NamedTuple
 import pandas as pd
 
 from splatseed.bench.comparisons import gains
-from splatseed.bench.plan import ANY_RATIO, DEPTH, Arm
+from splatseed.bench.plan import ANY_RATIO, DEPTH, SFM, Arm
 from splatseed.bench.runs import Run, read_runs
 from splatseed.bench.statistics import Difference
 from splatseed.bench.study import Study, studies
 from splatseed.train.settings import StrategyName
-from splatseed.upsample import Profile
+from splatseed.upsample import Profile, configure
 
 __all__ = ["LAYOUT", "RANDOM", "Results", "Way", "read_results"]
 
@@ -82,8 +82,9 @@ class Results:
     def label(self, way: Way, method: str, ratio: float) -> str:
         """The label in a study of a way's arm; a method whose profiles are the same has one arm."""
         known = [a for a in self.arms if (a.method, a.ratio) == (method, ratio)]
-        own = [a for a in known if a.profile == way.profile]
-        return (own or known)[0].label if known else ""
+        if not (method == SFM or configure(method) == configure(method, "paper")):
+            known = [a for a in known if a.profile == way.profile]
+        return known[0].label if known else ""
 
     def gain(self, way: Way, scene: str, method: str, ratio: float) -> Difference | None:
         """What an arm gained over SfM's points on a scene, dB; None without both."""

@@ -103,9 +103,9 @@ def page_tables(results: Results) -> dict[str, list[Table]]:
     return {
         **{
             f"table{number}": [
-                _by_ratio(results, way, key, scenes, full=way in first)
+                table
                 for way in finished
-                if scenes
+                if (table := _by_ratio(results, way, key, scenes, full=way in first)).rows
             ]
             for number, (key, scenes) in enumerate(kinds, start=1)
         },
@@ -133,8 +133,9 @@ def _by_ratio(
     theirs, printed = paper_psnr(key), paper_gains(key)
     for ratio in results.ratios(scenes):
         shown, kinds = f"{ratio:g}x", [(method, ratio) for method in methods]
-        for scene in (each for each in scenes if ratio in results.ratios([each])):
-            gained = [results.gain(way, scene, *kind) for kind in kinds]
+        run = {each: [results.gain(way, each, *kind) for kind in kinds] for each in scenes}
+        run = {scene: gained for scene, gained in run.items() if any(gained)}
+        for scene, gained in run.items():
             if not full:
                 rows.append((scene, shown, *map(_gain_cell, gained)))
                 continue
@@ -148,6 +149,8 @@ def _by_ratio(
                     for e in own[1:]
                 ]
                 rows.append((f"{scene}, paper", shown, *_marked([own[0], *more])))
+        if not run:
+            continue
         blank = ("",) if full else ()
         rows.append(("mean", shown, *blank, *_mean_gains(results, way, scenes, kinds)))
         if any(kind in printed for kind in kinds):
