@@ -41,6 +41,16 @@ def test_model_is_found_in_its_usual_places(scene_dir, model, place):
         np.testing.assert_array_equal(scene.tracks.xyz, model.tracks.xyz)
 
 
+def test_photographs_are_where_most_of_them_are(scene_dir):
+    shutil.copytree(scene_dir / "images", scene_dir / "images_2")
+    for missing in ("images/left/image000.jpg", "images_2/left/image001.jpg"):
+        (scene_dir / missing).unlink()
+    (scene_dir / "images_2/left/image002.jpg").unlink()
+    assert load_scene(scene_dir).source.image_dir == scene_dir / "images"
+    named = scene_dir.rename(scene_dir.with_name("colmap"))  # as nerfstudio's folder of a model
+    assert load_scene(named).source.image_dir == named / "images"
+
+
 def test_binary_goes_before_text_and_text_before_ply(scene_dir, model):
     folder = scene_dir / "sparse/0"
     lines = "".join(f"{i} 0 {i} 1 7 7 7 0.5\n" for i in range(10))

@@ -98,8 +98,9 @@ def test_what_cannot_be_a_mask_is_named(scene_path):
         masks_of(load_scene(scene_path))
 
 
-def test_transforms_name_masks(scene_path, tmp_path):
-    """Their ``mask_path`` is read, and a new file has one for each frame."""
+@pytest.mark.parametrize("folder", ["elsewhere", "masks"])
+def test_transforms_name_masks(scene_path, tmp_path, folder):
+    """Their ``mask_path`` is read, whatever it names, and a new file has one for each frame."""
     scene = load_scene(scene_path)
     for i in range(9):
         paint(tmp_path / f"other/view_{i:03}.png.png")
@@ -109,9 +110,13 @@ def test_transforms_name_masks(scene_path, tmp_path):
     assert [frame["mask_path"] for frame in frames] == [
         f"masks/{image.name}.png" for image in scene.images
     ]
-    (tmp_path / "out/masks").rename(tmp_path / "out/elsewhere")
-    for frame in frames:
-        frame["mask_path"] = frame["mask_path"].replace("masks/", "elsewhere/")
+    (tmp_path / "out/masks").rename(tmp_path / "out/old")
+    for i, frame in enumerate(frames):
+        old, frame["mask_path"] = frame["mask_path"], f"{folder}/{i}.png"
+        (tmp_path / "out" / folder).mkdir(exist_ok=True)
+        (tmp_path / "out" / old.replace("masks/", "old/")).rename(
+            tmp_path / "out" / frame["mask_path"]
+        )
     text = json.loads((tmp_path / "out/transforms.json").read_text("utf-8"))
     (tmp_path / "out/transforms.json").write_text(json.dumps({**text, "frames": frames}), "utf-8")
     again = load_scene(tmp_path / "out")

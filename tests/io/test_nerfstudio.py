@@ -16,7 +16,7 @@ from PIL import Image as PilImage
 from splatseed.camera import Camera, Intrinsics, rotation_from_quat
 from splatseed.errors import OutputError, SceneFormatError, SplatseedError
 from splatseed.io import load_scene, write_scene
-from splatseed.io.nerfstudio import read_transforms
+from splatseed.io.nerfstudio import _same_cameras, read_transforms
 from splatseed.io.ply import read_ply, write_ply
 from splatseed.pointcloud import PointCloud
 from splatseed.similarity import Similarity
@@ -144,6 +144,22 @@ def test_instant_ngps_recentred_poses_are_fitted(content, scene_dir, model, rng)
     assert any("turned, moved and scaled by 0.37" in text for text in scene.warnings)
 
 
+def test_cameras_are_the_same_by_their_paths_or_by_names_that_are_unique(model):
+    first, second = (replace(i, name=f"cam{n}/0.jpg") for n, i in enumerate(model.images[:2]))
+    for others, same in (([second, first], 2), ([replace(second, name="other/0.jpg")], 0)):
+        pairs = _same_cameras([first, second], others)
+        assert len(pairs) == same
+        assert all(np.array_equal(*pair) for pair in pairs)
+
+
+def test_cameras_of_two_kinds_are_refused(scene_dir, tmp_path):
+    first, *rest = load_scene(scene_dir).images
+    fisheye = Intrinsics(99, "OPENCV_FISHEYE", 96, 72, (80.0, 80.0, 48.0, 36.0, 0.1, 0.0, 0.0, 0.0))
+    mixed = load_scene(scene_dir).replace(images=(replace(first, intrinsics=fisheye), *rest))
+    with pytest.raises(OutputError, match="of one kind"):
+        write_scene(mixed, tmp_path / "out", format="transforms")
+
+
 def test_colmap_points_of_another_world_are_refused(content, scene_dir, rng):
     for frame in content["frames"]:
         for row in frame["transform_matrix"][:3]:
@@ -254,6 +270,8 @@ def test_blenders_files_are_one_scene_and_so_is_its_output(layout, tmp_path, rng
     write_ply(root / "points3d.ply", points)
     scene = load_scene(root)
     again = load_scene(write_scene(scene, tmp_path / "out", format=layout).path)
+    linked = [each for each in (tmp_path / "out/images").rglob("*") if each.is_symlink()]
+    assert not any(each.is_dir() for each in linked)  # which gsplat's examples do not enter
     wanted = [[f"{part}/r_{i}.png" for i in range(counts[part])] for part in ("train", "test")]
     pixels = []
     for each in (scene, again):

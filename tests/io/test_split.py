@@ -21,6 +21,7 @@ def parts(scene):
     ("file", "start", "end"),
     [
         ("test_list.txt", "", ""),
+        ("val_list.txt", "", ""),
         ("validation_list.txt", "", ""),
         ("test.txt", "images/", ""),
         ("sparse/0/test.txt", "", ""),
@@ -57,7 +58,7 @@ def test_two_lists_can_leave_images_out(scene_dir):
 
 
 def test_names_of_no_image_are_told(scene_dir):
-    (scene_dir / "test_list.txt").write_text("\n".join([*TEST, "left/imgae002.jpg"]))
+    (scene_dir / "test_list.txt").write_text("\n".join([*TEST, "left/imgae002.jpg"]), "utf-8-sig")
     scene = load_scene(scene_dir)
     assert parts(scene)[1] == TEST
     assert any("left/imgae002.jpg" in each for each in scene.warnings)
@@ -75,7 +76,8 @@ def test_the_lists_of_transforms_json_are_followed_and_carried_over(scene_dir, t
     for layout in ("transforms", "colmap"):
         out = write_scene(scene, tmp_path / f"to_{layout}", format=layout).path
         assert parts(load_scene(out)) == (TRAIN, TEST), layout
-    assert set((tmp_path / "to_colmap/test_list.txt").read_text().split()) == TEST
+    for part in ("test", "val"):  # nerfstudio wants both
+        assert set((tmp_path / f"to_colmap/{part}_list.txt").read_text().split()) == TEST
     # nerfstudio fails over a listed file that no frame has
     write_scene(scene.replace(images=scene.images[:2]), tmp_path / "fewer")
     content = json.loads((tmp_path / "fewer/transforms.json").read_text())

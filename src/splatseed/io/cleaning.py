@@ -168,7 +168,11 @@ def offset_of(scene: Scene) -> Float64[np.ndarray, " 3"]:
 
 
 def recentred(scene: Scene, offset: Float64[np.ndarray, " 3"]) -> Scene:
-    """A scene moved by ``-offset``; files beside the model no longer belong to it."""
+    """A scene moved by ``-offset``; files beside the model no longer belong to it.
+
+    Raises:
+        ParameterError: Its points were read in single precision, which does not resolve them.
+    """
     images = tuple(
         replace(image, translation=image.translation + image.camera.cam_from_world[:3, :3] @ offset)
         for image in scene.images
@@ -177,6 +181,14 @@ def recentred(scene: Scene, offset: Float64[np.ndarray, " 3"]) -> Scene:
     if tracks is not None:
         xyz[: len(tracks)] = tracks.xyz
         tracks = replace(tracks, xyz=tracks.xyz - offset)
+    elif len(xyz) > 1:
+        step, extent = float(np.spacing(np.float32(np.abs(xyz).max()))), float(np.ptp(xyz, 0).max())
+        if step > _RESOLUTION * extent > 0:
+            raise ParameterError(
+                "points that single precision resolves, to be recentred",
+                found=f"a PLY at {np.abs(xyz).max():,.0f}, where it has steps of {step:.2g}",
+                fix="Subtract an offset from the PLY and the poses before, in double precision.",
+            )
     source = scene.source and replace(scene.source, model_dir=None, transforms_path=None)
     points = scene.points.replace(xyz=(xyz - offset).astype(np.float32))
     return replace(scene, images=images, points=points, tracks=tracks, source=source)

@@ -432,7 +432,8 @@ def scene_root(model_dir: Path) -> Path:
     levels = 1 if parts[-1] == "sparse" else 2 if parts[-2:-1] == ("sparse",) else 0
     if not levels:
         return model_dir
-    levels += parts[-levels - 1] == "colmap"
+    above = model_dir.absolute().parents[levels - 1]
+    levels += above.name == "colmap" and not any((above / name).is_dir() for name in _IMAGE_DIRS)
     named = model_dir if len(model_dir.parts) >= levels else model_dir.absolute()
     return named.parents[levels - 1]
 
@@ -442,11 +443,7 @@ def read_colmap_scene(model_dir: Path) -> Scene:
     root = scene_root(model_dir)
     intrinsics, images = read_model_cameras(model_dir)
     points, tracks, points_path = read_model_points(model_dir)
-    # The first known folder that holds the first image, else the first that exists.
-    folders = [root / name for name in _IMAGE_DIRS if (root / name).is_dir()]
-    first = images[0].name if images else ""
-    holding = (folder for folder in (*folders, root) if first and (folder / first).is_file())
-    image_dir = next(holding, folders[0] if folders else None)
+    image_dir = _image_dir(root, images)
     warnings = [*image_warnings(images, image_dir, root), *lens_warnings(images)]
     if model_dir.name == "0" and find_model(model_dir.with_name("1")):
         warnings.append(f"{model_dir.parent} has several models; this is {model_dir.name}.")
@@ -461,6 +458,18 @@ def read_colmap_scene(model_dir: Path) -> Scene:
         )
     source = SceneSource("colmap", root, points_path, model_dir, image_dir)
     return Scene(points, images, intrinsics, tracks, source, tuple(warnings))
+
+
+def _image_dir(root: Path, images: Sequence[Image]) -> Path | None:
+    """The first known folder with all images, else with the most; the first at all without any."""
+    folders = [root / name for name in _IMAGE_DIRS if (root / name).is_dir()]
+    held = dict[Path, int]()
+    for folder in (*folders, root):
+        held[folder] = sum((folder / image.name).is_file() for image in images)
+        if held[folder] == len(images) > 0:
+            break
+    best = max(held, key=lambda folder: held[folder])
+    return best if held[best] else next(iter(folders), None)
 
 
 def read_model_cameras(model_dir: Path) -> tuple[tuple[Intrinsics, ...], tuple[Image, ...]]:

@@ -50,6 +50,17 @@ _WAIT_NOT = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr
 _COUNT = struct.Struct("<Q")
 
 
+def files_below(folder: Path) -> list[Path]:
+    """What is in a folder and its subfolders, linked ones too, but folders; sorted."""
+    found = list[Path]()
+    for place, folders, names in os.walk(folder, followlinks=True):
+        if os.path.realpath(place) in map(os.path.realpath, Path(place).parents):
+            folders.clear()  # a link that leads back
+        else:
+            found += [Path(place, name) for name in names]
+    return sorted(found)
+
+
 def is_video(path: Path) -> bool:
     """Whether a path is a video file, by its name."""
     return path.suffix.lower() in VIDEO_SUFFIXES and path.is_file()

@@ -19,7 +19,7 @@ from jaxtyping import Bool
 from splatseed.camera import Intrinsics
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io.depth_maps import Undistortion
-from splatseed.io.files import guarded, read_bytes
+from splatseed.io.files import files_below, guarded, read_bytes
 from splatseed.io.photograph import has_alpha, open_photograph, photograph_bytes
 from splatseed.literal import agreeing, counted
 from splatseed.scene import Masks, Scene
@@ -65,7 +65,8 @@ def with_own_masks(scene: Scene) -> Scene:
     folder = scene.source.image_dir if scene.source else None
     if scene.source is None or folder is None or scene.masks is not None:
         return scene
-    beside = folder.with_name(FOLDER) if folder != scene.source.root else folder / FOLDER
+    alone = folder.absolute() != scene.source.root.absolute()
+    beside = folder.with_name(FOLDER) if alone else folder / FOLDER
     found = [each for each in (beside, scene.source.root / FOLDER) if each.is_dir()]
     files, notes = find_masks([i.name for i in scene.images], found[0]) if found else ({}, [])
     return scene.replace(masks=Masks(files), warnings=(*scene.warnings, *notes))
@@ -76,14 +77,15 @@ def masks_beside(photographs: Path) -> tuple[Masks, list[str]]:
     folder = photographs.absolute().with_name(FOLDER)
     if not folder.is_dir() or not photographs.is_dir():
         return Masks({}), []
-    names = (path.relative_to(photographs).as_posix() for path in photographs.rglob("*"))
+    names = (path.relative_to(photographs).as_posix() for path in files_below(photographs))
     files, notes = find_masks(sorted(names), folder)
     return Masks(files), [f"{counted(len(files), 'photograph')} with a mask in {folder}.", *notes]
 
 
 def find_masks(names: Collection[str], folder: Path) -> tuple[dict[str, Path], list[str]]:
     """The masks in a folder by the names of their images, and a note on those without one."""
-    there = {path.relative_to(folder).as_posix(): path for path in sorted(folder.rglob("*.png"))}
+    found = (path for path in files_below(folder) if path.suffix == ".png")
+    there = {path.relative_to(folder).as_posix(): path for path in found}
     files, used = {}, set()
     for name in names:
         short = name.removeprefix("images/")  # where photographs are named from the scene's folder

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -302,9 +303,7 @@ def _transform_of_model(
         candidates = [transforms.applied_transform]
     elif model_dir.parts[-3:-2] != ("colmap",):  # not a folder that nerfstudio made
         candidates.reverse()
-    named = {PurePath(image.name).name: image.camera.center for image in model_images}
-    here = {PurePath(image.name).name: image.camera.center for image in transforms.images}
-    pairs = [(center, named[name]) for name, center in here.items() if name in named]
+    pairs = _same_cameras(transforms.images, model_images)
     if not pairs:
         doubt = f"no image of {model_dir} is in {transforms.path.name}; its points may lie askew."
         return candidates[0], [doubt]
@@ -325,6 +324,22 @@ def _transform_of_model(
         found=f"cameras {np.median(off):.3g} apart in a scene of extent {extent:.3g}",
         fix="Name a PLY in the space of the poses as ply_file_path, or read the COLMAP scene.",
     )
+
+
+def _same_cameras(
+    images: Sequence[Image], others: Sequence[Image]
+) -> list[tuple[Float64[np.ndarray, " 3"], Float64[np.ndarray, " 3"]]]:
+    """Centres of cameras of the same name in both, by paths, else by file names that are unique."""
+    for path in (lambda n: n.removeprefix("images/"), lambda n: PurePath(n).name):
+        centers: list[dict[str, Any]] = []
+        for each in (images, others):
+            names = Counter(path(image.name) for image in each)
+            found = {path(i.name): i.camera.center for i in each if names[path(i.name)] == 1}
+            centers.append(found)
+        pairs = [(center, centers[1][n]) for n, center in centers[0].items() if n in centers[1]]
+        if pairs:
+            return pairs
+    return []
 
 
 def read_cloud_transform(path: Path, scene: Scene) -> Similarity:

@@ -15,8 +15,12 @@ from splatseed.io.files import read_bytes
 from splatseed.literal import agreeing, counted
 from splatseed.scene import Scene, Split
 
-ROOT_LISTS = ("train_list.txt", "test_list.txt", "validation_list.txt", "train.txt", "test.txt")
-"""Lists in a scene's folder: for training, test and validation; for training and test."""
+ROOT_LISTS = (
+    *("train_list.txt", "test_list.txt", "val_list.txt", "validation_list.txt"),
+    *("train.txt", "test.txt"),
+)
+"""Lists in a scene's folder: for training, test and validation, of which nerfstudio looks for the
+one name and reads the other; for training and test."""
 MODEL_LISTS = ("test.txt",)
 """Lists beside a COLMAP model."""
 _SHOWN = 3
@@ -52,9 +56,9 @@ def _lists(scene: Scene) -> Iterator[tuple[str, list[list[str]]]]:
         if any(parts):
             yield "list of file names in transforms.json", parts
     for folder, files, place in (
-        (source.root, ROOT_LISTS[:3], ""),
+        (source.root, ROOT_LISTS[:4], ""),
         (source.model_dir, ("", *MODEL_LISTS), " beside the model"),
-        (source.root, ROOT_LISTS[3:], ""),
+        (source.root, ROOT_LISTS[4:], ""),
     ):
         parts = [_read(folder / name) if folder and name else [] for name in files]
         if any(parts):
@@ -65,7 +69,7 @@ def _lists(scene: Scene) -> Iterator[tuple[str, list[list[str]]]]:
 def _read(path: Path) -> list[str]:
     if not path.is_file():
         return []
-    lines = read_bytes(path).decode("utf-8", "replace").splitlines()
+    lines = read_bytes(path).decode("utf-8-sig", "replace").splitlines()
     return [line.strip() for line in lines if line.strip()]
 
 
@@ -75,7 +79,7 @@ def _split(scene: Scene, origin: str, parts: list[list[str]]) -> tuple[Split | N
     folder = scene.source.image_dir if scene.source else None
     prefixes = ("", "images/", f"{folder.name}/" if folder else "")
     if len(parts) > 2 and not _known(names, parts[1], prefixes):
-        parts = [parts[0], parts[2] or parts[1]]  # validation
+        parts = [parts[0], next(filter(None, parts[2:]), parts[1])]  # validation
     known = [_known(names, each, prefixes) for each in parts[:2]]
     train, test = (frozenset(each.values()) for each in known)
     unknown = [name for i in (0, 1) for name in parts[i] if name not in known[i]]

@@ -28,7 +28,7 @@ from splatseed.errors import OutputError, PointCloudError
 from splatseed.io import colmap, nerfstudio
 from splatseed.io.cleaning import clean_scene, renumber
 from splatseed.io.files import open_file
-from splatseed.io.masks import FOLDER as MASKS, write_masks
+from splatseed.io.masks import FOLDER as MASKS, find_masks, write_masks
 from splatseed.io.ply import ply_header, ply_rows, write_ply
 from splatseed.io.seeds import SEEDS, PositionDigest, write_origins, write_seeds
 from splatseed.io.split import MODEL_LISTS, ROOT_LISTS
@@ -184,7 +184,12 @@ def _rewrites_masks(scene: Scene, layout: Layout) -> bool:
     if masks is None or source is None or not masks.files:
         return False
     named = layout == "transforms" and source.transforms_path and masks.choice is None
-    inside = all((source.root / MASKS) in path.parents for path in masks.files.values())
+    folder = (source.root / MASKS).absolute()
+    inside = all(folder in path.absolute().parents for path in masks.files.values())
+    if inside and layout == "colmap":  # where masks are known by their names alone
+        inside = find_masks([image.name for image in scene.images], folder)[0].keys() == (
+            masks.files.keys()
+        )
     return masks.inverted or not (inside or named)
 
 
@@ -285,7 +290,8 @@ def write_split(scene: Scene, folder: Path) -> None:
             _copy_files(scene.source.model_dir, MODEL_LISTS, folder / "sparse" / "0")
     if scene.listed is None or any((folder / name).exists() for name in ROOT_LISTS):
         return
-    for part, images in zip(ROOT_LISTS, scene.split(), strict=False):  # train and test
+    train, test = scene.split()
+    for part, images in zip(ROOT_LISTS, (train, test, test), strict=False):  # val: test, too
         text = "".join(f"{image.name}\n" for image in images)
         (folder / part).write_text(text, "utf-8")
 
@@ -353,6 +359,13 @@ def _new_json(scene: Scene, A: Float64[np.ndarray, "3 4"] | None) -> dict[str, A
     """A new ``transforms.json``, poses turned by A; images are ``images/NAME``."""
     used = {image.intrinsics.camera_id: image.intrinsics for image in scene.images}
     cameras = {camera_id: _camera_fields(camera) for camera_id, camera in used.items()}
+    models = sorted({fields["camera_model"] for fields in cameras.values()})
+    if len(models) > 1:  # nerfstudio takes one for all
+        raise OutputError(
+            "cameras of one kind, for transforms.json",
+            found=" and ".join(models),
+            fix="Undistort the scene first (splatseed undistort), or write the COLMAP layout.",
+        )
     shared = next(iter(cameras.values()), {})
     if len(used) != 1:
         shared = {"camera_model": shared.get("camera_model", "OPENCV")}
@@ -423,9 +436,10 @@ def image_folders(scene: Scene) -> dict[str, Path]:
         return folders
     if source.image_dir.resolve() != source.root.resolve():
         return {**folders, "images": source.image_dir}
-    firsts = _first_folders(image.name for image in scene.images)
     folders.pop("images", None)
-    return {**folders, **{f"images/{first}": source.image_dir / first for first in firsts}}
+    names = [n for n in (image.name for image in scene.images) if _first_folders([n])]
+    # One by one: gsplat's examples do not enter a linked folder within images.
+    return {**folders, **{f"images/{name}": source.image_dir / name for name in names}}
 
 
 def _first_folders(paths: Iterable[str]) -> list[str]:

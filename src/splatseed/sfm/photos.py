@@ -24,7 +24,7 @@ from PIL import Image as PilImage
 from scipy.ndimage import laplace
 
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
-from splatseed.io.files import VIDEO_SUFFIXES
+from splatseed.io.files import VIDEO_SUFFIXES, files_below
 from splatseed.io.photograph import check_photograph, open_photograph, photograph_bytes
 from splatseed.io.staging import read_manifest
 from splatseed.literal import name_some, quoted
@@ -79,7 +79,7 @@ def find_photos(image_dir: Path) -> tuple[dict[str, Size], dict[str, list[str]]]
             found=f"what splatseed {kind} wrote, with pictures of its own",
             fix=f"Name the folder of its photographs, such as {quoted(image_dir / 'images')}.",
         )
-    relative = [path.relative_to(image_dir) for path in image_dir.rglob("*") if path.is_file()]
+    relative = [path.relative_to(image_dir) for path in files_below(image_dir) if path.is_file()]
     files = [path for path in relative if not any(part.startswith(".") for part in path.parts)]
     names, foreign = (
         sorted(path.as_posix() for path in files if path.suffix.lower() in suffixes)
