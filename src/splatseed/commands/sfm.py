@@ -20,6 +20,7 @@ from splatseed.io.masks import masks_beside
 from splatseed.io.staging import check_output
 from splatseed.literal import counted, name_some, quoted, visible
 from splatseed.runtime.torch_device import DeviceName
+from splatseed.scene import Masks
 from splatseed.sfm import MatcherName, Settings, SfmReport, reconstruct
 from splatseed.sfm.photos import pick_frames
 
@@ -100,6 +101,7 @@ def _from_photographs(options: Options, images: Path, clock: StageClock) -> SfmR
     video = images != options.images
     matcher = options.matcher or ("sequential" if video else "exhaustive")
     settings = Settings(matcher, options.device, seed=options.seed, threads=options.threads)
+    masks: Masks | None = None
     if options.poses_from is None:
         stages = ["mapping"]
         how: dict[str, Any] = {
@@ -111,9 +113,13 @@ def _from_photographs(options: Options, images: Path, clock: StageClock) -> SfmR
         poses = load_scene(options.poses_from, require_points=False)
         how = {"poses_from": poses, "refine_poses": options.refine_poses}
     clock.expect("features", "matching", *stages, "undistortion")
-    masks, notes = masks_beside(images)
-    for note in notes:
-        print_note(note)
+    named = options.poses_from is not None and poses.masks is not None and poses.masks.files
+    if named:
+        masks = poses.masks
+    elif not video:
+        masks, notes = masks_beside(images)
+        for note in notes:
+            print_note(note)
     return reconstruct(
         images,
         options.output,

@@ -129,7 +129,8 @@ def upsample(
     if verify:
         cloud = _add_verified(whole, cloud, progress, note)
     if cover is not None:
-        cloud = add_cover(whole, cloud, cell=cover, seed=seed, progress=progress)
+        held = getattr(made, "hold_out", 0)
+        cloud = add_cover(whole, cloud, cell=cover, hold_out=held, seed=seed, progress=progress)
     if most is not None:
         cloud = thin_to(whole, cloud, most, made, seed, progress, cell=cover)
     return cloud
@@ -184,12 +185,14 @@ def add_cover(
     cloud: PointCloud | None = None,
     *,
     cell: int = CELL,
+    hold_out: int = 0,
     seed: int = 0,
     progress: Progress = silent,
 ) -> PointCloud:
     """A cloud plus a seed for each part of the photographs that it leaves empty.
 
     Without a cloud, the scene's own; parts are ``cell`` pixels wide, at the size that methods use.
+    Every ``hold_out``-th photograph by name is left out; 0: none.
 
     Raises:
         ParameterError: The side is below 1.
@@ -197,7 +200,7 @@ def add_cover(
         SceneNotFoundError: There are no photographs.
     """
     points = scene.points if cloud is None else cloud
-    images = photographed(scene, without="do without cover")
+    images = photographed(scene, hold_out, without="do without cover")
     views = read_views(scene, images, MAX_SIZE, progress)
     return with_cover(views, points, cell, seed, progress)
 

@@ -15,7 +15,7 @@ import importlib
 import math
 import struct
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -167,8 +167,11 @@ def guessed_model(run: Run, photos: Mapping[str, Size], camera_model: str, *, sh
     return model
 
 
-def posed_model(pycolmap: Any, poses: Sequence[Image]) -> Any:
-    """A model with the poses and cameras of images, exactly as given; image i is the i-th."""
+def posed_model(pycolmap: Any, poses: Sequence[Image], without: Collection[str] = ()) -> Any:
+    """A model with the poses and cameras of images, exactly as given; image i is the i-th.
+
+    Some can be left out, by name.
+    """
     model, ids = pycolmap.Reconstruction(), dict[int, int]()
     for number, posed in enumerate(poses, 1):
         lens = posed.intrinsics
@@ -183,6 +186,8 @@ def posed_model(pycolmap: Any, poses: Sequence[Image]) -> Any:
                 has_prior_focal_length=True,  # matches are verified with the true focal length
             )
             model.add_camera_with_trivial_rig(camera)
+        if posed.name in without:
+            continue
         image = pycolmap.Image(name=posed.name, image_id=number, camera_id=camera_id)
         model.add_image_with_trivial_frame(image, rigid(pycolmap, posed))
     return model
@@ -297,13 +302,16 @@ def map_images(run: Run, names: Sequence[str]) -> Path:
     return models_dir / str(best)
 
 
-def triangulate_points(run: Run, poses: Sequence[Image]) -> Path:
-    """Triangulate points with cameras and poses held fixed; the folder of the model."""
+def triangulate_points(run: Run, poses: Sequence[Image], without: Collection[str] = ()) -> Path:
+    """Triangulate points with cameras and poses held fixed; the folder of the model.
+
+    Images can be left out, by name.
+    """
     model_dir = run.work / "model"
     model_dir.mkdir()
     options = _options(run)
     options.max_extra_param = math.inf  # a known lens is trusted: Kinects have a k3 above 1
-    posed = posed_model(run.pycolmap, poses)
+    posed = posed_model(run.pycolmap, poses, without)
     model = run.stage(
         "triangulation",
         lambda: run.pycolmap.triangulate_points(

@@ -9,7 +9,7 @@ interrupt a kill.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
@@ -55,6 +55,7 @@ class SfmReport:
     mean_reprojection_error: float  # over points, of their means; px, undistorted
     seconds: Mapping[str, float]  # wall time of each stage, in the order in which they ran
     refinement: Refinement | None = None  # what it changed; None where it was not asked for
+    poses: tuple[Image, ...] = ()  # known ones, as refined
 
 
 Job: TypeAlias = Callable[..., SfmReport]
@@ -70,6 +71,7 @@ def reconstruct(
     shared_camera: bool = True,
     poses_from: Scene | None = None,
     refine_poses: bool = False,
+    held_out: Collection[str] = (),
     masks: Masks | None = None,
     overwrite: bool = False,
     on_progress: Progress = silent,
@@ -94,6 +96,8 @@ def reconstruct(
         refine_poses: Refine these poses, if they are off by a few degrees or per cent of the
             cameras' extent, as those of phones and SLAM are. They stay exactly as given where
             refinement would lower the mean reprojection error by less than 0.1 px.
+        held_out: Photographs of known pose, by name, that have no part in the points and are not in
+            the scene, but are refined with the others: those of a test, say.
         masks: Where no features are looked for; the scene gets them, undistorted.
         overwrite: Replace ``output`` if it exists.
         on_progress: Called with the stage and the fraction done.
@@ -116,14 +120,15 @@ def reconstruct(
         if on_photos is not None:
             on_photos(list(photos), left_out)
         how = (images, staging, settings, on_progress, _reconstruct)
-        report = _call(*how, photos, camera_model, shared_camera, poses, refine_poses, masks)
+        asked = camera_model, shared_camera, poses, refine_poses, held_out, masks
+        report = _call(*how, photos, *asked)
         if poses_from is not None:
             write_split(poses_from, staging)
         manifest = {
             "job": "reconstruct" if poses is None else "triangulate",
             "version": version("splatseed"),
             "settings": asdict(settings),
-            "report": {key: value for key, value in asdict(report).items() if key != "path"},
+            "report": {k: v for k, v in asdict(report).items() if k not in {"path", "poses"}},
         }
         write_json(staging / MANIFEST, manifest)
     return replace(report, path=Path(output))
@@ -137,6 +142,7 @@ def _reconstruct(
     shared_camera: bool,
     poses: Sequence[Image] | None,
     refine_poses: bool,
+    held_out: Collection[str],
     masks: Masks | None,
 ) -> SfmReport:
     refinement = None
@@ -148,9 +154,10 @@ def _reconstruct(
         colmap.match_photographs(run, colmap.posed_model(run.pycolmap, poses), masks)
         if refine_poses:
             poses, refinement = refine(run, poses)
-        model_dir = colmap.triangulate_points(run, poses)
+        model_dir = colmap.triangulate_points(run, poses, held_out)
     _export(run, model_dir, staging, masks)
-    return replace(_report(run, staging, list(photos)), refinement=refinement)
+    report = _report(run, staging, list(photos))
+    return replace(report, refinement=refinement, poses=tuple(poses or ()))
 
 
 def _export(
@@ -203,11 +210,14 @@ def _undistort(
     return _report(run, staging, names)
 
 
-def refined(scene: Scene, seed: int, progress: Progress = silent) -> tuple[Scene, str]:
+def refined(
+    scene: Scene, seed: int, progress: Progress = silent, *, hold_out: int = 0
+) -> tuple[Scene, str]:
     """The scene at refined poses, with the points that its photographs' features give.
 
-    Its photographs, lenses and depth maps stay; its own points are replaced. Also what was done, in
-    a sentence.
+    Its photographs, lenses and depth maps stay; its own points are replaced. The test views, every
+    ``hold_out``-th (0: none) or those of the scene's list, are refined with the others, but no
+    point is of them. Also what was done, in a sentence.
 
     Raises:
         SceneNotFoundError: It has no photographs.
@@ -215,15 +225,17 @@ def refined(scene: Scene, seed: int, progress: Progress = silent) -> tuple[Scene
         MissingDependencyError: pycolmap is absent.
     """
     folder = photograph_folder(scene)
+    test = scene.split(hold_out)[1] if hold_out else ()
     with TemporaryDirectory(prefix="splatseed-refine-") as name:
         report = reconstruct(
             *(folder, Path(name) / "scene", Settings(seed=seed)),
             poses_from=scene,
             refine_poses=True,
+            held_out=frozenset(image.name for image in test),
             masks=scene.masks,
             on_progress=progress,
         )
-        found = load_scene(report.path)
+        found = load_scene(report.path).replace(images=report.poses)
     change, points = report.refinement, f"{report.num_points:,} points were triangulated"
     assert change is not None  # noqa: S101  (it was asked for)
     if change.kept:
@@ -244,7 +256,11 @@ def with_refined(scene: Scene, found: Scene) -> Scene:
     """
     posed = {image.name: image for image in found.images}
     pairs = [(image, posed.get(image.name, image)) for image in scene.images]
-    images = tuple(replace(i, quat=pose.quat, translation=pose.translation) for i, pose in pairs)
+    images = tuple(
+        # Features were of the points that are gone.
+        replace(i, quat=pose.quat, translation=pose.translation, observations=None)
+        for i, pose in pairs
+    )
     points = PointCloud(found.points.xyz, found.points.rgb)
     return scene.replace(images=images, points=points, tracks=None)
 

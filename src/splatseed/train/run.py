@@ -131,7 +131,7 @@ def prepare_run(
         scene = _as_masked(scene, begun)
     device = pick_device(settings.backend, progress)
     if refine_poses:
-        scene = _at_refined_poses(scene, folder, begun, settings.seed, note, progress)
+        scene = _at_refined_poses(scene, folder, begun, settings, note, progress)
     posed, stereo = scene, None
     start = read_start(Path(settings.start), scene, note) if settings.start else None
     if start is None:
@@ -200,7 +200,7 @@ def _at_refined_poses(
     scene: Scene,
     folder: RunFolder,
     begun: Mapping[str, Any] | None,
-    seed: int,
+    settings: TrainSettings,
     note: Callable[[str], None],
     progress: Progress,
 ) -> Scene:
@@ -220,7 +220,7 @@ def _at_refined_poses(
             fix="Name the scene that they were made from, or refine before seeds are made: "
             "splatseed upsample SCENE --refine-poses -o OUT.",
         )
-    scene, told = refined(scene, seed, progress)
+    scene, told = refined(scene, settings.seed, progress, hold_out=settings.test_every)
     note(told)
     return scene
 

@@ -238,7 +238,8 @@ def _run_in_memory(options: Options, methods: dict[str, Any]) -> None:
             from splatseed.sfm import refined  # noqa: PLC0415  (loads with its use)
 
             clock.expect("features", "matching", "refinement", "triangulation", "undistortion")
-            scene, told = refined(scene, options.seed, clock)
+            held = getattr(methods[options.method], "hold_out", 0)
+            scene, told = refined(scene, options.seed, clock, hold_out=held)
             notes.append(told)
         if options.method == DEFAULT_METHOD:  # which needs photographs
             options = replace(options, method=str(method_for(scene, note=notes.append)))

@@ -125,7 +125,7 @@ class GivenClouds(Cloud):
         nothing = np.empty((0, 3))
         seen = [visibility.of(image) if len(visibility.xyz) else nothing for image in images]
         colored = all(file.colors == "rgb" for file in streamed.files)
-        own = voxels.rgb if any(file.colors != "none" for file in streamed.files) else None
+        own = voxels.rgb if all(file.colors != "none" for file in streamed.files) else None
         rays = _free_rays(scene, images, views, seen, rng, progress) if self.clean else None
         judged = judge(
             views, seen, voxels, own if colored else None, progress, clean=self.clean, rays=rays
@@ -138,7 +138,9 @@ class GivenClouds(Cloud):
         kept = f"Kept {len(judged.kept):,} of {len(voxels):,} merged points: {', '.join(gone)}."
         notes = [*_read_notes(streamed), *_check_fit(judged), kept]
         if scene.has_photographs and not colored:
-            lacks = "no colours" if own is None else "intensity only"
+            known = any(file.colors != "none" for file in streamed.files)
+            lacks = "intensity only" if own is not None else "colours in some files only"
+            lacks = lacks if known else "no colours"
             notes.append(f"The cloud has {lacks}: colours are those of the photographs.")
         share = covered_share(frames, xyz, CELL, silent)
         if share < CORNER:

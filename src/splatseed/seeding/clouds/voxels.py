@@ -39,6 +39,8 @@ ASIDE = 0.381966
 """Where voxels begin along each axis: walls at round coordinates would lie on their sides, and
 rounding put their points into either."""
 FINEST = 20  # halvings of the first points' extent that make the first side of even voxels
+LEAST_EXTENT = 1e-6
+"""Of the first points, as they may be one alone, such as a marker."""
 
 
 class _Table(NamedTuple):
@@ -111,7 +113,7 @@ class Voxels:
             _find_levels(xyz, self._matrices, self._sides, self._sizes, levels)
         else:
             if not self._num:
-                extent = max(float(np.ptp(xyz, axis=0).max()), float(np.finfo(np.float32).tiny))
+                extent = max(float(np.ptp(xyz, axis=0).max()), LEAST_EXTENT)
                 self._even = int(np.floor(np.log2(extent))) - FINEST
             levels[:] = self._even
         colors = np.zeros((1, 3), np.uint8) if rgb is None else np.ascontiguousarray(rgb)
@@ -299,7 +301,7 @@ def stream(
     voxels = Voxels(capacity, views, pixels)
     low, high, bad = np.full(3, np.inf), np.full(3, -np.inf), 0
     for file in files:
-        before = voxels.total
+        before, bad_before = voxels.total, bad
         for chunk, left_out in _finite_chunks(file, "read", progress):
             bad += left_out
             xyz = chunk.xyz if scene_from_cloud is None else scene_from_cloud.points(chunk.xyz)
@@ -309,7 +311,7 @@ def stream(
         if voxels.total == before:
             raise PointCloudError(
                 f"points with finite coordinates in {file.path}",
-                found=f"{bad:,} that are not finite" if bad else "none",
+                found=f"{bad - bad_before:,} that are not finite" if bad > bad_before else "none",
                 fix="Export the cloud again.",
             )
     return Streamed(voxels, files, bad, low, high)
