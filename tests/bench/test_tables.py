@@ -294,3 +294,4 @@ def test_single_runs_and_changed_files_claim_nothing():
     assert compare(fox, []) is None
     same = [*runs(max_steps=2000), *fox]  # of two sets the one whose settings are the same
     assert compare(fox, same).settings == ()
+    assert "0 of A, 1 of B." in compare(fox, same).notes[-1]

@@ -69,10 +69,11 @@ def refining(room, monkeypatch):
 
     def reconstruct(folder, output, settings, **how):
         assert how["refine_poses"]
+        assert how["held_out"] == {image.name for image in truth.split(8)[1]}
         calls.append(folder)
         write_scene(truth, output)
         change = Refinement(False, 9.0, 0.5, 0.1, 0.2, 0.1, 0.2)
-        return SfmReport(output, 12, 12, (), len(truth.points), 3.0, 0.5, {}, change)
+        return SfmReport(output, 12, 12, (), len(truth.points), 3.0, 0.5, {}, change, truth.images)
 
     monkeypatch.setattr("splatseed.sfm.pipeline.reconstruct", reconstruct)
     return calls

@@ -70,9 +70,9 @@ def test_held_out_photographs_are_never_read(method, room, monkeypatch):
     monkeypatch.setattr(
         view, "load_photograph", lambda path, *a: (read.append(path.name), load(path, *a))[1]
     )
-    ss.upsample(room, method, hold_out=4)
+    ss.upsample(room, method, hold_out=4, cover=12)
     names = sorted(image.name for image in room.images)
-    assert sorted(read) == [name for i, name in enumerate(names) if i % 4]
+    assert sorted(set(read)) == [name for i, name in enumerate(names) if i % 4]
 
 
 @by_photographs

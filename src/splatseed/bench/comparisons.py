@@ -12,6 +12,7 @@ from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from importlib.resources import files
+from itertools import product
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -346,14 +347,15 @@ def compare(a: Sequence[Run], b: Sequence[Run]) -> Comparison | None:
 
     None if one of them has no finished run.
     """
-    pairs = [(one, other) for one in studies(a) for other in studies(b)]
+    sets = studies(a), studies(b)
+    pairs = list(product(*sets))
     if not pairs:
         return None
     # Among sets that differ equally, the ones with most in common.
     first, second = both = min(
         pairs, key=lambda pair: (len(_differing(*pair)), -len(_places(pair[0]) & _places(pair[1])))
     )
-    apart = [len({id(pair[i]) for pair in pairs}) - 1 for i in (0, 1)]
+    apart = [len(each) - 1 for each in sets]
     variants = {**first.variants, **second.variants}
 
     def ordered(places: set[Place]) -> list[Place]:

@@ -18,6 +18,7 @@ from splatseed.depthmap import DepthMaps
 from splatseed.errors import SceneNotFoundError
 from splatseed.io import find_depths, load_originals
 from splatseed.io.clouds import open_cloud
+from splatseed.io.colmap import scene_root
 from splatseed.io.files import open_file, read_bytes
 from splatseed.io.load import search_depths
 from splatseed.io.photograph import open_photograph, photograph_bytes
@@ -55,7 +56,12 @@ class PlannedScene:
     @property
     def label(self) -> str:
         """Its name, or its folder's."""
-        return self.name or ("demo" if self.is_demo else Path(self.path).resolve().name)
+        return self.name or ("demo" if self.is_demo else self.root.name)
+
+    @property
+    def root(self) -> Path:
+        """Its folder, also where that of its model is named."""
+        return scene_root(Path(self.path).resolve())
 
 
 @dataclass(frozen=True)

@@ -195,7 +195,7 @@ def _changed(plan: Plan, options: Options) -> Plan:
     labels = Counter(scene.label for scene in scenes)
     for i, scene in enumerate(scenes):  # folders of the same name are told apart by their parents
         if labels[scene.label] > 1 and not scene.is_demo and not scene.name:
-            scenes[i] = replace(scene, name="_".join(Path(scene.path).resolve().parts[-2:]))
+            scenes[i] = replace(scene, name="_".join(scene.root.parts[-2:]))
     depth = [str(folder) for folder in options.depth]
     if len(depth) == 1 and any(Path(depth[0], scene.label).is_dir() for scene in scenes):
         below = [Path(depth[0], scene.label) for scene in scenes]

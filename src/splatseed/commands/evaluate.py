@@ -83,6 +83,8 @@ def run(arguments: list[str]) -> None:
            "See splatseed evaluate --help.") for name, least in LEAST.items()),
     )  # fmt: skip
     scene = Path(str(scene))
+    moved = options.scene is None and not scene.exists()
+    refuse((moved, f"the scene of the run at {scene}", "none", "Say where it is: --scene SCENE."))
     if options.renders is not None:
         check_output(
             options.renders, kind="evaluate", overwrite=options.overwrite,
@@ -93,7 +95,7 @@ def run(arguments: list[str]) -> None:
         inputs = [scene, gaussians, trained.config, trained.metrics]
         check_free(options.output, overwrite=options.overwrite, protect=inputs)
     with stage_display() as clock:
-        result, doubt = _evaluate(options, gaussians, scene, numbers, masks, clock)
+        result, doubts = _evaluate(options, gaussians, scene, numbers, config, masks, clock)
     rows = [
         (score.name, *_numbers(score), f"{1e3 * score.seconds:.1f}") for score in result.per_image
     ]
@@ -122,7 +124,7 @@ def run(arguments: list[str]) -> None:
     print_pairs(str(options.model), facts)
     if result.lpips is None:
         print_note(f"LPIPS was not computed: {result.lpips_reason}")
-    if doubt:
+    for doubt in doubts:
         print_note(doubt)
 
 
@@ -131,10 +133,11 @@ def _evaluate(
     gaussians: Path,
     scene: Path,
     numbers: Mapping[str, int],
+    config: Mapping[str, Any],
     masks: str | None,
     clock: StageClock,
-) -> tuple[EvalResult, str]:
-    """Score the test views, write what was asked for, and say why it may be another's scene."""
+) -> tuple[EvalResult, list[str]]:
+    """Score the test views, write what was asked for, and say what makes the scores doubtful."""
     from splatseed.splat.covisible import find_covisible, pixel_masks  # noqa: PLC0415  (kernels)
     from splatseed.splat.evaluate import evaluate_model, load_model  # noqa: PLC0415  (PyTorch)
     from splatseed.splat.metrics import load_lpips  # noqa: PLC0415  (PyTorch)
@@ -169,7 +172,13 @@ def _evaluate(
     if options.output is not None:
         named = {"model": options.model, "scene": scene}
         write_json(options.output, {**named, **numbers, **result.to_dict()})
-    return result, model.doubt
+    doubts, own = [model.doubt] if model.doubt else [], config.get("test_every")
+    shown = {view.name for view in model.views}
+    if isinstance(own, int):
+        shown &= {image.name for image in model.scene.split(own)[0]}
+        told = f"{len(shown)} of these {len(model.views)} views were trained on: the run held out"
+        doubts += [f"{told} every {own}th."] * bool(shown)
+    return result, doubts
 
 
 def _numbers(scores: EvalResult | ViewScore) -> tuple[str, ...]:

@@ -61,6 +61,8 @@ def run(arguments: list[str]) -> None:
     config = config_of(options.model) if cleans else {}
     scene = config.get("scene") if options.clean == OWN else options.clean
     inputs = [Path(scene)] if isinstance(scene, str) else []
+    moved = options.clean == OWN and isinstance(scene, str) and not Path(scene).exists()
+    refuse((moved, f"the scene of the run at {scene}", "none", "Say where it is: --clean SCENE."))
     check_free(target, overwrite=options.overwrite, protect=inputs)
     refuse(
         (options.clean == OWN and not isinstance(scene, str),
@@ -108,6 +110,7 @@ def _scoring_command(options: Options) -> str:
     """How to score the file as its run was scored; what no run tells is left as a word."""
     config = config_of(options.model)
     scene, factor, every = (config.get(name) for name in ("scene", "data_factor", "test_every"))
+    scene = scene if options.clean in {None, OWN} else options.clean
     words = ["splatseed evaluate", quoted(options.output)]
     words += ["--scene", quoted(scene) if isinstance(scene, str) else "SCENE"]
     if not isinstance(factor, int):

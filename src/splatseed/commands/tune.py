@@ -93,7 +93,7 @@ def run(arguments: list[str]) -> None:
     for name, needed in (("methods", SFM), ("strategies", "default")):
         expected, given = f"{needed} among --{name}, the baseline", getattr(options, name)
         refuse((needed not in given, expected, " ".join(given), "Add it."))
-    folder = options.output or Path(f"tune_{options.scene.resolve().name}")
+    folder = options.output or Path(f"tune_{PlannedScene(str(options.scene)).label}")
     check_bench_folder(folder, "tune", [options.scene])
     with bench.open_machine(bench.Options(), "auto") as machine:
         new = not folder.exists()
@@ -115,7 +115,9 @@ def _open(options: Options, folder: Path, machine: Machine, arguments: Sequence[
     with stage_display() as clock:
         clock("read", 0.0)
         path = make_validation_scene(options.scene, folder / "scene", _TEST_EVERY)
-        facts = survey(PlannedScene(str(path), options.scene.resolve().name), progress=clock)
+        facts = survey(
+            PlannedScene(str(path), PlannedScene(str(options.scene)).label), progress=clock
+        )
     factor = max(1, -(-facts.long_side // _LONG_SIDE))
     budget, least_steps = options.budget, 0
     if "grow" in options.strategies:
@@ -252,7 +254,7 @@ class _Tuning:
         options, scene, commands = self.options, self.options.scene, []
         rung = Rung(options.max_steps, 0, 1)
         spec = next(each for each in self.specs(rung) if each.arm == arm)
-        seeded = f"{scene.resolve().name}_{arm.method}"
+        seeded = f"{PlannedScene(str(scene)).label}_{arm.method}"
         if arm.method != SFM:
             points = max(spec.most_seeds or 0, self.facts.num_points)
             looks = "hold_out" in spec.parameters

@@ -32,7 +32,10 @@ _TRANSFORMS = "transforms.json"
 _ABOVE = 3
 """Folders above a file in which its scene is looked for: images may lie in folders of their own."""
 _SCANS = frozenset({".las", ".laz", ".e57", ".pcd", ".xyz", ".asc", ".pts", ".glb"})
-_TRIANGULATE = "Make points with: splatseed sfm IMAGES --poses-from SCENE -o OUT."
+_TRIANGULATE = (
+    "Method auto needs none: splatseed upsample SCENE -o OUT. Or make points with: splatseed sfm"
+    " IMAGES --poses-from SCENE -o OUT."
+)
 
 
 def load_scene(path: str | Path, *, require_points: bool = True) -> Scene:

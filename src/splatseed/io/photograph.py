@@ -133,7 +133,9 @@ def image_warnings(images: Sequence[Image], image_dir: Path | None, root: Path) 
     if not images:
         return []
     if image_dir is None:
-        return ["The images folder is missing; points can be made, but nothing can be trained."]
+        dead = root / "images" if (root / "images").is_symlink() else None
+        gone = f"{dead} leads to {dead.readlink()}, which is not there" if dead else "is missing"
+        return [f"The images folder {gone}; points can be made, but nothing can be trained."]
     count, warnings = len(images), []
     missing = {im.name: None for im in images if not (image_dir / im.name).is_file()}
     if missing:

@@ -66,6 +66,8 @@ FEWER = 0.8
 """The part of the Gaussians to try again with where memory ended."""
 OPTIONS = {"seeding": "seeds", "cap_max": "budget"}
 """Command-line names of settings, where they differ."""
+_PLACES = ("scene", "points")
+"""Where the scene lies, in a config; its content is the same wherever that is."""
 LOGGED = ("seconds", "loss", "psnr/train", "psnr/test", "gaussians", "ssim/test")
 """TensorBoard's names of a record's numbers, after the step."""
 
@@ -178,6 +180,8 @@ def prepare_run(
         # The cost of growth includes finding depth.
         state.watch.seconds += 0.0 if seeding_knew else seconds
         folder.begin(config, posed if refine_poses else None)
+    else:
+        _note_places(folder, begun, config)
     if tensorboard:
         run.log_to_tensorboard()
     return run
@@ -316,6 +320,13 @@ def _check_begun(
         raise _another_scene(folder, begun, which or f"points in {config['scene']}")
     if begun and begun.get("photographs") != config["photographs"]:
         raise _another_scene(folder, begun, f"photographs or poses in {config['scene']}")
+
+
+def _note_places(folder: RunFolder, begun: Mapping[str, Any], config: Mapping[str, Any]) -> None:
+    """Record where the scene of a resumed run lies now, so that evaluate and view find it."""
+    moved = {name: config[name] for name in _PLACES if begun.get(name) != config[name]}
+    if moved:
+        write_json(folder.config, {**begun, **moved})
 
 
 def _as_masked(scene: Scene, begun: Mapping[str, Any]) -> Scene:

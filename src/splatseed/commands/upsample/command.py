@@ -20,6 +20,7 @@ from splatseed.console import OUT, print_note, stage_display
 from splatseed.depthmap import DepthKind
 from splatseed.io import find_depths, load_originals, write_scene
 from splatseed.io.clouds import open_cloud
+from splatseed.io.colmap import scene_root
 from splatseed.io.load import with_own_depths
 from splatseed.io.masks import with_masks
 from splatseed.io.staging import check_output
@@ -176,6 +177,7 @@ def run(arguments: list[str]) -> None:
     planned_size(1, options.ratio, None if options.ratio is None else options.num_points)
     inputs = (options.scene, options.depth_maps, options.cloud_transform, *options.cloud_files)
     protect = [path for path in inputs if path is not None]
+    protect += [scene_root(options.scene)] if options.scene.is_dir() else []
     check_output(options.output, kind="upsample", overwrite=options.overwrite, protect=protect)
     if options.gaussians is not None:
         check_free(options.gaussians, overwrite=options.overwrite, protect=protect)
