@@ -176,8 +176,8 @@ def _evaluate(
     shown = {view.name for view in model.views}
     if isinstance(own, int):
         shown &= {image.name for image in model.scene.split(own)[0]}
-        told = f"{len(shown)} of these {len(model.views)} views were trained on: the run held out"
-        doubts += [f"{told} every {own}th."] * bool(shown)
+        told = f"{len(shown)} of these {len(model.views)} views were trained on"
+        doubts += [f"{told}: the run held out one in {own}."] * bool(shown)
     return result, doubts
 
 
