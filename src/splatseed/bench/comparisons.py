@@ -87,10 +87,7 @@ def _adjusted(family: Mapping[Key, Difference | None]) -> dict[Key, Difference]:
 
 
 def clear_best(study: Study, strategy: StrategyName, scene: str) -> bool:
-    """Whether a scene's best arm is better than every other one beyond noise.
-
-    Not while runs of one are missing.
-    """
+    """Whether a scene's best arm beats all others beyond noise; False while runs are missing."""
     scores = study.scores(strategy, scene)
     noise, df = statistics.pooled_noise(scores.to_numpy())
     complete = scores.dropna()

@@ -44,7 +44,7 @@ Rows = list[Row]
 
 
 def _gain_cell(gain: Difference | None, digits: int = 3, alone: str = "") -> Cell:
-    """A gain with its standard error, or what it is of alone, and whether it is within noise."""
+    """A gain with its standard error, or with ``alone`` if it is of one sample; ~: within noise."""
     if gain is None:
         return ""
     mark = NOISE if gain.verdict == "within noise" else ""

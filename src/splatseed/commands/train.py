@@ -34,7 +34,14 @@ from splatseed.scores import TrainingResult
 from splatseed.seeding.upsampling import parse_budget
 from splatseed.train.folder import RunFolder
 from splatseed.train.seeds import why_not_seeded
-from splatseed.train.settings import BUDGET, LEAST_GAUSSIANS, Seeding, StrategyName, TrainSettings
+from splatseed.train.settings import (
+    BUDGET,
+    LEAST_GAUSSIANS,
+    OPTIONS,
+    Seeding,
+    StrategyName,
+    TrainSettings,
+)
 from splatseed.upsample.method import fits
 from splatseed.views.view import at_file_size, poses_of, user_cache_dir
 
@@ -50,7 +57,7 @@ HOST, PORT = "127.0.0.1", 8080
 """Where browsers watch, if the port is free."""
 RUN_NOTES = {"splatseed", "points", "photographs", "device", "versions"}
 """What config.json records besides options."""
-_SETTINGS = {"seeds": "seeding", "budget": "cap_max", "long_side": "data_factor"}
+_SETTINGS = {option: name for name, option in OPTIONS.items()} | {"long_side": "data_factor"}
 """Settings by the options that stand for them, where these have other names."""
 BEST_SETTINGS = replace(DEFAULT, strategy=BEST)
 

@@ -254,7 +254,7 @@ class _Tuning:
         options, scene, commands = self.options, self.options.scene, []
         rung = Rung(options.max_steps, 0, 1)
         spec = next(each for each in self.specs(rung) if each.arm == arm)
-        seeded = f"{PlannedScene(str(scene)).label}_{arm.method}"
+        seeded = f"{self.facts.name}_{arm.method}"
         if arm.method != SFM:
             points = max(spec.most_seeds or 0, self.facts.num_points)
             looks = "hold_out" in spec.parameters

@@ -51,7 +51,7 @@ _COUNT = struct.Struct("<Q")
 
 
 def files_below(folder: Path) -> list[Path]:
-    """What is in a folder and its subfolders, linked ones too, but folders; sorted."""
+    """The files in a folder and its subfolders, linked ones too, sorted."""
     found = list[Path]()
     for place, folders, names in os.walk(folder, followlinks=True):
         if os.path.realpath(place) in map(os.path.realpath, Path(place).parents):

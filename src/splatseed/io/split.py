@@ -19,8 +19,8 @@ ROOT_LISTS = (
     *("train_list.txt", "test_list.txt", "val_list.txt", "validation_list.txt"),
     *("train.txt", "test.txt"),
 )
-"""Lists in a scene's folder: for training, test and validation, of which nerfstudio looks for the
-one name and reads the other; for training and test."""
+"""Lists in a scene's folder: for training, test and validation (nerfstudio checks for the last of
+these names, and reads the one before); for training and test."""
 MODEL_LISTS = ("test.txt",)
 """Lists beside a COLMAP model."""
 _SHOWN = 3

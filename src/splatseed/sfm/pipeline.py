@@ -55,7 +55,7 @@ class SfmReport:
     mean_reprojection_error: float  # over points, of their means; px, undistorted
     seconds: Mapping[str, float]  # wall time of each stage, in the order in which they ran
     refinement: Refinement | None = None  # what it changed; None where it was not asked for
-    poses: tuple[Image, ...] = ()  # known ones, as refined
+    poses: tuple[Image, ...] = ()  # the known poses, refined if that was asked for
 
 
 Job: TypeAlias = Callable[..., SfmReport]

@@ -45,7 +45,7 @@ from splatseed.train.device import check_fits, pick_device
 from splatseed.train.folder import Record, RunFolder, write_curve_csv, write_curve_png
 from splatseed.train.parameters import gaussians_of, take_mean
 from splatseed.train.seeds import first_gaussians, known_depths, seeded, seeds_facts, usable_seeds
-from splatseed.train.settings import TrainSettings
+from splatseed.train.settings import OPTIONS, TrainSettings
 from splatseed.train.start import read_start, start_facts, started_gaussians
 from splatseed.train.state import (
     TrainState,
@@ -64,8 +64,6 @@ SAVE_EVERY = 60.0
 """Least seconds between checkpoints, so that saving stays a small part of the time."""
 FEWER = 0.8
 """The part of the Gaussians to try again with where memory ended."""
-OPTIONS = {"seeding": "seeds", "cap_max": "budget"}
-"""Command-line names of settings, where they differ."""
 _PLACES = ("scene", "points")
 """Where the scene lies, in a config; its content is the same wherever that is."""
 LOGGED = ("seconds", "loss", "psnr/train", "psnr/test", "gaussians", "ssim/test")

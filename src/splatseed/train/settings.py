@@ -27,6 +27,8 @@ LEAST_GAUSSIANS = 2
 BUDGET = 1_000_000
 """Default cap of the strategies that have a budget."""
 AS_3DGS = "-3dgs"
+OPTIONS = {"seeding": "seeds", "cap_max": "budget"}
+"""Command-line names of settings, where they differ."""
 
 BYTES_EACH = 2000
 """Memory per Gaussian in training: its 59 numbers, their gradients and two moments (944 bytes),

@@ -40,7 +40,7 @@ ASIDE = 0.381966
 rounding put their points into either."""
 FINEST = 20  # halvings of the first points' extent that make the first side of even voxels
 LEAST_EXTENT = 1e-6
-"""Of the first points, as they may be one alone, such as a marker."""
+"""Least extent that is assumed of the first points: there may be one alone, such as a marker."""
 
 
 class _Table(NamedTuple):
