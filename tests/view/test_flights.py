@@ -77,6 +77,15 @@ def test_an_orbit_goes_around_what_the_cameras_look_at(run_folder):
     np.testing.assert_allclose(np.linalg.norm(centers[:, :2], axis=1), 3, atol=0.2)
     np.testing.assert_allclose(centers[:, 2], 1, atol=0.1)
     assert len(orbit([], gaussians, 7, (64, 48))) == 7  # a model alone has a way around it too
+    one = gaussians.select(np.zeros(3, int))  # all in one place
+    apart = _centers(orbit([], one, 7, (64, 48))) - one.means[0]
+    assert (np.linalg.norm(apart, axis=1) > 3 * np.exp(one.scales[0].max())).all()
+    assert np.isfinite(apart).all()
+
+
+def test_cameras_that_are_upside_down_to_each_other_have_an_up():
+    np.testing.assert_allclose(flights.upward(np.array([0.0, 0.0, -3.0])), [0, 0, -1])
+    np.testing.assert_allclose(flights.upward(np.zeros(3)), [0, -1, 0])
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ torch = pytest.importorskip("torch", reason="rendering needs PyTorch")
 pytest.importorskip("viser", reason="the viewer needs viser (extra view)")
 
 from splatseed.commands import view as verb
-from splatseed.errors import ParameterError
+from splatseed.errors import ParameterError, SceneFormatError
 from splatseed.io import load_scene
 from splatseed.pointcloud import PointCloud
 from splatseed.splat.evaluate import evaluate_views
@@ -28,7 +28,7 @@ from splatseed.splat.gaussians import TrainingFrame
 from splatseed.train.run import prepare_run
 from splatseed.train.settings import TrainSettings
 from splatseed.view import pictures, session as session_module
-from splatseed.view.models import open_shown, stage_frame
+from splatseed.view.models import Shown, open_shown, stage_frame
 from splatseed.view.pictures import Entry, canvas_view, clouds_of, fitted_fov, laid_onto, stage_pose
 from splatseed.view.server import TrainingViewer, Viewer, free_port
 
@@ -277,6 +277,26 @@ def test_points_of_several_origins_are_switched_apart(rng):
     np.testing.assert_allclose(clouds[0].xyz, 2 * cloud.xyz[:50], rtol=1e-6)
 
 
+def test_of_many_cameras_as_many_are_test_views_as_of_all(room):
+    scene = load_scene(room)
+    images = tuple(replace(scene.images[0], name=f"{i:04}.png") for i in range(3000))
+    shown = Shown("many", scene.replace(images=images))
+    drawn = pictures.add_cameras(Mock(), shown, stage_frame(shown), print)
+    tested = {image.name for image in scene.replace(images=images).split()[1]}
+    assert len(drawn) <= pictures.MOST_CAMERAS + 1
+    assert sum(image.name in tested for image, _ in drawn) / len(drawn) == pytest.approx(
+        0.125, 0.05
+    )
+
+
+def test_names_are_shown_as_they_are():
+    session = object.__new__(session_module.Session)
+    session._note = Mock(content="")
+    session._say("<img src=x onerror=alert(1)>.png cannot be read.")
+    assert "&lt;img src=x" in session._note.content
+    assert "<img" not in session._note.content
+
+
 # A run that trains -------------------------------------------------------------------------------
 
 STEPS = 40
@@ -363,3 +383,20 @@ def test_a_folder_that_holds_many_says_which_are_shown(room, tmp_path, monkeypat
     assert [path.name for path in verb._within(tmp_path)] == ["a", "b"]
     said = capsys.readouterr()
     assert "holds 3" in said.out + said.err
+
+
+def test_runs_of_the_same_name_are_told_apart(run_folder, tmp_path):
+    paths = [tmp_path / each / "fern" / "run" for each in "ab"]
+    for path in paths:
+        shutil.copytree(run_folder, path)
+    opened, beside = verb._opened(verb.Options(paths[0], compare=paths[1]))
+    assert ([each.name for each in opened], beside) == (["a/fern/run", "b/fern/run"], 1)
+    opened, beside = verb._opened(verb.Options(paths[0].parent, compare=paths[0]))
+    assert ([each.name for each in opened], beside) == (["run"], 0)
+
+
+def test_nothing_to_show_is_an_error(tmp_path):
+    for name in ("cameras", "images", "points3D"):
+        (tmp_path / f"{name}.txt").write_text("1 PINHOLE 4 3 2 2 2 1.5\n" * (name == "cameras"))
+    with pytest.raises(SceneFormatError, match="something to show"):
+        open_shown(tmp_path)

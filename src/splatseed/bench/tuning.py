@@ -34,7 +34,7 @@ _STEP = 10
 """Steps of a first rung are tried in multiples of this."""
 _OVERTIME = 1.1
 """By how much the estimated time may exceed the time given."""
-_LEAST_VIEWS = 4
+LEAST_VIEWS = 4
 """Fewest training views of a scene: some to train on, and at least one to validate on."""
 Results = Mapping[Arm, Mapping[int, RunResult]]
 """Results by arm and repeat."""
@@ -182,8 +182,8 @@ def make_validation_scene(scene_path: Path, target: Path, test_every: int = 8) -
     for image in scene.images:
         check_lens(image, scene_path)
     train, _ = scene.split(test_every)
-    if len(train) < _LEAST_VIEWS:
-        least = f"at least {_LEAST_VIEWS} training views in {scene_path}, to hold some of them out"
+    if len(train) < LEAST_VIEWS:
+        least = f"at least {LEAST_VIEWS} training views in {scene_path}, to hold some of them out"
         raise SceneNotFoundError(least, found=f"{len(train)}", fix="Tune a scene with more.")
     alone = scene.replace(images=train, listed=None)
     write_scene(alone, target, format="colmap", provenance={"command": "tune"})

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -111,10 +111,11 @@ def run(arguments: list[str]) -> None:
 
 def _opened(options: Options) -> list[Shown]:
     """The model, and the one that is compared with it, which the same cameras see."""
-    from splatseed.view.models import open_shown, share_a_world  # noqa: PLC0415  (imports PyTorch)
+    from splatseed.view.models import names_of, open_shown, share_a_world  # noqa: PLC0415  (imports PyTorch)
 
     paths = [path for path in (options.model, options.compare) if path is not None]
-    models = [open_shown(path, options.scene) for path in paths]
+    named = zip(names_of(paths), paths, strict=True)
+    models = [replace(open_shown(path, options.scene), name=name) for name, path in named]
     look = "Train it first (splatseed train), or look at it with splatseed view."
     for path, shown in zip(paths, models, strict=True):
         bare = shown.gaussians is None

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from splatseed.bench.tuning import LEAST_VIEWS
 from splatseed.console import print_note, print_pairs
 from splatseed.lens import undistort_command, undistorted
 from splatseed.literal import quoted
@@ -84,7 +85,8 @@ def advice_commands(
         train = f"splatseed train OUT {training}"
     if not trains:
         return first or [("look", f"splatseed view {source}")]
-    if advice.method in (AS_IT_IS, "auto") and len(scene.points):
+    tunable = len(scene.split()[0]) >= LEAST_VIEWS and len(scene.points)
+    if advice.method in (AS_IT_IS, "auto") and tunable:
         tune = f"splatseed tune {source} --minutes 30{planned.tuning}"
         return [*first, ("train", train), ("or by experiment", tune)]
     return [*first, ("train", train)]

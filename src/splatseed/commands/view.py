@@ -25,7 +25,7 @@ if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for i
     from splatseed.view.models import Shown
 
 MOST_OPENED = 12
-LOCAL = {"127.0.0.1", "localhost", "::1"}
+LOCAL = {"127.0.0.1", "localhost"}
 
 
 @dataclass(frozen=True)
@@ -82,17 +82,16 @@ def run(arguments: list[str]) -> None:
 
 def _opened(options: Options) -> tuple[list[Shown], int | None]:
     """What to show, under names that tell them apart; and which is compared with the first."""
-    from splatseed.view.models import open_shown  # noqa: PLC0415  (imports PyTorch)
+    from splatseed.view.models import names_of, open_shown  # noqa: PLC0415  (imports PyTorch)
 
-    paths = _within(options.what)
-    beside = None if options.compare is None else len(paths)
-    paths += [] if options.compare is None else _within(options.compare)
-    names = [path.name for path in paths]
-    opened = []
-    for path in paths:
-        name = path.name if names.count(path.name) == 1 else f"{path.parent.name}/{path.name}"
-        opened.append(replace(open_shown(path, options.scene), name=name or str(path)))
-    return opened, beside
+    paths = {path.resolve(): path for path in _within(options.what)}
+    beside = None
+    if options.compare is not None:
+        compared = {path.resolve(): path for path in _within(options.compare)}
+        paths |= compared  # one that is shown already is not shown twice
+        beside = list(paths).index(next(iter(compared)))
+    named = zip(names_of(list(paths.values())), paths.values(), strict=True)
+    return [replace(open_shown(path, options.scene), name=name) for name, path in named], beside
 
 
 def _within(path: Path) -> list[Path]:

@@ -223,6 +223,8 @@ def untrainable(scene: Scene) -> str:
     """
     if not scene.images:
         return "Points alone cannot be trained: that needs their scene's photographs and cameras."
+    if not all(scene.split()):
+        return "Training needs at least two photographs, one to train on and one to test."
     folder = scene.source.image_dir if scene.source else None
     if folder is None:
         return "Training needs the photographs: put them beside the model in a folder named images."

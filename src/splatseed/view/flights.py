@@ -42,6 +42,8 @@ MADE_UP_SIZE = (960, 720)
 LOOKS, LOOKED_AT, LEAST_SEEN = 60, 5000, 0.002
 """Views and Gaussians sampled to decide whether a path misses the model: one that sees a smaller
 share of the Gaussians does, and more than half must not."""
+CANCELLED = 1e-6
+"""Length of a mean up direction below which the cameras' cancel."""
 FAR_AWAY = 10.0
 """A path is far away beyond this many times the cameras' extent."""
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -88,10 +90,12 @@ def orbit(
     else:
         focus = np.median(gaussians.means.astype(np.float64), axis=0)
         reach = np.quantile(np.linalg.norm(gaussians.means - focus, axis=1), CORE)
-        up = np.array([0.0, -1.0, 0.0])  # as in the world of most captures
+        if not reach > 0:  # all are in one place
+            reach = max(1.0, 3 * np.exp(gaussians.scales.astype(np.float64).max()))
+        up = np.zeros(3)
         centers = (focus + reach * np.array([2.0, -0.7, 0.0]))[None]
         lens = _lens([pinhole_view(MADE_UP_SIZE, 2 * np.arctan(0.5), np.eye(4))], size)
-    up = up / np.linalg.norm(up)
+    up = upward(up)
     offsets = centers - focus
     # Distances from the focus along up, and around it.
     heights = offsets @ up
@@ -104,6 +108,12 @@ def orbit(
         for angle in 2 * np.pi * np.arange(frames) / frames
     ]
     return _posed(lens, [(eye, focus, up) for eye in eyes])
+
+
+def upward(up: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, " 3"]:
+    """A mean of up directions as a unit vector; where they cancel, most captures' up."""
+    length = np.linalg.norm(up)
+    return up / length if length > CANCELLED else np.array([0.0, -1.0, 0.0])
 
 
 def focus_of(views: Sequence[View]) -> Float64[np.ndarray, " 3"]:

@@ -7,6 +7,7 @@ content decides what it is; a model knows its scene if the run or the user names
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +19,7 @@ from PIL import Image as PillowImage, ImageDraw
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io import load_scene
 from splatseed.io.files import read_bytes
+from splatseed.literal import quoted
 from splatseed.scene import Scene
 from splatseed.splat.formats import detect_format, read_model
 from splatseed.splat.gaussians import Gaussians, TrainingFrame, training_frame
@@ -76,12 +78,19 @@ def open_shown(path: Path, scene_path: Path | None = None) -> Shown:
     if not path.is_dir() or not folder.is_run:
         if path.is_file() and _is_model(path):
             return Shown(path.name, scene_at(scene_path), read_model(path))
-        return Shown(path.name, scene_at(path))
+        bare = load_scene(path, require_points=False)
+        if not bare.images and not len(bare.points):
+            raise SceneFormatError(
+                f"something to show at {path}",
+                found="no images, points or Gaussians",
+                fix="Name a scene, a run, or a file of points or Gaussians.",
+            )
+        return Shown(path.name, bare)
     if not folder.gaussians.is_file():
         raise SceneNotFoundError(
             f"{folder.path} to be a finished run of splatseed train",
             found="a run that has not finished",
-            fix=f"Continue it: splatseed train SCENE -o {folder.path} --resume.",
+            fix=f"Continue it: splatseed train SCENE -o {quoted(folder.path)} --resume.",
         )
     config, scene = folder.read_config(), scene_at(scene_path)
     named = folder.scene_of(config)
@@ -90,6 +99,17 @@ def open_shown(path: Path, scene_path: Path | None = None) -> Shown:
             scene = scene_at(Path(named))
     factor, every = (int(config.get(*each)) for each in (("data_factor", 1), ("test_every", 8)))
     return Shown(folder.path.name, scene, read_model(folder.gaussians), factor, every)
+
+
+def names_of(paths: Sequence[Path]) -> list[str]:
+    """A name for each path: its own, after as many of its folders as tell it from the others."""
+    wholes = [path.absolute().parts for path in paths]
+    names = []
+    for whole in wholes:
+        ends = (whole[start:] for start in reversed(range(len(whole))))
+        own = (end for end in ends if sum(each[-len(end) :] == end for each in wholes) == 1)
+        names.append("/".join(next(own, whole[-1:])))
+    return names
 
 
 def _is_model(path: Path) -> bool:

@@ -45,7 +45,7 @@ CELL = 8  # side in pixels of the cells that are tested for seeds
 PHOTOGRAPH_SIDE, CELLS_SIDE, ERROR_SIDE = 1600, 800, 640  # FLIP takes 1.6 s a megapixel on a core
 AT_A_CAMERA = {"photograph", "error", "depth map", "uncovered cells"}
 GO = "Click a camera to stand where a photograph was taken."
-MOST_CAMERAS = 400  # that are drawn; of more, an even subset
+MOST_CAMERAS = 400  # that are drawn
 FRUSTUM, LEAST_FRUSTUM, MOST_FRUSTUM = 0.5, 0.008, 0.05
 """Size of a camera relative to the distance to the next one, and its bounds on the stage."""
 POINT_PIXELS = 1.4
@@ -264,10 +264,17 @@ def point_size(
 def add_cameras(
     gui_scene: Any, shown: Shown, frame: TrainingFrame, fly: Callable[[Image], None]
 ) -> list[tuple[Image, Any]]:
-    """Add a frustum for each image's camera, test views in another colour; a click flies there."""
+    """Add a frustum for each image's camera, test views in another colour; a click flies there.
+
+    Of more than ``MOST_CAMERAS``, every n-th training and every n-th test view.
+    """
     assert shown.scene is not None  # noqa: S101  (see above)
     tested = {image.name for image in shown.scene.split(shown.test_every)[1]}
-    images = shown.scene.images[:: max(1, -(-len(shown.scene.images) // MOST_CAMERAS))]
+    every = max(1, -(-len(shown.scene.images) // MOST_CAMERAS))
+    parts = [
+        [i for i in shown.scene.images if (i.name in tested) == test] for test in (False, True)
+    ]
+    images = [image for part in parts for image in part[::every]]
     size, poses = MOST_FRUSTUM, [stage_pose(image.camera, frame) for image in images]
     if len(images) > 1:  # the largest at which neighbouring cameras do not overlap
         centers = np.array([center for _, center in poses])

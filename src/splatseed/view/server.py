@@ -27,7 +27,7 @@ from jaxtyping import Float32
 from splatseed.errors import ParameterError
 from splatseed.requirements import require
 from splatseed.scene import Image, Scene
-from splatseed.view.flights import orbit
+from splatseed.view.flights import orbit, upward
 from splatseed.view.models import Shown, stage_frame
 from splatseed.view.pictures import Drawn, Entry, fitted_fov, stage_pose
 from splatseed.view.session import Session
@@ -80,6 +80,7 @@ class Viewer:
 
         self.entries, self._beside = entries, beside
         self._sessions: dict[int, Session] = {}
+        self._left = set[int]()  # browsers that have gone before they were welcome
         self._lock = threading.Lock()
         # A browser may disconnect at any moment: no warning that it missed the rest.
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
@@ -112,11 +113,16 @@ class Viewer:
         session = Session(client, self.entries, self._beside)
         self.greet(client.gui, session)
         with self._lock:
-            self._sessions[client.client_id] = session
+            if client.client_id not in self._left:
+                self._sessions[client.client_id] = session
+                return
+        session.close()
 
     def _leave(self, client: Any) -> None:
         with self._lock:
             session = self._sessions.pop(client.client_id, None)
+            if session is None:
+                self._left.add(client.client_id)
         if session is not None:
             session.close()
 
@@ -133,9 +139,9 @@ class Viewer:
             position = position - step * camera.world_from_cam[:3, 2]
         else:
             camera = orbit([], entry.shown.model, 1, (600, 400))[0].camera
-            up, fov, (_, position) = np.array([0.0, -1.0, 0.0]), 0.9, stage_pose(camera, frame)
+            up, fov, (_, position) = np.zeros(3), 0.9, stage_pose(camera, frame)
         ahead = camera.world_from_cam[:3, 2]
-        self.server.scene.set_up_direction(tuple(up / np.linalg.norm(up)))
+        self.server.scene.set_up_direction(tuple(upward(up)))
         start = self.server.initial_camera
         start.position, start.look_at = tuple(position), tuple(position + ahead)
         start.fov = fov

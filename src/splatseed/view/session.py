@@ -8,6 +8,7 @@ own thread ends.
 
 from __future__ import annotations
 
+import html
 import io
 import logging
 import threading
@@ -149,7 +150,7 @@ class Session:
         self._second = gui.add_dropdown("Beside it", seconds, initial_value=second)
         border = CLEAR_OF_CONTROLS if shown else 0.5
         self._split = gui.add_slider("Border at", 0.05, 0.95, 0.01, border, visible=shown)
-        self._note = gui.add_markdown("", visible=False)
+        self._note = gui.add_html("", visible=False)
         shot = gui.add_button("Screenshot")
         with gui.add_folder("Points"):
             self._points_on = gui.add_checkbox("Show points", not first.has_model)
@@ -197,6 +198,7 @@ class Session:
         for handle in (*self._nodes.values(), *cameras, *self._origins.values()):
             handle.remove()
         self._nodes, self._cameras, self._origins = {}, [], {}
+        self._go.options, self._legend.content = ("-",), ""
         if shown.scene is None:
             return
         if shown.scene.images:
@@ -377,7 +379,8 @@ class Session:
         return split_picture(left, right, *names, at=float(self._split.value))
 
     def _say(self, text: str) -> None:
-        shown = visible(text)
+        # As text: names of photographs may be anything, and the page would run a script.
+        shown = f'<div style="padding:0 1em">{html.escape(visible(text))}</div>' if text else ""
         if self._note.content != shown:
             self._note.content, self._note.visible = shown, bool(shown)
 

@@ -127,7 +127,7 @@ def load_split(
         raise SceneNotFoundError(
             "at least two images with a pose, one to train on and one to test",
             found=f"{len(scene.images)}",
-            fix="Name a scene with photographs: a point cloud alone cannot be trained.",
+            fix="Name a scene with more photographs.",
         )
     views = load_views(
         scene, (*train, *test), data_factor=data_factor, min_side=min_side, cache_dir=cache_dir,
