@@ -65,12 +65,14 @@ def grow(strategy, params, optimizers, names=None, steps=21):
     """A loop in which nothing is learnt; the first round is the last of 21 steps."""
     strategy.check_sanity(params, optimizers)
     state = strategy.initialize_state()
+    # As gsplat's trainer and as nerfstudio 1.1.5 call it.
+    more = {"packed": strategy.absgrad} if "features_dc" in params else {"lr": 1e-3}
     torch.manual_seed(0)
     for step in range(steps):
         strategy.step_pre_backward(params, optimizers, state, step, {})
         views = (POSE[None], K[None], GREY[None], TRUTH[None])
         strategy.observe(params, state, step, *views, names)
-        strategy.step_post_backward(params, optimizers, state, step, {}, lr=1e-3)
+        strategy.step_post_backward(params, optimizers, state, step, {}, **more)
     return state
 
 

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from splatseed.render import rasterization
+from splatseed.train.device import pick_device
 from splatseed.train.growing import contributions
 from splatseed.views.view import View
 
@@ -41,6 +42,7 @@ def compare(crowd: int) -> list[dict[str, Any]]:
     Args:
         crowd: How many Gaussians the larger cases have.
     """
+    pick_device("cuda")  # so that gsplat, which compiles at its first call, finds ninja
     found = []
     for name, case in cases(crowd).items():
         try:
@@ -62,7 +64,7 @@ def _failed(name: str, error: Exception) -> dict[str, Any]:
 
 
 def _gsplat() -> Callable[..., Any]:
-    from gsplat import rasterization as theirs  # noqa: PLC0415  (compiles for CUDA when imported)
+    from gsplat import rasterization as theirs  # noqa: PLC0415  (its own, not ours)
 
     return theirs  # type: ignore[no-any-return]  # gsplat is untyped
 

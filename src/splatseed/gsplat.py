@@ -13,7 +13,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from jaxtyping import Float
@@ -48,6 +48,7 @@ class GrowStrategy(MCMCStrategy):  # type: ignore[misc]  # gsplat has no types
     Gaussians on one device. The defaults are for 30,000 steps: scale them with the run's.
     """
 
+    absgrad: ClassVar[bool] = False  # nerfstudio 1.1.5 asks every strategy
     noise_lr: float = field(default=0.0, init=False)
     min_opacity: float = field(default=FAINT, init=False)
     refine_start_iter: int = GROW_EVERY
@@ -148,6 +149,7 @@ class GrowStrategy(MCMCStrategy):  # type: ignore[misc]  # gsplat has no types
         step: int,
         info: Any,
         lr: float | None = None,  # noqa: ARG002  (what MCMCStrategy is called with)
+        packed: bool = False,  # noqa: ARG002  (what nerfstudio 1.1.5 calls every strategy with)
     ) -> None:
         """At the end of a round, remove, place and split Gaussians.
 

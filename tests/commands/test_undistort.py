@@ -8,6 +8,7 @@ import shutil
 
 import numpy as np
 import pytest
+from PIL import Image
 
 pytest.importorskip("pycolmap", reason="needs pycolmap")
 
@@ -66,6 +67,19 @@ def test_a_distorted_scene_becomes_one_of_pinholes(distorted, tmp_path, splatsee
     again = splatseed("undistort", path, "-o", out)
     assert (again.code, "--overwrite" in again.err) == (2, True)
     assert [each.name for each in tmp_path.iterdir() if each.name.startswith(".")] == []
+
+
+def test_photographs_may_be_resized_copies(distorted, tmp_path, splatseed):
+    path, out = shutil.copytree(distorted, tmp_path / "scene"), tmp_path / "straight"
+    for photograph in (path / "images").iterdir():
+        with Image.open(photograph) as picture:
+            picture.resize((60, 45)).save(photograph)
+    run = splatseed("undistort", path, "-o", out)
+    assert run.code == 0, run
+    before, after = load_scene(path), load_scene(out)
+    lens = after.intrinsics[0]
+    assert load_views(after, after.images[:1])[0].width == lens.width < 70
+    np.testing.assert_allclose(lens.K[0, 0], before.intrinsics[0].K[0, 0] / 2, rtol=0.1)
 
 
 def test_an_upsampled_scene_keeps_what_is_known_of_its_points(distorted, tmp_path, splatseed):

@@ -9,7 +9,8 @@ from scipy.spatial import cKDTree
 from splatseed.camera import Camera
 from splatseed.depth.alignment import Alignment, Settings
 from splatseed.depth.comparison import choose_neighbors, find_support, synchronize_scales
-from splatseed.depth.views import DepthView, Reduced, sample_pixels
+from splatseed.depth.views import DepthView, Reduced, counting, sample_pixels
+from splatseed.depthmap import DepthMap
 from splatseed.progress import silent
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
@@ -48,6 +49,16 @@ def view(camera, z, rgb=GRAY, factor=1.0):
     pixel, copy = np.flatnonzero(z > 0), reduced(camera, z, rgb)
     drawn = (pixel, z.ravel()[pixel], rgb.reshape(-1, 3)[pixel], np.zeros(len(pixel), bool))
     return DepthView(Alignment(1.0, 0.0, 100, 0.05), camera, *drawn, exhausted=False, reduced=copy)
+
+
+def test_a_pixel_of_a_smaller_map_counts_only_if_all_that_it_covers_do():
+    mask, shown = np.ones((50, 80), bool), np.ones((7, 10), bool)
+    mask[31, 47], shown[31 * 7 // 50, 47 * 10 // 80] = False, False
+    kinds = (DepthMap(np.ones((7, 10), np.float32)), DepthMap(np.ones((100, 160), np.float32)))
+    np.testing.assert_array_equal(counting(mask, kinds[0]), shown)
+    assert np.argwhere(~counting(mask, kinds[1])).tolist() == [
+        [row, column] for row in (62, 63) for column in (94, 95)
+    ]
 
 
 POINTS = np.array(

@@ -107,7 +107,9 @@ def test_rgbd_capture_by_the_frames_numbers(tmp_path, name):
     put(tmp_path / "room/results/depth000007.png", 500)
     put(tmp_path / "room/results/depth12.png", 1000)
     (tmp_path / "cam_params.json").write_text('{"camera": {"scale": 250.0}}')
-    scene = scene_of("frame7.jpg", "frame000012.jpg")
+    for frame in ("frame7.png", "frame000012.png"):  # photographs, of a scene elsewhere
+        put(tmp_path / "room/results" / frame, 3)
+    scene = scene_of("frame7.png", "frame000012.png")
     depths = find_depths(scene, tmp_path / "room" / name)
     assert [depths.read(im.name).values[0, 0] for im in scene.images] == [2, 4]
 

@@ -105,9 +105,7 @@ def read_view(
     check_lens(image, reason="along whose rays pixels are lifted")
     depth = depths.read(image.name)
     if (mask := read_mask(masks, image.name, folder / image.name)) is not None:
-        row = np.arange(depth.height)[:, None] * mask.shape[0] // depth.height
-        column = np.arange(depth.width) * mask.shape[1] // depth.width
-        values = np.where(mask[row, column], depth.values, np.float32(np.nan))
+        values = np.where(counting(mask, depth), depth.values, np.float32(np.nan))
         depth = DepthMap(values, depth.kind)
     camera = map_camera(depth, image)
     points = camera_points(camera, visibility.of(image))
@@ -137,6 +135,14 @@ def read_view(
     rgb = np.asarray(photograph)[row, column]
     reduced = None if coarse is None else _reduce(camera, coarse, unit, photograph)
     return DepthView(alignment, camera, pixel, z, rgb, edge, len(pixel) < num, reduced)
+
+
+def counting(mask: Bool[np.ndarray, "P Q"], depth: DepthMap) -> Bool[np.ndarray, "H W"]:
+    """Which pixels of a map count: those of which all pixels of the photograph do."""
+    for axis, size in enumerate(depth.values.shape):
+        starts = np.arange(size) * mask.shape[axis] // size
+        mask = np.logical_and.reduceat(mask, starts, axis=axis)
+    return mask
 
 
 def _reduce(

@@ -2,9 +2,9 @@
 
 ``scale`` is stored units per scene unit, by which a file's numbers are divided. A *stem* is a map's
 path without suffix. For the image ``a/b.jpg`` the stems are tried in this order: ``a/b.jpg``,
-``a/b.jpg.geometric`` and ``.photometric`` (COLMAP's dense stereo), ``a/b``, ``a/b_depth``,
-``a/depthN`` for ``a/frameN.jpg`` (NICE-SLAM) and ``a/X.depth`` for ``a/X.color.png`` (7-Scenes);
-for each, the suffixes in the order of ``SUFFIXES``. Promise: a map is float32 with NaN where
+``a/b.jpg.geometric`` and ``.photometric`` (COLMAP's dense stereo), ``a/depthN`` for
+``a/frameN.jpg`` (NICE-SLAM), ``a/X.depth`` for ``a/X.color.png`` (7-Scenes), ``a/b`` and
+``a/b_depth``; for each, the suffixes in the order of ``SUFFIXES``. Promise: a map is float32 with NaN where
 unknown; reading is safe from several threads; matching depends on names only.
 """
 
@@ -181,11 +181,12 @@ def _stems(file_name: str) -> Iterator[str]:
     """The stems that a map of this image may have, in order of preference."""
     stem = PurePosixPath(file_name).stem
     yield from (file_name, f"{file_name}.geometric", f"{file_name}.photometric")
-    yield from (stem, f"{stem}_depth")
+    # Before the image's own name, by which its file may lie beside them.
     if number := _FRAME.fullmatch(stem):
         yield f"depth{int(number[1])}"
     if stem.endswith(".color"):
         yield f"{stem.removesuffix('.color')}.depth"
+    yield from (stem, f"{stem}_depth")
 
 
 def read_description(path: Path) -> tuple[DepthKind | None, float | None]:

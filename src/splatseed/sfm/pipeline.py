@@ -36,6 +36,7 @@ from splatseed.sfm import colmap
 from splatseed.sfm.colmap import Run, Settings
 from splatseed.sfm.photos import Size, find_photos, match_poses
 from splatseed.sfm.refinement import Refinement, refine
+from splatseed.views.view import at_file_size
 
 OnPhotos: TypeAlias = Callable[[Sequence[str], Mapping[str, Sequence[str]]], None]
 _DEFAULT = Settings()
@@ -192,6 +193,7 @@ def undistort(
     """
     require("pycolmap")
     images = _all_photographs(scene)
+    scene = at_file_size(scene).replace(intrinsics=())  # pycolmap wants cameras of the files' size
     with _staged(images, Path(output), "undistort", overwrite=overwrite) as staging:
         work = staging / ".work" / "distorted"
         distorted = write_scene(scene, work, format="colmap", require_points=False).path
