@@ -4,8 +4,8 @@
 path without suffix. For the image ``a/b.jpg`` the stems are tried in this order: ``a/b.jpg``,
 ``a/b.jpg.geometric`` and ``.photometric`` (COLMAP's dense stereo), ``a/depthN`` for
 ``a/frameN.jpg`` (NICE-SLAM), ``a/X.depth`` for ``a/X.color.png`` (7-Scenes), ``a/b`` and
-``a/b_depth``; for each, the suffixes in the order of ``SUFFIXES``. Promise: a map is float32 with NaN where
-unknown; reading is safe from several threads; matching depends on names only.
+``a/b_depth``; for each, the suffixes in the order of ``SUFFIXES``. Promise: a map is float32 with
+NaN where unknown; reading is safe from several threads; matching depends on names only.
 """
 
 from __future__ import annotations
