@@ -32,7 +32,7 @@ def model(rng, tmp_path):
 def test_a_run_is_exported_cropped_cleaned_and_can_be_scored(model, splatseed, tmp_path):
     folder, out = tmp_path / "run", tmp_path / "out.spz"
     folder.mkdir()
-    config = {"scene": "/data/my scene", "data_factor": 2, "test_every": 5}
+    config = {"scene": "/data/my scene", "data_factor": 2, "test_every": 5, "masks": "/my/m"}
     for name, content in (("config.json", config), ("splatseed.json", {})):
         (folder / name).write_text(json.dumps(content))
     model.rename(folder / "point_cloud.ply")
@@ -41,7 +41,9 @@ def test_a_run_is_exported_cropped_cleaned_and_can_be_scored(model, splatseed, t
         run = splatseed("export", folder / named, "-o", out, *how)
         assert run.code == 0, run
         said = " ".join(run.out.split())
-        assert f"{out} --scene '/data/my scene' --data-factor 2 --test-every 5" in said
+        assert (
+            f"{out} --scene '/data/my scene' --data-factor 2 --test-every 5 --masks /my/m" in said
+        )
     kept = read_model(out)
     assert 70 < len(kept) < 130
     assert kept.means[:, 2].min() > -0.01

@@ -36,13 +36,21 @@ def test_steps_and_time_left_are_always_there():
 
 def test_a_file_gives_options_and_the_command_line_wins(tmp_path):
     toml = tmp_path / "run.toml"
-    toml.write_text('scene = "room"\nmax_steps = 7\nopacity_reset = true\nseeds = "scene"\n')
+    toml.write_text(
+        'scene = "room"\nmax_steps = 7\nopacity_reset = true\nseeds = "scene"\nbudget = 900\n'
+    )
     options = parse(["-o", "out", "--config", str(toml)])
     assert (options.scene, options.output) == (Path("room"), Path("out"))
     assert (options.training.max_steps, options.training.opacity_reset) == (7, True)
-    assert options.seeds == "scene"
+    assert (options.seeds, options.budget) == ("scene", "900")
     options = parse(["mine", f"--config={toml}", "--max-steps=9", "-o", "out"])
     assert (options.scene, options.training.max_steps) == (Path("mine"), 9)
+    for one, other in (("long_side", "data_factor"), ("data_factor", "long_side")):
+        toml.write_text(f"{one} = 8\n")
+        words = ["mine", "-o", "out", "--config", str(toml), f"--{other.replace('_', '-')}", "4"]
+        options = parse(words)
+        sizes = {"long_side": options.long_side, "data_factor": options.training.data_factor}
+        assert sizes == {one: {"long_side": None, "data_factor": 1}[one], other: 4}
     with pytest.raises(SceneNotFoundError):
         parse(["--config", str(tmp_path / "none.toml")])
 

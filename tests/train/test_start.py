@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -84,6 +85,34 @@ def test_a_smaller_budget_keeps_those_that_contribute_most(room, first, tmp_path
     other = prepare_run(room, tmp_path / "other", going_on(tmp_path / "some.ply"))
     best, any_ = (evaluate_views(r.trainer.render, r.trainer.test_views) for r in (run, other))
     assert best.psnr > any_.psnr + 1
+
+
+def test_a_run_is_in_its_scenes_world_whatever_its_clones(room_path, first, splatseed, tmp_path):
+    """As mcmc makes them; a file of the same Gaussians may be of another scene."""
+    run = shutil.copytree(first[0].parent, tmp_path / "run")
+    whole = read_model(run / "point_cloud.ply")
+    write_model(run / "point_cloud.ply", whole.select(np.arange(len(whole)) // 40))
+    file = shutil.copy(run / "point_cloud.ply", tmp_path / "file.ply")
+    words = ["train", room_path, "--max-steps", 3, "--strategy", "none", "-o"]
+    for model, code in ((run, 0), (file, 2)):
+        ended = splatseed(*words, tmp_path / f"{model.stem}_on", "--start", model)
+        assert (ended.code, "another scene" in ended.err) == (code, code == 2)
+    assert splatseed("evaluate", run).code == 0
+    assert splatseed("evaluate", run, "--scene", room_path).code == 2
+
+
+def test_the_config_of_such_a_run_serves_another(room_path, first, splatseed, tmp_path):
+    words = ["train", room_path, "--max-steps", 3, "--strategy", "none", "-o"]
+    for name, given in (
+        ("a", ["--start", first[0]]),
+        ("b", ["--config", tmp_path / "a/config.json"]),
+        ("c", ["--config", tmp_path / "a/config.json", "--seeds", "scene", "--long-side", 80]),
+    ):
+        ended = splatseed(*words, tmp_path / name, *given)
+        assert ended.code == 0, ended.err
+    configs = [json.loads((tmp_path / name / "config.json").read_text()) for name in "abc"]
+    assert [config["start"] for config in configs] == [str(first[0]), str(first[0]), None]
+    assert configs[2]["data_factor"] > 1
 
 
 def test_the_command(room_path, first, splatseed, tmp_path):

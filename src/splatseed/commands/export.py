@@ -120,4 +120,6 @@ def _scoring_command(options: Options) -> str:
         words += ["--data-factor", str(factor)]
     if isinstance(every, int) and every != TrainSettings.test_every:
         words += ["--test-every", str(every)]
+    if config.get("masks") is not None and options.clean in {None, OWN}:
+        words += ["--masks", quoted(config["masks"])]
     return " ".join(words)

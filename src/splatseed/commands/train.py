@@ -59,6 +59,8 @@ RUN_NOTES = {"splatseed", "points", "photographs", "device", "versions"}
 """What config.json records besides options."""
 _SETTINGS = {option: name for name, option in OPTIONS.items()} | {"long_side": "data_factor"}
 """Settings by the options that stand for them, where these have other names."""
+RIVALS = (("start", "seeds"), ("start", "refine_poses"), ("long_side", "data_factor"))
+"""Options of which one alone can be given: on the command line it takes the place of the other."""
 BEST_SETTINGS = replace(DEFAULT, strategy=BEST)
 
 
@@ -116,11 +118,19 @@ def parse(arguments: list[str]) -> Options:
     parser = ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--config", type=Path, nargs="?")  # what is missing, tyro tells
     path = parser.parse_known_args(arguments)[0].config
-    return parse_options(Options, "train", arguments, None if path is None else _in_file(path))
+    default = None if path is None else _in_file(path, _words(arguments))
+    return parse_options(Options, "train", arguments, default)
 
 
-def _in_file(path: Path) -> Options:
-    """The options in a .toml or in a run's config.json."""
+def _words(arguments: Sequence[str]) -> set[str]:
+    """The fields of the options on the command line."""
+    options = {each.partition("=")[0] for each in arguments if each.startswith("--")}
+    return {option.removeprefix("--").replace("-", "_") for option in options}
+
+
+def _in_file(path: Path, words: Collection[str]) -> Options:
+    """The options in a .toml or in a run's config.json, but for rivals of the command line's."""
+    rivals = {b for pair in RIVALS for a, b in (pair, pair[::-1]) if a in words}
     kinds = {"training": TrainSettings, "": Options}
     fields = {
         name: (group, hint)
@@ -130,6 +140,8 @@ def _in_file(path: Path) -> Options:
     }
     given: dict[str, dict[str, Any]] = {group: {} for group in kinds}
     for name, value in _read_config(path).items():
+        if name in rivals:
+            continue
         if name not in fields:
             raise SceneFormatError(
                 f"options of splatseed train in {path}",
@@ -166,15 +178,16 @@ def _read_config(path: Path) -> dict[str, Any]:
             fix="Write lines such as max_steps = 7000.",
         ) from None
     if isinstance(content.get("seeds"), dict):  # a run's: what its seeds were
-        content["seeds"] = content.pop("seeding", None)
+        seeding = content.pop("seeding", None)
+        content["seeds"] = None if content.get("start") else seeding
+    if isinstance(content.get("budget"), int | float):
+        content["budget"] = str(content["budget"])
     return {k: v for k, v in content.items() if k not in RUN_NOTES and v is not None}
 
 
 def _named(arguments: Sequence[str], config: Path | None) -> set[str]:
     """The settings that are given on the command line or in a file, whatever their values."""
-    options = {each.partition("=")[0] for each in arguments if each.startswith("--")}
-    words = {option.removeprefix("--").replace("-", "_") for option in options}
-    words |= set(() if config is None else _read_config(config))
+    words = _words(arguments) | set(() if config is None else _read_config(config))
     return {_SETTINGS.get(word, word) for word in words}
 
 

@@ -38,7 +38,13 @@ from splatseed.requirements import require
 from splatseed.scene import Scene
 from splatseed.scores import CurvePoint, EvalResult, TrainingResult
 from splatseed.splat.formats import write_model
-from splatseed.splat.gaussians import TrainingFrame, stray_note, stray_views, training_frame
+from splatseed.splat.gaussians import (
+    Gaussians,
+    TrainingFrame,
+    stray_note,
+    stray_views,
+    training_frame,
+)
 from splatseed.splat.rendering import picture_names, write_render
 from splatseed.splat.ssim import WINDOW
 from splatseed.train.device import check_fits, pick_device
@@ -133,7 +139,7 @@ def prepare_run(
     if refine_poses:
         scene = _at_refined_poses(scene, folder, begun, settings, note, progress)
     posed, stereo = scene, None
-    start = read_start(Path(settings.start), scene, note) if settings.start else None
+    start = _started(settings.start, scene, note)
     if start is None:
         scene, stereo = seeded(scene, settings, device.type, note, progress)
         trained = scene.split(settings.test_every)[0]
@@ -253,6 +259,16 @@ def make_config(
             **{name: _version(name) for name in ("torch", "gsplat", "numba", "numpy")},
         },
     }
+
+
+def _started(named: str | None, scene: Scene, note: Callable[[str], None]) -> Gaussians | None:
+    """The Gaussians of the file that a run starts from, if it names one."""
+    if named is None:
+        return None
+    folder, trained = RunFolder(Path(named).parent), False
+    if Path(named) == folder.gaussians and folder.is_run:
+        trained = folder.read_config().get("photographs") == _photographs_digest(scene)
+    return read_start(Path(named), scene, note, trained=trained)
 
 
 def _photographs_digest(scene: Scene) -> str:

@@ -32,14 +32,18 @@ ABSENT = -20.0
 """Logit of an opacity that renders nothing, for those that a file gives as 0."""
 
 
-def read_start(path: Path, scene: Scene, note: Callable[[str], None]) -> Gaussians:
-    """The Gaussians of a file, in the scene's world.
+def read_start(
+    path: Path, scene: Scene, note: Callable[[str], None], *, trained: bool = False
+) -> Gaussians:
+    """The Gaussians of a file, in the scene's world; ``trained``: on just these poses.
 
     Raises:
         SceneNotFoundError: There is no such file.
         SceneFormatError: It holds no Gaussians, or they belong to another scene.
     """
-    gaussians, told = in_scene_world(path, scene, read_model(path))
+    gaussians, told = read_model(path), ""
+    if not trained:  # where mcmc's clones may seem to be in another world
+        gaussians, told = in_scene_world(path, scene, gaussians)
     if told:
         note(told)
     # Some trainers write opacities of 0 and 1, whose logits are infinite.

@@ -122,6 +122,16 @@ def test_of_a_damaged_cloud_nothing_is_kept(content, tmp_path, splatseed):
     assert [each.name for each in tmp_path.iterdir()] == ["a.xyz"]
 
 
+def test_after_a_number_that_cannot_be_another_may_be_asked_for(tmp_path, splatseed):
+    np.savetxt(tmp_path / "a.txt", np.random.default_rng(0).random((100, 3)))
+    words = ("upsample", tmp_path / "a.txt", "-o", tmp_path / "out", "--method", "mls")
+    run = splatseed(*words, "--num-points", 10)
+    assert (run.code, "100 originals" in run.err) == (2, True)
+    assert [each.name for each in tmp_path.iterdir()] == ["a.txt"]
+    run = splatseed(*words, "--num-points", 300)
+    assert run.code == 0, run.err
+
+
 def test_interrupted_it_says_what_is_kept_and_goes_on(cloud, tmp_path, splatseed, monkeypatch):
     def interrupted(*_):
         raise KeyboardInterrupt

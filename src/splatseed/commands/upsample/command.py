@@ -16,7 +16,7 @@ from splatseed.commands.options import MaskChoice, check_least, parse_options, r
 from splatseed.commands.upsample import output
 from splatseed.commands.upsample.cloud import load_cloud
 from splatseed.commands.upsample.tiled import find_source, run_tiled
-from splatseed.console import OUT, print_note, stage_display
+from splatseed.console import OUT, StageClock, print_note, stage_display
 from splatseed.depthmap import DepthKind
 from splatseed.io import find_depths, load_originals, write_scene
 from splatseed.io.clouds import open_cloud
@@ -276,16 +276,29 @@ def _run_in_memory(options: Options, methods: dict[str, Any]) -> None:
         )  # fmt: skip
         if cloud is not None:
             cloud.write(options.output)
-        if options.gaussians is not None:
-            output.write_start(options.gaussians, seeded, method, clock)
-            notes.append(f"The initial Gaussians are in {visible(options.gaussians)}.")
-        if options.preview:
-            output.write_previews(options, scene, seeds, method, clock)
+        _write_more(options, scene, seeded, method, clock)
         seconds = clock.seconds()
+    if options.gaussians is not None:
+        notes.append(f"The initial Gaussians are in {visible(options.gaussians)}.")
     origins = output.origins_of(seeds, report.num_points)
     output.summarise(options, scene, len(scene.points), origins, report, seconds, findings)
     for sentence in notes:
         print_note(sentence)
+
+
+def _write_more(
+    options: Options, scene: Scene, seeded: Scene, method: Upsampler, clock: StageClock
+) -> None:
+    """Write what was asked for beside the scene, which is there already."""
+    try:
+        if options.gaussians is not None:
+            output.write_start(options.gaussians, seeded, method, clock)
+        if options.preview:
+            output.write_previews(options, scene, seeded.points, method, clock)
+    except KeyboardInterrupt as stop:
+        whole = f"The scene in {visible(options.output)} is whole"
+        stop.add_note(f"{whole}; its pictures or initial Gaussians may be missing.")
+        raise
 
 
 def _read(options: Options, method: Upsampler) -> Scene:

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from splatseed.commands.upsample.command import Options
     from splatseed.upsample.tiles import Source, Tiled
 
-CLOUDS = (".las", ".laz", ".e57", ".pcd", ".xyz", ".csv", ".asc", ".pts", ".npz", ".glb")
+CLOUDS = (".las", ".laz", ".e57", ".pcd", ".xyz", ".txt", ".csv", ".asc", ".pts", ".npz", ".glb")
 """Files of points that only ``open_cloud`` reads."""
 PER_POINT, PER_NEIGHBOR = 120, 20
 """Bytes that a cloud in memory takes for each original, and for each neighbour of it."""
@@ -104,7 +104,10 @@ def _needed(options: Options, method: Upsampler, count: int) -> int:
     """Bytes that the whole cloud takes in memory."""
     from splatseed.upsample.nearest import NearestMethod  # noqa: PLC0415  (SciPy, Numba)
 
-    total = planned_size(count, options.ratio, options.num_points)
+    # Rows may repeat others: whether the number is too small, only the distinct ones tell.
+    total = planned_size(
+        count, options.ratio, options.num_points and max(count, options.num_points)
+    )
     neighbors = method.num_queried if isinstance(method, NearestMethod) else 16
     return PROCESS + total * BYTES_EACH + count * (PER_POINT + PER_NEIGHBOR * neighbors)
 
@@ -166,7 +169,8 @@ def run_tiled(options: Options, methods: Mapping[str, Upsampler], source: Source
         place = ", ".join(f"{each:,.0f}" for each in tiled.origin)
         print_note(
             f"The cloud lies far from zero, where float32 is coarse: ({place}) was subtracted from"
-            " all points. splatseed.json has it as origin."
+            " all points, and must be from a scene that they are put into. splatseed.json has it as"
+            " origin."
         )
 
 

@@ -180,7 +180,11 @@ def make_tiled(
             found=f"enough for {plan.tile_points:,}",
             fix=f"Pass the --memory of the first time, or remove {work} to begin anew.",
         )
-    num_new = planned_size(store.count, request.ratio, request.num_points) - store.count
+    try:
+        num_new = planned_size(store.count, request.ratio, request.num_points) - store.count
+    except ParameterError:  # no command can go on from here
+        remove(work)
+        raise
     tiled = Tiled(
         work, store.count, num_new, facts["non_finite"], facts["repeats"],
         tuple(Rows(work).origin.tolist()), len(store.counts), plan.at_once, request,
