@@ -112,8 +112,8 @@ def after_depth(path: Path, scene: Scene, maps: Path, known: int, *, aligned: bo
 
 def look(path: Path, maps: Path) -> tuple[str, str]:
     """The command that shows depth maps."""
-    info = f"splatseed info {quoted(path)} --depth {quoted(maps)} --picture depth.png"
-    return "look", info
+    picture = quoted(f"{maps.resolve().name}.png")
+    return "look", f"splatseed info {quoted(path)} --depth {quoted(maps)} --picture {picture}"
 
 
 def number_for(points: int, known: int, most: int) -> str:

@@ -366,7 +366,8 @@ def similarity_in(path: Path, content: Any, scene: Scene, fix: str) -> Similarit
     scale, rows = 1.0, content
     if isinstance(content, dict):
         rows = next((content[key] for key in _MATRIX_KEYS if key in content), None)
-        scale = content.get("scale", 1.0)
+        # Beside a matrix it repeats that of the matrix, as in alignment.json.
+        scale = content.get("scale", 1.0) if "transform" in content else 1.0
     try:
         matrix = np.atleast_1d(np.array(rows, np.float64))
         matrix = np.concatenate([matrix[:3] * float(scale), np.eye(4)[3:]])

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
 from splatseed.errors import PointCloudError
+from splatseed.io.nerfstudio import read_cloud_transform
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
 from splatseed.seeding.clouds import align as module
@@ -78,6 +81,9 @@ def test_a_cloud_that_is_shifted_scaled_and_turned(made, tmp_path, monkeypatch):
         found.scene_from_cloud.points(MOVE.translation[None])[0],
         atol=1e-6,
     )
+    (tmp_path / "alignment.json").write_text(json.dumps(found.report))
+    again = read_cloud_transform(tmp_path / "alignment.json", Scene(PointCloud.empty()))
+    np.testing.assert_allclose(again.matrix, found.scene_from_cloud.matrix, rtol=1e-9)
 
 
 def box(num, rng):

@@ -79,6 +79,10 @@ def test_marks_without_tracks_count_as_the_median(rng):
     np.testing.assert_allclose(found.covariance[250:], np.tile(usual * np.eye(3), (50, 1, 1)))
     assert not found.sensitivity[250:].any()
     assert not icp.find_marks(scene).covariance.any()
+    none = dataclasses.replace(
+        tracks(xyz), offsets=np.zeros(301, int), image_ids=np.empty(0), point2d_idx=np.empty(0)
+    )
+    assert len(icp.find_marks(scene.replace(tracks=none)).xyz) == 300
 
 
 HERE = Similarity(1.0, np.eye(3), np.zeros(3))

@@ -68,6 +68,8 @@ def find_marks(scene: Scene) -> Marks:
     """An even choice of the scene's points; those without a track get the median variance."""
     points, tracks = scene.points, scene.tracks
     own = (points.source == ORIGINAL) & points.distinct
+    if tracks is not None and not tracks.lengths.any():  # a model without observations
+        tracks = None
     if tracks is not None:
         own[: len(tracks)] &= tracks.lengths >= LEAST_VIEWS
     if np.count_nonzero(own) < LEAST_MARKS:
