@@ -156,8 +156,8 @@ def cloud_warnings(points: PointCloud) -> tuple[str, ...]:
     if step > _RESOLUTION * float((high - low).max()) > 0:
         warnings.append(
             "The coordinates are so large beside the scene's extent that float32 cannot resolve"
-            " it; recentre the scene (subtract an offset from points and cameras) first. With a scan,"
-            " --cloud SCAN --recenter does."
+            " it; recentre the scene (subtract an offset from points and cameras) first. With a"
+            " scan, --cloud SCAN --recenter does."
         )
     return tuple(warnings)
 
