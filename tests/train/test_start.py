@@ -98,7 +98,7 @@ def test_a_run_is_in_its_scenes_world_whatever_its_clones(room_path, first, spla
         ended = splatseed(*words, tmp_path / f"{model.stem}_on", "--start", model)
         assert (ended.code, "another scene" in ended.err) == (code, code == 2)
     assert splatseed("evaluate", run).code == 0
-    assert splatseed("evaluate", run, "--scene", room_path).code == 2
+    assert splatseed("evaluate", file, "--scene", room_path).code == 2
 
 
 def test_the_config_of_such_a_run_serves_another(room_path, first, splatseed, tmp_path):

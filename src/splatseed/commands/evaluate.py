@@ -142,7 +142,6 @@ def _evaluate(
     from splatseed.splat.evaluate import evaluate_model, load_model  # noqa: PLC0415  (PyTorch)
     from splatseed.splat.metrics import load_lpips  # noqa: PLC0415  (PyTorch)
     from splatseed.splat.rendering import picture_names, write_render  # noqa: PLC0415  (PyTorch)
-    from splatseed.splat.world import NO_TRANSFORM  # noqa: PLC0415  (PyTorch)
     from splatseed.train.device import pick_device  # noqa: PLC0415  (PyTorch)
 
     clock("read", 0.0)
@@ -153,12 +152,9 @@ def _evaluate(
         if options.lpips_weights is not None:
             raise
         reason = str(error)
-    # A run is in the world of the scene that it names; mcmc's clones may seem to be in another.
-    transform = options.transform
-    if config and options.scene is None:
-        transform = transform or NO_TRANSFORM
     model = load_model(
-        gaussians, scene, **numbers, transform=transform, masks=masks,
+        gaussians, scene, **numbers, transform=options.transform, masks=masks,
+        trained_on=config.get("photographs"),
         device=pick_device(options.backend, clock), cache_dir=user_cache_dir(), progress=clock,
     )  # fmt: skip
     seen = pixel_masks(find_covisible(model.scene, numbers["test_every"], clock), model.views)

@@ -7,6 +7,7 @@ rounded to 8 bits, and 16-bit colours keep their upper 8 (Pillow's way).
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Sequence
 from io import BytesIO
@@ -45,6 +46,22 @@ def photograph_folder(scene: Scene) -> Path:
             "photographs into a folder named images.",
         )
     return folder
+
+
+def photographs_digest(scene: Scene) -> str:
+    """A fingerprint of lenses, poses and the sizes of the files, as they are when training begins.
+
+    A run notes it: it tells later whether a scene is still what the run was trained on.
+    """
+    digest = hashlib.blake2b(digest_size=16)
+    folder = scene.source.image_dir if scene.source else None
+    for image in scene.images:
+        lens, path = image.intrinsics, folder and folder / image.name
+        size = path.stat().st_size if path and path.is_file() else None
+        facts = f"{image.name!r} {lens.params} {lens.width} {lens.height} {size}"
+        digest.update(facts.encode())  # repr escapes what is no UTF-8 in a name
+        digest.update(image.quat.tobytes() + image.translation.tobytes())
+    return digest.hexdigest()
 
 
 def photograph_bytes(path: Path) -> bytes:

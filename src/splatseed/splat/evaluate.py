@@ -28,6 +28,7 @@ from torch import Tensor
 from splatseed.errors import ParameterError, SceneNotFoundError
 from splatseed.io import load_scene
 from splatseed.io.masks import with_masks
+from splatseed.io.photograph import photographs_digest
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 from splatseed.scores import NOT_ASKED, EvalResult, ViewScore
@@ -37,7 +38,7 @@ from splatseed.splat.metrics import LPIPS_NET, Lpips, color_corrected, flip_map,
 from splatseed.splat.rendering import ModelRenderer, fill_masked, mask_of, photograph_of
 from splatseed.splat.ssim import WINDOW
 from splatseed.splat.world import NO_TRANSFORM, check_world, find_transform, view_in
-from splatseed.views.view import View, load_views, poses_of
+from splatseed.views.view import View, at_file_size, load_views, poses_of
 
 Covisible: TypeAlias = Mapping[str, Bool[np.ndarray, "H W"]]
 """Which pixels of each test view at least two training views see, by the view's name."""
@@ -168,6 +169,7 @@ def load_model(
     test_every: int = 8,
     transform: str | None = None,
     masks: str | None = None,
+    trained_on: str | None = None,
     device: torch.device | None = None,
     cache_dir: Path | None = None,
     progress: Progress = silent,
@@ -182,6 +184,8 @@ def load_model(
         transform: From the scene's world to the model's, as for ``find_transform``; when left out,
             they must be the same.
         masks: Which masks, as for ``io.masks.with_masks``.
+        trained_on: The ``photographs_digest`` of the run; where it is the scene's, they are the
+            same, whatever the clones that mcmc makes look like.
         device: Where to render; the CPU when left out.
         cache_dir: Where smaller photographs are cached; nowhere when left out.
         progress: Told how far it is.
@@ -210,7 +214,9 @@ def load_model(
         progress=progress,
     )
     world = None if transform is None else find_transform(transform, scene)
-    doubt = "" if transform == NO_TRANSFORM else check_world(path, scene, gaussians, world)
+    proven = transform is None and trained_on == photographs_digest(at_file_size(scene))
+    unasked = proven or transform == NO_TRANSFORM
+    doubt = "" if unasked else check_world(path, scene, gaussians, world)
     frame = training_frame([view_in(world, view) for view in poses_of(train)])
     image = ModelRenderer(gaussians, frame, device).image
     return TrainedModel(gaussians, views, lambda view: image(view_in(world, view)), scene, doubt)

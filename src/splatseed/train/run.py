@@ -8,7 +8,6 @@ scene's world; the end of a GPU's memory is told in a sentence, with a number to
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import platform
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -30,6 +29,7 @@ from splatseed.errors import (
 )
 from splatseed.io import load_scene
 from splatseed.io.masks import mask_choice, with_masks
+from splatseed.io.photograph import photographs_digest
 from splatseed.io.seeds import was_upsampled
 from splatseed.io.staging import write_json
 from splatseed.literal import counted
@@ -253,7 +253,7 @@ def make_config(
         **dataclasses.asdict(settings),
         "device": device,
         "seeds": dict(seeds),
-        "photographs": _photographs_digest(scene),
+        "photographs": photographs_digest(scene),
         "versions": {
             "python": platform.python_version(),
             **{name: _version(name) for name in ("torch", "gsplat", "numba", "numpy")},
@@ -267,21 +267,8 @@ def _started(named: str | None, scene: Scene, note: Callable[[str], None]) -> Ga
         return None
     folder, trained = RunFolder(Path(named).parent), False
     if Path(named) == folder.gaussians and folder.is_run:
-        trained = folder.read_config().get("photographs") == _photographs_digest(scene)
+        trained = folder.read_config().get("photographs") == photographs_digest(scene)
     return read_start(Path(named), scene, note, trained=trained)
-
-
-def _photographs_digest(scene: Scene) -> str:
-    """A fingerprint of lenses, poses and the sizes of the files, which a resumed run must find."""
-    digest = hashlib.blake2b(digest_size=16)
-    folder = scene.source.image_dir if scene.source else None
-    for image in scene.images:
-        lens, path = image.intrinsics, folder and folder / image.name
-        size = path.stat().st_size if path and path.is_file() else None
-        facts = f"{image.name!r} {lens.params} {lens.width} {lens.height} {size}"
-        digest.update(facts.encode())  # repr escapes what is no UTF-8 in a name
-        digest.update(image.quat.tobytes() + image.translation.tobytes())
-    return digest.hexdigest()
 
 
 def _version(package: str) -> str | None:
