@@ -16,7 +16,7 @@ from .test_package import tracked_files
 
 MOST_OPTIONS = 140
 MOST_FILES = 260
-MOST_LINES = {"src": 43_000, "tests": 23_300}
+MOST_LINES = {"src": 43_000, "tests": 23_250}
 
 
 def test_options_over_all_verbs():

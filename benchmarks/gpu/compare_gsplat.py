@@ -64,7 +64,7 @@ def _failed(name: str, error: Exception) -> dict[str, Any]:
 
 
 def _gsplat() -> Callable[..., Any]:
-    from gsplat import rasterization as theirs  # noqa: PLC0415  (its own, not ours)
+    from gsplat import rasterization as theirs  # noqa: PLC0415  (once ninja is found)
 
     return theirs  # type: ignore[no-any-return]  # gsplat is untyped
 

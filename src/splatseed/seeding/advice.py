@@ -119,10 +119,10 @@ def advise(
         return Advice(AS_IT_IS, (f"It has {per_pixel}.", full), measured)
     if strategy == "grow":
         places_itself = (
-            "Strategy grow puts new Gaussians at the depth that stereo finds; points that method "
-            "auto added before it changed quality by 0.3 dB at most, either way, on all but one of "
-            "the captures measured. Under 3DGS's densification, which other trainers use, they "
-            "gained 0.2 dB on average: splatseed upsample adds them."
+            "Strategy grow puts new Gaussians at the depth that stereo finds; adding points by "
+            "method auto first gained or lost 0.3 dB at most on all but one of the captures "
+            "measured. Under 3DGS's densification, which other trainers use, that gained 0.2 dB on "
+            "average: splatseed upsample adds them."
         )
         return Advice(AS_IT_IS, (f"It has {per_pixel}.", places_itself), measured)
     reasons = [f"It has {per_pixel}, and room for {has:.1f} times as many seeds."]

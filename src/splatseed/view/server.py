@@ -80,7 +80,7 @@ class Viewer:
 
         self.entries, self._beside = entries, beside
         self._sessions: dict[int, Session] = {}
-        self._left = set[int]()  # browsers that have gone before they were welcome
+        self._left = set[int]()  # browsers that left before they were welcomed
         self._lock = threading.Lock()
         # A browser may disconnect at any moment: no warning that it missed the rest.
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")

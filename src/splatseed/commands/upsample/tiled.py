@@ -169,8 +169,8 @@ def run_tiled(options: Options, methods: Mapping[str, Upsampler], source: Source
         place = ", ".join(f"{each:,.0f}" for each in tiled.origin)
         print_note(
             f"The cloud lies far from zero, where float32 is coarse: ({place}) was subtracted from"
-            " all points, and must be from a scene that they are put into. splatseed.json has it as"
-            " origin."
+            " all points; subtract it from the cameras of a scene, too, before you add them to it."
+            " splatseed.json has it as origin."
         )
 
 
