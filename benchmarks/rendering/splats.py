@@ -11,7 +11,7 @@ always counted.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +23,7 @@ from splatseed.camera import Camera
 from splatseed.render.binning import RECORD, TILE, depth_order, list_tiles
 from splatseed.render.layout import gather
 from splatseed.runtime.jit import kernel, parallel_range
-from splatseed.splat.gaussians import SH_C0, Gaussians, neighbor_distances
+from splatseed.splat.gaussians import PARAMETERS, SH_C0, Gaussians, neighbor_distances
 from splatseed.synthetic.room import Room, build_room, orbit_cameras, render_views, visible
 from splatseed.views.view import View
 
@@ -68,7 +68,7 @@ class Workload:
     def load(path: Path) -> Workload:
         """Read what ``save`` wrote."""
         with np.load(path) as arrays:
-            gaussians = Gaussians(**{each.name: arrays[each.name] for each in fields(Gaussians)})
+            gaussians = Gaussians(**{name: arrays[name] for name in PARAMETERS})
             rows = zip(*(arrays[name] for name in VIEW), strict=True)
             views = tuple(
                 View(f"{i:03d}.png", image, K, image.shape[1], image.shape[0], pose)

@@ -169,8 +169,7 @@ def test_what_is_no_model_is_named(files, tmp_path):
     many[8:12] = b"\xff\xff\xff\x7f"
     turned = bytearray(files[".spz"])
     turned[len(turned) // 3] ^= 255  # what is unpacked may be longer
-    broken = _gaussians(9)
-    broken.means[3, 1] = np.nan
+    broken = replace(_gaussians(9), opacities=np.full(9, np.nan, np.float32))
     write_model(tmp_path / "nan.ply", broken)
     for name, content, word in (
         ("a.spz", b"", "an empty file"),
@@ -184,7 +183,7 @@ def test_what_is_no_model_is_named(files, tmp_path):
         ("turned.spz", bytes(turned), "whole"),
         ("b.ply", files[".ply"].replace(b"f_dc_1", b"f_dc_9"), "f_dc_1"),
         ("c.ply", bare + bytes(4), "trained Gaussians"),
-        ("nan.ply", (tmp_path / "nan.ply").read_bytes(), "Gaussian 3"),
+        ("nan.ply", (tmp_path / "nan.ply").read_bytes(), "9 Gaussians without a usable opacity"),
     ):
         (tmp_path / name).write_bytes(content)
         with pytest.raises(SplatseedError, match=word):

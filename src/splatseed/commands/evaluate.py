@@ -172,8 +172,9 @@ def _evaluate(
             result = evaluate_model(model, on_view=draw, **asked)
     if options.output is not None:
         named = {"model": options.model, "scene": scene}
-        write_json(options.output, {**named, **numbers, **result.to_dict()})
-    doubts, own = [model.doubt] if model.doubt else [], config.get("test_every")
+        noted = {"notes": list(model.notes)} if model.notes else {}
+        write_json(options.output, {**named, **numbers, **result.to_dict(), **noted})
+    doubts, own = [*model.notes, *filter(None, [model.doubt])], config.get("test_every")
     shown = {view.name for view in model.views}
     if isinstance(own, int):
         shown &= {image.name for image in model.scene.split(own)[0]}

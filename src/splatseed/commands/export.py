@@ -75,9 +75,10 @@ def run(arguments: list[str]) -> None:
     )  # fmt: skip
     if cleans:
         require("torch")
+    notes: list[str] = []
     with stage_display() as clock:
         clock("read", 0.0)
-        gaussians = read_model(path)
+        gaussians = read_model(path, notes.append)
         # What leaves nothing is refused before photographs are compared.
         kept = keep_gaussians(gaussians, crop, options.min_opacity)
         floaters = np.zeros(len(gaussians), bool)
@@ -101,6 +102,8 @@ def run(arguments: list[str]) -> None:
         ("output", str(target)),
     ]
     print_pairs("splatseed export", rows)
+    for note in notes:
+        print_note(note)
     if name == "splat" and gaussians.shN.size:
         print_note("A .splat has no view-dependent colour: the model's is left out.")
     print_pairs("next", [("score it", _scoring_command(options))])

@@ -105,6 +105,8 @@ def run(arguments: list[str]) -> None:
         ("video", f"{options.output}, {options.output.stat().st_size / 1e6:.1f} MB"),
     ]
     print_pairs("splatseed flight", rows)
+    for note in (note for shown in models for note in shown.notes):
+        print_note(note)
     if models[0].scene is None and options.path is None:
         print_note("No cameras are known, so the video circles; --scene SCENE names the scene's.")
 

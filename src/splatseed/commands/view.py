@@ -128,6 +128,8 @@ def _announce(options: Options, port: int, opened: list[Shown], beside: int | No
     if beside is not None:
         rows.append(("side by side", f"{opened[0].name} left, {opened[beside].name} right"))
     print_pairs("splatseed view", rows)
+    for note in (note for shown in opened for note in shown.notes):
+        print_note(note)
     commands = [("open in a browser", f"http://{host}:{port}")]
     if options.host in LOCAL:
         tunnel = f"ssh -L {port}:localhost:{port} {socket.gethostname()}"

@@ -152,6 +152,7 @@ class TrainedModel:
     """Gaussians in the scene's world, its test views, and what renders a view of that world.
 
     ``doubt`` says why the Gaussians may not be in that world after all; empty if they surely are.
+    ``notes`` says what of the file was left out or changed on reading.
     """
 
     gaussians: Gaussians
@@ -159,6 +160,7 @@ class TrainedModel:
     render: Render
     scene: Scene
     doubt: str = ""
+    notes: tuple[str, ...] = ()
 
 
 def load_model(
@@ -196,7 +198,8 @@ def load_model(
             are.
         ParameterError: The transform cannot be computed.
     """
-    gaussians = read_model(path)
+    notes: list[str] = []
+    gaussians = read_model(path, notes.append)
     scene = with_masks(load_scene(scene_path, require_points=False), masks)
     train, test = scene.split(test_every)
     if not train or not test:
@@ -219,7 +222,9 @@ def load_model(
     doubt = "" if unasked else check_world(path, scene, gaussians, world)
     frame = training_frame([view_in(world, view) for view in poses_of(train)])
     image = ModelRenderer(gaussians, frame, device).image
-    return TrainedModel(gaussians, views, lambda view: image(view_in(world, view)), scene, doubt)
+    return TrainedModel(
+        gaussians, views, lambda view: image(view_in(world, view)), scene, doubt, tuple(notes)
+    )
 
 
 def evaluate_model(model: TrainedModel, **options: Any) -> EvalResult:

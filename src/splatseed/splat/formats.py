@@ -2,8 +2,9 @@
 
 A .ply has one vertex per Gaussian, all float32; of f_rest_* all of red comes first, then green,
 then blue. Promise: a file's content decides its format when it is read, its name when it is
-written; a file appears whole or not at all; positions read are finite. A .ply is read back bit for
-bit, its properties found by name; packed formats lose fine detail, and the Gaussians' order.
+written; a file appears whole or not at all; what is read can be drawn (``cleaning.py``). A .ply is
+read back bit for bit, its properties found by name; packed formats lose fine detail, and the
+Gaussians' order.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import zlib
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
@@ -25,6 +26,7 @@ from splatseed.io.staging import atomic_file
 from splatseed.literal import beginning, did_you_mean
 from splatseed.progress import Progress, silent
 from splatseed.splat import packed, sog
+from splatseed.splat.cleaning import drop_unusable
 from splatseed.splat.gaussians import Gaussians
 
 _HEADER = 1 << 20
@@ -80,7 +82,7 @@ def _decode_ply(path: Path) -> Gaussians:
         )
     reader.offset, reader.record = header.size, "element vertex"
     rows = reader.array(header.dtype(vertex), vertex.num_rows)
-    arrays = {
+    arrays: dict[str, Any] = {
         name: np.array(structured_to_unstructured(rows[list(each)]), np.float32, order="C")
         for name, each in columns.items()
         if each
@@ -126,23 +128,21 @@ SUFFIXES = {each.suffix: name for name, each in FORMATS.items()}
 """The formats' names by file name suffix."""
 
 
-def read_model(path: Path) -> Gaussians:
+def read_model(path: Path, note: Callable[[str], None] = lambda _: None) -> Gaussians:
     """Read trained Gaussians: .ply, compressed .ply, .splat, .spz, .sog (or its meta.json).
+
+    Gaussians that cannot be drawn, as one of their numbers is NaN, are left out; ``note`` is called
+    with each sentence that the user should read about the model.
 
     Raises:
         SceneNotFoundError: There is no such file.
-        SceneFormatError: It holds no Gaussians in a known format, or is damaged.
+        SceneFormatError: It holds no Gaussians in a known format that can be drawn, or is damaged.
         MissingDependencyError: It is an .spz of version 4, which needs zstandard.
     """
     gaussians = FORMATS[detect_format(path, read_bytes(path))].decode(path)
-    # Only of positions: some trainers write opacity +inf for opaque Gaussians.
-    bad = ~np.isfinite(gaussians.means).all(axis=1)
-    if bad.any():
-        raise SceneFormatError(
-            f"{path} to have finite positions",
-            found=f"{np.count_nonzero(bad)} that are not, the first in Gaussian {np.argmax(bad)}",
-            fix="Train or export it again, or remove those Gaussians.",
-        )
+    gaussians, left_out = drop_unusable(path, gaussians)
+    if left_out:
+        note(left_out)
     return gaussians
 
 

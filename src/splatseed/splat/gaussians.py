@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int64
@@ -23,6 +23,8 @@ from splatseed.errors import PointCloudError
 from splatseed.pointcloud import PointCloud
 from splatseed.views.view import View
 
+PARAMETERS = ("means", "scales", "quats", "opacities", "sh0", "shN")
+"""The names of a Gaussian's arrays, in order."""
 SH_C0 = 0.28209479177387814
 """The spherical harmonic of degree 0, 1 / (2 sqrt(pi)); colour = 0.5 + SH_C0 * sh0."""
 SH_C1 = 0.4886025119029199  # of degree 1, sqrt(3 / (4 pi))
@@ -48,7 +50,11 @@ camera that cannot be one."""
 
 @dataclass(frozen=True, eq=False)
 class Gaussians:
-    """The parameters of N Gaussians, float32; see the module for their conventions."""
+    """The parameters of N Gaussians, float32; see the module for their conventions.
+
+    ``antialiased``: they were trained with opacities compensated for the blur of the screen
+    (``rasterize_mode="antialiased"``) and must be rendered so.
+    """
 
     means: Float32[np.ndarray, "N 3"]
     scales: Float32[np.ndarray, "N 3"]
@@ -56,6 +62,7 @@ class Gaussians:
     opacities: Float32[np.ndarray, " N"]
     sh0: Float32[np.ndarray, "N 1 3"]
     shN: Float32[np.ndarray, "N K 3"]  # noqa: N815  (gsplat's name)
+    antialiased: bool = False
 
     def __len__(self) -> int:
         return len(self.means)
@@ -67,11 +74,12 @@ class Gaussians:
 
     def arrays(self) -> dict[str, Float32[np.ndarray, "N ..."]]:
         """The parameters by name, in the order above."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: getattr(self, name) for name in PARAMETERS}
 
     def select(self, index: Bool[np.ndarray, " N"] | Int64[np.ndarray, " M"]) -> Gaussians:
         """Some of the Gaussians, by index or mask."""
-        return Gaussians(**{name: array[index] for name, array in self.arrays().items()})
+        parts = {name: array[index] for name, array in self.arrays().items()}
+        return dataclasses.replace(self, **parts)
 
 
 def initial_gaussians(

@@ -26,6 +26,7 @@ from splatseed.io.files import COPY_AGAIN, ByteReader, guarded, read_bytes
 from splatseed.io.ply import parse_header
 from splatseed.requirements import require
 from splatseed.runtime.memory import check_memory
+from splatseed.splat.cleaning import MAX_LOG_SCALE
 from splatseed.splat.gaussians import SH_C0, Gaussians
 
 SH_COUNTS = (0, 3, 8, 15)
@@ -37,7 +38,7 @@ SPZ_MAGIC = b"NGSP"
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 """The components that remain, by the index of the largest."""
 _MORTON_BITS = 16
-_CHUNK, MOST_LOG_SCALE, _SH_RANGE = 256, 20.0, 8.0
+_CHUNK, _SH_RANGE = 256, 8.0
 _BOUNDS = [
     [f"{end}_{name}" for name in names]
     for names in (("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b"))
@@ -151,18 +152,24 @@ def encode_splat(gaussians: Gaussians) -> list[bytes]:
 
 
 def decode_splat(path: Path) -> Gaussians:
-    """A whole number of records, with scales of 0 or more."""
+    """A whole number of records; scales that are negative become NaN.
+
+    As a .splat has no signature, one without usable scales and means in half of its Gaussians is
+    no .splat.
+    """
     reader = ByteReader(path)
     reader.record = "Gaussians"
     rows = reader.array(RECORD, len(reader.data) // RECORD.itemsize)
     reader.finish()
-    good = np.isfinite(rows["scale"]).all(axis=1) & (rows["scale"] >= 0).all(axis=1)
-    if not len(rows) or not good.all():
-        raise reader.error("scales of 0 or more", f"others in {np.count_nonzero(~good)} Gaussians")
-    least = np.finfo(np.float32).tiny
+    usable = (np.isfinite(rows["scale"]) & (rows["scale"] >= 0)).all(axis=1)
+    bad = np.count_nonzero(~(usable & np.isfinite(rows["mean"]).all(axis=1)))
+    if 2 * bad >= len(rows):
+        raise reader.error("finite positions and scales", f"others in {bad} Gaussians")
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scales = np.log(rows["scale"])
     return Gaussians(
         means=np.ascontiguousarray(rows["mean"], np.float32),
-        scales=np.log(np.maximum(rows["scale"], least)).astype(np.float32),
+        scales=scales.astype(np.float32),
         quats=_unit_quats((rows["quat"].astype(np.float32) - 128) / 128),
         opacities=opacity_logits(rows["rgba"][:, 3]),
         sh0=((rows["rgba"][:, None, :3] / 255 - 0.5) / SH_C0).astype(np.float32),
@@ -177,7 +184,7 @@ def encode_compressed_ply(gaussians: Gaussians) -> list[bytes]:
     """In Z-curve order."""
     order = morton_order(gaussians.means)
     count, rest = len(order), 3 * gaussians.shN.shape[1]
-    scales = np.clip(gaussians.scales[order], -MOST_LOG_SCALE, MOST_LOG_SCALE)
+    scales = np.clip(gaussians.scales[order], -MAX_LOG_SCALE, MAX_LOG_SCALE)
     colors = gaussians.sh0[order, 0] * np.float32(SH_C0) + np.float32(0.5)
     chunk, starts = np.arange(count) // _CHUNK, np.arange(0, count, _CHUNK)
     tables, units = [], []

@@ -21,6 +21,7 @@ from splatseed.errors import SceneFormatError
 from splatseed.io.files import guarded, read_bytes
 from splatseed.progress import Progress, silent
 from splatseed.splat import packed
+from splatseed.splat.cleaning import MAX_LOG_SCALE
 from splatseed.splat.gaussians import Gaussians
 
 CONVERTER = "npx @playcanvas/splat-transform"
@@ -57,8 +58,7 @@ def encode(gaussians: Gaussians, progress: Progress = silent) -> list[bytes]:
     # The three smaller components in RGB, 252 + the index of the largest in A.
     smaller = packed.rounded_bytes(three * np.sqrt(0.5) * 255 + 127.5)
     quats = np.column_stack([smaller, _QUAT_MARK + largest])
-    most = packed.MOST_LOG_SCALE  # an infinite one would make all means of its cluster infinite
-    logs = np.clip(gaussians.scales, -most, most)
+    logs = np.clip(gaussians.scales, -MAX_LOG_SCALE, MAX_LOG_SCALE)
     scales, sh0 = codebook(logs), codebook(gaussians.sh0)
     colors = codes(gaussians.sh0[order, 0], sh0)
     opacity = packed.opacity_bytes(gaussians.opacities[order])

@@ -9,7 +9,6 @@ oscillating; their mean does not oscillate (Polyak and Juditsky, 1992).
 
 from __future__ import annotations
 
-import dataclasses
 import inspect
 from collections.abc import Mapping
 from typing import Any
@@ -19,7 +18,7 @@ import torch
 from jaxtyping import Float, Float32
 from torch import Tensor
 
-from splatseed.splat.gaussians import SCENE_SCALE, Gaussians
+from splatseed.splat.gaussians import PARAMETERS, SCENE_SCALE, Gaussians
 from splatseed.splat.rendering import opacities_of
 from splatseed.train.schedule import Schedule
 
@@ -60,8 +59,8 @@ def as_parameters(tensors: Mapping[str, Tensor]) -> Parameters:
 
 def gaussians_of(params: Parameters | Mapping[str, Tensor]) -> Gaussians:
     """The parameters as NumPy arrays (sharing memory on the CPU)."""
-    names = (field.name for field in dataclasses.fields(Gaussians))
-    return Gaussians(**{name: params[name].detach().cpu().numpy() for name in names})
+    arrays: dict[str, Any] = {name: params[name].detach().cpu().numpy() for name in PARAMETERS}
+    return Gaussians(**arrays)
 
 
 def length_units(params: Parameters) -> Float[Tensor, "#N"]:

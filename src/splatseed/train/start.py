@@ -41,7 +41,7 @@ def read_start(
         SceneNotFoundError: There is no such file.
         SceneFormatError: It holds no Gaussians, or they belong to another scene.
     """
-    gaussians, told = read_model(path), ""
+    gaussians, told = read_model(path, note), ""
     if not trained:  # where mcmc's clones may seem to be in another world
         gaussians, told = in_scene_world(path, scene, gaussians)
     if told:

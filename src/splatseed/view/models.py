@@ -39,7 +39,8 @@ class Shown:
     """What a viewer shows: a scene, a model, or a model with its scene, in the scene's world.
 
     ``data_factor`` downsampled the photographs of the model's run; every ``test_every``-th image,
-    sorted by name, is a test view.
+    sorted by name, is a test view. ``notes`` says what of the model was left out or changed on
+    reading.
     """
 
     name: str
@@ -47,6 +48,7 @@ class Shown:
     gaussians: Gaussians | None = None
     data_factor: int = 1
     test_every: int = 8
+    notes: tuple[str, ...] = ()
 
     @property
     def model(self) -> Gaussians:
@@ -74,10 +76,11 @@ def open_shown(path: Path, scene_path: Path | None = None) -> Shown:
     def scene_at(place: Path | None) -> Scene | None:
         return None if place is None else load_scene(place, require_points=False)
 
-    folder = RunFolder(path)
+    folder, notes = RunFolder(path), list[str]()
     if not path.is_dir() or not folder.is_run:
         if path.is_file() and _is_model(path):
-            return Shown(path.name, scene_at(scene_path), read_model(path))
+            gaussians = read_model(path, notes.append)
+            return Shown(path.name, scene_at(scene_path), gaussians, notes=tuple(notes))
         bare = load_scene(path, require_points=False)
         if not bare.images and not len(bare.points):
             raise SceneFormatError(
@@ -98,7 +101,8 @@ def open_shown(path: Path, scene_path: Path | None = None) -> Shown:
         with suppress(SceneNotFoundError, SceneFormatError):  # it is gone
             scene = scene_at(Path(named))
     factor, every = (int(config.get(*each)) for each in (("data_factor", 1), ("test_every", 8)))
-    return Shown(folder.path.name, scene, read_model(folder.gaussians), factor, every)
+    gaussians = read_model(folder.gaussians, notes.append)
+    return Shown(folder.path.name, scene, gaussians, factor, every, tuple(notes))
 
 
 def names_of(paths: Sequence[Path]) -> list[str]:
