@@ -10,6 +10,7 @@ from hypothesis.extra import numpy as hnp
 
 from splatseed.camera import (
     CAMERA_MODELS,
+    PANORAMA,
     Camera,
     Intrinsics,
     quat_from_rotation,
@@ -73,7 +74,17 @@ def test_models_are_colmaps(name):
     ours = Intrinsics(1, name, 640, 480, tuple(params))
     np.testing.assert_allclose(ours.K, theirs.calibration_matrix())
     theirs.params = params
-    assert ours.is_pinhole == theirs.is_undistorted()
+    if not ours.is_fisheye:  # a fisheye without coefficients counts as undistorted there
+        assert ours.has_distortion == (not theirs.is_undistorted())
+        assert ours.is_pinhole == theirs.is_undistorted()
+    assert (ours.pinhole.model, ours.pinhole.K.tolist()) == ("PINHOLE", ours.K.tolist())
+
+
+def test_all_of_pycolmaps_models_are_known():
+    ids = {str(name): int(model) for name, model in pycolmap.CameraModelId.__members__.items()}
+    del ids["INVALID"]
+    known = (*CAMERA_MODELS.values(), PANORAMA)
+    assert {model.name: model.model_id for model in known} == ids
 
 
 def test_projection_is_colmaps(rng):
@@ -88,7 +99,11 @@ def test_projection_is_colmaps(rng):
 
 @pytest.mark.parametrize(
     ("model", "params", "says"),
-    [("FISHEYE", (1.0,) * 4, "'FISHEYE'"), ("PINHOLE", (1.0,) * 3, "4 parameters; found 3")],
+    [
+        ("POLAROID", (1.0,) * 4, "'POLAROID'"),
+        ("EQUIRECTANGULAR", (9.0, 5.0), "panoramas"),
+        ("PINHOLE", (1.0,) * 3, "4 parameters; found 3"),
+    ],
 )
 def test_records_that_are_none(model, params, says):
     with pytest.raises(SceneFormatError, match=says) as error:

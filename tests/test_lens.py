@@ -14,7 +14,8 @@ def make_lens(model, rng, size=0.03):
     info = CAMERA_MODELS[model]
     pinhole = ((50.0, 55.0) if info.num_focal == 2 else (50.0,)) + (32.0, 24.0)
     rest = rng.normal(scale=size, size=info.num_params - len(pinhole))
-    return Intrinsics(1, model, 64, 48, (*pinhole, *((0.7,) if model == "FOV" else rest)))
+    rest = {"FOV": (0.7,), "EUCM": (0.6, 1.2)}.get(model, rest)
+    return Intrinsics(1, model, 64, 48, (*pinhole, *rest))
 
 
 @pytest.fixture(params=CAMERA_MODELS)
@@ -63,6 +64,15 @@ def test_without_coefficients_a_lens_is_a_pinhole(model, rng, rays):
     np.testing.assert_array_equal(distort(straight, rays), rays)
     assert not straight.has_distortion
     assert lens.has_distortion == (zeros > 0)
+
+
+def test_a_division_lens_shows_no_ray_beyond_its_largest():
+    """r = s / (1 + k s^2) is largest, 1 / (2 sqrt k), where s = 1 / sqrt k."""
+    lens = Intrinsics(1, "SIMPLE_DIVISION", 64, 48, (50.0, 32.0, 24.0, 0.25))
+    s = distort(lens, np.array([0.99, 0.0]))[0]
+    assert s / (1 + 0.25 * s**2) == pytest.approx(0.99)
+    assert np.isnan(distort(lens, np.array([1.01, 0.0]))).all()
+    assert fold_radius(lens, 3.0) == pytest.approx(1.0, abs=3 / 500)
 
 
 def test_a_lens_folds_where_its_radius_is_largest():

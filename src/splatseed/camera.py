@@ -42,9 +42,16 @@ CAMERA_MODELS: dict[str, CameraModel] = {
         CameraModel(9, "RADIAL_FISHEYE", 5, 1),
         CameraModel(10, "THIN_PRISM_FISHEYE", 12, 2),
         CameraModel(11, "RAD_TAN_THIN_PRISM_FISHEYE", 16, 2),
+        CameraModel(12, "SIMPLE_DIVISION", 4, 1),
+        CameraModel(13, "DIVISION", 5, 2),
+        CameraModel(14, "SIMPLE_FISHEYE", 3, 1),
+        CameraModel(15, "FISHEYE", 4, 2),
+        CameraModel(16, "EUCM", 6, 2),
     )
 }
-"""COLMAP's camera models by name; ids and parameter counts as in its models.h."""
+"""COLMAP's camera models by name, but for panoramas; ids and parameter counts as in COLMAP 4.2."""
+PANORAMA = CameraModel(17, "EQUIRECTANGULAR", 2, 0)
+"""COLMAP's model of a whole sphere, which has no focal length: no pinhole camera shows as much."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +70,13 @@ class Intrinsics:
 
     def __post_init__(self) -> None:
         model = CAMERA_MODELS.get(self.model)
+        if self.model == PANORAMA.name:
+            raise SceneFormatError(
+                f"camera {self.camera_id} to be of perspective or fisheye photographs",
+                found=f"{self.model}, whole panoramas",
+                fix="Cut each panorama into perspective views and find their poses, as COLMAP's "
+                "panorama_sfm.py does, then use the scene of these views.",
+            )
         if model is None:
             raise SceneFormatError(
                 f"camera {self.camera_id} to have one of COLMAP's models "
@@ -83,10 +97,23 @@ class Intrinsics:
         return self.model in {"PINHOLE", "SIMPLE_PINHOLE"}
 
     @property
+    def is_fisheye(self) -> bool:
+        """Whether distances in the image grow with the angle from the axis, not its tangent."""
+        return self.model.endswith("FISHEYE")
+
+    @property
     def has_distortion(self) -> bool:
         """Whether straight lines look bent: not if all coefficients are 0, always by a fisheye."""
-        num_focal = CAMERA_MODELS[self.model].num_focal
-        return self.model.endswith("FISHEYE") or any(self.params[num_focal + 2 :])
+        terms = self.params[CAMERA_MODELS[self.model].num_focal + 2 :]
+        if self.model == "EUCM":
+            terms = terms[:1]  # without alpha, beta has no effect
+        return self.is_fisheye or any(terms)
+
+    @property
+    def pinhole(self) -> Intrinsics:
+        """The same camera as PINHOLE; its distortion is left out."""
+        (fx, _, cx), (_, fy, cy), _ = self.K.tolist()
+        return replace(self, model="PINHOLE", params=(fx, fy, cx, cy))
 
     @property
     def K(self) -> Float64[np.ndarray, "3 3"]:  # noqa: N802  (the field's name)

@@ -59,8 +59,12 @@ def distort(lens: Intrinsics, xy: Float64[np.ndarray, "*B 2"]) -> Float64[np.nda
     """
     x, y = xy[..., 0], xy[..., 1]
     k = lens.params[CAMERA_MODELS[lens.model].num_focal + 2 :]
-    if lens.model.endswith("FISHEYE"):
+    if lens.is_fisheye:
         x, y = _equidistant(x, y)
+    if lens.model.endswith("DIVISION"):
+        return np.stack(_division(x, y, k[0]), axis=-1)
+    if lens.model == "EUCM":
+        return np.stack(_unified(x, y, *k), axis=-1)
     if lens.model == "FOV":
         return np.stack(_field_of_view(x, y, k[0]), axis=-1)
     if lens.model == "RAD_TAN_THIN_PRISM_FISHEYE":  # tangential terms apply to the radial result
@@ -171,3 +175,20 @@ def _field_of_view(x: np.ndarray, y: np.ndarray, omega: float) -> Plane:
     scale = np.full_like(r, slope / omega)  # the limit at r = 0
     np.divide(np.arctan(r * slope), r * omega, out=scale, where=r > 0)
     return x * scale, y * scale
+
+
+def _division(x: np.ndarray, y: np.ndarray, k: float) -> Plane:
+    """Fitzgibbon: a point (u, v) of the image is of the ray (u, v, 1 + k (u^2 + v^2)).
+
+    With k > 0 rays beyond 1 / (2 sqrt k) have no image: NaN.
+    """
+    # s = radius in the image / radius r on the plane solves k r^2 s^2 - s + 1 = 0.
+    with np.errstate(invalid="ignore"):
+        scale = 2 / (1 + np.sqrt(1 - 4 * k * (x * x + y * y)))
+    return x * scale, y * scale
+
+
+def _unified(x: np.ndarray, y: np.ndarray, alpha: float, beta: float) -> Plane:
+    """Khomutenko, Garcia and Martinet's enhanced unified camera model, of a ray (x, y, 1)."""
+    denominator = alpha * np.sqrt(beta * (x * x + y * y) + 1) + 1 - alpha
+    return x / denominator, y / denominator

@@ -9,13 +9,17 @@ import shutil
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.ndimage import map_coordinates
 
 pytest.importorskip("pycolmap", reason="needs pycolmap")
 
 from splatseed.errors import SceneFormatError
 from splatseed.io import load_scene, write_scene
 from splatseed.io.colmap import write_images
+from splatseed.io.photograph import lens_warnings
 from splatseed.io.seeds import saw_all_photographs, was_upsampled
+from splatseed.lens import image_points, rays_through
+from splatseed.sfm import undistort
 from splatseed.synthetic import make_capture, write_capture
 from splatseed.views.view import check_lens, load_views
 
@@ -123,3 +127,55 @@ def test_a_scene_that_lacks_something_is_refused(distorted, tmp_path, splatseed)
         assert (run.code, run.err.count("\n")) == (2, 1)
         assert gone.rpartition("/")[2] in run.err
         assert not (tmp_path / "out").exists()
+
+
+def test_what_is_undistorted_follows_the_lens_not_its_coefficients(distorted, tmp_path):
+    """A fisheye without coefficients is resampled; models that are pinholes become PINHOLE."""
+    scene = load_scene(distorted)
+    old = scene.images[0].intrinsics
+    straight = old.pinhole.params
+    lenses = [
+        dataclasses.replace(old, camera_id=i, model=model, params=(*straight, *terms))
+        for i, (model, terms) in enumerate(
+            [("FISHEYE", ()), ("EUCM", (0.5, 1.1)), ("EUCM", (0.0, 1.1)), ("OPENCV", (0.0,) * 4)], 1
+        )
+    ]
+    images = tuple(
+        dataclasses.replace(image, intrinsics=lens, observations=None)
+        for image, lens in zip(scene.images, lenses, strict=False)
+    )
+    scene = scene.replace(images=images, intrinsics=tuple(lenses), tracks=None, listed=None)
+    out = undistort(scene, tmp_path / "straight").path
+    after = load_scene(out)
+    assert {image.intrinsics.model for image in after.images} == {"PINHOLE"}
+    same = [
+        (out / "images" / image.name).read_bytes()
+        == (distorted / "images" / image.name).read_bytes()
+        for image in scene.images
+    ]
+    assert same == [False, False, True, True]
+    assert after.images[3].intrinsics.params == straight
+    fisheye, pinhole = lenses[0], after.images[0].intrinsics
+    # The middle, as its rays see it through the lens
+    rows, columns = np.mgrid[20 : pinhole.height - 20, 20 : pinhole.width - 20]
+    uv = np.stack([columns, rows], axis=-1) + 0.5
+    u, v = np.moveaxis(image_points(fisheye, rays_through(pinhole, uv)) - 0.5, -1, 0)
+    before, written = (
+        np.asarray(Image.open(folder / "images" / images[0].name).convert("L"), float)
+        for folder in (distorted, out)
+    )
+    difference = np.abs(map_coordinates(before, [v, u], order=1) - written[rows, columns])
+    assert difference.mean() < 1
+
+
+@pytest.mark.parametrize("layout", ["colmap", "transforms"])
+def test_a_model_without_distortion_is_written_as_pinhole(layout, distorted, tmp_path):
+    scene = load_scene(distorted)
+    old = scene.images[0].intrinsics
+    lens = dataclasses.replace(old, model="DIVISION", params=(*old.pinhole.params, 0.0))
+    images = tuple(dataclasses.replace(image, intrinsics=lens) for image in scene.images)
+    scene = scene.replace(images=images, intrinsics=(lens,))
+    written = load_scene(write_scene(scene, tmp_path / "out", format=layout).path)
+    assert written.images[0].intrinsics.model == "PINHOLE"
+    assert written.images[0].intrinsics.params == old.pinhole.params
+    assert not lens_warnings(scene.images)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import struct
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from splatseed.errors import OutputError
+from splatseed.camera import CAMERA_MODELS, Intrinsics
+from splatseed.errors import OutputError, SceneFormatError
 from splatseed.io import colmap
 
 from .checks import CAMERAS
@@ -63,6 +65,35 @@ def test_text_may_have_comments_blank_lines_any_line_ends_and_names_with_spaces(
     assert [len(image.observations) for image in images] == [0, 2, 0]
     assert images[1].observations.xy.tolist() == [[1, 2], [3, 4]]
     assert images[1].observations.point_ids.tolist() == [-1, 9]
+
+
+@pytest.mark.parametrize("name", CAMERA_MODELS)
+def test_every_camera_model_is_read_in_both_forms(name, tmp_path):
+    pycolmap = pytest.importorskip("pycolmap", reason="writes the model")
+    made = pycolmap.Reconstruction()
+    camera = pycolmap.Camera.create_from_model_name(7, name, 500.0, 640, 480)
+    made.add_camera_with_trivial_rig(camera)
+    made.write_binary(tmp_path)
+    made.write_text(tmp_path)
+    for suffix in ("bin", "txt"):
+        (read_back,) = colmap.read_cameras(tmp_path / f"cameras.{suffix}")
+        assert read_back == Intrinsics(7, name, 640, 480, tuple(camera.params))
+
+
+@pytest.mark.parametrize(
+    ("model_id", "says"),
+    [
+        (17, r"camera 7 .*cameras.bin.*EQUIRECTANGULAR.*Cut each panorama"),
+        (18, r"cameras.bin, record 1 of 1.*18, of a newer COLMAP.*image_undistorter"),
+        (-1, r"id of a COLMAP camera model.*Copy the file again"),
+        (2**30, r"id of a COLMAP camera model.*Copy the file again"),
+    ],
+)
+def test_models_without_a_pinhole_or_of_the_future_are_no_damage(model_id, says, tmp_path):
+    path = tmp_path / "cameras.bin"
+    path.write_bytes(struct.pack("<QIiQQ2d", 1, 7, model_id, 64, 32, 64.0, 32.0))
+    with pytest.raises(SceneFormatError, match=says):
+        colmap.read_cameras(path)
 
 
 # COLMAP itself is the judge of what its formats say.

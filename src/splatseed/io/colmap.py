@@ -18,7 +18,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt8
 
-from splatseed.camera import CAMERA_MODELS, Intrinsics, quat_from_rotation
+from splatseed.camera import CAMERA_MODELS, PANORAMA, Intrinsics, quat_from_rotation
 from splatseed.errors import OutputError, PointCloudError, SceneFormatError, SceneNotFoundError
 from splatseed.io.files import COPY_AGAIN, ByteReader, numbered_lines
 from splatseed.io.photograph import image_warnings, lens_warnings
@@ -34,6 +34,8 @@ UNKNOWN_ERROR = -1.0
 _MODEL_FILES = ("cameras", "images", "points3D")
 _IMAGE_DIRS = ("images", "images_2", "images_4", "images_8", "image", "input")
 _MAX_SIZE = 2**31 - 1
+_MOST_MODELS = 100
+"""An unknown camera model with a lower id is taken for a newer one, not for damage."""
 _RIGID_TOLERANCE = 1e-3  # of rotation @ rotation.T against the identity
 _NORM_RANGE = (1e-100, 1e100)  # inside it the square of a quaternion's norm is a normal float
 _COUNT = struct.Struct("<Q")
@@ -151,9 +153,17 @@ def rigid_pose(
 
 def _binary_cameras(path: Path) -> Iterator[tuple[Any, ...]]:
     reader = ByteReader(path)
-    for where in reader.records(_CAMERA.size + 3 * 8, "cameras"):
+    for where in reader.records(_CAMERA.size, "cameras"):
         camera_id, model_id, *size = reader.unpack(_CAMERA)
-        model = next((m for m in CAMERA_MODELS.values() if m.model_id == model_id), None)
+        known = (*CAMERA_MODELS.values(), PANORAMA)
+        model = next((m for m in known if m.model_id == model_id), None)
+        if model is None and len(known) <= model_id < _MOST_MODELS:
+            raise SceneFormatError(
+                f"the id of a camera model of COLMAP 4.2 or older, 0 to {len(known) - 1}, in "
+                f"{where}",
+                found=f"{model_id}, of a newer COLMAP",
+                fix="Undistort the scene to PINHOLE with that COLMAP (colmap image_undistorter).",
+            )
         if model is None:
             raise reader.error("the id of a COLMAP camera model", str(model_id))
         params = reader.unpack(struct.Struct(f"<{model.num_params}d"))

@@ -205,7 +205,7 @@ def warnings_but_lens(scene: Scene) -> list[str]:
 
 def lens_warnings(images: Sequence[Image]) -> list[str]:
     """A sentence on lens distortion, which not every trainer supports."""
-    models = sorted({im.intrinsics.model for im in images if not im.intrinsics.is_pinhole})
+    models = sorted({im.intrinsics.model for im in images if im.intrinsics.has_distortion})
     if not models:
         return []
     lenses = f"Cameras have lens distortion ({', '.join(models)})"

@@ -156,7 +156,7 @@ def find_tum_depths(scene: Scene, root: Path) -> depth_maps.DepthFiles | None:
     scale = depth_maps.read_capture_scale(camera) if camera else None
     posed = {image.name: image.intrinsics for image in scene.images if image.name in paths}
     lens = _tum_camera(root)[0]
-    bent = not lens.is_pinhole and all(camera.is_pinhole for camera in posed.values())
+    bent = lens.has_distortion and not any(each.has_distortion for each in posed.values())
     folder = scene.source.image_dir if scene.source else None
     if bent and folder is not None:
         name, original = next(iter(originals.items()))

@@ -256,7 +256,7 @@ def _write_colmap(scene: Scene, folder: Path) -> tuple[list[str], dict[str, Path
     cameras = {camera.camera_id: camera for camera in scene.intrinsics}
     for image in scene.images:
         cameras.setdefault(image.intrinsics.camera_id, image.intrinsics)
-    colmap.write_cameras(model_dir / "cameras.bin", tuple(cameras.values()))
+    colmap.write_cameras(model_dir / "cameras.bin", tuple(map(_straight, cameras.values())))
     colmap.write_images(model_dir / "images.bin", images)
     colmap.write_points3d(model_dir / "points3D.bin", scene.points, tracks)
     write_ply(model_dir / "points3D.ply", scene.points)
@@ -386,8 +386,14 @@ def _new_json(scene: Scene, A: Float64[np.ndarray, "3 4"] | None) -> dict[str, A
     return content
 
 
+def _straight(camera: Intrinsics) -> Intrinsics:
+    """The camera as PINHOLE if it has no distortion, as some trainers refuse other models."""
+    return camera if camera.has_distortion or camera.is_pinhole else camera.pinhole
+
+
 def _camera_fields(camera: Intrinsics) -> dict[str, Any]:
     """The fields of one camera record, under nerfstudio's names."""
+    camera = _straight(camera)
     model = _MODELS.get(camera.model)
     if model is None:
         raise OutputError(

@@ -25,6 +25,7 @@ import numpy as np
 from PIL import Image as PilImage
 
 from splatseed import errors
+from splatseed.camera import Intrinsics
 from splatseed.io.masks import write_masks
 from splatseed.literal import name_some
 from splatseed.progress import Progress
@@ -42,6 +43,7 @@ _BLOCK_IMAGES = 16  # matches are committed, and progress is visible, per block 
 _POLL_SECONDS = 0.1
 _ORIENTATION, _SHORT, _UPRIGHT = 0x0112, 3, 1  # the tag, its type, the value that turns nothing
 _HEAD_BYTES = 1 << 17  # the EXIF segment, at most 64 KiB, comes first or after a small one
+_BARELY = 2e-7  # a coefficient that pycolmap takes for distortion, and that moves no pixel
 _MORE_PHOTOGRAPHS = (
     "Take more overlapping photographs, take out those of other places, or try the exhaustive "
     "matcher or a simpler camera_model such as SIMPLE_RADIAL."
@@ -340,8 +342,13 @@ def export_scene(run: Run, model_dir: Path, staging: Path, *, distinct: bool = T
     Raises:
         OutputError: Not all images could be written.
     """
-    pycolmap, dense = run.pycolmap, run.work / "dense"
-    num_images = pycolmap.Reconstruction(model_dir).num_reg_images()
+    pycolmap, dense, straight = run.pycolmap, run.work / "dense", run.work / "straight"
+    given = pycolmap.Reconstruction(model_dir)
+    num_images = given.num_reg_images()
+    for camera in given.cameras.values():
+        name_distortion(camera)
+    straight.mkdir()
+    given.write(straight)
 
     def num_written() -> int:
         return sum(path.is_file() for path in (dense / "images").rglob("*"))
@@ -349,7 +356,7 @@ def export_scene(run: Run, model_dir: Path, staging: Path, *, distinct: bool = T
     run.stage(
         "undistortion",
         lambda: pycolmap.undistort_images(
-            dense, model_dir, run.image_dir, num_threads=run.settings.threads
+            dense, straight, run.image_dir, num_threads=run.settings.threads
         ),
         num_written,
         num_images,
@@ -371,6 +378,23 @@ def export_scene(run: Run, model_dir: Path, staging: Path, *, distinct: bool = T
         drop_repeats(model)
     model.update_point_3d_errors()
     model.write(staging / "sparse" / "0")
+
+
+def name_distortion(camera: Any) -> None:
+    """Make pycolmap undistort a camera if, and only if, it has distortion.
+
+    It goes by the coefficients: it would copy a fisheye's photographs where they are all 0, and
+    resample those of an EUCM camera that is a pinhole.
+    """
+    size, params = (camera.width, camera.height), tuple(camera.params)
+    lens = Intrinsics(camera.camera_id, camera.model.name, *size, params)
+    models = type(camera.model)
+    if lens.is_fisheye and camera.is_undistorted():
+        camera.model = models.OPENCV_FISHEYE
+        camera.params = [*lens.pinhole.params, _BARELY, 0.0, 0.0, 0.0]
+    elif not lens.has_distortion and not lens.is_pinhole:
+        camera.model = models.PINHOLE
+        camera.params = list(lens.pinhole.params)
 
 
 def drop_repeats(model: Any) -> None:
