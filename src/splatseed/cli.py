@@ -27,7 +27,6 @@ VERBS = {
     "view": "Look at scenes and models in the browser.",
     "flight": "Make a video of a flight through a trained model.",
     "bench": "Compare methods by training: many runs, resumable, then a report.",
-    "tune": "Find the best seeds and strategy for a scene by short runs on it.",
     "depth": "Make depth maps of the photographs, by a network or by stereo.",
     "info": "Show what is in a scene, and what is wrong with it.",
     "sfm": "Make a scene from photographs (pycolmap).",

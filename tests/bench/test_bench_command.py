@@ -174,21 +174,21 @@ def test_a_dry_run_of_the_quick_preset_loads_nothing_heavy():
         (("-o", "B", "--scenes", "ROOM", "--methods", "depth", "--depth", "a", "b"), "--depth"),
         (("-o", "ROOM/B", "--scenes", "ROOM"), "apart from the input"),
         (("-o", "B", "--preset", "mipnerf360"), "--data"),
-        (("-o", "B", "--preset", "replica", "--data", "TUNED"), "none of office0"),
+        (("-o", "B", "--preset", "replica", "--data", "OTHER"), "none of office0"),
         (
-            ("-o", "B", "--preset", "replica", "--data", "TUNED", "--scenes", "ROOM"),
+            ("-o", "B", "--preset", "replica", "--data", "OTHER", "--scenes", "ROOM"),
             "--scenes among",
         ),
         (("-o", "B", "--preset", "quick", "--plan", "x.toml"), "both"),
         (("--dry-run", "--plan", "lpips.toml"), "LPIPS"),
-        (("-o", "TUNED", "--scenes", "ROOM"), "splatseed tune wrote"),
+        (("-o", "OTHER", "--scenes", "ROOM"), "splatseed upsample wrote"),
     ],
 )
 def test_bad_words_are_refused_and_nothing_is_written(
     bench, room_path, tmp_path, monkeypatch, words, said
 ):
     monkeypatch.chdir(tmp_path)
-    begin(tmp_path / "TUNED", "tune", [], [])
+    begin(tmp_path / "OTHER", "upsample", [], [])
     (tmp_path / "lpips.toml").write_text(f"lpips = true\n[[scenes]]\npath = '{room_path}'\n")
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     before = sorted(tmp_path.rglob("*"))

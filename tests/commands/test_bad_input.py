@@ -80,7 +80,6 @@ WORDS = [
     (("info", "ROOM", "--depth", "ROOM", "--depth-scale", "0"), "scale"),
     (("upsample", "ROOM"), "-o"),
     (("upsample", "ROOM", "-o", "more.ply"), "-o more"),
-    ((*UP, "--address", "auto"), "--executor ray"),
     ((*UP, "--jobs", "0"), "--jobs"),
     ((*UP, "--budget", "1e-9rho"), "1e-9rho"),
     ((*UP, "--cover", "8"), "--auto.cell"),
@@ -411,9 +410,8 @@ WRITERS = {
     "demo": ["--overwrite"],
     "train": ["ROOM", "--overwrite"],
     "bench": ["--scenes", "ROOM"],
-    "tune": ["ROOM"],
 }
-"""The last two have no --overwrite, as they go on with what is theirs."""
+"""The last has no --overwrite, as it goes on with what is its own."""
 
 
 @pytest.mark.parametrize("make", [_run_folder, _bench, _notes])

@@ -42,7 +42,7 @@ def test_a_colmap_scene(room, splatseed):
     low = [float(x) for x in rows["bounding box"].split()[:3]]
     np.testing.assert_allclose(low, scene.points.xyz.min(axis=0), rtol=1e-3)
     advised = run.out.partition("\nnext\n")[2]
-    assert re.findall(r"splatseed (\w+)", advised) == ["train", "tune"]
+    assert re.findall(r"splatseed (\w+)", advised) == ["train"]
 
 
 def test_the_advice_depends_on_the_plan(room, splatseed):
@@ -53,7 +53,6 @@ def test_the_advice_depends_on_the_plan(room, splatseed):
     assert "leave the points as they are" in sparse
     assert "Strategy grow puts new Gaussians" in " ".join(sparse.split())
     assert "--seeds scene --budget 5400 --max-steps 20000" in sparse
-    assert "--minutes 30 --budget 0.5rho --max-steps 20000\n" in sparse
 
 
 def test_info_does_not_wait_for_numba(room):

@@ -35,13 +35,13 @@ def bent(room, tmp_path) -> Path:
 
 
 def follow(out: str, splatseed) -> list[str]:
-    """Run what was printed, with few steps and no experiments, and return the verbs."""
+    """Run what was printed, with few steps, and return the verbs."""
     verbs = []
     for words in lines_of(out):
         verbs.append(words[0])
         if "--max-steps" in words:
             words[words.index("--max-steps") + 1] = "3"
-        if words[0] not in {"tune", "sfm"}:
+        if words[0] != "sfm":
             run = splatseed(*words)
             assert run.code == 0, (words, run.err)
     return verbs
@@ -57,7 +57,7 @@ def test_what_info_advises_works(points, bent, tmp_path, monkeypatch, splatseed)
     monkeypatch.chdir(tmp_path)
     run = splatseed("info", scene)
     assert run.code == 0, run.err
-    wanted = ["train", "tune"] if points else ["upsample", "train", "sfm"]
+    wanted = ["train"] if points else ["upsample", "train", "sfm"]
     assert follow(run.out, splatseed) == ["undistort", *wanted]
     assert points or len(load_scene("OUT").points) > 500
 
@@ -74,7 +74,6 @@ def test_nothing_is_to_be_trained_without_its_photographs(kept, own_room, tmp_pa
         assert run.code == 0, run.err
         assert missing[kept] in run.out
         assert "splatseed train" not in run.out
-        assert "splatseed tune" not in run.out
         assert "gsplat" not in run.out
     if kept == "no folder":  # so that there is nothing to look at
         assert "-> mls" in run.out

@@ -278,8 +278,6 @@ def test_a_capture_has_its_own_maps_and_needs_no_points(rgbd, surfaces, tmp_path
         (("upsample", rgbd, *lift[:3]), "num_points"),
         (("upsample", rgbd, *lift[:2], "--num-points", 9), "--poses-from"),
         (mls, none),
-        ((*mls, "--tile-points", 100), none),
-        (("tune", out), none),
         (("bench", "--scenes", out), none),
     ):
         refused = splatseed(*words, "-o", tmp_path / "other")

@@ -153,7 +153,7 @@ def test_a_scene_without_originals_keeps_what_its_points_are(scene, tmp_path, kn
         ({"command": "upsample", "parameters": {"hold_out": 8}}, False),
         ({"command": "upsample", "parameters": {"k": 16}}, False),  # not made from photographs
         ({"command": "upsample"}, False),
-        ({"command": "tune", "parameters": {"hold_out": 0}}, False),
+        ({"command": "write_scene", "parameters": {"hold_out": 0}}, False),
     ],
 )
 def test_seeds_that_saw_the_test_views_are_known(scene, tmp_path, told, all_of_them):

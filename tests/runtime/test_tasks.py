@@ -16,7 +16,6 @@ import pytest
 
 import splatseed
 from splatseed.errors import ParameterError, TaskLostError
-from splatseed.progress import silent
 from splatseed.runtime.tasks import Child, HereTasks, ProcessTasks, slot_environment
 
 from .task_functions import die, fail, raise_unpicklable
@@ -39,8 +38,6 @@ def test_a_failure_ends_no_other_task(tasks):
     assert str(results[0].error) == "expected x; found it. Mend it."
     assert (type(results[0].error), type(results[2].error)) == (ParameterError, ValueError)
     assert {(1, "start", 0.0), (1, "half", 0.5), (2, "half", 0.5)} <= set(told)
-    with pytest.raises(ParameterError):
-        tasks.run_all(fail, [("x",)], "stage", silent)
 
 
 @POSIX

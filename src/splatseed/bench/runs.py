@@ -101,15 +101,14 @@ def read_runs(bench: Path) -> list[Run]:
         SceneFormatError: A file is not of the layout that this version writes.
     """
     kind = read_manifest(bench).get("command")
-    if kind not in {"bench", "tune"}:
+    if kind != "bench":
         fix = "Name the folder that splatseed bench wrote."
         raise SceneNotFoundError(f"a benchmark at {bench}", found=kind or "none", fix=fix)
     runs = [read_run(bench, spec) for spec in _planned_runs(bench)]
     known = {run_folder(bench, run.spec).name for run in runs}
-    # A tuning has runs that no plan lists; else what failed in an earlier plan is no longer asked.
-    told = (RESULT, ERROR) if kind == "tune" else (RESULT,)
-    ended = {path.parent for name in told for path in bench.glob(f"runs/*/{name}")}
-    return [*runs, *(_read(each) for each in sorted(ended) if each.name not in known)]
+    # What failed in an earlier plan is no longer asked for.
+    finished = sorted(path.parent for path in bench.glob(f"runs/*/{RESULT}"))
+    return [*runs, *(_read(each) for each in finished if each.name not in known)]
 
 
 def counts(runs: Sequence[Run]) -> str:
@@ -122,19 +121,19 @@ def counts(runs: Sequence[Run]) -> str:
     return ", ".join([counted(len(runs), "run"), *told])
 
 
-def check_bench_folder(folder: Path, verb: str, protect: Sequence[Path]) -> None:
-    """Refuse a folder that this verb (bench or tune) did not write, before any work is done.
+def check_bench_folder(folder: Path, protect: Sequence[Path]) -> None:
+    """Refuse a folder that ``bench`` did not write, before any work is done.
 
     Raises:
         OutputError: It is another's, or lies in a scene of ``protect`` or around one.
     """
     kind = read_manifest(folder).get("command")
-    if kind == verb:
+    if kind == "bench":
         check_apart(folder, protect)
     elif kind is None:
-        check_output(folder, kind=verb, protect=protect)
+        check_output(folder, kind="bench", protect=protect)
     else:
-        expected = f"the folder of splatseed {verb}, or a new one, at {folder}"
+        expected = f"the folder of splatseed bench, or a new one, at {folder}"
         found = f"what splatseed {kind} wrote"
         raise OutputError(expected, found=found, fix="Choose another folder.")
 

@@ -345,7 +345,7 @@ def _bench(options: Options, plan: Plan, machine: Machine, arguments: Sequence[s
     bench = options.output
     demo = bench / "scenes" / "demo" if bench else None
     if bench is not None and not options.dry_run:
-        check_bench_folder(bench, "bench", [Path(s.path) for s in plan.scenes if not s.is_demo])
+        check_bench_folder(bench, [Path(s.path) for s in plan.scenes if not s.is_demo])
     if plan.lpips:
         from splatseed.splat.metrics import load_lpips  # noqa: PLC0415  (PyTorch)
 

@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from splatseed.bench.tuning import LEAST_VIEWS
 from splatseed.console import print_note, print_pairs
 from splatseed.lens import undistort_command, undistorted
 from splatseed.literal import quoted
@@ -34,14 +33,13 @@ Commands = list[tuple[str, str]]
 
 
 class Planned(NamedTuple):
-    """How a scene will be trained, and the options of train and tune that say so."""
+    """How a scene will be trained, and the options of train that say so."""
 
     budget: int
     max_steps: int
     strategy: str
     most_seeds: int
     flags: str
-    tuning: str
 
     @classmethod
     def of(cls, scene: Scene, budget: str | None = None, max_steps: int = FULL_RUN) -> Planned:
@@ -49,18 +47,17 @@ class Planned(NamedTuple):
         images = at_file_size(scene).images
         sizes = [image.intrinsics.width * image.intrinsics.height for image in images]
         pixels = round(float(np.median(sizes))) if sizes else BUDGET
-        number, flags, tuning = max(2, min(BUDGET, pixels)), "", ""
+        number, flags = max(2, min(BUDGET, pixels)), ""
         if budget is not None:
             from splatseed.seeding.upsampling import points_within  # noqa: PLC0415  (loads Numba)
 
             number = max(2, points_within(scene, budget))
-            # A trial's photographs are smaller, and so is its number of Gaussians.
-            flags, tuning = f"--budget {number} ", f" --budget {number / pixels:.3g}rho"
+            flags = f"--budget {number} "
         if max_steps != FULL_RUN:
-            flags, tuning = f"{flags}--max-steps {max_steps} ", f"{tuning} --max-steps {max_steps}"
+            flags = f"{flags}--max-steps {max_steps} "
         settings = TrainSettings(strategy="auto", max_steps=max_steps, cap_max=number)
         most = most_seeds(settings, number)
-        return cls(number, max_steps, settings.densification, most, flags, tuning)
+        return cls(number, max_steps, settings.densification, most, flags)
 
 
 def advice_commands(
@@ -85,10 +82,6 @@ def advice_commands(
         train = f"splatseed train OUT {training}"
     if not trains:
         return first or [("look", f"splatseed view {source}")]
-    tunable = len(scene.split()[0]) >= LEAST_VIEWS and len(scene.points)
-    if advice.method in (AS_IT_IS, "auto") and tunable:
-        tune = f"splatseed tune {source} --minutes 30{planned.tuning}"
-        return [*first, ("train", train), ("or by experiment", tune)]
     return [*first, ("train", train)]
 
 

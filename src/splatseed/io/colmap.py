@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int64, UInt8
+from jaxtyping import Float64, Int64, UInt8
 
 from splatseed.camera import CAMERA_MODELS, PANORAMA, Intrinsics, quat_from_rotation
 from splatseed.errors import OutputError, PointCloudError, SceneFormatError, SceneNotFoundError
@@ -295,22 +295,6 @@ def write_points3d(path: Path, points: PointCloud, tracks: Tracks | None) -> Non
         if tracks is not None:
             file.write(_joined_records(heads[:known], tracks).data)
         file.write(heads[known:].view(np.uint8).data)  # a record without a track is its head
-
-
-def set_point_count(path: Path, count: int) -> None:
-    """Change the number of points that a ``points3D.bin`` promises, before more are appended."""
-    with path.open("r+b") as file:
-        file.write(_COUNT.pack(count))
-
-
-def point_rows(
-    first_id: int, xyz: Float32[np.ndarray, "n 3"], rgb: UInt8[np.ndarray, "n 3"]
-) -> memoryview:
-    """Records of points without a track, as ``write_points3d`` writes them; ids from the first."""
-    heads = np.zeros(len(xyz), _POINT)
-    heads["id"] = np.arange(first_id, first_id + len(xyz))
-    heads["xyz"], heads["rgb"], heads["error"] = xyz, rgb, UNKNOWN_ERROR
-    return heads.view(np.uint8).data
 
 
 def _joined_records(heads: np.ndarray, tracks: Tracks) -> UInt8[np.ndarray, " B"]:

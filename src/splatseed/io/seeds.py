@@ -13,7 +13,6 @@ import hashlib
 import math
 import shutil
 import zipfile
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -43,38 +42,21 @@ _STORED: dict[str, tuple[tuple[int, ...], np.dtype[Any]]] = {
 _DIGEST_BYTES = 16
 
 
-class PositionDigest:
-    """The fingerprint of positions that come a piece at a time; -0.0 counts as 0.0."""
-
-    def __init__(self, xyz: Float32[np.ndarray, "n 3"]) -> None:
-        self._hash = hashlib.blake2b(digest_size=_DIGEST_BYTES)
-        self.add(xyz)
-
-    def add(self, xyz: Float32[np.ndarray, "n 3"]) -> None:
-        """Take the next positions."""
-        self._hash.update(np.ascontiguousarray(xyz + np.float32(0.0), "<f4").tobytes())
-
-    def bytes(self) -> bytes:
-        """The fingerprint of all of them."""
-        return self._hash.digest()
+def _position_digest(xyz: Float32[np.ndarray, "n 3"]) -> bytes:
+    """The fingerprint of positions; -0.0 counts as 0.0."""
+    digest = hashlib.blake2b(digest_size=_DIGEST_BYTES)
+    digest.update(np.ascontiguousarray(xyz + np.float32(0.0), "<f4").tobytes())
+    return digest.digest()
 
 
 def write_seeds(folder: Path, points: PointCloud) -> None:
     """Write ``seeds.npz`` into an output, if it says more than the other files."""
     known = {n: values for n, values in points.attributes.items() if not np.isnan(values).all()}
-    write_origins(folder, PositionDigest(points.xyz).bytes(), points.source, known)
-
-
-def write_origins(
-    folder: Path, digest: bytes, source: np.ndarray, known: Mapping[str, np.ndarray] | None = None
-) -> None:
-    """The same of points that are not in memory: only their sources, uint8 [N], are."""
-    arrays = dict(known or {})
-    if not np.isin(source, (ORIGINAL, GENERATED)).all():
-        arrays = {"source": source, **arrays}
-    if arrays:
-        arrays = {name: values.astype(_STORED[name][1]) for name, values in arrays.items()}
-        arrays = {"digest": np.frombuffer(digest, np.uint8), **arrays}
+    if not np.isin(points.source, (ORIGINAL, GENERATED)).all():
+        known = {"source": points.source, **known}
+    if known:
+        arrays = {name: values.astype(_STORED[name][1]) for name, values in known.items()}
+        arrays = {"digest": np.frombuffer(_position_digest(points.xyz), np.uint8), **arrays}
         np.savez_compressed(folder / SEEDS, **arrays)  # type: ignore[arg-type]  # by name
 
 
@@ -149,7 +131,7 @@ def _read_seeds(folder: Path, points: PointCloud) -> tuple[dict[str, np.ndarray]
             return {}, ()
         with zipfile.ZipFile(path) as archive:
             digest = _member(archive, "digest", (_DIGEST_BYTES,), np.dtype("u1"))
-            if digest.tobytes() != PositionDigest(points.xyz).bytes():
+            if digest.tobytes() != _position_digest(points.xyz):
                 return {}, (f"{SEEDS} was ignored: it belongs to other points than the scene's.",)
             there = {name.removesuffix(".npy") for name in archive.namelist()}
             arrays = {

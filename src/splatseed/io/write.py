@@ -13,15 +13,15 @@ import errno
 import os
 import platform
 import shutil
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, suppress
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path, PurePath
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float32, Float64, UInt8
+from jaxtyping import Float64
 
 from splatseed.camera import CAMERA_MODELS, Intrinsics
 from splatseed.errors import OutputError, PointCloudError
@@ -29,15 +29,13 @@ from splatseed.io import colmap, nerfstudio
 from splatseed.io.cleaning import clean_scene, renumber
 from splatseed.io.files import open_file
 from splatseed.io.masks import FOLDER as MASKS, find_masks, write_masks
-from splatseed.io.ply import ply_header, ply_rows, write_ply
-from splatseed.io.seeds import SEEDS, PositionDigest, write_origins, write_seeds
+from splatseed.io.ply import write_ply
+from splatseed.io.seeds import write_seeds
 from splatseed.io.split import MODEL_LISTS, ROOT_LISTS
 from splatseed.io.staging import MANIFEST, output_folder, write_json
-from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.scene import Scene
 
 Layout = Literal["colmap", "transforms"]
-Piece = tuple[Float32[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]
 
 _KIND = "write_scene"
 """The kind of an output whose provenance names no verb."""
@@ -58,25 +56,6 @@ _SIBLINGS = tuple(
     f"{kind}{scale}" for kind in ("images", "masks", "depths") for scale in ("", "_2", "_4", "_8")
 )
 """Folders in which trainers look for photographs, by the resolution they ask for."""
-
-
-@dataclass(frozen=True)
-class PointStream:
-    """Points that follow those of a scene a piece at a time: more than memory holds."""
-
-    num_original: int
-    """How many of them come from the input; they come first."""
-    num_new: int
-    code: int
-    """``PointCloud.source`` of the new ones."""
-    pieces: Callable[[], Iterator[Piece]]
-    files: tuple[Path, ...] = ()
-    """The input's, which the output must stay apart from."""
-    left_out: tuple[int, int] = (0, 0)
-    """Rows of the input that are not finite, and that repeat a position."""
-
-    def __len__(self) -> int:
-        return self.num_original + self.num_new
 
 
 @dataclass(frozen=True)
@@ -105,7 +84,6 @@ def write_scene(
     overwrite: bool = False,
     copy_images: bool = False,
     provenance: Mapping[str, object] | None = None,
-    stream: PointStream | None = None,
     require_points: bool = True,
 ) -> WriteReport:
     """Write a scene folder for training.
@@ -118,7 +96,6 @@ def write_scene(
         overwrite: Whether an earlier output of splatseed may be replaced.
         copy_images: Copy the image folders instead of linking them.
         provenance: How the points were made, for ``splatseed.json``.
-        stream: Points that follow those of the scene, more than memory holds.
         require_points: Whether a scene without any point is refused.
 
     Returns:
@@ -132,14 +109,13 @@ def write_scene(
     path, layout, made = Path(path), _choose_layout(scene, format), dict(provenance or {})
     source, clean = scene.source, clean_scene(scene)  # one from load_scene is clean already
     required = require_points or bool(len(scene.points))
-    if required and not len(clean.points) and not (stream and len(stream)):
+    if required and not len(clean.points):
         raise PointCloudError(
             "at least one point with finite coordinates",
             found=f"{len(scene.points)} points, none of them finite",
             fix="Check the cloud.",
         )
-    more = stream or PointStream(0, 0, ORIGINAL, lambda: iter(()))
-    inputs = (*(source.inputs if source else ()), *more.files)
+    inputs = source.inputs if source else ()
     kind = str(made.get("command", _KIND))
     with output_folder(path, kind=kind, overwrite=overwrite, protect=inputs) as folder:
         write_layout = _write_colmap if layout == "colmap" else _write_transforms
@@ -150,17 +126,15 @@ def write_scene(
             alone = replace(masks, alpha=False)  # photographs keep their transparency
             names = [im.name for im in clean.images if (photographs / im.name).is_file()]
             write_masks(alone, photographs, names, folder / MASKS)
-        if stream is not None:
-            _append_points(folder, clean.points, stream)
         linked = bring(image_sources, folder, copy=copy_images)
         tops = {PurePath(each).parts[0] for each in linked}
         own = [each for each in folder.rglob("*") if each.relative_to(folder).parts[0] not in tops]
         files = [each.relative_to(folder).as_posix() for each in own if not each.is_dir()]
         counts = {
-            "num_points": len(clean.points) + len(more),
-            "num_original": clean.points.num_original + more.num_original,
-            "dropped_nonfinite": clean.left_out.non_finite + more.left_out[0],
-            "dropped_duplicates": clean.left_out.duplicates + more.left_out[1],
+            "num_points": len(clean.points),
+            "num_original": clean.points.num_original,
+            "dropped_nonfinite": clean.left_out.non_finite,
+            "dropped_duplicates": clean.left_out.duplicates,
         }
         versions = {"python": platform.python_version()}
         for package in _PACKAGES:
@@ -216,35 +190,6 @@ def _choose_layout(scene: Scene, wanted: str) -> Layout:
         return "transforms"
     known = "a format of auto, colmap or transforms, which needs images"
     raise OutputError(known, found=repr(wanted), fix="Write the COLMAP layout (--format colmap).")
-
-
-def _append_points(folder: Path, first: PointCloud, stream: PointStream) -> None:
-    """Append points to the point files of a scene that was written with the first ones alone."""
-    total, digest = len(first) + len(stream), PositionDigest(first.xyz)
-    transforms, model = folder / "sparse_pc.ply", folder / "sparse/0/points3D.bin"
-    ply = transforms if transforms.exists() else model.with_suffix(".ply")
-    with ExitStack() as files:
-        rows = files.enter_context(ply.open("wb"))
-        rows.write(ply_header(total))
-        rows.write(ply_rows(first.xyz, first.rgb))
-        records = None
-        if model.exists():
-            colmap.set_point_count(model, total)
-            records = files.enter_context(model.open("ab"))
-        written = len(first)
-        for xyz, rgb in stream.pieces():
-            digest.add(xyz)
-            rows.write(ply_rows(xyz, rgb))
-            if records is not None:
-                records.write(colmap.point_rows(written + 1, xyz, rgb))
-            written += len(xyz)
-    assert written == total  # noqa: S101  (the headers say so)
-    if ply == transforms:
-        shutil.copyfile(ply, folder / "pointcloud.ply")
-    (folder / SEEDS).unlink(missing_ok=True)
-    runs = (len(first) + stream.num_original, stream.num_new)
-    source = np.repeat(np.array([ORIGINAL, stream.code], np.uint8), runs)
-    write_origins(folder, digest.bytes(), source)
 
 
 def _write_colmap(scene: Scene, folder: Path) -> tuple[list[str], dict[str, Path]]:

@@ -22,7 +22,7 @@ import traceback
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
-from contextlib import closing, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import IO, Any, TypeAlias, cast
 
@@ -91,17 +91,6 @@ class Tasks(ABC):
         Raises:
             KeyboardInterrupt: The user stopped it; tasks that ended in time were given before.
         """
-
-    def run_all(
-        self, function: Function, calls: Sequence[tuple[Any, ...]], stage: str, progress: Progress
-    ) -> None:
-        """Call it for what it leaves on the disk; the first error that a task raises ends all."""
-        progress(stage, 0.0)
-        with closing(self.run(function, calls)) as results:  # type: ignore[type-var]  # a generator
-            for done, result in enumerate(results, start=1):
-                if result.error is not None:
-                    raise result.error
-                progress(stage, done / len(calls))
 
 
 class HereTasks(Tasks):

@@ -70,11 +70,6 @@ class NearestMethod(ABC):
         """Neighbours that points are made from."""
 
     @property
-    def untileable_reason(self) -> str:
-        """What the method computes from all points at once; empty if it computes nothing so."""
-        return ""
-
-    @property
     def num_queried(self) -> int:
         """Neighbours to look for: those that points are made from, or that isolation shows in."""
         if not self.reject_isolated:

@@ -15,7 +15,6 @@ from splatseed.commands.models import check_free
 from splatseed.commands.options import MaskChoice, check_least, parse_options, refuse
 from splatseed.commands.upsample import output
 from splatseed.commands.upsample.cloud import load_cloud
-from splatseed.commands.upsample.tiled import find_source, run_tiled
 from splatseed.console import OUT, StageClock, print_note, stage_display
 from splatseed.depthmap import DepthKind
 from splatseed.io import find_depths, load_originals, write_scene
@@ -104,17 +103,8 @@ class Options:
     recenter: bool = False
     """Write scene and cloud around 0, with the offset in recenter.json: for national grids."""
     memory: Annotated[str | None, tyro.conf.arg(metavar="BYTES|4G")] = None
-    """Memory limit, by default what is free: larger clouds are upsampled in tiles on disk; --cloud
-    merges within it (at most 4G by default)."""
-    jobs: int | None = None
-    """Tiles at a time, each in a process of its own; by default as many as cores and memory
-    allow."""
-    executor: Literal["local", "ray"] = "local"
-    """Where tiles run: on this machine, or on a Ray cluster that shares its disk."""
-    address: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT|auto")] = None
-    """The cluster's address, or auto on one of its nodes; by default a cluster on this machine."""
-    tile_points: int | None = None
-    """Maximum points per tile; by default what memory allows."""
+    """For --cloud: the memory within which scans are merged; by default what is free, at most
+    4G."""
     preview: bool = False
     """Also write pictures: before and after, origins, cells covered, the method's stereo maps."""
     gaussians: Path | None = None
@@ -183,16 +173,12 @@ def run(arguments: list[str]) -> None:
         check_free(options.gaussians, overwrite=options.overwrite, protect=protect)
     for file in options.cloud_files:
         open_cloud(file)  # reads headers only: what is wrong is told before work begins
-    source = find_source(options, methods)
-    if source is not None:
-        run_tiled(options, methods, source)
-    else:
-        _run_in_memory(options, methods)
+    _upsample(options, methods)
 
 
 def _check(options: Options) -> None:
     """Refuse options out of their range, and those that another makes pointless."""
-    check_least(options, 1, "num_points", "jobs", "tile_points")
+    check_least(options, 1, "num_points")
     check_least(options, 0, "seed")
     method, cell, folder = options.method, options.cover_cell, options.output
     maps = options.depth_kind is not None or options.depth_scale is not None
@@ -202,8 +188,6 @@ def _check(options: Options) -> None:
         (folder.suffix.lower() in FILES and not folder.is_dir(),
          "a folder for -o, as a whole scene is written", f"{folder}, the name of a file",
          f"Pass -o {quoted(folder.parent / folder.stem)}: a .ply of the points is included."),
-        (options.address is not None and options.executor != "ray",
-         "--executor ray with --address", "local", "Add --executor ray."),
         (cell is not None and cell < 1, "--cover of 1 or more", cell, "Try --cover 8."),
         (cell is not None and method in COVERING,
          f"--{method}.cell for method {method}, which already covers", f"--cover {cell}",
@@ -211,6 +195,8 @@ def _check(options: Options) -> None:
         (maps and options.depth_maps is None,
          "--depth DIR, which --depth-kind and --depth-scale refer to", "none", "Name the folder."),
         (framed and not options.cloud_files, "--cloud FILE", "none", "Name the scan."),
+        (options.memory is not None and not options.cloud_files,
+         "--cloud FILE with --memory, within which scans are merged", "none", "Leave it out."),
         (options.cloud_files and method not in WITH_CLOUD,
          f"--method {', '.join(WITH_CLOUD[:-1])} or {WITH_CLOUD[-1]} with --cloud", method,
          "Leave --method out for the cloud's points alone: interpolating needs no scan."),
@@ -228,8 +214,7 @@ def _check(options: Options) -> None:
         )  # fmt: skip
 
 
-def _run_in_memory(options: Options, methods: dict[str, Any]) -> None:
-    """Upsample a scene that fits into memory whole."""
+def _upsample(options: Options, methods: dict[str, Any]) -> None:
     notes: list[str] = []
     with stage_display() as clock:
         clock("read", 0.0)

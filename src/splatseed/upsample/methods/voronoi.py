@@ -65,11 +65,6 @@ class Voronoi(NearestMethod):
         """Neighbours that shape a cell."""
         return self.k
 
-    @property
-    def untileable_reason(self) -> str:
-        """Cells in the bounding box are those of one diagram of all points."""
-        return "the cells of Qhull's diagram in the bounding box" if self.cells == "box" else ""
-
     def weigh(
         self, cloud: PreparedCloud, neighbors: Neighbors, progress: Progress
     ) -> tuple[Float64[np.ndarray, " n"], RowData]:
