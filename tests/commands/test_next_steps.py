@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from splatseed.camera import Intrinsics
+from splatseed.commands.next_steps import tell_training
 from splatseed.io import load_scene, write_scene
 from splatseed.pointcloud import PointCloud
 
@@ -88,6 +89,21 @@ def test_a_cloud_alone_is_advised(room, tmp_path, monkeypatch, splatseed):
     advised = splatseed("info", cloud)
     assert "Points alone cannot be trained" in advised.out
     assert follow(advised.out, splatseed) == ["upsample"]
+
+
+@pytest.mark.parametrize(("off", "told"), [(0.4, False), (3.0, True)])
+def test_graphdecos_trainer_ignores_principal_points(off, told, room, capsys):
+    scene = load_scene(room)
+    lens = scene.intrinsics[0]
+    fx, fy, cx, cy = lens.params
+    lens = dataclasses.replace(lens, params=(fx, fy, cx, cy - off))
+    images = tuple(dataclasses.replace(each, intrinsics=lens) for each in scene.images)
+    tell_training(room, scene.replace(images=images), Path("out"), "colmap")
+    said = capsys.readouterr().out
+    assert "graphdeco" in said
+    assert (f"ignores principal points, which are up to {off} px off" in said) == told
+    tell_training(room, scene.replace(images=images), Path("out"), "transforms")
+    assert "ignores" not in capsys.readouterr().out  # that trainer does not read it
 
 
 def test_only_trainers_that_undistort_are_named_for_a_distorted_scene(bent, tmp_path, splatseed):

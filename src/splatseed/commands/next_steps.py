@@ -28,6 +28,8 @@ PINHOLE_ONLY = frozenset({"splatseed", "graphdeco", "OpenSplat", "LichtFeld"})
 """Trainers that do not deal with lens distortion themselves, as far as we know."""
 COMMON_LENSES = frozenset({"SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"})
 """The distortion that the others know."""
+CENTRED = 0.5
+"""Pixels by which a principal point may be off the centre without a word."""
 
 Commands = list[tuple[str, str]]
 
@@ -141,12 +143,25 @@ def tell_training(read_from: Path, scene: Scene, output: Path, layout: SceneForm
     lenses = {image.intrinsics.model for image in scene.images if image.intrinsics.has_distortion}
     known = lenses <= COMMON_LENSES
     if known:
-        print_pairs("train it with", training_commands(output, layout, distorted=bool(lenses)))
+        trainers = training_commands(output, layout, distorted=bool(lenses))
+        print_pairs("train it with", trainers)
+        if "graphdeco" in dict(trainers) and (off := off_centre(scene)) > CENTRED:
+            print_note(
+                f"graphdeco's trainer ignores principal points, which are up to {off:.1f} px off "
+                "the photographs' centres: it trains as if they were there. The others read them."
+            )
     if lenses:
         print_note(
             f"{'The other trainers' if known else 'Trainers'} need photographs without lens "
             f"distortion: begin with {undistort_command(read_from)}, and upsample that scene."
         )
+
+
+def off_centre(scene: Scene) -> float:
+    """How far principal points are off the photographs' centres, the largest distance in pixels."""
+    sizes = np.array([(im.camera.width, im.camera.height) for im in scene.images])
+    points = np.array([im.camera.K[:2, 2] for im in scene.images])
+    return float(np.linalg.norm(points - sizes / 2, axis=1).max(initial=0.0))
 
 
 def training_commands(path: Path, layout: SceneFormat, *, distorted: bool = False) -> Commands:
