@@ -1,7 +1,8 @@
 """Progress: how long work tells a caller how far it is.
 
 A ``Progress`` is any callable that takes a stage's name and the fraction of it that is done, from
-0 to 1. Library functions take one and default to ``silent``; the command line passes a rich bar.
+0 to 1. Library functions take one and default to ``silent``; the command line passes a rich bar. A
+``Note`` is called with a sentence that the user should read.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from contextvars import ContextVar
 from typing import TypeAlias
 
 Progress: TypeAlias = Callable[[str, float], None]
+Note: TypeAlias = Callable[[str], None]
 
 thread_limit: ContextVar[int | None] = ContextVar("thread_limit", default=None)
 """Most threads of ``in_threads``; as many as there are cores if None."""
@@ -20,6 +22,10 @@ thread_limit: ContextVar[int | None] = ContextVar("thread_limit", default=None)
 
 def silent(stage: str, fraction: float) -> None:
     """Report to nobody."""
+
+
+def silent_note(sentence: str) -> None:
+    """Discard the sentence."""
 
 
 def blocks(total: int, size: int, stage: str, progress: Progress) -> Iterator[tuple[int, int]]:

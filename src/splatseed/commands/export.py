@@ -92,7 +92,7 @@ def run(arguments: list[str]) -> None:
                 path, Path(str(scene)), masks=masks, progress=clock, **numbers
             )
             kept = keep_gaussians(gaussians.select(~floaters), crop, options.min_opacity)
-        write_model(target, kept, clock)
+        write_model(target, kept, clock, notes.append)
     before, after = path.stat().st_size, target.stat().st_size
     rows = [
         ("Gaussians", f"{len(kept):,} of {len(gaussians):,}"),

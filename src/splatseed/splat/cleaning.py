@@ -1,9 +1,9 @@
 """Leaving out what no renderer can draw of a model that was read, so that every format gets it.
 
 Kept are opacities of exactly 0 and 1, whose logits are infinite, sizes of 0 (a flat Gaussian), and
-a rotation of length 0 where all three sizes are equal, as it turns nothing. Left out are
-Gaussians with any other number that is not finite, with a size beyond e^20 units, whose covariance
-overflows in a renderer, and with a rotation of length 0.
+a rotation of length 0 where all three sizes are equal, as it turns nothing. Left out are Gaussians
+with any other number that is not finite, with a size beyond e^20 or a position beyond 1e18 units,
+whose squares overflow in a renderer, and with a rotation of length 0.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from splatseed.splat.gaussians import Gaussians
 
 MAX_LOG_SCALE = 20.0
 """Larger sizes are left out; log-scales of compressed PLY end here, too."""
+MAX_POSITION = 1e18
 MIN_LOG_SCALE = float(np.log(np.finfo(np.float32).tiny))
 """The log-scale of a size of 0, which would be -infinity."""
 _NORMS = (1e-6, 1e6)
@@ -67,7 +68,7 @@ def _unusable(
     with np.errstate(invalid="ignore"):
         spread = gaussians.scales.max(axis=1) - gaussians.scales.min(axis=1)
         return {
-            "position": infinite(gaussians.means),
+            "position": ~(np.abs(gaussians.means) <= MAX_POSITION).all(axis=1),  # also NaN
             "size": ~(gaussians.scales <= MAX_LOG_SCALE).all(axis=1),  # also NaN
             "rotation": infinite(gaussians.quats) | ((norms == 0) & ~(spread < _ROUND)),
             "opacity": np.isnan(gaussians.opacities),

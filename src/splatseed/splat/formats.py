@@ -24,7 +24,7 @@ from splatseed.io.files import COPY_AGAIN, ByteReader, read_bytes
 from splatseed.io.ply import EXPORT_PLY_AGAIN, Element, parse_header
 from splatseed.io.staging import atomic_file
 from splatseed.literal import beginning, did_you_mean
-from splatseed.progress import Progress, silent
+from splatseed.progress import Note, Progress, silent, silent_note
 from splatseed.splat import packed, sog
 from splatseed.splat.cleaning import drop_unusable
 from splatseed.splat.gaussians import Gaussians
@@ -49,7 +49,7 @@ _ELSEWHERE = {
 """Formats that are neither read nor written here, and the tools that write them."""
 
 
-def _encode_ply(gaussians: Gaussians) -> list[bytes | memoryview]:
+def _encode_ply(gaussians: Gaussians, _: Note = silent_note) -> list[bytes | memoryview]:
     count, rest = len(gaussians), 3 * gaussians.shN.shape[1]
     columns = _columns(rest)
     arrays = {**gaussians.arrays(), "normals": np.zeros((count, 3), np.float32)}
@@ -102,7 +102,7 @@ class Format(NamedTuple):
 
     suffix: str
     about: str
-    encode: Callable[[Gaussians], Iterable[bytes | memoryview]]
+    encode: Callable[[Gaussians, Note], Iterable[bytes | memoryview]]
     decode: Callable[[Path], Gaussians]
 
 
@@ -128,7 +128,7 @@ SUFFIXES = {each.suffix: name for name, each in FORMATS.items()}
 """The formats' names by file name suffix."""
 
 
-def read_model(path: Path, note: Callable[[str], None] = lambda _: None) -> Gaussians:
+def read_model(path: Path, note: Note = silent_note) -> Gaussians:
     """Read trained Gaussians: .ply, compressed .ply, .splat, .spz, .sog (or its meta.json).
 
     Gaussians that cannot be drawn, as one of their numbers is NaN, are left out; ``note`` is called
@@ -146,8 +146,13 @@ def read_model(path: Path, note: Callable[[str], None] = lambda _: None) -> Gaus
     return gaussians
 
 
-def write_model(path: Path, gaussians: Gaussians, progress: Progress = silent) -> None:
+def write_model(
+    path: Path, gaussians: Gaussians, progress: Progress = silent, note: Note = silent_note
+) -> None:
     """Write at least one Gaussian, at finite positions, in the format that the file name asks for.
+
+    ``note`` is called with each sentence that the user should read about what the format cannot
+    hold.
 
     Raises:
         ParameterError: The suffix belongs to no format written here.
@@ -155,7 +160,10 @@ def write_model(path: Path, gaussians: Gaussians, progress: Progress = silent) -
     """
     name = format_of_name(path)
     progress("encode", 0.0)
-    parts = sog.encode(gaussians, progress) if name == "sog" else FORMATS[name].encode(gaussians)
+    if name == "sog":
+        parts: Iterable[bytes | memoryview] = sog.encode(gaussians, note, progress)
+    else:
+        parts = FORMATS[name].encode(gaussians, note)
     progress("encode", 1.0)
     with atomic_file(path) as partial, partial.open("wb") as file:
         file.writelines(parts)

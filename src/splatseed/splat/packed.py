@@ -18,15 +18,26 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32, Int64, UInt8, UInt32
+from jaxtyping import Bool, Float32, Int64, UInt8, UInt32
 from numpy.lib.recfunctions import structured_to_unstructured
 
 from splatseed.errors import ParameterError
 from splatseed.io.files import COPY_AGAIN, ByteReader, guarded, read_bytes
 from splatseed.io.ply import parse_header
+from splatseed.literal import agreeing, counted
+from splatseed.progress import Note, silent_note
 from splatseed.requirements import require
 from splatseed.runtime.memory import check_memory
 from splatseed.splat.cleaning import MAX_LOG_SCALE
+from splatseed.splat.extent import (
+    COARSE,
+    Fit,
+    best_fit,
+    left_out_note,
+    morton_codes,
+    morton_order,
+    shells_of,
+)
 from splatseed.splat.gaussians import SH_C0, Gaussians
 
 SH_COUNTS = (0, 3, 8, 15)
@@ -37,13 +48,16 @@ SPZ_MAGIC = b"NGSP"
 
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 """The components that remain, by the index of the largest."""
-_MORTON_BITS = 16
 _CHUNK, _SH_RANGE = 256, 8.0
 _BOUNDS = [
     [f"{end}_{name}" for name in names]
     for names in (("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b"))
     for end in ("min", "max")
 ]
+_GLARING = 2.5
+"""Colours farther from mid grey, 0.5, are apart: a byte is too coarse for them and all others."""
+_FILLER = np.array([0, 0x20080200, 0, 0], "<u4")
+"""The least of all that its chunk holds, not turned, opacity 0; left out on reading."""
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _Layout = tuple[tuple[int, int], ...]
 """Shift and number of bits of each part of a packed number."""
@@ -55,6 +69,10 @@ _SPZ_HEADER = struct.Struct("<4sIIBBBB")
 _SPZ_VERSION = 3  # the latest that every reader accepts
 _SPZ_MOST, _SPZ_FRACTION = 2**23 - 1, 20
 """Largest position in units of 2^-f, 24 bits with a sign; largest f."""
+_SPZ_SCALES = (-10.0, 255 / 16 - 10)
+"""Log-scales that a byte holds."""
+_MAX_LOST = 0.1
+"""Share of the picture that far Gaussians may take with them, where no bits would hold them."""
 _SPZ_NINE_BITS = np.float32(511 * np.sqrt(2))
 _SPZ_COLOR = 0.15 * 255
 """Bytes per unit of the first coefficient: the format's scale."""
@@ -110,19 +128,6 @@ def rounded_bytes(values: np.ndarray) -> UInt8[np.ndarray, "..."]:
     return np.asarray(np.clip(np.rint(values), 0, 255), np.uint8)
 
 
-def morton_order(xyz: Float32[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:
-    """The order of points along a Z curve through their bounding box."""
-    low, high = xyz.min(axis=0), xyz.max(axis=0)
-    extent = np.where(high > low, high - low, 1).astype(np.float64)
-    cells = ((xyz - low) / extent * (2**_MORTON_BITS - 1)).astype(np.uint64)
-    code = np.zeros(len(xyz), np.uint64)
-    for bit in range(_MORTON_BITS):
-        for axis in range(3):
-            digit = (cells[:, axis] >> np.uint64(bit)) & np.uint64(1)
-            code |= digit << np.uint64(3 * bit + axis)
-    return np.argsort(code, kind="stable")
-
-
 def _unit_quats(quats: Float32[np.ndarray, "N 4"]) -> Float32[np.ndarray, "N 4"]:
     """Quaternions of length 1; zeros become the identity."""
     norms = np.linalg.norm(quats, axis=1, keepdims=True)
@@ -135,7 +140,7 @@ def _unit_quats(quats: Float32[np.ndarray, "N 4"]) -> Float32[np.ndarray, "N 4"]
 # .splat -------------------------------------------------------------------------------------------
 
 
-def encode_splat(gaussians: Gaussians) -> list[bytes]:
+def encode_splat(gaussians: Gaussians, _: Note = silent_note) -> list[bytes]:
     """By size times opacity, so that a viewer can draw the most important ones first."""
     log_opacity = -np.logaddexp(0, -gaussians.opacities.astype(np.float64))
     size = gaussians.scales.astype(np.float64).sum(axis=1) + log_opacity
@@ -180,9 +185,9 @@ def decode_splat(path: Path) -> Gaussians:
 # Compressed PLY -----------------------------------------------------------------------------------
 
 
-def encode_compressed_ply(gaussians: Gaussians) -> list[bytes]:
-    """In Z-curve order."""
-    order = morton_order(gaussians.means)
+def encode_compressed_ply(gaussians: Gaussians, _: Note = silent_note) -> list[bytes]:
+    """In Z-curve order, far Gaussians and colours beyond any display's in chunks of their own."""
+    order, fillers = _in_chunks(gaussians)
     count, rest = len(order), 3 * gaussians.shN.shape[1]
     scales = np.clip(gaussians.scales[order], -MAX_LOG_SCALE, MAX_LOG_SCALE)
     colors = gaussians.sh0[order, 0] * np.float32(SH_C0) + np.float32(0.5)
@@ -203,6 +208,7 @@ def encode_compressed_ply(gaussians: Gaussians) -> list[bytes]:
     packed[:, 1] = (largest.astype(np.uint32) << 30) | turn
     packed[:, 2] = _pack(units[1], _VECTOR_BITS)
     packed[:, 3] = _pack(units[2], _COLOR_BITS) | opacity_bytes(gaussians.opacities[order])
+    packed[fillers] = _FILLER
     coefficients = gaussians.shN[order].transpose(0, 2, 1).reshape(count, rest)
     # A coefficient c in [-4, 4] is the byte (c / 8 + 1/2) 256.
     sh = np.clip((coefficients / _SH_RANGE + 0.5) * 256, 0, 255).astype(np.uint8)
@@ -213,6 +219,29 @@ def encode_compressed_ply(gaussians: Gaussians) -> list[bytes]:
         lines += [f"element sh {count}", *(f"property uchar f_rest_{i}" for i in range(rest))]
     header = ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")
     return [header, np.hstack(tables).astype("<f4").tobytes(), packed.tobytes(), sh.tobytes()]
+
+
+def _in_chunks(gaussians: Gaussians) -> tuple[Int64[np.ndarray, " M"], Bool[np.ndarray, " M"]]:
+    """The Gaussians by chunk, and which places only fill one up.
+
+    Bounds of a chunk are its members'; so Gaussians of different shells, and those of colours far
+    beyond black or white, share none: each group but the last ends with fillers, invisible
+    Gaussians that repeat the place of one of it.
+    """
+    colors = gaussians.sh0[:, 0] * np.float32(SH_C0) + np.float32(0.5)
+    glaring = (np.abs(colors - np.float32(0.5)) > _GLARING).any(axis=1)
+    groups = 2 * shells_of(gaussians.means) + glaring
+    order = np.lexsort((morton_codes(gaussians.means), groups))
+    ends = np.append(np.flatnonzero(np.diff(groups[order])) + 1, len(order))
+    parts = [np.arange(0, ends[0]), *map(np.arange, ends[:-1], ends[1:])]
+    missing = [-len(part) % _CHUNK for part in parts[:-1]] + [0]
+    index = [
+        np.append(part, np.full(more, part[-1])) for part, more in zip(parts, missing, strict=True)
+    ]
+    filled = [
+        np.arange(len(part) + more) >= len(part) for part, more in zip(parts, missing, strict=True)
+    ]
+    return order[np.concatenate(index)], np.concatenate(filled)
 
 
 def decode_compressed_ply(path: Path) -> Gaussians:
@@ -253,7 +282,9 @@ def decode_compressed_ply(path: Path) -> Gaussians:
             rows = (centers.astype(np.float32) - np.float32(0.5)) * np.float32(_SH_RANGE)
             shN = np.ascontiguousarray(rows.reshape(len(rows), 3, -1).transpose(0, 2, 1))
         three = (_unpack(turn, _THREE_BITS) - np.float32(0.5)) * np.float32(np.sqrt(2))
-        return Gaussians(
+        packed = np.stack([position, turn, scale, color], axis=1)
+        kept = (packed != _FILLER).any(axis=1)
+        gaussians = Gaussians(
             means=within(_unpack(position, _VECTOR_BITS), 0),
             scales=within(_unpack(scale, _VECTOR_BITS), 1),
             quats=from_smallest_three((turn >> 30).astype(np.int64), three),
@@ -261,6 +292,7 @@ def decode_compressed_ply(path: Path) -> Gaussians:
             sh0=((colors - np.float32(0.5)) / np.float32(SH_C0))[:, None],
             shN=shN,
         )
+        return gaussians if kept.all() or not kept.any() else gaussians.select(kept)
 
 
 def _pack(units: Float32[np.ndarray, "N 3"], layout: _Layout) -> UInt32[np.ndarray, " N"]:
@@ -280,18 +312,15 @@ def _unpack(packed: UInt32[np.ndarray, " N"], layout: _Layout) -> Float32[np.nda
 # .spz ---------------------------------------------------------------------------------------------
 
 
-def encode_spz(gaussians: Gaussians) -> list[bytes]:
-    """In Z-curve order, of degree 3 at most."""
+def encode_spz(gaussians: Gaussians, note: Note = silent_note) -> list[bytes]:
+    """In Z-curve order, of degree 3 at most.
+
+    Raises:
+        ParameterError: Positions are beyond what the format can hold.
+    """
+    gaussians, bits = _fixed_point(gaussians, note)
     order = morton_order(gaussians.means)
     rest = gaussians.shN.shape[1]
-    farthest = float(np.abs(gaussians.means).max())
-    if farthest > _SPZ_MOST:
-        raise ParameterError(
-            f"positions within {_SPZ_MOST:,} of the origin, which is all that .spz can hold",
-            found=f"one at {farthest:.3g}",
-            fix="Export another format, or crop the model.",
-        )
-    bits = int(np.clip(np.log2(_SPZ_MOST / max(farthest, 1e-9)), 0, _SPZ_FRACTION))
     # A position in units of 2^-f; a coefficient c beyond the first as 128 c + 128.
     fixed = np.rint(gaussians.means[order] * _SPZ_AXES * np.float64(2**bits)).astype("<i4")
     sh = np.rint(gaussians.shN[order] * _SPZ_SH[:rest, None] * 128 + 128)
@@ -314,6 +343,44 @@ def encode_spz(gaussians: Gaussians) -> list[bytes]:
     header = _SPZ_HEADER.pack(SPZ_MAGIC, _SPZ_VERSION, len(order), degree, bits, 0, 0)
     body = b"".join(np.ascontiguousarray(part).tobytes() for part in parts)
     return [gzip.compress(header + body, 6, mtime=0)]
+
+
+def _fixed_point(gaussians: Gaussians, note: Note) -> tuple[Gaussians, int]:
+    """The Gaussians that the format holds, and the fractional bits of their positions.
+
+    All have the same bits: the most that hold every position, unless a few far ones would cost the
+    others their place.
+    """
+    farthest = np.abs(gaussians.means.astype(np.float64)).max(axis=1)
+    fits = [Fit(farthest <= _SPZ_MOST / 2.0**bits, 2.0**-bits) for bits in range(_SPZ_FRACTION + 1)]
+    whole = [bits for bits, fit in enumerate(fits) if fit.kept.all()]
+    first = max(whole, default=0)
+    chosen, lost, error = best_fit(gaussians, fits[first:])
+    bits = first + chosen
+    kept, most = fits[bits].kept, _SPZ_MOST / 2.0**bits
+    if not kept.any() or (not whole and lost > _MAX_LOST):
+        raise ParameterError(
+            f"positions within {_SPZ_MOST:,} of the origin, which is all that .spz can hold",
+            found=f"one at {farthest.max():.3g}",
+            fix="Export another format, or crop the model.",
+        )
+    if not kept.all():
+        note(left_out_note(".spz", kept, f"more than {most:,.4g} units from the origin"))
+    if error > COARSE:
+        steps = f"up to {most:,.4g} units from the origin in steps of {2.0**-bits:.3g}"
+        note(
+            f"A .spz holds positions {steps}, too coarse for this model: export another format, or "
+            "move the model to the origin."
+        )
+    scales = np.sort(gaussians.scales[kept], axis=1)  # of a flat Gaussian the least does not count
+    beyond = (scales[:, 2] > _SPZ_SCALES[1]) | (scales[:, 1] < _SPZ_SCALES[0])
+    if number := int(np.count_nonzero(beyond)):
+        least, largest = np.exp(_SPZ_SCALES)
+        note(
+            f"A .spz holds sizes from {least:.2g} to {largest:.0f} units: "
+            f"{counted(number, 'Gaussian')} {agreeing(number, 'has', 'have')} the nearest."
+        )
+    return gaussians if kept.all() else gaussians.select(kept), bits
 
 
 def decode_spz(path: Path) -> Gaussians:

@@ -19,9 +19,10 @@ from jaxtyping import Float32, Float64, Int64, UInt8
 
 from splatseed.errors import SceneFormatError
 from splatseed.io.files import guarded, read_bytes
-from splatseed.progress import Progress, silent
+from splatseed.progress import Note, Progress, silent, silent_note
 from splatseed.splat import packed
 from splatseed.splat.cleaning import MAX_LOG_SCALE
+from splatseed.splat.extent import COARSE, Fit, best_fit, left_out_note, morton_order, shells_of
 from splatseed.splat.gaussians import Gaussians
 
 CONVERTER = "npx @playcanvas/splat-transform"
@@ -43,14 +44,15 @@ _STAMP = (1980, 1, 1, 0, 0, 0)
 """The timestamp of each picture in the zip, fixed so that equal Gaussians give equal bytes."""
 
 
-def encode(gaussians: Gaussians, progress: Progress = silent) -> list[bytes]:
+def encode(
+    gaussians: Gaussians, note: Note = silent_note, progress: Progress = silent
+) -> list[bytes]:
     """The bytes of a file with the Gaussians, in Z-curve order."""
     from PIL import Image  # noqa: PLC0415  (slow to import)
 
-    order = packed.morton_order(gaussians.means)
-    # sign(p) log(1 + |p|): finer steps near the middle of the scene
-    means = gaussians.means[order].astype(np.float64)
-    curved = np.sign(means) * np.log1p(np.abs(means))
+    gaussians = _within_steps(gaussians, note)
+    order = morton_order(gaussians.means)
+    curved = _curved(gaussians.means[order])
     low, high = curved.min(axis=0), curved.max(axis=0)
     positions = np.rint((curved - low) / np.where(high > low, high - low, 1) * 65535)
     positions = positions.astype(np.int64)
@@ -105,6 +107,33 @@ def encode(gaussians: Gaussians, progress: Progress = silent) -> list[bytes]:
             Image.fromarray(pixels).save(picture, "WEBP", lossless=True, exact=True, quality=75)
             archive.writestr(zipfile.ZipInfo(name, _STAMP), picture.getvalue())
     return [file.getvalue()]
+
+
+def _curved(means: Float32[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
+    """sign(p) log(1 + |p|): finer steps near the middle of the scene."""
+    xyz = means.astype(np.float64)
+    return np.asarray(np.sign(xyz) * np.log1p(np.abs(xyz)))
+
+
+def _within_steps(gaussians: Gaussians, note: Note) -> Gaussians:
+    """The Gaussians without far ones that would make the steps of all positions coarse."""
+    shells, curved = shells_of(gaussians.means), _curved(gaussians.means)
+    fits = []
+    for last in np.unique(shells)[::-1]:
+        kept = shells <= last
+        step = np.ptp(curved[kept], axis=0) / 65535
+        fits.append(Fit(kept, (step * np.exp(np.abs(curved))).max(axis=1)))
+    chosen, _, error = best_fit(gaussians, fits)
+    kept = fits[chosen].kept
+    if not kept.all():
+        nearest = np.abs(gaussians.means[~kept]).max(axis=1).min()
+        note(left_out_note(".sog", kept, f"{nearest:,.4g} units or more from the origin"))
+    if error > COARSE:
+        note(
+            "A .sog rounds the positions of this model too much: export another format, or move "
+            "the model to the origin."
+        )
+    return gaussians if kept.all() else gaussians.select(kept)
 
 
 def decode(path: Path) -> Gaussians:
