@@ -115,6 +115,12 @@ class SceneSource:
     model_dir: Path | None = None  # COLMAP's, if there is one
     image_dir: Path | None = None  # that ``Image.name`` is relative to, if there is one
     transforms_path: Path | None = None  # if it was read
+    named: Path | None = None  # what the user named, which may be one model or file of several
+
+    @property
+    def again(self) -> Path:
+        """What to name to read the same again, absolute."""
+        return (self.named or self.root).resolve()
 
     @property
     def inputs(self) -> tuple[Path, ...]:

@@ -57,8 +57,6 @@ def test_binary_goes_before_text_and_text_before_ply(scene_dir, model):
     (folder / "points3D.txt").write_text(lines)
     write_ply(folder / "points3D.ply", model.points.replace(rgb=np.full((10, 3), 9, np.uint8)))
     assert load_scene(scene_dir).source.points_path.suffix == ".bin"
-    shutil.copytree(folder, scene_dir / "sparse/1")
-    assert "several models" in warnings_of(scene_dir)
     assert "undistort" in warnings_of(scene_dir)
     (folder / "points3D.bin").unlink()
     assert (load_scene(scene_dir).points.rgb == 7).all()

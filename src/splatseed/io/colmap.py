@@ -23,6 +23,7 @@ from splatseed.errors import OutputError, PointCloudError, SceneFormatError, Sce
 from splatseed.io.files import COPY_AGAIN, ByteReader, numbered_lines
 from splatseed.io.photograph import image_warnings, lens_warnings
 from splatseed.io.ply import read_ply
+from splatseed.io.point_files import first_with_points, other_points
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import NO_POINT, Image, Observations, Scene, SceneSource, Tracks
 
@@ -38,9 +39,12 @@ _MOST_MODELS = 100
 """An unknown camera model with a lower id is taken for a newer one, not for damage."""
 _RIGID_TOLERANCE = 1e-3  # of rotation @ rotation.T against the identity
 _NORM_RANGE = (1e-100, 1e100)  # inside it the square of a quaternion's norm is a normal float
+_POINT_SUFFIXES = (".bin", ".txt", ".ply")
 _COUNT = struct.Struct("<Q")
 _CAMERA = struct.Struct("<IiQQ")  # camera id, model id, width, height; then the parameters
 _POSE = struct.Struct("<I7dI")  # image id, wxyz quaternion, translation, camera id; then the name
+LEAST_IMAGE_BYTES = _POSE.size + 1 + 8
+"""Of a record in ``images.bin``: an empty name's end, and the number of features."""
 _FEATURE = np.dtype([("xy", "<f8", 2), ("point_id", "<u8")])
 _POINT = np.dtype(
     [("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("length", "<u8")]
@@ -172,7 +176,7 @@ def _binary_cameras(path: Path) -> Iterator[tuple[Any, ...]]:
 
 def _binary_images(path: Path) -> Iterator[tuple[Any, ...]]:
     reader = ByteReader(path)
-    for where in reader.records(_POSE.size + 1 + 8, "images"):
+    for where in reader.records(LEAST_IMAGE_BYTES, "images"):
         image_id, *pose, camera_id = reader.unpack(_POSE)
         name = reader.text()
         features = reader.array(_FEATURE, reader.count(_FEATURE.itemsize, "features"))
@@ -411,13 +415,32 @@ def _bad(expected: str, where: str, found: str) -> SceneFormatError:
 
 def find_model(*folders: Path) -> Path | None:
     """The first of the given folders that holds a model."""
-    return next((f for f in folders if any(_model_file(f, name) for name in _MODEL_FILES)), None)
+    return next((f for f in folders if any(model_file(f, name) for name in _MODEL_FILES)), None)
 
 
-def _model_file(model_dir: Path, name: str) -> Path | None:
-    suffixes = (".bin", ".txt", ".ply") if name == "points3D" else (".bin", ".txt")
-    candidates = (model_dir / f"{name}{suffix}" for suffix in suffixes)
+def model_file(model_dir: Path, name: str) -> Path | None:
+    """The file of a model that is read for cameras, images or points3D."""
+    if name == "points3D":
+        return first_with_points(_point_files(model_dir))
+    candidates = (model_dir / f"{name}{suffix}" for suffix in (".bin", ".txt"))
     return next((path for path in candidates if path.is_file()), None)
+
+
+def _point_files(model_dir: Path) -> list[Path]:
+    paths = (model_dir / f"points3D{suffix}" for suffix in _POINT_SUFFIXES)
+    return [path for path in paths if path.is_file()]
+
+
+def _other_points(model_dir: Path, root: Path, read: Path, points: PointCloud) -> list[str]:
+    """Notes on other files of points, from which other trainers may start."""
+    files, notes = _point_files(model_dir), list[str]()
+    for i, path in enumerate(files):
+        before = " and ".join(each.name for each in files[:i])
+        notes += other_points(read, points.xyz, path, f"move {before} out of {model_dir}")
+    place = f"copy it to {model_dir / 'points3D.ply'}"
+    if first := [each.name for each in files if each.suffix != ".ply"]:
+        place += f" and move {' and '.join(first)} out of that folder"
+    return notes + other_points(read, points.xyz, root / "init.ply", place)
 
 
 def scene_root(model_dir: Path) -> Path:
@@ -439,12 +462,11 @@ def read_colmap_scene(model_dir: Path) -> Scene:
     points, tracks, points_path = read_model_points(model_dir)
     image_dir = _image_dir(root, images)
     warnings = [*image_warnings(images, image_dir, root), *lens_warnings(images)]
-    if model_dir.name == "0" and find_model(model_dir.with_name("1")):
-        warnings.append(f"{model_dir.parent} has several models; this is {model_dir.name}.")
+    warnings += _other_points(model_dir, root, points_path, points)
     if (root / "transforms.json").is_file():
         warnings.append(f"{root / 'transforms.json'} is there too; name it to read it instead.")
     if not images and (tracks is not None or intrinsics or image_dir is not None):
-        tracks, path = None, _model_file(model_dir, "images")  # tracks name images
+        tracks, path = None, model_file(model_dir, "images")  # tracks name images
         why = f"{path} lists no images" if path else f"{model_dir} has no images.bin or images.txt"
         warnings.append(
             f"{why}, so no photograph has a pose: copy the whole model, or make one with splatseed"
@@ -468,7 +490,7 @@ def _image_dir(root: Path, images: Sequence[Image]) -> Path | None:
 
 def read_model_cameras(model_dir: Path) -> tuple[tuple[Intrinsics, ...], tuple[Image, ...]]:
     """The camera and the image records of a model."""
-    cameras_path, images_path = _model_file(model_dir, "cameras"), _model_file(model_dir, "images")
+    cameras_path, images_path = model_file(model_dir, "cameras"), model_file(model_dir, "images")
     if cameras_path is None and images_path is not None:
         expected = f"cameras.bin or cameras.txt beside {images_path}"
         raise SceneNotFoundError(expected, found="neither", fix="Copy the whole model.")
@@ -478,7 +500,7 @@ def read_model_cameras(model_dir: Path) -> tuple[tuple[Intrinsics, ...], tuple[I
 
 def read_model_points(model_dir: Path) -> tuple[PointCloud, Tracks | None, Path]:
     """The points of a model, ``points3D.ply`` if need be, their tracks if any, and their file."""
-    path = _model_file(model_dir, "points3D")
+    path = model_file(model_dir, "points3D")
     if path is None:
         return PointCloud.empty(), None, model_dir / "points3D.bin"
     return (read_ply(path), None, path) if path.suffix == ".ply" else (*read_points3d(path), path)

@@ -14,11 +14,12 @@ from pathlib import Path
 from splatseed.depthmap import DepthKind
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.io.cleaning import clean_scene, cloud_warnings
-from splatseed.io.colmap import find_model, read_colmap_scene, scene_root
+from splatseed.io.colmap import find_model, scene_root
 from splatseed.io.depth_files import KINDS, SUFFIXES
 from splatseed.io.depth_maps import DepthFiles, match_by_name
 from splatseed.io.files import is_video, odd_kind
 from splatseed.io.masks import with_own_masks
+from splatseed.io.model_choice import nested_model, read_model, scene_model
 from splatseed.io.nerfstudio import is_blender, read_blender, read_transforms_scene
 from splatseed.io.ply import read_ply, refuse_model
 from splatseed.io.rgbd import find_tum_depths, is_tum, load_rgbd, load_tum
@@ -66,6 +67,8 @@ def load_scene(path: str | Path, *, require_points: bool = True) -> Scene:
         if reader is None:
             raise _no_scene(path)
         scene = reader()
+        if scene.source is not None:
+            scene = scene.replace(source=replace(scene.source, named=path.absolute()))
     except OSError as error:  # from looking for files; reading them raises our own
         raise SceneFormatError(
             f"a scene at {path} that can be read",
@@ -115,15 +118,14 @@ def is_scene(folder: Path) -> bool:
 
 def _reader(folder: Path) -> Callable[[], Scene] | None:
     """What reads the scene of a folder, by the names in it."""
-    model = find_model(*(folder / each for each in ("sparse/0", "sparse", "", "0")))
-    if model is not None:
-        return partial(read_colmap_scene, model)
+    if (model := scene_model(folder)) is not None:
+        return partial(read_model, model)
     if (folder / _TRANSFORMS).is_file():
         return partial(read_transforms_scene, folder / _TRANSFORMS)
     if is_blender(folder):
         return partial(read_blender, folder)
-    if (nested := find_model(folder / "colmap/sparse/0")) is not None:
-        return partial(read_colmap_scene, nested)
+    if (nested := nested_model(folder)) is not None:
+        return partial(read_model, nested)
     if (folder / "traj.txt").is_file():
         return partial(load_rgbd, folder)
     return partial(load_tum, folder) if is_tum(folder) else None

@@ -31,8 +31,10 @@ from splatseed.io.colmap import (
     rigid_pose,
 )
 from splatseed.io.files import guarded, odd_kind, open_file, read_bytes, read_json
+from splatseed.io.model_choice import ranked_models
 from splatseed.io.photograph import image_warnings, lens_warnings
 from splatseed.io.ply import read_ply
+from splatseed.io.point_files import other_points
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Masks, Scene, SceneSource, Split
 from splatseed.similarity import Similarity, fit_similarity, similarity_of
@@ -282,10 +284,32 @@ def _find_points(transforms: Transforms) -> tuple[PointCloud, Path, list[str]]:
         notes.append(f"ply_file_path {named} is {odd_kind(root / named) or 'not there'}.")
     ply = next((root / name for name in names if (root / name).is_file()), None)
     if ply is not None:
-        return read_ply(ply), ply, notes
-    model_dir = find_model(root / "colmap/sparse/0", root / "sparse/0", root / "sparse")
-    if model_dir is None:
+        points = read_ply(ply)
+        for name in (*names, "init.ply"):
+            use = f"name it as ply_file_path in {transforms.path.name}"
+            notes += other_points(ply, points.xyz, root / name, use)
+        return points, ply, notes
+    models = _models(root)
+    if not models:
         return PointCloud.empty(), root / _POINT_FILES[0], notes
+    for model_dir in models[:-1]:  # the file may be of one that is not the largest
+        with suppress(SceneFormatError):
+            return _points_of_model(transforms, model_dir, notes)
+    return _points_of_model(transforms, models[-1], notes)
+
+
+def _models(root: Path) -> list[Path]:
+    """COLMAP models near a ``transforms.json``, the likeliest first."""
+    places = (root / "colmap/sparse", root / "sparse")
+    found = next(filter(None, map(ranked_models, places)), [])
+    flat = find_model(*places)
+    return found or ([flat] if flat else [])
+
+
+def _points_of_model(
+    transforms: Transforms, model_dir: Path, notes: list[str]
+) -> tuple[PointCloud, Path, list[str]]:
+    """The points of a COLMAP model, in the transforms' space."""
     points, tracks, points_path = read_model_points(model_dir)
     _, model_images = read_model_cameras(model_dir)
     transform, doubts = _transform_of_model(transforms, model_dir, model_images)

@@ -246,7 +246,7 @@ def make_config(
     points = source.points_path if source and not refine_poses else None
     return {
         "splatseed": _version("splatseed"),
-        "scene": str(source.root.resolve()) if source else None,
+        "scene": str(source.again) if source else None,
         "points": str(points.resolve()) if points else None,
         "refine_poses": refine_poses,
         "masks": mask_choice(scene),

@@ -1,0 +1,75 @@
+"""Which of several COLMAP models is read, and how the others can be."""
+
+from __future__ import annotations
+
+import shutil
+
+import pytest
+
+from splatseed.errors import SceneFormatError
+from splatseed.io import colmap, load_scene
+from splatseed.io.model_choice import count_images
+
+from .conftest import written
+
+
+@pytest.fixture
+def model_of(scene_dir, model):
+    """Writes a model of some of the images into a numbered folder."""
+
+    def write(number, count, parent="sparse"):
+        folder = scene_dir / parent / str(number)
+        folder.mkdir(parents=True, exist_ok=True)
+        few = model._replace(images=model.images[:count])
+        written(folder, few)
+        return folder
+
+    return write
+
+
+def note_of(path):
+    (note,) = [each for each in load_scene(path).warnings if "models" in each]
+    return note
+
+
+@pytest.mark.parametrize("parent", ["sparse", "colmap/sparse"])
+def test_the_model_with_most_images_is_read_and_all_are_counted(scene_dir, model_of, parent):
+    shutil.rmtree(scene_dir / "sparse")
+    for number, count in ((0, 1), (9, 3), (10, 4), (2, 4)):
+        model_of(number, count, parent)
+    scene = load_scene(scene_dir)
+    assert (scene.source.model_dir, len(scene.images)) == (scene_dir / parent / "2", 4)
+    note = note_of(scene_dir)
+    assert "0 with 1 image, 2 with 4 images, 9 with 3 images, 10 with 4 images: 2 is read" in note
+    assert f"such as {scene_dir / parent / '10'}." in note
+    named = load_scene(scene_dir / parent / "9")
+    assert (len(named.images), named.source.root) == (3, scene_dir)
+    assert named.source.again == scene_dir / parent / "9"
+    assert load_scene(scene_dir / parent).source.model_dir.name == "2"
+
+
+def test_one_model_needs_no_note_whatever_its_number(scene_dir, model_of):
+    shutil.rmtree(scene_dir / "sparse")
+    model_of(3, 2)
+    scene = load_scene(scene_dir)
+    assert len(scene.images) == 2
+    assert not any("models" in each for each in scene.warnings)
+
+
+def test_a_damaged_model_is_left_aside_unless_it_was_the_largest(scene_dir, model_of):
+    (model_of(0, 1) / "images.bin").write_bytes(b"")
+    model_of(1, 3)
+    assert len(load_scene(scene_dir).images) == 3
+    assert "0 with damaged images" in note_of(scene_dir)
+    path = model_of(0, 4) / "images.bin"
+    path.write_bytes(path.read_bytes()[:-99])  # cut short: its count says what is lost
+    with pytest.raises(SceneFormatError, match=r"sparse/0/images\.bin"):
+        load_scene(scene_dir)
+
+
+def test_images_of_text_are_counted(tmp_path):
+    text = "# 2 images\n\n1 1 0 0 0 0 0 0 1 a b.jpg\n\n2 1 0 0 0 0 0 0 1 c.jpg\n1 2 -1\n"
+    (tmp_path / "images.txt").write_text(text)
+    assert count_images(tmp_path) == 2
+    colmap.write_images(tmp_path / "images.bin", ())
+    assert count_images(tmp_path) == 0
