@@ -26,10 +26,10 @@ SOURCE = Path(splatseed.__file__).parent
 MODULES = ["splatseed"] + [m.name for m in pkgutil.walk_packages(splatseed.__path__, "splatseed.")]
 
 ORDER = (
-    "errors", "literal", "requirements", "progress", "runtime", "camera", "similarity", "lens",
-    "pointcloud", "depthmap", "scene", "scores", "io", "views", "depth", "upsample", "seeding",
-    "synthetic", "sfm", "render", "splat", "train", "gsplat", "view", "bench",
-    "console", "commands", "cli",
+    "errors", "literal", "requirements", "progress", "frozen", "runtime", "camera",
+    "similarity", "lens", "pointcloud", "depthmap", "scene", "scores", "io", "views", "depth",
+    "upsample", "seeding", "synthetic", "sfm", "render", "splat", "train", "gsplat", "view",
+    "bench", "console", "commands", "cli",
 )  # fmt: skip
 """Parts of the package: each imports only parts before it, or itself."""
 

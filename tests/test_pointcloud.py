@@ -22,6 +22,31 @@ def test_arrays_are_read_only_and_the_callers_stay_writable():
     with pytest.raises(dataclasses.FrozenInstanceError):
         cloud.xyz = xyz
     xyz[0], rgb[0] = 1, 1
+    assert not cloud.xyz.any()
+    assert not cloud.rgb.any()
+
+
+def test_what_nobody_can_write_to_is_shared_and_all_else_copied():
+    cloud = PointCloud(np.zeros((8, 3), np.float32), np.zeros((8, 3), np.uint8))
+    for other in (cloud.replace(rgb=cloud.rgb + 1), cloud.select(slice(2, 5))):
+        assert np.shares_memory(other.xyz, cloud.xyz)
+    held = np.zeros((8, 3), np.float32)
+    for given_ in (held[:], np.frombuffer(bytearray(96), np.float32).reshape(8, 3)):
+        given_.flags.writeable = False  # another array still can be written to
+        assert not np.shares_memory(PointCloud(given_, cloud.rgb).xyz, given_)
+    kept = np.frombuffer(bytes(96), np.float32).reshape(8, 3)
+    assert np.shares_memory(PointCloud(kept, cloud.rgb).xyz, kept)
+
+
+def test_clouds_are_equal_by_their_points_and_described_by_their_number(rng):
+    xyz, rgb = rng.normal(size=(5, 3)), np.zeros((5, 3), np.uint8)
+    xyz[1] = np.nan
+    cloud, same = PointCloud(xyz, rgb), PointCloud(xyz, rgb)
+    assert cloud == same
+    assert hash(cloud) == hash(same)
+    others = (cloud.select(slice(4)), cloud.replace(sizes=np.ones(5)), cloud.replace(rgb=rgb + 1))
+    assert all(cloud != other for other in (*others, "a cloud"))
+    assert repr(others[1]) == "PointCloud(5 points, 5 of them original, sizes)"
 
 
 def test_distinct_points_are_finite_and_the_first_at_their_position(rng):

@@ -7,9 +7,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from splatseed.camera import Intrinsics
+from splatseed.camera import Camera, Intrinsics
+from splatseed.depth.stereo import StereoMap
+from splatseed.depthmap import DepthMap
+from splatseed.errors import ParameterError, SceneNotFoundError
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import NO_POINT, Image, Observations, Scene, Tracks
+from splatseed.similarity import Similarity
 
 INTRINSICS = Intrinsics(1, "PINHOLE", 64, 48, (50.0, 50.0, 32.0, 24.0))
 
@@ -76,3 +80,62 @@ def test_features_of_points_that_went_belong_to_none(scene):
     np.testing.assert_array_equal(ids, [0, NO_POINT, NO_POINT, 4])
     others = scene.replace(points=scene.points.replace(xyz=scene.points.xyz + 1))
     assert (others.images[0].observations.point_ids == NO_POINT).all()
+
+
+@pytest.mark.parametrize("test_every", [0, -8, 1, 2.5])
+def test_a_split_that_leaves_nothing_to_train_on_is_refused(test_every):
+    with pytest.raises(ParameterError, match="test_every as a whole number of 2 or more"):
+        Scene(PointCloud.empty(), (_image("a.jpg"),)).split(test_every)
+
+
+def test_records_share_no_array_that_their_maker_can_change():
+    def arrays(kind, **given):
+        record = kind(**given)
+        return [(given[name], getattr(record, name)) for name in given]
+
+    rows, ids = np.ones((4, 3)), np.arange(5)
+    pose, seen = np.eye(4), np.zeros(4, np.uint32)
+    made = [
+        *arrays(Observations, xy=rows[:, :2], point_ids=ids),
+        *arrays(Tracks, point_ids=ids, xyz=rows, errors=rows[0], offsets=ids, image_ids=seen,
+                point2d_idx=seen),
+        *arrays(Camera, K=np.eye(3), cam_from_world=pose, width=4, height=4)[:2],
+        *arrays(Similarity, rotation=np.eye(3), translation=rows[0], scale=1.0)[:2],
+        *arrays(DepthMap, values=rows),
+    ]  # fmt: skip
+    image = dataclasses.replace(_image("a.jpg"), quat=pose[0])
+    for given, kept in [*made, (pose[0], image.quat)]:
+        assert given.flags.writeable
+        assert not kept.flags.writeable
+        assert not np.shares_memory(given, kept)
+        assert (given == kept).all()
+
+
+def test_a_description_is_a_line():
+    many = Observations(np.zeros((5000, 2)), np.full(5000, NO_POINT))
+    image = dataclasses.replace(_image("a.jpg"), observations=many)
+    scene = Scene(PointCloud(np.zeros((5000, 3)), np.zeros((5000, 3), np.uint8)), (image,) * 500)
+    assert repr(scene) == "Scene(made in memory: 500 images, 5,000 points)"
+    assert len(repr(image)) < 400
+
+
+def test_maps_in_memory_are_a_scenes_depths():
+    """As stereo returns them, or by name; anything else is refused at once."""
+    scene = Scene(PointCloud.empty(), (_image("a.jpg"),))
+    depth = np.array([[2.0, np.nan], [0.0, 3.0]], np.float32)
+    more = (np.zeros((2, 2, 3)), np.ones((2, 2)), (), np.zeros((2, 2), np.uint8))
+    stereo = StereoMap("a.jpg", scene.images[0].camera, depth, *more)
+    for given in ((stereo,), [stereo], {"a.jpg": depth}, {"a.jpg": DepthMap(depth)}):
+        depths = scene.replace(depths=given).depths
+        np.testing.assert_array_equal(depths.read("a.jpg").values[:, 1], depth[:, 1])
+        assert list(depths) == ["a.jpg"]
+        assert scene.replace(depths=depths).depths is depths
+        with pytest.raises(SceneNotFoundError):
+            depths.read("b.jpg")
+    for wrong in (depth, "maps", [depth], {"a.jpg": "text"}, {"a.jpg": depth[0]}):
+        with pytest.raises(ParameterError, match="depth maps by image name"):
+            scene.replace(depths=wrong)
+    bent = Intrinsics(1, "SIMPLE_RADIAL", 64, 48, (50.0, 32.0, 24.0, 0.1))
+    scene = scene.replace(images=(dataclasses.replace(scene.images[0], intrinsics=bent),))
+    with pytest.raises(ParameterError, match="without lens distortion"):
+        scene.replace(depths=(stereo,))

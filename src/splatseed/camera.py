@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 from splatseed.errors import SceneFormatError
+from splatseed.frozen import read_only
 
 
 class CameraModel(NamedTuple):
@@ -149,6 +150,10 @@ class Camera:
     width: int  # pixels
     height: int
     cam_from_world: Float64[np.ndarray, "4 4"]  # world to OpenCV camera axes
+
+    def __post_init__(self) -> None:
+        for name in ("K", "cam_from_world"):
+            object.__setattr__(self, name, read_only(getattr(self, name), np.float64))
 
     @property
     def world_from_cam(self) -> Float64[np.ndarray, "4 4"]:

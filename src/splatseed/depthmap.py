@@ -8,15 +8,16 @@ map on demand, so a scene's maps need not fit in memory.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32, Float64
 
 from splatseed.camera import Camera
-from splatseed.errors import SceneFormatError
+from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
+from splatseed.frozen import read_only
 
 DepthKind = Literal["z", "ray", "inverse"]
 """What a value is: planar depth z along the camera's axis, distance along the pixel's ray, or an
@@ -36,6 +37,9 @@ class DepthMap:
 
     values: Float32[np.ndarray, "H W"]
     kind: DepthKind = "z"  # what a value is
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "values", read_only(self.values))
 
     @property
     def width(self) -> int:
@@ -64,6 +68,7 @@ class DepthMap:
         return Camera(K, self.width, self.height, camera.cam_from_world)
 
 
+@runtime_checkable
 class DepthMaps(Protocol):
     """The depth maps of a scene, by image name."""
 
@@ -83,3 +88,57 @@ class DepthMaps(Protocol):
             SceneNotFoundError: The image has none, or its file is gone.
             SceneFormatError: The file is not what its format promises.
         """
+
+
+class HeldDepths(dict[str, DepthMap]):
+    """Depth maps in memory, by image name."""
+
+    def read(self, name: str) -> DepthMap:
+        """The map of an image."""
+        if name not in self:
+            raise SceneNotFoundError(
+                f"a depth map of {name}", found=f"maps of {len(self):,} others", fix="Add one."
+            )
+        return self[name]
+
+
+def maps_by_name(maps: Any, distorted: Collection[str] = ()) -> DepthMaps:
+    """Depth maps as a scene holds them, from these or from what a caller has in memory.
+
+    Args:
+        maps: ``DepthMaps``; a mapping from image names to a ``DepthMap`` or an array of planar
+            depth; or records with a ``name`` and planar ``depth``, as ``stereo_depths`` returns.
+        distorted: Names of images whose cameras have lens distortion. Stereo's maps are of
+            photographs without it, so they do not fit.
+
+    Raises:
+        ParameterError: ``maps`` is none of these, or stereo's of such an image.
+    """
+    if isinstance(maps, DepthMaps):
+        return maps
+    try:
+        if isinstance(maps, Mapping):
+            return HeldDepths({name: _as_map(each) for name, each in maps.items()})
+        held = HeldDepths({each.name: _as_map(each.depth) for each in maps})
+    except (AttributeError, TypeError, ValueError):
+        raise ParameterError(
+            "depth maps by image name, such as find_depths gives, or what stereo_depths returns",
+            found=type(maps).__name__,
+            fix="Pass a dict of DepthMap by image name.",
+        ) from None
+    if bent := [name for name in held if name in distorted]:
+        raise ParameterError(
+            "stereo's depth maps of images without lens distortion",
+            found=f"a lens with distortion for {bent[0]}",
+            fix="Undistort the scene first: splatseed undistort SCENE -o OUT.",
+        )
+    return held
+
+
+def _as_map(values: Any) -> DepthMap:
+    if isinstance(values, DepthMap):
+        return values
+    array = np.asarray(values, np.float32)
+    if array.ndim != 2:
+        raise ValueError
+    return DepthMap(np.where(array > 0, array, np.float32(np.nan)))

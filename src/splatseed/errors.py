@@ -4,8 +4,13 @@ Each says what was expected, what was found and how to mend it, in one line a us
 
     SplatseedError
     ├── InputError    the user's data or options
-    │   └── SceneNotFoundError, SceneFormatError, PointCloudError, ParameterError, OutputError
+    │   ├── SceneNotFoundError (FileNotFoundError), SceneFormatError, OutputError
+    │   └── PointCloudError, ParameterError (ValueError)
+    │       └── UnknownNameError (KeyError)
     └── ReconstructionError, MissingDependencyError, TaskLostError
+
+Those in parentheses are also Python's own, which callers may expect: an ``except OSError`` or
+``except ValueError`` around code that raises ours must let them pass first.
 """
 
 from __future__ import annotations
@@ -28,8 +33,12 @@ class SplatseedError(Exception):
         self.found = found
         self.fix = fix
 
+    def __str__(self) -> str:
+        """The sentence; ``KeyError`` would quote it."""
+        return str(self.args[0])
+
     def __reduce__(self) -> tuple[partial[SplatseedError], tuple[str]]:
-        """How it is carried from one process to another."""
+        """Makes errors with keyword-only arguments picklable."""
         return partial(type(self), found=self.found, fix=self.fix), (self.expected,)
 
 
@@ -37,7 +46,7 @@ class InputError(SplatseedError):
     """The user's data or options are at fault."""
 
 
-class SceneNotFoundError(InputError):
+class SceneNotFoundError(InputError, FileNotFoundError):
     """There is no scene, model, image or file where one was named."""
 
 
@@ -45,12 +54,16 @@ class SceneFormatError(InputError):
     """A file is there but is not what its format promises."""
 
 
-class PointCloudError(InputError):
+class PointCloudError(InputError, ValueError):
     """Point arrays of the wrong shape or type, or too few usable points."""
 
 
-class ParameterError(InputError):
+class ParameterError(InputError, ValueError):
     """An option or a method's parameter is out of its range."""
+
+
+class UnknownNameError(ParameterError, KeyError):
+    """There is nothing of that name to choose."""
 
 
 class OutputError(InputError):

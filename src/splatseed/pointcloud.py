@@ -3,8 +3,8 @@
 Notation: N points; ``xyz`` in scene units and the scene's world frame; ``rgb`` 8-bit sRGB as stored
 by COLMAP; ``source`` is 0 for an original point, otherwise the code of the method that made it.
 The *attributes* normals, sizes and confidence are optional, and NaN where unknown for a point.
-Promise: arrays have the shapes and dtypes below and are read-only; methods return new clouds, in
-which every point keeps all its attributes.
+Promise: arrays have the shapes and dtypes below, are read-only, and change with no array of the
+caller's; methods return new clouds, in which every point keeps all its attributes.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from splatseed.errors import PointCloudError
+from splatseed.frozen import read_only
 from splatseed.literal import visible
 
 ORIGINAL = 0
@@ -83,14 +84,31 @@ class PointCloud:
             ("rgb", rgb, np.uint8),
             ("source", source, np.uint8),
         ):
-            object.__setattr__(self, name, _read_only(array, dtype))
+            object.__setattr__(self, name, read_only(array, dtype))
         for name, value in self.attributes.items():
             values = np.asarray(value)
             _check_attribute(name, values, len(xyz))
-            object.__setattr__(self, name, _read_only(values, np.float32))
+            object.__setattr__(self, name, read_only(values, np.float32))
 
     def __len__(self) -> int:
         return len(self.xyz)
+
+    def __repr__(self) -> str:
+        known = "".join(f", {name}" for name in self.attributes)
+        return f"PointCloud({len(self):,} points, {self.num_original:,} of them original{known})"
+
+    def __eq__(self, other: object) -> bool:
+        """Whether two clouds have the same points, in the same order, with the same attributes."""
+        if not isinstance(other, PointCloud):
+            return NotImplemented
+        own, others = self._arrays, other._arrays
+        return own.keys() == others.keys() and all(
+            values is others[name] or np.array_equal(values, others[name], equal_nan=True)
+            for name, values in own.items()
+        )
+
+    def __hash__(self) -> int:
+        return hash((PointCloud, len(self)))
 
     @staticmethod
     def empty() -> PointCloud:
@@ -102,6 +120,10 @@ class PointCloud:
         """The ``ATTRIBUTES`` that the cloud has, by name."""
         values = {name: getattr(self, name) for name in ATTRIBUTES}
         return {name: value for name, value in values.items() if value is not None}
+
+    @property
+    def _arrays(self) -> dict[str, np.ndarray]:
+        return {"xyz": self.xyz, "rgb": self.rgb, "source": self.source, **self.attributes}
 
     @property
     def num_original(self) -> int:
@@ -133,8 +155,8 @@ class PointCloud:
 
     def select(self, which: Bool[np.ndarray, " N"] | Int[np.ndarray, " M"] | slice) -> PointCloud:
         """The points at ``which`` (a mask, indices or a slice), in that order."""
-        chosen = {name: values[which] for name, values in self.attributes.items()}
-        return PointCloud(self.xyz[which], self.rgb[which], self.source[which], **chosen)
+        chosen = {name: _unwritable(values[which]) for name, values in self._arrays.items()}
+        return PointCloud(**chosen)
 
     def replace(self, **changes: np.ndarray | None) -> PointCloud:
         """A copy with some of its arrays replaced; None removes an attribute."""
@@ -145,18 +167,17 @@ class PointCloud:
         """The clouds one after another; attributes that one lacks and another has become NaN."""
         known = [name for name in ATTRIBUTES if any(name in c.attributes for c in clouds)]
         return PointCloud(
-            np.concatenate([c.xyz for c in clouds]),
-            np.concatenate([c.rgb for c in clouds]),
-            np.concatenate([c.source for c in clouds]),
-            **{name: _joined(clouds, name) for name in known},
+            _unwritable(np.concatenate([c.xyz for c in clouds])),
+            _unwritable(np.concatenate([c.rgb for c in clouds])),
+            _unwritable(np.concatenate([c.source for c in clouds])),
+            **{name: _unwritable(_joined(clouds, name)) for name in known},
         )
 
 
-def _read_only(array: np.ndarray, dtype: type) -> np.ndarray:
-    """A contiguous read-only view of ``array``; the caller's own array stays writable."""
-    view: np.ndarray = np.ascontiguousarray(array, dtype=dtype).view()
-    view.flags.writeable = False
-    return view
+def _unwritable(array: np.ndarray) -> np.ndarray:
+    """An array that only we hold, which a cloud need not copy once it is read-only."""
+    array.flags.writeable = False
+    return array
 
 
 def _joined(clouds: Sequence[PointCloud], name: str) -> Float32[np.ndarray, "N ..."]:

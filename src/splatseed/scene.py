@@ -18,7 +18,9 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt32, UInt64
 
 from splatseed.camera import Camera, Intrinsics, rotation_from_quat
-from splatseed.depthmap import DepthMaps
+from splatseed.depthmap import DepthMaps, maps_by_name
+from splatseed.errors import ParameterError
+from splatseed.frozen import read_only
 from splatseed.pointcloud import ORIGINAL, PointCloud
 
 NO_POINT = -1
@@ -34,8 +36,15 @@ class Observations:
     xy: Float64[np.ndarray, "M 2"]  # pixel coordinates
     point_ids: Int64[np.ndarray, " M"]  # of the 3D point each belongs to; ``NO_POINT`` = none
 
+    def __post_init__(self) -> None:
+        _freeze(self, "xy", "point_ids")
+
     def __len__(self) -> int:
         return len(self.point_ids)
+
+    def __repr__(self) -> str:
+        belong = np.count_nonzero(self.point_ids != NO_POINT)
+        return f"Observations({len(self):,} features, {belong:,} of them of points)"
 
     def without(self, point_ids: Int64[np.ndarray, " P"] | None) -> Observations:
         """The same features, of which those of some points, or of all, belong to none."""
@@ -57,6 +66,9 @@ class Image:
     quat: Float64[np.ndarray, " 4"]  # wxyz rotation of ``cam_from_world``, as in the file
     translation: Float64[np.ndarray, " 3"]  # of ``cam_from_world``
     observations: Observations | None = None  # None where the format has none
+
+    def __post_init__(self) -> None:
+        _freeze(self, "quat", "translation")
 
     @cached_property
     def camera(self) -> Camera:
@@ -84,8 +96,14 @@ class Tracks:
     image_ids: UInt32[np.ndarray, " T"]
     point2d_idx: UInt32[np.ndarray, " T"]
 
+    def __post_init__(self) -> None:
+        _freeze(self, "point_ids", "xyz", "errors", "offsets", "image_ids", "point2d_idx")
+
     def __len__(self) -> int:
         return len(self.point_ids)
+
+    def __repr__(self) -> str:
+        return f"Tracks({len(self):,} points, {len(self.image_ids):,} observations)"
 
     @property
     def lengths(self) -> Int64[np.ndarray, " N"]:
@@ -182,8 +200,20 @@ class Scene:
     left_out: LeftOut = field(default_factory=LeftOut)  # how many points of its files were
     masks: Masks | None = None  # which pixels of its photographs do not count; None: all count
 
+    def __post_init__(self) -> None:
+        if self.depths is not None:
+            distorted = {im.name for im in self.images if im.intrinsics.has_distortion}
+            object.__setattr__(self, "depths", maps_by_name(self.depths, distorted))
+
+    def __repr__(self) -> str:
+        where = f"{self.source.root}, {self.source.format}" if self.source else "made in memory"
+        maps = "" if self.depths is None else f", {len(self.depths):,} depth maps"
+        return f"Scene({where}: {len(self.images):,} images, {len(self.points):,} points{maps})"
+
     def replace(self, **changes: Any) -> Scene:
         """A copy with some fields replaced.
+
+        As ``depths`` also what ``stereo_depths`` returns, and a dict of maps by name, will do.
 
         When ``points`` are replaced and ``tracks`` are not, the originals among the new points
         keep their tracks if they stand first and in the same order, as ``upsample`` puts them.
@@ -215,7 +245,17 @@ class Scene:
         return folder is not None and any((folder / each.name).is_file() for each in self.images)
 
     def split(self, test_every: int = 8) -> tuple[tuple[Image, ...], tuple[Image, ...]]:
-        """Training and test images by name: as listed, else every ``test_every``-th is tested."""
+        """Training and test images by name: as listed, else every ``test_every``-th is tested.
+
+        Raises:
+            ParameterError: ``test_every`` is no whole number of 2 or more, which leaves both some.
+        """
+        if not isinstance(test_every, (int, np.integer)) or test_every < 2:
+            raise ParameterError(
+                "test_every as a whole number of 2 or more",
+                found=repr(test_every),
+                fix="With 8, every 8th image is kept for testing.",
+            )
         ordered = sorted(self.images, key=lambda image: image.name)
         if self.listed is not None:
             parts = (self.listed.train, self.listed.test)
@@ -223,6 +263,12 @@ class Scene:
             return train, test
         train = tuple(image for i, image in enumerate(ordered) if i % test_every)
         return train, tuple(ordered[::test_every])
+
+
+def _freeze(record: object, *names: str) -> None:
+    """Let a frozen record have arrays that nobody else can change."""
+    for name in names:
+        object.__setattr__(record, name, read_only(getattr(record, name)))
 
 
 def _without(image: Image, point_ids: Int64[np.ndarray, " P"] | None) -> Image:

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float64
 
+from splatseed.frozen import read_only
+
 _TOLERANCE = 1e-3
 """Largest deviation of rotation @ rotation.T from the identity."""
 
@@ -22,6 +24,10 @@ class Similarity:
     scale: float  # above 0
     rotation: Float64[np.ndarray, "3 3"]
     translation: Float64[np.ndarray, " 3"]  # in the target's units
+
+    def __post_init__(self) -> None:
+        for name in ("rotation", "translation"):
+            object.__setattr__(self, name, read_only(getattr(self, name)))
 
     def points(self, xyz: Float[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
         """Points of the source in the target."""

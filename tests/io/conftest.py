@@ -44,8 +44,9 @@ def model(rng) -> Model:
     images = []
     for i, (image_id, slot) in enumerate(zip(image_ids.tolist(), slots, strict=True)):
         name, lens = f"left/image{i:03d}.jpg", intrinsics[i % 2]
-        seen = Observations(640 * rng.random((12, 2)), np.full(12, -1))
-        seen.point_ids[slot] = point_ids
+        ids = np.full(12, -1)
+        ids[slot] = point_ids
+        seen = Observations(640 * rng.random((12, 2)), ids)
         quat, translation = rng.normal(size=4), rng.normal(size=3)
         quat /= np.linalg.norm(quat)
         images.append(Image(name, image_id, lens, quat, translation, seen))

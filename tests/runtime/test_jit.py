@@ -6,6 +6,7 @@ from __future__ import annotations
 import importlib
 import os
 import pickle
+import subprocess
 import sys
 
 import numba
@@ -97,3 +98,51 @@ def test_a_kernel_reaches_what_compiles_it_and_the_lanes_that_it_uses():
     assert "splatseed.cli" not in reached
     for name in ("jit", "compilation", "simd", "shuffles"):
         assert f"splatseed.runtime.{name}" in reached
+
+
+AT_ONCE = """
+import os, sys, threading
+import numba, numpy as np
+from splatseed.runtime.jit import kernel, parallel_range
+
+@kernel
+def add_one(x):
+    for i in parallel_range(len(x)):
+        x[i] += 1.0
+
+def call_often():
+    x = np.zeros(1000)
+    for _ in range(300):
+        add_one(x)
+    assert (x == 300).all()
+
+def run(number):
+    threads = [threading.Thread(target=call_often) for _ in range(number)]
+    [each.start() for each in threads]
+    if hasattr(os, "fork") and os.environ["NUMBA_THREADING_LAYER"] == "workqueue":
+        child = os.fork()  # while others are in kernels
+        if child == 0:
+            call_often()
+            os._exit(0)
+        assert os.waitpid(child, 0)[1] == 0
+    [each.join() for each in threads]
+
+run(3)
+add_one(np.zeros(1))
+print(numba.threading_layer(), type(add_one).__name__)
+"""
+
+
+@pytest.mark.parametrize(
+    ("layer", "called"), [("workqueue", "_OneAtATime"), ("omp", "CPUDispatcher")]
+)
+def test_python_threads_may_call_kernels_at_once(tmp_path, layer, called):
+    """Numba's workqueue layer ends the process by itself; the lock costs other layers nothing."""
+    (tmp_path / "at_once.py").write_text(AT_ONCE)
+    environment = {**os.environ, "NUMBA_THREADING_LAYER": layer, "NUMBA_NUM_THREADS": "2"}
+    command = [sys.executable, "-W", "ignore", str(tmp_path / "at_once.py")]
+    run = subprocess.run(
+        command, env=environment, capture_output=True, text=True, timeout=60, check=False
+    )
+    assert run.returncode == 0, run.stderr
+    assert run.stdout.split() == [layer, called]

@@ -17,7 +17,7 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 from splatseed.bench.plan import SHARED, Plan
 from splatseed.bench.scenes import DEMO, PlannedScene
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
-from splatseed.io.files import read_text
+from splatseed.io.files import StrPath, read_text
 from splatseed.train.settings import TrainSettings
 from splatseed.upsample.method import describe_type, fits
 
@@ -39,13 +39,14 @@ KINDS: Mapping[str, Any] = {
 """The type of each key of a plan: those of ``Plan``, except that ``training`` is flat."""
 
 
-def read_plan(path: Path, folder: Path | None = None) -> Plan:
+def read_plan(path: StrPath, folder: Path | None = None) -> Plan:
     """Read a plan; its paths are relative to a folder, the file's own when left out.
 
     Raises:
         SceneNotFoundError: There is no such file.
         SceneFormatError: It is no TOML, or a key or a value is not one of a plan.
     """
+    path = Path(path)
     content = _read_toml(path)
     _check(path, content, KINDS)
     methods = content.get("parameters", {})

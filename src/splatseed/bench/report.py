@@ -32,7 +32,7 @@ from splatseed.bench.plan_file import PLAN
 from splatseed.bench.runs import Run, counts, read_calls, read_runs
 from splatseed.bench.study import Study, studies
 from splatseed.bench.tables import Number, Table, to_html, write_table
-from splatseed.io.files import read_text
+from splatseed.io.files import StrPath, read_text
 from splatseed.io.staging import atomic_file, output_folder
 from splatseed.literal import counted
 from splatseed.progress import Progress, silent
@@ -64,13 +64,14 @@ class Report:
     notes: tuple[str, ...]
 
 
-def write_report(bench: Path, progress: Progress = silent) -> Report:
+def write_report(bench: StrPath, progress: Progress = silent) -> Report:
     """Write the report of a benchmark into its folder.
 
     Raises:
         SceneNotFoundError: There is no benchmark.
         OutputError: A file cannot be written.
     """
+    bench = Path(bench)
     runs = read_runs(bench)
     found, page, notes = studies(runs), _Page(), dict[str, None]()
     said, summary, several = list[str](), list[Part](), len(found) > 1

@@ -23,7 +23,7 @@ from typing import Any
 
 from splatseed.bench.plan import RunResult, RunSpec
 from splatseed.errors import OutputError, SceneFormatError, SceneNotFoundError
-from splatseed.io.files import read_text
+from splatseed.io.files import StrPath, read_text
 from splatseed.io.staging import (
     MANIFEST,
     check_apart,
@@ -93,13 +93,14 @@ def _planned_runs(bench: Path) -> list[RunSpec]:
         raise _not_ours(bench / _PLANNED, error, fix) from None
 
 
-def read_runs(bench: Path) -> list[Run]:
+def read_runs(bench: StrPath) -> list[Run]:
     """All runs of a benchmark: those of the last plan, in its order, then others that are finished.
 
     Raises:
         SceneNotFoundError: There is no benchmark.
         SceneFormatError: A file is not of the layout that this version writes.
     """
+    bench = Path(bench)
     kind = read_manifest(bench).get("command")
     if kind != "bench":
         fix = "Name the folder that splatseed bench wrote."

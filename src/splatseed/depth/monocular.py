@@ -29,6 +29,7 @@ from splatseed import errors
 from splatseed.depthmap import DepthKind
 from splatseed.io import photograph
 from splatseed.io.depth_maps import depth_folder
+from splatseed.io.files import StrPath
 from splatseed.literal import quoted
 from splatseed.progress import Progress, silent
 from splatseed.requirements import require
@@ -70,7 +71,7 @@ class DepthReport(NamedTuple):
 def estimate_depths(
     scene: Scene,
     network: DepthNetwork,
-    output: Path,
+    output: StrPath,
     *,
     max_size: int = 1600,
     overwrite: bool = False,
@@ -89,6 +90,7 @@ def estimate_depths(
             ratio.
         OutputError: The folder cannot be written.
     """
+    output = Path(output)
     folder, kind, flat = photograph.photograph_folder(scene), network.meaning.kind, []
     protect = (folder,) if scene.source is None else scene.source.inputs
     with depth_folder(

@@ -20,7 +20,7 @@ from jaxtyping import Float64, Int64, UInt8
 
 from splatseed.camera import CAMERA_MODELS, PANORAMA, Intrinsics, quat_from_rotation
 from splatseed.errors import OutputError, PointCloudError, SceneFormatError, SceneNotFoundError
-from splatseed.io.files import COPY_AGAIN, ByteReader, numbered_lines
+from splatseed.io.files import COPY_AGAIN, ByteReader, StrPath, numbered_lines
 from splatseed.io.photograph import image_warnings, lens_warnings
 from splatseed.io.ply import read_ply
 from splatseed.io.point_files import first_with_points, other_points
@@ -58,8 +58,9 @@ _Points: TypeAlias = tuple[UInt8[np.ndarray, "N 3"], Tracks, Callable[[int], str
 """Colours, all else, and the place of point i in the file."""
 
 
-def read_cameras(path: Path) -> tuple[Intrinsics, ...]:
+def read_cameras(path: StrPath) -> tuple[Intrinsics, ...]:
     """The camera records of a ``cameras.bin`` or ``cameras.txt``, in file order."""
+    path = Path(path)
     cameras: dict[int, Intrinsics] = {}
     for where, camera_id, *record in (_text_cameras if path.suffix == ".txt" else _binary_cameras)(
         path
@@ -88,8 +89,9 @@ def make_intrinsics(
     return camera
 
 
-def read_images(path: Path, intrinsics: Sequence[Intrinsics]) -> tuple[Image, ...]:
+def read_images(path: StrPath, intrinsics: Sequence[Intrinsics]) -> tuple[Image, ...]:
     """The image records of an ``images.bin`` or ``images.txt``, in file order."""
+    path = Path(path)
     cameras = {camera.camera_id: camera for camera in intrinsics}
     images: dict[int, Image] = {}
     names: set[str] = set()
@@ -116,11 +118,12 @@ def read_images(path: Path, intrinsics: Sequence[Intrinsics]) -> tuple[Image, ..
     return tuple(images.values())
 
 
-def read_points3d(path: Path) -> tuple[PointCloud, Tracks]:
+def read_points3d(path: StrPath) -> tuple[PointCloud, Tracks]:
     """The points of a ``points3D.bin`` or ``points3D.txt`` in file order, and their tracks.
 
     Nothing is repaired; what is beyond float32 is infinite in the cloud, to be seen and dropped.
     """
+    path = Path(path)
     rgb, tracks, place = (_text_points if path.suffix == ".txt" else _binary_points)(path)
     ids = tracks.point_ids
     if (ids < 0).any():
@@ -238,8 +241,9 @@ def _pair_offsets(starts: Int64[np.ndarray, " N+1"]) -> Int64[np.ndarray, " T"]:
     return offsets
 
 
-def write_cameras(path: Path, intrinsics: Sequence[Intrinsics]) -> None:
+def write_cameras(path: StrPath, intrinsics: Sequence[Intrinsics]) -> None:
     """Write a ``cameras.bin``."""
+    path = Path(path)
     with path.open("wb") as file:
         file.write(_COUNT.pack(len(intrinsics)))
         for camera in intrinsics:
@@ -249,8 +253,9 @@ def write_cameras(path: Path, intrinsics: Sequence[Intrinsics]) -> None:
             file.write(np.array(camera.params, "<f8").tobytes())
 
 
-def write_images(path: Path, images: Sequence[Image]) -> None:
+def write_images(path: StrPath, images: Sequence[Image]) -> None:
     """Write an ``images.bin``; images without observations get zero features."""
+    path = Path(path)
     with path.open("wb") as file:
         file.write(_COUNT.pack(len(images)))
         for image in images:
@@ -279,11 +284,12 @@ def _pack(layout: struct.Struct, where: str, *values: float) -> bytes:
         ) from None
 
 
-def write_points3d(path: Path, points: PointCloud, tracks: Tracks | None) -> None:
+def write_points3d(path: StrPath, points: PointCloud, tracks: Tracks | None) -> None:
     """Write a ``points3D.bin``; tracks belong to the first points.
 
     The others get the ids that follow the largest, error -1 (COLMAP's "unknown") and no track.
     """
+    path = Path(path)
     check_tracks(points, tracks)
     known = len(tracks) if tracks is not None else 0
     heads = np.zeros(len(points), _POINT)
@@ -455,8 +461,9 @@ def scene_root(model_dir: Path) -> Path:
     return named.parents[levels - 1]
 
 
-def read_colmap_scene(model_dir: Path) -> Scene:
+def read_colmap_scene(model_dir: StrPath) -> Scene:
     """The scene of a model: its images, its points, and warnings for the user."""
+    model_dir = Path(model_dir)
     root = scene_root(model_dir)
     intrinsics, images = read_model_cameras(model_dir)
     points, tracks, points_path = read_model_points(model_dir)

@@ -24,6 +24,7 @@ from splatseed.errors import OutputError, ParameterError, SceneFormatError
 from splatseed.io import colmap, photograph
 from splatseed.io.cleaning import clean_scene, renumber
 from splatseed.io.depth_maps import depth_folder, safe_parts
+from splatseed.io.files import StrPath
 from splatseed.io.staging import MANIFEST, output_folder, write_json
 from splatseed.io.write import bring, image_folders
 from splatseed.lens import rays_through
@@ -75,7 +76,7 @@ class DenseReport:
 def write_dense_maps(
     scene: Scene,
     maps: Iterable[DenseMap],
-    path: str | Path,
+    path: StrPath,
     *,
     overwrite: bool = False,
     provenance: Mapping[str, object] | None = None,
@@ -122,7 +123,7 @@ def write_dense_maps(
 def write_dense_workspace(  # noqa: D417  (the rest is as for maps)
     scene: Scene,
     maps: Iterable[DenseMap],
-    path: str | Path,
+    path: StrPath,
     *,
     overwrite: bool = False,
     copy_images: bool = False,

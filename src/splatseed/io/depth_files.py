@@ -19,7 +19,7 @@ from typing import Any, NamedTuple, get_args
 import numpy as np
 
 from splatseed.depthmap import DepthKind
-from splatseed.io.files import guarded, read_bytes, read_npy
+from splatseed.io.files import StrPath, guarded, read_bytes, read_npy
 from splatseed.literal import beginning
 from splatseed.requirements import require
 
@@ -46,7 +46,7 @@ class StoredDepth(NamedTuple):
     kind: DepthKind | None = None
 
 
-def read_stored(path: Path) -> StoredDepth:
+def read_stored(path: StrPath) -> StoredDepth:
     """Read a depth map; its suffix, one of ``SUFFIXES``, tells the format.
 
     ``.npy``: an array [H, W], or with an axis of length 1 before or after. ``.npz``: the array
@@ -56,6 +56,7 @@ def read_stored(path: Path) -> StoredDepth:
     then float32 rows (mvs/mat.h). PNG of 8 or 16 bits, TIFF of 8, 16 or 32 bits or floats.
     OpenEXR: the channel Z, else depth, D, Y, V or R, else the only one.
     """
+    path = Path(path)
     data, kind = read_bytes(path), None
     with guarded(path, "a depth map"):
         suffix = path.suffix.lower()

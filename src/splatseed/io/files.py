@@ -30,6 +30,9 @@ from splatseed.errors import SceneFormatError, SceneNotFoundError, SplatseedErro
 from splatseed.literal import beginning, describe_error
 from splatseed.runtime.memory import free_memory
 
+StrPath = str | os.PathLike[str]
+"""A path, as functions that read or write files take it."""
+
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".mts", ".3gp"})
 COPY_AGAIN = "Copy the file again, or export it again."
 ARCHIVE_FAILURES = (
@@ -134,6 +137,8 @@ def readable(path: Path) -> Iterator[None]:
     """
     try:
         yield
+    except SplatseedError:
+        raise
     except (FileNotFoundError, NotADirectoryError):
         raise SceneNotFoundError(f"a file at {path}", found="none", fix="Check the path.") from None
     except OSError as error:

@@ -12,12 +12,12 @@ from functools import partial
 from pathlib import Path
 
 from splatseed.depthmap import DepthKind
-from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
+from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError, SplatseedError
 from splatseed.io.cleaning import clean_scene, cloud_warnings
 from splatseed.io.colmap import find_model, scene_root
 from splatseed.io.depth_files import KINDS, SUFFIXES
 from splatseed.io.depth_maps import DepthFiles, match_by_name
-from splatseed.io.files import is_video, odd_kind
+from splatseed.io.files import StrPath, is_video, odd_kind
 from splatseed.io.masks import with_own_masks
 from splatseed.io.model_choice import nested_model, read_model, scene_model
 from splatseed.io.nerfstudio import is_blender, read_blender, read_transforms_scene
@@ -39,7 +39,7 @@ _TRIANGULATE = (
 )
 
 
-def load_scene(path: str | Path, *, require_points: bool = True) -> Scene:
+def load_scene(path: StrPath, *, require_points: bool = True) -> Scene:
     """Read a scene.
 
     Args:
@@ -69,6 +69,8 @@ def load_scene(path: str | Path, *, require_points: bool = True) -> Scene:
         scene = reader()
         if scene.source is not None:
             scene = scene.replace(source=replace(scene.source, named=path.absolute()))
+    except SplatseedError:
+        raise
     except OSError as error:  # from looking for files; reading them raises our own
         raise SceneFormatError(
             f"a scene at {path} that can be read",
@@ -83,11 +85,12 @@ def load_scene(path: str | Path, *, require_points: bool = True) -> Scene:
     return scene.replace(warnings=(*scene.warnings, *cloud_warnings(scene.points)))
 
 
-def load_originals(path: str | Path, *, require_points: bool = True) -> Scene:
+def load_originals(path: StrPath, *, require_points: bool = True) -> Scene:
     """As ``load_scene``, without the points that splatseed added before, of which a warning tells.
 
     If no originals remain, it is a ``SceneNotFoundError``, too.
     """
+    path = Path(path)
     scene = load_scene(path, require_points=require_points)
     points = scene.points.originals
     added = len(scene.points) - len(points)
@@ -111,8 +114,9 @@ def check_there(path: Path) -> None:
         raise SceneNotFoundError(f"a scene at {path}", found=found, fix="Check the path.")
 
 
-def is_scene(folder: Path) -> bool:
+def is_scene(folder: StrPath) -> bool:
     """Whether a folder looks like a scene, by the names in it."""
+    folder = Path(folder)
     return _reader(folder) is not None
 
 
@@ -199,7 +203,7 @@ def _is_run(path: Path) -> SceneNotFoundError:
 
 
 def find_depths(
-    scene: Scene, path: Path, *, kind: DepthKind | None = None, scale: float | None = None
+    scene: Scene, path: StrPath, *, kind: DepthKind | None = None, scale: float | None = None
 ) -> DepthFiles:
     """The depth maps in a folder that belong to images of a scene, read one by one on demand.
 

@@ -30,7 +30,7 @@ from splatseed.io.colmap import (
     read_model_points,
     rigid_pose,
 )
-from splatseed.io.files import guarded, odd_kind, open_file, read_bytes, read_json
+from splatseed.io.files import StrPath, guarded, odd_kind, open_file, read_bytes, read_json
 from splatseed.io.model_choice import ranked_models
 from splatseed.io.photograph import image_warnings, lens_warnings
 from splatseed.io.ply import read_ply
@@ -71,8 +71,9 @@ class Transforms:
     warnings: tuple[str, ...]
 
 
-def read_transforms_scene(path: Path) -> Scene:
+def read_transforms_scene(path: StrPath) -> Scene:
     """Read a ``transforms.json`` and the points that belong to it; the cloud may be empty."""
+    path = Path(path)
     transforms = read_transforms(path)
     points, points_path, notes = _find_points(transforms)
     images, folder = transforms.images, transforms.image_dir
@@ -98,12 +99,13 @@ def is_blender(folder: Path) -> bool:
     return all((folder / name).is_file() for name in _BLENDER)
 
 
-def read_blender(folder: Path) -> Scene:
+def read_blender(folder: StrPath) -> Scene:
     """Read both files as one scene, whose split is theirs, and the points in their space.
 
     Images are named with their folders (``train/r_0.png``); those of ``transforms_val.json`` are
     left out.
     """
+    folder = Path(folder)
     parts = [read_transforms(folder / name) for name in _BLENDER]
     cameras: dict[tuple[object, ...], Intrinsics] = {}
     images: list[Image] = []
@@ -366,12 +368,13 @@ def _same_cameras(
     return []
 
 
-def read_cloud_transform(path: Path, scene: Scene) -> Similarity:
+def read_cloud_transform(path: StrPath, scene: Scene) -> Similarity:
     """The transform from a cloud's frame to the scene's; a ``SceneFormatError`` if it is none.
 
     Nerfstudio's file leads from the scene to the world that it trains and exports in, so a cloud
     from there goes the other way.
     """
+    path = Path(path)
     with suppress(ValueError):  # not plain numbers
         rows = np.loadtxt(read_bytes(path).decode("utf-8").splitlines(), np.float64, ndmin=2)
         return similarity_in(path, rows.tolist(), scene, _MATRIX_FIX)

@@ -18,7 +18,7 @@ from jaxtyping import Float32, UInt8
 
 from splatseed.errors import SceneFormatError
 from splatseed.io.cloud_file import RGB, XYZ, CloudFile, LineCloud, RowCloud
-from splatseed.io.files import check_room, open_file, readable
+from splatseed.io.files import StrPath, check_room, open_file, readable
 from splatseed.literal import beginning
 from splatseed.pointcloud import PointCloud
 
@@ -133,7 +133,7 @@ def open_ply(path: Path) -> CloudFile:
     return LineCloud(path, names, header.size, vertex.num_rows, types=whole)
 
 
-def read_ply(path: Path) -> PointCloud:
+def read_ply(path: StrPath) -> PointCloud:
     """The vertices of a PLY file as a cloud; nothing is repaired.
 
     Colours that are not a number are mid grey, and so are all without colours.
@@ -143,6 +143,7 @@ def read_ply(path: Path) -> PointCloud:
         SceneFormatError: It is malformed, shorter than its header promises or larger than the free
             memory, or has no vertices with x, y, z.
     """
+    path = Path(path)
     with readable(path):
         cloud = open_ply(path)
         check_room(path, path.stat().st_size)
@@ -152,8 +153,9 @@ def read_ply(path: Path) -> PointCloud:
     return PointCloud(xyz, np.full(xyz.shape, _GREY, np.uint8) if whole.rgb is None else whole.rgb)
 
 
-def write_ply(path: Path, points: PointCloud) -> None:
+def write_ply(path: StrPath, points: PointCloud) -> None:
     """Write binary float32 x, y, z and zero normals, uchar red, green, blue; nothing else."""
+    path = Path(path)
     with path.open("wb") as file:
         file.write(ply_header(len(points)))
         file.write(ply_rows(points.xyz, points.rgb))

@@ -21,7 +21,7 @@ from splatseed.camera import Intrinsics, rotation_from_quat
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io import depth_maps
 from splatseed.io.colmap import make_intrinsics, rigid_pose
-from splatseed.io.files import guarded, numbered_lines, open_file, read_json
+from splatseed.io.files import StrPath, guarded, numbered_lines, open_file, read_json
 from splatseed.io.photograph import lens_warnings
 from splatseed.literal import agreeing, counted
 from splatseed.pointcloud import PointCloud
@@ -45,8 +45,9 @@ them (the images of freiburg3 are undistorted already). The first pixel's centre
 _DEFAULT_CAMERA = (525.0, 525.0, 319.5, 239.5)  # ROS's, which that page gives too
 
 
-def load_rgbd(root: Path) -> Scene:
+def load_rgbd(root: StrPath) -> Scene:
     """Read images, poses and depth maps in Replica's layout; frames without a pose are left out."""
+    root = Path(root)
     folder, track = root / "results", root / "traj.txt"
     listed = folder.iterdir() if folder.is_dir() else ()
     there = [(int(m[1]), p.name, p) for p in listed if (m := _FRAME.fullmatch(p.name))]
@@ -96,12 +97,13 @@ def is_tum(root: Path) -> bool:
     return (root / "rgb.txt").is_file() and (root / "groundtruth.txt").is_file()
 
 
-def load_tum(root: Path) -> Scene:
+def load_tum(root: StrPath) -> Scene:
     """Read images, poses and depth maps in TUM's layout.
 
     A pose is interpolated between the records before and after the image if both are near, else it
     is the nearest record's. Images without a pose or a file are left out with a warning.
     """
+    root = Path(root)
     track = root / "groundtruth.txt"
     times, names = _read_list(root / "rgb.txt")
     intrinsics, guessed = _tum_camera(root)

@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from splatseed.errors import OutputError
+from splatseed.errors import OutputError, SplatseedError
 from splatseed.io.files import read_text
 
 try:
@@ -205,6 +205,8 @@ def oserror_as_output_error(target: Path) -> Iterator[None]:
     """Let an ``OSError`` in the block become an ``OutputError`` that says what to do."""
     try:
         yield
+    except SplatseedError:
+        raise
     except OSError as error:
         fix = _FIXES.get(error.errno or 0, "Check the disk and try again.")
         where = f" at {error.filename}" if error.filename else ""

@@ -27,7 +27,7 @@ from splatseed.camera import CAMERA_MODELS, Intrinsics
 from splatseed.errors import OutputError, PointCloudError
 from splatseed.io import colmap, nerfstudio
 from splatseed.io.cleaning import clean_scene, renumber
-from splatseed.io.files import open_file
+from splatseed.io.files import StrPath, open_file
 from splatseed.io.masks import FOLDER as MASKS, find_masks, write_masks
 from splatseed.io.ply import write_ply
 from splatseed.io.seeds import write_seeds
@@ -78,7 +78,7 @@ class WriteReport:
 
 def write_scene(
     scene: Scene,
-    path: str | Path,
+    path: StrPath,
     *,
     format: Literal["auto", "colmap", "transforms"] = "auto",  # noqa: A002  (the user's word)
     overwrite: bool = False,

@@ -4,6 +4,9 @@ Promise: a kernel divides by zero as NumPy does (Numba's Python semantics turn i
 inside ``prange``), releases the GIL, and never reorders floating-point sums, so its bytes do not
 depend on the number of threads or on the cache. Of several processes that want it, one compiles it.
 
+Numba's workqueue layer, the only one where there is neither OpenMP nor TBB, ends the process when
+two threads run parallel loops at once. There a lock lets kernels run one after another.
+
 Machine code is cached on disk, keyed on the contents of the kernel's own file and of every file of
 its package or of splatseed that this one *reaches* through imports at the top of files, since
 kernels use functions and constants of other files. Dates and places of files do not count.
@@ -15,6 +18,7 @@ import hashlib
 import os
 import re
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
@@ -26,6 +30,7 @@ import numba
 from filelock import FileLock, Timeout
 from numba.core import config, event
 from numba.core.compiler_lock import global_compiler_lock
+from numba.core.registry import CPUDispatcher
 
 from splatseed.runtime.compilation import tell
 
@@ -57,8 +62,47 @@ _IMPORT = re.compile(
 
 
 def kernel(function: F) -> F:
-    """Compile a function whose ``parallel_range`` loops run on all threads."""
-    return _compile(function, parallel=True)
+    """Compile a function whose ``parallel_range`` loops run on all threads.
+
+    Python threads may call it at once. Serial functions must not call it: they take no lock.
+    """
+    compiled: Any = _compile(function, parallel=True)
+    if isinstance(compiled, CPUDispatcher):  # not with ``NUMBA_DISABLE_JIT``
+        compiled.__class__ = _OneAtATime
+    return cast("F", compiled)
+
+
+_one_at_a_time = threading.RLock()
+"""Held by the thread that runs a kernel, where the threading layer needs that."""
+
+
+class _OneAtATime(CPUDispatcher):
+    """A kernel under the lock, until the first call of any has loaded a layer that needs none."""
+
+    def __call__(self, *arguments: Any, **named: Any) -> Any:
+        if _threads_may_share():
+            self.__class__ = CPUDispatcher  # type: ignore[assignment]  # a call then costs nothing more
+            return self(*arguments, **named)
+        with _one_at_a_time:
+            return super().__call__(*arguments, **named)
+
+
+def _threads_may_share() -> bool:
+    """Whether the threading layer lets threads run loops at once; not if none is loaded."""
+    try:
+        return bool(numba.threading_layer() != "workqueue")  # type: ignore[attr-defined]  # absent from Numba's stubs
+    except ValueError:  # the first call loads it
+        return False
+
+
+if hasattr(os, "register_at_fork"):  # not on Windows
+    # A process that forks within another thread's kernel would inherit a lock that nobody releases,
+    # and a layer in the midst of its work.
+    os.register_at_fork(
+        before=_one_at_a_time.acquire,
+        after_in_parent=_one_at_a_time.release,
+        after_in_child=_one_at_a_time.release,
+    )
 
 
 def inline(function: F) -> F:

@@ -24,7 +24,7 @@ from PIL import Image as PilImage
 from scipy.ndimage import laplace
 
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
-from splatseed.io.files import VIDEO_SUFFIXES, files_below
+from splatseed.io.files import VIDEO_SUFFIXES, StrPath, files_below
 from splatseed.io.photograph import check_photograph, open_photograph, photograph_bytes
 from splatseed.io.staging import read_manifest
 from splatseed.literal import name_some, quoted
@@ -52,7 +52,7 @@ _LEAST_FRAMES = 3
 """Fewer photographs make no scene."""
 
 
-def find_photos(image_dir: Path) -> tuple[dict[str, Size], dict[str, list[str]]]:
+def find_photos(image_dir: StrPath) -> tuple[dict[str, Size], dict[str, list[str]]]:
     """The photographs below ``image_dir``, at least two.
 
     Hidden files are left out, and so are 16-bit and floating-point grey images: those are the
@@ -66,6 +66,7 @@ def find_photos(image_dir: Path) -> tuple[dict[str, Size], dict[str, list[str]]]
         SceneNotFoundError: The folder is missing or holds fewer than two photographs.
         SceneFormatError: An image cannot be decoded.
     """
+    image_dir = Path(image_dir)
     if not image_dir.is_dir():
         raise SceneNotFoundError(
             f"a folder of photographs or a video at {image_dir}",

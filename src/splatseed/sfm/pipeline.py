@@ -22,6 +22,7 @@ from splatseed import errors
 from splatseed.camera import CAMERA_MODELS
 from splatseed.io import load_scene, write_scene
 from splatseed.io.colmap import read_model_cameras
+from splatseed.io.files import StrPath
 from splatseed.io.masks import FOLDER as MASKS, write_masks
 from splatseed.io.photograph import photograph_folder
 from splatseed.io.seeds import carry_seeds
@@ -64,8 +65,8 @@ Job: TypeAlias = Callable[..., SfmReport]
 
 
 def reconstruct(
-    image_dir: Path | str,
-    output: Path | str,
+    image_dir: StrPath,
+    output: StrPath,
     settings: Settings = _DEFAULT,
     *,
     camera_model: str = "OPENCV",
@@ -177,7 +178,7 @@ def _export(
 
 
 def undistort(
-    scene: Scene, output: Path | str, *, overwrite: bool = False, on_progress: Progress = silent
+    scene: Scene, output: StrPath, *, overwrite: bool = False, on_progress: Progress = silent
 ) -> SfmReport:
     """Write a scene with undistorted photographs and PINHOLE cameras.
 

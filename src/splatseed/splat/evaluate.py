@@ -18,6 +18,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
+from splatseed.io.files import StrPath
 from splatseed.requirements import require
 
 require("torch", "flip_evaluator")  # before what loads it, for one clear error
@@ -164,8 +165,8 @@ class TrainedModel:
 
 
 def load_model(
-    path: Path,
-    scene_path: Path,
+    path: StrPath,
+    scene_path: StrPath,
     *,
     data_factor: int = 1,
     test_every: int = 8,
@@ -198,6 +199,8 @@ def load_model(
             are.
         ParameterError: The transform cannot be computed.
     """
+    path = Path(path)
+    scene_path = Path(scene_path)
     notes: list[str] = []
     gaussians = read_model(path, notes.append)
     scene = with_masks(load_scene(scene_path, require_points=False), masks)

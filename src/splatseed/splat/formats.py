@@ -20,7 +20,7 @@ from jaxtyping import Float64
 from numpy.lib.recfunctions import structured_to_unstructured
 
 from splatseed.errors import ParameterError, SceneFormatError
-from splatseed.io.files import COPY_AGAIN, ByteReader, read_bytes
+from splatseed.io.files import COPY_AGAIN, ByteReader, StrPath, read_bytes
 from splatseed.io.ply import EXPORT_PLY_AGAIN, Element, parse_header
 from splatseed.io.staging import atomic_file
 from splatseed.literal import beginning, did_you_mean
@@ -128,7 +128,7 @@ SUFFIXES = {each.suffix: name for name, each in FORMATS.items()}
 """The formats' names by file name suffix."""
 
 
-def read_model(path: Path, note: Note = silent_note) -> Gaussians:
+def read_model(path: StrPath, note: Note = silent_note) -> Gaussians:
     """Read trained Gaussians: .ply, compressed .ply, .splat, .spz, .sog (or its meta.json).
 
     Gaussians that cannot be drawn, as one of their numbers is NaN, are left out; ``note`` is called
@@ -139,6 +139,7 @@ def read_model(path: Path, note: Note = silent_note) -> Gaussians:
         SceneFormatError: It holds no Gaussians in a known format that can be drawn, or is damaged.
         MissingDependencyError: It is an .spz of version 4, which needs zstandard.
     """
+    path = Path(path)
     gaussians = FORMATS[detect_format(path, read_bytes(path))].decode(path)
     gaussians, left_out = drop_unusable(path, gaussians)
     if left_out:
@@ -147,7 +148,7 @@ def read_model(path: Path, note: Note = silent_note) -> Gaussians:
 
 
 def write_model(
-    path: Path, gaussians: Gaussians, progress: Progress = silent, note: Note = silent_note
+    path: StrPath, gaussians: Gaussians, progress: Progress = silent, note: Note = silent_note
 ) -> None:
     """Write at least one Gaussian, at finite positions, in the format that the file name asks for.
 
@@ -158,6 +159,7 @@ def write_model(
         ParameterError: The suffix belongs to no format written here.
         OutputError: The file cannot be written.
     """
+    path = Path(path)
     name = format_of_name(path)
     progress("encode", 0.0)
     if name == "sog":

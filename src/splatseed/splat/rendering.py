@@ -18,6 +18,7 @@ import torch
 from jaxtyping import Bool, Float, Float32, UInt8
 from torch import Tensor
 
+from splatseed.io.files import StrPath
 from splatseed.io.staging import atomic_file
 from splatseed.render import rasterization
 from splatseed.runtime.torch_device import free_bytes
@@ -230,12 +231,13 @@ def as_bytes(image: Float32[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
 
 
 def write_render(
-    path: Path,
+    path: StrPath,
     photograph: UInt8[np.ndarray, "H W 3"],
     render: Float32[np.ndarray, "H W 3"],
     errors: Float32[np.ndarray, "H W"],
 ) -> None:
     """Write a PNG of photograph, render and FLIP in a row."""
+    path = Path(path)
     from PIL import Image  # noqa: PLC0415  (slow to import)
 
     gap = np.full((len(photograph), GAP, 3), 255, np.uint8)

@@ -19,6 +19,7 @@ from splatseed.camera import Camera, Intrinsics, quat_from_rotation
 from splatseed.errors import ParameterError
 from splatseed.io import write_scene
 from splatseed.io.depth_maps import write_description
+from splatseed.io.files import StrPath
 from splatseed.io.staging import output_folder
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Observations, Scene, Tracks
@@ -92,7 +93,7 @@ def make_capture(
     return Capture(_scene(cameras, images, tracked), images, depths, room, tracked.outliers)
 
 
-def write_capture(capture: Capture, path: Path | str, *, overwrite: bool = False) -> Path:
+def write_capture(capture: Capture, path: StrPath, *, overwrite: bool = False) -> Path:
     """Write a COLMAP scene: ``images/*.png``, ``sparse/0`` and, extra, ``depths/*.png``.
 
     A depth PNG has 16 bits and holds metres times ``DEPTH_SCALE``, as ``depths/depths.json`` says;

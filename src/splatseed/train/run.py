@@ -28,6 +28,7 @@ from splatseed.errors import (
     SceneNotFoundError,
 )
 from splatseed.io import load_scene
+from splatseed.io.files import StrPath
 from splatseed.io.masks import mask_choice, with_masks
 from splatseed.io.photograph import photographs_digest
 from splatseed.io.seeds import was_upsampled
@@ -78,7 +79,7 @@ LOGGED = ("seconds", "loss", "psnr/train", "psnr/test", "gaussians", "ssim/test"
 
 def prepare_run(
     scene: Scene,
-    output: Path,
+    output: StrPath,
     settings: TrainSettings,
     *,
     resume: bool = False,

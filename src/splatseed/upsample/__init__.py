@@ -23,7 +23,7 @@ from typing import Any, Literal, cast
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
-from splatseed.errors import ParameterError, PointCloudError
+from splatseed.errors import ParameterError, PointCloudError, UnknownNameError
 from splatseed.pointcloud import ATTRIBUTES, GENERATED, ORIGINAL, PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.runtime.memory import check_memory
@@ -75,7 +75,7 @@ class MethodRegistry(Mapping[str, type[Upsampler]]):
             return cast("type[Upsampler]", getattr(import_module(module), attribute))
         if name in self._plugins:
             return cast("type[Upsampler]", self._plugins[name].load())
-        raise ParameterError(
+        raise UnknownNameError(
             f"one of the methods {', '.join(self)}", found=repr(name), fix="Choose one of these."
         )
 
@@ -290,12 +290,14 @@ def planned_size(num_original: int, ratio: float | None, num_points: int | None)
                 fix="A ratio of 8 makes eight times as many points.",
             )
         num_points = round(min(float(ratio) * num_original, MAX_POINTS + 1))
-    if not isinstance(num_points, (int, np.integer)) or num_points > MAX_POINTS:
+    is_whole = isinstance(num_points, Real) and float(num_points).is_integer()  # also 1e6
+    if not is_whole or num_points > MAX_POINTS:
         raise ParameterError(
             f"a whole number of points, {MAX_POINTS:,} at most",
             found=repr(num_points),
-            fix="Ask for fewer.",
+            fix="Ask for fewer." if is_whole else "Round it.",
         )
+    num_points = int(num_points)
     if num_points < num_original:
         raise ParameterError(
             f"a number of points of at least the {num_original:,} originals",

@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float64, UInt8
 from PIL import Image as PillowImage, ImageDraw
 
 from splatseed.camera import Camera
+from splatseed.io.files import StrPath
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
 from splatseed.upsample import origin_name
@@ -44,15 +45,17 @@ class CoveredView(NamedTuple):
 
 
 def preview_pair(
-    scene: Scene, upsampled: PointCloud, path: Path | str, *, title: str = "upsampled"
+    scene: Scene, upsampled: PointCloud, path: StrPath, *, title: str = "upsampled"
 ) -> Path:
     """Write a picture of the scene's points beside the upsampled ones, described by a title."""
+    path = Path(path)
     clouds = {"original": scene.points, title: upsampled}
     return page.write_grid(_cloud_tiles(clouds, choose_camera(scene), PAIR_SIDE), path, columns=2)
 
 
-def preview_methods(scene: Scene, clouds: Mapping[str, PointCloud], path: Path | str) -> Path:
+def preview_methods(scene: Scene, clouds: Mapping[str, PointCloud], path: StrPath) -> Path:
     """Write a grid: the photograph if there is one, the scene's points, and clouds by label."""
+    path = Path(path)
     clouds, side = {"original": scene.points, **clouds}, page.GRID_SIDE
     tiles = _photograph(scene, side, "photograph")
     return page.write_grid([*tiles, *_cloud_tiles(clouds, choose_camera(scene), side)], path)
@@ -62,12 +65,13 @@ def preview_errors(
     clouds: Mapping[str, PointCloud],
     distances: Mapping[str, Float64[np.ndarray, " N"]],
     camera: Camera,
-    path: Path | str,
+    path: StrPath,
 ) -> Path:
     """Write a grid of clouds by label, their points coloured by their distance to the true surface.
 
     Distances are in spacings h of the originals; from 1 on points have the last colour.
     """
+    path = Path(path)
     colored = {
         f"{label}   {len(cloud):,} points: mean error {distances[label].mean():.2f} spacings": (
             cloud.replace(rgb=page.map_colors(distances[label], 0.0, 1.0, "plasma"))
@@ -79,8 +83,9 @@ def preview_errors(
     return page.write_grid(tiles, path, footer=bar)
 
 
-def preview_origins(scene: Scene, points: PointCloud, path: Path | str) -> Path:
+def preview_origins(scene: Scene, points: PointCloud, path: StrPath) -> Path:
     """Write a page: the seeds in their own colours, and by origin over the photograph."""
+    path = Path(path)
     camera = choose_camera(scene)
     scale = PAIR_SIDE / max(camera.width, camera.height)
     size = page.fitted(camera.width, camera.height, PAIR_SIDE)
@@ -108,13 +113,14 @@ def preview_alignment(
     rgb: UInt8[np.ndarray, "N 3"] | None,
     marks: Float64[np.ndarray, "M 3"],
     share: Float64[np.ndarray, " M"],
-    path: Path | str,
+    path: StrPath,
 ) -> Path:
     """Write a page of photograph, aligned cloud and residuals, side by side.
 
     The cloud is a sample in the scene's frame, grey without colours; ``marks`` are the scene's
     points that it was aligned with, ``share`` of each 0 on the cloud to 1 where it does not count.
     """
+    path = Path(path)
     blend = np.clip(share, 0, 1)[:, None]
     shades = np.rint((1 - blend) * NEAR + blend * FAR).astype(np.uint8)
     clouds = {
@@ -128,8 +134,9 @@ def preview_alignment(
     return page.write_grid(tiles, path, columns=len(tiles))
 
 
-def preview_cells(views: Sequence[CoveredView], path: Path | str) -> Path:
+def preview_cells(views: Sequence[CoveredView], path: StrPath) -> Path:
     """Write a page: for each view, the cells covered by the originals, and by all seeds."""
+    path = Path(path)
     tiles = []
     for view in views:
         size = page.fitted(view.photograph.shape[1], view.photograph.shape[0])

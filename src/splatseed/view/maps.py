@@ -16,6 +16,7 @@ from jaxtyping import Float, Float64, UInt8
 
 from splatseed.depth.alignment import Alignment, PlanarDepth, map_camera
 from splatseed.depth.stereo import StereoMap
+from splatseed.io.files import StrPath
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene
 from splatseed.view import page
@@ -28,13 +29,12 @@ LIMIT = 0.1
 """Relative errors of depth from this value on have the last colour."""
 
 
-def preview_maps(
-    scene: Scene, maps: Sequence[StereoMap], path: Path | str, *, most: int = 4
-) -> Path:
+def preview_maps(scene: Scene, maps: Sequence[StereoMap], path: StrPath, *, most: int = 4) -> Path:
     """Write a page with a row of ``map_tiles`` for at most so many of the maps, evenly chosen.
 
     Grey stands in for a photograph that cannot be read.
     """
+    path = Path(path)
     by_name = {image.name: image for image in scene.images}
     places = np.linspace(0, len(maps) - 1, min(most, len(maps)))
     tiles: list[page.Tile] = []
@@ -73,13 +73,14 @@ def _shortened(label: str, length: int) -> str:
     return label if len(label) <= length else f"...{label[3 - length :]}"
 
 
-def preview_depth(scene: Scene, alignments: Mapping[str, Alignment], path: Path) -> Path:
+def preview_depth(scene: Scene, alignments: Mapping[str, Alignment], path: StrPath) -> Path:
     """Write a page of depth maps and their agreement with the scene's points.
 
     A row shows an image's photograph, its depth, and its SfM points on the photograph, coloured by
     |depth of the map / depth of the point - 1|. The rows are the best and the worst aligned image,
     a typical one, and one that was left out, if there are such. Alignments are by name.
     """
+    path = Path(path)
     by_name, visibility = {image.name: image for image in scene.images}, find_visibility(scene)
     used = sorted(
         (name for name, a in alignments.items() if a.rejected is None),

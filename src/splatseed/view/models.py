@@ -18,7 +18,7 @@ from PIL import Image as PillowImage, ImageDraw
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io import load_scene
-from splatseed.io.files import read_bytes
+from splatseed.io.files import StrPath, read_bytes
 from splatseed.literal import quoted
 from splatseed.scene import Scene
 from splatseed.splat.formats import detect_format, read_model
@@ -63,7 +63,7 @@ class Shown:
         return poses_of(images, self.data_factor)
 
 
-def open_shown(path: Path, scene_path: Path | None = None) -> Shown:
+def open_shown(path: StrPath, scene_path: Path | None = None) -> Shown:
     """Read what a user names: a scene, a run folder, or a file of Gaussians or points.
 
     A model's scene is that at ``scene_path``, by default the one that its run names, if it exists.
@@ -72,6 +72,7 @@ def open_shown(path: Path, scene_path: Path | None = None) -> Shown:
         SceneNotFoundError: ``path``, or the scene that the user names, does not exist.
         SceneFormatError: It is damaged, or cannot be shown.
     """
+    path = Path(path)
 
     def scene_at(place: Path | None) -> Scene | None:
         return None if place is None else load_scene(place, require_points=False)

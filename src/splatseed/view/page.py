@@ -17,6 +17,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image as PillowImage, ImageDraw, ImageFont
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.io.files import StrPath
 from splatseed.io.photograph import decode_photograph, photograph_bytes
 from splatseed.io.staging import atomic_file
 from splatseed.scene import Image, Scene
@@ -56,7 +57,7 @@ def latin(text: str) -> str:
 
 def write_grid(
     tiles: Sequence[Tile],
-    path: Path | str,
+    path: StrPath,
     *,
     columns: int | None = None,
     footer: UInt8[np.ndarray, "H W 3"] | None = None,

@@ -22,6 +22,7 @@ from jaxtyping import Bool, Float64, UInt8
 
 from splatseed.camera import Camera
 from splatseed.errors import OutputError, ParameterError, SceneFormatError, SceneNotFoundError
+from splatseed.io.files import StrPath
 from splatseed.io.masks import read_mask
 from splatseed.io.photograph import (
     decode_photograph,
@@ -256,13 +257,14 @@ FILTER = "box-2"  # part of the key: change it whenever the downsampling changes
 
 
 def load_photograph(
-    path: Path, factor: int = 1, cache_dir: Path | None = None
+    path: StrPath, factor: int = 1, cache_dir: Path | None = None
 ) -> tuple[UInt8[np.ndarray, "H W 3"], tuple[int, int]]:
     """The pixels of an image file, each a block of ``factor``^2, and the file's width and height.
 
     Transparent pixels are laid over black, which Gaussians are drawn on. Smaller copies are kept in
     ``cache_dir``, if there is one.
     """
+    path = Path(path)
     if factor < 1:
         raise ParameterError(
             "--data-factor of 1 or more", found=f"{factor}", fix="Images are never enlarged."

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io.cloud_file import CloudChunk, CloudFile
-from splatseed.io.files import readable
+from splatseed.io.files import StrPath, readable
 from splatseed.io.ply import refuse_model
 
 __all__ = ["CloudChunk", "CloudFile", "open_cloud"]
@@ -29,7 +29,7 @@ _READERS = {
 }
 
 
-def open_cloud(path: Path | str) -> CloudFile:
+def open_cloud(path: StrPath) -> CloudFile:
     """Open a cloud; the ending of its name tells the format.
 
     Args:
