@@ -47,9 +47,11 @@ def test_words_reach_the_reconstruction_and_its_report_the_user(called, tmp_path
 
 def test_the_photographs_are_counted_by_folder(called, tmp_path, splatseed, capsys):
     splatseed("sfm", tmp_path, "-o", tmp_path / "out")
-    called["on_photos"](["scene/a.png", "run/b.png", "scene/c.png"], {"of grey": ["run/d.png"]})
+    called["on_photos"](
+        ["scene/a.png", "run/b.png", "scene/c.png"], {"of grey": ["run/d.png"]}, "1 camera"
+    )
     told = capsys.readouterr()
-    assert told.err == f"3 photographs in {tmp_path}: 2 in scene, 1 in run\n"
+    assert told.err == f"3 photographs in {tmp_path}: 2 in scene, 1 in run\n1 camera\n"
     assert "1 image of grey, run/d.png" in told.out
 
 

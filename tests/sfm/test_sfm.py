@@ -153,6 +153,7 @@ def test_photographs_are_told_first_and_an_interrupt_leaves_nothing(photos, tmp_
     folder, told = tmp_path / "photos", []
     shutil.copytree(photos, folder / "below")
     PilImage.new("I;16", (320, 240)).save(folder / "depth.png")
+    PilImage.new("L", (64, 48)).save(folder / "conf_00000.png")
     (folder / "phone.heic").touch()
 
     def interrupt(stage, _):
@@ -164,9 +165,9 @@ def test_photographs_are_told_first_and_an_interrupt_leaves_nothing(photos, tmp_
             folder,
             tmp_path / "scene",
             on_progress=interrupt,
-            on_photos=lambda names, left_out: told.append((names[0], *left_out.values())),
+            on_photos=lambda names, left_out, _: told.append((names[0], *left_out.values())),
         )
-    assert told == [("below/view_000.png", ["depth.png"], ["phone.heic"])]
+    assert told == [("below/view_000.png", ["depth.png"], ["conf_00000.png"], ["phone.heic"])]
     assert list(tmp_path.iterdir()) == [folder]
 
 

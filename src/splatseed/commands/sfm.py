@@ -46,7 +46,8 @@ class Options:
     camera_model: str = "OPENCV"
     """COLMAP's model of the lens; not used with --poses-from."""
     shared_camera: bool = True
-    """One lens for all photographs of a size; not used with --poses-from."""
+    """One camera for the photographs of a lens, by their size and EXIF; not used with
+    --poses-from."""
     device: DeviceName = "auto"
     """Where features are detected and matched; auto takes a GPU if pycolmap can use one."""
     seed: int = 0
@@ -133,13 +134,15 @@ def _from_photographs(options: Options, images: Path, clock: StageClock) -> SfmR
 
 
 def _tell_photographs(
-    images: Path, names: Sequence[str], left_out: Mapping[str, Sequence[str]]
+    images: Path, names: Sequence[str], left_out: Mapping[str, Sequence[str]], cameras: str
 ) -> None:
     """Say what is read, since a folder named by mistake may hold pictures of other things below."""
     folders = Counter(str(PurePosixPath(name).parent) for name in names)
     shown = name_some([f"{count:,} in {folder}" for folder, count in folders.most_common()])
     where = "" if set(folders) == {"."} else f": {shown}"
     ERR.print(visible(f"{counted(len(names), 'photograph')} in {images}{where}"), soft_wrap=True)
+    if cameras:
+        ERR.print(cameras, soft_wrap=True)
     for what, them in left_out.items():
         print_note(f"Left out: {counted(len(them), 'image')} {what}, {name_some(them)}.")
 

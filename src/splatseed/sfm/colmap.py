@@ -15,7 +15,7 @@ import importlib
 import math
 import struct
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -32,7 +32,7 @@ from splatseed.progress import Progress
 from splatseed.requirements import install_command
 from splatseed.runtime.torch_device import DeviceName
 from splatseed.scene import Image, Masks
-from splatseed.sfm.photos import Size
+from splatseed.sfm.cameras import SharedCamera
 
 MatcherName: TypeAlias = Literal["exhaustive", "sequential"]
 T = TypeVar("T")
@@ -150,21 +150,18 @@ class Run:
             ) from error
 
 
-def guessed_model(run: Run, photos: Mapping[str, Size], camera_model: str, *, shared: bool) -> Any:
-    """A model without poses, with cameras of EXIF's or a default focal length.
-
-    With ``shared``, photographs of one size have one camera.
-    """
+def guessed_model(run: Run, cameras: Sequence[SharedCamera], camera_model: str) -> Any:
+    """A model without poses, with cameras of EXIF's or a default focal length."""
     pycolmap, model = run.pycolmap, run.pycolmap.Reconstruction()
     options = pycolmap.ImageReaderOptions(camera_model=camera_model)
-    ids: dict[Any, int] = {}
-    for number, (name, size) in enumerate(photos.items(), 1):
-        camera_id = ids.setdefault(size if shared else name, len(ids) + 1)
-        if not model.exists_camera(camera_id):
-            camera = pycolmap.infer_camera_from_image(run.image_dir / name, options)
-            camera.camera_id = camera_id
-            model.add_camera_with_trivial_rig(camera)
-        image = pycolmap.Image(name=name, image_id=number, camera_id=camera_id)
+    ids: dict[str, int] = {}
+    for camera_id, shared in enumerate(cameras, 1):
+        camera = pycolmap.infer_camera_from_image(run.image_dir / shared.typical, options)
+        camera.camera_id = camera_id
+        model.add_camera_with_trivial_rig(camera)
+        ids |= dict.fromkeys(shared.names, camera_id)
+    for number, name in enumerate(sorted(ids), 1):
+        image = pycolmap.Image(name=name, image_id=number, camera_id=ids[name])
         model.add_image_with_trivial_frame(image)
     return model
 

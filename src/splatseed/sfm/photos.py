@@ -12,7 +12,8 @@ correlation (Kuglin and Hines 1975). A frame's *sharpness* is the variance of it
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping
+import re
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -31,9 +32,7 @@ from splatseed.literal import name_some, quoted
 from splatseed.progress import Progress, silent
 from splatseed.requirements import require
 from splatseed.scene import Image, Scene
-
-Size = tuple[int, int]
-"""Width and height in pixels as stored, before any EXIF rotation."""
+from splatseed.sfm.cameras import Photo, Photos, read_exif
 
 _SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
 _FOREIGN_SUFFIXES = frozenset(
@@ -42,7 +41,11 @@ _FOREIGN_SUFFIXES = frozenset(
 )  # fmt: skip
 _GREY = "of 16-bit or floating-point grey, as depth maps are"
 _FOREIGN = "of a format that is not read"
+_MAP = "of grey, named as maps of depth or confidence are"
 _DEPTH_MODES = ("I", "F")  # Pillow's names for 16- and 32-bit grey
+_GREY_MODES = ("L", "1", "LA")
+_MAPS = re.compile(r"(^|[/_.-])(conf|confidence|depth|disparity|masks?)([/_.\d-]|$)", re.IGNORECASE)
+"""Names of the maps that phones' scanning apps write beside photographs."""
 
 _LOOK_WIDTH, _BLOCK = 256, 64
 """Width at which frames are analysed, and the side of the blocks whose shifts are measured, px."""
@@ -52,15 +55,17 @@ _LEAST_FRAMES = 3
 """Fewer photographs make no scene."""
 
 
-def find_photos(image_dir: StrPath) -> tuple[dict[str, Size], dict[str, list[str]]]:
+def find_photos(image_dir: StrPath) -> tuple[dict[str, Photo], dict[str, list[str]]]:
     """The photographs below ``image_dir``, at least two.
 
     Hidden files are left out, and so are 16-bit and floating-point grey images: those are the
-    depth maps of an RGB-D capture. Formats such as HEIC and cameras' raw ones are not read.
+    depth maps of an RGB-D capture, and 8-bit grey ones that are named as an app's maps of
+    confidence or depth, beside photographs in colour. Formats such as HEIC and cameras' raw ones
+    are not read.
 
     Returns:
-        The photographs' sizes by their names (paths relative to the folder), in order of names; and
-        the names of other images by what they are.
+        The photographs by their names (paths relative to the folder), in order of names; and the
+        names of other images by what they are.
 
     Raises:
         SceneNotFoundError: The folder is missing or holds fewer than two photographs.
@@ -87,10 +92,14 @@ def find_photos(image_dir: StrPath) -> tuple[dict[str, Size], dict[str, list[str
         for suffixes in (_SUFFIXES, _FOREIGN_SUFFIXES)
     )
     with ThreadPoolExecutor() as pool:  # Pillow decodes outside the GIL
-        sizes = dict(zip(names, pool.map(lambda n: _size(image_dir / n), names), strict=True))
-    photos = {name: size for name, size in sizes.items() if size is not None}
-    grey = [name for name, size in sizes.items() if size is None]
-    left_out = {what: them for what, them in ((_GREY, grey), (_FOREIGN, foreign)) if them}
+        read = dict(zip(names, pool.map(lambda n: _read(image_dir / n), names), strict=True))
+    grey = [name for name, (photo, _) in read.items() if photo is None]
+    maps = [name for name, (_, colours) in read.items() if not colours and _MAPS.search(name)]
+    if not any(colours for _, colours in read.values()):
+        maps = []
+    photos = {n: photo for n, (photo, _) in read.items() if photo is not None and n not in maps}
+    kinds = ((_GREY, grey), (_MAP, [n for n in maps if n not in grey]), (_FOREIGN, foreign))
+    left_out = {what: them for what, them in kinds if them}
     if len(photos) < 2:
         found = [f"{len(them)} {what} ({name_some(them)})" for what, them in left_out.items()]
         if others := len(files) - len(names) - len(foreign):
@@ -105,14 +114,16 @@ def find_photos(image_dir: StrPath) -> tuple[dict[str, Size], dict[str, list[str
     return photos, left_out
 
 
-def _size(path: Path) -> Size | None:
-    """The size of a photograph, decoded and found whole; None for a depth map."""
+def _read(path: Path) -> tuple[Photo | None, bool]:
+    """A photograph, decoded and found whole, None for a depth map; and whether it has colours."""
     with open_photograph(path, photograph_bytes(path)) as image:
-        grey = image.mode.startswith(_DEPTH_MODES)
-    return None if grey else check_photograph(path)
+        mode, exif = image.mode, read_exif(image)
+    if mode.startswith(_DEPTH_MODES):
+        return None, False
+    return Photo(check_photograph(path), exif), mode not in _GREY_MODES
 
 
-def match_poses(photos: Mapping[str, Size], scene: Scene, image_dir: Path) -> tuple[Image, ...]:
+def match_poses(photos: Photos, scene: Scene, image_dir: Path) -> tuple[Image, ...]:
     """The images of ``scene`` that are among the photographs, in their order.
 
     Raises:
@@ -130,7 +141,7 @@ def match_poses(photos: Mapping[str, Size], scene: Scene, image_dir: Path) -> tu
             fix="Names must be equal, relative to the images folder, suffix included.",
         )
     for image in images:
-        lens, (width, height) = image.intrinsics, photos[image.name]
+        lens, (width, height) = image.intrinsics, photos[image.name].size
         if (width, height) != (lens.width, lens.height):
             raise SceneFormatError(
                 f"{image_dir / image.name} to have the size of its camera {lens.camera_id}, "

@@ -34,12 +34,13 @@ from splatseed.requirements import require
 from splatseed.runtime.tasks import Child
 from splatseed.scene import Image, Masks, Scene
 from splatseed.sfm import colmap
+from splatseed.sfm.cameras import SharedCamera, describe_cameras, share_cameras
 from splatseed.sfm.colmap import Run, Settings
-from splatseed.sfm.photos import Size, find_photos, match_poses
+from splatseed.sfm.photos import find_photos, match_poses
 from splatseed.sfm.refinement import Refinement, refine
 from splatseed.views.view import at_file_size
 
-OnPhotos: TypeAlias = Callable[[Sequence[str], Mapping[str, Sequence[str]]], None]
+OnPhotos: TypeAlias = Callable[[Sequence[str], Mapping[str, Sequence[str]], str], None]
 _DEFAULT = Settings()
 _REASON = re.compile(r"what\(\):\s*(.*)|^[EF]\d{8}\s.*?\]\s*(.*)", re.MULTILINE)
 
@@ -93,7 +94,8 @@ def reconstruct(
             photographs' size.
         settings: How features are detected and matched.
         camera_model: COLMAP's model of the lens in the photographs, where poses are not known.
-        shared_camera: One lens for all photographs of a size, or one for each photograph; likewise.
+        shared_camera: One camera for the photographs of a lens (``share_cameras``), or one for each
+            photograph; likewise.
         poses_from: A scene whose ``images`` give poses and intrinsics; its points are not used.
         refine_poses: Refine these poses, if they are off by a few degrees or per cent of the
             cameras' extent, as those of phones and SLAM are. They stay exactly as given where
@@ -103,8 +105,9 @@ def reconstruct(
         masks: Where no features are looked for; the scene gets them, undistorted.
         overwrite: Replace ``output`` if it exists.
         on_progress: Called with the stage and the fraction done.
-        on_photos: Called before work begins with the photographs' names, and with those of other
-            images, by what they are.
+        on_photos: Called before work begins with the photographs' names, with those of other
+            images, by what they are, and with a description of the cameras, empty if poses are
+            known.
 
     Raises:
         InputError: Images missing, unreadable or of another size than their known camera; fewer
@@ -118,12 +121,16 @@ def reconstruct(
     images = Path(image_dir).absolute()
     photos, left_out = find_photos(images)
     poses = None if poses_from is None else match_poses(photos, poses_from, images)
+    cameras = share_cameras(photos)
+    described = describe_cameras(cameras) if poses is None and shared_camera else ""
+    if not shared_camera:
+        cameras = tuple(SharedCamera((name,), name, "") for name in photos)
     with _staged(images, Path(output), "sfm", overwrite=overwrite) as staging:
         if on_photos is not None:
-            on_photos(list(photos), left_out)
+            on_photos(list(photos), left_out, described)
         how = (images, staging, settings, on_progress, _reconstruct)
-        asked = camera_model, shared_camera, poses, refine_poses, held_out, masks
-        report = _call(*how, photos, *asked)
+        asked = camera_model, poses, refine_poses, held_out, masks
+        report = _call(*how, list(photos), cameras, *asked)
         if poses_from is not None:
             write_split(poses_from, staging)
         manifest = {
@@ -139,9 +146,9 @@ def reconstruct(
 def _reconstruct(
     run: Run,
     staging: Path,
-    photos: Mapping[str, Size],
+    names: Sequence[str],
+    cameras: Sequence[SharedCamera],
     camera_model: str,
-    shared_camera: bool,
     poses: Sequence[Image] | None,
     refine_poses: bool,
     held_out: Collection[str],
@@ -149,16 +156,16 @@ def _reconstruct(
 ) -> SfmReport:
     refinement = None
     if poses is None:
-        model = colmap.guessed_model(run, photos, camera_model, shared=shared_camera)
+        model = colmap.guessed_model(run, cameras, camera_model)
         colmap.match_photographs(run, model, masks)
-        model_dir = colmap.map_images(run, list(photos))
+        model_dir = colmap.map_images(run, names)
     else:
         colmap.match_photographs(run, colmap.posed_model(run.pycolmap, poses), masks)
         if refine_poses:
             poses, refinement = refine(run, poses)
         model_dir = colmap.triangulate_points(run, poses, held_out)
     _export(run, model_dir, staging, masks)
-    report = _report(run, staging, list(photos))
+    report = _report(run, staging, names)
     return replace(report, refinement=refinement, poses=tuple(poses or ()))
 
 

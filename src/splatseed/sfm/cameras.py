@@ -1,0 +1,193 @@
+"""Which photographs share a camera: by size, by what EXIF says of camera and lens, and by folder.
+
+A camera here is one setting of one lens, with one focal length to solve for. Photographs of a
+phone's two lenses have one size, and so have those of two zoom settings: one focal length for both
+fits neither. Too many cameras are a loss as well, since few photographs determine a focal length
+and distortion loosely; a zoom ring that was touched is still one setting.
+
+Notation: a *focal length* in mm is the 35 mm equivalent, where EXIF has it: digital zoom changes
+it alone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from itertools import groupby, pairwise
+from pathlib import PurePosixPath
+from statistics import median_low
+from typing import NamedTuple, TypeAlias
+
+from PIL import Image as PilImage
+
+from splatseed.literal import agreeing, counted, name_some
+
+Size = tuple[int, int]
+"""Width and height in pixels as stored, before any EXIF rotation."""
+
+_MAKE, _MODEL, _IFD, _FOCAL, _FOCAL_35, _LENS = 0x010F, 0x0110, 0x8769, 0x920A, 0xA405, 0xA434
+_ROUNDING = 0.75
+"""Millimetres by which a 35 mm equivalent, a whole number, differs from the focal length's."""
+_SAME = 1.01
+"""Ratio of focal lengths up to which they count as one setting."""
+_NEAR = 1.06
+"""The same where one of them has few photographs."""
+_ENOUGH = 4
+"""Photographs that determine a camera of their own."""
+
+
+class Exif(NamedTuple):
+    """What EXIF says of the camera; empty or None where it says nothing."""
+
+    make: str = ""
+    model: str = ""
+    lens: str = ""
+    focal: float | None = None  # mm
+    focal_35: float | None = None  # mm, equivalent
+
+
+class Photo(NamedTuple):
+    """A photograph's facts that decide on its camera."""
+
+    size: Size
+    exif: Exif = Exif()
+
+
+Photos: TypeAlias = Mapping[str, Photo]
+"""By name, a path relative to the folder of all, with ``/``."""
+
+
+class SharedCamera(NamedTuple):
+    """Photographs that share a camera, by name; ``typical`` has the median focal length."""
+
+    names: tuple[str, ...]
+    typical: str
+    label: str  # for the user, such as "Apple iPhone 15 at 26 mm"; empty if EXIF says nothing
+
+
+def read_exif(image: PilImage.Image) -> Exif:
+    """The camera by the EXIF of a picture whose header was read; nothing where it is damaged."""
+    with suppress(Exception):  # Pillow raises what it likes for tags that are cut short
+        tags = image.getexif()
+        own = tags.get_ifd(_IFD)
+        texts = (_text(tags.get(_MAKE)), _text(tags.get(_MODEL)), _text(own.get(_LENS)))
+        return Exif(*texts, _length(own.get(_FOCAL)), _length(own.get(_FOCAL_35)))
+    return Exif()
+
+
+def _text(value: object) -> str:
+    if isinstance(value, bytes):
+        value = value.decode("utf-8", "replace")
+    return " ".join(value.replace("\0", " ").split()) if isinstance(value, str) else ""
+
+
+def _length(value: object) -> float | None:
+    """A tag's millimetres; 0, as cameras write for an unknown length, and 0 / 0 are none."""
+    with suppress(TypeError, ValueError, ArithmeticError):
+        length = float(value)  # type: ignore[arg-type]  # what is no number raises
+        return length if 0 < length < math.inf else None
+    return None
+
+
+def share_cameras(photos: Photos) -> tuple[SharedCamera, ...]:
+    """The cameras of photographs, in the order of their first one.
+
+    Photographs share a camera if size, make, model and lens are the same, focal lengths are nearly
+    so, and folders are, where each of these has photographs enough.
+    """
+    lengths = _focal_lengths(photos)
+    groups: list[list[str]] = []
+    for alike in _grouped(photos, lambda name: (photos[name].size, *photos[name].exif[:3])):
+        for known in _grouped(alike, lambda name: lengths[name] is not None):
+            for setting in _settings(known, lengths):
+                groups += _by_folder(setting)
+    groups = sorted(map(sorted, _without_strays(groups, photos)))
+    return tuple(_shared(names, photos, lengths) for names in groups)
+
+
+def describe_cameras(cameras: Sequence[SharedCamera]) -> str:
+    """How many cameras there are, and which, in a few words."""
+    labels = [
+        f"{camera.label or 'unnamed'} ({counted(len(camera.names), 'photograph')})"
+        for camera in cameras
+    ]
+    number = counted(len(cameras), "camera")
+    if not any(camera.label for camera in cameras):
+        how = agreeing(len(cameras), "for all", "by size and folder")
+        return f"{number} {how}: EXIF names none"
+    return f"{number} by EXIF: {name_some(labels)}"
+
+
+def _focal_lengths(photos: Photos) -> dict[str, float | None]:
+    """The photographs' focal lengths, not rounded where EXIF's own says more."""
+    found: dict[str, float | None] = {}
+    for names in _grouped(photos, lambda name: photos[name].exif[:3]):
+        both = [photos[name].exif for name in names]
+        crops = [e.focal_35 / e.focal for e in both if e.focal and e.focal_35]
+        crop = median_low(crops) if crops else 1.0
+        for name in names:
+            exif = photos[name].exif
+            exact = exif.focal * crop if exif.focal else None
+            rounded = exif.focal_35 or exact
+            # Another lens of a phone, or digital zoom, has another equivalent.
+            apart = exact is None or rounded is None or abs(exact - rounded) > _ROUNDING
+            found[name] = rounded if apart else exact
+    return found
+
+
+def _settings(names: Sequence[str], lengths: Mapping[str, float | None]) -> list[list[str]]:
+    """Photographs of one lens, by settings of its focal length."""
+    groups = [
+        list(same)
+        for _, same in groupby(sorted(names, key=lambda n: lengths[n] or 0.0), lengths.__getitem__)
+    ]
+    while len(groups) > 1:  # neighbours join, the nearest first
+        spans = [(lengths[b[-1]] or 1.0) / (lengths[a[0]] or 1.0) for a, b in pairwise(groups)]
+        joined = [
+            (span, i)
+            for i, span in enumerate(spans)
+            if span <= _SAME or (span <= _NEAR and min(map(len, groups[i : i + 2])) < _ENOUGH)
+        ]
+        if not joined:
+            break
+        i = min(joined)[1]
+        groups[i : i + 2] = [groups[i] + groups[i + 1]]
+    return groups
+
+
+def _by_folder(names: Sequence[str]) -> list[list[str]]:
+    """Photographs of one setting by folder; folders of few are one group."""
+    folders = _grouped(names, lambda name: PurePosixPath(name).parent)
+    rest = [name for each in folders if len(each) < _ENOUGH for name in each]
+    return [*(each for each in folders if len(each) >= _ENOUGH), *([rest] if rest else [])]
+
+
+def _without_strays(groups: Sequence[list[str]], photos: Photos) -> list[list[str]]:
+    """A few photographs without EXIF join the others of their size if these are of one camera."""
+    kept = [list(each) for each in groups]
+    for group in groups:
+        size, exif = photos[group[0]]
+        others = [each for each in kept if photos[each[0]].size == size and each != group]
+        if len(group) < _ENOUGH and exif == Exif() and len(others) == 1:
+            kept.remove(group)
+            others[0] += group
+    return kept
+
+
+def _shared(
+    names: Sequence[str], photos: Photos, lengths: Mapping[str, float | None]
+) -> SharedCamera:
+    known = sorted((length, name) for name in names if (length := lengths[name]) is not None)
+    length, typical = known[len(known) // 2] if known else (None, names[0])
+    exif = photos[typical].exif
+    model = exif.model if exif.model.startswith(exif.make) else f"{exif.make} {exif.model}"
+    label = " at ".join(filter(None, [model.strip(), f"{length:.3g} mm" if length else ""]))
+    return SharedCamera(tuple(names), typical, label)
+
+
+def _grouped(names: Iterable[str], key: Callable[[str], object]) -> list[list[str]]:
+    groups: dict[object, list[str]] = {}
+    for name in names:
+        groups.setdefault(key(name), []).append(name)
+    return list(groups.values())
