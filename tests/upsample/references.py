@@ -1,4 +1,6 @@
-"""Slow, literal versions of every method: Python loops straight from the equations.
+"""Slow versions of every method as splatseed has it by default: plain Python loops.
+
+The paper's own are in ``paper_equations``.
 
 Notation: ``xyz`` float64 [n, 3] are distinct finite originals in file order, ``i`` a base point,
 ``rows`` its neighbours, nearest first. A *surface* is a function S(u, v) fitted to the neighbours
@@ -14,7 +16,7 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from scipy.interpolate import BSpline, SmoothBivariateSpline
+from scipy.interpolate import BSpline
 
 
 class Cloud(NamedTuple):
@@ -36,7 +38,6 @@ class Patch(NamedTuple):
     frame: str = "local"
     placement: str = "disc"
     clamp: float | None = 0.25
-    reject_isolated: bool = True
 
 
 def neighbors(xyz, i, k):
@@ -58,10 +59,8 @@ def is_isolated(xyz, i, k):
     return spacing(xyz, i) > 3.0 * around[len(around) // 4]
 
 
-def base_weights(xyz, k, *, reject_isolated):
+def base_weights(xyz, k):
     """1 for points that may serve as bases, else 0, [n]."""
-    if not reject_isolated:
-        return np.ones(len(xyz))
     return np.array([0.0 if is_isolated(xyz, i, k) else 1.0 for i in range(len(xyz))])
 
 
@@ -70,9 +69,9 @@ def draw_bases(weight, num_new, rng):
     return np.repeat(np.arange(len(weight)), rng.multinomial(num_new, weight / weight.sum()))
 
 
-def linear(cloud, num_new, rng, *, reject_isolated=True):
+def linear(cloud, num_new, rng):
     """Eq. 1: P = a P1 + (1 - a) P2; the same for colours."""
-    weight = base_weights(cloud.xyz, 1, reject_isolated=reject_isolated)
+    weight = base_weights(cloud.xyz, 1)
     bases = draw_bases(weight, num_new, rng)
     alpha = rng.random(num_new, dtype=np.float32).astype(np.float64)
     new_xyz, new_rgb = [], []
@@ -83,9 +82,9 @@ def linear(cloud, num_new, rng, *, reject_isolated=True):
     return np.array(new_xyz), np.array(new_rgb)
 
 
-def triangle(cloud, num_new, rng, *, reject_isolated=True):
+def triangle(cloud, num_new, rng):
     """Eq. 2: barycentric weights 1 - sqrt(s), sqrt(s) (1 - t), sqrt(s) t; the same for colours."""
-    weight = base_weights(cloud.xyz, 2, reject_isolated=reject_isolated)
+    weight = base_weights(cloud.xyz, 2)
     bases = draw_bases(weight, num_new, rng)
     draws = rng.random((num_new, 2), dtype=np.float32).astype(np.float64)
     new_xyz, new_rgb = [], []
@@ -120,7 +119,7 @@ def color_at(cloud, i, rows, p):
 
 def on_patches(cloud, num_new, rng, patch):
     """New points on a surface fitted to the neighbours of every base."""
-    weight = base_weights(cloud.xyz, patch.k, reject_isolated=patch.reject_isolated)
+    weight = base_weights(cloud.xyz, patch.k)
     bases = draw_bases(weight, num_new, rng)
     columns = 3 if patch.placement == "triangle" else 2
     draws = rng.random((num_new, columns), dtype=np.float32).astype(np.float64)
@@ -226,10 +225,3 @@ def _least_gcv(design, z, candidates):
         rest = np.eye(len(z)) - hat
         scores.append(len(z) * np.sum((rest @ z) ** 2) / np.trace(rest) ** 2)
     return candidates[int(np.argmin(scores))]
-
-
-def bicubic_surface(local, distance, s=None):
-    """What the paper names: FITPACK's smoothing spline with s = 0.1 k, by FITPACK itself."""
-    x, y, z = local.T
-    spline = SmoothBivariateSpline(x, y, z, s=0.1 * len(distance) if s is None else s)
-    return lambda u, v: spline.ev(u, v).item()

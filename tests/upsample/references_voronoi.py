@@ -1,12 +1,10 @@
-"""Slow, literal Voronoi upsampling: one cell at a time, by SciPy's Qhull.
+"""Slow Voronoi upsampling as it is by default: one cell at a time, by SciPy's Qhull.
 
 Notation: as in ``references``. A cell is (centre, radius, volume), the centre being the mean of its
 vertices and the radius the largest distance of one from there.
 """
 
 from __future__ import annotations
-
-import itertools
 
 import numpy as np
 from scipy.spatial import ConvexHull, HalfspaceIntersection, Voronoi
@@ -36,21 +34,12 @@ def true_cells(sites):
     return [None if -1 in r else _cell(diagram.vertices[r]) for r in regions]
 
 
-def box_cells(xyz):
-    """Cells of the points among the corners of their bounding box enlarged by 10%."""
-    middle, half = (xyz.max(axis=0) + xyz.min(axis=0)) / 2, np.ptp(xyz, axis=0) / 2
-    corners = middle + 1.1 * half * np.array(list(itertools.product((-1, 1), repeat=3)))
-    return true_cells(np.concatenate([xyz, corners]))[: len(xyz)]
-
-
-def voronoi(cloud, num_new, rng, *, box=False, k=25):
-    """Eq. 6: a cell by its volume, then uniform in the ball of half its radius."""
+def voronoi(cloud, num_new, rng, *, k=25):
+    """A cell by its relative volume, then uniform in the ball of half its radius."""
     xyz = cloud.xyz
-    weight = base_weights(xyz, k, reject_isolated=not box)
-    cells = box_cells(xyz) if box else [clamped_cell(xyz, i, k) for i in range(len(xyz))]
+    cells = [clamped_cell(xyz, i, k) for i in range(len(xyz))]
     volume = np.array([cell[2] for cell in cells])
-    weight = weight * (volume if box else _relative(xyz, volume, k))
-    bases = draw_bases(weight, num_new, rng)
+    bases = draw_bases(base_weights(xyz, k) * _relative(xyz, volume, k), num_new, rng)
     draws = rng.random((num_new, 3), dtype=np.float32).astype(np.float64)
     new_xyz, new_rgb = [], []
     for i, (d0, d1, d2) in zip(bases, draws, strict=True):

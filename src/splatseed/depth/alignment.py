@@ -4,7 +4,9 @@ Notation: at an SfM point that falls into a pixel, ``value`` is the map's and ``
 planar depth, float64 [M]. For maps of the kinds "z" and "ray" z = scale value (value divided by the
 length of the pixel's ray for "ray"; the shift is 0), for "inverse" 1 / z = scale value + shift: the
 *line* that networks of the MiDaS kind leave open. A ray has unit z in camera axes, so that its
-length is distance over planar depth, and passes through its pixel's centre, at +0.5.
+length is distance over planar depth, and passes through its pixel's centre, at +0.5. With
+``unit_ray``, as in the paper's equation 9, depth of any kind counts as distance along the ray, both
+where the scale is fitted and where pixels are lifted.
 Promise: an image is left out when too few of its points see depth, or when it fits much worse than
 the others; each such image is reported with the reason. Nothing is random; multiplying ``z`` by a
 power of two divides or multiplies the result by it exactly.
@@ -100,9 +102,15 @@ class Settings:
         return self.min_agreeing > 0 or not self.see_through
 
 
-def least_squares_scale(value: Values, z: Values) -> float:
-    """The s that minimises sum (s value - z)^2: the paper's equation 7."""
-    return float(value @ z / (value @ value))
+def least_squares_scale(
+    raw: Float64[np.ndarray, " M ..."], sfm: Float64[np.ndarray, " M ..."]
+) -> float:
+    """The s that minimises sum |s raw - sfm|^2: the paper's equation 7.
+
+    ``raw`` are lifted pixels before scaling, p_raw, and ``sfm`` the SfM points that fall into them,
+    both relative to the camera's centre.
+    """
+    return float(np.vdot(raw, sfm) / np.vdot(raw, raw))
 
 
 def median_scale(value: Values, z: Values) -> float:
@@ -302,9 +310,11 @@ def align_map(
     points: SeenPoints,
     fit: Fit = Settings.fit,
     min_points: int = Settings.min_points,
+    *,
+    unit_ray: bool = Settings.unit_ray,
 ) -> Alignment:
     """Align one map, whose camera is in its own pixels, with the SfM points that its image sees."""
-    value, z = _values_at(depth, camera, points)
+    value, z, points = _values_at(depth, camera, points, unit_ray=unit_ray)
     known = depth.values[np.isfinite(depth.values)]
     refused = None
     if not known.size:
@@ -317,8 +327,12 @@ def align_map(
         return Alignment(np.nan, 0.0, len(value), np.nan, refused)
     if depth.kind == "inverse":
         scale, shift = (robust_line if fit == "robust" else least_squares_line)(value, z)
+    elif fit == "robust":
+        scale, shift = median_scale(value, z), 0.0
     else:
-        scale, shift = (median_scale if fit == "robust" else least_squares_scale)(value, z), 0.0
+        centers = np.floor(points.uv) + 0.5
+        raw = value[:, None] * _rays(camera, centers)
+        scale, shift = least_squares_scale(raw, points.z[:, None] * _rays(camera, points.uv)), 0.0
     residual = _residual(depth, value, z, scale, shift)
     if depth.kind == "inverse" and not scale > 0:
         refused = "values rise with depth, so they are not its inverse"
@@ -327,9 +341,11 @@ def align_map(
     return Alignment(scale, shift, len(value), residual, refused)
 
 
-def trust_units(depth: DepthMap, camera: Camera, points: SeenPoints) -> Alignment:
+def trust_units(
+    depth: DepthMap, camera: Camera, points: SeenPoints, *, unit_ray: bool = Settings.unit_ray
+) -> Alignment:
     """Take a map as being in scene units, checked against the SfM points if there are any."""
-    value, z = _values_at(depth, camera, points)
+    value, z, _ = _values_at(depth, camera, points, unit_ray=unit_ray)
     residual, refused = np.nan, None
     if not np.isfinite(depth.values).any():
         refused = NO_DEPTH
@@ -343,18 +359,28 @@ def trust_units(depth: DepthMap, camera: Camera, points: SeenPoints) -> Alignmen
     return Alignment(1.0, 0.0, len(value), residual, refused)
 
 
-def _values_at(depth: DepthMap, camera: Camera, points: SeenPoints) -> tuple[Values, Values]:
-    """The map's values at the points that see depth, and these points' planar depths.
+def _values_at(
+    depth: DepthMap, camera: Camera, points: SeenPoints, *, unit_ray: bool
+) -> tuple[Values, Values, SeenPoints]:
+    """The map's values at the points that see depth, the depths to compare, and these points.
 
     A point takes the value of the pixel it falls into. Distances along the ray are turned into
-    planar depth by the ray through that pixel's centre.
+    planar depth by the ray through that pixel's centre. Their inverses cannot be, as their shift is
+    not known yet: the points' planar depths become distances instead.
     """
     column, row = points.uv.astype(np.int64).T
-    value = depth.values[row, column].astype(np.float64)
-    if depth.kind == "ray":
+    value, z = depth.values[row, column].astype(np.float64), points.z
+    if depth.kind == "inverse":
+        z = z * ray_length(camera, column, row) if unit_ray else z
+    elif depth.kind == "ray" or unit_ray:
         value /= ray_length(camera, column, row)
     known = np.isfinite(value) & ((value > 0) | (depth.kind == "inverse"))
-    return value[known], points.z[known]
+    return value[known], z[known], SeenPoints(points.uv[known], points.z[known])
+
+
+def _rays(camera: Camera, uv: Float64[np.ndarray, "M 2"]) -> Float64[np.ndarray, "M 3"]:
+    """Rays of unit z through image positions, in camera axes."""
+    return np.column_stack([uv, np.ones(len(uv))]) @ np.linalg.inv(camera.K).T
 
 
 def _residual(depth: DepthMap, value: Values, z: Values, scale: float, shift: float) -> float:

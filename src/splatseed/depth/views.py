@@ -109,16 +109,17 @@ def read_view(
         depth = DepthMap(values, depth.kind)
     camera = map_camera(depth, image)
     points = camera_points(camera, visibility.of(image))
+    ray = {"unit_ray": settings.unit_ray}
     if settings.align:
-        alignment = align_map(depth, camera, points, settings.fit, settings.min_points)
+        alignment = align_map(depth, camera, points, settings.fit, settings.min_points, **ray)
     else:
-        alignment = trust_units(depth, camera, points)
+        alignment = trust_units(depth, camera, points, **ray)
     if alignment.rejected is not None:
         none, no_rgb = np.empty(0, np.int64), np.empty((0, 3), np.uint8)
         no_z = np.empty(0, np.float32)
         return DepthView(alignment, camera, none, no_z, no_rgb, none > 0, True, None)
     scale, shift = alignment.scale, alignment.shift
-    planar = PlanarDepth.of(depth, camera, scale, shift, unit_ray=settings.unit_ray)
+    planar = PlanarDepth.of(depth, camera, scale, shift, **ray)
     pixel, edge = sample_pixels(planar.values, num, points.uv, settings, rng)
     z, unit, coarse = planar.at(pixel), planar.scale, None
     if settings.compares_views or settings.synchronizes:

@@ -6,7 +6,8 @@ given only, so that they give the same for a cloud in tiles (``upsample.tiles``)
 
 Colours: c = sum_j w_j c_j / sum_j w_j over the base point and its neighbours, with
 w_j = 1 / max(|p - p_j|, 0.01 h), h the base point's spacing, in linear arithmetic on the 8-bit
-values as in the paper, rounded to the nearest.
+values as in the paper, rounded to the nearest. Points that may lie far from their base can take the
+originals nearest to themselves instead (``colors_of_nearest``).
 """
 
 from __future__ import annotations
@@ -20,11 +21,12 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
 from splatseed.errors import PointCloudError
-from splatseed.progress import Progress
+from splatseed.progress import Progress, in_threads
 from splatseed.runtime.jit import inline, kernel, parallel_range
 from splatseed.scene import Scene
 from splatseed.upsample.method import NewPoints, check_fields
 from splatseed.upsample.neighbors import (
+    QUERY_BLOCK,
     Bases,
     Neighbors,
     PreparedCloud,
@@ -137,6 +139,30 @@ def interpolate_colors(
         bases.start, bases.count, new_xyz, rgb,
     )  # fmt: skip
     return rgb
+
+
+def colors_of_nearest(
+    cloud: PreparedCloud,
+    neighbors: Neighbors,
+    new_xyz: Float32[np.ndarray, "M 3"],
+    k: int,
+    progress: Progress,
+) -> UInt8[np.ndarray, "M 3"]:
+    """Colours of new points at world positions from the k originals nearest to each."""
+    rgb, spacing = np.empty_like(cloud.rgb), np.empty(len(cloud))
+    rgb[cloud.rank], spacing[cloud.rank] = cloud.rgb, neighbors.spacing
+    out = np.empty((len(new_xyz), 3), np.uint8)
+    nth = np.arange(1, min(k, len(cloud)) + 1)
+
+    def work(start: int, stop: int) -> None:
+        local = new_xyz[start:stop] - cloud.center
+        distance, number = cloud.tree.query(local, nth)
+        weight = 1.0 / np.maximum(distance, FLOOR * spacing[number[:, :1]])
+        weight /= weight.sum(axis=1, keepdims=True)
+        out[start:stop] = np.einsum("mk,mkc->mc", weight, rgb[number]) + 0.5
+
+    in_threads(work, len(new_xyz), QUERY_BLOCK, "colours", progress)
+    return out
 
 
 @kernel

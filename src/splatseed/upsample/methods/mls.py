@@ -3,8 +3,9 @@
 Minimise sum_j w_j (q(u_j, v_j) - z_j)^2 over q of degree 2, with w_j = 1 / max(d_j, d_1 / 2):
 inverse to the distance from the base point, bounded at the base itself. Coordinates are scaled
 by the distance of the k-th neighbour, and a ridge of 1e-6 times the mean diagonal resolves what
-collinear or too few neighbours leave undetermined. A position drawn on the patch is moved along the
-normal onto q.
+collinear or too few neighbours leave undetermined. In world axes, as the paper has it, the ridge is
+1e-12, so that it decides nothing else. A position drawn on the patch is moved along the normal onto
+q.
 """
 
 from __future__ import annotations
@@ -20,7 +21,9 @@ from splatseed.runtime.jit import inline, kernel, parallel_range
 from splatseed.upsample.patches import Patches, PatchMethod
 
 TERMS = 6  # 1, u, v, u^2, uv, v^2
-RIDGE = 1e-6  # relative to the mean diagonal: far below what six or more points determine
+RIDGE = {"local": 1e-6, "world": 1e-12}
+"""By frame, relative to the mean diagonal. In world axes neighbours are often nearly collinear: a
+ridge of 1e-6 would move 1.4% of fern's new points by over a tenth of the spacing."""
 
 
 @dataclass(frozen=True)
@@ -43,17 +46,18 @@ class Mls(PatchMethod):
         """Fit rows ``first:last`` and write q(u, v) of all their new points into ``out`` [M]."""
         _heights(
             patches.cloud.xyz, patches.neighbors.idx, patches.neighbors.distance, patches.frames,
-            patches.bases.start, patches.bases.count, patches.uv, first, last, out,
+            patches.bases.start, patches.bases.count, patches.uv, RIDGE[self.frame], first, last,
+            out,
         )  # fmt: skip
 
 
 @kernel
-def _heights(xyz, idx, distance, frames, start, count, uv, first, last, out):  # type: ignore[no-untyped-def]  # Numba's types
+def _heights(xyz, idx, distance, frames, start, count, uv, ridge, first, last, out):  # type: ignore[no-untyped-def]  # Numba's types
     """Heights of all new points of rows ``first:last``."""
     for i in parallel_range(first, last):
         if count[i] > 0:
             scale = distance[i, -1]
-            q = _fit(xyz, i, idx[i], distance[i], frames[i])
+            q = _fit(xyz, i, idx[i], distance[i], frames[i], ridge)
             for m in range(start[i], start[i] + count[i]):
                 u, v = uv[m, 0] / scale, uv[m, 1] / scale
                 # q(u, v), by Horner's rule
@@ -62,7 +66,7 @@ def _heights(xyz, idx, distance, frames, start, count, uv, first, last, out):  #
 
 
 @inline
-def _fit(xyz, i, rows, distance, frame):  # type: ignore[no-untyped-def]  # Numba's types
+def _fit(xyz, i, rows, distance, frame, ridge):  # type: ignore[no-untyped-def]  # Numba's types
     """Coefficients of 1, u, v, u^2, uv, v^2, with lengths in units of the k-th distance."""
     normal, rhs = np.zeros((TERMS, TERMS)), np.zeros(TERMS)
     term = np.empty(TERMS)
@@ -85,18 +89,18 @@ def _fit(xyz, i, rows, distance, frame):  # type: ignore[no-untyped-def]  # Numb
             rhs[a] += scaled * z
             for b in range(a + 1):
                 normal[a, b] += scaled * term[b]
-    _solve(normal, rhs)
+    _solve(normal, rhs, ridge)
     return rhs
 
 
 @inline
-def _solve(normal, rhs):  # type: ignore[no-untyped-def]  # Numba's types
+def _solve(normal, rhs, ridge):  # type: ignore[no-untyped-def]  # Numba's types
     """Solve the ridge-regularised normal equations in place, by Cholesky on the lower triangle."""
     trace = 0.0
     for a in range(TERMS):
         trace += normal[a, a]
     for a in range(TERMS):
-        normal[a, a] += RIDGE * trace / TERMS
+        normal[a, a] += ridge * trace / TERMS
     for a in range(TERMS):
         for b in range(a):
             for c in range(b):

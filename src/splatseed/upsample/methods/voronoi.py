@@ -1,13 +1,15 @@
 """Voronoi upsampling (paper, eq. 6): new points where originals are sparse.
 
 A cell is drawn with probability proportional to its volume, and the point is uniform in the ball
-(c_i, r_i / 2) about the cell's centre; its colour comes from the 5 nearest originals.
+(c_i, r_i / 2) about the cell's centre; its colour comes from 5 neighbours.
 
 Default: cells are clamped to half the distance of the 25th neighbour (``cells``), and the
 probability is the volume relative to the median of the neighbours', capped at 8: otherwise all new
-points go to the sparse background, most of them outside the scene.
+points go to the sparse background, most of them outside the scene. The 5 neighbours are the
+cell's: its points lie close to them.
 Paper: SciPy's Voronoi cells of the originals and the corners of the bounding box enlarged by 10%,
-drawn by volume (``cells``).
+drawn by the volume vol_i = E[|v - c_i|]^3 of their vertices v (``cells``). The 5 neighbours are
+those of the new point.
 """
 
 from __future__ import annotations
@@ -23,7 +25,13 @@ from splatseed.progress import Progress, blocks
 from splatseed.runtime.jit import kernel, parallel_range
 from splatseed.upsample.cells import MAX_NEIGHBORS, Cells, box_cells, build_cells
 from splatseed.upsample.method import NewPoints, require
-from splatseed.upsample.nearest import NearestMethod, RowData, UniformSource, interpolate_colors
+from splatseed.upsample.nearest import (
+    NearestMethod,
+    RowData,
+    UniformSource,
+    colors_of_nearest,
+    interpolate_colors,
+)
 from splatseed.upsample.neighbors import Bases, Neighbors, PreparedCloud
 from splatseed.upsample.patches import local_frames
 
@@ -37,7 +45,7 @@ class Voronoi(NearestMethod):
     k: int = 25
     """Neighbours that shape a cell; half the distance of the last bounds it."""
     cells: Literal["clamped", "box"] = "clamped"
-    """Cells clamped to their neighbourhood, or Qhull's in the enlarged bounding box (paper:
+    """Cells clamped to their neighbourhood, or SciPy's in the enlarged bounding box (paper:
     box)."""
     ball: float = 0.5
     """Radius of the ball for new points, as a fraction of the cell's radius (paper: 0.5)."""
@@ -57,7 +65,7 @@ class Voronoi(NearestMethod):
 
     @classmethod
     def paper(cls) -> Self:
-        """Cells in the bounding box enlarged by 10%, drawn by volume alone."""
+        """Cells in the bounding box enlarged by 10%, drawn by equation 6's volume alone."""
         return cls(cells="box", reject_isolated=False)
 
     @property
@@ -97,9 +105,11 @@ class Voronoi(NearestMethod):
             cloud.xyz, cloud.center, known["center"], self.ball * known["radius"], frames,
             bases.start, bases.count, xyz,
         )  # fmt: skip
-        return NewPoints(
-            xyz, interpolate_colors(cloud, neighbors.nearest(self.color_k), bases, xyz)
-        )
+        if self.cells == "box":
+            rgb = colors_of_nearest(cloud, neighbors, xyz, self.color_k, progress)
+        else:
+            rgb = interpolate_colors(cloud, neighbors.nearest(self.color_k), bases, xyz)
+        return NewPoints(xyz, rgb)
 
 
 def _clamped_cells(cloud: PreparedCloud, neighbors: Neighbors, progress: Progress) -> Cells:
