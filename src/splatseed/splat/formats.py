@@ -1,7 +1,6 @@
 """Files of trained Gaussians: 3DGS's .ply and the packed formats; and choosing which to keep.
 
-A .ply has one vertex per Gaussian, all float32; of f_rest_* all of red comes first, then green,
-then blue. Promise: a file's content decides its format when it is read, its name when it is
+Promise: a file's content decides its format when it is read, its name when it is
 written; a file appears whole or not at all; what is read can be drawn (``cleaning.py``). A .ply is
 read back bit for bit, its properties found by name; packed formats lose fine detail, and the
 Gaussians' order.
@@ -13,33 +12,21 @@ import zlib
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
-from numpy.lib.recfunctions import structured_to_unstructured
 
 from splatseed.errors import ParameterError, SceneFormatError
-from splatseed.io.files import COPY_AGAIN, ByteReader, StrPath, read_bytes
-from splatseed.io.ply import EXPORT_PLY_AGAIN, Element, parse_header
+from splatseed.io.files import COPY_AGAIN, StrPath, read_bytes
 from splatseed.io.staging import atomic_file
 from splatseed.literal import beginning, did_you_mean
 from splatseed.progress import Note, Progress, silent, silent_note
-from splatseed.splat import packed, sog
+from splatseed.splat import model_ply, packed, sog
 from splatseed.splat.cleaning import drop_unusable
 from splatseed.splat.gaussians import Gaussians
 
 _HEADER = 1 << 20
-_COLUMNS = {
-    "means": ("x", "y", "z"),
-    "normals": ("nx", "ny", "nz"),
-    "sh0": ("f_dc_0", "f_dc_1", "f_dc_2"),
-    "shN": (),
-    "opacities": ("opacity",),
-    "scales": ("scale_0", "scale_1", "scale_2"),
-    "quats": ("rot_0", "rot_1", "rot_2", "rot_3"),
-}
-"""The properties of a .ply in the order in which 3DGS writes them, but for f_rest_*."""
 _ELSEWHERE = {
     ".ksplat": "GaussianSplats3D's own tool (util/create-ksplat.js) makes one from a .ply",
     ".glb": f"{sog.CONVERTER} MODEL.ply OUT.glb makes one from a .ply",
@@ -49,61 +36,13 @@ _ELSEWHERE = {
 """Formats that are neither read nor written here, and the tools that write them."""
 
 
-def _encode_ply(gaussians: Gaussians, _: Note = silent_note) -> list[bytes | memoryview]:
-    count, rest = len(gaussians), 3 * gaussians.shN.shape[1]
-    columns = _columns(rest)
-    arrays = {**gaussians.arrays(), "normals": np.zeros((count, 3), np.float32)}
-    arrays["shN"] = gaussians.shN.transpose(0, 2, 1)
-    tables = [arrays[name].reshape(count, len(each)) for name, each in columns.items()]
-    properties = "".join(f"property float {p}\n" for each in columns.values() for p in each)
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {count}\n{properties}"
-    table = np.concatenate(tables, axis=1, dtype="<f4")
-    return [f"{header}end_header\n".encode("ascii"), table.data]
-
-
-def _decode_ply(path: Path) -> Gaussians:
-    reader = ByteReader(path, EXPORT_PLY_AGAIN)
-    header = parse_header(path, reader.data)
-    vertex = header.elements[0] if header.elements else Element("none", 0, {})
-    names = set(vertex.types)
-    rest = sum(name.startswith("f_rest_") for name in names)
-    columns = {name: each for name, each in _columns(rest).items() if name != "normals"}
-    missing = [name for each in columns.values() for name in each if name not in names]
-    found = f"no {', '.join(missing[:5])}" if missing else ""
-    if not found and (not header.byte_order or vertex.has_lists):
-        found = "an ascii file, or lists"
-    elif not found and (rest not in {3 * k for k in packed.SH_COUNTS} or not vertex.num_rows):
-        found = f"{rest} f_rest properties and {vertex.num_rows} vertices"
-    if found:
-        raise SceneFormatError(
-            f"{path} to hold trained Gaussians in 3DGS's layout, binary",
-            found=found,
-            fix="Name the point_cloud.ply of a training run, not the seeds or a mesh.",
-        )
-    reader.offset, reader.record = header.size, "element vertex"
-    rows = reader.array(header.dtype(vertex), vertex.num_rows)
-    arrays: dict[str, Any] = {
-        name: np.array(structured_to_unstructured(rows[list(each)]), np.float32, order="C")
-        for name, each in columns.items()
-        if each
-    }
-    arrays["opacities"], arrays["sh0"] = arrays["opacities"][:, 0], arrays["sh0"][:, None]
-    planes = arrays.get("shN", np.zeros((len(rows), 0))).reshape(len(rows), 3, rest // 3)
-    arrays["shN"] = np.array(planes.transpose(0, 2, 1), np.float32, order="C")
-    return Gaussians(**arrays)
-
-
-def _columns(rest: int) -> dict[str, tuple[str, ...]]:
-    return {**_COLUMNS, "shN": tuple(f"f_rest_{i}" for i in range(rest))}
-
-
 class Format(NamedTuple):
     """A format: its files' suffix, what it preserves and who reads it, and its two functions."""
 
     suffix: str
     about: str
     encode: Callable[[Gaussians, Note], Iterable[bytes | memoryview]]
-    decode: Callable[[Path], Gaussians]
+    decode: Callable[[Path, Note], Gaussians]
 
 
 FORMATS = {
@@ -112,7 +51,8 @@ FORMATS = {
         packed.encode_compressed_ply, packed.decode_compressed_ply,
     ),
     "ply": Format(
-        ".ply", "everything, as 3DGS writes it; every tool reads it", _encode_ply, _decode_ply
+        ".ply", "everything, as 3DGS writes it; every tool reads it",
+        model_ply.encode, model_ply.decode,
     ),
     "splat": Format(
         ".splat", "no view-dependent colour; web viewers", packed.encode_splat, packed.decode_splat
@@ -140,7 +80,7 @@ def read_model(path: StrPath, note: Note = silent_note) -> Gaussians:
         MissingDependencyError: It is an .spz of version 4, which needs zstandard.
     """
     path = Path(path)
-    gaussians = FORMATS[detect_format(path, read_bytes(path))].decode(path)
+    gaussians = FORMATS[detect_format(path, read_bytes(path))].decode(path, note)
     gaussians, left_out = drop_unusable(path, gaussians)
     if left_out:
         note(left_out)

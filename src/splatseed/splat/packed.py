@@ -12,6 +12,7 @@ PlayCanvas's splat-transform and engine; nianticlabs/spz (load-spz.cc, splat-typ
 from __future__ import annotations
 
 import gzip
+import re
 import struct
 import zlib
 from pathlib import Path
@@ -69,6 +70,10 @@ _SPZ_HEADER = struct.Struct("<4sIIBBBB")
 _SPZ_VERSION = 3  # the latest that every reader accepts
 _SPZ_MOST, _SPZ_FRACTION = 2**23 - 1, 20
 """Largest position in units of 2^-f, 24 bits with a sign; largest f."""
+_SPZ_ANTIALIASED = 1
+"""The flag of models that are to be rendered with antialiasing."""
+_SPZ_DEGREES = (*SH_COUNTS, 24)
+"""Coefficients beyond the first by degree; those of degree 4 are not used."""
 _SPZ_SCALES = (-10.0, 255 / 16 - 10)
 """Log-scales that a byte holds."""
 _MAX_LOST = 0.1
@@ -84,6 +89,10 @@ _SPZ_STEP = 4
 """Further coefficients are rounded to this many 128ths, so that gzip saves more. Niantic's writer
 takes 8 for the first degree and 16 for the others: files are a quarter smaller, but coefficients of
 a short run vanish, and with them up to 2.8 dB (docs/formats.md)."""
+
+_RENDER_MODE = re.compile(
+    rb"^comment[ \t]+(?:SplatRenderMode:|antialiased)[ \t]+(\w+)", re.MULTILINE | re.IGNORECASE
+)
 
 # What formats share -------------------------------------------------------------------------------
 
@@ -123,6 +132,17 @@ def opacity_logits(values: UInt8[np.ndarray, " N"]) -> Float32[np.ndarray, " N"]
     return np.log(opacity / (1 - opacity)).astype(np.float32)
 
 
+def antialiased_comment(gaussians: Gaussians) -> list[str]:
+    """The line of a PLY header, Brush's, that says how the Gaussians are to be rendered."""
+    return ["comment SplatRenderMode: mip"] if gaussians.antialiased else []
+
+
+def is_antialiased(header: bytes) -> bool:
+    """Whether a PLY header says so, by its last comment of Brush or Postshot about it."""
+    modes = _RENDER_MODE.findall(header)
+    return bool(modes) and modes[-1].lower() in {b"mip", b"1"}
+
+
 def rounded_bytes(values: np.ndarray) -> UInt8[np.ndarray, "..."]:
     """Values from 0 to 255 as bytes; others are clipped."""
     return np.asarray(np.clip(np.rint(values), 0, 255), np.uint8)
@@ -140,8 +160,13 @@ def _unit_quats(quats: Float32[np.ndarray, "N 4"]) -> Float32[np.ndarray, "N 4"]
 # .splat -------------------------------------------------------------------------------------------
 
 
-def encode_splat(gaussians: Gaussians, _: Note = silent_note) -> list[bytes]:
+def encode_splat(gaussians: Gaussians, note: Note = silent_note) -> list[bytes]:
     """By size times opacity, so that a viewer can draw the most important ones first."""
+    if gaussians.antialiased:
+        note(
+            "The model is to be rendered with antialiasing, which a .splat cannot say: small "
+            "Gaussians will be too opaque."
+        )
     log_opacity = -np.logaddexp(0, -gaussians.opacities.astype(np.float64))
     size = gaussians.scales.astype(np.float64).sum(axis=1) + log_opacity
     order = np.argsort(-size, kind="stable")
@@ -156,7 +181,7 @@ def encode_splat(gaussians: Gaussians, _: Note = silent_note) -> list[bytes]:
     return [rows.tobytes()]
 
 
-def decode_splat(path: Path) -> Gaussians:
+def decode_splat(path: Path, _: Note = silent_note) -> Gaussians:
     """A whole number of records; scales that are negative become NaN.
 
     As a .splat has no signature, one without usable scales and means in half of its Gaussians is
@@ -212,7 +237,8 @@ def encode_compressed_ply(gaussians: Gaussians, _: Note = silent_note) -> list[b
     coefficients = gaussians.shN[order].transpose(0, 2, 1).reshape(count, rest)
     # A coefficient c in [-4, 4] is the byte (c / 8 + 1/2) 256.
     sh = np.clip((coefficients / _SH_RANGE + 0.5) * 256, 0, 255).astype(np.uint8)
-    lines = ["ply", "format binary_little_endian 1.0", f"element chunk {len(starts)}"]
+    lines = ["ply", "format binary_little_endian 1.0", *antialiased_comment(gaussians)]
+    lines += [f"element chunk {len(starts)}"]
     lines += [f"property float {name}" for names in _BOUNDS for name in names]
     lines += [f"element vertex {count}", *(f"property uint {name}" for name in _PACKED)]
     if rest:
@@ -244,7 +270,7 @@ def _in_chunks(gaussians: Gaussians) -> tuple[Int64[np.ndarray, " M"], Bool[np.n
     return order[np.concatenate(index)], np.concatenate(filled)
 
 
-def decode_compressed_ply(path: Path) -> Gaussians:
+def decode_compressed_ply(path: Path, _: Note = silent_note) -> Gaussians:
     """Chunks, vertices, and coefficients if there are some."""
     reader = ByteReader(path)
     header = parse_header(path, reader.data)
@@ -291,6 +317,7 @@ def decode_compressed_ply(path: Path) -> Gaussians:
             opacities=opacity_logits((color & 255).astype(np.uint8)),
             sh0=((colors - np.float32(0.5)) / np.float32(SH_C0))[:, None],
             shN=shN,
+            antialiased=is_antialiased(reader.data[: header.size]),
         )
         return gaussians if kept.all() or not kept.any() else gaussians.select(kept)
 
@@ -340,7 +367,8 @@ def encode_spz(gaussians: Gaussians, note: Note = silent_note) -> list[bytes]:
         rounded_bytes(np.floor((sh + _SPZ_STEP // 2) / _SPZ_STEP) * _SPZ_STEP),
     ]
     degree = SH_COUNTS.index(rest)
-    header = _SPZ_HEADER.pack(SPZ_MAGIC, _SPZ_VERSION, len(order), degree, bits, 0, 0)
+    flags = _SPZ_ANTIALIASED * gaussians.antialiased
+    header = _SPZ_HEADER.pack(SPZ_MAGIC, _SPZ_VERSION, len(order), degree, bits, flags, 0)
     body = b"".join(np.ascontiguousarray(part).tobytes() for part in parts)
     return [gzip.compress(header + body, 6, mtime=0)]
 
@@ -383,19 +411,19 @@ def _fixed_point(gaussians: Gaussians, note: Note) -> tuple[Gaussians, int]:
     return gaussians if kept.all() else gaussians.select(kept), bits
 
 
-def decode_spz(path: Path) -> Gaussians:
+def decode_spz(path: Path, note: Note = silent_note) -> Gaussians:
     """Of any version; 4 needs zstandard."""
     data = read_bytes(path)
     with guarded(path, "a whole .spz"):
         stream = zlib.decompressobj(wbits=31)
         in_zstd = data.startswith(SPZ_MAGIC)
         header = data if in_zstd else stream.decompress(data, _SPZ_HEADER.size)
-        _, version, count, degree, bits, _, _ = _SPZ_HEADER.unpack_from(header)
+        _, version, count, degree, bits, flags, _ = _SPZ_HEADER.unpack_from(header)
         if not 1 <= version <= 4:
             raise ValueError(f"version {version}; versions 1 to 4 are known")
-        if degree >= len(SH_COUNTS) or count == 0 or bits > 24:
+        if degree >= len(_SPZ_DEGREES) or count == 0 or bits > 24:
             raise ValueError(f"{count} Gaussians of degree {degree}, {bits} fractional bits")
-        rest = SH_COUNTS[degree]
+        rest = _SPZ_DEGREES[degree]
         # Position, opacity, colour, scale, rotation, harmonics: bytes per Gaussian.
         sizes = [6 if version == 1 else 9, 1, 3, 3, 3 if version < 3 else 4, 3 * rest]
         check_memory(count, sum(sizes), "Gaussians", fix=COPY_AGAIN)
@@ -411,6 +439,11 @@ def decode_spz(path: Path) -> Gaussians:
         parts = np.split(np.frombuffer(body, np.uint8), count * np.cumsum(sizes)[:-1])
         position, opacity, color, scale, turn, sh = (part.reshape(count, -1) for part in parts)
         harmonics = (sh.reshape(count, rest, 3).astype(np.float32) - 128) / 128
+        if rest > len(_SPZ_SH):
+            note(
+                f"Of {rest} coefficients beyond the first, the {len(_SPZ_SH)} of degree 3 are used."
+            )
+            rest, harmonics = len(_SPZ_SH), harmonics[:, : len(_SPZ_SH)]
         if version == 1:  # half floats
             means = np.ascontiguousarray(position).view("<f2").astype(np.float32)
         else:
@@ -425,6 +458,7 @@ def decode_spz(path: Path) -> Gaussians:
             opacities=opacity_logits(opacity[:, 0]),
             sh0=((color - 127.5) / _SPZ_COLOR).astype(np.float32)[:, None],
             shN=np.asarray(harmonics * _SPZ_SH[:rest, None], np.float32),
+            antialiased=bool(flags & _SPZ_ANTIALIASED),
         )
 
 

@@ -98,6 +98,8 @@ def _rasterize(
     view: View,
     shown: Tensor | int,
     mode: Literal["RGB", "ED"] = "RGB",
+    *,
+    antialiased: bool = False,
 ) -> tuple[Float[Tensor, "H W D"], Float[Tensor, "H W 1"], dict[str, Any]]:
     """Render features, or harmonics up to a degree: image, alphas, ``info``."""
     colors: Tensor | tuple[Tensor, Tensor]
@@ -111,6 +113,7 @@ def _rasterize(
         params["means"], params["quats"], torch.exp(params["scales"]),
         opacities_of(params["opacities"]), colors, camera.viewmats, camera.Ks,
         view.width, view.height, sh_degree=degree, packed=False, render_mode=mode,
+        rasterize_mode="antialiased" if antialiased else "classic",
     )  # fmt: skip
     # Unlike indexing, squeeze's backward allocates no image of zeros.
     return images.squeeze(0), alphas.squeeze(0), info
@@ -119,13 +122,14 @@ def _rasterize(
 class ModelRenderer:
     """Renders Gaussians of the world, without gradients, on a device, by default the CPU.
 
-    In ``frame`` near planes and single precision work.
+    In ``frame`` near planes and single precision work. Antialiased Gaussians are rendered so.
     """
 
     def __init__(
         self, gaussians: Gaussians, frame: TrainingFrame, device: torch.device | None = None
     ) -> None:
         self.frame, self.count = frame, len(gaussians)
+        self._antialiased = gaussians.antialiased
         arrays = frame.gaussians_from_world(gaussians).arrays()
         self._params = {name: torch.tensor(array, device=device) for name, array in arrays.items()}
 
@@ -146,7 +150,9 @@ class ModelRenderer:
     @torch.no_grad()
     def _images(self, view: View, mode: Literal["RGB", "ED"]) -> tuple[Tensor, Tensor]:
         degree = math.isqrt(1 + self._params["shN"].shape[1]) - 1
-        return _rasterize(self._params, self.frame.view(view), degree, mode)[:2]
+        return _rasterize(
+            self._params, self.frame.view(view), degree, mode, antialiased=self._antialiased
+        )[:2]
 
 
 # Photographs --------------------------------------------------------------------------------------

@@ -30,6 +30,8 @@ CONVERTER = "npx @playcanvas/splat-transform"
 
 _VERSION = 2
 _META = "meta.json"
+_ANTIALIASED = "antialiased"
+"""What meta.json gives as the model of Gaussians that are to be rendered so."""
 _PER_ROW = 64  # palette entries per row of the centroid picture
 _MOST_LEVELS = 16  # the palette grows with the number of Gaussians, to 2^16 entries
 _MOST_BYTES, _MOST_META = 1 << 31, 1 << 24
@@ -81,6 +83,8 @@ def encode(
         "quats": {"files": ["quats.webp"]},
         "sh0": {"codebook": sh0.tolist(), "files": ["sh0.webp"]},
     }
+    if gaussians.antialiased:
+        meta["model"] = _ANTIALIASED
     count, rest, _ = gaussians.shN.shape
     if rest and count > 1:
         levels = min(int(np.log2(count)), _MOST_LEVELS)
@@ -136,7 +140,7 @@ def _within_steps(gaussians: Gaussians, note: Note) -> Gaussians:
     return gaussians if kept.all() else gaussians.select(kept)
 
 
-def decode(path: Path) -> Gaussians:
+def decode(path: Path, _: Note = silent_note) -> Gaussians:
     """The Gaussians in a file, or in the unpacked folder that a ``meta.json`` lies in."""
     from PIL import Image  # noqa: PLC0415  (slow to import)
 
@@ -183,6 +187,7 @@ def decode(path: Path) -> Gaussians:
             opacities=packed.opacity_logits(sh0[:, 3]),
             sh0=centers["sh0"][sh0[:, None, :3]],
             shN=shN,
+            antialiased=meta.get("model") == _ANTIALIASED,
         )
 
 

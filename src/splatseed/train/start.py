@@ -46,8 +46,14 @@ def read_start(
         gaussians, told = in_scene_world(path, scene, gaussians)
     if told:
         note(told)
+    if gaussians.antialiased:
+        note(
+            f"{path} was trained with antialiasing; this run goes on without, so small Gaussians "
+            "are too opaque at first."
+        )
     # Some trainers write opacities of 0 and 1, whose logits are infinite.
-    return dataclasses.replace(gaussians, opacities=gaussians.opacities.clip(ABSENT, OPAQUE))
+    opacities = gaussians.opacities.clip(ABSENT, OPAQUE)
+    return dataclasses.replace(gaussians, opacities=opacities, antialiased=False)
 
 
 def start_facts(gaussians: Gaussians) -> dict[str, Any]:

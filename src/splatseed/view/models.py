@@ -128,7 +128,7 @@ def _is_model(path: Path) -> bool:
         kind = detect_format(path, data)
     except SceneFormatError:
         return False
-    return kind != "ply" or b" rot_0\n" in data[:_HEADER].replace(b"\r", b"")
+    return kind != "ply" or b" scale_0\n" in data[:_HEADER].replace(b"\r", b"")
 
 
 def share_a_world(first: Shown, second: Shown) -> bool:

@@ -1,0 +1,246 @@
+"""Trained Gaussians in .ply files: 3DGS's layout, and what other trainers and tools make of it.
+
+A vertex is a Gaussian; of f_rest_* all of red comes first, then green, then blue. Properties are
+found by name, in any order and type; those that are not known are ignored. Notation: s_i are a
+Gaussian's three sizes, f is Mip-Splatting's ``filter_3D``. Promise: what is written in 3DGS's
+layout is read back bit for bit; what needs more than its own numbers to be drawn (networks, a time)
+is refused by name.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32
+from numpy.lib.recfunctions import structured_to_unstructured
+
+from splatseed.errors import SceneFormatError
+from splatseed.io.files import ByteReader, guarded
+from splatseed.io.ply import EXPORT_PLY_AGAIN, Element, Header, parse_header
+from splatseed.progress import Note, silent_note
+from splatseed.splat.gaussians import SH_C0, Gaussians
+from splatseed.splat.packed import SH_COUNTS, antialiased_comment, is_antialiased
+
+_XYZ, _DC = ("x", "y", "z"), ("f_dc_0", "f_dc_1", "f_dc_2")
+_SCALES = ("scale_0", "scale_1", "scale_2")
+_ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
+_COLORS = ("red", "green", "blue")
+_FILTER = "filter_3D"
+_OTHER_KINDS = {
+    "f_anchor_feat": "anchors (as of Scaffold-GS), of which networks make the Gaussians",
+    "f_offset": "anchors (as of Scaffold-GS), of which networks make the Gaussians",
+    "trbf_": "Gaussians that move and fade over time (as of Spacetime Gaussians)",
+    "motion_": "Gaussians that move over time (as of Spacetime Gaussians)",
+    "scaling_t": "Gaussians in space and time (4D Gaussian Splatting)",
+    "scale_t": "Gaussians in space and time (4D Gaussian Splatting)",
+    "sb_params": "Beta kernels (as of Deformable Beta Splatting), not Gaussians",
+    "f_asg": "colours that a network computes (as of Spec-Gaussian)",
+}
+"""Beginnings of properties' names that tell models which their own program alone can draw."""
+FLATNESS = 1e-3
+"""Thickness of a flat Gaussian, relative to its smaller size: far below a pixel."""
+_UNUSED = (24, 35)  # coefficients beyond the first of degrees 4 and 5
+_BYTES = 2.0  # colours as floats beyond this are from 0 to 255, not from 0 to 1
+_LIST = re.compile(rb"^property[ \t]+list[ \t]+\S+[ \t]+\S+[ \t]+(\S+)", re.MULTILINE)
+
+
+def encode(gaussians: Gaussians, _: Note = silent_note) -> list[bytes | memoryview]:
+    """All of the Gaussians, as 3DGS writes them."""
+    count, rest = len(gaussians), 3 * gaussians.shN.shape[1]
+    harmonics = gaussians.shN.transpose(0, 2, 1).reshape(count, rest)
+    columns = [
+        (_XYZ, gaussians.means),
+        (("nx", "ny", "nz"), np.zeros((count, 3), np.float32)),
+        (_DC, gaussians.sh0[:, 0]),
+        (_rest_names(rest), harmonics),
+        (("opacity",), gaussians.opacities[:, None]),
+        (_SCALES, gaussians.scales),
+        (_ROTATION, gaussians.quats),
+    ]
+    lines = ["ply", "format binary_little_endian 1.0"]
+    lines += antialiased_comment(gaussians)
+    lines += [f"element vertex {count}"]
+    lines += [f"property float {name}" for names, _ in columns for name in names]
+    table = np.concatenate([values for _, values in columns], axis=1, dtype="<f4")
+    return ["\n".join([*lines, "end_header\n"]).encode("ascii"), table.data]
+
+
+def decode(path: Path, note: Note = silent_note) -> Gaussians:
+    """The Gaussians of a .ply by any program."""
+    reader = ByteReader(path, EXPORT_PLY_AGAIN)
+    header = parse_header(path, reader.data)
+    names = {name for element in _up_to_vertices(header)[-1:] for name in element.types}
+    _check(path, header, names, reader.data)
+    rows = _rows(reader, header)
+    arrays: dict[str, Any] = {
+        "means": _columns(rows, _XYZ),
+        "opacities": _columns(rows, ["opacity"])[:, 0],
+        "sh0": _first_colors(rows, names)[:, None],
+        "shN": _harmonics(rows, names, note),
+    }
+    arrays["scales"], arrays["quats"] = _shape(rows, names, note)
+    if _FILTER in names:
+        sizes = _columns(rows, [_FILTER])[:, 0]
+        arrays["scales"], arrays["opacities"] = filtered(
+            arrays["scales"], arrays["opacities"], sizes
+        )
+        note(
+            f"{path} has filter_3D, of Mip-Splatting and its kin: sizes and opacities are as this "
+            "filter makes them. Their renderers also blur the picture less than 3DGS's, which "
+            "splatseed's is like, so that scores may differ."
+        )
+    return Gaussians(**arrays, antialiased=is_antialiased(reader.data[: header.size]))
+
+
+def filtered(
+    scales: Float32[np.ndarray, "N 3"], opacities: Float32[np.ndarray, " N"], size: np.ndarray
+) -> tuple[Float32[np.ndarray, "N 3"], Float32[np.ndarray, " N"]]:
+    """Log-scales and opacity logits after Mip-Splatting's 3D smoothing filter (Yu et al., 2024).
+
+    The Gaussian is convolved with another of size f and keeps its integral: s_i' = sqrt(s_i^2 +
+    f^2), and the opacity is multiplied by sqrt(det / det'), the product of s_i / s_i'.
+    """
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        logs, others = scales.astype(np.float64), np.log(np.abs(size.astype(np.float64)))
+        wide = np.logaddexp(2 * logs, 2 * others[:, None]) / 2
+        logits = opacities.astype(np.float64)
+        # log opacity = -log(1 + exp(-x)), and back x = log o - log(1 - o)
+        log_opacity = -np.logaddexp(0, -logits) + (logs - wide).sum(axis=1)
+        thinned = log_opacity - np.log(-np.expm1(log_opacity))
+    unchanged = size == 0
+    return (
+        np.where(unchanged[:, None], scales, wide).astype(np.float32),
+        np.where(unchanged, opacities, thinned).astype(np.float32),
+    )
+
+
+def _check(path: Path, header: Header, names: set[str], data: bytes) -> None:
+    """Refuse a file that holds no Gaussians, or none that can be drawn from their numbers alone."""
+    rest = sum(name.startswith("f_rest_") for name in names)
+    needed = [*_XYZ, *(() if set(_COLORS) <= names else _DC), *_rest_names(rest), "opacity"]
+    needed += ["scale_0", *(_ROTATION if "scale_1" in names else ())]
+    missing = [name for name in needed if name not in names]
+    kinds = (
+        f"{kind}: {name}"
+        for name in sorted(names)
+        for start, kind in _OTHER_KINDS.items()
+        if name.startswith(start)
+    )
+    before = _up_to_vertices(header)
+    count = before[-1].num_rows if before else 0
+    found, fix = next(kinds, ""), "Export it as plain Gaussians with the program that trained it."
+    if not found:
+        fix = "Name the point_cloud.ply of a training run, not the seeds or a mesh."
+        if missing:
+            found = f"no {', '.join(missing[:5])}"
+        elif any(element.has_lists for element in before):
+            found = f"the list property {b', '.join(_LIST.findall(data, 0, header.size)).decode()}"
+            fix = "Export it again without the list."
+        elif rest not in {3 * k for k in (*SH_COUNTS, *_UNUSED)} or not count:
+            found = f"{rest} f_rest properties and {count} vertices"
+    if found:
+        raise SceneFormatError(
+            f"{path} to hold trained Gaussians in 3DGS's layout", found=found, fix=fix
+        )
+
+
+def _up_to_vertices(header: Header) -> list[Element]:
+    """The elements of a file before its vertices, and these."""
+    names = [element.name for element in header.elements]
+    last = names.index("vertex") if "vertex" in names else len(names)
+    return list(header.elements[: last + 1])
+
+
+def _rows(reader: ByteReader, header: Header) -> np.ndarray:
+    """The vertices, as a structured array."""
+    reader.offset = header.size
+    *others, vertex = _up_to_vertices(header)
+    if not header.byte_order:
+        return _ascii_rows(reader, sum(element.num_rows for element in others), vertex)
+    for element in others:
+        reader.record = f"element {element.name}"
+        reader.array(header.dtype(element), element.num_rows)
+    reader.record = "element vertex"
+    return reader.array(header.dtype(vertex), vertex.num_rows)
+
+
+def _ascii_rows(reader: ByteReader, skipped: int, element: Element) -> np.ndarray:
+    """The vertices of an ascii file, after some lines of other elements."""
+    # What is not a byte is kept as float64, whatever is declared: a float32 as text is exact there.
+    dtype = np.dtype([(n, kind if kind == "u1" else "f8") for n, kind in element.types.items()])
+    with guarded(reader.path, "rows of numbers after its header", fix=EXPORT_PLY_AGAIN):
+        table = np.loadtxt(
+            io.BytesIO(reader.data[reader.offset :]),
+            comments=None, skiprows=skipped, max_rows=element.num_rows, ndmin=2,
+        )  # fmt: skip
+        if table.shape != (element.num_rows, len(element.types)):
+            raise ValueError(
+                f"{len(table)} rows of {table.shape[1]} numbers, of "
+                f"{element.num_rows} of {len(element.types)}"
+            )
+        rows = np.empty(len(table), dtype)
+        for i, name in enumerate(element.types):
+            rows[name] = table[:, i]
+    return rows
+
+
+def _columns(rows: np.ndarray, names: Sequence[str]) -> Float32[np.ndarray, "N K"]:
+    """Properties as float32; what is beyond its range becomes infinite."""
+    with np.errstate(over="ignore"):
+        return np.array(structured_to_unstructured(rows[list(names)]), np.float32, order="C")
+
+
+def _first_colors(rows: np.ndarray, names: set[str]) -> Float32[np.ndarray, "N 3"]:
+    """f_dc_*; or red, green and blue, as integers or as floats from 0 to 1 or to 255."""
+    if set(_DC) <= names:
+        return _columns(rows, _DC)
+    kinds = [rows.dtype[name] for name in _COLORS]
+    colors = _columns(rows, _COLORS).astype(np.float64)
+    top = 255.0
+    if all(kind.kind in "iu" for kind in kinds):
+        top = float(np.iinfo(kinds[0]).max)
+    elif (colors[np.isfinite(colors)] <= _BYTES).all():
+        top = 1.0
+    return ((colors / top - 0.5) / SH_C0).astype(np.float32)
+
+
+def _harmonics(rows: np.ndarray, names: set[str], note: Note) -> Float32[np.ndarray, "N K 3"]:
+    """Coefficients beyond the first, of degree 3 at most."""
+    rest = sum(name.startswith("f_rest_") for name in names)
+    if not rest:
+        return np.zeros((len(rows), 0, 3), np.float32)
+    each, most = rest // 3, SH_COUNTS[-1]
+    if each > most:
+        note(f"Of {each} coefficients beyond the first, the {most} up to degree 3 are used.")
+    every = _rest_names(rest)
+    used = [name for color in range(3) for name in every[color * each :][: min(each, most)]]
+    planes = _columns(rows, used).reshape(len(rows), 3, -1)
+    return np.array(planes.transpose(0, 2, 1), np.float32, order="C")
+
+
+def _shape(
+    rows: np.ndarray, names: set[str], note: Note
+) -> tuple[Float32[np.ndarray, "N 3"], Float32[np.ndarray, "N 4"]]:
+    """Log-scales and rotations: of balls with one size, of discs with two, as of 2DGS."""
+    scales = _columns(rows, [name for name in _SCALES if name in names])
+    if scales.shape[1] == 1:
+        note("Each Gaussian has one size, scale_0: it is read as round.")
+        quats = np.tile(np.array([1, 0, 0, 0], np.float32), (len(rows), 1))
+        return np.repeat(scales, 3, axis=1), quats
+    if scales.shape[1] == 2:
+        note(
+            "Gaussians have two sizes, without scale_2, as of 2D Gaussian Splatting: they are read "
+            "as flat. Its renderer intersects rays with discs, so scores may differ."
+        )
+        thin = scales.min(axis=1, keepdims=True) + np.float32(np.log(FLATNESS))
+        scales = np.concatenate([scales, thin], axis=1)
+    return scales, _columns(rows, _ROTATION)
+
+
+def _rest_names(number: int) -> tuple[str, ...]:
+    return tuple(f"f_rest_{i}" for i in range(number))
