@@ -42,6 +42,25 @@ def test_nothing_is_drawn_where_nobody_looks(capsys):
     assert list(clock.seconds()) == ["read", "compiling kernels"]
 
 
+def test_a_log_has_a_line_per_stage_with_its_count(capsys, monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(console.time, "perf_counter", lambda: now[0])
+    with stage_display(lines=True) as clock:
+        clock.count(2000, "photographs", "features")
+        for seconds, stage, fraction in (
+            *((0, "prepare", 0), (0, "features", 0), (20, "features", 0.2)),
+            *((40, "features", 0.4), (50, "features", 0.5), (62, "features", 1.0)),
+            *((62, "features", 1.0), (62, "mapping", 0.0), (64.5, "mapping", 1.0)),
+        ):
+            now[0] = seconds
+            clock(stage, fraction)
+    assert capsys.readouterr().err.splitlines() == [
+        "features: 800 of 2,000 photographs, 40 s",
+        "features: 2,000 photographs, 62 s",
+        "mapping: done, 2.5 s",
+    ]
+
+
 def test_a_log_is_told_once_of_compilation_that_takes_long(capsys, monkeypatch):
     now = iter(range(0, 1000, 10))
     monkeypatch.setattr(console.time, "perf_counter", lambda: float(next(now)))

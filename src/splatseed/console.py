@@ -1,13 +1,14 @@
 """The terminal: progress bars on stderr, results on stdout.
 
-Promise: nothing is drawn when stderr is not a terminal; a stage's time runs until the next begins;
+Promise: nothing is drawn when stderr is not a terminal, where long work prints a line per stage
+instead; a stage's time runs until the next begins;
 what is printed is shown as it is, so that no file name can colour, move or rewrite anything.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from typing import Any
 
@@ -37,6 +38,8 @@ ERR = LiteralConsole(stderr=True)
 WIDEST = 1000
 """Most characters of a table's line in a file."""
 COMPILE = "compiling kernels"
+LINE_AFTER = 30.0
+"""Seconds between lines on a stage that goes on, off a terminal."""
 TOLD_AFTER = 3.0
 """Compilations shorter than this many seconds are not logged."""
 
@@ -49,10 +52,34 @@ class _Bars(rich_progress.BarColumn):
         return bar
 
 
+class _Lines:
+    """A ``Progress`` that prints a line when a stage ends, and now and then before."""
+
+    def __init__(self, items: Mapping[str, tuple[int, str]]) -> None:
+        self._items = items  # how many of what a stage goes through
+        self._times: dict[str, tuple[float, float]] = {}  # of a stage's start and its last line
+        self._ended = set[str]()
+
+    def __call__(self, stage: str, fraction: float) -> None:
+        now = time.perf_counter()
+        start, last = self._times.setdefault(stage, (now, now))
+        if stage in self._ended or (fraction < 1 and now - last < LINE_AFTER):
+            return
+        self._times[stage] = start, now
+        total, noun = self._items.get(stage, (0, ""))
+        done = f" {round(fraction * total):,} of {total:,} {noun}" if total else f" {fraction:.0%}"
+        if fraction >= 1:
+            self._ended.add(stage)
+            done = f" {total:,} {noun}" if total else " done"
+        ERR.print(f"{stage}:{done}, {now - start:.{0 if now - start >= 10 else 1}f} s")
+
+
 class StageClock:
     """A ``Progress`` that times the stages and, within ``stage_display``, shows them."""
 
     def __init__(self) -> None:
+        self._lines: _Lines | None = None
+        self._items: dict[str, tuple[int, str]] = {}
         self._bar: rich_progress.Progress | None = None
         self._tasks: dict[str, rich_progress.TaskID] = {}
         self._started: list[tuple[str, float]] = []
@@ -64,6 +91,8 @@ class StageClock:
         """Note that ``fraction`` of ``stage`` is done."""
         if not self._started or self._started[-1][0] != stage:
             self._started.append((stage, time.perf_counter()))
+        if self._lines is not None:
+            self._lines(stage, fraction)
         if self._bar is not None:
             self.expect(stage)
             self._bar.start_task(self._tasks[stage])
@@ -74,6 +103,10 @@ class StageClock:
         for stage in stages:
             if self._bar is not None and stage not in self._tasks:
                 self._tasks[stage] = self._bar.add_task(stage, total=1.0, start=False)
+
+    def count(self, number: int, noun: str, *stages: str) -> None:
+        """Say that stages go through so many items; lines off a terminal have their number."""
+        self._items |= dict.fromkeys(stages, (number, noun))
 
     def seconds(self) -> dict[str, float]:
         """Wall time of each stage so far, in order of first appearance."""
@@ -115,12 +148,12 @@ class StageClock:
 
 @contextmanager
 def stage_display(
-    clock: StageClock | None = None, *, remaining: bool = False
+    clock: StageClock | None = None, *, remaining: bool = False, lines: bool = False
 ) -> Iterator[StageClock]:
     """Show progress bars on stderr while the block runs; print to stdout only outside the block.
 
     A ``clock`` that was shown before goes on; ``remaining`` shows the time left, too, for stages
-    that take minutes.
+    that take minutes. With ``lines``, each stage prints a line where stderr is not a terminal.
     """
     clock = StageClock() if clock is None else clock
     named, left = (
@@ -130,6 +163,7 @@ def stage_display(
     columns += [left, rich_progress.TimeRemainingColumn()] if remaining else []
     drawn = rich_progress.Progress(*columns, console=ERR, transient=True)
     bar = drawn if ERR.is_terminal else None
+    clock._lines = _Lines(clock._items) if lines and bar is None else None  # noqa: SLF001  (ours)
     with clock._shown(bar), bar or nullcontext(), watched(clock.compilation):  # noqa: SLF001  (ours)
         yield clock
 

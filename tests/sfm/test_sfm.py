@@ -129,7 +129,7 @@ def test_a_known_lens_is_believed_and_triangulation_repeats_itself(posed, photos
 
 @pytest.mark.parametrize("num", [8, 3])
 def test_too_few_registered_is_an_error_that_names_them(num, photos, tmp_path, monkeypatch):
-    """Fewer than half, or none; and nothing is left, COLMAP's own log neither."""
+    """Fewer than half, or none; the work is kept for the next call, COLMAP's own log is not."""
     mixed = tmp_path / "mixed"
     if num == 8:
         shutil.copytree(photos, mixed)
@@ -139,13 +139,25 @@ def test_too_few_registered_is_an_error_that_names_them(num, photos, tmp_path, m
         noise = gaussian_filter(np.random.default_rng(i).normal(128, 200, (120, 160)), 2)
         PilImage.fromarray(noise.clip(0, 255).astype(np.uint8)).save(mixed / f"other{i}.png")
     monkeypatch.setenv("TMPDIR", str(tmp_path / "temporary"))
+    how = {"camera_model": "SIMPLE_RADIAL", "shared_camera": False}
     with pytest.raises(ReconstructionError) as caught:
-        reconstruct(mixed, tmp_path / "scene", camera_model="SIMPLE_RADIAL")
+        reconstruct(mixed, tmp_path / "scene", **how)
+    assert f"kept in {tmp_path / 'scene_sfm'}" in caught.value.fix
+    assert "exhaustive" not in caught.value.fix  # it was
+    assert "SIMPLE_RADIAL" not in caught.value.fix
+    assert {path.name for path in tmp_path.iterdir()} == {"mixed", "temporary", "scene_sfm"}
     if num == 8:
         assert "6 in the largest" in caught.value.found
         assert "other0.png" in caught.value.found
         assert "view_000.png" not in caught.value.found
-    assert {path.name for path in tmp_path.iterdir()} == {"mixed", "temporary"}
+        assert "--partial" in caught.value.fix
+        notes = []
+        report = reconstruct(mixed, tmp_path / "scene", **how, partial=True, on_note=notes.append)
+        assert (report.registered, len(report.unregistered)) == (6, 8)
+        assert "mapping" not in report.seconds  # its models were kept
+        assert [note.split(" from")[0] for note in notes] == ["Goes on"]
+        assert len(load_scene(report.path).images) == 6
+        assert {path.name for path in tmp_path.iterdir()} == {"mixed", "temporary", "scene"}
     assert not list((tmp_path / "temporary").iterdir())
 
 
@@ -168,7 +180,7 @@ def test_photographs_are_told_first_and_an_interrupt_leaves_nothing(photos, tmp_
             on_photos=lambda names, left_out, _: told.append((names[0], *left_out.values())),
         )
     assert told == [("below/view_000.png", ["depth.png"], ["conf_00000.png"], ["phone.heic"])]
-    assert list(tmp_path.iterdir()) == [folder]
+    assert {path.name for path in tmp_path.iterdir()} == {"photos", "scene_sfm"}
 
 
 def test_a_dying_process_is_one_clear_error(photos, tmp_path, monkeypatch):
@@ -254,7 +266,8 @@ def test_what_cannot_be_done_is_refused_and_nothing_written(posed, photos, tmp_p
     ):
         with pytest.raises(error):
             reconstruct(photos, output, **options)
-    assert files_below(tmp_path) == {"mine.txt"}
+    kept = {f"out/scene_sfm/{name}" for name in ("database.db", "splatseed.json")}
+    assert files_below(tmp_path) == {"mine.txt", *kept}  # of the last, whose features are found
     assert len(files_below(photos)) == 6
 
 

@@ -54,6 +54,8 @@ class Options:
     """Seed of every random choice."""
     threads: int = -1
     """Worker threads; -1 = all cores."""
+    partial: bool = False
+    """Write the scene even if fewer than half of the photographs get a pose."""
     overwrite: bool = False
     """Replace an output folder that splatseed wrote before."""
 
@@ -76,9 +78,11 @@ def run(arguments: list[str]) -> None:
          "Name a scene with the poses, or leave --refine-poses out to have all poses found."),
         (known and lens, "the lens from --poses-from, without options of its own",
          ", ".join(lens), "Leave them out."),
+        (known and options.partial, "--partial where poses are searched for",
+         "it with --poses-from, of which all are known", "Leave it out."),
         (known and video, f"{poses} with --poses-from", "a video", f"Name {poses}."),
     )  # fmt: skip
-    with stage_display(remaining=True) as clock:
+    with stage_display(remaining=True, lines=True) as clock:
         clock("prepare", 0.0)
         make = _from_video if video else _from_photographs
         report = make(options, options.images, clock)
@@ -108,6 +112,7 @@ def _from_photographs(options: Options, images: Path, clock: StageClock) -> SfmR
         how: dict[str, Any] = {
             "camera_model": options.camera_model,
             "shared_camera": options.shared_camera,
+            "partial": options.partial,
         }
     else:
         stages = [*(["refinement"] if options.refine_poses else []), "triangulation"]
@@ -128,15 +133,26 @@ def _from_photographs(options: Options, images: Path, clock: StageClock) -> SfmR
         masks=masks,
         overwrite=options.overwrite,
         on_progress=clock,
-        on_photos=None if video else partial(_tell_photographs, images),
+        on_note=print_note,
+        on_photos=partial(_tell_photographs, options, clock),
         **how,
     )
 
 
 def _tell_photographs(
-    images: Path, names: Sequence[str], left_out: Mapping[str, Sequence[str]], cameras: str
+    options: Options,
+    clock: StageClock,
+    names: Sequence[str],
+    left_out: Mapping[str, Sequence[str]],
+    cameras: str,
 ) -> None:
     """Say what is read, since a folder named by mistake may hold pictures of other things below."""
+    images, number = options.images, len(names)
+    clock.count(number, "photographs", "features")
+    if options.matcher != "sequential" and not is_video(images):
+        clock.count(number * (number - 1) // 2, "pairs", "matching")
+    if is_video(images):
+        return
     folders = Counter(str(PurePosixPath(name).parent) for name in names)
     shown = name_some([f"{count:,} in {folder}" for folder, count in folders.most_common()])
     where = "" if set(folders) == {"."} else f": {shown}"
@@ -169,6 +185,8 @@ def _summarise(options: Options, report: SfmReport) -> None:
         ("output", str(report.path)),
     ]
     print_pairs("splatseed sfm", rows)
+    if 2 * report.registered < report.total:
+        print_note("This is a part of the scene: fewer than half of the photographs have a pose.")
     if report.unregistered:
         print_note(f"without a pose: {name_some(report.unregistered)}")
     print_pairs("next", [("", f"splatseed upsample {quoted(options.output)} -o OUT --preview")])

@@ -36,9 +36,10 @@ def run(arguments: list[str]) -> None:
     options = parse_options(Options, "undistort", arguments)
     output, overwrite = options.output, options.overwrite
     check_output(output, kind="undistort", overwrite=overwrite, protect=[options.scene])
-    with stage_display() as clock:
+    with stage_display(lines=True) as clock:
         clock("read", 0.0)
         scene = load_scene(options.scene, require_points=False)
+        clock.count(len(scene.images), "photographs", "undistortion")
         report = undistort(scene, output, overwrite=overwrite, on_progress=clock)
     counts = [("images", f"{report.registered:,}"), ("points", f"{report.num_points:,}")]
     print_pairs("splatseed undistort", [*counts, ("output", str(output))])

@@ -52,6 +52,7 @@ class Photo(NamedTuple):
 
     size: Size
     exif: Exif = Exif()
+    digest: str = ""  # of the file's bytes
 
 
 Photos: TypeAlias = Mapping[str, Photo]
@@ -167,7 +168,7 @@ def _without_strays(groups: Sequence[list[str]], photos: Photos) -> list[list[st
     """A few photographs without EXIF join the others of their size if these are of one camera."""
     kept = [list(each) for each in groups]
     for group in groups:
-        size, exif = photos[group[0]]
+        size, exif = photos[group[0]][:2]
         others = [each for each in kept if photos[each[0]].size == size and each != group]
         if len(group) < _ENOUGH and exif == Exif() and len(others) == 1:
             kept.remove(group)

@@ -27,12 +27,14 @@ from PIL import Image as PilImage
 from splatseed import errors
 from splatseed.camera import Intrinsics
 from splatseed.io.masks import write_masks
-from splatseed.literal import name_some
+from splatseed.io.staging import remove
+from splatseed.literal import counted, name_some
 from splatseed.progress import Progress
 from splatseed.requirements import install_command
 from splatseed.runtime.torch_device import DeviceName
 from splatseed.scene import Image, Masks
 from splatseed.sfm.cameras import SharedCamera
+from splatseed.sfm.kept import DATABASE, MODELS, Kept
 
 MatcherName: TypeAlias = Literal["exhaustive", "sequential"]
 T = TypeVar("T")
@@ -44,10 +46,8 @@ _POLL_SECONDS = 0.1
 _ORIENTATION, _SHORT, _UPRIGHT = 0x0112, 3, 1  # the tag, its type, the value that turns nothing
 _HEAD_BYTES = 1 << 17  # the EXIF segment, at most 64 KiB, comes first or after a small one
 _BARELY = 2e-7  # a coefficient that pycolmap takes for distortion, and that moves no pixel
-_MORE_PHOTOGRAPHS = (
-    "Take more overlapping photographs, take out those of other places, or try the exhaustive "
-    "matcher or a simpler camera_model such as SIMPLE_RADIAL."
-)
+_SIMPLE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL")
+_COMPLETE = "complete"  # the file that ends a folder of models
 
 
 @dataclass(frozen=True)
@@ -115,12 +115,13 @@ class Run:
     image_dir: Path
     work: Path  # a scratch folder, removed at the end
     on_progress: Progress
+    kept: Kept | None = None  # where features, matches and models outlive a failure
     seconds: dict[str, float] = field(default_factory=dict)  # wall time of the stages so far
 
     @property
     def database(self) -> Path:
         """The feature database."""
-        return self.work / "database.db"
+        return (self.kept.folder if self.kept else self.work) / DATABASE
 
     def stage(self, name: str, work: Callable[[], T], count: Callable[[], int], total: int) -> T:
         """What ``work`` returns, a blocking call of pycolmap, which releases the GIL.
@@ -207,12 +208,7 @@ def match_photographs(run: Run, model: Any, masks: Masks | None = None) -> None:
     write_masks(masks, run.image_dir, names.values(), folder)
     masked = {"mask_path": str(folder)} if folder.is_dir() else {}
     with pycolmap.Database.open(run.database) as database:
-        for camera_id, camera in sorted(model.cameras.items()):
-            database.write_camera(camera, use_camera_id=True)
-            database.write_rig(model.rig(camera_id), use_rig_id=True)
-        for image_id in names:
-            database.write_frame(model.frame(image_id), use_frame_id=True)
-            database.write_image(model.image(image_id), use_image_id=True)
+        _write_model(run, database, model)
         extraction = pycolmap.FeatureExtractionOptions(
             max_image_size=settings.max_image_size, num_threads=settings.threads
         )
@@ -256,22 +252,75 @@ def match_photographs(run: Run, model: Any, masks: Masks | None = None) -> None:
         )
 
 
+def _write_model(run: Run, database: Any, model: Any) -> None:
+    """Write a model's cameras and images to a database, unless it has them from an earlier run."""
+    if database.num_images() == len(model.images):
+        if run.kept is not None and run.kept.stale_matches:
+            database.clear_two_view_geometries()
+            database.clear_matches()
+            for camera in model.cameras.values():
+                database.update_camera(camera)
+        return
+    database.clear_all_tables()  # what a kill left half-written
+    for camera_id, camera in sorted(model.cameras.items()):
+        database.write_camera(camera, use_camera_id=True)
+        database.write_rig(model.rig(camera_id), use_rig_id=True)
+    for image_id in sorted(model.images):
+        database.write_frame(model.frame(image_id), use_frame_id=True)
+        database.write_image(model.image(image_id), use_image_id=True)
+
+
 def _options(run: Run) -> Any:
     return run.pycolmap.IncrementalPipelineOptions(
         num_threads=run.settings.threads, random_seed=run.settings.seed
     )
 
 
-def map_images(run: Run, names: Sequence[str]) -> Path:
+def map_images(run: Run, names: Sequence[str], camera_model: str, *, partial: bool) -> Path:
     """Solve for poses, lenses and points; the folder of the model with the most images.
 
     Raises:
-        ReconstructionError: No model was found, or it has fewer than half of the photographs.
+        ReconstructionError: No model was found, or it has fewer than half of the photographs and
+            is not wanted ``partial``.
     """
-    models_dir = run.work / "models"
+    models_dir = (run.kept.folder if run.kept else run.work) / MODELS
+    models = _mapped(run, models_dir, len(names))
+    more = ["take more overlapping photographs", "take out those of other places"]
+    if run.settings.matcher != "exhaustive":
+        more.append("use the exhaustive matcher")
+    if camera_model not in _SIMPLE:
+        more.append("use a simpler camera model such as SIMPLE_RADIAL")
+    advice = f"{', '.join(more[:-1])} or {more[-1]}"
+    if run.kept:
+        advice = f"{advice}; features and matches are kept in {run.kept.folder}"
+    if not models:
+        raise errors.ReconstructionError(
+            f"a model of the {len(names)} photographs",
+            found="no two that match well enough to begin one",
+            fix=f"{advice[0].upper()}{advice[1:]}.",
+        )
+    best = max(models, key=lambda i: (models[i].num_reg_images(), models[i].num_points3D()))
+    found = {image.name for image in models[best].images.values() if image.has_pose}
+    if 2 * len(found) < len(names) and not partial:
+        raise errors.ReconstructionError(
+            f"at least half of the {len(names)} photographs to get a pose",
+            found=f"{len(found)} in the largest of {counted(len(models), 'model')}; "
+            f"without a pose: {name_some([name for name in names if name not in found])}",
+            fix=f"Add --partial (from Python, partial=True) to write the scene of these "
+            f"{len(found)}; for more, {advice}.",
+        )
+    return models_dir / str(best)
+
+
+def _mapped(run: Run, models_dir: Path, total: int) -> dict[int, Any]:
+    """The models by the names of their folders, those of an earlier run if it finished them."""
+    if (models_dir / _COMPLETE).exists():
+        folders = (path for path in models_dir.iterdir() if path.is_dir())
+        return {int(path.name): run.pycolmap.Reconstruction(path) for path in folders}
+    remove(models_dir)
     models_dir.mkdir()
     registered: list[None] = []  # but for those with which a model begins
-    models = run.stage(
+    models: dict[int, Any] = run.stage(
         "mapping",
         lambda: run.pycolmap.incremental_mapping(
             run.database,
@@ -281,24 +330,10 @@ def map_images(run: Run, names: Sequence[str]) -> Path:
             next_image_callback=lambda: registered.append(None),
         ),
         lambda: len(registered),
-        len(names),
+        total,
     )
-    if not models:
-        raise errors.ReconstructionError(
-            f"a model of the {len(names)} images in {run.image_dir}",
-            found="no two images that match well enough to begin one",
-            fix=_MORE_PHOTOGRAPHS,
-        )
-    best = max(models, key=lambda i: (models[i].num_reg_images(), models[i].num_points3D()))
-    found = {image.name for image in models[best].images.values() if image.has_pose}
-    if 2 * len(found) < len(names):
-        raise errors.ReconstructionError(
-            f"at least half of the {len(names)} images in {run.image_dir} to register",
-            found=f"{len(found)} in the largest of {len(models)} models; "
-            f"without a pose: {name_some([name for name in names if name not in found])}",
-            fix=_MORE_PHOTOGRAPHS,
-        )
-    return models_dir / str(best)
+    (models_dir / _COMPLETE).touch()
+    return models
 
 
 def triangulate_points(run: Run, poses: Sequence[Image], without: Collection[str] = ()) -> Path:

@@ -11,6 +11,7 @@ correlation (Kuglin and Hines 1975). A frame's *sharpness* is the variance of it
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import re
 from collections.abc import Iterator
@@ -116,11 +117,13 @@ def find_photos(image_dir: StrPath) -> tuple[dict[str, Photo], dict[str, list[st
 
 def _read(path: Path) -> tuple[Photo | None, bool]:
     """A photograph, decoded and found whole, None for a depth map; and whether it has colours."""
-    with open_photograph(path, photograph_bytes(path)) as image:
+    encoded = photograph_bytes(path)
+    with open_photograph(path, encoded) as image:
         mode, exif = image.mode, read_exif(image)
     if mode.startswith(_DEPTH_MODES):
         return None, False
-    return Photo(check_photograph(path), exif), mode not in _GREY_MODES
+    digest = hashlib.blake2b(encoded, digest_size=16).hexdigest()
+    return Photo(check_photograph(path), exif, digest), mode not in _GREY_MODES
 
 
 def match_poses(photos: Photos, scene: Scene, image_dir: Path) -> tuple[Image, ...]:

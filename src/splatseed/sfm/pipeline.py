@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path, PurePosixPath
@@ -19,7 +19,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, TypeAlias
 
 from splatseed import errors
-from splatseed.camera import CAMERA_MODELS
+from splatseed.camera import CAMERA_MODELS, Intrinsics
 from splatseed.io import load_scene, write_scene
 from splatseed.io.colmap import read_model_cameras
 from splatseed.io.files import StrPath
@@ -36,6 +36,7 @@ from splatseed.scene import Image, Masks, Scene
 from splatseed.sfm import colmap
 from splatseed.sfm.cameras import SharedCamera, describe_cameras, share_cameras
 from splatseed.sfm.colmap import Run, Settings
+from splatseed.sfm.kept import Kept, kept_work, work_key
 from splatseed.sfm.photos import find_photos, match_poses
 from splatseed.sfm.refinement import Refinement, refine
 from splatseed.views.view import at_file_size
@@ -76,9 +77,12 @@ def reconstruct(
     refine_poses: bool = False,
     held_out: Collection[str] = (),
     masks: Masks | None = None,
+    partial: bool = False,
+    keep: bool = True,
     overwrite: bool = False,
     on_progress: Progress = silent,
     on_photos: OnPhotos | None = None,
+    on_note: Callable[[str], None] = lambda _: None,
 ) -> SfmReport:
     """Make a scene from photographs: features, matching, mapping or triangulation, undistortion.
 
@@ -103,17 +107,22 @@ def reconstruct(
         held_out: Photographs of known pose, by name, that have no part in the points and are not in
             the scene, but are refined with the others: those of a test, say.
         masks: Where no features are looked for; the scene gets them, undistorted.
+        partial: Accept a model of fewer than half of the photographs.
+        keep: Keep features, matches and models in ``OUTPUT_sfm`` if this fails, and go on from
+            those that an earlier call left there (``sfm.kept``).
         overwrite: Replace ``output`` if it exists.
         on_progress: Called with the stage and the fraction done.
         on_photos: Called before work begins with the photographs' names, with those of other
             images, by what they are, and with a description of the cameras, empty if poses are
             known.
+        on_note: Called with a sentence on kept work.
 
     Raises:
         InputError: Images missing, unreadable or of another size than their known camera; fewer
             than two with a known pose; an option out of range; output not writable.
-        ReconstructionError: No model came out, or fewer than half of the images got a pose; no
-            point could be triangulated at known poses, or ``refine`` refused them.
+        ReconstructionError: No model came out, or fewer than half of the images got a pose and
+            ``partial`` is False; no point could be triangulated at known poses, or ``refine``
+            refused them.
         MissingDependencyError: pycolmap is absent or cannot use the device.
     """
     colmap.check_choice("camera_model", camera_model, tuple(CAMERA_MODELS))
@@ -128,9 +137,13 @@ def reconstruct(
     with _staged(images, Path(output), "sfm", overwrite=overwrite) as staging:
         if on_photos is not None:
             on_photos(list(photos), left_out, described)
-        how = (images, staging, settings, on_progress, _reconstruct)
-        asked = camera_model, poses, refine_poses, held_out, masks
-        report = _call(*how, list(photos), cameras, *asked)
+        lenses = _lenses(cameras, camera_model, poses)
+        matching = (settings.matcher, settings.seed)
+        key = work_key(photos, lenses, masks, settings.max_image_size, matching)
+        asked = camera_model, poses, refine_poses, held_out, masks, partial
+        with kept_work(Path(output), key, on_note) if keep else nullcontext() as kept:
+            how = (images, staging, settings, on_progress, kept, _reconstruct)
+            report = _call(*how, list(photos), cameras, *asked)
         if poses_from is not None:
             write_split(poses_from, staging)
         manifest = {
@@ -143,6 +156,19 @@ def reconstruct(
     return replace(report, path=Path(output))
 
 
+def _lenses(
+    cameras: Sequence[SharedCamera], camera_model: str, poses: Sequence[Image] | None
+) -> list[tuple[Sequence[str], Intrinsics | str]]:
+    """The photographs that share a camera, and its lens, or the lens's model if it is unknown."""
+    if poses is None:
+        return [(camera.names, camera_model) for camera in cameras]
+    lenses = {image.intrinsics.camera_id: image.intrinsics for image in poses}
+    return [
+        ([image.name for image in poses if image.intrinsics.camera_id == camera_id], lens)
+        for camera_id, lens in lenses.items()
+    ]
+
+
 def _reconstruct(
     run: Run,
     staging: Path,
@@ -153,12 +179,13 @@ def _reconstruct(
     refine_poses: bool,
     held_out: Collection[str],
     masks: Masks | None,
+    partial: bool,
 ) -> SfmReport:
     refinement = None
     if poses is None:
         model = colmap.guessed_model(run, cameras, camera_model)
         colmap.match_photographs(run, model, masks)
-        model_dir = colmap.map_images(run, names)
+        model_dir = colmap.map_images(run, names, camera_model, partial=partial)
     else:
         colmap.match_photographs(run, colmap.posed_model(run.pycolmap, poses), masks)
         if refine_poses:
@@ -207,7 +234,7 @@ def undistort(
         distorted = write_scene(scene, work, format="colmap", require_points=False).path
         names, how = sorted(image.name for image in scene.images), (images, staging, _DEFAULT)
         model_dir = distorted / "sparse" / "0"
-        report = _call(*how, on_progress, _undistort, model_dir, names, scene.masks)
+        report = _call(*how, on_progress, None, _undistort, model_dir, names, scene.masks)
         carry_seeds(scene, distorted, staging)
         write_split(scene, staging)
     return replace(report, path=Path(output))
@@ -243,6 +270,7 @@ def refined(
             refine_poses=True,
             held_out=frozenset(image.name for image in test),
             masks=scene.masks,
+            keep=False,
             on_progress=progress,
         )
         found = load_scene(report.path).replace(images=report.poses)
@@ -285,11 +313,17 @@ def _staged(images: Path, output: Path, kind: str, *, overwrite: bool) -> Iterat
 
 
 def _call(
-    images: Path, staging: Path, settings: Settings, progress: Progress, job: Job, *arguments: Any
+    images: Path,
+    staging: Path,
+    settings: Settings,
+    progress: Progress,
+    kept: Kept | None,
+    job: Job,
+    *arguments: Any,
 ) -> SfmReport:
     """Do a job, with arguments of its own, in a child process."""
     log = staging / ".work" / "log.txt"
-    call = (_work, images, staging, settings, job, arguments)
+    call = (_work, images, staging, settings, kept, job, arguments)
     with closing(Child(log=log.open("w+b"))) as child:
         try:
             report: SfmReport = child.call(*call, progress=progress)
@@ -298,6 +332,8 @@ def _call(
             if reasons:
                 found = f"{found.partition(':')[0]}: {''.join(reasons[-1])}"
             fix = "Check disk space and memory."
+            if kept is not None:
+                fix = f"{fix[:-1]}, and run it again: what is done is kept in {kept.folder}."
             raise errors.ReconstructionError("pycolmap to finish", found=found, fix=fix) from error
     return report
 
@@ -306,6 +342,7 @@ def _work(
     images: Path,
     staging: Path,
     settings: Settings,
+    kept: Kept | None,
     job: Job,
     arguments: Sequence[Any],
     progress: Progress,
@@ -313,7 +350,8 @@ def _work(
     pycolmap = colmap.require_pycolmap(settings.device)
     pycolmap.logging.logtostderr = True  # alone: it would leave files in the temporary folder
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.ERROR)
-    return job(Run(pycolmap, settings, images, staging / ".work", progress), staging, *arguments)
+    run = Run(pycolmap, settings, images, staging / ".work", progress, kept)
+    return job(run, staging, *arguments)
 
 
 def _report(run: Run, staging: Path, names: Sequence[str]) -> SfmReport:
