@@ -16,6 +16,7 @@ from splatseed.depth import lifting
 from splatseed.depth.alignment import PlanarDepth, lift_pixels
 from splatseed.depth.lifting import Cubes, thin
 from splatseed.errors import ParameterError, PointCloudError, SceneFormatError, SceneNotFoundError
+from splatseed.scene import Split
 
 FLOAT32 = 3e-6  # metres, in a room of 5
 
@@ -100,7 +101,11 @@ def test_held_out_images_are_not_even_read(exact):
     scene = exact.replace(depths=Watched(exact.depths))
     lifted(scene, 200, hold_out=8)
     test_names = {image.name for image in scene.split(8)[1]}
-    assert names == {image.name for image in scene.images} - test_names
+    used = {image.name for image in scene.images} - test_names
+    assert names == used
+    names.clear()
+    lifted(scene.replace(listed=Split(frozenset(used), frozenset(test_names), "list")), 200)
+    assert names == used
 
 
 def test_a_second_reading_comes_when_the_first_was_not_enough(exact, make_maps, monkeypatch):

@@ -151,6 +151,10 @@ def test_a_scene_without_originals_keeps_what_its_points_are(scene, tmp_path, kn
     [
         ({"command": "upsample", "parameters": {"hold_out": 0}}, True),
         ({"command": "upsample", "parameters": {"hold_out": 8}}, False),
+        (
+            {"command": "upsample", "parameters": {"hold_out": 0}, "listed_tests_held_out": True},
+            False,
+        ),
         ({"command": "upsample", "parameters": {"k": 16}}, False),  # not made from photographs
         ({"command": "upsample"}, False),
         ({"command": "write_scene", "parameters": {"hold_out": 0}}, False),

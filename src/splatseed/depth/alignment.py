@@ -89,7 +89,8 @@ class Settings:
     """Spread points as evenly as their number allows, whatever image they come from (paper:
     no)."""
     hold_out: int = 0
-    """Leave out every n-th image by name, as trainers do for testing (8); 0 = use all."""
+    """Leave out every n-th image by name, as trainers do for testing (8); 0 = use all but
+    test images that the scene lists."""
 
     @property
     def synchronizes(self) -> bool:

@@ -31,10 +31,19 @@ from splatseed.io.colmap import (
     rigid_pose,
 )
 from splatseed.io.files import StrPath, guarded, odd_kind, open_file, read_bytes, read_json
+from splatseed.io.frame_files import (
+    Frame,
+    FrameFiles,
+    any_photograph,
+    find_frames,
+    named_depths,
+    named_masks,
+)
 from splatseed.io.model_choice import ranked_models
 from splatseed.io.photograph import image_warnings, lens_warnings
 from splatseed.io.ply import read_ply
 from splatseed.io.point_files import other_points
+from splatseed.literal import counted
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Masks, Scene, SceneSource, Split
 from splatseed.similarity import Similarity, fit_similarity, similarity_of
@@ -42,7 +51,6 @@ from splatseed.similarity import Similarity, fit_similarity, similarity_of
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """Turns camera axes from OpenGL's to OpenCV's, and back."""
 
-_SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG", ".JPEG")  # tried when a file_path has none
 _PERSPECTIVE = {"OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"}
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 _FIX = "Correct the file, or export the scene again."
@@ -65,14 +73,23 @@ class Transforms:
     path: Path
     json: Mapping[str, Any]
     images: tuple[Image, ...]
+    frames: tuple[Frame, ...]  # of the images
     intrinsics: tuple[Intrinsics, ...]
     image_dir: Path  # names are relative to it
     applied_transform: Float64[np.ndarray, "3 4"] | None
     warnings: tuple[str, ...]
 
+    @property
+    def listed(self) -> Split | None:
+        """The split of ``frames`` and ``test_frames``."""
+        pairs = list(zip(self.images, self.frames, strict=True))
+        test = frozenset(image.name for image, frame in pairs if frame.tests)
+        train = frozenset(image.name for image, frame in pairs if not frame.tests)
+        return Split(train, test, f"test_frames in {self.path.name}") if train and test else None
+
 
 def read_transforms_scene(path: StrPath) -> Scene:
-    """Read a ``transforms.json`` and the points that belong to it; the cloud may be empty."""
+    """Read a ``transforms.json`` and what belongs to it; the cloud may be empty."""
     path = Path(path)
     transforms = read_transforms(path)
     points, points_path, notes = _find_points(transforms)
@@ -80,33 +97,36 @@ def read_transforms_scene(path: StrPath) -> Scene:
     source = SceneSource(
         "transforms", path.parent, points_path, image_dir=folder, transforms_path=path
     )
-    notes = [*transforms.warnings, *notes, *image_warnings(images, folder, path.parent)]
-    warnings = (*notes, *lens_warnings(images))
-    named = (frame.get("mask_path") for frame in transforms.json["frames"])
-    files = {
-        image.name: path.parent / mask
-        for image, mask in zip(images, named, strict=True)
-        if isinstance(mask, str)
-    }
+    frames = {i.name: f.fields for i, f in zip(images, transforms.frames, strict=True)}
+    masks, gone = named_masks(FrameFiles(path), frames)
+    notes = [*transforms.warnings, *notes, *gone, *image_warnings(images, folder, path.parent)]
     return Scene(
-        points, images, transforms.intrinsics, source=source, warnings=warnings,
-        masks=Masks(files) if files else None,
+        points, images, transforms.intrinsics, source=source,
+        warnings=(*notes, *lens_warnings(images)),
+        depths=named_depths(FrameFiles(path), frames, transforms.json),
+        listed=transforms.listed,
+        masks=Masks(masks) if masks else None,
     )  # fmt: skip
 
 
 def is_blender(folder: Path) -> bool:
-    """Whether a folder has ``transforms_train.json`` and ``transforms_test.json``."""
-    return all((folder / name).is_file() for name in _BLENDER)
+    """Whether a folder has a ``transforms_train.json``, as Blender's data sets do."""
+    return (folder / _BLENDER[0]).is_file()
 
 
 def read_blender(folder: StrPath) -> Scene:
-    """Read both files as one scene, whose split is theirs, and the points in their space.
+    """Read training and test images as one scene, whose split is theirs, and points in their space.
 
     Images are named with their folders (``train/r_0.png``); those of ``transforms_val.json`` are
-    left out.
+    left out. Test images without any photograph, as BlenderNeRF writes them, are left out.
     """
     folder = Path(folder)
-    parts = [read_transforms(folder / name) for name in _BLENDER]
+    parts, notes, split = [read_transforms(folder / _BLENDER[0])], list[str](), True
+    if (path := folder / _BLENDER[1]).is_file() and any_photograph(path):
+        parts.append(read_transforms(path))
+    else:
+        split, lacking = False, "there is none" if not path.is_file() else "it has no photographs"
+        notes = [f"{path}: {lacking}, so training images are held out for testing."]
     cameras: dict[tuple[object, ...], Intrinsics] = {}
     images: list[Image] = []
     for part in parts:
@@ -117,8 +137,8 @@ def read_blender(folder: StrPath) -> Scene:
             name = os.path.relpath(part.image_dir / image.name, folder.absolute())
             name = PurePath(name).as_posix()
             images.append(replace(image, name=name, image_id=len(images) + 1, intrinsics=shared))
-    points, points_path, notes = _find_points(parts[0])
-    notes = list(dict.fromkeys((*parts[0].warnings, *parts[1].warnings, *notes)))
+    points, points_path, found = _find_points(parts[0])
+    notes = list(dict.fromkeys((*notes, *(each for p in parts for each in p.warnings), *found)))
     names, num_train = [image.name for image in images], len(parts[0].images)
     train, test = frozenset(names[:num_train]), frozenset(names[num_train:])
     return Scene(
@@ -127,7 +147,7 @@ def read_blender(folder: StrPath) -> Scene:
         tuple(cameras.values()),
         source=SceneSource("transforms", folder, points_path, image_dir=folder),
         warnings=(*notes, *image_warnings(images, folder, folder), *lens_warnings(images)),
-        listed=Split(train, test, f"pair of {_BLENDER[0]} and {_BLENDER[1]}"),
+        listed=Split(train, test, f"pair of {_BLENDER[0]} and {_BLENDER[1]}") if split else None,
         masks=Masks({}, alpha=False),  # what is transparent is empty, and black
     )
 
@@ -135,47 +155,59 @@ def read_blender(folder: StrPath) -> Scene:
 def read_transforms(path: Path) -> Transforms:
     """Read the cameras of a ``transforms.json``; its points are read by ``load_scene``."""
     meta = read_json(path, fix=_FIX)
-    frames = meta.get("frames") if isinstance(meta, dict) else None
-    if not isinstance(frames, list) or not frames or not all(isinstance(f, dict) for f in frames):
-        found = "something else" if frames else "none"
-        raise SceneFormatError(f"{path} to have a list of frames", found=found, fix=_FIX)
-    files = [_image_file(path, i, frame) for i, frame in enumerate(frames)]
+    frames, notes = find_frames(path, meta)
     # The folder beside the file that holds all images, else the deepest one that does. Links are
     # not followed, so that names are as in COLMAP.
-    image_dir = Path(os.path.commonpath([file.parent for file in files]))
+    image_dir = Path(os.path.commonpath([frame.file.parent for frame in frames]))
     root = Path(os.path.abspath(path)).parent  # noqa: PTH100
     if root in image_dir.parents:
         image_dir = root / image_dir.relative_to(root).parts[0]
-    names = [file.relative_to(image_dir).as_posix() for file in files]
-    ids = [frame.get("colmap_im_id") for frame in frames]
-    if not all(isinstance(i, int) and 0 < i <= MAX_ID for i in ids) or len({*ids}) < len(ids):
+    named = [frame.fields.get("colmap_im_id") for frame in frames]
+    ids = [i for i in named if isinstance(i, int) and 0 < i <= MAX_ID]
+    if len({*ids}) < len(frames):
         ids = list(range(1, len(frames) + 1))
     cameras: dict[tuple[str, int, int, tuple[float, ...]], Intrinsics] = {}
-    images: list[Image] = []
-    seen: set[str] = set()
-    odd = 0
-    for i, (name, frame) in enumerate(zip(names, frames, strict=True)):
-        where = f"{path}, frame {i + 1} ({name})"
-        if name in seen:
-            expected = f"{where} to have an image of its own"
-            raise SceneFormatError(expected, found=f"{name!r} again", fix=_FIX)
-        seen.add(name)
-        values = {**meta, **frame}
-        key = _camera(where, values, files[i])
+    images: dict[str, Image] = {}
+    kept: list[Frame] = []
+    odd = repeated = 0
+    for frame, image_id in zip(frames, ids, strict=True):
+        name = frame.file.relative_to(image_dir).as_posix()
+        where = f"{frame.where} ({name})"
+        values = {**meta, **frame.fields}
+        key = _camera(where, values, frame.file)
         if key not in cameras:
             cameras[key] = make_intrinsics(where, len(cameras) + 1, *key)
         odd += bool(values.get("k4")) and key[0] != "OPENCV_FISHEYE"
-        pose = _matrix(f"{where}, transform_matrix", frame.get("transform_matrix"))
+        pose = _matrix(f"{where}, transform_matrix", frame.fields.get("transform_matrix"))
         quat, translation = rigid_pose(where, pose @ OPENCV_FROM_OPENGL)
-        images.append(Image(name, ids[i], cameras[key], quat, translation))
+        image = Image(name, image_id, cameras[key], quat, translation)
+        if name in images:
+            repeated += 1
+            _check_repeated(where, images[name], image)
+            continue
+        images[name] = image
+        kept.append(frame)
     applied = meta.get("applied_transform")
     if applied is not None:
         applied = _matrix(f"{path}, applied_transform", applied)
-    note = f"k4 of {odd} frames is not used: COLMAP's perspective models have no such term."
-    cameras_of = tuple(cameras.values())
+    if odd:
+        notes.append(
+            f"k4 of {odd} frames is not used: COLMAP's perspective models have no such term."
+        )
+    if repeated:
+        notes.append(f"{counted(repeated, 'frame')} of {path.name} repeat others and are left out.")
     return Transforms(
-        path, meta, tuple(images), cameras_of, image_dir, applied, (note,) if odd else ()
-    )
+        path, meta, tuple(images.values()), tuple(kept), tuple(cameras.values()), image_dir,
+        applied, tuple(notes),
+    )  # fmt: skip
+
+
+def _check_repeated(where: str, first: Image, again: Image) -> None:
+    """Raise an error if an image has two poses or cameras."""
+    same = np.allclose(first.quat, again.quat) and np.allclose(first.translation, again.translation)
+    if not same or first.intrinsics != again.intrinsics:
+        expected = f"{where} to have an image of its own"
+        raise SceneFormatError(expected, found=f"{again.name!r} again, elsewhere", fix=_FIX)
 
 
 def apply_transform(
@@ -184,19 +216,6 @@ def apply_transform(
     """Points [N, 3] taken through an affine map [3, 4], float64."""
     with np.errstate(invalid="ignore"):  # infinite points stay infinite or NaN
         return np.asarray(np.asarray(xyz, np.float64) @ transform[:, :3].T + transform[:, 3])
-
-
-def _image_file(path: Path, idx: int, frame: Mapping[str, Any]) -> Path:
-    """The absolute path of a frame's image, which may not exist."""
-    name = frame.get("file_path")
-    if not isinstance(name, str) or not name or "\0" in name:
-        where = f"{path}, frame {idx + 1}"
-        raise SceneFormatError(f"a file_path in {where}", found=repr(name), fix=_FIX)
-    file = Path(os.path.abspath(path.parent / name))  # noqa: PTH100  (resolve would follow links)
-    if file.suffix in _SUFFIXES or file.is_file():
-        return file
-    candidates = (file.with_name(file.name + suffix) for suffix in _SUFFIXES)
-    return next((candidate for candidate in candidates if candidate.is_file()), file)
 
 
 def _number(where: str, values: Mapping[str, Any], key: str, default: float | None = None) -> float:

@@ -106,7 +106,8 @@ def saw_all_photographs(scene: Scene) -> bool:
     """Whether ``splatseed upsample`` made new points from photographs and held none out."""
     facts = _upsampling(scene) or {}
     try:
-        return bool(facts["num_new"]) and facts["parameters"]["hold_out"] == 0
+        all_used = facts["parameters"]["hold_out"] == 0 and not facts.get("listed_tests_held_out")
+        return bool(facts["num_new"]) and all_used
     except (TypeError, KeyError):
         return False  # not made from photographs
 

@@ -28,6 +28,7 @@ from splatseed.errors import OutputError, PointCloudError
 from splatseed.io import colmap, nerfstudio
 from splatseed.io.cleaning import clean_scene, renumber
 from splatseed.io.files import StrPath, open_file
+from splatseed.io.frame_files import FrameFiles
 from splatseed.io.masks import FOLDER as MASKS, find_masks, write_masks
 from splatseed.io.ply import write_ply
 from splatseed.io.seeds import write_seeds
@@ -45,7 +46,7 @@ _MODEL_EXTRAS = ("depth_params.json",)  # graphdeco's trainer reads it if presen
 _SAME_POSE = 1e-9  # relative and absolute; a pose that went through other formats is that near
 _NERFSTUDIO_FROM_COLMAP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]])
 """The ``applied_transform`` that nerfstudio gives a COLMAP model: (x, y, z) -> (x, z, -y)."""
-_PATH_KEYS = ("file_path", "mask_path", "depth_file_path")
+_PATH_KEYS = ("file_path", "mask_path", "depth_file_path", "depth_path")
 _LIST_KEYS = ("train_filenames", "val_filenames", "test_filenames")
 _TERMS = {"OPENCV": ("k1", "k2", "p1", "p2"), "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4")}
 """Nerfstudio's distortion terms, in the order of COLMAP's parameters."""
@@ -274,9 +275,12 @@ def _write_transforms(scene: Scene, folder: Path) -> tuple[list[str], dict[str, 
         transforms = nerfstudio.read_transforms(source.transforms_path)
         content = _kept_json(transforms, names)
         if scene.masks is not None and scene.masks.choice is not None:
-            kept = [image.name for image in transforms.images if image.name in names]
-            _name_masks(scene, content["frames"], kept)
-        found = (frame.get(key) for frame in content["frames"] for key in _PATH_KEYS)
+            pairs = list(zip(transforms.images, transforms.frames, strict=True))
+            for key, tests in (("frames", False), ("test_frames", True)):
+                kept = [i.name for i, f in pairs if i.name in names and f.tests == tests]
+                _name_masks(scene, content.get(key, ()), kept)
+        frames = (*content["frames"], *content.get("test_frames", ()))
+        found = (frame.get(key) for frame in frames for key in _PATH_KEYS)
         paths = [each for each in found if isinstance(each, str) and not Path(each).is_absolute()]
         if source.image_dir is not None and source.image_dir.resolve() == source.root.resolve():
             paths += names  # a frame's own path may lack the extension
@@ -356,25 +360,40 @@ def _camera_fields(camera: Intrinsics) -> dict[str, Any]:
 def _kept_json(transforms: nerfstudio.Transforms, names: Collection[str]) -> dict[str, Any]:
     """The file's content, with only the named images, for use in another folder."""
     root, content = transforms.path.parent, transforms.json
+    files = FrameFiles(transforms.path)
+    finders = dict(
+        zip(_PATH_KEYS, (files.photograph, files.mask, *[files.depth_map] * 2), strict=True)
+    )
 
-    def portable(path: Any) -> Any:
-        if isinstance(path, str) and os.path.normpath(path).startswith(".."):
+    def portable(path: Any, key: str = "file_path") -> Any:
+        """A path that leads to the same file from another folder, on this computer."""
+        if not isinstance(path, str):
+            return path
+        found, plain = finders[key](path), Path(os.path.abspath(root / path))  # noqa: PTH100
+        if found and found.path not in (plain, plain.with_name(plain.name + found.path.suffix)):
+            path = Path(os.path.relpath(found.path, root)).as_posix()
+        if os.path.normpath(path).startswith(".."):
             return os.path.abspath(root / path)  # noqa: PTH100  (resolve would follow links)
         return path
 
-    frames, gone = [], set()
-    for frame, image in zip(content["frames"], transforms.images, strict=True):
+    frames: dict[bool, list[dict[str, Any]]] = {False: [], True: []}
+    used = set()
+    for frame, image in zip(transforms.frames, transforms.images, strict=True):
         if image.name in names:
-            moved = {key: portable(frame[key]) for key in _PATH_KEYS if key in frame}
-            frames.append({**frame, **moved})
-        else:
-            gone.add(os.path.normpath(str(frame["file_path"])))
+            fields = frame.fields
+            moved = {key: portable(fields[key], key) for key in _PATH_KEYS if key in fields}
+            frames[frame.tests].append({**fields, **moved})
+            used.add(os.path.normpath(str(fields["file_path"])))
+    all_of = (*content["frames"], *(f.fields for f in transforms.frames if f.tests))
+    gone = {os.path.normpath(str(frame.get("file_path"))) for frame in all_of} - used
     lists: dict[str, list[Any]] = {}
     for key in (key for key in _LIST_KEYS if isinstance(content.get(key), list)):
-        names = [name for name in content[key] if isinstance(name, str)]
+        listed = [name for name in content[key] if isinstance(name, str)]
         # Nerfstudio fails over names that no frame has.
-        lists[key] = [portable(name) for name in names if os.path.normpath(name) not in gone]
-    return {**content, **lists, "frames": frames}
+        lists[key] = [portable(name) for name in listed if os.path.normpath(name) not in gone]
+    kept = {key: value for key, value in content.items() if key != "test_frames"}
+    tests = {"test_frames": frames[True]} if frames[True] else {}
+    return {**kept, **lists, "frames": frames[False], **tests}
 
 
 def image_folders(scene: Scene) -> dict[str, Path]:

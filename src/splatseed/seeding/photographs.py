@@ -35,7 +35,8 @@ class PhotographMethod:
     max_size: int = MAX_SIZE
     """Photographs are downsampled by a whole factor to at most this many pixels a side."""
     hold_out: int = 0
-    """Leave out every n-th image by name, as trainers do for testing (8); 0 = use all."""
+    """Leave out every n-th image by name, as trainers do for testing (8); 0 = use all but
+    test images that the scene lists."""
 
     name: ClassVar[str]
     traits: ClassVar[Traits] = Traits(frozenset({"photographs"}), chooses_number=True)
@@ -180,7 +181,7 @@ def photographed(
     """
     folder = scene.source.image_dir if scene.source else None
     ordered = sorted(scene.images, key=lambda image: image.name)
-    used = list(scene.split(hold_out)[0]) if hold_out else ordered
+    used = list(scene.split(hold_out)[0]) if hold_out or scene.listed else ordered
     if ordered and not used:
         raise SceneNotFoundError(
             "photographs beside those held out for testing",

@@ -262,7 +262,7 @@ def refined(
         MissingDependencyError: pycolmap is absent.
     """
     folder = photograph_folder(scene)
-    test = scene.split(hold_out)[1] if hold_out else ()
+    test = scene.split(hold_out)[1] if hold_out or scene.listed else ()
     with TemporaryDirectory(prefix="splatseed-refine-") as name:
         report = reconstruct(
             *(folder, Path(name) / "scene", Settings(seed=seed)),

@@ -257,7 +257,7 @@ def _upsample(options: Options, methods: dict[str, Any]) -> None:
         layout = "colmap" if options.recenter else options.format
         report = write_scene(
             seeded, options.output, format=layout, overwrite=options.overwrite,
-            copy_images=options.copy_images, provenance=output.provenance(options, method),
+            copy_images=options.copy_images, provenance=output.provenance(options, scene, method),
         )  # fmt: skip
         if cloud is not None:
             cloud.write(options.output)
@@ -303,6 +303,9 @@ def _announce(
     for warning in scene.warnings:
         print_note(warning)
     name, method = options.method, methods[options.method]
+    if (listed := scene.listed) is not None and hasattr(method, "hold_out"):
+        tests = counted(len(listed.test), "test image")
+        print_note(f"{tests} of the scene's {listed.origin} take no part in the seeds.")
     for other, given in methods.items():
         changed = given != configure(other, options.profile) and not (
             other == CLOUD and options.cloud_files

@@ -45,7 +45,7 @@ def parameters_of(method: Upsampler) -> dict[str, object]:
     return {name: value for name, value in given.items() if name not in TOLD_ELSEWHERE}
 
 
-def provenance(options: Options, method: Upsampler) -> dict[str, object]:
+def provenance(options: Options, scene: Scene, method: Upsampler) -> dict[str, object]:
     """How the output was made, for ``splatseed.json``."""
 
     def full(path: Path | None) -> str | None:
@@ -63,6 +63,7 @@ def provenance(options: Options, method: Upsampler) -> dict[str, object]:
         "method": options.method,
         "profile": options.profile,
         "parameters": parameters_of(method),
+        "listed_tests_held_out": scene.listed is not None,
         "cloud": cloud if options.cloud_files else None,
         "depth": full(options.depth_maps),
         "ratio": options.ratio,

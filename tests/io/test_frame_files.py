@@ -1,0 +1,185 @@
+"""What a transforms.json names is found, also where it was written on another computer."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image as PilImage
+
+from splatseed.errors import SceneFormatError
+from splatseed.io import load_scene, write_scene
+
+LENS = {"w": 8, "h": 6, "fl_x": 7.0}
+
+
+def shoot(root, *names, mode="RGB", value=9):
+    for name in names:
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        PilImage.new(mode, (8, 6), value).save(root / name)
+
+
+def frame(i, **fields):
+    pose = np.eye(4)
+    pose[0, 3] = i
+    return {"transform_matrix": pose.tolist(), **fields}
+
+
+def write(root, names, name="transforms.json", **root_fields):
+    frames = [
+        frame(i, **({"file_path": n} if isinstance(n, str) else n)) for i, n in enumerate(names)
+    ]
+    root.mkdir(parents=True, exist_ok=True)
+    (root / name).write_text(json.dumps({**LENS, **root_fields, "frames": frames}))
+    return root
+
+
+def load(root):
+    return load_scene(root, require_points=False)
+
+
+def files_of(scene):
+    return [
+        (scene.source.image_dir / image.name).relative_to(scene.source.root).as_posix()
+        for image in scene.images
+    ]
+
+
+@pytest.mark.parametrize(
+    ("named", "there", "told"),
+    [
+        ("images\\{}.png", "images/{}.png", False),
+        (".\\images\\{}.png", "images/{}.png", False),
+        ("./images/{}", "images/{}.JPG", False),
+        ("images/{}", "images/{}.tif", False),
+        ("images/my%20{}.png", "images/my {}.png", False),
+        ("images/{}.depth", "images/{}.depth.png", False),
+        ("images/IMG{}.jpg", "images/IMG{}.JPG", True),
+        ("images/img{}.jpg", "images/IMG{}.JPG", True),
+        ("C:\\data\\room\\images\\{}.png", "images/{}.png", True),
+        ("C:/data/room/{}.png", "images/{}.png", True),
+        ("\\\\server\\share\\images\\{}.png", "images/{}.png", True),
+        ("/home/else/room/images/a/{}.png", "images/a/{}.png", True),
+        ("../room/images/{}.png", "images/{}.png", True),
+        ("{}.png", "images/{}.png", True),
+    ],
+)
+def test_photographs_are_found_and_named_in_the_output(tmp_path, named, there, told):
+    root = tmp_path / "scene"
+    shoot(root, *(there.format(i) for i in range(3)))
+    shoot(root, "images/0.depth.png", mode="I;16")
+    scene = load(write(root, [named.format(i) for i in range(3)]))
+    assert files_of(scene) == [there.format(i) for i in range(3)]
+    notes = [each for each in scene.warnings if "not there" in each]
+    assert len(notes) == told == len(scene.warnings)
+    out = write_scene(scene, tmp_path / "out", require_points=False).path
+    frames = json.loads((out / "transforms.json").read_text())["frames"]
+    again = load(out)
+    assert files_of(again) == files_of(scene)
+    assert again.has_photographs
+    assert all("\\" not in each["file_path"] for each in frames)
+
+
+def test_what_is_missing_is_no_other_frames_photograph(tmp_path):
+    root = tmp_path / "scene"
+    shoot(root, "left/0.png", "images/0.png", "0.png")
+    names = ["left/0.png", "right/0.png", "0.png"]
+    assert files_of(load(write(root, names))) == names
+    no_size = write(tmp_path / "b", [], **dict.fromkeys(LENS), camera_angle_x=1.0)
+    shoot(no_size, "images/0.png")
+    write(no_size, ["images/0.png", "images/1.png"], w=None, h=None)
+    scene = load(no_size)
+    assert files_of(scene) == ["images/0.png"]
+    assert "1 of 2 frames" in " ".join(scene.warnings)
+
+
+def test_repeated_frames_are_left_out_unless_they_disagree(tmp_path):
+    root = tmp_path / "scene"
+    shoot(root, "images/0.png", "images/1.png")
+    same = [{"file_path": n, **frame(0)} for n in ("images/0.png", "./images/0.png")]
+    write(root, [*same, "images/1.png"])
+    scene = load(root)
+    assert files_of(scene) == ["images/0.png", "images/1.png"]
+    assert "1 frame of transforms.json repeat" in " ".join(scene.warnings)
+    write(root, ["images/0.png", "images\\0.png"])
+    with pytest.raises(SceneFormatError, match=r"frame 2 .*image of its own"):
+        load(root)
+
+
+def test_test_frames_are_the_split_and_bad_ones_are_left_out(tmp_path):
+    """As in ScanNet++, whose photographs lie beside the file's folder."""
+    root = tmp_path / "dslr/nerfstudio"
+    shoot(tmp_path / "dslr", *(f"resized_images/{i}.JPG" for i in range(5)))
+    shoot(tmp_path / "dslr", "resized_anon_masks/1.png", mode="L")
+    names = [{"file_path": "0.JPG", "is_bad": False}, {"file_path": "1.JPG", "mask_path": "1.png"}]
+    names.append({"file_path": "2.JPG", "is_bad": True})
+    tests = [frame(3, file_path="3.JPG"), frame(4, file_path="4.JPG")]
+    write(root, names, test_frames=tests)
+    scene = load(root)
+    assert [[i.name for i in part] for part in scene.split()] == [
+        ["0.JPG", "1.JPG"],
+        ["3.JPG", "4.JPG"],
+    ]
+    assert scene.masks.files == {"1.JPG": tmp_path / "dslr/resized_anon_masks/1.png"}
+    assert "1 frame marked is_bad" in " ".join(scene.warnings)
+    again = load(write_scene(scene, tmp_path / "out", require_points=False).path)
+    assert again.split() != again.replace(listed=None).split()
+    assert [len(part) for part in again.split()] == [2, 2]
+    assert again.masks.files.keys() == {"1.JPG"}
+    for i in (3, 4):  # as where photographs are kept back
+        (tmp_path / f"dslr/resized_images/{i}.JPG").unlink()
+    scene = load(root)
+    assert (len(scene.images), scene.listed) == (2, None)
+    assert "2 test frames have no photographs" in " ".join(scene.warnings)
+
+
+@pytest.mark.parametrize("with_file", [True, False])
+def test_blenders_files_without_test_pictures(tmp_path, with_file):
+    root = tmp_path / "scene"
+    shoot(root, *(f"train/{i:04}.png" for i in range(9)))
+    sized = dict.fromkeys(LENS) | {"camera_angle_x": 1.0}
+    write(root, [f"train/{i:04}" for i in range(9)], "transforms_train.json", **sized)
+    if with_file:
+        write(root, [f"test/{i:04}" for i in range(5)], "transforms_test.json", **sized)
+    scene = load(root)
+    assert [len(part) for part in scene.split()] == [7, 2]
+    assert scene.listed is None
+    assert sum("held out" in each for each in scene.warnings) == 1
+
+
+@pytest.mark.parametrize(
+    ("key", "fields", "stored", "expected"),
+    [
+        ("depth_path", {"integer_depth_scale": 10 / 65535}, 13107, 2.0),
+        ("depth_file_path", {}, 2000, 2.0),
+        ("depth_file_path", {"depth_unit_scale_factor": 0.01}, 200, 2.0),
+        ("depth_path", {}, 2000, 2.0),
+    ],
+)
+def test_depth_maps_have_the_unit_of_the_file(tmp_path, key, fields, stored, expected):
+    root = tmp_path / "scene"
+    shoot(root, "images/0.png", "images/1.png")
+    shoot(root, "sensor/d_0.png", mode="I;16", value=stored)
+    write(root, [{"file_path": "images/0", key: "sensor\\d_0.png"}, "images/1"], **fields)
+    scene = load(root)
+    assert list(scene.depths) == ["0.png"]
+    depth = scene.depths.read("0.png")
+    np.testing.assert_allclose(depth.values, expected, rtol=1e-4)
+    again = load(write_scene(scene, tmp_path / "out", require_points=False).path)
+    np.testing.assert_array_equal(again.depths.read("0.png").values, depth.values)
+    write(root, [{"file_path": "images/0", key: "sensor/d_0.png"}], integer_depth_scale=-1)
+    with pytest.raises(SceneFormatError, match="integer_depth_scale"):
+        load(root)
+
+
+def test_masks_that_are_named_are_found_or_told(tmp_path):
+    root = tmp_path / "scene"
+    shoot(root, "images/0.png", "images/1.png")
+    shoot(root, "masks/0.png", mode="L")
+    names = [
+        {"file_path": f"images/{i}.png", "mask_path": f"D:\\x\\masks\\{i}.png"} for i in (0, 1)
+    ]
+    scene = load(write(root, names))
+    assert scene.masks.files == {"0.png": root / "masks/0.png"}
+    assert "1 mask that transforms.json names cannot be found" in " ".join(scene.warnings)
