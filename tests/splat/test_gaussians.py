@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
@@ -21,7 +19,6 @@ from splatseed.splat.gaussians import (
     fit_harmonics,
     initial_gaussians,
     neighbor_distances,
-    stray_views,
     training_frame,
 )
 from splatseed.views.view import View, load_split
@@ -179,20 +176,3 @@ def test_sizes_shrink_with_the_frame(room):
     assert np.isnan(cloud.sizes[0])
     assert cloud.sizes[1] > 0
     assert frame.cloud_from_world(room.points).sizes is None
-
-
-def _moved(view, center):
-    """The view from another place, in the same direction."""
-    cam_from_world = view.cam_from_world.copy()
-    cam_from_world[:3, 3] = -cam_from_world[:3, :3] @ center
-    return dataclasses.replace(view, cam_from_world=cam_from_world)
-
-
-def test_among_few_cameras_or_two_camps_none_is_a_stray(room):
-    """A stereo pair and one wide view, say, or a close-up and a distant flight."""
-    train, _ = load_split(room)
-    assert stray_views(train) == ()
-    far = [_moved(view, np.array([0.0, 1e6 + i, 0.0])) for i, view in enumerate(train[:3])]
-    for count in range(4):
-        assert stray_views([*train[1 : 1 + count], far[0]]) == ()
-    assert stray_views([*train, *far]) == ()

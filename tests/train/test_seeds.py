@@ -16,7 +16,7 @@ from splatseed.progress import silent
 from splatseed.splat.gaussians import initial_gaussians
 from splatseed.train.parameters import make_optimizers, make_parameters, optimize
 from splatseed.train.schedule import make_schedule
-from splatseed.train.seeds import MARGIN, NEAREST, near_depths, seeded, seeds_digest, usable_seeds
+from splatseed.train.seeds import MARGIN, near_depths, seeded, seeds_digest, usable_seeds
 from splatseed.train.settings import TrainSettings
 from splatseed.views.view import load_split
 
@@ -127,7 +127,7 @@ def _literal(xyz, views):
     for i, point in enumerate(xyz):
         for view in views:
             x, y, z = (view.cam_from_world @ [*point, 1.0])[:3]
-            if z <= NEAREST:
+            if z <= view.near:
                 continue
             u, v, _ = view.K @ [x / z, y / z, 1.0]
             across = -MARGIN * view.width <= u <= (1 + MARGIN) * view.width

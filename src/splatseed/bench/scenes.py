@@ -24,8 +24,8 @@ from splatseed.io.load import search_depths
 from splatseed.io.photograph import open_photograph, photograph_bytes
 from splatseed.progress import Progress, in_threads, silent
 from splatseed.scene import Scene
-from splatseed.splat.gaussians import stray_note, stray_views
-from splatseed.views.view import check_lens, poses_of
+from splatseed.views.sight import stray_notes
+from splatseed.views.view import check_lens
 
 DEMO = "demo:"
 """The path of the synthetic room, which is made in the benchmark's folder on demand."""
@@ -155,7 +155,7 @@ def survey(
     if with_depth and (planned.depth or search_depths(scene, depth) is not None):
         maps, scene = str(depth.resolve()), scene.replace(depths=find_depths(scene, depth))
     told = [*scene.warnings, *([scene.listed.sentence] if scene.listed else [])]
-    told += map(stray_note, stray_views(poses_of(scene.images)))
+    told += stray_notes(scene)
     return SceneFacts(
         str(path.resolve()), planned.label, planned.images, maps, scan,
         num_points=len(scene.points), num_images=len(scene.images), pixels=size[0] * size[1],

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from splatseed.commands.models import check_free, config_of, model_file
+from splatseed.commands.models import check_free, config_of, model_file, near_plane_of
 from splatseed.commands.options import MaskChoice, parse_options, refuse
 from splatseed.console import StageClock, print_note, print_pairs, print_table, stage_display
 from splatseed.errors import MissingDependencyError, SceneNotFoundError
@@ -154,7 +154,7 @@ def _evaluate(
         reason = str(error)
     model = load_model(
         gaussians, scene, **numbers, transform=options.transform, masks=masks,
-        trained_on=config.get("photographs"),
+        trained_on=config.get("photographs"), near_plane=near_plane_of(config),
         device=pick_device(options.backend, clock), cache_dir=user_cache_dir(), progress=clock,
     )  # fmt: skip
     seen = pixel_masks(find_covisible(model.scene, numbers["test_every"], clock), model.views)

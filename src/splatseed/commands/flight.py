@@ -144,7 +144,7 @@ def _size(options: Options, shown: Shown) -> tuple[int, int]:
                 fix="Try --size 960x540.",
             )
         return even_size(int(words[0]), int(words[1]))
-    for view in shown.train_views[:1]:
+    for view in shown.usual_views[:1]:
         return even_size(view.width, view.height, MOST_SIDE)
     return WITHOUT_CAMERAS
 
@@ -154,7 +154,7 @@ def _path(options: Options, shown: Shown, size: tuple[int, int]) -> tuple[list[V
     from splatseed.splat.world import NO_TRANSFORM, find_transform  # noqa: PLC0415  (imports PyTorch)
     from splatseed.view import flights  # noqa: PLC0415  (likewise)
 
-    cameras, frames = shown.train_views, max(1, round(options.seconds * FPS))
+    cameras, frames = shown.usual_views, max(1, round(options.seconds * FPS))
     if options.path == ORBIT or (options.path is None and len(cameras) < 2):
         return flights.orbit(cameras, shown.model, frames, size), FPS
     if options.path is None:

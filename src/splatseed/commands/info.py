@@ -35,6 +35,7 @@ from splatseed.seeding import diagnostics
 from splatseed.seeding.advice import Advice, advice_for
 from splatseed.seeding.photographs import has_points, photographed
 from splatseed.train.schedule import FULL_RUN
+from splatseed.views.sight import stray_notes
 
 if TYPE_CHECKING:  # Numba, which takes a while to load, comes with it
     from splatseed.depth.alignment import Alignment
@@ -88,7 +89,7 @@ def run(arguments: list[str]) -> None:
         poses = _look_at_poses(scene, clock)
         masks = diagnostics.mask_statistics(scene, clock)
     doubt = poses["problem"] if poses else ""
-    problems += [masks.problem] if masks.problem else []
+    problems += [*stray_notes(scene), *([masks.problem] if masks.problem else [])]
     problems += [*_unfit_maps(scene, alignments or {}), *([doubt] if doubt else [])]
     if options.json:
         facts = {

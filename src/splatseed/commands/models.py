@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -54,6 +55,12 @@ def check_free(
         raise OutputError(f"a file name at {path}", found=found, fix="Choose another name.")
     if path.exists() and not overwrite:
         raise OutputError(f"no file at {path}", found="one", fix=fix)
+
+
+def near_plane_of(config: Mapping[str, Any]) -> float | None:
+    """The near plane that a run was trained with, in its world; None for others."""
+    near = config.get("near_plane")
+    return float(near) if isinstance(near, float) and 0 < near < math.inf else None
 
 
 def config_of(path: Path) -> Mapping[str, Any]:

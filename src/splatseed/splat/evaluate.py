@@ -34,11 +34,12 @@ from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 from splatseed.scores import NOT_ASKED, EvalResult, ViewScore
 from splatseed.splat.formats import read_model
-from splatseed.splat.gaussians import Gaussians, training_frame
+from splatseed.splat.gaussians import Gaussians, frame_of_model
 from splatseed.splat.metrics import LPIPS_NET, Lpips, color_corrected, flip_map, psnr, ssim_of_all
 from splatseed.splat.rendering import ModelRenderer, fill_masked, mask_of, photograph_of
 from splatseed.splat.ssim import WINDOW
 from splatseed.splat.world import NO_TRANSFORM, check_world, find_transform, view_in
+from splatseed.views.sight import shown_points
 from splatseed.views.view import View, at_file_size, load_views, poses_of
 
 Covisible: TypeAlias = Mapping[str, Bool[np.ndarray, "H W"]]
@@ -173,6 +174,7 @@ def load_model(
     transform: str | None = None,
     masks: str | None = None,
     trained_on: str | None = None,
+    near_plane: float | None = None,
     device: torch.device | None = None,
     cache_dir: Path | None = None,
     progress: Progress = silent,
@@ -189,6 +191,7 @@ def load_model(
         masks: Which masks, as for ``io.masks.with_masks``.
         trained_on: The ``photographs_digest`` of the run; where it is the scene's, they are the
             same, whatever the clones that mcmc makes look like.
+        near_plane: The run's, in the model's world; when left out, it is found anew.
         device: Where to render; the CPU when left out.
         cache_dir: Where smaller photographs are cached; nowhere when left out.
         progress: Told how far it is.
@@ -223,7 +226,14 @@ def load_model(
     proven = transform is None and trained_on == photographs_digest(at_file_size(scene))
     unasked = proven or transform == NO_TRANSFORM
     doubt = "" if unasked else check_world(path, scene, gaussians, world)
-    frame = training_frame([view_in(world, view) for view in poses_of(train)])
+    points = shown_points(scene)
+    frame = frame_of_model(
+        [view_in(world, view) for view in poses_of(train)],
+        points if world is None else world.points(points),
+        gaussians,
+    )
+    if near_plane is not None:
+        frame = dataclasses.replace(frame, near=near_plane * frame.scale)
     image = ModelRenderer(gaussians, frame, device).image
     return TrainedModel(
         gaussians, views, lambda view: image(view_in(world, view)), scene, doubt, tuple(notes)

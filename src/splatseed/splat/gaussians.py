@@ -3,10 +3,13 @@
 Notation: N Gaussians; ``means`` [N, 3], ``scales`` [N, 3] as logarithms, ``quats`` [N, 4] wxyz of
 any length, ``opacities`` [N] as logits, ``sh0`` [N, 1, 3], ``shN`` [N, 15, 3]: gsplat's names and
 conventions. In the training frame the cameras' centroid is at 0 and the farthest camera at distance
-1, ``x_train = scale (x_world - origin)``; a *stray* camera is so far from all others that its pose
-must be wrong. Promise: no PyTorch; equal seeds and views give equal Gaussians, whatever the number
-of threads. The frame depends on the training cameras alone, without the strays, so that runs from
-different seeds are compared in one frame; single precision suffices there for distant origins.
+1, ``x_train = scale (x_world - origin)``; a *stray* camera, of a wrong pose, has no part in it
+(``views.sight``). The *near plane* is a length of its own: it follows from the depths that cameras
+see, not from how far they stand apart, which on a walk is a thousand times as much. Promise: no
+PyTorch; equal seeds and views give equal Gaussians, whatever the number of threads. The frame
+depends on the training cameras alone, strays and near plane also on the scene's own points, so that
+runs from different seeds are compared in one frame; only without points do new ones tell. Single
+precision suffices there for distant origins.
 """
 
 from __future__ import annotations
@@ -21,7 +24,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from splatseed.errors import PointCloudError
 from splatseed.pointcloud import PointCloud
-from splatseed.views.view import View
+from splatseed.views.sight import camera_centers, sight_of
+from splatseed.views.view import NEAR_PLANE, View
 
 PARAMETERS = ("means", "scales", "quats", "opacities", "sh0", "shN")
 """The names of a Gaussian's arrays, in order."""
@@ -42,10 +46,13 @@ CELL = 4.0  # side in pixels of the cells within which seeds occlude each other
 LEAST_VIEWS, MOST_PROJECTIONS = 16, 50_000_000
 """An even subset of the views, but never fewer than the first, is used beyond as many seeds times
 views as the second."""
-MIN_CAMERAS, STRAY_SHARE, STRAY_DISTANCE = 5, 0.1, 10.0
-"""Among fewer cameras than the first, none is a stray; among more, at most this share of them, but
-always one, can be. A stray is this many times farther from the cameras' median than the farthest
-camera that cannot be one."""
+NEAR_SHARE = 0.01
+"""The near plane, as a share of the near depth of what the cameras see (``views.sight``): a hundred
+times nearer than nine tenths of the points of any view. What a camera really sees is seldom ten
+times nearer than that; a Gaussian a hundred times nearer sits in the lens, where it covers the
+picture of one view and is seen by no other."""
+VISIBLE = -2.2  # logit of the least opacity, a tenth, of Gaussians that show where a scene is
+NOWHERE = np.empty((0, 3), np.float32)  # no points are known
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,7 +186,7 @@ def fit_harmonics(seeds: PointCloud, views: Sequence[View]) -> Float32[np.ndarra
     asked = np.linspace(0, len(views) - 1, min(most, len(views))).round().astype(int)
     for view in [views[i] for i in np.unique(asked)]:
         index, column, row = _shown(xyz, view)
-        sight = xyz[index].astype(np.float64) - _centers([view])[0]
+        sight = xyz[index].astype(np.float64) - camera_centers([view])[0]
         d = sight / np.maximum(np.linalg.norm(sight, axis=1, keepdims=True), 1e-12)
         ones = np.full(len(d), SH_C0)
         basis = np.stack([ones, -SH_C1 * d[:, 1], SH_C1 * d[:, 2], -SH_C1 * d[:, 0]], axis=1)
@@ -219,6 +226,8 @@ class TrainingFrame:
 
     origin: Float64[np.ndarray, " 3"]  # the point of the world that becomes 0
     scale: float  # training units per world unit
+    near: float = NEAR_PLANE  # the near plane, in training units
+    strays: tuple[str, ...] = ()  # names of the views that set neither scale nor near plane
 
     def points_from_world(self, xyz: Float[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N 3"]:
         """World points in the training frame."""
@@ -254,46 +263,37 @@ class TrainingFrame:
         )
 
     def view(self, view: View) -> View:
-        """The same view, its camera posed in the training frame."""
+        """The same view, its camera posed in the training frame, with the frame's near plane."""
         cam_from_train = view.cam_from_world.copy()
         rotation, translation = view.cam_from_world[:3, :3], view.cam_from_world[:3, 3]
         # x_cam = R x + t = (R x_train + s (R o + t)) / s: the same image, depths times s.
         cam_from_train[:3, 3] = self.scale * (rotation @ self.origin + translation)
-        return dataclasses.replace(view, cam_from_world=cam_from_train)
+        return dataclasses.replace(view, cam_from_world=cam_from_train, near=self.near)
 
 
-def training_frame(views: Sequence[View]) -> TrainingFrame:
-    """The frame of these cameras without the strays; only a translation if all are in one place."""
-    centers = _centers(views)
-    near = centers[~_is_stray(centers)]
-    origin = near.mean(axis=0)
-    extent = float(np.linalg.norm(near - origin, axis=1).max())
-    rounding = 1e-9 * float(np.abs(near).max())  # of which the extent of one place may be
-    return TrainingFrame(origin, 1.0 / extent if extent > rounding else 1.0)
+def frame_of_model(
+    views: Sequence[View], points: Float[np.ndarray, "P 3"], gaussians: Gaussians | None
+) -> TrainingFrame:
+    """The training frame that a model is rendered in; without points its Gaussians replace them."""
+    if len(points) or gaussians is None:
+        return training_frame(views, points)
+    shown = gaussians.opacities > VISIBLE
+    return training_frame(views, gaussians.means[shown & np.isfinite(gaussians.means).all(axis=1)])
 
 
-def stray_views(views: Sequence[View]) -> tuple[str, ...]:
-    """Names of the views whose cameras are strays."""
-    strays = _is_stray(_centers(views))
-    return tuple(view.name for view, stray in zip(views, strays, strict=True) if stray)
+def training_frame(
+    views: Sequence[View], points: Float[np.ndarray, "P 3"] = NOWHERE
+) -> TrainingFrame:
+    """The frame of these cameras without the strays; only a translation if all are in one place.
 
-
-def stray_note(name: str) -> str:
-    """The note for the user about a stray camera."""
-    return f"The camera of {name} is far from all others: check its pose, or leave it out."
-
-
-def _centers(views: Sequence[View]) -> Float64[np.ndarray, "V 3"]:
-    return np.array([-view.cam_from_world[:3, :3].T @ view.cam_from_world[:3, 3] for view in views])
-
-
-def _is_stray(centers: Float64[np.ndarray, "V 3"]) -> Bool[np.ndarray, " V"]:
-    """Which cameras are far from all others: at most a tenth of them, or one."""
-    if len(centers) < MIN_CAMERAS:
-        return np.zeros(len(centers), bool)
-    distances = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
-    # The nearest nine tenths of the cameras can be no strays: the distance of their farthest.
-    usual = max(1, len(centers) - max(1, round(STRAY_SHARE * len(centers))))
-    reach = np.partition(distances, usual - 1)[usual - 1]
-    rounding = 1e-9 * float(np.abs(np.median(centers, axis=0)).max())
-    return np.asarray((distances > STRAY_DISTANCE * reach) & (reach > rounding))
+    ``points`` are finite and show where the scene is: ``PointCloud.references``, or Gaussians.
+    """
+    centers, sight = camera_centers(views), sight_of(views, points)
+    usual = centers[~sight.strays]
+    origin = usual.mean(axis=0)
+    extent = float(np.linalg.norm(usual - origin, axis=1).max())
+    rounding = 1e-9 * float(np.abs(usual).max())  # of which the extent of one place may be
+    scale = 1.0 / extent if extent > rounding else 1.0
+    near = NEAR_PLANE if sight.near is None else NEAR_SHARE * sight.near * scale
+    names = (view.name for view, stray in zip(views, sight.strays, strict=True) if stray)
+    return TrainingFrame(origin, scale, near, tuple(names))

@@ -112,8 +112,8 @@ def _rasterize(
     images, alphas, info = rasterization(
         params["means"], params["quats"], torch.exp(params["scales"]),
         opacities_of(params["opacities"]), colors, camera.viewmats, camera.Ks,
-        view.width, view.height, sh_degree=degree, packed=False, render_mode=mode,
-        rasterize_mode="antialiased" if antialiased else "classic",
+        view.width, view.height, near_plane=view.near, sh_degree=degree, packed=False,
+        render_mode=mode, rasterize_mode="antialiased" if antialiased else "classic",
     )  # fmt: skip
     # Unlike indexing, squeeze's backward allocates no image of zeros.
     return images.squeeze(0), alphas.squeeze(0), info

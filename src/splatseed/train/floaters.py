@@ -27,13 +27,14 @@ from splatseed.io.masks import with_masks
 from splatseed.progress import Progress, silent
 from splatseed.seeding.clouds.judging import find_evidence
 from splatseed.seeding.photographs import photographed
-from splatseed.splat.gaussians import Gaussians, training_frame
+from splatseed.splat.gaussians import Gaussians, frame_of_model
 from splatseed.splat.rendering import fill_masked, mask_of, photograph_of, render_view
 from splatseed.train.device import pick_device
 from splatseed.train.parameters import make_parameters
 from splatseed.train.seeds import DepthMaps, known_depths
 from splatseed.train.settings import TrainSettings
 from splatseed.train.start import read_start
+from splatseed.views.sight import shown_points
 from splatseed.views.view import (
     View,
     at_file_size,
@@ -88,7 +89,7 @@ def floaters_of_model(
         settings = replace(settings, data_factor=factor_for(images, StereoSettings.max_size))
     factor, cache = settings.data_factor, user_cache_dir()
     views = load_views(scene, images, data_factor=factor, cache_dir=cache, progress=progress)
-    frame, device = training_frame(views), _device(progress)
+    frame, device = frame_of_model(views, shown_points(scene), gaussians), _device(progress)
     depths, _ = known_depths(scene, frame.scale, settings, device.type, progress=progress)
     views = tuple(frame.view(view) for view in views)
     return find_floaters(frame.gaussians_from_world(gaussians), views, depths, device, progress)

@@ -39,13 +39,7 @@ from splatseed.requirements import require
 from splatseed.scene import Scene
 from splatseed.scores import CurvePoint, EvalResult, TrainingResult
 from splatseed.splat.formats import write_model
-from splatseed.splat.gaussians import (
-    Gaussians,
-    TrainingFrame,
-    stray_note,
-    stray_views,
-    training_frame,
-)
+from splatseed.splat.gaussians import Gaussians, TrainingFrame, frame_of_model
 from splatseed.splat.rendering import picture_names, write_render
 from splatseed.splat.ssim import WINDOW
 from splatseed.train.device import check_fits, pick_device
@@ -62,6 +56,7 @@ from splatseed.train.state import (
     save_checkpoint,
 )
 from splatseed.train.trainer import Trainer
+from splatseed.views.sight import notes_on, shown_points
 from splatseed.views.view import View, at_file_size, check_lens, load_split, poses_of
 
 Score = Callable[..., EvalResult]
@@ -145,9 +140,13 @@ def prepare_run(
         scene, stereo = seeded(scene, settings, device.type, note, progress)
         trained = scene.split(settings.test_every)[0]
         seeds = usable_seeds(scene.points, settings, note, poses_of(trained, settings.data_factor))
+    frame = _frame_of(scene, settings, start)
+    for told in notes_on(frame.strays):
+        note(told)
     check_fits(len(seeds if start is None else start), device)
     began = seeds_facts(seeds) if start is None else start_facts(start)
     config = make_config(scene, began, settings, _name(device), refine_poses=refine_poses)
+    config["near_plane"] = frame.near / frame.scale  # in the world, for whoever renders the run
     _check_begun(folder, begun, config)
     views = load_split(
         scene,
@@ -157,9 +156,6 @@ def prepare_run(
         cache_dir=cache_dir,
         progress=progress,
     )
-    frame = training_frame(views[0])
-    for name in stray_views(views[0]):
-        note(stray_note(name))
     known, seconds = known_depths(
         scene, frame.scale, settings, device.type,
         stereo=stereo, kept=depths, note=note, progress=progress,
@@ -169,7 +165,7 @@ def prepare_run(
         state = load_checkpoint(folder.checkpoint, strategy, settings.schedule, device)
     else:
         first = (
-            first_gaussians(seeds, views[0], settings)
+            first_gaussians(seeds, views[0], frame, settings)
             if start is None
             else started_gaussians(start, views[0], frame, settings, device, note)
         )
@@ -190,6 +186,12 @@ def prepare_run(
     if tensorboard:
         run.log_to_tensorboard()
     return run
+
+
+def _frame_of(scene: Scene, settings: TrainSettings, start: Gaussians | None) -> TrainingFrame:
+    """The frame of the training views; where there are no points, Gaussians show the scene."""
+    poses = poses_of(scene.split(settings.test_every)[0])
+    return frame_of_model(poses, shown_points(scene), start)
 
 
 def _check_images(scene: Scene) -> None:
@@ -373,7 +375,7 @@ class TrainingRun:
         state: TrainState,
         views: tuple[Sequence[View], Sequence[View]],
     ) -> None:
-        self.folder, self.settings, self.state, self._frame = folder, settings, state, frame
+        self.folder, self.settings, self.state, self.frame = folder, settings, state, frame
         self._board: Any = None  # TensorBoard's writer, if asked for
         self._saved, self._saved_step = time.monotonic(), state.step or None
         train, test = ([frame.view(view) for view in part] for part in views)
@@ -445,7 +447,7 @@ class TrainingRun:
             progress("score", 0.0)
             folder.claim([folder.renders / name for name in self._pictures.values()])
             scores = score(self.trainer.render, views, on_view=self._draw)
-            world = self._frame.gaussians_to_world(gaussians_of(state.params))
+            world = self.frame.gaussians_to_world(gaussians_of(state.params))
             result = TrainingResult(
                 dataclasses.replace(scores, num_gaussians=len(world), model_bytes=world.num_bytes),
                 tuple(

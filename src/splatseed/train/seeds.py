@@ -31,13 +31,13 @@ from splatseed.scene import Image, Scene
 from splatseed.seeding.advice import AS_IT_IS, advice_for
 from splatseed.splat.gaussians import (
     Gaussians,
+    TrainingFrame,
     fit_harmonics,
     initial_gaussians,
-    stray_views,
     training_frame,
 )
 from splatseed.train.settings import AS_3DGS, BUDGET, TrainSettings
-from splatseed.views.view import View
+from splatseed.views.view import NEAR_PLANE, View
 
 SEEDS_SHARE = {"default": 0.7, "mcmc": 0.7}
 """Most seeds as a fraction of the cap, for strategies that add Gaussians; others may use it all."""
@@ -48,8 +48,6 @@ LEAST_VIEWS = 64
 MARGIN = 0.1
 """A point outside the photograph by up to this fraction of its size counts as seen: a large
 Gaussian there reaches in."""
-NEAREST = 0.01
-"""The rasteriser's near plane: nothing nearer is drawn."""
 PER_RENDERED = {"cpu": 0.06, "cuda": 0.01}
 """Most pixels compared per pixel rendered in training, by the device that renders: on the CPU,
 stereo then takes at most a tenth of training's seconds (bonsai and treehill at 1,500 steps: 7%).
@@ -177,15 +175,14 @@ def seeds_digest(seeds: PointCloud) -> str:
 
 
 def first_gaussians(
-    seeds: PointCloud, views: Sequence[View], settings: TrainSettings
+    seeds: PointCloud, views: Sequence[View], frame: TrainingFrame, settings: TrainSettings
 ) -> tuple[Gaussians, Float32[np.ndarray, " N"]]:
     """One Gaussian per seed, in the training frame, and their near depths [N].
 
     Seeds, finite, and training views are in the world; stray cameras have no part.
     """
-    frame, strays = training_frame(views), stray_views(views)
     seeds = frame.cloud_from_world(seeds)
-    views = [frame.view(view) for view in views if view.name not in strays]
+    views = [frame.view(view) for view in views if view.name not in frame.strays]
     lengths, schedule = near_depths(seeds.xyz, views), settings.schedule
     gaussians = initial_gaussians(
         seeds,
@@ -207,8 +204,10 @@ def gaussians_of_scene(
     Raises:
         PointCloudError: Fewer than two distinct finite points.
     """
-    gaussians, _ = first_gaussians(cloud.select(cloud.finite), views, settings)
-    return training_frame(views).gaussians_to_world(gaussians)
+    seeds = cloud.select(cloud.finite)
+    frame = training_frame(views, seeds.references.xyz)
+    gaussians, _ = first_gaussians(seeds, views, frame, settings)
+    return frame.gaussians_to_world(gaussians)
 
 
 def near_depths(xyz: Float[np.ndarray, "N 3"], views: Sequence[View]) -> Float32[np.ndarray, " N"]:
@@ -223,7 +222,8 @@ def near_depths(xyz: Float[np.ndarray, "N 3"], views: Sequence[View]) -> Float32
     known = np.isfinite(nearest)
     # A point that no view sees gets no gradient; any positive length will do.
     nearest[~known] = np.median(nearest[known]) if known.any() else 1.0
-    return np.asarray(np.maximum(nearest, NEAREST), np.float32)
+    least = min((view.near for view in views), default=NEAR_PLANE)
+    return np.asarray(np.maximum(nearest, least), np.float32)
 
 
 def _seen_depths(
@@ -235,7 +235,7 @@ def _seen_depths(
         row[0] * columns[0] + row[1] * columns[1] + row[2] * columns[2] + row[3]
         for row in view.cam_from_world[:3]
     )
-    seen = depths > NEAREST
+    seen = depths > view.near  # nothing nearer is drawn
     for across, focal, center, size in (
         (x, view.K[0, 0], view.K[0, 2], view.width),
         (y, view.K[1, 1], view.K[1, 2], view.height),

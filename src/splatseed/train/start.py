@@ -77,7 +77,7 @@ def started_gaussians(
     ``gaussians`` and training views are in the world.
     """
     gaussians = frame.gaussians_from_world(_of_degree(gaussians, settings.sh_degree))
-    views = [frame.view(view) for view in views]
+    views = [frame.view(view) for view in views if view.name not in frame.strays]
     cap, count = settings.cap, len(gaussians)
     if cap is not None and count > cap:
         gaussians = gaussians.select(_contributing_most(gaussians, views, cap, device))

@@ -2,7 +2,7 @@
 
 Notation: a path is a sequence of views without pixels, one per frame, in world coordinates with
 OpenCV axes; a *stop* is a camera that a path is made from. Promise: equal input gives equal paths;
-cameras far from all others are left out; a video appears whole or not at all.
+a video appears whole or not at all.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from splatseed.literal import counted
 from splatseed.progress import Progress, silent
 from splatseed.requirements import require
 from splatseed.similarity import Similarity
-from splatseed.splat.gaussians import Gaussians, stray_views
+from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.rendering import ModelRenderer, as_bytes
 from splatseed.view.models import CORE, pinhole_view, split_picture
 from splatseed.view.page import depth_picture, nearness, usual_range
@@ -59,8 +59,7 @@ def smooth_path(views: Sequence[View], frames: int, size: tuple[int, int]) -> li
     Raises:
         ParameterError: There are fewer than two cameras, or all are in one place.
     """
-    strays = stray_views(views)
-    ordered = _in_order([view for view in views if view.name not in strays])
+    ordered = _in_order(views)
     poses = _poses(ordered)
     reach = np.linalg.norm(poses[:, :3] - poses[:, :3].mean(axis=0), axis=1).max() if ordered else 0
     if len(ordered) < 2 or not reach > 0:

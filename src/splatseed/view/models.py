@@ -22,9 +22,10 @@ from splatseed.io.files import StrPath, read_bytes
 from splatseed.literal import quoted
 from splatseed.scene import Scene
 from splatseed.splat.formats import detect_format, read_model
-from splatseed.splat.gaussians import Gaussians, TrainingFrame, training_frame
+from splatseed.splat.gaussians import Gaussians, TrainingFrame, frame_of_model
 from splatseed.train.folder import RunFolder
 from splatseed.view.page import font, latin
+from splatseed.views.sight import shown_points
 from splatseed.views.view import View, poses_of
 
 MODEL_SUFFIXES = (".spz", ".splat", ".sog", ".ksplat", ".glb")
@@ -61,6 +62,12 @@ class Shown:
         """The training cameras, as large as the run's photographs; none without a scene."""
         images = self.scene.split(self.test_every)[0] if self.scene else ()
         return poses_of(images, self.data_factor)
+
+    @property
+    def usual_views(self) -> tuple[View, ...]:
+        """The training cameras without those that stray from all others."""
+        views, strays = self.train_views, stage_frame(self).strays
+        return tuple(view for view in views if view.name not in strays)
 
 
 def open_shown(path: StrPath, scene_path: Path | None = None) -> Shown:
@@ -150,7 +157,8 @@ def stage_frame(shown: Shown) -> TrainingFrame:
     """The training frame or, with fewer than two cameras, one fitted to the model or the points."""
     scene = shown.scene
     if scene is not None and len(scene.images) > 1:
-        return training_frame(poses_of(scene.split(shown.test_every)[0]))
+        poses = poses_of(scene.split(shown.test_every)[0])
+        return frame_of_model(poses, shown_points(scene), shown.gaussians)
     if shown.gaussians is not None:
         xyz = shown.gaussians.means.astype(np.float64)
     else:

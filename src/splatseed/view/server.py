@@ -28,7 +28,7 @@ from splatseed.errors import ParameterError
 from splatseed.requirements import require
 from splatseed.scene import Image, Scene
 from splatseed.view.flights import orbit, upward
-from splatseed.view.models import Shown, stage_frame
+from splatseed.view.models import Shown
 from splatseed.view.pictures import Drawn, Entry, fitted_fov, stage_pose
 from splatseed.view.session import Session
 from splatseed.views.view import View
@@ -151,7 +151,7 @@ class _LiveEntry(Entry):
     """A run's scene and its current Gaussians, drawn by the thread that calls ``serve``."""
 
     def __init__(self, shown: Shown, run: TrainingRun) -> None:
-        super().__init__(shown, stage_frame(shown))
+        super().__init__(shown, run.frame)
 
         def color(view: View) -> Float32[np.ndarray, "H W 3"]:
             image = run.trainer.render(self.frame.view(view))

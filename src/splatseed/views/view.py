@@ -39,6 +39,7 @@ from splatseed.scene import Image, Masks, Scene
 ASPECT_SLACK = 0.02
 """By how much a file's aspect ratio may differ from its camera's: the rounding of a copy."""
 READERS = 4  # threads that decode photographs
+NEAR_PLANE = 0.01  # where nothing is known of the scene; gsplat's
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +53,7 @@ class View:
     height: int
     cam_from_world: Float64[np.ndarray, "4 4"]
     mask: Bool[np.ndarray, "H W"] | None = None  # pixels that count; None: all
+    near: float = NEAR_PLANE  # no Gaussian nearer than this is drawn; in the unit of the pose
 
     @property
     def camera(self) -> Camera:

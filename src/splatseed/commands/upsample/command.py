@@ -38,6 +38,7 @@ from splatseed.upsample import (
     planned_size,
     traits_of,
 )
+from splatseed.views.sight import stray_notes
 
 FILES = (".ply", ".las", ".laz", ".e57", ".pcd", ".xyz", ".pts", ".npz", ".bin", ".txt")
 """Suffixes by which somebody means a file of points."""
@@ -300,7 +301,7 @@ def _announce(
     options: Options, scene: Scene, methods: Mapping[str, Upsampler], number: str, takes: str
 ) -> None:
     """Print what will be done, what a cloud takes, and which flags have no effect."""
-    for warning in scene.warnings:
+    for warning in (*scene.warnings, *stray_notes(scene)):
         print_note(warning)
     name, method = options.method, methods[options.method]
     if (listed := scene.listed) is not None and hasattr(method, "hold_out"):
