@@ -59,3 +59,15 @@ def test_nothing_is_replaced_unasked_and_no_run_is_written_into(model, splatseed
     before = model.read_bytes()
     assert splatseed("export", model, "-o", model, "--overwrite").code == 2
     assert model.read_bytes() == before
+
+
+def test_what_is_left_out_is_said_once(model, splatseed, tmp_path):
+    broken = read_model(model)
+    broken.scales[5, 0], broken.means[7] = np.nan, 1e9
+    write_model(tmp_path / "broken.ply", broken)
+    run = splatseed("export", tmp_path / "broken.ply", "-o", tmp_path / "out.spz")
+    assert run.code == 0, run
+    said = " ".join(run.out.split())
+    assert said.count("has no usable size and was left out") == 1
+    assert said.count("1 Gaussian of 399 is more than") == 1
+    assert len(read_model(tmp_path / "out.spz")) == 398

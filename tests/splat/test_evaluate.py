@@ -105,7 +105,7 @@ def model_path(larger_room_path, tmp_path_factory):
     return path
 
 
-def test_a_ply_of_the_world_is_scored_on_the_test_views(larger_room_path, model_path):
+def test_a_ply_of_the_world_is_scored_on_the_test_views(larger_room_path, model_path, tmp_path):
     model, scene = load_model(model_path, larger_room_path), load_scene(larger_room_path)
     result = evaluate_model(model)
     assert [s.name for s in result.per_image] == [i.name for i in scene.split()[1]]
@@ -115,6 +115,13 @@ def test_a_ply_of_the_world_is_scored_on_the_test_views(larger_room_path, model_
     assert result.psnr > black.psnr + 1
     with pytest.raises(SceneNotFoundError, match="to have images"):
         load_model(model_path, larger_room_path / "sparse/0/points3D.ply")
+    # A Gaussian that is broken changes no score, and is said.
+    broken = dataclasses.replace(model.gaussians, scales=model.gaussians.scales.copy())
+    broken.scales[9] = np.nan
+    path = tmp_path / "broken.ply"
+    write_model(path, broken)
+    whole = load_model(path, larger_room_path)
+    assert (model.notes, len(whole.notes), len(whole.gaussians)) == ((), 1, len(broken) - 1)
     # It looks the same in whatever frame it is rendered; nothing lies at the nearer near plane.
     frame = training_frame(poses_of(scene.split()[0]))
     other = dataclasses.replace(frame, origin=frame.origin + 0.5, scale=3 * frame.scale)

@@ -174,8 +174,9 @@ def _ascii_rows(reader: ByteReader, skipped: int, element: Element) -> np.ndarra
     # What is not a byte is kept as float64, whatever is declared: a float32 as text is exact there.
     dtype = np.dtype([(n, kind if kind == "u1" else "f8") for n, kind in element.types.items()])
     with guarded(reader.path, "rows of numbers after its header", fix=EXPORT_PLY_AGAIN):
+        text = reader.data[reader.offset :].replace(b"nan(ind)", b"nan")  # as Windows writes it
         table = np.loadtxt(
-            io.BytesIO(reader.data[reader.offset :]),
+            io.BytesIO(text),
             comments=None, skiprows=skipped, max_rows=element.num_rows, ndmin=2,
         )  # fmt: skip
         if table.shape != (element.num_rows, len(element.types)):
