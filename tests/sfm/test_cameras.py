@@ -36,6 +36,7 @@ WIDE, TELE, NONE = phone(5.7, 26), phone(9.0, 77), Photo(SIZE)
         ([(WIDE, 8), (TELE, 8)], [8, 8]),
         ([(WIDE, 8), (TELE, 1)], [8, 1]),  # alone, but no part of the other lens
         ([(WIDE, 8), (phone(5.7, 27), 8)], [8, 8]),  # digital zoom
+        ([(WIDE, 8), (Photo(SIZE, WIDE.exif._replace(zoom=2.0)), 8)], [8, 8]),
         ([(WIDE, 8), (phone(5.7, 26, "front"), 8)], [8, 8]),
         ([(WIDE, 8), (Photo(SIZE, Exif("Maker", "Drone", "", 5.7, 26)), 8)], [8, 8]),
         ([(WIDE, 8), (phone(5.7, 26, size=(3000, 4000)), 8)], [8, 8]),
@@ -80,7 +81,7 @@ def test_the_cameras_are_described():
 def test_exif_is_read_and_what_is_none_of_it_left(tmp_path):
     exif = Image.Exif()
     exif[0x010F], exif[0x0110] = "Maker\0", " Maker One "
-    exif.get_ifd(0x8769).update({0x920A: 5.7, 0xA405: 0, 0xA434: "back camera"})
+    exif.get_ifd(0x8769).update({0x920A: 5.7, 0xA405: 0, 0xA434: "back camera", 0xA404: 1.0})
     Image.new("RGB", (8, 8)).save(tmp_path / "a.jpg", exif=exif)
     with Image.open(tmp_path / "a.jpg") as image:
         assert read_exif(image) == Exif("Maker", "Maker One", "back camera", 5.7, None)

@@ -33,6 +33,7 @@ def fail(output, key):
         (kept.folder / "database.db").touch()
         (kept.folder / "models" / "0").mkdir(parents=True, exist_ok=True)
         raise KeyboardInterrupt
+    assert "The same command goes on" in notes.pop()
     return notes, (*stale, found)
 
 

@@ -26,7 +26,8 @@ from splatseed.literal import agreeing, counted, name_some
 Size = tuple[int, int]
 """Width and height in pixels as stored, before any EXIF rotation."""
 
-_MAKE, _MODEL, _IFD, _FOCAL, _FOCAL_35, _LENS = 0x010F, 0x0110, 0x8769, 0x920A, 0xA405, 0xA434
+_MAKE, _MODEL, _IFD = 0x010F, 0x0110, 0x8769
+_FOCAL, _FOCAL_35, _LENS, _ZOOM = 0x920A, 0xA405, 0xA434, 0xA404
 _ROUNDING = 0.75
 """Millimetres by which a 35 mm equivalent, a whole number, differs from the focal length's."""
 _SAME = 1.01
@@ -45,6 +46,7 @@ class Exif(NamedTuple):
     lens: str = ""
     focal: float | None = None  # mm
     focal_35: float | None = None  # mm, equivalent
+    zoom: float | None = None  # digital; some phones change only this
 
 
 class Photo(NamedTuple):
@@ -73,7 +75,9 @@ def read_exif(image: PilImage.Image) -> Exif:
         tags = image.getexif()
         own = tags.get_ifd(_IFD)
         texts = (_text(tags.get(_MAKE)), _text(tags.get(_MODEL)), _text(own.get(_LENS)))
-        return Exif(*texts, _length(own.get(_FOCAL)), _length(own.get(_FOCAL_35)))
+        zoom = _length(own.get(_ZOOM))
+        lengths = (_length(own.get(_FOCAL)), _length(own.get(_FOCAL_35)))
+        return Exif(*texts, *lengths, None if zoom == 1 else zoom)
     return Exif()
 
 
@@ -99,7 +103,7 @@ def share_cameras(photos: Photos) -> tuple[SharedCamera, ...]:
     """
     lengths = _focal_lengths(photos)
     groups: list[list[str]] = []
-    for alike in _grouped(photos, lambda name: (photos[name].size, *photos[name].exif[:3])):
+    for alike in _grouped(photos, lambda name: (photos[name].size, *_lens_of(photos[name]))):
         for known in _grouped(alike, lambda name: lengths[name] is not None):
             for setting in _settings(known, lengths):
                 groups += _by_folder(setting)
@@ -120,10 +124,15 @@ def describe_cameras(cameras: Sequence[SharedCamera]) -> str:
     return f"{number} by EXIF: {name_some(labels)}"
 
 
+def _lens_of(photo: Photo) -> tuple[object, ...]:
+    exif = photo.exif
+    return exif.make, exif.model, exif.lens, exif.zoom
+
+
 def _focal_lengths(photos: Photos) -> dict[str, float | None]:
     """The photographs' focal lengths, not rounded where EXIF's own says more."""
     found: dict[str, float | None] = {}
-    for names in _grouped(photos, lambda name: photos[name].exif[:3]):
+    for names in _grouped(photos, lambda name: _lens_of(photos[name])):
         both = [photos[name].exif for name in names]
         crops = [e.focal_35 / e.focal for e in both if e.focal and e.focal_35]
         crop = median_low(crops) if crops else 1.0

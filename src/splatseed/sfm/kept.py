@@ -87,9 +87,11 @@ def kept_work(
         stale = _prepare(folder, key, lambda text: on_note(text.format(quoted(folder))))
         try:
             yield Kept(folder, stale)
-        except BaseException:
+        except BaseException as error:
             if not (folder / DATABASE).exists():
                 remove(folder)
+            elif isinstance(error, KeyboardInterrupt):
+                on_note(f"The same command goes on from what is kept in {quoted(folder)}.")
             raise
         remove(folder)
 
