@@ -26,7 +26,7 @@ from splatseed.pointcloud import ORIGINAL, PointCloud
 NO_POINT = -1
 """The point id of a feature that belongs to no point."""
 
-SceneFormat = Literal["colmap", "transforms", "ply", "rgbd"]
+SceneFormat = Literal["colmap", "transforms", "ply", "rgbd", "llff"]
 
 
 @dataclass(frozen=True, eq=False)

@@ -60,7 +60,7 @@ def files_of(scene):
         ("C:\\data\\room\\images\\{}.png", "images/{}.png", True),
         ("C:/data/room/{}.png", "images/{}.png", True),
         ("\\\\server\\share\\images\\{}.png", "images/{}.png", True),
-        ("/home/else/room/images/a/{}.png", "images/a/{}.png", True),
+        ("/data/room/images/a/{}.png", "images/a/{}.png", True),
         ("../room/images/{}.png", "images/{}.png", True),
         ("{}.png", "images/{}.png", True),
     ],

@@ -149,7 +149,7 @@ def test_scene_without_points_is_an_error_unless_allowed(scene_dir, scenes):
         ("hall.laz", SceneFormatError, r"--cloud \S+hall\.laz"),
         ("a walk.mp4", SceneFormatError, r"splatseed sfm '.*/a walk\.mp4'"),
         ("empty", SceneNotFoundError, "empty"),
-        ("half", SceneNotFoundError, r"transforms_train\.json"),
+        ("half", SceneNotFoundError, r"transforms_test\.json"),
         (".", SceneNotFoundError, r"Name one of them: \S+scene$"),
         ("scene/images", SceneNotFoundError, r"Name the scene's folder: \S+scene$"),
         ("scene/sparse/0/points3D.bin", SceneFormatError, r"Name the scene's folder: \S+scene$"),
@@ -161,7 +161,7 @@ def test_scene_without_points_is_an_error_unless_allowed(scene_dir, scenes):
 def test_what_is_no_scene_is_one_error(tmp_path, scene_dir, name, error, names):
     for folder in ("empty", "half", "run"):
         (tmp_path / folder).mkdir()
-    for file in ("notes.txt", "hall.laz", "a walk.mp4", "half/transforms_train.json", "run/a.json"):
+    for file in ("notes.txt", "hall.laz", "a walk.mp4", "half/transforms_test.json", "run/a.json"):
         (tmp_path / file).touch()
     (scene_dir / "images/left/view.png").touch()
     (scene_dir / "splatseed.json").write_text('{"command": "upsample"}')

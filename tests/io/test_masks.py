@@ -12,7 +12,9 @@ from PIL import Image as PilImage
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io import load_scene, write_scene
 from splatseed.io.load import with_own_depths
-from splatseed.io.masks import with_masks
+from splatseed.io.mask_files import masks_among
+from splatseed.io.masks import masks_beside, with_masks
+from splatseed.sfm.photos import find_photos
 from splatseed.synthetic import write_capture
 from splatseed.upsample import upsample
 from splatseed.views.view import load_views
@@ -87,8 +89,8 @@ def test_a_folder_none_and_inverted_can_be_chosen(scene_path, tmp_path):
 
 def test_what_cannot_be_a_mask_is_named(scene_path):
     path = scene_path / "masks/view_000.png"
-    paint(path, size=(48, 36), box=np.s_[:5, :5])
-    with pytest.raises(SceneFormatError, match=r"view_000.png.* 96 x 72; found 48 x 36"):
+    paint(path, size=(48, 40), box=np.s_[:5, :5])
+    with pytest.raises(SceneFormatError, match=r"view_000.png.* 96 x 72; found 48 x 40"):
         masks_of(load_scene(scene_path))
     paint(path, box=np.s_[:, :])
     with pytest.raises(SceneFormatError, match=r"view_000.png that count.*found none"):
@@ -165,3 +167,90 @@ def test_undistortion_carries_masks_along(sixteen_views, tmp_path):
         painted = (view.photograph == (255, 0, 255)).all(axis=2)
         assert not (painted & view.mask).any()
         assert np.count_nonzero(~view.mask) < 1.35 * np.count_nonzero(painted) + 400
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("masks/{}.PNG", "masks/{}.jpg", "Masks/{}.png", "mask/{}.png.png", "images/masks/{}.png"),
+        *("mask/{}.mask.png", "masks/{}_mask.png", "masks/{}.png.mask.png", "masks/VIEW_003.png"),
+        *("images/{}.mask.png", "images/{}_mask.png", "images/{}.png.mask.png"),
+    ],
+)
+def test_masks_of_other_tools_are_found_and_written_as_colmaps(scene_path, tmp_path, name):
+    counts = paint(scene_path / name.format("view_003"))
+    scene = load_scene(scene_path)
+    assert scene.masks.files.keys() == {"view_003.png"}
+    (mask,) = [each for each in masks_of(scene) if each is not None]
+    if not name.endswith(".jpg"):  # which blurs edges
+        assert np.array_equal(mask, counts)
+    assert np.count_nonzero(mask != counts) < 40
+    for layout in ("colmap", "transforms"):
+        out = write_scene(scene, tmp_path / layout, format=layout).path
+        assert np.array_equal(masks_of(load_scene(out))[3], mask)
+
+
+@pytest.mark.parametrize(
+    ("name", "way"),
+    [
+        ("segmentation/view_003.png", "inverted:{}/segmentation"),
+        ("dynamic_masks/view_003.png", "{}/dynamic_masks"),
+        ("images/dynamic_mask_view_003.png", "inverted:{}/images"),
+        ("sky_masks/view_003.png", "{}/sky_masks"),
+    ],
+)
+def test_masks_of_unknown_meaning_are_mentioned_and_can_be_named(scene_path, name, way):
+    paint(scene_path / name)
+    scene = load_scene(scene_path)
+    way = way.format(scene_path)
+    assert not scene.masks.files
+    assert sum(f"--masks {way}" in each for each in scene.warnings) == 1
+    assert with_masks(scene, way).masks.files.keys() == {"view_003.png"}
+
+
+def test_masks_that_fit_no_photograph_are_counted_and_so_are_photographs_without(scene_path):
+    paint(scene_path / "masks/IMG_1.png")
+    said, folder = " ".join(load_scene(scene_path).warnings), scene_path / "masks"
+    assert f"1 mask in {folder} belongs to no image of the scene, such as IMG_1" in said
+    paint(scene_path / "mask/view_001.png")
+    scene = load_scene(scene_path)  # the folder that fits
+    assert scene.masks.files.keys() == {"view_001.png"}
+    assert "8 images of 9 with masks" in " ".join(scene.warnings)
+
+
+def test_masks_of_another_size_are_resized(scene_path):
+    path = scene_path / "masks/view_000.png"
+    paint(path, size=(48, 36), box=np.s_[10:20, 15:30])
+    scene = load_scene(scene_path)
+    assert "resized" in " ".join(scene.warnings)
+    counts = np.ones((72, 96), bool)
+    counts[20:40, 30:60] = False
+    assert np.array_equal(masks_of(scene)[0], counts)
+    paint(path, size=(144, 108), box=np.s_[31:61, 45:90])
+    counts[20] = counts[40, 30:60] = True
+    counts[20, 30:60] = counts[40, 30:60] = False
+    assert np.array_equal(masks_of(load_scene(scene_path))[0], counts)
+
+
+def test_a_transparent_mask_masks(scene_path):
+    values = np.full((72, 96, 4), 255, np.uint8)
+    values[BOX][..., 3] = 0
+    (scene_path / "masks").mkdir()
+    PilImage.fromarray(values).save(scene_path / "masks/view_000.png")
+    assert np.array_equal(masks_of(load_scene(scene_path))[0], values[..., 3] > 0)
+
+
+def test_masks_are_no_photographs(scene_path):
+    for name in ("view_001_mask.png", "view_002.png.mask.png", "masks/view_003.png"):
+        counts = paint(scene_path / "images" / name)
+        rgb = np.repeat(counts[..., None], 3, axis=2).astype(np.uint8) * 255
+        PilImage.fromarray(rgb).save(scene_path / "images" / name)
+    pytest.importorskip("pycolmap")
+    photos, left_out = find_photos(scene_path / "images")
+    assert len(photos) == 9
+    assert [len(names) for names in left_out.values()] == [3]
+    masks, _ = masks_beside(scene_path / "images")
+    assert masks.files.keys() == {"view_003.png"}  # a folder goes first
+    names = ["a.jpg", "b_mask.jpg", "a_mask.png", "x/masks/a.png"]
+    assert masks_among(names) == {"a_mask.png", "x/masks/a.png"}
+    assert masks_among(["mask/a.png", "mask/b.png"]) == set()

@@ -33,7 +33,7 @@ UNKNOWN_ERROR = -1.0
 """COLMAP's reprojection error of a point that has none yet."""
 
 _MODEL_FILES = ("cameras", "images", "points3D")
-_IMAGE_DIRS = ("images", "images_2", "images_4", "images_8", "image", "input")
+IMAGE_DIRS = ("images", "images_2", "images_4", "images_8", "image", "input")
 _MAX_SIZE = 2**31 - 1
 _MOST_MODELS = 100
 """An unknown camera model with a lower id is taken for a newer one, not for damage."""
@@ -456,7 +456,7 @@ def scene_root(model_dir: Path) -> Path:
     if not levels:
         return model_dir
     above = model_dir.absolute().parents[levels - 1]
-    levels += above.name == "colmap" and not any((above / name).is_dir() for name in _IMAGE_DIRS)
+    levels += above.name == "colmap" and not any((above / name).is_dir() for name in IMAGE_DIRS)
     named = model_dir if len(model_dir.parts) >= levels else model_dir.absolute()
     return named.parents[levels - 1]
 
@@ -485,7 +485,7 @@ def read_colmap_scene(model_dir: StrPath) -> Scene:
 
 def _image_dir(root: Path, images: Sequence[Image]) -> Path | None:
     """The first known folder with all images, else with the most; the first at all without any."""
-    folders = [root / name for name in _IMAGE_DIRS if (root / name).is_dir()]
+    folders = [root / name for name in IMAGE_DIRS if (root / name).is_dir()]
     held = dict[Path, int]()
     for folder in (*folders, root):
         held[folder] = sum((folder / image.name).is_file() for image in images)

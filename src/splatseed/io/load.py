@@ -18,11 +18,12 @@ from splatseed.io.colmap import find_model, scene_root
 from splatseed.io.depth_files import KINDS, SUFFIXES
 from splatseed.io.depth_maps import DepthFiles, match_by_name
 from splatseed.io.files import StrPath, is_video, odd_kind
+from splatseed.io.llff import is_llff, read_llff
 from splatseed.io.masks import with_own_masks
 from splatseed.io.model_choice import nested_model, read_model, scene_model
 from splatseed.io.nerfstudio import is_blender, read_blender, read_transforms_scene
 from splatseed.io.ply import read_ply, refuse_model
-from splatseed.io.rgbd import find_tum_depths, is_tum, load_rgbd, load_tum
+from splatseed.io.rgbd import find_tum_depths, is_replica, is_tum, load_rgbd, load_tum
 from splatseed.io.seeds import recall_seeds
 from splatseed.io.split import follow_lists
 from splatseed.io.staging import MANIFEST, read_manifest
@@ -45,9 +46,10 @@ def load_scene(path: StrPath, *, require_points: bool = True) -> Scene:
     Args:
         path: A folder with a COLMAP model (``sparse/0``, ``sparse``, ``colmap/sparse/0``, itself
             the model, or ``0`` in it), with ``transforms.json``, with ``transforms_train.json`` and
-            ``transforms_test.json``, or with an RGB-D capture (``traj.txt``, or ``rgb.txt`` and
-            ``groundtruth.txt``); or a ``.json`` or ``.ply`` file. Where there are several,
-            ``sparse`` precedes ``transforms.json``, which precedes ``colmap/sparse/0``.
+            ``transforms_test.json``, with LLFF's ``poses_bounds.npy``, or with an RGB-D capture
+            (``traj.txt``, or ``rgb.txt`` and ``groundtruth.txt``); or a ``.json`` or ``.ply`` file.
+            Where there are several, ``sparse`` precedes ``transforms.json``, which precedes
+            ``colmap/sparse/0``.
         require_points: Whether a scene without points is an error; else its cloud is empty.
 
     Returns:
@@ -130,9 +132,8 @@ def _reader(folder: Path) -> Callable[[], Scene] | None:
         return partial(read_blender, folder)
     if (nested := nested_model(folder)) is not None:
         return partial(read_model, nested)
-    if (folder / "traj.txt").is_file():
-        return partial(load_rgbd, folder)
-    return partial(load_tum, folder) if is_tum(folder) else None
+    others = ((is_llff, read_llff), (is_replica, load_rgbd), (is_tum, load_tum))
+    return next((partial(read, folder) for known, read in others if known(folder)), None)
 
 
 def _read_file(path: Path) -> Scene:
@@ -189,7 +190,8 @@ def _no_scene(path: Path) -> SceneNotFoundError:
     else:
         fix = "Name the scene's folder, or a .ply or .json file itself. For photographs alone, "
         fix += "run: splatseed sfm IMAGES -o SCENE."
-    expected = f"sparse/0, sparse, colmap/sparse/0, {_TRANSFORMS}, traj.txt or groundtruth.txt"
+    expected = f"sparse/0, sparse, colmap/sparse/0, {_TRANSFORMS}, poses_bounds.npy, "
+    expected += "traj.txt or groundtruth.txt"
     return SceneNotFoundError(f"{expected} in {path}", found=found, fix=fix)
 
 

@@ -1,32 +1,36 @@
-"""Masks: which pixels of photographs count; finding their files, reading and writing them.
+"""Masks: which pixels of photographs count; reading and writing them.
 
-A mask is an image of its photograph's size, 0 where a pixel is masked, as COLMAP and
-nerfstudio take it. The mask of ``a/b.jpg`` is ``a/b.jpg.png`` (COLMAP's name) or
-``a/b.png`` in a folder of masks. Pixels of a photograph that are not opaque are masked, too.
+A mask is an image of its photograph's shape, 0 where a pixel is masked, as COLMAP and nerfstudio
+take it; ``mask_files`` finds them. Pixels of a photograph that are not opaque are masked, too.
 Promise: a pixel of a smaller copy, or of an undistorted one, counts only if all that it was made
 from count.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool
 
 from splatseed.camera import Intrinsics
-from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.errors import SceneFormatError, SceneNotFoundError, SplatseedError
 from splatseed.io.depth_maps import Undistortion
-from splatseed.io.files import files_below, guarded, read_bytes
+from splatseed.io.files import files_below, guarded, open_file, read_bytes
+from splatseed.io.mask_files import find_masks, masks_among, own_masks
 from splatseed.io.photograph import has_alpha, open_photograph, photograph_bytes
-from splatseed.literal import agreeing, counted
+from splatseed.literal import counted
 from splatseed.scene import Masks, Scene
+
+if TYPE_CHECKING:
+    from PIL import Image as PilImage
 
 NONE, INVERTED = "none", "inverted"
 """Choices of masks besides a folder; ``inverted:DIR`` inverts those of a folder."""
-FOLDER = "masks"
 _LISTED = "masks of the scene's images, named a.jpg.png or a.png for a.jpg,"
 
 
@@ -44,7 +48,9 @@ def with_masks(scene: Scene, choice: str | None) -> Scene:
     files: Mapping[str, Path] = own.files
     folder = Path(place).absolute() if place else None
     if folder is not None:
-        files, notes = find_masks([image.name for image in scene.images], folder)
+        names = [image.name for image in scene.images]
+        image_dir = scene.source.image_dir if scene.source else None
+        files, notes = find_masks(names, folder, image_dir, named=True)
         choice = f"{INVERTED}:{folder}" if inverted else str(folder)
     if not files:
         where = f"in {folder}" if folder else "beside its photographs"
@@ -61,44 +67,48 @@ def mask_choice(scene: Scene) -> str | None:
 
 
 def with_own_masks(scene: Scene) -> Scene:
-    """A scene that was just read, with the masks beside its photographs."""
+    """A scene that was just read, with the masks near its photographs."""
     folder = scene.source.image_dir if scene.source else None
     if scene.source is None or folder is None or scene.masks is not None:
         return scene
-    alone = folder.absolute() != scene.source.root.absolute()
-    beside = folder.with_name(FOLDER) if alone else folder / FOLDER
-    found = [each for each in (beside, scene.source.root / FOLDER) if each.is_dir()]
-    files, notes = find_masks([i.name for i in scene.images], found[0]) if found else ({}, [])
+    names = [image.name for image in scene.images]
+    files, notes = own_masks(names, folder, scene.source.root)
+    notes += _resized(files, folder)
     return scene.replace(masks=Masks(files), warnings=(*scene.warnings, *notes))
 
 
 def masks_beside(photographs: Path) -> tuple[Masks, list[str]]:
-    """The masks of a folder of photographs, in ``masks`` beside it, and notes for the user."""
-    folder = photographs.absolute().with_name(FOLDER)
-    if not folder.is_dir() or not photographs.is_dir():
+    """The masks near a folder of photographs, and notes for the user."""
+    folder = photographs.absolute()
+    if not photographs.is_dir():
         return Masks({}), []
-    names = (path.relative_to(photographs).as_posix() for path in files_below(photographs))
-    files, notes = find_masks(sorted(names), folder)
-    return Masks(files), [f"{counted(len(files), 'photograph')} with a mask in {folder}.", *notes]
+    below = (path.relative_to(photographs).as_posix() for path in files_below(photographs))
+    names = sorted(below)
+    names = sorted(set(names) - masks_among(names))
+    files, notes = own_masks(names, folder, folder.parent)
+    if files:
+        where = next(iter(files.values())).parent
+        notes = [f"{counted(len(files), 'photograph')} with a mask in {where}.", *notes]
+    return Masks(files), notes
 
 
-def find_masks(names: Collection[str], folder: Path) -> tuple[dict[str, Path], list[str]]:
-    """The masks in a folder by the names of their images, and a note on those without one."""
-    found = (path for path in files_below(folder) if path.suffix == ".png")
-    there = {path.relative_to(folder).as_posix(): path for path in found}
-    files, used = {}, set()
-    for name in names:
-        short = name.removeprefix("images/")  # where photographs are named from the scene's folder
-        for each in (f"{short}.png", Path(short).with_suffix(".png").as_posix()):
-            if each in there:
-                files[name] = there[each]
-                used.add(each)
-                break
-    left = [name for name in there if name not in used]
-    if not left:
-        return files, []
-    belong = f"{agreeing(len(left), 'belongs', 'belong')} to no image of the scene"
-    return files, [f"{counted(len(left), 'mask')} in {folder} {belong}, such as {left[0]}."]
+def _resized(files: Mapping[str, Path], folder: Path) -> list[str]:
+    """A note if masks have another size than their photographs; only two headers are opened."""
+    for name, path in files.items():
+        with suppress(SplatseedError, OSError, ValueError):
+            sizes = [_size(path), _size(folder / name)]
+            if sizes[0] == sizes[1]:
+                return []
+            mask, photograph = (f"{width} x {height}" for width, height in sizes)
+            return [f"Masks are resized to their photographs: {path} has {mask}, not {photograph}."]
+    return []
+
+
+def _size(path: Path) -> tuple[int, int]:
+    from PIL import Image as PilImage  # noqa: PLC0415  (slow to import)
+
+    with open_file(path) as file, PilImage.open(file) as picture:
+        return picture.size
 
 
 def read_mask(
@@ -122,16 +132,15 @@ def read_mask(
     if path is not None:
         with guarded(path, "a mask, an image of one channel"):
             picture = open_photograph(path, read_bytes(path))
-            wide = picture.mode.startswith(("I", "F"))  # which Pillow's conversion clips
-            values = np.asarray(picture if wide else picture.convert("L"))
-            parts.append((values > 0) != masks.inverted)
+            marked = _read_counts(picture) != masks.inverted
         size = open_photograph(photograph, photograph_bytes(photograph)).size
-        if picture.size != size:
+        if not _same_shape(picture.size, size):
             raise SceneFormatError(
                 f"the mask {path} to have the size of {name}, {size[0]} x {size[1]}",
                 found=f"{picture.size[0]} x {picture.size[1]}",
-                fix="Make it from that photograph, without resizing.",
+                fix="Make it from that photograph, without cropping or turning.",
             )
+        parts.append(_fitted(marked, size))
     if masks.alpha and (opaque := _opaque(photograph)) is not None:
         parts.append(opaque)
     if not parts:
@@ -149,6 +158,34 @@ def read_mask(
             f"pass --masks {INVERTED}.",
         )
     return None if counts.all() else np.asarray(counts)
+
+
+def _read_counts(picture: PilImage.Image) -> Bool[np.ndarray, "H W"]:
+    """Which pixels of a mask are neither 0 nor transparent."""
+    if picture.mode.startswith(("I", "F")):  # which Pillow's conversion clips
+        return np.asarray(np.asarray(picture) > 0)
+    least = 128 if picture.format == "JPEG" else 1  # whose 0 may be stored as a little more
+    counts = np.asarray(picture.convert("L")) >= least
+    if has_alpha(picture):
+        counts &= np.asarray(picture.convert("RGBA").getchannel("A")) > 0
+    return np.asarray(counts)
+
+
+def _same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Whether two sizes differ by a scale, within a pixel."""
+    return abs(size[0] * other[1] - size[1] * other[0]) <= max(*size, *other)
+
+
+def _fitted(counts: Bool[np.ndarray, "H W"], size: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
+    """A mask at another size: a pixel counts if all those of the mask in it do."""
+    for axis, length in enumerate(size[::-1]):
+        count = counts.shape[axis]
+        if count != length:
+            edges = np.arange(length + 1) * count
+            start, stop = edges[:-1] // length, -(-edges[1:] // length)
+            masked = np.cumsum(np.insert(~counts, 0, False, axis=axis), axis=axis)
+            counts = masked.take(start, axis=axis) == masked.take(stop, axis=axis)
+    return counts
 
 
 def _opaque(photograph: Path) -> Bool[np.ndarray, "H W"] | None:

@@ -45,6 +45,11 @@ them (the images of freiburg3 are undistorted already). The first pixel's centre
 _DEFAULT_CAMERA = (525.0, 525.0, 319.5, 239.5)  # ROS's, which that page gives too
 
 
+def is_replica(root: Path) -> bool:
+    """Whether a folder has the trajectory of Replica's layout."""
+    return (root / "traj.txt").is_file()
+
+
 def load_rgbd(root: StrPath) -> Scene:
     """Read images, poses and depth maps in Replica's layout; frames without a pose are left out."""
     root = Path(root)

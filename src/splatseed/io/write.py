@@ -29,12 +29,13 @@ from splatseed.io import colmap, nerfstudio
 from splatseed.io.cleaning import clean_scene, renumber
 from splatseed.io.files import StrPath, open_file
 from splatseed.io.frame_files import FrameFiles
-from splatseed.io.masks import FOLDER as MASKS, find_masks, write_masks
+from splatseed.io.mask_files import FOLDER as MASKS, find_masks
+from splatseed.io.masks import write_masks
 from splatseed.io.ply import write_ply
 from splatseed.io.seeds import write_seeds
 from splatseed.io.split import MODEL_LISTS, ROOT_LISTS
 from splatseed.io.staging import MANIFEST, output_folder, write_json
-from splatseed.scene import Scene
+from splatseed.scene import Scene, SceneSource
 
 Layout = Literal["colmap", "transforms"]
 
@@ -158,7 +159,7 @@ def _rewrites_masks(scene: Scene, layout: Layout) -> bool:
     masks, source = scene.masks, scene.source
     if masks is None or source is None or not masks.files:
         return False
-    named = layout == "transforms" and source.transforms_path and masks.choice is None
+    named = layout == "transforms" and masks.choice is None and _names_masks(source)
     folder = (source.root / MASKS).absolute()
     inside = all(folder in path.absolute().parents for path in masks.files.values())
     if inside and layout == "colmap":  # where masks are known by their names alone
@@ -166,6 +167,14 @@ def _rewrites_masks(scene: Scene, layout: Layout) -> bool:
             masks.files.keys()
         )
     return masks.inverted or not (inside or named)
+
+
+def _names_masks(source: SceneSource) -> bool:
+    """Whether the scene's own ``transforms.json`` names masks."""
+    if source.transforms_path is None:
+        return False
+    frames = nerfstudio.read_transforms(source.transforms_path).frames
+    return any(isinstance(frame.fields.get("mask_path"), str) for frame in frames)
 
 
 def _name_masks(scene: Scene, frames: Sequence[dict[str, Any]], names: Sequence[str]) -> None:
@@ -274,7 +283,8 @@ def _write_transforms(scene: Scene, folder: Path) -> tuple[list[str], dict[str, 
         names = {image.name for image in scene.images}
         transforms = nerfstudio.read_transforms(source.transforms_path)
         content = _kept_json(transforms, names)
-        if scene.masks is not None and scene.masks.choice is not None:
+        chosen = scene.masks is not None and scene.masks.choice is not None
+        if chosen or _rewrites_masks(scene, "transforms"):
             pairs = list(zip(transforms.images, transforms.frames, strict=True))
             for key, tests in (("frames", False), ("test_frames", True)):
                 kept = [i.name for i, f in pairs if i.name in names and f.tests == tests]

@@ -240,6 +240,7 @@ TURNS: Mapping[str, Callable[[Poses], Poses]] = MappingProxyType(
 OPENCV = "with OpenCV's camera axes (x right, y down, z forward)"
 WRITTEN = {
     "colmap": f"the model's images hold cam_from_world, {OPENCV}",
+    "llff": "poses_bounds.npy holds world_from_cam, with camera axes down, right, back",
     "rgbd": f"its trajectory holds world_from_cam, {OPENCV}",
     "transforms": "each transform_matrix is world_from_cam, with OpenGL's camera axes (x right, "
     "y up, z back)",

@@ -27,6 +27,7 @@ from scipy.ndimage import laplace
 
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.io.files import VIDEO_SUFFIXES, StrPath, files_below
+from splatseed.io.mask_files import masks_among
 from splatseed.io.photograph import check_photograph, open_photograph, photograph_bytes
 from splatseed.io.staging import read_manifest
 from splatseed.literal import name_some, quoted
@@ -42,6 +43,7 @@ _FOREIGN_SUFFIXES = frozenset(
 )  # fmt: skip
 _GREY = "of 16-bit or floating-point grey, as depth maps are"
 _FOREIGN = "of a format that is not read"
+_MASK = "named as masks of others are"
 _MAP = "of grey, named as maps of depth or confidence are"
 _DEPTH_MODES = ("I", "F")  # Pillow's names for 16- and 32-bit grey
 _GREY_MODES = ("L", "1", "LA")
@@ -92,6 +94,8 @@ def find_photos(image_dir: StrPath) -> tuple[dict[str, Photo], dict[str, list[st
         sorted(path.as_posix() for path in files if path.suffix.lower() in suffixes)
         for suffixes in (_SUFFIXES, _FOREIGN_SUFFIXES)
     )
+    masks = masks_among(names)
+    names = [name for name in names if name not in masks]
     with ThreadPoolExecutor() as pool:  # Pillow decodes outside the GIL
         read = dict(zip(names, pool.map(lambda n: _read(image_dir / n), names), strict=True))
     grey = [name for name, (photo, _) in read.items() if photo is None]
@@ -99,7 +103,12 @@ def find_photos(image_dir: StrPath) -> tuple[dict[str, Photo], dict[str, list[st
     if not any(colours for _, colours in read.values()):
         maps = []
     photos = {n: photo for n, (photo, _) in read.items() if photo is not None and n not in maps}
-    kinds = ((_GREY, grey), (_MAP, [n for n in maps if n not in grey]), (_FOREIGN, foreign))
+    kinds = (
+        (_GREY, grey),
+        (_MAP, [n for n in maps if n not in grey]),
+        (_FOREIGN, foreign),
+        (_MASK, sorted(masks)),
+    )
     left_out = {what: them for what, them in kinds if them}
     if len(photos) < 2:
         found = [f"{len(them)} {what} ({name_some(them)})" for what, them in left_out.items()]

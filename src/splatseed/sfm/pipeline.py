@@ -23,7 +23,8 @@ from splatseed.camera import CAMERA_MODELS, Intrinsics
 from splatseed.io import load_scene, write_scene
 from splatseed.io.colmap import read_model_cameras
 from splatseed.io.files import StrPath
-from splatseed.io.masks import FOLDER as MASKS, write_masks
+from splatseed.io.mask_files import FOLDER as MASKS
+from splatseed.io.masks import write_masks
 from splatseed.io.photograph import photograph_folder
 from splatseed.io.seeds import carry_seeds
 from splatseed.io.staging import MANIFEST, output_folder, write_json

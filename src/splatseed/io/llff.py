@@ -1,0 +1,118 @@
+"""Poses in ``poses_bounds.npy`` of LLFF, beside a folder of photographs.
+
+A row holds a 3 x 5 matrix, row by row, and the depths of the nearest and farthest points. The
+matrix has ``world_from_cam`` with camera axes down, right, back, and the column height, width,
+focal length; rows are in the order of the photographs' names. Source: LLFF's ``pose_utils.py`` and
+its description of the file. The centre of the image is the principal point, and lenses have no
+distortion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from splatseed.camera import Intrinsics
+from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.io.colmap import IMAGE_DIRS, make_intrinsics, rigid_pose
+from splatseed.io.files import StrPath, guarded, open_file, read_npy
+from splatseed.io.frame_files import SUFFIXES
+from splatseed.io.mask_files import masks_among
+from splatseed.io.photograph import image_warnings
+from splatseed.literal import counted
+from splatseed.pointcloud import PointCloud
+from splatseed.scene import Image, Scene, SceneSource
+
+POSES = "poses_bounds.npy"
+_OPENCV_FROM_LLFF = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
+"""Its columns are down, right and back in OpenCV's axes right, down, forward."""
+_MOST_BYTES = 1 << 28
+
+
+def is_llff(folder: Path) -> bool:
+    """Whether a folder has LLFF's poses."""
+    return (folder / POSES).is_file()
+
+
+def read_llff(root: StrPath) -> Scene:
+    """The photographs and poses of a folder; the cloud is empty."""
+    root = Path(root)
+    path = root / POSES
+    rows = _read_rows(path)
+    folder, names = _photographs(root, len(rows))
+    cameras: dict[tuple[float, ...], Intrinsics] = {}
+    images, size = [], _size(folder / names[0])
+    for i, (name, row) in enumerate(zip(names, rows, strict=True)):
+        where = f"{path}, row {i + 1} ({name})"
+        matrix = row[:15].reshape(3, 5)
+        key = tuple(matrix[:, 4].tolist())
+        if key not in cameras:
+            cameras[key] = _camera(where, len(cameras) + 1, key, size)
+        world_from_cam = np.hstack([matrix[:, :3] @ _OPENCV_FROM_LLFF.T, matrix[:, 3:4]])
+        images.append(Image(name, i + 1, cameras[key], *rigid_pose(where, world_from_cam)))
+    return Scene(
+        PointCloud.empty(),
+        tuple(images),
+        tuple(cameras.values()),
+        source=SceneSource("llff", root, path, image_dir=folder),
+        warnings=tuple(image_warnings(images, folder, root)),
+    )
+
+
+def _read_rows(path: Path) -> Float64[np.ndarray, "N 17"]:
+    expected = "LLFF's poses, rows of 17 finite numbers"
+    with guarded(path, expected), open_file(path) as file:
+        rows = read_npy(file, _MOST_BYTES)
+        if rows.ndim != 2 or rows.shape[1] not in {15, 17} or not len(rows):
+            raise ValueError(f"an array of {' x '.join(map(str, rows.shape))}")
+        rows = rows.astype(np.float64)
+        if not np.isfinite(rows[:, :15]).all():
+            raise ValueError("values that are not finite")
+        return rows
+
+
+def _photographs(root: Path, count: int) -> tuple[Path, list[str]]:
+    """The first folder with as many photographs as there are poses, and their sorted names."""
+    found = dict[Path, list[str]]()
+    for folder in (root / name for name in IMAGE_DIRS):
+        files = [each.name for each in folder.iterdir()] if folder.is_dir() else []
+        names = [n for n in files if Path(n).suffix.lower() in SUFFIXES and not n.startswith(".")]
+        found[folder] = sorted(set(names) - masks_among(names))
+        if len(found[folder]) == count:
+            return folder, found[folder]
+    there = [f"{len(names)} in {folder.name}" for folder, names in found.items() if names]
+    expected = (
+        f"{counted(count, 'photograph')} in {root / IMAGE_DIRS[0]}, one for each pose of {POSES}"
+    )
+    fix = "Put back all photographs, and no others."
+    if not there:
+        raise SceneNotFoundError(expected, found="none", fix=fix)
+    raise SceneFormatError(expected, found=" and ".join(there), fix=fix)
+
+
+def _size(path: Path) -> tuple[int, int] | None:
+    """The size of a photograph; None if it cannot be read, which is reported later."""
+    from PIL import Image as PilImage  # noqa: PLC0415  (slow to import)
+
+    try:
+        with open_file(path) as file, PilImage.open(file) as picture:
+            return picture.size
+    except (OSError, ValueError, PilImage.DecompressionBombError):
+        return None
+
+
+def _camera(
+    where: str, camera_id: int, hwf: Sequence[float], size: tuple[int, int] | None
+) -> Intrinsics:
+    """The camera of photographs of this size, which may be smaller than those of the poses."""
+    height, width, focal = hwf
+    if not (width > 0 and height > 0):
+        return make_intrinsics(where, camera_id, "PINHOLE", int(width), int(height), (focal,) * 4)
+    x = y = 1.0
+    if size is not None and abs(size[0] * height - size[1] * width) <= max(width, height):
+        x, y = size[0] / width, size[1] / height
+    w, h = round(width * x), round(height * y)
+    return make_intrinsics(where, camera_id, "PINHOLE", w, h, (focal * x, focal * y, w / 2, h / 2))

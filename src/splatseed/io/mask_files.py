@@ -1,0 +1,162 @@
+"""Where masks lie and what they are called: which file is the mask of which photograph.
+
+For the photograph ``a/b.jpg`` these are its masks in a folder of masks, first match first:
+``a/b.jpg.png`` (COLMAP), ``a/b.png`` (nerfstudio), ``a/b.jpg.mask.png`` (RealityScan),
+``a/b.mask.png`` (OpenMVS), ``a/b_mask.png`` (3DGRUT), each also as JPEG, in any case; else a file
+of such a name without the subfolder, if no other photograph is called so. The last three may also
+lie beside the photograph. Promise: matching depends on names only; a photograph of the scene is
+never a mask.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection
+from pathlib import Path, PurePosixPath
+
+from splatseed.io.files import files_below
+from splatseed.literal import agreeing, counted
+
+FOLDER = "masks"
+SUFFIXES = (".png", ".jpg", ".jpeg")
+_FOLDERS = ("masks", "mask")
+_UNCLEAR = ("mask", "segment")
+"""Parts of the names of folders whose pictures may be masks, of unknown meaning."""
+_INVERTED = "dynamic_mask_"
+"""Before the name of a mask of instant-ngp, in which 0 is what counts."""
+
+
+def own_masks(
+    names: Collection[str], image_dir: Path, root: Path
+) -> tuple[dict[str, Path], list[str]]:
+    """The masks near a folder of photographs, by the photographs' names, and notes for the user."""
+    alone = image_dir.absolute() != root.absolute()
+    parents = [image_dir.parent, root, image_dir] if alone else [image_dir]
+    folders = list(dict.fromkeys(each for parent in parents for each in _folders(parent)))
+    known = [each for name in _FOLDERS for each in folders if each.name.casefold() == name]
+    unused = list[str]()
+    for folder in known:
+        files, notes = find_masks(names, folder, image_dir)
+        if files:
+            return files, notes
+        unused = unused or notes
+    if files := _beside(names, image_dir):
+        return files, unused
+    for folder in folders:
+        if folder not in known and (found := find_masks(names, folder, image_dir)[0]):
+            unused.append(
+                f"{folder} holds pictures named as {counted(len(found), 'photograph')}, which are"
+                f" not used: pass --masks {folder} if 0 masks there, --masks inverted:{folder} if"
+                " it is what counts."
+            )
+    marked = {PurePosixPath(_dynamic(name)).name.casefold() for name in names}
+    if dynamic := [path for path in _listing(names, image_dir) if path.stem.casefold() in marked]:
+        unused.append(
+            f"{counted(len(dynamic), 'mask')} of instant-ngp beside the photographs, such as"
+            f" {dynamic[0].name}, are not used: --masks inverted:{image_dir} uses them."
+        )
+    return {}, unused
+
+
+def find_masks(
+    names: Collection[str], folder: Path, image_dir: Path | None = None, *, named: bool = False
+) -> tuple[dict[str, Path], list[str]]:
+    """The masks in a folder by the names of their images, and notes on those without one.
+
+    If the folder is ``named`` by the user, masks of instant-ngp count too.
+    """
+    is_own = image_dir is not None and folder.resolve() == image_dir.resolve()
+    taken = set(names) if is_own else set()
+    paths = (path for path in files_below(folder) if path.suffix.lower() in SUFFIXES)
+    every = {path.relative_to(folder).as_posix(): path for path in paths}
+    there = {name: path for name, path in every.items() if name not in taken}
+    folded = {name.casefold(): path for name, path in reversed(there.items())}
+    same = Counter(PurePosixPath(name).stem.casefold() for name in names)
+    files, used = dict[str, Path](), set[Path]()
+    for name in names:
+        short = name.removeprefix("images/")  # where photographs are named from the scene's folder
+        stems = [*_mask_stems(short), *([_dynamic(short)] if named else [])]
+        exact = (there.get(stem + suffix) for stem in stems for suffix in SUFFIXES)
+        any_case = (folded.get((s + suffix).casefold()) for s in stems for suffix in SUFFIXES)
+        path = next(filter(None, exact), None) or next(filter(None, any_case), None)
+        if path is None and same[PurePosixPath(name).stem.casefold()] == 1:
+            flat = ((PurePosixPath(s).name + suffix) for s in stems for suffix in SUFFIXES)
+            path = next(filter(None, (folded.get(each.casefold()) for each in flat)), None)
+        if path is not None:
+            files[name] = path
+            used.add(path)
+    left = [] if is_own else [path for path in there.values() if path not in used]
+    return files, _notes(names, files, left, folder)
+
+
+def _notes(
+    names: Collection[str], files: Collection[str], left: list[Path], folder: Path
+) -> list[str]:
+    """On masks without an image, and on images without a mask where others have one."""
+    said = []
+    if left:
+        belong = f"{agreeing(len(left), 'belongs', 'belong')} to no image of the scene"
+        such = left[0].relative_to(folder)
+        said.append(f"{counted(len(left), 'mask')} in {folder} {belong}, such as {such}")
+    if files and (whole := [name for name in names if name not in files]):
+        have = agreeing(len(whole), "has none and is", "have none and are")
+        where = "" if left else f" of {len(names)} with masks in {folder}"
+        said.append(f"{counted(len(whole), 'image')}{where} {have} used whole, such as {whole[0]}")
+    return [f"{'; '.join(said)}."] if said else []
+
+
+def masks_among(names: Collection[str]) -> set[str]:
+    """Which files of a folder of photographs are masks of others, by their names."""
+    folders = {*_FOLDERS, "dynamic_masks", "segmentation"}
+    inside = {n for n in names if {p.casefold() for p in PurePosixPath(n).parts[:-1]} & folders}
+    inside = inside if len(inside) < len(names) else set()
+    rest = [name for name in names if name not in inside]
+    marked = {s.casefold() for n in rest for s in (*_mask_stems(n)[2:], _dynamic(n))}
+    return inside | {n for n in rest if _stem(n) in marked and _is_mask_file(n)}
+
+
+def _is_mask_file(name: str) -> bool:
+    return PurePosixPath(name).suffix.lower() in SUFFIXES
+
+
+def _stem(name: str) -> str:
+    return PurePosixPath(name).with_suffix("").as_posix().casefold()
+
+
+def _mask_stems(name: str) -> list[str]:
+    """The paths, but for the suffix, of a photograph's mask; the first two only in a folder."""
+    stem = PurePosixPath(name).with_suffix("").as_posix()
+    return [name, stem, f"{name}.mask", f"{stem}.mask", f"{stem}_mask"]
+
+
+def _dynamic(name: str) -> str:
+    """The path, but for the suffix, of a photograph's mask of instant-ngp."""
+    pure = PurePosixPath(name)
+    return pure.with_name(f"{_INVERTED}{pure.stem}").as_posix()
+
+
+def _listing(names: Collection[str], image_dir: Path) -> list[Path]:
+    """Files beside photographs that are none of these and may be masks."""
+    folders = sorted({(image_dir / name).parent for name in names})
+    files = (f for folder in folders if folder.is_dir() for f in sorted(folder.iterdir()))
+    taken = {image_dir / name for name in names}
+    return [f for f in files if f.suffix.lower() in SUFFIXES and f not in taken]
+
+
+def _beside(names: Collection[str], image_dir: Path) -> dict[str, Path]:
+    """The masks that lie beside photographs."""
+    there = {f.relative_to(image_dir).as_posix().casefold(): f for f in _listing(names, image_dir)}
+    files = {}
+    for name in names:
+        marked = (s + suffix for s in _mask_stems(name)[2:] for suffix in SUFFIXES)
+        if path := next((there[m.casefold()] for m in marked if m.casefold() in there), None):
+            files[name] = path
+    return files
+
+
+def _folders(parent: Path) -> list[Path]:
+    """Subfolders whose names suggest masks, that named masks first."""
+    if not parent.is_dir():
+        return []
+    named = [each for each in parent.iterdir() if any(p in each.name.casefold() for p in _UNCLEAR)]
+    return sorted((f for f in named if f.is_dir()), key=lambda f: (f.name != FOLDER, f.name))
