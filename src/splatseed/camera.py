@@ -55,6 +55,19 @@ PANORAMA = CameraModel(17, "EQUIRECTANGULAR", 2, 0)
 """COLMAP's model of a whole sphere, which has no focal length: no pinhole camera shows as much."""
 
 
+_TWO_FOCAL = {
+    "SIMPLE_PINHOLE": "PINHOLE",
+    "SIMPLE_RADIAL": "OPENCV",
+    "RADIAL": "OPENCV",
+    "SIMPLE_RADIAL_FISHEYE": "OPENCV_FISHEYE",
+    "RADIAL_FISHEYE": "OPENCV_FISHEYE",
+    "SIMPLE_DIVISION": "DIVISION",
+    "SIMPLE_FISHEYE": "FISHEYE",
+}
+"""The model of two focal lengths that begins with the same coefficients and is equal to one of a
+single focal length where the further coefficients are 0."""
+
+
 @dataclass(frozen=True)
 class Intrinsics:
     """A COLMAP camera record: everything but the pose.
@@ -125,12 +138,27 @@ class Intrinsics:
         return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
     def resized(self, width: int, height: int) -> Intrinsics:
-        """The lens of a resized copy of the photographs."""
-        num_focal = CAMERA_MODELS[self.model].num_focal
-        x, y = width / self.width, height / self.height
-        pixels = zip(self.params, (*(x, y)[:num_focal], x, y), strict=False)
-        params = (*(each * scale for each, scale in pixels), *self.params[num_focal + 2 :])
-        return replace(self, width=width, height=height, params=params)
+        """The camera of a photograph that was resized to this size; itself at its own size.
+
+        Distortion acts on normalised coordinates, so only focal lengths and centre change. Where
+        the two axes are scaled differently, by rounding or stretching, a model with one focal
+        length gives way to its counterpart with two.
+        """
+        if (width, height) == (self.width, self.height):
+            return self
+        x, y, name = width / self.width, height / self.height, self.model
+        num_focal, focal = CAMERA_MODELS[name].num_focal, self.params[:1]
+        terms = self.params[num_focal + 2 :]
+        if num_focal == 2:
+            focal = (self.params[0] * x, self.params[1] * y)
+        elif width * self.height == height * self.width:
+            focal = (self.params[0] * x,)
+        else:
+            name, focal = _TWO_FOCAL[name], (self.params[0] * x, self.params[0] * y)
+            terms += (0.0,) * (CAMERA_MODELS[name].num_params - 4 - len(terms))
+        cx, cy = self.params[num_focal : num_focal + 2]
+        params = (*focal, cx * x, cy * y, *terms)
+        return replace(self, model=name, width=width, height=height, params=params)
 
 
 @dataclass(frozen=True, eq=False)

@@ -199,6 +199,7 @@ class Scene:
     listed: Split | None = None  # the split given by lists beside the scene
     left_out: LeftOut = field(default_factory=LeftOut)  # how many points of its files were
     masks: Masks | None = None  # which pixels of its photographs do not count; None: all count
+    absent: tuple[str, ...] = ()  # names of images that were left out; the split counts them
 
     def __post_init__(self) -> None:
         if self.depths is not None:
@@ -247,6 +248,8 @@ class Scene:
     def split(self, test_every: int = 8) -> tuple[tuple[Image, ...], tuple[Image, ...]]:
         """Training and test images by name: as listed, else every ``test_every``-th is tested.
 
+        Images that are ``absent`` are counted, so that the others keep their part without them.
+
         Raises:
             ParameterError: ``test_every`` is no whole number of 2 or more, which leaves both some.
         """
@@ -261,8 +264,9 @@ class Scene:
             parts = (self.listed.train, self.listed.test)
             train, test = (tuple(i for i in ordered if i.name in part) for part in parts)
             return train, test
-        train = tuple(image for i, image in enumerate(ordered) if i % test_every)
-        return train, tuple(ordered[::test_every])
+        tested = {*sorted([*(image.name for image in ordered), *self.absent])[::test_every]}
+        train = tuple(image for image in ordered if image.name not in tested)
+        return train, tuple(image for image in ordered if image.name in tested)
 
 
 def _freeze(record: object, *names: str) -> None:

@@ -137,11 +137,13 @@ def test_a_plain_folder_of_a_distorted_capture_says_what_it_fits(bent, tmp_path,
     assert "--method depth" not in run.out
 
 
-def test_a_missing_photograph_is_found_before_any_work(own_room, tmp_path, splatseed, stereo):
+def test_missing_photographs_are_found_before_any_work(own_room, tmp_path, splatseed, stereo):
     scene = load_scene(own_room)
-    path = scene.source.image_dir / scene.images[-1].name
-    path.unlink()
+    for image in scene.images[len(scene.images) // 2 - 1 :]:
+        path = scene.source.image_dir / image.name
+        path.unlink()
     run = splatseed("depth", own_room, "--stereo", "--colmap", "-o", tmp_path / "d")
-    assert (run.code, path.name in run.err) == (2, True)
+    assert (run.code, scene.images[-2].name in run.err) == (2, False)
+    assert "at least half of the scene's" in run.err
     assert not (tmp_path / "d").exists()
     assert not stereo.calls

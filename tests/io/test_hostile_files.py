@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import shutil
 import socket
 
 import numpy as np
@@ -50,7 +51,8 @@ def test_what_is_no_file_is_not_called_missing(odd, name, is_, scene_dir, model)
         load_scene(odd / name)
     _rename(scene_dir, model, str(odd / name))
     scene = load_scene(scene_dir)
-    assert f"{odd / name}, which is {is_}, not a file." in " ".join(scene.warnings)
+    assert f"{odd / name} is {is_}, not a file." in " ".join(scene.warnings)
+    shutil.rmtree(scene_dir / "images/left")
     assert f"{odd / name} is {is_}, not a file." in untrainable(scene)
 
 

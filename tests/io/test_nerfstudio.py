@@ -230,7 +230,7 @@ def test_any_value_in_any_field_gives_our_errors_alone(content, tmp_path, data):
     assert all(np.isfinite(im.camera.cam_from_world).all() for im in transforms.images)
 
 
-DIAGONALS = ([2.0, 2, 2, 2], [1.0, 1, -1, 1], [np.nan, 1, 1, 1])
+DIAGONALS = ([2.0, 2, 2, 2], [1.0, 1, -1, 1], [0.0, 1, 1, 1])
 
 
 @pytest.mark.parametrize(

@@ -249,9 +249,9 @@ def test_what_cannot_be_done_is_refused_and_nothing_written(posed, photos, tmp_p
         with pytest.raises(ParameterError, match=name):
             Settings(**{name: value})
     out, first = tmp_path / "out" / "scene", posed.images[0]
-    half = Intrinsics(1, "PINHOLE", 160, 120, (152.0, 152.0, 80.0, 60.0))
+    cut = Intrinsics(1, "PINHOLE", 160, 110, (152.0, 152.0, 80.0, 60.0))
     renamed = tuple(replace(image, name=f"x{image.name}") for image in posed.images)
-    small = tuple(replace(image, intrinsics=half) for image in posed.images)
+    small = tuple(replace(image, intrinsics=cut) for image in posed.images)
     here = {"quat": first.quat, "translation": first.translation}
     same_place = tuple(replace(image, **here) for image in posed.images)
     (tmp_path / "mine.txt").write_text("keep")

@@ -9,13 +9,15 @@ import numpy as np
 import pytest
 from PIL import Image as PilImage
 
-from splatseed.camera import Intrinsics
+from splatseed.camera import CAMERA_MODELS, Intrinsics
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.io import load_scene
+from splatseed.io.photograph_checks import ROUNDING, _off, fits
 from splatseed.lens import image_points
+from splatseed.scene import NO_POINT, Observations
 from splatseed.seeding.upsampling import frames_of, points_within
 from splatseed.views.projection import undistort
-from splatseed.views.view import at_file_size, load_photograph, load_split, load_views
+from splatseed.views.view import at_file_size, load_photograph, load_split, load_views, poses_of
 
 
 @pytest.fixture
@@ -68,7 +70,8 @@ def copied(room_path, tmp_path):
 def test_files_resized_beforehand_scale_the_intrinsics(copied):
     image = copied.images[0]
     path = copied.source.image_dir / image.name
-    PilImage.open(path).resize((48, 36)).save(path)
+    for each in path.parent.iterdir():
+        PilImage.open(each).resize((48, 36)).save(each)
     (view,) = load_views(copied, [image])
     assert np.allclose(view.K[:2], image.camera.K[:2] / 2)
     small = at_file_size(copied)
@@ -78,8 +81,97 @@ def test_files_resized_beforehand_scale_the_intrinsics(copied):
     assert {(each.width, each.height) for each in frames_of(copied)} == {(48, 36)}
     assert at_file_size(small) is small
     PilImage.open(path).resize((48, 48)).save(path)
-    with pytest.raises(SceneFormatError, match="aspect ratio of its camera"):
+    with pytest.raises(SceneFormatError, match="found 48 x 48: cropped, or stretched"):
         load_views(copied, [image])
+
+
+RECORD = 96, 72
+COPIES = [(48, 36), (192, 144), (37, 28), (95, 72), (96, 71), (97, 72), (120, 91)]
+
+
+@pytest.mark.parametrize("name", CAMERA_MODELS)
+def test_a_point_has_the_same_relative_place_in_every_copy(name, room, tmp_path):
+    """At any size, also of slightly other shape, and whether views or the scene are resized."""
+    model = CAMERA_MODELS[name]
+    focal, terms = (80.0, 84.0)[: model.num_focal], model.num_params - model.num_focal - 2
+    lens = Intrinsics(1, name, *RECORD, (*focal, 47.0, 37.0, *(0.02, -0.01, 0.005, 0.01)[:terms])
+        + (0.001,) * max(0, terms - 4))  # fmt: skip
+    (tmp_path / "images").mkdir()
+    source = dataclasses.replace(room.source, image_dir=tmp_path / "images")
+    images = []
+    for i, size in enumerate(COPIES):
+        PilImage.new("RGB", size).save(tmp_path / "images" / f"{i}.png")
+        seen = Observations(np.array([[48.0, 18.0]]), np.array([NO_POINT]))
+        old = room.images[0]
+        images.append(dataclasses.replace(old, name=f"{i}.png", intrinsics=lens, observations=seen))
+    scene = room.replace(images=tuple(images), intrinsics=(lens,), source=source)
+    sized = at_file_size(scene)
+    assert [(i.intrinsics.width, i.intrinsics.height) for i in sized.images] == COPIES
+    assert (
+        len({i.intrinsics.camera_id for i in sized.images}) == len(sized.intrinsics) == len(COPIES)
+    )
+    xy = np.array([[0.3, -0.2], [-0.25, 0.1], [0.0, 0.0]])
+    for image, size in zip(sized.images, COPIES, strict=True):
+        place = image_points(image.intrinsics, xy) / size
+        assert np.allclose(place, image_points(lens, xy) / RECORD, atol=1e-12)
+        assert np.allclose(image.observations.xy / size, [[0.5, 0.25]])
+    for factor in (1, 3):
+        one, other = (
+            load_views(s, s.images, data_factor=factor, undistort=True) for s in (scene, sized)
+        )
+        frames = poses_of(sized.images, factor)
+        for a, b, c, size in zip(one, other, frames, COPIES, strict=True):
+            assert np.array_equal(a.K, b.K)
+            assert np.array_equal(a.K, c.K)
+            shown = np.array([a.width, a.height]) * factor
+            assert (
+                (a.width, a.height) == (c.width, c.height) == (size[0] // factor, size[1] // factor)
+            )
+            assert np.allclose(
+                factor * a.K[:2] / np.array(size)[:, None], lens.K[:2] / np.array(RECORD)[:, None]
+            )
+            assert (shown <= size).all()
+
+
+@pytest.mark.parametrize(
+    ("size", "orientation", "says"),
+    [
+        ((72, 96), 6, "found 72 x 96: stored turned, with EXIF orientation 6; 1 more of 9"),
+        ((36, 48), 8, "found 36 x 48: stored turned, with EXIF orientation 8"),
+        ((72, 96), 1, "found 72 x 96: turned, width and height are swapped"),
+        ((96, 60), 1, "found 96 x 60: cropped, or stretched"),
+        ((48, 36), 6, ""),
+        ((96, 71), 3, ""),
+    ],
+)
+def test_each_photograph_is_checked_against_its_own_record(size, orientation, says, copied):
+    exif = PilImage.Exif()
+    exif[0x0112] = orientation
+    images = sorted(copied.images, key=lambda image: image.name)[:9]
+    for image in images[3:5]:
+        PilImage.new("RGB", size).save(copied.source.image_dir / image.name, exif=exif)
+    told = " ".join(load_scene(copied.source.root).warnings)
+    if not says:
+        assert "not fit" not in told
+        assert [view.photograph.shape[1::-1] for view in load_views(copied, images)][3] == size
+        return
+    assert f"{images[3].name} has {size[0]} x {size[1]} pixels, its camera" in told
+    with pytest.raises(SceneFormatError, match=says) as caught:
+        load_views(copied, images)
+    assert images[3].name in caught.value.expected
+    assert at_file_size(copied) is copied
+
+
+def test_a_shape_that_no_rounding_explains_is_said_once():
+    def warned(record, *sizes):
+        lens = Intrinsics(1, "PINHOLE", *record, (900.0, 900.0, 500.0, 500.0))
+        return [_off(lens, size) > ROUNDING for size in sizes if fits(lens, size)]
+
+    assert warned((1920, 1088), (1920, 1080), (960, 544), (961, 544), (480, 272)) == [True] + 3 * [
+        False
+    ]
+    assert warned((1616, 1203), (808, 601), (808, 602), (404, 300), (16, 12)) == 4 * [False]
+    assert warned((100, 99), (99, 100), (100, 99), (50, 50)) == [False, False]  # turned: no copy
 
 
 def bent(room, k):

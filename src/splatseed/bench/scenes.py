@@ -21,7 +21,8 @@ from splatseed.io.clouds import open_cloud
 from splatseed.io.colmap import scene_root
 from splatseed.io.files import open_file, read_bytes
 from splatseed.io.load import search_depths
-from splatseed.io.photograph import open_photograph, photograph_bytes
+from splatseed.io.photograph import photograph_bytes
+from splatseed.io.photograph_checks import check_sizes, with_photographs
 from splatseed.progress import Progress, in_threads, silent
 from splatseed.scene import Scene
 from splatseed.views.sight import stray_notes
@@ -98,7 +99,7 @@ def open_scene(scene: PlannedScene) -> Scene:
     """A scene with its original points, and with the depth maps that are named.
 
     Raises:
-        SceneNotFoundError: There is no scene, or no such folder.
+        SceneNotFoundError: There is no scene, no such folder, or less than half its photographs.
         SceneFormatError: A file is not what its format promises.
     """
     opened = load_originals(Path(scene.path))
@@ -108,6 +109,8 @@ def open_scene(scene: PlannedScene) -> Scene:
             raise SceneNotFoundError(expected, found="none", fix="Name another, or none.")
         source = replace(opened.source, image_dir=opened.source.root / scene.images)
         opened = opened.replace(source=source)
+    if opened.images and opened.source is not None and opened.source.image_dir is not None:
+        opened = with_photographs(opened)
     return opened.replace(depths=find_depths(opened, Path(scene.depth))) if scene.depth else opened
 
 
@@ -145,8 +148,7 @@ def survey(
         raise SceneNotFoundError(f"photographs in {path}", found="none", fix=fix)
     for image in scene.images:
         check_lens(image, path)
-    first = folder / scene.images[0].name
-    size = open_photograph(first, photograph_bytes(first)).size
+    size = check_sizes(scene.images, folder)[scene.images[0].name]
     maps = scan = ""
     if with_cloud and planned.cloud:
         scan = str(Path(planned.cloud).resolve())
@@ -190,6 +192,8 @@ def scene_digest(scene: Scene, folder: Path, progress: Progress = silent) -> str
         _add(digest, np.array(lens.params, np.float64), image.quat, image.translation)
         if image.observations is not None:
             _add(digest, image.observations.xy, image.observations.point_ids)
+    if scene.absent:
+        _add(digest, sorted(scene.absent))
     if scene.listed is not None:
         _add(digest, (sorted(scene.listed.train), sorted(scene.listed.test)))
 

@@ -25,6 +25,7 @@ from splatseed.depth.stereo.maps import LEAST_SIZE, MOST_GRID
 from splatseed.depthmap import DepthKind
 from splatseed.io import dense, load_scene
 from splatseed.io.photograph import warnings_but_lens
+from splatseed.io.photograph_checks import with_photographs
 from splatseed.io.staging import check_output
 from splatseed.literal import name_some, quoted, visible
 from splatseed.requirements import require
@@ -167,6 +168,7 @@ def _run_stereo(options: Options) -> None:
         scene = load_scene(options.scene, require_points=False)
         if options.hold_out:
             scene = scene.replace(images=scene.split(options.hold_out)[0])
+        scene = with_photographs(scene) if scene.images else scene
         if options.colmap:
             dense.check_dense_scene(scene, undistorts=True)
         given = {name: getattr(options, name) for name in ("max_size", "grid")}

@@ -28,6 +28,7 @@ from splatseed.depth.comparison import choose_neighbors, find_support, synchroni
 from splatseed.depth.views import DepthView, read_view
 from splatseed.errors import PointCloudError, SceneFormatError, SceneNotFoundError
 from splatseed.io.photograph import photograph_folder
+from splatseed.io.photograph_checks import with_photographs
 from splatseed.literal import agreeing
 from splatseed.progress import Progress, in_threads, silent
 from splatseed.runtime.hashing import scramble
@@ -94,8 +95,13 @@ def lift(
             found=f"{len(scene.images)} images, and maps of none of them",
             fix="Name the folder with the maps: --depth DIR.",
         )
-    folder, notes = photograph_folder(scene), []
-    if lacking := len(used) - len(images):
+    folder, notes, there = (
+        photograph_folder(scene),
+        [],
+        {i.name for i in with_photographs(scene).images},
+    )
+    images = [image for image in images if image.name in there]
+    if lacking := sum(image.name not in depths for image in used):
         what = agreeing(lacking, "has no depth map and gives", "have no depth map and give")
         notes.append(f"{lacking} of {len(used)} images {what} no points.")
 

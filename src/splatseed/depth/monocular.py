@@ -30,12 +30,12 @@ from splatseed.depthmap import DepthKind
 from splatseed.io import photograph
 from splatseed.io.depth_maps import depth_folder
 from splatseed.io.files import StrPath
+from splatseed.io.photograph_checks import check_sizes, with_photographs
 from splatseed.literal import quoted
 from splatseed.progress import Progress, silent
 from splatseed.requirements import require
 from splatseed.runtime.torch_device import DeviceName, pick_torch_device
 from splatseed.scene import Scene
-from splatseed.views.view import file_from_camera
 
 _EXAMPLE = "depth-anything/Depth-Anything-V2-Small-hf"
 _ID = re.compile(r"\w[\w.-]*/\w[\w.-]*")
@@ -85,12 +85,12 @@ def estimate_depths(
     were made, for ``splatseed.json``.
 
     Raises:
-        SceneNotFoundError: The scene has no images, or a photograph is missing.
+        SceneNotFoundError: The scene has no images, or fewer than half of the photographs.
         SceneFormatError: A photograph cannot be decoded, or differs from its camera in aspect
             ratio.
         OutputError: The folder cannot be written.
     """
-    output = Path(output)
+    scene, output = with_photographs(scene), Path(output)
     folder, kind, flat = photograph.photograph_folder(scene), network.meaning.kind, []
     protect = (folder,) if scene.source is None else scene.source.inputs
     with depth_folder(
@@ -115,15 +115,14 @@ def estimate_depths(
 
 def _sizes(scene: Scene, folder: Path, max_size: int, progress: Progress) -> dict[str, Size]:
     """The size at which the network sees each photograph, by name, in order of names."""
-    in_order = sorted(scene.images, key=lambda image: image.name)
-    lenses, sizes = {image.name: image.intrinsics for image in in_order}, {}
+    names, sizes = sorted(image.name for image in scene.images), {}
+    check_sizes(scene.images, folder)
     with ThreadPoolExecutor() as pool:  # Pillow decodes outside the GIL
-        checked = pool.map(lambda name: photograph.check_photograph(folder / name), lenses)
-        for (name, lens), (width, height) in zip(lenses.items(), checked, strict=True):
-            file_from_camera(folder / name, (width, height), (lens.width, lens.height))
+        checked = pool.map(lambda name: photograph.check_photograph(folder / name), names)
+        for name, (width, height) in zip(names, checked, strict=True):
             factor = min(max_size / max(width, height), 1.0)
             sizes[name] = max(round(width * factor), 1), max(round(height * factor), 1)
-            progress("check images", len(sizes) / len(lenses))
+            progress("check images", len(sizes) / len(names))
     return sizes
 
 

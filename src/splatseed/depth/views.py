@@ -32,9 +32,10 @@ from splatseed.depth.alignment import (
 from splatseed.depthmap import DepthMap, DepthMaps
 from splatseed.io.masks import read_mask
 from splatseed.io.photograph import decode_photograph, photograph_bytes
+from splatseed.io.photograph_checks import check_sizes
 from splatseed.runtime.jit import inline
 from splatseed.scene import Image, Masks
-from splatseed.views.view import check_lens, file_from_camera
+from splatseed.views.view import check_lens
 from splatseed.views.visibility import Visibility, camera_points
 
 if TYPE_CHECKING:
@@ -129,7 +130,7 @@ def read_view(
     del depth, planar  # before the photograph needs memory
     path = folder / image.name
     photograph = decode_photograph(path, photograph_bytes(path))
-    file_from_camera(path, photograph.size, (camera.width, camera.height))
+    check_sizes([image], folder)
     row, column = (each + 0.5 for each in np.divmod(pixel, camera.width))
     row = (row * photograph.height / camera.height).astype(np.int64)
     column = (column * photograph.width / camera.width).astype(np.int64)

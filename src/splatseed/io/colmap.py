@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import struct
 from array import array
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -21,9 +21,11 @@ from jaxtyping import Float64, Int64, UInt8
 from splatseed.camera import CAMERA_MODELS, PANORAMA, Intrinsics, quat_from_rotation
 from splatseed.errors import OutputError, PointCloudError, SceneFormatError, SceneNotFoundError
 from splatseed.io.files import COPY_AGAIN, ByteReader, StrPath, numbered_lines
-from splatseed.io.photograph import image_warnings, lens_warnings
+from splatseed.io.photograph import lens_warnings
+from splatseed.io.photograph_checks import image_warnings
 from splatseed.io.ply import read_ply
 from splatseed.io.point_files import first_with_points, other_points
+from splatseed.io.unusable import NotFiniteError, Unusable, check_enough, unusable_warning
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import NO_POINT, Image, Observations, Scene, SceneSource, Tracks
 
@@ -58,26 +60,36 @@ _Points: TypeAlias = tuple[UInt8[np.ndarray, "N 3"], Tracks, Callable[[int], str
 """Colours, all else, and the place of point i in the file."""
 
 
-def read_cameras(path: StrPath) -> tuple[Intrinsics, ...]:
-    """The camera records of a ``cameras.bin`` or ``cameras.txt``, in file order."""
+def read_cameras(path: StrPath, unusable: Unusable | None = None) -> tuple[Intrinsics, ...]:
+    """The camera records of a ``cameras.bin`` or ``cameras.txt``, in file order.
+
+    Records that are not finite are left out and added to ``unusable``; without it they are errors.
+    """
     path = Path(path)
     cameras: dict[int, Intrinsics] = {}
     for where, camera_id, *record in (_text_cameras if path.suffix == ".txt" else _binary_cameras)(
         path
     ):
         _require(camera_id not in cameras, "each camera id once", where, f"{camera_id} again")
-        cameras[camera_id] = make_intrinsics(where, camera_id, *record)
+        try:
+            cameras[camera_id] = make_intrinsics(where, camera_id, *record)
+        except NotFiniteError as error:
+            if unusable is None:
+                raise
+            unusable[camera_id] = error
     return tuple(cameras.values())
 
 
 def make_intrinsics(
     where: str, camera_id: int, model: str, width: int, height: int, params: Sequence[float]
 ) -> Intrinsics:
-    """A checked camera record."""
+    """A checked camera record; a ``NotFiniteError`` if its numbers make no camera."""
     _require(0 <= camera_id <= MAX_ID, f"a camera id from 0 to {MAX_ID}", where, camera_id)
     fits = 0 < width <= _MAX_SIZE and 0 < height <= _MAX_SIZE
     _require(fits, "a camera with a size in pixels", where, f"{width} x {height}")
-    _require(all(map(math.isfinite, params)), "finite camera parameters", where, tuple(params))
+    _require_finite(
+        all(map(math.isfinite, params)), "finite camera parameters", where, tuple(params)
+    )
     try:
         camera = Intrinsics(camera_id, model, width, height, tuple(params))
     except SceneFormatError as error:
@@ -85,12 +97,18 @@ def make_intrinsics(
         raise SceneFormatError(expected, found=error.found, fix=error.fix) from None
     lengths = camera.params[: CAMERA_MODELS[model].num_focal]
     found = ", ".join(f"{each:g}" for each in lengths)
-    _require(min(lengths) > 0, "a focal length above 0", where, found)
+    _require_finite(min(lengths) > 0, "a focal length above 0", where, found)
     return camera
 
 
-def read_images(path: StrPath, intrinsics: Sequence[Intrinsics]) -> tuple[Image, ...]:
-    """The image records of an ``images.bin`` or ``images.txt``, in file order."""
+def read_images(
+    path: StrPath, intrinsics: Sequence[Intrinsics], unusable: Unusable | None = None
+) -> tuple[Image, ...]:
+    """The image records of an ``images.bin`` or ``images.txt``, in file order.
+
+    Those whose pose is not finite, or whose camera is among ``unusable``, are left out and added to
+    it by name; without it they are errors.
+    """
     path = Path(path)
     cameras = {camera.camera_id: camera for camera in intrinsics}
     images: dict[int, Image] = {}
@@ -102,10 +120,17 @@ def read_images(path: StrPath, intrinsics: Sequence[Intrinsics]) -> tuple[Image,
         _require(bool(name), "an image name", where, "an empty one")
         _require(name not in names, "each image name once", where, f"{name} again")
         of = f"of image {name!r}"
-        _require(all(map(math.isfinite, pose)), f"a finite pose {of}", where, tuple(pose))
-        norm = math.hypot(*pose[:4])
-        is_rotation = _NORM_RANGE[0] < norm < _NORM_RANGE[1]
-        _require(is_rotation, f"a rotation quaternion {of}", where, tuple(pose[:4]))
+        names.add(name)
+        if unusable is not None and camera_id in unusable:
+            unusable[name] = unusable[camera_id]
+            continue
+        try:
+            _check_pose(pose, of, where)
+        except NotFiniteError as error:
+            if unusable is None:
+                raise
+            unusable[name] = error
+            continue
         known = f"one of the {len(cameras)} camera records as that {of}"
         _require(camera_id in cameras, known, where, f"camera id {camera_id}")
         ids = observations.point_ids
@@ -113,9 +138,14 @@ def read_images(path: StrPath, intrinsics: Sequence[Intrinsics]) -> tuple[Image,
         _require(in_range, f"point ids from -1 (none) to 2^63 - 1 {of}", where, "another")
         quat, translation = np.split(np.array(pose, np.float64), [4])
         lens = cameras[camera_id]
-        names.add(name)
         images[image_id] = Image(name, image_id, lens, quat, translation, observations)
     return tuple(images.values())
+
+
+def _check_pose(pose: Sequence[float], of: str, where: str) -> None:
+    _require_finite(all(map(math.isfinite, pose)), f"a finite pose {of}", where, tuple(pose))
+    is_rotation = _NORM_RANGE[0] < math.hypot(*pose[:4]) < _NORM_RANGE[1]
+    _require_finite(is_rotation, f"a rotation quaternion {of}", where, tuple(pose[:4]))
 
 
 def read_points3d(path: StrPath) -> tuple[PointCloud, Tracks]:
@@ -412,6 +442,11 @@ def _require(holds: bool, expected: str, where: str, found: object) -> None:
         raise _bad(expected, where, str(found))
 
 
+def _require_finite(holds: bool, expected: str, where: str, found: object) -> None:
+    if not holds:
+        raise NotFiniteError(f"{expected} in {where}", found=str(found), fix=COPY_AGAIN)
+
+
 def _bad(expected: str, where: str, found: str) -> SceneFormatError:
     return SceneFormatError(f"{expected} in {where}", found=found, fix=COPY_AGAIN)
 
@@ -465,10 +500,11 @@ def read_colmap_scene(model_dir: StrPath) -> Scene:
     """The scene of a model: its images, its points, and warnings for the user."""
     model_dir = Path(model_dir)
     root = scene_root(model_dir)
-    intrinsics, images = read_model_cameras(model_dir)
+    intrinsics, images, unusable = _read_model(model_dir)
     points, tracks, points_path = read_model_points(model_dir)
     image_dir = _image_dir(root, images)
     warnings = [*image_warnings(images, image_dir, root), *lens_warnings(images)]
+    warnings += unusable_warning(unusable, len(images))
     warnings += _other_points(model_dir, root, points_path, points)
     if (root / "transforms.json").is_file():
         warnings.append(f"{root / 'transforms.json'} is there too; name it to read it instead.")
@@ -480,7 +516,9 @@ def read_colmap_scene(model_dir: StrPath) -> Scene:
             " sfm IMAGES -o SCENE. Points can be interpolated, but nothing can be trained."
         )
     source = SceneSource("colmap", root, points_path, model_dir, image_dir)
-    return Scene(points, images, intrinsics, tracks, source, tuple(warnings))
+    return Scene(
+        points, images, intrinsics, tracks, source, tuple(warnings), absent=tuple(unusable)
+    )
 
 
 def _image_dir(root: Path, images: Sequence[Image]) -> Path | None:
@@ -496,13 +534,28 @@ def _image_dir(root: Path, images: Sequence[Image]) -> Path | None:
 
 
 def read_model_cameras(model_dir: Path) -> tuple[tuple[Intrinsics, ...], tuple[Image, ...]]:
-    """The camera and the image records of a model."""
+    """The camera and the image records of a model that can be used."""
+    return _read_model(model_dir)[:2]
+
+
+def _read_model(
+    model_dir: Path,
+) -> tuple[tuple[Intrinsics, ...], tuple[Image, ...], Mapping[str, NotFiniteError]]:
+    """The same, and what is wrong with other images, by name.
+
+    Raises:
+        NotFiniteError: Fewer than half of the images can be used.
+    """
     cameras_path, images_path = model_file(model_dir, "cameras"), model_file(model_dir, "images")
     if cameras_path is None and images_path is not None:
         expected = f"cameras.bin or cameras.txt beside {images_path}"
         raise SceneNotFoundError(expected, found="neither", fix="Copy the whole model.")
-    intrinsics = read_cameras(cameras_path) if cameras_path else ()
-    return intrinsics, read_images(images_path, intrinsics) if images_path else ()
+    bad: Unusable = {}
+    intrinsics = read_cameras(cameras_path, bad) if cameras_path else ()
+    images = read_images(images_path, intrinsics, bad) if images_path else ()
+    unusable = {name: error for name, error in bad.items() if isinstance(name, str)}
+    check_enough(unusable, len(images))
+    return intrinsics, images, unusable
 
 
 def read_model_points(model_dir: Path) -> tuple[PointCloud, Tracks | None, Path]:

@@ -25,6 +25,7 @@ from splatseed.io import colmap, photograph
 from splatseed.io.cleaning import clean_scene, renumber
 from splatseed.io.depth_maps import depth_folder, safe_parts
 from splatseed.io.files import StrPath
+from splatseed.io.photograph_checks import Size, check_sizes
 from splatseed.io.staging import MANIFEST, output_folder, write_json
 from splatseed.io.write import bring, image_folders
 from splatseed.lens import rays_through
@@ -35,8 +36,6 @@ from splatseed.scene import Image, Observations, Scene, Tracks
 DenseMap: TypeAlias = Any
 """A ``splatseed.depth.stereo.StereoMap``: name, camera, depth, normal, confidence, sources and
 agreeing of one image."""
-Size = tuple[int, int]
-"""Width and height in pixels."""
 Undistort: TypeAlias = Callable[
     [UInt8[np.ndarray, "H W 3"], Intrinsics, Float64[np.ndarray, "3 3"]],
     tuple[UInt8[np.ndarray, "H W 3"], Bool[np.ndarray, "H W"]],
@@ -51,7 +50,6 @@ _MAX_CHANGE = 1.25
 _SAME_POSE = 1e-6
 _KINDS = ("photometric", "geometric")
 """COLMAP's two passes; stereo_fusion reads the second unless told otherwise."""
-_ASPECT_SLACK = 0.02
 _PER_MAP = 200
 """Points of a map: enough to tell which views overlap much and which little."""
 _GREY = 128
@@ -220,15 +218,7 @@ def _size_of(image: Image, folder: Path, *, undistorts: bool) -> Size:
     if "/".join(safe_parts(image.name)) != image.name or "\n" in image.name:
         expected = "image names that stay inside their folder"
         raise OutputError(expected, found=repr(image.name), fix="Rename the image.")
-    path = folder / image.name
-    size = photograph.open_photograph(path, photograph.photograph_bytes(path)).size
-    if abs(size[0] / size[1] / (lens.width / lens.height) - 1) > _ASPECT_SLACK:
-        raise SceneFormatError(
-            f"{path} to have the shape of its camera, {lens.width} x {lens.height}",
-            found=f"{size[0]} x {size[1]}",
-            fix="Use the images that the model was made from, or a resized copy of them.",
-        )
-    return size
+    return check_sizes([image], folder)[image.name]
 
 
 def _write_each(
@@ -388,8 +378,8 @@ def _bring_photographs(
             path, target = source / image.name, folder / "images" / image.name
             encoded = photograph.photograph_bytes(path)
             pixels = np.asarray(photograph.decode_photograph(path, encoded))
-            K = scaled_K(image.camera, *pixels.shape[1::-1])
-            straight = PilImage.fromarray(undistort(pixels, image.intrinsics, K)[0])
+            lens = image.intrinsics.resized(*pixels.shape[1::-1])
+            straight = PilImage.fromarray(undistort(pixels, lens, lens.K)[0])
             target.parent.mkdir(parents=True, exist_ok=True)
             jpeg = PilImage.registered_extensions()[target.suffix.lower()] == "JPEG"
             # The pixels of a JPEG come from one already.
@@ -411,7 +401,7 @@ def _photograph_model(
     images = {}
     for image in sorted(scene.images, key=lambda image: image.image_id):
         lens, size, seen = image.intrinsics, sizes[image.name], image.observations
-        (fx, _, cx), (_, fy, cy), _ = scaled_K(image.camera, *size).tolist()
+        (fx, _, cx), (_, fy, cy), _ = lens.resized(*size).K.tolist()
         pinhole = Intrinsics(len(cameras) + 1, "PINHOLE", *size, (fx, fy, cx, cy))
         record = cameras.setdefault((lens.camera_id, size), pinhole)
         if seen is not None:

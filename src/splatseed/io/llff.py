@@ -21,7 +21,7 @@ from splatseed.io.colmap import IMAGE_DIRS, make_intrinsics, rigid_pose
 from splatseed.io.files import StrPath, guarded, open_file, read_npy
 from splatseed.io.frame_files import SUFFIXES
 from splatseed.io.mask_files import masks_among
-from splatseed.io.photograph import image_warnings
+from splatseed.io.photograph_checks import image_warnings
 from splatseed.literal import counted
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene, SceneSource

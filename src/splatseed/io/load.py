@@ -26,7 +26,7 @@ from splatseed.io.ply import read_ply, refuse_model
 from splatseed.io.rgbd import find_tum_depths, is_replica, is_tum, load_rgbd, load_tum
 from splatseed.io.seeds import recall_seeds
 from splatseed.io.split import follow_lists
-from splatseed.io.staging import MANIFEST, read_manifest
+from splatseed.io.staging import ABSENT, MANIFEST, read_manifest
 from splatseed.literal import name_some, quoted
 from splatseed.scene import Scene, SceneSource
 
@@ -83,8 +83,17 @@ def load_scene(path: StrPath, *, require_points: bool = True) -> Scene:
         fix = _TRIANGULATE if scene.images else "Name a scene or a PLY that has points."
         raise SceneNotFoundError(f"points in {path}", found="none", fix=fix)
     # seeds.npz and the manifest count the points as the files have them, so this comes first.
-    scene = with_own_masks(clean_scene(follow_lists(recall_seeds(scene))))
+    scene = with_own_masks(clean_scene(follow_lists(_recall_absent(recall_seeds(scene)))))
     return scene.replace(warnings=(*scene.warnings, *cloud_warnings(scene.points)))
+
+
+def _recall_absent(scene: Scene) -> Scene:
+    """The scene with the images that it lacked before splatseed wrote it, by its manifest."""
+    noted = read_manifest(scene.source.root).get(ABSENT) if scene.source else None
+    if not isinstance(noted, list) or not all(isinstance(name, str) for name in noted):
+        return scene
+    there = {*scene.absent, *(image.name for image in scene.images)}
+    return scene.replace(absent=(*scene.absent, *(name for name in noted if name not in there)))
 
 
 def load_originals(path: StrPath, *, require_points: bool = True) -> Scene:

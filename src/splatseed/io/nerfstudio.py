@@ -40,9 +40,11 @@ from splatseed.io.frame_files import (
     named_masks,
 )
 from splatseed.io.model_choice import ranked_models
-from splatseed.io.photograph import image_warnings, lens_warnings
+from splatseed.io.photograph import lens_warnings
+from splatseed.io.photograph_checks import image_warnings
 from splatseed.io.ply import read_ply
 from splatseed.io.point_files import other_points
+from splatseed.io.unusable import NotFiniteError, check_enough, unusable_warning
 from splatseed.literal import counted
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Masks, Scene, SceneSource, Split
@@ -68,7 +70,10 @@ _POSE_TOLERANCE = 1e-2  # of the cameras' extent, between transforms.json and it
 
 @dataclass(frozen=True, eq=False)
 class Transforms:
-    """A ``transforms.json``, read and checked; images in the file's order, in OpenCV axes."""
+    """A ``transforms.json``, read and checked; images in the file's order, in OpenCV axes.
+
+    Frames whose pose or camera is not finite are left out of images and frames.
+    """
 
     path: Path
     json: Mapping[str, Any]
@@ -78,6 +83,7 @@ class Transforms:
     image_dir: Path  # names are relative to it
     applied_transform: Float64[np.ndarray, "3 4"] | None
     warnings: tuple[str, ...]
+    absent: tuple[str, ...] = ()  # the images of frames that are left out
 
     @property
     def listed(self) -> Split | None:
@@ -105,7 +111,7 @@ def read_transforms_scene(path: StrPath) -> Scene:
         warnings=(*notes, *lens_warnings(images)),
         depths=named_depths(FrameFiles(path), frames, transforms.json),
         listed=transforms.listed,
-        masks=Masks(masks) if masks else None,
+        masks=Masks(masks) if masks else None, absent=transforms.absent,
     )  # fmt: skip
 
 
@@ -169,16 +175,21 @@ def read_transforms(path: Path) -> Transforms:
     cameras: dict[tuple[str, int, int, tuple[float, ...]], Intrinsics] = {}
     images: dict[str, Image] = {}
     kept: list[Frame] = []
+    unusable: dict[str, NotFiniteError] = {}
     odd = repeated = 0
     for frame, image_id in zip(frames, ids, strict=True):
         name = frame.file.relative_to(image_dir).as_posix()
         where = f"{frame.where} ({name})"
         values = {**meta, **frame.fields}
-        key = _camera(where, values, frame.file)
-        if key not in cameras:
-            cameras[key] = make_intrinsics(where, len(cameras) + 1, *key)
+        try:
+            key = _camera(where, values, frame.file)
+            if key not in cameras:
+                cameras[key] = make_intrinsics(where, len(cameras) + 1, *key)
+            pose = _matrix(f"{where}, transform_matrix", frame.fields.get("transform_matrix"))
+        except NotFiniteError as error:
+            unusable[name] = error
+            continue
         odd += bool(values.get("k4")) and key[0] != "OPENCV_FISHEYE"
-        pose = _matrix(f"{where}, transform_matrix", frame.fields.get("transform_matrix"))
         quat, translation = rigid_pose(where, pose @ OPENCV_FROM_OPENGL)
         image = Image(name, image_id, cameras[key], quat, translation)
         if name in images:
@@ -187,6 +198,7 @@ def read_transforms(path: Path) -> Transforms:
             continue
         images[name] = image
         kept.append(frame)
+    check_enough(unusable, len(images))
     applied = meta.get("applied_transform")
     if applied is not None:
         applied = _matrix(f"{path}, applied_transform", applied)
@@ -196,9 +208,10 @@ def read_transforms(path: Path) -> Transforms:
         )
     if repeated:
         notes.append(f"{counted(repeated, 'frame')} of {path.name} repeat others and are left out.")
+    notes += unusable_warning(unusable, len(images))
     return Transforms(
         path, meta, tuple(images.values()), tuple(kept), tuple(cameras.values()), image_dir,
-        applied, tuple(notes),
+        applied, tuple(notes), tuple(unusable),
     )  # fmt: skip
 
 
@@ -224,7 +237,8 @@ def _number(where: str, values: Mapping[str, Any], key: str, default: float | No
         number = float(value) if not isinstance(value, bool) else math.nan
     if not math.isfinite(number):
         other = "none" if value is None else repr(value)
-        raise SceneFormatError(f"a number {key} in {where}", found=other, fix=_FIX)
+        kind = NotFiniteError if isinstance(value, float) else SceneFormatError
+        raise kind(f"a number {key} in {where}", found=other, fix=_FIX)
     return number
 
 
@@ -258,7 +272,7 @@ def _focal_length(
         focal_length = _number(where, values, f"fl_{axis}", default)
     if not 0 < focal_length < math.inf:
         expected = f"a positive focal length fl_{axis} in {where}"
-        raise SceneFormatError(expected, found=f"{focal_length:g}", fix=_FIX)
+        raise NotFiniteError(expected, found=f"{focal_length:g}", fix=_FIX)
     return focal_length
 
 
@@ -286,7 +300,11 @@ def _matrix(where: str, value: Any) -> Float64[np.ndarray, "3 4"]:
     matrix: np.ndarray = np.empty(0)
     with suppress(TypeError, ValueError, OverflowError):
         matrix = np.array(value, np.float64)
-    if matrix.shape not in {(3, 4), (4, 4)} or not np.isfinite(matrix[:3]).all():
+    fits = matrix.shape in {(3, 4), (4, 4)}
+    if fits and not (np.isfinite(matrix[:3]).all() and matrix[:3, :3].any()):
+        found = "zeros alone" if np.isfinite(matrix[:3]).all() else "NaN or infinity"
+        raise NotFiniteError(f"a matrix of finite numbers in {where}", found=found, fix=_FIX)
+    if not fits:
         found = "none" if value is None else "something else"
         raise SceneFormatError(f"a matrix of 3 x 4 numbers in {where}", found=found, fix=_FIX)
     return matrix[:3]

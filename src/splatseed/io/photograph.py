@@ -8,7 +8,6 @@ rounded to 8 bits, and 16-bit colours keep their upper 8 (Pillow's way).
 from __future__ import annotations
 
 import hashlib
-import os
 from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
@@ -17,8 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
-from splatseed.io.files import guarded, odd_kind, open_file, other_spelling, read_bytes
-from splatseed.literal import agreeing, describe_error
+from splatseed.io.files import guarded, other_spelling, read_bytes
 from splatseed.scene import Image, Scene
 
 if TYPE_CHECKING:
@@ -30,9 +28,8 @@ _WIDE_GREY = ("I", "F")
 """Pillow's modes for one channel of more than 8 bits, which its own conversion clips at 255."""
 _INKS = ("CMYK", "LAB")
 """Pillow's modes that are not RGB or grey; it would convert inks by a rule of thumb."""
-_COPY_AGAIN = "Copy or export the image again."
+COPY_AGAIN = "Copy or export the image again."
 _WHOLE = "an image, neither cut short nor damaged"
-_MAX_OPENED = 32  # files whose size is compared
 
 
 def photograph_folder(scene: Scene) -> Path:
@@ -79,7 +76,7 @@ def open_photograph(path: Path, encoded: bytes) -> PilImage.Image:
     """The photograph in a file's bytes; only its header is decoded yet."""
     from PIL import Image as PilImage  # noqa: PLC0415  (slow to import)
 
-    with guarded(path, "an image", fix=_COPY_AGAIN):
+    with guarded(path, "an image", fix=COPY_AGAIN):
         return PilImage.open(BytesIO(encoded))
 
 
@@ -99,7 +96,7 @@ def decode_photograph(path: Path, encoded: bytes) -> PilImage.Image:
         )
     if photograph.mode.startswith(_WIDE_GREY):
         return _eight_bits(path, photograph).convert("RGB")
-    with guarded(path, _WHOLE, fix=_COPY_AGAIN):
+    with guarded(path, _WHOLE, fix=COPY_AGAIN):
         if has_alpha(photograph):
             from PIL import Image as PilImage  # noqa: PLC0415  (slow to import)
 
@@ -118,7 +115,7 @@ def check_photograph(path: Path) -> tuple[int, int]:
     photograph = open_photograph(path, photograph_bytes(path))
     size = photograph.size
     photograph.draft(None, (size[0] // _CHECK_SCALE, size[1] // _CHECK_SCALE))
-    with guarded(path, _WHOLE, fix=_COPY_AGAIN):
+    with guarded(path, _WHOLE, fix=COPY_AGAIN):
         photograph.load()
     return size
 
@@ -127,7 +124,7 @@ def _eight_bits(path: Path, photograph: PilImage.Image) -> PilImage.Image:
     """Grey of 16 bits or of floats, as 8 bits."""
     from PIL import Image as PilImage  # noqa: PLC0415  (slow to import)
 
-    with guarded(path, _WHOLE, fix=_COPY_AGAIN):
+    with guarded(path, _WHOLE, fix=COPY_AGAIN):
         values = np.asarray(photograph)
     most = 1.0 if photograph.mode == "F" else 65535.0
     # 32-bit integers can have any range; some versions of Pillow open 16-bit PNGs as such.
@@ -143,58 +140,6 @@ def _eight_bits(path: Path, photograph: PilImage.Image) -> PilImage.Image:
     if transparent is not None:
         grey[values == transparent] = 0
     return PilImage.fromarray(grey)
-
-
-def image_warnings(images: Sequence[Image], image_dir: Path | None, root: Path) -> list[str]:
-    """What is wrong with the image files against their records; only a few headers are opened."""
-    if not images:
-        return []
-    if image_dir is None:
-        dead = root / "images" if (root / "images").is_symlink() else None
-        gone = f"{dead} leads to {dead.readlink()}, which is not there" if dead else "is missing"
-        return [f"The images folder {gone}; points can be made, but nothing can be trained."]
-    count, warnings = len(images), []
-    missing = {im.name: None for im in images if not (image_dir / im.name).is_file()}
-    if missing:
-        first, are = next(iter(missing)), agreeing(len(missing), "is", "are")
-        near, kind = other_spelling(image_dir / first), odd_kind(image_dir / first)
-        hint = f"; {near} is there, but names must be equal to the letter" if near else ""
-        hint = f", which is {kind}" if kind else hint
-        hint = "; folders are separated by /, as on Linux, not by \\" if "\\" in first else hint
-        warnings.append(
-            f"{len(missing)} of {count} images {are} missing in {image_dir}, the first is "
-            f"{first}{hint}."
-        )
-    # Links, which somebody made on purpose, may lead anywhere: they are not followed.
-    around = os.path.abspath(root)  # noqa: PTH100
-    paths = {im.name: os.path.abspath(image_dir / im.name) for im in images}  # noqa: PTH100
-    outside = [n for n, path in paths.items() if os.path.commonpath([path, around]) != around]
-    if outside:
-        lie = agreeing(len(outside), "lies", "lie")
-        warnings.append(
-            f"{len(outside)} of {count} images {lie} outside of {root}, the first is {outside[0]}."
-        )
-    present = [im for im in images if im.name not in missing]
-    sample = present[:: -(-len(present) // _MAX_OPENED) or 1]  # evenly spaced, the first among them
-    wrong = [text for im in sample if (text := _size_warning(im, image_dir))]
-    return [*warnings, *wrong[:1]]
-
-
-def _size_warning(image: Image, image_dir: Path) -> str | None:
-    from PIL import Image as PilImage, UnidentifiedImageError  # noqa: PLC0415  (slow to import)
-
-    try:
-        with open_file(image_dir / image.name) as file, PilImage.open(file) as picture:
-            size = picture.size
-    except (OSError, UnidentifiedImageError, PilImage.DecompressionBombError) as error:
-        return f"{image.name} cannot be read: {describe_error(error)}."
-    lens = image.intrinsics
-    if size == (lens.width, lens.height):
-        return None
-    return (
-        f"{image.name} has {size[0]} x {size[1]} pixels, its camera {lens.camera_id} {lens.width} x"
-        f" {lens.height}; some trainers rescale, others fail."
-    )
 
 
 def warnings_but_lens(scene: Scene) -> list[str]:

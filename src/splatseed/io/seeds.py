@@ -22,7 +22,7 @@ from jaxtyping import Float32
 
 from splatseed.errors import PointCloudError
 from splatseed.io.files import ARCHIVE_FAILURES, read_npy
-from splatseed.io.staging import MANIFEST, read_manifest, write_json
+from splatseed.io.staging import ABSENT, MANIFEST, read_manifest, write_json
 from splatseed.pointcloud import ATTRIBUTES, GENERATED, ORIGINAL, PointCloud
 from splatseed.scene import Scene
 
@@ -121,7 +121,8 @@ def carry_seeds(scene: Scene, written: Path, folder: Path) -> None:
     if (written / SEEDS).is_file():
         shutil.copyfile(written / SEEDS, folder / SEEDS)
     counts = {key: read_manifest(written)[key] for key in ("num_points", "num_original")}
-    write_json(folder / MANIFEST, {**counts, UPSAMPLED: _upsampling(scene)})
+    absent = {ABSENT: list(scene.absent)} if scene.absent else {}
+    write_json(folder / MANIFEST, {**counts, **absent, UPSAMPLED: _upsampling(scene)})
 
 
 def _read_seeds(folder: Path, points: PointCloud) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:

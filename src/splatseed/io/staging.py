@@ -34,6 +34,8 @@ except ImportError:  # on Windows nothing can be locked, so leftovers stay
     fcntl = None  # type: ignore[assignment]
 
 MANIFEST = "splatseed.json"
+ABSENT = "absent"
+"""The manifest's key for ``Scene.absent``."""
 """The file that marks a folder as written by splatseed."""
 
 _SETTLED = 5.0

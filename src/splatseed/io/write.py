@@ -34,7 +34,7 @@ from splatseed.io.masks import write_masks
 from splatseed.io.ply import write_ply
 from splatseed.io.seeds import write_seeds
 from splatseed.io.split import MODEL_LISTS, ROOT_LISTS
-from splatseed.io.staging import MANIFEST, output_folder, write_json
+from splatseed.io.staging import ABSENT, MANIFEST, output_folder, write_json
 from splatseed.scene import Scene, SceneSource
 
 Layout = Literal["colmap", "transforms"]
@@ -147,6 +147,8 @@ def write_scene(
             bare = source.points_path if source.format == "ply" else source.root
             read = str(source.transforms_path or bare)
         num_new = counts["num_points"] - counts["num_original"]
+        if scene.absent:  # so that the others train or test as before
+            made[ABSENT] = list(scene.absent)
         facts = {"source": read, **made, "format": layout, **counts, "num_new": num_new}
         write_json(folder / MANIFEST, {**facts, "notes": notes, "versions": versions})
     return WriteReport(
@@ -263,7 +265,10 @@ def _rigs(scene: Scene, model_dir: Path) -> tuple[list[str], list[str]]:
     why = "as text they would not be read beside the binary model"
     if there:  # they repeat the poses of the images
         now, before = (
-            {(im.image_id, im.name): im.camera.cam_from_world for im in images}
+            {
+                (im.image_id, im.name, im.intrinsics.camera_id): im.camera.cam_from_world
+                for im in images
+            }
             for images in (scene.images, colmap.read_model_cameras(model_dir)[1])
         )
         if now.keys() == before.keys() and all(

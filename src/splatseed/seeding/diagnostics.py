@@ -229,9 +229,9 @@ def untrainable(scene: Scene) -> str:
     if folder is None:
         return "Training needs the photographs: put them beside the model in a folder named images."
     missing = [image.name for image in scene.images if not (folder / image.name).is_file()]
-    if not missing:
+    if 2 * len(missing) <= len(scene.images):
         return ""
-    needs = f"Training needs all {len(scene.images):,} photographs"
+    needs = f"Training needs at least half of the {len(scene.images):,} photographs"
     if kind := odd_kind(folder / missing[0]):
         return f"{needs}: {visible(missing[0])} is {kind}."
     which = agreeing(len(missing), "", f"and {len(missing) - 1:,} more ")

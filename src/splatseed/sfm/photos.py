@@ -29,6 +29,7 @@ from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundErro
 from splatseed.io.files import VIDEO_SUFFIXES, StrPath, files_below
 from splatseed.io.mask_files import masks_among
 from splatseed.io.photograph import check_photograph, open_photograph, photograph_bytes
+from splatseed.io.photograph_checks import check_sizes, resized_to
 from splatseed.io.staging import read_manifest
 from splatseed.literal import name_some, quoted
 from splatseed.progress import Progress, silent
@@ -136,15 +137,15 @@ def _read(path: Path) -> tuple[Photo | None, bool]:
 
 
 def match_poses(photos: Photos, scene: Scene, image_dir: Path) -> tuple[Image, ...]:
-    """The images of ``scene`` that are among the photographs, in their order.
+    """The images of ``scene`` that are among the photographs, in their order and at their sizes.
 
     Raises:
         SceneNotFoundError: Fewer than two names are in both.
-        SceneFormatError: A photograph has another size than its camera.
+        SceneFormatError: A photograph is neither of its camera's size nor a resized copy.
     """
     posed = {image.name: image for image in scene.images}
     # Observations are not needed where they go, in another process.
-    images = tuple(replace(posed[name], observations=None) for name in photos if name in posed)
+    images = [replace(posed[name], observations=None) for name in photos if name in posed]
     if len(images) < 2:
         raise SceneNotFoundError(
             f"two or more images of {image_dir} among the {len(posed)} posed images "
@@ -152,16 +153,7 @@ def match_poses(photos: Photos, scene: Scene, image_dir: Path) -> tuple[Image, .
             found=f"{len(images)} of {len(photos)} ({name_some(list(photos)[:3])}, ...)",
             fix="Names must be equal, relative to the images folder, suffix included.",
         )
-    for image in images:
-        lens, (width, height) = image.intrinsics, photos[image.name].size
-        if (width, height) != (lens.width, lens.height):
-            raise SceneFormatError(
-                f"{image_dir / image.name} to have the size of its camera {lens.camera_id}, "
-                f"{lens.width}x{lens.height}",
-                found=f"{width}x{height}",
-                fix="Give the images that the poses were made for, at the same scale.",
-            )
-    return images
+    return resized_to(images, check_sizes(images, image_dir))
 
 
 class PickedFrames(NamedTuple):

@@ -26,6 +26,7 @@ from splatseed.io.files import StrPath
 from splatseed.io.mask_files import FOLDER as MASKS
 from splatseed.io.masks import write_masks
 from splatseed.io.photograph import photograph_folder
+from splatseed.io.photograph_checks import check_sizes, with_photographs
 from splatseed.io.seeds import carry_seeds
 from splatseed.io.staging import MANIFEST, output_folder, write_json
 from splatseed.io.write import write_split
@@ -221,14 +222,17 @@ def undistort(
     photographs changes a little. The output has COLMAP's layout.
 
     Raises:
-        SceneNotFoundError: The scene has no photographs, or one is missing.
-        SceneFormatError: The name of one leads out of their folder.
+        SceneNotFoundError: Fewer than half of the photographs are there.
+        SceneFormatError: The name of one leads out of their folder, or one does not fit its camera.
         OutputError: ``output`` is taken or cannot be written.
         ReconstructionError: pycolmap failed.
         MissingDependencyError: pycolmap is absent.
     """
     require("pycolmap")
-    images = _all_photographs(scene)
+    scene = with_photographs(scene)
+    images = photograph_folder(scene).absolute()
+    _check_names(scene)
+    check_sizes(scene.images, images)
     scene = at_file_size(scene).replace(intrinsics=())  # pycolmap wants cameras of the files' size
     with _staged(images, Path(output), "undistort", overwrite=overwrite) as staging:
         work = staging / ".work" / "distorted"
@@ -371,9 +375,8 @@ def _report(run: Run, staging: Path, names: Sequence[str]) -> SfmReport:
     )
 
 
-def _all_photographs(scene: Scene) -> Path:
-    """The folder of a scene's photographs, all of which are there."""
-    folder = photograph_folder(scene)
+def _check_names(scene: Scene) -> None:
+    """Refuse names of photographs that lead out of their folder."""
     for name in (image.name for image in scene.images):
         path = PurePosixPath(name.replace("\\", "/"))
         if path.is_absolute() or ".." in path.parts:  # pycolmap writes to a folder joined with it
@@ -382,10 +385,3 @@ def _all_photographs(scene: Scene) -> Path:
                 found=repr(name),
                 fix="Move it into the folder and rename it in the model.",
             )
-        if not (folder / name).is_file():
-            raise errors.SceneNotFoundError(
-                "a scene with all of its photographs",
-                found=f"{name} missing in {folder}",
-                fix="Put it there, or drop it from the model.",
-            )
-    return folder.absolute()

@@ -30,6 +30,8 @@ from splatseed.errors import ParameterError, SceneNotFoundError
 from splatseed.io import load_scene
 from splatseed.io.masks import with_masks
 from splatseed.io.photograph import photographs_digest
+from splatseed.io.photograph_checks import with_photographs
+from splatseed.literal import agreeing, name_some
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 from splatseed.scores import NOT_ASKED, EvalResult, ViewScore
@@ -207,6 +209,13 @@ def load_model(
     notes: list[str] = []
     gaussians = read_model(path, notes.append)
     scene = with_masks(load_scene(scene_path, require_points=False), masks)
+    if scene.images:
+        scene = at_file_size(_with_test_photographs(scene, test_every))
+    if gone := scene.absent:
+        are = agreeing(len(gone), "image of the scene is", "images of the scene are")
+        notes.append(
+            f"{len(gone)} {are} left out, without a photograph or a pose: {name_some(gone, 3)}."
+        )
     train, test = scene.split(test_every)
     if not train or not test:
         raise SceneNotFoundError(
@@ -223,7 +232,7 @@ def load_model(
         progress=progress,
     )
     world = None if transform is None else find_transform(transform, scene)
-    proven = transform is None and trained_on == photographs_digest(at_file_size(scene))
+    proven = transform is None and trained_on == photographs_digest(scene)
     unasked = proven or transform == NO_TRANSFORM
     doubt = "" if unasked else check_world(path, scene, gaussians, world)
     points = shown_points(scene)
@@ -238,6 +247,18 @@ def load_model(
     return TrainedModel(
         gaussians, views, lambda view: image(view_in(world, view)), scene, doubt, tuple(notes)
     )
+
+
+def _with_test_photographs(scene: Scene, test_every: int) -> Scene:
+    """As ``with_photographs``, but where most are missing the test views' alone are needed."""
+    try:
+        return with_photographs(scene)
+    except SceneNotFoundError:
+        tested = scene.split(test_every)[1]
+        there = with_photographs(scene.replace(images=tested))
+        gone = {image.name for image in tested} - {image.name for image in there.images}
+        images = tuple(image for image in scene.images if image.name not in gone)
+        return scene.replace(images=images, absent=there.absent)
 
 
 def evaluate_model(model: TrainedModel, **options: Any) -> EvalResult:

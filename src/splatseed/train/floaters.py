@@ -24,6 +24,7 @@ from splatseed.depth.stereo.maps import StereoSettings
 from splatseed.errors import MissingDependencyError, SceneFormatError
 from splatseed.io import load_scene
 from splatseed.io.masks import with_masks
+from splatseed.io.photograph_checks import with_photographs
 from splatseed.progress import Progress, silent
 from splatseed.seeding.clouds.judging import find_evidence
 from splatseed.seeding.photographs import photographed
@@ -82,7 +83,9 @@ def floaters_of_model(
         ParameterError: A number is out of range.
     """
     settings = TrainSettings(strategy="grow", data_factor=data_factor or 1, test_every=test_every)
-    scene = at_file_size(with_masks(load_scene(scene_path, require_points=False), masks))
+    scene = at_file_size(
+        with_photographs(with_masks(load_scene(scene_path, require_points=False), masks))
+    )
     images = photographed(scene, test_every, without="leave --clean out")
     gaussians = read_start(path, scene, lambda _: None)
     if data_factor is None:

@@ -30,7 +30,8 @@ from splatseed.errors import (
 from splatseed.io import load_scene
 from splatseed.io.files import StrPath
 from splatseed.io.masks import mask_choice, with_masks
-from splatseed.io.photograph import photographs_digest
+from splatseed.io.photograph import photograph_folder, photographs_digest
+from splatseed.io.photograph_checks import check_sizes, with_photographs
 from splatseed.io.seeds import was_upsampled
 from splatseed.io.staging import write_json
 from splatseed.literal import counted
@@ -111,7 +112,8 @@ def prepare_run(
 
     Raises:
         OutputError: ``output`` is taken, protected or cannot be written.
-        SceneNotFoundError: Photographs are missing, or the run to resume lost its refined poses.
+        SceneNotFoundError: Fewer than half of the photographs are there, or the run to resume lost
+            its refined poses.
         SceneFormatError: A camera, a photograph or the run to resume cannot be used.
         PointCloudError: Too few points, or more than fit into memory.
         ParameterError: No GPU although one was requested; settings or a scene that differ from the
@@ -119,8 +121,7 @@ def prepare_run(
         ReconstructionError: Poses cannot be refined.
         MissingDependencyError: TensorBoard or pycolmap is needed and absent.
     """
-    _check_images(scene)  # before the folder is looked at, which may be a cloud's own
-    scene = at_file_size(scene)
+    scene = _photographed(scene)  # before the folder is looked at, which may be a cloud's own
     if tensorboard:
         require("tensorboard")
     folder = RunFolder(Path(output))
@@ -194,7 +195,8 @@ def _frame_of(scene: Scene, settings: TrainSettings, start: Gaussians | None) ->
     return frame_of_model(poses, shown_points(scene), start)
 
 
-def _check_images(scene: Scene) -> None:
+def _photographed(scene: Scene) -> Scene:
+    """The scene with the images that can be trained on, and cameras of their files' sizes."""
     source = scene.source
     if not scene.images:
         raise SceneNotFoundError(
@@ -205,6 +207,9 @@ def _check_images(scene: Scene) -> None:
         )
     for image in scene.images:
         check_lens(image, source.root if source else None)
+    scene = with_photographs(scene)
+    check_sizes(scene.images, photograph_folder(scene))
+    return at_file_size(scene)
 
 
 def _at_refined_poses(

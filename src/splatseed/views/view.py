@@ -9,12 +9,13 @@ original in ``cache_dir``, and a failure to write there is ignored.
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 import sys
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -30,14 +31,13 @@ from splatseed.io.photograph import (
     photograph_bytes,
     photograph_folder,
 )
+from splatseed.io.photograph_checks import check_sizes, file_sizes, resized_to
 from splatseed.io.staging import atomic_file
 from splatseed.lens import undistort_first
 from splatseed.progress import Progress, silent
 from splatseed.runtime.memory import check_memory
 from splatseed.scene import Image, Masks, Scene
 
-ASPECT_SLACK = 0.02
-"""By how much a file's aspect ratio may differ from its camera's: the rounding of a copy."""
 READERS = 4  # threads that decode photographs
 NEAR_PLANE = 0.01  # where nothing is known of the scene; gsplat's
 
@@ -75,31 +75,18 @@ def poses_of(images: Sequence[Image], data_factor: int = 1) -> tuple[View, ...]:
 
 
 def at_file_size(scene: Scene) -> Scene:
-    """The scene with its cameras in pixels of the files.
+    """The scene with the camera of each image in pixels of its photograph.
 
-    These may be resized copies of what the model was made from; the first photograph stands for
-    all, and without it nothing changes.
+    Photographs may be resized copies of those that the model was made from. An image whose
+    photograph is missing, cannot be read or does not fit keeps its camera.
     """
     folder = scene.source.image_dir if scene.source else None
-    paths = ((image, folder / image.name) for image in scene.images if folder)
-    image, path = next((each for each in paths if each[1].is_file()), (None, Path()))
-    if image is None:
+    images = resized_to(scene.images, {} if folder is None else file_sizes(scene.images, folder))
+    if all(image is before for image, before in zip(images, scene.images, strict=True)):
         return scene
-    try:
-        width, height = open_photograph(path, photograph_bytes(path)).size
-    except SceneFormatError:  # whoever needs its pixels tells
-        return scene
-    own = image.intrinsics
-    if (width, height) == (own.width, own.height):
-        return scene
-    scale = np.array([width / own.width, height / own.height])
-    images = []
-    for each in scene.images:
-        lens, found = each.intrinsics, each.observations
-        sides = np.maximum(np.rint(scale * [lens.width, lens.height]), 1).astype(int).tolist()
-        moved = found and replace(found, xy=found.xy * scale)
-        images.append(replace(each, intrinsics=lens.resized(*sides), observations=moved))
-    return scene.replace(images=tuple(images))
+    cameras = {lens.camera_id: lens for lens in scene.intrinsics}
+    cameras |= {image.intrinsics.camera_id: image.intrinsics for image in images}
+    return scene.replace(images=images, intrinsics=tuple(cameras.values()))
 
 
 def data_factor(images: Sequence[Image], max_size: int) -> int:
@@ -165,10 +152,11 @@ def load_views(
     for image in images if not undistort else ():
         check_lens(image, scene.source.root if scene.source else None)
     if images:
-        first, factor = folder / images[0].name, max(data_factor, 1)
-        width, height = open_photograph(first, photograph_bytes(first)).size
+        sizes, factor = check_sizes(images, folder), max(data_factor, 1)
+        width, height = sizes[images[0].name]
         check_memory(
-            len(images) * width * height // factor**2, 3, "pixels of photographs",
+            sum(math.prod(size) for size in sizes.values()) // factor**2, 3,
+            "pixels of photographs",
             found=f"{len(images)} of {width} x {height}, downsampled by {factor}",
             fix="Downsample more (--data-factor), take fewer, or free some memory.",
         )  # fmt: skip
@@ -211,19 +199,18 @@ def _load_view(
     height, width = photograph.shape[:2]
     if min(width, height) < min_side:
         raise _too_small(path, min_side, data_factor, (width, height))
-    camera = image.camera
-    scale = file_from_camera(path, file_size, (camera.width, camera.height)) / data_factor
-    K = np.diag([*scale, 1.0]) @ camera.K
+    lens, pose = image.intrinsics.resized(*file_size), image.camera.cam_from_world
+    K = np.diag([1 / data_factor, 1 / data_factor, 1.0]) @ lens.K
     mask = read_mask(masks, image.name, path, data_factor)
-    if not image.intrinsics.has_distortion:
-        return View(image.name, photograph, K, width, height, camera.cam_from_world, mask)
+    if not lens.has_distortion:
+        return View(image.name, photograph, K, width, height, pose, mask)
     from splatseed.views.projection import undistort  # noqa: PLC0415  (loads Numba)
 
-    photograph, known = undistort(photograph, image.intrinsics, K)
+    photograph, known = undistort(photograph, lens, K)
     if mask is not None:
         white = np.repeat(np.where(mask, 255, 0).astype(np.uint8)[..., None], 3, axis=2)
-        known &= undistort(white, image.intrinsics, K)[0][..., 0] == 255
-    return View(image.name, photograph, K, width, height, camera.cam_from_world, known)
+        known &= undistort(white, lens, K)[0][..., 0] == 255
+    return View(image.name, photograph, K, width, height, pose, known)
 
 
 def _too_small(
@@ -235,24 +222,6 @@ def _too_small(
         found=f"{size[0]} x {size[1]}",
         fix="Choose a smaller --data-factor, or a larger --long-side.",
     )
-
-
-def file_from_camera(
-    path: Path, file_size: tuple[int, int], camera_size: tuple[int, int]
-) -> Float64[np.ndarray, " 2"]:
-    """How many pixels of the file a pixel of the camera record is, along x and y.
-
-    Raises:
-        SceneFormatError: Their aspect ratios differ.
-    """
-    scale = np.array(file_size) / np.array(camera_size)
-    if abs(scale[0] / scale[1] - 1) > ASPECT_SLACK:
-        raise SceneFormatError(
-            f"{path} to have the aspect ratio of its camera, {camera_size[0]} x {camera_size[1]}",
-            found=f"{file_size[0]} x {file_size[1]}",
-            fix="Use the images that the model was made from, or a resized copy of them.",
-        )
-    return np.asarray(scale)
 
 
 FILTER = "box-2"  # part of the key: change it whenever the downsampling changes

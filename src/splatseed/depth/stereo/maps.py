@@ -179,10 +179,11 @@ def stereo_depths(
 
     Raises:
         ParameterError: A choice is out of range.
-        SceneNotFoundError: There are fewer than two photographs.
+        SceneNotFoundError: There are fewer than two photographs, or than half of the scene's.
         SceneFormatError: A photograph cannot be used.
     """
     from splatseed.depth.stereo.depths import find_stereo, known_visibility  # noqa: PLC0415  (loads Numba)
+    from splatseed.io.photograph_checks import with_photographs  # noqa: PLC0415  (loads with its use)
     from splatseed.views.view import at_file_size, data_factor, load_views  # noqa: PLC0415  (loads with its use)
 
     settings = replace(settings or StereoSettings(), **choices)
@@ -192,7 +193,7 @@ def stereo_depths(
             found=f"{len(scene.images)}",
             fix="Name a scene with photographs: depth comes from comparing them.",
         )
-    scene = at_file_size(scene)
+    scene = at_file_size(with_photographs(scene))
     views = load_views(
         scene,
         scene.images,
