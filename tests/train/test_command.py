@@ -140,3 +140,27 @@ def test_a_run_that_cannot_be_followed_is_one_sentence_and_stays(
     assert told in said
     assert said.count("error:") == 1
     assert {path: path.read_bytes() for path in run.iterdir()} == before
+
+
+def test_large_photographs_are_smaller_by_default_and_stay_so(
+    room_path, tmp_path, capsys, monkeypatch
+):
+    """The run, its resumption and its scores are at the size that the default chose at first."""
+    run, advance = tmp_path / "run", Trainer._advance
+
+    def step(self, number):
+        if number == 1:
+            os.kill(os.getpid(), signal.SIGINT)
+        return advance(self, number)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Trainer, "_advance", step)
+        patch.setattr("splatseed.train.settings.TRAINED_SIDE", 48)
+        assert _run(room_path, "--max-steps", "3", "--strategy", "none", "-o", run) == 130
+    assert (
+        "96 x 72 pixels are used at 48 x 36, as the default is 48 a side" in capsys.readouterr().out
+    )
+    assert _json(run / "config.json")["data_factor"] == 2
+    assert _run(room_path, "-o", run, "--resume") == 0  # with a default that changes nothing
+    assert "48 x 36" in capsys.readouterr().out
+    assert _run(room_path, "--data-factor", "1", "-o", run, "--resume") == 2

@@ -19,9 +19,11 @@ from splatseed.errors import ParameterError
 from splatseed.literal import did_you_mean
 from splatseed.scores import CurvePoint, EvalResult
 from splatseed.seeding.upsampling import RHO, parse_budget
+from splatseed.train.duration import GROWTH, step_seconds
 from splatseed.train.seeds import most_seeds
 from splatseed.train.settings import Backend, StrategyName, TrainSettings
 from splatseed.upsample import METHODS, Profile, Upsampler, chooses_number, configure
+from splatseed.views.view import TRAINED_SIDE
 
 SFM = "sfm"
 """The method that leaves the cloud of Structure-from-Motion as it is; its ratio is 1."""
@@ -42,8 +44,6 @@ _WHAT = ("name", "digest", "depth_digest", "cloud_digest")
 """What of a scene determines results; the rest says where it lies, or follows from it."""
 _LISTS = ("methods", "strategies", "profiles", "ratios", "budgets")
 _DEFAULT = TrainSettings()
-_GROWTH = 3.0
-"""Gaussians at the end of a run per seed, with densification and without a cap: a guess."""
 _ADDED, _ADDED_PER_PIXEL = 3e5, 3.0
 """And those that 3DGS's conventions add in runs of any length: fern's 6,000 SfM points were 265,000
 after 60 steps at 75 x 100 pixels, 570,000 in the first quarter of 7,000 at 300 x 400."""
@@ -133,22 +133,21 @@ class RunSpec:
         cap = self.settings.cap or math.inf
         made = self.scene.num_points * (self.arm.ratio or _LIKELY_RATIO)
         seeds = min(made, self.most_seeds or cap)
-        grown = seeds if self.settings.densification == "none" else seeds * _GROWTH
+        grown = seeds if self.settings.densification == "none" else seeds * GROWTH
         if self.arm.strategy == "default-3dgs":
-            pixels = self.scene.pixels_at(self.training.data_factor)
+            pixels = self.scene.pixels_at(self.training.factor)
             grown = seeds + _ADDED + _ADDED_PER_PIXEL * pixels
         return seeds, min(grown, cap)
 
     def seconds(self, threads: int) -> float:
         """Seconds on so many threads by a rough model, which can be several times off.
 
-        A step takes a + b G + c P seconds for G Gaussians and P pixels: measured on 2 cores with
-        AVX-512 on three scenes, and on one GPU with 3 million Gaussians.
+        A step's are those of ``train.duration``.
         """
         on_gpu = self.training.backend == "cuda"
-        a, b, c, around = (8e-3, 5e-9, 2e-9, 20.0) if on_gpu else (6e-3, 0.18e-6, 0.09e-6, 6.0)
-        pixels = self.scene.pixels_at(self.training.data_factor)
-        step = a + b * sum(self.gaussians) / 2 + c * pixels
+        around = 20.0 if on_gpu else 6.0
+        pixels = self.scene.pixels_at(self.training.factor)
+        step = step_seconds("cuda" if on_gpu else "cpu", sum(self.gaussians) / 2, pixels)
         renders = 0.3 * _TESTS * self.scene.num_images / self.training.test_every
         grows, method = self.settings.densification == "grow", plain(self.arm.method)
         compares = grows or (method != SFM and chooses_number(method))
@@ -280,7 +279,7 @@ class Plan:
             (not self.budgets or training.cap_max is None, "budgets or cap_max", "both"),
             (long_side is None or long_side >= _LEAST_SIDE,
              f"long_side of {_LEAST_SIDE} or more", long_side),
-            (long_side is None or training.data_factor == 1, "long_side or data_factor", "both"),
+            (long_side is None or training.factor == 1, "long_side or data_factor", "both"),
             (self.repeats >= 1, "repeats of 1 or more", self.repeats),
         ):  # fmt: skip
             if not fits:
@@ -359,8 +358,8 @@ def _needed(scene: SceneFacts, method: str) -> SceneFacts:
 def _training(plan: Plan, scene: SceneFacts, arm: Arm, backend: Backend) -> TrainSettings:
     """The plan's settings, at the size and with the number of Gaussians that this scene has."""
     factor = plan.training.data_factor
-    if plan.long_side is not None:
-        factor = max(1, -(-scene.long_side // plan.long_side))
+    if plan.long_side is not None or factor is None:
+        factor = max(1, -(-scene.long_side // (plan.long_side or TRAINED_SIDE)))
     settings = replace(plan.training, backend=backend, data_factor=factor)
     if not arm.budget:
         return settings

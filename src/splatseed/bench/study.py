@@ -147,7 +147,7 @@ def studies(runs: Iterable[Run]) -> tuple[Study, ...]:
         parts: dict[int, list[Run]] = defaultdict(list)
         for run in group:  # apart where a scene has several sizes
             alone = len(sizes) > len({digest for digest, _ in sizes})
-            parts[run.spec.training.data_factor if alone else 0].append(run)
+            parts[run.spec.training.factor if alone else 0].append(run)
         grouped += [_study(dict(key), part) for part in parts.values()]
     return tuple(sorted(grouped, key=lambda study: -len(study.runs)))
 
@@ -183,7 +183,7 @@ def _study(settings: Mapping[str, object], runs: Sequence[Run]) -> Study:
             continue
         label = _label(spec, several)
         variants.setdefault(label, arm)
-        factors[scene] = min(spec.training.data_factor, factors.get(scene, 10**9))
+        factors[scene] = min(spec.training.factor, factors.get(scene, 10**9))
         told: tuple[object, ...] = (arm.strategy, scene, label, spec.repeat, spec, result)
         rows.append({**dict(zip(_COLUMNS, told, strict=True)), **_measures(result)})
     sizes = set(factors.values())

@@ -85,7 +85,8 @@ class Options:
     max_steps: int | None = None
     """Training steps (30000); schedules and learning rates adapt to them."""
     data_factor: int | None = None
-    """Divide the width and height of the photographs by this whole number (1)."""
+    """Divide the width and height of the photographs by this whole number; by default by the
+    smallest that leaves at most 1600 pixels on their longer side, per scene."""
     long_side: int | None = None
     """Downsample photographs by a whole factor, per scene, to at most this many pixels on their
     longer side; instead of --data-factor."""
@@ -390,7 +391,7 @@ def _announcement(plan: Plan, runs: Sequence[Run], machine: Machine) -> Iterator
         time_left = estimate(left, runs, machine.threads) / min(machine.jobs, len(left))
         disk = 0.0
         for spec in left:
-            disk += 60e3 + 18 * spec.scene.pixels_at(spec.training.data_factor)  # three pictures
+            disk += 60e3 + 18 * spec.scene.pixels_at(spec.training.factor)  # three pictures
             disk += 236 * spec.gaussians[1] * plan.keep_models
         yield f"about {spoken_time(time_left)} ({by}), {disk / 1e6:,.1f} MB kept"
 

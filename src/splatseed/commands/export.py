@@ -119,7 +119,7 @@ def _scoring_command(options: Options) -> str:
     if not isinstance(factor, int):
         print_note("Score it at the size of training: N is the --data-factor of the run.")
         words += ["--data-factor", "N"]
-    elif factor != TrainSettings.data_factor:
+    elif factor != 1:
         words += ["--data-factor", str(factor)]
     if isinstance(every, int) and every != TrainSettings.test_every:
         words += ["--test-every", str(every)]

@@ -47,7 +47,9 @@ class Planned(NamedTuple):
     def of(cls, scene: Scene, budget: str | None = None, max_steps: int = FULL_RUN) -> Planned:
         """A scene's plan, from the options."""
         images = at_file_size(scene).images
-        sizes = [image.intrinsics.width * image.intrinsics.height for image in images]
+        factor = TrainSettings().sized(images).factor
+        lenses = [image.intrinsics for image in images]
+        sizes = [(lens.width // factor) * (lens.height // factor) for lens in lenses]
         pixels = round(float(np.median(sizes))) if sizes else BUDGET
         number, flags = max(2, min(BUDGET, pixels)), ""
         if budget is not None:

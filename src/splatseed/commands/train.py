@@ -5,11 +5,14 @@ from __future__ import annotations
 import json
 import math
 import sys
+import time
 import tomllib
 from argparse import ArgumentParser
+from collections import deque
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from datetime import timedelta
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_args, get_type_hints
@@ -31,7 +34,8 @@ from splatseed.requirements import require
 from splatseed.runtime.interruption import exit_code
 from splatseed.scene import Scene
 from splatseed.scores import TrainingResult
-from splatseed.seeding.upsampling import parse_budget
+from splatseed.seeding.upsampling import RHO, parse_budget
+from splatseed.train.duration import TOO_LONG, Progressed, about_an_hour, in_words, seconds_left
 from splatseed.train.folder import RunFolder
 from splatseed.train.seeds import why_not_seeded
 from splatseed.train.settings import (
@@ -43,7 +47,7 @@ from splatseed.train.settings import (
     TrainSettings,
 )
 from splatseed.upsample.method import fits
-from splatseed.views.view import at_file_size, poses_of, user_cache_dir
+from splatseed.views.view import at_file_size, data_factor, poses_of, user_cache_dir
 
 if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
     from splatseed.train.run import TrainingRun
@@ -55,6 +59,11 @@ BEST: StrategyName = "auto"
 """The default strategy."""
 HOST, PORT = "127.0.0.1", 8080
 """Where browsers watch, if the port is free."""
+FEWEST_STEPS, WINDOW, SURE_AFTER, ESTIMATED_EVERY = 5, 100, 10.0, 5
+"""Steps before the time left is estimated; those that it is estimated by; seconds of them after
+which it is said; and steps between estimates."""
+WORTH_SAYING = 120.0
+"""Seconds of training that are worth a line."""
 RUN_NOTES = {"splatseed", "points", "photographs", "device", "versions"}
 """What config.json records besides options."""
 _SETTINGS = {option: name for name, option in OPTIONS.items()} | {"long_side": "data_factor"}
@@ -206,9 +215,11 @@ def run(arguments: list[str]) -> None:
     for note in notes:
         print_note(note)
     _announce(options, training)
-    with _watched(options, training) as viewer, _training_bar(training) as show:
+    left = _TimeLeft(training, per_pixel=_per_pixel(options))
+    with _watched(options, training) as viewer, _training_bar(training, left) as show:
 
         def on_step(step: int) -> None:
+            left.on_step(step)
             show(step)
             if viewer is not None:
                 viewer.on_step(step)
@@ -244,7 +255,7 @@ def _prepare(
         note(warning)
     if scene.listed is not None:
         note(scene.listed.sentence)
-    settings = _within_budget(options, _sized(options, settings, scene), scene, note)
+    settings = _within_budget(options, _sized(options, settings, scene, note), scene, note)
     seeds, refines = bool(options.seeds), options.refine_poses
     refuse(
         (settings.start and seeds, "--start or --seeds", "both", "Leave one out."),
@@ -267,17 +278,27 @@ def _prepare(
     )
 
 
-def _sized(options: Options, settings: TrainSettings, scene: Scene) -> TrainSettings:
-    """The settings, with the factor that --long-side amounts to in this scene."""
+def _sized(
+    options: Options, settings: TrainSettings, scene: Scene, note: Callable[[str], None]
+) -> TrainSettings:
+    """The settings, with the factor that --long-side or the default amounts to in this scene."""
     side = options.long_side
     if side is None:
-        return settings
+        folder = RunFolder(options.output)
+        if settings.data_factor is None and options.resume and folder.is_run:
+            kept = folder.read_config().get("data_factor")
+            return replace(settings, data_factor=kept if isinstance(kept, int) else 1)
+        return settings.sized(scene.images, note)
     refuse(
-        (settings.data_factor != 1, "--long-side or --data-factor", "both", "Leave one out."),
+        (
+            settings.data_factor is not None,
+            "--long-side or --data-factor",
+            "both",
+            "Leave one out.",
+        ),
         (side < 1, "--long-side of 1 or more", side, "Try 800."),
     )
-    sizes = [max(image.intrinsics.width, image.intrinsics.height) for image in scene.images]
-    return replace(settings, data_factor=max(1, -(-max(sizes, default=1) // side)))
+    return replace(settings, data_factor=data_factor(scene.images, side) if scene.images else 1)
 
 
 def _within_budget(
@@ -289,7 +310,7 @@ def _within_budget(
         return settings
     from splatseed.seeding.budget import median_pixels  # noqa: PLC0415  (loads Numba)
 
-    views = poses_of(scene.images, settings.data_factor)
+    views = poses_of(scene.images, settings.factor)
     pixels = median_pixels(views) if views else 0
     if options.budget is None:
         cap = max(2, min(BUDGET, round(pixels)))
@@ -348,8 +369,58 @@ def _watched(options: Options, training: TrainingRun) -> Iterator[TrainingViewer
         viewer.close()
 
 
+def _per_pixel(options: Options) -> bool:
+    """Whether the budget follows the size of the photographs."""
+    return options.budget is None or options.budget.strip().lower().endswith(RHO)
+
+
+class _TimeLeft:
+    """How long a run will take, by its own steps so far; says so once, early on.
+
+    A pause by the viewer counts as if steps were slow, until the next ``WINDOW`` steps.
+    """
+
+    def __init__(self, training: TrainingRun, *, per_pixel: bool) -> None:
+        self.seconds: float | None = None  # until the last step; None as long as it is unknown
+        self._training, self._per_pixel, self._is_said = training, per_pixel, False
+        self._steps: deque[float] = deque(maxlen=WINDOW + 1)  # when the last ones were done
+
+    def on_step(self, step: int) -> None:
+        """Note that a step is done."""
+        self._steps.append(time.monotonic())
+        begun = self._steps[-1] - self._steps[0]
+        if len(self._steps) <= FEWEST_STEPS or step % ESTIMATED_EVERY:
+            return
+        training = self._training
+        view, device = training.trainer.train_views[0], training.trainer.device.type
+        each, pixels = begun / (len(self._steps) - 1), view.width * view.height
+        now = Progressed(step, each, training.count(), pixels, device)
+        self.seconds = seconds_left(training.settings, now)
+        if not self._is_said and begun > SURE_AFTER:
+            self._is_said = True
+            for note in self._notes(now, self.seconds):
+                print_note(note)
+                OUT.file.flush()
+
+    @property
+    def text(self) -> str:
+        """For the progress bar; empty until it is known."""
+        return "" if self.seconds is None else f"{timedelta(seconds=round(self.seconds))} left"
+
+    def _notes(self, now: Progressed, left: float) -> Iterator[str]:
+        settings, view = self._training.settings, self._training.trainer.train_views[0]
+        steps = f"{settings.max_steps - now.step:,} steps that are left"
+        slow = now.device == "cpu" and left > TOO_LONG
+        if slow or (left > WORTH_SAYING and not ERR.is_terminal):
+            yield f"The {steps} take about {in_words(left)}."
+        if slow:
+            side = max(view.width, view.height) * settings.factor
+            flags = about_an_hour(settings, now, side, per_pixel=self._per_pixel)
+            yield f"On this CPU, training with {flags} takes about an hour; a GPU is much faster."
+
+
 @contextmanager
-def _training_bar(training: TrainingRun) -> Iterator[Callable[[int], None]]:
+def _training_bar(training: TrainingRun, left: _TimeLeft) -> Iterator[Callable[[int], None]]:
     """A function that shows the steps done; draws nothing when stderr is not a terminal."""
     if not ERR.is_terminal:
         yield lambda _: None
@@ -357,10 +428,11 @@ def _training_bar(training: TrainingRun) -> Iterator[Callable[[int], None]]:
     columns = bar_columns()
     with rich_progress.Progress(*columns, console=ERR, transient=True, expand=True) as bar:
         first, total = training.state.step, training.settings.max_steps
-        task = bar.add_task("", total=total, completed=first)
+        task = bar.add_task("", total=total, completed=first, left="")
 
         def show(step: int) -> None:
-            bar.update(task, completed=step, description=_line(training, bar.tasks[0].speed))
+            line = _line(training, bar.tasks[0].speed)
+            bar.update(task, completed=step, description=line, left=left.text)
 
         yield show
 
@@ -372,7 +444,7 @@ def bar_columns() -> tuple[rich_progress.ProgressColumn, ...]:
     return (
         rich_progress.BarColumn(BAR_WIDTH, table_column=whole),
         rich_progress.MofNCompleteColumn(table_column=whole),
-        rich_progress.TimeRemainingColumn(table_column=whole),
+        rich_progress.TextColumn("{task.fields[left]}", table_column=whole),
         rich_progress.TextColumn("{task.description}", markup=False, table_column=rest),
     )
 

@@ -28,7 +28,7 @@ from splatseed.upsample import (
     upsample as add_points,
 )
 from splatseed.upsample.method import NewPoints
-from splatseed.views.view import View, at_file_size, data_factor, poses_of
+from splatseed.views.view import TRAINED_SIDE, View, at_file_size, data_factor, poses_of
 
 if TYPE_CHECKING:
     from splatseed.depth.stereo.maps import StereoResult
@@ -233,10 +233,11 @@ def share_covered(scene: Scene, cloud: PointCloud, cell: int = CELL) -> float:
 
 
 def points_within(scene: Scene, budget: int | str) -> int:
-    """``parse_budget`` with the photographs of a scene."""
+    """``parse_budget`` with the photographs of a scene, at the size of training by default."""
     from splatseed.seeding.budget import median_pixels  # noqa: PLC0415  (loads Numba)
 
-    photographs = poses_of(at_file_size(scene).images)
+    images = at_file_size(scene).images
+    photographs = poses_of(images, data_factor(images, TRAINED_SIDE)) if images else ()
     return parse_budget(budget, median_pixels(photographs) if photographs else 0)
 
 

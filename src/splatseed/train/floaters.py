@@ -90,7 +90,7 @@ def floaters_of_model(
     gaussians = read_start(path, scene, lambda _: None)
     if data_factor is None:
         settings = replace(settings, data_factor=factor_for(images, StereoSettings.max_size))
-    factor, cache = settings.data_factor, user_cache_dir()
+    factor, cache = settings.factor, user_cache_dir()
     views = load_views(scene, images, data_factor=factor, cache_dir=cache, progress=progress)
     frame, device = frame_of_model(views, shown_points(scene), gaussians), _device(progress)
     depths, _ = known_depths(scene, frame.scale, settings, device.type, progress=progress)

@@ -32,7 +32,7 @@ from splatseed.splat.gaussians import SH_C0
 from splatseed.splat.rendering import camera_of, fill_masked, mask_of, opacities_of, render_features
 from splatseed.train.device import Capacity, on_one_thread
 from splatseed.train.parameters import NEAR_DEPTHS, Optimizers, Parameters
-from splatseed.train.schedule import Schedule
+from splatseed.train.schedule import FULL_AT, Schedule
 from splatseed.train.strategies import Strategy
 from splatseed.views.view import View
 
@@ -50,8 +50,6 @@ pixels, and spends again. Where growth filled it, wrong pixels have had their sh
 cost 0.48 dB in a bare room."""
 FULL = 0.95
 """Fraction of the budget from which on it counts as full."""
-FULL_AT = 0.35
-"""Fraction of the run by which the budget is spent."""
 FASTEST = 0.5
 """Most Gaussians added in a round, as a fraction of the existing ones."""
 PLACED = 0.75

@@ -125,14 +125,14 @@ def prepare_run(
     if tensorboard:
         require("tensorboard")
     folder = RunFolder(Path(output))
-    protect = [*(scene.source.inputs if scene.source else ())]
-    protect += [Path(settings.start)] if settings.start else []
+    inputs = scene.source.inputs if scene.source else ()
+    protect = [*inputs, *([Path(settings.start)] if settings.start else [])]
     folder.check(overwrite=overwrite, resume=resume, protect=protect)
     begun = folder.read_config() if resume and folder.is_run else None
     if begun:
         settings, refine_poses = resumed(begun, settings, named, refine_poses=refine_poses)
         scene = _as_masked(scene, begun)
-    device = pick_device(settings.backend, progress)
+    settings, device = settings.sized(scene.images, note), pick_device(settings.backend, progress)
     if refine_poses:
         scene = _at_refined_poses(scene, folder, begun, settings, note, progress)
     posed, stereo = scene, None
@@ -140,7 +140,7 @@ def prepare_run(
     if start is None:
         scene, stereo = seeded(scene, settings, device.type, note, progress)
         trained = scene.split(settings.test_every)[0]
-        seeds = usable_seeds(scene.points, settings, note, poses_of(trained, settings.data_factor))
+        seeds = usable_seeds(scene.points, settings, note, poses_of(trained, settings.factor))
     frame = _frame_of(scene, settings, start)
     for told in notes_on(frame.strays):
         note(told)
@@ -151,7 +151,7 @@ def prepare_run(
     _check_begun(folder, begun, config)
     views = load_split(
         scene,
-        data_factor=settings.data_factor,
+        data_factor=settings.factor,
         test_every=settings.test_every,
         min_side=WINDOW,  # smaller views have no SSIM
         cache_dir=cache_dir,
@@ -302,6 +302,7 @@ def resumed(
     default = {**dataclasses.asdict(TrainSettings()), "refine_poses": False}
     now = {**dataclasses.asdict(asked), "refine_poses": refine_poses}
     then = {name: begun.get(name, each) for name, each in default.items() if name != "backend"}
+    then["data_factor"] = begun.get("data_factor", 1)  # None is no run's
     for name, value in then.items():
         if now[name] != value and (name in named or now[name] != default[name]):
             raise ParameterError(

@@ -52,6 +52,8 @@ MOST_FORGETTING = 1e-2
 """A short run forgets faster in proportion to how much shorter it is than a full one, but at most
 by this factor: its gradients shrink within some hundred steps, and steps are divided by the
 remembered ones."""
+FULL_AT = 0.35
+"""Fraction of the run by which ``grow`` has spent its budget."""
 GROW_EVERY = FULL_RUN // 15
 """Steps of a full run between rounds of ``grow``, and before the first: each round looks at
 contributions for as many photographs as it can."""

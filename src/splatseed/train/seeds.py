@@ -263,10 +263,10 @@ def stereo_size(images: Sequence[Image], settings: TrainSettings, device: str) -
     pixels = sum(image.camera.width * image.camera.height for image in images)
     most = min(full, longest)
     compared = pixels * (most / longest) ** 2
-    rendered = settings.max_steps * pixels / len(images) / settings.data_factor**2
+    rendered = settings.max_steps * pixels / len(images) / settings.factor**2
     # Pixels go with the square of the size.
     affordable = int(most * math.sqrt(PER_RENDERED[device] * rendered / compared))
-    least = max(LEAST_SIZE[device], longest // settings.data_factor if device == "cpu" else 0)
+    least = max(LEAST_SIZE[device], longest // settings.factor if device == "cpu" else 0)
     return min(full, max(least, affordable))
 
 
@@ -281,7 +281,7 @@ def compared_images(
     # In pixels of the photographs, at the size that is compared and at the one that is trained.
     each = [size / max(image.camera.width, image.camera.height) for image in images]
     scale = min(1.0, float(np.median(each))) if each else 1.0
-    affordable = PER_RENDERED[device] * settings.max_steps / (scale * settings.data_factor) ** 2
+    affordable = PER_RENDERED[device] * settings.max_steps / (scale * settings.factor) ** 2
     count = min(len(images), max(LEAST_COMPARED, int(affordable)))
     places = np.linspace(0, len(images) - 1, count).round().astype(int)
     return [images[i] for i in places]

@@ -6,14 +6,16 @@ conventions, as gsplat's trainer has them, for comparison with published numbers
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Annotated, Literal, cast, get_args
 
 import tyro
 
 from splatseed.errors import ParameterError
+from splatseed.scene import Image
 from splatseed.train.schedule import FULL_RUN, Densification, Schedule, make_schedule, started
+from splatseed.views.view import TRAINED_SIDE, data_factor
 
 StrategyName = Literal[
     "auto", "default", "grow", "mcmc", "none", "default-3dgs", "mcmc-3dgs", "none-3dgs"
@@ -68,8 +70,9 @@ class TrainSettings:
     published numbers."""
     max_steps: int = FULL_RUN
     """Training steps; schedules and learning rates adapt to them."""
-    data_factor: int = 1
-    """Divide the width and height of the photographs by this whole number."""
+    data_factor: int | None = None
+    """Divide the width and height of the photographs by this whole number; by default by the
+    smallest that leaves at most 1600 pixels on their longer side."""
     seed: int = 0
     """Random seed; on the CPU, runs repeat exactly."""
     cap_max: tyro.conf.Suppress[int | None] = None  # the option is --budget
@@ -118,6 +121,33 @@ class TrainSettings:
                     found=f"{value}",
                     fix="Leave it out for the default.",
                 )
+
+    def sized(
+        self, images: Sequence[Image], note: Callable[[str], None] = lambda _: None
+    ) -> TrainSettings:
+        """With the factor that photographs are divided by, and a note if that is not the user's.
+
+        ``images`` are the scene's, with cameras in pixels of the files.
+        """
+        if self.data_factor is not None:
+            return self
+        factor = data_factor(images, TRAINED_SIDE) if images else 1
+        if factor > 1:
+            lens = max(
+                (im.intrinsics for im in images), key=lambda lens: max(lens.width, lens.height)
+            )
+            stored = f"{lens.width:,} x {lens.height:,}"
+            size = f"{lens.width // factor:,} x {lens.height // factor:,}"
+            note(
+                f"Photographs of {stored} pixels are used at {size}, as the default is "
+                f"{TRAINED_SIDE:,} a side at most: --data-factor 1 keeps their size."
+            )
+        return replace(self, data_factor=factor)
+
+    @property
+    def factor(self) -> int:
+        """What photographs are divided by, 1 before ``sized``."""
+        return self.data_factor or 1
 
     @property
     def densification(self) -> Densification:

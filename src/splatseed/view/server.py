@@ -203,7 +203,7 @@ class TrainingViewer(Viewer):
     """Serves a run of a scene while it trains, under a name; else as ``Viewer``."""
 
     def __init__(self, run: TrainingRun, scene: Scene, name: str, host: str, port: int) -> None:
-        shown = Shown(name, scene, None, run.settings.data_factor, run.settings.test_every)
+        shown = Shown(name, scene, None, run.settings.factor, run.settings.test_every)
         self._run, self._live = run, _LiveEntry(shown, run)
         self._paused, self.kept = False, False
         self._panels: list[tuple[Session, Any, Any]] = []

@@ -38,6 +38,8 @@ from splatseed.progress import Progress, silent
 from splatseed.runtime.memory import check_memory
 from splatseed.scene import Image, Masks, Scene
 
+TRAINED_SIDE = 1600
+"""Longest side of photographs in training by default, in pixels, as graphdeco's trainer has it."""
 READERS = 4  # threads that decode photographs
 NEAR_PLANE = 0.01  # where nothing is known of the scene; gsplat's
 
