@@ -133,6 +133,7 @@ class SceneSource:
     model_dir: Path | None = None  # COLMAP's, if there is one
     image_dir: Path | None = None  # that ``Image.name`` is relative to, if there is one
     transforms_path: Path | None = None  # if it was read
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)  # recorded beside its files
     named: Path | None = None  # what the user named, which may be one model or file of several
 
     @property
@@ -187,7 +188,11 @@ class LeftOut(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A capture: points, and the images and cameras that saw them."""
+    """A capture: points, and the images and cameras that saw them.
+
+    Positions, of points and in poses, are those of the files minus ``origin``, which is 0 unless
+    these lie so far from 0 that float32 does not resolve them.
+    """
 
     points: PointCloud
     images: tuple[Image, ...] = ()  # in file order; none for a bare cloud
@@ -200,6 +205,7 @@ class Scene:
     left_out: LeftOut = field(default_factory=LeftOut)  # how many points of its files were
     masks: Masks | None = None  # which pixels of its photographs do not count; None: all count
     absent: tuple[str, ...] = ()  # names of images that were left out; the split counts them
+    origin: Float64[np.ndarray, " 3"] = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:
         if self.depths is not None:
@@ -238,6 +244,12 @@ class Scene:
         first = points.xyz[: np.count_nonzero(kept)]
         same = np.array_equal(tracked[kept], first, equal_nan=True)
         return kept if same else np.zeros(len(tracked), bool)
+
+    @property
+    def offset(self) -> Float64[np.ndarray, " 3"]:
+        """What positions lack to the world: the origin, and the offset beside the files."""
+        beside = self.source.offset if self.source else (0.0, 0.0, 0.0)
+        return np.asarray(self.origin + np.array(beside))
 
     @property
     def has_photographs(self) -> bool:

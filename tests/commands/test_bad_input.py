@@ -150,7 +150,6 @@ WORDS = [
     ((*UP, "--cloud", "SCAN", "--memory", "a lot"), "found 'a lot'"),
     ((*UP, "--cloud", "SCAN", "--align", "--transform", "t.txt"), "found both"),
     ((*UP, "--cloud", "SCAN", "--transform", "none.txt"), "none.txt"),
-    ((*UP, "--cloud", "SCAN", "--recenter", "--format", "transforms"), "--format colmap"),
     (("evaluate", "ROOM"), "splatseed train ROOM"),
     ((*EVALUATE, "--lpips-weights", "nowhere"), "nowhere"),
     ((*EVALUATE, "--data-factor", "40"), "smaller --data-factor"),

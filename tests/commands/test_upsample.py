@@ -20,8 +20,8 @@ from PIL import Image as PilImage
 from splatseed.camera import rotation_from_quat
 from splatseed.commands.upsample.cloud import LoadedCloud
 from splatseed.io import load_scene, write_scene
-from splatseed.io.cleaning import recentred
 from splatseed.io.nerfstudio import read_cloud_transform
+from splatseed.io.origin import moved_by
 from splatseed.io.ply import read_ply, write_ply
 from splatseed.io.staging import unlisted_files
 from splatseed.pointcloud import PointCloud
@@ -346,14 +346,15 @@ def test_nerfstudios_transform_leads_from_the_scene_to_the_cloud(room, tmp_path)
 
 def test_recentring_moves_scene_and_cloud_alike(splatseed, room, xyz, surfaces, tmp_path):
     grid = np.array([564000.0, 5932000.0, 90.0])
-    write_scene(recentred(load_scene(room), -grid), tmp_path / "far", copy_images=True)
+    far = moved_by(load_scene(room), -grid).replace(origin=np.zeros(3))
+    write_scene(far, tmp_path / "far", copy_images=True)
     np.savez(tmp_path / "far.npz", xyz=MOVE.points(xyz))
     back = MOVE.inverse.then(Similarity(1.0, np.eye(3), grid))
     np.savetxt(tmp_path / "t.txt", back.matrix)
     words = ("upsample", tmp_path / "far", "--cloud", tmp_path / "far.npz", "-o", tmp_path / "out")
     refused = splatseed(*words)
     assert refused.code == 2
-    assert "--recenter" in refused.err
+    assert "give it with --transform" in refused.err
     run = splatseed(*words, "--transform", tmp_path / "t.txt", "--recenter", "--overwrite")
     assert run.code == 0, run.err
     assert unlisted_files(tmp_path / "out") == []
@@ -373,7 +374,7 @@ def test_recentring_moves_scene_and_cloud_alike(splatseed, room, xyz, surfaces, 
 SPOILT = {
     r"scan\.npz to be an archive of NumPy arrays": lambda xyz: xyz,  # cut short
     "found 9 that are not finite": lambda xyz: np.full_like(xyz[:9], np.nan),
-    r"none of 60,000, .* \(56\d{4}, 59\d{5}, .*--align.*--recenter would": lambda xyz: np.add(
+    r"none of 60,000, .* \(56\d{4}, 59\d{5}, .*--align.*--transform": lambda xyz: np.add(
         xyz, (564_000, 5_932_000, 87)
     ),  # a national grid
 }

@@ -117,7 +117,10 @@ def test_points_that_cannot_be_used_are_left_out_or_told(scene_dir, rng):
     text = " ".join(scene.warnings)
     assert "2 points are not finite" in text
     assert "1 point repeats" in text
-    room, notes = rng.uniform(-5, 5, (900, 3)), ("recentre", "1 point lies up to 1e+06 from the")
+    room, notes = (
+        rng.uniform(-5, 5, (900, 3)),
+        ("different frames", "1 point lies up to 1e+06 from the"),
+    )
     for xyz, told in (
         (room + np.array([500_000, 5_000_000, 100]), [notes[0]]),
         (1000 * room + np.array([5000, 0, 0]), []),

@@ -12,6 +12,7 @@ import tyro
 from splatseed.commands.models import check_free, config_of, model_file
 from splatseed.commands.options import parse_options, refuse
 from splatseed.console import print_note, print_pairs, stage_display
+from splatseed.io.origin import RECENTER, offset_beside, origin_of, place_words, write_offset
 from splatseed.literal import quoted
 from splatseed.requirements import require
 from splatseed.splat.formats import (
@@ -22,6 +23,7 @@ from splatseed.splat.formats import (
     read_model,
     write_model,
 )
+from splatseed.splat.world import shifted
 from splatseed.train.folder import RunFolder
 from splatseed.train.settings import TrainSettings
 
@@ -92,7 +94,16 @@ def run(arguments: list[str]) -> None:
                 path, Path(str(scene)), masks=masks, progress=clock, **numbers
             )
             kept = keep_gaussians(gaussians.select(~floaters), crop, options.min_opacity)
+        offset, far = offset_beside(path), origin_of(kept.means)
+        kept = shifted(kept, -far) if far.any() else kept
+        offset = far if offset is None else offset + far
         write_model(target, kept, clock, notes.append)
+        write_offset(target, offset)
+    if offset.any():
+        notes.append(
+            f"The file is around {place_words(offset)}, as {target.name}.{RECENTER} beside it has "
+            "it: coordinates before = after + offset."
+        )
     before, after = path.stat().st_size, target.stat().st_size
     rows = [
         ("Gaussians", f"{len(kept):,} of {len(gaussians):,}"),

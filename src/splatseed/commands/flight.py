@@ -6,15 +6,18 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
 import tyro
 
 from splatseed.commands.models import check_free, model_file
 from splatseed.commands.options import parse_options, refuse
 from splatseed.console import print_note, print_pairs, stage_display
 from splatseed.errors import ParameterError
+from splatseed.io.origin import shift_to
 from splatseed.pointcloud import PointCloud
 from splatseed.requirements import require
 from splatseed.scene import Scene
+from splatseed.similarity import Similarity
 from splatseed.train.settings import Backend
 
 if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
@@ -163,6 +166,12 @@ def _path(options: Options, shown: Shown, size: tuple[int, int]) -> tuple[list[V
     if options.transform is not None:
         world = find_transform(options.transform, shown.scene or Scene(PointCloud.empty()))
     views, fps = flights.path_of_file(options.path, size, world)
+    if world is None and shown.scene is not None:  # may be in its files' coordinates
+        centers = np.array([view.camera.center for view in views])
+        shift = shift_to(shown.scene, centers, unrecorded=True)
+        if shift.any():
+            world = Similarity(1.0, np.eye(3), -shift)
+            views, fps = flights.path_of_file(options.path, size, world)
     if options.transform != NO_TRANSFORM:
         flights.check_path(options.path, views, shown.model, cameras)
     return views, fps or FPS

@@ -11,9 +11,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Int64
 
-from splatseed.errors import ParameterError
 from splatseed.io.colmap import check_tracks
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import NO_POINT, Image, LeftOut, Observations, Scene, Tracks
@@ -21,8 +20,6 @@ from splatseed.scene import NO_POINT, Image, LeftOut, Observations, Scene, Track
 _FAR_OUT = 1e4
 """Times the inner half of the points: the sky of outdoor scenes is at some hundred times."""
 _FEW = 0.01  # of the points at most can be so far
-_RESOLUTION = 1e-4
-"""Steps of single precision coarser than this share of the extent show in renders."""
 
 
 def clean_scene(scene: Scene) -> Scene:
@@ -150,61 +147,4 @@ def cloud_warnings(points: PointCloud) -> tuple[str, ...]:
             f" than {_FAR_OUT:,.0f} times their extent: probably a reconstruction error; remove"
             f" {them}."
         )
-        xyz = xyz[~far]
-        low, high = np.percentile(xyz, (25, 75), axis=0)
-    step = float(np.spacing(np.abs(xyz).max()))
-    if step > _RESOLUTION * float((high - low).max()) > 0:
-        warnings.append(
-            "The coordinates are so large beside the scene's extent that float32 cannot resolve"
-            " it; recentre the scene (subtract an offset from points and cameras) first. With a"
-            " scan, --cloud SCAN --recenter does."
-        )
     return tuple(warnings)
-
-
-def offset_of(scene: Scene) -> Float64[np.ndarray, " 3"]:
-    """The middle of the cameras, in whole units."""
-    centers = np.array([image.camera.center for image in scene.images])
-    return np.asarray(np.rint(centers.mean(axis=0)))
-
-
-def recentred(scene: Scene, offset: Float64[np.ndarray, " 3"]) -> Scene:
-    """A scene moved by ``-offset``; files beside the model no longer belong to it.
-
-    Raises:
-        ParameterError: Its points were read in single precision, which does not resolve them.
-    """
-    images = tuple(
-        replace(image, translation=image.translation + image.camera.cam_from_world[:3, :3] @ offset)
-        for image in scene.images
-    )
-    xyz, tracks = scene.points.xyz.astype(np.float64), scene.tracks
-    if tracks is not None:
-        xyz[: len(tracks)] = tracks.xyz
-        tracks = replace(tracks, xyz=tracks.xyz - offset)
-    elif len(xyz) > 1:
-        step, extent = float(np.spacing(np.float32(np.abs(xyz).max()))), float(np.ptp(xyz, 0).max())
-        if step > _RESOLUTION * extent > 0:
-            raise ParameterError(
-                "points that single precision resolves, to be recentred",
-                found=f"a PLY at {np.abs(xyz).max():,.0f}, where it has steps of {step:.2g}",
-                fix="Subtract an offset from the PLY and the poses before, in double precision.",
-            )
-    source = scene.source and replace(scene.source, model_dir=None, transforms_path=None)
-    points = scene.points.replace(xyz=(xyz - offset).astype(np.float32))
-    return replace(scene, images=images, points=points, tracks=tracks, source=source)
-
-
-def check_precision(scene: Scene) -> None:
-    """Raise a ``ParameterError`` for a scene too far from 0 for single precision."""
-    if not scene.images:
-        return
-    centers = np.array([image.camera.center for image in scene.images])
-    spread = float(np.ptp(centers, axis=0).max())
-    step = float(np.spacing(np.float32(np.abs(centers).max())))
-    if step > _RESOLUTION * spread > 0:
-        raise ParameterError(
-            "a scene near 0: seeds are written in single precision",
-            found=f"cameras at {np.abs(centers).max():,.0f}, where it has steps of {step:.2g}",
-            fix="Pass --recenter: it writes scene and cloud around 0, and the offset to a file.",
-        )

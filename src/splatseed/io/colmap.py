@@ -21,9 +21,10 @@ from jaxtyping import Float64, Int64, UInt8
 from splatseed.camera import CAMERA_MODELS, PANORAMA, Intrinsics, quat_from_rotation
 from splatseed.errors import OutputError, PointCloudError, SceneFormatError, SceneNotFoundError
 from splatseed.io.files import COPY_AGAIN, ByteReader, StrPath, numbered_lines
+from splatseed.io.origin import around_origin
 from splatseed.io.photograph import lens_warnings
 from splatseed.io.photograph_checks import image_warnings
-from splatseed.io.ply import read_ply
+from splatseed.io.ply import read_exact_ply
 from splatseed.io.point_files import first_with_points, other_points
 from splatseed.io.unusable import NotFiniteError, Unusable, check_enough, unusable_warning
 from splatseed.pointcloud import PointCloud
@@ -501,7 +502,7 @@ def read_colmap_scene(model_dir: StrPath) -> Scene:
     model_dir = Path(model_dir)
     root = scene_root(model_dir)
     intrinsics, images, unusable = _read_model(model_dir)
-    points, tracks, points_path = read_model_points(model_dir)
+    points, exact, tracks, points_path = read_model_points(model_dir)
     image_dir = _image_dir(root, images)
     warnings = [*image_warnings(images, image_dir, root), *lens_warnings(images)]
     warnings += unusable_warning(unusable, len(images))
@@ -516,9 +517,10 @@ def read_colmap_scene(model_dir: StrPath) -> Scene:
             " sfm IMAGES -o SCENE. Points can be interpolated, but nothing can be trained."
         )
     source = SceneSource("colmap", root, points_path, model_dir, image_dir)
-    return Scene(
+    scene = Scene(
         points, images, intrinsics, tracks, source, tuple(warnings), absent=tuple(unusable)
     )
+    return around_origin(scene, exact)
 
 
 def _image_dir(root: Path, images: Sequence[Image]) -> Path | None:
@@ -558,9 +560,17 @@ def _read_model(
     return intrinsics, images, unusable
 
 
-def read_model_points(model_dir: Path) -> tuple[PointCloud, Tracks | None, Path]:
-    """The points of a model, ``points3D.ply`` if need be, their tracks if any, and their file."""
+def read_model_points(
+    model_dir: Path,
+) -> tuple[PointCloud, Float64[np.ndarray, "N 3"], Tracks | None, Path]:
+    """The points of a model, ``points3D.ply`` if need be, and their positions in double precision.
+
+    Also their tracks, if any, and their file.
+    """
     path = model_file(model_dir, "points3D")
     if path is None:
-        return PointCloud.empty(), None, model_dir / "points3D.bin"
-    return (read_ply(path), None, path) if path.suffix == ".ply" else (*read_points3d(path), path)
+        return PointCloud.empty(), np.empty((0, 3)), None, model_dir / "points3D.bin"
+    if path.suffix == ".ply":
+        return *read_exact_ply(path), None, path
+    points, tracks = read_points3d(path)
+    return points, tracks.xyz, tracks, path

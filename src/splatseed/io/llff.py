@@ -21,6 +21,7 @@ from splatseed.io.colmap import IMAGE_DIRS, make_intrinsics, rigid_pose
 from splatseed.io.files import StrPath, guarded, open_file, read_npy
 from splatseed.io.frame_files import SUFFIXES
 from splatseed.io.mask_files import masks_among
+from splatseed.io.origin import around_origin
 from splatseed.io.photograph_checks import image_warnings
 from splatseed.literal import counted
 from splatseed.pointcloud import PointCloud
@@ -53,13 +54,14 @@ def read_llff(root: StrPath) -> Scene:
             cameras[key] = _camera(where, len(cameras) + 1, key, size)
         world_from_cam = np.hstack([matrix[:, :3] @ _OPENCV_FROM_LLFF.T, matrix[:, 3:4]])
         images.append(Image(name, i + 1, cameras[key], *rigid_pose(where, world_from_cam)))
-    return Scene(
+    scene = Scene(
         PointCloud.empty(),
         tuple(images),
         tuple(cameras.values()),
         source=SceneSource("llff", root, path, image_dir=folder),
         warnings=tuple(image_warnings(images, folder, root)),
     )
+    return around_origin(scene)
 
 
 def _read_rows(path: Path) -> Float64[np.ndarray, "N 17"]:

@@ -22,7 +22,8 @@ from splatseed.io.llff import is_llff, read_llff
 from splatseed.io.masks import with_own_masks
 from splatseed.io.model_choice import nested_model, read_model, scene_model
 from splatseed.io.nerfstudio import is_blender, read_blender, read_transforms_scene
-from splatseed.io.ply import read_ply, refuse_model
+from splatseed.io.origin import around_origin
+from splatseed.io.ply import read_exact_ply, refuse_model
 from splatseed.io.rgbd import find_tum_depths, is_replica, is_tum, load_rgbd, load_tum
 from splatseed.io.seeds import recall_seeds
 from splatseed.io.split import follow_lists
@@ -53,7 +54,8 @@ def load_scene(path: StrPath, *, require_points: bool = True) -> Scene:
         require_points: Whether a scene without points is an error; else its cloud is empty.
 
     Returns:
-        The scene in the world frame of its files, cameras in OpenCV axes. Points are finite and
+        The scene in the world frame of its files, around an ``origin`` if these lie far from 0;
+        cameras in OpenCV axes. Points are finite and
         distinct: ``left_out`` counts the others. Points that splatseed added before have no tracks;
         their ``source`` and attributes come from ``seeds.npz``, else ``source`` is 255
         (``GENERATED``).
@@ -158,7 +160,9 @@ def _read_file(path: Path) -> Scene:
                 fix=f"Name the scene's folder: {path.parent}",
             )
     if suffix == ".ply":
-        return Scene(read_ply(path), source=SceneSource("ply", path.parent, path))
+        points, exact = read_exact_ply(path)
+        source = SceneSource("ply", path.parent, path)
+        return around_origin(Scene(points, source=source), exact)
     if suffix == ".json":
         return read_transforms_scene(path)
     if is_video(path):

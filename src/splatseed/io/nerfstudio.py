@@ -40,9 +40,10 @@ from splatseed.io.frame_files import (
     named_masks,
 )
 from splatseed.io.model_choice import ranked_models
+from splatseed.io.origin import around_origin
 from splatseed.io.photograph import lens_warnings
 from splatseed.io.photograph_checks import image_warnings
-from splatseed.io.ply import read_ply
+from splatseed.io.ply import read_exact_ply
 from splatseed.io.point_files import other_points
 from splatseed.io.unusable import NotFiniteError, check_enough, unusable_warning
 from splatseed.literal import counted
@@ -98,7 +99,7 @@ def read_transforms_scene(path: StrPath) -> Scene:
     """Read a ``transforms.json`` and what belongs to it; the cloud may be empty."""
     path = Path(path)
     transforms = read_transforms(path)
-    points, points_path, notes = _find_points(transforms)
+    points, exact, points_path, notes = _find_points(transforms)
     images, folder = transforms.images, transforms.image_dir
     source = SceneSource(
         "transforms", path.parent, points_path, image_dir=folder, transforms_path=path
@@ -106,13 +107,14 @@ def read_transforms_scene(path: StrPath) -> Scene:
     frames = {i.name: f.fields for i, f in zip(images, transforms.frames, strict=True)}
     masks, gone = named_masks(FrameFiles(path), frames)
     notes = [*transforms.warnings, *notes, *gone, *image_warnings(images, folder, path.parent)]
-    return Scene(
+    scene = Scene(
         points, images, transforms.intrinsics, source=source,
         warnings=(*notes, *lens_warnings(images)),
         depths=named_depths(FrameFiles(path), frames, transforms.json),
         listed=transforms.listed,
         masks=Masks(masks) if masks else None, absent=transforms.absent,
     )  # fmt: skip
+    return around_origin(scene, exact)
 
 
 def is_blender(folder: Path) -> bool:
@@ -143,11 +145,11 @@ def read_blender(folder: StrPath) -> Scene:
             name = os.path.relpath(part.image_dir / image.name, folder.absolute())
             name = PurePath(name).as_posix()
             images.append(replace(image, name=name, image_id=len(images) + 1, intrinsics=shared))
-    points, points_path, found = _find_points(parts[0])
+    points, exact, points_path, found = _find_points(parts[0])
     notes = list(dict.fromkeys((*notes, *(each for p in parts for each in p.warnings), *found)))
     names, num_train = [image.name for image in images], len(parts[0].images)
     train, test = frozenset(names[:num_train]), frozenset(names[num_train:])
-    return Scene(
+    scene = Scene(
         points,
         tuple(images),
         tuple(cameras.values()),
@@ -156,6 +158,7 @@ def read_blender(folder: StrPath) -> Scene:
         listed=Split(train, test, f"pair of {_BLENDER[0]} and {_BLENDER[1]}") if split else None,
         masks=Masks({}, alpha=False),  # what is transparent is empty, and black
     )
+    return around_origin(scene, exact)
 
 
 def read_transforms(path: Path) -> Transforms:
@@ -310,8 +313,10 @@ def _matrix(where: str, value: Any) -> Float64[np.ndarray, "3 4"]:
     return matrix[:3]
 
 
-def _find_points(transforms: Transforms) -> tuple[PointCloud, Path, list[str]]:
-    """The cloud, the file it came from, and notes for the user.
+def _find_points(
+    transforms: Transforms,
+) -> tuple[PointCloud, Float64[np.ndarray, "N 3"], Path, list[str]]:
+    """The cloud, its positions in double precision, the file it came from, and notes for the user.
 
     It is the PLY that the JSON names, else one known to lie in the transforms' space, else the
     points of a COLMAP model whose cameras determine the map into that space.
@@ -323,14 +328,14 @@ def _find_points(transforms: Transforms) -> tuple[PointCloud, Path, list[str]]:
         notes.append(f"ply_file_path {named} is {odd_kind(root / named) or 'not there'}.")
     ply = next((root / name for name in names if (root / name).is_file()), None)
     if ply is not None:
-        points = read_ply(ply)
+        points, exact = read_exact_ply(ply)
         for name in (*names, "init.ply"):
             use = f"name it as ply_file_path in {transforms.path.name}"
             notes += other_points(ply, points.xyz, root / name, use)
-        return points, ply, notes
+        return points, exact, ply, notes
     models = _models(root)
     if not models:
-        return PointCloud.empty(), root / _POINT_FILES[0], notes
+        return PointCloud.empty(), np.empty((0, 3)), root / _POINT_FILES[0], notes
     for model_dir in models[:-1]:  # the file may be of one that is not the largest
         with suppress(SceneFormatError):
             return _points_of_model(transforms, model_dir, notes)
@@ -347,14 +352,14 @@ def _models(root: Path) -> list[Path]:
 
 def _points_of_model(
     transforms: Transforms, model_dir: Path, notes: list[str]
-) -> tuple[PointCloud, Path, list[str]]:
+) -> tuple[PointCloud, Float64[np.ndarray, "N 3"], Path, list[str]]:
     """The points of a COLMAP model, in the transforms' space."""
-    points, tracks, points_path = read_model_points(model_dir)
+    points, exact, _, points_path = read_model_points(model_dir)
     _, model_images = read_model_cameras(model_dir)
     transform, doubts = _transform_of_model(transforms, model_dir, model_images)
-    xyz = apply_transform(transform, points.xyz if tracks is None else tracks.xyz)
+    xyz = apply_transform(transform, exact)
     with np.errstate(over="ignore"):  # beyond float32 is infinite, to be seen and dropped
-        return points.replace(xyz=xyz.astype(np.float32)), points_path, notes + doubts
+        return points.replace(xyz=xyz.astype(np.float32)), xyz, points_path, notes + doubts
 
 
 def _transform_of_model(

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32, Float64, UInt8
 
 from splatseed.errors import SceneFormatError
 from splatseed.io.cloud_file import RGB, XYZ, CloudFile, LineCloud, RowCloud
@@ -143,6 +143,11 @@ def read_ply(path: StrPath) -> PointCloud:
         SceneFormatError: It is malformed, shorter than its header promises or larger than the free
             memory, or has no vertices with x, y, z.
     """
+    return read_exact_ply(path)[0]
+
+
+def read_exact_ply(path: StrPath) -> tuple[PointCloud, Float64[np.ndarray, "N 3"]]:
+    """As ``read_ply``, and the positions in double precision."""
     path = Path(path)
     with readable(path):
         cloud = open_ply(path)
@@ -150,7 +155,8 @@ def read_ply(path: StrPath) -> PointCloud:
         whole = cloud.whole()
     with np.errstate(over="ignore"):  # beyond float32 is infinite, to be seen and dropped
         xyz = whole.xyz.astype(np.float32)
-    return PointCloud(xyz, np.full(xyz.shape, _GREY, np.uint8) if whole.rgb is None else whole.rgb)
+    rgb = np.full(xyz.shape, _GREY, np.uint8) if whole.rgb is None else whole.rgb
+    return PointCloud(xyz, rgb), whole.xyz
 
 
 def write_ply(path: StrPath, points: PointCloud) -> None:

@@ -22,6 +22,7 @@ from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io import depth_maps
 from splatseed.io.colmap import make_intrinsics, rigid_pose
 from splatseed.io.files import StrPath, guarded, numbered_lines, open_file, read_json
+from splatseed.io.origin import around_origin
 from splatseed.io.photograph import lens_warnings
 from splatseed.literal import agreeing, counted
 from splatseed.pointcloud import PointCloud
@@ -94,7 +95,8 @@ def _scene(
     track: Path, folder: Path, images: Sequence[Image], lens: Intrinsics, *warnings: str
 ) -> Scene:
     source = SceneSource("rgbd", track.parent, track, image_dir=folder)
-    return Scene(PointCloud.empty(), tuple(images), (lens,), source=source, warnings=warnings)
+    points = PointCloud.empty()
+    return around_origin(Scene(points, tuple(images), (lens,), source=source, warnings=warnings))
 
 
 def is_tum(root: Path) -> bool:

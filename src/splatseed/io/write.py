@@ -31,6 +31,7 @@ from splatseed.io.files import StrPath, open_file
 from splatseed.io.frame_files import FrameFiles
 from splatseed.io.mask_files import FOLDER as MASKS, find_masks
 from splatseed.io.masks import write_masks
+from splatseed.io.origin import write_offset
 from splatseed.io.ply import write_ply
 from splatseed.io.seeds import write_seeds
 from splatseed.io.split import MODEL_LISTS, ROOT_LISTS
@@ -38,6 +39,9 @@ from splatseed.io.staging import ABSENT, MANIFEST, output_folder, write_json
 from splatseed.scene import Scene, SceneSource
 
 Layout = Literal["colmap", "transforms"]
+Written = tuple[list[str], dict[str, Path], Float64[np.ndarray, " 3"]]
+"""Of a layout: notes for the user, the image folders that belong to it, and the offset of its
+space to the world."""
 
 _KIND = "write_scene"
 """The kind of an output whose provenance names no verb."""
@@ -121,7 +125,8 @@ def write_scene(
     kind = str(made.get("command", _KIND))
     with output_folder(path, kind=kind, overwrite=overwrite, protect=inputs) as folder:
         write_layout = _write_colmap if layout == "colmap" else _write_transforms
-        notes, image_sources = write_layout(clean, folder)
+        notes, image_sources, offset = write_layout(clean, folder)
+        write_offset(folder, offset)
         masks, photographs = clean.masks, source.image_dir if source else None
         if masks and photographs and _rewrites_masks(clean, layout):
             image_sources.pop(MASKS, None)
@@ -204,8 +209,8 @@ def _choose_layout(scene: Scene, wanted: str) -> Layout:
     raise OutputError(known, found=repr(wanted), fix="Write the COLMAP layout (--format colmap).")
 
 
-def _write_colmap(scene: Scene, folder: Path) -> tuple[list[str], dict[str, Path]]:
-    """Write ``sparse/0``; returns notes for the user and the image folders that belong to it."""
+def _write_colmap(scene: Scene, folder: Path) -> Written:
+    """Write ``sparse/0``."""
     model_dir = folder / "sparse" / "0"
     model_dir.mkdir(parents=True)
     tracks, images, num_broken = renumber(scene)
@@ -236,7 +241,7 @@ def _write_colmap(scene: Scene, folder: Path) -> tuple[list[str], dict[str, Path
             " if there is one, into that copy."
         )
     write_split(scene, folder)
-    return notes, image_folders(scene)
+    return notes, image_folders(scene), scene.offset
 
 
 def write_split(scene: Scene, folder: Path) -> None:
@@ -281,13 +286,15 @@ def _rigs(scene: Scene, model_dir: Path) -> tuple[list[str], list[str]]:
     return [], [f"Rigs and frames were left out: {why}."]
 
 
-def _write_transforms(scene: Scene, folder: Path) -> tuple[list[str], dict[str, Path]]:
-    """Write ``transforms.json`` and its PLY; returns notes and the image folders it names."""
-    source, points = scene.source, scene.points
+def _write_transforms(scene: Scene, folder: Path) -> Written:
+    """Write ``transforms.json`` and its PLY."""
+    source, points, offset = scene.source, scene.points, scene.offset
     if source is not None and source.transforms_path is not None:
         names = {image.name for image in scene.images}
         transforms = nerfstudio.read_transforms(source.transforms_path)
         content = _kept_json(transforms, names)
+        if scene.origin.any():
+            content = _moved_json(content, scene.origin)
         chosen = scene.masks is not None and scene.masks.choice is not None
         if chosen or _rewrites_masks(scene, "transforms"):
             pairs = list(zip(transforms.images, transforms.frames, strict=True))
@@ -309,14 +316,14 @@ def _write_transforms(scene: Scene, folder: Path) -> tuple[list[str], dict[str, 
         if A is not None:
             xyz = nerfstudio.apply_transform(A, points.xyz).astype(np.float32)
             normals = None if points.normals is None else points.normals @ A[:, :3].T
-            points = points.replace(xyz=xyz, normals=normals)
+            points, offset = points.replace(xyz=xyz, normals=normals), A[:, :3] @ offset
     write_json(folder / "transforms.json", {**content, "ply_file_path": "sparse_pc.ply"})
     write_ply(folder / "sparse_pc.ply", points)
     shutil.copyfile(folder / "sparse_pc.ply", folder / "pointcloud.ply")  # LichtFeld's name for it
     write_seeds(folder, points)
     if source is not None:
         _copy_files(source.root, ROOT_LISTS, folder)
-    return [], folders
+    return [], folders, offset
 
 
 def _new_json(scene: Scene, A: Float64[np.ndarray, "3 4"] | None) -> dict[str, Any]:
@@ -409,6 +416,25 @@ def _kept_json(transforms: nerfstudio.Transforms, names: Collection[str]) -> dic
     kept = {key: value for key, value in content.items() if key != "test_frames"}
     tests = {"test_frames": frames[True]} if frames[True] else {}
     return {**kept, **lists, "frames": frames[False], **tests}
+
+
+def _moved_json(content: dict[str, Any], offset: Float64[np.ndarray, " 3"]) -> dict[str, Any]:
+    """The content with an offset subtracted from the space of its poses."""
+
+    def moved(rows: Sequence[Sequence[float]]) -> list[list[float]]:
+        matrix = np.array(rows, np.float64)
+        matrix[:3, 3] -= offset
+        return [[float(value) for value in row] for row in matrix]
+
+    key = "transform_matrix"
+    more: dict[str, Any] = {
+        name: [{**frame, key: moved(frame[key])} for frame in content[name]]
+        for name in ("frames", "test_frames")
+        if name in content
+    }
+    if content.get("applied_transform") is not None:
+        more["applied_transform"] = moved(content["applied_transform"])
+    return {**content, **more}
 
 
 def image_folders(scene: Scene) -> dict[str, Path]:

@@ -25,6 +25,7 @@ from splatseed.io.colmap import read_model_cameras
 from splatseed.io.files import StrPath
 from splatseed.io.mask_files import FOLDER as MASKS
 from splatseed.io.masks import write_masks
+from splatseed.io.origin import write_offset
 from splatseed.io.photograph import photograph_folder
 from splatseed.io.photograph_checks import check_sizes, with_photographs
 from splatseed.io.seeds import carry_seeds
@@ -148,6 +149,7 @@ def reconstruct(
             report = _call(*how, list(photos), cameras, *asked)
         if poses_from is not None:
             write_split(poses_from, staging)
+            write_offset(staging, poses_from.offset)
         manifest = {
             "job": "reconstruct" if poses is None else "triangulate",
             "version": version("splatseed"),
@@ -242,6 +244,7 @@ def undistort(
         report = _call(*how, on_progress, None, _undistort, model_dir, names, scene.masks)
         carry_seeds(scene, distorted, staging)
         write_split(scene, staging)
+        write_offset(staging, scene.offset)
     return replace(report, path=Path(output))
 
 

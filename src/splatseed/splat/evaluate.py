@@ -40,7 +40,7 @@ from splatseed.splat.gaussians import Gaussians, frame_of_model
 from splatseed.splat.metrics import LPIPS_NET, Lpips, color_corrected, flip_map, psnr, ssim_of_all
 from splatseed.splat.rendering import ModelRenderer, fill_masked, mask_of, photograph_of
 from splatseed.splat.ssim import WINDOW
-from splatseed.splat.world import NO_TRANSFORM, check_world, find_transform, view_in
+from splatseed.splat.world import NO_TRANSFORM, around_scene, check_world, find_transform, view_in
 from splatseed.views.sight import shown_points
 from splatseed.views.view import View, at_file_size, load_views, poses_of
 
@@ -231,6 +231,8 @@ def load_model(
         cache_dir=cache_dir,
         progress=progress,
     )
+    if transform is None:
+        gaussians = around_scene(path, scene, gaussians, notes.append)
     world = None if transform is None else find_transform(transform, scene)
     proven = transform is None and trained_on == photographs_digest(scene)
     unasked = proven or transform == NO_TRANSFORM

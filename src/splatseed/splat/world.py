@@ -22,6 +22,7 @@ from splatseed.camera import quat_from_rotation
 from splatseed.errors import ParameterError, SceneFormatError
 from splatseed.io.files import read_json
 from splatseed.io.nerfstudio import NERFSTUDIO, similarity_in
+from splatseed.io.origin import offset_beside, place_words, shift_to
 from splatseed.scene import Scene
 from splatseed.similarity import Similarity, fit_similarity, similarity_of
 from splatseed.splat.gaussians import Gaussians
@@ -64,7 +65,34 @@ def find_transform(word: str, scene: Scene) -> Similarity | None:
     content = read_json(path, "a transform in JSON", fix=_FIX)
     if isinstance(content, list) and content and isinstance(content[0], dict):
         return _of_cameras(path, content, scene)
-    return similarity_in(path, content, scene, _FIX)  # a matrix, or nerfstudio's
+    world = similarity_in(path, content, scene, _FIX)  # a matrix, or nerfstudio's
+    return _in_files(scene).then(world)
+
+
+def around_scene(
+    path: Path, scene: Scene, gaussians: Gaussians, note: Callable[[str], None] = lambda _: None
+) -> Gaussians:
+    """Gaussians, read from a path, moved to the origin that the scene is worked on around.
+
+    By the offset beside the file, else as ``shift_to`` finds; ``note`` says so where it is guessed.
+    """
+    recorded = offset_beside(path)
+    shift = shift_to(scene, gaussians.means, recorded, unrecorded=True)
+    if not shift.any():
+        return gaussians
+    if recorded is None:
+        note(f"The Gaussians of {path} lie far from the scene's origin: {_moved_by(shift)}.")
+    return shifted(gaussians, shift)
+
+
+def _moved_by(shift: Float64[np.ndarray, " 3"]) -> str:
+    return f"they were moved by {place_words(shift)} to it"
+
+
+def shifted(gaussians: Gaussians, shift: Float64[np.ndarray, " 3"]) -> Gaussians:
+    """The Gaussians moved by a shift."""
+    means = gaussians.means.astype(np.float64) + shift
+    return dataclasses.replace(gaussians, means=means.astype(np.float32))
 
 
 def check_world(
@@ -218,9 +246,17 @@ def _of_cameras(path: Path, cameras: list[Any], scene: Scene) -> Similarity:
     return world
 
 
+def _in_files(scene: Scene) -> Similarity:
+    """From the scene's positions to those of its files."""
+    return Similarity(1.0, np.eye(3), scene.origin)
+
+
 def _of_gsplat(scene: Scene) -> Similarity:
-    """How gsplat's examples (1.5, examples/datasets/normalize.py) normalise a COLMAP scene."""
-    xyz = scene.points.xyz[scene.points.finite].astype(np.float64)
+    """How gsplat's examples (1.5, examples/datasets/normalize.py) normalise a COLMAP scene.
+
+    It depends on where the origin of the files is.
+    """
+    xyz = scene.points.xyz[scene.points.finite] + scene.origin
     if len(xyz) < 3 or not scene.images:
         raise ParameterError(
             "a scene with points and cameras, of which gsplat computes its transform",
@@ -228,6 +264,7 @@ def _of_gsplat(scene: Scene) -> Similarity:
             fix="Name a file with the transform.",
         )
     world_from_cam = np.stack([image.camera.world_from_cam for image in scene.images])
+    world_from_cam[:, :3, 3] += scene.origin
     # Mean up direction to -y, by Rodrigues' rotation that takes one unit vector to another.
     up = -world_from_cam[:, :3, 1].mean(axis=0)
     up /= np.linalg.norm(up)
@@ -255,4 +292,4 @@ def _of_gsplat(scene: Scene) -> Similarity:
         matrix = np.diag([1.0, -1.0, -1.0]) @ matrix
     world = similarity_of(matrix)
     assert world is not None  # noqa: S101  (rotations and one scale)
-    return world
+    return _in_files(scene).then(world)

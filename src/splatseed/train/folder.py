@@ -13,9 +13,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+from jaxtyping import Float64
+
 from splatseed.errors import OutputError, SceneFormatError
 from splatseed.io import staging, write_scene
 from splatseed.io.files import read_text
+from splatseed.io.origin import add_offset
 from splatseed.io.staging import MANIFEST, atomic_file, write_json
 from splatseed.scene import Scene
 
@@ -64,10 +68,16 @@ class RunFolder:
                 fix=f"Pass {go_on}--overwrite to replace it, or choose another.",
             )
 
-    def begin(self, config: Mapping[str, object], refined: Scene | None = None) -> None:
+    def begin(
+        self,
+        config: Mapping[str, object],
+        refined: Scene | None = None,
+        offset: Float64[np.ndarray, " 3"] | None = None,
+    ) -> None:
         """Make the folder, empty but for the config, and the scene if its poses were refined.
 
-        Removes what ``check`` allowed to replace.
+        ``offset`` is the scene's, which its Gaussians will be around. Removes what ``check``
+        allowed to replace.
         """
         # The manifest first: a run that is interrupted here can be replaced.
         files = [self.config, self.checkpoint, self.metrics, self.gaussians, self.curve_csv]
@@ -76,6 +86,8 @@ class RunFolder:
             staging.remove(self.path)
         manifest = {"command": KIND, "version": config["splatseed"]}
         write_json(self.path / MANIFEST, {**manifest, "files": [path.name for path in files]})
+        if offset is not None:
+            add_offset(self.path, offset)
         if refined is not None:  # before the config, so that no run lacks it
             # COLMAP's layout keeps poses to the bit.
             write_scene(refined, self.scene, format="colmap")

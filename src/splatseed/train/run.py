@@ -181,7 +181,7 @@ def prepare_run(
     if not begun:
         # The cost of growth includes finding depth.
         state.watch.seconds += 0.0 if seeding_knew else seconds
-        folder.begin(config, posed if refine_poses else None)
+        folder.begin(config, posed if refine_poses else None, scene.offset)
     else:
         _note_places(folder, begun, config)
     if tensorboard:

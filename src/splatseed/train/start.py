@@ -21,7 +21,7 @@ from jaxtyping import Float32
 from splatseed.scene import Scene
 from splatseed.splat.formats import read_model
 from splatseed.splat.gaussians import Gaussians, TrainingFrame
-from splatseed.splat.world import in_scene_world
+from splatseed.splat.world import around_scene, in_scene_world
 from splatseed.train.growing import OPAQUE, contributions
 from splatseed.train.parameters import make_parameters
 from splatseed.train.seeds import near_depths
@@ -41,7 +41,7 @@ def read_start(
         SceneNotFoundError: There is no such file.
         SceneFormatError: It holds no Gaussians, or they belong to another scene.
     """
-    gaussians, told = read_model(path, note), ""
+    gaussians, told = around_scene(path, scene, read_model(path, note), note), ""
     if not trained:  # where mcmc's clones may seem to be in another world
         gaussians, told = in_scene_world(path, scene, gaussians)
     if told:

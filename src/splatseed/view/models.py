@@ -23,6 +23,7 @@ from splatseed.literal import quoted
 from splatseed.scene import Scene
 from splatseed.splat.formats import detect_format, read_model
 from splatseed.splat.gaussians import Gaussians, TrainingFrame, frame_of_model
+from splatseed.splat.world import around_scene
 from splatseed.train.folder import RunFolder
 from splatseed.view.page import font, latin
 from splatseed.views.sight import shown_points
@@ -87,8 +88,10 @@ def open_shown(path: StrPath, scene_path: Path | None = None) -> Shown:
     folder, notes = RunFolder(path), list[str]()
     if not path.is_dir() or not folder.is_run:
         if path.is_file() and _is_model(path):
-            gaussians = read_model(path, notes.append)
-            return Shown(path.name, scene_at(scene_path), gaussians, notes=tuple(notes))
+            gaussians, scene = read_model(path, notes.append), scene_at(scene_path)
+            if scene is not None:
+                gaussians = around_scene(path, scene, gaussians, notes.append)
+            return Shown(path.name, scene, gaussians, notes=tuple(notes))
         bare = load_scene(path, require_points=False)
         if not bare.images and not len(bare.points):
             raise SceneFormatError(
@@ -110,6 +113,8 @@ def open_shown(path: StrPath, scene_path: Path | None = None) -> Shown:
             scene = scene_at(Path(named))
     factor, every = (int(config.get(*each)) for each in (("data_factor", 1), ("test_every", 8)))
     gaussians = read_model(folder.gaussians, notes.append)
+    if scene is not None:
+        gaussians = around_scene(folder.gaussians, scene, gaussians, notes.append)
     return Shown(folder.path.name, scene, gaussians, factor, every, tuple(notes))
 
 

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
 
-from splatseed.io.cleaning import check_precision, offset_of, recentred
+from splatseed.io.clouds import open_cloud
 from splatseed.io.nerfstudio import read_cloud_transform
+from splatseed.io.origin import shift_to
 from splatseed.io.staging import add_files, write_json
 from splatseed.literal import visible
 from splatseed.progress import Progress
@@ -22,8 +24,9 @@ if TYPE_CHECKING:
     from splatseed.seeding.clouds.align import CloudAlignment
     from splatseed.seeding.clouds.method import Cloud, GivenClouds
 
-RECENTER = "recenter.json"
 ALIGNMENT = "alignment.json", "preview_alignment.png"
+SAMPLE = 10_000
+"""Points of a file by which it is known whether it is around the scene's offset."""
 CLOSE = 0.01
 """Residual at which a point's colour is halfway, in extents."""
 
@@ -31,30 +34,21 @@ CLOSE = 0.01
 class LoadedCloud(NamedTuple):
     """A scene, and the method ``cloud`` with files in its frame.
 
-    ``takes``: a line on the memory; ``offset``: what was subtracted from the scene's coordinates.
+    ``takes``: a line on the memory.
     """
 
     scene: Scene
     method: GivenClouds
     takes: str = ""
     alignment: CloudAlignment | None = None
-    offset: Float64[np.ndarray, " 3"] | None = None
 
     @property
     def notes(self) -> list[str]:
         """What the user should know, one sentence each."""
-        notes = [] if self.alignment is None else [self.alignment.sentence]
-        if self.offset is not None:
-            place = ", ".join(f"{value:.0f}" for value in self.offset)
-            notes.append(f"Scene and cloud were moved by -({place}), as {RECENTER} has it.")
-        return notes
+        return [] if self.alignment is None else [self.alignment.sentence]
 
     def write(self, folder: Path) -> None:
         """Write the reports beside the scene, if there are any."""
-        if self.offset is not None:
-            add_files(folder, [RECENTER])  # or --overwrite would take it for the user's
-            meaning = "coordinates before = after + offset"
-            write_json(folder / RECENTER, {"offset": self.offset.tolist(), "meaning": meaning})
         if (found := self.alignment) is not None:
             from splatseed.view.clouds import preview_alignment  # noqa: PLC0415  (Pillow)
 
@@ -66,24 +60,27 @@ class LoadedCloud(NamedTuple):
 
 
 def load_cloud(options: Options, scene: Scene, method: Cloud, progress: Progress) -> LoadedCloud:
-    """The scene, recentred if so asked, and the method ``cloud`` with its files in its frame."""
+    """The scene, and the method ``cloud`` with its files in its frame."""
     files, memory = options.cloud_files, options.memory_bytes
     plan = method.of(*files, memory=memory).plan(scene)
     most = f"at most {plan.capacity:,} voxels, {words_of(plan.memory)} of memory"
     takes = f"\n  -> {', '.join(visible(path) for path in files)}: {most}"
-    transform = offset = alignment = None
+    transform = alignment = None
     if options.cloud_transform is not None:
         transform = read_cloud_transform(options.cloud_transform, scene)
-    if options.recenter:
-        offset = offset_of(scene)
-        scene = recentred(scene, offset)
-        moved = Similarity(1.0, np.eye(3), -offset)
-        transform = moved if transform is None else transform.then(moved)
-    check_precision(scene)
+        transform = transform.then(Similarity(1.0, np.eye(3), -scene.origin))
+    elif not options.align and (shift := shift_to(scene, _sample(files))).any():
+        transform = Similarity(1.0, np.eye(3), shift)
     if options.align:
         from splatseed.seeding.clouds.align import align  # noqa: PLC0415  (loads Numba)
 
         alignment = align(scene, files, progress)
         transform = alignment.scene_from_cloud
     given = method.of(*files, transform=transform, memory=memory)
-    return LoadedCloud(scene, given, takes, alignment, offset)
+    return LoadedCloud(scene, given, takes, alignment)
+
+
+def _sample(files: Sequence[Path]) -> Float64[np.ndarray, "N 3"]:
+    """The first points of each file that are finite."""
+    firsts = (next(iter(open_cloud(file).chunks(SAMPLE)), None) for file in files)
+    return np.concatenate([np.empty((0, 3)), *(c.xyz[c.finite] for c in firsts if c is not None)])

@@ -22,6 +22,7 @@ from splatseed.io.clouds import open_cloud
 from splatseed.io.colmap import scene_root
 from splatseed.io.load import with_own_depths
 from splatseed.io.masks import with_masks
+from splatseed.io.origin import RECENTER, middle_of_cameras, moved_by, place_words
 from splatseed.io.staging import check_output
 from splatseed.literal import counted, quoted, visible
 from splatseed.runtime.memory import bytes_of
@@ -102,7 +103,7 @@ class Options:
     align: bool = False
     """For --cloud: find --transform from the scene's points."""
     recenter: bool = False
-    """Write scene and cloud around 0, with the offset in recenter.json: for national grids."""
+    """Write the scene, and a cloud in its frame, around 0, with the offset in recenter.json."""
     memory: Annotated[str | None, tyro.conf.arg(metavar="BYTES|4G")] = None
     """For --cloud: the memory within which scans are merged; by default what is free, at most
     4G."""
@@ -184,7 +185,7 @@ def _check(options: Options) -> None:
     method, cell, folder = options.method, options.cover_cell, options.output
     maps = options.depth_kind is not None or options.depth_scale is not None
     moved = options.cloud_transform is not None
-    framed = moved or options.align or options.recenter or method == CLOUD
+    framed = moved or options.align or method == CLOUD
     refuse(
         (folder.suffix.lower() in FILES and not folder.is_dir(),
          "a folder for -o, as a whole scene is written", f"{folder}, the name of a file",
@@ -201,8 +202,6 @@ def _check(options: Options) -> None:
         (options.cloud_files and method not in WITH_CLOUD,
          f"--method {', '.join(WITH_CLOUD[:-1])} or {WITH_CLOUD[-1]} with --cloud", method,
          "Leave --method out for the cloud's points alone: interpolating needs no scan."),
-        (options.recenter and options.format == "transforms",
-         "--format colmap with --recenter", "transforms", "Leave --format out."),
         (options.align and moved, "--align or --transform", "both", "Leave one of them out."),
     )  # fmt: skip
     if (start := options.gaussians) is not None:
@@ -229,6 +228,11 @@ def _upsample(options: Options, methods: dict[str, Any]) -> None:
             held = getattr(methods[options.method], "hold_out", 0)
             scene, told = refined(scene, options.seed, clock, hold_out=held)
             notes.append(told)
+        if options.recenter:
+            offset = middle_of_cameras(scene)
+            scene = moved_by(scene, offset)
+            whole = place_words(scene.offset)
+            notes.append(f"The scene is written around {whole}, as {RECENTER} has it.")
         if options.method == DEFAULT_METHOD:  # which needs photographs
             options = replace(options, method=str(method_for(scene, note=notes.append)))
         cloud, extra_method = None, None
@@ -255,9 +259,8 @@ def _upsample(options: Options, methods: dict[str, Any]) -> None:
         findings = output.findings(scene, seeds, method)
         clock("write", 0.0)
         seeded = scene.replace(points=seeds)
-        layout = "colmap" if options.recenter else options.format
         report = write_scene(
-            seeded, options.output, format=layout, overwrite=options.overwrite,
+            seeded, options.output, format=options.format, overwrite=options.overwrite,
             copy_images=options.copy_images, provenance=output.provenance(options, scene, method),
         )  # fmt: skip
         if cloud is not None:

@@ -13,6 +13,7 @@ from splatseed.commands.next_steps import tell_training
 from splatseed.commands.upsample.cloud import ALIGNMENT
 from splatseed.console import StageClock, print_note, print_pairs
 from splatseed.io import WriteReport
+from splatseed.io.origin import write_offset
 from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
@@ -112,6 +113,7 @@ def write_start(path: Path, scene: Scene, method: Upsampler, progress: Progress)
     views = read_views(scene, images, MAX_SIZE, progress)
     settings = TrainSettings(strategy="grow", seed_colors=True)
     write_model(path, gaussians_of_scene(scene.points, views, settings))
+    write_offset(path, scene.offset)
 
 
 def write_previews(

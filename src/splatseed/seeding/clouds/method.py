@@ -16,6 +16,7 @@ from jaxtyping import Float64
 
 from splatseed.depth.stereo.maps import StereoSettings
 from splatseed.errors import ParameterError, PointCloudError
+from splatseed.io.origin import ELSEWHERE
 from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
 from splatseed.seeding.photographs import MAX_SIZE, compare, photographed, read_views
@@ -116,7 +117,7 @@ class GivenClouds(Cloud):
         paths = [Path(each) for each in self.files]
         streamed = stream(paths, self.transform, frames, self.pixels, capacity, progress)
         voxels, images, views = streamed.voxels, scene.images, frames
-        if not len(voxels):
+        if not len(voxels) or _is_elsewhere(streamed, scene):
             raise _out_of_view(streamed, scene)
         if scene.has_photographs:
             images = photographed(scene, self.hold_out)
@@ -172,14 +173,21 @@ def _free_rays(
     return free_rays(views, certain, [np.nan_to_num(depth, nan=np.inf) for depth in maps])
 
 
+def _is_elsewhere(streamed: Streamed, scene: Scene) -> bool:
+    """Whether a cloud is so far from the cameras that it only happens to be before one of them."""
+    centers = np.array([image.camera.center for image in scene.images])
+    first, last = centers.min(axis=0), centers.max(axis=0)
+    gap = np.maximum(streamed.low - last, first - streamed.high).max()
+    extent = max((streamed.high - streamed.low).max(), (last - first).max())
+    return bool(gap > ELSEWHERE * extent > 0)
+
+
 def _out_of_view(streamed: Streamed, scene: Scene) -> PointCloudError:
-    """The error for clouds of which no point falls in any photograph."""
+    """The error for clouds of which no point falls in any photograph, or none near a camera."""
     centers = np.array([image.camera.center for image in scene.images])
     low, high = streamed.low, streamed.high
     fix = "They are in different frames: find the transform with --align, or give it with "
     fix += "--transform FILE."
-    if max(np.abs(low).max(), np.abs(high).max()) > GRID:
-        fix += " --recenter would move both alike: it is for a scene in the cloud's own grid."
     return PointCloudError(
         "points of the cloud in view of the scene's cameras, which stand "
         f"{_span(centers.min(axis=0), centers.max(axis=0))}",
