@@ -64,7 +64,7 @@ FEWEST_STEPS, WINDOW, SURE_AFTER, ESTIMATED_EVERY = 5, 100, 10.0, 5
 which it is said; and steps between estimates."""
 WORTH_SAYING = 120.0
 """Seconds of training that are worth a line."""
-RUN_NOTES = {"splatseed", "points", "photographs", "device", "versions"}
+RUN_NOTES = {"splatseed", "points", "photographs", "device", "versions", "near_plane"}
 """What config.json records besides options."""
 _SETTINGS = {option: name for name, option in OPTIONS.items()} | {"long_side": "data_factor"}
 """Settings by the options that stand for them, where these have other names."""

@@ -7,7 +7,7 @@ farther from the cameras that do than these reach or look: its pose must be wron
 rooms, nor a long walk, nor a drone over ground photographs has strays. The *near depth* is the
 smallest, over the views, of the depth beyond which nine tenths of a view's points lie.
 
-Promise: both scale with the scene, and turn and move with it; as long as fewer than half of the
+Promise: both scale with the scene, and turn and move with it; as long as at most half of the
 cameras are strays, how many there are, where they stand, and a few points far out change neither.
 Where points do not tell, a stray is far from nine tenths of the cameras.
 """
@@ -60,7 +60,7 @@ def sight_of(views: Sequence[View], xyz: Float[np.ndarray, "P 3"]) -> Sight:
     usual = np.median(count)
     fewest = max(1.0, LEAST_SHARE * usual, min(LEAST_POINTS, FEW_SHARE * usual))
     seeing = (count >= fewest) & (area >= LEAST_AREA)
-    if 2 * seeing.sum() > len(views):
+    if 2 * seeing.sum() >= len(views):
         around = np.median(centers[seeing], axis=0)
         distance = np.linalg.norm(centers - around, axis=1)
         reach = max(distance[seeing].max(), np.median(middle[seeing]))
