@@ -371,6 +371,26 @@ def test_recentring_moves_scene_and_cloud_alike(splatseed, room, xyz, surfaces, 
     assert np.median(np.abs(surfaces.distance(new))) < 0.01
 
 
+def test_any_scene_is_recentred_and_a_scan_in_its_grid_goes_with_it(splatseed, room, tmp_path):
+    site, plain = np.array([40.0, -30.0, 2.0]), load_scene(room)
+    write_scene(moved_by(plain, -site).replace(origin=np.zeros(3)), tmp_path / "site")
+    words = ("upsample", tmp_path / "site", "-o", tmp_path / "out", "--recenter", "--method", "mls")
+    run = splatseed(*words)
+    assert run.code == 0, run.err
+    assert "recenter.json has it" in run.out + run.err
+    out = load_scene(tmp_path / "out")
+    assert np.abs(out.offset - site).max() < 3
+    # The written scene knows its grid: a scan in that goes where the scene is.
+    np.savez(tmp_path / "scan.npz", xyz=plain.points.xyz + site)
+    words = ("upsample", tmp_path / "out", "-o", tmp_path / "seeds", "--cloud")
+    local = splatseed(*words, tmp_path / "scan.npz")
+    assert local.code == 0, local.err
+    seeds = load_scene(tmp_path / "seeds")
+    new = seeds.points.xyz[seeds.points.source == CLOUD] + seeds.offset - site
+    assert len(new) > 100
+    assert np.abs(new).max() < np.abs(plain.points.xyz).max() + 0.1
+
+
 SPOILT = {
     r"scan\.npz to be an archive of NumPy arrays": lambda xyz: xyz,  # cut short
     "found 9 that are not finite": lambda xyz: np.full_like(xyz[:9], np.nan),

@@ -17,6 +17,7 @@ from splatseed.console import ERR, StageClock, print_note, print_pairs, stage_di
 from splatseed.io import load_scene
 from splatseed.io.files import is_video
 from splatseed.io.masks import masks_beside
+from splatseed.io.origin import RECENTER
 from splatseed.io.staging import check_output
 from splatseed.literal import counted, name_some, quoted, visible
 from splatseed.runtime.torch_device import DeviceName
@@ -117,6 +118,8 @@ def _from_photographs(options: Options, images: Path, clock: StageClock) -> SfmR
     else:
         stages = [*(["refinement"] if options.refine_poses else []), "triangulation"]
         poses = load_scene(options.poses_from, require_points=False)
+        for note in (each for each in poses.warnings if RECENTER in each):
+            print_note(note)
         how = {"poses_from": poses, "refine_poses": options.refine_poses}
     clock.expect("features", "matching", *stages, "undistortion")
     named = options.poses_from is not None and poses.masks is not None and poses.masks.files

@@ -33,7 +33,7 @@ COARSE_PACE, GAIN = 1e-3, 8.0
 too coarse; an origin then helps if coordinates are so many extents."""
 UNKNOWN = 1e3
 """The extent of what is in one place: it may be of any size."""
-APART = 20.0
+APART = 5.0
 """Frames are told from each other if they are so many extents of the cameras apart."""
 ELSEWHERE = 1e3
 """Points so many extents from the cameras, of theirs and the cameras', are in another frame."""

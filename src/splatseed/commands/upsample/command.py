@@ -229,10 +229,10 @@ def _upsample(options: Options, methods: dict[str, Any]) -> None:
             scene, told = refined(scene, options.seed, clock, hold_out=held)
             notes.append(told)
         if options.recenter:
-            offset = middle_of_cameras(scene)
-            scene = moved_by(scene, offset)
-            whole = place_words(scene.offset)
-            notes.append(f"The scene is written around {whole}, as {RECENTER} has it.")
+            scene = moved_by(scene, middle_of_cameras(scene))
+            around = f"written around {place_words(scene.offset)}, as {RECENTER} has it."
+            there = "around 0 already: --recenter changes nothing."
+            notes.append(f"The scene is {around if scene.offset.any() else there}")
         if options.method == DEFAULT_METHOD:  # which needs photographs
             options = replace(options, method=str(method_for(scene, note=notes.append)))
         cloud, extra_method = None, None
