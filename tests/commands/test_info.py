@@ -218,7 +218,7 @@ def test_a_seeded_scene_is_to_be_trained_and_not_seeded_again(room, tmp_path, sp
 # Poses --------------------------------------------------------------------------------------------
 
 
-def test_sound_poses_without_points_ask_for_some(room, tmp_path, splatseed):
+def test_sound_poses_without_points_ask_for_some(room, tmp_path, splatseed, monkeypatch):
     scene = load_scene(room).replace(points=PointCloud.empty(), tracks=None, depths=None)
     write_scene(scene, tmp_path / "nerf", format="transforms", require_points=False)
     run = splatseed("info", tmp_path / "nerf")
@@ -231,6 +231,9 @@ def test_sound_poses_without_points_ask_for_some(room, tmp_path, splatseed):
     assert f"--poses-from {tmp_path / 'nerf'}" in advised
     assert "--refine-poses" not in advised
     assert "nan" not in run.out
+    monkeypatch.setattr("splatseed.seeding.poses.check_poses", lambda *_: 0.08)
+    problems = json.loads(splatseed("info", tmp_path / "nerf", "--json").out)["problems"]
+    assert sum("agree on the depth of only 8%" in each for each in problems) == 1
 
 
 def test_poses_of_a_device_are_to_be_refined(as_by_a_device, tmp_path, splatseed):

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from splatseed.camera import Intrinsics
 from splatseed.errors import PointCloudError
 from splatseed.pointcloud import PointCloud
-from splatseed.scene import Image, Scene, Tracks
+from splatseed.scene import Image, Masks, Scene, Tracks
 from splatseed.seeding import diagnostics as module
 from splatseed.synthetic import SHAPES
 
@@ -94,6 +96,28 @@ def test_empty_regions(size, rng):
     assert regions.mean == pytest.approx(np.mean(shares))
     assert regions.worst == pytest.approx(max(shares))
     assert regions.worst_name == ["a.png", "b.png"][int(np.argmax(shares))]
+
+
+def test_masked_area_has_no_points_to_miss(rng):
+    """Cells count if half of their pixels do; an image of a file without a mask counts whole."""
+    lens = Intrinsics(1, "PINHOLE", 320, 200, (100.0, 100.0, 160.0, 100.0))
+    names = ("a.png", "b.png", "c.png")
+    images = tuple(Image(n, 1, lens, np.array([1.0, 0, 0, 0]), np.zeros(3)) for n in names)
+    uv = np.indices((20, 32)).reshape(2, -1).T[:, ::-1] * 10 + 5.0
+    left = uv[uv[:, 0] < 160]
+    scene = _scene(images[0].camera.unproject(left, np.full(len(left), 2.0)), images=images)
+    assert module.empty_regions(scene).mean == pytest.approx(0.5)
+    counts = np.zeros((200, 320), bool)
+    counts[:, :246] = True  # 86 columns on the right; the cell across the edge counts
+    cells = module._cell_shares(images[0], counts)
+    assert cells.shape == (20, 32)
+    np.testing.assert_allclose(cells[0, [0, 23, 24, 25]], [1, 1, 0.6, 0])
+    scene = scene.replace(masks=Masks({"a.png": Path("a"), "b.png": Path("b")}))
+    sample = module.MaskSample({"a.png": cells, "b.png": np.zeros((20, 32))}, (0.2, 1.0), "")
+    regions = module.empty_regions(scene, sample=sample)
+    assert regions.mean == pytest.approx((9 / 25 + 0.5) / 2)  # b.png has nothing that counts
+    assert regions.worst_name == "c.png"
+    assert module.mask_statistics(scene, sample) == module.MaskStatistics(2, 0.6, "")
 
 
 def _statistics(num_points, isolated, duplicates=0):

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from PIL import Image as PilImage
+from scipy.ndimage import zoom
 from scipy.spatial.transform import Rotation
 
 from splatseed.camera import quat_from_rotation
 from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.io import load_scene
 from splatseed.pointcloud import PointCloud
 from splatseed.seeding import poses as module
-from splatseed.seeding.poses import TURNS, check_poses, pose_error, random_start
+from splatseed.seeding.poses import TURNS, check_poses, low_agreement, pose_error, random_start
 from splatseed.seeding.upsampling import upsample
 
 YZ, XY = np.diag([1.0, -1.0, -1.0, 1.0]), np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -124,3 +128,57 @@ def test_points_fill_a_cube_around_the_cameras(room, trainer, num):
     assert ((centers > low) & (centers < high)).all()
     again = random_start(room, np.random.default_rng(0), trainer)
     assert again.xyz.tobytes() == points.xyz.tobytes()
+
+
+def _changed(scene, folder, change, mask=None):
+    """The scene without points, its photographs changed, and with one mask for all."""
+    path = shutil.copytree(scene.source.root, folder)
+    rng = np.random.default_rng(1)
+    for file in sorted((path / "images").iterdir()):
+        pixels = change(np.asarray(PilImage.open(file), np.float64), rng)
+        PilImage.fromarray(pixels.clip(0, 255).astype(np.uint8)).save(file)
+        if mask is not None:
+            (path / "masks").mkdir(exist_ok=True)
+            PilImage.fromarray(mask).save(path / "masks" / f"{file.name}.png")
+    return load_scene(path).replace(points=PointCloud.empty(), tracks=None)
+
+
+def test_only_pixels_that_count_have_to_agree(room, tmp_path):
+    mask = np.zeros((120, 160), np.uint8)
+    mask[40:100, 50:130] = 255  # a quarter
+    scene = _changed(room, tmp_path / "statue", lambda pixels, _: pixels, mask)
+    share = check_poses(scene, scene.images)
+    assert share > 0.3
+    assert low_agreement(share, 0.75) == ""
+
+
+def test_light_that_changes_is_told_and_exposure_is_not(room, tmp_path):
+    exposed = _changed(room, tmp_path / "exposed", lambda p, rng: p * rng.uniform(0.4, 1.2))
+    assert low_agreement(check_poses(exposed, exposed.images)) == ""
+
+    def light(pixels, rng):
+        return pixels * np.exp(2.0 * zoom(rng.normal(size=(9, 12)), 120 / 9, order=1))[..., None]
+
+    lit = _changed(room, tmp_path / "lit", light)
+    told = low_agreement(check_poses(lit, lit.images))
+    assert "agree on the depth of only" in told
+    assert "reasons are light that changes between photographs" in told
+    assert "masks that leave 20% of the pixels" in low_agreement(0.08, 0.8)
+
+
+def test_an_error_is_in_pixels_of_the_size_that_is_compared(room, poses, monkeypatch):
+    """A larger photograph is compared smaller; what is told is the number that is judged."""
+    turns = np.tile(np.eye(4), (len(poses), 1, 1))
+    angles = np.radians(0.6) * np.random.default_rng(0).normal(size=(len(poses), 3))
+    turns[:, :3, :3] = Rotation.from_rotvec(angles).as_matrix()
+    scene = _posed(room, turns @ poses)
+    whole = pose_error(scene, scene.images)
+    monkeypatch.setattr(module.StereoSettings, "max_size", 80)
+    half = pose_error(scene, scene.images)
+    assert (whole.side, half.side) == (160, 80)
+    assert half.px == pytest.approx(whole.px / 2)
+    assert half.degrees == whole.degrees
+    for error in (whole, half):
+        assert error.exact == (round(error.px, 2) <= 0.5) == (error.warning == "")
+        assert f"{error.px:.2g} px" in str(error)
+        assert f"at {error.side} px a side" in str(error)

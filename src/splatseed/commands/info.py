@@ -80,17 +80,18 @@ def run(arguments: list[str]) -> None:
         scene = _read(options)
         cloud = diagnostics.cloud_statistics(scene, clock)
         tracks = diagnostics.track_statistics(scene)
-        regions = diagnostics.empty_regions(scene, clock)
+        sample = diagnostics.read_mask_sample(scene, clock)
+        masks = diagnostics.mask_statistics(scene, sample)
+        regions = diagnostics.empty_regions(scene, clock, sample)
         # An empty part is reason to upsample, which was done.
         empty = None if was_upsampled(scene) else regions
         problems = [*diagnostics.find_problems(scene, cloud, empty)]
         alignments = None if options.depth is None else _alignments(options, scene, clock)
         known = _known_depths(scene.depths, clock) if options.depth and scene.depths else 0
-        poses = _look_at_poses(scene, clock)
-        masks = diagnostics.mask_statistics(scene, clock)
+        poses, faint = _look_at_poses(scene, masks.share, clock)
     doubt = poses["problem"] if poses else ""
     problems += [*stray_notes(scene), *([masks.problem] if masks.problem else [])]
-    problems += [*_unfit_maps(scene, alignments or {}), *([doubt] if doubt else [])]
+    problems += [*_unfit_maps(scene, alignments or {}), *(each for each in (doubt, faint) if each)]
     if options.json:
         facts = {
             "points": cloud, "tracks": tracks, "empty": regions, "poses": poses, "masks": masks,
@@ -174,24 +175,30 @@ def _unfit_maps(scene: Scene, alignments: Mapping[str, Alignment]) -> list[str]:
     return [f"{maps} cannot be aligned with the points, and are left out"] if unfit else []
 
 
-def _look_at_poses(scene: Scene, progress: Progress) -> dict[str, Any] | None:
+def _look_at_poses(
+    scene: Scene, masked: float, progress: Progress
+) -> tuple[dict[str, Any] | None, str]:
     """Compare a few photographs of a scene without points; None with points or without any.
+
+    Also a sentence if they agree at few pixels; masks leave out the share ``masked`` of all.
 
     Gives the share of the pixels looked at whose depth others confirm (``agreement``), by how much
     the photographs miss each other (``error``), and why they should not be used as they are.
     """
     if has_points(scene) or not scene.has_photographs:
-        return None
-    from splatseed.seeding.poses import check_poses, pose_error  # noqa: PLC0415  (loads Numba)
+        return None, ""
+    from splatseed.seeding.poses import check_poses, low_agreement, pose_error  # noqa: PLC0415  (loads Numba)
 
     try:
         images = photographed(scene)
         agreement = check_poses(scene, images, progress)
     except SplatseedError as refused:
         problem = f"The photographs cannot be compared: {refused}"
-        return {"agreement": 0.0, "error": None, "problem": problem}
+        return {"agreement": 0.0, "error": None, "problem": problem}, ""
     error = pose_error(scene, images, progress)
-    return {"agreement": agreement, "error": error, "problem": error.warning if error else ""}
+    problem = error.warning if error else ""
+    facts = {"agreement": agreement, "error": error, "problem": problem}
+    return facts, low_agreement(agreement, masked)
 
 
 def _next(

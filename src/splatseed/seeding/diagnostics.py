@@ -10,11 +10,12 @@ neighbours; nothing is random; photographs are opened only for their masks.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float64
+from jaxtyping import Bool, Float, Float64
 from scipy.spatial import cKDTree
 
 from splatseed.errors import PointCloudError, SplatseedError
@@ -31,6 +32,8 @@ FAR_SPACINGS, FAR_SAMPLE = 3.0, 50_000
 many new points that is asked, at most."""
 EMPTY_CELLS = 32
 """Empty regions are counted on a grid with this many cells along an image's longer side."""
+COUNTED = 0.5
+"""Least share of a cell's pixels that count for the cell to count, where there are masks."""
 MASKS_READ = 32
 """Most photographs whose masks are read."""
 MANY_ISOLATED, MANY_EMPTY = 0.02, 0.5
@@ -110,20 +113,34 @@ def track_statistics(scene: Scene) -> TrackStatistics | None:
     return TrackStatistics(float(lengths.mean()), _five(lengths), float(known.mean()), _five(known))
 
 
-def empty_regions(scene: Scene, progress: Progress = silent) -> EmptyRegions | None:
+def empty_regions(
+    scene: Scene, progress: Progress = silent, sample: MaskSample | None = None
+) -> EmptyRegions | None:
     """The share of the images' area without points; None for a scene without images or points.
 
-    Visibility is not tested: a wall with points behind it counts as covered.
+    Masked area does not count; where there are masks, images of the ``sample``, which is read if it
+    is not given, stand for all. Visibility is not tested: a wall with points behind it counts as
+    covered.
     """
     if not scene.images or not len(scene.points):
         return None
     xyz = np.ascontiguousarray(scene.points.xyz[scene.points.finite].T, np.float64)
-    shares = []
-    for i, image in enumerate(scene.images):
-        shares.append(_empty_share(image, xyz))
-        progress("empty regions", (i + 1) / len(scene.images))
-    worst = int(np.argmax(shares))
-    return EmptyRegions(float(np.mean(shares)), shares[worst], scene.images[worst].name)
+    sample = read_mask_sample(scene, progress) if sample is None else sample
+    images, files = list(scene.images), scene.masks.files if scene.masks else {}
+    if any(cells is not None for cells in sample.cells.values()):
+        whole = {image.name for image in images if files and image.name not in files}
+        images = [image for image in images if image.name in whole or image.name in sample.cells]
+    shares: dict[str, float] = {}
+    for i, image in enumerate(images):
+        counted = sample.cells.get(image.name)
+        counts = np.ones(_cells_of(image), bool) if counted is None else counted >= COUNTED
+        if counts.any():
+            shares[image.name] = 1.0 - float(_seen_cells(image, xyz)[counts].mean())
+        progress("empty regions", (i + 1) / len(images))
+    if not shares:
+        return None
+    worst = max(shares, key=lambda name: shares[name])
+    return EmptyRegions(float(np.mean(list(shares.values()))), shares[worst], worst)
 
 
 def find_problems(
@@ -162,12 +179,18 @@ def find_problems(
     return tuple(problems)
 
 
-def _empty_share(image: Image, xyz: Float64[np.ndarray, "3 N"]) -> float:
-    """Share of a grid's cells that no point projects into."""
+def _cells_of(image: Image) -> tuple[int, int]:
+    """Rows and columns of an image's grid."""
+    width, height = image.intrinsics.width, image.intrinsics.height
+    cell = max(width, height) / EMPTY_CELLS
+    return max(math.ceil(height / cell), 1), max(math.ceil(width / cell), 1)
+
+
+def _seen_cells(image: Image, xyz: Float64[np.ndarray, "3 N"]) -> Bool[np.ndarray, "R C"]:
+    """Which cells of a grid a point projects into."""
     camera = image.camera
     width, height = camera.width, camera.height
-    cell = max(width, height) / EMPTY_CELLS
-    columns, rows = max(math.ceil(width / cell), 1), max(math.ceil(height / cell), 1)
+    cell, (rows, columns) = max(width, height) / EMPTY_CELLS, _cells_of(image)
     pixel_from_world = camera.K @ camera.cam_from_world[:3]
     # Ten times as fast as @, whose routines suit matrices that are large in both dimensions.
     u, v, depth = np.einsum("ij,jn->in", pixel_from_world[:, :3], xyz) + pixel_from_world[:, 3:]
@@ -177,7 +200,7 @@ def _empty_share(image: Image, xyz: Float64[np.ndarray, "3 N"]) -> float:
     seen = np.zeros((rows, columns), bool)
     row = np.minimum((v[inside] * scale).astype(int), rows - 1)  # rounding may reach the border
     seen[row, np.minimum((u[inside] * scale).astype(int), columns - 1)] = True
-    return 1.0 - np.count_nonzero(seen) / seen.size
+    return seen
 
 
 @dataclass(frozen=True)
@@ -189,15 +212,26 @@ class MaskStatistics:
     problem: str  # why a mask cannot be used; empty if none of those looked at
 
 
-def mask_statistics(scene: Scene, progress: Progress = silent) -> MaskStatistics:
-    """Count masks, and measure up to ``MASKS_READ`` of them, evenly spread."""
+@dataclass(frozen=True)
+class MaskSample:
+    """The masks of up to ``MASKS_READ`` photographs, evenly spread."""
+
+    cells: Mapping[str, Float64[np.ndarray, "R C"] | None]
+    """By image, the share of each cell's pixels that count; None: the image is used whole."""
+    shares: tuple[float, ...]  # of pixels that do not count, of each masked photograph
+    problem: str  # why one cannot be used
+
+
+def read_mask_sample(scene: Scene, progress: Progress = silent) -> MaskSample:
+    """Read the masks of some photographs of a scene."""
     folder = scene.source.image_dir if scene.source else None
     if folder is None or scene.masks is None:
-        return MaskStatistics(0, 0.0, "")
+        return MaskSample({}, (), "")
     files = scene.masks.files
     images = [im for im in scene.images if (im.name in files or not files)]
     images = [im for im in images if (folder / im.name).is_file()]
     asked = images[:: -(-len(images) // MASKS_READ) or 1]
+    cells: dict[str, Float64[np.ndarray, "R C"] | None] = {}
     shares, problem = [], ""
     for i, image in enumerate(asked):
         try:
@@ -205,11 +239,29 @@ def mask_statistics(scene: Scene, progress: Progress = silent) -> MaskStatistics
         except SplatseedError as error:
             problem = problem or str(error)
             continue
+        cells[image.name] = None if counts is None else _cell_shares(image, counts)
         if image.name in files or counts is not None:
             shares.append(0.0 if counts is None else 1.0 - float(counts.mean()))
         progress("read masks", (i + 1) / len(asked))
-    images_with = len(files) or len(shares)
-    return MaskStatistics(images_with, float(np.mean(shares)) if shares else 0.0, problem)
+    return MaskSample(cells, tuple(shares), problem)
+
+
+def mask_statistics(scene: Scene, sample: MaskSample) -> MaskStatistics:
+    """Count masks, and say how much those of a sample leave out."""
+    files = scene.masks.files if scene.masks and sample.cells else {}
+    share = float(np.mean(sample.shares)) if sample.shares else 0.0
+    return MaskStatistics(len(files) or len(sample.shares), share, sample.problem)
+
+
+def _cell_shares(image: Image, counts: Bool[np.ndarray, "H W"]) -> Float64[np.ndarray, "R C"]:
+    """The share of the pixels that count, in each cell of an image."""
+    shares: np.ndarray = counts
+    for axis, number in enumerate(_cells_of(image)):
+        starts = np.arange(number) * shares.shape[axis] // number
+        sizes = np.diff([*starts, shares.shape[axis]])
+        total = np.add.reduceat(shares, starts, axis=axis, dtype=np.float64)
+        shares = total / np.expand_dims(np.maximum(sizes, 1), 1 - axis)
+    return shares
 
 
 def _five(values: np.ndarray) -> Five:

@@ -91,11 +91,11 @@ class Stereo(PhotographMethod):
         images = photographed(scene, self.hold_out)
         warnings: tuple[str, ...] = ()
         if not has_points(scene):
-            from splatseed.seeding.poses import check_poses, pose_error  # noqa: PLC0415  (loads Numba)
+            from splatseed.seeding.poses import check_poses, low_agreement, pose_error  # noqa: PLC0415  (loads Numba)
 
-            check_poses(scene, images, progress)
+            faint = low_agreement(check_poses(scene, images, progress))
             error = pose_error(scene, images, progress)
-            warnings = (error.warning,) if error and error.warning else ()
+            warnings = tuple(each for each in (error.warning if error else "", faint) if each)
         views = read_views(scene, images, self.max_size, progress)
         start = time.perf_counter()
         stereo = compare(scene, images, views, self.grid, rng, progress)

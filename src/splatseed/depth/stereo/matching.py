@@ -225,11 +225,11 @@ def _match(
             sweep(quad_images, color, number, rng.integers(1 << 63, dtype=np.uint64), planes, costs)
     if view.mask is not None:
         # Undistortion leaves borders without pixels, whose planes mean nothing.
-        costs[~_blocks_known(view.mask, grid)] = np.inf
+        costs[~blocks_known(view.mask, grid)] = np.inf
     return planes, costs
 
 
-def _blocks_known(mask: Bool[np.ndarray, "H W"], grid: int) -> Bool[np.ndarray, "h w"]:
+def blocks_known(mask: Bool[np.ndarray, "H W"], grid: int) -> Bool[np.ndarray, "h w"]:
     """Which blocks of grid x grid pixels lie entirely in the photograph."""
     rows, columns = mask.shape[0] // grid, mask.shape[1] // grid
     blocks = mask[: rows * grid, : columns * grid].reshape(rows, grid, columns, grid)
