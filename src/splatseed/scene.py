@@ -205,6 +205,7 @@ class Scene:
     left_out: LeftOut = field(default_factory=LeftOut)  # how many points of its files were
     masks: Masks | None = None  # which pixels of its photographs do not count; None: all count
     absent: tuple[str, ...] = ()  # names of images that were left out; the split counts them
+    white: int = 65535  # the value of white in photographs of 16 bits a channel
     origin: Float64[np.ndarray, " 3"] = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:

@@ -10,7 +10,12 @@ import pytest
 from PIL import Image as PilImage
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.io import load_scene, write_scene
+from splatseed.io.bit_depth import find_white
+from splatseed.io.masks import read_mask
 from splatseed.io.photograph import check_photograph, decode_photograph, photograph_bytes
+from splatseed.scene import Masks
+from splatseed.views.view import load_views
 
 
 def decoded(path):
@@ -120,3 +125,57 @@ def test_transparent_pixels_are_black(tmp_path):
         assert (pixels == np.array([0, 0, 0, 200, 200, 200])[:, None]).all()
     (tmp_path / "a.png").write_bytes(png16(ALL16[..., None], transparent=65535))
     assert decoded(tmp_path / "a.png")[-1, -2:].tolist() == [[255, 255, 255], [0, 0, 0]]
+
+
+def tiff16(values, path):
+    """Write a little-endian TIFF of 16 bits of [H, W, 3], uncompressed."""
+    height, width, count = values.shape
+    data, at = values.astype("<u2").tobytes(), 8 + 2 + 12 * 10 + 4
+    tags = [
+        (256, 3, 1, width), (257, 3, 1, height), (258, 3, 3, at), (259, 3, 1, 1), (262, 3, 1, 2),
+        (273, 4, 1, at + 6), (277, 3, 1, count), (278, 3, 1, height), (279, 4, 1, len(data)),
+        (284, 3, 1, 1),
+    ]  # fmt: skip
+    rows = b"".join(struct.pack("<HHII", *tag) for tag in tags)
+    head = b"II*\0" + struct.pack("<IH", 8, len(tags)) + rows + bytes(4)
+    path.write_bytes(head + struct.pack("<3H", 16, 16, 16) + data)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, "tif"])
+@pytest.mark.parametrize("bits", [8, 10, 12, 14, 16])
+def test_photographs_of_fewer_bits_are_stretched_alike(count, bits, rng, tmp_path):
+    """The brightest decides for all, so that a dark one stays dark."""
+    channels, suffix = (3, "tif") if count == "tif" else (count, "png")
+    opaque = 2**bits - 1 if channels == 4 else 65535
+    bright = rng.integers(0, 2**bits, (6, 9, channels))
+    bright[0, 0, 0] = 2**bits - 1
+    paths = [tmp_path / f"{name}.{suffix}" for name in ("dark", "bright")]
+    both = list(zip(paths, (bright // 16, bright), strict=True))
+    for path, values in both:
+        if channels in {2, 4}:
+            values[..., -1] = opaque
+        if count == "tif":
+            tiff16(values, path)
+        else:
+            path.write_bytes(png16(values))
+    white, notes = find_white([*paths, tmp_path / "none.png"])
+    assert white == 2**bits - 1
+    said = f"only use {bits} (values up to {white:,})"
+    assert [said in note for note in notes] == ([True] if bits < 16 else [])
+    for path, values in both:
+        pixels = np.array(decode_photograph(path, photograph_bytes(path), white))
+        colors = values[..., :1] if channels < 3 else values[..., :3]
+        assert np.abs(pixels - 255 * colors / white).max() <= 0.51
+        assert read_mask(Masks({}), path.name, path) is None  # all are opaque
+
+
+def test_a_scene_of_14_bits_has_its_note_once_and_bright_views(room, tmp_path):
+    write_scene(room.replace(images=room.images[:2]), tmp_path / "scene", copy_images=True)
+    for image in room.images[:2]:
+        pixels = np.asarray(PilImage.open(room.source.image_dir / image.name).convert("RGB"))
+        values = np.rint(pixels * (16383 / 255)).astype(np.uint16)
+        (tmp_path / "scene/images" / image.name).write_bytes(png16(values))
+    scene = load_scene(tmp_path / "scene")
+    assert sum("use 14 (values" in each for each in scene.warnings) == 1
+    wide, plain = (load_views(each, each.images[:1])[0] for each in (scene, room))
+    assert np.array_equal(wide.photograph, plain.photograph)

@@ -104,7 +104,7 @@ def _texture(scene: Scene) -> float:
     energies = []
     for path in [folder / image.name for image in scene.images] if folder is not None else []:
         with suppress(SplatseedError):  # a photograph that cannot be read is not part of the mean
-            picture = decode_photograph(path, photograph_bytes(path))
+            picture = decode_photograph(path, photograph_bytes(path), scene.white)
             scale = _SIDE / max(picture.size)
             width, height = (max(round(side * scale), 2) for side in picture.size)
             small = picture.convert("L").resize((width, height), PilImage.Resampling.BOX)

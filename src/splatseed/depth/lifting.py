@@ -115,8 +115,9 @@ def lift(
             for i in range(start, stop):
                 own, share = np.random.default_rng(seeds[i]), math.ceil(num / len(images))
                 views[i] = read_view(
-                    images[i], folder, scene.masks, depths, visibility, settings, share, own
-                )
+                    images[i], folder, scene.masks, depths, visibility, settings, share, own,
+                    scene.white,
+                )  # fmt: skip
 
         in_threads(work, len(images), 1, "read images", progress)
         return [views[i] for i in range(len(images))]

@@ -101,7 +101,9 @@ def estimate_depths(
         progress("predict depth", 0.0)
         for done, (name, size) in enumerate(sizes.items(), 1):
             path = folder / name
-            picture = photograph.decode_photograph(path, photograph.photograph_bytes(path))
+            picture = photograph.decode_photograph(
+                path, photograph.photograph_bytes(path), scene.white
+            )
             if picture.size != size:
                 picture = picture.resize(size, PilImage.Resampling.BICUBIC)
             values = network(np.array(picture))

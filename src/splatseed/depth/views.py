@@ -30,6 +30,7 @@ from splatseed.depth.alignment import (
     trust_units,
 )
 from splatseed.depthmap import DepthMap, DepthMaps
+from splatseed.io.bit_depth import WHITE
 from splatseed.io.masks import read_mask
 from splatseed.io.photograph import decode_photograph, photograph_bytes
 from splatseed.io.photograph_checks import check_sizes
@@ -101,6 +102,7 @@ def read_view(
     settings: Settings,
     num: int,
     rng: np.random.Generator,
+    white: int = WHITE,
 ) -> DepthView:
     """Read an image from the photographs' folder and its map, and draw about ``num`` candidates."""
     check_lens(image, reason="along whose rays pixels are lifted")
@@ -129,7 +131,7 @@ def read_view(
         coarse = planar.every(step // 2, step)
     del depth, planar  # before the photograph needs memory
     path = folder / image.name
-    photograph = decode_photograph(path, photograph_bytes(path))
+    photograph = decode_photograph(path, photograph_bytes(path), white)
     check_sizes([image], folder)
     row, column = (each + 0.5 for each in np.divmod(pixel, camera.width))
     row = (row * photograph.height / camera.height).astype(np.int64)

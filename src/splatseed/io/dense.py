@@ -377,7 +377,7 @@ def _bring_photographs(
         for image in bent[start:stop]:
             path, target = source / image.name, folder / "images" / image.name
             encoded = photograph.photograph_bytes(path)
-            pixels = np.asarray(photograph.decode_photograph(path, encoded))
+            pixels = np.asarray(photograph.decode_photograph(path, encoded, scene.white))
             lens = image.intrinsics.resized(*pixels.shape[1::-1])
             straight = PilImage.fromarray(undistort(pixels, lens, lens.K)[0])
             target.parent.mkdir(parents=True, exist_ok=True)

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from splatseed.depthmap import DepthKind
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError, SplatseedError
+from splatseed.io.bit_depth import WHITE, find_white
 from splatseed.io.cleaning import clean_scene, cloud_warnings
 from splatseed.io.colmap import find_model, scene_root
 from splatseed.io.depth_files import KINDS, SUFFIXES
@@ -86,7 +87,11 @@ def load_scene(path: StrPath, *, require_points: bool = True) -> Scene:
         raise SceneNotFoundError(f"points in {path}", found="none", fix=fix)
     # seeds.npz and the manifest count the points as the files have them, so this comes first.
     scene = with_own_masks(clean_scene(follow_lists(_recall_absent(recall_seeds(scene)))))
-    return scene.replace(warnings=(*scene.warnings, *cloud_warnings(scene.points)))
+    folder, white, notes = scene.source.image_dir if scene.source else None, WHITE, list[str]()
+    if folder is not None:
+        white, notes = find_white([folder / image.name for image in scene.images])
+    warnings = (*scene.warnings, *notes, *cloud_warnings(scene.points))
+    return scene.replace(warnings=warnings, white=white)
 
 
 def _recall_absent(scene: Scene) -> Scene:

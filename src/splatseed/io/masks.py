@@ -19,6 +19,7 @@ from jaxtyping import Bool
 
 from splatseed.camera import Intrinsics
 from splatseed.errors import SceneFormatError, SceneNotFoundError, SplatseedError
+from splatseed.io.bit_depth import is_wide, opaque_value, wide_values
 from splatseed.io.depth_maps import Undistortion
 from splatseed.io.files import files_below, guarded, open_file, read_bytes
 from splatseed.io.mask_files import find_masks, masks_among, own_masks
@@ -196,6 +197,9 @@ def _opaque(photograph: Path) -> Bool[np.ndarray, "H W"] | None:
     if not has_alpha(picture) or picture.mode.startswith(("I", "F")):
         return None
     with guarded(photograph, "an image, neither cut short nor damaged"):
+        if is_wide(picture):
+            alpha = wide_values(photograph_bytes(photograph))[..., -1]
+            return np.asarray(alpha == opaque_value(alpha))
         return np.asarray(np.asarray(picture.convert("RGBA").getchannel("A")) == 255)
 
 

@@ -1,8 +1,8 @@
 """Photographs: a file's bytes, size and pixels; and what is wrong with a scene's, before training.
 
 Promise: pixels are as stored, before any EXIF rotation, because COLMAP counts them so; transparent
-ones are composited over black, the background of renders; 16-bit grey, and floats in [0, 1], are
-rounded to 8 bits, and 16-bit colours keep their upper 8 (Pillow's way).
+ones are composited over black, the background of renders; 16 bits a channel, and floats in [0, 1],
+are rounded to 8 bits, of which the capture's *white* (``io.bit_depth``) becomes 255.
 """
 
 from __future__ import annotations
@@ -14,8 +14,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import UInt16
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.io.bit_depth import WHITE, is_wide, opaque_value, wide_values
 from splatseed.io.files import guarded, other_spelling, read_bytes
 from splatseed.scene import Image, Scene
 
@@ -80,8 +82,8 @@ def open_photograph(path: Path, encoded: bytes) -> PilImage.Image:
         return PilImage.open(BytesIO(encoded))
 
 
-def decode_photograph(path: Path, encoded: bytes) -> PilImage.Image:
-    """The pixels in a file's bytes, as RGB.
+def decode_photograph(path: Path, encoded: bytes, white: int = WHITE) -> PilImage.Image:
+    """The pixels in a file's bytes, as RGB; of 16 bits, ``white`` becomes 255.
 
     Raises:
         SceneFormatError: It is no image, is cut short or damaged, is in inks (CMYK), or has numbers
@@ -95,8 +97,10 @@ def decode_photograph(path: Path, encoded: bytes) -> PilImage.Image:
             fix="Export it as sRGB: the look of its colours depends on a printer's profile.",
         )
     if photograph.mode.startswith(_WIDE_GREY):
-        return _eight_bits(path, photograph).convert("RGB")
+        return _grey_of(path, photograph, white).convert("RGB")
     with guarded(path, _WHOLE, fix=COPY_AGAIN):
+        if is_wide(photograph):
+            return _colors_of(wide_values(encoded), photograph, white)
         if has_alpha(photograph):
             from PIL import Image as PilImage  # noqa: PLC0415  (slow to import)
 
@@ -120,7 +124,25 @@ def check_photograph(path: Path) -> tuple[int, int]:
     return size
 
 
-def _eight_bits(path: Path, photograph: PilImage.Image) -> PilImage.Image:
+def _colors_of(
+    values: UInt16[np.ndarray, "H W C"], photograph: PilImage.Image, white: int
+) -> PilImage.Image:
+    """Colours, or grey, of 16 bits as RGB over black."""
+    from PIL import Image as PilImage  # noqa: PLC0415  (slow to import)
+
+    channels = values.shape[-1]
+    colors = values[..., : channels - (channels in {2, 4})]
+    shown = np.minimum(colors.astype(np.float32) * np.float32(255 / white), 255)
+    if channels in {2, 4}:
+        shown *= (values[..., -1] / np.float32(opaque_value(values[..., -1])))[..., None]
+    transparent = photograph.info.get("transparency")
+    if isinstance(transparent, tuple):
+        shown[(colors == transparent).all(axis=-1)] = 0
+    pixels = np.rint(shown).astype(np.uint8)
+    return PilImage.fromarray(np.ascontiguousarray(np.broadcast_to(pixels, (*pixels.shape[:2], 3))))
+
+
+def _grey_of(path: Path, photograph: PilImage.Image, white: int) -> PilImage.Image:
     """Grey of 16 bits or of floats, as 8 bits."""
     from PIL import Image as PilImage  # noqa: PLC0415  (slow to import)
 
@@ -135,7 +157,8 @@ def _eight_bits(path: Path, photograph: PilImage.Image) -> PilImage.Image:
             found=f"{values.dtype} from {values.min():g} to {values.max():g}",
             fix="Export the photograph with 8 bits a channel.",
         )
-    grey = np.rint(values.astype(np.float32) * np.float32(255 / most)).astype(np.uint8)
+    scale = np.float32(255 / (1.0 if photograph.mode == "F" else white))
+    grey = np.rint(np.minimum(values.astype(np.float32) * scale, 255)).astype(np.uint8)
     transparent = photograph.info.get("transparency")
     if transparent is not None:
         grey[values == transparent] = 0

@@ -166,7 +166,8 @@ def photograph_at(
     if folder is None or image is None:
         return None
     try:
-        picture = decode_photograph(folder / image.name, photograph_bytes(folder / image.name))
+        path = folder / image.name
+        picture = decode_photograph(path, photograph_bytes(path), scene.white)
     except (SceneNotFoundError, SceneFormatError):
         return None
     return np.array(picture.resize(size, PillowImage.Resampling.LANCZOS))

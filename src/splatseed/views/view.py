@@ -23,6 +23,7 @@ from jaxtyping import Bool, Float64, UInt8
 
 from splatseed.camera import Camera
 from splatseed.errors import OutputError, ParameterError, SceneFormatError, SceneNotFoundError
+from splatseed.io.bit_depth import WHITE
 from splatseed.io.files import StrPath
 from splatseed.io.masks import read_mask
 from splatseed.io.photograph import (
@@ -165,7 +166,9 @@ def load_views(
     views = []
     with ThreadPoolExecutor(READERS) as pool:
         for view in pool.map(
-            lambda image: _load_view(image, folder, data_factor, min_side, cache_dir, scene.masks),
+            lambda image: _load_view(
+                image, folder, data_factor, min_side, cache_dir, scene.masks, scene.white
+            ),
             images,
         ):
             views.append(view)
@@ -195,9 +198,10 @@ def _load_view(
     min_side: int,
     cache_dir: Path | None,
     masks: Masks | None,
+    white: int,
 ) -> View:
     path = folder / image.name
-    photograph, file_size = load_photograph(path, data_factor, cache_dir)
+    photograph, file_size = load_photograph(path, data_factor, cache_dir, white)
     height, width = photograph.shape[:2]
     if min(width, height) < min_side:
         raise _too_small(path, min_side, data_factor, (width, height))
@@ -210,8 +214,8 @@ def _load_view(
 
     photograph, known = undistort(photograph, lens, K)
     if mask is not None:
-        white = np.repeat(np.where(mask, 255, 0).astype(np.uint8)[..., None], 3, axis=2)
-        known &= undistort(white, lens, K)[0][..., 0] == 255
+        shown = np.repeat(np.where(mask, 255, 0).astype(np.uint8)[..., None], 3, axis=2)
+        known &= undistort(shown, lens, K)[0][..., 0] == 255
     return View(image.name, photograph, K, width, height, pose, known)
 
 
@@ -226,11 +230,11 @@ def _too_small(
     )
 
 
-FILTER = "box-2"  # part of the key: change it whenever the downsampling changes
+FILTER = "box-3"  # part of the key: change it whenever the downsampling changes
 
 
 def load_photograph(
-    path: StrPath, factor: int = 1, cache_dir: Path | None = None
+    path: StrPath, factor: int = 1, cache_dir: Path | None = None, white: int = WHITE
 ) -> tuple[UInt8[np.ndarray, "H W 3"], tuple[int, int]]:
     """The pixels of an image file, each a block of ``factor``^2, and the file's width and height.
 
@@ -244,12 +248,14 @@ def load_photograph(
         )
     encoded = photograph_bytes(path)
     digest = hashlib.blake2b(encoded, digest_size=16, person=FILTER.encode()).hexdigest()
-    kept = None if cache_dir is None or factor == 1 else cache_dir / f"{digest}_{factor}.png"
+    kept = (
+        None if cache_dir is None or factor == 1 else cache_dir / f"{digest}_{factor}_{white}.png"
+    )
     if kept is not None and kept.is_file():
         with suppress(SceneFormatError):  # a damaged copy is made again
             photograph = decode_photograph(kept, photograph_bytes(kept))
             return np.array(photograph), open_photograph(path, encoded).size
-    original = decode_photograph(path, encoded)
+    original = decode_photograph(path, encoded, white)
     width, height = original.width // factor, original.height // factor
     if not width or not height:
         raise _too_small(path, 1, factor, (width, height))
