@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import shutil
 
 import numpy as np
 import pytest
@@ -13,12 +14,14 @@ torch = pytest.importorskip("torch", reason="evaluation needs PyTorch")
 
 from splatseed.errors import ParameterError, SceneNotFoundError
 from splatseed.io import load_scene
+from splatseed.io.photograph import photographs_digest
+from splatseed.io.photograph_checks import with_photographs
 from splatseed.scores import EvalResult, ViewScore
 from splatseed.splat.evaluate import evaluate_model, evaluate_views, load_model
 from splatseed.splat.formats import write_model
 from splatseed.splat.gaussians import initial_gaussians, training_frame
 from splatseed.splat.rendering import ModelRenderer
-from splatseed.views.view import View, poses_of
+from splatseed.views.view import View, at_file_size, poses_of
 
 
 @pytest.fixture
@@ -128,3 +131,30 @@ def test_a_ply_of_the_world_is_scored_on_the_test_views(larger_room_path, model_
     moved = ModelRenderer(model.gaussians, other)
     for view in model.views:
         torch.testing.assert_close(moved.image(view), model.render(view), atol=2e-3, rtol=0)
+
+
+def test_missing_photographs_leave_the_other_test_views(larger_room_path, model_path, tmp_path):
+    root = tmp_path / "room"
+    shutil.copytree(larger_room_path, root)
+    whole = load_scene(root)
+    train, test = whole.split()
+    folder = root / "images"
+    for image in (test[1], train[0]):
+        (folder / image.name).unlink()
+    model = load_model(model_path, root)
+    assert [view.name for view in model.views] == [test[0].name]
+    assert [image.name for image in model.scene.split()[0]] == [i.name for i in train[1:]]
+    assert len(model.notes) == 1
+    assert (
+        f"2 images of the scene are left out, without a photograph or a pose: {train[0].name}"
+        in model.notes[0]
+    )
+    trained_on = photographs_digest(at_file_size(with_photographs(load_scene(root))))
+    assert photographs_digest(model.scene) == trained_on
+    for image in train[1:]:
+        (folder / image.name).unlink()
+    alone = load_model(model_path, root)  # only test photographs are needed
+    assert [view.name for view in alone.views] == [test[0].name]
+    (folder / test[0].name).unlink()
+    with pytest.raises(SceneNotFoundError, match="at least half"):
+        load_model(model_path, root)

@@ -6,6 +6,7 @@ import csv
 import dataclasses
 import json
 import os
+import shutil
 import signal
 
 import numba
@@ -15,6 +16,7 @@ import torch
 from PIL import Image as PilImage
 
 from splatseed.errors import OutputError, ParameterError, PointCloudError, SceneFormatError
+from splatseed.io import load_scene
 from splatseed.splat.evaluate import evaluate_views
 from splatseed.splat.formats import read_model
 from splatseed.splat.rendering import opacities_of
@@ -132,6 +134,18 @@ def test_a_stray_pose_is_named_and_has_no_part_in_the_frame(room, tmp_path):
         runs.append(prepare_run(scene, tmp_path / name, asked, note=notes.append))
     assert _bytes(runs[0]) == _bytes(runs[1])
     assert [far.name in note for note in notes] == [True]
+
+
+def test_missing_photographs_change_no_other_views_part(room_path, tmp_path):
+    shutil.copytree(room_path, tmp_path / "room")
+    whole = load_scene(tmp_path / "room")
+    train, test = (list(part) for part in whole.split(3))
+    for gone in (test.pop(0), train.pop(1)):
+        (whole.source.image_dir / gone.name).unlink()
+    settings = TrainSettings(strategy="none", data_factor=2, test_every=3)
+    run = prepare_run(whole, tmp_path / "run", settings)
+    for views, images in ((run.trainer.train_views, train), (run.trainer.test_views, test)):
+        assert [view.name for view in views] == [image.name for image in images]
 
 
 def test_a_run_ends_with_the_mean_of_its_last_fifth(begin, monkeypatch):
