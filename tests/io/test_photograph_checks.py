@@ -116,7 +116,8 @@ def test_a_model_whose_poses_are_mostly_nan_is_an_error(scene_dir, model):
 )
 def test_frames_of_nan_are_left_out(change, scene_dir):
     whole = load_scene(scene_dir)
-    write_scene(whole.replace(images=[replace(i, intrinsics=whole.intrinsics[0]) for i in whole.images]),
+    pinholes = [replace(image, intrinsics=whole.intrinsics[0]) for image in whole.images]
+    write_scene(whole.replace(images=pinholes),
         scene_dir.with_name("json"), format="transforms")  # fmt: skip
     path = scene_dir.with_name("json") / "transforms.json"
     content = json.loads(path.read_text())
