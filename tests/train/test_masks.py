@@ -86,8 +86,8 @@ def test_masked_pixels_have_no_part_in_loss_growth_and_scores(occluded_path, beg
     run = begin(strategy="none")
     (seen,) = load_views(scene, scene.images[1:2])
     params, error = run.state.params, torch.ones(mask.shape)
-    counted = contributions(params, run._frame.view(seen), error)[0]
-    masked = contributions(params, run._frame.view(seen), error * mask)[1]
+    counted = contributions(params, run.frame.view(seen), error)[0]
+    masked = contributions(params, run.frame.view(seen), error * mask)[1]
     assert torch.allclose(counted, masked)
 
 

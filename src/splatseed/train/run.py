@@ -39,9 +39,9 @@ from splatseed.progress import Progress, silent
 from splatseed.requirements import require
 from splatseed.scene import Scene
 from splatseed.scores import CurvePoint, EvalResult, TrainingResult
-from splatseed.splat.formats import write_model
+from splatseed.splat.formats import read_model, write_model
 from splatseed.splat.gaussians import Gaussians, TrainingFrame, frame_of_model
-from splatseed.splat.rendering import picture_names, write_render
+from splatseed.splat.rendering import ModelRenderer, picture_names, write_render
 from splatseed.splat.ssim import WINDOW
 from splatseed.train.device import check_fits, pick_device
 from splatseed.train.folder import Record, RunFolder, write_curve_csv, write_curve_png
@@ -384,6 +384,7 @@ class TrainingRun:
         self.folder, self.settings, self.state, self.frame = folder, settings, state, frame
         self._board: Any = None  # TensorBoard's writer, if asked for
         self._saved, self._saved_step = time.monotonic(), state.step or None
+        self._test_views = views[1]
         train, test = ([frame.view(view) for view in part] for part in views)
         self._pictures = picture_names(view.name for view in test)
         self.trainer = Trainer(state, settings, train, test, self._on_record)
@@ -438,7 +439,7 @@ class TrainingRun:
         return done
 
     def finish(self, score: Score, progress: Progress = silent) -> TrainingResult:
-        """Score the test views and write the results; the checkpoint, no longer needed, is removed.
+        """Write the Gaussians, score them and write the results; then the checkpoint is removed.
 
         Returns what is written to metrics.json.
 
@@ -446,14 +447,17 @@ class TrainingRun:
             OutputError: A result cannot be written.
             PointCloudError: The GPU's memory does not suffice.
         """
-        state, folder, views = self.state, self.folder, self.trainer.test_views
+        state, folder = self.state, self.folder
         if state.step < self.settings.max_steps:  # at its last step training has taken it
             take_mean(state.params, state.mean)
         with self.told():
             progress("score", 0.0)
             folder.claim([folder.renders / name for name in self._pictures.values()])
-            scores = score(self.trainer.render, views, on_view=self._draw)
-            world = self.frame.gaussians_to_world(gaussians_of(state.params))
+            write_model(folder.gaussians, self.frame.gaussians_to_world(gaussians_of(state.params)))
+            # What is scored is what the user gets: the file, read back.
+            world = read_model(folder.gaussians)
+            render = ModelRenderer(world, self.frame, self.trainer.device).image
+            scores = score(render, self._test_views, on_view=self._draw)
             result = TrainingResult(
                 dataclasses.replace(scores, num_gaussians=len(world), model_bytes=world.num_bytes),
                 tuple(
@@ -466,7 +470,6 @@ class TrainingRun:
                 num_seeds=folder.read_config()["seeds"]["count"],
                 held_by_memory_at=state.strategy.capacity.held_at,
             )
-            write_model(folder.gaussians, world)
             write_curve_csv(folder.curve_csv, state.records)
             write_curve_png(folder.curve_png, state.records)
             write_json(folder.metrics, result.to_dict())  # last: the run has finished

@@ -15,7 +15,7 @@ import tyro
 from splatseed.errors import ParameterError
 from splatseed.scene import Image
 from splatseed.train.schedule import FULL_RUN, Densification, Schedule, make_schedule, started
-from splatseed.views.view import TRAINED_SIDE, data_factor
+from splatseed.views.view import TRAINED_SIDE, default_factor
 
 StrategyName = Literal[
     "auto", "default", "grow", "mcmc", "none", "default-3dgs", "mcmc-3dgs", "none-3dgs"
@@ -131,7 +131,7 @@ class TrainSettings:
         """
         if self.data_factor is not None:
             return self
-        factor = data_factor(images, TRAINED_SIDE) if images else 1
+        factor = default_factor(images)
         if factor > 1:
             lens = max(
                 (im.intrinsics for im in images), key=lambda lens: max(lens.width, lens.height)

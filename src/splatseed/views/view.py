@@ -98,6 +98,11 @@ def data_factor(images: Sequence[Image], max_size: int) -> int:
     return max(1, -(-side // max_size))
 
 
+def default_factor(images: Sequence[Image]) -> int:
+    """The factor by which training divides photographs unless the user says otherwise."""
+    return data_factor(images, TRAINED_SIDE) if images else 1
+
+
 def load_split(
     scene: Scene,
     *,
