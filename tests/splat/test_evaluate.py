@@ -125,6 +125,8 @@ def test_a_ply_of_the_world_is_scored_on_the_test_views(larger_room_path, model_
     write_model(path, broken)
     whole = load_model(path, larger_room_path)
     assert (model.notes, len(whole.notes), len(whole.gaussians)) == ((), 1, len(broken) - 1)
+    cut = load_model(model_path, larger_room_path, near_plane=1e3)  # all is nearer
+    assert not cut.render(cut.views[0]).any()
     # It looks the same in whatever frame it is rendered; nothing lies at the nearer near plane.
     frame = training_frame(poses_of(scene.split()[0]))
     other = dataclasses.replace(frame, origin=frame.origin + 0.5, scale=3 * frame.scale)

@@ -17,6 +17,7 @@ from PIL import Image as PilImage
 
 from splatseed.errors import OutputError, ParameterError, PointCloudError, SceneFormatError
 from splatseed.io import load_scene
+from splatseed.pointcloud import PointCloud
 from splatseed.splat.evaluate import evaluate_views
 from splatseed.splat.formats import read_model
 from splatseed.splat.rendering import opacities_of
@@ -24,6 +25,7 @@ from splatseed.train import device, run as run_module, trainer
 from splatseed.train.parameters import add_to_mean, gaussians_of, length_units
 from splatseed.train.run import prepare_run
 from splatseed.train.settings import TrainSettings
+from splatseed.view.models import Shown, stage_frame
 
 RESUME, CAP = {"resume": True}, 400
 
@@ -146,6 +148,32 @@ def test_missing_photographs_change_no_other_views_part(room_path, tmp_path):
     run = prepare_run(whole, tmp_path / "run", settings)
     for views, images in ((run.trainer.train_views, train), (run.trainer.test_views, test)):
         assert [view.name for view in views] == [image.name for image in images]
+
+
+def test_a_walk_is_learnt_however_long_it_is(room, tmp_path):
+    """From 100 units to 20,000, past things as near as ever: 2,400 once rendered nothing."""
+    scores = []
+    for step in (100.0, 20_000.0):
+        moved = np.array([step, 0.0, 0.0])
+        images = [
+            dataclasses.replace(
+                image, translation=image.translation - image.camera.cam_from_world[:3, :3] @ moved
+            )
+            if i % 2
+            else image
+            for i, image in enumerate(room.images)
+        ]
+        xyz = np.concatenate([room.points.xyz, room.points.xyz + moved.astype(np.float32)])
+        points = PointCloud(xyz, np.tile(room.points.rgb, (2, 1)))
+        scene = room.replace(images=tuple(images), points=points, tracks=None)
+        asked = TrainSettings(strategy="none", data_factor=2, max_steps=10)
+        run = prepare_run(scene, tmp_path / f"{step}", asked, note=pytest.fail)
+        assert run.train()
+        scores.append(run.trainer.test_scores()[0])
+        config, stage = run.folder.read_config(), stage_frame(Shown("walk", scene))
+        assert config["near_plane"] == pytest.approx(run.frame.near / run.frame.scale)
+        assert (stage.near, stage.scale) == pytest.approx((run.frame.near, run.frame.scale))
+    assert scores[1] == pytest.approx(scores[0], abs=0.05)
 
 
 def test_a_run_ends_with_the_mean_of_its_last_fifth(begin, monkeypatch):

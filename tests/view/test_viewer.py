@@ -277,6 +277,20 @@ def test_points_of_several_origins_are_switched_apart(rng):
     np.testing.assert_allclose(clouds[0].xyz, 2 * cloud.xyz[:50], rtol=1e-6)
 
 
+def test_sizes_are_those_of_what_cameras_see(room, run_folder):
+    frame = stage_frame(shown := open_shown(run_folder, room))
+    # On a long walk, on which all that cameras see is a thousandth of their extent away.
+    walk = replace(frame, near=frame.near / 1000)
+    clouds = clouds_of(shown.scene.points, frame, 1000)
+    before, after = (pictures.point_size(clouds, shown.scene.images, f) for f in (frame, walk))
+    assert after < 0.02 * before
+    gui = Mock()
+    for each in (frame, walk):
+        pictures.add_cameras(gui, shown, each, print)
+    sizes = [call.kwargs["scale"] for call in gui.add_camera_frustum.call_args_list]
+    assert sizes[-1] < 0.02 * sizes[0]
+
+
 def test_of_many_cameras_as_many_are_test_views_as_of_all(room):
     scene = load_scene(room)
     images = tuple(replace(scene.images[0], name=f"{i:04}.png") for i in range(3000))

@@ -8,7 +8,7 @@ import pytest
 from splatseed.camera import Intrinsics
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Observations, Scene
-from splatseed.views.projection import FULL, LEAST, MOST, WIDE, choose_sources
+from splatseed.views.projection import FULL, LEAST, MOST, WIDE, choose_by_pose, choose_sources
 from splatseed.views.visibility import choose_camera, choose_image
 
 
@@ -97,3 +97,13 @@ def test_tiny_and_flat_clouds_get_a_camera_too(num, offset):
     camera = choose_camera(scene_of(line))
     assert np.isfinite(camera.cam_from_world).all()
     assert in_frame(camera, line.astype(np.float32)).any()
+
+
+def test_a_camera_far_away_takes_no_neighbour_from_others():
+    """Sources without points: distances once counted relative to the largest of all."""
+    poses = np.tile(np.eye(4), (13, 1, 1))
+    poses[:12, 0, 3] = 0.1 * np.arange(12)
+    poses[12, 0, 3] = 1e7
+    chosen = choose_by_pose(poses, 4)
+    assert (chosen[:12] >= 0).all()
+    np.testing.assert_array_equal(chosen[:12], choose_by_pose(poses[:12], 4))

@@ -229,6 +229,11 @@ class TrainingFrame:
     near: float = NEAR_PLANE  # the near plane, in training units
     strays: tuple[str, ...] = ()  # names of the views that set neither scale nor near plane
 
+    @property
+    def near_depth(self) -> float:
+        """The depth at which what cameras see begins (``views.sight``), in training units."""
+        return self.near / NEAR_SHARE
+
     def points_from_world(self, xyz: Float[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N 3"]:
         """World points in the training frame."""
         return np.asarray((xyz.astype(np.float64) - self.origin) * self.scale, np.float32)

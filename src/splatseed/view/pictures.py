@@ -50,6 +50,8 @@ FRUSTUM, LEAST_FRUSTUM, MOST_FRUSTUM = 0.5, 0.008, 0.05
 """Size of a camera relative to the distance to the next one, and its bounds on the stage."""
 POINT_PIXELS = 1.4
 """Diameter of a point in pixels, as the first camera sees it in a picture 1000 pixels high."""
+FARTHER, CLOSER = 10.0, 3.0
+"""Points are sized for at most this many near depths, and cameras drawn for at most this many."""
 TEST_COLOR, TRAIN_COLOR = (213, 94, 0), (0, 114, 178)
 _DRAWING = threading.Lock()
 
@@ -258,7 +260,9 @@ def point_size(
     """The diameter on the stage at which the first camera sees a point a few pixels wide."""
     xyz = np.concatenate([cloud.xyz[:: max(1, len(cloud.xyz) // 5000)] for cloud in clouds])
     eye = stage_pose(images[0].camera, frame)[1] if images else 3 * np.ones(3)
-    return float(np.median(np.linalg.norm(xyz - eye, axis=1))) * POINT_PIXELS / 1000
+    distance = float(np.median(np.linalg.norm(xyz - eye, axis=1)))
+    # Most of a long walk is far away, and all of it from a camera that strays.
+    return min(distance, FARTHER * frame.near_depth) * POINT_PIXELS / 1000
 
 
 def add_cameras(
@@ -281,6 +285,7 @@ def add_cameras(
         gaps = np.linalg.norm(centers[:, None] - centers[None], axis=2)
         np.fill_diagonal(gaps, np.inf)
         size = float(np.clip(FRUSTUM * np.median(gaps.min(axis=1)), LEAST_FRUSTUM, MOST_FRUSTUM))
+    size = min(size, MOST_FRUSTUM * CLOSER * frame.near_depth)
     handles = []
     for i, (image, (wxyz, position)) in enumerate(zip(images, poses, strict=True)):
         camera = image.camera

@@ -144,7 +144,7 @@ class Viewer:
         self.server.scene.set_up_direction(tuple(upward(up)))
         start = self.server.initial_camera
         start.position, start.look_at = tuple(position), tuple(position + ahead)
-        start.fov = fov
+        start.fov, start.near = fov, min(start.near, frame.near)
 
 
 class _LiveEntry(Entry):

@@ -53,7 +53,8 @@ def cosine_between(point, first, second):  # type: ignore[no-untyped-def]  # Num
 LEAST, FULL, WIDE, MOST = 1.0, 4.0, 15.0, 45.0
 """Degrees between which the weight rises, stays full, and falls."""
 ALIKE = 30.0  # largest angle in degrees between the axes of cameras that look the same way
-SAME_PLACE = 1e-6  # share of the cameras' spread within which two cameras count as coincident
+SAME_PLACE = 1e-6  # share of the usual distance within which two cameras count as coincident
+ROUNDING = 1e-12  # share of the largest distance that is rounding
 MOST_POINTS = 4000  # points tested per view: more do not change the order of its pairs
 
 
@@ -94,7 +95,9 @@ def choose_by_pose(
     cosine = cam_from_world[:, 2, :3] @ cam_from_world[:, 2, :3].T
     chosen = np.full((len(centers), num), -1)
     for i in range(len(centers)):
-        other = np.flatnonzero(gap[i] > SAME_PLACE * gap.max())
+        apart = gap[i][gap[i] > ROUNDING * gap.max()]
+        # By the median, so that one camera far away does not make all others coincide.
+        other = np.flatnonzero(gap[i] > SAME_PLACE * (np.median(apart) if len(apart) else np.inf))
         alike = other[cosine[i, other] > np.cos(np.radians(ALIKE))]
         if len(alike) < num:
             alike = other[np.argsort(-cosine[i, other], kind="stable")[:num]]
