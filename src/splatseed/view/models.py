@@ -111,7 +111,7 @@ def open_shown(path: StrPath, scene_path: Path | None = None) -> Shown:
     if scene is None and named is not None:
         with suppress(SceneNotFoundError, SceneFormatError):  # it is gone
             scene = scene_at(Path(named))
-    factor, every = (int(config.get(*each)) for each in (("data_factor", 1), ("test_every", 8)))
+    factor, every = (int(config.get(n) or d) for n, d in (("data_factor", 1), ("test_every", 8)))
     gaussians = read_model(folder.gaussians, notes.append)
     if scene is not None:
         gaussians = around_scene(folder.gaussians, scene, gaussians, notes.append)
