@@ -25,8 +25,6 @@ if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for i
 
 LEAST = {"data_factor": 1, "test_every": 2}
 """Numbers that a run's config gives where no option does, and their least values."""
-DEFAULTS = {"data_factor": 1, "test_every": TrainSettings.test_every}
-"""Those of a model that no run tells of: it is scored at the photographs' own size."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +71,7 @@ def run(arguments: list[str]) -> None:
     gaussians, config = model_file(options.model), config_of(options.model)
     scene, masks = options.scene or config.get("scene"), options.masks or config.get("masks")
     numbers: dict[str, Any] = {
-        name: config.get(name, DEFAULTS[name]) if given is None else given
+        name: config.get(name, getattr(TrainSettings, name)) if given is None else given
         for name in LEAST
         for given in [getattr(options, name)]
     }
