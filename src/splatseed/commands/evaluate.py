@@ -42,7 +42,7 @@ class Options:
     scene: Path | None = None
     """The scene the model belongs to, in the same world; a run knows its own."""
     data_factor: int | None = None
-    """Factor by which photographs are downsampled; a run's own, else as train's default."""
+    """Factor by which photographs are downsampled; by default a run's own, else 1."""
     test_every: int | None = None
     """Score every n-th image, sorted by name; by default as the run was trained, else 8."""
     transform: Annotated[str | None, tyro.conf.arg(metavar="FILE|gsplat|none")] = None
