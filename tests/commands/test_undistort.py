@@ -121,11 +121,20 @@ def test_train_prints_the_command_that_mends_the_scene(distorted, tmp_path, spla
 
 def test_a_scene_that_lacks_something_is_refused(distorted, tmp_path, splatseed):
     path = write_scene(load_scene(distorted), tmp_path / "own", copy_images=True).path
-    for gone in ("images/view_003.png", "sparse/0/images.bin"):
-        (path / gone).unlink()
+    (path / "images/view_003.png").unlink()
+    run = splatseed("undistort", path, "-o", tmp_path / "some")
+    assert (run.code, run.out.count("1 of 12 images is missing")) == (0, 1), run
+    some, whole = load_scene(tmp_path / "some"), load_scene(path)
+    assert {image.name for image in some.images} == {f"view_{i:03}.png" for i in range(12) if i != 3}
+    assert [i.name for i in some.split()[1]] == [i.name for i in whole.split()[1]]
+    photographs = sorted((path / "images").iterdir())
+    for gone in (*photographs[:6], path / "sparse/0/images.bin"):
+        gone.unlink()
+        if gone in photographs[:5]:
+            continue
         run = splatseed("undistort", path, "-o", tmp_path / "out")
         assert (run.code, run.err.count("\n")) == (2, 1)
-        assert gone.rpartition("/")[2] in run.err
+        assert "photographs" in run.err if gone in photographs else gone.name in run.err
         assert not (tmp_path / "out").exists()
 
 

@@ -231,9 +231,9 @@ def undistort(
         MissingDependencyError: pycolmap is absent.
     """
     require("pycolmap")
+    _check_names(scene)
     scene = with_photographs(scene)
     images = photograph_folder(scene).absolute()
-    _check_names(scene)
     check_sizes(scene.images, images)
     scene = at_file_size(scene).replace(intrinsics=())  # pycolmap wants cameras of the files' size
     with _staged(images, Path(output), "undistort", overwrite=overwrite) as staging:
