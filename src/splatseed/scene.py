@@ -266,17 +266,17 @@ class Scene:
         Raises:
             ParameterError: ``test_every`` is no whole number of 2 or more, which leaves both some.
         """
+        ordered = sorted(self.images, key=lambda image: image.name)
+        if self.listed is not None:
+            parts = (self.listed.train, self.listed.test)
+            train, test = (tuple(i for i in ordered if i.name in part) for part in parts)
+            return train, test
         if not isinstance(test_every, (int, np.integer)) or test_every < 2:
             raise ParameterError(
                 "test_every as a whole number of 2 or more",
                 found=repr(test_every),
                 fix="With 8, every 8th image is kept for testing.",
             )
-        ordered = sorted(self.images, key=lambda image: image.name)
-        if self.listed is not None:
-            parts = (self.listed.train, self.listed.test)
-            train, test = (tuple(i for i in ordered if i.name in part) for part in parts)
-            return train, test
         tested = {*sorted([*(image.name for image in ordered), *self.absent])[::test_every]}
         train = tuple(image for image in ordered if image.name not in tested)
         return train, tuple(image for image in ordered if image.name in tested)
