@@ -78,6 +78,6 @@ def test_a_mistrusted_point_is_a_neighbor_but_no_base(profile, weight):
     scene = scene_with(np.full(300, 3), np.where(np.arange(300) == 7, 50.0, 0.5))
     cloud = prepare(scene.points, trusted_originals(scene))
     neighbors = cloud.neighbors(8)
-    weights, _ = configure("linear", profile).weigh(cloud, neighbors, silent)
+    weights, _ = configure("linear", profile).base_weights(cloud, neighbors, silent)
     assert weights[cloud.rank == 7] == weight
     assert 7 in cloud.rank[neighbors.idx]

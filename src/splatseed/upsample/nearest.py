@@ -1,8 +1,7 @@
 """The base of every method that starts from a base point and its nearest neighbours.
 
-Such a method has two steps with the draw of the bases between them: ``weigh`` says how likely each
-row is a base, ``place`` makes the points. Promise: both look at a row and the neighbours it is
-given only, so that they give the same for a cloud in tiles (``upsample.tiles``) as for the whole.
+Such a method has two steps with the draw of the bases between them: ``base_weights`` says how
+likely each row is a base, ``sample`` makes the points.
 
 Colours: c = sum_j w_j c_j / sum_j w_j over the base point and its neighbours, with
 w_j = 1 / max(|p - p_j|, 0.01 h), h the base point's spacing, in linear arithmetic on the 8-bit
@@ -15,7 +14,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol, Self, TypeAlias
+from typing import ClassVar, Self, TypeAlias
 
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
@@ -37,16 +36,8 @@ from splatseed.upsample.neighbors import (
 
 OUTLIER_CHECK_NEIGHBORS = 8
 
-RowData: TypeAlias = Mapping[str, np.ndarray]
-"""What ``weigh`` has found out about rows and ``place`` needs: arrays [n, ...] by name."""
-
-
-class UniformSource(Protocol):
-    """A NumPy generator, or the part of its stream that a tile has."""
-
-    def random(self, size: Any, dtype: Any) -> Float32[np.ndarray, "..."]:
-        """Numbers from 0 to 1; the first axis is that of the new points."""
-        ...
+Aux: TypeAlias = Mapping[str, np.ndarray]
+"""What ``base_weights`` has found out about rows and ``sample`` needs: arrays [n, ...] by name."""
 
 
 @dataclass(frozen=True)
@@ -85,10 +76,10 @@ class NearestMethod(ABC):
         cloud = prepare_scene(scene, progress)
         self.check_enough(len(cloud))
         neighbors = cloud.neighbors(self.num_queried)
-        weight, known = self.weigh(cloud, neighbors, progress)
+        weight, aux = self.base_weights(cloud, neighbors, progress)
         neighbors = neighbors.nearest(self.num_neighbors)
         bases = draw_bases(cloud, num_new, rng, weight=weight)
-        return self.place(cloud, neighbors, known, bases, rng, progress)
+        return self.sample(cloud, neighbors, aux, bases, rng, progress)
 
     def check_enough(self, number: int) -> None:
         """Refuse a cloud with fewer distinct points than the method needs (PointCloudError)."""
@@ -99,30 +90,30 @@ class NearestMethod(ABC):
                 fix="Use a cloud with more points, or the method 'random'.",
             )
 
-    def weigh(
+    def base_weights(
         self, cloud: PreparedCloud, neighbors: Neighbors, progress: Progress
-    ) -> tuple[Float64[np.ndarray, " n"], RowData]:
-        """Each own row's weight as a base, and what ``place`` is to know of own rows.
+    ) -> tuple[Float64[np.ndarray, " n"], Aux]:
+        """Each row's weight as a base, and what ``sample`` needs besides.
 
-        ``neighbors`` are ``num_queried``, of own rows and of all their neighbours.
+        ``neighbors`` are ``num_queried`` a row.
         """
         if not self.reject_isolated:
-            return np.ones(cloud.num_own), {}
+            return np.ones(len(cloud)), {}
         return sound_bases(cloud, neighbors), {}
 
     @abstractmethod
-    def place(
+    def sample(
         self,
         cloud: PreparedCloud,
         neighbors: Neighbors,
-        known: RowData,
+        aux: Aux,
         bases: Bases,
-        rng: UniformSource,
+        rng: np.random.Generator,
         progress: Progress,
     ) -> NewPoints:
-        """Make the points of all bases; ``neighbors`` are ``num_neighbors`` of own rows.
+        """Make the points of all bases; ``neighbors`` are ``num_neighbors`` a row.
 
-        ``known`` is what ``weigh`` has found.
+        ``aux`` is what ``base_weights`` has found.
         """
 
 

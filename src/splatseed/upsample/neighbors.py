@@ -7,9 +7,7 @@ distance to the 6 nearest. A point's *number* is its place in the array that a k
 from.
 Promise: random draws are assigned by rank, not by row, and equal distances are ordered by number,
 also where the k-th of them is as far as the next, so that results follow from the points alone: any
-tree over the same points, and any division of them among several trees, gives the same. A cloud
-that is one tile of a larger one has *halo* rows after its own: points of other tiles that are
-neighbours of its own, but no bases (``upsample.tiles``).
+tree over the same points gives the same.
 """
 
 from __future__ import annotations
@@ -39,7 +37,7 @@ SHORT_TRACK = 3  # images, up to which a track counts as short
 BAD_ERROR = 2.0  # reprojection errors above this are bad, in units of the scene's median
 DRAW_BLOCK = 1 << 20
 """Ranks whose bases are drawn together: first how many each block of ranks makes, then which in it
-make them, so that clouds larger than memory are drawn a block at a time."""
+make them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,17 +75,11 @@ class PreparedCloud:
     rank: Int64[np.ndarray, " n"]  # place of each row in file order
     trusted: Bool[np.ndarray, " n"]  # rows that may serve as bases
     center: Float64[np.ndarray, " 3"]  # centroid in the world
-    tree: cKDTree  # over the positions in file order; None in a tile of a larger cloud
+    tree: cKDTree  # over the positions in file order
     progress: Progress = silent
-    halo: int = 0  # rows at the end that are neighbours only
 
     def __len__(self) -> int:
         return len(self.xyz)
-
-    @property
-    def num_own(self) -> int:
-        """Rows that may be bases."""
-        return len(self.xyz) - self.halo
 
     def neighbors(self, k: int) -> Neighbors:
         """The ``k`` nearest other rows of every row (all of them if there are fewer).
@@ -105,7 +97,6 @@ class PreparedCloud:
             k, NEIGHBOR_BYTES * len(self), f"neighbours of each of {len(self):,} points",
             fix="Pass a smaller k, {most} at most, or close other programs.",
         )  # fmt: skip
-        assert self.tree is not None  # noqa: S101  (a tile's neighbours are found elsewhere)
         tree, idx = self.tree, np.empty((len(self), k), np.int32)
         row_of_rank = np.empty(len(self), np.int32)
         row_of_rank[self.rank] = np.arange(len(self), dtype=np.int32)
@@ -199,43 +190,26 @@ def draw_bases(
     """
     by_rank = np.empty(len(cloud))
     by_rank[cloud.rank] = weight if weight.any() else 1.0
-    sums = [by_rank[first : first + DRAW_BLOCK].sum() for first in range(0, len(cloud), DRAW_BLOCK)]
-    totals = draw_blocks(np.array(sums), num_new, rng)
-    counts = np.concatenate(
-        [
-            draw_in_block(by_rank[block * DRAW_BLOCK : (block + 1) * DRAW_BLOCK], total, rng)
-            for block, total in enumerate(totals)
-        ]
-    )
+    blocks = [by_rank[first : first + DRAW_BLOCK] for first in range(0, len(cloud), DRAW_BLOCK)]
+    sums = np.array([block.sum() for block in blocks])
+    totals = rng.multinomial(num_new, sums / sums.sum())
+    # Counts per base, drawn by rank: rows depend on how the kd-tree cut space.
+    drawn = [
+        rng.multinomial(total, block / block.sum()) if total else np.zeros(len(block), np.int64)
+        for block, total in zip(blocks, totals, strict=True)
+    ]
+    counts = np.concatenate(drawn)
     starts = np.cumsum(counts) - counts
     return Bases(starts[cloud.rank], counts[cloud.rank].astype(np.int64), num_new)
 
 
-def draw_blocks(
-    sums: Float64[np.ndarray, " b"], num_new: int, rng: np.random.Generator
-) -> Int64[np.ndarray, " b"]:
-    """How many new points each block of ``DRAW_BLOCK`` ranks makes, from its sum of weights."""
-    return np.asarray(rng.multinomial(num_new, sums / sums.sum()))
-
-
-def draw_in_block(
-    weight: Float64[np.ndarray, " m"], total: int, rng: np.random.Generator
-) -> Int64[np.ndarray, " m"]:
-    """How many of a block's ``total`` new points each of its ranks makes; blocks come in order."""
-    if not weight.any():  # the only block without weight that is asked: total is 0
-        return np.zeros(len(weight), np.int64)
-    # Counts per base, drawn by rank: rows depend on how the kd-tree cut space.
-    return np.asarray(rng.multinomial(total, weight / weight.sum()))
-
-
 def sound_bases(cloud: PreparedCloud, neighbors: Neighbors) -> Float64[np.ndarray, " n"]:
-    """Weight 1 for own rows that may serve as bases and are not isolated, else 0.
+    """Weight 1 for rows that may serve as bases and are not isolated, else 0.
 
     A row is isolated when its spacing is over 3 times the lower quartile of its neighbours'
     spacings: local, so that a sparse background is not taken for noise as a global filter would.
     """
-    own, spacing = slice(cloud.num_own), neighbors.spacing
-    idx = neighbors.idx[own, :OUTLIER_NEIGHBORS]
+    spacing, idx = neighbors.spacing, neighbors.idx[:, :OUTLIER_NEIGHBORS]
     isolated = np.empty(len(idx), bool)
     # The lower quartile, which a few outliers among the neighbours do not move.
     nth = idx.shape[1] // 4
@@ -245,7 +219,7 @@ def sound_bases(cloud: PreparedCloud, neighbors: Neighbors) -> Float64[np.ndarra
         isolated[start:stop] = spacing[start:stop] > OUTLIER_FACTOR * quartile
 
     in_threads(judge, len(idx), QUERY_BLOCK, "isolated points", silent)
-    return np.asarray(cloud.trusted[own] & ~isolated, np.float64)
+    return np.asarray(cloud.trusted & ~isolated, np.float64)
 
 
 AT_ONCE = 1 << 20  # neighbours fetched at once for points at whose k-th distance there are several
@@ -317,11 +291,7 @@ def sort_rows(
 def distances_of(
     xyz: Float64[np.ndarray, "n 3"], idx: Int32[np.ndarray, "m k"], least: float
 ) -> Float64[np.ndarray, "m k"]:
-    """The distances of the first m rows from their neighbours, at least ``least``.
-
-    Computed here and not taken from the tree, so that neighbours that were stored as numbers alone
-    get the same distances again.
-    """
+    """The distances of the first m rows from their neighbours, at least ``least``."""
     distance = np.empty(idx.shape)
 
     def fill(start: int, stop: int) -> None:

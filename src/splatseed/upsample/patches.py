@@ -23,7 +23,7 @@ from jaxtyping import Bool, Float32, Float64, Int32
 from splatseed.progress import Progress, blocks
 from splatseed.runtime.jit import inline, kernel, parallel_range
 from splatseed.upsample.method import NewPoints, require
-from splatseed.upsample.nearest import NearestMethod, RowData, UniformSource, interpolate_colors
+from splatseed.upsample.nearest import Aux, NearestMethod, interpolate_colors
 from splatseed.upsample.neighbors import Bases, Neighbors, PreparedCloud
 
 COLLINEAR = 1e-9
@@ -206,7 +206,7 @@ def place_on_disc(
     bases: Bases,
     collinear: Bool[np.ndarray, " n"],
     radius: float,
-    rng: UniformSource,
+    rng: np.random.Generator,
 ) -> Float32[np.ndarray, "M 2"]:
     """Uniform in the disc of ``radius`` times the base point's spacing."""
     uv = rng.random((bases.total, 2), dtype=np.float32)
@@ -219,7 +219,7 @@ def place_in_triangle(
     neighbors: Neighbors,
     bases: Bases,
     frames: Float64[np.ndarray, "n 3 3"],
-    rng: UniformSource,
+    rng: np.random.Generator,
 ) -> Float32[np.ndarray, "M 2"]:
     """Uniform in the triangle of the base and two of its 8 nearest, drawn at random."""
     draws = rng.random((bases.total, 3), dtype=np.float32)
@@ -234,7 +234,7 @@ def place_in_box(
     neighbors: Neighbors,
     bases: Bases,
     frames: Float64[np.ndarray, "n 3 3"],
-    rng: UniformSource,
+    rng: np.random.Generator,
 ) -> Float32[np.ndarray, "M 2"]:
     """Uniform in the bounding box of the neighbourhood along e_u and e_v (the paper's text)."""
     uv = rng.random((bases.total, 2), dtype=np.float32)
@@ -340,25 +340,25 @@ class PatchMethod(NearestMethod, ABC):
         """Neighbours in a fit."""
         return self.k
 
-    def place(
+    def sample(
         self,
         cloud: PreparedCloud,
         neighbors: Neighbors,
-        known: RowData,
+        aux: Aux,
         bases: Bases,
-        rng: UniformSource,
+        rng: np.random.Generator,
         progress: Progress,
     ) -> NewPoints:
         """Fit a patch to every base and put its points on it."""
         patches = self._patches(cloud, neighbors, bases, rng)
         height = np.empty(bases.total, np.float32)
-        for first, last in blocks(cloud.num_own, BLOCK, self.name, progress):
+        for first, last in blocks(len(cloud), BLOCK, self.name, progress):
             self.heights(patches, first, last, height)
         xyz = lift(patches, height, self.clamp)
         return NewPoints(xyz, interpolate_colors(cloud, neighbors, bases, xyz))
 
     def _patches(
-        self, cloud: PreparedCloud, neighbors: Neighbors, bases: Bases, rng: UniformSource
+        self, cloud: PreparedCloud, neighbors: Neighbors, bases: Bases, rng: np.random.Generator
     ) -> Patches:
         """Put a patch on every row and choose where its new points go."""
         if self.frame == "local":

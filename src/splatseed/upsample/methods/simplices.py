@@ -17,7 +17,7 @@ import numpy as np
 from splatseed.progress import Progress
 from splatseed.runtime.jit import kernel, parallel_range
 from splatseed.upsample.method import NewPoints
-from splatseed.upsample.nearest import NearestMethod, RowData, UniformSource
+from splatseed.upsample.nearest import Aux, NearestMethod
 from splatseed.upsample.neighbors import Bases, Neighbors, PreparedCloud
 
 
@@ -26,13 +26,13 @@ class _Simplex(NearestMethod):
 
     name: ClassVar[str]
 
-    def place(
+    def sample(
         self,
         cloud: PreparedCloud,
         neighbors: Neighbors,
-        known: RowData,
+        aux: Aux,
         bases: Bases,
-        rng: UniformSource,
+        rng: np.random.Generator,
         progress: Progress,
     ) -> NewPoints:
         """Make the points of all bases."""

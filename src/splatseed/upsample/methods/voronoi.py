@@ -25,13 +25,7 @@ from splatseed.progress import Progress, blocks
 from splatseed.runtime.jit import kernel, parallel_range
 from splatseed.upsample.cells import MAX_NEIGHBORS, Cells, box_cells, build_cells
 from splatseed.upsample.method import NewPoints, require
-from splatseed.upsample.nearest import (
-    NearestMethod,
-    RowData,
-    UniformSource,
-    colors_of_nearest,
-    interpolate_colors,
-)
+from splatseed.upsample.nearest import Aux, NearestMethod, colors_of_nearest, interpolate_colors
 from splatseed.upsample.neighbors import Bases, Neighbors, PreparedCloud
 from splatseed.upsample.patches import local_frames
 
@@ -73,36 +67,35 @@ class Voronoi(NearestMethod):
         """Neighbours that shape a cell."""
         return self.k
 
-    def weigh(
+    def base_weights(
         self, cloud: PreparedCloud, neighbors: Neighbors, progress: Progress
-    ) -> tuple[Float64[np.ndarray, " n"], RowData]:
+    ) -> tuple[Float64[np.ndarray, " n"], Aux]:
         """Weights by volume, and the cells' centres [n, 3] and radii [n]."""
-        weight, _ = super().weigh(cloud, neighbors, progress)
+        weight, _ = super().base_weights(cloud, neighbors, progress)
         neighbors = neighbors.nearest(self.k)
         if self.cells == "box":
             center, radius, volume = box_cells(cloud, progress)
             return weight * volume, {"center": center, "radius": radius}
         center, radius, volume, _ = _clamped_cells(cloud, neighbors, progress)
-        relative = np.empty(cloud.num_own)
+        relative = np.empty(len(cloud))
         _relative_volume(volume, neighbors.idx, float(self.max_weight), relative)
         weight = weight * relative
-        own = slice(cloud.num_own)
-        return weight, {"center": center[own], "radius": radius[own]}
+        return weight, {"center": center, "radius": radius}
 
-    def place(
+    def sample(
         self,
         cloud: PreparedCloud,
         neighbors: Neighbors,
-        known: RowData,
+        aux: Aux,
         bases: Bases,
-        rng: UniformSource,
+        rng: np.random.Generator,
         progress: Progress,
     ) -> NewPoints:
         """Put the points of all bases in the balls of their cells."""
         frames, _ = local_frames(cloud.xyz, neighbors.idx)
         xyz = rng.random((bases.total, 3), dtype=np.float32)
         _place(
-            cloud.xyz, cloud.center, known["center"], self.ball * known["radius"], frames,
+            cloud.xyz, cloud.center, aux["center"], self.ball * aux["radius"], frames,
             bases.start, bases.count, xyz,
         )  # fmt: skip
         if self.cells == "box":
@@ -124,7 +117,7 @@ def _clamped_cells(cloud: PreparedCloud, neighbors: Neighbors, progress: Progres
 
 @kernel
 def _relative_volume(volume, idx, cap, relative):  # type: ignore[no-untyped-def]  # Numba's types
-    """Each own volume relative to the median of its neighbours', at most ``cap``."""
+    """Each volume relative to the median of its neighbours', at most ``cap``."""
     for i in parallel_range(len(relative)):
         around = np.sort(volume[idx[i]])
         median = 0.5 * (around[(around.size - 1) // 2] + around[around.size // 2])
