@@ -146,7 +146,7 @@ def test_the_worst_are_listed_first_and_the_rest_on_demand(tour, tmp_path, splat
     names, rng = sorted(depths)[:14], np.random.default_rng(4)
     with depth_folder(maps, "z") as writer:
         for i, name in enumerate(names):
-            z = np.float32(depths.read(name).values)
+            z = np.array(depths.read(name).values, np.float32)
             if i in {2, 4}:  # nothing in one, much that is wrong in the other
                 z[rng.random(z.shape) < {2: 1.0, 4: 0.2}[i]] *= {2: np.nan, 4: 1.3}[i]
             writer.write(name, z)

@@ -120,9 +120,9 @@ def test_the_commands_to_train_with_name_what_is_there(seeded):
 
 
 def test_a_bare_ply_where_new_points_coincide(tmp_path, splatseed):
-    coarse = np.float32(2**20)  # floats here are 1/8 apart: points between these fall together
-    xyz = coarse + np.float32(np.random.default_rng(0).integers(0, 64, (300, 3))) / 8
-    xyz = np.unique(xyz, axis=0).astype(np.float32)
+    xyz = np.random.default_rng(0).uniform(-1, 1, (250, 3)).astype(np.float32)
+    # Pairs of the nearest that single precision can tell apart: points between them fall together.
+    xyz = np.concatenate([xyz, np.nextafter(xyz[:50], np.float32(2))])
     write_ply(tmp_path / "cloud.ply", PointCloud(xyz, np.full(xyz.shape, (200, 0, 0), np.uint8)))
     words = ("upsample", tmp_path / "cloud.ply", "--method", "linear", "-o", tmp_path / "out")
     run = splatseed(*words, "--preview")

@@ -155,7 +155,8 @@ def test_large_photographs_are_smaller_by_default_and_stay_so(
 
     with monkeypatch.context() as patch:
         patch.setattr(Trainer, "_advance", step)
-        patch.setattr("splatseed.train.settings.TRAINED_SIDE", 48)
+        for module in ("train.settings", "views.view"):
+            patch.setattr(f"splatseed.{module}.TRAINED_SIDE", 48)
         assert _run(room_path, "--max-steps", "3", "--strategy", "none", "-o", run) == 130
     assert (
         "96 x 72 pixels are used at 48 x 36, as the default is 48 a side" in capsys.readouterr().out
