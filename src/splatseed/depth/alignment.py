@@ -312,9 +312,15 @@ def align_map(
     fit: Fit = Settings.fit,
     min_points: int = Settings.min_points,
     *,
-    unit_ray: bool = Settings.unit_ray,
+    unit_ray: bool | None = None,
 ) -> Alignment:
-    """Align one map, whose camera is in its own pixels, with the SfM points that its image sees."""
+    """Align one map, whose camera is in its own pixels, with the SfM points that its image sees.
+
+    Without ``unit_ray``, depth is along rays for least squares, as equation 7 fits what equation 9
+    lifts, and planar otherwise.
+    """
+    if unit_ray is None:
+        unit_ray = fit == "least-squares"
     value, z, points = _values_at(depth, camera, points, unit_ray=unit_ray)
     known = depth.values[np.isfinite(depth.values)]
     refused = None
