@@ -135,24 +135,26 @@ def interpolate_colors(
 def colors_of_nearest(
     cloud: PreparedCloud,
     neighbors: Neighbors,
-    new_xyz: Float32[np.ndarray, "M 3"],
+    local_xyz: Float32[np.ndarray, "M 3"],
     k: int,
     progress: Progress,
 ) -> UInt8[np.ndarray, "M 3"]:
-    """Colours of new points at world positions from the k originals nearest to each."""
+    """Colours of new points from the k originals nearest to each.
+
+    Positions are relative to the cloud's centre: rounded far from 0, they would have others.
+    """
     rgb, spacing = np.empty_like(cloud.rgb), np.empty(len(cloud))
     rgb[cloud.rank], spacing[cloud.rank] = cloud.rgb, neighbors.spacing
-    out = np.empty((len(new_xyz), 3), np.uint8)
+    out = np.empty((len(local_xyz), 3), np.uint8)
     nth = np.arange(1, min(k, len(cloud)) + 1)
 
     def work(start: int, stop: int) -> None:
-        local = new_xyz[start:stop] - cloud.center
-        distance, number = cloud.tree.query(local, nth)
+        distance, number = cloud.tree.query(local_xyz[start:stop], nth)
         weight = 1.0 / np.maximum(distance, FLOOR * spacing[number[:, :1]])
         weight /= weight.sum(axis=1, keepdims=True)
         out[start:stop] = np.einsum("mk,mkc->mc", weight, rgb[number]) + 0.5
 
-    in_threads(work, len(new_xyz), QUERY_BLOCK, "colours", progress)
+    in_threads(work, len(local_xyz), QUERY_BLOCK, "colours", progress)
     return out
 
 

@@ -94,12 +94,12 @@ class Voronoi(NearestMethod):
         """Put the points of all bases in the balls of their cells."""
         frames, _ = local_frames(cloud.xyz, neighbors.idx)
         xyz = rng.random((bases.total, 3), dtype=np.float32)
-        _place(
-            cloud.xyz, cloud.center, aux["center"], self.ball * aux["radius"], frames,
-            bases.start, bases.count, xyz,
-        )  # fmt: skip
+        local = xyz.copy() if self.cells == "box" else xyz[:0]
+        balls = aux["center"], self.ball * aux["radius"], frames, bases.start, bases.count
+        _place(cloud.xyz, cloud.center, *balls, xyz)
         if self.cells == "box":
-            rgb = colors_of_nearest(cloud, neighbors, xyz, self.color_k, progress)
+            _place(cloud.xyz, np.zeros(3), *balls, local)
+            rgb = colors_of_nearest(cloud, neighbors, local, self.color_k, progress)
         else:
             rgb = interpolate_colors(cloud, neighbors.nearest(self.color_k), bases, xyz)
         return NewPoints(xyz, rgb)
