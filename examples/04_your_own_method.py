@@ -16,10 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 
 import splatseed as ss
+from splatseed.methods import NewPoints
+from splatseed.methods.neighbors import prepare_scene
 from splatseed.progress import Progress
 from splatseed.scene import Scene
-from splatseed.upsample import NewPoints
-from splatseed.upsample.neighbors import prepare_scene
 
 
 @dataclass(frozen=True)

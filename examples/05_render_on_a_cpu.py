@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from splatseed.render import rasterization
+from splatseed.rendering import rasterization
 from splatseed.synthetic import make_capture
 
 NUM_GAUSSIANS = 600

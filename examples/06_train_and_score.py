@@ -17,7 +17,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before PyTorch: see docs/
 import splatseed as ss
 from splatseed.splat.evaluate import evaluate_views
 from splatseed.synthetic import make_capture, write_capture
-from splatseed.train import TrainSettings, prepare_run
+from splatseed.training import TrainSettings, prepare_run
 
 
 def main(scene_dir: Path, steps: int) -> None:

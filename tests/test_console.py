@@ -14,8 +14,8 @@ from rich.console import Console
 import splatseed
 from splatseed import console
 from splatseed.console import StageClock, print_note, print_pairs, print_table, stage_display
-from splatseed.literal import quoted, visible
 from splatseed.runtime import compilation
+from splatseed.text import quoted, visible
 
 LONG = "/".join(["a_rather_long_folder_name"] * 9)
 EVIL = "a\x1b[31mb\x1b]0;title\x07 :fire: [red]c[/red] \u202ereversed\rd\n{e} \\ ' \"f"

@@ -26,18 +26,16 @@ SOURCE = Path(splatseed.__file__).parent
 MODULES = ["splatseed"] + [m.name for m in pkgutil.walk_packages(splatseed.__path__, "splatseed.")]
 
 ORDER = (
-    "errors", "literal", "requirements", "progress", "frozen", "runtime", "camera",
-    "similarity", "lens", "pointcloud", "depthmap", "scene", "scores", "io", "views", "depth",
-    "upsample", "seeding", "synthetic", "sfm", "render", "splat", "train", "gsplat", "view",
-    "bench", "console", "commands", "cli",
+    "errors", "text", "requirements", "progress", "frozen", "runtime", "camera",
+    "similarity", "lens", "pointcloud", "depthmap", "scene", "scores", "io", "photos", "depth",
+    "methods", "seeding", "synthetic", "sfm", "rendering", "splat", "training", "integrations",
+    "gsplat", "viewer", "bench", "console", "commands", "cli",
 )  # fmt: skip
 """Parts of the package: each imports only parts before it, or itself."""
 
-LAZY = re.compile(r"[a-z_]+(\.[a-z_]+)+:[A-Z]\w+")
-
 
 def _imports(path):
-    """What a file imports anywhere, also within functions, or names as "module:Class"."""
+    """What a file imports anywhere, also within functions."""
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -47,8 +45,6 @@ def _imports(path):
                 yield from (f"splatseed.{alias.name}" for alias in node.names)
             else:
                 yield str(node.module)
-        elif isinstance(node, ast.Constant) and LAZY.fullmatch(str(node.value)):
-            yield str(node.value).partition(":")[0]
 
 
 def _files(part):
@@ -125,11 +121,11 @@ def test_modules_of_a_part_import_each_other_in_no_circle(part):
     TopologicalSorter(modules).prepare()  # raises CycleError, which names the circle
 
 
-@pytest.mark.parametrize("part", ["views", "depth", "upsample", "seeding"])
+@pytest.mark.parametrize("part", ["photos", "depth", "methods", "seeding"])
 def test_what_makes_seeds_needs_little(part):
     """Beside the standard library; networks may need more."""
     allowed = {"splatseed", "numpy", "jaxtyping", "numba", "scipy"}
-    more = {"views": {"PIL"}, "depth": {"PIL", "llvmlite"}, "upsample": {"filelock"}}
+    more = {"photos": {"PIL"}, "depth": {"PIL", "llvmlite"}, "methods": {"filelock"}}
     allowed |= more.get(part, set())
     for path in _files(part):
         tops = {name.split(".")[0] for name in _imports(path)}
@@ -243,8 +239,10 @@ def _assert_explained(each, where):
 
 
 def test_the_front_door_lists_what_the_packages_promise():
-    promised = "METHODS Camera PointCloud Scene SplatseedError cover load_scene stereo_depths"
-    assert splatseed.__all__ == [*promised.split(), "upsample", "upsample_points", "write_scene"]
+    promised = "METHODS Camera PointCloud Scene SplatseedError add_cover load_scene stereo_depths"
+    promised += " upsample upsample_points write_scene"
+    assert sorted(splatseed.__all__) == sorted(promised.split())
+    assert all(getattr(splatseed, name) for name in splatseed.__all__)
 
 
 def test_every_error_is_ours_and_says_three_things():
@@ -270,20 +268,20 @@ def test_dependencies_are_those_that_are_imported():
     base = {re.split(r"[><=\[;]", line)[0] for line in project["dependencies"]}
     names = {e: {re.split(r"[><=\[;]", line)[0] for line in extras[e]} for e in extras}
     more = names["train"] | names["tensorboard"]
-    called = {"PIL": "pillow", "imageio_ffmpeg": "imageio-ffmpeg"}
+    called = {"PIL": "pillow", "imageio_ffmpeg": "imageio-ffmpeg", "lazy_loader": "lazy-loader"}
     called["flip_evaluator"] = "flip-evaluator"
     for path in SOURCE.rglob("*.py"):
         imported = {name.split(".")[0] for name in _imports(path)}
         needed = imported - set(sys.stdlib_module_names) - {"splatseed", "pycolmap"}
         needed -= {"fused_ssim"} if path.name == "trainer.py" else set()  # taken where it is there
         part = path.relative_to(SOURCE).parts[0]
-        trains = part in {"render", "splat", "train", "view", "bench", "commands"}
+        trains = part in {"rendering", "splat", "training", "viewer", "bench", "commands"}
         # One loads torch, and gsplat's kernels, for those parts; one is a strategy of gsplat's.
         trains = trains or path.name in {"torch_device.py", "gsplat.py"}
         allowed = base | more if trains else base
         allowed = base | names["depth"] if path.name == "monocular.py" else allowed
         allowed = base | names["cluster"] if path.name.startswith("ray_") else allowed
-        if part in {"splat", "view", "commands", "sfm"}:
+        if part in {"splat", "viewer", "commands", "sfm"}:
             allowed = allowed | names["view"]
         if path.parent.name == "clouds":
             allowed = allowed | names["scan"]

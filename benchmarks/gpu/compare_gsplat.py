@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from splatseed.render import rasterization
-from splatseed.train.device import pick_device
-from splatseed.train.growing import contributions
-from splatseed.views.view import View
+from splatseed.photos.view import View
+from splatseed.rendering import rasterization
+from splatseed.training.device import pick_device
+from splatseed.training.growing import contributions
 
 __all__ = ["ODD_ONES", "TOLERANCE", "compare"]
 

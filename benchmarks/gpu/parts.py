@@ -13,8 +13,8 @@ import torch
 
 from splatseed import load_scene
 from splatseed.splat.evaluate import evaluate_views
-from splatseed.train import TrainSettings, prepare_run
-from splatseed.train.device import pick_device
+from splatseed.training import TrainSettings, prepare_run
+from splatseed.training.device import pick_device
 
 __all__ = ["machine", "train"]
 

@@ -19,13 +19,13 @@ from benchmarks.training.peer_stand_ins import Capture, load_peer
 from torch import Tensor
 
 from splatseed import load_scene
+from splatseed.photos.view import View, load_split
 from splatseed.splat.evaluate import evaluate_views
 from splatseed.splat.metrics import l1_and_ssim_by_convolution
-from splatseed.train import TrainSettings
-from splatseed.train.device import pick_device
-from splatseed.train.seeds import usable_seeds
-from splatseed.train.trainer import _fused_ssim
-from splatseed.views.view import View, load_split
+from splatseed.training import TrainSettings
+from splatseed.training.device import pick_device
+from splatseed.training.seeds import usable_seeds
+from splatseed.training.trainer import _fused_ssim
 
 __all__ = ["train"]
 

@@ -21,8 +21,8 @@ from splatseed.bench.plan import ANY_RATIO, DEPTH, SFM, Arm
 from splatseed.bench.runs import Run, read_runs
 from splatseed.bench.statistics import Difference
 from splatseed.bench.study import Study, studies
-from splatseed.train.settings import StrategyName
-from splatseed.upsample import Profile, configure
+from splatseed.methods import Profile, configure
+from splatseed.training.settings import StrategyName
 
 __all__ = ["LAYOUT", "RANDOM", "Results", "Way", "read_results"]
 

@@ -29,10 +29,10 @@ from splatseed import PointCloud, Scene
 from splatseed.camera import Intrinsics, quat_from_rotation
 from splatseed.errors import MissingDependencyError
 from splatseed.io import write_scene
+from splatseed.photos.view import View
 from splatseed.scene import Image
 from splatseed.splat.formats import write_model
 from splatseed.splat.gaussians import SH_C0
-from splatseed.views.view import View
 
 __all__ = ["seconds_per_step"]
 

@@ -27,7 +27,7 @@ from benchmarks.rendering.torch_rasterizer import rasterize
 from torch import Tensor
 
 from splatseed.errors import SplatseedError
-from splatseed.render import rasterization
+from splatseed.rendering import rasterization
 
 __all__: list[str] = []
 

@@ -20,12 +20,12 @@ from jaxtyping import Bool, Float32, Float64
 from scipy.spatial.transform import Rotation
 
 from splatseed.camera import Camera
-from splatseed.render.binning import RECORD, TILE, depth_order, list_tiles
-from splatseed.render.layout import gather
+from splatseed.photos.view import View
+from splatseed.rendering.binning import RECORD, TILE, depth_order, list_tiles
+from splatseed.rendering.layout import gather
 from splatseed.runtime.jit import kernel, parallel_range
 from splatseed.splat.gaussians import PARAMETERS, SH_C0, Gaussians, neighbor_distances
 from splatseed.synthetic.room import Room, build_room, orbit_cameras, render_views, visible
-from splatseed.views.view import View
 
 __all__ = ["Workload", "make_workload", "useful_pairs"]
 

@@ -2,8 +2,8 @@
 
 Notation: N Gaussians, one camera, D = 3 channels; tiles are 16 x 16 px. Promise: it is given what
 costs nothing to give: projection, culling and spherical harmonics are gsplat's own PyTorch
-versions, for all Gaussians at once; lists are sorted once; within a tile everything is computed for
-all pixels and all listed Gaussians at once. The specification is ``splatseed.render.reference``'s,
+versions, for all Gaussians at once; lists are sorted once; within a tile everything is computed
+for all pixels and listed Gaussians. The specification is ``splatseed.rendering.reference``'s,
 cut-offs included, and the tests hold the two rasterisers to each other.
 """
 
@@ -39,7 +39,7 @@ def rasterize(
     sh_degree: int,
     packed: bool = False,  # noqa: ARG001  (gsplat's argument; ``info`` here never is)
 ) -> tuple[Float[Tensor, "1 H W 3"], Float[Tensor, "1 H W 1"], dict[str, Any]]:
-    """Image, alphas and ``info``, as ``splatseed.render.rasterization`` gives them."""
+    """Image, alphas and ``info``, as ``splatseed.rendering.rasterization`` gives them."""
     covariances, _ = _quat_scale_to_covar_preci(quats, scales, compute_preci=False)
     radii, means2d, depths, conics, _ = _fully_fused_projection(
         means, covariances, viewmats, Ks, width, height

@@ -31,14 +31,14 @@ from benchmarks.rendering.stopwatch import RENDER_STAGES, Place, Stopwatch, time
 
 from splatseed import load_scene
 from splatseed.errors import SplatseedError
+from splatseed.photos.view import load_split
 from splatseed.splat.gaussians import Gaussians, TrainingFrame, initial_gaussians, training_frame
 from splatseed.splat.rendering import render_view
-from splatseed.train.parameters import make_optimizers, make_parameters
-from splatseed.train.seeds import near_depths, usable_seeds
-from splatseed.train.settings import TrainSettings
-from splatseed.train.state import TrainState, make_strategy
-from splatseed.train.trainer import Trainer, _Loss
-from splatseed.views.view import load_split
+from splatseed.training.parameters import make_optimizers, make_parameters
+from splatseed.training.seeds import near_depths, usable_seeds
+from splatseed.training.settings import TrainSettings
+from splatseed.training.state import TrainState, make_strategy
+from splatseed.training.trainer import Trainer, _Loss
 
 __all__: list[str] = []
 

@@ -22,12 +22,12 @@ from benchmarks.common.markdown import table
 from benchmarks.rendering.splats import make_workload
 from PIL import Image
 
+from splatseed.photos.view import View
 from splatseed.splat.gaussians import training_frame
-from splatseed.view.flights import smooth_path
-from splatseed.view.models import Shown
-from splatseed.view.pictures import Entry
-from splatseed.view.session import FrameLoop
-from splatseed.views.view import View
+from splatseed.viewer.flights import smooth_path
+from splatseed.viewer.models import Shown
+from splatseed.viewer.pictures import Entry
+from splatseed.viewer.session import FrameLoop
 
 QUALITY = 70
 

@@ -19,11 +19,11 @@ from benchmarks.common.markdown import table
 from benchmarks.seeds.cover_rules import rule_table
 
 from splatseed.errors import SplatseedError
+from splatseed.photos.view import View
+from splatseed.photos.visibility import look_at
 from splatseed.seeding.budget import thin
 from splatseed.seeding.cover import cover
 from splatseed.seeding.coverage import HIDING, NEARER, covered_share, grid_from_world, grid_of
-from splatseed.views.view import View
-from splatseed.views.visibility import look_at
 
 __all__: list[str] = []
 

@@ -17,10 +17,10 @@ from benchmarks.common.markdown import table
 from scipy.spatial import Delaunay, QhullError
 
 from splatseed.io import load_scene
+from splatseed.photos.view import View, poses_of
 from splatseed.progress import silent
 from splatseed.scene import Image, Scene
 from splatseed.seeding import cover, coverage
-from splatseed.views.view import View, poses_of
 
 __all__ = ["rule_table"]
 

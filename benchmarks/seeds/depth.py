@@ -38,11 +38,11 @@ from splatseed.depth.alignment import map_camera
 from splatseed.errors import SceneNotFoundError
 from splatseed.io import find_depths
 from splatseed.io.photograph import decode_photograph, photograph_bytes
+from splatseed.photos.view import user_cache_dir
+from splatseed.photos.visibility import choose_camera
 from splatseed.progress import in_threads, silent
 from splatseed.scene import Scene, SceneSource, Tracks
-from splatseed.view.points import render_points
-from splatseed.views.view import user_cache_dir
-from splatseed.views.visibility import choose_camera
+from splatseed.viewer.points import render_points
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # as the command line does
 

@@ -29,13 +29,13 @@ from benchmarks.stereo.speed import prepare_views
 
 import splatseed as ss
 from splatseed.errors import SplatseedError
+from splatseed.methods.method import NewPoints
+from splatseed.photos.view import user_cache_dir
+from splatseed.photos.visibility import find_visibility
 from splatseed.scene import Scene
 from splatseed.seeding import verify as module
-from splatseed.seeding.photographs import MAX_SIZE, read_views
+from splatseed.seeding.photo_methods import MAX_SIZE, read_views
 from splatseed.synthetic.room import build_room
-from splatseed.upsample.method import NewPoints
-from splatseed.views.view import user_cache_dir
-from splatseed.views.visibility import find_visibility
 
 __all__ = ["whole_run"]
 

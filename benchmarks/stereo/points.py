@@ -18,8 +18,8 @@ from benchmarks.common.clouds import find_scenes
 import splatseed as ss
 from splatseed.depth.stereo.depths import find_stereo
 from splatseed.depth.stereo.maps import StereoResult, StereoSettings
-from splatseed.views.view import data_factor, load_views
-from splatseed.views.visibility import Visibility, find_visibility
+from splatseed.photos.view import data_factor, load_views
+from splatseed.photos.visibility import Visibility, find_visibility
 
 __all__ = ["FEW", "PointScore", "score_few", "score_points"]
 

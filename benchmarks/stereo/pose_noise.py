@@ -31,12 +31,12 @@ import splatseed as ss
 from splatseed.camera import quat_from_rotation
 from splatseed.depth.stereo.maps import stereo_depths
 from splatseed.errors import ReconstructionError, SplatseedError
+from splatseed.photos.view import user_cache_dir
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
 from splatseed.seeding.poses import pose_error
 from splatseed.sfm import refined
 from splatseed.similarity import fit_similarity
-from splatseed.views.view import user_cache_dir
 
 __all__: list[str] = []
 

@@ -22,11 +22,11 @@ from splatseed.depth.stereo.cost import make_quads
 from splatseed.depth.stereo.depths import find_stereo, fuse
 from splatseed.depth.stereo.maps import StereoSettings
 from splatseed.depth.stereo.patchmatch import QuadImages, begin, sweep
+from splatseed.photos.view import load_views
+from splatseed.photos.visibility import find_visibility
 from splatseed.pointcloud import PointCloud
 from splatseed.synthetic import make_capture, write_capture
 from splatseed.synthetic.texture import value_noise
-from splatseed.views.view import load_views
-from splatseed.views.visibility import find_visibility
 
 __all__ = ["hypothesis_seconds", "prepare_views", "whole_run"]
 

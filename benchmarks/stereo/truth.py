@@ -22,12 +22,12 @@ import splatseed as ss
 from splatseed.depth.stereo.depths import find_stereo, fuse, known_visibility
 from splatseed.depth.stereo.maps import StereoResult, StereoSettings
 from splatseed.io import find_depths
+from splatseed.photos.view import data_factor, load_views
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
 from splatseed.synthetic import make_capture, write_capture
 from splatseed.synthetic.room import Room, render_views
 from splatseed.synthetic.texture import Plain
-from splatseed.views.view import data_factor, load_views
 
 __all__ = [
     "MADE_STEP",

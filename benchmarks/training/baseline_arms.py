@@ -16,8 +16,8 @@ from typing import Any
 
 from splatseed import load_scene
 from splatseed.splat.evaluate import evaluate_views
-from splatseed.train import TrainSettings, prepare_run
-from splatseed.train.schedule import LEARNING_RATES, Schedule
+from splatseed.training import TrainSettings, prepare_run
+from splatseed.training.schedule import LEARNING_RATES, Schedule
 
 __all__ = ["ARMS", "CAPS", "Arm", "fingerprint", "train"]
 

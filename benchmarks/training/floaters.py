@@ -28,17 +28,17 @@ from PIL import Image
 
 import splatseed as ss
 from splatseed.errors import SplatseedError
+from splatseed.photos.view import View, poses_of
 from splatseed.scene import Scene
 from splatseed.splat.evaluate import evaluate_views
 from splatseed.splat.gaussians import SH_C0, Gaussians, TrainingFrame, training_frame
 from splatseed.splat.rendering import ModelRenderer, as_bytes
 from splatseed.synthetic import make_capture, write_capture
-from splatseed.train import TrainSettings, prepare_run
-from splatseed.train.floaters import find_floaters
-from splatseed.train.parameters import gaussians_of
-from splatseed.train.seeds import known_depths
-from splatseed.train.settings import StrategyName
-from splatseed.views.view import View, poses_of
+from splatseed.training import TrainSettings, prepare_run
+from splatseed.training.floaters import find_floaters
+from splatseed.training.parameters import gaussians_of
+from splatseed.training.seeds import known_depths
+from splatseed.training.settings import StrategyName
 
 __all__: list[str] = []
 

@@ -43,14 +43,14 @@ from matplotlib.patches import Rectangle
 
 import splatseed as ss
 from splatseed.errors import SplatseedError
+from splatseed.photos.view import View, user_cache_dir
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
 from splatseed.seeding.poses import random_start
 from splatseed.splat.evaluate import EvalResult, evaluate_views
-from splatseed.train import TrainSettings, prepare_run
-from splatseed.train.run import TrainingRun
-from splatseed.train.settings import Seeding, StrategyName
-from splatseed.views.view import View, user_cache_dir
+from splatseed.training import TrainSettings, prepare_run
+from splatseed.training.run import TrainingRun
+from splatseed.training.settings import Seeding, StrategyName
 
 __all__ = ["train_all"]
 

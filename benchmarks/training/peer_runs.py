@@ -23,15 +23,15 @@ from torch import Tensor
 from splatseed import Scene, load_scene
 from splatseed.errors import SceneFormatError
 from splatseed.io.depth_maps import depth_folder
-from splatseed.render import mcmc_on_cpu
+from splatseed.photos.view import View, load_split
+from splatseed.rendering import mcmc_on_cpu
 from splatseed.runtime.memory import keep_freed_memory
 from splatseed.splat.evaluate import Render, evaluate_views
-from splatseed.train import TrainSettings, prepare_run
-from splatseed.train.device import Capacity
-from splatseed.train.schedule import FULL_RUN
-from splatseed.train.seeds import known_depths, usable_seeds
-from splatseed.train.strategies import Capped
-from splatseed.views.view import View, load_split
+from splatseed.training import TrainSettings, prepare_run
+from splatseed.training.device import Capacity
+from splatseed.training.schedule import FULL_RUN
+from splatseed.training.seeds import known_depths, usable_seeds
+from splatseed.training.strategies import Capped
 
 __all__ = ["Split", "read_scene", "train_ours", "train_peer"]
 

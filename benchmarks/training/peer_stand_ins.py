@@ -32,10 +32,10 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from splatseed.errors import MissingDependencyError, SceneNotFoundError
+from splatseed.photos.view import View
 from splatseed.pointcloud import PointCloud
-from splatseed.render import rasterization
+from splatseed.rendering import rasterization
 from splatseed.splat.ssim import l1_and_ssim
-from splatseed.views.view import View
 
 __all__ = ["Capture", "Peer", "check_examples", "fused_ssim", "load_peer"]
 

@@ -26,9 +26,9 @@ from benchmarks.training.peer_runs import Split, read_scene
 from benchmarks.training.peer_stand_ins import check_examples
 
 from splatseed.errors import ParameterError, SplatseedError
-from splatseed.train import TrainSettings
-from splatseed.train.settings import BUDGET, StrategyName
-from splatseed.views.view import load_split
+from splatseed.photos.view import load_split
+from splatseed.training import TrainSettings
+from splatseed.training.settings import BUDGET, StrategyName
 
 __all__: list[str] = []
 

@@ -22,7 +22,7 @@ from benchmarks.training.baseline import read_ledger
 
 from splatseed.errors import SplatseedError
 from splatseed.seeding.advice import AS_IT_IS, ROOM, Measured, advise
-from splatseed.train.seeds import SEEDS_SHARE
+from splatseed.training.seeds import SEEDS_SHARE
 
 __all__: list[str] = []
 

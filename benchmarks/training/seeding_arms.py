@@ -17,14 +17,14 @@ from typing import Any
 import numpy as np
 
 import splatseed as ss
+from splatseed.methods import configure
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene, Split
 from splatseed.seeding.poses import random_start
 from splatseed.sfm import refined
 from splatseed.splat.evaluate import evaluate_views
-from splatseed.train import TrainSettings, prepare_run
-from splatseed.train.seeds import most_seeds, stereo_size
-from splatseed.upsample import configure
+from splatseed.training import TrainSettings, prepare_run
+from splatseed.training.seeds import most_seeds, stereo_size
 
 __all__ = ["ARMS", "TEST_EVERY", "train", "triangulated", "validation_split"]
 

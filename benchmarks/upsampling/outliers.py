@@ -18,8 +18,8 @@ from benchmarks.common.markdown import table
 
 from splatseed import PointCloud
 from splatseed.errors import SplatseedError
+from splatseed.methods.neighbors import PreparedCloud, prepare, sound_bases
 from splatseed.synthetic.surfaces import Sphere
-from splatseed.upsample.neighbors import PreparedCloud, prepare, sound_bases
 
 __all__ = ["outlier_table"]
 

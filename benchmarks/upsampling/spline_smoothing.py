@@ -14,8 +14,8 @@ from benchmarks.common.clouds import room
 from benchmarks.common.markdown import table
 from scipy.interpolate import SmoothBivariateSpline
 
-from splatseed.upsample.neighbors import prepare
-from splatseed.upsample.patches import local_frames
+from splatseed.methods.neighbors import prepare
+from splatseed.methods.patches import local_frames
 
 __all__ = ["smoothing_table"]
 

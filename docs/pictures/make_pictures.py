@@ -27,13 +27,13 @@ from splatseed.depth.alignment import align
 from splatseed.io import find_depths
 from splatseed.io.depth_maps import depth_folder
 from splatseed.io.staging import atomic_file
+from splatseed.methods import methods_for
+from splatseed.photos.visibility import choose_camera, choose_image, find_visibility, look_at
 from splatseed.scene import Image
 from splatseed.seeding.diagnostics import spacing
 from splatseed.synthetic import Capture, make_capture, write_capture
-from splatseed.upsample import methods_for
-from splatseed.view.maps import preview_depth
-from splatseed.view.points import render_points
-from splatseed.views.visibility import choose_camera, choose_image, find_visibility, look_at
+from splatseed.viewer.maps import preview_depth
+from splatseed.viewer.points import render_points
 
 HERE = Path(__file__).parent
 RATIO = 8

@@ -5,25 +5,7 @@
 ['auto', 'cloud', 'cover']
 """
 
-from splatseed.camera import Camera
-from splatseed.depth.stereo import stereo_depths
-from splatseed.errors import SplatseedError
-from splatseed.io import load_scene, write_scene
-from splatseed.pointcloud import PointCloud
-from splatseed.scene import Scene
-from splatseed.seeding.upsampling import add_cover as cover, upsample
-from splatseed.upsample import METHODS, upsample_points
+import lazy_loader
 
-__all__ = [
-    "METHODS",
-    "Camera",
-    "PointCloud",
-    "Scene",
-    "SplatseedError",
-    "cover",
-    "load_scene",
-    "stereo_depths",
-    "upsample",
-    "upsample_points",
-    "write_scene",
-]
+# The names, with their types, stand in __init__.pyi; each is loaded when it is first used.
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -16,8 +16,8 @@ from rich.table import Table
 
 from splatseed.console import ERR, OUT
 from splatseed.errors import SplatseedError
-from splatseed.literal import did_you_mean, visible
 from splatseed.runtime.interruption import Termination, exit_code
+from splatseed.text import did_you_mean, visible
 
 VERBS = {
     "upsample": "Add points to a scene and write it for any 3DGS trainer.",

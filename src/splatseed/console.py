@@ -18,8 +18,8 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from splatseed.literal import visible
 from splatseed.runtime.compilation import watched
+from splatseed.text import visible
 
 
 class LiteralConsole(Console):

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from splatseed.camera import CAMERA_MODELS, Intrinsics
-from splatseed.literal import quoted
+from splatseed.text import quoted
 
 DIRECTIONS, STEPS = 8, 1024
 """Number of rays along which a fold is searched for, and of samples on each."""

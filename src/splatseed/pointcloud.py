@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from splatseed.errors import PointCloudError
 from splatseed.frozen import read_only
-from splatseed.literal import visible
+from splatseed.text import visible
 
 ORIGINAL = 0
 """The ``source`` code of points that were in the input."""

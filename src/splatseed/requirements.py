@@ -9,7 +9,7 @@ from pathlib import Path
 from shlex import quote
 
 from splatseed.errors import MissingDependencyError
-from splatseed.literal import quoted
+from splatseed.text import quoted
 
 EXTRAS = {
     "train": (

@@ -9,7 +9,7 @@ import pytest
 from splatseed.bench.plan import Plan
 from splatseed.bench.scenes import PlannedScene
 from splatseed.synthetic import make_capture, write_capture
-from splatseed.train.settings import TrainSettings
+from splatseed.training.settings import TrainSettings
 
 
 @pytest.fixture(scope="session")

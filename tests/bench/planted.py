@@ -11,7 +11,7 @@ from splatseed.bench.plan import SFM, SHARED, Arm, RunResult, RunSpec
 from splatseed.bench.runs import ERROR, RESULT, Run, begin, run_folder
 from splatseed.bench.scenes import PlannedScene, SceneFacts, survey
 from splatseed.scores import CurvePoint, EvalResult, ViewScore
-from splatseed.train.settings import TrainSettings
+from splatseed.training.settings import TrainSettings
 
 SCENES = ("bonsai", "fox", "room0", "treehill")
 GAINS = {(SFM, 1): 0.0, ("linear", 8): 0.3, ("mls", 4): 0.2, ("mls", 8): 0.5, ("random", 8): -0.4}

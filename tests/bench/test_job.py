@@ -24,7 +24,7 @@ from splatseed.io.ply import write_ply
 from splatseed.runtime.tasks import HereTasks
 from splatseed.splat.covisible import read_covisible
 from splatseed.synthetic import make_capture
-from splatseed.train.seeds import seeds_digest
+from splatseed.training.seeds import seeds_digest
 
 from .planted import surveyed
 

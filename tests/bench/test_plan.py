@@ -16,7 +16,7 @@ from splatseed.bench.plan_file import plan_text, preset_plan, read_plan
 from splatseed.bench.scenes import DEMO, PlannedScene, SceneFacts
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.scores import CurvePoint, EvalResult, ViewScore
-from splatseed.train.settings import TrainSettings
+from splatseed.training.settings import TrainSettings
 
 from .planted import surveyed
 

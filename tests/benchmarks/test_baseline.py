@@ -8,8 +8,8 @@ pytest.importorskip("torch", reason="training needs PyTorch")
 
 from splatseed.io import load_scene
 from splatseed.synthetic import make_capture, write_capture
-from splatseed.train import TrainSettings
-from splatseed.train.schedule import make_schedule
+from splatseed.training import TrainSettings
+from splatseed.training.schedule import make_schedule
 
 MODULES = ("training.baseline", "training.baseline_arms")
 

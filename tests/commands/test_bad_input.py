@@ -26,9 +26,9 @@ from splatseed.io.staging import MANIFEST, atomic_file, output_folder
 from splatseed.pointcloud import PointCloud
 from splatseed.splat.formats import write_model
 from splatseed.splat.gaussians import initial_gaussians
-from splatseed.train.folder import RunFolder
-from splatseed.train.settings import TrainSettings
-from splatseed.train.state import load_checkpoint, make_strategy
+from splatseed.training.folder import RunFolder
+from splatseed.training.settings import TrainSettings
+from splatseed.training.state import load_checkpoint, make_strategy
 
 from ..command_line import parser_of
 

@@ -15,9 +15,9 @@ from splatseed import synthetic
 from splatseed.commands import demo
 from splatseed.errors import MissingDependencyError
 from splatseed.io import load_scene
+from splatseed.methods import METHODS
 from splatseed.runtime.compilation import tell
 from splatseed.synthetic import write_capture
-from splatseed.upsample import METHODS
 
 
 @pytest.fixture(autouse=True)

@@ -13,8 +13,8 @@ from splatseed.io import load_scene
 from splatseed.splat.evaluate import evaluate_views
 from splatseed.splat.formats import write_model
 from splatseed.splat.gaussians import initial_gaussians
-from splatseed.train.run import prepare_run
-from splatseed.train.settings import TrainSettings
+from splatseed.training.run import prepare_run
+from splatseed.training.settings import TrainSettings
 
 
 @pytest.fixture(scope="module")

@@ -18,9 +18,9 @@ from splatseed.io import find_depths, load_scene, write_scene
 from splatseed.io.colmap import write_points3d
 from splatseed.io.depth_maps import depth_folder
 from splatseed.io.ply import write_ply
+from splatseed.methods import upsample
 from splatseed.pointcloud import PointCloud
 from splatseed.synthetic import make_capture, write_capture
-from splatseed.upsample import upsample
 
 
 def _pairs(out):

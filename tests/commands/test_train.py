@@ -19,7 +19,7 @@ from splatseed.sfm import Refinement, SfmReport
 pytest.importorskip("torch", reason="training needs PyTorch")
 pytest.importorskip("gsplat", reason="training needs gsplat's strategies")
 
-from splatseed.view.models import open_shown
+from splatseed.viewer.models import open_shown
 
 SHORT = ("--max-steps", "3", "--data-factor", "2")
 

@@ -19,9 +19,9 @@ from splatseed.io.colmap import write_images
 from splatseed.io.photograph import lens_warnings
 from splatseed.io.seeds import saw_all_photographs, was_upsampled
 from splatseed.lens import image_points, rays_through
+from splatseed.photos.view import check_lens, load_views
 from splatseed.sfm import undistort
 from splatseed.synthetic import make_capture, write_capture
-from splatseed.views.view import check_lens, load_views
 
 from ..bent import bend
 

@@ -24,12 +24,12 @@ from splatseed.io.nerfstudio import read_cloud_transform
 from splatseed.io.origin import moved_by
 from splatseed.io.ply import read_ply, write_ply
 from splatseed.io.staging import unlisted_files
+from splatseed.methods import METHODS, SOURCE_CODES, chooses_number, configure, upsample
 from splatseed.pointcloud import PointCloud
 from splatseed.sfm.refinement import poses_of, turns
 from splatseed.similarity import Similarity
 from splatseed.splat.formats import read_model
 from splatseed.synthetic import make_capture
-from splatseed.upsample import METHODS, SOURCE_CODES, chooses_number, configure, upsample
 
 from ..command_line import exit_code
 
@@ -421,7 +421,9 @@ def test_the_files_of_an_alignment_are_listed(splatseed, room, scan, tmp_path, m
         "splatseed.commands.upsample.command.load_cloud",
         lambda _, scene, method, __: LoadedCloud(scene, method.of(scan), alignment=found),
     )
-    monkeypatch.setattr("splatseed.view.clouds.preview_alignment", lambda *given: given[-1].touch())
+    monkeypatch.setattr(
+        "splatseed.viewer.clouds.preview_alignment", lambda *given: given[-1].touch()
+    )
     out = tmp_path / "out"
     run = splatseed("upsample", room, "--cloud", scan, "-o", out)
     assert run.code == 0, run.err

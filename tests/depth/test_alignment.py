@@ -16,7 +16,7 @@ from splatseed.depth.alignment import (
     robust_line,
 )
 from splatseed.depthmap import DepthMap
-from splatseed.views.visibility import camera_points, find_visibility
+from splatseed.photos.visibility import camera_points, find_visibility
 
 SCALES = 1.5 ** np.linspace(-3, 3, 12)
 

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image as PillowImage
 
 from splatseed.io import load_scene
-from splatseed.upsample import METHODS
+from splatseed.methods import METHODS
 
 FOLDER = Path(__file__).parents[2] / "examples"
 EXAMPLES = sorted(FOLDER.glob("*.py"))

@@ -21,8 +21,8 @@ from splatseed.io.dense import (
     write_map,
 )
 from splatseed.io.ply import read_ply
+from splatseed.photos.projection import undistort
 from splatseed.synthetic import make_capture, write_capture
-from splatseed.views.projection import undistort
 
 from ..bent import bend
 from ..stereo_maps import true_maps

@@ -13,9 +13,9 @@ from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io import colmap, load_scene
 from splatseed.io.cleaning import clean_scene
 from splatseed.io.ply import write_ply
+from splatseed.methods import upsample
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import LeftOut, Scene
-from splatseed.upsample import upsample
 
 
 def rewrite_points(scene_dir, xyz):

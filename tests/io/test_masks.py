@@ -14,10 +14,10 @@ from splatseed.io import load_scene, write_scene
 from splatseed.io.load import with_own_depths
 from splatseed.io.mask_files import masks_among
 from splatseed.io.masks import masks_beside, with_masks
+from splatseed.methods import upsample
+from splatseed.photos.view import load_views
 from splatseed.sfm.photos import find_photos
 from splatseed.synthetic import write_capture
-from splatseed.upsample import upsample
-from splatseed.views.view import load_views
 
 from ..bent import bend
 

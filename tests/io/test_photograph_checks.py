@@ -11,7 +11,7 @@ import pytest
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io import colmap, load_scene, write_scene
 from splatseed.io.photograph_checks import with_photographs
-from splatseed.views.visibility import find_visibility
+from splatseed.photos.visibility import find_visibility
 
 
 def names(images):

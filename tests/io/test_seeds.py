@@ -16,8 +16,8 @@ from splatseed.io.seeds import SEEDS, _read_seeds, saw_all_photographs, was_upsa
 from splatseed.pointcloud import ATTRIBUTES, GENERATED, PointCloud
 from splatseed.progress import silent
 from splatseed.synthetic import make_capture
-from splatseed.train.seeds import seeded
-from splatseed.train.settings import TrainSettings
+from splatseed.training.seeds import seeded
+from splatseed.training.settings import TrainSettings
 
 from .checks import damages
 

@@ -93,8 +93,8 @@ def test_a_kernel_is_compiled_again_when_a_file_that_it_reaches_changes(tiny):
 
 
 def test_a_kernel_reaches_what_compiles_it_and_the_lanes_that_it_uses():
-    importlib.import_module("splatseed.render.harmonics")
-    reached = jit.reached_files("splatseed.render.harmonics").keys()
+    importlib.import_module("splatseed.rendering.harmonics")
+    reached = jit.reached_files("splatseed.rendering.harmonics").keys()
     assert "splatseed.cli" not in reached
     for name in ("jit", "compilation", "simd", "shuffles"):
         assert f"splatseed.runtime.{name}" in reached

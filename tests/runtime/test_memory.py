@@ -11,13 +11,13 @@ from splatseed.depth.stereo import StereoSettings, stereo_depths
 from splatseed.depth.stereo.matching import BYTES_A_DEPTH, check_stereo_memory
 from splatseed.errors import ParameterError
 from splatseed.io import load_scene
+from splatseed.methods import BYTES_EACH, number_of_new, upsample
+from splatseed.methods.neighbors import NEIGHBOR_BYTES
+from splatseed.photos.view import load_views
 from splatseed.pointcloud import PointCloud
 from splatseed.runtime import memory
 from splatseed.synthetic import make_capture, write_capture
-from splatseed.train.device import BYTES_EACH as BYTES_TRAINED
-from splatseed.upsample import BYTES_EACH, number_of_new, upsample
-from splatseed.upsample.neighbors import NEIGHBOR_BYTES
-from splatseed.views.view import load_views
+from splatseed.training.device import BYTES_EACH as BYTES_TRAINED
 
 
 @pytest.fixture

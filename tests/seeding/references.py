@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from splatseed.views.view import View
-from splatseed.views.visibility import look_at
+from splatseed.photos.view import View
+from splatseed.photos.visibility import look_at
 
 NEARER, HIDING, WITNESSES = 0.1, 5, 12
 

@@ -7,12 +7,12 @@ import pytest
 
 import splatseed as ss
 from splatseed.errors import ParameterError
+from splatseed.methods import SOURCE_CODES
+from splatseed.photos import view
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import silent
 from splatseed.scene import Split
 from splatseed.seeding.upsampling import parse_budget, share_covered, thin_to
-from splatseed.upsample import SOURCE_CODES
-from splatseed.views import view
 
 by_photographs = pytest.mark.parametrize("method", ["stereo", "cover", "auto"])
 STEREO, COVER, CLOUD = (SOURCE_CODES[name] for name in ("stereo", "cover", "cloud"))

@@ -15,12 +15,12 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from splatseed.camera import Intrinsics, quat_from_rotation
+from splatseed.methods.method import NewPoints
+from splatseed.photos.view import View
+from splatseed.photos.visibility import Visibility
 from splatseed.scene import Image
 from splatseed.seeding import verify as module
 from splatseed.synthetic.room import Room, render_view
-from splatseed.upsample.method import NewPoints
-from splatseed.views.view import View
-from splatseed.views.visibility import Visibility
 
 from ..depth.stereo.made import DOWN, STONE, WIDTH, arc, tilted_plane
 from .references import make_view, matrix_of, project

@@ -9,8 +9,8 @@ import pytest
 
 pytest.importorskip("torch", reason="scoring needs PyTorch")
 
+from splatseed.photos.view import poses_of
 from splatseed.splat.covisible import find_covisible, pixel_masks, read_covisible, write_covisible
-from splatseed.views.view import poses_of
 
 
 def _truth(depths, view, train):

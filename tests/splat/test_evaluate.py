@@ -16,12 +16,12 @@ from splatseed.errors import ParameterError, SceneNotFoundError
 from splatseed.io import load_scene
 from splatseed.io.photograph import photographs_digest
 from splatseed.io.photograph_checks import with_photographs
+from splatseed.photos.view import View, at_file_size, poses_of
 from splatseed.scores import EvalResult, ViewScore
 from splatseed.splat.evaluate import evaluate_model, evaluate_views, load_model
 from splatseed.splat.formats import write_model
 from splatseed.splat.gaussians import initial_gaussians, training_frame
 from splatseed.splat.rendering import ModelRenderer
-from splatseed.views.view import View, at_file_size, poses_of
 
 
 @pytest.fixture

@@ -9,6 +9,7 @@ from hypothesis import given, settings, strategies as st
 from splatseed.camera import rotation_from_quat
 from splatseed.errors import PointCloudError
 from splatseed.io.ply import read_ply
+from splatseed.photos.view import View, load_split
 from splatseed.pointcloud import PointCloud
 from splatseed.splat.formats import write_model
 from splatseed.splat.gaussians import (
@@ -21,7 +22,6 @@ from splatseed.splat.gaussians import (
     neighbor_distances,
     training_frame,
 )
-from splatseed.views.view import View, load_split
 
 SIDE = 64
 

@@ -22,7 +22,7 @@ from splatseed.splat.metrics import (
     psnr,
 )
 from splatseed.splat.ssim import l1_and_ssim
-from splatseed.train.trainer import photometric_loss
+from splatseed.training.trainer import photometric_loss
 
 # L1, SSIM, PSNR -----------------------------------------------------------------------------------
 

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from splatseed.errors import SceneFormatError
+from splatseed.photos.view import View
 from splatseed.splat.formats import read_model, write_model
 from splatseed.splat.gaussians import Gaussians, TrainingFrame
-from splatseed.views.view import View
 
 C0 = 0.28209479177387814  # 3DGS, utils/sh_utils.py
 KINDS = {"<f4": "float", "<f8": "double", "u1": "uchar", "<u2": "ushort", "<i4": "int"}

@@ -23,9 +23,9 @@ from splatseed.bench.plan import SFM, RunResult, RunSpec
 from splatseed.bench.runs import Run
 from splatseed.bench.statistics import Difference, difference
 from splatseed.bench.study import Study, studies, variant_order
-from splatseed.literal import counted
 from splatseed.seeding.advice import AS_IT_IS, ROOM, Measured, advise
-from splatseed.train.settings import StrategyName
+from splatseed.text import counted
+from splatseed.training.settings import StrategyName
 
 Key = TypeVar("Key", bound=Hashable)
 

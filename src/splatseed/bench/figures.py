@@ -21,7 +21,7 @@ from splatseed.bench.comparisons import ArmKey, baseline_of, compared_arms, gain
 from splatseed.bench.plan import SFM, Arm
 from splatseed.bench.statistics import Difference
 from splatseed.bench.study import Study
-from splatseed.train.settings import StrategyName
+from splatseed.training.settings import StrategyName
 
 _BLACK = "#222222"
 _COLORS = {

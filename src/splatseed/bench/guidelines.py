@@ -49,7 +49,7 @@ def describe(scene: Scene, progress: Progress = silent) -> dict[str, float]:
     Raises:
         PointCloudError: Fewer than four distinct finite originals.
     """
-    from splatseed.upsample.neighbors import prepare  # noqa: PLC0415  (SciPy and Numba)
+    from splatseed.methods.neighbors import prepare  # noqa: PLC0415  (SciPy and Numba)
 
     cloud = prepare(scene.points.originals, progress=progress)
     if len(cloud) < 4:

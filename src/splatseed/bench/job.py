@@ -36,6 +36,8 @@ from splatseed.errors import (
 )
 from splatseed.io.files import ARCHIVE_FAILURES
 from splatseed.io.staging import MANIFEST, atomic_file, output_folder, write_json
+from splatseed.methods import Upsampler, chooses_number, configure
+from splatseed.photos.view import user_cache_dir
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.runtime.compilation import watched
@@ -46,13 +48,11 @@ from splatseed.scores import EvalResult
 from splatseed.seeding.advice import DEFAULT_METHOD
 from splatseed.seeding.clouds.method import Cloud
 from splatseed.seeding.upsampling import thin_to, upsample
-from splatseed.train.seeds import compared_images, stereo_size
-from splatseed.train.settings import TrainSettings
-from splatseed.upsample import Upsampler, chooses_number, configure
-from splatseed.views.view import user_cache_dir
+from splatseed.training.seeds import compared_images, stereo_size
+from splatseed.training.settings import TrainSettings
 
 if TYPE_CHECKING:  # PyTorch, which takes a while
-    from splatseed.train.run import TrainingRun
+    from splatseed.training.run import TrainingRun
 
 _PICTURES = 3
 """Test views that are kept as pictures."""
@@ -122,7 +122,7 @@ def run_job(
 ) -> RunResult:
     """Carry out a run, and make its folder in the benchmark's."""
     from splatseed.splat.metrics import load_lpips  # noqa: PLC0415  (PyTorch)
-    from splatseed.train.run import prepare_run  # noqa: PLC0415  (PyTorch)
+    from splatseed.training.run import prepare_run  # noqa: PLC0415  (PyTorch)
 
     begun = time.perf_counter()
     with output_folder(run_folder(bench, spec), kind="bench", overwrite=True) as folder:

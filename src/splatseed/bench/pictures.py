@@ -34,7 +34,7 @@ from splatseed.io.photograph import decode_photograph, photograph_bytes
 from splatseed.io.staging import write_json
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
-from splatseed.view.clouds import preview_methods
+from splatseed.viewer.clouds import preview_methods
 
 FIGURES = "figures"
 _DESCRIPTORS = "descriptors.json"

@@ -16,14 +16,14 @@ from typing import Any, Self, get_args
 
 from splatseed.bench.scenes import PlannedScene, SceneFacts
 from splatseed.errors import ParameterError
-from splatseed.literal import did_you_mean
+from splatseed.methods import METHODS, Profile, Upsampler, chooses_number, configure
+from splatseed.photos.view import TRAINED_SIDE
 from splatseed.scores import CurvePoint, EvalResult
 from splatseed.seeding.upsampling import RHO, parse_budget
-from splatseed.train.duration import GROWTH, step_seconds
-from splatseed.train.seeds import most_seeds
-from splatseed.train.settings import Backend, StrategyName, TrainSettings
-from splatseed.upsample import METHODS, Profile, Upsampler, chooses_number, configure
-from splatseed.views.view import TRAINED_SIDE
+from splatseed.text import did_you_mean
+from splatseed.training.duration import GROWTH, step_seconds
+from splatseed.training.seeds import most_seeds
+from splatseed.training.settings import Backend, StrategyName, TrainSettings
 
 SFM = "sfm"
 """The method that leaves the cloud of Structure-from-Motion as it is; its ratio is 1."""

@@ -18,8 +18,8 @@ from splatseed.bench.plan import SHARED, Plan
 from splatseed.bench.scenes import DEMO, PlannedScene
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.io.files import StrPath, read_text
-from splatseed.train.settings import TrainSettings
-from splatseed.upsample.method import describe_type, fits
+from splatseed.methods.method import describe_type, fits
+from splatseed.training.settings import TrainSettings
 
 PresetName = Literal["mipnerf360", "replica", "paper-small", "paper-depth", "laptop", "quick"]
 PLAN = "plan.toml"

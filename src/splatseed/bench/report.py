@@ -34,8 +34,8 @@ from splatseed.bench.study import Study, studies
 from splatseed.bench.tables import Number, Table, to_html, write_table
 from splatseed.io.files import StrPath, read_text
 from splatseed.io.staging import atomic_file, output_folder
-from splatseed.literal import counted
 from splatseed.progress import Progress, silent
+from splatseed.text import counted
 
 REPORT, TABLES = "report.html", "tables"
 _KIND = "bench report"

@@ -32,7 +32,7 @@ from splatseed.io.staging import (
     read_manifest,
     write_json,
 )
-from splatseed.literal import counted
+from splatseed.text import counted
 
 RESULT, ERROR = "result.json", "error.json"
 _PLANNED = "planned.json"

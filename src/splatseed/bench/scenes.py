@@ -23,10 +23,10 @@ from splatseed.io.files import open_file, read_bytes
 from splatseed.io.load import search_depths
 from splatseed.io.photograph import photograph_bytes
 from splatseed.io.photograph_checks import check_sizes, with_photographs
+from splatseed.photos.sight import stray_notes
+from splatseed.photos.view import check_lens
 from splatseed.progress import Progress, in_threads, silent
 from splatseed.scene import Scene
-from splatseed.views.sight import stray_notes
-from splatseed.views.view import check_lens
 
 DEMO = "demo:"
 """The path of the synthetic room, which is made in the benchmark's folder on demand."""

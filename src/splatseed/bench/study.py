@@ -18,8 +18,8 @@ import pandas as pd
 
 from splatseed.bench.plan import SFM, SHARED, Arm, RunResult, RunSpec
 from splatseed.bench.runs import Run
-from splatseed.train.settings import StrategyName, TrainSettings
-from splatseed.upsample import METHODS
+from splatseed.methods import METHODS
+from splatseed.training.settings import StrategyName, TrainSettings
 
 _COLUMNS = ("strategy", "scene", "seeds", "repeat", "spec", "result")
 _BESIDE = {"maps": "depth_digest", "scan": "cloud_digest"}

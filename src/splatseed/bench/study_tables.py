@@ -20,7 +20,7 @@ from splatseed.bench.plan import SFM
 from splatseed.bench.statistics import Difference
 from splatseed.bench.study import Study
 from splatseed.bench.tables import Cell, Number, Row, Table, make_table
-from splatseed.train.settings import StrategyName
+from splatseed.training.settings import StrategyName
 
 NOISE, CLEAR, ONE_RUN = "~", "†", "(1 run)"
 _FEWEST = 3

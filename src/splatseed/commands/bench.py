@@ -34,13 +34,13 @@ from splatseed.commands.options import check_least, parse_options, refuse
 from splatseed.console import ERR, OUT, print_note, print_pairs, print_table, stage_display
 from splatseed.errors import ParameterError, SceneNotFoundError
 from splatseed.io.staging import atomic_file, check_output, output_folder
-from splatseed.literal import counted, did_you_mean, quoted, visible
+from splatseed.methods import Profile
 from splatseed.requirements import require
 from splatseed.runtime.interruption import exit_code
 from splatseed.runtime.memory import check_memory
 from splatseed.runtime.tasks import ProcessTasks, Tasks, cores, slot_environment
-from splatseed.train.settings import BYTES_EACH, Backend, StrategyName
-from splatseed.upsample import Profile
+from splatseed.text import counted, did_you_mean, quoted, visible
+from splatseed.training.settings import BYTES_EACH, Backend, StrategyName
 
 if TYPE_CHECKING:
     from splatseed.bench.tables import Table
@@ -250,7 +250,7 @@ def open_machine(options: Options, backend: Backend) -> Iterator[Machine]:
     if options.executor == "local":
         yield _local_machine(options.jobs, backend)
         return
-    from splatseed.runtime.ray_tasks import RayTasks, ray_cluster  # noqa: PLC0415  (an extra)
+    from splatseed.runtime.ray_tasks import RayTasks, ray_cluster
 
     with ray_cluster(options.address):
         tasks = RayTasks(gpu=None if backend == "auto" else backend == "cuda", jobs=options.jobs)
@@ -262,13 +262,13 @@ def _local_machine(jobs: int | None, backend: Backend) -> Machine:
     chosen: Backend = "cpu"
     driver = which("nvidia-smi") or which("rocminfo") or Path("/proc/driver/nvidia").exists()
     if backend == "cuda" or (backend == "auto" and driver):  # else PyTorch sees no GPU
-        from splatseed.train.device import pick_device  # noqa: PLC0415  (PyTorch, which takes seconds)
+        from splatseed.training.device import pick_device
 
         with stage_display() as clock:  # gsplat's kernels are built here, not by each run
             chosen = "cuda" if pick_device(backend, clock).type == "cuda" else "cpu"
     gpus = [""]
     if chosen == "cuda":
-        import torch  # noqa: PLC0415  (takes a while)
+        import torch
 
         named = [each for each in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if each]
         gpus = named or [f"{i}" for i in range(torch.cuda.device_count())]
@@ -348,7 +348,7 @@ def _bench(options: Options, plan: Plan, machine: Machine, arguments: Sequence[s
     if bench is not None and not options.dry_run:
         check_bench_folder(bench, [Path(s.path) for s in plan.scenes if not s.is_demo])
     if plan.lpips:
-        from splatseed.splat.metrics import load_lpips  # noqa: PLC0415  (PyTorch)
+        from splatseed.splat.metrics import load_lpips
 
         load_lpips()  # refuses now what every run would
     if bench is None or options.dry_run:
@@ -359,7 +359,7 @@ def _bench(options: Options, plan: Plan, machine: Machine, arguments: Sequence[s
         comments = "".join(f"# {' '.join(line.split())}\n" for line in told)
         OUT.print(f"{plan_text(plan)}\n{comments}", end="", soft_wrap=True)
         return
-    from splatseed.splat.metrics import lpips_is_here  # noqa: PLC0415  (PyTorch)
+    from splatseed.splat.metrics import lpips_is_here
 
     plan, scenes, specs, notes = _prepare(options, plan, machine, demo)
     begin(bench, "bench", specs, arguments)
@@ -447,8 +447,8 @@ def spoken_time(seconds: float) -> str:
 
 
 def _print_summary(bench: Path, runs: Sequence[Run]) -> None:
-    from splatseed.bench.study import studies  # noqa: PLC0415  (pandas, which takes a while)
-    from splatseed.bench.study_tables import arm_table  # noqa: PLC0415  (pandas)
+    from splatseed.bench.study import studies
+    from splatseed.bench.study_tables import arm_table
 
     for study in studies(runs):
         _print_table(arm_table(study))
@@ -471,7 +471,7 @@ def print_failures(bench: Path, runs: Sequence[Run]) -> None:
 def _report(arguments: list[str]) -> None:
     options = parse_options(ReportOptions, "bench report", arguments)
     require("pandas", "jinja2")
-    from splatseed.bench.report import write_report  # noqa: PLC0415  (pandas, an extra)
+    from splatseed.bench.report import write_report
 
     with stage_display() as clock:
         clock("read", 0.0)
@@ -490,9 +490,9 @@ def _report(arguments: list[str]) -> None:
 def _compare(arguments: list[str]) -> None:
     options = parse_options(CompareOptions, "bench compare", arguments)
     require("pandas")
-    from splatseed.bench.comparisons import compare  # noqa: PLC0415  (pandas, an extra)
-    from splatseed.bench.study_tables import comparison_tables  # noqa: PLC0415  (pandas)
-    from splatseed.bench.tables import write_table  # noqa: PLC0415  (pandas)
+    from splatseed.bench.comparisons import compare
+    from splatseed.bench.study_tables import comparison_tables
+    from splatseed.bench.tables import write_table
 
     written: Any = {"kind": "bench compare", "protect": (options.a, options.b)}
     if options.output is not None:

@@ -35,19 +35,19 @@ from splatseed.console import StageClock, print_note, print_pairs, print_table, 
 from splatseed.errors import MissingDependencyError
 from splatseed.io import find_depths, load_scene, write_scene
 from splatseed.io.staging import add_files, atomic_file, output_folder, read_manifest
-from splatseed.literal import quoted
+from splatseed.methods import METHODS, chooses_number, configure, methods_for, upsample
 from splatseed.pointcloud import PointCloud
 from splatseed.requirements import require
 from splatseed.runtime.compilation import watched
 from splatseed.runtime.tasks import Child
 from splatseed.scene import Scene
-from splatseed.upsample import METHODS, chooses_number, configure, methods_for, upsample
+from splatseed.text import quoted
 
 if TYPE_CHECKING:  # they load Numba, or PyTorch, which may be absent
     from splatseed.scores import TrainingResult
     from splatseed.seeding.diagnostics import GeometryScore
-    from splatseed.train.settings import TrainSettings
-    from splatseed.view.page import Tile
+    from splatseed.training.settings import TrainSettings
+    from splatseed.viewer.page import Tile
 
 SHOWN = "auto"
 SEED = 0
@@ -156,7 +156,7 @@ def compiled_ahead(parts: Sequence[str]) -> Iterator[Callable[[], None]]:
 
 def compile_ahead(parts: Sequence[str]) -> None:
     """Compile what methods and training need by running a small demo; a second process does."""
-    from splatseed.synthetic import make_capture, write_capture  # noqa: PLC0415  (loads Numba)
+    from splatseed.synthetic import make_capture, write_capture
 
     waiting = list(parts)
     with tempfile.TemporaryDirectory(prefix="splatseed-", ignore_cleanup_errors=True) as folder:
@@ -173,10 +173,10 @@ def compile_ahead(parts: Sequence[str]) -> None:
 
 
 def _compile(part: str, scene: Scene, folder: Path) -> None:
-    from splatseed.view.clouds import preview_pair  # noqa: PLC0415  (loads Numba)
+    from splatseed.viewer.clouds import preview_pair
 
     if part == TRAINING:
-        from splatseed.train.settings import TrainSettings  # noqa: PLC0415  (loads with its use)
+        from splatseed.training.settings import TrainSettings
 
         settings = TrainSettings(cap_max=2000, max_steps=4, backend="cpu")
         _train_arm(folder, SFM, settings, StageClock())
@@ -203,10 +203,10 @@ def _has_pytorch() -> bool:
 
 def _make_points(options: Options) -> None:
     """The capture, its points by every method, their errors, and pictures."""
-    from splatseed.seeding.diagnostics import measure, spacing  # noqa: PLC0415  (SciPy)
-    from splatseed.synthetic import make_capture, write_capture  # noqa: PLC0415  (loads Numba)
-    from splatseed.view import clouds as pictures  # noqa: PLC0415  (likewise)
-    from splatseed.views.visibility import choose_camera  # noqa: PLC0415  (loads with its use)
+    from splatseed.photos.visibility import choose_camera
+    from splatseed.seeding.diagnostics import measure, spacing
+    from splatseed.synthetic import make_capture, write_capture
+    from splatseed.viewer import clouds as pictures
 
     clock, out = StageClock(), options.output
     with (
@@ -297,8 +297,8 @@ def _train(options: Options) -> bool:
     except MissingDependencyError as error:
         print_note(f"not trained: {error.found} installed. {error.fix}")
         return False
-    from splatseed.train.settings import TrainSettings  # noqa: PLC0415  (loads with its use)
-    from splatseed.view.page import write_grid  # noqa: PLC0415  (likewise)
+    from splatseed.training.settings import TrainSettings
+    from splatseed.viewer.page import write_grid
 
     folder, steps = options.output, options.train_steps
     scenes = [f"scene_{name}" for name in (RANDOM, POSES)]
@@ -327,7 +327,7 @@ def _train(options: Options) -> bool:
 
 def _seed_poses_alone(folder: Path, clock: StageClock) -> float:
     """Write scenes whose seeds come from poses and photographs alone; the seconds of the method."""
-    from splatseed.seeding.poses import random_start  # noqa: PLC0415  (loads with its use)
+    from splatseed.seeding.poses import random_start
 
     scene = load_scene(folder / "scene").replace(points=PointCloud.empty(), tracks=None)
     clock("seed poses alone", 0.0)
@@ -345,11 +345,11 @@ def _train_arm(
     folder: Path, name: str, settings: TrainSettings, clock: StageClock
 ) -> tuple[TrainingResult, tuple[Tile, ...]]:
     """Train from an arm's seeds, and score; also a test view's photograph, render and errors."""
-    from splatseed.splat.evaluate import evaluate_views  # noqa: PLC0415  (imports PyTorch)
-    from splatseed.splat.metrics import flip_map  # noqa: PLC0415  (likewise)
-    from splatseed.splat.rendering import as_bytes, error_picture, photograph_of  # noqa: PLC0415  (likewise)
-    from splatseed.train.run import prepare_run  # noqa: PLC0415  (likewise)
-    from splatseed.view.page import Tile  # noqa: PLC0415  (likewise)
+    from splatseed.splat.evaluate import evaluate_views
+    from splatseed.splat.metrics import flip_map
+    from splatseed.splat.rendering import as_bytes, error_picture, photograph_of
+    from splatseed.training.run import prepare_run
+    from splatseed.viewer.page import Tile
 
     stage = f"train {ARMS[name]}"
     scene = load_scene(folder / ("scene" if name == SFM else f"scene_{name}"))

@@ -27,11 +27,11 @@ from splatseed.io import dense, load_scene
 from splatseed.io.photograph import warnings_but_lens
 from splatseed.io.photograph_checks import with_photographs
 from splatseed.io.staging import check_output
-from splatseed.literal import name_some, quoted, visible
 from splatseed.requirements import require
 from splatseed.runtime.torch_device import DeviceName
 from splatseed.scene import Scene
 from splatseed.seeding.diagnostics import is_distorted
+from splatseed.text import name_some, quoted, visible
 
 if TYPE_CHECKING:  # kernels load with their use
     from splatseed.depth.stereo import StereoMap
@@ -129,7 +129,7 @@ def _run_network(options: Options) -> None:
         scene = load_scene(options.scene, require_points=False)
         clock("load network", 0.0)
         require("torch", "transformers")
-        from splatseed.depth.monocular import estimate_depths, load_network  # noqa: PLC0415  (imports PyTorch)
+        from splatseed.depth.monocular import estimate_depths, load_network
 
         network = load_network(str(options.model), kind=options.depth_kind, device=options.device)
         kind, reason = network.meaning.kind, network.meaning.reason
@@ -160,7 +160,7 @@ def _run_network(options: Options) -> None:
 
 
 def _run_stereo(options: Options) -> None:
-    from splatseed.depth.stereo import stereo_depths  # noqa: PLC0415  (loads little)
+    from splatseed.depth.stereo import stereo_depths
 
     start = time.perf_counter()
     with stage_display() as clock:
@@ -177,12 +177,12 @@ def _run_stereo(options: Options) -> None:
         how: dict[str, Any] = {"overwrite": options.overwrite, "progress": clock}
         write = dense.write_dense_maps
         if options.colmap:
-            from splatseed.views.projection import undistort  # noqa: PLC0415  (Numba)
+            from splatseed.photos.projection import undistort
 
             write, how["undistort"] = dense.write_dense_workspace, undistort
         report = write(scene, maps, options.output, provenance=_provenance(options), **how)
         if options.preview:
-            from splatseed.view.maps import preview_maps  # noqa: PLC0415  (Pillow)
+            from splatseed.viewer.maps import preview_maps
 
             clock("preview", 0.0)
             preview_maps(scene, maps, options.output / PICTURE)

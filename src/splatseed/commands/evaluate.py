@@ -14,11 +14,11 @@ from splatseed.commands.options import MaskChoice, parse_options, refuse
 from splatseed.console import StageClock, print_note, print_pairs, print_table, stage_display
 from splatseed.errors import MissingDependencyError, SceneNotFoundError
 from splatseed.io.staging import check_output, output_folder, write_json
-from splatseed.literal import counted
+from splatseed.photos.view import View, user_cache_dir
 from splatseed.requirements import require
-from splatseed.train.folder import RunFolder
-from splatseed.train.settings import Backend, TrainSettings
-from splatseed.views.view import View, user_cache_dir
+from splatseed.text import counted
+from splatseed.training.folder import RunFolder
+from splatseed.training.settings import Backend, TrainSettings
 
 if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
     from splatseed.scores import EvalResult, ViewScore
@@ -142,11 +142,11 @@ def _evaluate(
 
     Also returns the factor that photographs were divided by, and what makes the scores doubtful.
     """
-    from splatseed.splat.covisible import find_covisible, pixel_masks  # noqa: PLC0415  (kernels)
-    from splatseed.splat.evaluate import evaluate_model, load_model  # noqa: PLC0415  (PyTorch)
-    from splatseed.splat.metrics import load_lpips  # noqa: PLC0415  (PyTorch)
-    from splatseed.splat.rendering import picture_names, write_render  # noqa: PLC0415  (PyTorch)
-    from splatseed.train.device import pick_device  # noqa: PLC0415  (PyTorch)
+    from splatseed.splat.covisible import find_covisible, pixel_masks
+    from splatseed.splat.evaluate import evaluate_model, load_model
+    from splatseed.splat.metrics import load_lpips
+    from splatseed.splat.rendering import picture_names, write_render
+    from splatseed.training.device import pick_device
 
     clock("read", 0.0)
     lpips, reason = None, ""

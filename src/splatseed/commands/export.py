@@ -13,7 +13,6 @@ from splatseed.commands.models import check_free, config_of, model_file
 from splatseed.commands.options import parse_options, refuse
 from splatseed.console import print_note, print_pairs, stage_display
 from splatseed.io.origin import RECENTER, offset_beside, origin_of, place_words, write_offset
-from splatseed.literal import quoted
 from splatseed.requirements import require
 from splatseed.splat.formats import (
     FORMATS,
@@ -24,8 +23,9 @@ from splatseed.splat.formats import (
     write_model,
 )
 from splatseed.splat.world import shifted
-from splatseed.train.folder import RunFolder
-from splatseed.train.settings import TrainSettings
+from splatseed.text import quoted
+from splatseed.training.folder import RunFolder
+from splatseed.training.settings import TrainSettings
 
 OWN = "own"
 """For --clean: the scene that the run names."""
@@ -85,7 +85,7 @@ def run(arguments: list[str]) -> None:
         kept = keep_gaussians(gaussians, crop, options.min_opacity)
         floaters = np.zeros(len(gaussians), bool)
         if cleans:
-            from splatseed.train.floaters import floaters_of_model  # noqa: PLC0415  (imports PyTorch)
+            from splatseed.training.floaters import floaters_of_model
 
             asked = ("data_factor", "test_every")
             numbers = {n: value for n in asked if isinstance(value := config.get(n), int)}

@@ -18,11 +18,11 @@ from splatseed.pointcloud import PointCloud
 from splatseed.requirements import require
 from splatseed.scene import Scene
 from splatseed.similarity import Similarity
-from splatseed.train.settings import Backend
+from splatseed.training.settings import Backend
 
 if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
-    from splatseed.view.models import Shown
-    from splatseed.views.view import View
+    from splatseed.photos.view import View
+    from splatseed.viewer.models import Shown
 
 MOST_SIDE = 1280
 LEAST_SIDE = 16
@@ -85,10 +85,10 @@ def run(arguments: list[str]) -> None:
     check_free(options.output, overwrite=options.overwrite, protect=inputs)
     require("torch", "imageio_ffmpeg")
     # These import PyTorch.
-    from splatseed.splat.rendering import ModelRenderer  # noqa: PLC0415  (likewise)
-    from splatseed.train.device import pick_device  # noqa: PLC0415  (loads with its use)
-    from splatseed.view.flights import flight_frames, write_video  # noqa: PLC0415  (likewise)
-    from splatseed.view.models import stage_frame  # noqa: PLC0415  (likewise)
+    from splatseed.splat.rendering import ModelRenderer
+    from splatseed.training.device import pick_device
+    from splatseed.viewer.flights import flight_frames, write_video
+    from splatseed.viewer.models import stage_frame
 
     with stage_display() as clock:
         clock("read", 0.0)
@@ -116,7 +116,7 @@ def run(arguments: list[str]) -> None:
 
 def _opened(options: Options) -> list[Shown]:
     """The model, and the one that is compared with it, which the same cameras see."""
-    from splatseed.view.models import names_of, open_shown, share_a_world  # noqa: PLC0415  (imports PyTorch)
+    from splatseed.viewer.models import names_of, open_shown, share_a_world
 
     paths = [path for path in (options.model, options.compare) if path is not None]
     named = zip(names_of(paths), paths, strict=True)
@@ -136,7 +136,7 @@ def _opened(options: Options) -> list[Shown]:
 
 def _size(options: Options, shown: Shown) -> tuple[int, int]:
     """Width and height of the video."""
-    from splatseed.view.flights import even_size  # noqa: PLC0415  (loads with its use)
+    from splatseed.viewer.flights import even_size
 
     if options.size is not None:
         words = options.size.lower().split("x")
@@ -154,8 +154,8 @@ def _size(options: Options, shown: Shown) -> tuple[int, int]:
 
 def _path(options: Options, shown: Shown, size: tuple[int, int]) -> tuple[list[View], float]:
     """The cameras, one per frame, and the frame rate."""
-    from splatseed.splat.world import NO_TRANSFORM, find_transform  # noqa: PLC0415  (imports PyTorch)
-    from splatseed.view import flights  # noqa: PLC0415  (likewise)
+    from splatseed.splat.world import NO_TRANSFORM, find_transform
+    from splatseed.viewer import flights
 
     cameras, frames = shown.usual_views, max(1, round(options.seconds * FPS))
     if options.path == ORBIT or (options.path is None and len(cameras) < 2):

@@ -28,14 +28,14 @@ from splatseed.depthmap import DepthKind, DepthMaps
 from splatseed.errors import SplatseedError
 from splatseed.io import find_depths, load_scene
 from splatseed.io.seeds import was_upsampled
-from splatseed.literal import counted, quoted, visible
+from splatseed.photos.sight import stray_notes
 from splatseed.progress import Progress
 from splatseed.scene import Scene
 from splatseed.seeding import diagnostics
 from splatseed.seeding.advice import Advice, advice_for
-from splatseed.seeding.photographs import has_points, photographed
-from splatseed.train.schedule import FULL_RUN
-from splatseed.views.sight import stray_notes
+from splatseed.seeding.photo_methods import has_points, photographed
+from splatseed.text import counted, quoted, visible
+from splatseed.training.schedule import FULL_RUN
 
 if TYPE_CHECKING:  # Numba, which takes a while to load, comes with it
     from splatseed.depth.alignment import Alignment
@@ -145,11 +145,11 @@ def _read(options: Options) -> Scene:
 
 def _alignments(options: Options, scene: Scene, clock: StageClock) -> dict[str, Alignment]:
     """How each map fits the SfM points, drawn if requested."""
-    from splatseed.depth.alignment import align  # noqa: PLC0415  (loads Numba)
+    from splatseed.depth.alignment import align
 
     alignments = align(scene, progress=clock)
     if options.picture is not None:
-        from splatseed.view.maps import preview_depth  # noqa: PLC0415  (loads with its use)
+        from splatseed.viewer.maps import preview_depth
 
         clock("draw picture", 0.0)
         preview_depth(scene, alignments, options.picture)
@@ -187,7 +187,7 @@ def _look_at_poses(
     """
     if has_points(scene) or not scene.has_photographs:
         return None, ""
-    from splatseed.seeding.poses import check_poses, low_agreement, pose_error  # noqa: PLC0415  (loads Numba)
+    from splatseed.seeding.poses import check_poses, low_agreement, pose_error
 
     try:
         images = photographed(scene)

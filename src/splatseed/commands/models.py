@@ -12,8 +12,8 @@ from splatseed.io.files import odd_kind
 from splatseed.io.load import is_scene
 from splatseed.io.masks import NONE
 from splatseed.io.staging import check_apart, check_parents
-from splatseed.literal import quoted
-from splatseed.train.folder import RunFolder
+from splatseed.text import quoted
+from splatseed.training.folder import RunFolder
 
 
 def model_file(path: Path) -> Path:

@@ -9,14 +9,14 @@ import numpy as np
 
 from splatseed.console import print_note, print_pairs
 from splatseed.lens import undistort_command, undistorted
-from splatseed.literal import quoted
+from splatseed.photos.view import at_file_size
 from splatseed.scene import Scene, SceneFormat
 from splatseed.seeding.advice import AS_IT_IS, SEEDED, Advice
 from splatseed.seeding.diagnostics import is_distorted, untrainable
-from splatseed.train.schedule import FULL_RUN
-from splatseed.train.seeds import most_seeds
-from splatseed.train.settings import BUDGET, TrainSettings
-from splatseed.views.view import at_file_size
+from splatseed.text import quoted
+from splatseed.training.schedule import FULL_RUN
+from splatseed.training.seeds import most_seeds
+from splatseed.training.settings import BUDGET, TrainSettings
 
 RATIO = 16
 PER_POINT = 8
@@ -53,7 +53,7 @@ class Planned(NamedTuple):
         pixels = round(float(np.median(sizes))) if sizes else BUDGET
         number, flags = max(2, min(BUDGET, pixels)), ""
         if budget is not None:
-            from splatseed.seeding.upsampling import points_within  # noqa: PLC0415  (loads Numba)
+            from splatseed.seeding.upsampling import points_within
 
             number = max(2, points_within(scene, budget))
             flags = f"--budget {number} "

@@ -19,11 +19,11 @@ from splatseed.io.files import is_video
 from splatseed.io.masks import masks_beside
 from splatseed.io.origin import RECENTER
 from splatseed.io.staging import check_output
-from splatseed.literal import counted, name_some, quoted, visible
 from splatseed.runtime.torch_device import DeviceName
 from splatseed.scene import Masks
 from splatseed.sfm import MatcherName, Settings, SfmReport, reconstruct
 from splatseed.sfm.photos import pick_frames
+from splatseed.text import counted, name_some, quoted, visible
 
 
 @dataclass(frozen=True)

@@ -28,17 +28,19 @@ from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundErro
 from splatseed.io import load_scene
 from splatseed.io.files import read_text
 from splatseed.io.masks import with_masks
-from splatseed.literal import did_you_mean, quoted, visible
+from splatseed.methods.method import fits
+from splatseed.photos.view import at_file_size, data_factor, poses_of, user_cache_dir
 from splatseed.progress import Progress
 from splatseed.requirements import require
 from splatseed.runtime.interruption import exit_code
 from splatseed.scene import Scene
 from splatseed.scores import TrainingResult
 from splatseed.seeding.upsampling import RHO, parse_budget
-from splatseed.train.duration import TOO_LONG, Progressed, about_an_hour, in_words, seconds_left
-from splatseed.train.folder import RunFolder
-from splatseed.train.seeds import why_not_seeded
-from splatseed.train.settings import (
+from splatseed.text import did_you_mean, quoted, visible
+from splatseed.training.duration import TOO_LONG, Progressed, about_an_hour, in_words, seconds_left
+from splatseed.training.folder import RunFolder
+from splatseed.training.seeds import why_not_seeded
+from splatseed.training.settings import (
     BUDGET,
     LEAST_GAUSSIANS,
     OPTIONS,
@@ -46,12 +48,10 @@ from splatseed.train.settings import (
     StrategyName,
     TrainSettings,
 )
-from splatseed.upsample.method import fits
-from splatseed.views.view import at_file_size, data_factor, poses_of, user_cache_dir
 
 if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
-    from splatseed.train.run import TrainingRun
-    from splatseed.view.server import TrainingViewer
+    from splatseed.training.run import TrainingRun
+    from splatseed.viewer.server import TrainingViewer
 
 BAR_WIDTH = 12
 DEFAULT = TrainSettings()
@@ -230,7 +230,7 @@ def run(arguments: list[str]) -> None:
         saved = f"interrupted after step {training.state.step:,}; saved. Continue with:"
         ERR.print(f"\n{saved}\n  splatseed train {again}", soft_wrap=True)
         sys.exit(exit_code())
-    from splatseed.splat.evaluate import evaluate_views  # noqa: PLC0415  (imports PyTorch)
+    from splatseed.splat.evaluate import evaluate_views
 
     with stage_display(clock):
         result = training.finish(partial(evaluate_views, progress=clock), clock)
@@ -244,7 +244,7 @@ def _prepare(
     note: Callable[[str], None],
     clock: Progress,
 ) -> TrainingRun:
-    from splatseed.train.run import prepare_run  # noqa: PLC0415  (imports PyTorch)
+    from splatseed.training.run import prepare_run
 
     clock("read", 0.0)
     has_points = options.seeds == "scene" and not options.refine_poses
@@ -308,7 +308,7 @@ def _within_budget(
     chosen = settings.strategy == BEST and settings.cap_max is None
     if options.budget is None and not (chosen and scene.images):
         return settings
-    from splatseed.seeding.budget import median_pixels  # noqa: PLC0415  (loads Numba)
+    from splatseed.seeding.budget import median_pixels
 
     views = poses_of(scene.images, settings.factor)
     pixels = median_pixels(views) if views else 0
@@ -316,7 +316,7 @@ def _within_budget(
         cap = max(2, min(BUDGET, round(pixels)))
         each = "one for each pixel of a photograph; --budget sets another"
         if settings.start:  # a merge of two may be larger, and must not be thinned unasked
-            from splatseed.splat.formats import read_model  # noqa: PLC0415  (loads with its use)
+            from splatseed.splat.formats import read_model
 
             cap = max(cap, len(read_model(Path(settings.start))))
             each = "one for each pixel of a photograph, or as many as it starts with"
@@ -351,7 +351,7 @@ def _watched(options: Options, training: TrainingRun) -> Iterator[TrainingViewer
     if not options.view:
         yield None
         return
-    from splatseed.view.server import TrainingViewer, free_port  # noqa: PLC0415  (imports PyTorch)
+    from splatseed.viewer.server import TrainingViewer, free_port
 
     posed = training.folder.scene  # there is one if poses were refined
     scene = load_scene(posed if posed.is_dir() else options.scene, require_points=False)
@@ -489,7 +489,7 @@ def _summarise(options: Options, training: TrainingRun, result: TrainingResult) 
 
 def _next_commands(output: Path) -> list[tuple[str, str]]:
     """What to do with a finished run; LPIPS only where its weights are."""
-    from splatseed.splat.metrics import lpips_is_here  # noqa: PLC0415  (imports PyTorch)
+    from splatseed.splat.metrics import lpips_is_here
 
     score = ("score again, with LPIPS", f"splatseed evaluate {quoted(output)}")
     return [("look at it", f"splatseed view {quoted(output)}"), *[score] * lpips_is_here()]

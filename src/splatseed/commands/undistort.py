@@ -14,9 +14,9 @@ from splatseed.io import load_scene
 from splatseed.io.photograph import warnings_but_lens
 from splatseed.io.seeds import was_upsampled
 from splatseed.io.staging import check_output
-from splatseed.literal import quoted
 from splatseed.seeding.diagnostics import is_distorted
 from splatseed.sfm import undistort
+from splatseed.text import quoted
 
 
 @dataclass(frozen=True)

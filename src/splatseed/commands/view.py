@@ -14,15 +14,15 @@ import tyro
 from splatseed.commands.options import parse_options
 from splatseed.console import OUT, print_note, print_pairs, stage_display
 from splatseed.io.load import check_there, is_scene
-from splatseed.literal import counted, visible
 from splatseed.requirements import require
 from splatseed.runtime.interruption import Termination, exit_code
 from splatseed.splat.formats import SUFFIXES
-from splatseed.train.folder import RunFolder
-from splatseed.train.settings import Backend
+from splatseed.text import counted, visible
+from splatseed.training.folder import RunFolder
+from splatseed.training.settings import Backend
 
 if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
-    from splatseed.view.models import Shown
+    from splatseed.viewer.models import Shown
 
 MOST_OPENED = 12
 LOCAL = {"127.0.0.1", "localhost"}
@@ -51,10 +51,10 @@ def run(arguments: list[str]) -> None:
     """Run the verb with these arguments."""
     options = parse_options(Options, "view", arguments)
     require("torch", "viser")
-    from splatseed.train.device import pick_device  # noqa: PLC0415  (imports PyTorch)
-    from splatseed.view.models import stage_frame  # noqa: PLC0415  (likewise)
-    from splatseed.view.pictures import Entry  # noqa: PLC0415  (likewise)
-    from splatseed.view.server import Viewer, free_port  # noqa: PLC0415  (likewise)
+    from splatseed.training.device import pick_device
+    from splatseed.viewer.models import stage_frame
+    from splatseed.viewer.pictures import Entry
+    from splatseed.viewer.server import Viewer, free_port
 
     for path in filter(None, (options.what, options.compare)):
         check_there(path)  # a slip in a path is told before a port that is taken
@@ -82,7 +82,7 @@ def run(arguments: list[str]) -> None:
 
 def _opened(options: Options) -> tuple[list[Shown], int | None]:
     """What to show, under names that tell them apart; and which is compared with the first."""
-    from splatseed.view.models import names_of, open_shown  # noqa: PLC0415  (imports PyTorch)
+    from splatseed.viewer.models import names_of, open_shown
 
     paths = {path.resolve(): path for path in _within(options.what)}
     beside = None

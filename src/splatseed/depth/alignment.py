@@ -23,9 +23,9 @@ from jaxtyping import Float32, Float64, Int, Int64
 from splatseed.camera import Camera
 from splatseed.depthmap import DepthMap
 from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.photos.visibility import SeenPoints, camera_points, find_visibility
 from splatseed.progress import Progress, in_threads, silent
 from splatseed.scene import Image, Scene
-from splatseed.views.visibility import SeenPoints, camera_points, find_visibility
 
 Fit = Literal["robust", "least-squares"]
 """Medians and reweighting, or the paper's equation 7."""

@@ -30,9 +30,9 @@ from scipy.sparse.linalg import spsolve
 
 from splatseed.depth.alignment import SIGMA_OF_MEDIAN, Settings
 from splatseed.depth.views import DepthView, Reduced
+from splatseed.photos.projection import cosine_between, place
 from splatseed.progress import Progress, in_threads
 from splatseed.runtime.jit import inline, kernel, parallel_range
-from splatseed.views.projection import cosine_between, place
 
 MIN_SAMPLES, SAMPLES = 4, 40
 """Candidates of a view by which its neighbours are judged: the fewer, the more views there are."""

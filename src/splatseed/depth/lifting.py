@@ -29,12 +29,12 @@ from splatseed.depth.views import DepthView, read_view
 from splatseed.errors import PointCloudError, SceneFormatError, SceneNotFoundError
 from splatseed.io.photograph import photograph_folder
 from splatseed.io.photograph_checks import with_photographs
-from splatseed.literal import agreeing
+from splatseed.photos.visibility import find_visibility
 from splatseed.progress import Progress, in_threads, silent
 from splatseed.runtime.hashing import scramble
 from splatseed.runtime.jit import kernel, parallel_range
 from splatseed.scene import Image, Scene
-from splatseed.views.visibility import find_visibility
+from splatseed.text import agreeing
 
 SOUND, UNCONFIRMED, NEAR_EDGE, DISTRUSTED = range(4)
 """Tiers, in the order in which they are used up; the last is never used."""

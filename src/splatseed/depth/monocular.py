@@ -31,11 +31,11 @@ from splatseed.io import photograph
 from splatseed.io.depth_maps import depth_folder
 from splatseed.io.files import StrPath
 from splatseed.io.photograph_checks import check_sizes, with_photographs
-from splatseed.literal import quoted
 from splatseed.progress import Progress, silent
 from splatseed.requirements import require
 from splatseed.runtime.torch_device import DeviceName, pick_torch_device
 from splatseed.scene import Scene
+from splatseed.text import quoted
 
 _EXAMPLE = "depth-anything/Depth-Anything-V2-Small-hf"
 _ID = re.compile(r"\w[\w.-]*/\w[\w.-]*")

@@ -34,10 +34,10 @@ from splatseed.io.bit_depth import WHITE
 from splatseed.io.masks import read_mask
 from splatseed.io.photograph import decode_photograph, photograph_bytes
 from splatseed.io.photograph_checks import check_sizes
+from splatseed.photos.view import check_lens
+from splatseed.photos.visibility import Visibility, camera_points
 from splatseed.runtime.jit import inline
 from splatseed.scene import Image, Masks
-from splatseed.views.view import check_lens
-from splatseed.views.visibility import Visibility, camera_points
 
 if TYPE_CHECKING:
     from PIL import Image as PilImage

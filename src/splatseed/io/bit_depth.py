@@ -19,7 +19,7 @@ from jaxtyping import UInt16
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io.files import guarded, open_file, read_bytes
-from splatseed.literal import counted
+from splatseed.text import counted
 
 if TYPE_CHECKING:
     from PIL import Image as PilImage

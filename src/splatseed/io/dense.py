@@ -40,7 +40,7 @@ Undistort: TypeAlias = Callable[
     [UInt8[np.ndarray, "H W 3"], Intrinsics, Float64[np.ndarray, "3 3"]],
     tuple[UInt8[np.ndarray, "H W 3"], Bool[np.ndarray, "H W"]],
 ]
-"""``splatseed.views.projection.undistort`` or an equivalent: takes pixels, lens and matrix, and
+"""``splatseed.photos.projection.undistort`` or an equivalent: takes pixels, lens and matrix, and
 returns pixels and which of them are known."""
 
 _MAX_SOURCES = 8

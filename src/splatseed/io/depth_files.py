@@ -20,8 +20,8 @@ import numpy as np
 
 from splatseed.depthmap import DepthKind
 from splatseed.io.files import StrPath, guarded, read_bytes, read_npy
-from splatseed.literal import beginning
 from splatseed.requirements import require
+from splatseed.text import beginning
 
 KINDS: tuple[DepthKind, ...] = get_args(DepthKind)
 

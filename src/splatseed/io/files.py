@@ -27,8 +27,8 @@ import numpy as np
 from numpy.lib import format as npy_format
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError, SplatseedError
-from splatseed.literal import beginning, describe_error
 from splatseed.runtime.memory import free_memory
+from splatseed.text import beginning, describe_error
 
 StrPath = str | os.PathLike[str]
 """A path, as functions that read or write files take it."""

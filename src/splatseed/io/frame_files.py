@@ -21,7 +21,7 @@ from splatseed.errors import SceneFormatError
 from splatseed.io.depth_files import SUFFIXES as DEPTH_SUFFIXES
 from splatseed.io.depth_maps import DepthFiles
 from splatseed.io.files import read_json
-from splatseed.literal import counted
+from splatseed.text import counted
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
 """Tried in this order, in any case, for a photograph named without one."""

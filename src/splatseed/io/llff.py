@@ -23,9 +23,9 @@ from splatseed.io.frame_files import SUFFIXES
 from splatseed.io.mask_files import masks_among
 from splatseed.io.origin import around_origin
 from splatseed.io.photograph_checks import image_warnings
-from splatseed.literal import counted
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene, SceneSource
+from splatseed.text import counted
 
 POSES = "poses_bounds.npy"
 _OPENCV_FROM_LLFF = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])

@@ -29,8 +29,8 @@ from splatseed.io.rgbd import find_tum_depths, is_replica, is_tum, load_rgbd, lo
 from splatseed.io.seeds import recall_seeds
 from splatseed.io.split import follow_lists
 from splatseed.io.staging import ABSENT, MANIFEST, read_manifest
-from splatseed.literal import name_some, quoted
 from splatseed.scene import Scene, SceneSource
+from splatseed.text import name_some, quoted
 
 _TRANSFORMS = "transforms.json"
 _ABOVE = 3

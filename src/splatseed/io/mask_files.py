@@ -15,7 +15,7 @@ from collections.abc import Collection
 from pathlib import Path, PurePosixPath
 
 from splatseed.io.files import files_below
-from splatseed.literal import agreeing, counted
+from splatseed.text import agreeing, counted
 
 FOLDER = "masks"
 SUFFIXES = (".png", ".jpg", ".jpeg")

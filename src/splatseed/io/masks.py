@@ -24,8 +24,8 @@ from splatseed.io.depth_maps import Undistortion
 from splatseed.io.files import files_below, guarded, open_file, read_bytes
 from splatseed.io.mask_files import find_masks, masks_among, own_masks
 from splatseed.io.photograph import has_alpha, open_photograph, photograph_bytes
-from splatseed.literal import counted
 from splatseed.scene import Masks, Scene
+from splatseed.text import counted
 
 if TYPE_CHECKING:
     from PIL import Image as PilImage

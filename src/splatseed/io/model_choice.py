@@ -12,8 +12,8 @@ from pathlib import Path
 from splatseed.errors import SplatseedError
 from splatseed.io.colmap import LEAST_IMAGE_BYTES, find_model, model_file, read_colmap_scene
 from splatseed.io.files import numbered_lines, open_file
-from splatseed.literal import counted
 from splatseed.scene import Scene
+from splatseed.text import counted
 
 _UNKNOWN = -1
 

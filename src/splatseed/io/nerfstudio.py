@@ -46,10 +46,10 @@ from splatseed.io.photograph_checks import image_warnings
 from splatseed.io.ply import read_exact_ply
 from splatseed.io.point_files import other_points
 from splatseed.io.unusable import NotFiniteError, check_enough, unusable_warning
-from splatseed.literal import counted
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Masks, Scene, SceneSource, Split
 from splatseed.similarity import Similarity, fit_similarity, similarity_of
+from splatseed.text import counted
 
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """Turns camera axes from OpenGL's to OpenCV's, and back."""

@@ -19,8 +19,8 @@ from splatseed.camera import Intrinsics
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io.files import guarded, odd_kind, open_file, other_spelling
 from splatseed.io.photograph import COPY_AGAIN, photograph_bytes, photograph_folder
-from splatseed.literal import agreeing, counted, name_some
 from splatseed.scene import Image, Scene
+from splatseed.text import agreeing, counted, name_some
 
 Size = tuple[int, int]
 """Width and height."""

@@ -19,8 +19,8 @@ from jaxtyping import Float32, Float64, UInt8
 from splatseed.errors import SceneFormatError
 from splatseed.io.cloud_file import RGB, XYZ, CloudFile, LineCloud, RowCloud
 from splatseed.io.files import StrPath, check_room, open_file, readable
-from splatseed.literal import beginning
 from splatseed.pointcloud import PointCloud
+from splatseed.text import beginning
 
 EXPORT_PLY_AGAIN = "Copy the file again, or export it again as a binary little-endian PLY."
 

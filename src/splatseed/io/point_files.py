@@ -16,7 +16,7 @@ from jaxtyping import Float
 from splatseed.errors import SplatseedError
 from splatseed.io.files import open_file, read_file
 from splatseed.io.ply import open_ply, read_ply
-from splatseed.literal import counted
+from splatseed.text import counted
 
 _TOLERANCE = 1e-4
 """Of the points' extent: text and PLY files round positions."""

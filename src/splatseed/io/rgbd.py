@@ -24,9 +24,9 @@ from splatseed.io.colmap import make_intrinsics, rigid_pose
 from splatseed.io.files import StrPath, guarded, numbered_lines, open_file, read_json
 from splatseed.io.origin import around_origin
 from splatseed.io.photograph import lens_warnings
-from splatseed.literal import agreeing, counted
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene, SceneSource
+from splatseed.text import agreeing, counted
 
 _FRAME = re.compile(r"frame(\d+)\.(?:jpe?g|png)", re.IGNORECASE)
 _TOLERANCE = 0.02

@@ -12,8 +12,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
 
 from splatseed.io.files import read_bytes
-from splatseed.literal import agreeing, counted
 from splatseed.scene import Scene, Split
+from splatseed.text import agreeing, counted
 
 ROOT_LISTS = (
     *("train_list.txt", "test_list.txt", "val_list.txt", "validation_list.txt"),

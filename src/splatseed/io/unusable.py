@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any, TypeAlias
 
 from splatseed.errors import SceneFormatError
-from splatseed.literal import agreeing, name_some
+from splatseed.text import agreeing, name_some
 
 
 class NotFiniteError(SceneFormatError):

@@ -19,9 +19,9 @@ from typing import Literal
 import numpy as np
 
 from splatseed.io.seeds import was_upsampled
+from splatseed.methods import Upsampler
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
-from splatseed.upsample import Upsampler
 
 DEFAULT_METHOD, FALLBACK = "auto", "mls"
 """The default method, and its replacement for scenes without photographs."""

@@ -23,10 +23,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32, Int64
 
 from splatseed.errors import ParameterError, PointCloudError
+from splatseed.photos.view import View
 from splatseed.runtime.hashing import FREE, scramble, slot_of
 from splatseed.runtime.jit import inline, kernel, parallel_range
 from splatseed.seeding.coverage import check_points, grid_from_world, project_block
-from splatseed.views.view import View
 
 CLOSEST = 4
 """Views in which a kept point is marked: enough for neighbours to share one, few enough to be

@@ -23,6 +23,8 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64, UInt8
 
 from splatseed.errors import ParameterError, PointCloudError
+from splatseed.photos.projection import place
+from splatseed.photos.view import View
 from splatseed.progress import Progress, silent
 from splatseed.runtime.jit import inline
 from splatseed.seeding.coverage import (
@@ -33,8 +35,6 @@ from splatseed.seeding.coverage import (
     grid_from_world,
     grid_of,
 )
-from splatseed.views.projection import place
-from splatseed.views.view import View
 
 SECTORS = 8
 

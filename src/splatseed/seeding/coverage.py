@@ -20,10 +20,10 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 
 from splatseed.errors import ParameterError, PointCloudError
+from splatseed.photos.projection import place
+from splatseed.photos.view import View
 from splatseed.progress import Progress, in_threads, silent
 from splatseed.runtime.jit import inline
-from splatseed.views.projection import place
-from splatseed.views.view import View
 
 NEARER = 0.1  # by what fraction of a cell's depth its neighbours must be nearer to hide it
 HIDING = 5  # how many of the eight neighbours must be nearer

@@ -21,9 +21,9 @@ from scipy.spatial import cKDTree
 from splatseed.errors import PointCloudError, SplatseedError
 from splatseed.io.files import odd_kind
 from splatseed.io.masks import read_mask
-from splatseed.literal import agreeing, visible
 from splatseed.progress import Progress, silent
 from splatseed.scene import NO_POINT, Image, Scene
+from splatseed.text import agreeing, visible
 
 NEIGHBORS = 6
 """Neighbours whose mean distance is the spacing: those of a point in a hexagonal pattern."""
@@ -77,7 +77,7 @@ class EmptyRegions:
 
 def cloud_statistics(scene: Scene, progress: Progress = silent) -> CloudStatistics:
     """Count, measure and check the points of a scene."""
-    from splatseed.upsample.neighbors import prepare, sound_bases  # noqa: PLC0415  (SciPy)
+    from splatseed.methods.neighbors import prepare, sound_bases  # noqa: PLC0415  (SciPy)
 
     xyz, left = scene.points.xyz, scene.left_out
     finite = xyz[scene.points.finite].astype(np.float64)

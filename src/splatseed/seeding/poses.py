@@ -26,12 +26,12 @@ from splatseed.depth.stereo.depths import any_depth
 from splatseed.depth.stereo.maps import StereoSettings
 from splatseed.depth.stereo.matching import blocks_known, match_views
 from splatseed.errors import SceneFormatError, SceneNotFoundError
-from splatseed.literal import quoted
+from splatseed.photos.projection import choose_by_pose
+from splatseed.photos.view import View, data_factor, load_views
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
-from splatseed.views.projection import choose_by_pose
-from splatseed.views.view import View, data_factor, load_views
+from splatseed.text import quoted
 
 Gray = Float64[np.ndarray, "H W"]
 Pixel = Float64[np.ndarray, " 2"]

@@ -13,12 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from splatseed.errors import ParameterError
-from splatseed.pointcloud import ORIGINAL, PointCloud
-from splatseed.progress import Progress, silent
-from splatseed.scene import Scene
-from splatseed.seeding.advice import DEFAULT_METHOD, method_for
-from splatseed.seeding.photographs import MAX_SIZE, Stereo, photographed, read_views, with_cover
-from splatseed.upsample import (
+from splatseed.methods import (
     Profile,
     Upsampler,
     as_cloud,
@@ -27,8 +22,13 @@ from splatseed.upsample import (
     source_code,
     upsample as add_points,
 )
-from splatseed.upsample.method import NewPoints
-from splatseed.views.view import TRAINED_SIDE, View, at_file_size, data_factor, poses_of
+from splatseed.methods.method import NewPoints
+from splatseed.photos.view import TRAINED_SIDE, View, at_file_size, data_factor, poses_of
+from splatseed.pointcloud import ORIGINAL, PointCloud
+from splatseed.progress import Progress, silent
+from splatseed.scene import Scene
+from splatseed.seeding.advice import DEFAULT_METHOD, method_for
+from splatseed.seeding.photo_methods import MAX_SIZE, Stereo, photographed, read_views, with_cover
 
 if TYPE_CHECKING:
     from splatseed.depth.stereo.maps import StereoResult
@@ -207,8 +207,8 @@ def add_cover(
 
 def _add_verified(scene: Scene, cloud: PointCloud, progress: Progress, note: Note) -> PointCloud:
     """A cloud with its interpolated points checked against the photographs; others stay."""
+    from splatseed.photos.visibility import find_visibility  # noqa: PLC0415  (loads with its use)
     from splatseed.seeding.verify import verify  # noqa: PLC0415  (kernels load with use)
-    from splatseed.views.visibility import find_visibility  # noqa: PLC0415  (loads with its use)
 
     guessed = np.isin(cloud.source, [source_code(name) for name in INTERPOLATING])
     if not guessed.any():

@@ -29,17 +29,17 @@ from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
 from splatseed.depth.stereo.cost import NOISE, SAMPLES, best_cost, grey_image, prepare_window
 from splatseed.depth.stereo.matching import make_quad_images
+from splatseed.methods.method import NewPoints
+from splatseed.methods.neighbors import Neighbors, PreparedCloud, prepare
+from splatseed.methods.patches import local_frames
+from splatseed.photos.projection import choose_sources, place, views_of_points
+from splatseed.photos.view import View
+from splatseed.photos.visibility import Visibility
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, in_threads, silent
 from splatseed.runtime.jit import always_inline, inline, kernel, parallel_range
 from splatseed.runtime.simd import LANES
 from splatseed.scene import Image
-from splatseed.upsample.method import NewPoints
-from splatseed.upsample.neighbors import Neighbors, PreparedCloud, prepare
-from splatseed.upsample.patches import local_frames
-from splatseed.views.projection import choose_sources, place, views_of_points
-from splatseed.views.view import View
-from splatseed.views.visibility import Visibility
 
 NEIGHBORS = 16  # neighbours that determine a normal, as for mls
 FLAT = 0.4

@@ -21,7 +21,7 @@ from typing import NamedTuple, TypeAlias
 
 from PIL import Image as PilImage
 
-from splatseed.literal import agreeing, counted, name_some
+from splatseed.text import agreeing, counted, name_some
 
 Size = tuple[int, int]
 """Width and height in pixels as stored, before any EXIF rotation."""

@@ -28,13 +28,13 @@ from splatseed import errors
 from splatseed.camera import Intrinsics
 from splatseed.io.masks import write_masks
 from splatseed.io.staging import remove
-from splatseed.literal import counted, name_some
 from splatseed.progress import Progress
 from splatseed.requirements import install_command
 from splatseed.runtime.torch_device import DeviceName
 from splatseed.scene import Image, Masks
 from splatseed.sfm.cameras import SharedCamera
 from splatseed.sfm.kept import DATABASE, MODELS, Kept
+from splatseed.text import counted, name_some
 
 MatcherName: TypeAlias = Literal["exhaustive", "sequential"]
 T = TypeVar("T")

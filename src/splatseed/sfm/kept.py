@@ -16,9 +16,9 @@ from typing import Any, NamedTuple
 
 from splatseed.camera import Intrinsics
 from splatseed.io.staging import MANIFEST, held, read_manifest, remove, write_json
-from splatseed.literal import quoted
 from splatseed.scene import Masks
 from splatseed.sfm.cameras import Photos
+from splatseed.text import quoted
 
 KIND = "sfm work"
 DATABASE, MODELS = "database.db", "models"

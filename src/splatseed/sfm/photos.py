@@ -31,11 +31,11 @@ from splatseed.io.mask_files import masks_among
 from splatseed.io.photograph import check_photograph, open_photograph, photograph_bytes
 from splatseed.io.photograph_checks import check_sizes, resized_to
 from splatseed.io.staging import read_manifest
-from splatseed.literal import name_some, quoted
 from splatseed.progress import Progress, silent
 from splatseed.requirements import require
 from splatseed.scene import Image, Scene
 from splatseed.sfm.cameras import Photo, Photos, read_exif
+from splatseed.text import name_some, quoted
 
 _SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
 _FOREIGN_SUFFIXES = frozenset(

@@ -31,6 +31,7 @@ from splatseed.io.photograph_checks import check_sizes, with_photographs
 from splatseed.io.seeds import carry_seeds
 from splatseed.io.staging import MANIFEST, output_folder, write_json
 from splatseed.io.write import write_split
+from splatseed.photos.view import at_file_size
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.requirements import require
@@ -42,7 +43,6 @@ from splatseed.sfm.colmap import Run, Settings
 from splatseed.sfm.kept import Kept, kept_work, work_key
 from splatseed.sfm.photos import find_photos, match_poses
 from splatseed.sfm.refinement import Refinement, refine
-from splatseed.views.view import at_file_size
 
 OnPhotos: TypeAlias = Callable[[Sequence[str], Mapping[str, Sequence[str]], str], None]
 _DEFAULT = Settings()

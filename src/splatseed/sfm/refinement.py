@@ -23,9 +23,9 @@ from jaxtyping import Bool, Float64
 
 from splatseed.camera import quat_from_rotation
 from splatseed.errors import ReconstructionError
-from splatseed.literal import name_some
 from splatseed.scene import Image
 from splatseed.sfm.colmap import Run, posed_model, rigid
+from splatseed.text import name_some
 
 COARSE = (6.0, 2.0)
 """Degrees by which an observation may miss its point in the first rounds."""

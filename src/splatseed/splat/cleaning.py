@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from splatseed.errors import SceneFormatError
-from splatseed.literal import agreeing, counted
 from splatseed.splat.gaussians import Gaussians
+from splatseed.text import agreeing, counted
 
 MAX_LOG_SCALE = 20.0
 """Larger sizes are left out; log-scales of compressed PLY end here, too."""

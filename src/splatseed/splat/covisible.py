@@ -21,10 +21,10 @@ from jaxtyping import Bool, Float32
 from splatseed.depthmap import DepthMaps
 from splatseed.io.files import ARCHIVE_FAILURES
 from splatseed.io.staging import atomic_file
+from splatseed.photos.view import View, data_factor, poses_of
 from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
 from splatseed.seeding.coverage import NEARER, cell_depths, grid_from_world, grid_of
-from splatseed.views.view import View, data_factor, poses_of
 
 _LEAST_VIEWS = 2  # training views that must see a pixel
 _CELLS, _LEAST_CELL = 100, 2.0

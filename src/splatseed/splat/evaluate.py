@@ -31,7 +31,8 @@ from splatseed.io import load_scene
 from splatseed.io.masks import with_masks
 from splatseed.io.photograph import photographs_digest
 from splatseed.io.photograph_checks import with_photographs
-from splatseed.literal import agreeing, name_some
+from splatseed.photos.sight import shown_points
+from splatseed.photos.view import View, at_file_size, default_factor, load_views, poses_of
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 from splatseed.scores import NOT_ASKED, EvalResult, ViewScore
@@ -41,8 +42,7 @@ from splatseed.splat.metrics import LPIPS_NET, Lpips, color_corrected, flip_map,
 from splatseed.splat.rendering import ModelRenderer, fill_masked, mask_of, photograph_of
 from splatseed.splat.ssim import WINDOW
 from splatseed.splat.world import NO_TRANSFORM, around_scene, check_world, find_transform, view_in
-from splatseed.views.sight import shown_points
-from splatseed.views.view import View, at_file_size, default_factor, load_views, poses_of
+from splatseed.text import agreeing, name_some
 
 Covisible: TypeAlias = Mapping[str, Bool[np.ndarray, "H W"]]
 """Which pixels of each test view at least two training views see, by the view's name."""

@@ -15,8 +15,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 
-from splatseed.literal import agreeing, counted
 from splatseed.splat.gaussians import Gaussians
+from splatseed.text import agreeing, counted
 
 NEAR, RATIO = 8.0, 64.0
 """Where shell 0 ends, in reaches, and how much larger each further shell is."""

@@ -20,11 +20,11 @@ from jaxtyping import Float64
 from splatseed.errors import ParameterError, SceneFormatError
 from splatseed.io.files import COPY_AGAIN, StrPath, read_bytes
 from splatseed.io.staging import atomic_file
-from splatseed.literal import beginning, did_you_mean
 from splatseed.progress import Note, Progress, silent, silent_note
 from splatseed.splat import model_ply, packed, sog
 from splatseed.splat.cleaning import drop_unusable
 from splatseed.splat.gaussians import Gaussians
+from splatseed.text import beginning, did_you_mean
 
 _HEADER = 1 << 20
 _ELSEWHERE = {

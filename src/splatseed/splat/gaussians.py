@@ -23,9 +23,9 @@ from jaxtyping import Bool, Float, Float32, Float64, Int64
 from numpy.lib.stride_tricks import sliding_window_view
 
 from splatseed.errors import PointCloudError
+from splatseed.photos.sight import camera_centers, sight_of
+from splatseed.photos.view import NEAR_PLANE, View
 from splatseed.pointcloud import PointCloud
-from splatseed.views.sight import camera_centers, sight_of
-from splatseed.views.view import NEAR_PLANE, View
 
 PARAMETERS = ("means", "scales", "quats", "opacities", "sh0", "shN")
 """The names of a Gaussian's arrays, in order."""

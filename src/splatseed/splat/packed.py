@@ -25,7 +25,6 @@ from numpy.lib.recfunctions import structured_to_unstructured
 from splatseed.errors import ParameterError
 from splatseed.io.files import COPY_AGAIN, ByteReader, guarded, read_bytes
 from splatseed.io.ply import parse_header
-from splatseed.literal import agreeing, counted
 from splatseed.progress import Note, silent_note
 from splatseed.requirements import require
 from splatseed.runtime.memory import check_memory
@@ -40,6 +39,7 @@ from splatseed.splat.extent import (
     shells_of,
 )
 from splatseed.splat.gaussians import SH_C0, Gaussians
+from splatseed.text import agreeing, counted
 
 SH_COUNTS = (0, 3, 8, 15)
 """Coefficients beyond the first, by the degree of the spherical harmonics."""

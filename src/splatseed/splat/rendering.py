@@ -20,10 +20,10 @@ from torch import Tensor
 
 from splatseed.io.files import StrPath
 from splatseed.io.staging import atomic_file
-from splatseed.render import rasterization
+from splatseed.photos.view import View
+from splatseed.rendering import rasterization
 from splatseed.runtime.torch_device import free_bytes
 from splatseed.splat.gaussians import Gaussians, TrainingFrame
-from splatseed.views.view import View
 
 SHARE = 0.25  # most of a GPU's free memory that photographs may take
 LEAST_ALPHA = 0.05  # below which a pixel has no depth

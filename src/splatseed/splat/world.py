@@ -23,10 +23,10 @@ from splatseed.errors import ParameterError, SceneFormatError
 from splatseed.io.files import read_json
 from splatseed.io.nerfstudio import NERFSTUDIO, similarity_in
 from splatseed.io.origin import offset_beside, place_words, shift_to
+from splatseed.photos.view import View
 from splatseed.scene import Scene
 from splatseed.similarity import Similarity, fit_similarity, similarity_of
 from splatseed.splat.gaussians import Gaussians
-from splatseed.views.view import View
 
 GSPLAT, NO_TRANSFORM = "gsplat", "none"
 """Words that name a transform: that of gsplat's examples, and none, without any check."""

@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int64, UInt8
 
 from splatseed.camera import Camera
+from splatseed.photos.visibility import look_at
 from splatseed.synthetic.surfaces import (
     Box,
     Cylinder,
@@ -33,7 +34,6 @@ from splatseed.synthetic.surfaces import (
     yaw_frame,
 )
 from splatseed.synthetic.texture import Mottled, Plain, Texture, Tiles
-from splatseed.views.visibility import look_at
 
 BARE = "bare wall"
 """Name of the surface without texture."""

@@ -13,9 +13,9 @@ import torch
 from gsplat.cuda._torch_impl import _quat_scale_to_covar_preci, _spherical_harmonics
 from pretend_cuda import Pretend, check_input, elem, note
 
-from splatseed.render.autograd import Blend, Lens, Project
-from splatseed.render.mcmc import compute_relocation
-from splatseed.render.rasterize import intersect
+from splatseed.rendering.autograd import Blend, Lens, Project
+from splatseed.rendering.mcmc import compute_relocation
+from splatseed.rendering.rasterize import intersect
 
 SEEN: list = [None, None]
 """Radii and depths of the last projection, which blending takes."""

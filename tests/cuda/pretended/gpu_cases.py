@@ -27,19 +27,19 @@ import torch
 from splatseed.errors import MissingDependencyError, PointCloudError
 from splatseed.splat.evaluate import evaluate_views
 from splatseed.splat.metrics import ssim_of_all
-from splatseed.gsplat import GrowStrategy
+from splatseed.integrations.gsplat import GrowStrategy
 from splatseed.io import load_scene
 from splatseed.io.depth_maps import depth_folder
 from splatseed.runtime import torch_device
 from splatseed.splat import rendering
 from splatseed.splat.gaussians import initial_gaussians
 from splatseed.synthetic import make_capture, write_capture
-from splatseed.train import TrainSettings, prepare_run, state, trainer
-from splatseed.train.device import Capacity
-from splatseed.train.parameters import as_parameters
-from splatseed.view import pictures
-from splatseed.view.models import Shown, stage_frame
-from splatseed.views.view import load_split
+from splatseed.training import TrainSettings, prepare_run, state, trainer
+from splatseed.training.device import Capacity
+from splatseed.training.parameters import as_parameters
+from splatseed.viewer import pictures
+from splatseed.viewer.models import Shown, stage_frame
+from splatseed.photos.view import load_split
 
 STEPS = 12
 VIEWS = 7

@@ -8,8 +8,8 @@ import pytest
 
 from splatseed.depth.stereo.depths import find_stereo
 from splatseed.depth.stereo.maps import StereoSettings
-from splatseed.views.view import load_views
-from splatseed.views.visibility import find_visibility
+from splatseed.photos.view import load_views
+from splatseed.photos.visibility import find_visibility
 
 from .made import arc, ball_before_wall, photograph, tilted_plane
 

@@ -11,12 +11,12 @@ import numpy as np
 from PIL import Image as PillowImage
 
 from splatseed.camera import Camera, Intrinsics, quat_from_rotation
+from splatseed.photos.visibility import look_at
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene, SceneSource
 from splatseed.synthetic.room import Room, pixel_rays, render_view
 from splatseed.synthetic.surfaces import Rectangle, Sphere, Union
 from splatseed.synthetic.texture import Mottled, Plain
-from splatseed.views.visibility import look_at
 
 WIDTH, HEIGHT, FOCAL = 96, 80, 100.0
 FAR = 3.0

@@ -13,9 +13,9 @@ from splatseed.depth.stereo import depths as without_points, stereo_depths
 from splatseed.depth.stereo.depths import find_stereo
 from splatseed.depth.stereo.maps import StereoSettings
 from splatseed.errors import ParameterError, SceneNotFoundError
+from splatseed.photos.view import load_views
+from splatseed.photos.visibility import find_visibility
 from splatseed.pointcloud import PointCloud
-from splatseed.views.view import load_views
-from splatseed.views.visibility import find_visibility
 
 from .conftest import SETTINGS
 from .made import (

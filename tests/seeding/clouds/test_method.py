@@ -8,9 +8,9 @@ from scipy.spatial import KDTree
 
 import splatseed as ss
 from splatseed.errors import PointCloudError
+from splatseed.methods import SOURCE_CODES
 from splatseed.seeding.clouds.method import Cloud
 from splatseed.similarity import Similarity
-from splatseed.upsample import SOURCE_CODES
 
 CLOUD, COVER = SOURCE_CODES["cloud"], SOURCE_CODES["cover"]
 NUM, GHOSTS = 75_000, 2_000

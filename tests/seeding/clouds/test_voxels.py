@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
+from splatseed.photos.view import View
 from splatseed.progress import silent
 from splatseed.seeding.clouds import judging as module
 from splatseed.seeding.clouds.judging import find_evidence, find_support, find_surfaces, free_rays
 from splatseed.seeding.clouds.voxels import ASIDE, Voxels
-from splatseed.views.view import View
 
 
 def view(center, focal, width, height, shade=0):

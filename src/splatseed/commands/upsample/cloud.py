@@ -13,11 +13,11 @@ from splatseed.io.clouds import open_cloud
 from splatseed.io.nerfstudio import read_cloud_transform
 from splatseed.io.origin import shift_to
 from splatseed.io.staging import add_files, write_json
-from splatseed.literal import visible
 from splatseed.progress import Progress
 from splatseed.runtime.memory import words_of
 from splatseed.scene import Scene
 from splatseed.similarity import Similarity
+from splatseed.text import visible
 
 if TYPE_CHECKING:
     from splatseed.commands.upsample.command import Options
@@ -50,7 +50,7 @@ class LoadedCloud(NamedTuple):
     def write(self, folder: Path) -> None:
         """Write the reports beside the scene, if there are any."""
         if (found := self.alignment) is not None:
-            from splatseed.view.clouds import preview_alignment  # noqa: PLC0415  (Pillow)
+            from splatseed.viewer.clouds import preview_alignment
 
             add_files(folder, ALIGNMENT)
             report, picture = (folder / name for name in ALIGNMENT)
@@ -72,7 +72,7 @@ def load_cloud(options: Options, scene: Scene, method: Cloud, progress: Progress
     elif not options.align and (shift := shift_to(scene, _sample(files))).any():
         transform = Similarity(1.0, np.eye(3), shift)
     if options.align:
-        from splatseed.seeding.clouds.align import align  # noqa: PLC0415  (loads Numba)
+        from splatseed.seeding.clouds.align import align
 
         alignment = align(scene, files, progress)
         transform = alignment.scene_from_cloud

@@ -24,13 +24,7 @@ from splatseed.io.load import with_own_depths
 from splatseed.io.masks import with_masks
 from splatseed.io.origin import RECENTER, middle_of_cameras, moved_by, place_words
 from splatseed.io.staging import check_output
-from splatseed.literal import counted, quoted, visible
-from splatseed.runtime.memory import bytes_of
-from splatseed.scene import Scene
-from splatseed.seeding import photographs
-from splatseed.seeding.advice import DEFAULT_METHOD, method_for
-from splatseed.seeding.upsampling import points_within, upsample
-from splatseed.upsample import (
+from splatseed.methods import (
     METHODS,
     Profile,
     Upsampler,
@@ -39,7 +33,13 @@ from splatseed.upsample import (
     planned_size,
     traits_of,
 )
-from splatseed.views.sight import stray_notes
+from splatseed.photos.sight import stray_notes
+from splatseed.runtime.memory import bytes_of
+from splatseed.scene import Scene
+from splatseed.seeding import photo_methods
+from splatseed.seeding.advice import DEFAULT_METHOD, method_for
+from splatseed.seeding.upsampling import points_within, upsample
+from splatseed.text import counted, quoted, visible
 
 FILES = (".ply", ".las", ".laz", ".e57", ".pcd", ".xyz", ".pts", ".npz", ".bin", ".txt")
 """Suffixes by which somebody means a file of points."""
@@ -220,9 +220,9 @@ def _upsample(options: Options, methods: dict[str, Any]) -> None:
         clock("read", 0.0)
         scene = _read(options, methods[options.method])
         if options.gaussians is not None:
-            photographs.photographed(scene, without="leave out --gaussians")  # they bound sizes
+            photo_methods.photographed(scene, without="leave out --gaussians")  # they bound sizes
         if options.refine_poses:
-            from splatseed.sfm import refined  # noqa: PLC0415  (loads with its use)
+            from splatseed.sfm import refined
 
             clock.expect("features", "matching", "refinement", "triangulation", "undistortion")
             held = getattr(methods[options.method], "hold_out", 0)
@@ -319,8 +319,8 @@ def _announce(
     if options.profile == "paper" and configure(name, "paper") == configure(name):
         print_note(f"Profile paper changes nothing for method {name}.")
     how = ""
-    if isinstance(method, photographs.Stereo) and not photographs.begins_from_points(scene):
-        points = "too few" if photographs.has_points(scene) else "no"
+    if isinstance(method, photo_methods.Stereo) and not photo_methods.begins_from_points(scene):
+        points = "too few" if photo_methods.has_points(scene) else "no"
         where = "" if scene.depths is None else ", around its depth maps"
         how = f": {points} points, so depth is found by comparing photographs{where}"
     kind = scene.source.format if scene.source else "memory"

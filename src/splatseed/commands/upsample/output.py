@@ -14,16 +14,16 @@ from splatseed.commands.upsample.cloud import ALIGNMENT
 from splatseed.console import StageClock, print_note, print_pairs
 from splatseed.io import WriteReport
 from splatseed.io.origin import write_offset
+from splatseed.methods import Profile, Upsampler, chooses_number, configure, origin_name
 from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
 from splatseed.seeding.diagnostics import far_share
-from splatseed.seeding.photographs import MAX_SIZE, Stereo, photographed, read_views
+from splatseed.seeding.photo_methods import MAX_SIZE, Stereo, photographed, read_views
 from splatseed.seeding.upsampling import CELL, share_covered
 from splatseed.splat.formats import write_model
-from splatseed.train.seeds import gaussians_of_scene
-from splatseed.train.settings import TrainSettings
-from splatseed.upsample import Profile, Upsampler, chooses_number, configure, origin_name
+from splatseed.training.seeds import gaussians_of_scene
+from splatseed.training.settings import TrainSettings
 
 if TYPE_CHECKING:
     from splatseed.commands.upsample.command import Options
@@ -120,8 +120,8 @@ def write_previews(
     options: Options, scene: Scene, seeds: PointCloud, method: Upsampler, clock: StageClock
 ) -> None:
     """Draw before and after; with photographs also origins, covered cells and stereo's maps."""
-    from splatseed.seeding.coverage import covered_cells  # noqa: PLC0415  (kernels load with use)
-    from splatseed.view import clouds, maps  # noqa: PLC0415  (Pillow)
+    from splatseed.seeding.coverage import covered_cells
+    from splatseed.viewer import clouds, maps
 
     folder = options.output
     clock("preview", 0.0)

@@ -19,12 +19,12 @@ from splatseed.camera import Camera
 from splatseed.depth.stereo.maps import TOO_FEW, StereoResult, StereoSettings
 from splatseed.depth.stereo.matching import Hints, hints_from, match_views, other_from_view
 from splatseed.depthmap import DepthMap
+from splatseed.photos.projection import choose_by_pose, choose_sources
+from splatseed.photos.view import View
+from splatseed.photos.visibility import Visibility, find_visibility
 from splatseed.progress import Progress, silent
 from splatseed.runtime.jit import inline
 from splatseed.scene import Image, Scene
-from splatseed.views.projection import choose_by_pose, choose_sources
-from splatseed.views.view import View
-from splatseed.views.visibility import Visibility, find_visibility
 
 LEAST_SEEN = 300
 """A scene counts as having no points if half of its images see fewer. Coarse stereo takes two or

@@ -16,9 +16,9 @@ from jaxtyping import Float32, Int64, UInt8
 
 from splatseed.camera import Camera
 from splatseed.errors import ParameterError, SceneNotFoundError
+from splatseed.photos.view import View
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
-from splatseed.views.view import View
 
 TOO_FEW = 30
 """Points that are not worth being searched around, and vouch for no pose."""
@@ -184,7 +184,7 @@ def stereo_depths(
     """
     from splatseed.depth.stereo.depths import find_stereo, known_visibility  # noqa: PLC0415  (loads Numba)
     from splatseed.io.photograph_checks import with_photographs  # noqa: PLC0415  (loads with its use)
-    from splatseed.views.view import at_file_size, data_factor, load_views  # noqa: PLC0415  (loads with its use)
+    from splatseed.photos.view import at_file_size, data_factor, load_views  # noqa: PLC0415  (loads with its use)
 
     settings = replace(settings or StereoSettings(), **choices)
     if len(scene.images) < 2:

@@ -25,10 +25,10 @@ from scipy.spatial import cKDTree
 from splatseed.depth.stereo.cost import grey_image, make_quads
 from splatseed.depth.stereo.maps import StereoResult, StereoSettings
 from splatseed.depth.stereo.patchmatch import QuadImages, begin, sweep
+from splatseed.photos.view import View
 from splatseed.progress import Progress, in_threads
 from splatseed.runtime.jit import inline
 from splatseed.runtime.memory import check_memory
-from splatseed.views.view import View
 
 NEAREST = 3
 """Points whose depth is tried as a fronto-parallel plane."""

@@ -26,13 +26,13 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64, UInt8, UInt16
 
 from splatseed.errors import PointCloudError
+from splatseed.photos.projection import place
+from splatseed.photos.view import View
 from splatseed.progress import Progress
 from splatseed.runtime.hashing import FREE, scramble, slot_of
 from splatseed.runtime.jit import inline, kernel, parallel_range
 from splatseed.seeding.clouds.voxels import Voxels
 from splatseed.seeding.coverage import cell_counts, depths_of_views, grid_from_world
-from splatseed.views.projection import place
-from splatseed.views.view import View
 
 
 def find_support(

@@ -17,18 +17,18 @@ from jaxtyping import Float64
 from splatseed.depth.stereo.maps import StereoSettings
 from splatseed.errors import ParameterError, PointCloudError
 from splatseed.io.origin import ELSEWHERE
+from splatseed.methods import source_code
+from splatseed.methods.method import NewPoints, Traits, check_fields, require
 from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
-from splatseed.seeding.photographs import MAX_SIZE, compare, photographed, read_views
+from splatseed.seeding.photo_methods import MAX_SIZE, compare, photographed, read_views
 from splatseed.seeding.upsampling import CELL, frames_of
 from splatseed.similarity import Similarity
-from splatseed.upsample import source_code
-from splatseed.upsample.method import NewPoints, Traits, check_fields, require
 
 if TYPE_CHECKING:
+    from splatseed.photos.view import View
     from splatseed.seeding.clouds.judging import Judged, Surface
     from splatseed.seeding.clouds.voxels import MemoryPlan, Streamed
-    from splatseed.views.view import View
 
 FITS = 0.2
 """Below this share of the scene's own points at the cloud's depth it is another's: a cloud of
@@ -108,10 +108,10 @@ class GivenClouds(Cloud):
         self, scene: Scene, num_new: int, rng: np.random.Generator, progress: Progress
     ) -> NewPoints:
         """Seeds from the clouds."""
+        from splatseed.photos.visibility import find_visibility  # noqa: PLC0415  (loads with its use)
         from splatseed.seeding.clouds.judging import judge  # noqa: PLC0415  (loads Numba)
         from splatseed.seeding.clouds.voxels import stream  # noqa: PLC0415  (loads Numba)
         from splatseed.seeding.coverage import covered_share  # noqa: PLC0415  (loads Numba)
-        from splatseed.views.visibility import find_visibility  # noqa: PLC0415  (loads with its use)
 
         capacity, frames = self.plan(scene).capacity, frames_of(scene)
         paths = [Path(each) for each in self.files]

@@ -23,13 +23,13 @@ from jaxtyping import Float32, Float64, Int16, Int32, UInt8, UInt64
 
 from splatseed.errors import ParameterError, PointCloudError
 from splatseed.io.clouds import CloudChunk, CloudFile, open_cloud
+from splatseed.photos.view import View
 from splatseed.progress import Progress
 from splatseed.runtime.hashing import scramble
 from splatseed.runtime.jit import inline, kernel, parallel_range
 from splatseed.runtime.memory import free_memory, option_of, words_of
 from splatseed.seeding.coverage import grid_from_world
 from splatseed.similarity import Similarity
-from splatseed.views.view import View
 
 BYTES_EACH = 320
 """Bytes per voxel, at most: 45 here, the others where voxels are looked at, thinned and written."""

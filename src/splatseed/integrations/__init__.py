@@ -1,0 +1,1 @@
+"""splatseed inside other trainers."""

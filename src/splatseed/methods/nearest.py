@@ -1,0 +1,211 @@
+"""The base of every method that starts from a base point and its nearest neighbours.
+
+Such a method has two steps with the draw of the bases between them: ``base_weights`` says how
+likely each row is a base, ``sample`` makes the points.
+
+Colours: c = sum_j w_j c_j / sum_j w_j over the base point and its neighbours, with
+w_j = 1 / max(|p - p_j|, 0.01 h), h the base point's spacing, in linear arithmetic on the 8-bit
+values as in the paper, rounded to the nearest. Points that may lie far from their base can take the
+originals nearest to themselves instead (``colors_of_nearest``).
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar, Self, TypeAlias
+
+import numpy as np
+from jaxtyping import Float32, Float64, UInt8
+
+from splatseed.errors import PointCloudError
+from splatseed.methods.method import NewPoints, check_fields
+from splatseed.methods.neighbors import (
+    QUERY_BLOCK,
+    Bases,
+    Neighbors,
+    PreparedCloud,
+    draw_bases,
+    prepare_scene,
+    sound_bases,
+)
+from splatseed.progress import Progress, in_threads
+from splatseed.runtime.jit import inline, kernel, parallel_range
+from splatseed.scene import Scene
+
+OUTLIER_CHECK_NEIGHBORS = 8
+
+Aux: TypeAlias = Mapping[str, np.ndarray]
+"""What ``base_weights`` has found out about rows and ``sample`` needs: arrays [n, ...] by name."""
+
+
+@dataclass(frozen=True)
+class NearestMethod(ABC):
+    """Base of the methods that need only the nearest neighbours of a base point."""
+
+    reject_isolated: bool = True
+    """Start nothing from isolated points, or from ones with a short, bad track (paper: no)."""
+
+    min_points: ClassVar[int] = 2
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+    @classmethod
+    def paper(cls) -> Self:
+        """The parameters that follow the paper to the letter."""
+        return cls(reject_isolated=False)
+
+    @property
+    @abstractmethod
+    def num_neighbors(self) -> int:
+        """Neighbours that points are made from."""
+
+    @property
+    def num_queried(self) -> int:
+        """Neighbours to look for: those that points are made from, or that isolation shows in."""
+        if not self.reject_isolated:
+            return self.num_neighbors
+        return max(self.num_neighbors, OUTLIER_CHECK_NEIGHBORS)
+
+    def __call__(
+        self, scene: Scene, num_new: int, rng: np.random.Generator, progress: Progress
+    ) -> NewPoints:
+        """Make ``num_new`` points."""
+        cloud = prepare_scene(scene, progress)
+        self.check_enough(len(cloud))
+        neighbors = cloud.neighbors(self.num_queried)
+        weight, aux = self.base_weights(cloud, neighbors, progress)
+        neighbors = neighbors.nearest(self.num_neighbors)
+        bases = draw_bases(cloud, num_new, rng, weight=weight)
+        return self.sample(cloud, neighbors, aux, bases, rng, progress)
+
+    def check_enough(self, number: int) -> None:
+        """Refuse a cloud with fewer distinct points than the method needs (PointCloudError)."""
+        if number < self.min_points:
+            raise PointCloudError(
+                f"at least {self.min_points} distinct finite points for {type(self).__name__}",
+                found=f"{number}",
+                fix="Use a cloud with more points, or the method 'random'.",
+            )
+
+    def base_weights(
+        self, cloud: PreparedCloud, neighbors: Neighbors, progress: Progress
+    ) -> tuple[Float64[np.ndarray, " n"], Aux]:
+        """Each row's weight as a base, and what ``sample`` needs besides.
+
+        ``neighbors`` are ``num_queried`` a row.
+        """
+        if not self.reject_isolated:
+            return np.ones(len(cloud)), {}
+        return sound_bases(cloud, neighbors), {}
+
+    @abstractmethod
+    def sample(
+        self,
+        cloud: PreparedCloud,
+        neighbors: Neighbors,
+        aux: Aux,
+        bases: Bases,
+        rng: np.random.Generator,
+        progress: Progress,
+    ) -> NewPoints:
+        """Make the points of all bases; ``neighbors`` are ``num_neighbors`` a row.
+
+        ``aux`` is what ``base_weights`` has found.
+        """
+
+
+FLOOR = 0.01  # lower limit of distances, in units of the base point's spacing
+
+
+def interpolate_colors(
+    cloud: PreparedCloud, neighbors: Neighbors, bases: Bases, new_xyz: Float32[np.ndarray, "M 3"]
+) -> UInt8[np.ndarray, "M 3"]:
+    """Colours uint8 [M, 3] of new points at world positions ``new_xyz``."""
+    rgb = np.empty((bases.total, 3), np.uint8)
+    _interpolate(
+        cloud.xyz, cloud.rgb, cloud.center, neighbors.idx, FLOOR * neighbors.spacing,
+        bases.start, bases.count, new_xyz, rgb,
+    )  # fmt: skip
+    return rgb
+
+
+def colors_of_nearest(
+    cloud: PreparedCloud,
+    neighbors: Neighbors,
+    local_xyz: Float32[np.ndarray, "M 3"],
+    k: int,
+    progress: Progress,
+) -> UInt8[np.ndarray, "M 3"]:
+    """Colours of new points from the k originals nearest to each.
+
+    Positions are relative to the cloud's centre: rounded far from 0, they would have others.
+    """
+    rgb, spacing = np.empty_like(cloud.rgb), np.empty(len(cloud))
+    rgb[cloud.rank], spacing[cloud.rank] = cloud.rgb, neighbors.spacing
+    out = np.empty((len(local_xyz), 3), np.uint8)
+    nth = np.arange(1, min(k, len(cloud)) + 1)
+
+    def work(start: int, stop: int) -> None:
+        distance, number = cloud.tree.query(local_xyz[start:stop], nth)
+        weight = 1.0 / np.maximum(distance, FLOOR * spacing[number[:, :1]])
+        weight /= weight.sum(axis=1, keepdims=True)
+        out[start:stop] = np.einsum("mk,mkc->mc", weight, rgb[number]) + 0.5
+
+    in_threads(work, len(local_xyz), QUERY_BLOCK, "colours", progress)
+    return out
+
+
+@kernel
+def _interpolate(xyz, rgb, center, idx, floor, start, count, new_xyz, out):  # type: ignore[no-untyped-def]  # Numba's types
+    for i in parallel_range(len(count)):
+        if count[i] > 0:
+            around, color = _gather(xyz, rgb, i, idx[i])
+            weight = np.empty(around.shape[1], np.float32)
+            # Squared, like the distances it bounds.
+            nearest = np.float32(floor[i] * floor[i])
+            for m in range(start[i], start[i] + count[i]):
+                x = np.float32(new_xyz[m, 0] - center[0] - xyz[i, 0])
+                y = np.float32(new_xyz[m, 1] - center[1] - xyz[i, 1])
+                z = np.float32(new_xyz[m, 2] - center[2] - xyz[i, 2])
+                _weights(around, x, y, z, nearest, weight)
+                _mix(weight, color, out[m])
+
+
+@inline
+def _gather(xyz, rgb, i, rows):  # type: ignore[no-untyped-def]  # Numba's types
+    """Positions relative to the base [3, k + 1] and colours [k + 1, 3], for all its new points."""
+    k = rows.size
+    around, color = np.zeros((3, k + 1), np.float32), np.empty((k + 1, 3), np.float32)
+    for axis in range(3):
+        color[k, axis] = rgb[i, axis]  # the base itself comes last, at the origin
+        for j in range(k):
+            around[axis, j] = xyz[rows[j], axis] - xyz[i, axis]
+            color[j, axis] = rgb[rows[j], axis]
+    return around, color
+
+
+@inline
+def _weights(around, x, y, z, nearest, weight):  # type: ignore[no-untyped-def]  # Numba's types
+    """Inverse distances; separate from the sums, so that the square roots are vectorised."""
+    for j in range(weight.size):
+        dx, dy, dz = x - around[0, j], y - around[1, j], z - around[2, j]
+        squared = max(dx * dx + dy * dy + dz * dz, nearest)
+        weight[j] = np.float32(1.0) / np.sqrt(squared)
+
+
+@inline
+def _mix(weight, color, out):  # type: ignore[no-untyped-def]  # Numba's types
+    total = red = green = blue = np.float32(0.0)
+    for j in range(weight.size):
+        total += weight[j]
+        red += weight[j] * color[j, 0]
+        green += weight[j] * color[j, 1]
+        blue += weight[j] * color[j, 2]
+    # Rounded to the nearest, as uint8 cuts off.
+    half = np.float32(0.5)
+    out[0] = np.uint8(red / total + half)
+    out[1] = np.uint8(green / total + half)
+    out[2] = np.uint8(blue / total + half)

@@ -1,0 +1,109 @@
+"""Linear and triangular upsampling (paper, eqs. 1 and 2): points between nearest neighbours.
+
+Linear: P = a P1 + (1 - a) P2 with a ~ U[0, 1], P1 a random original and P2 its nearest neighbour.
+Triangular: P = b0 P1 + b1 P2 + b2 P3 with the two nearest, (b0, b1, b2) uniform in the triangle:
+the barycentric weights come from the square-root map. Colours likewise. Promise: every new point
+lies between two originals, or in the triangle of three.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from splatseed.methods.method import NewPoints
+from splatseed.methods.nearest import Aux, NearestMethod
+from splatseed.methods.neighbors import Bases, Neighbors, PreparedCloud
+from splatseed.progress import Progress
+from splatseed.runtime.jit import kernel, parallel_range
+
+
+class _Simplex(NearestMethod):
+    """The base of both."""
+
+    name: ClassVar[str]
+
+    def sample(
+        self,
+        cloud: PreparedCloud,
+        neighbors: Neighbors,
+        aux: Aux,
+        bases: Bases,
+        rng: np.random.Generator,
+        progress: Progress,
+    ) -> NewPoints:
+        """Make the points of all bases."""
+        num = bases.total
+        draws = rng.random((num, 2) if self.num_neighbors == 2 else num, dtype=np.float32)
+        progress(self.name, 0.0)
+        new = NewPoints(np.empty((num, 3), np.float32), np.empty((num, 3), np.uint8))
+        self._fill(
+            cloud.xyz, cloud.rgb, cloud.center, neighbors.idx, bases.start, bases.count,
+            draws, new.xyz, new.rgb,
+        )  # fmt: skip
+        progress(self.name, 1.0)
+        return new
+
+    @staticmethod
+    @abstractmethod
+    def _fill(*arrays: np.ndarray) -> None:
+        """The kernel that fills positions and colours."""
+
+
+@dataclass(frozen=True)
+class Linear(_Simplex):
+    """Points on the segments between originals and their nearest neighbours (eq. 1)."""
+
+    name: ClassVar[str] = "linear"
+    num_neighbors: ClassVar[int] = 1
+
+    @staticmethod
+    def _fill(*arrays: np.ndarray) -> None:
+        _on_segments(*arrays)
+
+
+@dataclass(frozen=True)
+class Triangle(_Simplex):
+    """Points in the triangles of originals and their two nearest neighbours (eq. 2)."""
+
+    name: ClassVar[str] = "triangle"
+    min_points: ClassVar[int] = 3
+    num_neighbors: ClassVar[int] = 2
+
+    @staticmethod
+    def _fill(*arrays: np.ndarray) -> None:
+        _in_triangles(*arrays)
+
+
+@kernel
+def _on_segments(xyz, rgb, center, idx, start, count, alpha, out_xyz, out_rgb):  # type: ignore[no-untyped-def]  # Numba's types
+    """P = a P1 + (1 - a) P2 and the same for colours, for all new points of all rows."""
+    for i in parallel_range(len(count)):
+        j = idx[i, 0]
+        for m in range(start[i], start[i] + count[i]):
+            a = np.float64(alpha[m])
+            for axis in range(3):
+                out_xyz[m, axis] = a * xyz[i, axis] + (1.0 - a) * xyz[j, axis] + center[axis]
+                color = a * rgb[i, axis] + (1.0 - a) * rgb[j, axis]
+                out_rgb[m, axis] = np.uint8(color + 0.5)
+
+
+@kernel
+def _in_triangles(xyz, rgb, center, idx, start, count, draws, out_xyz, out_rgb):  # type: ignore[no-untyped-def]  # Numba's types
+    """P = b0 P1 + b1 P2 + b2 P3 and the same for colours, for all new points of all rows."""
+    for i in parallel_range(len(count)):
+        p, q = idx[i, 0], idx[i, 1]
+        for m in range(start[i], start[i] + count[i]):
+            root = np.sqrt(np.float64(draws[m, 0]))
+            b1 = root * (1.0 - np.float64(draws[m, 1]))
+            b2 = root - b1
+            b0 = 1.0 - root
+            for axis in range(3):
+                out_xyz[m, axis] = (
+                    b0 * xyz[i, axis] + b1 * xyz[p, axis] + b2 * xyz[q, axis] + center[axis]
+                )
+                color = b0 * rgb[i, axis] + b1 * rgb[p, axis] + b2 * rgb[q, axis]
+                out_rgb[m, axis] = np.uint8(color + 0.5)

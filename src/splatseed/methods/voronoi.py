@@ -1,0 +1,140 @@
+"""Voronoi upsampling (paper, eq. 6): new points where originals are sparse.
+
+A cell is drawn with probability proportional to its volume, and the point is uniform in the ball
+(c_i, r_i / 2) about the cell's centre; its colour comes from 5 neighbours.
+
+Default: cells are clamped to half the distance of the 25th neighbour (``cells``), and the
+probability is the volume relative to the median of the neighbours', capped at 8: otherwise all new
+points go to the sparse background, most of them outside the scene. The 5 neighbours are the
+cell's: its points lie close to them.
+Paper: SciPy's Voronoi cells of the originals and the corners of the bounding box enlarged by 10%,
+drawn by the volume vol_i = E[|v - c_i|]^3 of their vertices v (``cells``). The 5 neighbours are
+those of the new point.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar, Literal, Self
+
+import numpy as np
+from jaxtyping import Float64
+
+from splatseed.methods.cells import MAX_NEIGHBORS, Cells, box_cells, build_cells
+from splatseed.methods.method import NewPoints, require
+from splatseed.methods.nearest import Aux, NearestMethod, colors_of_nearest, interpolate_colors
+from splatseed.methods.neighbors import Bases, Neighbors, PreparedCloud
+from splatseed.methods.patches import local_frames
+from splatseed.progress import Progress, blocks
+from splatseed.runtime.jit import kernel, parallel_range
+
+BLOCK = 1 << 14
+
+
+@dataclass(frozen=True)
+class Voronoi(NearestMethod):
+    """Points in the Voronoi cells of the originals, more where cells are large (eq. 6)."""
+
+    k: int = 25
+    """Neighbours that shape a cell; half the distance of the last bounds it."""
+    cells: Literal["clamped", "box"] = "clamped"
+    """Cells clamped to their neighbourhood, or SciPy's in the enlarged bounding box (paper:
+    box)."""
+    ball: float = 0.5
+    """Radius of the ball for new points, as a fraction of the cell's radius (paper: 0.5)."""
+    color_k: int = 5
+    """Nearest originals that colour a new point (paper: 5)."""
+    max_weight: float = 8.0
+    """Cap on a cell's volume relative to the median of its neighbours' (clamped cells only)."""
+
+    min_points: ClassVar[int] = 4
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(4 <= self.k <= MAX_NEIGHBORS, f"voronoi.k from 4 to {MAX_NEIGHBORS}", self.k)
+        require(0 < self.ball <= 1, "voronoi.ball above 0 and up to 1", self.ball)
+        require(1 <= self.color_k <= self.k, "voronoi.color_k from 1 to voronoi.k", self.color_k)
+        require(self.max_weight >= 1, "voronoi.max_weight of at least 1", self.max_weight)
+
+    @classmethod
+    def paper(cls) -> Self:
+        """Cells in the bounding box enlarged by 10%, drawn by equation 6's volume alone."""
+        return cls(cells="box", reject_isolated=False)
+
+    @property
+    def num_neighbors(self) -> int:
+        """Neighbours that shape a cell."""
+        return self.k
+
+    def base_weights(
+        self, cloud: PreparedCloud, neighbors: Neighbors, progress: Progress
+    ) -> tuple[Float64[np.ndarray, " n"], Aux]:
+        """Weights by volume, and the cells' centres [n, 3] and radii [n]."""
+        weight, _ = super().base_weights(cloud, neighbors, progress)
+        neighbors = neighbors.nearest(self.k)
+        if self.cells == "box":
+            center, radius, volume = box_cells(cloud, progress)
+            return weight * volume, {"center": center, "radius": radius}
+        center, radius, volume, _ = _clamped_cells(cloud, neighbors, progress)
+        relative = np.empty(len(cloud))
+        _relative_volume(volume, neighbors.idx, float(self.max_weight), relative)
+        weight = weight * relative
+        return weight, {"center": center, "radius": radius}
+
+    def sample(
+        self,
+        cloud: PreparedCloud,
+        neighbors: Neighbors,
+        aux: Aux,
+        bases: Bases,
+        rng: np.random.Generator,
+        progress: Progress,
+    ) -> NewPoints:
+        """Put the points of all bases in the balls of their cells."""
+        frames, _ = local_frames(cloud.xyz, neighbors.idx)
+        xyz = rng.random((bases.total, 3), dtype=np.float32)
+        local = xyz.copy() if self.cells == "box" else xyz[:0]
+        balls = aux["center"], self.ball * aux["radius"], frames, bases.start, bases.count
+        _place(cloud.xyz, cloud.center, *balls, xyz)
+        if self.cells == "box":
+            _place(cloud.xyz, np.zeros(3), *balls, local)
+            rgb = colors_of_nearest(cloud, neighbors, local, self.color_k, progress)
+        else:
+            rgb = interpolate_colors(cloud, neighbors.nearest(self.color_k), bases, xyz)
+        return NewPoints(xyz, rgb)
+
+
+def _clamped_cells(cloud: PreparedCloud, neighbors: Neighbors, progress: Progress) -> Cells:
+    """The cells of all rows with neighbours, block by block."""
+    frames, _ = local_frames(cloud.xyz, neighbors.idx)
+    n = len(neighbors.idx)
+    cells = Cells(np.empty((n, 3)), np.empty(n), np.empty(n), np.empty(n, bool))
+    for first, last in blocks(n, BLOCK, "voronoi", progress):
+        build_cells(cloud.xyz, neighbors.idx, neighbors.distance, frames, first, last, cells)
+    return cells
+
+
+@kernel
+def _relative_volume(volume, idx, cap, relative):  # type: ignore[no-untyped-def]  # Numba's types
+    """Each volume relative to the median of its neighbours', at most ``cap``."""
+    for i in parallel_range(len(relative)):
+        around = np.sort(volume[idx[i]])
+        median = 0.5 * (around[(around.size - 1) // 2] + around[around.size // 2])
+        relative[i] = min(volume[i] / median, cap) if median > 0.0 else 1.0
+
+
+@kernel
+def _place(xyz, site_center, center, radius, frames, start, count, out):  # type: ignore[no-untyped-def]  # Numba's types
+    """Uniform in each cell's ball, replacing the draws in ``out``; directions turn with frames."""
+    for i in parallel_range(len(count)):
+        for m in range(start[i], start[i] + count[i]):
+            r = radius[i] * np.float64(out[m, 0]) ** (1.0 / 3.0)
+            n = 2.0 * np.float64(out[m, 1]) - 1.0
+            angle = 2.0 * math.pi * np.float64(out[m, 2])
+            ring = math.sqrt(max(1.0 - n * n, 0.0))
+            u, v = ring * math.cos(angle), ring * math.sin(angle)
+            for axis in range(3):
+                direction = u * frames[i, 0, axis] + v * frames[i, 1, axis] + n * frames[i, 2, axis]
+                local = xyz[i, axis] + center[i, axis] + r * direction
+                out[m, axis] = site_center[axis] + local

@@ -1,0 +1,262 @@
+"""Methods that look at the photographs, which determine the number of seeds: not a ratio.
+
+``stereo`` puts seeds on surfaces by comparing them; ``cover`` puts one in every part of every
+photograph that no point falls in; ``auto`` does both. Held-out views are never looked at.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from splatseed.depth.stereo.maps import MOST_GRID, TOO_FEW, StereoSettings
+from splatseed.errors import PointCloudError, SceneNotFoundError
+from splatseed.methods import as_cloud, source_code
+from splatseed.methods.method import NewPoints, Traits, check_fields, require
+from splatseed.photos.view import View, at_file_size, data_factor, load_views
+from splatseed.pointcloud import PointCloud
+from splatseed.progress import Progress
+from splatseed.scene import Image, Scene
+
+if TYPE_CHECKING:
+    from splatseed.depth.stereo.maps import StereoMap, StereoResult
+
+MAX_SIZE = 800  # longer side in pixels at which photographs are used
+
+
+@dataclass(frozen=True)
+class PhotographMethod:
+    """The base of the three methods."""
+
+    max_size: int = MAX_SIZE
+    """Photographs are downsampled by a whole factor to at most this many pixels a side."""
+    hold_out: int = 0
+    """Leave out every n-th image by name, as trainers do for testing (8); 0 = use all but
+    test images that the scene lists."""
+
+    name: ClassVar[str]
+    traits: ClassVar[Traits] = Traits(frozenset({"photographs"}), chooses_number=True)
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        require(self.max_size >= 64, f"{self.name}.max_size of at least 64", self.max_size)
+        for field, most in (("spacing", 256), ("cell", 256), ("grid", MOST_GRID)):
+            value = getattr(self, field, 1)
+            require(1 <= value <= most, f"{self.name}.{field} from 1 to {most}", value)
+
+
+@dataclass(frozen=True)
+class Stereo(PhotographMethod):
+    """Seeds on surfaces, from comparing photographs with each other."""
+
+    spacing: float = 8.0
+    """Pixels between stereo's seeds in the photographs; at least the grid."""
+    grid: int = 4
+    """Pixels between depths, along a row and a column."""
+
+    name: ClassVar[str] = "stereo"
+
+    def maps(
+        self, scene: Scene, only: Sequence[int], seed: int, progress: Progress
+    ) -> tuple[StereoMap, ...]:
+        """Depth and normals of photographs, as ``upsample`` computes them with this seed.
+
+        ``only`` indexes ``photographed(scene, hold_out)``.
+        """
+        images = photographed(scene, self.hold_out)
+        views = read_views(scene, images, self.max_size, progress)
+        rng = np.random.default_rng(seed)
+        stereo = compare(scene, images, views, self.grid, rng, progress, only)
+        return tuple(stereo.map(i) for i in only)
+
+    def __call__(
+        self, scene: Scene, num_new: int, rng: np.random.Generator, progress: Progress
+    ) -> NewPoints:
+        """Make the new points of a scene."""
+        return self.seeds_and_stereo(scene, rng, progress)[0]
+
+    def seeds_and_stereo(
+        self, scene: Scene, rng: np.random.Generator, progress: Progress
+    ) -> tuple[NewPoints, StereoResult]:
+        """The new points of a scene, and what comparing the photographs found.
+
+        Without points, the scene's poses are checked first.
+        """
+        from splatseed.depth.stereo.depths import fuse  # noqa: PLC0415  (kernels load with use)
+
+        images = photographed(scene, self.hold_out)
+        warnings: tuple[str, ...] = ()
+        if not has_points(scene):
+            from splatseed.seeding.poses import check_poses, low_agreement, pose_error  # noqa: PLC0415  (loads Numba)
+
+            faint = low_agreement(check_poses(scene, images, progress))
+            error = pose_error(scene, images, progress)
+            warnings = tuple(each for each in (error.warning if error else "", faint) if each)
+        views = read_views(scene, images, self.max_size, progress)
+        start = time.perf_counter()
+        stereo = compare(scene, images, views, self.grid, rng, progress)
+        seeds = fuse(stereo, self.spacing, progress)
+        found = _found(scene, stereo, time.perf_counter() - start)
+        source = np.full(len(seeds), source_code("stereo"), np.uint8)
+        new = NewPoints(
+            seeds.xyz, seeds.rgb, (*found, *warnings), seeds.normals, seeds.sizes,
+            seeds.confidence, source,
+        )  # fmt: skip
+        return new, stereo
+
+
+@dataclass(frozen=True)
+class Cover(PhotographMethod):
+    """A seed for every cell of every photograph that no point falls in."""
+
+    cell: int = 8
+    """Side of such a cell, in pixels."""
+
+    name: ClassVar[str] = "cover"
+
+    def __call__(
+        self, scene: Scene, num_new: int, rng: np.random.Generator, progress: Progress
+    ) -> NewPoints:
+        """Make the new points of a scene, which needs some already: their depths are carried on."""
+        originals = scene.points.originals
+        if not originals.finite.any():
+            raise PointCloudError(
+                "points for the method cover, which carries their depths into the gaps",
+                found="none",
+                fix="Choose --method auto, which compares the photographs first.",
+            )
+        views = read_views(scene, photographed(scene, self.hold_out), self.max_size, progress)
+        return _cover(views, originals, self.cell, rng, progress)
+
+
+@dataclass(frozen=True)
+class Auto(Stereo):
+    """Stereo, then cover: a seed for every cell of every photograph, on surfaces where possible."""
+
+    cell: int = 8
+    """Side of a cell in pixels; a cell without points gets a seed."""
+
+    name: ClassVar[str] = "auto"
+
+    def seeds_and_stereo(
+        self, scene: Scene, rng: np.random.Generator, progress: Progress
+    ) -> tuple[NewPoints, StereoResult]:
+        """The same, and a seed in each part that is then still empty."""
+        seeds, stereo = super().seeds_and_stereo(scene, rng, progress)
+        known = PointCloud.concatenate(scene.points.originals, PointCloud(seeds.xyz, seeds.rgb))
+        gaps = _cover(stereo.views, known, self.cell, rng, progress)
+        arrays = {
+            name: np.concatenate([getattr(seeds, name), getattr(gaps, name)])
+            for name in NewPoints._fields
+            if name != "notes"
+        }
+        return NewPoints(**arrays, notes=seeds.notes), stereo
+
+
+def has_points(scene: Scene) -> bool:
+    """Whether there are points that vouch for the poses, as far as points can."""
+    points = scene.points.originals
+    return int(np.count_nonzero(points.distinct)) >= TOO_FEW
+
+
+def begins_from_points(scene: Scene) -> bool:
+    """Whether there are enough points for stereo to search around; else photographs must do."""
+    from splatseed.depth.stereo.depths import enough_points  # noqa: PLC0415  (kernels load with use)
+    from splatseed.photos.visibility import find_visibility  # noqa: PLC0415  (loads with its use)
+
+    return enough_points(find_visibility(scene), scene.images)
+
+
+def photographed(
+    scene: Scene, hold_out: int = 0, *, without: str = "choose --method mls"
+) -> tuple[Image, ...]:
+    """The images whose photographs are used, by name; ``hold_out`` as in ``PhotographMethod``.
+
+    Raises:
+        SceneNotFoundError: There are none; the message says to do ``without``.
+    """
+    folder = scene.source.image_dir if scene.source else None
+    ordered = sorted(scene.images, key=lambda image: image.name)
+    used = list(scene.split(hold_out)[0]) if hold_out or scene.listed else ordered
+    if ordered and not used:
+        raise SceneNotFoundError(
+            "photographs beside those held out for testing",
+            found=f"none: all {len(ordered)} are held out",
+            fix="Add photographs to the scene.",
+        )
+    if folder is not None:
+        used = [image for image in used if (folder / image.name).is_file()]
+    if folder is None or not used:
+        raise SceneNotFoundError(
+            "photographs of the scene",
+            found=f"none of {len(ordered)} images" if folder else "no folder with images",
+            fix=f"Put them beside the model in a folder named images, or {without}.",
+        )
+    return tuple(used)
+
+
+def read_views(
+    scene: Scene, images: Sequence[Image], max_size: int, progress: Progress
+) -> tuple[View, ...]:
+    """The photographs of some images, undistorted, at most ``max_size`` pixels a side."""
+    sized = at_file_size(scene.replace(images=tuple(images))).images
+    factor = data_factor(sized, max_size)
+    return load_views(scene, images, data_factor=factor, undistort=True, progress=progress)
+
+
+def compare(
+    scene: Scene,
+    images: Sequence[Image],
+    views: Sequence[View],
+    grid: int,
+    rng: np.random.Generator,
+    progress: Progress,
+    only: Sequence[int] | None = None,
+) -> StereoResult:
+    """Stereo of the photographs, or what ``only`` some need; depths are ``grid`` pixels apart."""
+    from splatseed.depth.stereo.depths import find_stereo, known_visibility  # noqa: PLC0415  (loads Numba)
+
+    settings, seed = StereoSettings(grid=grid), int(rng.integers(1 << 32))
+    return find_stereo(views, images, known_visibility(scene), settings, seed, progress, only)
+
+
+def with_cover(
+    views: Sequence[View], points: PointCloud, cell: int, seed: int, progress: Progress
+) -> PointCloud:
+    """The points, plus a seed in each cell (its side in pixels) of the views that they leave."""
+    code = source_code("cover")
+    new = _cover(views, points, cell, np.random.default_rng([seed, code]), progress)
+    return PointCloud.concatenate(points, as_cloud(new, len(new.xyz), code))
+
+
+def _cover(
+    views: Sequence[View],
+    cloud: PointCloud,
+    cell: int,
+    rng: np.random.Generator,
+    progress: Progress,
+) -> NewPoints:
+    from splatseed.seeding.cover import cover  # noqa: PLC0415  (kernels load with use)
+
+    xyz, masks = cloud.xyz[cloud.finite], [view.mask for view in views]
+    seeds = cover(views, xyz, cell=cell, rng=rng, masks=masks, progress=progress)
+    normals = np.full((len(seeds.xyz), 3), np.nan, np.float32)
+    source = np.full(len(seeds.xyz), source_code("cover"), np.uint8)
+    return NewPoints(seeds.xyz, seeds.rgb, (), normals, seeds.size, seeds.confidence, source)
+
+
+def _found(scene: Scene, stereo: StereoResult, seconds: float) -> tuple[str, ...]:
+    """What comparing photographs found if points could not guide it, and how long it took."""
+    if begins_from_points(scene):
+        return ()
+    points = "too few" if has_points(scene) else "no"
+    share = np.mean([stereo.kept(i).mean() for i in range(len(stereo.views))])
+    told = (
+        f"There were {points} points to begin from: comparing the photographs gave {share:.0%} of "
+        f"their pixels a confirmed depth, in {seconds:.0f} s."
+    )
+    return (told,)

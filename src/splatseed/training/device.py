@@ -1,0 +1,79 @@
+"""Where to train, and how many Gaussians fit into memory there.
+
+Promise: a requested GPU is used or an error, never silently replaced; a cloud too large to train is
+refused before the first step, with the number that fits, and a growing one is held at what fits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+
+from splatseed.errors import PointCloudError
+from splatseed.progress import Progress, silent
+from splatseed.runtime.torch_device import free_bytes, load_kernels, pick_torch_device
+from splatseed.training.settings import BYTES_EACH, Backend
+
+
+def pick_device(backend: Backend, progress: Progress = silent) -> torch.device:
+    """The device that a backend stands for, ready to render; ``auto`` takes a GPU if there is one.
+
+    The first time gsplat's kernels are built, which ``progress`` is told.
+
+    Raises:
+        ParameterError: CUDA is asked for and there is none.
+        MissingDependencyError: gsplat has no kernels for the GPU and they cannot be built here.
+    """
+    device = pick_torch_device(backend, "--backend")
+    if device.type == "cuda":
+        load_kernels("--backend", progress)
+    return device
+
+
+def check_fits(count: int, device: torch.device) -> None:
+    """Refuse more Gaussians than can be trained."""
+    free = free_bytes(device)
+    if free is not None and count * BYTES_EACH > free:
+        most = free // BYTES_EACH
+        raise PointCloudError(
+            f"at most {most:,} points, which the {free / 1e9:.1f} GB of free memory hold",
+            found=f"{count:,}",
+            fix=f"Pass --budget {most}, upsample less, or free some memory.",
+        )
+
+
+@contextmanager
+def on_one_thread(device: torch.device) -> Iterator[None]:
+    """Let PyTorch compute on one thread of the CPU while the block runs.
+
+    For functions of gsplat's whose last digits depend on the number of threads, as sigmoid's do.
+    """
+    threads = torch.get_num_threads()
+    if device.type == "cpu":
+        torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+class Capacity:
+    """How many Gaussians a run may grow to: the cap, or what fits into memory if that is less."""
+
+    def __init__(self, cap: int | None, device: torch.device) -> None:
+        self.cap = cap
+        self._device = device
+        self.held_at: int | None = None
+        """The number at which memory first stopped a run, which then depends on the machine."""
+
+    def limit(self, count: int, wanted: int) -> int:
+        """The most that ``count`` Gaussians may become if the strategy wants ``wanted``."""
+        most = wanted if self.cap is None else min(self.cap, wanted)
+        free = free_bytes(self._device)
+        if free is None or most - count <= free // BYTES_EACH:
+            return most
+        fits = count + free // BYTES_EACH
+        self.held_at = self.held_at or fits
+        return fits

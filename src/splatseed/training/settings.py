@@ -1,0 +1,180 @@
+"""The settings of a run: what a user may choose.
+
+Notation: a *step* shows one photograph. A strategy whose name ends in ``-3dgs`` trains in 3DGS's
+conventions, as gsplat's trainer has them, for comparison with published numbers; see ``schedule``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated, Literal, cast, get_args
+
+import tyro
+
+from splatseed.errors import ParameterError
+from splatseed.photos.view import TRAINED_SIDE, default_factor
+from splatseed.scene import Image
+from splatseed.training.schedule import FULL_RUN, Densification, Schedule, make_schedule, started
+
+StrategyName = Literal[
+    "auto", "default", "grow", "mcmc", "none", "default-3dgs", "mcmc-3dgs", "none-3dgs"
+]
+Backend = Literal["auto", "cpu", "cuda"]
+Placing = Literal["stereo", "none"]
+Seeding = Literal["advised", "auto", "scene"]
+Exposure = Literal["none", "affine"]
+
+LEAST_GAUSSIANS = 2
+BUDGET = 1_000_000
+"""Default cap of the strategies that have a budget."""
+AS_3DGS = "-3dgs"
+OPTIONS = {"seeding": "seeds", "cap_max": "budget"}
+"""Command-line names of settings, where they differ."""
+
+BYTES_EACH = 2000
+"""Memory per Gaussian in training: its 59 numbers, their gradients and two moments (944 bytes),
+and as much again for the rasteriser's lists and for copies while Gaussians are added."""
+ALLOWED: dict[str, int | Sequence[object]] = {
+    "strategy": get_args(StrategyName),
+    "backend": get_args(Backend),
+    "placing": get_args(Placing),
+    "seeding": get_args(Seeding),
+    "exposure": get_args(Exposure),
+    "sh_degree": range(4),
+    "max_steps": 1,
+    "data_factor": 1,
+    "seed": 0,
+    "test_every": 2,
+    "cap_max": LEAST_GAUSSIANS,
+}
+"""Choices, or the least number, of settings."""
+
+
+@dataclass(frozen=True)
+class TrainSettings:
+    """How to train.
+
+    A setting is declared only here, besides the code that uses it: the options of ``train``, the
+    plans of ``bench`` and ``config.json`` take these fields as they are, with defaults and
+    docstrings. Suppressed ones are no options: a file of ``train --config`` or a plan sets them.
+
+    Raises:
+        ParameterError: A value is out of its range.
+    """
+
+    strategy: StrategyName = "default"
+    """Densify as 3DGS does (default), grow within a budget where renders are wrong, densify as MCMC
+    does up to a cap, keep the number of seeds, or do what did best in our measurements, which is
+    grow (auto); -3dgs: in 3DGS's own conventions for rates, sizes and schedules, to compare with
+    published numbers."""
+    max_steps: int = FULL_RUN
+    """Training steps; schedules and learning rates adapt to them."""
+    data_factor: int | None = None
+    """Divide the width and height of the photographs by this whole number; by default by the
+    smallest that leaves at most 1600 pixels on their longer side."""
+    seed: int = 0
+    """Random seed; on the CPU, runs repeat exactly."""
+    cap_max: tyro.conf.Suppress[int | None] = None  # the option is --budget
+    """Maximum Gaussians, by default 1000000 for grow and mcmc; if there are more seeds, they are
+    thinned."""
+    backend: Backend = "auto"
+    """Where to train; auto takes a GPU if PyTorch sees one."""
+    sh_degree: tyro.conf.Suppress[int] = 3
+    """Degree of the spherical harmonics: how finely colours depend on the viewing direction, 0 to
+    3."""
+    test_every: int = 8
+    """Keep every n-th image, sorted by name, for testing."""
+    exposure: Exposure = "none"
+    """Colour transform of each training photograph, learnt with the Gaussians, for photographs of
+    changing exposure or white balance: affine, or none. Judge by the colour-corrected PSNR."""
+    placing: tyro.conf.Suppress[Placing] = "stereo"
+    """Strategy grow: put most of the new Gaussians on wrong pixels, at the depth that stereo finds
+    there (stereo), or only split Gaussians (none)."""
+    opacity_reset: tyro.conf.Suppress[bool] = False
+    """Lower all opacities from time to time, as 3DGS does (strategy default; gsplat 1.5.3 does
+    not)."""
+    seed_sizes: tyro.conf.Suppress[bool] = False
+    """Start with the sizes in the scene's seeds.npz instead of the gaps between seeds."""
+    seed_normals: tyro.conf.Suppress[bool] = False
+    """Start with flat discs where the scene's seeds.npz has normals."""
+    seed_colors: tyro.conf.Suppress[bool] = False
+    """Start with the colours that the training photographs show for each seed, by direction."""
+    start: Annotated[str | None, tyro.conf.arg(metavar="MODEL|RUN")] = None
+    """Continue from trained Gaussians instead of points: a run, or any trainer's file of this
+    scene, edited or not. Holes are filled where the strategy adds Gaussians."""
+    seeding: tyro.conf.Suppress[Seeding] = "scene"  # the option is --seeds, "advised" by default
+    """Start from the scene's points as they are, let method ``auto`` add the points that the
+    training photographs need, or do what ``splatseed info`` advises. Points that splatseed has
+    added already, and 3DGS's conventions, are left alone."""
+
+    def __post_init__(self) -> None:
+        for name, allowed in ALLOWED.items():
+            value = getattr(self, name)
+            if isinstance(allowed, int):
+                fits, expected = value is None or value >= allowed, f"of {allowed} or more"
+            else:
+                fits, expected = value in allowed, f"among {', '.join(map(str, allowed))}"
+            if not fits:
+                raise ParameterError(
+                    f"--{name.replace('_', '-')} {expected}",
+                    found=f"{value}",
+                    fix="Leave it out for the default.",
+                )
+
+    def sized(
+        self, images: Sequence[Image], note: Callable[[str], None] = lambda _: None
+    ) -> TrainSettings:
+        """With the factor that photographs are divided by, and a note if that is not the user's.
+
+        ``images`` are the scene's, with cameras in pixels of the files.
+        """
+        if self.data_factor is not None:
+            return self
+        factor = default_factor(images)
+        if factor > 1:
+            lens = max(
+                (im.intrinsics for im in images), key=lambda lens: max(lens.width, lens.height)
+            )
+            stored = f"{lens.width:,} x {lens.height:,}"
+            size = f"{lens.width // factor:,} x {lens.height // factor:,}"
+            note(
+                f"Photographs of {stored} pixels are used at {size}, as the default is "
+                f"{TRAINED_SIDE:,} a side at most: --data-factor 1 keeps their size."
+            )
+        return replace(self, data_factor=factor)
+
+    @property
+    def factor(self) -> int:
+        """What photographs are divided by, 1 before ``sized``."""
+        return self.data_factor or 1
+
+    @property
+    def densification(self) -> Densification:
+        """The strategy, whatever the conventions; for ``auto`` the one that did best."""
+        if self.strategy == "auto":
+            return "grow"
+        return cast("Densification", self.strategy.removesuffix(AS_3DGS))
+
+    @property
+    def idle(self) -> tuple[str, ...]:
+        """Names of settings that differ from their defaults, but not for this strategy."""
+        given = (
+            ("opacity_reset", self.opacity_reset, "default"),
+            ("placing", self.placing != "stereo", "grow"),
+        )
+        return tuple(name for name, set_, of in given if set_ and self.densification != of)
+
+    @property
+    def schedule(self) -> Schedule:
+        """The run's hyperparameters and their timing."""
+        as_3dgs = self.strategy.endswith(AS_3DGS)
+        schedule = make_schedule(self.densification, self.max_steps, as_3dgs=as_3dgs)
+        return started(schedule) if self.start else schedule
+
+    @property
+    def cap(self) -> int | None:
+        """Most Gaussians; None for no limit."""
+        if self.cap_max is None and self.densification in ("grow", "mcmc"):
+            return BUDGET
+        return self.cap_max

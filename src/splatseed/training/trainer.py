@@ -1,0 +1,233 @@
+"""The training loop: render a view, compare it with its photograph, optimise, densify.
+
+Notation: a step shows one training view; images are [H, W, 3], values about 0..1. Promise: on the
+CPU equal settings and seeds give equal bytes, whatever the number of threads and however often the
+run was interrupted: the order of the photographs is drawn from (seed, epoch), and PyTorch's
+generator, which the strategies use, is set from (seed, step) before each step. On a GPU a step
+waits for it only where gsplat does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from splatseed.photos.view import View
+from splatseed.runtime.interruption import interruption
+from splatseed.runtime.memory import keep_freed_memory
+from splatseed.splat.metrics import l1_and_ssim_by_convolution, psnr, ssim_of_all
+from splatseed.splat.rendering import Photographs, fill_masked, mask_of, photograph_of, render_view
+from splatseed.splat.ssim import l1_and_ssim
+from splatseed.training.folder import Record
+from splatseed.training.parameters import add_to_mean, optimize, take_mean, with_dropout
+from splatseed.training.schedule import FEW
+from splatseed.training.settings import TrainSettings
+from splatseed.training.state import TrainState
+
+RECORDS, TESTS = 200, 20
+"""How many records the curve of a run has, and how often the test views are rendered for it."""
+SSIM_WEIGHT = 0.2
+
+
+class Trainer:
+    """Trains a state, which is changed in place, on views in the training frame."""
+
+    def __init__(
+        self,
+        state: TrainState,
+        settings: TrainSettings,
+        train_views: Sequence[View],
+        test_views: Sequence[View],
+        on_record: Callable[[Record], None] = lambda _: None,
+    ) -> None:
+        self.state = state
+        self.settings = settings
+        self.train_views = train_views
+        self.test_views = test_views
+        self.on_record = on_record
+        self.is_whole = True  # the state is one between two steps, which a checkpoint may keep
+        self._photographs = Photographs(train_views, self.device)
+        keep_freed_memory()
+
+    def run(self, on_step: Callable[[int], None] = lambda _: None) -> bool:
+        """Train to the last step, or until the user interrupts; returns whether it is done.
+
+        ``on_step`` is called with the number of steps done, after each.
+        """
+        state = self.state
+        gpus = [self.device] if self.device.type == "cuda" else []
+        with interruption() as stop, torch.random.fork_rng(gpus):
+            state.watch.start()
+            while state.step < self.settings.max_steps and not stop.requested:
+                shown = self._advance(state.step)
+                state.step += 1
+                on_step(state.step)
+                if self._is_due(RECORDS) or self._is_due(TESTS):
+                    self._record(*shown)
+            state.watch.stop()
+        return state.step >= self.settings.max_steps
+
+    def warm_up(self) -> None:
+        """Render and compare once, so that kernels are compiled before the clock runs."""
+        view = self.train_views[0]
+        render, _ = render_view(self.state.params, view, self.settings.sh_degree)
+        photometric_loss(render, self._photographs.of(view)).backward()
+        self.clear_gradients()
+
+    def clear_gradients(self) -> None:
+        """Forget a step that did not reach its end."""
+        for value in self.state.params.values():
+            value.grad = None
+
+    @torch.no_grad()
+    def render(self, view: View) -> Float[Tensor, "H W 3"]:
+        """The current render of a view."""
+        degree = self.settings.schedule.sh_degree(self.state.step, self.settings.sh_degree)
+        return render_view(self.state.params, view, degree)[0]
+
+    def _advance(self, step: int) -> tuple[View, Float[Tensor, "H W 3"], Float[Tensor, "H W 3"]]:
+        """Take one step; returns the view, its render at its exposure, and its photograph."""
+        state, schedule = self.state, self.settings.schedule
+        params, optimizers, strategy = state.params, state.optimizers, state.strategy
+        words = np.random.SeedSequence([self.settings.seed, step]).generate_state(1, np.uint64)
+        random = int(words[0] >> 1)  # 63 bits: PyTorch's seeds are signed
+        # torch.manual_seed would also note a stack trace for each kind of device that is not here.
+        torch.default_generator.manual_seed(random)
+        if self.device.type == "cuda":
+            torch.cuda.manual_seed(random)
+        epoch, position = divmod(step, len(self.train_views))
+        order = _epoch_order(self.settings.seed, epoch, len(self.train_views))
+        index = int(order[position])
+        view = self.train_views[index]
+        photograph = self._photographs.of(view)
+        # The recorded loss and PSNR are with dropout.
+        sparse = len(self.train_views) <= FEW
+        shown = with_dropout(params, schedule.dropout_at(step)) if sparse else params
+        plain, info = render_view(shown, view, schedule.sh_degree(step, self.settings.sh_degree))
+        render, mask = plain, mask_of(view, self.device)
+        if state.exposures is not None:
+            state.exposures.fit(index, plain, photograph, mask)
+            render = state.exposures.applied(index, plain)
+        # gsplat's strategies ask PyTorch to retain the gradient of the 2D means here.
+        strategy.before(params, optimizers, step, info)
+        loss = photometric_loss(fill_masked(render, photograph, mask), photograph)
+        state.losses.append(loss.detach())
+        penalty = strategy.regularization(params)
+        # The recorded loss is without the penalty, so that strategies can be compared.
+        (loss if penalty is None else loss + penalty).backward()
+        self.is_whole = False
+        optimize(params, optimizers, schedule.rates(step))
+        if state.exposures is None:
+            strategy.observe(params, view, render, photograph, step)
+        else:  # at the mean exposure, which is that of the Gaussians it may add
+            undone = state.exposures.undone(index, photograph)
+            strategy.observe(params, view, plain, undone, step)
+        strategy.after(params, optimizers, step, info)
+        if schedule.mean_from is not None and step >= schedule.mean_from:
+            add_to_mean(state.mean, params)
+            if step + 1 == self.settings.max_steps:
+                take_mean(params, state.mean)
+        self.is_whole = True
+        return view, render.detach(), photograph
+
+    def _record(
+        self, view: View, render: Float[Tensor, "H W 3"], photograph: Float[Tensor, "H W 3"]
+    ) -> None:
+        """Note how far the run is; the clock stands still meanwhile."""
+        state = self.state
+        loss = float(torch.stack(state.losses).mean(dtype=torch.float64))
+        state.watch.stop()
+        state.losses.clear()
+        tested_psnr, tested_ssim = self.test_scores() if self._is_due(TESTS) else (None, None)
+        seconds = round(state.watch.seconds, 3)
+        shown = round(psnr(render, photograph, mask_of(view, self.device)), 4)
+        count = len(state.params["means"])
+        record = Record(state.step, seconds, loss, shown, tested_psnr, count, tested_ssim)
+        state.records.append(record)
+        self.on_record(record)
+        state.watch.start()
+
+    def test_scores(self) -> tuple[float, float]:
+        """Means over the test views of each one's PSNR, dB, and SSIM."""
+        scores = []
+        for view in self.test_views:
+            photograph, mask = photograph_of(view, self.device), mask_of(view, self.device)
+            render = fill_masked(self.render(view), photograph, mask)
+            scores.append((psnr(render, photograph, mask), ssim_of_all(render, photograph, mask)))
+        psnrs, ssims = zip(*scores, strict=True)
+        return round(sum(psnrs) / len(psnrs), 4), round(sum(ssims) / len(ssims), 5)
+
+    def _is_due(self, times: int) -> bool:
+        """Whether something that happens ``times`` times in a run is due after this step."""
+        step, last = self.state.step, self.settings.max_steps
+        # Evenly spread over the run, and always at its last step.
+        return step * times // last > (step - 1) * times // last
+
+    @property
+    def device(self) -> torch.device:
+        """Where the Gaussians are."""
+        means: Tensor = self.state.params["means"]
+        return means.device
+
+
+@lru_cache(maxsize=2)
+def _epoch_order(seed: int, epoch: int, count: int) -> Int[np.ndarray, " V"]:
+    """The order of the photographs in one pass over them."""
+    return np.random.default_rng([seed, epoch]).permutation(count)
+
+
+def photometric_loss(
+    render: Float[Tensor, "H W 3"], photograph: Float[Tensor, "H W 3"]
+) -> Float[Tensor, ""]:
+    """0.8 L1 + 0.2 (1 - SSIM), differentiable in ``render`` (Kerbl et al. 2023, eq. 7).
+
+    On a GPU the fused kernel of the package ``fused-ssim`` serves where it is installed. Both are
+    float32, at least 11 pixels a side.
+    """
+    fused = _fused_ssim() if render.is_cuda else None
+    if fused is None:
+        loss: Tensor = _Loss.apply(render, photograph)
+        return loss
+    l1 = (render - photograph).abs().mean()
+    x, y = (image.permute(2, 0, 1)[None].contiguous() for image in (render, photograph))
+    return (1 - SSIM_WEIGHT) * l1 + SSIM_WEIGHT * (1 - fused(x, y, padding="valid"))
+
+
+@lru_cache
+def _fused_ssim() -> Callable[..., Tensor] | None:
+    """The function of the package fused-ssim, None without it."""
+    try:
+        from fused_ssim import fused_ssim  # noqa: PLC0415  (optional)
+    except ImportError:
+        return None
+    return fused_ssim  # type: ignore[no-any-return]  # it has no types
+
+
+class _Loss(torch.autograd.Function):
+    """The loss and its analytic gradient: a Numba pass, on a GPU convolutions without TF32."""
+
+    @staticmethod
+    def forward(ctx: Any, render: Tensor, photograph: Tensor) -> Tensor:
+        weights = 1 - SSIM_WEIGHT, SSIM_WEIGHT
+        if render.device.type == "cpu":
+            arrays = render.detach().contiguous().numpy(), photograph.contiguous().numpy()
+            l1, similarity, slopes = l1_and_ssim(*arrays, *weights)
+            ctx.save_for_backward(torch.from_numpy(slopes))
+            return torch.tensor(weights[0] * l1 + weights[1] * (1 - similarity))
+        of_l1, of_ssim, gradient = l1_and_ssim_by_convolution(render, photograph, *weights)
+        ctx.save_for_backward(gradient)
+        return weights[0] * of_l1 + weights[1] * (1 - of_ssim)
+
+    @staticmethod
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor, None]:
+        (gradient,) = ctx.saved_tensors
+        # backward mostly starts at the loss, and multiplying by one takes a whole pass; on a GPU
+        # looking at the number would wait.
+        at_loss = gradient.device.type == "cpu" and float(upstream[0]) == 1.0
+        return gradient if at_loss else gradient * upstream[0], None

@@ -1,0 +1,182 @@
+"""Pages of clouds, as one of the scene's own cameras sees them if it has any.
+
+Notation: cell (i, j) of a ``covered`` grid [rows, columns] starts at pixel (``cell i``, ``cell j``)
+and has ``cell`` px a side; the last row and column may reach beyond the photograph. Promise: files
+appear whole or not at all, else ``OutputError`` is raised; ``PointCloudError`` if a scene that is
+to be looked at has no finite points; cells are coloured exactly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float64, UInt8
+from PIL import Image as PillowImage, ImageDraw
+
+from splatseed.camera import Camera
+from splatseed.io.files import StrPath
+from splatseed.methods import origin_name
+from splatseed.photos.visibility import choose_camera, choose_image
+from splatseed.pointcloud import PointCloud
+from splatseed.scene import Scene
+from splatseed.viewer import page
+from splatseed.viewer.points import origin_colors, points_over, render_points
+
+PAIR_SIDE = 800
+GREY = 150
+NEAR, FAR = np.array([0, 114, 178]), np.array([213, 94, 0])
+"""Colours of points on an aligned cloud and of those off it."""
+EMPTY, BLEND = np.array([214.0, 20.0, 190.0]), 0.6
+"""Colour of cells without a seed, magenta, the rarest in photographs, and its opacity."""
+DIM = 0.75  # the photograph under cells
+
+
+class CoveredView(NamedTuple):
+    """A view's name and photograph, and which of its cells held a seed before and after."""
+
+    name: str
+    photograph: UInt8[np.ndarray, "H W 3"]
+    cell: int  # its side, in pixels of the photograph
+    before: Bool[np.ndarray, "rows columns"]
+    after: Bool[np.ndarray, "rows columns"]
+
+
+def preview_pair(
+    scene: Scene, upsampled: PointCloud, path: StrPath, *, title: str = "upsampled"
+) -> Path:
+    """Write a picture of the scene's points beside the upsampled ones, described by a title."""
+    path = Path(path)
+    clouds = {"original": scene.points, title: upsampled}
+    return page.write_grid(_cloud_tiles(clouds, choose_camera(scene), PAIR_SIDE), path, columns=2)
+
+
+def preview_methods(scene: Scene, clouds: Mapping[str, PointCloud], path: StrPath) -> Path:
+    """Write a grid: the photograph if there is one, the scene's points, and clouds by label."""
+    path = Path(path)
+    clouds, side = {"original": scene.points, **clouds}, page.GRID_SIDE
+    tiles = _photograph(scene, side, "photograph")
+    return page.write_grid([*tiles, *_cloud_tiles(clouds, choose_camera(scene), side)], path)
+
+
+def preview_errors(
+    clouds: Mapping[str, PointCloud],
+    distances: Mapping[str, Float64[np.ndarray, " N"]],
+    camera: Camera,
+    path: StrPath,
+) -> Path:
+    """Write a grid of clouds by label, their points coloured by their distance to the true surface.
+
+    Distances are in spacings h of the originals; from 1 on points have the last colour.
+    """
+    path = Path(path)
+    colored = {
+        f"{label}   {len(cloud):,} points: mean error {distances[label].mean():.2f} spacings": (
+            cloud.replace(rgb=page.map_colors(distances[label], 0.0, 1.0, "plasma"))
+        )
+        for label, cloud in clouds.items()
+    }
+    tiles = _cloud_tiles(colored, camera, page.GRID_SIDE, counted=False)
+    bar = page.color_bar("0", "1 spacing or more from the surface")
+    return page.write_grid(tiles, path, footer=bar)
+
+
+def preview_origins(scene: Scene, points: PointCloud, path: StrPath) -> Path:
+    """Write a page: the seeds in their own colours, and by origin over the photograph."""
+    path = Path(path)
+    camera = choose_camera(scene)
+    scale = PAIR_SIDE / max(camera.width, camera.height)
+    size = page.fitted(camera.width, camera.height, PAIR_SIDE)
+    photograph = page.photograph_at(scene, choose_image(scene), size)
+    colored = points.replace(rgb=origin_colors(points.source))
+    tiles = [
+        page.Tile(f"{len(points):,} seeds", render_points(points, camera, scale=scale)),
+        page.Tile("by origin", points_over(colored, camera, photograph, scale=scale)),
+    ]
+    # Below them, the name of each origin after a dot of its colour.
+    strip = PillowImage.new("RGB", (2 * size[0], page.STRIP_HEIGHT), page.PAPER)
+    draw, letters, x = ImageDraw.Draw(strip), page.font(18), 8.0
+    codes, counts = np.unique(points.source, return_counts=True)
+    for code, count, color in zip(codes, counts, origin_colors(codes).tolist(), strict=True):
+        words = f"{origin_name(int(code))} {count:,}"
+        draw.ellipse((x, 14, x + 16, 30), fill=tuple(color))
+        draw.text((x + 24, 22), words, fill=page.INK, font=letters, anchor="lm")
+        x += 24 + letters.getlength(words) + 28
+    return page.write_grid(tiles, path, columns=2, footer=np.asarray(strip))
+
+
+def preview_alignment(
+    scene: Scene,
+    cloud: Float64[np.ndarray, "N 3"],
+    rgb: UInt8[np.ndarray, "N 3"] | None,
+    marks: Float64[np.ndarray, "M 3"],
+    share: Float64[np.ndarray, " M"],
+    path: StrPath,
+) -> Path:
+    """Write a page of photograph, aligned cloud and residuals, side by side.
+
+    The cloud is a sample in the scene's frame, grey without colours; ``marks`` are the scene's
+    points that it was aligned with, ``share`` of each 0 on the cloud to 1 where it does not count.
+    """
+    path = Path(path)
+    blend = np.clip(share, 0, 1)[:, None]
+    shades = np.rint((1 - blend) * NEAR + blend * FAR).astype(np.uint8)
+    clouds = {
+        "the cloud from its camera, as aligned": PointCloud(
+            cloud, np.full(cloud.shape, GREY, np.uint8) if rgb is None else rgb
+        ),
+        "the scene's points: blue on the cloud, orange off it": PointCloud(marks, shades),
+    }
+    drawn = _cloud_tiles(clouds, choose_camera(scene), PAIR_SIDE, counted=False)
+    tiles = [*_photograph(scene, PAIR_SIDE, "a photograph"), *drawn]
+    return page.write_grid(tiles, path, columns=len(tiles))
+
+
+def preview_cells(views: Sequence[CoveredView], path: StrPath) -> Path:
+    """Write a page: for each view, the cells covered by the originals, and by all seeds."""
+    path = Path(path)
+    tiles = []
+    for view in views:
+        size = page.fitted(view.photograph.shape[1], view.photograph.shape[0])
+        for label, covered in (
+            (f"{view.name[-28:]}: {view.before.mean():.1%} covered", view.before),
+            (f"with new points: {view.after.mean():.1%}", view.after),
+        ):
+            picture = cell_picture(view.photograph, covered, view.cell)
+            tiles.append(page.Tile(label, page.resized(picture, size)))
+    return page.write_grid(tiles, path, columns=2 if len(views) == 1 else 4)
+
+
+def cell_picture(
+    photograph: UInt8[np.ndarray, "H W 3"], covered: Bool[np.ndarray, "rows columns"], cell: int
+) -> UInt8[np.ndarray, "H W 3"]:
+    """The dimmed photograph, as large as where cells were counted, with empty ones in magenta."""
+    height, width = photograph.shape[:2]
+    empty = ~np.kron(covered, np.ones((cell, cell), bool))[:height, :width, None]
+    dimmed = DIM * photograph.astype(np.float64)
+    grey = dimmed.mean(axis=2, keepdims=True)
+    picture = np.where(empty, (1 - BLEND) * grey + BLEND * EMPTY, dimmed)
+    return np.asarray(np.round(picture), np.uint8)
+
+
+def _photograph(scene: Scene, side: int, label: str) -> list[page.Tile]:
+    """The photograph of the camera that ``choose_camera`` takes, if it can be read."""
+    camera = choose_camera(scene)
+    size = page.fitted(camera.width, camera.height, side)
+    photograph = page.photograph_at(scene, choose_image(scene), size)
+    return [] if photograph is None else [page.Tile(label, photograph)]
+
+
+def _cloud_tiles(
+    clouds: Mapping[str, PointCloud], camera: Camera, side: int, *, counted: bool = True
+) -> list[page.Tile]:
+    scale = side / max(camera.width, camera.height)
+    return [
+        page.Tile(
+            f"{label}   {len(cloud):,} points" if counted else label,
+            render_points(cloud, camera, scale=scale),
+        )
+        for label, cloud in clouds.items()
+    ]

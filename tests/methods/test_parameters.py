@@ -1,0 +1,134 @@
+"""How many points, by which method, with which parameters: and what is said when it cannot be."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import splatseed as ss
+from splatseed import METHODS
+from splatseed.errors import ParameterError, PointCloudError
+from splatseed.methods import configure
+
+from .contract import METHOD_NAMES, PHOTOGRAPH_METHODS, Copies
+
+BUILT_IN = [name for name in METHOD_NAMES if name != "copies"]
+PAPER = {"profile": "paper"}
+
+WRONG_PARAMETERS = {
+    "mls.k": (2, 10.0, "10", True),
+    "mls.frame": ("locl",),
+    "mls.disc_radius": (0, np.inf),
+    "mls.clamp": (-0.1, np.nan),
+    "mls.neighbours": (12,),
+    "linear.k": (3,),
+    "linear.reject_isolated": (1,),
+    "random.k": (3,),
+    "spline.smoothing": (0, "gvc"),
+    "spline.basis": ("cubic",),
+    "voronoi.k": (3, 1000),
+    "voronoi.ball": (0,),
+    "voronoi.color_k": (26,),
+    "voronoi.max_weight": (0.5,),
+    "depth.fit": ("ransac",),
+    "depth.min_points": (0,),
+    "depth.max_residual_ratio": (0.5,),
+    "depth.region": (0, 1.5),
+    "depth.edge_tolerance": (0,),
+    "depth.edge_radius": (0,),
+    "depth.num_neighbors": (0,),
+    "depth.min_agreeing": (13,),
+    "depth.tolerance": (1,),
+    "depth.color_tolerance": (2,),
+    "depth.hold_out": (1, -1),
+}
+
+
+@pytest.mark.parametrize("parameter", WRONG_PARAMETERS)
+def test_wrong_parameters_are_named(parameter):
+    method, name = parameter.split(".")
+    for wrong in WRONG_PARAMETERS[parameter]:
+        with pytest.raises(ParameterError, match=f"{parameter}|a parameter of {method}.*{name}"):
+            configure(method, **{name: wrong})
+
+
+WRONG_CALLS = [
+    ({"method": "mlx"}, "linear, triangle"),
+    ({"profile": "papr"}, "'default' or 'paper'"),
+    *(({"ratio": wrong}, "at least 1") for wrong in (0.5, np.nan, np.inf, "8")),
+    ({"ratio": 1e308}, "4,294,967,296 at most"),
+    *(({"num_points": wrong}, "at least the 160 originals") for wrong in (159, -1)),
+    *(({"num_points": wrong}, "a whole number") for wrong in (200.5, "800")),
+    ({"ratio": 2, "num_points": 320}, "found both"),
+    *(({"seed": wrong}, "a seed") for wrong in (-1, "one")),
+    *(({"method": Copies(), **own}, "its own parameters") for own in ({"k": 9}, PAPER)),
+]
+
+
+@pytest.mark.parametrize(("options", "says"), WRONG_CALLS, ids=str)
+def test_wrong_calls_are_named(options, says, wavy):
+    with pytest.raises(ParameterError, match=says):
+        ss.upsample(wavy, **options)
+
+
+@pytest.mark.parametrize("method", BUILT_IN)
+@pytest.mark.parametrize("size", [{"ratio": 1}, {"num_points": 160}], ids=str)
+def test_nothing_to_add_gives_the_originals(method, size, wavy):
+    seeds = ss.upsample(wavy, method, **size)
+    np.testing.assert_array_equal(seeds.xyz, wavy.xyz)
+    np.testing.assert_array_equal(seeds.rgb, wavy.rgb)
+
+
+PAPER_DEPTH = {
+    "fit": "least-squares", "unit_ray": True, "region": 0.5, "placement": "uniform",
+    "min_agreeing": 0, "see_through": True, "spread": False, "edge_tolerance": None,
+}  # fmt: skip
+
+
+def test_depth_has_the_papers_values():
+    """Those of the other methods are in the references'."""
+    chosen = configure("depth", "paper")
+    assert {name: getattr(chosen, name) for name in PAPER_DEPTH} == PAPER_DEPTH
+
+
+@pytest.mark.usefixtures("third_party")
+def test_a_third_party_adds_methods_and_takes_none_over(wavy):
+    assert METHODS["copies"] is Copies
+    assert METHODS["mls"] is not Copies
+    names = [*BUILT_IN, *PHOTOGRAPH_METHODS, "cloud", "copies"]
+    assert list(METHODS) == names
+    assert len(METHODS) == len(names)
+    assert set(ss.upsample(wavy, "copies").source) == {0, 255}
+
+
+class Changing(Copies):
+    """A third party's method that knows more of its points, or gets them wrong."""
+
+    def __init__(self, change):
+        object.__setattr__(self, "change", change)
+
+    def __call__(self, scene, num_new, rng, progress):
+        return self.change(super().__call__(scene, num_new, rng, progress))
+
+
+def test_what_a_method_knows_of_its_points_is_handed_on(wavy):
+    source, sizes = np.array([9, 8, 9, 8], np.uint8), np.full(4, 0.5)
+    knowing = Changing(lambda new: new._replace(sizes=sizes, source=source))
+    seeds = ss.upsample(wavy, knowing, num_points=len(wavy) + 4)
+    assert seeds.source[len(wavy) :].tolist() == [9, 8, 9, 8]
+    assert seeds.sizes[len(wavy) :].tolist() == [0.5] * 4
+    assert np.isnan(seeds.sizes[: len(wavy)]).all()
+    assert seeds.normals is None
+    assert ss.upsample(wavy, Copies(), num_points=len(wavy) + 4).attributes == {}
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"xyz": np.full((4, 3), np.nan, np.float32)}, "at new point 0"),
+        *(({"source": np.full(4, wrong)}, "codes from 1 to 255") for wrong in (0, 256)),
+    ],
+)
+def test_a_third_partys_bad_points_are_refused(change, says, wavy):
+    with pytest.raises(PointCloudError, match=says):
+        ss.upsample(wavy, Changing(lambda new: new._replace(**change)), num_points=len(wavy) + 4)

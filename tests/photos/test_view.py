@@ -1,0 +1,277 @@
+"""Views: the box filter, intrinsics, the cache, the split, undistortion, and what is refused."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+
+import numpy as np
+import pytest
+from PIL import Image as PilImage
+
+from splatseed.camera import CAMERA_MODELS, Intrinsics
+from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
+from splatseed.io import load_scene
+from splatseed.io.photograph_checks import ROUNDING, _off, fits
+from splatseed.lens import image_points
+from splatseed.photos.projection import undistort
+from splatseed.photos.view import at_file_size, load_photograph, load_split, load_views, poses_of
+from splatseed.scene import NO_POINT, Observations
+from splatseed.seeding.upsampling import frames_of, points_within
+
+
+@pytest.fixture
+def picture(tmp_path, rng):
+    path = tmp_path / "a.png"
+    PilImage.fromarray(rng.integers(0, 256, (23, 37, 3), np.uint8)).save(path)
+    return path
+
+
+@pytest.mark.parametrize("factor", [1, 2, 3, 5])
+def test_a_smaller_photograph_is_the_mean_over_blocks(picture, factor):
+    full = np.asarray(PilImage.open(picture), np.float64)
+    pixels, size = load_photograph(picture, factor)
+    height, width = 23 // factor, 37 // factor
+    blocks = full[: height * factor, : width * factor]
+    means = blocks.reshape(height, factor, width, factor, 3).mean(axis=(1, 3))
+    assert size == (37, 23)
+    assert pixels.shape == (height, width, 3)
+    assert np.abs(pixels - means).max() < 0.6  # Pillow rounds in fixed point
+
+
+def test_the_cache_is_used_and_knows_a_changed_photograph(picture, tmp_path):
+    cache = tmp_path / "cache"
+    first, _ = load_photograph(picture, 2, cache)
+    (kept,) = cache.iterdir()
+    PilImage.fromarray(255 - first).save(kept)
+    assert np.array_equal(load_photograph(picture, 2, cache)[0], 255 - first)
+    kept.write_bytes(b"damaged")
+    assert np.array_equal(load_photograph(picture, 2, cache)[0], first)
+    PilImage.new("RGB", (37, 23), (9, 9, 9)).save(picture)
+    assert (load_photograph(picture, 2, cache)[0] == 9).all()
+
+
+@pytest.mark.parametrize("factor", [1, 2, 3])
+def test_a_point_stays_on_its_pixel(room, factor):
+    """A point's pixel in the view is its pixel in the camera record over the factor."""
+    image, xyz = room.images[0], room.points.xyz[:50]
+    (view,) = load_views(room, [image], data_factor=factor)
+    uv, depth = image.camera.project(xyz)
+    small = view.camera.project(xyz)[0]
+    assert np.allclose(small[depth > 0], uv[depth > 0] / factor, atol=1e-6)
+
+
+@pytest.fixture
+def copied(room_path, tmp_path):
+    shutil.copytree(room_path, tmp_path / "copy")
+    return load_scene(tmp_path / "copy")
+
+
+def test_files_resized_beforehand_scale_the_intrinsics(copied):
+    image = copied.images[0]
+    path = copied.source.image_dir / image.name
+    for each in path.parent.iterdir():
+        PilImage.open(each).resize((48, 36)).save(each)
+    (view,) = load_views(copied, [image])
+    assert np.allclose(view.K[:2], image.camera.K[:2] / 2)
+    small = at_file_size(copied)
+    assert np.allclose(small.images[-1].camera.K[:2], image.camera.K[:2] / 2)
+    assert np.allclose(small.images[1].observations.xy, copied.images[1].observations.xy / 2)
+    assert points_within(copied, "1rho") == 48 * 36
+    assert {(each.width, each.height) for each in frames_of(copied)} == {(48, 36)}
+    assert at_file_size(small) is small
+    PilImage.open(path).resize((48, 48)).save(path)
+    with pytest.raises(SceneFormatError, match="found 48 x 48: cropped, or stretched"):
+        load_views(copied, [image])
+
+
+RECORD = 96, 72
+COPIES = [(48, 36), (192, 144), (37, 28), (95, 72), (96, 71), (97, 72), (120, 91)]
+
+
+@pytest.mark.parametrize("name", CAMERA_MODELS)
+def test_a_point_has_the_same_relative_place_in_every_copy(name, room, tmp_path):
+    """At any size, also of slightly other shape, and whether views or the scene are resized."""
+    model = CAMERA_MODELS[name]
+    focal, terms = (80.0, 84.0)[: model.num_focal], model.num_params - model.num_focal - 2
+    lens = Intrinsics(1, name, *RECORD, (*focal, 47.0, 37.0, *(0.02, -0.01, 0.005, 0.01)[:terms])
+        + (0.001,) * max(0, terms - 4))  # fmt: skip
+    (tmp_path / "images").mkdir()
+    source = dataclasses.replace(room.source, image_dir=tmp_path / "images")
+    images = []
+    for i, size in enumerate(COPIES):
+        PilImage.new("RGB", size).save(tmp_path / "images" / f"{i}.png")
+        seen = Observations(np.array([[48.0, 18.0]]), np.array([NO_POINT]))
+        old = room.images[0]
+        images.append(dataclasses.replace(old, name=f"{i}.png", intrinsics=lens, observations=seen))
+    scene = room.replace(images=tuple(images), intrinsics=(lens,), source=source)
+    sized = at_file_size(scene)
+    assert [(i.intrinsics.width, i.intrinsics.height) for i in sized.images] == COPIES
+    assert (
+        len({i.intrinsics.camera_id for i in sized.images}) == len(sized.intrinsics) == len(COPIES)
+    )
+    xy = np.array([[0.3, -0.2], [-0.25, 0.1], [0.0, 0.0]])
+    for image, size in zip(sized.images, COPIES, strict=True):
+        place = image_points(image.intrinsics, xy) / size
+        assert np.allclose(place, image_points(lens, xy) / RECORD, atol=1e-12)
+        assert np.allclose(image.observations.xy / size, [[0.5, 0.25]])
+    for factor in (1, 3):
+        one, other = (
+            load_views(s, s.images, data_factor=factor, undistort=True) for s in (scene, sized)
+        )
+        frames = poses_of(sized.images, factor)
+        for a, b, c, size in zip(one, other, frames, COPIES, strict=True):
+            assert np.array_equal(a.K, b.K)
+            assert np.array_equal(a.K, c.K)
+            shown = np.array([a.width, a.height]) * factor
+            assert (
+                (a.width, a.height) == (c.width, c.height) == (size[0] // factor, size[1] // factor)
+            )
+            assert np.allclose(
+                factor * a.K[:2] / np.array(size)[:, None], lens.K[:2] / np.array(RECORD)[:, None]
+            )
+            assert (shown <= size).all()
+
+
+@pytest.mark.parametrize(
+    ("size", "orientation", "says"),
+    [
+        ((72, 96), 6, "found 72 x 96: stored turned, with EXIF orientation 6; 1 more of 9"),
+        ((36, 48), 8, "found 36 x 48: stored turned, with EXIF orientation 8"),
+        ((72, 96), 1, "found 72 x 96: turned, width and height are swapped"),
+        ((96, 60), 1, "found 96 x 60: cropped, or stretched"),
+        ((48, 36), 6, ""),
+        ((96, 71), 3, ""),
+    ],
+)
+def test_each_photograph_is_checked_against_its_own_record(size, orientation, says, copied):
+    exif = PilImage.Exif()
+    exif[0x0112] = orientation
+    images = sorted(copied.images, key=lambda image: image.name)[:9]
+    for image in images[3:5]:
+        PilImage.new("RGB", size).save(copied.source.image_dir / image.name, exif=exif)
+    told = " ".join(load_scene(copied.source.root).warnings)
+    if not says:
+        assert "not fit" not in told
+        assert [view.photograph.shape[1::-1] for view in load_views(copied, images)][3] == size
+        return
+    assert f"{images[3].name} has {size[0]} x {size[1]} pixels, its camera" in told
+    with pytest.raises(SceneFormatError, match=says) as caught:
+        load_views(copied, images)
+    assert images[3].name in caught.value.expected
+    assert at_file_size(copied) is copied
+
+
+def test_a_shape_that_no_rounding_explains_is_said_once():
+    def warned(record, *sizes):
+        lens = Intrinsics(1, "PINHOLE", *record, (900.0, 900.0, 500.0, 500.0))
+        return [_off(lens, size) > ROUNDING for size in sizes if fits(lens, size)]
+
+    assert warned((1920, 1088), (1920, 1080), (960, 544), (961, 544), (480, 272)) == [True] + 3 * [
+        False
+    ]
+    assert warned((1616, 1203), (808, 601), (808, 602), (404, 300), (16, 12)) == 4 * [False]
+    assert warned((100, 99), (99, 100), (100, 99), (50, 50)) == [False, False]  # turned: no copy
+
+
+def bent(room, k):
+    lens = Intrinsics(1, "SIMPLE_RADIAL", 96, 72, (80.0, 48.0, 36.0, k))
+    return dataclasses.replace(room.images[0], intrinsics=lens)
+
+
+def test_what_cannot_be_read_is_said(room, tmp_path):
+    bad = tmp_path / "bad.png"
+    bad.write_bytes(b"no image")
+    for error, says, read, *words in (
+        (SceneFormatError, "undistort", load_views, room, [bent(room, 0.1)]),
+        (SceneFormatError, "to be an image", load_photograph, bad),
+        (SceneNotFoundError, "no such file", load_photograph, tmp_path / "none.png"),
+        (ParameterError, "never enlarged", load_photograph, bad, 0),
+        (SceneNotFoundError, "at least two images", load_split, room.replace(images=())),
+    ):
+        with pytest.raises(error, match=says):
+            read(*words)
+    with pytest.raises(SceneFormatError, match="smaller --data-factor"):
+        load_views(room, room.images[:1], data_factor=9, min_side=11)
+    assert load_views(room, [bent(room, 0.0)])
+
+
+WIDTH, HEIGHT = 96, 72
+LENSES = [
+    Intrinsics(1, "OPENCV", WIDTH, HEIGHT, (80.0, 84.0, 47.0, 37.0, 0.3, 0.05, 0.02, -0.01)),
+    Intrinsics(1, "OPENCV_FISHEYE", WIDTH, HEIGHT, (60.0, 60.0, 48.0, 36.0, 0.6, -0.01, 0.0, 0.0)),
+]
+
+
+def rays_of(K, column, row):
+    return np.stack([(column - K[0, 2]) / K[0, 0], (row - K[1, 2]) / K[1, 1]], axis=-1)
+
+
+COLUMN, ROW = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+
+
+def painting(xy):
+    """A smooth picture of the plane at depth 1."""
+    x, y = xy[..., 0], xy[..., 1]
+    waves = [np.sin(5 * x + 2 * y), np.cos(4 * y - x), np.sin(3 * x) * np.cos(3 * y)]
+    return 127.5 + 120 * np.stack(waves, axis=-1)
+
+
+def photograph(lens):
+    """What the lens sees of the painting: rays of its pixels by fixed-point iteration."""
+    goal, xy = np.stack([COLUMN, ROW], axis=-1), rays_of(lens.K, COLUMN, ROW)
+    for _ in range(200):
+        xy = xy + 0.5 * (goal - image_points(lens, xy)) / lens.K[[0, 1], [0, 1]]
+    assert np.abs(image_points(lens, xy) - goal).max() < 1e-6
+    return np.rint(painting(xy)).astype(np.uint8)
+
+
+@pytest.mark.parametrize("lens", LENSES, ids=lambda lens: lens.model)
+def test_colours_are_interpolated_between_four_pixels(lens, rng):
+    """A literal loop over pixels."""
+    source = rng.integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
+    pixels, known = undistort(source, lens, lens.K)
+    padded = np.pad(source.astype(float), ((1, 1), (1, 1), (0, 0)), mode="edge")
+    for i, j in np.ndindex(HEIGHT, WIDTH):
+        u, v = image_points(lens, rays_of(lens.K, np.array(j + 0.5), np.array(i + 0.5)))
+        if not (0 <= u <= WIDTH and 0 <= v <= HEIGHT):
+            assert not known[i, j]
+            assert not pixels[i, j].any()
+            continue
+        x, y = min(int(u + 0.5), WIDTH), min(int(v + 0.5), HEIGHT)
+        a, b = u + 0.5 - x, v + 0.5 - y
+        upper = (1 - a) * padded[y, x] + a * padded[y, x + 1]
+        lower = (1 - a) * padded[y + 1, x] + a * padded[y + 1, x + 1]
+        assert np.abs(pixels[i, j] - ((1 - b) * upper + b * lower)).max() <= 0.5 + 1e-9
+    assert 0 < known.sum() < known.size
+
+
+def test_what_a_fold_would_show_again_is_unknown():
+    lens = Intrinsics(1, "SIMPLE_RADIAL", WIDTH, HEIGHT, (30.0, 48.0, 36.0, -0.3))
+    white = np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
+    pixels, known = undistort(white, lens, lens.K)
+    rays = rays_of(lens.K, COLUMN, ROW)
+    uv = image_points(lens, rays)
+    assert np.all((uv > 0) & (uv < [WIDTH, HEIGHT]), axis=-1).all()  # all would show something
+    distance = np.linalg.norm(rays, axis=-1)
+    fold = np.sqrt(1 / 0.9)
+    assert known[distance < 0.99 * fold].all()
+    assert not known[distance > 1.01 * fold].any()
+    assert np.array_equal(pixels[..., 0] == 255, known)
+
+
+def test_views_are_undistorted_where_that_is_asked_for(copied):
+    """One photograph is of a lens, and a copy of half the size."""
+    bent = LENSES[0]
+    image, other = dataclasses.replace(copied.images[0], intrinsics=bent), copied.images[1]
+    half = PilImage.fromarray(photograph(bent)).reduce(2)
+    half.save(copied.source.image_dir / image.name)
+    lens, straight = load_views(copied, [image, other], undistort=True)
+    assert lens.mask.shape == lens.photograph.shape[:2] == (HEIGHT // 2, WIDTH // 2)
+    assert np.allclose(lens.K[:2], bent.K[:2] / 2)
+    column, row = np.meshgrid(np.arange(WIDTH // 2) + 0.5, np.arange(HEIGHT // 2) + 0.5)
+    error = np.abs(lens.photograph - painting(rays_of(lens.K, column, row))).max(axis=-1)
+    assert np.mean(error[lens.mask] < 5) > 0.95
+    assert straight.mask is None
+    (alone,) = load_views(copied, [other])
+    assert np.array_equal(alone.photograph, straight.photograph)

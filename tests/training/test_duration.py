@@ -1,0 +1,90 @@
+"""How long a run takes: the arithmetic, not the clock."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from splatseed.camera import Intrinsics
+from splatseed.pointcloud import PointCloud
+from splatseed.scene import Image, Scene
+from splatseed.seeding.upsampling import points_within
+from splatseed.training.duration import (
+    HOUR,
+    Progressed,
+    about_an_hour,
+    in_words,
+    mean_gaussians,
+    seconds_left,
+    step_seconds,
+)
+from splatseed.training.schedule import FULL_AT
+from splatseed.training.settings import TrainSettings
+
+GROW = TrainSettings(strategy="auto", max_steps=10_000, cap_max=400_000, data_factor=3)
+EARLY = Progressed(100, 0.5, 20_000, 1344 * 1008)
+
+
+@pytest.mark.parametrize(
+    ("strategy", "stop", "last"), [("grow", FULL_AT, 400_000), ("mcmc", 25 / 30, 400_000),
+                                   ("default", 0.5, 20_000 * 3**0.98)],
+)  # fmt: skip
+def test_the_mean_number_is_that_of_its_steps(strategy, stop, last):
+    """A sum over the steps: linear until growth ends, the last number from there on."""
+    settings = replace(GROW, strategy=strategy)
+    counts = [
+        20_000 + (last - 20_000) * min(1.0, (step - 100) / (stop * 10_000 - 100))
+        for step in range(100, 10_000)
+    ]
+    assert mean_gaussians(settings, EARLY) == pytest.approx(sum(counts) / len(counts), rel=1e-3)
+    assert mean_gaussians(replace(settings, strategy="none"), EARLY) == 20_000
+    assert mean_gaussians(settings, EARLY._replace(step=9_000, gaussians=9)) == 9
+
+
+def test_later_steps_are_slower_and_the_machine_is_the_runs_own():
+    left = seconds_left(GROW, EARLY)
+    assert left > 1.3 * 9_900 * EARLY.seconds
+    assert seconds_left(GROW, EARLY._replace(seconds=1.0)) == pytest.approx(2 * left)
+    assert seconds_left(GROW, EARLY._replace(step=10_000)) == 0
+    steady = replace(GROW, strategy="none")
+    assert seconds_left(steady, EARLY) == pytest.approx(9_900 * 0.5)
+
+
+@pytest.mark.parametrize("per_pixel", [True, False])
+@pytest.mark.parametrize(("seconds", "steps"), [(0.3, 10_000), (2.4, 30_000), (40.0, 30_000)])
+def test_what_is_advised_takes_about_an_hour(seconds, steps, per_pixel):
+    settings, now = replace(GROW, max_steps=steps), EARLY._replace(seconds=seconds)
+    words = about_an_hour(settings, now, 4032, per_pixel=per_pixel).split()
+    options = dict(zip(words[::2], map(int, words[1::2]), strict=True))
+    factor = -(-4032 // options["--long-side"])  # as --long-side is understood
+    assert factor >= 3
+    smaller = (3 / factor) ** 2
+    pixels, cap = now.pixels * smaller, 400_000 * (smaller if per_pixel else 1)
+    chosen = replace(settings, max_steps=options.get("--max-steps", steps), cap_max=round(cap))
+    count = min(20_000, round(cap))
+    slower = seconds / step_seconds("cpu", 20_000, now.pixels)
+    each = slower * step_seconds("cpu", count, pixels)
+    expected = seconds_left(chosen, Progressed(0, each, count, round(pixels)))
+    assert HOUR / 3 < expected < 1.05 * HOUR  # and no less than need be
+
+
+def test_durations_in_words():
+    assert [in_words(s) for s in (20, 3600, 5300, 86_400)] == [
+        "1 minute", "60 minutes", "88 minutes", "24 hours"
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(("side", "factor"), [(1600, 1), (1601, 2), (1920, 2), (4032, 3)])
+def test_photographs_are_1600_pixels_a_side_at_most_unless_asked(side, factor, rng):
+    lens = Intrinsics(1, "PINHOLE", side, side // 2, (900.0, 900.0, side / 2, side / 4))
+    image = Image("a.jpg", 1, lens, rng.normal(size=4), rng.normal(size=3))
+    notes: list[str] = []
+    settings = TrainSettings().sized((image,), notes.append)
+    assert (settings.data_factor, len(notes)) == (factor, factor > 1)
+    assert TrainSettings(data_factor=1).sized((image,), notes.append).data_factor == 1
+    if factor > 1:
+        assert f"{side // factor:,} x" in notes[0]
+    # Budgets in rho count pixels at that size, in whatever verb.
+    scene = Scene(PointCloud.empty(), (image,))
+    assert points_within(scene, "1rho") == (side // factor) * (side // 2 // factor)

@@ -1,0 +1,104 @@
+"""Masked pixels count neither in training nor in scores: an occluder that moves leaves no trace."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image as PilImage
+
+from splatseed.errors import ParameterError
+from splatseed.io import load_scene
+from splatseed.io.masks import with_masks
+from splatseed.photos.view import load_views
+from splatseed.splat.evaluate import evaluate_views
+from splatseed.splat.metrics import ssim_of_all
+from splatseed.splat.rendering import fill_masked
+from splatseed.training.growing import contributions
+from splatseed.training.trainer import photometric_loss
+
+
+@pytest.fixture(scope="module")
+def occluded_path(larger_room_path, tmp_path_factory):
+    """The room with a box before a part of each training photograph, elsewhere in each."""
+    path = shutil.copytree(larger_room_path, tmp_path_factory.mktemp("masks") / "occluded")
+    (path / "masks").mkdir()
+    rng = np.random.default_rng(0)
+    for i in set(range(12)) - {0, 8}:
+        photograph = path / f"images/view_{i:03}.png"
+        pixels = np.asarray(PilImage.open(photograph)).copy()
+        box = tuple(slice(at, at + 36) for at in rng.integers(0, [54, 84]))
+        mask = np.full(pixels.shape[:2], 255, np.uint8)
+        pixels[box], mask[box] = (255, 0, 255), 0
+        PilImage.fromarray(pixels).save(photograph)
+        PilImage.fromarray(mask).save(path / f"masks/view_{i:03}.png.png")
+    return path
+
+
+def test_masks_keep_an_occluder_out(larger_room_path, occluded_path, splatseed, tmp_path):
+    """The test views have none, so that the scores compare."""
+
+    def score(name, path, *options):
+        run = splatseed(
+            "train", path, "-o", tmp_path / name, "--max-steps", 150, "--seeds", "scene",
+            "--strategy", "none", *options,
+        )  # fmt: skip
+        assert run.code == 0, run.err
+        return json.loads((tmp_path / name / "metrics.json").read_text("utf-8"))["psnr"]
+
+    clean, masked = score("clean", larger_room_path), score("masked", occluded_path)
+    whole = score("whole", occluded_path, "--masks", "none")
+    assert masked > whole + 1
+    assert masked - whole > 2 * (clean - masked)
+    again = splatseed("evaluate", tmp_path / "whole", "-o", tmp_path / "scores.json")
+    assert again.code == 0
+    assert json.loads((tmp_path / "scores.json").read_text("utf-8"))["psnr"] == pytest.approx(whole)
+    told = json.loads(splatseed("info", occluded_path, "--json").out)["masks"]
+    assert told["images"] == 10
+    assert told["share"] == pytest.approx(36**2 / (120 * 90))
+
+
+def test_masked_pixels_have_no_part_in_loss_growth_and_scores(occluded_path, begin):
+    scene = load_scene(occluded_path)
+    (view,) = load_views(scene, scene.images[1:2])
+    photograph, mask = torch.tensor(view.photograph / 255.0).float(), torch.tensor(view.mask)
+    render = torch.rand(photograph.shape, generator=torch.manual_seed(0))
+    other = torch.where(mask[..., None], render, 1 - render)
+    losses = []
+    for each in (render.requires_grad_(), other.detach().requires_grad_()):
+        loss = photometric_loss(fill_masked(each, photograph, mask), photograph)
+        loss.backward()
+        losses.append(float(loss.detach()))
+        assert (each.grad[~mask] == 0).all()
+    assert losses[0] == losses[1]
+    results = [
+        evaluate_views(lambda _, each=each: each.detach(), [view]) for each in (render, other)
+    ]
+    assert results[0].psnr == results[1].psnr
+    assert results[0].ssim == results[1].ssim < 0.5
+    everywhere = torch.ones_like(mask)
+    assert ssim_of_all(render.detach(), photograph, everywhere) == pytest.approx(
+        ssim_of_all(render.detach(), photograph), abs=1e-5
+    )
+    run = begin(strategy="none")
+    (seen,) = load_views(scene, scene.images[1:2])
+    params, error = run.state.params, torch.ones(mask.shape)
+    counted = contributions(params, run.frame.view(seen), error)[0]
+    masked = contributions(params, run.frame.view(seen), error * mask)[1]
+    assert torch.allclose(counted, masked)
+
+
+def test_a_resumed_run_keeps_its_masks(occluded_path, tmp_path, begin):
+    from splatseed.training.run import prepare_run
+    from splatseed.training.settings import TrainSettings
+
+    scene, settings = load_scene(occluded_path), TrainSettings(max_steps=30, strategy="none")
+    prepare_run(with_masks(scene, "inverted"), tmp_path / "run", settings)
+    resumed = prepare_run(scene, tmp_path / "run", settings, resume=True)
+    (view, *_) = (v for v in resumed.trainer.train_views if v.name == "view_001.png")
+    assert 0 < view.mask.mean() < 0.5
+    with pytest.raises(ParameterError, match="--masks inverted, as when the run began"):
+        prepare_run(with_masks(scene, "none"), tmp_path / "run", settings, resume=True)

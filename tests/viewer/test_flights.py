@@ -1,0 +1,233 @@
+"""Flights: smooth, upright paths past the cameras, and readable videos."""
+
+from __future__ import annotations
+
+import dataclasses
+import gc
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="rendering needs PyTorch")
+ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="videos need imageio-ffmpeg (extra view)")
+
+from splatseed.errors import ParameterError, SceneFormatError
+from splatseed.io import load_scene, write_scene
+from splatseed.photos.view import View, poses_of
+from splatseed.photos.visibility import look_at
+from splatseed.similarity import Similarity
+from splatseed.splat.formats import read_model
+from splatseed.splat.gaussians import Gaussians
+from splatseed.splat.rendering import ModelRenderer
+from splatseed.viewer import flights
+from splatseed.viewer.flights import orbit, path_of_file, smooth_path
+from splatseed.viewer.models import Shown, open_shown, pinhole_view, split_picture, stage_frame
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def _ring(count=24, radius=3.0, height=1.0):
+    """Cameras in a ring that look at the origin."""
+    views = []
+    for i, angle in enumerate(np.linspace(0, 2 * np.pi, count, endpoint=False)):
+        eye = np.array([radius * np.cos(angle), radius * np.sin(angle), height])
+        K = np.array([[100.0, 0, 60], [0, 100.0, 45], [0, 0, 1]])
+        pose = look_at(eye, np.zeros(3), UP)
+        views.append(View(f"{i:03}", np.empty((0, 0, 3), np.uint8), K, 120, 90, pose))
+    return views
+
+
+def _centers(views):
+    return np.array([-v.cam_from_world[:3, :3].T @ v.cam_from_world[:3, 3] for v in views])
+
+
+# Paths --------------------------------------------------------------------------------------------
+
+
+def test_a_path_follows_the_cameras_evenly(rng):
+    cameras = _ring()
+    path = smooth_path(cameras, 90, (160, 90))
+    centers = _centers(path)
+    assert len(path) == 90
+    np.testing.assert_allclose(np.linalg.norm(centers[:, :2], axis=1), 3, atol=0.15)
+    steps = np.linalg.norm(np.diff(centers, axis=0), axis=1)
+    assert steps.max() < 1.2 * steps.min()
+    for view in path:
+        rotation = view.cam_from_world[:3, :3]
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
+        assert (-rotation[1] @ UP) > 0.9
+    assert (path[0].width, path[0].height) == (160, 90)
+    np.testing.assert_allclose(path[0].K[:2, 2], [80, 45])
+    # Names in no order: it goes from neighbour to neighbour.
+    names = rng.permutation(24)
+    shuffled = [dataclasses.replace(v, name=f"{i}") for i, v in zip(names, cameras, strict=True)]
+    again = _centers(smooth_path(shuffled, 90, (160, 90)))
+    assert np.linalg.norm(np.diff(again, axis=0), axis=1).max() < 2 * steps.max()
+    with pytest.raises(ParameterError, match="two places"):
+        smooth_path(cameras[:1], 10, (64, 48))
+
+
+def test_an_orbit_goes_around_what_the_cameras_look_at(run_folder):
+    cameras = _ring()
+    np.testing.assert_allclose(flights.focus_of(cameras), 0, atol=0.1)
+    gaussians = read_model(run_folder / "point_cloud.ply")
+    centers = _centers(orbit(cameras, gaussians, 60, (160, 90)))
+    np.testing.assert_allclose(np.linalg.norm(centers[:, :2], axis=1), 3, atol=0.2)
+    np.testing.assert_allclose(centers[:, 2], 1, atol=0.1)
+    assert len(orbit([], gaussians, 7, (64, 48))) == 7  # a model alone has a way around it too
+    one = gaussians.select(np.zeros(3, int))  # all in one place
+    apart = _centers(orbit([], one, 7, (64, 48))) - one.means[0]
+    assert (np.linalg.norm(apart, axis=1) > 3 * np.exp(one.scales[0].max())).all()
+    assert np.isfinite(apart).all()
+
+
+def test_cameras_that_are_upside_down_to_each_other_have_an_up():
+    np.testing.assert_allclose(flights.upward(np.array([0.0, 0.0, -3.0])), [0, 0, -1])
+    np.testing.assert_allclose(flights.upward(np.zeros(3)), [0, -1, 0])
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "[]",
+        '{"camera_path": []}',
+        '{"camera_path": [{"camera_to_world": [1, 2]}]}',
+        '{"camera_path": [{"camera_to_world": [1,0,0,0,0,1,0,0,0,0,5,0,0,0,0,1]}]}',
+        '{"camera_path": [{"camera_to_world": [1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1], "fov": 200}]}',
+    ],
+)
+def test_what_is_no_path_is_refused(content, tmp_path):
+    (tmp_path / "path.json").write_text(content)
+    with pytest.raises(SceneFormatError, match="camera path"):
+        path_of_file(tmp_path / "path.json", (64, 48))
+
+
+# Renders ------------------------------------------------------------------------------------------
+
+
+def test_depth_is_that_of_a_wall():
+    """A wall of Gaussians 4 units ahead, in a world 100 units large."""
+    xy = np.stack(np.meshgrid(*2 * [np.linspace(-4, 4, 41)]), axis=-1).reshape(-1, 2)
+    ones = np.ones((len(xy), 1), np.float32)
+    wall = Gaussians(
+        means=np.float32([100, 100, 104]) + np.hstack([xy, 0 * ones]).astype(np.float32),
+        scales=ones * np.float32([np.log(0.15), np.log(0.15), np.log(0.15) - 3]),
+        quats=ones * np.float32([1, 0, 0, 0]),
+        opacities=4 * ones[:, 0],
+        sh0=np.zeros((len(xy), 1, 3), np.float32),
+        shN=np.zeros((len(xy), 0, 3), np.float32),
+    )
+    pose = np.eye(4)
+    pose[:3, 3] = -100
+    view = pinhole_view((64, 48), 2 * np.arctan(24 / 50), pose)
+    renderer = ModelRenderer(wall, stage_frame(Shown("wall", None, wall)))
+    np.testing.assert_allclose(renderer.depth(view), 4, atol=0.02)
+    np.testing.assert_allclose(renderer.color(view), 0.5, atol=0.03)
+
+
+def test_pictures_are_split_where_asked():
+    red, blue = np.zeros((20, 40, 3), np.uint8), np.zeros((20, 40, 3), np.uint8)
+    red[..., 0], blue[..., 2] = 255, 255
+    split = split_picture(red, blue, at=0.25)
+    assert (split[:, :9, 0] == 255).all()
+    assert (split[:, 12:, 2] == 255).all()
+
+
+def test_a_ply_of_points_is_shown_as_points(room):
+    assert open_shown(room / "sparse/0/points3D.ply").gaussians is None
+
+
+# The command --------------------------------------------------------------------------------------
+
+
+def _frames(path):
+    """A video's frames, [F, H, W, 3], and its frames per second."""
+    reader = ffmpeg.read_frames(str(path))
+    facts = next(reader)
+    width, height = facts["size"]
+    frames = [np.frombuffer(each, np.uint8).reshape(height, width, 3) for each in reader]
+    return np.stack(frames), facts["fps"]
+
+
+def test_a_flight_is_a_video_of_the_scene(run_folder, tmp_path, splatseed):
+    out = tmp_path / "deep/flight.mp4"
+    said = splatseed("flight", run_folder, "-o", out, "--seconds", 0.2)
+    assert (said.code, said.err) == (0, "")
+    frames, fps = _frames(out)
+    assert (frames.shape, fps) == ((6, 90, 120, 3), 30)
+    assert frames.mean() > 20
+    assert np.abs(np.diff(frames.astype(int), axis=0)).mean() > 0.5  # it moves
+
+
+def test_without_cameras_the_video_circles_and_says_so(run_folder, tmp_path, splatseed):
+    ply = shutil.copy(run_folder / "point_cloud.ply", tmp_path / "model.ply")
+    words = ("flight", ply, "--seconds", 0.05, "--size", "48x32", "-o")
+    assert "circles" in splatseed(*words, tmp_path / "a.mp4").out
+    assert "circles" not in splatseed(*words, tmp_path / "b.mp4", "--path", "orbit").out
+    assert (_frames(tmp_path / "a.mp4")[0] == _frames(tmp_path / "b.mp4")[0]).all()
+
+
+def test_a_path_through_nerfstudios_world_needs_its_transform(
+    room, run_folder, tmp_path, splatseed
+):
+    """Turned, moved and scaled: as it is, it leads past the model; with the transform it does
+    not."""
+    turn = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
+    world = Similarity(0.01, turn, np.array([0.2, 40.0, 0.1]))
+    rows = np.column_stack([turn, world.translation / 0.01]).tolist()
+    content = {"transform": rows, "scale": 0.01}
+    (tmp_path / "dataparser_transforms.json").write_text(json.dumps(content))
+    camera = load_scene(room).images[3].camera
+    pose = np.linalg.inv(world.camera(camera.cam_from_world)) @ np.diag([1.0, -1, -1, 1])
+    fov = np.degrees(2 * np.arctan(camera.height / 2 / camera.K[1, 1]))
+    frames = 2 * [{"camera_to_world": pose.reshape(-1).tolist(), "fov": fov}]
+    path = tmp_path / "path.json"
+    path.write_text(json.dumps({"camera_path": frames, "fps": 8}))
+    words = ("flight", run_folder, "-o", tmp_path / "flight.mp4", "--path", path)
+    said = splatseed(*words)
+    assert (said.code, "--transform" in said.err) == (2, True)
+    said = splatseed(*words, "--transform", tmp_path / "dataparser_transforms.json")
+    assert said.code == 0, said.err
+    gaussians = read_model(run_folder / "point_cloud.ply")
+    renderer = ModelRenderer(gaussians, stage_frame(Shown("", None, gaussians)))
+    wanted = renderer.color(poses_of([load_scene(room).images[3]])[0])
+    shown = _frames(tmp_path / "flight.mp4")[0][0] / 255
+    assert np.abs(shown - wanted).mean() < 0.01  # mirrored, it would be 0.02
+    said = splatseed(*words, "--transform", "none", "--depth", "--overwrite")
+    assert said.code == 0, said.err
+    depth, fps = _frames(tmp_path / "flight.mp4")
+    assert (len(depth), fps) == (2, 8)
+
+
+def test_models_of_other_places_are_refused(run_folder, room, tmp_path, splatseed):
+    scene = load_scene(room)
+    moved = [dataclasses.replace(im, translation=im.translation + 1) for im in scene.images]
+    write_scene(scene.replace(images=tuple(moved)), tmp_path / "elsewhere")
+    other = shutil.copytree(run_folder, tmp_path / "other")
+    config = json.loads((other / "config.json").read_text())
+    config["scene"] = str(tmp_path / "elsewhere")
+    (other / "config.json").write_text(json.dumps(config))
+    words = ("flight", run_folder, "--compare", other, "--seconds", 0.05, "--size", "101x75")
+    heard = splatseed(*words, "-o", tmp_path / "a.mp4")
+    assert (heard.code, heard.err.count("\n")) == (2, 1)
+    assert "--compare" in heard.err
+    heard = splatseed(*words, "-o", tmp_path / "a.mp4", "--scene", room)
+    assert heard.code == 0, heard.err
+    frames, _ = _frames(tmp_path / "a.mp4")
+    assert frames.shape[1:] == (76, 100, 3)  # odd sizes become even
+    assert (frames[:, 10:60, 49:51].mean(axis=(0, 2, 3)) > 150).all()  # the line between them
+
+
+def test_a_stopped_video_leaves_nothing_and_ffmpeg_says_nothing(tmp_path, capfd):
+    def stopped():
+        yield np.zeros((32, 48, 3), np.uint8)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt) as caught:
+        flights.write_video(tmp_path / "a.mp4", stopped(), (48, 32), 30.0)
+    del caught  # and with it the frames that keep ffmpeg's pipe open
+    gc.collect()
+    assert capfd.readouterr().err == ""
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,423 @@
+"""The viewer in a browser, and of a run that trains: pages are driven, and looked at."""
+
+from __future__ import annotations
+
+import base64
+import io
+import shutil
+import socket
+import threading
+import time
+from contextlib import contextmanager
+from dataclasses import replace
+from unittest.mock import Mock
+
+import numpy as np
+import pytest
+from PIL import Image
+
+torch = pytest.importorskip("torch", reason="rendering needs PyTorch")
+pytest.importorskip("viser", reason="the viewer needs viser (extra view)")
+
+from splatseed.commands import view as verb
+from splatseed.errors import ParameterError, SceneFormatError
+from splatseed.io import load_scene
+from splatseed.pointcloud import PointCloud
+from splatseed.splat.evaluate import evaluate_views
+from splatseed.splat.gaussians import TrainingFrame
+from splatseed.training.run import prepare_run
+from splatseed.training.settings import TrainSettings
+from splatseed.viewer import pictures, session as session_module
+from splatseed.viewer.models import Shown, open_shown, stage_frame
+from splatseed.viewer.pictures import (
+    Entry,
+    canvas_view,
+    clouds_of,
+    fitted_fov,
+    laid_onto,
+    stage_pose,
+)
+from splatseed.viewer.server import TrainingViewer, Viewer, free_port
+
+from ..bench import browser
+
+needs_browser = pytest.mark.skipif(browser.CHROMIUM is None, reason="Chromium is not installed")
+
+BLANK = 15  # a picture whose values deviate by less shows nothing
+
+
+def _entry(shown):
+    return Entry(shown, stage_frame(shown))
+
+
+@contextmanager
+def _served(*entries, **more):
+    port = free_port("127.0.0.1", 0)
+    viewer = Viewer(list(entries), "127.0.0.1", port, **more)
+    viewer.url = f"http://127.0.0.1:{port}"
+    yield viewer
+    viewer.stop()
+
+
+@pytest.fixture
+def viewer(entry):
+    """A run, served."""
+    with _served(entry) as served:
+        yield served
+
+
+@pytest.fixture
+def entry(run_folder):
+    return _entry(open_shown(run_folder))
+
+
+FLAGS = (
+    *(flag for flag in browser.FLAGS if flag != "--disable-gpu"),
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--ignore-gpu-blocklist",
+)
+
+
+@contextmanager
+def served_page(folder, url):
+    """A page of a browser, with WebGL in software, at an address."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(browser, "FLAGS", FLAGS)
+        with browser.chromium(folder) as page:
+            page.open(url, 800, 600)
+            yield page
+
+
+def screenshot(page):
+    """What the page shows, [H, W, 3]."""
+    data = base64.b64decode(page.call("Page.captureScreenshot")["data"])
+    return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
+
+
+def waits_for(condition, seconds=30.0):
+    """What comes true in time."""
+    until = time.monotonic() + seconds
+    while not (answer := condition()) and time.monotonic() < until:
+        time.sleep(0.1)
+    return answer
+
+
+def text(page):
+    return page.run("document.body.innerText")
+
+
+def click_text(page, words, tag):
+    """Click the last element that has just these words."""
+    page.run(
+        f"[...document.querySelectorAll({tag!r})]"
+        f".filter(e => e.innerText === {words!r}).at(-1).click()"
+    )
+
+
+def toggle(page, label):
+    """Click the checkbox that stands beside a label."""
+    page.run(
+        "(() => { let e = [...document.querySelectorAll('*')]"
+        f".filter(e => e.innerText === {label!r}).at(-1);"
+        " while (!e.querySelector('input[type=checkbox]')) e = e.parentElement;"
+        " e.querySelector('input[type=checkbox]').click(); })()"
+    )
+
+
+def _session(viewer):
+    assert waits_for(lambda: viewer.sessions, 90), "the page does not connect"
+    return viewer.sessions[-1]
+
+
+def _settled(session):
+    """Wait for a full picture of what is shown."""
+    canvas = session._client.camera
+    full = (canvas.image_height, canvas.image_width)
+    drawn = lambda: session._picture is not None and session._picture.shape[:2] == full
+    return waits_for(drawn, 90)
+
+
+# The page ----------------------------------------------------------------------------------------
+
+
+@needs_browser
+def test_a_run_is_seen_offline_and_a_flight_ends_at_its_camera(viewer, run_folder, tmp_path):
+    with served_page(tmp_path, viewer.url) as page:
+        session = _session(viewer)
+        count = len(open_shown(run_folder).scene.points)
+        assert waits_for(lambda: f"original: {count:,}" in text(page)), text(page)
+        assert _settled(session)
+        # Not blank; the browser may still show the picture before, so it is waited for.
+        assert waits_for(lambda: screenshot(page)[100:, :350].std() > BLANK)
+        assert all(r.startswith((viewer.url, "data:", "blob:")) for r in page.requests)
+        image, frustum = session._cameras[0]
+        session._cameras_on.value = True
+        frustum._impl.click_cb[0].callback(None)  # what viser calls at a click on it
+        assert waits_for(lambda: session.at is image and not frustum.visible)  # not in its own way
+        session._kind.value = "photograph"
+        session.refresh()
+        assert _settled(session)
+        _, position = stage_pose(image.camera, viewer.entries[0].frame)
+        np.testing.assert_allclose(session._client.camera.position, position, atol=1e-4)
+        assert session._note.content == ""
+        page.drag(100, 400, 200)  # it leaves the camera's place, and with it the photograph
+        assert waits_for(lambda: session.at is None and frustum.visible)
+        assert waits_for(lambda: "Click a camera" in session._note.content)
+
+
+@needs_browser
+def test_switches_act_and_a_browser_gets_as_many_points_as_it_draws(entry, tmp_path, monkeypatch):
+    monkeypatch.setattr(session_module, "FIRST_POINTS", 100)
+    monkeypatch.setattr(session_module.Session, "_affordable_points", lambda _: 10**6)
+    other, total = _entry(replace(entry.shown, name="other")), len(entry.shown.scene.points)
+    with _served(entry, other, beside=other) as viewer, served_page(tmp_path, viewer.url) as page:
+        session = _session(viewer)
+        assert (session._second.value, session._split.visible) == ("other: Gaussians", True)
+        assert waits_for(lambda: f"original: {total:,}" in text(page))
+        assert waits_for(lambda: len(session._clouds["original"].xyz) == total)
+        before = session._cameras_on.value
+        toggle(page, "Show cameras")
+        assert waits_for(lambda: session._cameras_on.value != before)
+        shots = []
+        session._client.send_file_download = lambda name, data, **_: shots.append((name, data))
+        click_text(page, "Screenshot", "button")
+        assert waits_for(lambda: shots)
+        assert shots[0][1].startswith(b"\x89PNG")
+        monkeypatch.undo()
+        monkeypatch.setattr(session_module, "FIRST_POINTS", 100)
+        assert session._affordable_points() > 0
+        # One that does not answer is left with the points that it has, shown.
+        monkeypatch.setattr(session_module, "MOST_PATIENCE", 0.0)
+        with pytest.raises(TimeoutError):
+            session._affordable_points()
+        session._points_on.value = True
+        session._restyle()
+        assert all(node.visible for node in session._nodes.values())
+
+
+@needs_browser
+def test_two_browsers_have_switches_of_their_own_and_may_go(viewer, tmp_path):
+    with served_page(tmp_path / "a", viewer.url) as first:
+        one = _session(viewer)
+        with served_page(tmp_path / "b", viewer.url):
+            assert waits_for(lambda: len(viewer.sessions) == 2)
+            two = viewer.sessions[-1]
+            assert waits_for(lambda: two._nodes)
+            two._kind.value = "depth"
+            two._points_on.value = True
+            two._restyle()
+            assert one._kind.value == "Gaussians"
+            assert not next(iter(one._nodes.values())).visible
+        # The second was cut off; the first goes on.
+        assert waits_for(lambda: len(viewer.sessions) == 1)
+        assert waits_for(lambda: not two._loop._thread.is_alive())
+        frames = one._loop.frames
+        one.refresh()
+        assert waits_for(lambda: one._loop.frames > frames)
+        first.open(viewer.url, 800, 600)
+        assert waits_for(lambda: viewer.sessions not in ([], [one]))
+
+
+# What is drawn -----------------------------------------------------------------------------------
+
+
+def _canvas_at(entry, image, size):
+    wxyz, position = stage_pose(image.camera, entry.frame)
+    fov = fitted_fov(image.camera, size[0] / size[1])
+    return canvas_view(wxyz, position, fov, size, entry.frame)
+
+
+def test_a_canvas_at_a_camera_is_that_camera(entry):
+    image = entry.shown.scene.images[3]
+    canvas = _canvas_at(entry, image, (image.camera.width, image.camera.height))
+    np.testing.assert_allclose(canvas.cam_from_world, image.camera.cam_from_world, atol=1e-9)
+    np.testing.assert_allclose(canvas.K[1, 1], image.camera.K[1, 1])
+    white = np.full((90, 120, 3), 255, np.uint8)  # of a wide one it fills the middle
+    wide = laid_onto(_canvas_at(entry, image, (400, 90)), white, image.camera, smooth=False)
+    columns = np.flatnonzero(wide[45, :, 0])
+    assert abs(len(columns) - 120) <= 2
+    assert abs(columns.mean() - 199.5) <= 1
+
+
+def test_every_picture_is_drawn_and_a_moving_one_keeps_what_shows_most(entry, monkeypatch):
+    image = entry.shown.scene.images[0]
+    canvas = _canvas_at(entry, image, (160, 120))
+    kinds = ("Gaussians", "depth", "photograph", "error", "points", "origins", "uncovered cells")
+    assert entry.kinds == kinds
+    drawn = {}
+    for kind in kinds:
+        drawn[kind], why = entry.draw(kind, canvas, image)
+        assert (why, drawn[kind].shape) == ("", (120, 160, 3))
+        assert drawn[kind].std() > 3
+    # What is drawn is what was photographed, as far as Gaussians nobody trained can be.
+    photograph, full = drawn["photograph"].astype(int), drawn["Gaussians"].astype(int)
+    assert np.abs(photograph - full).mean() < np.abs(photograph[:, ::-1] - full).mean()
+    half = len(entry.shown.gaussians) // 2
+    monkeypatch.setattr(pictures, "MOST_MOVING", half)
+    quick, _ = entry.draw("Gaussians", canvas, image, quick=True)
+    assert entry.quick_renderer.count == half
+    assert np.abs(full - quick).mean() < 0.6 * full.std()
+
+
+def test_what_cannot_be_drawn_says_why(room, run_folder, tmp_path):
+    own = shutil.copytree(room, tmp_path / "own")
+    entry = _entry(open_shown(run_folder, own))
+    image = entry.shown.scene.images[0]
+    canvas = _canvas_at(entry, image, (64, 48))
+    for kind in ("photograph", "error", "uncovered cells"):
+        picture, why = entry.draw(kind, canvas, None)
+        assert (picture, "Click a camera" in why) == (None, True)
+    shutil.rmtree(own)
+    picture, why = entry.draw("photograph", canvas, image)
+    assert (picture, "cannot be read" in why) == (None, True)
+    assert entry.draw("uncovered cells", canvas, image)[0] is not None
+
+
+def test_points_of_several_origins_are_switched_apart(rng):
+    source = np.repeat(np.array([0, 2, 9], np.uint8), 50)
+    rgb = rng.integers(0, 255, (150, 3), dtype=np.uint8)
+    cloud = PointCloud(rng.random((150, 3)), rgb, source)
+    clouds = clouds_of(cloud, TrainingFrame(np.zeros(3), 2.0), 1000)
+    assert [each.count for each in clouds] == [50, 50, 50]
+    assert len({each.color for each in clouds}) == 3
+    np.testing.assert_allclose(clouds[0].xyz, 2 * cloud.xyz[:50], rtol=1e-6)
+
+
+def test_sizes_are_those_of_what_cameras_see(room, run_folder):
+    frame = stage_frame(shown := open_shown(run_folder, room))
+    # On a long walk, on which all that cameras see is a thousandth of their extent away.
+    walk = replace(frame, near=frame.near / 1000)
+    clouds = clouds_of(shown.scene.points, frame, 1000)
+    before, after = (pictures.point_size(clouds, shown.scene.images, f) for f in (frame, walk))
+    assert after < 0.02 * before
+    gui = Mock()
+    for each in (frame, walk):
+        pictures.add_cameras(gui, shown, each, print)
+    sizes = [call.kwargs["scale"] for call in gui.add_camera_frustum.call_args_list]
+    assert sizes[-1] < 0.02 * sizes[0]
+
+
+def test_of_many_cameras_as_many_are_test_views_as_of_all(room):
+    scene = load_scene(room)
+    images = tuple(replace(scene.images[0], name=f"{i:04}.png") for i in range(3000))
+    shown = Shown("many", scene.replace(images=images))
+    drawn = pictures.add_cameras(Mock(), shown, stage_frame(shown), print)
+    tested = {image.name for image in scene.replace(images=images).split()[1]}
+    assert len(drawn) <= pictures.MOST_CAMERAS + 1
+    assert sum(image.name in tested for image, _ in drawn) / len(drawn) == pytest.approx(
+        0.125, 0.05
+    )
+
+
+def test_names_are_shown_as_they_are():
+    session = object.__new__(session_module.Session)
+    session._note = Mock(content="")
+    session._say("<img src=x onerror=alert(1)>.png cannot be read.")
+    assert "&lt;img src=x" in session._note.content
+    assert "<img" not in session._note.content
+
+
+# A run that trains -------------------------------------------------------------------------------
+
+STEPS = 40
+
+
+@pytest.fixture
+def watched(room, tmp_path):
+    pytest.importorskip("gsplat", reason="training needs gsplat's strategies")
+    scene = load_scene(room)
+    settings = TrainSettings(max_steps=STEPS, data_factor=2, test_every=4, strategy="none")
+    run = prepare_run(scene, tmp_path / "run", settings)
+    viewer = TrainingViewer(run, scene, "room", "127.0.0.1", free_port("127.0.0.1", 0))
+    viewer._sessions[0] = Mock()  # stands for a browser: without one, nothing is drawn
+    yield run, viewer, scene
+    viewer.close()
+
+
+def test_renders_come_between_steps_and_change_nothing(watched, room, tmp_path):
+    run, viewer, scene = watched
+    canvas, pictures = _canvas_at(viewer.entries[0], scene.images[0], (80, 60)), []
+
+    def look():
+        while len(pictures) < 5:
+            pictures.append(viewer._live.draw("Gaussians", canvas, None))
+
+    thread = threading.Thread(target=look)
+    thread.start()
+    assert run.train(viewer.on_step)
+    viewer._live.close()
+    thread.join(30)
+    drawn = [picture for picture, _ in pictures if picture is not None]
+    assert drawn
+    assert all(picture.std() > 5 for picture in drawn)
+    picture, why = viewer._live.draw("Gaussians", canvas, None)  # who looks after the end is told
+    assert (picture, "ended" in why) == (None, True)
+    numbers = viewer._numbers()
+    for told in (f"step {STEPS}", f"{len(run.state.params['means']):,} Gaussians", "test views"):
+        assert told in numbers
+    alone = prepare_run(load_scene(room), tmp_path / "alone", run.settings)
+    assert alone.train()
+    for name, value in alone.state.params.items():
+        np.testing.assert_array_equal(value.detach(), run.state.params[name].detach())
+
+
+def test_a_pause_holds_and_a_stop_keeps(watched):
+    run, viewer, _ = watched
+    viewer.pause(on=True)
+    waited = []
+
+    def serve(wait=0.0):
+        waited.extend([run.state.step] if wait else [])
+        if len(waited) == 3:
+            viewer.pause(on=False)
+
+    def on_step(step):
+        viewer.on_step(step)
+        if step == 5:
+            viewer.stop_and_keep()
+
+    viewer._live.serve = serve
+    assert not run.train(on_step)
+    assert (waited, viewer.kept, run.state.step) == ([1, 1, 1], True, 6)
+    assert run.finish(evaluate_views).steps == 6
+    assert run.folder.gaussians.is_file()
+    assert not run.folder.checkpoint.exists()
+
+
+# The command -------------------------------------------------------------------------------------
+
+
+def test_a_port_that_is_taken_is_an_error():
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        with pytest.raises(ParameterError, match="in use"):
+            free_port("127.0.0.1", taken.getsockname()[1])
+
+
+def test_a_folder_that_holds_many_says_which_are_shown(room, tmp_path, monkeypatch, capsys):
+    for name in "abc":
+        (tmp_path / name).symlink_to(room)
+    assert [path.name for path in verb._within(tmp_path)] == ["a", "b", "c"]
+    monkeypatch.setattr(verb, "MOST_OPENED", 2)
+    assert [path.name for path in verb._within(tmp_path)] == ["a", "b"]
+    said = capsys.readouterr()
+    assert "holds 3" in said.out + said.err
+
+
+def test_runs_of_the_same_name_are_told_apart(run_folder, tmp_path):
+    paths = [tmp_path / each / "fern" / "run" for each in "ab"]
+    for path in paths:
+        shutil.copytree(run_folder, path)
+    opened, beside = verb._opened(verb.Options(paths[0], compare=paths[1]))
+    assert ([each.name for each in opened], beside) == (["a/fern/run", "b/fern/run"], 1)
+    opened, beside = verb._opened(verb.Options(paths[0].parent, compare=paths[0]))
+    assert ([each.name for each in opened], beside) == (["run"], 0)
+
+
+def test_nothing_to_show_is_an_error(tmp_path):
+    for name in ("cameras", "images", "points3D"):
+        (tmp_path / f"{name}.txt").write_text("1 PINHOLE 4 3 2 2 2 1.5\n" * (name == "cameras"))
+    with pytest.raises(SceneFormatError, match="something to show"):
+        open_shown(tmp_path)
