@@ -165,3 +165,18 @@ def test_a_shell_reads_quoted_names_back():
     )  # fmt: skip
     read = done.stdout.decode("utf-8", "surrogateescape").split("\0")[:-1]
     assert [each.removeprefix("./") for each in read] == names
+
+
+def test_arguments_of_the_library_are_printed_as_options(capsys):
+    console.print_note("Pass `data_factor=1`, `scene` or `cap_max=9`; not a`b`, `A` or `a b`.")
+    said = "Pass --data-factor 1, --scene or --budget 9; not a--b, `A` or `a b`."
+    assert capsys.readouterr().out == f"note: {said}\n"
+    options = {
+        "`overwrite=True`": "--overwrite",
+        "`depth.align=False`": "--depth.no-align",
+        "`masks='my masks'`": "--masks 'my masks'",
+        "`masks=FILE`": "--masks FILE",
+        "`mls.k=8`": "--mls.k 8",
+    }
+    for argument, option in options.items():
+        assert console.with_options(argument) == option

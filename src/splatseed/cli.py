@@ -14,7 +14,7 @@ from typing import NoReturn
 
 from rich.table import Table
 
-from splatseed.console import ERR, OUT
+from splatseed.console import ERR, OUT, with_options
 from splatseed.errors import SplatseedError
 from splatseed.runtime.interruption import Termination, exit_code
 from splatseed.text import did_you_mean, visible
@@ -129,9 +129,9 @@ def _ends_gpu_memory(error: RuntimeError) -> bool:
 
 
 def _fail(message: str) -> NoReturn:
-    """Print one error on stderr and exit with 2."""
+    """Print an error on stderr, with options for the library's arguments, and exit with 2."""
     ERR.print("error:", style="bold red", end=" ")
-    ERR.print(visible(" ".join(message.splitlines())), soft_wrap=True)
+    ERR.print(visible(with_options(" ".join(message.splitlines()))), soft_wrap=True)
     sys.exit(2)
 
 

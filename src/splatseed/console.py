@@ -7,6 +7,8 @@ what is printed is shown as it is, so that no file name can colour, move or rewr
 
 from __future__ import annotations
 
+import ast
+import re
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
@@ -19,7 +21,12 @@ from rich.table import Table
 from rich.text import Text
 
 from splatseed.runtime.compilation import watched
-from splatseed.text import visible
+from splatseed.text import quoted, visible
+
+ARGUMENT = re.compile(r"`(?P<name>[a-z]\w*(?:\.[a-z]\w*)*)(?:=(?P<value>[^`]+))?`")
+"""An argument in a message of the library, with its value if one is suggested."""
+OPTIONS = {"cap_max": "budget", "seeding": "seeds", "depths": "depth"}
+"""Options whose names differ from the arguments they set."""
 
 
 class LiteralConsole(Console):
@@ -168,6 +175,31 @@ def stage_display(
         yield clock
 
 
+def with_options(message: str) -> str:
+    """Replace arguments in a library's message (see ``errors``) by the command line's options.
+
+    Example:
+        >>> with_options("Pass a smaller `ratio`, `mls.k=8` or `overwrite=True`.")
+        'Pass a smaller --ratio, --mls.k 8 or --overwrite.'
+        >>> with_options("Pass `depth.align=False` or `masks='my masks'`.")
+        "Pass --depth.no-align or --masks 'my masks'."
+    """
+    return ARGUMENT.sub(_option, message)
+
+
+def _option(argument: re.Match[str]) -> str:
+    group, dot, name = argument["name"].rpartition(".")
+    name = OPTIONS.get(name, name).replace("_", "-")
+    value = argument["value"]
+    if value in {None, "True", "False"}:
+        return f"--{group}{dot}{'no-' * (value == 'False')}{name}"
+    try:
+        text = str(ast.literal_eval(value))
+    except (ValueError, SyntaxError):  # a placeholder, such as FILE
+        text = value
+    return f"--{group}{dot}{name} {quoted(text)}"
+
+
 def print_pairs(title: str, rows: Sequence[tuple[str, str]]) -> None:
     """Print names and their values, or commands, unwrapped so that they can be copied."""
     _print_title(title)
@@ -177,9 +209,9 @@ def print_pairs(title: str, rows: Sequence[tuple[str, str]]) -> None:
 
 
 def print_note(note: str) -> None:
-    """Print one thing the user should know."""
+    """Print a note, with options for the library's arguments."""
     OUT.print("note:", style="yellow", end=" ")
-    OUT.print(visible(note), soft_wrap=True)
+    OUT.print(visible(with_options(note)), soft_wrap=True)
 
 
 def print_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:

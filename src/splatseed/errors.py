@@ -9,6 +9,11 @@ Each says what was expected, what was found and how to mend it, in one line a us
     │       └── UnknownNameError (KeyError)
     └── ReconstructionError, MissingDependencyError, TaskLostError
 
+A message names an argument in backticks, as Python code: `ratio`, `max_steps=7000`,
+`overwrite=True`. The command line prints the option instead (`--ratio`, `--max-steps 7000`,
+`--overwrite`; ``console.with_options``), so messages of the library contain no options. Text values
+are quoted: ``f"`masks={str(folder)!r}`"``. Notes follow the same rule.
+
 Those in parentheses are also Python's own, which callers may expect: an ``except OSError`` or
 ``except ValueError`` around code that raises ours must let them pass first.
 """

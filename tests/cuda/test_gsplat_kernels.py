@@ -33,8 +33,8 @@ from splatseed.errors import MissingDependencyError
 from splatseed.runtime.torch_device import load_kernels
 stages = []
 try:
-    load_kernels("--backend", lambda stage, _: stages.append(stage))
-    load_kernels("--backend")  # the second time there is nothing to do
+    load_kernels("backend", lambda stage, _: stages.append(stage))
+    load_kernels("backend")  # the second time there is nothing to do
 except MissingDependencyError as error:
     print(error)
 print(*stages)

@@ -218,7 +218,7 @@ def load_network(
     require("transformers")
     from transformers.utils import logging  # noqa: PLC0415  (seconds to import)
 
-    where = pick_torch_device(device, "--device")
+    where = pick_torch_device(device, "device")
     path = Path(model)
     if path.is_file() or (path.is_dir() and not (path / "config.json").is_file()):
         raise _misfit(model, "a file" if path.is_file() else "no config.json in it")

@@ -63,9 +63,14 @@ def words_of(amount: int, *, up: bool = False) -> str:
     return f"{rounded:,.{digits}f} {name}"
 
 
-def option_of(amount: int) -> str:
-    """The option that allows at least so many bytes, such as ``--memory 4.1G``."""
-    return f"--memory {words_of(amount, up=True).replace(',', '')[:-1].replace(' ', '')}"
+def memory_argument(amount: int) -> str:
+    """Format the argument that allows at least ``amount`` bytes, for a message.
+
+    Example:
+        >>> memory_argument(4_400_000_000)
+        "`memory='4.1G'`"
+    """
+    return f"`memory='{words_of(amount, up=True).replace(',', '')[:-1].replace(' ', '')}'`"
 
 
 def free_memory() -> int | None:

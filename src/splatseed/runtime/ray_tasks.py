@@ -82,8 +82,8 @@ def _no_cluster(address: str | None, found: str) -> ParameterError:
     return ParameterError(
         f"a Ray cluster at {address or 'this machine'}, of the same versions of Ray and Python",
         found=found,
-        fix="Start it with: ray start --head; then pass --address auto on its node. If it asks for "
-        "a token, set RAY_AUTH_MODE=token and RAY_AUTH_TOKEN for both.",
+        fix="Start it with: ray start --head; then pass `address='auto'` on its node. If it asks "
+        "for a token, set RAY_AUTH_MODE=token and RAY_AUTH_TOKEN for both.",
     )
 
 
@@ -111,7 +111,7 @@ class RayTasks(Tasks):
             raise ParameterError(
                 f"a node of the cluster with {self.threads} CPUs{' and a GPU' * self.gpu}",
                 found=f"{len(fitting)} nodes, none with so much",
-                fix="Pass fewer --threads, or add nodes.",
+                fix="Pass fewer `threads`, or add nodes.",
             )
         self.words = f"Ray, {self.jobs} tasks at a time"
 

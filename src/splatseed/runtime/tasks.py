@@ -263,7 +263,7 @@ class Child:
         return TaskLostError(
             "a process that lives until its work is done",
             found=found,
-            fix="Out of memory? Use fewer processes at a time (--jobs), or smaller settings.",
+            fix="Out of memory? Use fewer processes at a time (`jobs`), or smaller settings.",
         )
 
 

@@ -35,19 +35,20 @@ BACKEND = "gsplat.cuda._backend"
 BUILDING = "building gsplat's kernels, some minutes, once"
 
 
-def pick_torch_device(choice: DeviceName, option: str) -> torch.device:
-    """The device of a choice; ``auto`` takes a GPU if PyTorch sees one.
+def pick_torch_device(choice: DeviceName, argument: str) -> torch.device:
+    """Return the device for a choice; ``auto`` takes a GPU if PyTorch sees one.
 
-    A ``ParameterError``, which names the ``option``: CUDA is requested and there is none.
+    Raises:
+        ParameterError: CUDA is requested and PyTorch sees no GPU; the message names ``argument``.
     """
     import torch  # noqa: PLC0415  (see the promise)
 
     seen = torch.cuda.is_available()
     if choice == "cuda" and not seen:
         raise ParameterError(
-            f"a GPU for {option} cuda",
+            f"a GPU for `{argument}='cuda'`",
             found="none that PyTorch sees",
-            fix=f"Pass {option} cpu, or install PyTorch's CUDA build.",
+            fix=f"Pass `{argument}='cpu'`, or install PyTorch's CUDA build.",
         )
     return torch.device("cuda" if seen and choice != "cpu" else "cpu")
 
@@ -64,15 +65,15 @@ def free_bytes(device: torch.device) -> int | None:
     return free_memory()
 
 
-def load_kernels(option: str, progress: Progress = silent) -> None:
-    """Make sure that gsplat can render on CUDA; builds its kernels the first time.
+def load_kernels(argument: str, progress: Progress = silent) -> None:
+    """Load gsplat's CUDA kernels; build them the first time.
 
-    gsplat 1.5.3 compiles them when they are first called. Left to itself it says "disabled" without
-    a toolkit and fails at the first render; two processes that build at once delete each other's
-    files: here they wait for each other at a lock.
+    gsplat 1.5.3 builds them on the first call. Without a toolkit, it prints "disabled" and fails
+    at the first render; two processes that build at once delete each other's files, so a lock lets
+    them build one after another.
 
     Args:
-        option: The option that chooses the CPU instead, for errors.
+        argument: The argument that chooses the CPU instead, for errors.
         progress: Called with the stage of building.
 
     Raises:
@@ -95,7 +96,7 @@ def load_kernels(option: str, progress: Progress = silent) -> None:
     }
     missing = [f"no {name}" for name, path in tools.items() if path is None]
     if missing and not find_spec("gsplat.csrc"):  # csrc: they came compiled
-        raise _cannot_build(", ".join(missing), option)
+        raise _cannot_build(", ".join(missing), argument)
     root = os.environ.get("TORCH_EXTENSIONS_DIR") or cpp_extension.get_default_build_root()
     Path(root).mkdir(parents=True, exist_ok=True)
     with FileLock(Path(root, "gsplat_cuda.splatseed.lock")):
@@ -107,12 +108,12 @@ def load_kernels(option: str, progress: Progress = silent) -> None:
         except (ImportError, OSError, RuntimeError) as error:
             lines = [line for line in str(error).splitlines() if "error" in line.lower()]
             told = (lines or [type(error).__name__])[0].strip()[:200]
-            raise _cannot_build(f"{told} ({tools['nvcc']})", option) from error
+            raise _cannot_build(f"{told} ({tools['nvcc']})", argument) from error
     if loaded is None:
-        raise _cannot_build("kernels that gsplat could not load", option)
+        raise _cannot_build("kernels that gsplat could not load", argument)
 
 
-def _cannot_build(found: str, option: str) -> MissingDependencyError:
+def _cannot_build(found: str, argument: str) -> MissingDependencyError:
     import torch  # noqa: PLC0415  (see the promise)
 
     version = torch.version.cuda
@@ -121,5 +122,5 @@ def _cannot_build(found: str, option: str) -> MissingDependencyError:
         "gsplat's compiled kernels, or nvcc, a C++ compiler and ninja to build them",
         found=found,
         fix=f"Install {toolkit}, which PyTorch was built with, and g++ (ninja comes with gsplat), "
-        f"or pass {option} cpu.",
+        f"or pass `{argument}='cpu'`.",
     )

@@ -26,9 +26,9 @@ def pick_device(backend: Backend, progress: Progress = silent) -> torch.device:
         ParameterError: CUDA is asked for and there is none.
         MissingDependencyError: gsplat has no kernels for the GPU and they cannot be built here.
     """
-    device = pick_torch_device(backend, "--backend")
+    device = pick_torch_device(backend, "backend")
     if device.type == "cuda":
-        load_kernels("--backend", progress)
+        load_kernels("backend", progress)
     return device
 
 

@@ -27,7 +27,7 @@ from splatseed.photos.view import View
 from splatseed.progress import Progress
 from splatseed.runtime.hashing import scramble
 from splatseed.runtime.jit import inline, kernel, parallel_range
-from splatseed.runtime.memory import free_memory, option_of, words_of
+from splatseed.runtime.memory import free_memory, memory_argument, words_of
 from splatseed.seeding.coverage import grid_from_world
 from splatseed.similarity import Similarity
 
@@ -281,7 +281,9 @@ def plan_memory(most: int | None, views: Sequence[View]) -> MemoryPlan:
             f"at least {words_of(needed, up=True)} of memory for a cloud and {len(views):,} "
             "photographs",
             found=words_of(allowed) + ("" if asked else ", which are free"),
-            fix=f"Pass {option_of(needed)}." if asked else "Free some, or use a larger machine.",
+            fix=f"Pass {memory_argument(needed)}."
+            if asked
+            else "Free some, or use a larger machine.",
         )
     capacity = min((allowed - fixed) // BYTES_EACH, MOST)
     return MemoryPlan(capacity, fixed + capacity * BYTES_EACH)
