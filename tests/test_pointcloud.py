@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from hypothesis.extra import numpy as hnp
 
-from splatseed.errors import PointCloudError
-from splatseed.pointcloud import ATTRIBUTES, PointCloud
+from splatseed.errors import OutputError, PointCloudError
+from splatseed.pointcloud import ATTRIBUTES, GENERATED, PointCloud
 
 
 def test_arrays_are_read_only_and_the_callers_stay_writable():
@@ -137,3 +137,25 @@ def test_arrays_that_do_not_fit(name, values, says):
     fit = {"xyz": np.zeros((4, 3)), "rgb": np.zeros((4, 3), np.uint8)}
     with pytest.raises(PointCloudError, match=says):
         PointCloud(**fit | {name: values})
+
+
+def test_own_points_come_after_the_others():
+    cloud = PointCloud(np.zeros((2, 3)), np.zeros((2, 3), np.uint8), sizes=np.ones(2))
+    more = cloud.with_added(np.ones((3, 3)), np.full((3, 3), 9, np.uint8), confidence=np.ones(3))
+    assert more.select(slice(2)).replace(confidence=None) == cloud
+    assert more.source.tolist() == [0, 0, GENERATED, GENERATED, GENERATED]
+    np.testing.assert_array_equal(more.sizes, [1, 1, *[np.nan] * 3])
+    np.testing.assert_array_equal(more.confidence, [*[np.nan] * 2, 1, 1, 1])
+    with pytest.raises(PointCloudError):
+        cloud.with_added(np.ones((3, 3)), np.ones((3, 3)))
+
+
+def test_a_ply_has_positions_and_colours(tmp_path, rng):
+    xyz, rgb = rng.random((5, 3)), rng.integers(0, 255, (5, 3), np.uint8)
+    cloud = PointCloud(xyz, rgb, np.full(5, 3))
+    path = tmp_path / "new" / "seeds.ply"
+    for _ in range(2):  # the second replaces the first
+        cloud.write_ply(path)
+        assert PointCloud.read_ply(path) == cloud.replace(source=None)
+    with pytest.raises(OutputError):
+        cloud.write_ply(tmp_path)

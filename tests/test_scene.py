@@ -6,11 +6,12 @@ import dataclasses
 
 import numpy as np
 import pytest
+from PIL import Image as Photograph
 
 from splatseed.camera import Camera, Intrinsics
 from splatseed.depth.stereo import StereoMap
 from splatseed.depthmap import DepthMap
-from splatseed.errors import ParameterError, SceneNotFoundError
+from splatseed.errors import ParameterError, SceneNotFoundError, UnknownNameError
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import NO_POINT, Image, Observations, Scene, Tracks
 from splatseed.similarity import Similarity
@@ -111,12 +112,54 @@ def test_records_share_no_array_that_their_maker_can_change():
         assert (given == kept).all()
 
 
-def test_a_description_is_a_line():
+def test_reprs_are_short():
     many = Observations(np.zeros((5000, 2)), np.full(5000, NO_POINT))
     image = dataclasses.replace(_image("a.jpg"), observations=many)
     scene = Scene(PointCloud(np.zeros((5000, 3)), np.zeros((5000, 3), np.uint8)), (image,) * 500)
-    assert repr(scene) == "Scene(made in memory: 500 images, 5,000 points)"
-    assert len(repr(image)) < 400
+    assert len(repr(scene).splitlines()) <= 5
+    for shown in ("500", "64 x 48", "5,000"):
+        assert shown in repr(scene)
+    assert len(repr(image)) < 100
+
+
+def test_images_by_name(room, room_path):
+    image = room[room.images[3].name]
+    assert image is room.images[3]
+    assert image.path == room_path / "images" / image.name
+    np.testing.assert_array_equal(image.K, image.intrinsics.K)
+    np.testing.assert_array_equal(image.cam_from_world, image.camera.cam_from_world)
+    assert (image.K.shape, image.cam_from_world.shape) == ((3, 3), (4, 4))
+    with Photograph.open(image.path) as file:
+        np.testing.assert_array_equal(image.read(), np.asarray(file.convert("RGB")))
+    assert image.name in room
+    assert "no.jpg" not in room
+    with pytest.raises(TypeError):
+        iter(room)
+
+
+def test_an_unknown_name_lists_near_ones():
+    scene = Scene(PointCloud.empty(), (_image("left/DSC01.JPG"), _image("left/DSC02.JPG")))
+    for name, near in (("dsc01.jpg", "left/DSC01.JPG"), ("left/DSC2.JPG", "left/DSC02.JPG")):
+        with pytest.raises(KeyError) as caught:
+            scene[name]
+        assert near in caught.value.fix
+    for name in ("zebra", 0):
+        with pytest.raises(UnknownNameError, match=r"scene\.images"):
+            scene[name]
+
+
+def test_an_image_without_a_folder_has_no_path():
+    with pytest.raises(FileNotFoundError, match=r"a\.jpg"):
+        _image("a.jpg").read()
+
+
+def test_own_points_and_maps_go_into_a_copy(room):
+    more = room.points.with_added(np.ones((2, 3)), np.full((2, 3), 7, np.uint8))
+    changed = room.with_points(more)
+    assert (changed.points, changed.tracks) == (more, room.tracks)
+    name = room.images[0].name
+    depths = room.with_depths({name: np.ones((72, 96))}).depths
+    assert (list(depths), room.depths) == ([name], None)
 
 
 def test_maps_in_memory_are_a_scenes_depths():

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace as dataclass_replace
+from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
@@ -161,6 +162,49 @@ class PointCloud:
     def replace(self, **changes: np.ndarray | None) -> PointCloud:
         """A copy with some of its arrays replaced; None removes an attribute."""
         return dataclass_replace(self, **changes)  # type: ignore[arg-type]  # None for attributes
+
+    def with_added(
+        self,
+        xyz: Float[np.ndarray, "M 3"],
+        rgb: UInt8[np.ndarray, "M 3"],
+        **attributes: Float[np.ndarray, "M ..."],
+    ) -> PointCloud:
+        """A copy with points of your own after these; their ``source`` is ``GENERATED``.
+
+        Args:
+            xyz: Positions, [M, 3], scene units, world frame.
+            rgb: Colours, uint8 [M, 3].
+            attributes: Any of ``normals``, ``sizes`` and ``confidence``; unknown where left out.
+
+        Raises:
+            PointCloudError: As for a new ``PointCloud``.
+        """
+        own = PointCloud(xyz, rgb, **attributes)
+        return PointCloud.concatenate(self, own.replace(source=np.full(len(own), GENERATED)))
+
+    @staticmethod
+    def read_ply(path: str | Path) -> PointCloud:
+        """The vertices of a PLY file, all as originals; mid grey where it has no colours.
+
+        Raises:
+            SceneNotFoundError: There is no such file.
+            SceneFormatError: It is no PLY, cut short, or has no vertices with x, y and z.
+        """
+        from splatseed.io.ply import read_ply  # noqa: PLC0415  (io imports clouds)
+
+        return read_ply(path)
+
+    def write_ply(self, path: str | Path) -> None:
+        """Write positions (float32) and colours (uint8) as a binary PLY; replaces a file there.
+
+        Every trainer of 3D Gaussian Splatting reads it. ``source`` and attributes are not in it.
+
+        Raises:
+            OutputError: It cannot be written.
+        """
+        from splatseed.io.ply import write_ply_file  # noqa: PLC0415  (io imports clouds)
+
+        write_ply_file(path, self)
 
     @staticmethod
     def concatenate(*clouds: PointCloud) -> PointCloud:

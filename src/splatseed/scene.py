@@ -2,24 +2,25 @@
 
 Notation: an ``_id`` comes from a file and may have gaps, an ``_idx`` is contiguous. ``tracks``
 belong to the first ``len(tracks)`` points, which are the originals in file order. Promise: a Scene
-is frozen; ``replace`` returns a copy; nothing here reads or writes files, but
-``has_photographs`` looks whether there are any.
+is frozen; ``replace`` and ``with_...`` return copies; no file is opened but by ``Image.read``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace as dataclass_replace
+from difflib import get_close_matches
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int64, UInt32, UInt64
+from jaxtyping import Bool, Float32, Float64, Int64, UInt8, UInt32, UInt64
 
 from splatseed.camera import Camera, Intrinsics, rotation_from_quat
 from splatseed.depthmap import DepthMaps, maps_by_name
-from splatseed.errors import ParameterError
+from splatseed.errors import ParameterError, SceneNotFoundError, UnknownNameError
 from splatseed.frozen import read_only
 from splatseed.pointcloud import ORIGINAL, PointCloud
 
@@ -66,9 +67,58 @@ class Image:
     quat: Float64[np.ndarray, " 4"]  # wxyz rotation of ``cam_from_world``, as in the file
     translation: Float64[np.ndarray, " 3"]  # of ``cam_from_world``
     observations: Observations | None = None  # None where the format has none
+    folder: Path | None = None  # the images folder; a scene sets it from its source
+    white: int = 65535  # the value of white in 16-bit photographs; a scene sets it
 
     def __post_init__(self) -> None:
         _freeze(self, "quat", "translation")
+
+    def __repr__(self) -> str:
+        lens = self.intrinsics
+        seen = f", {self.observations}" if self.observations is not None else ""
+        return f"Image({self.name!r}, {lens.width} x {lens.height} {lens.model}{seen})"
+
+    @property
+    def path(self) -> Path:
+        """The photograph's file, which need not exist.
+
+        Raises:
+            SceneNotFoundError: The image has no folder: its scene was made in memory.
+        """
+        if self.folder is None:
+            raise SceneNotFoundError(
+                f"a folder that holds the photograph {self.name}",
+                found="none",
+                fix="Load the scene from a folder that has its photographs.",
+            )
+        return self.folder / self.name
+
+    def in_folder(self, folder: Path, white: int) -> Image:
+        """The image with the folder of its photograph, and that one's value of white."""
+        if (self.folder, self.white) == (folder, white):
+            return self
+        return dataclass_replace(self, folder=folder, white=white)
+
+    @property
+    def K(self) -> Float64[np.ndarray, "3 3"]:  # noqa: N802  (the field's name)
+        """The pinhole matrix [3, 3] in pixels of a photograph of the camera record's size."""
+        return self.camera.K
+
+    @property
+    def cam_from_world(self) -> Float64[np.ndarray, "4 4"]:
+        """The pose [4, 4]: world points to OpenCV camera axes (x right, y down, z forward)."""
+        return self.camera.cam_from_world
+
+    def read(self) -> UInt8[np.ndarray, "H W 3"]:
+        """The photograph, sRGB, as stored: not rotated by EXIF, not resized, not undistorted.
+
+        Raises:
+            SceneNotFoundError: There is no such file.
+            SceneFormatError: It is no image, or damaged.
+        """
+        from splatseed.io.photograph import read_photograph  # noqa: PLC0415  (io imports scenes)
+
+        return read_photograph(self.path, self.white)
 
     @cached_property
     def camera(self) -> Camera:
@@ -212,16 +262,67 @@ class Scene:
         if self.depths is not None:
             distorted = {im.name for im in self.images if im.intrinsics.has_distortion}
             object.__setattr__(self, "depths", maps_by_name(self.depths, distorted))
+        folder = self.source.image_dir if self.source else None
+        if folder is not None:
+            images = tuple(image.in_folder(folder, self.white) for image in self.images)
+            object.__setattr__(self, "images", images)
 
     def __repr__(self) -> str:
         where = f"{self.source.root}, {self.source.format}" if self.source else "made in memory"
-        maps = "" if self.depths is None else f", {len(self.depths):,} depth maps"
-        return f"Scene({where}: {len(self.images):,} images, {len(self.points):,} points{maps})"
+        added = len(self.points) - self.points.num_original
+        lines = [
+            f"Scene({where})",
+            f"  images: {len(self.images):,}{_size_range(self.images)}",
+            f"  points: {self.points.num_original:,} originals, {added:,} added",
+            f"  tracks: {'none' if self.tracks is None else f'of {len(self.tracks):,} points'}",
+            f"  depths: {'none' if self.depths is None else f'{len(self.depths):,} maps'}",
+        ]
+        return "\n".join(lines)
+
+    def __getitem__(self, name: str) -> Image:
+        """The image of a name, as in ``scene["DSC07956.JPG"]``.
+
+        Raises:
+            UnknownNameError: A ``KeyError``; it lists names that are near.
+        """
+        if name in self:
+            return self._images_by_name[name]
+        names = list(self._images_by_name)
+        last = str(name).rpartition("/")[2].casefold()
+        near = [each for each in names if each.rpartition("/")[2].casefold() == last]
+        near += [each for each in get_close_matches(str(name), names) if each not in near]
+        fix = f"Did you mean {' or '.join(map(repr, near[:3]))}?"
+        raise UnknownNameError(
+            f"the name of one of the scene's {len(names):,} images",
+            found=repr(name),
+            fix=fix if near else "scene.images lists them, each with its name.",
+        )
+
+    def __contains__(self, name: object) -> bool:
+        """Whether an image has this name."""
+        return isinstance(name, str) and name in self._images_by_name
+
+    __iter__ = None  # or else Python would ask for images 0, 1, ... by ``__getitem__``
+
+    @cached_property
+    def _images_by_name(self) -> dict[str, Image]:
+        return {image.name: image for image in self.images}
+
+    def with_points(self, points: PointCloud) -> Scene:
+        """A copy with other points; see ``replace`` for what becomes of tracks."""
+        return self.replace(points=points)
+
+    def with_depths(self, depths: Any) -> Scene:
+        """A copy with other depth maps.
+
+        Args:
+            depths: What ``stereo_depths`` returns, ``DepthMaps``, or a dict by image name of
+                ``DepthMap`` or of arrays [H, W] of planar depth in scene units.
+        """
+        return self.replace(depths=depths)
 
     def replace(self, **changes: Any) -> Scene:
         """A copy with some fields replaced.
-
-        As ``depths`` also what ``stereo_depths`` returns, and a dict of maps by name, will do.
 
         When ``points`` are replaced and ``tracks`` are not, the originals among the new points
         keep their tracks if they stand first and in the same order, as ``upsample`` puts them.
@@ -280,6 +381,13 @@ class Scene:
         tested = {*sorted([*(image.name for image in ordered), *self.absent])[::test_every]}
         train = tuple(image for image in ordered if image.name not in tested)
         return train, tuple(image for image in ordered if image.name in tested)
+
+
+def _size_range(images: Sequence[Image]) -> str:
+    """The pixels of the smallest and the largest image; empty without images."""
+    sizes = sorted({(im.intrinsics.width, im.intrinsics.height) for im in images}, key=math.prod)
+    ends = dict.fromkeys([*sizes[:1], *sizes[-1:]])
+    return f", {' to '.join(f'{width} x {height}' for width, height in ends)} px" if ends else ""
 
 
 def _freeze(record: object, *names: str) -> None:

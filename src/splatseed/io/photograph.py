@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import UInt16
+from jaxtyping import UInt8, UInt16
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io.bit_depth import WHITE, is_wide, opaque_value, wide_values
@@ -107,6 +107,14 @@ def decode_photograph(path: Path, encoded: bytes, white: int = WHITE) -> PilImag
             black = PilImage.new("RGBA", photograph.size, (0, 0, 0, 255))
             return PilImage.alpha_composite(black, photograph.convert("RGBA")).convert("RGB")
         return photograph.convert("RGB")
+
+
+def read_photograph(path: Path, white: int = WHITE) -> UInt8[np.ndarray, "H W 3"]:
+    """The pixels of a file, at its size; errors as ``photograph_bytes`` and ``decode_photograph``.
+
+    ``white`` is the value that becomes 255 in a file of 16 bits a channel.
+    """
+    return np.array(decode_photograph(path, photograph_bytes(path), white))
 
 
 def has_alpha(photograph: PilImage.Image) -> bool:

@@ -19,6 +19,7 @@ from jaxtyping import Float32, Float64, UInt8
 from splatseed.errors import SceneFormatError
 from splatseed.io.cloud_file import RGB, XYZ, CloudFile, LineCloud, RowCloud
 from splatseed.io.files import StrPath, check_room, open_file, readable
+from splatseed.io.staging import atomic_file
 from splatseed.pointcloud import PointCloud
 from splatseed.text import beginning
 
@@ -165,6 +166,12 @@ def write_ply(path: StrPath, points: PointCloud) -> None:
     with path.open("wb") as file:
         file.write(ply_header(len(points)))
         file.write(ply_rows(points.xyz, points.rgb))
+
+
+def write_ply_file(path: StrPath, points: PointCloud) -> None:
+    """As ``write_ply``, but the file appears whole or not at all (``OutputError``)."""
+    with atomic_file(Path(path)) as partial:
+        write_ply(partial, points)
 
 
 def ply_header(count: int) -> bytes:
