@@ -11,17 +11,22 @@ from splatseed.errors import PointCloudError
 from splatseed.io.nerfstudio import read_cloud_transform
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
-from splatseed.seeding.clouds import align as module
-from splatseed.seeding.clouds.align import align, spread_rotations
+from splatseed.seeding.clouds.align import AlignSettings, align
+from splatseed.seeding.clouds.global_search import SearchSettings, spread_rotations
+from splatseed.seeding.clouds.icp import Stage
 from splatseed.similarity import Similarity
 
 MOVE = Similarity(0.37, spread_rotations(500)[321], np.array([5.6e5, 5.9e6, -80.0]))
-QUICK = (
-    (60, 150, 10, 0.25, 0.04, 0.04, 0.75),
-    (6, 600, 15, 0.1, 0.02, 0.02, 0.75),
-    (3, 1500, 40, 0.04, 0.005, 0.01, 0.75),
+FEWER_SCALES = AlignSettings(search=SearchSettings(scales=SearchSettings.scales[1:4]))
+QUICK = AlignSettings(
+    search=SearchSettings(rotations=150, refined=2),
+    stages=(
+        Stage(60, 150, 10, 0.25, 0.04, 0.75, 0.04),
+        Stage(6, 600, 15, 0.1, 0.02, 0.75, 0.02),
+        Stage(3, 1500, 40, 0.04, 0.005, 0.75, 0.01),
+    ),
 )
-"""Fewer tries than for real clouds, as tests must be quick."""
+"""Less than real clouds need, as tests must be quick."""
 
 
 def place(rng, num):
@@ -53,28 +58,28 @@ def shades(xyz):
 def made():
     """Noisy points of the room, a tenth of them wrong, and many exact ones."""
     rng = np.random.default_rng(11)
-    marks = place(rng, 1500)
-    marks += 0.005 * rng.standard_t(3, marks.shape)
-    marks[::10] += rng.normal(size=marks[::10].shape)
-    return marks, place(rng, 40_000)
+    tie_xyz = place(rng, 1500)
+    tie_xyz += 0.005 * rng.standard_t(3, tie_xyz.shape)
+    tie_xyz[::10] += rng.normal(size=tie_xyz[::10].shape)
+    return tie_xyz, place(rng, 40_000)
 
 
-def aligned(folder, marks, xyz, **arrays):
+def aligned(folder, tie_xyz, xyz, settings, **arrays):
     np.savez(folder / "cloud.npz", xyz=xyz, **arrays)
-    return align(Scene(PointCloud(marks, shades(marks))), [folder / "cloud.npz"])
+    scene = Scene(PointCloud(tie_xyz, shades(tie_xyz)))
+    return align(scene, [folder / "cloud.npz"], settings=settings)
 
 
 @pytest.mark.slow
-def test_a_cloud_that_is_shifted_scaled_and_turned(made, tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "SCALES", module.SCALES[1:4])
-    marks, dense = made
-    found = aligned(tmp_path, marks, MOVE.points(dense), rgb=shades(dense))
+def test_a_cloud_that_is_shifted_scaled_and_turned(made, tmp_path):
+    tie_xyz, dense = made
+    found = aligned(tmp_path, tie_xyz, MOVE.points(dense), FEWER_SCALES, rgb=shades(dense))
     back = found.scene_from_cloud.points(MOVE.points(dense))
     assert np.linalg.norm(back - dense, axis=1).max() < 0.005  # metres
-    turn = found.scene_from_cloud.rotation @ MOVE.rotation
-    assert np.degrees(np.arccos(min(1.0, (np.trace(turn) - 1) / 2))) < 0.1
-    assert found.share > 0.5
-    assert found.likeness > 0.5
+    rotation = found.scene_from_cloud.rotation @ MOVE.rotation
+    assert np.degrees(np.arccos(min(1.0, (np.trace(rotation) - 1) / 2))) < 0.1
+    assert found.inlier_ratio > 0.5
+    assert found.brightness_correlation > 0.5
     assert found.error < 0.003 * found.extent
     np.testing.assert_allclose(
         np.array(found.report["matrix"])[:3] @ np.append(MOVE.translation, 1.0),
@@ -94,27 +99,24 @@ def box(num, rng):
 
 
 @pytest.mark.parametrize(
-    ("case", "says"),
+    ("case", "found"),
     [
-        ("another place", "one reliable alignment of the cloud"),
+        ("another place", "one reliable alignment"),
         ("a box that looks alike from several sides", "several that fit"),
-        ("few points of a cloud", "at least 1,000 points apart"),
-        ("few points of a scene", "at least 200 points of the scene's own"),
+        ("few points of a cloud", "at least 1,000 points"),
+        ("few points of a scene", "at least 200 points"),
     ],
 )
-def test_what_is_not_sure_is_refused(case, says, made, rng, tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "ROTATIONS", 150)
-    monkeypatch.setattr(module, "BEST", 2)
-    monkeypatch.setattr(module, "ROUNDS", QUICK)
-    marks, dense = made
+def test_an_unreliable_alignment_is_refused(case, found, made, rng, tmp_path):
+    tie_xyz, dense = made
     if case == "another place":
         blobs = [(2, 0, 1) * rng.normal(size=(4000, 3)) + rng.normal(size=3) * 3 for _ in range(6)]
         dense = np.concatenate(blobs)
     elif "box" in case:
-        marks, dense = box(2000, rng), box(30000, rng)
+        tie_xyz, dense = box(2000, rng), box(30000, rng)
     elif "cloud" in case:
         dense = dense[:500]
     else:
-        marks = marks[:50]
-    with pytest.raises(PointCloudError, match=says):
-        aligned(tmp_path, marks, dense)
+        tie_xyz = tie_xyz[:50]
+    with pytest.raises(PointCloudError, match=found):
+        aligned(tmp_path, tie_xyz, dense, QUICK)

@@ -45,7 +45,7 @@ class LoadedCloud(NamedTuple):
     @property
     def notes(self) -> list[str]:
         """What the user should know, one sentence each."""
-        return [] if self.alignment is None else [self.alignment.sentence]
+        return [] if self.alignment is None else [self.alignment.summary]
 
     def write(self, folder: Path) -> None:
         """Write the reports beside the scene, if there are any."""
@@ -56,7 +56,7 @@ class LoadedCloud(NamedTuple):
             report, picture = (folder / name for name in ALIGNMENT)
             write_json(report, found.report)
             off = found.residuals / (2 * CLOSE * found.extent)
-            preview_alignment(self.scene, found.sample, found.rgb, found.marks, off, picture)
+            preview_alignment(self.scene, found.sample, found.rgb, found.tie_points, off, picture)
 
 
 def load_cloud(options: Options, scene: Scene, method: Cloud, progress: Progress) -> LoadedCloud:
