@@ -207,7 +207,7 @@ def quality_table(name: str, options: argparse.Namespace) -> str:
     for arm in options.arms:
         method, profile, changes = ARMS[arm]
         if method == "depth":
-            changes = {"hold_out": HELD_OUT, **changes}
+            changes = {"test_every": HELD_OUT, **changes}
         clouds[arm] = ss.upsample(scene, method, ratio=RATIO, profile=profile, **changes)
     if options.pictures:
         draw(scene, clouds, options.pictures / f"{name.replace('/', '_')}.png")

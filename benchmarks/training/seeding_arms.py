@@ -115,7 +115,7 @@ def _seeds(scene: Scene, arm: str, settings: TrainSettings) -> PointCloud:
     name = chosen.pop("method")
     size = stereo_size(scene.split(TEST_EVERY)[0], settings, "cpu")
     known = {field.name for field in dataclasses.fields(ss.METHODS[name])}
-    given = {"hold_out": TEST_EVERY, "max_size": size}
+    given = {"test_every": TEST_EVERY, "max_size": size}
     method = configure(name, **{option: given[option] for option in known & given.keys()})
     points = ss.upsample(scene, method, budget=most_seeds(settings, settings.cap or 0), **chosen)
     return points.select(points.distinct)

@@ -73,10 +73,10 @@ def _moved(spec, **changes):
 COMMANDS = {
     "sfm": ["--method", "linear", "--ratio", "1"],
     "linear": ["--method", "linear", "--ratio", "2"],
-    "depth": ["--method", "depth", "--ratio", "2", "--depth", "DEPTH", "--depth.hold-out", "4"],
-    "cloud": ["--method", "cloud", "--cloud", "SCAN", "--cloud.hold-out", "4"],
-    "cloud+cover": ["--method", "cover", "--cloud", "SCAN", "--cloud.hold-out", "4",
-                    "--cover.hold-out", "4"],
+    "depth": ["--method", "depth", "--ratio", "2", "--depth", "DEPTH", "--depth.test-every", "4"],
+    "cloud": ["--method", "cloud", "--cloud", "SCAN", "--cloud.test-every", "4"],
+    "cloud+cover": ["--method", "cover", "--cloud", "SCAN", "--cloud.test-every", "4",
+                    "--cover.test-every", "4"],
 }  # fmt: skip
 
 

@@ -142,7 +142,7 @@ def test_depth_needs_maps_and_never_sees_the_test_photographs(small_plan, room_p
     facts = surveyed(room_path, with_depth=True)
     assert facts.depth == str(room_path)
     _, depth = plan_runs(plan, [facts], "cpu", "1")
-    assert depth.parameters == {"hold_out": plan.training.test_every}
+    assert depth.parameters == {"test_every": plan.training.test_every}
     assert depth.scene.depth_digest == facts.depth_digest
     with pytest.raises(SceneNotFoundError, match="folder of depth maps"):
         surveyed(room_path, depth=tmp_path / "none", with_depth=True)
@@ -160,7 +160,7 @@ def test_a_scan_is_part_of_what_its_methods_depend_on(small_plan, room_path, tmp
     assert {run.scene.cloud for run in others} == {str(scan)}
     every = plan.training.test_every
     assert [run.parameters for run in others] == [
-        {"hold_out": every}, {"hold_out": every, "cloud.hold_out": every},
+        {"test_every": every}, {"test_every": every, "cloud.test_every": every},
     ]  # fmt: skip
     scan.write_text("1 2 4\n" * 9)
     changed = plan_runs(plan, [surveyed(room_path, cloud=scan)], "cpu", "1")

@@ -105,8 +105,8 @@ def test_parameters_and_profiles_are_variants_of_their_own():
         run
         for method, changes in (
             ("mls", {"parameters": {"k": 12}}), ("mls", {"profile": "paper"}),
-            ("depth", {"parameters": {"hold_out": 8, "cloud.hold_out": 8}}),
-            ("depth", {"parameters": {"hold_out": 4}}),
+            ("depth", {"parameters": {"test_every": 8, "cloud.test_every": 8}}),
+            ("depth", {"parameters": {"test_every": 4}}),
             ("cloud", {"scan": "aaaa1"}), ("cloud", {"scan": "bbbb2"}),
         )
         for run in runs(scenes=FOX, gains={(method, 8): 0.1}, **changes)
@@ -114,7 +114,7 @@ def test_parameters_and_profiles_are_variants_of_their_own():
     study = one([*runs(scenes=FOX, repeats=2), *more])
     assert list(study.seeded) == [
         "linear 8x", "mls 4x", "mls 8x", "mls 8x k=12", "mls 8x (paper)", "depth 8x",
-        "depth 8x hold_out=4", "random 8x", "cloud 8x scan=aaaa", "cloud 8x scan=bbbb",
+        "depth 8x test_every=4", "random 8x", "cloud 8x scan=aaaa", "cloud 8x scan=bbbb",
     ]  # fmt: skip
     assert study.description.endswith("splatseed 0.1.0, 2 to 3 repeats")
 

@@ -117,7 +117,7 @@ WORDS = [
     ((*DEPTH, "--stereo", "--model", "some"), "--model"),
     ((*DEPTH, "--stereo", "--max-size", "5"), "--max-size"),
     ((*DEPTH, "--stereo", "--grid", "99"), "--grid"),
-    ((*DEPTH, "--stereo", "--hold-out", "1"), "--hold-out"),
+    ((*DEPTH, "--stereo", "--test-every", "1"), "--test-every"),
     ((*DEPTH, "--stereo", "--depth-kind", "z"), "--depth-kind"),
     ((*DEPTH, "--model", "some", "--colmap"), "--colmap"),
     ((*DEPTH, "--model", "nobody/Depth-Nothing-hf"), "nobody/Depth-Nothing-hf"),

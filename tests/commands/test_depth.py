@@ -100,7 +100,9 @@ def test_a_plain_folder(room, tmp_path, splatseed, stereo):
 
 @pytest.mark.usefixtures("stereo")
 def test_test_photographs_are_held_out_of_the_maps(room, tmp_path, splatseed):
-    assert splatseed("depth", room, "--stereo", "--hold-out", 8, "-o", tmp_path / "maps").code == 0
+    assert (
+        splatseed("depth", room, "--stereo", "--test-every", 8, "-o", tmp_path / "maps").code == 0
+    )
     train, test = load_scene(room).split(8)
     depths = find_depths(load_scene(room), tmp_path / "maps")
     assert sorted(depths) == [each.name for each in train]

@@ -48,7 +48,7 @@ def test_depth_captures_need_no_points_for_the_default(name, scenes, tmp_path, s
     assert "--poses-from" in run.err
     assert not list(tmp_path.iterdir())
     if name == "replica/room0":  # the other has 143 photographs
-        few = ["--auto.hold-out", 0, "--auto.max-size", 320]
+        few = ["--auto.test-every", 0, "--auto.max-size", 320]
         run = splatseed("upsample", scenes / name, *few, "-o", tmp_path / "out")
         assert run.code == 0
         assert len(load_scene(tmp_path / "out").points) > 3000

@@ -103,7 +103,7 @@ def test_an_upsampled_scene_keeps_what_is_known_of_its_points(distorted, tmp_pat
     np.testing.assert_array_equal(load_scene(twice).points.source, before.source)
     assert was_upsampled(load_scene(twice))
     facts = json.loads((seeded / "splatseed.json").read_text())
-    facts["parameters"]["hold_out"] = 0
+    facts["parameters"]["test_every"] = 0
     del facts["listed_tests_held_out"]
     (seeded / "splatseed.json").write_text(json.dumps(facts))
     assert splatseed("undistort", seeded, "-o", out, "--overwrite").code == 0

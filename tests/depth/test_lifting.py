@@ -99,7 +99,7 @@ def test_held_out_images_are_not_even_read(exact):
 
     names = set()
     scene = exact.replace(depths=Watched(exact.depths))
-    lifted(scene, 200, hold_out=8)
+    lifted(scene, 200, test_every=8)
     test_names = {image.name for image in scene.split(8)[1]}
     used = {image.name for image in scene.images} - test_names
     assert names == used

@@ -149,15 +149,16 @@ def test_a_scene_without_originals_keeps_what_its_points_are(scene, tmp_path, kn
 @pytest.mark.parametrize(
     ("told", "all_of_them"),
     [
-        ({"command": "upsample", "parameters": {"hold_out": 0}}, True),
-        ({"command": "upsample", "parameters": {"hold_out": 8}}, False),
+        ({"command": "upsample", "parameters": {"test_every": 0}}, True),
+        ({"command": "upsample", "parameters": {"hold_out": 0}}, True),  # as 0.3 wrote it
+        ({"command": "upsample", "parameters": {"test_every": 8}}, False),
         (
-            {"command": "upsample", "parameters": {"hold_out": 0}, "listed_tests_held_out": True},
+            {"command": "upsample", "parameters": {"test_every": 0}, "listed_tests_held_out": True},
             False,
         ),
         ({"command": "upsample", "parameters": {"k": 16}}, False),  # not made from photographs
         ({"command": "upsample"}, False),
-        ({"command": "write_scene", "parameters": {"hold_out": 0}}, False),
+        ({"command": "write_scene", "parameters": {"test_every": 0}}, False),
     ],
 )
 def test_seeds_that_saw_the_test_views_are_known(scene, tmp_path, told, all_of_them):

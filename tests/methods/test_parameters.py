@@ -40,7 +40,7 @@ WRONG_PARAMETERS = {
     "depth.min_agreeing": (13,),
     "depth.tolerance": (1,),
     "depth.color_tolerance": (2,),
-    "depth.hold_out": (1, -1),
+    "depth.test_every": (1, -1),
 }
 
 

@@ -96,7 +96,7 @@ def test_only_scenes_without_points_are_checked_and_say_what_was_found(room, pos
     upsample(room, "stereo", note=notes.append)
     assert len(notes) == 1
     with pytest.raises(SceneNotFoundError, match=r"beside those held out.*all 1 are held out"):
-        upsample(_posed(room, poses[:1]), hold_out=8)
+        upsample(_posed(room, poses[:1]), test_every=8)
 
 
 def test_noise_is_measured(room, poses):

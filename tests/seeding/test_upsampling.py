@@ -71,7 +71,7 @@ def test_held_out_photographs_are_never_read(method, room, monkeypatch):
     monkeypatch.setattr(
         view, "load_photograph", lambda path, *a: (read.append(path.name), load(path, *a))[1]
     )
-    ss.upsample(room, method, hold_out=4, cover=12)
+    ss.upsample(room, method, test_every=4, cover=12)
     names = sorted(image.name for image in room.images)
     assert sorted(set(read)) == [name for i, name in enumerate(names) if i % 4]
     if method == "cover":  # the same, where the scene itself says which test

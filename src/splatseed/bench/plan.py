@@ -295,8 +295,8 @@ class Plan:
 
     def _own_parameters(self, method: str) -> dict[str, Any]:
         """A method's own parameters, and what keeps the test photographs from it."""
-        looks = hasattr(METHODS[plain(method)], "hold_out")
-        held = {"hold_out": self.training.test_every} if looks else {}
+        looks = hasattr(METHODS[plain(method)], "test_every")
+        held = {"test_every": self.training.test_every} if looks else {}
         return {**held, **self.parameters.get(plain(method), {})}
 
     def arms(self, strategy: StrategyName) -> tuple[Arm, ...]:

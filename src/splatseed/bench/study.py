@@ -222,7 +222,10 @@ def _label(spec: RunSpec, several: Sequence[str]) -> str:
     if spec.arm.method == SFM:
         return SFM
     # A plan asks every method that looks at photographs to hold out the test views.
-    usual = [("hold_out", spec.training.test_every), ("cloud.hold_out", spec.training.test_every)]
+    usual = [
+        ("test_every", spec.training.test_every),
+        ("cloud.test_every", spec.training.test_every),
+    ]
     told = [f"{k}={v}" for k, v in sorted(spec.parameters.items()) if (k, v) not in usual]
     digests = {kind: getattr(spec.scene, _BESIDE[kind])[:4] for kind in several}
     told += [f"{kind}={digest}" for kind, digest in digests.items() if digest]

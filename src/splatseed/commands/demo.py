@@ -119,8 +119,8 @@ def run(arguments: list[str]) -> None:
 
 def _upsample_by(name: str, scene: Scene, ratio: float = RATIO) -> PointCloud:
     """The scene's points and new ones; methods that choose their number ignore the ratio."""
-    looks = hasattr(METHODS[name], "hold_out")
-    method = configure(name, hold_out=TEST_EVERY) if looks else configure(name)
+    looks = hasattr(METHODS[name], "test_every")
+    method = configure(name, test_every=TEST_EVERY) if looks else configure(name)
     return upsample(scene, method, ratio=None if chooses_number(name) else ratio, seed=SEED)
 
 

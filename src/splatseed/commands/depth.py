@@ -42,7 +42,7 @@ MAX_SIZE = 1600
 PICTURE = "preview_maps.png"
 PACKAGES = ("splatseed", "transformers", "torch", "numba", "numpy", "pillow", "scipy")
 OF_NETWORK = ("device", "depth_kind")
-OF_STEREO = ("colmap", "grid", "preview", "hold_out")
+OF_STEREO = ("colmap", "grid", "preview", "test_every")
 MIN_PIXELS = 3
 """Photographs that must confirm a point fused by COLMAP. Its default of 5 suits unconfirmed maps;
 our pixels are confirmed already, and few views see the borders."""
@@ -70,7 +70,7 @@ class Options:
     grid: int | None = None
     """With --stereo: one pixel of the map per block of GRID x GRID pixels of the photograph; 4 by
     default."""
-    hold_out: int | None = None
+    test_every: int | None = None
     """With --stereo: leave out every n-th image by name; 8 leaves out those that trainers test
     on."""
     preview: bool = False
@@ -91,7 +91,7 @@ def run(arguments: list[str]) -> None:
     """Run the verb with these arguments."""
     options = parse_options(Options, "depth", arguments)
     check_least(options, 1, "grid")
-    check_least(options, 2, "hold_out")
+    check_least(options, 2, "test_every")
     check_least(options, LEAST_SIZE if options.stereo else 1, "max_size")
     foreign = OF_NETWORK if options.stereo else OF_STEREO
     idle = [name for name in foreign if getattr(options, name) != getattr(Options, name)]
@@ -166,8 +166,8 @@ def _run_stereo(options: Options) -> None:
     with stage_display() as clock:
         clock("read", 0.0)
         scene = load_scene(options.scene, require_points=False)
-        if options.hold_out:
-            scene = scene.replace(images=scene.split(options.hold_out)[0])
+        if options.test_every:
+            scene = scene.replace(images=scene.split(options.test_every)[0])
         scene = with_photographs(scene) if scene.images else scene
         if options.colmap:
             dense.check_dense_scene(scene, undistorts=True)

@@ -88,7 +88,7 @@ class Settings:
     spread: bool = True
     """Spread points as evenly as their number allows, whatever image they come from (paper:
     no)."""
-    hold_out: int = 0
+    test_every: int = 0
     """Leave out every n-th image by name, as trainers do for testing (8); 0 = use all but
     test images that the scene lists."""
 

@@ -86,8 +86,8 @@ def lift(
     scene, center = _centered(scene)
     depths, visibility = scene.depths, find_visibility(scene)
     used = scene.images
-    if settings.hold_out or scene.listed:
-        used = scene.split(settings.hold_out)[0]
+    if settings.test_every or scene.listed:
+        used = scene.split(settings.test_every)[0]
     images = [image for image in used if depths is not None and image.name in depths]
     if depths is None or not images:
         raise SceneNotFoundError(

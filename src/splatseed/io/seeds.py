@@ -106,9 +106,11 @@ def saw_all_photographs(scene: Scene) -> bool:
     """Whether ``splatseed upsample`` made new points from photographs and held none out."""
     facts = _upsampling(scene) or {}
     try:
-        all_used = facts["parameters"]["hold_out"] == 0 and not facts.get("listed_tests_held_out")
+        parameters = facts["parameters"]  # splatseed 0.3 wrote hold_out
+        test_every = parameters.get("test_every", parameters.get("hold_out"))
+        all_used = test_every == 0 and not facts.get("listed_tests_held_out")
         return bool(facts["num_new"]) and all_used
-    except (TypeError, KeyError):
+    except (TypeError, KeyError, AttributeError):
         return False  # not made from photographs
 
 

@@ -95,8 +95,8 @@ def check_fields(method: Any) -> None:
     for field in dataclasses.fields(method):
         value, hint = getattr(method, field.name), hints[field.name]
         require(fits(value, hint), f"{label}.{field.name} as {describe_type(hint)}", value)
-    held = getattr(method, "hold_out", 0)
-    require(held == 0 or held >= 2, f"{label}.hold_out of 0 or 2 and more", held)
+    held = getattr(method, "test_every", 0)
+    require(held == 0 or held >= 2, f"{label}.test_every of 0 or 2 and more", held)
 
 
 def fits(value: object, hint: Any) -> bool:

@@ -34,7 +34,7 @@ class PhotographMethod:
 
     max_size: int = MAX_SIZE
     """Photographs are downsampled by a whole factor to at most this many pixels a side."""
-    hold_out: int = 0
+    test_every: int = 0
     """Leave out every n-th image by name, as trainers do for testing (8); 0 = use all but
     test images that the scene lists."""
 
@@ -65,9 +65,9 @@ class Stereo(PhotographMethod):
     ) -> tuple[StereoMap, ...]:
         """Depth and normals of photographs, as ``upsample`` computes them with this seed.
 
-        ``only`` indexes ``photographed(scene, hold_out)``.
+        ``only`` indexes ``photographed(scene, test_every)``.
         """
-        images = photographed(scene, self.hold_out)
+        images = photographed(scene, self.test_every)
         views = read_views(scene, images, self.max_size, progress)
         rng = np.random.default_rng(seed)
         stereo = compare(scene, images, views, self.grid, rng, progress, only)
@@ -88,7 +88,7 @@ class Stereo(PhotographMethod):
         """
         from splatseed.depth.stereo.depths import fuse  # noqa: PLC0415  (kernels load with use)
 
-        images = photographed(scene, self.hold_out)
+        images = photographed(scene, self.test_every)
         warnings: tuple[str, ...] = ()
         if not has_points(scene):
             from splatseed.seeding.poses import check_poses, low_agreement, pose_error  # noqa: PLC0415  (loads Numba)
@@ -129,7 +129,7 @@ class Cover(PhotographMethod):
                 found="none",
                 fix="Choose --method auto, which compares the photographs first.",
             )
-        views = read_views(scene, photographed(scene, self.hold_out), self.max_size, progress)
+        views = read_views(scene, photographed(scene, self.test_every), self.max_size, progress)
         return _cover(views, originals, self.cell, rng, progress)
 
 
@@ -172,16 +172,16 @@ def begins_from_points(scene: Scene) -> bool:
 
 
 def photographed(
-    scene: Scene, hold_out: int = 0, *, without: str = "choose --method mls"
+    scene: Scene, test_every: int = 0, *, without: str = "choose --method mls"
 ) -> tuple[Image, ...]:
-    """The images whose photographs are used, by name; ``hold_out`` as in ``PhotographMethod``.
+    """The images whose photographs are used, by name; ``test_every`` as in ``PhotographMethod``.
 
     Raises:
         SceneNotFoundError: There are none; the message says to do ``without``.
     """
     folder = scene.source.image_dir if scene.source else None
     ordered = sorted(scene.images, key=lambda image: image.name)
-    used = list(scene.split(hold_out)[0]) if hold_out or scene.listed else ordered
+    used = list(scene.split(test_every)[0]) if test_every or scene.listed else ordered
     if ordered and not used:
         raise SceneNotFoundError(
             "photographs beside those held out for testing",

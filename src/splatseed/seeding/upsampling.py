@@ -129,8 +129,8 @@ def upsample(
     if verify:
         cloud = _add_verified(whole, cloud, progress, note)
     if cover is not None:
-        held = getattr(made, "hold_out", 0)
-        cloud = add_cover(whole, cloud, cell=cover, hold_out=held, seed=seed, progress=progress)
+        held = getattr(made, "test_every", 0)
+        cloud = add_cover(whole, cloud, cell=cover, test_every=held, seed=seed, progress=progress)
     if most is not None:
         cloud = thin_to(whole, cloud, most, made, seed, progress, cell=cover)
     return cloud
@@ -185,14 +185,14 @@ def add_cover(
     cloud: PointCloud | None = None,
     *,
     cell: int = CELL,
-    hold_out: int = 0,
+    test_every: int = 0,
     seed: int = 0,
     progress: Progress = silent,
 ) -> PointCloud:
     """A cloud plus a seed for each part of the photographs that it leaves empty.
 
     Without a cloud, the scene's own; parts are ``cell`` pixels wide, at the size that methods use.
-    Every ``hold_out``-th photograph by name is left out; 0: none.
+    Every ``test_every``-th photograph by name is left out; 0: none.
 
     Raises:
         ParameterError: The side is below 1.
@@ -200,7 +200,7 @@ def add_cover(
         SceneNotFoundError: There are no photographs.
     """
     points = scene.points if cloud is None else cloud
-    images = photographed(scene, hold_out, without="do without cover")
+    images = photographed(scene, test_every, without="do without cover")
     views = read_views(scene, images, MAX_SIZE, progress)
     return with_cover(views, points, cell, seed, progress)
 
@@ -267,7 +267,7 @@ def thin_to(
     if not guessed.any() or guessed.all():
         return _keep(scene, points, num)
     known = points.select(~guessed)
-    images = photographed(scene, getattr(method, "hold_out", 0))
+    images = photographed(scene, getattr(method, "test_every", 0))
     views = read_views(scene, images, getattr(method, "max_size", MAX_SIZE), progress)
     cell = cell or int(getattr(method, "cell", CELL))
     # Guesses get what the measured points leave, and a tenth at least.

@@ -256,12 +256,12 @@ def _undistort(
 
 
 def refined(
-    scene: Scene, seed: int, progress: Progress = silent, *, hold_out: int = 0
+    scene: Scene, seed: int, progress: Progress = silent, *, test_every: int = 0
 ) -> tuple[Scene, str]:
     """The scene at refined poses, with the points that its photographs' features give.
 
     Its photographs, lenses and depth maps stay; its own points are replaced. The test views, every
-    ``hold_out``-th (0: none) or those of the scene's list, are refined with the others, but no
+    ``test_every``-th (0: none) or those of the scene's list, are refined with the others, but no
     point is of them. Also what was done, in a sentence.
 
     Raises:
@@ -270,7 +270,7 @@ def refined(
         MissingDependencyError: pycolmap is absent.
     """
     folder = photograph_folder(scene)
-    test = scene.split(hold_out)[1] if hold_out or scene.listed else ()
+    test = scene.split(test_every)[1] if test_every or scene.listed else ()
     with TemporaryDirectory(prefix="splatseed-refine-") as name:
         report = reconstruct(
             *(folder, Path(name) / "scene", Settings(seed=seed)),

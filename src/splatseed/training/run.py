@@ -242,7 +242,7 @@ def _at_refined_poses(
             fix="Name the scene that they were made from, or refine before seeds are made: "
             "splatseed upsample SCENE --refine-poses -o OUT.",
         )
-    scene, told = refined(scene, settings.seed, progress, hold_out=settings.test_every)
+    scene, told = refined(scene, settings.seed, progress, test_every=settings.test_every)
     note(told)
     return scene
 

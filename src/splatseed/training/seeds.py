@@ -85,7 +85,7 @@ def seeded(
     if saw_all_photographs(scene):
         note(
             "The seeds were made from all photographs, test views included, which may flatter the "
-            "score: train the scene itself, or seed without test views: --auto.hold-out 8."
+            "score: train the scene itself, or seed without test views: --auto.test-every 8."
         )
     if settings.seeding == "scene" or why_not_seeded(scene, settings):
         return scene, None
@@ -102,7 +102,7 @@ def seeded(
     size = stereo_size(scene.split(settings.test_every)[0], settings, device)
     cloud, stereo = upsample_with_stereo(
         scene,
-        Auto(hold_out=settings.test_every, max_size=size),
+        Auto(test_every=settings.test_every, max_size=size),
         None if settings.cap is None else most_seeds(settings, settings.cap),
         progress=progress,
         note=note,

@@ -225,8 +225,8 @@ def _upsample(options: Options, methods: dict[str, Any]) -> None:
             from splatseed.sfm import refined
 
             clock.expect("features", "matching", "refinement", "triangulation", "undistortion")
-            held = getattr(methods[options.method], "hold_out", 0)
-            scene, told = refined(scene, options.seed, clock, hold_out=held)
+            held = getattr(methods[options.method], "test_every", 0)
+            scene, told = refined(scene, options.seed, clock, test_every=held)
             notes.append(told)
         if options.recenter:
             scene = moved_by(scene, middle_of_cameras(scene))
@@ -307,7 +307,7 @@ def _announce(
     for warning in (*scene.warnings, *stray_notes(scene)):
         print_note(warning)
     name, method = options.method, methods[options.method]
-    if (listed := scene.listed) is not None and hasattr(method, "hold_out"):
+    if (listed := scene.listed) is not None and hasattr(method, "test_every"):
         tests = counted(len(listed.test), "test image")
         print_note(f"{tests} of the scene's {listed.origin} take no part in the seeds.")
     for other, given in methods.items():

@@ -109,7 +109,7 @@ def write_start(path: Path, scene: Scene, method: Upsampler, progress: Progress)
 
     Photographs that the method held out are not used.
     """
-    images = photographed(scene, getattr(method, "hold_out", 0))
+    images = photographed(scene, getattr(method, "test_every", 0))
     views = read_views(scene, images, MAX_SIZE, progress)
     settings = TrainSettings(strategy="grow", seed_colors=True)
     write_model(path, gaussians_of_scene(scene.points, views, settings))
@@ -142,7 +142,7 @@ def write_previews(
     if isinstance(method, Stereo):
         # Recomputed for the few that are shown: keeping all maps would take as much memory as the
         # views.
-        some = _some_of(photographed(scene, method.hold_out))
+        some = _some_of(photographed(scene, method.test_every))
         maps.preview_maps(scene, method.maps(scene, some, options.seed, clock), folder / MAPS)
     clock("preview", 1.0)
 

@@ -50,7 +50,7 @@ class Cloud:
     """Take colours from the photographs even if the cloud has some."""
     clean: bool = True
     """Leave out points that the photographs contradict, and points that float alone."""
-    hold_out: int = 0
+    test_every: int = 0
     """Leave out every n-th image by name, as trainers do for testing (8); 0 = use all."""
 
     name: ClassVar[str] = "cloud"
@@ -120,7 +120,7 @@ class GivenClouds(Cloud):
         if not len(voxels) or _is_elsewhere(streamed, scene):
             raise _out_of_view(streamed, scene)
         if scene.has_photographs:
-            images = photographed(scene, self.hold_out)
+            images = photographed(scene, self.test_every)
             views = read_views(scene, images, MAX_SIZE, progress)
         visibility = find_visibility(scene)
         nothing = np.empty((0, 3))
