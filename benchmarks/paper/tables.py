@@ -21,8 +21,8 @@ import pandas as pd
 import tyro
 from benchmarks.paper.gained import LAYOUT, RANDOM, Results, Way, read_results
 from benchmarks.paper.guidelines import at_ratio, verdict_table
+from benchmarks.paper.printed import printed_costs, printed_gains, printed_psnr
 
-from splatseed.bench.comparisons import paper_costs, paper_gains, paper_psnr
 from splatseed.bench.plan import SFM
 from splatseed.bench.statistics import Difference, adjusted, over_scenes
 from splatseed.bench.study_tables import NOISE
@@ -60,7 +60,7 @@ class Options:
     """Write the paper's tables, and the runs that they are of."""
 
     benches: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """Folders of ``splatseed bench``: of the presets paper-small and paper-depth, and others."""
+    """Folders of ``splatseed bench``: of the plans small.toml and depth.toml, and others."""
     output: Annotated[Path, tyro.conf.arg(aliases=("-o",))] = RESULTS
     """The folder of paper.md, whose tables are replaced."""
 
@@ -130,7 +130,7 @@ def _by_ratio(
 ) -> Table:
     """Gains by ratio and scene, and in full the scores too; with their means, and the paper's."""
     methods, rows = _columns(results, scenes), list[Row]()
-    theirs, printed = paper_psnr(key), paper_gains(key)
+    theirs, printed = printed_psnr(key), printed_gains(key)
     for ratio in results.ratios(scenes):
         shown, kinds = f"{ratio:g}x", [(method, ratio) for method in methods]
         run = {each: [results.gain(way, each, *kind) for kind in kinds] for each in scenes}
@@ -217,7 +217,7 @@ def _costs(results: Results, way: Way, key: str, scenes: Sequence[str]) -> Table
         ).dropna().mean()
         for name in COSTS
     }  # fmt: skip
-    printed = paper_costs(key).reindex(kinds)
+    printed = printed_costs(key).reindex(kinds)
     means |= {name: printed[name] for name in PRINTED}
     rows = list[Row]()
     for ratio in (1.0, *ratios):

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from functools import partial
+from pathlib import Path
 
 import pytest
 
@@ -26,6 +27,7 @@ from splatseed.io import load_scene
 from splatseed.runtime.tasks import HereTasks
 from splatseed.synthetic import make_capture
 
+PAPER_PLAN = Path(__file__).parents[2] / "benchmarks" / "paper" / "small.toml"
 COMMAND = (sys.executable, "-c", "from splatseed.cli import main; main()", "bench")
 
 
@@ -133,10 +135,10 @@ def test_presets_leave_out_what_is_not_there(bench, own_room, tmp_path):
     )
 
 
-def test_options_make_a_preset_smaller(bench, own_room, tmp_path):
+def test_options_make_a_plan_smaller(bench, own_room, tmp_path):
     for name in ("fern", "desk"):
         shutil.copytree(own_room, tmp_path / "data" / name)
-    words = ("--preset", "paper-small", "--data", tmp_path / "data", "--scenes", "desk", "fern")
+    words = ("--plan", PAPER_PLAN, "--data", tmp_path / "data", "--scenes", "desk", "fern")
     code, out, err = bench(*words, "--budgets", "9rho", "--repeats", 1, "--dry-run")
     assert (code, err) == (0, "")
     (tmp_path / "plan.toml").write_text(out)

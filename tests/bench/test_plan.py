@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from splatseed.bench.plan import SFM, Arm, Plan, RunResult, RunSpec, plan_runs
-from splatseed.bench.plan_file import plan_text, preset_plan, read_plan
+from splatseed.bench.plan_file import plan_text, read_plan
 from splatseed.bench.scenes import DEMO, PlannedScene, SceneFacts
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.scores import CurvePoint, EvalResult, ViewScore
@@ -20,6 +20,7 @@ from splatseed.training.settings import TrainSettings
 
 from .planted import surveyed
 
+PAPER_PLAN = Path(__file__).parents[2] / "benchmarks" / "paper" / "small.toml"
 TEXTS = st.text(st.characters(exclude_categories=["Cs"]), min_size=1, max_size=20)
 RATIOS = st.floats(1, 1e6, exclude_min=True)
 
@@ -264,7 +265,7 @@ def test_a_key_is_of_all_but_where_a_scene_lies_and_how_a_ratio_is_written():
 
 
 def test_budgets_leave_uncapped_strategies_alone():
-    plan = preset_plan("paper-small", Path("DIR"))
+    plan = read_plan(PAPER_PLAN, Path("DIR"))
     free, equal = map(plan.arms, plan.strategies)
     assert {arm.budget for arm in free} == {""}
     assert {arm.budget for arm in equal} == set(plan.budgets)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 import re
 from html import unescape
@@ -53,11 +52,10 @@ def test_a_whole_benchmark(tmp_path):
     planned = runs(scenes=scenes, strategies=strategies, repeats=2, **GONE)
     bench = write_bench(tmp_path / "b", planned)
     report = write_report(bench)
-    ids = {"summary", "cost", "scores", "gains", "curves", "resources", "guidelines", "setup"}
+    ids = {"summary", "cost", "scores", "gains", "curves", "resources", "setup"}
     assert ids <= ids_of(bench)
     names = {path.name for path in (bench / "tables").iterdir()}
-    wanted = ("table1_default-3dgs", "table2_default", "gains_default", "arms", "seconds",
-              "winners_default", "guidelines_default")  # fmt: skip
+    wanted = ("psnr_default-3dgs", "psnr_default", "gains_default", "arms", "seconds")
     assert {f"{name}.{kind}" for name in wanted for kind in ("csv", "md", "tex", "html")} <= names
     figures = {path.name for path in (bench / "figures").iterdir()}
     assert {"psnr_steps_default.png", "psnr_seconds_arms.png", "gain_arms.png"} <= figures
@@ -184,9 +182,7 @@ GOOD = (("linear", 2), 0.2), (("mls", 3), 0.5)
 
 
 def test_seeds_and_views_are_shown_and_not_made_again(tmp_path, capture, monkeypatch):
-    bench, true = with_capture(tmp_path / "b", *capture, *GOOD), pictures_module.describe
-    unknown = {"texture": math.nan}
-    monkeypatch.setattr(pictures_module, "describe", lambda *given: true(*given) | unknown)
+    bench = with_capture(tmp_path / "b", *capture, *GOOD)
     report, first = write_report(bench), (bench / REPORT).read_bytes()
     assert not report.notes
     assert len(list((bench / "figures").glob("clouds_.._a_room_*.png"))) == 1
@@ -194,9 +190,6 @@ def test_seeds_and_views_are_shown_and_not_made_again(tmp_path, capture, monkeyp
     shown = r"test view view1: sfm \+ none on the left, mls 3x \+ none on the right \(\+0\.\d\d dB"
     assert re.search(shown, text_of(bench))
     assert "FLIP of sfm + none FLIP of mls 3x + none" in text_of(bench)
-    kept = json.loads((bench / "descriptors.json").read_text("utf-8"), parse_constant=pytest.fail)
-    assert list(kept) == [capture[1]]
-    assert kept[capture[1]]["texture"] is None
     monkeypatch.setattr(pictures_module, "open_unchanged", pytest.fail)
     write_report(bench)
     assert (bench / REPORT).read_bytes() == first
@@ -212,7 +205,6 @@ def test_a_changed_scene_costs_its_pictures_alone_and_losers_are_not_called_the_
     path, digest = capture
     bench = with_capture(tmp_path / "b", path, digest[::-1], (("mls", 3), -0.1), noise=0.0)
     assert "expected the files of" in write_report(bench).notes[0]
-    assert "sfm,,," in (bench / "tables" / "winners_none.csv").read_text("utf-8")
     said = text_of(bench)
     assert "view1: sfm + none on the left, mls 3x + none on the right (-0.10 dB" in said
 

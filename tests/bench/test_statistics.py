@@ -13,7 +13,6 @@ from splatseed.bench.statistics import (
     adjusted,
     holm,
     over_scenes,
-    over_views_and_repeats,
     paired_differences,
     pooled_noise,
     these_scenes,
@@ -79,22 +78,6 @@ def test_over_scenes_is_scipys_one_sample_t_test(rng):
     assert ours.p == pytest.approx(expected.pvalue)
     assert ours.df == 6
     assert math.isnan(over_scenes([0.3]).p)
-
-
-def test_views_and_repeats_are_both_samples(rng):
-    """The stated variance is, on average, that of means of new views and new repeats."""
-    views, repeats, noise = 2.0, 1.0, 0.5
-    found, stated = [], []
-    for _ in range(4000):
-        gains = rng.normal(scale=views, size=6) + rng.normal(scale=repeats, size=(3, 1))
-        told = over_views_and_repeats(gains + rng.normal(scale=noise, size=(3, 6)))
-        found.append(told.mean)
-        stated.append(told.se**2)
-    assert np.mean(stated) == pytest.approx(np.var(found), rel=0.1)
-    one = over_views_and_repeats(np.array([[0.5, 0.6, 0.4]]))
-    same = over_scenes([0.5, 0.6, 0.4])
-    assert (one.mean, one.se, one.df, one.p) == pytest.approx((same.mean, same.se, same.df, same.p))
-    assert math.isnan(over_views_and_repeats(np.array([[0.5]])).se)
 
 
 def test_holm_step_by_step(rng):

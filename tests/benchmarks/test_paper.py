@@ -10,7 +10,6 @@ import pytest
 
 pytest.importorskip("pandas", reason="tables need pandas")
 
-from splatseed.bench.comparisons import paper_psnr
 from splatseed.bench.runs import Run
 from splatseed.bench.tables import to_markdown
 from splatseed.errors import SceneFormatError
@@ -66,7 +65,10 @@ def test_a_benchmark_that_was_killed_fills_the_page_and_blanks_the_rest(paper, t
     assert face[-1] == ""
     assert face[-2].startswith(f"**{np.mean(mls):.2f} / .800 (+0.")
     theirs = row(text, "bonsai, paper", "16x")
-    assert theirs[2] == f"{paper_psnr('mipnerf360').loc['bonsai', ('sfm', 1.0)]:.2f}"
+    assert (
+        theirs[2]
+        == f"{paper('printed').printed_psnr('mipnerf360').loc['bonsai', ('sfm', 1.0)]:.2f}"
+    )
     assert row(text, "mean", "4x")[-2].startswith("+0.6")
 
     ledger = pd.read_csv(tmp_path / "tables" / "paper_runs.csv")
@@ -119,3 +121,14 @@ def test_the_page_has_a_place_for_every_table(paper, tmp_path):
     for name, tables in paper("tables").page_tables(results).items():
         assert tables == []
         assert f"<!-- {name}:begin -->" in text
+
+
+def test_the_printed_gains_have_three_means(paper):
+    """All variants together, the best variant, the best of each scene; see docs/paper.md."""
+    for dataset, *expected in (
+        ("mipnerf360", 0.117, 0.202, 0.258),
+        ("replica", 0.343, 0.507, 0.646),
+    ):
+        gains = paper("printed").printed_gains(dataset)
+        means = [gains.to_numpy().mean(), gains.mean().max(), gains.max(axis=1).mean()]
+        assert means == pytest.approx(expected, abs=5e-4)

@@ -1,4 +1,4 @@
-"""Comparisons between runs: gains of variants, arms at equal cost, the paper's, two benchmarks.
+"""Comparisons between runs: gains of variants, arms at equal cost, two benchmarks.
 
 A *gain* is the PSNR of a run less that of its baseline, dB, paired by scene and repeat; an *arm* is
 a variant with a strategy. A run *reaches* a target when its test PSNR, linear between tests, first
@@ -10,8 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, lru_cache
-from importlib.resources import files
+from functools import lru_cache
 from itertools import product
 from typing import NamedTuple, TypeVar
 
@@ -23,7 +22,6 @@ from splatseed.bench.plan import SFM, RunResult, RunSpec
 from splatseed.bench.runs import Run
 from splatseed.bench.statistics import Difference, difference
 from splatseed.bench.study import Study, studies, variant_order
-from splatseed.seeding.advice import AS_IT_IS, ROOM, Measured, advise
 from splatseed.text import counted
 from splatseed.training.settings import StrategyName
 
@@ -234,88 +232,6 @@ def _over_scenes(frame: pd.DataFrame, column: str) -> Difference | None:
         return None
     means = frame.groupby("scene")[column].mean()
     return statistics.over_scenes(frame[column] if len(means) == 1 else means)
-
-
-_ROOMS = (1.0, 1.1, 1.3, 1.6, 2.0, 3.0, 5.0, 1e9)
-"""Candidate thresholds of the advice; the last leaves every scene as it is."""
-
-
-def score_advice(study: Study, strategy: StrategyName) -> pd.DataFrame:
-    """How good the advice is, leave-one-out: each scene's threshold is fitted on the others only.
-
-    A row per scene has the advised method (``advice``; None without a necessary run) and mean PSNR
-    in dB by method.
-    """
-    psnr = {scene: _by_method(study, strategy, scene) for scene in study.scenes}
-    known = {s: each for s, each in psnr.items() if AS_IT_IS in each and "auto" in each}
-    base = study.under(strategy)
-    base = base[base["seeds"] == SFM].drop_duplicates("scene").set_index("scene")
-
-    def followed(scene: str, room: float) -> str:
-        """The advised method, or the scene's points as they are if it was not run."""
-        run = base.loc[scene]
-        most = run["spec"].most_seeds or int(run["gaussians"])
-        said = advise(Measured(int(run["num_seeds"]), 0.0), most, strategy=strategy, room=room)
-        return said.method if said.method in known[scene] else AS_IT_IS
-
-    def advised(scene: str) -> str:
-        """By the threshold that suits the other scenes best; among equals the one in use."""
-
-        def served(room: float) -> tuple[float, bool]:
-            scores = (known[other][followed(other, room)] for other in known if other != scene)
-            return round(sum(scores), 6), room == ROOM
-
-        return followed(scene, max(_ROOMS, key=served))
-
-    rows = [{"advice": advised(s) if s in known else None, **each} for s, each in psnr.items()]
-    return pd.DataFrame(rows, index=list(psnr))
-
-
-def _by_method(study: Study, strategy: StrategyName, scene: str) -> dict[str, float]:
-    """Mean PSNR over repeats by method; the first variant stands for its method."""
-    means = study.scores(strategy, scene).mean(axis=1).dropna()
-    scores: dict[str, float] = {}
-    for label in [*means.index[means.index != SFM], *means.index[means.index == SFM]]:
-        variant = study.variants[label]
-        if variant.profile == "default":
-            scores.setdefault(variant.method, float(means[label]))
-    return scores
-
-
-DATASETS = {"mipnerf360": "Mip-NeRF360", "replica": "Replica"}
-PAPER_TABLES = {"mipnerf360": "table1", "replica": "table2"}
-
-
-@cache
-def paper_psnr(key: str) -> pd.DataFrame:
-    """The paper's PSNR on a dataset (30,000 steps): a row per scene, a column per method and ratio.
-
-    Example:
-        >>> float(paper_psnr("mipnerf360").loc["bonsai", ("sfm", 1.0)])
-        32.291
-    """
-    return _read(f"{PAPER_TABLES[key]}_{key}_psnr.csv").pivot_table(
-        index="scene", columns=["method", "ratio"], values="psnr_db", sort=False
-    )
-
-
-@cache
-def paper_gains(key: str) -> pd.DataFrame:
-    """The paper's PSNR less that of the cloud as it is, dB."""
-    table = paper_psnr(key)
-    return table.drop(columns=[(SFM, 1.0)]).sub(table[SFM, 1.0], axis=0)
-
-
-def paper_costs(key: str) -> pd.DataFrame:
-    """The paper's train_time_s and model_size_mb by method and ratio, not of all that it scored."""
-    table = _read("table3_time_size.csv")
-    return table[table["dataset"] == key].set_index(["method", "ratio"])
-
-
-@cache
-def _read(name: str) -> pd.DataFrame:
-    with (files("splatseed.bench") / "data" / name).open(encoding="utf-8") as file:
-        return pd.read_csv(file, dtype={"ratio": float})
 
 
 Place = tuple[StrategyName, str, str]

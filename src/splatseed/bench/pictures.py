@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 import re
 import tempfile
 from collections.abc import Mapping
@@ -23,75 +22,53 @@ from jaxtyping import UInt8
 
 from splatseed.bench.comparisons import baseline_of, rivals
 from splatseed.bench.figures import shown_seeds
-from splatseed.bench.guidelines import Descriptors, describe
 from splatseed.bench.job import make_seeds, open_unchanged
 from splatseed.bench.plan import RunSpec
 from splatseed.bench.runs import run_folder
 from splatseed.bench.study import Study
 from splatseed.errors import SplatseedError
-from splatseed.io.files import read_file, read_text
+from splatseed.io.files import read_file
 from splatseed.io.photograph import decode_photograph, photograph_bytes
-from splatseed.io.staging import write_json
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 from splatseed.viewer.clouds import preview_methods
 
 FIGURES = "figures"
-_DESCRIPTORS = "descriptors.json"
 _MOST = 10  # clouds in a picture
 _SIDE, _CLOUD_SIDE = 960, 1800
 
 
 @dataclass
 class ScenePictures:
-    """A study's scenes: descriptors, file name without suffix and PNG, and what is not shown."""
+    """Pictures of a study's scenes: file name without suffix and PNG; notes on missing ones."""
 
-    described: dict[str, Descriptors] = field(default_factory=dict)
     clouds: dict[str, tuple[str, bytes]] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
 
 def scene_pictures(bench: Path, study: Study, progress: Progress = silent) -> ScenePictures:
-    """Descriptors and pictures of a study's scenes, kept or new."""
-    pictures, kept = ScenePictures(), _kept_descriptors(bench)
+    """Draw the seeds of a study's scenes; read pictures that an earlier report drew."""
+    pictures = ScenePictures()
     for scene in study.scenes:
         runs = study.runs[study.runs["scene"] == scene].sort_values("repeat", kind="stable")
         first = runs.drop_duplicates("seeds").set_index("seeds")["spec"].to_dict()
         shown = shown_seeds(study, [label for label in study.seeded if label in first])
         specs: dict[str, RunSpec] = {label: first[label] for label in shown[:_MOST]}
-        any_run: RunSpec = runs["spec"].iloc[0]
-        digest = any_run.scene.digest
+        digest = runs["spec"].iloc[0].scene.digest
         told = [digest, *((name, each.key) for name, each in specs.items())]
         key = hashlib.blake2b(json.dumps(told).encode(), digest_size=8).hexdigest()
         name = re.sub(r"[^\w.-]+", "_", f"clouds_{scene}_{key}")  # a scene's can have slashes
         with suppress(OSError):
             pictures.clouds[scene] = name, read_file(bench / FIGURES / f"{name}.png")
+        if not specs or scene in pictures.clouds:
+            continue
+        facts = [spec.scene for spec in specs.values()]
         try:
-            if digest not in kept or (specs and scene not in pictures.clouds):
-                facts = [spec.scene for spec in (*specs.values(), any_run)]
-                opened = open_unchanged(next((each for each in facts if each.depth), facts[0]))
-                if digest not in kept:
-                    kept[digest] = describe(opened, progress)
-                if specs and scene not in pictures.clouds:
-                    pictures.clouds[scene] = name, _draw_seeds(opened, specs, progress, bench)
+            opened = open_unchanged(next((each for each in facts if each.depth), facts[0]))
+            pictures.clouds[scene] = name, _draw_seeds(opened, specs, progress, bench)
         except SplatseedError as error:
-            pictures.notes.append(f"{scene}: its points are not shown or described: {error}")
-        if digest in kept:
-            pictures.described[scene] = kept[digest]
-    if kept:  # JSON has no NaN: what is unknown is null
-        described = {digest: {k: None if math.isnan(v) else v for k, v in each.items()}
-                     for digest, each in kept.items()}  # fmt: skip
-        write_json(bench / _DESCRIPTORS, described)
+            pictures.notes.append(f"{scene}: its points are not shown: {error}")
     return pictures
-
-
-def _kept_descriptors(bench: Path) -> dict[str, Descriptors]:
-    """The descriptors of an earlier report, by fingerprint; empty if there are none."""
-    with suppress(OSError, ValueError, TypeError, AttributeError):
-        content = json.loads(read_text(bench / _DESCRIPTORS))
-        return {digest: {k: math.nan if v is None else float(v) for k, v in each.items()}
-                for digest, each in content.items()}  # fmt: skip
-    return {}
 
 
 def _draw_seeds(

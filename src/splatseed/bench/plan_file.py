@@ -21,7 +21,7 @@ from splatseed.io.files import StrPath, read_text
 from splatseed.methods.method import describe_type, fits
 from splatseed.training.settings import TrainSettings
 
-PresetName = Literal["mipnerf360", "replica", "paper-small", "paper-depth", "laptop", "quick"]
+PresetName = Literal["mipnerf360", "replica", "laptop", "quick"]
 PLAN = "plan.toml"
 """The name of the plan in the folder of a benchmark."""
 _FILES = ("path", "depth", "cloud")

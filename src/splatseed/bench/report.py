@@ -26,7 +26,6 @@ from splatseed.bench.comparisons import (
     gains,
     rivals,
 )
-from splatseed.bench.guidelines import guideline_table, guidelines, winner_table
 from splatseed.bench.plan import SFM
 from splatseed.bench.plan_file import PLAN
 from splatseed.bench.runs import Run, counts, read_calls, read_runs
@@ -260,20 +259,14 @@ def _study_sections(
             tables.scene_arm_table(study, base), figures.seconds_figure(study),
             tables.seconds_table(study, base),
         ]  # fmt: skip
-    yield "scores", "Scores", [table for s in each for table in tables.psnr_tables(study, s)]
+    yield "scores", "Scores", [tables.psnr_table(study, s) for s in each]
     gained: list[Part] = []
-    guided: list[Part] = []
     for s in each:
-        known = gains(study, s)
-        if known.seeds:
+        if gains(study, s).seeds:
             gained += [tables.gain_table(study, s), figures.scene_figure(study, s)]
-            derived = guidelines(study, known, drawn.described)
-            guided += [winner_table(known, drawn.described), guideline_table(derived, s)]
-            guided.append(tables.advice_table(study, s) if study.settings["budget"] else None)
-    yield "gains", "Gains", [*gained, tables.mean_gain_table(study)] if gained else []
+    yield "gains", "Gains", gained
     yield "curves", "Curves", [figures.curve_figure(study, s) for s in each]
     yield "resources", "Time and memory", [tables.cost_table(study, s) for s in each]
-    yield "guidelines", "Guidelines", guided
 
 
 def _run_parts(runs: Sequence[Run], found: Sequence[Study]) -> Iterator[Part]:

@@ -176,33 +176,6 @@ def over_scenes(means: Sequence[float] | Float64[np.ndarray, " S"]) -> Differenc
     return difference(float(values.mean()), se, n - 1, n)
 
 
-def over_views_and_repeats(gains: Float64[np.ndarray, "R V"]) -> Difference:
-    """The mean of paired differences, for views and repeats like these.
-
-    Both are samples. With the variances v of the views' means, r of the repeats' means and e of
-    what is left, the mean's is v / V + r / R - e / (V R), in the two-way model with random effects
-    and one value in each cell (Montgomery, Design and Analysis of Experiments, ch. 13); here it is
-    not less than either of the first two terms. Degrees of freedom are Satterthwaite's. A single
-    repeat says nothing of repeats, and a single view nothing of views.
-
-    Args:
-        gains: The difference in each repeat and view, finite, [R, V], at least one.
-    """
-    repeats, views = gains.shape
-    mean = float(gains.mean())
-    by_repeat, by_view = gains.mean(axis=1), gains.mean(axis=0)
-    of_views = float(by_view.var(ddof=1)) / views if views > 1 else 0.0
-    of_repeats = float(by_repeat.var(ddof=1)) / repeats if repeats > 1 else 0.0
-    free = (repeats - 1) * (views - 1)
-    left = gains - by_repeat[:, None] - by_view + mean
-    shared = float(np.sum(left**2)) / free / gains.size if free else 0.0
-    variance = max(of_views + of_repeats - shared, of_views, of_repeats)
-    squares = of_views**2 / max(views - 1, 1) + of_repeats**2 / max(repeats - 1, 1)
-    df = (of_views + of_repeats) ** 2 / squares if squares > 0 else max(repeats, views) - 1
-    se = math.sqrt(variance) if gains.size > 1 else math.nan
-    return difference(mean, se, df, gains.size)
-
-
 def holm(p: Sequence[float]) -> tuple[float, ...]:
     """Holm's adjustment of p values for their number; NaN stay so and do not count.
 

@@ -1,21 +1,18 @@
-"""The tables of a study: scores, gains, costs, arms at equal cost, advice; and of comparisons.
+"""Tables of a study (scores, gains, costs, arms at equal cost) and of a comparison.
 
-Means are over runs within a scene first, then over scenes; the paper's numbers have rows or columns
-of their own where a scene's name is one of its scenes; nothing is best that could be noise.
+Means are over the runs of a scene first, then over scenes. Only a significant gain is marked best.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from statistics import fmean
 
-import pandas as pd
 from scipy.stats import sem
 
 from splatseed.bench import comparisons
-from splatseed.bench.comparisons import DATASETS, PAPER_TABLES, ArmKey, compared_arms, gains
+from splatseed.bench.comparisons import ArmKey, compared_arms, gains
 from splatseed.bench.plan import SFM
 from splatseed.bench.statistics import Difference
 from splatseed.bench.study import Study
@@ -23,8 +20,6 @@ from splatseed.bench.tables import Cell, Number, Row, Table, make_table
 from splatseed.training.settings import StrategyName
 
 NOISE, CLEAR, ONE_RUN = "~", "†", "(1 run)"
-_FEWEST = 3
-"""Scenes from which on advice is scored."""
 _COSTS = {
     "num_seeds": ("seeds", 0), "seeding": ("upsampling, s", 2), "training": ("training, s", 1),
     "memory": ("peak memory, MB", 0), "gpu_memory": ("peak GPU memory, MB", 0),
@@ -58,39 +53,12 @@ def _ratio_cell(log: Difference | None) -> Cell:
     return Number(math.exp(log.mean), mark=NOISE if log.verdict == "within noise" else "")
 
 
-def psnr_tables(study: Study, strategy: StrategyName) -> list[Table]:
-    """PSNR by scene and variant: a table per dataset of the paper, and one for other scenes."""
-    left, tables = study.scenes_under(strategy), []
-    for key in (*DATASETS, ""):
-        scenes = [each for each in left if not key or each in comparisons.paper_psnr(key).index]
-        left = tuple(each for each in left if each not in scenes)
-        if scenes:
-            tables.append(_psnr_table(study, strategy, key, scenes))
-    return tables
-
-
-def _psnr_table(study: Study, strategy: StrategyName, key: str, scenes: Sequence[str]) -> Table:
-    columns, rows = (SFM, *study.seeded_under(strategy)), Rows()
-    for scene in scenes:
-        rows.append(_psnr_row(study, strategy, scene, columns))
-        if key:
-            printed = comparisons.paper_psnr(key).loc[scene].reindex(_entries(study, columns))
-            rows.append((f"{scene} (paper)", *map(Number, printed)))
-    printed_note = (
-        "Rows '(paper)' are the numbers printed there: 30,000 steps, a quarter (outdoors) or half "
-        "(indoors) of the size of Mip-NeRF360's photographs. Compare gains, not levels."
-    )
-    table = make_table(
-        "table_scenes", ("scene", *columns), rows, strategy=strategy, description=study.description,
-        dataset=DATASETS.get(key, "other scenes"), printed=printed_note if key else "",
-    )  # fmt: skip
-    return replace(table, name=f"{PAPER_TABLES[key]}_{strategy}") if key else table
-
-
-def _entries(study: Study, labels: Sequence[str]) -> list[tuple[str, float]]:
-    """Method and ratio of variants, by which the paper's tables are ordered."""
-    arms = [study.variants.get(label) for label in labels]
-    return [(arm.method, arm.ratio) if arm else (SFM, 1.0) for arm in arms]
+def psnr_table(study: Study, strategy: StrategyName) -> Table:
+    """PSNR by scene and variant."""
+    columns = (SFM, *study.seeded_under(strategy))
+    rows = [_psnr_row(study, strategy, s, columns) for s in study.scenes_under(strategy)]
+    return make_table("psnr", ("scene", *columns), rows, strategy=strategy,
+                      description=study.description)  # fmt: skip
 
 
 def _psnr_row(study: Study, strategy: StrategyName, scene: str, labels: Sequence[str]) -> Row:
@@ -115,7 +83,7 @@ def _psnr_row(study: Study, strategy: StrategyName, scene: str, labels: Sequence
 
 
 def cost_table(study: Study, strategy: StrategyName) -> Table:
-    """Time, memory and size by variant, over the scenes that sfm has too; the paper's beside."""
+    """Time, memory and size by variant, over the scenes that sfm has too."""
     part = study.under(strategy)
     part = part[part["scene"].isin(part.loc[part["seeds"] == SFM, "scene"])]
     means = part.groupby(["seeds", "scene"])[list(_COSTS)].mean().groupby("seeds").mean()
@@ -128,21 +96,16 @@ def cost_table(study: Study, strategy: StrategyName) -> Table:
     counts = part.groupby("seeds")["scene"].nunique().reindex(means.index)
     columns["scenes"] = [Number(each, 0) for each in counts]
     labels, scenes = list(means.index), tuple(sorted(set(part["scene"])))
-    for key, title in DATASETS.items():
-        if set(scenes) & set(comparisons.paper_psnr(key).index):
-            printed = comparisons.paper_costs(key).reindex(_entries(study, labels))
-            for name, what in (("train_time_s", "training, s"), ("model_size_mb", "model, MB")):
-                columns[f"paper, {what} ({title})"] = [Number(each, 0) for each in printed[name]]
     devices = sorted({result.device for result in study.under(strategy)["result"]})
     return make_table(
-        "table3", ("method", *columns), list(zip(labels, *columns.values(), strict=True)),
+        "costs", ("method", *columns), list(zip(labels, *columns.values(), strict=True)),
         strategy=strategy, count=len(scenes), scenes=", ".join(scenes),
         devices=", ".join(devices), description=study.description,
     )  # fmt: skip
 
 
 def gain_table(study: Study, strategy: StrategyName) -> Table:
-    """What each variant gains: on each scene, on these, on scenes like these, and in the paper."""
+    """What each variant gains: on each scene, on these, and on scenes like these."""
     gained = gains(study, strategy)
     rows: Rows = [
         (
@@ -158,39 +121,8 @@ def gain_table(study: Study, strategy: StrategyName) -> Table:
     if len(gained.scenes) > 1:
         like = (_gain_cell(each, alone="(1 scene)") for each in gained.on_like.values())
         rows.append(("mean, scenes like these", *like))
-    for key, title in DATASETS.items():
-        printed = comparisons.paper_gains(key)
-        scenes = [scene for scene in gained.scenes if scene in printed.index]
-        means = printed.loc[scenes].mean().reindex(_entries(study, gained.seeds))
-        if means.notna().any():
-            name = f"paper, {len(scenes)} of {len(printed)} {title} scenes"
-            rows.append((name, *(Number(mean, 3, signed=True) for mean in means)))
     return make_table("gains", ("scene", *gained.seeds), rows, strategy=strategy,
                       description=study.description)  # fmt: skip
-
-
-def mean_gain_table(study: Study) -> Table:
-    """The three kinds of mean gain, ours by strategy and the paper's."""
-    known, rows = {}, Rows()
-    for strategy in study.strategies:
-        gained = gains(study, strategy)
-        known[f"ours, {strategy}"] = pd.DataFrame([gained.means(s) for s in gained.scenes])
-    for key, title in DATASETS.items():
-        printed = comparisons.paper_gains(key)
-        labels = [f"{method} {ratio:g}x" for method, ratio in printed.columns]
-        known[f"paper, {title}"] = printed.set_axis(labels, axis=1)
-    for name, table in known.items():
-        complete = table.dropna(axis=1)  # the variants that every scene has
-        if not complete.empty:
-            means = complete.mean()
-            best = str(means.idxmax())
-            kinds = means.mean(), means[best], complete.max(axis=1).mean()
-            over_all, over_best, over_each = (Number(each, 3, signed=True) for each in kinds)
-            whole = (Number(size, 0) for size in complete.shape)
-            rows.append((name, over_all, over_best, best, over_each, *whole))
-    header = ("", "all variants together", "best single variant", "which",
-              "best of each scene (unfair)", "scenes", "variants")  # fmt: skip
-    return make_table("mean_gains", header, rows)
 
 
 def arm_table(study: Study) -> Table:
@@ -260,33 +192,6 @@ def seconds_table(study: Study, base: ArmKey) -> Table:
     header = ("seeds", "strategy", "seconds in all", f"gain at {base.label}'s seconds, dB",
               f"runs that reach {base.label}'s PSNR", "time to it", "steps to it")  # fmt: skip
     return make_table("seconds", header, rows, base=base.label)
-
-
-def advice_table(study: Study, strategy: StrategyName) -> Table | None:
-    """The advice for each scene, and its worth; None for too few scenes."""
-    scores = comparisons.score_advice(study, strategy)
-    left_out = scores.index[scores["advice"].isna()]
-    scores = scores.drop(left_out).dropna(axis=1, how="all")
-    if len(scores) < _FEWEST:
-        return None
-    psnr, advice = scores.drop(columns="advice").astype(float), scores["advice"]
-    advised = pd.Series([psnr.loc[scene, of] for scene, of in advice.items()], psnr.index)
-    best, missed = psnr.idxmax(axis=1), psnr.max(axis=1) - advised
-    always = (SFM, "mls", "auto")
-    over = pd.DataFrame({each: advised - psnr.get(each, math.nan) for each in always})
-    rows: Rows = [
-        (scene, advice[scene], best[scene], Number(missed[scene]),
-         *(Number(each, signed=True) for each in over.loc[scene]))
-        for scene in scores.index
-    ]  # fmt: skip
-    means = (Number(mean, signed=True) for mean in over.mean())
-    rows.append(("mean", "", "", Number(missed.mean()), *means))
-    over_always = (f"gain over always {each}" for each in always)
-    return make_table(
-        "advice", ("scene", "advice", "best arm", "missed, dB", *over_always), rows,
-        strategy=strategy, right=(missed <= 0.1).sum(), count=len(missed),
-        left_out=f"Left out for want of runs: {', '.join(left_out)}." if len(left_out) else "",
-    )  # fmt: skip
 
 
 def comparison_tables(comparison: comparisons.Comparison) -> tuple[Table, Table, Table]:

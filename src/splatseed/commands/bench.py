@@ -96,11 +96,10 @@ class Options:
     clouds: tuple[Path, ...] = ()
     """For methods cloud and cloud+auto: the scan of each scene, in its frame (docs/scans.md)."""
     preset: PresetName | None = None
-    """A ready-made plan: the paper's data sets; its tables at a quarter of the size (paper-small,
-    paper-depth); laptop, four real scenes on one core; all with --data. Or quick, on a synthetic
-    room."""
+    """A ready-made plan: the scenes of Mip-NeRF360 or Replica, or four for one core (laptop), each
+    with --data; or quick, on a synthetic room."""
     data: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """The folder of a preset's scenes."""
+    """The folder of the scenes of a preset or a plan; missing scenes are skipped."""
     plan: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """A plan as printed by --dry-run; other options change it."""
     dry_run: bool = False
@@ -162,7 +161,8 @@ def parse_plan(arguments: Sequence[str]) -> tuple[Options, Plan]:
         (not (output or options.dry_run), "-o BENCH, the folder of the benchmark", "none",
          "Name one, or --dry-run."),
         (options.plan and preset, "--plan or --preset", "both", "Leave one of them out."),
-        (data and not preset, "--preset with --data", "none", "Name the preset."),
+        (data and not (preset or options.plan), "--preset or --plan with --data", "neither",
+         "Name the preset."),
         (data and preset == "quick", "--scenes for the preset quick", "--data",
          "Name scenes, or none."),
         (named and not data, f"--data DIR, the folder of the scenes of {preset}", "none",
@@ -174,7 +174,7 @@ def parse_plan(arguments: Sequence[str]) -> tuple[Options, Plan]:
     if preset is not None:
         plan = preset_plan(preset, data)
     elif options.plan is not None:
-        plan = read_plan(options.plan)
+        plan = read_plan(options.plan, data)
     elif output and not options.scenes and (output / PLAN).is_file():
         plan = read_plan(output / PLAN)
     plan = _changed(plan, options)
@@ -297,7 +297,7 @@ def _prepare(
                     raise
                 notes.append(f"{scene.label} is left out: {error}")
     if not present:
-        expected = f"scenes of {options.preset} in {options.data}"
+        expected = f"scenes of {options.preset or options.plan} in {options.data}"
         found = f"none of {', '.join(scene.label for scene in plan.scenes)}"
         raise SceneNotFoundError(expected, found=found, fix="Name the folder that holds them.")
     plan = replace(plan, scenes=tuple(scene for scene, _ in present))
