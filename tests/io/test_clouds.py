@@ -107,11 +107,11 @@ def test_glb_of_a_scene(tmp_path, points):
     ],
 )
 def test_lzf_references(block, expected):
-    from splatseed.io.clouds.pcd import _decompress
+    from splatseed.io.clouds._kernels import decompress_lzf
 
     for cut, longer in ((0, 0), (0, 1), (1, 0)):
         out = np.empty(len(expected) + longer, np.uint8)
-        complete = _decompress(np.frombuffer(block[: len(block) - cut], np.uint8), out)
+        complete = decompress_lzf(np.frombuffer(block[: len(block) - cut], np.uint8), out)
         assert complete == (not cut and not longer)
         assert not complete or out.tobytes() == expected
 

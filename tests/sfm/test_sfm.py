@@ -25,7 +25,7 @@ from splatseed.pointcloud import PointCloud
 from splatseed.runtime import tasks
 from splatseed.scene import Scene, Split
 from splatseed.sfm import Settings, reconstruct
-from splatseed.sfm.colmap import clear_orientation, drop_repeats
+from splatseed.sfm.export import clear_orientation, drop_repeats
 from splatseed.similarity import fit_similarity
 
 pycolmap = pytest.importorskip("pycolmap")

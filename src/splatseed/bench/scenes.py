@@ -18,7 +18,7 @@ from splatseed.depthmap import DepthMaps
 from splatseed.errors import SceneNotFoundError
 from splatseed.io import find_depths, load_originals
 from splatseed.io.clouds import open_cloud
-from splatseed.io.colmap import scene_root
+from splatseed.io.colmap_model import scene_root
 from splatseed.io.files import open_file, read_bytes
 from splatseed.io.load import search_depths
 from splatseed.io.photograph import photograph_bytes

@@ -1,24 +1,11 @@
 """Reading and writing scenes, a file or folder per format.
 
-``load_scene`` recognises what a path holds; ``write_scene`` makes a folder that every 3D Gaussian
-Splatting trainer loads unchanged; ``find_depths`` finds the depth maps of a scene's images.
-Promise: malformed input and failing output raise one error from ``splatseed.errors``; importing
-this package loads neither Numba nor SciPy.
+``load_scene`` detects the format of a path; ``write_scene`` writes a folder that every 3D Gaussian
+Splatting trainer loads unchanged; ``find_depths`` finds the depth maps of a scene's images. Bad
+input and failed output raise one error from ``splatseed.errors``.
 """
 
-from splatseed.io.cleaning import clean_scene
-from splatseed.io.depth_maps import DepthFiles, DepthWriter, depth_folder
-from splatseed.io.load import find_depths, load_originals, load_scene
-from splatseed.io.write import WriteReport, write_scene
+import lazy_loader
 
-__all__ = [
-    "DepthFiles",
-    "DepthWriter",
-    "WriteReport",
-    "clean_scene",
-    "depth_folder",
-    "find_depths",
-    "load_originals",
-    "load_scene",
-    "write_scene",
-]
+# The names, with their types, stand in __init__.pyi; each is loaded when it is first used.
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

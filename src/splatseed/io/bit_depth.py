@@ -12,17 +12,15 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jaxtyping import UInt16
+from PIL import Image as PilImage
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io.files import guarded, open_file, read_bytes
 from splatseed.text import counted
-
-if TYPE_CHECKING:
-    from PIL import Image as PilImage
 
 WHITE = 65535
 """White where all 16 bits are used."""
@@ -60,8 +58,6 @@ def _layout(photograph: PilImage.Image) -> str:
 
 def wide_values(encoded: bytes) -> UInt16[np.ndarray, "H W C"]:
     """The values of an image that ``is_wide``; C = 1 (grey), 2 (grey, alpha), 3 or 4."""
-    from PIL import Image as PilImage  # noqa: PLC0415  (slow to import)
-
     picture = PilImage.open(BytesIO(encoded))
     layout = _layout(picture)
     if layout not in _LOW_BYTES:
@@ -114,8 +110,6 @@ def find_white(paths: Sequence[Path]) -> tuple[int, list[str]]:
 
 
 def _wide_file(path: Path) -> bool:
-    from PIL import Image as PilImage  # noqa: PLC0415  (slow to import)
-
     try:
         with guarded(path, "an image"), open_file(path) as file:
             return is_wide(PilImage.open(file))

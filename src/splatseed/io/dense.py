@@ -18,6 +18,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
+from PIL import Image as PilImage
 
 from splatseed.camera import Camera, Intrinsics
 from splatseed.errors import OutputError, ParameterError, SceneFormatError
@@ -199,8 +200,6 @@ def check_dense_scene(scene: Scene, *, undistorts: bool = False) -> dict[str, Si
 
 
 def _size_of(image: Image, folder: Path, *, undistorts: bool) -> Size:
-    from PIL import Image as PilImage  # noqa: PLC0415  (slow to import)
-
     lens = image.intrinsics
     if lens.has_distortion and not undistorts:
         raise SceneFormatError(
@@ -372,8 +371,6 @@ def _bring_photographs(
     bring({f"images/{name}": source / name for name in straight}, folder, copy=copy)
 
     def work(start: int, stop: int) -> None:
-        from PIL import Image as PilImage  # noqa: PLC0415  (slow to import)
-
         for image in bent[start:stop]:
             path, target = source / image.name, folder / "images" / image.name
             encoded = photograph.photograph_bytes(path)

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
 import numpy as np
+from PIL import Image as PilImage
 
 from splatseed.depthmap import DepthKind
 from splatseed.io.files import StrPath, guarded, read_bytes, read_npy
@@ -125,8 +126,6 @@ def _body(data: bytes, header: re.Match[bytes], dtype: str) -> np.ndarray:
 
 
 def _read_picture(_: Path, data: bytes) -> np.ndarray:
-    from PIL import Image as PilImage  # noqa: PLC0415  (slow to import)
-
     with PilImage.open(io.BytesIO(data), formats=("PNG", "TIFF")) as picture:
         if picture.mode not in _GREY:
             raise ValueError(f"a picture of mode {picture.mode}, not one channel")

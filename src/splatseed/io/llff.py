@@ -14,10 +14,12 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64
+from PIL import Image as PilImage
 
 from splatseed.camera import Intrinsics
 from splatseed.errors import SceneFormatError, SceneNotFoundError
-from splatseed.io.colmap import IMAGE_DIRS, make_intrinsics, rigid_pose
+from splatseed.io.camera_records import make_intrinsics, rigid_pose
+from splatseed.io.colmap_model import IMAGE_DIRS
 from splatseed.io.files import StrPath, guarded, open_file, read_npy
 from splatseed.io.frame_files import SUFFIXES
 from splatseed.io.mask_files import masks_among
@@ -97,8 +99,6 @@ def _photographs(root: Path, count: int) -> tuple[Path, list[str]]:
 
 def _size(path: Path) -> tuple[int, int] | None:
     """The size of a photograph; None if it cannot be read, which is reported later."""
-    from PIL import Image as PilImage  # noqa: PLC0415  (slow to import)
-
     try:
         with open_file(path) as file, PilImage.open(file) as picture:
             return picture.size

@@ -15,13 +15,12 @@ from splatseed.depthmap import DepthKind
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError, SplatseedError
 from splatseed.io.bit_depth import WHITE, find_white
 from splatseed.io.cleaning import clean_scene, cloud_warnings
-from splatseed.io.colmap import find_model, scene_root
+from splatseed.io.colmap_model import find_model, nested_model, read_model, scene_model, scene_root
 from splatseed.io.depth_files import KINDS, SUFFIXES
 from splatseed.io.depth_maps import DepthFiles, match_by_name
 from splatseed.io.files import StrPath, is_video, odd_kind
 from splatseed.io.llff import is_llff, read_llff
 from splatseed.io.masks import with_own_masks
-from splatseed.io.model_choice import nested_model, read_model, scene_model
 from splatseed.io.nerfstudio import is_blender, read_blender, read_transforms_scene
 from splatseed.io.origin import around_origin
 from splatseed.io.ply import read_exact_ply, refuse_model

@@ -12,10 +12,11 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool
+from numpy.lib.stride_tricks import sliding_window_view
+from PIL import Image as PilImage
 
 from splatseed.camera import Intrinsics
 from splatseed.errors import SceneFormatError, SceneNotFoundError, SplatseedError
@@ -26,9 +27,6 @@ from splatseed.io.mask_files import find_masks, masks_among, own_masks
 from splatseed.io.photograph import has_alpha, open_photograph, photograph_bytes
 from splatseed.scene import Masks, Scene
 from splatseed.text import counted
-
-if TYPE_CHECKING:
-    from PIL import Image as PilImage
 
 NONE, INVERTED = "none", "inverted"
 """Choices of masks besides a folder; ``inverted:DIR`` inverts those of a folder."""
@@ -106,8 +104,6 @@ def _resized(files: Mapping[str, Path], folder: Path) -> list[str]:
 
 
 def _size(path: Path) -> tuple[int, int]:
-    from PIL import Image as PilImage  # noqa: PLC0415  (slow to import)
-
     with open_file(path) as file, PilImage.open(file) as picture:
         return picture.size
 
@@ -232,8 +228,6 @@ def write_masks(
 
 
 def _write(path: Path, counts: Bool[np.ndarray, "H W"]) -> None:
-    from PIL import Image as PilImage  # noqa: PLC0415  (slow to import)
-
     path.parent.mkdir(parents=True, exist_ok=True)
     PilImage.fromarray(np.where(counts, 255, 0).astype(np.uint8)).save(path)
 
@@ -242,11 +236,10 @@ def _undistorted(
     counts: Bool[np.ndarray, "H W"], lens: Intrinsics, pinhole: Intrinsics
 ) -> Bool[np.ndarray, "h w"]:
     """A mask in the pixels of an undistorted photograph."""
-    from scipy.ndimage import binary_erosion  # noqa: PLC0415  (slow to import)
-
     if lens == pinhole:  # the photograph is a copy
         return counts
     # Colours come from the four pixels around a place, which lie within one pixel of the nearest.
-    sure = binary_erosion(counts, np.ones((3, 3)), border_value=True)
+    windows = sliding_window_view(np.pad(counts, 1, constant_values=True), (3, 3))
+    sure = np.asarray(windows.all(axis=(2, 3)))
     moved = Undistortion(lens, {"": pinhole}).apply("", sure.astype(np.float32))
     return np.asarray(moved == 1)  # NaN beyond the image, where the copy is black

@@ -19,16 +19,23 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
+from PIL import Image as PilImage
 
 from splatseed.camera import Intrinsics
 from splatseed.errors import SceneFormatError
-from splatseed.io.colmap import (
+from splatseed.io.camera_records import (
     MAX_ID,
-    find_model,
+    NotFiniteError,
+    check_enough,
     make_intrinsics,
+    rigid_pose,
+    unusable_warning,
+)
+from splatseed.io.colmap_model import (
+    find_model,
+    ranked_models,
     read_model_cameras,
     read_model_points,
-    rigid_pose,
 )
 from splatseed.io.files import StrPath, guarded, odd_kind, open_file, read_bytes, read_json
 from splatseed.io.frame_files import (
@@ -39,13 +46,11 @@ from splatseed.io.frame_files import (
     named_depths,
     named_masks,
 )
-from splatseed.io.model_choice import ranked_models
 from splatseed.io.origin import around_origin
 from splatseed.io.photograph import lens_warnings
 from splatseed.io.photograph_checks import image_warnings
 from splatseed.io.ply import read_exact_ply
 from splatseed.io.point_files import other_points
-from splatseed.io.unusable import NotFiniteError, check_enough, unusable_warning
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Masks, Scene, SceneSource, Split
 from splatseed.similarity import Similarity, fit_similarity, similarity_of
@@ -252,8 +257,6 @@ def _camera(
     if values.get("w") is not None and values.get("h") is not None:
         width, height = int(_number(where, values, "w")), int(_number(where, values, "h"))
     else:
-        from PIL import Image as PilImage  # noqa: PLC0415  (slow to import)
-
         expected = f"a readable image, or w and h to be, in {where}"
         with guarded(file, expected, fix=_FIX), open_file(file) as opened:
             width, height = PilImage.open(opened).size

@@ -11,18 +11,15 @@ import hashlib
 from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import UInt8, UInt16
+from PIL import Image as PilImage
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io.bit_depth import WHITE, is_wide, opaque_value, wide_values
 from splatseed.io.files import guarded, other_spelling, read_bytes
 from splatseed.scene import Image, Scene
-
-if TYPE_CHECKING:
-    from PIL import Image as PilImage
 
 _CHECK_SCALE = 8
 """JPEGs are checked at an eighth of their size: all bytes are read, few pixels are computed."""
@@ -76,8 +73,6 @@ def photograph_bytes(path: Path) -> bytes:
 
 def open_photograph(path: Path, encoded: bytes) -> PilImage.Image:
     """The photograph in a file's bytes; only its header is decoded yet."""
-    from PIL import Image as PilImage  # noqa: PLC0415  (slow to import)
-
     with guarded(path, "an image", fix=COPY_AGAIN):
         return PilImage.open(BytesIO(encoded))
 
@@ -102,8 +97,6 @@ def decode_photograph(path: Path, encoded: bytes, white: int = WHITE) -> PilImag
         if is_wide(photograph):
             return _colors_of(wide_values(encoded), photograph, white)
         if has_alpha(photograph):
-            from PIL import Image as PilImage  # noqa: PLC0415  (slow to import)
-
             black = PilImage.new("RGBA", photograph.size, (0, 0, 0, 255))
             return PilImage.alpha_composite(black, photograph.convert("RGBA")).convert("RGB")
         return photograph.convert("RGB")
@@ -136,8 +129,6 @@ def _colors_of(
     values: UInt16[np.ndarray, "H W C"], photograph: PilImage.Image, white: int
 ) -> PilImage.Image:
     """Colours, or grey, of 16 bits as RGB over black."""
-    from PIL import Image as PilImage  # noqa: PLC0415  (slow to import)
-
     channels = values.shape[-1]
     colors = values[..., : channels - (channels in {2, 4})]
     shown = np.minimum(colors.astype(np.float32) * np.float32(255 / white), 255)
@@ -152,8 +143,6 @@ def _colors_of(
 
 def _grey_of(path: Path, photograph: PilImage.Image, white: int) -> PilImage.Image:
     """Grey of 16 bits or of floats, as 8 bits."""
-    from PIL import Image as PilImage  # noqa: PLC0415  (slow to import)
-
     with guarded(path, _WHOLE, fix=COPY_AGAIN):
         values = np.asarray(photograph)
     most = 1.0 if photograph.mode == "F" else 65535.0

@@ -14,6 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from PIL import Image as PilImage
 
 from splatseed.camera import Intrinsics
 from splatseed.errors import SceneFormatError, SceneNotFoundError
@@ -56,8 +57,6 @@ def with_photographs(scene: Scene) -> Scene:
 
 def photograph_size(path: Path) -> Size:
     """Width and height of an image file; errors as ``photograph_bytes``'s and ``open``'s."""
-    from PIL import Image as PilImage  # noqa: PLC0415  (slow to import)
-
     if not path.is_file():
         photograph_bytes(path)  # raises the error of a missing file
     with guarded(path, "an image", fix=COPY_AGAIN), open_file(path) as file:
@@ -121,8 +120,6 @@ def _misfit(lens: Intrinsics, size: Size, path: Path) -> tuple[str, str]:
 
 def _sideways(path: Path) -> int:
     """EXIF's orientation if it swaps width and height, else 0."""
-    from PIL import Image as PilImage  # noqa: PLC0415  (slow to import)
-
     try:
         with open_file(path) as file, PilImage.open(file) as picture:
             orientation = int(picture.getexif().get(0x0112, 0))

@@ -16,11 +16,12 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
+from PIL import Image as PilImage
 
 from splatseed.camera import Intrinsics, rotation_from_quat
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io import depth_maps
-from splatseed.io.colmap import make_intrinsics, rigid_pose
+from splatseed.io.camera_records import make_intrinsics, rigid_pose
 from splatseed.io.files import StrPath, guarded, numbered_lines, open_file, read_json
 from splatseed.io.origin import around_origin
 from splatseed.io.photograph import lens_warnings
@@ -207,8 +208,6 @@ def _read_intrinsics(path: Path) -> Intrinsics:
 
 def _check_image(path: Path, intrinsics: Intrinsics) -> None:
     """Check that an image can be read and has the size of its camera; only its header is opened."""
-    from PIL import Image as PilImage  # noqa: PLC0415  (slow to import)
-
     expected = (intrinsics.width, intrinsics.height)
     with guarded(path, "a readable image"), open_file(path) as file, PilImage.open(file) as image:
         size = image.size

@@ -27,6 +27,7 @@ from splatseed.camera import CAMERA_MODELS, Intrinsics
 from splatseed.errors import OutputError, PointCloudError
 from splatseed.io import colmap, nerfstudio
 from splatseed.io.cleaning import clean_scene, renumber
+from splatseed.io.colmap_model import read_model_cameras
 from splatseed.io.files import StrPath, open_file
 from splatseed.io.frame_files import FrameFiles
 from splatseed.io.mask_files import FOLDER as MASKS, find_masks
@@ -274,7 +275,7 @@ def _rigs(scene: Scene, model_dir: Path) -> tuple[list[str], list[str]]:
                 (im.image_id, im.name, im.intrinsics.camera_id): im.camera.cam_from_world
                 for im in images
             }
-            for images in (scene.images, colmap.read_model_cameras(model_dir)[1])
+            for images in (scene.images, read_model_cameras(model_dir)[1])
         )
         if now.keys() == before.keys() and all(
             np.allclose(now[key], before[key], rtol=_SAME_POSE, atol=_SAME_POSE) for key in now

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import importlib
 import math
-import struct
 import time
 from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
@@ -22,10 +21,8 @@ from pathlib import Path
 from typing import Any, Literal, TypeAlias, TypeVar, get_args
 
 import numpy as np
-from PIL import Image as PilImage
 
 from splatseed import errors
-from splatseed.camera import Intrinsics
 from splatseed.io.masks import write_masks
 from splatseed.io.staging import remove
 from splatseed.progress import Progress
@@ -43,9 +40,6 @@ _OLDEST = 4  # the first to pose an image and its rig in one call
 _LARGEST = 2**31 - 1  # pycolmap takes a 32-bit int
 _BLOCK_IMAGES = 16  # matches are committed, and progress is visible, per block of 16 x 16 pairs
 _POLL_SECONDS = 0.1
-_ORIENTATION, _SHORT, _UPRIGHT = 0x0112, 3, 1  # the tag, its type, the value that turns nothing
-_HEAD_BYTES = 1 << 17  # the EXIF segment, at most 64 KiB, comes first or after a small one
-_BARELY = 2e-7  # a coefficient that pycolmap takes for distortion, and that moves no pixel
 _SIMPLE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL")
 _COMPLETE = "complete"  # the file that ends a folder of models
 
@@ -362,104 +356,3 @@ def triangulate_points(run: Run, poses: Sequence[Image], without: Collection[str
             "a capture without sideways motion has no depth to triangulate.",
         )
     return model_dir
-
-
-def export_scene(run: Run, model_dir: Path, staging: Path, *, distinct: bool = True) -> None:
-    """Write a model's photographs and points to ``staging`` with distortion removed.
-
-    Images whose camera is PINHOLE already are copied byte for byte, except that an EXIF orientation
-    is cleared. The points' reprojection errors are in pixels of the undistorted images. With
-    ``distinct``, points that COLMAP put exactly where another is are left out.
-
-    Raises:
-        OutputError: Not all images could be written.
-    """
-    pycolmap, dense, straight = run.pycolmap, run.work / "dense", run.work / "straight"
-    given = pycolmap.Reconstruction(model_dir)
-    num_images = given.num_reg_images()
-    for camera in given.cameras.values():
-        name_distortion(camera)
-    straight.mkdir()
-    given.write(straight)
-
-    def num_written() -> int:
-        return sum(path.is_file() for path in (dense / "images").rglob("*"))
-
-    run.stage(
-        "undistortion",
-        lambda: pycolmap.undistort_images(
-            dense, straight, run.image_dir, num_threads=run.settings.threads
-        ),
-        num_written,
-        num_images,
-    )
-    if num_written() != num_images:  # pycolmap only logs an image that it could not read or write
-        names = [image.name for image in pycolmap.Reconstruction(model_dir).images.values()]
-        missing = sorted(name for name in names if not (dense / "images" / name).is_file())
-        raise errors.OutputError(
-            f"{num_images} undistorted images to be written",
-            found=f"{num_written()}, without {', '.join(missing[:3])}",
-            fix="Check that these photographs open, and that there is space on the output's disk.",
-        )
-    (staging / "sparse").mkdir()
-    (dense / "sparse").rename(staging / "sparse" / "0")
-    (dense / "images").rename(staging / "images")
-    clear_orientation(staging / "images")
-    model = pycolmap.Reconstruction(staging / "sparse" / "0")
-    if distinct:
-        drop_repeats(model)
-    model.update_point_3d_errors()
-    model.write(staging / "sparse" / "0")
-
-
-def name_distortion(camera: Any) -> None:
-    """Make pycolmap undistort a camera if, and only if, it has distortion.
-
-    It goes by the coefficients: it would copy a fisheye's photographs where they are all 0, and
-    resample those of an EUCM camera that is a pinhole.
-    """
-    size, params = (camera.width, camera.height), tuple(camera.params)
-    lens = Intrinsics(camera.camera_id, camera.model.name, *size, params)
-    models = type(camera.model)
-    if lens.is_fisheye and camera.is_undistorted():
-        camera.model = models.OPENCV_FISHEYE
-        camera.params = [*lens.pinhole.params, _BARELY, 0.0, 0.0, 0.0]
-    elif not lens.has_distortion and not lens.is_pinhole:
-        camera.model = models.PINHOLE
-        camera.params = list(lens.pinhole.params)
-
-
-def drop_repeats(model: Any) -> None:
-    """Of a model's points at one float32 position, keep that with the longest track."""
-    points = model.points3D
-    longest_first = sorted(points, key=lambda i: (-points[i].track.length(), i))
-    xyz = np.array([points[i].xyz for i in longest_first], np.float32).reshape(-1, 3)
-    kept = np.unique(xyz + np.float32(0), axis=0, return_index=True)[1]  # -0.0 equals 0.0
-    for repeat in sorted(set(longest_first) - {longest_first[k] for k in kept}):
-        model.delete_point3D(repeat)
-
-
-def clear_orientation(folder: Path) -> None:
-    """Mark every JPEG below ``folder`` as upright in its stored orientation.
-
-    COLMAP reads pixels as they are stored and keeps EXIF's orientation in what it writes; a trainer
-    whose image reader obeys that tag (as OpenCV's does) would see the photograph rotated relative
-    to its camera. The two bytes of the tag change and nothing else.
-    """
-    for path in folder.rglob("*"):
-        if path.suffix.lower() not in {".jpg", ".jpeg"}:
-            continue
-        with PilImage.open(path) as image:
-            turned = image.getexif().get(_ORIENTATION, _UPRIGHT)
-        if turned not in range(_UPRIGHT + 1, 9):  # as stored, or no orientation
-            continue
-        content = path.read_bytes()
-        # EXIF's entry of a tag (TIFF 6.0): tag, type, count and value, in one of two byte orders.
-        for order in ("<HHIH", ">HHIH"):
-            entry = struct.pack(order, _ORIENTATION, _SHORT, 1, turned)
-            at = content.find(entry, 0, _HEAD_BYTES)
-            if at >= 0:
-                upright = struct.pack(order, _ORIENTATION, _SHORT, 1, _UPRIGHT)
-                path.unlink()  # a copy of a read-only photograph is read-only
-                path.write_bytes(content[:at] + upright + content[at + len(upright) :])
-                break

@@ -21,7 +21,7 @@ from typing import Any, TypeAlias
 from splatseed import errors
 from splatseed.camera import CAMERA_MODELS, Intrinsics
 from splatseed.io import load_scene, write_scene
-from splatseed.io.colmap import read_model_cameras
+from splatseed.io.colmap_model import read_model_cameras
 from splatseed.io.files import StrPath
 from splatseed.io.mask_files import FOLDER as MASKS
 from splatseed.io.masks import write_masks
@@ -40,6 +40,7 @@ from splatseed.scene import Image, Masks, Scene
 from splatseed.sfm import colmap
 from splatseed.sfm.cameras import SharedCamera, describe_cameras, share_cameras
 from splatseed.sfm.colmap import Run, Settings
+from splatseed.sfm.export import export_scene
 from splatseed.sfm.kept import Kept, kept_work, work_key
 from splatseed.sfm.photos import find_photos, match_poses
 from splatseed.sfm.refinement import Refinement, refine
@@ -204,7 +205,7 @@ def _export(
     run: Run, model_dir: Path, staging: Path, masks: Masks | None, *, distinct: bool = True
 ) -> None:
     """Write a model's photographs, their masks and its points without distortion."""
-    colmap.export_scene(run, model_dir, staging, distinct=distinct)
+    export_scene(run, model_dir, staging, distinct=distinct)
     if masks is None:
         return
     before, after = (

@@ -20,6 +20,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float64
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
 from splatseed.camera import quat_from_rotation
 from splatseed.errors import ReconstructionError
@@ -114,9 +116,6 @@ def align(moved: Poses, given: Poses) -> Poses:
     Each is weighed by its noise, which is estimated from the residuals, and a camera far from its
     given pose counts little. Given cameras must not all be in one place.
     """
-    from scipy.optimize import least_squares  # noqa: PLC0415  (slow to import)
-    from scipy.spatial.transform import Rotation  # noqa: PLC0415  (slow to import)
-
     size, middle = spread(given), given.centers.mean(axis=0)
     mean = Rotation.from_matrix(given.rotations.transpose(0, 2, 1) @ moved.rotations).mean()
     centered = moved.centers - moved.centers.mean(axis=0)
@@ -143,8 +142,6 @@ def align(moved: Poses, given: Poses) -> Poses:
 def _turn_vectors(
     a: Float64[np.ndarray, "N 3 3"], b: Float64[np.ndarray, "N 3 3"]
 ) -> Float64[np.ndarray, "N 3"]:
-    from scipy.spatial.transform import Rotation  # noqa: PLC0415  (slow to import)
-
     return np.asarray(Rotation.from_matrix(a @ b.transpose(0, 2, 1)).as_rotvec())
 
 

@@ -5,6 +5,7 @@ Structure-from-Motion would; ``SHAPES`` holds single surfaces to measure a metho
 """
 
 from splatseed.synthetic.capture import DEPTH_SCALE, Capture, make_capture, write_capture
-from splatseed.synthetic.surfaces import SHAPES, Surface
+from splatseed.synthetic.shapes import SHAPES
+from splatseed.synthetic.surfaces import Surface
 
 __all__ = ["DEPTH_SCALE", "SHAPES", "Capture", "Surface", "make_capture", "write_capture"]

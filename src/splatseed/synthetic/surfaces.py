@@ -11,16 +11,14 @@ rounding; ``SHAPES`` are fixed, nothing random.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from types import MappingProxyType
 from typing import Any, Protocol
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int64
 
-from splatseed.runtime.jit import inline
+from splatseed.synthetic._kernels import first_disc, nearest_disc
 
 Vector = Float64[np.ndarray, " 3"]
 Frame = Float64[np.ndarray, "3 3"]
@@ -399,7 +397,7 @@ class Discs(Surface):
 
     def _nearest(self, xyz: np.ndarray) -> Any:
         points = np.ascontiguousarray(xyz, np.float64)
-        return _nearest_disc(points, self.centers, self.axes, self.radii)
+        return nearest_disc(points, self.centers, self.axes, self.radii)
 
     def sample(self, num: int, rng: np.random.Generator) -> Points:
         leaf = rng.choice(len(self.radii), num, p=self.radii**2 / (self.radii**2).sum())
@@ -413,7 +411,7 @@ class Discs(Surface):
     def intersect(self, origin: Vector, directions: Points) -> Numbers:
         t = np.full(len(directions), np.inf)
         near = np.flatnonzero(np.isfinite(self._bound.intersect(origin, directions)))
-        t[near] = _first_disc(origin, directions[near], self.centers, self.axes, self.radii)
+        t[near] = first_disc(origin, directions[near], self.centers, self.axes, self.radii)
         return t
 
     def normals(self, xyz: Points) -> Points:
@@ -458,99 +456,3 @@ def _roots(
     q = -(half_b + np.copysign(np.sqrt(np.where(real, discriminant, 0.0)), half_b))
     with np.errstate(divide="ignore", invalid="ignore"):
         return q / a, c / q, real
-
-
-@inline
-def _nearest_disc(
-    xyz: np.ndarray,  # float64 [N, 3]
-    centers: np.ndarray,  # float64 [L, 3]
-    axes: np.ndarray,  # float64 [L, 3]
-    radii: np.ndarray,  # float64 [L]
-) -> tuple[np.ndarray, np.ndarray]:  # float64 [N], int64 [N]
-    """Distance to the nearest disc and its index."""
-    distances = np.empty(len(xyz))
-    which = np.empty(len(xyz), np.int64)
-    for i in range(len(xyz)):
-        best, best_j = np.inf, 0
-        for j in range(len(radii)):
-            x = xyz[i, 0] - centers[j, 0]
-            y = xyz[i, 1] - centers[j, 1]
-            z = xyz[i, 2] - centers[j, 2]
-            off = x * axes[j, 0] + y * axes[j, 1] + z * axes[j, 2]
-            x, y, z = x - off * axes[j, 0], y - off * axes[j, 1], z - off * axes[j, 2]
-            # Within the disc's plane: how far beyond its rim.
-            beyond = max(np.sqrt(x * x + y * y + z * z) - radii[j], 0.0)
-            squared = off * off + beyond * beyond
-            if squared < best:
-                best, best_j = squared, j
-        distances[i] = np.sqrt(best)
-        which[i] = best_j
-    return distances, which
-
-
-@inline
-def _first_disc(
-    origin: np.ndarray,  # float64 [3]
-    directions: np.ndarray,  # float64 [N, 3]
-    centers: np.ndarray,  # float64 [L, 3]
-    axes: np.ndarray,  # float64 [L, 3]
-    radii: np.ndarray,  # float64 [L]
-) -> np.ndarray:  # float64 [N]
-    """Smallest t > 0 at which each ray meets a disc; inf where none does."""
-    nearest = np.full(len(directions), np.inf)
-    for j in range(len(radii)):
-        nx, ny, nz = axes[j, 0], axes[j, 1], axes[j, 2]
-        ox, oy, oz = origin[0] - centers[j, 0], origin[1] - centers[j, 1], origin[2] - centers[j, 2]
-        height = ox * nx + oy * ny + oz * nz
-        limit = radii[j] * radii[j]
-        for i in range(len(directions)):
-            dx, dy, dz = directions[i, 0], directions[i, 1], directions[i, 2]
-            # Where the ray meets the disc's plane; infinite if parallel, and then no hit.
-            t = -height / (dx * nx + dy * ny + dz * nz)
-            x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
-            if t > 0.0 and t < nearest[i] and x * x + y * y + z * z <= limit:
-                nearest[i] = t
-    return nearest
-
-
-# Shapes ------------------------------------------------------------------------------------------
-
-
-def plane(tilt: float = 35.0, center: Vector | None = None) -> Rectangle:
-    """A 2 x 2 square turned by ``tilt`` degrees about the x axis; 90 makes it a wall."""
-    c, s = np.cos(np.radians(tilt)), np.sin(np.radians(tilt))
-    edge_u, edge_v = np.array([2.0, 0.0, 0.0]), np.array([0.0, 2.0 * c, 2.0 * s])
-    middle = np.zeros(3) if center is None else center
-    return Rectangle(middle - (edge_u + edge_v) / 2, edge_u, edge_v)
-
-
-def sine_sheet() -> SineSheet:
-    """A 2 x 2 sheet of three and a third waves with an amplitude of 0.1."""
-    return SineSheet(np.array([-1.0, -1.0, 0.0]), np.eye(3), np.array([2.0, 2.0]), 0.1, 0.6)
-
-
-def parallel_plates(gap: float = 0.1) -> Union:
-    """Two tilted 2 x 2 plates ``gap`` apart: neighbours on one must not mix with the other's."""
-    lower = plane()
-    return Union((lower, plane(center=gap * lower.frame[2])))
-
-
-def _box_corner() -> Union:
-    """Three unit squares that meet at right angles: a corner and three edges."""
-    x, y, z = yaw_frame(30.0)
-    origin = np.zeros(3)
-    return Union((Rectangle(origin, x, y), Rectangle(origin, y, z), Rectangle(origin, z, x)))
-
-
-SHAPES: MappingProxyType[str, Callable[[], Surface]] = MappingProxyType(
-    {
-        "plane": plane,
-        "sphere": lambda: Sphere(np.zeros(3), 1.0),
-        "cylinder": lambda: Cylinder(np.zeros(3), yaw_frame(0.0), 0.5, 2.0),
-        "sine sheet": sine_sheet,
-        "parallel plates": parallel_plates,
-        "box corner": _box_corner,
-    }
-)
-"""Makers of shapes of about unit size near the origin, by name, each of which provokes one kind of
-error; what is flat is tilted, as that reveals methods that work in world axes."""

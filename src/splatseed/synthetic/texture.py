@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float64
 
-from splatseed.runtime.jit import inline
+from splatseed.synthetic._kernels import noise_sum
 
 Color = tuple[float, float, float]
 
@@ -83,50 +83,4 @@ def value_noise(
     Random values at integer lattice points are joined by smoothstep interpolation; each
     octave is 0.7 times as strong as the one before.
     """
-    return np.asarray(_noise_sum(np.ascontiguousarray(xyz, np.float64), octaves, seed))
-
-
-@inline
-def _lattice(x: int, y: int, z: int, seed: int) -> float:
-    """A value in 0..1 hashed from a lattice point (multiply-xorshift rounds on 64 bits)."""
-    h = np.uint64(x) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(seed)
-    h = (h ^ (h >> np.uint64(29))) * np.uint64(0xBF58476D1CE4E5B9) + np.uint64(y)
-    h = (h ^ (h >> np.uint64(32))) * np.uint64(0x94D049BB133111EB) + np.uint64(z)
-    h = (h ^ (h >> np.uint64(29))) * np.uint64(0xBF58476D1CE4E5B9)
-    return float((h ^ (h >> np.uint64(32))) >> np.uint64(11)) * 2.0**-53
-
-
-@inline
-def _octave(x: float, y: float, z: float, seed: int) -> float:
-    """Value noise of one octave at one point: a smoothed trilinear blend of 8 lattice values."""
-    fx, fy, fz = np.floor(x), np.floor(y), np.floor(z)
-    ix, iy, iz = int(fx), int(fy), int(fz)
-    u, v, w = x - fx, y - fy, z - fz
-    u, v, w = u * u * (3 - 2 * u), v * v * (3 - 2 * v), w * w * (3 - 2 * w)
-    total = 0.0
-    for corner in range(8):
-        i, j, k = corner & 1, (corner >> 1) & 1, corner >> 2
-        weight = (u if i else 1 - u) * (v if j else 1 - v) * (w if k else 1 - w)
-        if weight > 0.0:
-            total += weight * _lattice(ix + i, iy + j, iz + k, seed)
-    return total
-
-
-@inline
-def _noise_sum(
-    xyz: np.ndarray,  # float64 [N, 3]
-    octaves: int,
-    seed: int,
-) -> np.ndarray:  # float64 [N]
-    """The weighted mean of ``octaves`` octaves at each point."""
-    result = np.zeros(len(xyz))
-    for i in range(len(xyz)):
-        scale, strength, total = 1.0, 1.0, 0.0
-        for octave in range(octaves):
-            value = _octave(xyz[i, 0] * scale, xyz[i, 1] * scale, xyz[i, 2] * scale, seed + octave)
-            result[i] += strength * value
-            total += strength
-            scale *= 2.0
-            strength *= 0.7
-        result[i] /= total
-    return result
+    return np.asarray(noise_sum(np.ascontiguousarray(xyz, np.float64), octaves, seed))

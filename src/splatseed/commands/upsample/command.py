@@ -19,7 +19,7 @@ from splatseed.console import OUT, StageClock, print_note, stage_display
 from splatseed.depthmap import DepthKind
 from splatseed.io import find_depths, load_originals, write_scene
 from splatseed.io.clouds import open_cloud
-from splatseed.io.colmap import scene_root
+from splatseed.io.colmap_model import scene_root
 from splatseed.io.load import with_own_depths
 from splatseed.io.masks import with_masks
 from splatseed.io.origin import RECENTER, middle_of_cameras, moved_by, place_words

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from splatseed.io.cloud_file import PACKED, XYZ, Block, CloudFile, LineCloud, RowCloud
+from splatseed.io.clouds._kernels import decompress_lzf
 from splatseed.io.files import guarded, open_file
-from splatseed.runtime.jit import inline
 from splatseed.runtime.memory import check_memory
 
 _HEADER_BYTES = 1 << 16
@@ -97,8 +97,7 @@ def _decompressed(
         if len(packed) < size or promised != needed:
             raise ValueError(f"{len(packed):,} bytes for {needed:,}")
         data = np.empty(needed, np.uint8)
-        decode: Any = _decompress
-        if not decode(np.frombuffer(packed, np.uint8), data):
+        if not decompress_lzf(np.frombuffer(packed, np.uint8), data):
             raise ValueError("bytes that are not")
     columns, at = {}, 0
     for name in dtype.names or ():
@@ -107,39 +106,3 @@ def _decompressed(
             columns[name] = data[at:stop].view(dtype[name])
         at = stop
     return columns
-
-
-@inline
-def _decompress(packed, out):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202  (Numba infers)
-    """Fill ``out`` from an LZF block; whether the block holds exactly so many bytes.
-
-    A block is a row of runs. A byte c below 32 is followed by c + 1 bytes as they are; any other
-    begins a reference: its upper 3 bits plus 2 are the length (7: plus the next byte), its lower 5
-    bits and the last byte the distance back, minus 1.
-    """
-    i, o, num, size = 0, 0, len(packed), len(out)
-    while i < num:
-        c = int(packed[i])
-        i += 1
-        if c < 32:
-            length = c + 1
-            if i + length > num or o + length > size:
-                return False
-            for k in range(length):
-                out[o + k] = packed[i + k]
-            i += length
-        else:
-            length = (c >> 5) + 2
-            if length == 9 and i < num:
-                length += int(packed[i])
-                i += 1
-            if i >= num:
-                return False
-            back = o - ((c & 31) << 8) - int(packed[i]) - 1
-            i += 1
-            if back < 0 or o + length > size:
-                return False
-            for k in range(length):  # may overlap what it writes
-                out[o + k] = out[back + k]
-        o += length
-    return o == size

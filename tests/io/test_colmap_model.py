@@ -8,7 +8,7 @@ import pytest
 
 from splatseed.errors import SceneFormatError
 from splatseed.io import colmap, load_scene
-from splatseed.io.model_choice import count_images
+from splatseed.io.colmap_model import count_images
 
 from .conftest import written
 

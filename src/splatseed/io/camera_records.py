@@ -1,0 +1,108 @@
+"""Cameras and poses in a scene's files: checked records, and images left out for lack of them.
+
+``where`` is the file, line or record that an error names.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, TypeAlias
+
+import numpy as np
+from jaxtyping import Float64
+
+from splatseed.camera import CAMERA_MODELS, Intrinsics, quat_from_rotation
+from splatseed.errors import SceneFormatError
+from splatseed.io.files import COPY_AGAIN
+from splatseed.text import agreeing, name_some
+
+MAX_ID = 2**32 - 1
+"""The largest camera id, image id or feature index: 32 bits in COLMAP's binary form."""
+_MAX_SIZE = 2**31 - 1
+_RIGID_TOLERANCE = 1e-3  # of rotation @ rotation.T against the identity
+_NORM_RANGE = (1e-100, 1e100)  # inside it the square of a quaternion's norm is a normal float
+
+
+class NotFiniteError(SceneFormatError):
+    """A camera or pose is NaN, infinite or zero; the scene can be used without its images."""
+
+
+Unusable: TypeAlias = dict[Any, NotFiniteError]
+"""Why records were left out, by camera id or image name."""
+
+
+def make_intrinsics(
+    where: str, camera_id: int, model: str, width: int, height: int, params: Sequence[float]
+) -> Intrinsics:
+    """A checked camera record; a ``NotFiniteError`` if its numbers make no camera."""
+    require(0 <= camera_id <= MAX_ID, f"a camera id from 0 to {MAX_ID}", where, camera_id)
+    fits = 0 < width <= _MAX_SIZE and 0 < height <= _MAX_SIZE
+    require(fits, "a camera with a size in pixels", where, f"{width} x {height}")
+    _require_finite(
+        all(map(math.isfinite, params)), "finite camera parameters", where, tuple(params)
+    )
+    try:
+        camera = Intrinsics(camera_id, model, width, height, tuple(params))
+    except SceneFormatError as error:
+        expected = f"{error.expected} in {where}"
+        raise SceneFormatError(expected, found=error.found, fix=error.fix) from None
+    lengths = camera.params[: CAMERA_MODELS[model].num_focal]
+    found = ", ".join(f"{each:g}" for each in lengths)
+    _require_finite(min(lengths) > 0, "a focal length above 0", where, found)
+    return camera
+
+
+def check_pose(pose: Sequence[float], of: str, where: str) -> None:
+    """Raise a ``NotFiniteError`` unless a wxyz quaternion and a translation make a pose."""
+    _require_finite(all(map(math.isfinite, pose)), f"a finite pose {of}", where, tuple(pose))
+    is_rotation = _NORM_RANGE[0] < math.hypot(*pose[:4]) < _NORM_RANGE[1]
+    _require_finite(is_rotation, f"a rotation quaternion {of}", where, tuple(pose[:4]))
+
+
+def rigid_pose(
+    where: str, world_from_cam: Float64[np.ndarray, "R 4"]
+) -> tuple[Float64[np.ndarray, " 4"], Float64[np.ndarray, " 3"]]:
+    """Quaternion and translation of ``cam_from_world``; a fourth row must be 0, 0, 0, 1."""
+    rotation = world_from_cam[:3, :3].T
+    with np.errstate(over="ignore", invalid="ignore"):  # huge numbers are not rigid either
+        off = np.abs(rotation @ rotation.T - np.eye(3)).max()
+        proper = np.linalg.det(rotation) > 0
+    affine = np.allclose(world_from_cam[3:], [[0, 0, 0, 1]], atol=_RIGID_TOLERANCE)
+    if not (off <= _RIGID_TOLERANCE and proper and affine):
+        expected = f"a rotation and a translation as world_from_cam in {where}"
+        fix = "Remove the scale from the poses (and from the points)."
+        raise SceneFormatError(expected, found="a scaled, sheared or mirrored one", fix=fix)
+    return quat_from_rotation(rotation), -rotation @ world_from_cam[:3, 3]
+
+
+def check_enough(unusable: Mapping[str, NotFiniteError], used: int) -> None:
+    """Raise what is wrong with the first unusable image, if fewer than half can be used."""
+    if len(unusable) > used:
+        raise next(iter(unusable.values()))
+
+
+def unusable_warning(unusable: Mapping[str, NotFiniteError], used: int) -> list[str]:
+    """A sentence on images that are left out, if there are any."""
+    if not unusable:
+        return []
+    count, whose = len(unusable), agreeing(len(unusable), "its", "their")
+    which = f"{count} of {count + used} images {agreeing(count, 'is', 'are')} left out"
+    why = f"{whose} pose or camera is not finite, or zero"
+    return [f"{which} ({name_some([*unusable], 3)}): {why}."]
+
+
+def require(holds: bool, expected: str, where: str, found: object) -> None:
+    """Raise a ``SceneFormatError`` for a record unless a condition holds."""
+    if not holds:
+        raise format_error(expected, where, str(found))
+
+
+def _require_finite(holds: bool, expected: str, where: str, found: object) -> None:
+    if not holds:
+        raise NotFiniteError(f"{expected} in {where}", found=str(found), fix=COPY_AGAIN)
+
+
+def format_error(expected: str, where: str, found: str) -> SceneFormatError:
+    """Make the error for a record that is not as expected."""
+    return SceneFormatError(f"{expected} in {where}", found=found, fix=COPY_AGAIN)

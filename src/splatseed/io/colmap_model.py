@@ -1,0 +1,227 @@
+"""COLMAP models: which folder holds a scene's, and the scene that it makes.
+
+A model is a folder with cameras, images and points3D, each as .bin, else .txt. COLMAP's mapper
+writes a model for each group of photographs that it could connect, into folders ``0``, ``1`` and so
+on, which are not ordered by size: the one with the most images is read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from splatseed.camera import Intrinsics
+from splatseed.errors import SceneNotFoundError, SplatseedError
+from splatseed.io.camera_records import NotFiniteError, Unusable, check_enough, unusable_warning
+from splatseed.io.colmap import MIN_IMAGE_BYTES, read_cameras, read_images, read_points3d
+from splatseed.io.files import StrPath, numbered_lines, open_file
+from splatseed.io.origin import around_origin
+from splatseed.io.photograph import lens_warnings
+from splatseed.io.photograph_checks import image_warnings
+from splatseed.io.ply import read_exact_ply
+from splatseed.io.point_files import first_with_points, other_points
+from splatseed.pointcloud import PointCloud
+from splatseed.scene import Image, Scene, SceneSource, Tracks
+from splatseed.text import counted
+
+IMAGE_DIRS = ("images", "images_2", "images_4", "images_8", "image", "input")
+_MODEL_FILES = ("cameras", "images", "points3D")
+_POINT_SUFFIXES = (".bin", ".txt", ".ply")
+_UNKNOWN = -1
+
+
+def scene_model(root: Path) -> Path | None:
+    """The model of a scene's folder, of ``sparse``, or of a folder of numbered models."""
+    largest = largest_model(root / "sparse")
+    return largest or find_model(root / "sparse", root) or largest_model(root)
+
+
+def nested_model(root: Path) -> Path | None:
+    """The model in ``colmap/sparse``, where nerfstudio puts it."""
+    return largest_model(root / "colmap/sparse") or find_model(root / "colmap/sparse")
+
+
+def largest_model(folder: Path) -> Path | None:
+    """The model with most images in a folder's numbered ones; of equals, the first."""
+    return next(iter(ranked_models(folder)), None)
+
+
+def ranked_models(folder: Path) -> list[Path]:
+    """The models in a folder's numbered ones, those with most images first."""
+    models = numbered_models(folder)
+    return models if len(models) < 2 else sorted(models, key=lambda each: -count_images(each))
+
+
+def numbered_models(folder: Path) -> list[Path]:
+    """The folders ``0``, ``1`` and so on that hold a model, by number."""
+    if not folder.is_dir():
+        return []
+    numbered = [each for each in folder.iterdir() if each.name.isdecimal()]
+    return [each for each in sorted(numbered, key=lambda p: int(p.name)) if find_model(each)]
+
+
+def count_images(model_dir: Path) -> int:
+    """How many images a model promises; -1 if the file is damaged."""
+    path = model_file(model_dir, "images")
+    if path is None:
+        return 0
+    with suppress(SplatseedError, OSError):
+        if path.suffix == ".txt":
+            return _count_lines(path)
+        with open_file(path) as file:
+            count = int.from_bytes(file.read(8), "little")
+        size = path.stat().st_size
+        if size >= 8 and count <= (size - 8) // MIN_IMAGE_BYTES:
+            return count
+    return _UNKNOWN
+
+
+def _count_lines(path: Path) -> int:
+    """Images of an ``images.txt``: each is a line, and one of features, which may be blank."""
+    count, lines = 0, numbered_lines(path)
+    for _, line in lines:
+        if line.strip() and not line.lstrip().startswith("#"):
+            count += 1
+            next(lines, None)
+    return count
+
+
+def read_model(model_dir: Path) -> Scene:
+    """The scene of a model, with a note if it is one of several."""
+    scene, models = read_colmap_scene(model_dir), numbered_models(model_dir.parent)
+    if len(models) < 2 or not model_dir.name.isdecimal():
+        return scene
+    counts = {each.name: count_images(each) for each in models}
+    shown = [
+        f"{name} with {counted(count, 'image') if count != _UNKNOWN else 'damaged images'}"
+        for name, count in counts.items()
+    ]
+    other = next(each for each in ranked_models(model_dir.parent) if each.name != model_dir.name)
+    there = f"{model_dir.parent} has {len(models)} models, {', '.join(shown)}"
+    note = f"{there}: {model_dir.name} is read. To read another, name it, such as {other}."
+    return scene.replace(warnings=(*scene.warnings, note))
+
+
+def find_model(*folders: Path) -> Path | None:
+    """The first of the given folders that holds a model."""
+    return next((f for f in folders if any(model_file(f, name) for name in _MODEL_FILES)), None)
+
+
+def model_file(model_dir: Path, name: str) -> Path | None:
+    """The file of a model that is read for cameras, images or points3D."""
+    if name == "points3D":
+        return first_with_points(_point_files(model_dir))
+    candidates = (model_dir / f"{name}{suffix}" for suffix in (".bin", ".txt"))
+    return next((path for path in candidates if path.is_file()), None)
+
+
+def _point_files(model_dir: Path) -> list[Path]:
+    paths = (model_dir / f"points3D{suffix}" for suffix in _POINT_SUFFIXES)
+    return [path for path in paths if path.is_file()]
+
+
+def _other_points(model_dir: Path, root: Path, read: Path, points: PointCloud) -> list[str]:
+    """Notes on other files of points, from which other trainers may start."""
+    files, notes = _point_files(model_dir), list[str]()
+    for i, path in enumerate(files):
+        before = " and ".join(each.name for each in files[:i])
+        notes += other_points(read, points.xyz, path, f"move {before} out of {model_dir}")
+    place = f"copy it to {model_dir / 'points3D.ply'}"
+    if first := [each.name for each in files if each.suffix != ".ply"]:
+        place += f" and move {' and '.join(first)} out of that folder"
+    return notes + other_points(read, points.xyz, root / "init.ply", place)
+
+
+def scene_root(model_dir: Path) -> Path:
+    """The scene's folder: the model's without ``sparse/0`` or ``sparse``, or ``colmap`` above."""
+    parts = model_dir.absolute().parts
+    levels = 1 if parts[-1] == "sparse" else 2 if parts[-2:-1] == ("sparse",) else 0
+    if not levels:
+        return model_dir
+    above = model_dir.absolute().parents[levels - 1]
+    levels += above.name == "colmap" and not any((above / name).is_dir() for name in IMAGE_DIRS)
+    named = model_dir if len(model_dir.parts) >= levels else model_dir.absolute()
+    return named.parents[levels - 1]
+
+
+def read_colmap_scene(model_dir: StrPath) -> Scene:
+    """The scene of a model: its images, its points, and warnings for the user."""
+    model_dir = Path(model_dir)
+    root = scene_root(model_dir)
+    intrinsics, images, unusable = _read_model(model_dir)
+    points, exact, tracks, points_path = read_model_points(model_dir)
+    image_dir = _image_dir(root, images)
+    warnings = [*image_warnings(images, image_dir, root), *lens_warnings(images)]
+    warnings += unusable_warning(unusable, len(images))
+    warnings += _other_points(model_dir, root, points_path, points)
+    if (root / "transforms.json").is_file():
+        warnings.append(f"{root / 'transforms.json'} is there too; name it to read it instead.")
+    if not images and (tracks is not None or intrinsics or image_dir is not None):
+        tracks, path = None, model_file(model_dir, "images")  # tracks name images
+        why = f"{path} lists no images" if path else f"{model_dir} has no images.bin or images.txt"
+        warnings.append(
+            f"{why}, so no photograph has a pose: copy the whole model, or make one with splatseed"
+            " sfm IMAGES -o SCENE. Points can be interpolated, but nothing can be trained."
+        )
+    source = SceneSource("colmap", root, points_path, model_dir, image_dir)
+    scene = Scene(
+        points, images, intrinsics, tracks, source, tuple(warnings), absent=tuple(unusable)
+    )
+    return around_origin(scene, exact)
+
+
+def _image_dir(root: Path, images: Sequence[Image]) -> Path | None:
+    """The first known folder with all images, else with the most; the first at all without any."""
+    folders = [root / name for name in IMAGE_DIRS if (root / name).is_dir()]
+    held = dict[Path, int]()
+    for folder in (*folders, root):
+        held[folder] = sum((folder / image.name).is_file() for image in images)
+        if held[folder] == len(images) > 0:
+            break
+    best = max(held, key=lambda folder: held[folder])
+    return best if held[best] else next(iter(folders), None)
+
+
+def read_model_cameras(model_dir: Path) -> tuple[tuple[Intrinsics, ...], tuple[Image, ...]]:
+    """The camera and the image records of a model that can be used."""
+    return _read_model(model_dir)[:2]
+
+
+def _read_model(
+    model_dir: Path,
+) -> tuple[tuple[Intrinsics, ...], tuple[Image, ...], Mapping[str, NotFiniteError]]:
+    """The same, and what is wrong with other images, by name.
+
+    Raises:
+        NotFiniteError: Fewer than half of the images can be used.
+    """
+    cameras_path, images_path = model_file(model_dir, "cameras"), model_file(model_dir, "images")
+    if cameras_path is None and images_path is not None:
+        expected = f"cameras.bin or cameras.txt beside {images_path}"
+        raise SceneNotFoundError(expected, found="neither", fix="Copy the whole model.")
+    bad: Unusable = {}
+    intrinsics = read_cameras(cameras_path, bad) if cameras_path else ()
+    images = read_images(images_path, intrinsics, bad) if images_path else ()
+    unusable = {name: error for name, error in bad.items() if isinstance(name, str)}
+    check_enough(unusable, len(images))
+    return intrinsics, images, unusable
+
+
+def read_model_points(
+    model_dir: Path,
+) -> tuple[PointCloud, Float64[np.ndarray, "N 3"], Tracks | None, Path]:
+    """The points of a model, ``points3D.ply`` if need be, and their positions in double precision.
+
+    Also their tracks, if any, and their file.
+    """
+    path = model_file(model_dir, "points3D")
+    if path is None:
+        return PointCloud.empty(), np.empty((0, 3)), None, model_dir / "points3D.bin"
+    if path.suffix == ".ply":
+        return *read_exact_ply(path), None, path
+    points, tracks = read_points3d(path)
+    return points, tracks.xyz, tracks, path
