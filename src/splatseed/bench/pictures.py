@@ -6,7 +6,6 @@ opened only for what an earlier report has not kept; if it is gone, only its pic
 
 from __future__ import annotations
 
-import hashlib
 import json
 import re
 import tempfile
@@ -30,6 +29,7 @@ from splatseed.errors import SplatseedError
 from splatseed.io.files import read_file
 from splatseed.io.photograph import decode_photograph, photograph_bytes
 from splatseed.progress import Progress, silent
+from splatseed.runtime.fingerprint import fingerprint
 from splatseed.scene import Scene
 from splatseed.viewer.clouds import preview_methods
 
@@ -56,7 +56,7 @@ def scene_pictures(bench: Path, study: Study, progress: Progress = silent) -> Sc
         specs: dict[str, RunSpec] = {label: first[label] for label in shown[:_MOST]}
         digest = runs["spec"].iloc[0].scene.digest
         told = [digest, *((name, each.key) for name, each in specs.items())]
-        key = hashlib.blake2b(json.dumps(told).encode(), digest_size=8).hexdigest()
+        key = fingerprint(json.dumps(told).encode())[:16]
         name = re.sub(r"[^\w.-]+", "_", f"clouds_{scene}_{key}")  # a scene's can have slashes
         with suppress(OSError):
             pictures.clouds[scene] = name, read_file(bench / FIGURES / f"{name}.png")

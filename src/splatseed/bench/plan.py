@@ -6,7 +6,6 @@ its runs are ordered so that all arms of all scenes have been run once before an
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 from collections import Counter
@@ -18,6 +17,7 @@ from splatseed.bench.scenes import PlannedScene, SceneFacts
 from splatseed.errors import ParameterError
 from splatseed.methods import METHODS, Profile, Upsampler, chooses_number, configure
 from splatseed.photos.view import TRAINED_SIDE
+from splatseed.runtime.fingerprint import fingerprint
 from splatseed.scores import CurvePoint, EvalResult
 from splatseed.seeding.upsampling import RHO, parse_budget
 from splatseed.text import did_you_mean
@@ -113,7 +113,7 @@ class RunSpec:
         """The fingerprint of everything that determines the result: 32 hexadecimal digits."""
         told = {**self.to_dict(), "scene": [getattr(self.scene, name) for name in _WHAT]}
         text = json.dumps(told, sort_keys=True, separators=(",", ":"))
-        return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+        return fingerprint(text.encode())
 
     @property
     def settings(self) -> TrainSettings:

@@ -7,7 +7,6 @@ photographs and scans count byte for byte, depth maps as read.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,12 +25,11 @@ from splatseed.io.photograph_checks import check_sizes, with_photographs
 from splatseed.photos.sight import stray_notes
 from splatseed.photos.view import check_lens
 from splatseed.progress import Progress, in_threads, silent
+from splatseed.runtime.fingerprint import fingerprint, fingerprint_all
 from splatseed.scene import Scene
 
 DEMO = "demo:"
 """The path of the synthetic room, which is made in the benchmark's folder on demand."""
-_SIZE = 16
-"""Bytes of a fingerprint."""
 
 
 @dataclass(frozen=True)
@@ -179,78 +177,58 @@ def fingerprints(
 
 
 def scene_digest(scene: Scene, folder: Path, progress: Progress = silent) -> str:
-    """Fingerprint of points, tracks, cameras, photographs and masks: 32 hexadecimal digits."""
-    digest = hashlib.blake2b(digest_size=_SIZE)
-    _add(digest, scene.points.xyz, scene.points.rgb)
+    """Fingerprint points, tracks, cameras, photographs and masks."""
+    parts: list[object] = [scene.points.xyz, scene.points.rgb]
     if scene.tracks is not None:
         tracks = scene.tracks
-        _add(digest, tracks.xyz, tracks.errors, tracks.offsets, tracks.image_ids)
+        parts += [tracks.xyz, tracks.errors, tracks.offsets, tracks.image_ids]
     images = sorted(scene.images, key=lambda image: image.name)
     for image in images:
         lens = image.intrinsics
-        _add(digest, (image.name, lens.model, lens.width, lens.height))
-        _add(digest, np.array(lens.params, np.float64), image.quat, image.translation)
+        parts.append((image.name, lens.model, lens.width, lens.height))
+        parts += [np.array(lens.params, np.float64), image.quat, image.translation]
         if image.observations is not None:
-            _add(digest, image.observations.xy, image.observations.point_ids)
+            parts += [image.observations.xy, image.observations.point_ids]
     if scene.absent:
-        _add(digest, sorted(scene.absent))
+        parts.append(sorted(scene.absent))
     if scene.listed is not None:
-        _add(digest, (sorted(scene.listed.train), sorted(scene.listed.test)))
+        parts.append((sorted(scene.listed.train), sorted(scene.listed.test)))
 
-    def of_file(i: int) -> bytes:
+    def of_file(i: int) -> str:
         name = images[i].name
         content = photograph_bytes(folder / name)
         if scene.masks is not None and name in scene.masks.files:
             content += read_bytes(scene.masks.files[name])
-        return hashlib.blake2b(content, digest_size=_SIZE).digest()
+        return fingerprint(content)
 
-    return _with_files(digest, of_file, len(images), "fingerprint photographs", progress)
+    files = _of_files(of_file, len(images), "fingerprint photographs", progress)
+    return fingerprint(*parts, files)
 
 
 def _depth_digest(maps: DepthMaps, progress: Progress) -> str:
-    """Fingerprint of depth maps as they are read."""
+    """Fingerprint depth maps as they are read."""
     names = sorted(maps)
 
-    def of_map(i: int) -> bytes:
+    def of_map(i: int) -> str:
         depth_map = maps.read(names[i])
-        digest = hashlib.blake2b(f"{names[i]}\n{depth_map.kind}\n".encode(), digest_size=_SIZE)
-        _add(digest, depth_map.values)
-        return digest.digest()
+        return fingerprint(f"{names[i]}\n{depth_map.kind}\n".encode(), depth_map.values)
 
-    digest = hashlib.blake2b(digest_size=_SIZE)
-    return _with_files(digest, of_map, len(names), "fingerprint depth", progress)
+    return fingerprint(_of_files(of_map, len(names), "fingerprint depth", progress))
 
 
 def _cloud_digest(path: Path, progress: Progress) -> str:
-    """Fingerprint of a scan's file, byte for byte."""
+    """Fingerprint the bytes of a scan's file."""
     progress("fingerprint the scan", 0.0)
-    digest = hashlib.blake2b(digest_size=_SIZE)
     with open_file(path) as file:
-        while piece := file.read(1 << 22):
-            digest.update(piece)
-    return digest.hexdigest()
+        return fingerprint_all(iter(lambda: file.read(1 << 22), b""))
 
 
-def _add(digest: hashlib.blake2b, *values: object) -> None:
-    """Arrays, hashed with their shapes so that two are never taken for one, and words."""
-    for value in values:
-        if isinstance(value, np.ndarray):
-            digest.update(repr((value.shape, value.dtype.str)).encode())
-            digest.update(value.tobytes())
-        else:
-            digest.update(repr(value).encode("utf-8", "backslashreplace"))
-
-
-def _with_files(
-    digest: hashlib.blake2b, of_file: Callable[[int], bytes], count: int, stage: str,
-    progress: Progress,
-) -> str:  # fmt: skip
-    """The fingerprint with those of files, which several threads read."""
-    each = [b""] * count
+def _of_files(of_file: Callable[[int], str], count: int, stage: str, progress: Progress) -> bytes:
+    """Fingerprint files in several threads; returns the bytes of all fingerprints in order."""
+    digests = [""] * count
 
     def work(start: int, _stop: int) -> None:
-        each[start] = of_file(start)
+        digests[start] = of_file(start)
 
     in_threads(work, count, 1, stage, progress)
-    digest.update(b"".join(each))
-    return digest.hexdigest()
+    return bytes.fromhex("".join(digests))

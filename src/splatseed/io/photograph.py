@@ -7,7 +7,6 @@ are rounded to 8 bits, of which the capture's *white* (``io.bit_depth``) becomes
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
@@ -19,6 +18,7 @@ from PIL import Image as PilImage
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io.bit_depth import WHITE, is_wide, opaque_value, wide_values
 from splatseed.io.files import guarded, other_spelling, read_bytes
+from splatseed.runtime.fingerprint import fingerprint
 from splatseed.scene import Image, Scene
 
 _CHECK_SCALE = 8
@@ -49,15 +49,15 @@ def photographs_digest(scene: Scene) -> str:
 
     A run notes it: it tells later whether a scene is still what the run was trained on.
     """
-    digest = hashlib.blake2b(digest_size=16)
+    parts = []
     folder = scene.source.image_dir if scene.source else None
     for image in scene.images:
         lens, path = image.intrinsics, folder and folder / image.name
         size = path.stat().st_size if path and path.is_file() else None
         facts = f"{image.name!r} {lens.params} {lens.width} {lens.height} {size}"
-        digest.update(facts.encode())  # repr escapes what is no UTF-8 in a name
-        digest.update(image.quat.tobytes() + image.translation.tobytes())
-    return digest.hexdigest()
+        parts.append(facts.encode())  # repr escapes what is no UTF-8 in a name
+        parts.append(image.quat.tobytes() + image.translation.tobytes())
+    return fingerprint(*parts)
 
 
 def photograph_bytes(path: Path) -> bytes:

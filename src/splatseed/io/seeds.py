@@ -9,7 +9,6 @@ points is reported and not used.
 
 from __future__ import annotations
 
-import hashlib
 import math
 import shutil
 import zipfile
@@ -24,6 +23,7 @@ from splatseed.errors import PointCloudError
 from splatseed.io.files import ARCHIVE_FAILURES, read_npy
 from splatseed.io.staging import ABSENT, MANIFEST, read_manifest, write_json
 from splatseed.pointcloud import ATTRIBUTES, GENERATED, ORIGINAL, PointCloud
+from splatseed.runtime.fingerprint import fingerprint
 from splatseed.scene import Scene
 
 SEEDS = "seeds.npz"
@@ -44,9 +44,8 @@ _DIGEST_BYTES = 16
 
 def _position_digest(xyz: Float32[np.ndarray, "n 3"]) -> bytes:
     """The fingerprint of positions; -0.0 counts as 0.0."""
-    digest = hashlib.blake2b(digest_size=_DIGEST_BYTES)
-    digest.update(np.ascontiguousarray(xyz + np.float32(0.0), "<f4").tobytes())
-    return digest.digest()
+    positions = np.ascontiguousarray(xyz + np.float32(0.0), "<f4").tobytes()
+    return bytes.fromhex(fingerprint(positions))
 
 
 def write_seeds(folder: Path, points: PointCloud) -> None:

@@ -7,7 +7,6 @@ A run that succeeds removes it.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from importlib.metadata import version
@@ -16,6 +15,7 @@ from typing import Any, NamedTuple
 
 from splatseed.camera import Intrinsics
 from splatseed.io.staging import MANIFEST, held, read_manifest, remove, write_json
+from splatseed.runtime.fingerprint import fingerprint
 from splatseed.scene import Masks
 from splatseed.sfm.cameras import Photos
 from splatseed.text import quoted
@@ -61,7 +61,7 @@ def _mask_facts(masks: Masks | None, name: str) -> tuple[object, ...]:
 
 
 def _digest(facts: Sequence[object]) -> str:
-    return hashlib.blake2b("\n".join(map(repr, facts)).encode(), digest_size=16).hexdigest()
+    return fingerprint("\n".join(map(repr, facts)).encode())
 
 
 @contextmanager

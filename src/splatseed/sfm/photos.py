@@ -11,7 +11,6 @@ correlation (Kuglin and Hines 1975). A frame's *sharpness* is the variance of it
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import re
 from collections.abc import Iterator
@@ -33,6 +32,7 @@ from splatseed.io.photograph_checks import check_sizes, resized_to
 from splatseed.io.staging import read_manifest
 from splatseed.progress import Progress, silent
 from splatseed.requirements import require
+from splatseed.runtime.fingerprint import fingerprint
 from splatseed.scene import Image, Scene
 from splatseed.sfm.cameras import Photo, Photos, read_exif
 from splatseed.text import name_some, quoted
@@ -132,7 +132,7 @@ def _read(path: Path) -> tuple[Photo | None, bool]:
         mode, exif = image.mode, read_exif(image)
     if mode.startswith(_DEPTH_MODES):
         return None, False
-    digest = hashlib.blake2b(encoded, digest_size=16).hexdigest()
+    digest = fingerprint(encoded)
     return Photo(check_photograph(path), exif, digest), mode not in _GREY_MODES
 
 

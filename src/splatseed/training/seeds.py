@@ -11,7 +11,6 @@ the same start can be written for other trainers: a run begins with exactly what
 
 from __future__ import annotations
 
-import hashlib
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -28,6 +27,7 @@ from splatseed.io.staging import atomic_file
 from splatseed.photos.view import NEAR_PLANE, View
 from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.progress import Progress, silent
+from splatseed.runtime.fingerprint import fingerprint
 from splatseed.scene import Image, Scene
 from splatseed.seeding.advice import AS_IT_IS, advice_for
 from splatseed.splat.gaussians import (
@@ -167,11 +167,8 @@ def seeds_facts(seeds: PointCloud) -> dict[str, Any]:
 
 def seeds_digest(seeds: PointCloud) -> str:
     """A fingerprint of positions, colours and attributes."""
-    digest = hashlib.blake2b(seeds.xyz.tobytes(), digest_size=16)
-    digest.update(seeds.rgb.tobytes())
-    for name, values in seeds.attributes.items():
-        digest.update(name.encode() + values.tobytes())
-    return digest.hexdigest()
+    own = (name.encode() + values.tobytes() for name, values in seeds.attributes.items())
+    return fingerprint(seeds.xyz.tobytes(), seeds.rgb.tobytes(), *own)
 
 
 def first_gaussians(

@@ -9,7 +9,6 @@ Gaussians than the budget keeps those that contribute most to the training photo
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ import torch
 from jaxtyping import Float32
 
 from splatseed.photos.view import View
+from splatseed.runtime.fingerprint import fingerprint
 from splatseed.scene import Scene
 from splatseed.splat.formats import read_model
 from splatseed.splat.gaussians import Gaussians, TrainingFrame
@@ -58,10 +58,8 @@ def read_start(
 
 def start_facts(gaussians: Gaussians) -> dict[str, Any]:
     """What a run's config says of its start, in place of its seeds."""
-    digest = hashlib.blake2b(digest_size=16)
-    for array in gaussians.arrays().values():
-        digest.update(np.ascontiguousarray(array).tobytes())
-    return {"count": len(gaussians), "digest": digest.hexdigest()}
+    arrays = (np.ascontiguousarray(array).tobytes() for array in gaussians.arrays().values())
+    return {"count": len(gaussians), "digest": fingerprint(*arrays)}
 
 
 def started_gaussians(
