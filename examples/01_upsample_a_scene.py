@@ -21,7 +21,7 @@ def main(scene_dir: Path, out: Path) -> None:
 
     scene = ss.load_scene(scene_dir)
     seeds = ss.upsample(scene)  # looks at the photographs
-    report = ss.write_scene(scene.replace(points=seeds), out, overwrite=True)
+    report = ss.write_scene(scene.with_points(seeds), out, overwrite=True)
 
     print(f"{len(scene.images)} images, {len(scene.points):,} points -> {len(seeds):,}")
     print(f"written to {report.path} ({report.layout} layout)")
