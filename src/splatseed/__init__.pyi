@@ -6,3 +6,4 @@ from .methods import METHODS as METHODS, upsample_points as upsample_points
 from .pointcloud import PointCloud as PointCloud
 from .scene import Scene as Scene
 from .seeding.upsampling import add_cover as add_cover, upsample as upsample
+from .training.api import Run as Run, evaluate as evaluate, train as train

@@ -2,29 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from splatseed.commands.models import check_free, config_of, model_file, near_plane_of
-from splatseed.commands.options import MaskChoice, parse_options, refuse
+from splatseed.commands.options import MaskChoice, parse_options
+from splatseed.commands.outputs import check_free
 from splatseed.console import StageClock, print_note, print_pairs, print_table, stage_display
-from splatseed.errors import MissingDependencyError, SceneNotFoundError
 from splatseed.io.staging import check_output, output_folder, write_json
-from splatseed.photos.view import View, user_cache_dir
+from splatseed.photos.view import View
 from splatseed.requirements import require
 from splatseed.text import counted
 from splatseed.training.folder import RunFolder
-from splatseed.training.settings import Backend, TrainSettings
+from splatseed.training.settings import Backend
 
 if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
     from splatseed.scores import EvalResult, ViewScore
-
-LEAST = {"data_factor": 1, "test_every": 2}
-"""Numbers that a run's config gives where no option does, and their least values."""
+    from splatseed.splat.evaluate import TrainedModel
+    from splatseed.training.evaluation import Evaluation
 
 
 @dataclass(frozen=True)
@@ -68,24 +66,13 @@ def run(arguments: list[str]) -> None:
     """Run the verb with these arguments."""
     options = parse_options(Options, "evaluate", arguments)
     require("torch", "flip_evaluator")
-    gaussians, config = model_file(options.model), config_of(options.model)
-    scene, masks = options.scene or config.get("scene"), options.masks or config.get("masks")
-    numbers: dict[str, Any] = {
-        name: config.get(name, getattr(TrainSettings, name)) if given is None else given
-        for name in LEAST
-        for given in [getattr(options, name)]
-    }
-    refuse(
-        (not isinstance(scene, str | Path), f"--scene, as {options.model} does not name its scene",
-         "none", "Pass --scene SCENE: the scene that it was trained on."),
-        *(((name, numbers[name]) != ("data_factor", None)
-           and (not isinstance(numbers[name], int) or numbers[name] < least),
-           f"--{name.replace('_', '-')} of {least} or more", numbers[name],
-           "See splatseed evaluate --help.") for name, least in LEAST.items()),
+    from splatseed.training.evaluation import Evaluation
+
+    evaluation = Evaluation.of(
+        options.model, options.scene, data_factor=options.data_factor,
+        test_every=options.test_every, transform=options.transform, masks=options.masks,
     )  # fmt: skip
-    scene = Path(str(scene))
-    moved = options.scene is None and not scene.exists()
-    refuse((moved, f"the scene of the run at {scene}", "none", "Say where it is: --scene SCENE."))
+    scene, gaussians = Path(str(evaluation.scene)), Path(str(evaluation.model))
     if options.renders is not None:
         check_output(
             options.renders, kind="evaluate", overwrite=options.overwrite,
@@ -96,7 +83,9 @@ def run(arguments: list[str]) -> None:
         inputs = [scene, gaussians, trained.config, trained.metrics]
         check_free(options.output, overwrite=options.overwrite, protect=inputs)
     with stage_display() as clock:
-        result, factor, doubts = _evaluate(options, gaussians, scene, numbers, config, masks, clock)
+        clock("read", 0.0)
+        model = evaluation.load(options.backend, clock)
+        result = _score(options, evaluation, model, clock)
     rows = [
         (score.name, *_numbers(score), f"{1e3 * score.seconds:.1f}") for score in result.per_image
     ]
@@ -118,54 +107,26 @@ def run(arguments: list[str]) -> None:
     facts = [
         ("Gaussians", f"{result.num_gaussians:,}"),
         ("size", f"{(result.model_bytes or 0) / 1e6:.1f} MB of parameters"),
-        ("data factor", f"{factor}"),
+        ("data factor", f"{model.data_factor}"),
     ]
     written = (("scores", options.output), ("renders", options.renders))
     facts += [(label, str(path)) for label, path in written if path is not None]
     print_pairs(str(options.model), facts)
     if result.lpips is None:
         print_note(f"LPIPS was not computed: {result.lpips_reason}")
-    for doubt in doubts:
+    for doubt in evaluation.doubts(model):
         print_note(doubt)
 
 
-def _evaluate(
-    options: Options,
-    gaussians: Path,
-    scene: Path,
-    numbers: Mapping[str, int],
-    config: Mapping[str, Any],
-    masks: str | None,
-    clock: StageClock,
-) -> tuple[EvalResult, int, list[str]]:
-    """Score the test views and write what was asked for.
-
-    Also returns the factor that photographs were divided by, and what makes the scores doubtful.
-    """
-    from splatseed.splat.covisible import find_covisible, pixel_masks
-    from splatseed.splat.evaluate import evaluate_model, load_model
-    from splatseed.splat.metrics import load_lpips
+def _score(
+    options: Options, evaluation: Evaluation, model: TrainedModel, clock: StageClock
+) -> EvalResult:
+    """Score the test views and write the files that were asked for."""
     from splatseed.splat.rendering import picture_names, write_render
-    from splatseed.training.device import pick_device
 
-    clock("read", 0.0)
-    lpips, reason = None, ""
-    try:
-        lpips = load_lpips(weights=options.lpips_weights)
-    except (MissingDependencyError, SceneNotFoundError) as error:
-        if options.lpips_weights is not None:
-            raise
-        reason = str(error)
-    model = load_model(
-        gaussians, scene, **numbers, transform=options.transform, masks=masks,
-        trained_on=config.get("photographs"), near_plane=near_plane_of(config),
-        device=pick_device(options.backend, clock), cache_dir=user_cache_dir(), progress=clock,
-    )  # fmt: skip
-    seen = pixel_masks(find_covisible(model.scene, numbers["test_every"], clock), model.views)
-    asked: dict[str, Any] = {"lpips": lpips, "lpips_reason": reason, "covisible": seen}
-    asked["progress"] = clock
+    score = partial(evaluation.score, model, lpips_weights=options.lpips_weights, progress=clock)
     if options.renders is None:
-        result = evaluate_model(model, **asked)
+        result = score()
     else:
         with output_folder(options.renders, kind="evaluate", overwrite=options.overwrite) as folder:
             names = picture_names(view.name for view in model.views)
@@ -173,19 +134,19 @@ def _evaluate(
             def draw(view: View, render: Any, errors: Any) -> None:
                 write_render(folder / names[view.name], view.photograph, render, errors)
 
-            result = evaluate_model(model, on_view=draw, **asked)
+            result = score(on_view=draw)
     if options.output is not None:
-        named = {"model": options.model, "scene": scene}
-        numbers = {**numbers, "data_factor": model.data_factor}
-        noted = {"notes": list(model.notes)} if model.notes else {}
-        write_json(options.output, {**named, **numbers, **result.to_dict(), **noted})
-    doubts, own = [*model.notes, *filter(None, [model.doubt])], config.get("test_every")
-    shown = {view.name for view in model.views}
-    if isinstance(own, int):
-        shown &= {image.name for image in model.scene.split(own)[0]}
-        told = f"{len(shown)} of these {len(model.views)} views were trained on"
-        doubts += [f"{told}: the run held out one in {own}."] * bool(shown)
-    return result, model.data_factor, doubts
+        content = {
+            "model": options.model,
+            "scene": evaluation.scene,
+            "data_factor": model.data_factor,
+            "test_every": evaluation.test_every,
+            **result.to_dict(),
+        }
+        if model.notes:
+            content["notes"] = list(model.notes)
+        write_json(options.output, content)
+    return result
 
 
 def _numbers(scores: EvalResult | ViewScore) -> tuple[str, ...]:

@@ -9,8 +9,8 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from splatseed.commands.models import check_free, config_of, model_file
 from splatseed.commands.options import parse_options, refuse
+from splatseed.commands.outputs import check_free
 from splatseed.console import print_note, print_pairs, stage_display
 from splatseed.io.origin import RECENTER, offset_beside, origin_of, place_words, write_offset
 from splatseed.requirements import require
@@ -25,6 +25,7 @@ from splatseed.splat.formats import (
 from splatseed.splat.world import shifted
 from splatseed.text import quoted
 from splatseed.training.folder import RunFolder
+from splatseed.training.models import config_of, model_file
 from splatseed.training.settings import TrainSettings
 
 OWN = "own"

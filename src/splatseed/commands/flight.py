@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import tyro
 
-from splatseed.commands.models import check_free, model_file
 from splatseed.commands.options import parse_options, refuse
+from splatseed.commands.outputs import check_free
 from splatseed.console import print_note, print_pairs, stage_display
 from splatseed.errors import ParameterError
 from splatseed.io.origin import shift_to
@@ -18,6 +18,7 @@ from splatseed.pointcloud import PointCloud
 from splatseed.requirements import require
 from splatseed.scene import Scene
 from splatseed.similarity import Similarity
+from splatseed.training.models import model_file
 from splatseed.training.settings import Backend
 
 if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it

@@ -20,9 +20,9 @@ import numpy as np
 import tyro
 
 from splatseed.commands import next_steps
-from splatseed.commands.models import check_free
 from splatseed.commands.next_steps import Commands, Planned
 from splatseed.commands.options import parse_options, refuse
+from splatseed.commands.outputs import check_free
 from splatseed.console import OUT, StageClock, print_note, print_pairs, print_table, stage_display
 from splatseed.depthmap import DepthKind, DepthMaps
 from splatseed.errors import SplatseedError

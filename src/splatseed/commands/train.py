@@ -11,7 +11,7 @@ from argparse import ArgumentParser
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from datetime import timedelta
 from functools import partial
 from pathlib import Path
@@ -21,33 +21,20 @@ import tyro
 from rich import progress as rich_progress
 from rich.table import Column
 
-from splatseed.commands.models import model_file
-from splatseed.commands.options import MaskChoice, parse_options, refuse
+from splatseed.commands.options import MaskChoice, parse_options
 from splatseed.console import ERR, OUT, print_note, print_pairs, stage_display
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.io import load_scene
 from splatseed.io.files import read_text
-from splatseed.io.masks import with_masks
 from splatseed.methods.method import fits
-from splatseed.photos.view import at_file_size, data_factor, poses_of, user_cache_dir
-from splatseed.progress import Progress
 from splatseed.requirements import require
 from splatseed.runtime.interruption import exit_code
-from splatseed.scene import Scene
 from splatseed.scores import TrainingResult
-from splatseed.seeding.upsampling import RHO, parse_budget
+from splatseed.seeding.upsampling import RHO
 from splatseed.text import did_you_mean, quoted, visible
 from splatseed.training.duration import TOO_LONG, Progressed, about_an_hour, in_words, seconds_left
 from splatseed.training.folder import RunFolder
-from splatseed.training.seeds import why_not_seeded
-from splatseed.training.settings import (
-    BUDGET,
-    LEAST_GAUSSIANS,
-    OPTIONS,
-    Seeding,
-    StrategyName,
-    TrainSettings,
-)
+from splatseed.training.settings import OPTIONS, Seeding, StrategyName, TrainSettings
 
 if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
     from splatseed.training.run import TrainingRun
@@ -64,7 +51,8 @@ FEWEST_STEPS, WINDOW, SURE_AFTER, ESTIMATED_EVERY = 5, 100, 10.0, 5
 which it is said; and steps between estimates."""
 WORTH_SAYING = 120.0
 """Seconds of training that are worth a line."""
-RUN_NOTES = {"splatseed", "points", "photographs", "device", "versions", "near_plane"}
+RUN_NOTES = {"splatseed", "points", "photographs", "device", "versions", "near_plane",
+    "frame"}  # fmt: skip
 """What config.json records besides options."""
 _SETTINGS = {option: name for name, option in OPTIONS.items()} | {"long_side": "data_factor"}
 """Settings by the options that stand for them, where these have other names."""
@@ -110,17 +98,6 @@ class Options:
     overwrite: bool = False
     """Replace an earlier run in the output folder."""
 
-    @property
-    def settings(self) -> TrainSettings:
-        """The options that make up the training settings."""
-        # A resumed run knows its own settings.
-        goes_on = self.resume and RunFolder(self.output).is_run
-        seeding = self.seeds or (DEFAULT.seeding if goes_on else "advised")
-        named = self.training.strategy
-        strategy = DEFAULT.strategy if goes_on and named == BEST else named
-        start = self.training.start and str(model_file(Path(self.training.start)).resolve())
-        return replace(self.training, seeding=seeding, strategy=strategy, start=start)
-
 
 def parse(arguments: list[str]) -> Options:
     """The options; those on the command line replace those of a file that --config names."""
@@ -141,7 +118,7 @@ def _in_file(path: Path, words: Collection[str]) -> Options:
     """The options in a .toml or in a run's config.json, but for rivals of the command line's."""
     rivals = {b for pair in RIVALS for a, b in (pair, pair[::-1]) if a in words}
     kinds = {"training": TrainSettings, "": Options}
-    fields = {
+    known = {
         name: (group, hint)
         for group, kind in kinds.items()
         for name, hint in get_type_hints(kind).items()
@@ -151,13 +128,13 @@ def _in_file(path: Path, words: Collection[str]) -> Options:
     for name, value in _read_config(path).items():
         if name in rivals:
             continue
-        if name not in fields:
+        if name not in known:
             raise SceneFormatError(
                 f"options of splatseed train in {path}",
                 found=repr(name),
-                fix=f"{did_you_mean(name, fields)}Run splatseed train --help.",
+                fix=f"{did_you_mean(name, known)}Run splatseed train --help.",
             )
-        group, hint = fields[name]
+        group, hint = known[name]
         named = Path in (hint, *get_args(hint)) and isinstance(value, str)
         given[group][name] = Path(value) if named else value
         if not fits(given[group][name], hint):
@@ -194,24 +171,41 @@ def _read_config(path: Path) -> dict[str, Any]:
     return {k: v for k, v in content.items() if k not in RUN_NOTES and v is not None}
 
 
-def _named(arguments: Sequence[str], config: Path | None) -> set[str]:
-    """The settings that are given on the command line or in a file, whatever their values."""
-    words = _words(arguments) | set(() if config is None else _read_config(config))
-    return {_SETTINGS.get(word, word) for word in words}
+def _given(options: Options, arguments: Sequence[str]) -> dict[str, Any]:
+    """The settings that the command line or the file of --config gives, whatever their values."""
+    words = _words(arguments) | set(() if options.config is None else _read_config(options.config))
+    names = {each.name for each in fields(TrainSettings)} & words
+    given = {name: getattr(options.training, name) for name in names}
+    return given if options.seeds is None else {**given, "seeding": options.seeds}
 
 
 def run(arguments: list[str]) -> None:
     """Run the verb with these arguments."""
     options = parse(arguments)
-    settings, named = options.settings, _named(arguments, options.config)
-    if "strategy" in named:  # a resumed run's must be that
-        settings = replace(settings, strategy=options.training.strategy)
     require("torch", "gsplat", "flip_evaluator", *(["viser"] if options.view else []))
+    from splatseed.splat.evaluate import evaluate_views
+    from splatseed.training.api import prepare_training
+
     notes: list[str] = []
     if options.resume and not RunFolder(options.output).is_run:
         notes.append(f"There is no run to resume in {options.output}: a new one begins.")
+    # ``api.train``, with displays.
     with stage_display() as clock:
-        training = _prepare(options, settings, named, notes.append, clock)
+        clock("read", 0.0)
+        training = prepare_training(
+            options.scene,
+            options.output,
+            budget=options.budget,
+            long_side=options.long_side,
+            masks=options.masks,
+            refine_poses=options.refine_poses,
+            resume=options.resume,
+            overwrite=options.overwrite,
+            tensorboard=options.tensorboard,
+            note=notes.append,
+            progress=clock,
+            **_given(options, arguments),
+        )
     for note in notes:
         print_note(note)
     _announce(options, training)
@@ -230,102 +224,9 @@ def run(arguments: list[str]) -> None:
         saved = f"interrupted after step {training.state.step:,}; saved. Continue with:"
         ERR.print(f"\n{saved}\n  splatseed train {again}", soft_wrap=True)
         sys.exit(exit_code())
-    from splatseed.splat.evaluate import evaluate_views
-
     with stage_display(clock):
         result = training.finish(partial(evaluate_views, progress=clock), clock)
     _summarise(options, training, result)
-
-
-def _prepare(
-    options: Options,
-    settings: TrainSettings,
-    named: Collection[str],
-    note: Callable[[str], None],
-    clock: Progress,
-) -> TrainingRun:
-    from splatseed.training.run import prepare_run
-
-    clock("read", 0.0)
-    has_points = options.seeds == "scene" and not options.refine_poses
-    required = has_points and not settings.start
-    scene = load_scene(options.scene, require_points=required)
-    scene = at_file_size(with_masks(scene, options.masks))
-    for warning in scene.warnings:
-        note(warning)
-    if scene.listed is not None:
-        note(scene.listed.sentence)
-    settings = _within_budget(options, _sized(options, settings, scene, note), scene, note)
-    seeds, refines = bool(options.seeds), options.refine_poses
-    refuse(
-        (settings.start and seeds, "--start or --seeds", "both", "Leave one out."),
-        (settings.start and refines, "--start or --refine-poses", "both", "Leave one out."),
-    )
-    if options.seeds == "auto" and (why := why_not_seeded(scene, settings)):
-        note(f"--seeds auto has no effect: {why}.")
-    return prepare_run(
-        scene,
-        options.output,
-        settings,
-        resume=options.resume,
-        named=named,
-        overwrite=options.overwrite,
-        refine_poses=options.refine_poses,
-        tensorboard=options.tensorboard,
-        cache_dir=user_cache_dir(),
-        note=note,
-        progress=clock,
-    )
-
-
-def _sized(
-    options: Options, settings: TrainSettings, scene: Scene, note: Callable[[str], None]
-) -> TrainSettings:
-    """The settings, with the factor that --long-side or the default amounts to in this scene."""
-    side = options.long_side
-    if side is None:
-        folder = RunFolder(options.output)
-        if settings.data_factor is None and options.resume and folder.is_run:
-            kept = folder.read_config().get("data_factor")
-            return replace(settings, data_factor=kept if isinstance(kept, int) else 1)
-        return settings.sized(scene.images, note)
-    refuse(
-        (
-            settings.data_factor is not None,
-            "--long-side or --data-factor",
-            "both",
-            "Leave one out.",
-        ),
-        (side < 1, "--long-side of 1 or more", side, "Try 800."),
-    )
-    return replace(settings, data_factor=data_factor(scene.images, side) if scene.images else 1)
-
-
-def _within_budget(
-    options: Options, settings: TrainSettings, scene: Scene, note: Callable[[str], None]
-) -> TrainSettings:
-    """The settings, with the cap that the budget amounts to in this scene."""
-    chosen = settings.strategy == BEST and settings.cap_max is None
-    if options.budget is None and not (chosen and scene.images):
-        return settings
-    from splatseed.seeding.budget import median_pixels
-
-    views = poses_of(scene.images, settings.factor)
-    pixels = median_pixels(views) if views else 0
-    if options.budget is None:
-        cap = max(2, min(BUDGET, round(pixels)))
-        each = "one for each pixel of a photograph; --budget sets another"
-        if settings.start:  # a merge of two may be larger, and must not be thinned unasked
-            from splatseed.splat.formats import read_model
-
-            cap = max(cap, len(read_model(Path(settings.start))))
-            each = "one for each pixel of a photograph, or as many as it starts with"
-        note(f"At most {cap:,} Gaussians, {each}.")
-        return replace(settings, cap_max=cap)
-    cap = parse_budget(options.budget, pixels)
-    least = f"--budget of {LEAST_GAUSSIANS} Gaussians or more"
-    refuse((cap < LEAST_GAUSSIANS, least, options.budget, "Try 0.25rho."))
-    return replace(settings, cap_max=cap)
 
 
 def _announce(options: Options, training: TrainingRun) -> None:

@@ -169,8 +169,8 @@ class TrainedModel:
 
 
 def load_model(
-    path: StrPath,
-    scene_path: StrPath,
+    model: Gaussians | StrPath,
+    scene: Scene | StrPath,
     *,
     data_factor: int | None = None,
     test_every: int = 8,
@@ -185,20 +185,20 @@ def load_model(
     """Read Gaussians that any trainer wrote, and the test views of their scene.
 
     Args:
-        path: A file that ``read_model`` reads.
-        scene_path: The scene.
+        model: A file that ``read_model`` reads, or Gaussians in the scene's frame.
+        scene: The scene, or its path.
         data_factor: The factor by which photographs are downsampled; when left out, as ``train``
             chooses it.
         test_every: Every n-th image, sorted by name, is a test view.
-        transform: From the scene's world to the model's, as for ``find_transform``; when left out,
+        transform: From the scene's frame to the model's, as for ``find_transform``; when left out,
             they must be the same.
         masks: Which masks, as for ``io.masks.with_masks``.
-        trained_on: The ``photographs_digest`` of the run; where it is the scene's, they are the
-            same, whatever the clones that mcmc makes look like.
-        near_plane: The run's, in the model's world; when left out, it is found anew.
+        trained_on: The ``photographs_digest`` of the run; where it is the scene's, the frames are
+            the same, whatever the clones that mcmc makes look like.
+        near_plane: The run's, in the model's units; when left out, it is found anew.
         device: Where to render; the CPU when left out.
         cache_dir: Where smaller photographs are cached; nowhere when left out.
-        progress: Told how far it is.
+        progress: Called with the name of a stage and its fraction done.
 
     Raises:
         SceneNotFoundError: The model, the scene or its images are missing.
@@ -206,11 +206,12 @@ def load_model(
             are.
         ParameterError: The transform cannot be computed.
     """
-    path = Path(path)
-    scene_path = Path(scene_path)
     notes: list[str] = []
-    gaussians = read_model(path, notes.append)
-    scene = with_masks(load_scene(scene_path, require_points=False), masks)
+    path = None if isinstance(model, Gaussians) else Path(model)
+    gaussians = model if isinstance(model, Gaussians) else read_model(Path(model), notes.append)
+    if not isinstance(scene, Scene):
+        scene = load_scene(Path(scene), require_points=False)
+    scene = with_masks(scene, masks)
     if scene.images:
         scene = at_file_size(_with_test_photographs(scene, test_every))
     if gone := scene.absent:
@@ -221,7 +222,8 @@ def load_model(
     train, test = scene.split(test_every)
     if not train or not test:
         raise SceneNotFoundError(
-            f"{scene_path} to have images, some to train on and some to test on",
+            f"{scene.source.root if scene.source else 'the scene'} to have images, some to train "
+            "on and some to test on",
             found=f"{len(scene.images)}",
             fix="Name the scene with its cameras and photographs.",
         )
@@ -234,7 +236,7 @@ def load_model(
         cache_dir=cache_dir,
         progress=progress,
     )
-    if transform is None:
+    if transform is None and path is not None:
         gaussians = around_scene(path, scene, gaussians, notes.append)
     world = None if transform is None else find_transform(transform, scene)
     proven = transform is None and trained_on == photographs_digest(scene)

@@ -96,7 +96,7 @@ def shifted(gaussians: Gaussians, shift: Float64[np.ndarray, " 3"]) -> Gaussians
 
 
 def check_world(
-    path: Path, scene: Scene, gaussians: Gaussians, given: Similarity | None = None
+    path: Path | None, scene: Scene, gaussians: Gaussians, given: Similarity | None = None
 ) -> str:
     """Refuse a model, read from a path, that is not in the world of the scene's points.
 
@@ -121,7 +121,8 @@ def check_world(
     if fitting:
         fix = f"They fit with --transform {fitting[0]}, unless it is a model of another scene."
     raise SceneFormatError(
-        f"the Gaussians of {path} in the world of the scene, where its points are",
+        f"the Gaussians{f' of {path}' if path else ''} in the world of the scene, where its points "
+        "are",
         found=f"points {ratio:.0f} times as far from the nearest Gaussian as Gaussians from each "
         "other: another frame, or another scene",
         fix=fix,
@@ -217,10 +218,11 @@ def _measure(scene: Scene, gaussians: Gaussians) -> Callable[[Similarity | None]
     return apart
 
 
-def _candidates(path: Path, scene: Scene) -> dict[str, Similarity | None]:
+def _candidates(path: Path | None, scene: Scene) -> dict[str, Similarity | None]:
     """Transforms that the model's trainer may have applied, by the words for --transform."""
     found: dict[str, Similarity | None] = {NO_TRANSFORM: None}
-    files = [folder / name for folder in path.resolve().parents[:4] for name in FILES]
+    folders = path.resolve().parents[:4] if path else ()
+    files = [folder / name for folder in folders for name in FILES]
     for word in (*(str(file) for file in files if file.is_file()), GSPLAT):
         with suppress(SceneFormatError, ParameterError):
             found[word] = find_transform(word, scene)

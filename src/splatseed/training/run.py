@@ -153,7 +153,9 @@ def prepare_run(
     check_fits(len(seeds if start is None else start), device)
     began = seeds_facts(seeds) if start is None else start_facts(start)
     config = make_config(scene, began, settings, _name(device), refine_poses=refine_poses)
-    config["near_plane"] = frame.near / frame.scale  # in the world, for whoever renders the run
+    # For renders of the run: they are made in the frame of training.
+    config["near_plane"] = frame.near / frame.scale
+    config["frame"] = {"origin": frame.origin.tolist(), "scale": frame.scale}
     _check_begun(folder, begun, config)
     views = load_split(
         scene,

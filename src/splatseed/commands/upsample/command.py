@@ -11,8 +11,8 @@ from typing import Annotated, Any, Literal, get_args
 
 import tyro
 
-from splatseed.commands.models import check_free
 from splatseed.commands.options import MaskChoice, check_least, parse_options, refuse
+from splatseed.commands.outputs import check_free
 from splatseed.commands.upsample import output
 from splatseed.commands.upsample.cloud import load_cloud
 from splatseed.console import OUT, StageClock, print_note, stage_display

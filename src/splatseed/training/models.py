@@ -1,23 +1,26 @@
-"""A trained model as a user names it, a run folder or a file, and where its files may go."""
+"""Trained models on disk: the folder of a finished run, or a file of Gaussians of any trainer."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from splatseed.errors import OutputError, SceneFormatError, SceneNotFoundError
+from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io.files import odd_kind
 from splatseed.io.load import is_scene
 from splatseed.io.masks import NONE
-from splatseed.io.staging import check_apart, check_parents
 from splatseed.text import quoted
 from splatseed.training.folder import RunFolder
 
 
 def model_file(path: Path) -> Path:
-    """The file of a model's Gaussians; for a run, its result."""
+    """Return the file of a model's Gaussians; for a run, the file in its folder.
+
+    Raises:
+        SceneNotFoundError: There is none, or the run has not finished.
+    """
     folder = RunFolder(path)
     for file in (path, folder.gaussians):
         if file.is_file():
@@ -37,36 +40,20 @@ def model_file(path: Path) -> Path:
     )
 
 
-def check_free(
-    path: Path,
-    *,
-    overwrite: bool = False,
-    protect: Sequence[Path] = (),
-    fix: str = "Pass --overwrite to replace it, or choose another name.",
-) -> None:
-    """Refuse a file that may not be written, before any work is done.
-
-    It may not be one of ``protect`` or lie in one. ``fix`` is told where a file is there.
-    """
-    check_apart(path, protect)
-    check_parents(path)
-    if path.exists() and not path.is_file():
-        found = "a folder" if path.is_dir() else "no regular file"
-        raise OutputError(f"a file name at {path}", found=found, fix="Choose another name.")
-    if path.exists() and not overwrite:
-        raise OutputError(f"no file at {path}", found="one", fix=fix)
-
-
 def near_plane_of(config: Mapping[str, Any]) -> float | None:
-    """The near plane that a run was trained with, in its world; None for others."""
+    """Return the near plane of a run's training, in scene units; None without one."""
     near = config.get("near_plane")
     return float(near) if isinstance(near, float) and 0 < near < math.inf else None
 
 
 def config_of(path: Path) -> Mapping[str, Any]:
-    """The config of a run, named by its folder or its result; empty for what belongs to no run.
+    """Read the config of a run, given its folder or its file of Gaussians; empty for other files.
 
-    Its scene is the one that was trained, and its masks are those of that scene.
+    ``scene`` is the trained scene (with refined poses, if the run refined them), ``masks`` are the
+    masks of that scene.
+
+    Raises:
+        SceneFormatError: The config is damaged.
     """
     folder = RunFolder(path if path.is_dir() else path.parent)
     if path not in (folder.path, folder.gaussians) or not folder.is_run:
@@ -77,5 +64,5 @@ def config_of(path: Path) -> Mapping[str, Any]:
         expected = f"masks of {folder.config} to name a folder"
         raise SceneFormatError(expected, found=str(masks), fix="Train again with --overwrite.")
     if config.get("refine_poses") is True and masks != NONE:
-        masks = None  # the scene with refined poses has the chosen ones
+        masks = None  # the scene with refined poses was written with its masks
     return {**config, "scene": folder.scene_of(config), "masks": masks}

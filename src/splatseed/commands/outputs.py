@@ -1,0 +1,29 @@
+"""Where the file of a trained model may be written."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from splatseed.errors import OutputError
+from splatseed.io.staging import check_apart, check_parents
+
+
+def check_free(
+    path: Path,
+    *,
+    overwrite: bool = False,
+    protect: Sequence[Path] = (),
+    fix: str = "Pass --overwrite to replace it, or choose another name.",
+) -> None:
+    """Refuse a file that may not be written, before any work is done.
+
+    It may not be one of ``protect`` or lie in one. ``fix`` is told where a file is there.
+    """
+    check_apart(path, protect)
+    check_parents(path)
+    if path.exists() and not path.is_file():
+        found = "a folder" if path.is_dir() else "no regular file"
+        raise OutputError(f"a file name at {path}", found=found, fix="Choose another name.")
+    if path.exists() and not overwrite:
+        raise OutputError(f"no file at {path}", found="one", fix=fix)

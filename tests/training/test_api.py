@@ -1,0 +1,99 @@
+"""Training and scoring as users write them: through ``splatseed`` alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import splatseed as ss
+from splatseed.errors import OutputError, ParameterError, SceneNotFoundError
+
+SHORT = {"strategy": "none", "max_steps": 30, "data_factor": 2, "test_every": 3, "backend": "cpu"}
+
+
+@pytest.fixture(scope="module")
+def trained(room_path, tmp_path_factory):
+    """A scene and a short run on it."""
+    scene = ss.load_scene(room_path)
+    return scene, ss.train(scene, tmp_path_factory.mktemp("runs") / "run", **SHORT)
+
+
+def test_a_run_has_the_scores_that_evaluate_gives(trained):
+    scene, run = trained
+    scores = ss.evaluate(run, scene).to_dict()
+    for name in ("psnr", "cc_psnr", "ssim", "flip", "num_gaussians"):
+        assert scores[name] == pytest.approx(run.metrics[name], rel=1e-6), name
+    assert len(run.gaussians) == run.metrics["num_gaussians"] == len(scene.points)
+
+
+def test_any_form_of_a_model_scores_the_same(trained, room_path):
+    scene, run = trained
+    expected = ss.evaluate(run, scene).psnr
+    same = {"data_factor": 2, "test_every": 3}
+    assert ss.evaluate(str(run.folder)).psnr == expected  # a run knows its scene
+    assert ss.evaluate(run.folder / "point_cloud.ply", room_path).psnr == expected
+    # Without the run's near plane: found anew, by the same rule.
+    assert ss.evaluate(run.gaussians, scene, **same).psnr == pytest.approx(expected, abs=1e-4)
+    with pytest.raises(ParameterError, match="scene"):
+        ss.evaluate(run.gaussians)
+
+
+def test_a_render_shows_the_photograph(trained):
+    scene, run = trained
+    image = scene.split(3)[1][0]
+    render = run.render(image)
+    assert render.shape == (72, 96, 3)
+    assert render.dtype == np.float32
+    assert 0 <= render.min() <= render.max() <= 1
+    assert np.array_equal(render, run.render(image.camera))
+    assert np.array_equal(render, ss.Run(run.folder).render(image))
+    errors = {
+        other.name: float(np.abs(render - other.read() / 255.0).mean()) for other in scene.images
+    }
+    assert min(errors, key=errors.__getitem__) == image.name
+
+
+def test_wrong_arguments_are_named(trained, tmp_path):
+    scene, run = trained
+    for wrong, named in (
+        ({"max_step": 3}, "max_steps"),
+        ({"strategy": "best"}, "strategy"),
+        ({"budget": "1roh"}, "1roh"),
+        ({"long_side": 0}, "long_side"),
+        ({"long_side": 48, "data_factor": 2}, "long_side"),
+        ({"start": str(run.folder), "seeding": "auto"}, "start"),
+    ):
+        with pytest.raises(ParameterError, match=named):
+            ss.train(scene, tmp_path / "run", **wrong)
+        assert not (tmp_path / "run").exists()
+    with pytest.raises(OutputError, match="overwrite"):
+        ss.train(scene, run.folder, **SHORT)
+    with pytest.raises(SceneNotFoundError):
+        ss.Run(tmp_path)
+
+
+def test_ctrl_c_keeps_the_run_which_resumes(trained, room_path, tmp_path):
+    scene, run = trained
+
+    def stop(step):
+        if step == 4:
+            import os
+            import signal
+
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt, match="step 4"):
+        ss.train(room_path, tmp_path / "run", on_step=stop, **SHORT)
+    resumed = ss.train(scene, tmp_path / "run", resume=True)
+    assert resumed.metrics["psnr"] == run.metrics["psnr"]
+
+
+def test_the_budget_limits_a_run(room_path, tmp_path):
+    notes = []
+    run = ss.train(
+        room_path, tmp_path / "run", max_steps=3, budget="0.25rho", long_side=48, note=notes.append
+    )
+    assert run.config["strategy"] == "auto"
+    assert run.config["cap_max"] == 48 * 36 // 4
+    assert run.metrics["num_gaussians"] <= 48 * 36 // 4
+    assert notes
