@@ -15,9 +15,7 @@ from pathlib import Path
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before PyTorch: see docs/training.md
 
 import splatseed as ss
-from splatseed.splat.evaluate import evaluate_views
 from splatseed.synthetic import make_capture, write_capture
-from splatseed.training import TrainSettings, prepare_run
 
 
 def main(scene_dir: Path, steps: int) -> None:
@@ -26,19 +24,23 @@ def main(scene_dir: Path, steps: int) -> None:
         write_capture(make_capture(seed=0, num_views=12, width=120, height=90), scene_dir)
 
     scene = ss.load_scene(scene_dir)
-    settings = TrainSettings(strategy="none", max_steps=steps, backend="cpu", seed=0)
     for name, points in (
         ("sfm", scene.points),
         ("mls 4x", ss.upsample(scene, method="mls", ratio=4, seed=0)),
     ):
-        folder = Path("runs") / name.replace(" ", "_")
-        run = prepare_run(scene.replace(points=points), folder, settings, overwrite=True)
-        run.train()
-        result = run.finish(evaluate_views)
-        scores = result.scores
+        run = ss.train(
+            scene.replace(points=points),
+            Path("runs") / name.replace(" ", "_"),
+            strategy="none",
+            seeding="scene",
+            max_steps=steps,
+            backend="cpu",
+            overwrite=True,
+        )
+        scores = run.metrics
         print(
-            f"{name:7s}{scores.psnr:6.2f} dB  SSIM {scores.ssim:.3f}"
-            f"  {scores.num_gaussians:6,} Gaussians  {result.train_seconds:.1f} s"
+            f"{name:7s}{scores['psnr']:6.2f} dB  SSIM {scores['ssim']:.3f}"
+            f"  {scores['num_gaussians']:6,} Gaussians  {scores['train_seconds']:.1f} s"
         )
 
 

@@ -216,7 +216,7 @@ class Split:
     def sentence(self) -> str:
         """What the user should know before training."""
         count = f"{len(self.train):,} training and {len(self.test):,} test images"
-        return f"The split is that of the scene's {self.origin}: {count}; --test-every is ignored."
+        return f"The split is that of the scene's {self.origin}: {count}; `test_every` is ignored."
 
 
 @dataclass(frozen=True)

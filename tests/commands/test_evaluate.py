@@ -75,7 +75,7 @@ def _says(run, *texts):
 def test_a_run_that_is_not_whole_is_refused(run_folder, splatseed, tmp_path):
     for name in ("config.json", "splatseed.json"):
         (tmp_path / name).write_bytes((run_folder / name).read_bytes())
-    _says(splatseed("evaluate", tmp_path), f"-o {tmp_path} --resume")
+    _says(splatseed("evaluate", tmp_path), "has not finished", "--resume")
     (tmp_path / "point_cloud.ply").write_bytes((run_folder / "point_cloud.ply").read_bytes())
     deep, masks = 9**6 * "[", '{"scene": "x", "masks": 5}'
     for content in ("[]", "{", '{"scene": 7}', '{"scene": "x", "data_factor": "two"}', deep, masks):

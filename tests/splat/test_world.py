@@ -55,13 +55,13 @@ def other(rng):
 def test_what_gsplats_examples_write_is_refused_and_scored_right(room, gaussians, psnr, tmp_path):
     path = tmp_path / "model.ply"
     write_model(path, moved(gaussians, find_transform("gsplat", load_scene(room))))
-    with pytest.raises(SceneFormatError, match=r"--transform gsplat"):
+    with pytest.raises(SceneFormatError, match=r"transform=.gsplat"):
         load_model(path, room)
     right, wrong = (evaluate_model(load_model(path, room, transform=t)) for t in ("gsplat", "none"))
     assert right.psnr == pytest.approx(psnr, abs=0.05)
     assert wrong.psnr < psnr - 1
     write_model(path, gaussians)
-    with pytest.raises(SceneFormatError, match="--transform none"):
+    with pytest.raises(SceneFormatError, match=r"transform=.none"):
         load_model(path, room, transform="gsplat")
 
 
@@ -88,7 +88,7 @@ def test_a_file_tells_the_transform(kind, room, gaussians, psnr, other, tmp_path
     }[kind]
     file = tmp_path / (kind if kind.endswith("json") else "t.json")
     file.write_text(json.dumps(content))
-    says = str(file) if kind.endswith("json") else "--transform FILE"
+    says = str(file) if kind.endswith("json") else "transform=FILE"
     with pytest.raises(SceneFormatError, match=says):
         load_model(path, room)
     result = evaluate_model(load_model(path, room, transform=str(file)))

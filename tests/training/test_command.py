@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 import torch
 
-from splatseed.commands.train import Options
 from splatseed.errors import ParameterError
 from splatseed.io import load_scene
 from splatseed.io.ply import write_ply
@@ -59,11 +58,11 @@ def test_trains_by_the_best_strategy_and_says_what_and_where(room_path, tmp_path
         config = _json(run / "config.json")
         assert (config["strategy"], config["cap_max"]) == (strategy, cap)
     # Where nothing is named, a run goes on as it began.
-    asked = Options(room_path, run, resume=True).settings
+    asked = TrainSettings()
     again = replace(asked, max_steps=3, data_factor=2)
     begun = replace(again, strategy="none", seeding="advised", cap_max=quarter)
     assert resumed(config, again, refine_poses=False) == (begun, False)
-    with pytest.raises(ParameterError, match="--max-steps 3, as when"):
+    with pytest.raises(ParameterError, match="max_steps=3"):
         resumed(config, asked, {"max_steps"}, refine_poses=False)
 
 
@@ -155,7 +154,7 @@ def test_large_photographs_are_smaller_by_default_and_stay_so(
 
     with monkeypatch.context() as patch:
         patch.setattr(Trainer, "_advance", step)
-        for module in ("train.settings", "views.view"):
+        for module in ("training.settings", "photos.view"):
             patch.setattr(f"splatseed.{module}.TRAINED_SIDE", 48)
         assert _run(room_path, "--max-steps", "3", "--strategy", "none", "-o", run) == 130
     assert (

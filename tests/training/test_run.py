@@ -59,7 +59,7 @@ def test_training_makes_unseen_views_better(begin, strategy, gain):
 def test_a_second_signal_says_what_is_kept(begin):
     with pytest.raises(KeyboardInterrupt) as stop:
         begin().train(_stop_after(5, times=2))
-    assert stop.value.__notes__ == ["The run as of step 0 is kept: continue it with --resume."]
+    assert stop.value.__notes__ == ["The run as of step 0 is kept: continue it with `resume=True`."]
 
 
 @pytest.fixture
@@ -246,10 +246,10 @@ def test_an_earlier_run_is_neither_replaced_nor_repeated_by_accident(begin, room
             begin(*given, max_steps=3)
 
     run = begin(max_steps=3)
-    refused(r"unfinished run.*--resume")
+    refused("unfinished run.*resume=True")
     run.train()
     run.finish(evaluate_views)
-    refused(r"found a finished run\. Pass --overwrite")
+    refused(r"found a finished run")
     refused("a finished one", "run", RESUME)
     assert begin(ways={"overwrite": True}, max_steps=3).state.step == 0
     assert not run.folder.metrics.exists()
@@ -265,13 +265,13 @@ def test_a_run_goes_on_with_its_own_settings_and_seeds(begin, room, tmp_path):
     run.train(_stop_after(4))
     resumed = prepare_run(room, tmp_path / "run", TrainSettings(), **RESUME)
     assert resumed.settings == run.settings
-    with pytest.raises(ParameterError, match="--max-steps 30"):
+    with pytest.raises(ParameterError, match="max_steps=30"):
         begin(ways=RESUME, max_steps=31, strategy="none")
     fewer = room.replace(points=room.points.select(slice(50)))
     with pytest.raises(ParameterError, match="other points"):
         prepare_run(fewer, tmp_path / "run", TrainSettings(), **RESUME)
     run.folder.checkpoint.write_bytes(b"damaged")
-    with pytest.raises(SceneFormatError, match="--overwrite"):
+    with pytest.raises(SceneFormatError, match="checkpoint"):
         prepare_run(room, tmp_path / "run", TrainSettings(), **RESUME)
 
 
@@ -286,7 +286,7 @@ def test_a_disk_that_is_full_among_the_results_costs_nothing(begin, monkeypatch)
 
     with monkeypatch.context() as patch:
         patch.setattr(run_module, "write_render", disk_full)
-        with pytest.raises(OutputError, match=r"No space left.*as of step 30 is kept.*--resume"):
+        with pytest.raises(OutputError, match=r"No space left.*as of step 30 is kept.*resume"):
             run.finish(evaluate_views)
     assert not run.folder.metrics.exists()
     resumed = begin(ways=RESUME, max_steps=30)
@@ -299,7 +299,7 @@ def test_a_disk_that_is_full_among_the_results_costs_nothing(begin, monkeypatch)
 
 def test_what_does_not_fit_the_memory_is_refused_with_what_would(begin, monkeypatch, tmp_path):
     monkeypatch.setattr(device, "free_bytes", lambda _: 100 * device.BYTES_EACH)
-    with pytest.raises(PointCloudError, match="--budget 100"):
+    with pytest.raises(PointCloudError, match="budget=100"):
         begin()
     assert not (tmp_path / "run").exists()
 
@@ -316,7 +316,7 @@ def test_memory_holds_growth_and_the_run_says_so(begin, monkeypatch, strategy):
 
 def test_a_gpu_that_is_not_there_is_not_replaced_in_silence(begin, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    with pytest.raises(ParameterError, match="--backend cpu"):
+    with pytest.raises(ParameterError, match=r"backend=.cpu"):
         begin(backend="cuda")
 
 

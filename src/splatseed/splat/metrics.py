@@ -275,8 +275,8 @@ def _weights_path(given: Path | None) -> Path:
         raise SceneNotFoundError(
             f"the weights for LPIPS, {path.name}",
             found="none" if given is None else f"{odd_kind(given) or 'no such file'} at {given}",
-            fix=f"Download {_URL}{path.name}, put it into {place}; pass its path with "
-            "--lpips-weights.",
+            fix=f"Download {_URL}{path.name}, put it into {place}; pass its path as "
+            "`lpips_weights`.",
         )
     return path
 

@@ -114,12 +114,12 @@ def check_world(
         )
     fix = (
         "No known transform fits: probably it is a model of another scene. Else name the "
-        "transform that its trainer applied with --transform FILE; "
-        f"to score it as it is, pass --transform {NO_TRANSFORM}."
+        "transform that its trainer applied as `transform=FILE`; "
+        f"to score it as it is, pass `transform={NO_TRANSFORM!r}`."
     )
     fitting = [w for w, each in ratios.items() if each < ratio / CLOSER and each <= DOUBTFUL]
     if fitting:
-        fix = f"They fit with --transform {fitting[0]}, unless it is a model of another scene."
+        fix = f"They fit with `transform={fitting[0]!r}`, unless it is a model of another scene."
     raise SceneFormatError(
         f"the Gaussians{f' of {path}' if path else ''} in the world of the scene, where its points "
         "are",
@@ -219,7 +219,7 @@ def _measure(scene: Scene, gaussians: Gaussians) -> Callable[[Similarity | None]
 
 
 def _candidates(path: Path | None, scene: Scene) -> dict[str, Similarity | None]:
-    """Transforms that the model's trainer may have applied, by the words for --transform."""
+    """Transforms that the model's trainer may have applied, by the values of ``transform``."""
     found: dict[str, Similarity | None] = {NO_TRANSFORM: None}
     folders = path.resolve().parents[:4] if path else ()
     files = [folder / name for folder in folders for name in FILES]

@@ -164,7 +164,7 @@ def train(
         **settings,
     )  # fmt: skip
     if not training.train(on_step):
-        done = f"stopped after step {training.state.step}, which is kept: pass resume=True"
+        done = f"stopped after step {training.state.step}, which is kept: pass `resume=True`"
         raise KeyboardInterrupt(done)
     training.finish(partial(evaluate_views, progress=progress), progress)
     return Run(training.folder.path)
@@ -191,7 +191,7 @@ def prepare_training(
     asked = _settings_from(settings, resumes=resumes)
     if asked.start and (refine_poses or "seeding" in settings):
         other = "refine_poses" if refine_poses else "seeding"
-        raise ParameterError(f"start or {other}", found="both", fix="Leave one out.")
+        raise ParameterError(f"`start` or `{other}`", found="both", fix="Leave one out.")
     if not isinstance(scene, Scene):
         points_alone = settings.get("seeding") == "scene" and not refine_poses and not asked.start
         scene = load_scene(scene, require_points=points_alone)
@@ -203,7 +203,7 @@ def prepare_training(
     asked = _sized(asked, scene, long_side, folder if resumes else None, note)
     asked = _within_budget(asked, budget, scene, note)
     if settings.get("seeding") == "auto" and (why := why_not_seeded(scene, asked)):
-        note(f"Seeding auto has no effect: {why}.")
+        note(f"`seeding='auto'` has no effect: {why}.")
     return prepare_run(
         scene,
         output,
@@ -305,9 +305,9 @@ def _sized(
             return dataclasses.replace(settings, data_factor=kept if isinstance(kept, int) else 1)
         return settings.sized(scene.images, note)
     if settings.data_factor is not None:
-        raise ParameterError("long_side or data_factor", found="both", fix="Leave one out.")
+        raise ParameterError("`long_side` or `data_factor`", found="both", fix="Leave one out.")
     if long_side < 1:
-        raise ParameterError("long_side of 1 or more", found=str(long_side), fix="Try 800.")
+        raise ParameterError("`long_side` of 1 or more", found=str(long_side), fix="Try 800.")
     factor = data_factor(scene.images, long_side) if scene.images else 1
     return dataclasses.replace(settings, data_factor=factor)
 
@@ -326,11 +326,11 @@ def _within_budget(
     if budget is not None:
         cap = parse_budget(budget, pixels)
         if cap < LEAST_GAUSSIANS:
-            expected = f"budget of {LEAST_GAUSSIANS} Gaussians or more"
+            expected = f"`budget` of {LEAST_GAUSSIANS} Gaussians or more"
             raise ParameterError(expected, found=str(budget), fix="Try 0.25rho.")
         return dataclasses.replace(settings, cap_max=cap)
     cap = max(2, min(BUDGET, round(pixels)))
-    reason = "one for each pixel of a photograph; budget sets another"
+    reason = "one for each pixel of a photograph; `budget` sets another"
     if settings.start:  # a merge of two may be larger, and must not be thinned unless asked for
         cap = max(cap, len(read_model(Path(settings.start))))
         reason = "one for each pixel of a photograph, or as many as it starts with"

@@ -40,7 +40,7 @@ def check_fits(count: int, device: torch.device) -> None:
         raise PointCloudError(
             f"at most {most:,} points, which the {free / 1e9:.1f} GB of free memory hold",
             found=f"{count:,}",
-            fix=f"Pass --budget {most}, upsample less, or free some memory.",
+            fix=f"Pass `budget={most}`, upsample less, or free some memory.",
         )
 
 

@@ -71,7 +71,7 @@ class Evaluation:
                 isinstance(value, int) and value >= MINIMUM[name]
             ):
                 raise ParameterError(
-                    f"{name} of {MINIMUM[name]} or more",
+                    f"`{name}` of {MINIMUM[name]} or more",
                     found=str(value),
                     fix="Leave it out for the default.",
                 )
@@ -152,12 +152,14 @@ def _scene_of(
     if not isinstance(trained, str | Path):
         name = "Gaussians" if isinstance(model, Gaussians) else str(model)
         raise ParameterError(
-            f"scene, as {name} does not name its scene",
+            f"`scene`, as {name} does not name its scene",
             found="none",
-            fix="Pass the scene that it was trained on.",
+            fix="Pass `scene=SCENE`: the scene that it was trained on.",
         )
     if not Path(trained).exists():
         raise ParameterError(
-            f"the scene of the run at {trained}", found="none", fix="Pass scene, where it is now."
+            f"the scene of the run at {trained}",
+            found="none",
+            fix="Pass `scene=SCENE`: where it is now.",
         )
     return Path(trained)

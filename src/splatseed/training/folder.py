@@ -52,7 +52,7 @@ class RunFolder:
             raise OutputError(
                 f"an unfinished run to resume at {self.path}",
                 found="a finished one",
-                fix="See its metrics.json, or pass --overwrite to train again.",
+                fix="See its metrics.json, or pass `overwrite=True` to train again.",
             )
         if resume and self.is_run:
             staging.check_apart(self.path, protect)
@@ -61,11 +61,11 @@ class RunFolder:
             self.path, kind=KIND, overwrite=overwrite or self.is_run, protect=protect
         )
         if self.is_run and not overwrite:
-            go_on = "" if ended else "--resume, without options that differ, to continue it, "
+            go_on = "" if ended else "`resume=True`, without settings that differ, to continue it, "
             raise OutputError(
                 f"no folder, or an empty one, at {self.path}",
                 found="a finished run" if ended else "an unfinished run",
-                fix=f"Pass {go_on}--overwrite to replace it, or choose another.",
+                fix=f"Pass {go_on}`overwrite=True` to replace it, or choose another.",
             )
 
     def begin(
@@ -112,7 +112,7 @@ class RunFolder:
             raise SceneFormatError(
                 f"{self.config} to be the config of a run",
                 found=found,
-                fix="Start again with --overwrite.",
+                fix="Start again with `overwrite=True`.",
             )
         return config
 

@@ -28,7 +28,7 @@ def model_file(path: Path) -> Path:
     found, fix = odd_kind(path) or "nothing there", "Check the path."
     if folder.is_run:
         found = "a run that has not finished"
-        fix = f"Finish it: splatseed train SCENE -o {quoted(path)} --resume."
+        fix = "Finish it: train with the same output and `resume=True`."
     elif path.is_dir() and is_scene(path):
         found, fix = "a scene", f"Train it first: splatseed train {quoted(path)} -o RUN."
     elif path.is_dir():
@@ -62,7 +62,7 @@ def config_of(path: Path) -> Mapping[str, Any]:
     masks = config.get("masks")
     if not isinstance(masks, str | None):
         expected = f"masks of {folder.config} to name a folder"
-        raise SceneFormatError(expected, found=str(masks), fix="Train again with --overwrite.")
+        raise SceneFormatError(expected, found=str(masks), fix="Train again with `overwrite=True`.")
     if config.get("refine_poses") is True and masks != NONE:
         masks = None  # the scene with refined poses was written with its masks
     return {**config, "scene": folder.scene_of(config), "masks": masks}

@@ -55,7 +55,7 @@ from splatseed.training.seeds import (
     seeds_facts,
     usable_seeds,
 )
-from splatseed.training.settings import OPTIONS, TrainSettings
+from splatseed.training.settings import TrainSettings
 from splatseed.training.start import read_start, start_facts, started_gaussians
 from splatseed.training.state import (
     TrainState,
@@ -239,7 +239,7 @@ def _at_refined_poses(
         return with_refined(scene, kept)
     if was_upsampled(scene):
         raise ParameterError(
-            "a scene that splatseed has not added points to, with --refine-poses",
+            "a scene that splatseed has not added points to, with `refine_poses`",
             found="seeds, which triangulated points would replace",
             fix="Name the scene that they were made from, or refine before seeds are made: "
             "splatseed upsample SCENE --refine-poses -o OUT.",
@@ -314,9 +314,9 @@ def resumed(
     for name, value in then.items():
         if now[name] != value and (name in named or now[name] != default[name]):
             raise ParameterError(
-                f"--{OPTIONS.get(name, name.replace('_', '-'))} {value}, as when the run began",
+                f"`{name}={value!r}`, as when the run began",
                 found=f"{now[name]}",
-                fix="Leave the option out to resume, or start again with --overwrite.",
+                fix="Leave it out to resume, or start again with `overwrite=True`.",
             )
     refined = then.pop("refine_poses") is True
     try:
@@ -325,7 +325,7 @@ def resumed(
         raise SceneFormatError(
             "the settings of a run in the config.json of the run",
             found="a text instead of a number",
-            fix="Start again with --overwrite.",
+            fix="Start again with `overwrite=True`.",
         ) from None
 
 
@@ -354,9 +354,9 @@ def _as_masked(scene: Scene, begun: Mapping[str, Any]) -> Scene:
         return with_masks(scene, then)
     if now != then:
         raise ParameterError(
-            f"--masks {then or 'left out'}, as when the run began",
+            f"`masks={then!r}`, as when the run began",
             found=str(now),
-            fix="Leave the option out to resume, or start again with --overwrite.",
+            fix="Leave it out to resume, or start again with `overwrite=True`.",
         )
     return scene
 
@@ -365,7 +365,7 @@ def _another_scene(folder: RunFolder, begun: Mapping[str, Any], found: str) -> P
     return ParameterError(
         f"the scene that the run began with ({begun.get('scene')}, says {folder.config})",
         found=f"other {found}",
-        fix="Name that scene, or start again with --overwrite.",
+        fix="Name that scene, or start again with `overwrite=True`.",
     )
 
 
@@ -514,8 +514,8 @@ class TrainingRun:
             raise PointCloudError(
                 "Gaussians and photographs that fit into the GPU's memory",
                 found=f"no memory left with {self.count():,} Gaussians",
-                fix=f"Start again with --budget {round(FEWER * self.count())} or smaller "
-                f"photographs (--data-factor), or end other programs on the GPU.{self._kept()}",
+                fix=f"Start again with `budget={round(FEWER * self.count())}` or smaller "
+                f"photographs (`data_factor`), or end other programs on the GPU.{self._kept()}",
             ) from error
         except OutputError as error:
             fix = error.fix + self._kept()
@@ -529,4 +529,4 @@ class TrainingRun:
         """A sentence on the checkpoint, if there is one, after another sentence."""
         if self._saved_step is None:
             return ""
-        return f" The run as of step {self._saved_step:,} is kept: continue it with --resume."
+        return f" The run as of step {self._saved_step:,} is kept: continue it with `resume=True`."

@@ -85,7 +85,7 @@ def seeded(
     if saw_all_photographs(scene):
         note(
             "The seeds were made from all photographs, test views included, which may flatter the "
-            "score: train the scene itself, or seed without test views: --auto.test-every 8."
+            "score: train the scene itself, or seed without test views: `auto.test_every=8`."
         )
     if settings.seeding == "scene" or why_not_seeded(scene, settings):
         return scene, None
@@ -110,7 +110,7 @@ def seeded(
     made, without, kept = f"{len(cloud):,} points", "", cloud.num_original
     if len(scene.points):
         made = f"{kept:,} points of the scene and {len(cloud) - kept:,} new ones"
-        without = " --seeds scene begins with the scene's points alone."
+        without = " `seeding='scene'` starts from the scene's points alone."
     note(f"Seeds by method auto: {made}, in {time.perf_counter() - start:.0f} s.{without}")
     return scene.replace(points=cloud), stereo
 
@@ -118,9 +118,9 @@ def seeded(
 def why_not_seeded(scene: Scene, settings: TrainSettings) -> str:
     """Why a run begins with the scene's points even if ``auto`` is asked for; empty if not."""
     if settings.strategy.endswith(AS_3DGS):
-        return f"strategy {settings.strategy} begins with the scene's points as they are"
+        return f"strategy {settings.strategy} starts from the scene's points as they are"
     if was_upsampled(scene):
-        return "splatseed upsample made the points, and training begins with them as they are"
+        return "its points are upsampled already, and training starts from them as they are"
     return ""
 
 

@@ -117,9 +117,7 @@ class TrainSettings:
                 fits, expected = value in allowed, f"among {', '.join(map(str, allowed))}"
             if not fits:
                 raise ParameterError(
-                    f"--{name.replace('_', '-')} {expected}",
-                    found=f"{value}",
-                    fix="Leave it out for the default.",
+                    f"`{name}` {expected}", found=f"{value}", fix="Leave it out for the default."
                 )
 
     def sized(
@@ -140,7 +138,7 @@ class TrainSettings:
             size = f"{lens.width // factor:,} x {lens.height // factor:,}"
             note(
                 f"Photographs of {stored} pixels are used at {size}, as the default is "
-                f"{TRAINED_SIDE:,} a side at most: --data-factor 1 keeps their size."
+                f"{TRAINED_SIDE:,} a side at most: `data_factor=1` keeps their size."
             )
         return replace(self, data_factor=factor)
 

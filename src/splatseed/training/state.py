@@ -181,5 +181,5 @@ def load_checkpoint(
     raise SceneFormatError(
         f"{path} to be a checkpoint of this version of splatseed",
         found=found,
-        fix="Start the run again with --overwrite.",
+        fix="Start again with `overwrite=True`.",
     )
