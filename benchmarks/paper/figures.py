@@ -23,7 +23,7 @@ from splatseed.bench.plan import DEPTH
 from splatseed.errors import SplatseedError
 from splatseed.io import find_depths
 from splatseed.io.staging import atomic_file
-from splatseed.photos.visibility import choose_camera, choose_image
+from splatseed.photos.viewpoint import choose_camera, choose_image
 from splatseed.viewer import page
 from splatseed.viewer.points import render_points
 

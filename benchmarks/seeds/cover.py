@@ -19,11 +19,14 @@ from benchmarks.common.markdown import table
 from benchmarks.seeds.cover_rules import rule_table
 
 from splatseed.errors import SplatseedError
+from splatseed.photos.projection import cells_from_world, grid_shape
 from splatseed.photos.view import View
-from splatseed.photos.visibility import look_at
+from splatseed.photos.viewpoint import look_at
+from splatseed.photos.visibility import SURFACE
+from splatseed.photos.zbuffer import MIN_NEARER
 from splatseed.seeding.budget import thin
 from splatseed.seeding.cover import cover
-from splatseed.seeding.coverage import HIDING, NEARER, covered_share, grid_from_world, grid_of
+from splatseed.seeding.coverage import covered_share
 
 __all__: list[str] = []
 
@@ -69,7 +72,7 @@ def numpy_share(views: Sequence[View], xyz: np.ndarray) -> float:
 
 
 def _numpy_cells(view: View, xyz: np.ndarray) -> np.ndarray:
-    (rows, cols), m = grid_of(view, CELL), grid_from_world(view, CELL)
+    (rows, cols), m = grid_shape(view.camera, CELL), cells_from_world(view.camera, CELL)
     x, y, depth = m[:, :3] @ xyz.T.astype(np.float64) + m[:, 3:]
     with np.errstate(divide="ignore", invalid="ignore"):
         j, i = np.floor(x / depth), np.floor(y / depth)
@@ -81,8 +84,8 @@ def _numpy_cells(view: View, xyz: np.ndarray) -> np.ndarray:
     depths[held] = depth[inside][order][first + count // 4]
     framed = np.pad(depths.reshape(rows, cols), 1, constant_values=np.inf)
     around = np.lib.stride_tricks.sliding_window_view(framed, (3, 3)).reshape(rows, cols, 9)
-    limit = depths.reshape(rows, cols, 1) * (1 - NEARER)
-    return np.isfinite(depths.reshape(rows, cols)) & ((around < limit).sum(axis=2) < HIDING)
+    limit = depths.reshape(rows, cols, 1) * (1 - SURFACE)
+    return np.isfinite(depths.reshape(rows, cols)) & ((around < limit).sum(axis=2) < MIN_NEARER)
 
 
 def best_seconds(work: Callable[[], object], repeats: int) -> tuple[float, float]:

@@ -17,10 +17,11 @@ from benchmarks.common.markdown import table
 from scipy.spatial import Delaunay, QhullError
 
 from splatseed.io import load_scene
+from splatseed.photos import projection, zbuffer
 from splatseed.photos.view import View, poses_of
 from splatseed.progress import silent
 from splatseed.scene import Image, Scene
-from splatseed.seeding import cover, coverage
+from splatseed.seeding import cover
 
 __all__ = ["rule_table"]
 
@@ -154,7 +155,7 @@ def _make_hole(
     xyz: np.ndarray, view: View, asked: Sequence[View], row: int, rng: np.random.Generator
 ) -> Hole | None:
     place, depth = _cells_of(view, xyz)
-    quartiles = coverage.cell_depths(view, xyz, CELL)
+    quartiles = zbuffer.cell_depths(view.camera, xyz, CELL)
     covered = np.isfinite(quartiles)
     empty = np.argwhere(~covered)
     target = place[row]
@@ -182,7 +183,7 @@ def _make_hole(
 
 def _cells_of(view: View, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Row and column of each point's cell, int64 [N, 2], and its depth."""
-    m = coverage.grid_from_world(view, CELL)
+    m = projection.cells_from_world(view.camera, CELL)
     x, y, depth = m[:, :3] @ xyz.T.astype(np.float64) + m[:, 3:]
     with np.errstate(divide="ignore", invalid="ignore"):
         place = np.floor(np.stack([y / depth, x / depth], axis=1))

@@ -39,7 +39,7 @@ from splatseed.errors import SceneNotFoundError
 from splatseed.io import find_depths
 from splatseed.io.photograph import decode_photograph, photograph_bytes
 from splatseed.photos.view import user_cache_dir
-from splatseed.photos.visibility import choose_camera
+from splatseed.photos.viewpoint import choose_camera
 from splatseed.progress import in_threads, silent
 from splatseed.scene import Scene, SceneSource, Tracks
 from splatseed.viewer.points import render_points

@@ -23,7 +23,7 @@ from jaxtyping import Float, Int, UInt8
 
 from splatseed.depth.stereo.depths import known_visibility
 from splatseed.depth.stereo.maps import StereoSettings
-from splatseed.photos.projection import choose_sources
+from splatseed.photos.sources import choose_sources
 from splatseed.photos.view import View, data_factor, load_views
 from splatseed.scene import Scene
 

@@ -28,7 +28,8 @@ from splatseed.io import find_depths
 from splatseed.io.depth_maps import depth_folder
 from splatseed.io.staging import atomic_file
 from splatseed.methods import methods_for
-from splatseed.photos.visibility import choose_camera, choose_image, find_visibility, look_at
+from splatseed.photos.viewpoint import choose_camera, choose_image, look_at
+from splatseed.photos.visibility import find_visibility
 from splatseed.scene import Image
 from splatseed.seeding.diagnostics import spacing
 from splatseed.synthetic import Capture, make_capture, write_capture

@@ -16,7 +16,7 @@ from splatseed.depth.alignment import (
     robust_line,
 )
 from splatseed.depthmap import DepthMap
-from splatseed.photos.visibility import camera_points, find_visibility
+from splatseed.photos.visibility import find_visibility, points_in_image
 
 SCALES = 1.5 ** np.linspace(-3, 3, 12)
 
@@ -102,7 +102,7 @@ def test_a_point_takes_the_pixel_it_falls_into(exact):
     corner = np.stack([column, row], axis=1)
 
     def align_at(uv):
-        points = camera_points(image.camera, image.camera.unproject(uv, values[row, column]))
+        points = points_in_image(image.camera, image.camera.unproject(uv, values[row, column]))
         return align_map(DepthMap(values), image.camera, points, "robust", 20)
 
     for inside in (0.01, 0.3, 0.7, 0.99):

@@ -21,7 +21,7 @@ from splatseed.io.dense import (
     write_map,
 )
 from splatseed.io.ply import read_ply
-from splatseed.photos.projection import undistort
+from splatseed.photos.undistortion import undistort
 from splatseed.synthetic import make_capture, write_capture
 
 from ..bent import bend

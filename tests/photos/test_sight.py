@@ -9,7 +9,7 @@ import pytest
 
 from splatseed.photos.sight import notes_on, sight_of, stray_views
 from splatseed.photos.view import View
-from splatseed.photos.visibility import look_at
+from splatseed.photos.viewpoint import look_at
 from splatseed.splat.gaussians import NEAR_SHARE, training_frame
 
 K = np.array([[140.0, 0, 80], [0, 140.0, 60], [0, 0, 1]])

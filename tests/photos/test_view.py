@@ -14,7 +14,7 @@ from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundErro
 from splatseed.io import load_scene
 from splatseed.io.photograph_checks import ROUNDING, _off, fits
 from splatseed.lens import image_points
-from splatseed.photos.projection import undistort
+from splatseed.photos.undistortion import undistort
 from splatseed.photos.view import at_file_size, load_photograph, load_split, load_views, poses_of
 from splatseed.scene import NO_POINT, Observations
 from splatseed.seeding.upsampling import frames_of, points_within

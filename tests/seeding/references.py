@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from splatseed.photos.view import View
-from splatseed.photos.visibility import look_at
+from splatseed.photos.viewpoint import look_at
 
 NEARER, HIDING, WITNESSES = 0.1, 5, 12
 

@@ -7,8 +7,9 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from splatseed.errors import ParameterError, PointCloudError
+from splatseed.photos.zbuffer import cell_depths
 from splatseed.seeding.budget import _places_in_views, thin
-from splatseed.seeding.coverage import cell_depths, covered_share
+from splatseed.seeding.coverage import covered_share
 
 from . import references as slow
 
@@ -21,7 +22,7 @@ def test_depths_are_those_of_the_loop(seed, cell, spread):
     view = slow.make_view(rng, int(width), int(height), rng.uniform(1, 200))
     xyz = (spread * rng.normal(size=(rng.integers(0, 600), 3))).astype(np.float32)
     expected = slow.cell_depths(view, xyz, cell)
-    np.testing.assert_array_equal(cell_depths(view, xyz, cell), expected)
+    np.testing.assert_array_equal(cell_depths(view.camera, xyz, cell), expected)
 
 
 def lattice(view, cells, depth):

@@ -9,9 +9,10 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from splatseed.errors import ParameterError, PointCloudError
+from splatseed.photos.zbuffer import cell_depths
 from splatseed.progress import silent
 from splatseed.seeding.cover import cover, depth_maps_of_views, guess_depths, world_from_grid
-from splatseed.seeding.coverage import cell_depths, covered_share
+from splatseed.seeding.coverage import covered_share
 
 from . import references as slow
 
@@ -90,7 +91,7 @@ def test_of_two_surfaces_a_seed_takes_the_one_that_no_view_looks_through(rng):
         pose[0, 3] += step
         aside.append(dataclasses.replace(view, cam_from_world=pose))
     witnesses = depth_maps_of_views(aside, points, 8, silent)
-    depths = cell_depths(view, points, 8)
+    depths = cell_depths(view.camera, points, 8)
     gap = np.flatnonzero(np.isinf(depths))
     back = world_from_grid(view, 8)
     for asked, expected in ((0, [2, 4]), (3, [4, 4])):

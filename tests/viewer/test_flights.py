@@ -16,7 +16,7 @@ ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="videos need imageio-ffmpe
 from splatseed.errors import ParameterError, SceneFormatError
 from splatseed.io import load_scene, write_scene
 from splatseed.photos.view import View, poses_of
-from splatseed.photos.visibility import look_at
+from splatseed.photos.viewpoint import look_at
 from splatseed.similarity import Similarity
 from splatseed.splat.formats import read_model
 from splatseed.splat.gaussians import Gaussians

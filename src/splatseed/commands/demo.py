@@ -203,7 +203,7 @@ def _has_pytorch() -> bool:
 
 def _make_points(options: Options) -> None:
     """The capture, its points by every method, their errors, and pictures."""
-    from splatseed.photos.visibility import choose_camera
+    from splatseed.photos.viewpoint import choose_camera
     from splatseed.seeding.diagnostics import measure, spacing
     from splatseed.synthetic import make_capture, write_capture
     from splatseed.viewer import clouds as pictures

@@ -177,7 +177,7 @@ def _run_stereo(options: Options) -> None:
         how: dict[str, Any] = {"overwrite": options.overwrite, "progress": clock}
         write = dense.write_dense_maps
         if options.colmap:
-            from splatseed.photos.projection import undistort
+            from splatseed.photos.undistortion import undistort
 
             write, how["undistort"] = dense.write_dense_workspace, undistort
         report = write(scene, maps, options.output, provenance=_provenance(options), **how)

@@ -23,7 +23,7 @@ from jaxtyping import Float32, Float64, Int, Int64
 from splatseed.camera import Camera
 from splatseed.depthmap import DepthMap
 from splatseed.errors import SceneFormatError, SceneNotFoundError
-from splatseed.photos.visibility import SeenPoints, camera_points, find_visibility
+from splatseed.photos.visibility import PointsInImage, find_visibility, points_in_image
 from splatseed.progress import Progress, in_threads, silent
 from splatseed.scene import Image, Scene
 
@@ -298,7 +298,7 @@ def align(
         for image in images[start:stop]:
             depth = depths.read(image.name)
             camera = map_camera(depth, image)
-            points = camera_points(camera, visibility.of(image))
+            points = points_in_image(camera, visibility.of(image))
             found[image.name] = align_map(depth, camera, points)
 
     in_threads(work, len(images), 1, "align depth", progress)
@@ -308,7 +308,7 @@ def align(
 def align_map(
     depth: DepthMap,
     camera: Camera,
-    points: SeenPoints,
+    points: PointsInImage,
     fit: Fit = Settings.fit,
     min_points: int = Settings.min_points,
     *,
@@ -339,7 +339,8 @@ def align_map(
     else:
         centers = np.floor(points.uv) + 0.5
         raw = value[:, None] * _rays(camera, centers)
-        scale, shift = least_squares_scale(raw, points.z[:, None] * _rays(camera, points.uv)), 0.0
+        target = points.depth[:, None] * _rays(camera, points.uv)
+        scale, shift = least_squares_scale(raw, target), 0.0
     residual = _residual(depth, value, z, scale, shift)
     if depth.kind == "inverse" and not scale > 0:
         refused = "values rise with depth, so they are not its inverse"
@@ -349,7 +350,7 @@ def align_map(
 
 
 def trust_units(
-    depth: DepthMap, camera: Camera, points: SeenPoints, *, unit_ray: bool = Settings.unit_ray
+    depth: DepthMap, camera: Camera, points: PointsInImage, *, unit_ray: bool = Settings.unit_ray
 ) -> Alignment:
     """Take a map as being in scene units, checked against the SfM points if there are any."""
     value, z, _ = _values_at(depth, camera, points, unit_ray=unit_ray)
@@ -367,8 +368,8 @@ def trust_units(
 
 
 def _values_at(
-    depth: DepthMap, camera: Camera, points: SeenPoints, *, unit_ray: bool
-) -> tuple[Values, Values, SeenPoints]:
+    depth: DepthMap, camera: Camera, points: PointsInImage, *, unit_ray: bool
+) -> tuple[Values, Values, PointsInImage]:
     """The map's values at the points that see depth, the depths to compare, and these points.
 
     A point takes the value of the pixel it falls into. Distances along the ray are turned into
@@ -376,13 +377,13 @@ def _values_at(
     not known yet: the points' planar depths become distances instead.
     """
     column, row = points.uv.astype(np.int64).T
-    value, z = depth.values[row, column].astype(np.float64), points.z
+    value, z = depth.values[row, column].astype(np.float64), points.depth
     if depth.kind == "inverse":
         z = z * ray_length(camera, column, row) if unit_ray else z
     elif depth.kind == "ray" or unit_ray:
         value /= ray_length(camera, column, row)
     known = np.isfinite(value) & ((value > 0) | (depth.kind == "inverse"))
-    return value[known], z[known], SeenPoints(points.uv[known], points.z[known])
+    return value[known], z[known], points.select(known)
 
 
 def _rays(camera: Camera, uv: Float64[np.ndarray, "M 2"]) -> Float64[np.ndarray, "M 3"]:

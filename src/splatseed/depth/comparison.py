@@ -30,7 +30,7 @@ from scipy.sparse.linalg import spsolve
 
 from splatseed.depth.alignment import SIGMA_OF_MEDIAN, Settings
 from splatseed.depth.views import DepthView, Reduced
-from splatseed.photos.projection import cosine_between, place
+from splatseed.photos._kernels import cosine_between, project_point
 from splatseed.progress import Progress, in_threads
 from splatseed.runtime.jit import inline, kernel, parallel_range
 
@@ -149,7 +149,7 @@ def _keep_seen(samples, m, z, factor, out):  # type: ignore[no-untyped-def]  # N
 @inline
 def _nearest(point, m):  # type: ignore[no-untyped-def]  # Numba's types
     """Depth of a point in a view, and the nearest grid point; column -1 if there is none."""
-    column, row, depth = place(point, m)
+    column, row, depth = project_point(point, m)
     column, row = column + 0.5, row + 0.5
     if not (0.0 <= column < MOST_COLUMNS and 0.0 <= row < MOST_COLUMNS):
         return depth, -1, -1
@@ -245,7 +245,7 @@ def _compare_pair(samples, z, factor, m, out):  # type: ignore[no-untyped-def]  
     logs = np.empty(len(samples))
     count = 0
     for k in range(len(samples)):
-        across, down, depth = place(samples[k], m)
+        across, down, depth = project_point(samples[k], m)
         if depth <= 0.0:
             continue
         # The nearest grid point: those lie at whole numbers.
@@ -300,7 +300,7 @@ def find_support(
 def _own_colors(xyz, grid_from_world, rgb, rgb_from_grid, out):  # type: ignore[no-untyped-def]  # Numba's types
     """Colours of a view's own reduced photograph at its candidates, as smooth as the others'."""
     for k in range(len(xyz)):
-        column, row, _ = place(xyz[k], grid_from_world)
+        column, row, _ = project_point(xyz[k], grid_from_world)
         p, q = _block(column, row, rgb_from_grid, rgb.shape)
         for channel in range(3):
             out[k, channel] = rgb[p, q, channel]
@@ -316,7 +316,7 @@ def _ask(  # type: ignore[no-untyped-def]  # Numba's types
     for k in range(len(xyz)):
         if only_unconfirmed and agreeing[k] >= enough:
             continue
-        column, row, depth = place(xyz[k], grid_from_world)
+        column, row, depth = project_point(xyz[k], grid_from_world)
         if depth > 0.0 and -0.5 <= column < width - 0.5 and -0.5 <= row < height - 0.5:
             # In the map's own units: one division here instead of four multiplications.
             verdict = _compare(z, column, row, depth / factor, tolerance)

@@ -35,7 +35,7 @@ from splatseed.io.masks import read_mask
 from splatseed.io.photograph import decode_photograph, photograph_bytes
 from splatseed.io.photograph_checks import check_sizes
 from splatseed.photos.view import check_lens
-from splatseed.photos.visibility import Visibility, camera_points
+from splatseed.photos.visibility import Visibility, points_in_image
 from splatseed.runtime.jit import inline
 from splatseed.scene import Image, Masks
 
@@ -111,7 +111,7 @@ def read_view(
         values = np.where(counting(mask, depth), depth.values, np.float32(np.nan))
         depth = DepthMap(values, depth.kind)
     camera = map_camera(depth, image)
-    points = camera_points(camera, visibility.of(image))
+    points = points_in_image(camera, visibility.of(image))
     ray = {"unit_ray": settings.unit_ray}
     if settings.align:
         alignment = align_map(depth, camera, points, settings.fit, settings.min_points, **ray)

@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64
 
 from splatseed.photos.view import View, poses_of
+from splatseed.photos.visibility import points_in_image
 from splatseed.scene import Scene
 
 NEAR_QUANTILE, LEAST_POINTS = 0.1, 20
@@ -55,8 +56,8 @@ def sight_of(views: Sequence[View], xyz: Float[np.ndarray, "P 3"]) -> Sight:
     if not views or not len(xyz):
         return Sight(_far_from_most(centers), None)
     most = max(LEAST_SAMPLE, MOST_PROJECTIONS // len(views))
-    columns = np.ascontiguousarray(xyz[:: -(-len(xyz) // most)].T, np.float64)
-    count, area, near, middle = np.array([_measured(view, columns) for view in views]).T
+    sample = np.asfortranarray(xyz[:: -(-len(xyz) // most)], np.float64)
+    count, area, near, middle = np.array([_measured(view, sample) for view in views]).T
     usual = np.median(count)
     fewest = max(1.0, LEAST_SHARE * usual, min(LEAST_POINTS, FEW_SHARE * usual))
     seeing = (count >= fewest) & (area >= LEAST_AREA)
@@ -110,22 +111,15 @@ def camera_centers(views: Sequence[View]) -> Float64[np.ndarray, "V 3"]:
     return np.asarray(-(rotation * shift[:, :, None]).sum(axis=1))
 
 
-def _measured(view: View, columns: Float64[np.ndarray, "3 P"]) -> tuple[float, float, float, float]:
-    """Number, share of the frame's area, near and median depth of the points within the frame."""
-    matrix = view.K @ view.cam_from_world[:3]
-    x, y, depth = (m[0] * columns[0] + m[1] * columns[1] + m[2] * columns[2] + m[3] for m in matrix)
-    # Multiplied by the depth, so that nothing is divided by zero.
-    inside = (depth > 0) & (x >= 0) & (x < view.width * depth)
-    inside &= (y >= 0) & (y < view.height * depth)
-    if not inside.any():
+def _measured(view: View, xyz: Float64[np.ndarray, "P 3"]) -> tuple[float, float, float, float]:
+    """Number, share of the image's area, near and median depth of the points within the image."""
+    points = points_in_image(view.camera, xyz)
+    if not len(points.point_idx):
         return 0.0, 0.0, np.inf, np.inf
-    depth = depth[inside]
-    sides = [
-        np.diff(np.quantile(across[inside] / depth, SPREAD))[0] / size
-        for across, size in ((x, view.width), (y, view.height))
-    ]
-    near, middle = np.quantile(depth, [NEAR_QUANTILE, 0.5])
-    return float(len(depth)), float(sides[0] * sides[1]), float(near), float(middle)
+    low, high = np.quantile(points.uv, SPREAD, axis=0)
+    width, height = (high - low) / [view.width, view.height]
+    near, middle = np.quantile(points.depth, [NEAR_QUANTILE, 0.5])
+    return float(len(points.point_idx)), float(width * height), float(near), float(middle)
 
 
 def _far_from_most(centers: Float64[np.ndarray, "V 3"]) -> Bool[np.ndarray, " V"]:

@@ -215,7 +215,7 @@ def _load_view(
     mask = read_mask(masks, image.name, path, data_factor)
     if not lens.has_distortion:
         return View(image.name, photograph, K, width, height, pose, mask)
-    from splatseed.photos.projection import undistort  # noqa: PLC0415  (loads Numba)
+    from splatseed.photos.undistortion import undistort  # noqa: PLC0415  (loads Numba)
 
     photograph, known = undistort(photograph, lens, K)
     if mask is not None:

@@ -1,9 +1,10 @@
-"""Which points each image sees, and the camera from which to look at a scene.
+"""Visibility: which points a camera sees, by projection or by a scene's tracks.
 
-Only distinct finite originals are seen. A point with a track is seen by the images of the track.
-Without tracks, points are projected; where several fall close together in an image, only the
-nearest are kept, as the others are probably hidden. The camera chosen is one of the scene's own if
-it has any, else one made up from the cloud alone. An image's *fill* is how much of it has points.
+Points are in an image if they lie in front of its camera and within its frame
+(``points_in_image``). A scene's tracks say which of its points an image sees; without tracks its
+points are projected, and the nearest of each coarse cell hide the others (``find_visibility``).
+What a whole cloud hides is found by ``photos.zbuffer``.
+Promise: results depend neither on the order of the points nor on the number of threads.
 """
 
 from __future__ import annotations
@@ -12,55 +13,88 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Bool, Float, Float64, Int64
 
 from splatseed.camera import Camera
-from splatseed.errors import PointCloudError
+from splatseed.photos.projection import pixels_from_world, project
 from splatseed.pointcloud import ORIGINAL
 from splatseed.scene import Image, Scene
 
-CELLS = 40  # columns and rows of the grid over an image in whose cells points hide each other
-HIDDEN = 1.1  # a point this many times as far as the nearest one in its cell counts as hidden
+SURFACE = 0.1  # share of a cell's depth up to which a point behind it counts as on its surface
+COARSE_GRID = (40, 40)  # rows and columns of the z-buffer for points without tracks
 
 
-class SeenPoints(NamedTuple):
-    """Points within an image: pixels, and planar depths."""
+class PointsInImage(NamedTuple):
+    """The M of N points that lie in front of a camera and within its image."""
 
-    uv: Float64[np.ndarray, "M 2"]
-    z: Float64[np.ndarray, " M"]
+    point_idx: Int64[np.ndarray, " M"]  # among the N points, rising
+    uv: Float64[np.ndarray, "M 2"]  # pixels
+    depth: Float64[np.ndarray, " M"]
+
+    def select(self, which: Bool[np.ndarray, " M"]) -> PointsInImage:
+        """Some of the points."""
+        return PointsInImage(*(values[which] for values in self))
+
+    def cells(
+        self, camera: Camera, shape: tuple[int, ...]
+    ) -> tuple[Int64[np.ndarray, " M"], Int64[np.ndarray, " M"]]:
+        """Row and column of each point in a grid of ``shape`` over the image."""
+        rows, cols = shape
+        per_pixel = np.array([cols / camera.width, rows / camera.height])
+        # Rounding may reach the border.
+        col, row = np.minimum((self.uv * per_pixel).astype(np.int64), [cols - 1, rows - 1]).T
+        return row, col
+
+    def nearest(self, camera: Camera, shape: tuple[int, ...]) -> Float64[np.ndarray, "rows cols"]:
+        """A z-buffer: the smallest depth in each cell of a grid; infinite without points."""
+        depths = np.full(shape, np.inf)
+        np.minimum.at(depths, self.cells(camera, shape), self.depth)
+        return depths
 
 
-def camera_points(camera: Camera, xyz: Float64[np.ndarray, "N 3"]) -> SeenPoints:
-    """The world points that lie in front of a camera and within its image."""
-    uv, z = camera.project(xyz)
-    inside = ((uv >= 0) & (uv < [camera.width, camera.height])).all(axis=1)  # NaN behind the camera
-    return SeenPoints(uv[inside], z[inside])
+def points_in_image(
+    camera: Camera, xyz: Float[np.ndarray, "N 3"], *, near: float = 0.0, margin: float = 0.0
+) -> PointsInImage:
+    """The world points beyond depth ``near`` and within the image.
+
+    ``margin`` extends the image on every side by this share of its size. Points with NaN are in no
+    image. For many cameras pass ``np.asfortranarray(xyz, np.float64)``.
+    """
+    column, row, depth = project(pixels_from_world(camera), xyz)
+    low_u, low_v = -margin * camera.width, -margin * camera.height
+    inside = (depth > near) & (column >= low_u) & (column < camera.width - low_u)
+    inside &= (row >= low_v) & (row < camera.height - low_v)
+    index = np.flatnonzero(inside)
+    return PointsInImage(index, np.stack([column[index], row[index]], axis=1), depth[index])
 
 
 @dataclass(frozen=True, eq=False)
 class Visibility:
-    """The points that every image sees."""
+    """The distinct, finite, original points of a scene, and which of them each image sees."""
 
-    xyz: Float64[np.ndarray, "N 3"]  # the distinct finite originals
+    xyz: Float64[np.ndarray, "N 3"]
     point_idx: Int64[np.ndarray, " T"]  # rows of ``xyz``, image after image
-    start: dict[int, int]  # where each image begins in ``point_idx``, by its id
-    count: dict[int, int]  # how many each sees, by its id
+    start: dict[int, int]  # of each image in ``point_idx``, by its id
+    count: dict[int, int]  # of the points that each sees, by its id
 
     def of(self, image: Image) -> Float64[np.ndarray, "M 3"]:
-        """The points an image sees, world positions [M, 3]: by tracks, or else by projection."""
+        """World positions of the points that an image sees."""
         return np.asarray(self.xyz[self.rows_of(image)])
 
     def rows_of(self, image: Image) -> Int64[np.ndarray, " M"]:
-        """The same as rows of ``xyz``."""
+        """The points that an image sees, as rows of ``xyz``: by tracks, else by projection."""
         count = self.count.get(image.image_id, 0)
         if count:
             start = self.start[image.image_id]
             return self.point_idx[start : start + count]
-        return _in_front(self.xyz, image.camera)
+        points = points_in_image(image.camera, self.xyz)
+        nearest = points.nearest(image.camera, COARSE_GRID)[points.cells(image.camera, COARSE_GRID)]
+        seen: Int64[np.ndarray, " M"] = points.point_idx[points.depth <= nearest * (1 + SURFACE)]
+        return seen
 
 
 def find_visibility(scene: Scene) -> Visibility:
-    """Compute the points of all images once, to be queried image by image."""
+    """Sort a scene's tracks by image, so that the points of each image can be looked up."""
     usable = np.flatnonzero((scene.points.source == ORIGINAL) & scene.points.distinct)
     xyz = scene.points.xyz[usable].astype(np.float64)
     tracks = scene.tracks
@@ -81,112 +115,3 @@ def find_visibility(scene: Scene) -> Visibility:
         dict(zip(ids.tolist(), start.tolist(), strict=True)),
         dict(zip(ids.tolist(), count.tolist(), strict=True)),
     )
-
-
-def _in_front(xyz: Float64[np.ndarray, "N 3"], camera: Camera) -> Int64[np.ndarray, " M"]:
-    """The rows of the points within the image that no nearby point hides."""
-    uv, z = camera.project(xyz)
-    size = np.array([camera.width, camera.height])
-    inside = np.flatnonzero((z > 0) & ((uv >= 0) & (uv < size)).all(axis=1))
-    column, row = (uv[inside] * CELLS / size).astype(np.int64).T
-    cell = row * CELLS + column
-    nearest = np.full(CELLS * CELLS, np.inf)
-    np.minimum.at(nearest, cell, z[inside])
-    # a tenth beyond the nearest point of the cell may still be its surface.
-    return np.asarray(inside[z[inside] <= HIDDEN * nearest[cell]])
-
-
-SAMPLE = 20_000  # points considered when choosing a camera
-FRAME_CELLS = (16, 12)  # columns and rows of the grid by which a frame's fill is measured
-CORE_SHARE = 0.6  # share of the points, those nearest to the median, that a made-up camera frames
-ELEVATION, MADE_UP_SIZE, MADE_UP_FOCAL = 28.0, (800, 600), 900.0
-"""Degrees by which a made-up camera looks down, and its size and focal length in pixels."""
-
-
-def look_at(
-    eye: Float64[np.ndarray, " 3"], target: Float64[np.ndarray, " 3"], up: Float64[np.ndarray, " 3"]
-) -> Float64[np.ndarray, "4 4"]:
-    """``cam_from_world`` [4, 4] of an OpenCV camera at ``eye`` that sees ``target`` upright.
-
-    ``up`` is the direction that is upward in the image, not along the view.
-    """
-    forward = (target - eye) / np.linalg.norm(target - eye)
-    right = np.cross(forward, up)
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    cam_from_world = np.eye(4)
-    cam_from_world[:3, :3] = rotation
-    cam_from_world[:3, 3] = -rotation @ eye
-    return cam_from_world
-
-
-def choose_camera(scene: Scene) -> Camera:
-    """The camera of ``choose_image``; for a bare cloud, one made up to frame its densest part.
-
-    It takes the direction in which the cloud is flattest as the vertical, upward where the cloud
-    thins out, and looks down on the points nearest the median at 28 degrees.
-    """
-    image = choose_image(scene)
-    return _made_up_camera(_finite_sample(scene)) if image is None else image.camera
-
-
-def choose_image(scene: Scene) -> Image | None:
-    """The image whose points fill most of its frame; among equals, the one with the most points.
-
-    An image's points are its features with a 3D point if the scene has features at all, else those
-    of a sample that project into its frame. The mere number of points would favour close-ups of the
-    richest texture. A scene without points, such as an RGB-D capture, gives the image in the middle
-    of its list; one without images gives None, or PointCloudError if it has no points, either.
-    """
-    if scene.images and not scene.points.finite.any():
-        return scene.images[len(scene.images) // 2]
-    xyz = _finite_sample(scene)
-    features = [image.observations for image in scene.images]
-    seen = [each.xy[each.point_ids >= 0] if each else np.empty((0, 2)) for each in features]
-    if not any(len(uv) for uv in seen):
-        seen = [image.camera.project(xyz)[0] for image in scene.images]
-    fill = [_fill(image.camera, uv) for image, uv in zip(scene.images, seen, strict=True)]
-    return scene.images[fill.index(max(fill))] if fill else None
-
-
-def _fill(camera: Camera, uv: Float64[np.ndarray, "M 2"]) -> tuple[int, int]:
-    """How many cells of a grid over the frame hold a point, and how many points it has."""
-    cells = uv / [camera.width, camera.height] * FRAME_CELLS
-    inside = ((cells >= 0) & (cells < FRAME_CELLS)).all(axis=1)  # NaN compares false
-    column, row = cells[inside].astype(np.int64).T
-    return len(np.unique(row * FRAME_CELLS[0] + column)), int(inside.sum())
-
-
-def _finite_sample(scene: Scene) -> Float64[np.ndarray, "N 3"]:
-    """At most ``SAMPLE`` finite points, evenly spaced in the file's order."""
-    xyz = scene.points.xyz[scene.points.finite].astype(np.float64)
-    if len(xyz) == 0:
-        raise PointCloudError(
-            "at least one finite point to look at",
-            found=f"none among {len(scene.points)}",
-            fix="Check that the cloud was read correctly.",
-        )
-    return np.asarray(xyz[:: -(-len(xyz) // SAMPLE)])
-
-
-def _made_up_camera(xyz: Float64[np.ndarray, "N 3"]) -> Camera:
-    center = np.median(xyz, axis=0)
-    radius = np.linalg.norm(xyz - center, axis=1)
-    core = xyz[radius <= np.quantile(radius, CORE_SHARE)]
-    _, axes = np.linalg.eigh(np.cov((core - center).T) if len(core) > 1 else np.eye(3))
-    up = _thin_side(core - center, axes[:, 0])
-    backward = _thin_side(core - center, axes[:, 1])
-    tilt = np.radians(ELEVATION)
-    toward_eye = np.cos(tilt) * backward + np.sin(tilt) * up
-    (width, height), extent = MADE_UP_SIZE, np.linalg.norm(core - center, axis=1).max() or 1.0
-    eye = center + toward_eye * extent * 2.0 * MADE_UP_FOCAL / width
-    K = np.array([[MADE_UP_FOCAL, 0, width / 2], [0, MADE_UP_FOCAL, height / 2], [0, 0, 1.0]])
-    return Camera(K, width, height, look_at(eye, center, up))
-
-
-def _thin_side(
-    offsets: Float64[np.ndarray, "N 3"], axis: Float64[np.ndarray, " 3"]
-) -> Float64[np.ndarray, " 3"]:
-    """The axis, directed to the cloud's longer tail: usually away from the ground."""
-    low, middle, high = np.percentile(offsets @ axis, [5, 50, 95])
-    return axis if high - middle >= middle - low else -axis

@@ -23,10 +23,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32, Int64
 
 from splatseed.errors import ParameterError, PointCloudError
+from splatseed.photos._kernels import project_block
+from splatseed.photos.projection import cells_from_world
 from splatseed.photos.view import View
 from splatseed.runtime.hashing import FREE, scramble, slot_of
 from splatseed.runtime.jit import inline, kernel, parallel_range
-from splatseed.seeding.coverage import check_points, grid_from_world, project_block
+from splatseed.seeding.coverage import check_points
 
 CLOSEST = 4
 """Views in which a kept point is marked: enough for neighbours to share one, few enough to be
@@ -177,7 +179,7 @@ def _places_in_space(xyz: Float32[np.ndarray, "N 3"]) -> _Places:
 
 def _places_in_views(xyz: Float32[np.ndarray, "N 3"], views: Sequence[View]) -> _Places:
     """Places in the views that see a point most closely."""
-    matrices = np.stack([grid_from_world(view, 1) for view in views])
+    matrices = np.stack([cells_from_world(view.camera, 1) for view in views])
     focals = np.array([np.sqrt(abs(view.K[0, 0] * view.K[1, 1])) for view in views])
     sizes = np.array([[view.width, view.height] for view in views], np.float64)
     shape = len(xyz), min(CLOSEST, len(views))

@@ -5,7 +5,7 @@ order, each seeing the seeds of the views before. An empty cell gets one seed on
 centre. For its depth, in each of eight sectors of 45 degrees around it the nearest covered cell is
 consulted, up to ``2 r + 1`` cells away, where r is the distance of the first one. A seed at that
 depth is *contradicted* by another view if it lies in front of a covered cell there, nearer by more
-than ``NEARER``: that view looks through it. The guess is the median of the sectors' depths,
+than ``SURFACE``: that view looks through it. The guess is the median of the sectors' depths,
 weighted by ``1 / ((1 + contradictions) distance^2)``. If a view has no covered cell, the median
 depth of all views is used.
 Promise: a cover seed is a guess and says so by its confidence; its depth is one of the view's; the
@@ -23,18 +23,14 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64, UInt8
 
 from splatseed.errors import ParameterError, PointCloudError
-from splatseed.photos.projection import place
+from splatseed.photos._kernels import project_point
+from splatseed.photos.projection import cells_from_world, grid_shape
 from splatseed.photos.view import View
+from splatseed.photos.visibility import SURFACE
+from splatseed.photos.zbuffer import cell_depths
 from splatseed.progress import Progress, silent
 from splatseed.runtime.jit import inline
-from splatseed.seeding.coverage import (
-    NEARER,
-    cell_depths,
-    check_points,
-    depths_of_views,
-    grid_from_world,
-    grid_of,
-)
+from splatseed.seeding.coverage import check_points, depths_of_views
 
 SECTORS = 8
 
@@ -56,7 +52,7 @@ def depth_maps_of_views(
     maps = depths_of_views(views, xyz, cell, progress, "look for uncovered cells")
     sizes = np.array([depths.size for depths in maps])
     return Witnesses(
-        np.stack([grid_from_world(view, cell) for view in views]),
+        np.stack([cells_from_world(view.camera, cell) for view in views]),
         np.array([depths.shape for depths in maps]),
         np.cumsum(sizes) - sizes,
         np.concatenate([depths.ravel() for depths in maps]),
@@ -65,7 +61,7 @@ def depth_maps_of_views(
 
 def world_from_grid(view: View, cell: float) -> Float64[np.ndarray, "3 4"]:
     """(column depth, row depth, depth, 1) to the world, columns and rows in cells."""
-    forward = np.vstack([grid_from_world(view, cell), [0.0, 0.0, 0.0, 1.0]])
+    forward = np.vstack([cells_from_world(view.camera, cell), [0.0, 0.0, 0.0, 1.0]])
     return np.asarray(np.linalg.inv(forward)[:3])
 
 
@@ -122,13 +118,13 @@ def _contradictions(point, matrices, shapes, starts, seen):  # type: ignore[no-u
     """How many views look through a point."""
     count = 0
     for v in range(len(matrices)):
-        column, row, depth = place(point, matrices[v])
+        column, row, depth = project_point(point, matrices[v])
         if depth > 0.0:
             rows, cols = shapes[v]
             if 0.0 <= column < cols and 0.0 <= row < rows:
                 there = seen[starts[v] + int(row) * cols + int(column)]
-                # In front of a covered cell by more than NEARER: that view sees past it.
-                count += there < np.inf and depth < there * (1.0 - NEARER)
+                # In front of a covered cell by more than SURFACE: that view sees past it.
+                count += there < np.inf and depth < there * (1.0 - SURFACE)
     return count
 
 
@@ -239,7 +235,7 @@ def cover(
     for v in rng.permutation(len(views)):
         # Drawn for every view, empty cells or not: one view's gaps do not change the next's draw.
         asked = _draw_others(int(v), len(views), rng)
-        depths = cell_depths(views[v], cloud.xyz, cell)
+        depths = cell_depths(views[v].camera, cloud.xyz, cell)
         empty = np.flatnonzero(np.isinf(depths))
         if len(empty) < depths.size:
             guess = guess_depths(depths, empty, world_from_grid(views[v], cell), witnesses, asked)
@@ -327,7 +323,7 @@ def _make_seeds(
 ) -> CoverSeeds:
     """Seeds in empty cells at the guessed depths, except where too few pixels count."""
     depths, reach = guess
-    shape = grid_of(view, cell)
+    shape = grid_shape(view.camera, cell)
     used = np.ones((1, 1), np.bool_) if mask is None else np.asarray(mask, np.bool_)
     rgb, usable = np.empty((len(empty), 3), np.uint8), np.empty(len(empty), np.bool_)
     _mean_colors(view.photograph, used, shape, empty, rgb, usable)

@@ -26,7 +26,7 @@ from splatseed.depth.stereo.depths import any_depth
 from splatseed.depth.stereo.maps import StereoSettings
 from splatseed.depth.stereo.matching import blocks_known, match_views
 from splatseed.errors import SceneFormatError, SceneNotFoundError
-from splatseed.photos.projection import choose_by_pose
+from splatseed.photos.sources import choose_by_pose
 from splatseed.photos.view import View, data_factor, load_views
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent

@@ -32,7 +32,8 @@ from splatseed.depth.stereo.matching import make_quad_images
 from splatseed.methods.method import NewPoints
 from splatseed.methods.neighbors import Neighbors, PreparedCloud, prepare
 from splatseed.methods.patches import local_frames
-from splatseed.photos.projection import choose_sources, place, views_of_points
+from splatseed.photos._kernels import project_point
+from splatseed.photos.sources import choose_sources, views_of_points
 from splatseed.photos.view import View
 from splatseed.photos.visibility import Visibility
 from splatseed.pointcloud import PointCloud
@@ -182,7 +183,7 @@ def _has_witnesses(point, sources, matrices, sizes):  # type: ignore[no-untyped-
 @inline
 def _holds(matrix, size, point):  # type: ignore[no-untyped-def]  # Numba's types
     """Whether a point lies in front of a camera and well within its frame."""
-    u, v, z = place(point, matrix)
+    u, v, z = project_point(point, matrix)
     inside = MARGIN <= u <= size[0] - MARGIN and MARGIN <= v <= size[1] - MARGIN
     return z > 0.0 and inside
 

@@ -1,9 +1,9 @@
 """Which pixels of the test views at least two training views see: where scores measure skill.
 
-What fewer show can only be guessed. Frames are cut into the cells of ``seeding.coverage``. A cell's
-depth is that of the scene's own depth map, else the lower quartile of its points' depths, or the
-median of the nearest cells. A training view sees a point if it projects into the view and lies no
-more than ``NEARER`` behind the depth there. Promise: the answer depends on cameras, points and
+What fewer show can only be guessed. Images are divided into the cells of ``photos.zbuffer``. A
+cell's depth is that of the scene's own depth map, else ``cell_depths``, or the median of the
+nearest cells. A training view sees a point that projects into it and lies no more than ``SURFACE``
+behind the depth there. Promise: the answer depends on cameras, points and
 depth maps alone, never on a render, so it is the same for everything that is scored on a scene.
 """
 
@@ -21,10 +21,12 @@ from jaxtyping import Bool, Float32
 from splatseed.depthmap import DepthMaps
 from splatseed.io.files import ARCHIVE_FAILURES
 from splatseed.io.staging import atomic_file
+from splatseed.photos.projection import grid_shape
 from splatseed.photos.view import View, data_factor, poses_of
+from splatseed.photos.visibility import SURFACE, points_in_image
+from splatseed.photos.zbuffer import cell_depths
 from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
-from splatseed.seeding.coverage import NEARER, cell_depths, grid_from_world, grid_of
 
 _LEAST_VIEWS = 2  # training views that must see a pixel
 _CELLS, _LEAST_CELL = 100, 2.0
@@ -101,9 +103,9 @@ def _depths(
     from scipy.spatial import cKDTree  # noqa: PLC0415  (slow to import)
 
     if maps is None:
-        depths = cell_depths(view, xyz, _cell(view))
+        depths = cell_depths(view.camera, xyz, _cell(view))
     else:  # RGB-D captures have planar depth
-        values = _resized(maps.read(view.name).values, *grid_of(view, _cell(view)))
+        values = _resized(maps.read(view.name).values, *grid_shape(view.camera, _cell(view)))
         depths = np.nan_to_num(values, nan=np.inf)
     known = np.isfinite(depths)
     if known.any() and not known.all():
@@ -122,20 +124,15 @@ def _covisible(
 ) -> Bool[np.ndarray, "rows cols"]:
     rows, cols = depths.shape
     known = np.isfinite(depths)
-    # The cells' centres at their depths, in the world, homogeneous.
-    place = np.indices(depths.shape).reshape(2, -1)[::-1] + 0.5
-    grid_from_pixels = np.diag([cols / view.width, rows / view.height, 1.0])
-    rays = np.linalg.inv(grid_from_pixels @ view.K) @ np.vstack([place, np.ones(rows * cols)])
-    in_cam = np.vstack([rays * np.where(known, depths, -1.0).ravel(), np.ones(rows * cols)])
-    xyz1 = np.linalg.inv(view.cam_from_world) @ in_cam
+    # The cells' centres at their depths, in the world.
+    centers = (np.indices(depths.shape).reshape(2, -1)[::-1] + 0.5).T
+    uv = centers * [view.width / cols, view.height / rows]
+    xyz = np.asfortranarray(view.camera.unproject(uv, np.where(known, depths, -1.0).ravel()))
     count = np.zeros(rows * cols, np.int32)
     for other, farthest in seen:
-        column, row, depth = grid_from_world(other, _cell(other)) @ xyz1
-        front = depth > 0
-        j, i = np.floor([column, row] / np.where(front, depth, 1.0))
-        inside = front & (j >= 0) & (j < farthest.shape[1]) & (i >= 0) & (i < farthest.shape[0])
-        i, j = (np.where(inside, each, 0).astype(np.int64) for each in (i, j))
-        count += inside & (farthest[i, j] >= (1.0 - NEARER) * depth)
+        points = points_in_image(other.camera, xyz)
+        there = farthest[points.cells(other.camera, farthest.shape)]
+        count[points.point_idx] += there >= (1.0 - SURFACE) * points.depth
     return np.asarray((count.reshape(depths.shape) >= _LEAST_VIEWS) & known)
 
 

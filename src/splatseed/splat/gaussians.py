@@ -177,6 +177,8 @@ def fit_harmonics(seeds: PointCloud, views: Sequence[View]) -> Float32[np.ndarra
     sum_v |1/2 + y(d_v) h - p_v|^2 + OWN |1/2 + C0 h_0 - p|^2 + EVEN |C1 h_1..3|^2 in each colour
     channel. A seed that no view sees keeps its colour. Views are in the seeds' frame.
     """
+    from splatseed.photos.zbuffer import visible_points  # noqa: PLC0415  (kernels)
+
     xyz = np.ascontiguousarray(seeds.xyz, np.float32)
     # Normal equations; OWN and EVEN make them regular even for a seed that no view sees.
     normal = np.tile(np.diag([OWN * SH_C0**2, *[EVEN * SH_C1**2] * 3]), (len(xyz), 1, 1))
@@ -185,7 +187,8 @@ def fit_harmonics(seeds: PointCloud, views: Sequence[View]) -> Float32[np.ndarra
     most = max(LEAST_VIEWS, MOST_PROJECTIONS // max(1, len(xyz)))
     asked = np.linspace(0, len(views) - 1, min(most, len(views))).round().astype(int)
     for view in [views[i] for i in np.unique(asked)]:
-        index, column, row = _shown(xyz, view)
+        index, uv, _ = visible_points(view.camera, xyz, CELL, view.mask)
+        column, row = uv.astype(np.int64).T
         sight = xyz[index].astype(np.float64) - camera_centers([view])[0]
         d = sight / np.maximum(np.linalg.norm(sight, axis=1, keepdims=True), 1e-12)
         ones = np.full(len(d), SH_C0)
@@ -197,27 +200,6 @@ def fit_harmonics(seeds: PointCloud, views: Sequence[View]) -> Float32[np.ndarra
         normal[index] += basis[:, :, None] * basis[:, None, :]
         right[index] += basis[:, :, None] * colors[:, None, :]
     return np.linalg.solve(normal, right).astype(np.float32)
-
-
-def _shown(xyz: Float32[np.ndarray, "N 3"], view: View) -> Int64[np.ndarray, "3 M"]:
-    """Index, column and row of the seeds that none in the same or a neighbouring cell occludes."""
-    from splatseed.seeding.coverage import NEARER, cell_depths, grid_of  # noqa: PLC0415  (kernels)
-
-    # Pixels times depth, and depth, in written-out sums: BLAS's order varies with threads.
-    matrix, columns = view.K @ view.cam_from_world[:3], xyz.T.astype(np.float64)
-    x, y, depth = (m[0] * columns[0] + m[1] * columns[1] + m[2] * columns[2] + m[3] for m in matrix)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        column, row = x / depth, y / depth
-    inside = (depth > 0) & (column >= 0) & (column < view.width) & (row >= 0) & (row < view.height)
-    index = np.flatnonzero(inside)
-    column, row = column[index].astype(np.int64), row[index].astype(np.int64)
-    (rows, cols), depths = grid_of(view, CELL), cell_depths(view, xyz, CELL)
-    nearest = depths[row * rows // view.height, column * cols // view.width]
-    if view.mask is not None:
-        nearest = np.where(view.mask[row, column], nearest, np.inf)
-    # A tenth behind the cell's depth still counts as its surface.
-    seen = (depth[index] <= nearest * (1 + NEARER)) & np.isfinite(nearest)
-    return np.stack([index, column, row])[:, seen]
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int64, UInt8
 
 from splatseed.camera import Camera
-from splatseed.photos.visibility import look_at
+from splatseed.photos.viewpoint import look_at
 from splatseed.synthetic.surfaces import (
     Box,
     Cylinder,

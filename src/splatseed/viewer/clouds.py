@@ -19,7 +19,7 @@ from PIL import Image as PillowImage, ImageDraw
 from splatseed.camera import Camera
 from splatseed.io.files import StrPath
 from splatseed.methods import origin_name
-from splatseed.photos.visibility import choose_camera, choose_image
+from splatseed.photos.viewpoint import choose_camera, choose_image
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
 from splatseed.viewer import page

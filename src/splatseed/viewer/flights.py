@@ -23,7 +23,7 @@ from splatseed.errors import OutputError, ParameterError, SceneFormatError
 from splatseed.io.files import guarded, read_bytes
 from splatseed.io.staging import atomic_file
 from splatseed.photos.view import View
-from splatseed.photos.visibility import look_at
+from splatseed.photos.viewpoint import look_at
 from splatseed.progress import Progress, silent
 from splatseed.requirements import require
 from splatseed.similarity import Similarity

@@ -26,7 +26,7 @@ from jaxtyping import Float32
 
 from splatseed.errors import ParameterError
 from splatseed.photos.view import View
-from splatseed.photos.visibility import choose_camera, choose_image
+from splatseed.photos.viewpoint import choose_camera, choose_image
 from splatseed.requirements import require
 from splatseed.scene import Image, Scene
 from splatseed.viewer.flights import orbit, upward

@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image as PillowImage
 
 from splatseed.camera import Camera, Intrinsics, quat_from_rotation
-from splatseed.photos.visibility import look_at
+from splatseed.photos.viewpoint import look_at
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene, SceneSource
 from splatseed.synthetic.room import Room, pixel_rays, render_view

@@ -11,7 +11,7 @@ import pytest
 from splatseed.depth.stereo import depths as without_points, stereo_depths
 from splatseed.depth.stereo.depths import SAMPLES, known_visibility
 from splatseed.depthmap import DepthMap
-from splatseed.photos.projection import choose_by_pose
+from splatseed.photos.sources import choose_by_pose
 from splatseed.photos.visibility import find_visibility
 from splatseed.pointcloud import PointCloud
 

@@ -19,7 +19,7 @@ from splatseed.camera import Camera
 from splatseed.depth.stereo.maps import TOO_FEW, StereoResult, StereoSettings
 from splatseed.depth.stereo.matching import Hints, hints_from, match_views, other_from_view
 from splatseed.depthmap import DepthMap
-from splatseed.photos.projection import choose_by_pose, choose_sources
+from splatseed.photos.sources import choose_by_pose, choose_sources
 from splatseed.photos.view import View
 from splatseed.photos.visibility import Visibility, find_visibility
 from splatseed.progress import Progress, silent

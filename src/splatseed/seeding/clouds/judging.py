@@ -1,6 +1,6 @@
 """What the photographs see of a cloud, and which of its voxels stay.
 
-Notation: a view's *surface* is the depth of its cells (``coverage.cell_depths``), of a side at
+Notation: a view's *surface* is the depth of its cells (``photos.zbuffer``), of a side at
 which a typical cell holds ``FILLED`` points, so that walls have no holes. A view *sees* points in
 front of its surface, and up to ``BEHIND`` of the depth behind it. The *samples* of a point are its
 pixels in the ``CLOSEST`` views that see it; their *agreement* is the share within ``ALIKE`` grey
@@ -26,13 +26,15 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64, UInt8, UInt16
 
 from splatseed.errors import PointCloudError
-from splatseed.photos.projection import place
+from splatseed.photos._kernels import project_point
+from splatseed.photos.projection import cells_from_world
 from splatseed.photos.view import View
+from splatseed.photos.zbuffer import cell_counts
 from splatseed.progress import Progress
 from splatseed.runtime.hashing import FREE, scramble, slot_of
 from splatseed.runtime.jit import inline, kernel, parallel_range
 from splatseed.seeding.clouds.voxels import Voxels
-from splatseed.seeding.coverage import cell_counts, depths_of_views, grid_from_world
+from splatseed.seeding.coverage import depths_of_views
 
 
 def find_support(
@@ -144,7 +146,9 @@ def _choose_cell(views: Sequence[View], xyz: Float32[np.ndarray, "N 3"]) -> int:
     """The smallest side at which a cell that holds points typically holds enough."""
     some = views[:: -(-len(views) // 8)]
     for cell in CELLS[:-1]:
-        counts = [count[count > 0] for view in some if len(count := cell_counts(view, xyz, cell))]
+        counts = [
+            count[count > 0] for view in some if len(count := cell_counts(view.camera, xyz, cell))
+        ]
         filled = np.concatenate(counts)
         if len(filled) and np.median(filled) >= FILLED:
             return cell
@@ -179,7 +183,7 @@ def find_evidence(
         for v, view in enumerate(views):
             free = np.empty((0, 0), np.float32) if rays is None else rays[v]
             _observe(
-                block, grid_from_world(view, 1), np.sqrt(abs(view.K[0, 0] * view.K[1, 1])),
+                block, cells_from_world(view.camera, 1), np.sqrt(abs(view.K[0, 0] * view.K[1, 1])),
                 view.width, view.height, surfaces[v], behind, free, view.photograph,
                 every if view.mask is None else view.mask, closeness, samples,
                 evidence.seen[part], evidence.through[part], evidence.confirmed[part],
@@ -222,7 +226,7 @@ def _observe(  # type: ignore[no-untyped-def]  # Numba's types
 ):  # fmt: skip
     """Add what one view sees of the points."""
     for k in parallel_range(len(xyz)):
-        column, row, depth = place(xyz[k], matrix)
+        column, row, depth = project_point(xyz[k], matrix)
         if not (depth > 0.0 and 0.0 <= column < width and 0.0 <= row < height):
             continue
         i, j = int(row), int(column)

@@ -23,12 +23,12 @@ from jaxtyping import Float32, Float64, Int16, Int32, UInt8, UInt64
 
 from splatseed.errors import ParameterError, PointCloudError
 from splatseed.io.clouds import CloudChunk, CloudFile, open_cloud
+from splatseed.photos.projection import cells_from_world
 from splatseed.photos.view import View
 from splatseed.progress import Progress
 from splatseed.runtime.hashing import scramble
 from splatseed.runtime.jit import inline, kernel, parallel_range
 from splatseed.runtime.memory import free_memory, memory_argument, words_of
-from splatseed.seeding.coverage import grid_from_world
 from splatseed.similarity import Similarity
 
 BYTES_EACH = 320
@@ -75,7 +75,7 @@ class Voxels:
         self._views, self._even = len(views), 0
         self.coarser = self.total = self.unseen = 0
         if views:
-            matrices = np.stack([grid_from_world(view, 1) for view in views])
+            matrices = np.stack([cells_from_world(view.camera, 1) for view in views])
             focals = [np.sqrt(abs(view.K[0, 0] * view.K[1, 1])) for view in views]
             self._matrices = matrices.astype(np.float32)
             self._sides = (pixels / np.array(focals)).astype(np.float32)
