@@ -18,16 +18,17 @@ def main() -> None:
     xyz[:, 2] = np.abs(xyz[:, 2])
     rgb = (255 * np.abs(xyz)).astype(np.uint8)
 
+    cloud = ss.PointCloud(xyz, rgb)
     for method in ("linear", "mls"):
-        more_xyz, more_rgb = ss.upsample_points(xyz, rgb, method=method, ratio=10, seed=0)
-        radius = np.linalg.norm(more_xyz[len(xyz) :], axis=1)
+        seeds = ss.upsample(cloud, method, ratio=10, seed=0)
+        radius = np.linalg.norm(seeds.xyz[len(xyz) :], axis=1)
         off = np.abs(radius - 1).mean()
-        print(f"{method:8}{len(more_xyz):,} points {more_rgb.dtype}, new ones {off:.5f} off")
+        print(f"{method:8}{len(seeds):,} points {seeds.rgb.dtype}, new ones {off:.5f} off")
 
     # A method's own parameters go along by name; a wrong one is named in one line.
-    ss.upsample_points(xyz, rgb, method="mls", ratio=2, k=24, placement="triangle")
+    ss.upsample(cloud, "mls", ratio=2, k=24, placement="triangle")
     try:
-        ss.upsample_points(xyz, rgb, method="mls", ratio=2, neighbours=24)
+        ss.upsample(cloud, "mls", ratio=2, neighbours=24)
     except ss.SplatseedError as error:
         print(f"error: {error}")
 

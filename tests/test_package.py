@@ -26,7 +26,7 @@ SOURCE = Path(splatseed.__file__).parent
 MODULES = ["splatseed"] + [m.name for m in pkgutil.walk_packages(splatseed.__path__, "splatseed.")]
 
 ORDER = (
-    "errors", "text", "requirements", "progress", "frozen", "runtime", "camera",
+    "errors", "settings", "text", "requirements", "progress", "frozen", "runtime", "camera",
     "similarity", "lens", "pointcloud", "depthmap", "scene", "scores", "io", "photos", "depth",
     "methods", "seeding", "synthetic", "sfm", "rendering", "splat", "training", "integrations",
     "gsplat", "viewer", "bench", "console", "commands", "cli",
@@ -246,7 +246,7 @@ def _assert_explained(each, where):
 
 def test_the_front_door_lists_what_the_packages_promise():
     promised = "METHODS Camera PointCloud Scene SplatseedError add_cover load_scene stereo_depths"
-    promised += " upsample upsample_points write_scene Run evaluate train"
+    promised += " upsample write_scene Run evaluate train"
     assert sorted(splatseed.__all__) == sorted(promised.split())
     assert all(getattr(splatseed, name) for name in splatseed.__all__)
 

@@ -29,7 +29,7 @@ from benchmarks.stereo.speed import prepare_views
 
 import splatseed as ss
 from splatseed.errors import SplatseedError
-from splatseed.methods.method import NewPoints
+from splatseed.methods.contract import NewPoints
 from splatseed.photos.view import user_cache_dir
 from splatseed.photos.visibility import find_visibility
 from splatseed.scene import Scene

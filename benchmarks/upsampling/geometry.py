@@ -40,7 +40,6 @@ ARMS: dict[str, dict[str, Any]] = {
     "mls, triangle placement": {"method": "mls", "placement": "triangle"},
     "mls, paper": {"method": "mls", "profile": "paper"},
     "spline (lambda 0.01)": {"method": "spline"},
-    "spline, gcv": {"method": "spline", "smoothing": "gcv"},
     "spline, triangle placement": {"method": "spline", "placement": "triangle"},
     "spline, paper": {"method": "spline", "profile": "paper"},
     "voronoi": {"method": "voronoi"},

@@ -17,7 +17,7 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float64, UInt8
-from scipy.interpolate import BSpline, SmoothBivariateSpline
+from scipy.interpolate import SmoothBivariateSpline
 from scipy.spatial import ConvexHull, QhullError, Voronoi, cKDTree
 
 from splatseed import PointCloud
@@ -32,8 +32,6 @@ SPLINE_SMOOTHING = 0.1 * SPLINE_NEIGHBORS
 VORONOI_NEIGHBORS = 5
 VORONOI_SITES = 115_000
 VORONOI_HULLS = 500
-CONTROL = 6
-LAMBDAS = np.logspace(-3.0, 2.0, 11)
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,54 +113,6 @@ def spline(originals: Originals, rng: np.random.Generator) -> NewPoint:
     return point, originals.blend(point, around)
 
 
-def spline_gcv(originals: Originals, rng: np.random.Generator) -> NewPoint:
-    """Not in the paper: a penalised spline, its smoothing by generalised cross-validation."""
-    base, around, local = _neighborhood(originals, SPLINE_NEIGHBORS, rng)
-    extent = np.abs(local).max(axis=0) + 1e-9
-    design = _tensor_basis(*(local[:, :2] / extent[:2]).T)
-    coefficients = _cross_validated(design, local[:, 2])
-    uv = _in_box(local, rng)
-    height = (_tensor_basis(*(uv / extent[:2])[:, None]) @ coefficients).item()
-    point = originals.xyz[base] + (*uv, height)
-    return point, originals.blend(point, around)
-
-
-def _tensor_basis(u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Products of six uniform cubic B-splines along each axis of [-1, 1], [m, 36]."""
-    knots = np.linspace(-1.0, 1.0, CONTROL - 2)
-    step = knots[1] - knots[0]
-    knots = np.concatenate(
-        [knots[0] - step * np.arange(3, 0, -1), knots, knots[-1] + step * np.arange(1, 4)]
-    )
-    along_u, along_v = (BSpline.design_matrix(x, knots, 3).toarray() for x in (u, v))
-    return np.einsum("ma,mb->mab", along_u, along_v).reshape(len(u), -1)
-
-
-def _roughness() -> np.ndarray:
-    """A discrete thin plate over the control values, [36, 36]."""
-    identity = np.eye(CONTROL)
-    slopes, bends = (np.diff(identity, n=n, axis=0) for n in (1, 2))
-    slopes, bends = slopes.T @ slopes, bends.T @ bends
-    return np.kron(bends, identity) + 2 * np.kron(slopes, slopes) + np.kron(identity, bends)
-
-
-ROUGHNESS = _roughness() + 1e-9 * np.eye(CONTROL * CONTROL)
-
-
-def _cross_validated(design: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Coefficients of the candidate lambda with the least m |r|^2 / (m - tr H)^2."""
-    normal = design.T @ design
-    best, chosen = np.inf, np.zeros(normal.shape[0])
-    for smoothing in LAMBDAS:
-        solved = np.linalg.solve(normal + smoothing * ROUGHNESS, design.T)
-        coefficients = solved @ z
-        residual = z - design @ coefficients
-        score = residual @ residual / (len(z) - np.sum(design * solved.T)) ** 2
-        if score < best:
-            best, chosen = score, coefficients
-    return chosen
-
-
 def bounding_box(originals: Originals, rng: np.random.Generator) -> NewPoint:
     """The ablation: anywhere in the bounding box."""
     low, high = _bounds(originals)
@@ -233,7 +183,6 @@ NAIVE: dict[str, Callable[[Originals, np.random.Generator], NewPoint]] = {
     "triangle": triangle,
     "mls": mls,
     "spline": spline,
-    "spline gcv": spline_gcv,
     "random": bounding_box,
 }
 """One new point of each method; Voronoi, which has shared work, is timed apart."""

@@ -31,14 +31,13 @@ from splatseed.errors import SplatseedError
 
 __all__: list[str] = []
 
-Method = Literal["linear", "triangle", "mls", "spline", "spline gcv", "voronoi", "random"]
+Method = Literal["linear", "triangle", "mls", "spline", "voronoi", "random"]
 
 OPTIONS: dict[str, dict[str, Any]] = {
     "linear": {"method": "linear"},
     "triangle": {"method": "triangle"},
     "mls": {"method": "mls"},
     "spline": {"method": "spline"},
-    "spline gcv": {"method": "spline", "smoothing": "gcv"},
     "voronoi": {"method": "voronoi"},
     "random": {"method": "random"},
 }

@@ -2,7 +2,7 @@ from .camera import Camera as Camera
 from .depth.stereo import stereo_depths as stereo_depths
 from .errors import SplatseedError as SplatseedError
 from .io import load_scene as load_scene, write_scene as write_scene
-from .methods import METHODS as METHODS, upsample_points as upsample_points
+from .methods import METHODS as METHODS
 from .pointcloud import PointCloud as PointCloud
 from .scene import Scene as Scene
 from .seeding.upsampling import add_cover as add_cover, upsample as upsample

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from PIL import Image as PilImage
 
+from splatseed import upsample
 from splatseed.commands.next_steps import number_for
 from splatseed.depth.alignment import align
 from splatseed.io import find_depths, load_scene, write_scene
 from splatseed.io.colmap import write_points3d
 from splatseed.io.depth_maps import depth_folder
 from splatseed.io.ply import write_ply
-from splatseed.methods import upsample
 from splatseed.pointcloud import PointCloud
 from splatseed.synthetic import make_capture, write_capture
 

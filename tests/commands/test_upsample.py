@@ -17,6 +17,7 @@ import pycolmap
 import pytest
 from PIL import Image as PilImage
 
+import splatseed as ss
 from splatseed.camera import rotation_from_quat
 from splatseed.commands.upsample.cloud import LoadedCloud
 from splatseed.io import load_scene, write_scene
@@ -24,7 +25,7 @@ from splatseed.io.nerfstudio import read_cloud_transform
 from splatseed.io.origin import moved_by
 from splatseed.io.ply import read_ply, write_ply
 from splatseed.io.staging import unlisted_files
-from splatseed.methods import METHODS, SOURCE_CODES, chooses_number, configure, upsample
+from splatseed.methods import METHODS, SOURCE_CODES, chooses_number, configure
 from splatseed.pointcloud import PointCloud
 from splatseed.sfm.refinement import poses_of, turns
 from splatseed.similarity import Similarity
@@ -162,7 +163,7 @@ def test_flags_and_the_profile_set_a_methods_parameters(flags, chosen, room, tmp
     words = ("--method", "mls", *flags, "-o", tmp_path / "out")
     assert splatseed("upsample", room, *words).code == 0
     assert _manifest(tmp_path / "out")["parameters"] == dataclasses.asdict(chosen)
-    written, expected = load_scene(tmp_path / "out").points, upsample(load_scene(room), chosen)
+    written, expected = load_scene(tmp_path / "out").points, ss.upsample(load_scene(room), chosen)
     np.testing.assert_array_equal(written.xyz, expected.xyz)
 
 

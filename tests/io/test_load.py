@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from PIL import Image as PilImage
 
+from splatseed import upsample
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io import colmap, load_scene
 from splatseed.io.cleaning import clean_scene
 from splatseed.io.ply import write_ply
-from splatseed.methods import upsample
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import LeftOut, Scene
 

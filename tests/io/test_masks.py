@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from PIL import Image as PilImage
 
+from splatseed import upsample
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io import load_scene, write_scene
 from splatseed.io.load import with_own_depths
 from splatseed.io.mask_files import masks_among
 from splatseed.io.masks import masks_beside, with_masks
-from splatseed.methods import upsample
 from splatseed.photos.view import load_views
 from splatseed.sfm.photos import find_photos
 from splatseed.synthetic import write_capture

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -18,9 +17,9 @@ from .references import Cloud
 def third_party(monkeypatch):
     """Installs a package that registers the method "copies", and one that wants to be "mls"."""
     found = [SimpleNamespace(name=name, load=lambda: Copies) for name in ("copies", "mls")]
-    # The front door has a function of the package's name.
-    package = sys.modules["splatseed.methods"]
-    monkeypatch.setattr(package, "entry_points", lambda *, group: found if group else [])
+    monkeypatch.setattr(
+        "splatseed.methods.registry.entry_points", lambda *, group: found if group else []
+    )
     METHODS.__dict__.pop("_plugins", None)
     yield
     METHODS.__dict__.pop("_plugins", None)

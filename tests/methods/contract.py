@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 import splatseed as ss
-from splatseed.methods.method import NewPoints
+from splatseed.methods.contract import NewPoints
 from splatseed.methods.neighbors import prepare_scene
 
 from .surroundings import scene_around

@@ -12,7 +12,6 @@ many points each base makes, then the uniform draws), so that the two agree poin
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -194,19 +193,9 @@ def _roughness():
 
 def pspline_surface(local, distance, smoothing=0.01):
     """Penalised 6 x 6 tensor-product cubic B-spline, by the dense normal equations."""
-    return _pspline(local, distance, lambda _design, _z: smoothing)
-
-
-def gcv_surface(local, distance, *, candidates):
-    """The same with smoothing of least GCV score."""
-    return _pspline(local, distance, partial(_least_gcv, candidates=candidates))
-
-
-def _pspline(local, distance, choose):
     unit = np.array([*np.abs(local[:, :2]).max(axis=0), 1.5 * distance[-1]])
     scaled = local / unit
     design, z = _bspline_design(scaled[:, :2]), scaled[:, 2]
-    smoothing = choose(design, z)
     normal = design.T @ design + smoothing * _roughness() + 1e-9 * np.eye(36)
     c = np.linalg.solve(normal, design.T @ z)
 
@@ -215,13 +204,3 @@ def _pspline(local, distance, choose):
         return unit[2] * (_bspline_design(place) @ c).item()
 
     return surface
-
-
-def _least_gcv(design, z, candidates):
-    """The candidate that minimises m |z - H z|^2 / tr(I - H)^2, the hat matrix H by inversion."""
-    scores = []
-    for smoothing in candidates:
-        hat = design @ np.linalg.inv(design.T @ design + smoothing * _roughness()) @ design.T
-        rest = np.eye(len(z)) - hat
-        scores.append(len(z) * np.sum((rest @ z) ** 2) / np.trace(rest) ** 2)
-    return candidates[int(np.argmin(scores))]

@@ -25,8 +25,8 @@ def new_points(xyz, method, **options):
     xyz = np.asarray(xyz, np.float32)
     rgb = np.zeros(xyz.shape, np.uint8)
     rgb[0] = 255
-    more = ss.upsample_points(xyz, rgb, method, num_points=len(xyz) + NUM, **options)
-    return more[0][len(xyz) :].astype(np.float64), more[1][len(xyz) :].astype(np.float64)
+    more = ss.upsample(ss.PointCloud(xyz, rgb), method, num_points=len(xyz) + NUM, **options)
+    return more.xyz[len(xyz) :].astype(np.float64), more.rgb[len(xyz) :].astype(np.float64)
 
 
 @pytest.fixture

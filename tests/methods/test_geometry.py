@@ -67,7 +67,7 @@ def test_errors_shrink_with_the_spacing_to_the_order_of_the_fit(method, order):
     error = {}
     for num in (500, 4000):  # of exact samples of a sphere, eight times as many: spaced by sqrt(8)
         xyz = SHAPES["sphere"]().sample(num, np.random.default_rng(1)).astype(np.float32)
-        new, _ = ss.upsample_points(xyz, np.zeros(xyz.shape, np.uint8), method, ratio=8)
+        new = ss.upsample(ss.PointCloud(xyz, np.zeros(xyz.shape, np.uint8)), method, ratio=8).xyz
         error[num] = np.abs(np.linalg.norm(new[num:].astype(np.float64), axis=1) - 1.0).mean()
     assert error[500] / error[4000] > 0.9 * 8 ** (order / 2)
 

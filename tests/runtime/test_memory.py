@@ -7,11 +7,13 @@ import os
 import numpy as np
 import pytest
 
+from splatseed import upsample
 from splatseed.depth.stereo import StereoSettings, stereo_depths
 from splatseed.depth.stereo.matching import BYTES_A_DEPTH, check_stereo_memory
 from splatseed.errors import ParameterError
 from splatseed.io import load_scene
-from splatseed.methods import BYTES_EACH, number_of_new, upsample
+from splatseed.methods import number_of_new
+from splatseed.methods.add_points import BYTES_EACH
 from splatseed.methods.neighbors import NEIGHBOR_BYTES
 from splatseed.photos.view import load_views
 from splatseed.pointcloud import PointCloud

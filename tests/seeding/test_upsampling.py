@@ -84,7 +84,7 @@ def test_held_out_photographs_are_never_read(method, room, monkeypatch):
 @by_photographs
 @pytest.mark.parametrize("size", [{"ratio": 4}, {"num_points": 5000}], ids=str)
 def test_the_photographs_say_how_many(method, size, room):
-    with pytest.raises(ParameterError, match="--budget"):
+    with pytest.raises(ParameterError, match="`budget`"):
         ss.upsample(room, method, **size)
 
 

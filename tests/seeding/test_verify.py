@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from splatseed.camera import Intrinsics, quat_from_rotation
-from splatseed.methods.method import NewPoints
+from splatseed.methods.contract import NewPoints
 from splatseed.photos.view import View
 from splatseed.photos.visibility import Visibility
 from splatseed.scene import Image

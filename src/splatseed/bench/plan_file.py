@@ -18,7 +18,7 @@ from splatseed.bench.plan import SHARED, Plan
 from splatseed.bench.scenes import DEMO, PlannedScene
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.io.files import StrPath, read_text
-from splatseed.methods.method import describe_type, fits
+from splatseed.settings import describe_type, fits
 from splatseed.training.settings import TrainSettings
 
 PresetName = Literal["mipnerf360", "replica", "laptop", "quick"]

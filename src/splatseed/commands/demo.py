@@ -35,12 +35,13 @@ from splatseed.console import StageClock, print_note, print_pairs, print_table, 
 from splatseed.errors import MissingDependencyError
 from splatseed.io import find_depths, load_scene, write_scene
 from splatseed.io.staging import add_files, atomic_file, output_folder, read_manifest
-from splatseed.methods import METHODS, chooses_number, configure, methods_for, upsample
+from splatseed.methods import METHODS, chooses_number, configure, methods_for
 from splatseed.pointcloud import PointCloud
 from splatseed.requirements import require
 from splatseed.runtime.compilation import watched
 from splatseed.runtime.tasks import Child
 from splatseed.scene import Scene
+from splatseed.seeding.upsampling import upsample
 from splatseed.text import quoted
 
 if TYPE_CHECKING:  # they load Numba, or PyTorch, which may be absent

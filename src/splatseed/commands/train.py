@@ -26,11 +26,11 @@ from splatseed.console import ERR, OUT, print_note, print_pairs, stage_display
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.io import load_scene
 from splatseed.io.files import read_text
-from splatseed.methods.method import fits
 from splatseed.requirements import require
 from splatseed.runtime.interruption import exit_code
 from splatseed.scores import TrainingResult
 from splatseed.seeding.upsampling import RHO
+from splatseed.settings import fits
 from splatseed.text import did_you_mean, quoted, visible
 from splatseed.training.duration import TOO_LONG, Progressed, about_an_hour, in_words, seconds_left
 from splatseed.training.folder import RunFolder

@@ -15,7 +15,7 @@ power of two divides or multiplies the result by it exactly.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int, Int64
@@ -26,6 +26,7 @@ from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.photos.visibility import PointsInImage, find_visibility, points_in_image
 from splatseed.progress import Progress, in_threads, silent
 from splatseed.scene import Image, Scene
+from splatseed.settings import Range
 
 Fit = Literal["robust", "least-squares"]
 """Medians and reweighting, or the paper's equation 7."""
@@ -48,6 +49,9 @@ UNIT_POINTS = 20
 UNIT_SLACK = 1.25
 """A map in scene units is refused if at least this many SfM points show it off by this factor."""
 
+MAX_VIEWS = 255
+"""Other views that a point can be compared with: 8 bits count them."""
+
 Values = Float64[np.ndarray, " M"]
 
 
@@ -59,36 +63,36 @@ class Settings:
     """Fit the scale (for inverse depth, and shift) of each map to the SfM points."""
     fit: Fit = "robust"
     """How to fit: medians and reweighting, or the paper's equation 7 (paper: least-squares)."""
-    min_points: int = 20
+    min_points: Annotated[int, Range(1)] = 20
     """Fewest SfM points that an image must see, else it is left out (paper: 1)."""
-    max_residual_ratio: float | None = 3.0
+    max_residual_ratio: Annotated[float | None, Range(1)] = 3.0
     """Leave out images that fit this many times worse than the median one (paper: none)."""
     synchronize_scales: bool = True
     """Then scale the maps, each by one factor, to agree with each other (paper: no)."""
     unit_ray: bool = False
     """Take z for the distance along the ray, as equation 9 says; this bends walls (paper: yes)."""
-    region: float = 1.0
+    region: Annotated[float, Range(above=0, maximum=1)] = 1.0
     """Central fraction of the width and of the height that pixels are drawn from (paper: 0.5)."""
     placement: Literal["empty", "uniform"] = "empty"
     """Draw pixels by their distance to the nearest SfM point, or uniformly (paper: uniform)."""
-    edge_tolerance: float | None = 0.03
+    edge_tolerance: Annotated[float | None, Range(above=0)] = 0.03
     """Avoid pixels near discontinuities larger than this fraction of depth (paper: none)."""
-    edge_radius: int = 3
+    edge_radius: Annotated[int, Range(1, 100)] = 3
     """Radius of the discontinuity test, in pixels of the map."""
-    min_agreeing: int = 2
+    min_agreeing: Annotated[int, Range(0, "num_neighbors")] = 2
     """Other views whose depth and colour must confirm a point; 0 = none (paper: 0)."""
     see_through: bool = False
     """Keep points that another view looks through (paper: yes)."""
-    num_neighbors: int = 12
+    num_neighbors: Annotated[int, Range(1, MAX_VIEWS)] = 12
     """Most other views that are compared with a point."""
-    tolerance: float = 0.02
+    tolerance: Annotated[float, Range(above=0, below=1)] = 0.02
     """Relative difference up to which two depths agree."""
-    color_tolerance: float | None = 0.15
+    color_tolerance: Annotated[float | None, Range(above=0, maximum=1)] = 0.15
     """Mean colour difference, 0 to 1, up to which two views agree; none = not compared."""
     spread: bool = True
     """Spread points as evenly as their number allows, whatever image they come from (paper:
     no)."""
-    test_every: int = 0
+    test_every: Annotated[int, Range(2, also=0)] = 0
     """Leave out every n-th image by name, as trainers do for testing (8); 0 = use all but
     test images that the scene lists."""
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from splatseed.methods.method import NewPoints
+from splatseed.methods.contract import NewPoints
 from splatseed.methods.neighbors import prepare_scene
 from splatseed.progress import Progress
 from splatseed.scene import Scene

@@ -14,11 +14,10 @@ from typing import ClassVar, Self
 import numpy as np
 
 from splatseed.depth.alignment import Settings
-from splatseed.methods.method import NewPoints, Traits, check_fields, require
+from splatseed.methods.contract import NewPoints, Traits
 from splatseed.progress import Progress
 from splatseed.scene import Scene
-
-MAX_VIEWS = 255
+from splatseed.settings import check_settings
 
 
 @dataclass(frozen=True)
@@ -28,21 +27,7 @@ class Depth(Settings):
     name: ClassVar[str] = "depth"
 
     def __post_init__(self) -> None:
-        check_fields(self)
-        edge, color, views = self.edge_tolerance, self.color_tolerance, self.num_neighbors
-        ratio = self.max_residual_ratio
-        for field, fits, expected in (
-            ("min_points", self.min_points >= 1, "of at least 1"),
-            ("region", 0 < self.region <= 1, "above 0, 1 at most"),
-            ("max_residual_ratio", ratio is None or ratio >= 1, "of at least 1"),
-            ("edge_tolerance", edge is None or edge > 0, "above 0"),
-            ("edge_radius", 1 <= self.edge_radius <= 100, "from 1 to 100"),
-            ("num_neighbors", 1 <= views <= MAX_VIEWS, f"from 1 to {MAX_VIEWS}"),
-            ("min_agreeing", 0 <= self.min_agreeing <= views, f"from 0 to {views}"),
-            ("tolerance", 0 < self.tolerance < 1, "between 0 and 1"),
-            ("color_tolerance", color is None or 0 < color <= 1, "above 0, 1 at most"),
-        ):
-            require(fits, f"depth.{field} {expected}", getattr(self, field))
+        check_settings(self, self.name)
 
     @property
     def traits(self) -> Traits:

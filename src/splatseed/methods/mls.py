@@ -17,7 +17,7 @@ from typing import ClassVar, Self
 import numpy as np
 from jaxtyping import Float32
 
-from splatseed.methods.patches import Patches, PatchMethod
+from splatseed.methods.patches import FitSize, Patches, PatchMethod
 from splatseed.runtime.jit import inline, kernel, parallel_range
 
 TERMS = 6  # 1, u, v, u^2, uv, v^2
@@ -30,7 +30,7 @@ ridge of 1e-6 would move 1.4% of fern's new points by over a tenth of the spacin
 class Mls(PatchMethod):
     """Points on weighted quadratic fits to the neighbours (moving least squares, eqs. 4-5)."""
 
-    k: int = 16
+    k: FitSize = 16
     """Neighbours in a fit (paper: 10)."""
 
     name: ClassVar[str] = "mls"

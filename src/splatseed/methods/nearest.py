@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
 from splatseed.errors import PointCloudError
-from splatseed.methods.method import NewPoints, check_fields
+from splatseed.methods.contract import NewPoints
 from splatseed.methods.neighbors import (
     QUERY_BLOCK,
     Bases,
@@ -33,6 +33,7 @@ from splatseed.methods.neighbors import (
 from splatseed.progress import Progress, in_threads
 from splatseed.runtime.jit import inline, kernel, parallel_range
 from splatseed.scene import Scene
+from splatseed.settings import check_settings
 
 OUTLIER_CHECK_NEIGHBORS = 8
 
@@ -50,7 +51,7 @@ class NearestMethod(ABC):
     min_points: ClassVar[int] = 2
 
     def __post_init__(self) -> None:
-        check_fields(self)
+        check_settings(self, getattr(self, "name", type(self).__name__.lower()))
 
     @classmethod
     def paper(cls) -> Self:

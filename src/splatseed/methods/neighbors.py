@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float64, Int32, Int64, UInt8
 from scipy.spatial import cKDTree
 
 from splatseed.errors import PointCloudError
-from splatseed.methods.method import nothing_finite
+from splatseed.methods.contract import nothing_finite
 from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.progress import Progress, in_threads, silent
 from splatseed.runtime.memory import check_memory

@@ -15,16 +15,17 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32
 
-from splatseed.methods.method import NewPoints, require
+from splatseed.methods.contract import NewPoints
 from splatseed.methods.nearest import Aux, NearestMethod, interpolate_colors
 from splatseed.methods.neighbors import Bases, Neighbors, PreparedCloud
 from splatseed.progress import Progress, blocks
 from splatseed.runtime.jit import inline, kernel, parallel_range
+from splatseed.settings import Range
 
 COLLINEAR = 1e-9
 """Ratio of the two largest variances below which a neighbourhood counts as collinear."""
@@ -290,6 +291,7 @@ def _box(xyz, idx, frames, start, count, uv):  # type: ignore[no-untyped-def]  #
 
 BLOCK = 1 << 13  # base points that are fitted between two updates of the progress bar
 MIN_NEIGHBORS = 3  # points other than the base that determine a plane with room for a height
+FitSize = Annotated[int, Range(MIN_NEIGHBORS)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -307,27 +309,20 @@ class Patches:
 class PatchMethod(NearestMethod, ABC):
     """Base of the methods that fit a height field to the neighbours of a base point."""
 
-    k: int = 16
+    k: FitSize = 16
     """Neighbours in a fit."""
     frame: Literal["local", "world"] = "local"
     """Axes of the fit: the neighbourhood's principal axes, or the world's (paper: world)."""
     placement: Literal["disc", "triangle", "box"] = "disc"
     """Where points are placed: a disc (best coverage), a triangle of neighbours (most exact), a
     box (paper: box)."""
-    disc_radius: float = 1.5
+    disc_radius: Annotated[float, Range(above=0)] = 1.5
     """Radius of the disc in units of the base point's spacing."""
-    clamp: float | None = 0.25
+    clamp: Annotated[float | None, Range(0)] = 0.25
     """How far a height may leave the neighbours' range, as a fraction of it (paper: no limit)."""
 
     min_points: ClassVar[int] = 4
     name: ClassVar[str]
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require(self.k >= MIN_NEIGHBORS, f"{self.name}.k of at least {MIN_NEIGHBORS}", self.k)
-        require(self.disc_radius > 0, f"{self.name}.disc_radius above 0", self.disc_radius)
-        clamp = self.clamp
-        require(clamp is None or clamp >= 0, f"{self.name}.clamp of at least 0", clamp)
 
     @abstractmethod
     def heights(

@@ -14,7 +14,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from splatseed.methods.method import NewPoints
+from splatseed.methods.contract import NewPoints
 from splatseed.methods.nearest import Aux, NearestMethod
 from splatseed.methods.neighbors import Bases, Neighbors, PreparedCloud
 from splatseed.progress import Progress

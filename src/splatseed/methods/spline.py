@@ -2,7 +2,7 @@
 
 Default: a P-spline. Over the 6 x 6 control values c of ``splines``, minimise
 sum_j (S(u_j, v_j) - z_j)^2 + lambda c' P c; the penalty makes the problem well-posed for 26 points
-and 36 unknowns. lambda is fixed, or chosen for every patch by generalised cross-validation.
+and 36 unknowns. lambda is fixed for all patches.
 
 Paper: FITPACK with smoothing s = 0.1 k at k = 25. Its smoothing is inert there: no fit gets an
 inner knot, so the result is the least-squares bicubic polynomial in world axes, which is what
@@ -13,16 +13,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
 from jaxtyping import Float32, Float64
 
 from splatseed.methods import splines
-from splatseed.methods.method import require
-from splatseed.methods.patches import Patches, PatchMethod
+from splatseed.methods.patches import FitSize, Patches, PatchMethod
 from splatseed.methods.splines import COEFFICIENTS, CONTROL, PatchBasis
 from splatseed.runtime.jit import inline, kernel, parallel_range
+from splatseed.settings import Range
 
 BAND = 3 * CONTROL + 3
 """Bandwidth: two overlapping basis functions are at most this far apart in the flat order."""
@@ -33,21 +33,14 @@ RIDGE = 1e-9  # ridge for control values that no data and, for a plane, no penal
 class Spline(PatchMethod):
     """Points on smooth B-spline surfaces fitted to the neighbours (eq. 3)."""
 
-    k: int = 25
+    k: FitSize = 25
     """Neighbours in a fit (paper: 25)."""
     basis: Literal["pspline", "bicubic"] = "pspline"
     """A penalised B-spline, or the bicubic that the paper's parameters give (paper: bicubic)."""
-    smoothing: float | Literal["gcv"] = 0.01
-    """Weight of the roughness penalty, or gcv: cross-validated (paper: s = 0.1 k, inert)."""
+    smoothing: Annotated[float, Range(above=0)] = 0.01
+    """Weight of the roughness penalty (paper: s = 0.1 k, inert)."""
 
     name: ClassVar[str] = "spline"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        fits = self.smoothing == "gcv" or (
-            not isinstance(self.smoothing, str) and 0 < self.smoothing < math.inf
-        )
-        require(fits, 'spline.smoothing above 0, or "gcv"', self.smoothing)
 
     @classmethod
     def paper(cls) -> Self:
@@ -65,20 +58,16 @@ class Spline(PatchMethod):
             return
         basis = splines.patch_basis(patches, first, last)
         count = patches.bases.count[first:last]
-        if isinstance(self.smoothing, str):
-            smoothing = splines.cross_validate(basis, count)
-        else:
-            smoothing = np.full(len(basis.z), float(self.smoothing))
-        coefficients = fit(basis, count, smoothing)
+        coefficients = fit(basis, count, self.smoothing)
         splines.evaluate(patches, coefficients, basis.scale, first, last, out)
 
 
-def fit(
-    basis: PatchBasis, count: np.ndarray, smoothing: Float64[np.ndarray, " rows"]
-) -> Float64[np.ndarray, "rows 36"]:
+def fit(basis: PatchBasis, count: np.ndarray, smoothing: float) -> Float64[np.ndarray, "rows 36"]:
     """Control values of every row with new points (``count`` > 0), [rows, 36]; else 0."""
     coefficients = np.zeros((len(basis.z), COEFFICIENTS))
-    _fit(basis.weight, basis.cell, basis.z, count, smoothing, splines.penalty(), coefficients)
+    _fit(
+        basis.weight, basis.cell, basis.z, count, float(smoothing), splines.penalty(), coefficients
+    )
     return coefficients
 
 
@@ -89,7 +78,7 @@ def _fit(weight, cell, z, count, smoothing, roughness, coefficients):  # type: i
             normal = np.empty((COEFFICIENTS, COEFFICIENTS))
             for a in range(COEFFICIENTS):
                 for b in range(a, min(COEFFICIENTS, a + BAND + 1)):
-                    normal[a, b] = smoothing[row] * roughness[a, b]
+                    normal[a, b] = smoothing * roughness[a, b]
                 normal[a, a] += RIDGE
             _accumulate(weight[row], cell[row], z[row], normal, coefficients[row])
             _solve(normal, coefficients[row])

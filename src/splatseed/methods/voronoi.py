@@ -16,18 +16,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
 from jaxtyping import Float64
 
 from splatseed.methods.cells import MAX_NEIGHBORS, Cells, box_cells, build_cells
-from splatseed.methods.method import NewPoints, require
+from splatseed.methods.contract import NewPoints
 from splatseed.methods.nearest import Aux, NearestMethod, colors_of_nearest, interpolate_colors
 from splatseed.methods.neighbors import Bases, Neighbors, PreparedCloud
 from splatseed.methods.patches import local_frames
 from splatseed.progress import Progress, blocks
 from splatseed.runtime.jit import kernel, parallel_range
+from splatseed.settings import Range
 
 BLOCK = 1 << 14
 
@@ -36,26 +37,20 @@ BLOCK = 1 << 14
 class Voronoi(NearestMethod):
     """Points in the Voronoi cells of the originals, more where cells are large (eq. 6)."""
 
-    k: int = 25
+    k: Annotated[int, Range(4, MAX_NEIGHBORS)] = 25
     """Neighbours that shape a cell; half the distance of the last bounds it."""
     cells: Literal["clamped", "box"] = "clamped"
     """Cells clamped to their neighbourhood, or SciPy's in the enlarged bounding box (paper:
     box)."""
-    ball: float = 0.5
+    ball: Annotated[float, Range(above=0, maximum=1)] = 0.5
     """Radius of the ball for new points, as a fraction of the cell's radius (paper: 0.5)."""
-    color_k: int = 5
+    color_k: Annotated[int, Range(1, "k")] = 5
     """Nearest originals that colour a new point (paper: 5)."""
-    max_weight: float = 8.0
+    max_weight: Annotated[float, Range(1)] = 8.0
     """Cap on a cell's volume relative to the median of its neighbours' (clamped cells only)."""
 
+    name: ClassVar[str] = "voronoi"
     min_points: ClassVar[int] = 4
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require(4 <= self.k <= MAX_NEIGHBORS, f"voronoi.k from 4 to {MAX_NEIGHBORS}", self.k)
-        require(0 < self.ball <= 1, "voronoi.ball above 0 and up to 1", self.ball)
-        require(1 <= self.color_k <= self.k, "voronoi.color_k from 1 to voronoi.k", self.color_k)
-        require(self.max_weight >= 1, "voronoi.max_weight of at least 1", self.max_weight)
 
     @classmethod
     def paper(cls) -> Self:

@@ -9,18 +9,19 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
 
 from splatseed.depth.stereo.maps import MOST_GRID, TOO_FEW, StereoSettings
 from splatseed.errors import PointCloudError, SceneNotFoundError
 from splatseed.methods import as_cloud, source_code
-from splatseed.methods.method import NewPoints, Traits, check_fields, require
+from splatseed.methods.contract import NewPoints, Traits
 from splatseed.photos.view import View, at_file_size, data_factor, load_views
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress
 from splatseed.scene import Image, Scene
+from splatseed.settings import Range, check_settings
 
 if TYPE_CHECKING:
     from splatseed.depth.stereo.maps import StereoMap, StereoResult
@@ -32,9 +33,9 @@ MAX_SIZE = 800  # longer side in pixels at which photographs are used
 class PhotographMethod:
     """The base of the three methods."""
 
-    max_size: int = MAX_SIZE
+    max_size: Annotated[int, Range(64)] = MAX_SIZE
     """Photographs are downsampled by a whole factor to at most this many pixels a side."""
-    test_every: int = 0
+    test_every: Annotated[int, Range(2, also=0)] = 0
     """Leave out every n-th image by name, as trainers do for testing (8); 0 = use all but
     test images that the scene lists."""
 
@@ -42,20 +43,16 @@ class PhotographMethod:
     traits: ClassVar[Traits] = Traits(frozenset({"photographs"}), chooses_number=True)
 
     def __post_init__(self) -> None:
-        check_fields(self)
-        require(self.max_size >= 64, f"{self.name}.max_size of at least 64", self.max_size)
-        for field, most in (("spacing", 256), ("cell", 256), ("grid", MOST_GRID)):
-            value = getattr(self, field, 1)
-            require(1 <= value <= most, f"{self.name}.{field} from 1 to {most}", value)
+        check_settings(self, self.name)
 
 
 @dataclass(frozen=True)
 class Stereo(PhotographMethod):
     """Seeds on surfaces, from comparing photographs with each other."""
 
-    spacing: float = 8.0
+    spacing: Annotated[float, Range(1, 256)] = 8.0
     """Pixels between stereo's seeds in the photographs; at least the grid."""
-    grid: int = 4
+    grid: Annotated[int, Range(1, MOST_GRID)] = 4
     """Pixels between depths, along a row and a column."""
 
     name: ClassVar[str] = "stereo"
@@ -77,12 +74,12 @@ class Stereo(PhotographMethod):
         self, scene: Scene, num_new: int, rng: np.random.Generator, progress: Progress
     ) -> NewPoints:
         """Make the new points of a scene."""
-        return self.seeds_and_stereo(scene, rng, progress)[0]
+        return self._with_stereo(scene, rng, progress)[0]
 
-    def seeds_and_stereo(
+    def _with_stereo(
         self, scene: Scene, rng: np.random.Generator, progress: Progress
     ) -> tuple[NewPoints, StereoResult]:
-        """The new points of a scene, and what comparing the photographs found.
+        """Make the new points and return stereo's result besides.
 
         Without points, the scene's poses are checked first.
         """
@@ -104,7 +101,7 @@ class Stereo(PhotographMethod):
         source = np.full(len(seeds), source_code("stereo"), np.uint8)
         new = NewPoints(
             seeds.xyz, seeds.rgb, (*found, *warnings), seeds.normals, seeds.sizes,
-            seeds.confidence, source,
+            seeds.confidence, source, stereo,
         )  # fmt: skip
         return new, stereo
 
@@ -113,7 +110,7 @@ class Stereo(PhotographMethod):
 class Cover(PhotographMethod):
     """A seed for every cell of every photograph that no point falls in."""
 
-    cell: int = 8
+    cell: Annotated[int, Range(1, 256)] = 8
     """Side of such a cell, in pixels."""
 
     name: ClassVar[str] = "cover"
@@ -137,24 +134,23 @@ class Cover(PhotographMethod):
 class Auto(Stereo):
     """Stereo, then cover: a seed for every cell of every photograph, on surfaces where possible."""
 
-    cell: int = 8
+    cell: Annotated[int, Range(1, 256)] = 8
     """Side of a cell in pixels; a cell without points gets a seed."""
 
     name: ClassVar[str] = "auto"
 
-    def seeds_and_stereo(
+    def _with_stereo(
         self, scene: Scene, rng: np.random.Generator, progress: Progress
     ) -> tuple[NewPoints, StereoResult]:
-        """The same, and a seed in each part that is then still empty."""
-        seeds, stereo = super().seeds_and_stereo(scene, rng, progress)
+        """Add a seed in every cell that stereo leaves empty."""
+        seeds, stereo = super()._with_stereo(scene, rng, progress)
         known = PointCloud.concatenate(scene.points.originals, PointCloud(seeds.xyz, seeds.rgb))
         gaps = _cover(stereo.views, known, self.cell, rng, progress)
-        arrays = {
+        arrays: dict[str, Any] = {
             name: np.concatenate([getattr(seeds, name), getattr(gaps, name)])
-            for name in NewPoints._fields
-            if name != "notes"
+            for name in ("xyz", "rgb", "normals", "sizes", "confidence", "source")
         }
-        return NewPoints(**arrays, notes=seeds.notes), stereo
+        return seeds._replace(**arrays), stereo
 
 
 def has_points(scene: Scene) -> bool:

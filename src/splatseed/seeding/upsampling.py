@@ -14,21 +14,21 @@ import numpy as np
 
 from splatseed.errors import ParameterError
 from splatseed.methods import (
+    NewPoints,
     Profile,
     Upsampler,
+    add_points,
     as_cloud,
     check_seed,
     configure,
     source_code,
-    upsample as add_points,
 )
-from splatseed.methods.method import NewPoints
 from splatseed.photos.view import TRAINED_SIDE, View, at_file_size, data_factor, poses_of
 from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 from splatseed.seeding.advice import DEFAULT_METHOD, method_for
-from splatseed.seeding.photo_methods import MAX_SIZE, Stereo, photographed, read_views, with_cover
+from splatseed.seeding.photo_methods import MAX_SIZE, photographed, read_views, with_cover
 
 if TYPE_CHECKING:
     from splatseed.depth.stereo.maps import StereoResult
@@ -60,6 +60,7 @@ def upsample(
     profile: Profile = "default",
     progress: Progress = silent,
     note: Note = lambda _: None,
+    on_stereo: Callable[[StereoResult], None] | None = None,
     **parameters: Any,
 ) -> PointCloud:
     """Better seeds for a scene.
@@ -84,6 +85,8 @@ def upsample(
         profile: "default", or "paper" for the paper's text to the letter.
         progress: Called with the stage and the fraction done.
         note: Called with what was left out or replaced, one sentence each.
+        on_stereo: Called with the depth maps and views of stereo, if the method compares
+            photographs and the budget leaves room for new points.
         parameters: Fields of the method, such as ``k=12``.
 
     Returns:
@@ -122,7 +125,7 @@ def upsample(
     first = None if extra_method is None else add_points(whole, extra_method, **options)
     cloud = add_points(
         scene if first is None else _with(whole, first, method), method, ratio=ratio,
-        num_points=num_points, profile=profile, **options, **parameters,
+        num_points=num_points, profile=profile, on_stereo=on_stereo, **options, **parameters,
     )  # fmt: skip
     if first is not None:
         cloud = PointCloud.concatenate(first, cloud.select(cloud.source != ORIGINAL))
@@ -134,29 +137,6 @@ def upsample(
     if most is not None:
         cloud = thin_to(whole, cloud, most, made, seed, progress, cell=cover)
     return cloud
-
-
-def upsample_with_stereo(
-    scene: Scene,
-    method: Stereo,
-    budget: int | None = None,
-    *,
-    progress: Progress = silent,
-    note: Note = lambda _: None,
-) -> tuple[PointCloud, StereoResult | None]:
-    """``upsample`` with seed 0, and its stereo; None where the originals fill the budget."""
-    scene = at_file_size(scene)
-    full = _full_already(scene, budget, 0, progress, note)
-    if full is not None:
-        return full, None
-    new, stereo = method.seeds_and_stereo(scene, np.random.default_rng(0), progress)
-    for sentence in new.notes:
-        note(sentence)
-    made = as_cloud(new, len(new.xyz), source_code(method.name))
-    cloud = PointCloud.concatenate(scene.points.originals, made)
-    if budget is not None:
-        cloud = thin_to(scene, cloud, budget, method, 0, progress)
-    return cloud, stereo
 
 
 def _full_already(

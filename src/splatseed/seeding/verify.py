@@ -29,7 +29,7 @@ from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
 from splatseed.depth.stereo.cost import NOISE, SAMPLES, best_cost, grey_image, prepare_window
 from splatseed.depth.stereo.matching import make_quad_images
-from splatseed.methods.method import NewPoints
+from splatseed.methods.contract import NewPoints
 from splatseed.methods.neighbors import Neighbors, PreparedCloud, prepare
 from splatseed.methods.patches import local_frames
 from splatseed.photos._kernels import project_point

@@ -79,8 +79,8 @@ def seeded(
 ) -> tuple[Scene, StereoResult | None]:
     """The scene with the points that method ``auto`` makes, if the settings or the advice say so.
 
-    Also returns the depth maps that it computed, if any: growth uses them too. The settings' cap
-    limits the points; ``note`` is called with what was made, and how to do without.
+    Also returns the stereo result behind them, if any: growth uses its depth maps too. The
+    settings' cap limits the points; ``note`` is called with what was made, and how to do without.
     """
     if saw_all_photographs(scene):
         note(
@@ -96,23 +96,25 @@ def seeded(
             note(f"Seeds: {advice.sentence}. {advice.reasons[-1]}")
             return scene, None
     from splatseed.seeding.photo_methods import Auto  # noqa: PLC0415  (loads with its use)
-    from splatseed.seeding.upsampling import upsample_with_stereo  # noqa: PLC0415  (kernels load with use)
+    from splatseed.seeding.upsampling import upsample  # noqa: PLC0415  (kernels load with use)
 
     start = time.perf_counter()
     size = stereo_size(scene.split(settings.test_every)[0], settings, device)
-    cloud, stereo = upsample_with_stereo(
+    stereo: list[StereoResult] = []
+    cloud = upsample(
         scene,
         Auto(test_every=settings.test_every, max_size=size),
-        None if settings.cap is None else most_seeds(settings, settings.cap),
+        budget=None if settings.cap is None else most_seeds(settings, settings.cap),
         progress=progress,
         note=note,
+        on_stereo=stereo.append,
     )
     made, without, kept = f"{len(cloud):,} points", "", cloud.num_original
     if len(scene.points):
         made = f"{kept:,} points of the scene and {len(cloud) - kept:,} new ones"
         without = " `seeding='scene'` starts from the scene's points alone."
     note(f"Seeds by method auto: {made}, in {time.perf_counter() - start:.0f} s.{without}")
-    return scene.replace(points=cloud), stereo
+    return scene.replace(points=cloud), stereo[0] if stereo else None
 
 
 def why_not_seeded(scene: Scene, settings: TrainSettings) -> str:

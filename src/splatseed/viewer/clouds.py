@@ -18,7 +18,7 @@ from PIL import Image as PillowImage, ImageDraw
 
 from splatseed.camera import Camera
 from splatseed.io.files import StrPath
-from splatseed.methods import origin_name
+from splatseed.methods import source_name
 from splatseed.photos.viewpoint import choose_camera, choose_image
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
@@ -100,7 +100,7 @@ def preview_origins(scene: Scene, points: PointCloud, path: StrPath) -> Path:
     draw, letters, x = ImageDraw.Draw(strip), page.font(18), 8.0
     codes, counts = np.unique(points.source, return_counts=True)
     for code, count, color in zip(codes, counts, origin_colors(codes).tolist(), strict=True):
-        words = f"{origin_name(int(code))} {count:,}"
+        words = f"{source_name(int(code))} {count:,}"
         draw.ellipse((x, 14, x + 16, 30), fill=tuple(color))
         draw.text((x + 24, 22), words, fill=page.INK, font=letters, anchor="lm")
         x += 24 + letters.getlength(words) + 28

@@ -22,7 +22,7 @@ from PIL import Image as PillowImage
 
 from splatseed.camera import Camera, quat_from_rotation, rotation_from_quat
 from splatseed.errors import SplatseedError
-from splatseed.methods import origin_name
+from splatseed.methods import source_name
 from splatseed.photos.view import View, poses_of
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene
@@ -250,7 +250,7 @@ def clouds_of(points: PointCloud, frame: TrainingFrame, most: int) -> list[Stage
         part = finite.select(np.flatnonzero(finite.source == code)[::every])
         color = tuple(origin_colors(np.array([code], np.uint8))[0].tolist())
         xyz = frame.points_from_world(part.xyz)
-        clouds.append(StageCloud(origin_name(code), xyz, part.rgb, color, count))
+        clouds.append(StageCloud(source_name(code), xyz, part.rgb, color, count))
     return clouds
 
 

@@ -14,7 +14,7 @@ from splatseed.commands.upsample.cloud import ALIGNMENT
 from splatseed.console import StageClock, print_note, print_pairs
 from splatseed.io import WriteReport
 from splatseed.io.origin import write_offset
-from splatseed.methods import Profile, Upsampler, chooses_number, configure, origin_name
+from splatseed.methods import Profile, Upsampler, chooses_number, configure, source_name
 from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
@@ -172,7 +172,7 @@ def origins_of(seeds: PointCloud, written: int) -> dict[str, int]:
     if len(seeds) > written:
         seeds = seeds.select(seeds.distinct)
     codes, counts = np.unique(seeds.source, return_counts=True)
-    return dict(zip(map(origin_name, codes.tolist()), counts.tolist(), strict=True))
+    return dict(zip(map(source_name, codes.tolist()), counts.tolist(), strict=True))
 
 
 def summarise(

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import numpy as np
 from jaxtyping import Float64
@@ -18,11 +18,12 @@ from splatseed.depth.stereo.maps import StereoSettings
 from splatseed.errors import ParameterError, PointCloudError
 from splatseed.io.origin import ELSEWHERE
 from splatseed.methods import source_code
-from splatseed.methods.method import NewPoints, Traits, check_fields, require
+from splatseed.methods.contract import NewPoints, Traits
 from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
 from splatseed.seeding.photo_methods import MAX_SIZE, compare, photographed, read_views
 from splatseed.seeding.upsampling import CELL, frames_of
+from splatseed.settings import Range, check_settings
 from splatseed.similarity import Similarity
 
 if TYPE_CHECKING:
@@ -44,21 +45,20 @@ GRID = 1e5  # coordinates from here on, in metres, are those of a national grid
 class Cloud:
     """Seeds from scans and dense clouds (--cloud), as many as the photographs resolve."""
 
-    pixels: float = 2.0
+    pixels: Annotated[float, Range(0.25, 64)] = 2.0
     """Side of the voxels that merge points, in pixels of the photograph that is closest."""
     recolor: bool = False
     """Take colours from the photographs even if the cloud has some."""
     clean: bool = True
     """Leave out points that the photographs contradict, and points that float alone."""
-    test_every: int = 0
+    test_every: Annotated[int, Range(2, also=0)] = 0
     """Leave out every n-th image by name, as trainers do for testing (8); 0 = use all."""
 
     name: ClassVar[str] = "cloud"
     traits: ClassVar[Traits] = Traits(frozenset({"cloud"}), chooses_number=True)
 
     def __post_init__(self) -> None:
-        check_fields(self)
-        require(0.25 <= self.pixels <= 64, "cloud.pixels from 0.25 to 64", self.pixels)
+        check_settings(self, self.name)
 
     def of(
         self, *files: Path | str, transform: Similarity | None = None, memory: int | None = None

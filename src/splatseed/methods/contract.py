@@ -9,17 +9,17 @@ of points are handled once, around the method.
 from __future__ import annotations
 
 import dataclasses
-import math
-import types
-import typing
-from typing import Any, Literal, NamedTuple, Protocol, Union, runtime_checkable
+from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from splatseed.errors import ParameterError, PointCloudError
+from splatseed.errors import PointCloudError
 from splatseed.progress import Progress
 from splatseed.scene import Scene
+
+if TYPE_CHECKING:
+    from splatseed.depth.stereo.maps import StereoResult
 
 
 class NewPoints(NamedTuple):
@@ -32,6 +32,7 @@ class NewPoints(NamedTuple):
     sizes: Float32[np.ndarray, " M"] | None = None  # initial radius of a Gaussian, scene units
     confidence: Float32[np.ndarray, " M"] | None = None  # that a surface is there, 0 to 1
     source: UInt8[np.ndarray, " M"] | None = None  # codes of their methods, never 0; None: its own
+    stereo: StereoResult | None = None  # of methods that compare the photographs
 
 
 Need = Literal["points", "depth", "photographs", "cloud"]
@@ -80,46 +81,3 @@ def nothing_finite(number: int) -> PointCloudError:
         found=f"{number} points, none of them finite and original",
         fix="Check that the scene holds the point cloud you meant.",
     )
-
-
-def require(condition: bool, expected: str, found: object) -> None:
-    """Refuse a method's parameter (``ParameterError``) unless ``condition`` holds."""
-    if not condition:
-        raise ParameterError(expected, found=repr(found), fix="Choose such a value.")
-
-
-def check_fields(method: Any) -> None:
-    """Refuse fields of a method's dataclass that are not of their type or choices."""
-    hints = typing.get_type_hints(type(method))
-    label = getattr(method, "name", type(method).__name__.lower())
-    for field in dataclasses.fields(method):
-        value, hint = getattr(method, field.name), hints[field.name]
-        require(fits(value, hint), f"{label}.{field.name} as {describe_type(hint)}", value)
-    held = getattr(method, "test_every", 0)
-    require(held == 0 or held >= 2, f"{label}.test_every of 0 or 2 and more", held)
-
-
-def fits(value: object, hint: Any) -> bool:
-    """Whether a value has a type: a plain one, a choice of literals, or a union of these."""
-    if typing.get_origin(hint) is Literal:
-        return isinstance(value, str) and value in typing.get_args(hint)
-    if typing.get_origin(hint) in {Union, types.UnionType}:
-        return any(fits(value, choice) for choice in typing.get_args(hint))
-    if isinstance(value, (bool, np.bool_)):
-        return hint is bool
-    if hint is float:
-        return isinstance(value, (int, float, np.integer, np.floating)) and math.isfinite(value)
-    if hint is int:
-        return isinstance(value, (int, np.integer))
-    return not isinstance(hint, type) or isinstance(value, hint)
-
-
-def describe_type(hint: Any) -> str:
-    """A type in words."""
-    if typing.get_origin(hint) in {Literal, Union, types.UnionType}:
-        return " or ".join(describe_type(choice) for choice in typing.get_args(hint))
-    plain = {int: "a whole number", float: "a finite number", bool: "true or false",
-             str: "text", dict: "a table", type(None): "none"}  # fmt: skip
-    if isinstance(hint, type):
-        return plain.get(hint, hint.__name__)
-    return repr(hint)

@@ -1,0 +1,165 @@
+"""One method's points after a scene's originals: ``add_points``, the first step of ``ss.upsample``.
+
+Promise: the originals come first and unchanged; the same seed gives the same bytes whatever the
+number of threads; new points are finite.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from numbers import Real
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from splatseed.errors import ParameterError, PointCloudError
+from splatseed.methods.contract import NewPoints, Upsampler, nothing_finite, traits_of
+from splatseed.methods.registry import METHODS, Profile, chooses_number, configure, source_code
+from splatseed.pointcloud import ATTRIBUTES, ORIGINAL, PointCloud
+from splatseed.progress import Progress, silent
+from splatseed.runtime.memory import check_memory
+from splatseed.scene import Scene
+
+if TYPE_CHECKING:
+    from splatseed.depth.stereo.maps import StereoResult
+
+DEFAULT_RATIO = 4.0
+BYTES_EACH = 200  # memory per point while it is made and written; measured as 125 at 1 to 3 million
+MAX_POINTS = 1 << 32  # a request for more points than this is a typo
+
+
+def add_points(
+    scene: Scene | PointCloud,
+    method: str | Upsampler,
+    *,
+    ratio: float | None = None,
+    num_points: int | None = None,
+    seed: int = 0,
+    profile: Profile = "default",
+    progress: Progress = silent,
+    note: Callable[[str], None] = lambda _: None,
+    on_stereo: Callable[[StereoResult], None] | None = None,
+    **parameters: Any,
+) -> PointCloud:
+    """Make the new points of one method, with their attributes, and put the originals before them.
+
+    Arguments and errors are those of ``splatseed.upsample``.
+    """
+    whole = scene if isinstance(scene, Scene) else Scene(scene)
+    originals = whole.points.originals
+    if isinstance(method, str):
+        chosen, name = configure(method, profile, **parameters), method
+    elif extra := [*parameters, *(["profile"] if profile != "default" else [])]:
+        raise ParameterError(
+            f"nothing beside {method!r}, which has its own parameters",
+            found=", ".join(extra),
+            fix="Give the method by name, or set its fields with dataclasses.replace.",
+        )
+    else:
+        chosen, kind = method, type(method)
+        name = next((each for each in METHODS if METHODS[each] is kind), kind.__name__)
+    num_new = number_of_new(chosen, name, len(originals), ratio, num_points)
+    check_seed(seed)
+    rng = np.random.default_rng(seed)
+    if num_new == 0 and len(originals) > 0:
+        return originals
+    if "points" in traits_of(chosen).needs and not originals.finite.any():
+        raise nothing_finite(len(originals))
+    new = NewPoints(*chosen(whole, num_new or 0, rng, progress))  # a plain tuple will do
+    for sentence in new.notes:
+        note(sentence)
+    if on_stereo is not None and new.stereo is not None:
+        on_stereo(new.stereo)
+    made = len(new.xyz) if num_new is None else num_new
+    return PointCloud.concatenate(originals, as_cloud(new, made, source_code(name)))
+
+
+def number_of_new(
+    method: Upsampler, name: str, num_original: int, ratio: float | None, num_points: int | None
+) -> int | None:
+    """How many points to make; None if the photographs determine it.
+
+    A ``ParameterError``: they do and a number is given, or it is out of range or beyond the memory.
+    """
+    if not chooses_number(method):
+        total = planned_size(num_original, ratio, num_points)
+        if total == 0 and "points" not in traits_of(method).needs:
+            raise ParameterError(
+                "num_points of 1 or more, as there are no originals that a ratio could multiply",
+                found="none" if num_points is None else f"{num_points}",
+                fix="Say how many.",
+            )
+        fix = "Ask for {most} in all, with `num_points` or a smaller `ratio`."
+        check_memory(total, BYTES_EACH, "points", fix=fix)
+        return total - num_original
+    if ratio is not None or num_points is not None:
+        given = f"`ratio={ratio!r}`" if ratio is not None else f"`num_points={num_points!r}`"
+        raise ParameterError(
+            f"no number of points for method {name!r}, which chooses it itself",
+            found=given,
+            fix="Drop it, pass `budget` to limit the number, or choose `method='mls'`.",
+        )
+    return None
+
+
+def check_seed(seed: int) -> None:
+    """Refuse what seeds no generator."""
+    if not isinstance(seed, (int, np.integer)) or seed < 0:
+        raise ParameterError(
+            "a seed that is a whole number from 0", found=repr(seed), fix="Choose such a seed."
+        )
+
+
+def planned_size(num_original: int, ratio: float | None, num_points: int | None) -> int:
+    """The number of points in all; a ``ParameterError`` if it cannot be, or both are given."""
+    if ratio is not None and num_points is not None:
+        raise ParameterError(
+            "either a ratio or a number of points", found="both", fix="Leave one of them out."
+        )
+    if num_points is None:
+        ratio = DEFAULT_RATIO if ratio is None else ratio
+        if not isinstance(ratio, Real) or not 1 <= ratio < np.inf:
+            raise ParameterError(
+                "ratio of at least 1 (points in all, per original)",
+                found=repr(ratio),
+                fix="A ratio of 8 makes eight times as many points.",
+            )
+        num_points = round(min(float(ratio) * num_original, MAX_POINTS + 1))
+    is_whole = isinstance(num_points, Real) and float(num_points).is_integer()  # also 1e6
+    if not is_whole or num_points > MAX_POINTS:
+        raise ParameterError(
+            f"a whole number of points, {MAX_POINTS:,} at most",
+            found=repr(num_points),
+            fix="Ask for fewer." if is_whole else "Round it.",
+        )
+    num_points = int(num_points)
+    if num_points < num_original:
+        raise ParameterError(
+            f"a number of points of at least the {num_original:,} originals",
+            found=f"{num_points:,}",
+            fix="Upsampling only adds points; ask for more.",
+        )
+    return num_points
+
+
+def as_cloud(new: NewPoints, num_new: int, code: int) -> PointCloud:
+    """What a method returned that was to make ``num_new`` points, checked (``PointCloudError``).
+
+    ``code`` is their ``source``, if the method gives none.
+    """
+    if not np.isfinite(new.xyz).all():
+        bad = int(np.flatnonzero(~np.isfinite(new.xyz).all(axis=1))[0])
+        raise PointCloudError(
+            "finite new points",
+            found=f"{new.xyz[bad].tolist()} at new point {bad}",
+            fix="Report this with the scene; float32 may be too small for its coordinates.",
+        )
+    source = np.full(num_new, code, np.uint8) if new.source is None else np.asarray(new.source)
+    if source.dtype != np.uint8 or (source == ORIGINAL).any():
+        raise PointCloudError(
+            "a uint8 source of new points, of codes from 1 to 255",
+            found=f"{source.dtype}, {np.count_nonzero(source == ORIGINAL):,} with the originals' 0",
+            fix="Leave the method's source out, or take codes of SOURCE_CODES.",
+        )
+    known = {name: getattr(new, name) for name in ATTRIBUTES}
+    return PointCloud(new.xyz, new.rgb, source, **known)

@@ -1,0 +1,141 @@
+"""METHODS: every upsampling method by name, and how one is configured.
+
+Built-in methods come first, then those that installed packages register under the entry-point group
+``splatseed.methods`` (``name = "package.module:Class"``). A class is imported when it is first
+looked up. No package can replace a built-in method.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Mapping
+from functools import cached_property
+from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any, Literal, cast
+
+from splatseed.errors import ParameterError, UnknownNameError
+from splatseed.methods.contract import Need, Upsampler, traits_of
+from splatseed.pointcloud import GENERATED, ORIGINAL, PointCloud
+from splatseed.scene import Scene
+
+GROUP = "splatseed.methods"
+
+BUILT_IN = {
+    "linear": "splatseed.methods.simplices:Linear",
+    "triangle": "splatseed.methods.simplices:Triangle",
+    "spline": "splatseed.methods.spline:Spline",
+    "mls": "splatseed.methods.mls:Mls",
+    "voronoi": "splatseed.methods.voronoi:Voronoi",
+    "depth": "splatseed.methods.depth:Depth",
+    "random": "splatseed.methods.bounding_box:BoundingBox",
+    "stereo": "splatseed.seeding.photo_methods:Stereo",
+    "cover": "splatseed.seeding.photo_methods:Cover",
+    "auto": "splatseed.seeding.photo_methods:Auto",
+    "cloud": "splatseed.seeding.clouds.method:Cloud",
+}
+
+_CODED = "linear triangle spline mls voronoi depth random stereo cover cloud"
+SOURCE_CODES = {name: code for code, name in enumerate(_CODED.split(), start=1)}
+"""The ``PointCloud.source`` code of each built-in method, which files keep."""
+
+
+class MethodRegistry(Mapping[str, type[Upsampler]]):
+    """The methods by name; a class is imported when it is first looked up."""
+
+    def __getitem__(self, name: str) -> type[Upsampler]:
+        if name in BUILT_IN:
+            module, _, attribute = BUILT_IN[name].partition(":")
+            return cast("type[Upsampler]", getattr(import_module(module), attribute))
+        if name in self._plugins:
+            return cast("type[Upsampler]", self._plugins[name].load())
+        raise UnknownNameError(
+            f"one of the methods {', '.join(self)}", found=repr(name), fix="Choose one of these."
+        )
+
+    def __contains__(self, name: object) -> bool:
+        return name in BUILT_IN or name in self._plugins
+
+    def __iter__(self) -> Iterator[str]:
+        yield from BUILT_IN
+        yield from self._plugins
+
+    def __len__(self) -> int:
+        return len(BUILT_IN) + len(self._plugins)
+
+    @cached_property
+    def _plugins(self) -> dict[str, EntryPoint]:
+        return {
+            entry.name: entry for entry in entry_points(group=GROUP) if entry.name not in BUILT_IN
+        }
+
+
+METHODS = MethodRegistry()
+
+
+def source_code(name: str) -> int:
+    """The ``PointCloud.source`` code of a method; 255 for every third-party method."""
+    return SOURCE_CODES.get(name, GENERATED)
+
+
+def source_name(code: int) -> str:
+    """The name of a ``PointCloud.source`` code."""
+    names = {ORIGINAL: "original", **{code: name for name, code in SOURCE_CODES.items()}}
+    return names.get(code, "other")
+
+
+Profile = Literal["default", "paper"]
+
+
+def configure(method: str, profile: Profile = "default", **parameters: Any) -> Upsampler:
+    """An upsampling method with its parameters.
+
+    Args:
+        method: A key of ``METHODS``.
+        profile: "default" avoids the paper's traps, "paper" follows its text to the letter.
+        parameters: Fields of the method that differ from the profile's.
+
+    Raises:
+        ParameterError: No such method, profile or parameter, or a value out of range.
+
+    Example:
+        >>> configure("mls", "paper").k, configure("mls", k=12).k
+        (10, 12)
+    """
+    kind = METHODS[method]
+    if profile not in {"default", "paper"}:
+        raise ParameterError(
+            "the profile 'default' or 'paper'", found=repr(profile), fix="Choose one of these."
+        )
+    chosen: Any = getattr(kind, "paper", kind)() if profile == "paper" else kind()
+    known = [f.name for f in dataclasses.fields(chosen)]
+    for name in parameters:
+        if name not in known:
+            raise ParameterError(
+                f"a parameter of {method} ({', '.join(known) or 'it has none'})",
+                found=repr(name),
+                fix="Check its spelling.",
+            )
+    configured: Upsampler = dataclasses.replace(chosen, **parameters)
+    return configured
+
+
+def chooses_number(method: str | Upsampler) -> bool:
+    """Whether the photographs, not the caller, determine how many points a method makes."""
+    return traits_of(configure(method) if isinstance(method, str) else method).chooses_number
+
+
+def methods_for(scene: Scene | PointCloud) -> tuple[str, ...]:
+    """The names of the methods for a scene: some need its depth maps, some its photographs.
+
+    Example:
+        >>> cloud = PointCloud(np.zeros((1, 3)), np.zeros((1, 3), np.uint8))
+        >>> "depth" in METHODS, "depth" in methods_for(cloud)
+        (True, False)
+    """
+    there: set[Need] = {"points"}
+    if isinstance(scene, Scene) and scene.depths is not None:
+        there.add("depth")
+    if isinstance(scene, Scene) and scene.has_photographs:
+        there.add("photographs")
+    return tuple(name for name in METHODS if traits_of(configure(name)).needs <= there)
