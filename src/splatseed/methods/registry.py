@@ -129,6 +129,7 @@ def methods_for(scene: Scene | PointCloud) -> tuple[str, ...]:
     """The names of the methods for a scene: some need its depth maps, some its photographs.
 
     Example:
+        >>> import numpy as np
         >>> cloud = PointCloud(np.zeros((1, 3)), np.zeros((1, 3), np.uint8))
         >>> "depth" in METHODS, "depth" in methods_for(cloud)
         (True, False)
