@@ -131,7 +131,11 @@ def test_modules_of_a_part_import_each_other_in_no_circle(part):
 def test_what_makes_seeds_needs_little(part):
     """Beside the standard library; networks may need more."""
     allowed = {"splatseed", "numpy", "jaxtyping", "numba", "scipy"}
-    more = {"photos": {"PIL"}, "depth": {"PIL", "llvmlite"}, "methods": {"filelock"}}
+    more = {
+        "photos": {"PIL", "platformdirs"},
+        "depth": {"PIL", "llvmlite"},
+        "methods": {"filelock"},
+    }
     allowed |= more.get(part, set())
     for path in _files(part):
         tops = {name.split(".")[0] for name in _imports(path)}

@@ -6,7 +6,6 @@ a new line, nor change the command it is printed in.
 
 from __future__ import annotations
 
-import os
 import re
 import shlex
 import unicodedata
@@ -39,17 +38,14 @@ def visible(text: object, keep: str = "") -> str:
 
 
 def quoted(path: Path | str) -> str:
-    r"""A path as one word of a command line, for a POSIX shell.
+    r"""Quote a path as one word of a command line, for a POSIX shell.
 
     Example:
-        >>> print(quoted("my scene"), quoted("-o"), quoted("a\nb"))
-        'my scene' ./-o $'a\nb'
+        >>> print(quoted("my scene"), quoted("-o"))
+        'my scene' ./-o
     """
     text = str(path)
-    text = f"./{text}" if text.startswith("-") else text
-    if all(map(_shows, text)):
-        return shlex.quote(text)
-    return "$'" + "".join(map(_ansi_c, text)) + "'"
+    return shlex.quote(f"./{text}" if text.startswith("-") else text)
 
 
 def describe_error(error: Exception) -> str:
@@ -119,12 +115,3 @@ def _shows(character: str) -> bool:
 
 def _escape(character: str) -> str:
     return character.encode("unicode_escape").decode("ascii")
-
-
-def _ansi_c(character: str) -> str:
-    r"""A character within $'...', which bash, zsh and POSIX of 2024 know."""
-    if _shows(character):
-        return f"\\{character}" if character in "\\'" else character
-    if character in "\n\t\r":
-        return _escape(character)
-    return "".join(f"\\x{byte:02x}" for byte in os.fsencode(character))

@@ -30,7 +30,7 @@ from splatseed.bench.runs import (
     read_runs,
 )
 from splatseed.bench.scenes import PlannedScene, SceneFacts, survey
-from splatseed.commands.options import check_least, parse_options, refuse
+from splatseed.commands.options import check_minimum, parse_options, refuse
 from splatseed.console import ERR, OUT, print_note, print_pairs, print_table, stage_display
 from splatseed.errors import ParameterError, SceneNotFoundError
 from splatseed.io.staging import atomic_file, check_output, output_folder
@@ -154,7 +154,7 @@ def parse_plan(arguments: Sequence[str]) -> tuple[Options, Plan]:
     folder to resume, or the default one.
     """
     options = parse_options(Options, "bench", arguments)
-    check_least(options, 1, "jobs", "repeats", "long_side", "max_steps", "data_factor")
+    check_minimum(options, 1, "jobs", "repeats", "long_side", "max_steps", "data_factor")
     output, preset, data = options.output, options.preset, options.data
     named = preset not in {None, "quick"}
     refuse(

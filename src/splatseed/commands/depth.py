@@ -19,7 +19,7 @@ import numpy as np
 import tyro
 
 from splatseed.commands.next_steps import after_depth, look
-from splatseed.commands.options import check_least, parse_options, refuse
+from splatseed.commands.options import check_minimum, parse_options, refuse
 from splatseed.console import OUT, print_note, print_pairs, stage_display
 from splatseed.depth.stereo.maps import LEAST_SIZE, MOST_GRID
 from splatseed.depthmap import DepthKind
@@ -90,9 +90,9 @@ class Options:
 def run(arguments: list[str]) -> None:
     """Run the verb with these arguments."""
     options = parse_options(Options, "depth", arguments)
-    check_least(options, 1, "grid")
-    check_least(options, 2, "test_every")
-    check_least(options, LEAST_SIZE if options.stereo else 1, "max_size")
+    check_minimum(options, 1, "grid")
+    check_minimum(options, 2, "test_every")
+    check_minimum(options, LEAST_SIZE if options.stereo else 1, "max_size")
     foreign = OF_NETWORK if options.stereo else OF_STEREO
     idle = [name for name in foreign if getattr(options, name) != getattr(Options, name)]
     refuse(

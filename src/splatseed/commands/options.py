@@ -1,8 +1,9 @@
-"""Parsing a verb's options: help, errors (exit code 2) and completion are tyro's."""
+"""Parse a verb's options with tyro, which prints help, errors (exit code 2) and completions."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Annotated, Any, TypeVar
 
 import tyro
@@ -12,33 +13,48 @@ from splatseed.errors import ParameterError
 Options = TypeVar("Options")
 
 CONFIG = (tyro.conf.DisallowNone, tyro.conf.FlagCreatePairsOff)
-"""An option that can be left out takes no None, and a switch only changes its default."""
+"""Optional options take no None; a switch has no negated twin."""
 
 
 MaskChoice = Annotated[str | None, tyro.conf.arg(metavar="DIR|none|inverted[:DIR]")]
-"""Which masks: see ``io.masks.with_masks``."""
+"""The masks to use: see ``io.masks.with_masks``."""
 
 
 def parse_options(
     kind: type[Options], verb: str, arguments: Sequence[str], default: Options | None = None
 ) -> Options:
-    """The options in ``arguments``, the words after the verb; ``default`` gives the others."""
+    """Parse ``arguments``, which follow the verb; ``default`` holds the values of other options."""
     given: dict[str, Any] = {} if default is None else {"default": default}
     prog = f"splatseed {verb}"
     options: Options = tyro.cli(kind, prog=prog, args=list(arguments), config=CONFIG, **given)
     return options
 
 
+def parse_some(kind: type[Options], arguments: Sequence[str]) -> Options:
+    """Parse the options of ``kind`` and skip all others.
+
+    For options that determine which others there are or their defaults, such as ``--profile``. If
+    one is invalid, all have their defaults: ``parse_options`` then reports the error.
+    """
+    with suppress(SystemExit):
+        return tyro.cli(
+            kind, args=list(arguments), config=CONFIG, add_help=False, console_outputs=False,
+            return_unknown_args=True,
+        )[0]  # fmt: skip
+    return kind()
+
+
 def refuse(*faults: tuple[object, str, object, str]) -> None:
-    """Refuse the first (whether it is there, what was expected, found, and helps) that is there."""
-    for there, expected, found, fix in faults:
-        if there:
+    """Raise for the first (condition, expected, found, fix) whose condition holds."""
+    for condition, expected, found, fix in faults:
+        if condition:
             raise ParameterError(expected, found=str(found), fix=fix)
 
 
-def check_least(options: object, least: float, *names: str) -> None:
-    """Refuse fields of parsed options below ``least``; None, for one not given, is none."""
+def check_minimum(options: object, minimum: float, *names: str) -> None:
+    """Refuse fields of parsed options below ``minimum``; options left unset are skipped."""
     for name in names:
         value, option = getattr(options, name), f"--{name.replace('_', '-')}"
-        wrong = value is not None and not value >= least
-        refuse((wrong, f"{option} of {least:g} or more", value, "Leave it out for the default."))
+        wrong = value is not None and not value >= minimum
+        expected = f"{option} of {minimum:g} or more"
+        refuse((wrong, expected, value, "Leave it out for the default."))

@@ -7,7 +7,6 @@ import math
 import sys
 import time
 import tomllib
-from argparse import ArgumentParser
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
@@ -21,7 +20,7 @@ import tyro
 from rich import progress as rich_progress
 from rich.table import Column
 
-from splatseed.commands.options import MaskChoice, parse_options
+from splatseed.commands.options import MaskChoice, parse_options, parse_some
 from splatseed.console import ERR, OUT, print_note, print_pairs, stage_display
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.io import load_scene
@@ -99,11 +98,14 @@ class Options:
     """Replace an earlier run in the output folder."""
 
 
+@dataclass(frozen=True)
+class _ConfigFile:
+    config: Path | None = None
+
+
 def parse(arguments: list[str]) -> Options:
     """The options; those on the command line replace those of a file that --config names."""
-    parser = ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument("--config", type=Path, nargs="?")  # what is missing, tyro tells
-    path = parser.parse_known_args(arguments)[0].config
+    path = parse_some(_ConfigFile, arguments).config
     default = None if path is None else _in_file(path, _words(arguments))
     return parse_options(Options, "train", arguments, default)
 

@@ -10,8 +10,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-import os
-import sys
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -20,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float64, UInt8
+from platformdirs import user_cache_path
 
 from splatseed.camera import Camera
 from splatseed.errors import OutputError, ParameterError, SceneFormatError, SceneNotFoundError
@@ -276,11 +275,5 @@ def load_photograph(
 
 
 def user_cache_dir() -> Path:
-    """Where this user's programs cache files (not created here)."""
-    if sys.platform == "win32":
-        base = os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local"
-    elif sys.platform == "darwin":
-        base = Path.home() / "Library" / "Caches"
-    else:
-        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(base) / "splatseed" / "images"
+    """Return the folder in which downsampled photographs are cached; it may not exist yet."""
+    return user_cache_path("splatseed", appauthor=False) / "images"

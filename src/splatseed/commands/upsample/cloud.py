@@ -1,4 +1,4 @@
-"""The part of ``splatseed upsample`` that brings clouds: in which frame, and what is told of it."""
+"""Load the point clouds of ``splatseed upsample --cloud`` into the scene's frame."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
+from splatseed.commands.upsample.options import Options
 from splatseed.io.clouds import open_cloud
 from splatseed.io.nerfstudio import read_cloud_transform
 from splatseed.io.origin import shift_to
@@ -19,36 +20,32 @@ from splatseed.scene import Scene
 from splatseed.similarity import Similarity
 from splatseed.text import visible
 
-if TYPE_CHECKING:
-    from splatseed.commands.upsample.command import Options
+if TYPE_CHECKING:  # Numba comes with them
     from splatseed.seeding.clouds.align import CloudAlignment
     from splatseed.seeding.clouds.method import Cloud, GivenClouds
 
 ALIGNMENT = "alignment.json", "preview_alignment.png"
 SAMPLE = 10_000
-"""Points of a file by which it is known whether it is around the scene's offset."""
+"""Points read from a file to tell whether its coordinates include the scene's offset."""
 CLOSE = 0.01
-"""Residual at which a point's colour is halfway, in extents."""
+"""Residual at the middle of the picture's colour scale, relative to the cloud's extent."""
 
 
 class LoadedCloud(NamedTuple):
-    """A scene, and the method ``cloud`` with files in its frame.
-
-    ``takes``: a line on the memory.
-    """
+    """A scene, and the method ``cloud`` whose files are in the scene's frame."""
 
     scene: Scene
     method: GivenClouds
-    takes: str = ""
+    memory_note: str = ""
     alignment: CloudAlignment | None = None
 
     @property
     def notes(self) -> list[str]:
-        """What the user should know, one sentence each."""
+        """Notes for the user."""
         return [] if self.alignment is None else [self.alignment.summary]
 
     def write(self, folder: Path) -> None:
-        """Write the reports beside the scene, if there are any."""
+        """Write the alignment's report and picture into the scene folder, if there is one."""
         if (found := self.alignment) is not None:
             from splatseed.viewer.clouds import preview_alignment
 
@@ -60,11 +57,11 @@ class LoadedCloud(NamedTuple):
 
 
 def load_cloud(options: Options, scene: Scene, method: Cloud, progress: Progress) -> LoadedCloud:
-    """The scene, and the method ``cloud`` with its files in its frame."""
+    """Find the transform of the clouds into the scene's frame, and configure the method with it."""
     files, memory = options.cloud_files, options.memory_bytes
     plan = method.of(*files, memory=memory).plan(scene)
-    most = f"at most {plan.capacity:,} voxels, {words_of(plan.memory)} of memory"
-    takes = f"\n  -> {', '.join(visible(path) for path in files)}: {most}"
+    limit = f"at most {plan.capacity:,} voxels, {words_of(plan.memory)} of memory"
+    memory_note = f"\n  -> {', '.join(visible(path) for path in files)}: {limit}"
     transform = alignment = None
     if options.cloud_transform is not None:
         transform = read_cloud_transform(options.cloud_transform, scene)
@@ -77,10 +74,10 @@ def load_cloud(options: Options, scene: Scene, method: Cloud, progress: Progress
         alignment = align(scene, files, progress)
         transform = alignment.scene_from_cloud
     given = method.of(*files, transform=transform, memory=memory)
-    return LoadedCloud(scene, given, takes, alignment)
+    return LoadedCloud(scene, given, memory_note, alignment)
 
 
 def _sample(files: Sequence[Path]) -> Float64[np.ndarray, "N 3"]:
-    """The first points of each file that are finite."""
+    """Return the finite ones among the first points of each file."""
     firsts = (next(iter(open_cloud(file).chunks(SAMPLE)), None) for file in files)
     return np.concatenate([np.empty((0, 3)), *(c.xyz[c.finite] for c in firsts if c is not None)])

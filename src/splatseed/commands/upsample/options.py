@@ -1,0 +1,177 @@
+"""The options of ``splatseed upsample``, with those of every method."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from splatseed.commands.options import MaskChoice, check_minimum, parse_options, parse_some, refuse
+from splatseed.depthmap import DepthKind
+from splatseed.methods import METHODS, Profile, Upsampler, configure
+from splatseed.runtime.memory import bytes_of
+from splatseed.seeding.advice import DEFAULT_METHOD
+from splatseed.text import quoted
+
+POINT_FILES = (".ply", ".las", ".laz", ".e57", ".pcd", ".xyz", ".pts", ".npz", ".bin", ".txt")
+"""Suffixes that suggest the user wants a point file, not a scene folder."""
+COVERING = ("auto", "cover")
+"""Methods that cover empty cells themselves, without --cover."""
+CLOUD = "cloud"
+WITH_CLOUD = (CLOUD, "auto", "stereo", "cover", "depth")
+"""Methods that take --cloud."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Upsample the points of a scene, ready for any 3DGS trainer."""
+
+    scene: Annotated[Path, tyro.conf.Positional]
+    """A COLMAP folder, one with transforms.json, an RGB-D capture, or a cloud (.ply, .las, .laz,
+    .e57, .xyz ...)."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """The scene folder to write."""
+    method: str = DEFAULT_METHOD
+    """The method that makes new points; --method NAME --help shows its own options."""
+    ratio: float | None = None
+    """Total points per original point, for methods that interpolate; 4 unless --num-points is
+    given."""
+    num_points: int | None = None
+    """Total points, not a ratio."""
+    budget: Annotated[str | None, tyro.conf.arg(metavar="N|Xrho")] = None
+    """Maximum points: a number, or 0.25rho for a quarter of a full-size photograph's pixels."""
+    cover_cell: Annotated[int | None, tyro.conf.arg(name="cover")] = None
+    """Cell side in pixels: each cell of a photograph that no point falls in gets a seed; auto and
+    cover have --auto.cell and --cover.cell instead."""
+    verify: bool = False
+    """Move interpolated points to where the photographs agree; drop those that fit nowhere."""
+    seed: int = 0
+    """Random seed: same seed, same bytes."""
+    profile: Profile = "default"
+    """Defaults of the methods' options: improved ones, or those of the paper's text."""
+    depth_maps: Annotated[Path | None, tyro.conf.arg(name="depth", metavar="DIR")] = None
+    """For --method depth: a folder of maps, as docs/formats.md lists them; by default the
+    scene's own."""
+    depth_kind: DepthKind | None = None
+    """What the maps hold: planar depth, distance along the ray, or inverse depth; by default
+    what the folder says, else z."""
+    depth_scale: float | None = None
+    """Stored units per unit of depth: 1000 for millimetres in a scene in metres; by default what
+    the folder says."""
+    masks: MaskChoice = None
+    """A folder of masks, where pixels of 0 do not count, or none; inverted: only they count. By
+    default the folder masks beside the photographs, and transparency."""
+    refine_poses: bool = False
+    """First refine a phone's or SLAM's poses and triangulate points; both replace the scene's."""
+    cloud_files: Annotated[
+        tyro.conf.UseAppendAction[tuple[Path, ...]],
+        tyro.conf.arg(name="cloud", metavar="FILE", help_behavior_hint="(repeatable)"),
+    ] = ()
+    """Seeds from a scan or dense cloud (docs/scans.md), alone or with
+    auto, stereo, cover or depth."""
+    cloud_transform: Annotated[Path | None, tyro.conf.arg(name="transform")] = None
+    """For --cloud: a 4x4 matrix from its frame to the scene's, as text or JSON, or nerfstudio's
+    dataparser_transforms.json."""
+    align: bool = False
+    """For --cloud: find --transform from the scene's points."""
+    recenter: bool = False
+    """Write the scene, and a cloud in its frame, around 0, with the offset in recenter.json."""
+    memory: Annotated[str | None, tyro.conf.arg(metavar="BYTES|4G")] = None
+    """For --cloud: the memory within which scans are merged; by default what is free, at most
+    4G."""
+    preview: bool = False
+    """Also write pictures: before and after, origins, cells covered, the method's stereo maps."""
+    gaussians: Path | None = None
+    """Also write the initial Gaussians as a 3DGS .ply, for trainers that start from one."""
+    format: Literal["auto", "colmap", "transforms"] = "auto"
+    """Layout to write: auto is the input's."""
+    copy_images: bool = False
+    """Copy images, do not link them."""
+    overwrite: bool = False
+    """Replace an earlier output."""
+
+    @property
+    def memory_bytes(self) -> int | None:
+        """The memory limit in bytes; None if there is none."""
+        return None if self.memory is None else bytes_of(self.memory)
+
+
+@dataclass(frozen=True)
+class _Choice:
+    """The options that determine which methods have options here, and the defaults of those."""
+
+    method: Literal[tuple(METHODS)] | None = None  # type: ignore[valid-type]  # known at run time
+    profile: Profile = "default"
+
+
+def parse(arguments: list[str]) -> tuple[Options, dict[str, Upsampler]]:
+    """Parse the options of the verb and of every method."""
+    chosen = parse_some(_Choice, arguments)
+    names: Collection[str] = METHODS
+    if {"-h", "--help"} & set(arguments):  # the options of all methods are too many to read
+        names = [] if chosen.method is None else [chosen.method]
+    methods = {name: configure(name, chosen.profile) for name in names}
+    options: Any = parse_options(_with_methods(methods), "upsample", arguments)
+    if options.cloud_files and chosen.method is None:
+        options = replace(options, method=CLOUD)
+    return options, {name: getattr(options, name) for name in METHODS}
+
+
+def full_options() -> type[Options]:
+    """Return the options of the verb and of every method."""
+    return _with_methods({name: configure(name) for name in METHODS})
+
+
+def _with_methods(methods: Mapping[str, Upsampler]) -> type[Options]:
+    """Return the options with a field per method, whose default is the method given."""
+    fields: list[Any] = [
+        (name, type(method), dataclasses.field(default=method)) for name, method in methods.items()
+    ]
+    full = dataclasses.make_dataclass(
+        "UpsampleOptions",
+        [("method", Literal[tuple(METHODS)], dataclasses.field(default=DEFAULT_METHOD)), *fields],
+        bases=(Options,),
+        frozen=True,
+    )
+    full.__doc__ = Options.__doc__
+    return full
+
+
+def check(options: Options) -> None:
+    """Refuse options out of range, and combinations in which one has no effect."""
+    check_minimum(options, 1, "num_points")
+    check_minimum(options, 0, "seed")
+    method, cell, folder = options.method, options.cover_cell, options.output
+    maps = options.depth_kind is not None or options.depth_scale is not None
+    moved = options.cloud_transform is not None
+    framed = moved or options.align or method == CLOUD
+    refuse(
+        (folder.suffix.lower() in POINT_FILES and not folder.is_dir(),
+         "a folder for -o, as a whole scene is written", f"{folder}, the name of a file",
+         f"Pass -o {quoted(folder.parent / folder.stem)}: a .ply of the points is included."),
+        (cell is not None and cell < 1, "--cover of 1 or more", cell, "Try --cover 8."),
+        (cell is not None and method in COVERING,
+         f"--{method}.cell for method {method}, which already covers", f"--cover {cell}",
+         f"Use --{method}.cell {cell} instead."),
+        (maps and options.depth_maps is None,
+         "--depth DIR, which --depth-kind and --depth-scale refer to", "none", "Name the folder."),
+        (framed and not options.cloud_files, "--cloud FILE", "none", "Name the scan."),
+        (options.memory is not None and not options.cloud_files,
+         "--cloud FILE with --memory, within which scans are merged", "none", "Leave it out."),
+        (options.cloud_files and method not in WITH_CLOUD,
+         f"--method {', '.join(WITH_CLOUD[:-1])} or {WITH_CLOUD[-1]} with --cloud", method,
+         "Leave --method out for the cloud's points alone: interpolating needs no scan."),
+        (options.align and moved, "--align or --transform", "both", "Leave one of them out."),
+    )  # fmt: skip
+    if (start := options.gaussians) is not None:
+        inside = folder.resolve() in (start.resolve(), *start.resolve().parents)
+        refuse(
+            (start.suffix.lower() != ".ply", "--gaussians FILE.ply", start, "Name a .ply file."),
+            (inside, "a file outside the scene that is written, for the initial Gaussians",
+             f"{start} in {folder}, where some trainers read any .ply as points",
+             "Name a file beside the folder."),
+        )  # fmt: skip

@@ -1,0 +1,155 @@
+"""Describe and summarise a run of ``splatseed upsample``."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from splatseed.commands.next_steps import tell_training
+from splatseed.commands.upsample.cloud import ALIGNMENT
+from splatseed.commands.upsample.options import Options
+from splatseed.commands.upsample.previews import PICTURES
+from splatseed.console import print_note, print_pairs
+from splatseed.io import WriteReport
+from splatseed.methods import Profile, Upsampler, chooses_number, configure, source_name
+from splatseed.pointcloud import ORIGINAL, PointCloud
+from splatseed.scene import Scene
+from splatseed.seeding.diagnostics import far_share
+from splatseed.seeding.upsampling import share_covered
+
+CLOUD_PARAMETERS = {"files", "transform", "memory", "alone"}
+"""Parameters of the method cloud that other lines show."""
+
+
+def parameters_of(method: Upsampler) -> dict[str, object]:
+    """Return a method's parameters by name, without those of a cloud that other lines show."""
+    given = dataclasses.asdict(method)  # type: ignore[call-overload]  # a method is a dataclass
+    return {name: value for name, value in given.items() if name not in CLOUD_PARAMETERS}
+
+
+def provenance(options: Options, scene: Scene, method: Upsampler) -> dict[str, object]:
+    """Return how the output was made, for ``splatseed.json``."""
+
+    def full(path: Path | None) -> str | None:
+        return None if path is None else str(path.resolve())
+
+    cloud = {
+        "files": [full(path) for path in options.cloud_files],
+        "transform": full(options.cloud_transform),
+        "align": options.align,
+        "recenter": options.recenter,
+        "memory": options.memory_bytes,
+    }
+    return {
+        "command": "upsample",
+        "method": options.method,
+        "profile": options.profile,
+        "parameters": parameters_of(method),
+        "listed_tests_held_out": scene.listed is not None,
+        "cloud": cloud if options.cloud_files else None,
+        "depth": full(options.depth_maps),
+        "ratio": options.ratio,
+        "num_points_asked": options.num_points,
+        "budget": options.budget,
+        "cover": options.cover_cell,
+        "verify": options.verify,
+        "seed": options.seed,
+    }
+
+
+def method_description(name: str, method: Upsampler, profile: Profile) -> str:
+    """Name a method and the parameters that differ from the profile's.
+
+    Example:
+        >>> method_description("mls", configure("mls", "paper", k=12), "paper")
+        'mls (profile paper, k=12)'
+    """
+    plain = parameters_of(configure(name, profile))
+    changes = [] if profile == "default" else [f"profile {profile}"]
+    changes += [f"{k}={v}" for k, v in parameters_of(method).items() if v != plain[k]]
+    return f"{name} ({', '.join(changes)})" if changes else name
+
+
+def number_summary(total: int | None, limit: int | None, changed_by: Sequence[str] = ()) -> str:
+    """Say how many points to expect; the options ``changed_by`` may add or drop some.
+
+    Example:
+        >>> number_summary(None, 50_000), number_summary(800, 1000)
+        ('at most 50,000 points', '800 points')
+    """
+    if limit is not None and (total is None or total > limit):
+        return f"at most {limit:,} points"
+    if total is None:
+        return "as many points as the photographs need"
+    before = f" before {' and '.join(changed_by)}" if changed_by else ""
+    return f"{total:,} points{before}"
+
+
+def findings(scene: Scene, seeds: PointCloud, method: Upsampler) -> list[tuple[str, str]]:
+    """Return rows on new points far from the originals, and on photograph cells covered."""
+    rows = []
+    if len(scene.points) and not chooses_number(method):
+        new = seeds.xyz[seeds.source != ORIGINAL]
+        far = far_share(scene.points.xyz, new)
+        rows.append(("far from any original", f"{far:.2%} of the new points, over 3 spacings"))
+    if scene.images:
+        before, after = share_covered(scene, scene.points), share_covered(scene, seeds)
+        share = f"{after:.1%} of the 8 x 8 pixel cells of the photographs have a point"
+        rows.append(("covered", f"{share}; {before:.1%} before"))
+    return rows
+
+
+def origin_counts(seeds: PointCloud, written: int) -> dict[str, int]:
+    """Count the points by origin; fewer than ``seeds`` are ``written`` if positions repeat."""
+    if len(seeds) > written:
+        seeds = seeds.select(seeds.distinct)
+    codes, counts = np.unique(seeds.source, return_counts=True)
+    return dict(zip(map(source_name, codes.tolist()), counts.tolist(), strict=True))
+
+
+def summarise(
+    options: Options,
+    scene: Scene,
+    num_read: int,
+    origins: Mapping[str, int],
+    written: WriteReport,
+    seconds: Mapping[str, float],
+    found: Sequence[tuple[str, str]],
+) -> None:
+    """Print the final table and the commands to run next."""
+    output, left_out = options.output, []
+    if written.dropped_nonfinite + written.dropped_duplicates:
+        left_out += [f"{written.dropped_nonfinite:,} not finite"]
+        left_out += [f"{written.dropped_duplicates:,} duplicate"]
+    if thinned := num_read - written.num_original:
+        left_out += [f"{thinned:,} originals, for the budget"]
+    made = ", ".join(f"{count:,} {name}" for name, count in origins.items())
+    rows = [
+        ("points in", f"{num_read:,}"),
+        ("points out", f"{written.num_points:,} ({made})"),
+        *([("left out", ", ".join(left_out))] if left_out else []),
+        *found,
+        ("seconds", ", ".join(f"{stage} {time:.2f}" for stage, time in seconds.items())),
+        ("output", str(output)),
+    ]
+    links = [Path(name) for name in written.files if (output / name).is_symlink()]
+    photographs = [link for link in links if link.parts[0] == "images"] or links
+    there = [(output / link).resolve() for link in photographs]
+    if linked := sorted({str(path if path.is_dir() else path.parent) for path in there}):
+        hint = "--copy-images makes a folder that can be moved"
+        rows.append(("images", f"linked, not copied: {', '.join(linked)}; {hint}"))
+    for label, names in (("alignment", ALIGNMENT), ("pictures", PICTURES)):
+        paths = [output / name for name in names if (output / name).is_file()]
+        rows += [("" if i else label, str(path)) for i, path in enumerate(paths)]
+    print_pairs("splatseed upsample", rows)
+    for note in written.notes:
+        print_note(note)
+    if written.layout == "transforms":
+        print_note(
+            "The commands for gsplat's examples, graphdeco's code and LichtFeld need COLMAP's "
+            "layout: --format colmap."
+        )
+    tell_training(options.scene, scene, output, written.layout)
