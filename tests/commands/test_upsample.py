@@ -22,7 +22,7 @@ from splatseed.camera import rotation_from_quat
 from splatseed.commands.upsample.cloud import LoadedCloud
 from splatseed.io import load_scene, write_scene
 from splatseed.io.nerfstudio import read_cloud_transform
-from splatseed.io.origin import moved_by
+from splatseed.io.origin import translated
 from splatseed.io.ply import read_ply, write_ply
 from splatseed.io.staging import unlisted_files
 from splatseed.methods import METHODS, SOURCE_CODES, chooses_number, configure
@@ -347,7 +347,7 @@ def test_nerfstudios_transform_leads_from_the_scene_to_the_cloud(room, tmp_path)
 
 def test_recentring_moves_scene_and_cloud_alike(splatseed, room, xyz, surfaces, tmp_path):
     grid = np.array([564000.0, 5932000.0, 90.0])
-    far = moved_by(load_scene(room), -grid).replace(origin=np.zeros(3))
+    far = translated(load_scene(room), -grid).replace(origin=np.zeros(3))
     write_scene(far, tmp_path / "far", copy_images=True)
     np.savez(tmp_path / "far.npz", xyz=MOVE.points(xyz))
     back = MOVE.inverse.then(Similarity(1.0, np.eye(3), grid))
@@ -374,7 +374,7 @@ def test_recentring_moves_scene_and_cloud_alike(splatseed, room, xyz, surfaces, 
 
 def test_any_scene_is_recentred_and_a_scan_in_its_grid_goes_with_it(splatseed, room, tmp_path):
     site, plain = np.array([40.0, -30.0, 2.0]), load_scene(room)
-    write_scene(moved_by(plain, -site).replace(origin=np.zeros(3)), tmp_path / "site")
+    write_scene(translated(plain, -site).replace(origin=np.zeros(3)), tmp_path / "site")
     words = ("upsample", tmp_path / "site", "-o", tmp_path / "out", "--recenter", "--method", "mls")
     run = splatseed(*words)
     assert run.code == 0, run.err

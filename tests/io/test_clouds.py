@@ -21,7 +21,7 @@ def points(rng):
     return rng.normal(0, 2, (NUM, 3)).round(3), rng.integers(0, 256, (NUM, 3)).astype(np.uint8)
 
 
-def whole(path, size=100):
+def read_cloud(path, size=100):
     chunks = list(open_cloud(path).chunks(size))
     assert all(0 < len(chunk) <= size for chunk in chunks)
     rgb = None if chunks[0].rgb is None else np.concatenate([chunk.rgb for chunk in chunks])
@@ -29,7 +29,7 @@ def whole(path, size=100):
 
 
 def check(path, xyz, rgb, tolerance=1e-9, size=100):
-    got_xyz, got_rgb = whole(path, size)
+    got_xyz, got_rgb = read_cloud(path, size)
     np.testing.assert_allclose(got_xyz, xyz, atol=tolerance, rtol=0)
     assert (got_rgb is None) == (rgb is None)
     if rgb is not None:
@@ -55,7 +55,7 @@ def test_las_of_a_national_grid_in_8_and_16_bits(tmp_path, points, suffix, facto
     las.withheld = np.arange(NUM) % 2
     las.write(path)
     assert open_cloud(path).colors == "intensity"
-    kept, grey = whole(path)
+    kept, grey = read_cloud(path)
     assert len(kept) == (NUM + 1) // 2
     assert grey[0].tolist() == [0, 0, 0]
     assert grey[-1].tolist() == [255, 255, 255]
@@ -171,4 +171,4 @@ def test_laz_that_is_cut_short(tmp_path, rng):
     for keep in (0.98, 0.2):
         path.write_bytes(path.read_bytes()[: int(keep * path.stat().st_size)])
         with pytest.raises(SceneFormatError, match="complete LAS or LAZ file"):
-            whole(path, 1000)
+            read_cloud(path, 1000)

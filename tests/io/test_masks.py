@@ -14,7 +14,7 @@ from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io import load_scene, write_scene
 from splatseed.io.load import with_own_depths
 from splatseed.io.mask_files import masks_among
-from splatseed.io.masks import masks_beside, with_masks
+from splatseed.io.masks import masks_near, with_masks
 from splatseed.photos.view import load_views
 from splatseed.sfm.photos import find_photos
 from splatseed.synthetic import write_capture
@@ -249,7 +249,7 @@ def test_masks_are_no_photographs(scene_path):
     photos, left_out = find_photos(scene_path / "images")
     assert len(photos) == 9
     assert [len(names) for names in left_out.values()] == [3]
-    masks, _ = masks_beside(scene_path / "images")
+    masks, _ = masks_near(scene_path / "images")
     assert masks.files.keys() == {"view_003.png"}  # a folder goes first
     names = ["a.jpg", "b_mask.jpg", "a_mask.png", "x/masks/a.png"]
     assert masks_among(names) == {"a_mask.png", "x/masks/a.png"}

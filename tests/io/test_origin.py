@@ -9,8 +9,15 @@ import pytest
 
 from splatseed.errors import SceneFormatError
 from splatseed.io import colmap, load_scene, write_scene
-from splatseed.io.origin import RECENTER, moved_by, offset_beside, origin_of, shift_to, write_offset
-from splatseed.io.ply import read_exact_ply
+from splatseed.io.origin import (
+    RECENTER,
+    choose_origin,
+    find_shift,
+    offset_beside,
+    translated,
+    write_offset,
+)
+from splatseed.io.ply import read_ply_float64
 
 UTM, ECEF = (218248.62, 1925986.38, 179.47), (-1288000.5, -4720500.25, 4079400.75)
 GRIDS = {"utm": UTM, "ecef": ECEF, "high": (0.0, 0.0, 3e6)}
@@ -19,7 +26,7 @@ GRIDS = {"utm": UTM, "ecef": ECEF, "high": (0.0, 0.0, 3e6)}
 def write_far(scene, offset, folder):
     """The scene elsewhere, in COLMAP's double precision."""
     write_scene(scene, folder)
-    far, model = moved_by(scene, -np.array(offset)), folder / "sparse" / "0"
+    far, model = translated(scene, -np.array(offset)), folder / "sparse" / "0"
     colmap.write_images(model / "images.bin", far.images)
     colmap.write_points3d(model / "points3D.bin", far.points, far.tracks)
     (model / "points3D.ply").unlink()
@@ -89,27 +96,27 @@ def test_ordinary_scenes_are_not_moved(room, rng):
     assert not room.offset.any()
     orbit = rng.normal(size=(40, 3))
     for places in (orbit, 1e4 * orbit, 1e-4 * orbit, orbit + 50, 1e6 * orbit + 1e7, orbit[:1] + 60):
-        assert not origin_of(places, in_order=True).any()
+        assert not choose_origin(places, in_order=True).any()
     clip = np.arange(40)[:, None] * [2.0, 0, 0] + [1500.0, 800, 0]  # a drive in a map's frame
-    assert not origin_of(clip, in_order=True).any()
+    assert not choose_origin(clip, in_order=True).any()
 
 
 def test_few_cameras_elsewhere_do_not_choose_the_origin(rng):
     for scale in (1.0, 1e-3, 1e3):  # of the unit of length
         walk = scale * (np.arange(40)[:, None] * [0.1, 0, 0] + np.array(UTM))
-        origin = origin_of(walk, in_order=True)
+        origin = choose_origin(walk, in_order=True)
         assert np.abs(np.median(walk, axis=0) - origin).max() <= 5 * scale
         walk[::3] = 0.0
         walk[4] = np.nan
         walk[5] = 1e30
-        found = origin_of(walk, in_order=True)
+        found = choose_origin(walk, in_order=True)
         assert np.abs(np.median(walk[np.isfinite(walk).all(1)], axis=0) - found).max() <= 5 * scale
 
 
 def test_a_long_walk_is_moved_though_it_is_as_long_as_it_is_far():
     rails = np.arange(2000)[:, None] * [5.0, 0, 0] + [2e5, 1e5, 0]  # 10 km
-    assert origin_of(rails, in_order=True).any()
-    assert not origin_of(rails * [1, 0, 0] + [0, 0, 0.0], in_order=False).any()
+    assert choose_origin(rails, in_order=True).any()
+    assert not choose_origin(rails * [1, 0, 0] + [0, 0, 0.0], in_order=False).any()
 
 
 def test_a_bare_cloud_is_moved_by_its_points(room, tmp_path):
@@ -119,7 +126,7 @@ def test_a_bare_cloud_is_moved_by_its_points(room, tmp_path):
     np.testing.assert_allclose(exact.points.xyz + exact.offset, xyz, atol=1e-6)
     write_scene(exact, tmp_path / "out")
     points = tmp_path / "out" / "sparse" / "0" / "points3D.ply"
-    np.testing.assert_array_equal(read_exact_ply(points)[0].xyz, exact.points.xyz)
+    np.testing.assert_array_equal(read_ply_float64(points)[0].xyz, exact.points.xyz)
     rounded = load_scene(double_ply(tmp_path / "single.ply", xyz.astype(np.float32)))
     assert any("single precision" in note for note in rounded.warnings)
     assert not any("single precision" in note for note in exact.warnings)
@@ -141,15 +148,15 @@ def test_positions_from_elsewhere_are_recognised(room, tmp_path):
     write_scene(scene, tmp_path / "out")
     around, local = load_scene(tmp_path / "out"), xyz + UTM - scene.offset
     for each in (scene, around):
-        np.testing.assert_allclose(xyz + UTM + shift_to(each, xyz + UTM), local, atol=1e-6)
-        assert not shift_to(each, local, unrecorded=True).any()
-        assert not shift_to(each, local, scene.offset).any()
+        np.testing.assert_allclose(xyz + UTM + find_shift(each, xyz + UTM), local, atol=1e-6)
+        assert not find_shift(each, local, unrecorded=True).any()
+        assert not find_shift(each, local, scene.offset).any()
         other = np.array([218000.0, 1926000.0, 0])
-        shift = shift_to(each, xyz + UTM - other, other)
+        shift = find_shift(each, xyz + UTM - other, other)
         np.testing.assert_allclose(xyz + UTM - other + shift, local, atol=1e-6)
         # A wrong record: it is where the cameras are as it is.
-        assert not shift_to(each, local, np.array([9e6, 0, 0]), unrecorded=True).any()
-    assert not shift_to(room, xyz + UTM).any()
+        assert not find_shift(each, local, np.array([9e6, 0, 0]), unrecorded=True).any()
+    assert not find_shift(room, xyz + UTM).any()
 
 
 def test_a_file_beside_that_holds_no_offset_is_an_error(tmp_path):

@@ -224,7 +224,7 @@ def test_missing_files_frames_of_another_size_and_bad_poses_are_named(room):
     whole = frame.read_bytes()
     for write, said in (
         (PilImage.new("RGB", (20, 15)).save, r"frame2\.jpg .* found 20x15"),
-        (lambda path: path.write_bytes(b"no image"), r"frame2\.jpg to be a readable image"),
+        (lambda path: path.write_bytes(b"no image"), r"frame2\.jpg to be an image"),
     ):
         write(frame)
         with pytest.raises(SceneFormatError, match=said):

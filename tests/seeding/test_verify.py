@@ -190,7 +190,7 @@ def test_nothing_is_made_up_from_degenerate_input(seed, num_views, num_known, sh
 
 
 GOOD, BAD, NONE = module.MAX_COST - 0.3, module.MAX_COST + 0.1, np.inf
-RICH, BARE = 10 * module.TEXTURE, 0.1 * module.TEXTURE
+RICH, TEXTURELESS = 10 * module.TEXTURE, 0.1 * module.TEXTURE
 
 
 @pytest.mark.parametrize(
@@ -200,11 +200,11 @@ RICH, BARE = 10 * module.TEXTURE, 0.1 * module.TEXTURE
         ((BAD, GOOD), (RICH, RICH), False, 2, 1 - GOOD),
         ((-0.01, BAD), (RICH, RICH), False, 1, 1.0),
         ((GOOD, NONE), (RICH, 0.0), True, 1, 1 - GOOD),
-        ((0.0, GOOD), (BARE, RICH), True, 2, 1 - GOOD),
-        ((0.0, BAD), (BARE, RICH), True, None, None),
+        ((0.0, GOOD), (TEXTURELESS, RICH), True, 2, 1 - GOOD),
+        ((0.0, BAD), (TEXTURELESS, RICH), True, None, None),
         ((BAD, NONE), (RICH, 0.0), True, None, None),
-        ((GOOD, GOOD), (BARE, BARE), False, None, None),
-        ((GOOD, NONE), (BARE, 0.0), True, 0, module.BARE_CONFIDENCE),
+        ((GOOD, GOOD), (TEXTURELESS, TEXTURELESS), False, None, None),
+        ((GOOD, NONE), (TEXTURELESS, 0.0), True, 0, module.BARE_CONFIDENCE),
         ((NONE, NONE), (0.0, 0.0), False, 0, np.nan),
         ((NONE, NONE), (0.0, 0.0), True, 0, np.nan),
     ],

@@ -106,7 +106,7 @@ def test_a_scene_has_the_refined_poses_and_one_without_matches_its_own(room, tmp
     noise = np.random.default_rng(0).integers(0, 256, (240, 320, 3), np.uint8)
     PilImage.fromarray(noise).save(photos / "view_000.png")
     given = room.replace(images=tuple(with_noise(room.images, 2.0, 3.0)))
-    how = {"poses_from": given, "refine_poses": True, "held_out": {"view_003.png"}}
+    how = {"poses_from": given, "refine_poses": True, "test_names": {"view_003.png"}}
     report = reconstruct(photos, tmp_path / "out", **how)
     shown = {image.name for image in load_scene(report.path).images}
     assert {image.name for image in report.poses} - shown == {"view_003.png"}

@@ -13,7 +13,7 @@ pytest.importorskip("torch")
 from splatseed.camera import rotation_from_quat
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.io import load_scene, write_scene
-from splatseed.io.origin import moved_by
+from splatseed.io.origin import translated
 from splatseed.similarity import Similarity, fit_similarity
 from splatseed.splat.evaluate import evaluate_model, load_model
 from splatseed.splat.formats import write_model
@@ -136,7 +136,7 @@ def test_what_gives_no_transform_is_refused(text, room, tmp_path):
 
 def test_a_transform_that_would_be_refused_itself_is_not_named(room, gaussians, tmp_path):
     """A small model at the origin, to which gsplat's transform only brings a far scene nearer."""
-    moved = moved_by(load_scene(room), np.array([-1000.0, 0.0, 0.0]))
+    moved = translated(load_scene(room), np.array([-1000.0, 0.0, 0.0]))
     scene = moved.replace(origin=np.zeros(3))
     small = replace(gaussians, means=gaussians.means * np.float32(1e-4))
     for given in (None, find_transform("gsplat", scene)):

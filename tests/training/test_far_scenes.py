@@ -9,7 +9,7 @@ pytest.importorskip("torch", reason="training needs PyTorch")
 pytest.importorskip("gsplat", reason="training needs gsplat's strategies")
 
 from splatseed.io import colmap, load_scene, write_scene
-from splatseed.io.origin import RECENTER, moved_by, offset_beside
+from splatseed.io.origin import RECENTER, offset_beside, translated
 from splatseed.splat.evaluate import evaluate_model, evaluate_views, load_model
 from splatseed.splat.formats import read_model, write_model
 from splatseed.splat.world import shifted
@@ -29,7 +29,7 @@ def runs(room, tmp_path_factory):
     for place, offset in PLACES.items():
         folder = tmp_path_factory.mktemp(place)
         write_scene(room, folder / "scene")
-        there, model = moved_by(room, -np.array(offset)), folder / "scene" / "sparse" / "0"
+        there, model = translated(room, -np.array(offset)), folder / "scene" / "sparse" / "0"
         colmap.write_images(model / "images.bin", there.images)
         colmap.write_points3d(model / "points3D.bin", there.points, there.tracks)
         run = prepare_run(load_scene(folder / "scene"), folder / "run", SETTINGS)

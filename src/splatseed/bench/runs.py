@@ -26,9 +26,9 @@ from splatseed.errors import OutputError, SceneFormatError, SceneNotFoundError
 from splatseed.io.files import StrPath, read_text
 from splatseed.io.staging import (
     MANIFEST,
-    check_apart,
     check_output,
-    held,
+    check_separate,
+    locked,
     read_manifest,
     write_json,
 )
@@ -130,7 +130,7 @@ def check_bench_folder(folder: Path, protect: Sequence[Path]) -> None:
     """
     kind = read_manifest(folder).get("command")
     if kind == "bench":
-        check_apart(folder, protect)
+        check_separate(folder, protect)
     elif kind is None:
         check_output(folder, kind="bench", protect=protect)
     else:
@@ -148,7 +148,7 @@ def alone_in(bench: Path) -> Iterator[None]:
     """
     with ExitStack() as stack:
         try:
-            stack.enter_context(held(bench))
+            stack.enter_context(locked(bench))
         except BlockingIOError:
             fix = "Wait until it ends, stop it, or name another folder."
             expected = f"no other process that carries out runs in {bench}"

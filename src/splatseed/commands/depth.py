@@ -24,7 +24,7 @@ from splatseed.console import OUT, print_note, print_pairs, stage_display
 from splatseed.depth.stereo.maps import LEAST_SIZE, MOST_GRID
 from splatseed.depthmap import DepthKind
 from splatseed.io import dense, load_scene
-from splatseed.io.photograph import warnings_but_lens
+from splatseed.io.photograph import warnings_without_lens
 from splatseed.io.photograph_checks import with_photographs
 from splatseed.io.staging import check_output
 from splatseed.requirements import require
@@ -207,7 +207,7 @@ def _summarise_stereo(
     )
     if options.preview:
         OUT.print(f"pictures: {visible(options.output / PICTURE)}", soft_wrap=True)
-    for warning in warnings_but_lens(scene):
+    for warning in warnings_without_lens(scene):
         print_note(warning)
     if report.empty:
         print_note(f"no other view confirms any pixel of: {name_some(report.empty, NAMES_SHOWN)}")

@@ -12,7 +12,7 @@ import tyro
 from splatseed.commands.options import parse_options, refuse
 from splatseed.commands.outputs import check_free
 from splatseed.console import print_note, print_pairs, stage_display
-from splatseed.io.origin import RECENTER, offset_beside, origin_of, place_words, write_offset
+from splatseed.io.origin import RECENTER, choose_origin, format_offset, offset_beside, write_offset
 from splatseed.requirements import require
 from splatseed.splat.formats import (
     FORMATS,
@@ -95,15 +95,15 @@ def run(arguments: list[str]) -> None:
                 path, Path(str(scene)), masks=masks, progress=clock, **numbers
             )
             kept = keep_gaussians(gaussians.select(~floaters), crop, options.min_opacity)
-        offset, far = offset_beside(path), origin_of(kept.means)
+        offset, far = offset_beside(path), choose_origin(kept.means)
         kept = shifted(kept, -far) if far.any() else kept
         offset = far if offset is None else offset + far
         write_model(target, kept, clock, notes.append)
         write_offset(target, offset)
     if offset.any():
         notes.append(
-            f"The file is around {place_words(offset)}, as {target.name}.{RECENTER} beside it has "
-            "it: coordinates before = after + offset."
+            f"The file is around {format_offset(offset)}, as {target.name}.{RECENTER} beside it "
+            "records: coordinates before = after + offset."
         )
     before, after = path.stat().st_size, target.stat().st_size
     rows = [

@@ -13,7 +13,7 @@ from splatseed.commands.options import parse_options, refuse
 from splatseed.commands.outputs import check_free
 from splatseed.console import print_note, print_pairs, stage_display
 from splatseed.errors import ParameterError
-from splatseed.io.origin import shift_to
+from splatseed.io.origin import find_shift
 from splatseed.pointcloud import PointCloud
 from splatseed.requirements import require
 from splatseed.scene import Scene
@@ -169,7 +169,7 @@ def _path(options: Options, shown: Shown, size: tuple[int, int]) -> tuple[list[V
     views, fps = flights.path_of_file(options.path, size, world)
     if world is None and shown.scene is not None:  # may be in its files' coordinates
         centers = np.array([view.camera.center for view in views])
-        shift = shift_to(shown.scene, centers, unrecorded=True)
+        shift = find_shift(shown.scene, centers, unrecorded=True)
         if shift.any():
             world = Similarity(1.0, np.eye(3), -shift)
             views, fps = flights.path_of_file(options.path, size, world)

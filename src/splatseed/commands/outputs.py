@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from splatseed.errors import OutputError
-from splatseed.io.staging import check_apart, check_parents
+from splatseed.io.staging import check_parents, check_separate
 
 
 def check_free(
@@ -20,7 +20,7 @@ def check_free(
 
     It may not be one of ``protect`` or lie in one. ``fix`` is told where a file is there.
     """
-    check_apart(path, protect)
+    check_separate(path, protect)
     check_parents(path)
     if path.exists() and not path.is_file():
         found = "a folder" if path.is_dir() else "no regular file"

@@ -16,7 +16,7 @@ from splatseed.commands.options import parse_options, refuse
 from splatseed.console import ERR, StageClock, print_note, print_pairs, stage_display
 from splatseed.io import load_scene
 from splatseed.io.files import is_video
-from splatseed.io.masks import masks_beside
+from splatseed.io.masks import masks_near
 from splatseed.io.origin import RECENTER
 from splatseed.io.staging import check_output
 from splatseed.runtime.torch_device import DeviceName
@@ -126,7 +126,7 @@ def _from_photographs(options: Options, images: Path, clock: StageClock) -> SfmR
     if named:
         masks = poses.masks
     elif not video:
-        masks, notes = masks_beside(images)
+        masks, notes = masks_near(images)
         for note in notes:
             print_note(note)
     return reconstruct(

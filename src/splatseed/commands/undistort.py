@@ -11,7 +11,7 @@ import tyro
 from splatseed.commands.options import parse_options
 from splatseed.console import print_note, print_pairs, stage_display
 from splatseed.io import load_scene
-from splatseed.io.photograph import warnings_but_lens
+from splatseed.io.photograph import warnings_without_lens
 from splatseed.io.seeds import was_upsampled
 from splatseed.io.staging import check_output
 from splatseed.seeding.diagnostics import is_distorted
@@ -43,7 +43,7 @@ def run(arguments: list[str]) -> None:
         report = undistort(scene, output, overwrite=overwrite, on_progress=clock)
     counts = [("images", f"{report.registered:,}"), ("points", f"{report.num_points:,}")]
     print_pairs("splatseed undistort", [*counts, ("output", str(output))])
-    for warning in warnings_but_lens(scene):
+    for warning in warnings_without_lens(scene):
         print_note(warning)
     if not is_distorted(scene):
         print_note("No camera had distortion: the photographs are copies.")

@@ -13,7 +13,7 @@ import tyro
 
 from splatseed.commands.options import parse_options
 from splatseed.console import OUT, print_note, print_pairs, stage_display
-from splatseed.io.load import check_there, is_scene
+from splatseed.io.load import check_exists, is_scene
 from splatseed.requirements import require
 from splatseed.runtime.interruption import Termination, exit_code
 from splatseed.splat.formats import SUFFIXES
@@ -57,7 +57,7 @@ def run(arguments: list[str]) -> None:
     from splatseed.viewer.server import Viewer, free_port
 
     for path in filter(None, (options.what, options.compare)):
-        check_there(path)  # a slip in a path is told before a port that is taken
+        check_exists(path)  # a slip in a path is told before a port that is taken
     port = free_port(options.host, options.port)
     with stage_display() as clock:
         clock("read", 0.0)

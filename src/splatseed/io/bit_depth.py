@@ -19,7 +19,7 @@ from jaxtyping import UInt16
 from PIL import Image as PilImage
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
-from splatseed.io.files import guarded, open_file, read_bytes
+from splatseed.io.files import open_file, read_bytes, translate_errors
 from splatseed.text import counted
 
 WHITE = 65535
@@ -40,7 +40,7 @@ _EIGHT_BITS = frozenset({".jpg", ".jpeg", ".bmp", ".webp"})  # formats without 1
 _AT_ONCE = 4  # photographs that are decoded at a time
 
 
-def is_wide(photograph: PilImage.Image) -> bool:
+def is_16_bit(photograph: PilImage.Image) -> bool:
     """Whether an opened image has 16 bits a channel."""
     grey = photograph.mode == "I" and photograph.format == "PNG"  # Pillow before version 11
     return grey or photograph.mode.startswith("I;16") or _layout(photograph) in _LOW_BYTES
@@ -56,8 +56,8 @@ def _layout(photograph: PilImage.Image) -> str:
     return first if isinstance(first, str) else ""
 
 
-def wide_values(encoded: bytes) -> UInt16[np.ndarray, "H W C"]:
-    """The values of an image that ``is_wide``; C = 1 (grey), 2 (grey, alpha), 3 or 4."""
+def read_16_bit(encoded: bytes) -> UInt16[np.ndarray, "H W C"]:
+    """The values of an image that ``is_16_bit``; C = 1 (grey), 2 (grey, alpha), 3 or 4."""
     picture = PilImage.open(BytesIO(encoded))
     layout = _layout(picture)
     if layout not in _LOW_BYTES:
@@ -93,7 +93,9 @@ def find_white(paths: Sequence[Path]) -> tuple[int, list[str]]:
 
     Files of 8 bits, and those that cannot be read, have no part in it.
     """
-    wide = [path for path in paths if path.suffix.lower() not in _EIGHT_BITS and _wide_file(path)]
+    wide = [
+        path for path in paths if path.suffix.lower() not in _EIGHT_BITS and _is_16_bit_file(path)
+    ]
     largest = 0
     with ThreadPoolExecutor(_AT_ONCE) as pool:
         for first in range(0, len(wide), _AT_ONCE):
@@ -109,10 +111,10 @@ def find_white(paths: Sequence[Path]) -> tuple[int, list[str]]:
     return white, [f"{which} {values}: all are stretched alike, with {white:,} as white."]
 
 
-def _wide_file(path: Path) -> bool:
+def _is_16_bit_file(path: Path) -> bool:
     try:
-        with guarded(path, "an image"), open_file(path) as file:
-            return is_wide(PilImage.open(file))
+        with translate_errors(path, "an image"), open_file(path) as file:
+            return is_16_bit(PilImage.open(file))
     except (SceneFormatError, SceneNotFoundError):
         return False
 
@@ -120,8 +122,8 @@ def _wide_file(path: Path) -> bool:
 def _largest(path: Path) -> int:
     """The largest value of a photograph's colours; 0 if it cannot be read."""
     try:
-        with guarded(path, "an image"):
-            values = wide_values(read_bytes(path))
+        with translate_errors(path, "an image"):
+            values = read_16_bit(read_bytes(path))
     except (SceneFormatError, SceneNotFoundError):
         return 0
     return int(values[..., : values.shape[-1] - (values.shape[-1] in {2, 4})].max(initial=0))

@@ -27,7 +27,7 @@ CHUNK = 1 << 20
 Block: TypeAlias = Mapping[str, Any] | np.ndarray
 XYZ = ("x", "y", "z")
 RGB = ("red", "green", "blue")
-PACKED = "packed rgb"
+PACKED_RGB = "packed rgb"
 """The column of colours in four bytes: blue, green, red, and one that is not used."""
 SAMPLES, SAMPLE_ROWS, SAMPLE_BYTES = 16, 4096, 1 << 16
 """Places in a file that are looked at to find ranges, and rows, or bytes of text, at each."""
@@ -35,7 +35,7 @@ SAMPLES, SAMPLE_ROWS, SAMPLE_BYTES = 16, 4096, 1 << 16
 _SH_NAMES = ("f_dc_0", "f_dc_1", "f_dc_2")
 _SH0 = 0.28209479177387814  # 1 / (2 sqrt(pi)); colour = 0.5 + SH0 * f_dc in 3DGS
 _RGB_NAMES = (
-    *((PACKED,), RGB, ("diffuse_red", "diffuse_green", "diffuse_blue")),
+    *((PACKED_RGB,), RGB, ("diffuse_red", "diffuse_green", "diffuse_blue")),
     *(("r", "g", "b"), _SH_NAMES),
 )
 _INTENSITY_NAMES = (
@@ -43,7 +43,7 @@ _INTENSITY_NAMES = (
     *("reflectance", "scalar_Reflectance"),
 )
 _GREY = 128
-_DARK, _BRIGHT = 1.0, 99.0
+_BLACK_PERCENTILE, _WHITE_PERCENTILE = 1.0, 99.0
 """Percentiles of intensity that become black and white: single mirrors outshine a whole scan."""
 _TEXT_BYTES = 1 << 22
 """Bytes of text read at once."""
@@ -120,7 +120,7 @@ class CloudFile(ABC):
             if len(block["x"]):
                 yield self._chunk(block, self._range)
 
-    def whole(self) -> CloudChunk:
+    def read_all(self) -> CloudChunk:
         """All rows at once, with ranges found in all of them; intensity is not used."""
         blocks = list(self._blocks(max(self.count or 0, 1)))  # one, or none of no rows
         if not blocks:
@@ -130,10 +130,14 @@ class CloudFile(ABC):
     def _range_of(self, sample: Block) -> tuple[float, float]:
         """The values that become black and white."""
         if self._rgb:
-            return 0.0, full_value(_columns(sample, self._rgb))
+            return 0.0, white_level(_columns(sample, self._rgb))
         known = np.asarray(sample[str(self._intensity)], np.float64)
         known = known[np.isfinite(known)]
-        low, high = np.percentile(known, (_DARK, _BRIGHT)) if known.size else (0.0, 1.0)
+        low, high = (
+            np.percentile(known, (_BLACK_PERCENTILE, _WHITE_PERCENTILE))
+            if known.size
+            else (0.0, 1.0)
+        )
         return float(low), float(high) if high > low else float(low) + 1.0
 
     def _chunk(self, block: Block, between: tuple[float, float] | None) -> CloudChunk:
@@ -144,22 +148,22 @@ class CloudFile(ABC):
         low, high = between
         if self._intensity:
             values = np.asarray(block[self._intensity], np.float64)
-            grey = color_bytes((values - low) / (high - low), 1.0)
+            grey = to_uint8((values - low) / (high - low), 1.0)
             return CloudChunk(xyz, np.repeat(grey[:, None], 3, axis=1))
         values = _columns(block, self._rgb)
         if self._rgb == _SH_NAMES:
-            return CloudChunk(xyz, color_bytes(0.5 + _SH0 * values.astype(np.float64), 1.0))
-        return CloudChunk(xyz, color_bytes(values, high))
+            return CloudChunk(xyz, to_uint8(0.5 + _SH0 * values.astype(np.float64), 1.0))
+        return CloudChunk(xyz, to_uint8(values, high))
 
 
 def _columns(block: Block, names: Sequence[str]) -> np.ndarray:
     """The columns of colours, side by side."""
-    if names == (PACKED,):
-        return np.ascontiguousarray(block[PACKED]).view(np.uint8).reshape(-1, 4)[:, 2::-1]
+    if names == (PACKED_RGB,):
+        return np.ascontiguousarray(block[PACKED_RGB]).view(np.uint8).reshape(-1, 4)[:, 2::-1]
     return np.stack([np.asarray(block[name]) for name in names], axis=1)
 
 
-def full_value(sample: Shaped[np.ndarray, "..."]) -> float:
+def white_level(sample: Shaped[np.ndarray, "..."]) -> float:
     """The value that means 255, as a sample of colours suggests."""
     if sample.dtype == np.uint8 or not sample.size:
         return 255.0
@@ -169,7 +173,7 @@ def full_value(sample: Shaped[np.ndarray, "..."]) -> float:
     return 1.0 if sample.dtype.kind == "f" and greatest <= 1.0 else 255.0
 
 
-def color_bytes(values: Shaped[np.ndarray, "..."], full: float) -> UInt8[np.ndarray, "..."]:
+def to_uint8(values: Shaped[np.ndarray, "..."], full: float) -> UInt8[np.ndarray, "..."]:
     """Colours of any numeric type as bytes, rounded."""
     if values.dtype == np.uint8:
         return np.ascontiguousarray(values)
@@ -177,7 +181,7 @@ def color_bytes(values: Shaped[np.ndarray, "..."], full: float) -> UInt8[np.ndar
     return np.asarray(np.clip(np.rint(known), 0, 255).astype(np.uint8))
 
 
-def check_size(path: Path, needed: int) -> None:
+def check_min_size(path: Path, needed: int) -> None:
     """Raise a ``SceneFormatError`` for a file of fewer bytes than are needed."""
     size = path.stat().st_size
     if size < needed:
@@ -199,7 +203,7 @@ class RowCloud(CloudFile):
 
     def __init__(self, path: Path, dtype: np.dtype[Any], offset: int, count: int) -> None:
         super().__init__(path, dtype.names or (), count)
-        check_size(path, offset + count * dtype.itemsize)
+        check_min_size(path, offset + count * dtype.itemsize)
         self.num_rows, self._dtype, self._offset = count, dtype, offset
 
     def _blocks(self, size: int) -> Iterator[np.ndarray]:

@@ -35,7 +35,7 @@ from splatseed.scene import NO_POINT, Image, Observations, Tracks
 UNKNOWN_ERROR = -1.0
 """COLMAP's reprojection error of a point that has none yet."""
 
-_MOST_MODELS = 100
+_MAX_MODEL_ID = 100
 """An unknown camera model with a lower id is taken for a newer one, not for damage."""
 _COUNT = struct.Struct("<Q")
 _CAMERA = struct.Struct("<IiQQ")  # camera id, model id, width, height; then the parameters
@@ -148,7 +148,7 @@ def _binary_cameras(path: Path) -> Iterator[tuple[Any, ...]]:
         camera_id, model_id, *size = reader.unpack(_CAMERA)
         known = (*CAMERA_MODELS.values(), PANORAMA)
         model = next((m for m in known if m.model_id == model_id), None)
-        if model is None and len(known) <= model_id < _MOST_MODELS:
+        if model is None and len(known) <= model_id < _MAX_MODEL_ID:
             raise SceneFormatError(
                 f"the id of a camera model of COLMAP 4.2 or older, 0 to {len(known) - 1}, in "
                 f"{where}",
@@ -183,8 +183,8 @@ def _binary_points(path: Path) -> _Points:
         raise reader.error("a whole point record", f"{reader.remaining} bytes to the file's end")
     reader.finish()
     buffer = np.frombuffer(reader.data, np.uint8)
-    points = _anywhere(buffer, _HEAD_BYTES)[starts[:-1]].view(_POINT)
-    observations = _anywhere(buffer, _PAIR_BYTES)[_pair_offsets(starts)].view(_OBSERVATION)
+    points = _unaligned_view(buffer, _HEAD_BYTES)[starts[:-1]].view(_POINT)
+    observations = _unaligned_view(buffer, _PAIR_BYTES)[_pair_offsets(starts)].view(_OBSERVATION)
     tracks = Tracks(
         point_ids=points["id"].astype(np.int64),
         xyz=points["xyz"].astype(np.float64),
@@ -211,7 +211,7 @@ def _scan_records(data: bytes, first: int, count: int) -> Int64[np.ndarray, " K+
     return np.array(starts, np.int64)
 
 
-def _anywhere(buffer: UInt8[np.ndarray, " B"], size: int) -> np.ndarray:
+def _unaligned_view(buffer: UInt8[np.ndarray, " B"], size: int) -> np.ndarray:
     """The ``size`` bytes from each byte of a buffer on, as one element: a view."""
     return np.ndarray(max(len(buffer) - size + 1, 0), f"V{size}", buffer, strides=(1,))
 
@@ -297,8 +297,10 @@ def _joined_records(heads: np.ndarray, tracks: Tracks) -> UInt8[np.ndarray, " B"
     observations["image_id"], observations["point2d_idx"] = tracks.image_ids, tracks.point2d_idx
     starts = tracks.offsets * _PAIR_BYTES + np.arange(len(heads) + 1) * _HEAD_BYTES
     buffer = np.empty(starts[-1], np.uint8)
-    _anywhere(buffer, _HEAD_BYTES)[starts[:-1]] = heads.view(f"V{_HEAD_BYTES}")
-    _anywhere(buffer, _PAIR_BYTES)[_pair_offsets(starts)] = observations.view(f"V{_PAIR_BYTES}")
+    _unaligned_view(buffer, _HEAD_BYTES)[starts[:-1]] = heads.view(f"V{_HEAD_BYTES}")
+    _unaligned_view(buffer, _PAIR_BYTES)[_pair_offsets(starts)] = observations.view(
+        f"V{_PAIR_BYTES}"
+    )
     return buffer
 
 

@@ -19,11 +19,11 @@ from splatseed.errors import SceneNotFoundError, SplatseedError
 from splatseed.io.camera_records import NotFiniteError, Unusable, check_enough, unusable_warning
 from splatseed.io.colmap import MIN_IMAGE_BYTES, read_cameras, read_images, read_points3d
 from splatseed.io.files import StrPath, numbered_lines, open_file
-from splatseed.io.origin import around_origin
+from splatseed.io.origin import recentered
 from splatseed.io.photograph import lens_warnings
 from splatseed.io.photograph_checks import image_warnings
-from splatseed.io.ply import read_exact_ply
-from splatseed.io.point_files import first_with_points, other_points
+from splatseed.io.ply import read_ply_float64
+from splatseed.io.point_files import differing_points_notes, first_with_points
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene, SceneSource, Tracks
 from splatseed.text import counted
@@ -129,11 +129,11 @@ def _other_points(model_dir: Path, root: Path, read: Path, points: PointCloud) -
     files, notes = _point_files(model_dir), list[str]()
     for i, path in enumerate(files):
         before = " and ".join(each.name for each in files[:i])
-        notes += other_points(read, points.xyz, path, f"move {before} out of {model_dir}")
+        notes += differing_points_notes(read, points.xyz, path, f"move {before} out of {model_dir}")
     place = f"copy it to {model_dir / 'points3D.ply'}"
     if first := [each.name for each in files if each.suffix != ".ply"]:
         place += f" and move {' and '.join(first)} out of that folder"
-    return notes + other_points(read, points.xyz, root / "init.ply", place)
+    return notes + differing_points_notes(read, points.xyz, root / "init.ply", place)
 
 
 def scene_root(model_dir: Path) -> Path:
@@ -171,7 +171,7 @@ def read_colmap_scene(model_dir: StrPath) -> Scene:
     scene = Scene(
         points, images, intrinsics, tracks, source, tuple(warnings), absent=tuple(unusable)
     )
-    return around_origin(scene, exact)
+    return recentered(scene, exact)
 
 
 def _image_dir(root: Path, images: Sequence[Image]) -> Path | None:
@@ -222,6 +222,6 @@ def read_model_points(
     if path is None:
         return PointCloud.empty(), np.empty((0, 3)), None, model_dir / "points3D.bin"
     if path.suffix == ".ply":
-        return *read_exact_ply(path), None, path
+        return *read_ply_float64(path), None, path
     points, tracks = read_points3d(path)
     return points, tracks.xyz, tracks, path

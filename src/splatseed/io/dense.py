@@ -51,7 +51,7 @@ _MAX_CHANGE = 1.25
 _SAME_POSE = 1e-6
 _KINDS = ("photometric", "geometric")
 """COLMAP's two passes; stereo_fusion reads the second unless told otherwise."""
-_PER_MAP = 200
+_POINTS_PER_MAP = 200
 """Points of a map: enough to tell which views overlap much and which little."""
 _GREY = 128
 
@@ -415,7 +415,7 @@ def _photograph_model(
 def _overlap_points(dense: DenseMap, views: Sequence[int]) -> tuple[np.ndarray, list[list[int]]]:
     """Points [n, 3] evenly over a map's pixels that a source confirms, and the views of each."""
     rows, columns = np.nonzero(np.isfinite(dense.depth) & (dense.agreeing > 0))
-    chosen = np.linspace(0, len(rows) - 1, min(_PER_MAP, len(rows))).astype(np.intp)
+    chosen = np.linspace(0, len(rows) - 1, min(_POINTS_PER_MAP, len(rows))).astype(np.intp)
     rows, columns = rows[chosen], columns[chosen]
     uv = np.stack([columns, rows], axis=1) + 0.5
     xyz = dense.camera.unproject(uv, dense.depth[rows, columns])

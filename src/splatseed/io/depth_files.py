@@ -20,7 +20,7 @@ import numpy as np
 from PIL import Image as PilImage
 
 from splatseed.depthmap import DepthKind
-from splatseed.io.files import StrPath, guarded, read_bytes, read_npy
+from splatseed.io.files import StrPath, read_bytes, read_npy, translate_errors
 from splatseed.requirements import require
 from splatseed.text import beginning
 
@@ -28,7 +28,7 @@ KINDS: tuple[DepthKind, ...] = get_args(DepthKind)
 
 _MAX_PIXELS = 2**28
 """The largest plausible map: a header that promises more is damaged or hostile."""
-_MOST_INFLATED = 100
+_MAX_INFLATION = 100
 """How many times larger than in its archive a map can be: measured values hardly compress."""
 _SMALL = 1 << 26
 """Maps of up to this many bytes are harmless at any compression: a map can be constant."""
@@ -59,7 +59,7 @@ def read_stored(path: StrPath) -> StoredDepth:
     """
     path = Path(path)
     data, kind = read_bytes(path), None
-    with guarded(path, "a depth map"):
+    with translate_errors(path, "a depth map"):
         suffix = path.suffix.lower()
         if suffix == ".npz":
             values, kind = _read_npz(data)
@@ -85,7 +85,7 @@ def _read_npz(data: bytes) -> StoredDepth:
         def member(name: str) -> np.ndarray:
             info = archive.getinfo(f"{name}.npy")
             packed, size = info.compress_size, info.file_size
-            if size > min(max(_SMALL, _MOST_INFLATED * packed), 8 * _MAX_PIXELS):
+            if size > min(max(_SMALL, _MAX_INFLATION * packed), 8 * _MAX_PIXELS):
                 raise ValueError(f"{packed:,} bytes that would become {size:,}")
             with archive.open(info) as file:
                 return read_npy(file, size)

@@ -25,7 +25,7 @@ from splatseed.camera import Intrinsics
 from splatseed.depthmap import DepthKind, DepthMap
 from splatseed.errors import OutputError, SceneFormatError, SceneNotFoundError
 from splatseed.io.depth_files import KINDS, SUFFIXES, check_stored, read_stored
-from splatseed.io.files import guarded, read_json
+from splatseed.io.files import read_json, translate_errors
 from splatseed.io.staging import MANIFEST, output_folder, write_json
 from splatseed.lens import image_points
 from splatseed.scene import Scene
@@ -37,7 +37,7 @@ DESCRIPTION = "depths.json"
 
 _INTEGER_SCALE = 1000.0
 """Default scale of integer maps: millimetres in a scene in metres."""
-_NOTHING_HIT = 1e9
+_NO_HIT = 1e9
 """From this distance on, a value means that a renderer's ray hit nothing; Blender writes 1e10."""
 _SATURATED = 65535
 _FOLDERS = ("", "stereo/depth_maps", "depth_maps", "results", "depths", "depth")
@@ -112,7 +112,7 @@ class DepthFiles:
         divisor = self.scale or (_INTEGER_SCALE if is_integer else 1.0)
         with np.errstate(over="ignore", invalid="ignore"):  # becomes infinite, and so NaN
             values: np.ndarray = (stored / np.float64(divisor)).astype(np.float32)
-            known = (np.abs(values) < _NOTHING_HIT) & ((values > 0) | (kind == "inverse"))
+            known = (np.abs(values) < _NO_HIT) & ((values > 0) | (kind == "inverse"))
         if is_integer and kind == "inverse":
             known &= stored != 0
         elif stored.dtype == np.uint16:
@@ -192,7 +192,7 @@ def _stems(file_name: str) -> Iterator[str]:
 def read_description(path: Path) -> tuple[DepthKind | None, float | None]:
     """Kind and scale that a ``depths.json`` gives; None for what it does not say."""
     content = read_json(path)
-    with guarded(path, "a description of depth maps", fix="Correct it, or leave it out."):
+    with translate_errors(path, "a description of depth maps", fix="Correct it, or leave it out."):
         scale, kind = _scale_in(content), content.get("kind")
         if kind not in (None, *KINDS):
             raise ValueError(f"kind {kind!r}, not one of {', '.join(KINDS)}")
@@ -208,7 +208,7 @@ def camera_file(folder: Path, above: int = 1) -> Path | None:
 def read_capture_scale(path: Path) -> float | None:
     """Stored units per metre that the ``cam_params.json`` of an RGB-D capture gives, if it does."""
     content = read_json(path)
-    with guarded(path, "the camera of a capture", fix="Correct it."):
+    with translate_errors(path, "the camera of a capture", fix="Correct it."):
         camera = content.get("camera") if isinstance(content, dict) else content
         return _scale_in({} if camera is None else camera)
 
@@ -243,7 +243,7 @@ class DepthWriter:
     def write(self, name: str, values: Float32[np.ndarray, "H W"]) -> None:
         """Keep the map of one image, NaN where nothing is known; safe from several threads."""
         path = self.folder.joinpath(*safe_parts(f"{name}.npy"))
-        with guarded(path, "a depth map"):
+        with translate_errors(path, "a depth map"):
             check_stored(values.shape, values.dtype)
         if path.exists():
             expected = "one depth map per image"

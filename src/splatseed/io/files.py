@@ -69,7 +69,7 @@ def is_video(path: Path) -> bool:
     return path.suffix.lower() in VIDEO_SUFFIXES and path.is_file()
 
 
-def other_spelling(path: Path) -> str | None:
+def similar_name(path: Path) -> str | None:
     """The name of a file beside a missing one that differs in its suffix or in case only."""
     near: list[str] = []
     with suppress(OSError):
@@ -78,7 +78,7 @@ def other_spelling(path: Path) -> str | None:
     return min(alike, key=lambda name: name.casefold() != path.name.casefold(), default=None)
 
 
-def odd_kind(path: Path) -> str:
+def special_kind(path: Path) -> str:
     """What a path is that is neither a regular file nor a folder; empty if it is, or is nothing."""
     try:
         mode = path.stat().st_mode
@@ -104,11 +104,11 @@ def open_file(path: Path) -> BinaryIO:
 def read_file(path: Path) -> bytes:
     """The whole content of a regular file; an ``OSError`` also if it exceeds the free memory."""
     with open_file(path) as file:
-        check_room(path, os.fstat(file.fileno()).st_size)
+        check_fits_memory(path, os.fstat(file.fileno()).st_size)
         return file.read()
 
 
-def check_room(path: Path, size: int) -> None:
+def check_fits_memory(path: Path, size: int) -> None:
     """Raise an ``OSError`` for a file whose content takes more bytes than are free."""
     free = free_memory()
     if free is not None and size > free:
@@ -122,13 +122,13 @@ def read_text(path: Path) -> str:
 
 
 def read_bytes(path: Path) -> bytes:
-    """The whole content of a regular file; errors as ``readable``'s."""
-    with readable(path):
+    """The whole content of a regular file; errors as ``translate_read_errors``'s."""
+    with translate_read_errors(path):
         return read_file(path)
 
 
 @contextmanager
-def readable(path: Path) -> Iterator[None]:
+def translate_read_errors(path: Path) -> Iterator[None]:
     """Turn an ``OSError`` from reading a file into one of our errors.
 
     Raises:
@@ -150,7 +150,7 @@ def readable(path: Path) -> Iterator[None]:
 
 
 @contextmanager
-def guarded(path: Path, expected: str, *, fix: str = COPY_AGAIN) -> Iterator[None]:
+def translate_errors(path: Path, expected: str, *, fix: str = COPY_AGAIN) -> Iterator[None]:
     """Turn whatever reading a bad file raises, in a package or here, into a ``SceneFormatError``.
 
     It says that the file at ``path`` should be what is ``expected``.
@@ -209,9 +209,9 @@ def numbered_lines(path: Path) -> Iterator[tuple[str, str]]:
 
 
 def read_json(path: Path, expected: str = "JSON", *, fix: str = COPY_AGAIN) -> Any:
-    """The content of a JSON file; errors as those of ``readable`` and ``guarded``."""
+    """Parse a JSON file; raises as ``read_bytes``, and SceneFormatError if it is not JSON."""
     data = read_bytes(path)
-    with guarded(path, expected, fix=fix):
+    with translate_errors(path, expected, fix=fix):
         if not data.strip():
             raise ValueError("an empty file")
         return json.loads(data)

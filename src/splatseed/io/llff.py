@@ -20,10 +20,10 @@ from splatseed.camera import Intrinsics
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io.camera_records import make_intrinsics, rigid_pose
 from splatseed.io.colmap_model import IMAGE_DIRS
-from splatseed.io.files import StrPath, guarded, open_file, read_npy
+from splatseed.io.files import StrPath, open_file, read_npy, translate_errors
 from splatseed.io.frame_files import SUFFIXES
 from splatseed.io.mask_files import masks_among
-from splatseed.io.origin import around_origin
+from splatseed.io.origin import recentered
 from splatseed.io.photograph_checks import image_warnings
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene, SceneSource
@@ -32,7 +32,7 @@ from splatseed.text import counted
 POSES = "poses_bounds.npy"
 _OPENCV_FROM_LLFF = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
 """Its columns are down, right and back in OpenCV's axes right, down, forward."""
-_MOST_BYTES = 1 << 28
+_MAX_BYTES = 1 << 28
 
 
 def is_llff(folder: Path) -> bool:
@@ -63,13 +63,13 @@ def read_llff(root: StrPath) -> Scene:
         source=SceneSource("llff", root, path, image_dir=folder),
         warnings=tuple(image_warnings(images, folder, root)),
     )
-    return around_origin(scene)
+    return recentered(scene)
 
 
 def _read_rows(path: Path) -> Float64[np.ndarray, "N 17"]:
     expected = "LLFF's poses, rows of 17 finite numbers"
-    with guarded(path, expected), open_file(path) as file:
-        rows = read_npy(file, _MOST_BYTES)
+    with translate_errors(path, expected), open_file(path) as file:
+        rows = read_npy(file, _MAX_BYTES)
         if rows.ndim != 2 or rows.shape[1] not in {15, 17} or not len(rows):
             raise ValueError(f"an array of {' x '.join(map(str, rows.shape))}")
         rows = rows.astype(np.float64)

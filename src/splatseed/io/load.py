@@ -18,23 +18,23 @@ from splatseed.io.cleaning import clean_scene, cloud_warnings
 from splatseed.io.colmap_model import find_model, nested_model, read_model, scene_model, scene_root
 from splatseed.io.depth_files import KINDS, SUFFIXES
 from splatseed.io.depth_maps import DepthFiles, match_by_name
-from splatseed.io.files import StrPath, is_video, odd_kind
+from splatseed.io.files import StrPath, is_video, special_kind
 from splatseed.io.llff import is_llff, read_llff
 from splatseed.io.masks import with_own_masks
 from splatseed.io.nerfstudio import is_blender, read_blender, read_transforms_scene
-from splatseed.io.origin import around_origin
-from splatseed.io.ply import read_exact_ply, refuse_model
+from splatseed.io.origin import recentered
+from splatseed.io.ply import read_ply_float64, refuse_gaussians
 from splatseed.io.rgbd import find_tum_depths, is_replica, is_tum, load_rgbd, load_tum
 from splatseed.io.seeds import recall_seeds
-from splatseed.io.split import follow_lists
+from splatseed.io.split import with_listed_split
 from splatseed.io.staging import ABSENT, MANIFEST, read_manifest
 from splatseed.scene import Scene, SceneSource
 from splatseed.text import name_some, quoted
 
 _TRANSFORMS = "transforms.json"
-_ABOVE = 3
+_MAX_LEVELS_UP = 3
 """Folders above a file in which its scene is looked for: images may lie in folders of their own."""
-_SCANS = frozenset({".las", ".laz", ".e57", ".pcd", ".xyz", ".asc", ".pts", ".glb"})
+_SCAN_SUFFIXES = frozenset({".las", ".laz", ".e57", ".pcd", ".xyz", ".asc", ".pts", ".glb"})
 _TRIANGULATE = (
     "Method auto needs none: splatseed upsample SCENE -o OUT. Or make points with: splatseed sfm"
     " IMAGES --poses-from SCENE -o OUT."
@@ -66,10 +66,10 @@ def load_scene(path: StrPath, *, require_points: bool = True) -> Scene:
     """
     path = Path(path)
     try:
-        check_there(path)
+        check_exists(path)
         reader = partial(_read_file, path) if path.is_file() else _reader(path)
         if reader is None:
-            raise _no_scene(path)
+            raise _no_scene_error(path)
         scene = reader()
         if scene.source is not None:
             scene = scene.replace(source=replace(scene.source, named=path.absolute()))
@@ -85,7 +85,7 @@ def load_scene(path: StrPath, *, require_points: bool = True) -> Scene:
         fix = _TRIANGULATE if scene.images else "Name a scene or a PLY that has points."
         raise SceneNotFoundError(f"points in {path}", found="none", fix=fix)
     # seeds.npz and the manifest count the points as the files have them, so this comes first.
-    scene = with_own_masks(clean_scene(follow_lists(_recall_absent(recall_seeds(scene)))))
+    scene = with_own_masks(clean_scene(with_listed_split(_restore_absent(recall_seeds(scene)))))
     folder, white, notes = scene.source.image_dir if scene.source else None, WHITE, list[str]()
     if folder is not None:
         white, notes = find_white([folder / image.name for image in scene.images])
@@ -93,7 +93,7 @@ def load_scene(path: StrPath, *, require_points: bool = True) -> Scene:
     return scene.replace(warnings=warnings, white=white)
 
 
-def _recall_absent(scene: Scene) -> Scene:
+def _restore_absent(scene: Scene) -> Scene:
     """The scene with the images that it lacked before splatseed wrote it, by its manifest."""
     noted = read_manifest(scene.source.root).get(ABSENT) if scene.source else None
     if not isinstance(noted, list) or not all(isinstance(name, str) for name in noted):
@@ -124,10 +124,10 @@ def load_originals(path: StrPath, *, require_points: bool = True) -> Scene:
     return scene.replace(points=points, warnings=(*scene.warnings, note))
 
 
-def check_there(path: Path) -> None:
+def check_exists(path: Path) -> None:
     """Raise a ``SceneNotFoundError`` if there is neither a file nor a folder."""
     if not path.is_file() and not path.is_dir():
-        found = odd_kind(path) or "no such file or folder"
+        found = special_kind(path) or "no such file or folder"
         raise SceneNotFoundError(f"a scene at {path}", found=found, fix="Check the path.")
 
 
@@ -152,11 +152,11 @@ def _reader(folder: Path) -> Callable[[], Scene] | None:
 
 
 def _read_file(path: Path) -> Scene:
-    refuse_model(path)
+    refuse_gaussians(path)
     kind, suffix = read_manifest(path.parent).get("command"), path.suffix.lower()
     if kind is not None and suffix == ".json" and not path.name.startswith("transforms"):
         if kind == "train":
-            raise _is_run(path.parent)
+            raise _run_error(path.parent)
         if is_scene(path.parent):
             raise SceneFormatError(
                 f"{path} to be a scene folder, a .ply or a .json file with frames",
@@ -164,9 +164,9 @@ def _read_file(path: Path) -> Scene:
                 fix=f"Name the scene's folder: {path.parent}",
             )
     if suffix == ".ply":
-        points, exact = read_exact_ply(path)
+        points, exact = read_ply_float64(path)
         source = SceneSource("ply", path.parent, path)
-        return around_origin(Scene(points, source=source), exact)
+        return recentered(Scene(points, source=source), exact)
     if suffix == ".json":
         return read_transforms_scene(path)
     if is_video(path):
@@ -174,7 +174,7 @@ def _read_file(path: Path) -> Scene:
     elif find_model(path.parent) is not None:
         found = "one file of a COLMAP model"
         fix = f"Name the scene's folder: {scene_root(path.parent)}"
-    elif suffix in _SCANS:
+    elif suffix in _SCAN_SUFFIXES:
         found = f"a {suffix} file, a scan"
         fix = f"Make seeds of it: splatseed upsample SCENE --cloud {quoted(path)} -o OUT."
     else:
@@ -186,15 +186,15 @@ def _read_file(path: Path) -> Scene:
 
 def _scene_above(path: Path) -> Path | None:
     """The scene that a file or folder lies in, spelled as the path is."""
-    for level, folder in enumerate(path.absolute().parents[:_ABOVE]):
+    for level, folder in enumerate(path.absolute().parents[:_MAX_LEVELS_UP]):
         if is_scene(folder):
             return path.parents[level] if level < len(path.parents) else folder
     return None
 
 
-def _no_scene(path: Path) -> SceneNotFoundError:
+def _no_scene_error(path: Path) -> SceneNotFoundError:
     if read_manifest(path).get("command") == "train":
-        return _is_run(path)
+        return _run_error(path)
     scenes = [each.name for each in sorted(path.iterdir()) if is_scene(each)]
     files = {each.name for suffix in ("*.json", "*.ply") for each in path.glob(suffix)}
     names = scenes or sorted(files - {MANIFEST})
@@ -212,7 +212,7 @@ def _no_scene(path: Path) -> SceneNotFoundError:
     return SceneNotFoundError(f"{expected} in {path}", found=found, fix=fix)
 
 
-def _is_run(path: Path) -> SceneNotFoundError:
+def _run_error(path: Path) -> SceneNotFoundError:
     run = quoted(path)
     return SceneNotFoundError(
         f"a scene at {path}",

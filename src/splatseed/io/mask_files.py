@@ -26,7 +26,7 @@ _INVERTED = "dynamic_mask_"
 """Before the name of a mask of instant-ngp, in which 0 is what counts."""
 
 
-def own_masks(
+def find_own_masks(
     names: Collection[str], image_dir: Path, root: Path
 ) -> tuple[dict[str, Path], list[str]]:
     """The masks near a folder of photographs, by the photographs' names, and notes for the user."""

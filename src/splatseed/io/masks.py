@@ -20,10 +20,10 @@ from PIL import Image as PilImage
 
 from splatseed.camera import Intrinsics
 from splatseed.errors import SceneFormatError, SceneNotFoundError, SplatseedError
-from splatseed.io.bit_depth import is_wide, opaque_value, wide_values
+from splatseed.io.bit_depth import is_16_bit, opaque_value, read_16_bit
 from splatseed.io.depth_maps import Undistortion
-from splatseed.io.files import files_below, guarded, open_file, read_bytes
-from splatseed.io.mask_files import find_masks, masks_among, own_masks
+from splatseed.io.files import files_below, open_file, read_bytes, translate_errors
+from splatseed.io.mask_files import find_masks, find_own_masks, masks_among
 from splatseed.io.photograph import has_alpha, open_photograph, photograph_bytes
 from splatseed.scene import Masks, Scene
 from splatseed.text import counted
@@ -71,12 +71,12 @@ def with_own_masks(scene: Scene) -> Scene:
     if scene.source is None or folder is None or scene.masks is not None:
         return scene
     names = [image.name for image in scene.images]
-    files, notes = own_masks(names, folder, scene.source.root)
+    files, notes = find_own_masks(names, folder, scene.source.root)
     notes += _resized(files, folder)
     return scene.replace(masks=Masks(files), warnings=(*scene.warnings, *notes))
 
 
-def masks_beside(photographs: Path) -> tuple[Masks, list[str]]:
+def masks_near(photographs: Path) -> tuple[Masks, list[str]]:
     """The masks near a folder of photographs, and notes for the user."""
     folder = photographs.absolute()
     if not photographs.is_dir():
@@ -84,7 +84,7 @@ def masks_beside(photographs: Path) -> tuple[Masks, list[str]]:
     below = (path.relative_to(photographs).as_posix() for path in files_below(photographs))
     names = sorted(below)
     names = sorted(set(names) - masks_among(names))
-    files, notes = own_masks(names, folder, folder.parent)
+    files, notes = find_own_masks(names, folder, folder.parent)
     if files:
         where = next(iter(files.values())).parent
         notes = [f"{counted(len(files), 'photograph')} with a mask in {where}.", *notes]
@@ -127,7 +127,7 @@ def read_mask(
         return None
     path, parts = masks.files.get(name), []
     if path is not None:
-        with guarded(path, "a mask, an image of one channel"):
+        with translate_errors(path, "a mask, an image of one channel"):
             picture = open_photograph(path, read_bytes(path))
             marked = _read_counts(picture) != masks.inverted
         size = open_photograph(photograph, photograph_bytes(photograph)).size
@@ -192,9 +192,9 @@ def _opaque(photograph: Path) -> Bool[np.ndarray, "H W"] | None:
     picture = open_photograph(photograph, photograph_bytes(photograph))
     if not has_alpha(picture) or picture.mode.startswith(("I", "F")):
         return None
-    with guarded(photograph, "an image, neither cut short nor damaged"):
-        if is_wide(picture):
-            alpha = wide_values(photograph_bytes(photograph))[..., -1]
+    with translate_errors(photograph, "an image, neither cut short nor damaged"):
+        if is_16_bit(picture):
+            alpha = read_16_bit(photograph_bytes(photograph))[..., -1]
             return np.asarray(alpha == opaque_value(alpha))
         return np.asarray(np.asarray(picture.convert("RGBA").getchannel("A")) == 255)
 

@@ -37,7 +37,14 @@ from splatseed.io.colmap_model import (
     read_model_cameras,
     read_model_points,
 )
-from splatseed.io.files import StrPath, guarded, odd_kind, open_file, read_bytes, read_json
+from splatseed.io.files import (
+    StrPath,
+    open_file,
+    read_bytes,
+    read_json,
+    special_kind,
+    translate_errors,
+)
 from splatseed.io.frame_files import (
     Frame,
     FrameFiles,
@@ -46,11 +53,11 @@ from splatseed.io.frame_files import (
     named_depths,
     named_masks,
 )
-from splatseed.io.origin import around_origin
+from splatseed.io.origin import recentered
 from splatseed.io.photograph import lens_warnings
 from splatseed.io.photograph_checks import image_warnings
-from splatseed.io.ply import read_exact_ply
-from splatseed.io.point_files import other_points
+from splatseed.io.ply import read_ply_float64
+from splatseed.io.point_files import differing_points_notes
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Masks, Scene, SceneSource, Split
 from splatseed.similarity import Similarity, fit_similarity, similarity_of
@@ -69,7 +76,7 @@ _BLENDER = ("transforms_train.json", "transforms_test.json")
 _POINT_FILES = ("sparse_pc.ply", "points3d.ply", "points3D.ply", "pointcloud.ply")
 _LEGACY_TRANSFORM = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]])
 """What nerfstudio applied to a COLMAP model before it wrote ``applied_transform``."""
-_FEWEST_FITTED = 4
+_MIN_FITTED = 4
 """Three camera centres do not suffice for a similarity: it fits any three nearly as well."""
 _POSE_TOLERANCE = 1e-2  # of the cameras' extent, between transforms.json and its COLMAP model
 
@@ -119,7 +126,7 @@ def read_transforms_scene(path: StrPath) -> Scene:
         listed=transforms.listed,
         masks=Masks(masks) if masks else None, absent=transforms.absent,
     )  # fmt: skip
-    return around_origin(scene, exact)
+    return recentered(scene, exact)
 
 
 def is_blender(folder: Path) -> bool:
@@ -163,7 +170,7 @@ def read_blender(folder: StrPath) -> Scene:
         listed=Split(train, test, f"pair of {_BLENDER[0]} and {_BLENDER[1]}") if split else None,
         masks=Masks({}, alpha=False),  # what is transparent is empty, and black
     )
-    return around_origin(scene, exact)
+    return recentered(scene, exact)
 
 
 def read_transforms(path: Path) -> Transforms:
@@ -258,7 +265,7 @@ def _camera(
         width, height = int(_number(where, values, "w")), int(_number(where, values, "h"))
     else:
         expected = f"a readable image, or w and h to be, in {where}"
-        with guarded(file, expected, fix=_FIX), open_file(file) as opened:
+        with translate_errors(file, expected, fix=_FIX), open_file(file) as opened:
             width, height = PilImage.open(opened).size
     fl_x = _focal_length(where, values, "x", width, None)
     fl_y = _focal_length(where, values, "y", height, fl_x)
@@ -328,13 +335,13 @@ def _find_points(
     named = transforms.json.get("ply_file_path")
     names = [name for name in (named, *_POINT_FILES) if isinstance(name, str)]
     if isinstance(named, str) and not (root / named).is_file():
-        notes.append(f"ply_file_path {named} is {odd_kind(root / named) or 'not there'}.")
+        notes.append(f"ply_file_path {named} is {special_kind(root / named) or 'not there'}.")
     ply = next((root / name for name in names if (root / name).is_file()), None)
     if ply is not None:
-        points, exact = read_exact_ply(ply)
+        points, exact = read_ply_float64(ply)
         for name in (*names, "init.ply"):
             use = f"name it as ply_file_path in {transforms.path.name}"
-            notes += other_points(ply, points.xyz, root / name, use)
+            notes += differing_points_notes(ply, points.xyz, root / name, use)
         return points, exact, ply, notes
     models = _models(root)
     if not models:
@@ -382,7 +389,7 @@ def _transform_of_model(
     extent = max(float(np.ptp(centers, axis=0).max()), 1e-6 * float(np.abs(centers).max()))
     maps: list[tuple[np.ndarray, list[str]]] = [(each, []) for each in candidates]
     fitted = fit_similarity(model_centers, centers)
-    if fitted is not None and len(pairs) >= _FEWEST_FITTED:
+    if fitted is not None and len(pairs) >= _MIN_FITTED:
         poses = f"The poses of {transforms.path.name} are those of {model_dir} turned, moved and"
         by = f"scaled by {fitted.scale:.3g}, as instant-ngp writes them"
         maps.append((fitted.matrix, [f"{poses} {by}; its points were brought there."]))

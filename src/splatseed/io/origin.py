@@ -39,7 +39,7 @@ ELSEWHERE = 1e3
 """Points so many extents from the cameras, of theirs and the cameras', are in another frame."""
 
 
-def origin_of(
+def choose_origin(
     places: Float[np.ndarray, "N 3"], *, in_order: bool = False
 ) -> Float64[np.ndarray, " 3"]:
     """The origin to work on places around, a round number; 0 where float32 resolves them there.
@@ -61,7 +61,7 @@ def origin_of(
     return np.asarray(np.rint(middle / unit) * unit)
 
 
-def around_origin(scene: Scene, exact: Float64[np.ndarray, "N 3"] | None = None) -> Scene:
+def recentered(scene: Scene, exact: Float64[np.ndarray, "N 3"] | None = None) -> Scene:
     """A scene as a reader made it, around its own origin if it is far from 0.
 
     ``exact`` are the positions of its points in double precision, if it has any.
@@ -70,16 +70,16 @@ def around_origin(scene: Scene, exact: Float64[np.ndarray, "N 3"] | None = None)
     images = sorted(scene.images, key=lambda image: image.name)
     centers = np.array([image.camera.center for image in images]).reshape(-1, 3)
     places = centers if len(centers) else scene.points.xyz if exact is None else exact
-    origin = origin_of(places, in_order=len(centers) > 0)
+    origin = choose_origin(places, in_order=len(centers) > 0)
     if origin.any():
         known = _known(places)
         notes = [_note(scene, origin, known), *_lost(scene, exact, origin)]
-        scene = moved_by(scene, origin, exact)
+        scene = translated(scene, origin, exact)
         scene = replace(scene, warnings=(*scene.warnings, *notes))
     return replace(scene, warnings=(*scene.warnings, *_elsewhere(scene, centers - origin)))
 
 
-def moved_by(
+def translated(
     scene: Scene, offset: Float64[np.ndarray, " 3"], exact: Float64[np.ndarray, "N 3"] | None = None
 ) -> Scene:
     """The scene with an offset subtracted from all positions, and added to its origin."""
@@ -104,7 +104,7 @@ def middle_of_cameras(scene: Scene) -> Float64[np.ndarray, " 3"]:
     return np.rint(np.median(xyz, axis=0)) if len(xyz) else np.zeros(3)
 
 
-def shift_to(
+def find_shift(
     scene: Scene,
     xyz: Float[np.ndarray, "N 3"],
     recorded: Float64[np.ndarray, " 3"] | None = None,
@@ -179,7 +179,7 @@ def offset_beside(path: Path) -> Float64[np.ndarray, " 3"] | None:
     return values
 
 
-def place_words(offset: Sequence[float] | np.ndarray) -> str:
+def format_offset(offset: Sequence[float] | np.ndarray) -> str:
     """An offset for a person to read."""
     return f"({', '.join(f'{value:.12g}' for value in offset)})"
 
@@ -220,7 +220,7 @@ def _note(
     step = np.spacing(np.float32(far))
     note = (
         f"The {what} lie so far from 0 that float32 has steps of {step:.2g} there: "
-        f"{place_words(origin)} is subtracted from all coordinates, and what is written stays "
+        f"{format_offset(origin)} is subtracted from all coordinates, and what is written stays "
         f"around it, with {RECENTER} beside it."
     )
     if (step := np.spacing(far)) > COARSE * extent > 0:

@@ -16,8 +16,8 @@ from jaxtyping import UInt8, UInt16
 from PIL import Image as PilImage
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
-from splatseed.io.bit_depth import WHITE, is_wide, opaque_value, wide_values
-from splatseed.io.files import guarded, other_spelling, read_bytes
+from splatseed.io.bit_depth import WHITE, is_16_bit, opaque_value, read_16_bit
+from splatseed.io.files import read_bytes, similar_name, translate_errors
 from splatseed.runtime.fingerprint import fingerprint
 from splatseed.scene import Image, Scene
 
@@ -28,7 +28,7 @@ _WIDE_GREY = ("I", "F")
 _INKS = ("CMYK", "LAB")
 """Pillow's modes that are not RGB or grey; it would convert inks by a rule of thumb."""
 COPY_AGAIN = "Copy or export the image again."
-_WHOLE = "an image, neither cut short nor damaged"
+_COMPLETE_IMAGE = "an image, neither cut short nor damaged"
 
 
 def photograph_folder(scene: Scene) -> Path:
@@ -66,14 +66,14 @@ def photograph_bytes(path: Path) -> bytes:
         return read_bytes(path)
     except SceneNotFoundError:
         found, fix = "no such file", "Put it there, or drop it from the model."
-        if near := other_spelling(path):
+        if near := similar_name(path):
             found, fix = f"{near} in its place", "Name it as the model does, to the letter."
         raise SceneNotFoundError(f"the image {path}", found=found, fix=fix) from None
 
 
 def open_photograph(path: Path, encoded: bytes) -> PilImage.Image:
     """The photograph in a file's bytes; only its header is decoded yet."""
-    with guarded(path, "an image", fix=COPY_AGAIN):
+    with translate_errors(path, "an image", fix=COPY_AGAIN):
         return PilImage.open(BytesIO(encoded))
 
 
@@ -93,9 +93,9 @@ def decode_photograph(path: Path, encoded: bytes, white: int = WHITE) -> PilImag
         )
     if photograph.mode.startswith(_WIDE_GREY):
         return _grey_of(path, photograph, white).convert("RGB")
-    with guarded(path, _WHOLE, fix=COPY_AGAIN):
-        if is_wide(photograph):
-            return _colors_of(wide_values(encoded), photograph, white)
+    with translate_errors(path, _COMPLETE_IMAGE, fix=COPY_AGAIN):
+        if is_16_bit(photograph):
+            return _colors_of(read_16_bit(encoded), photograph, white)
         if has_alpha(photograph):
             black = PilImage.new("RGBA", photograph.size, (0, 0, 0, 255))
             return PilImage.alpha_composite(black, photograph.convert("RGBA")).convert("RGB")
@@ -120,7 +120,7 @@ def check_photograph(path: Path) -> tuple[int, int]:
     photograph = open_photograph(path, photograph_bytes(path))
     size = photograph.size
     photograph.draft(None, (size[0] // _CHECK_SCALE, size[1] // _CHECK_SCALE))
-    with guarded(path, _WHOLE, fix=COPY_AGAIN):
+    with translate_errors(path, _COMPLETE_IMAGE, fix=COPY_AGAIN):
         photograph.load()
     return size
 
@@ -143,7 +143,7 @@ def _colors_of(
 
 def _grey_of(path: Path, photograph: PilImage.Image, white: int) -> PilImage.Image:
     """Grey of 16 bits or of floats, as 8 bits."""
-    with guarded(path, _WHOLE, fix=COPY_AGAIN):
+    with translate_errors(path, _COMPLETE_IMAGE, fix=COPY_AGAIN):
         values = np.asarray(photograph)
     most = 1.0 if photograph.mode == "F" else 65535.0
     # 32-bit integers can have any range; some versions of Pillow open 16-bit PNGs as such.
@@ -162,7 +162,7 @@ def _grey_of(path: Path, photograph: PilImage.Image, white: int) -> PilImage.Ima
     return PilImage.fromarray(grey)
 
 
-def warnings_but_lens(scene: Scene) -> list[str]:
+def warnings_without_lens(scene: Scene) -> list[str]:
     """What is wrong with a scene for a command that takes lens distortion out."""
     lens = lens_warnings(scene.images)
     return [warning for warning in scene.warnings if warning not in lens]

@@ -18,7 +18,7 @@ from PIL import Image as PilImage
 
 from splatseed.camera import Intrinsics
 from splatseed.errors import SceneFormatError, SceneNotFoundError
-from splatseed.io.files import guarded, odd_kind, open_file, other_spelling
+from splatseed.io.files import open_file, similar_name, special_kind, translate_errors
 from splatseed.io.photograph import COPY_AGAIN, photograph_bytes, photograph_folder
 from splatseed.scene import Image, Scene
 from splatseed.text import agreeing, counted, name_some
@@ -59,7 +59,7 @@ def photograph_size(path: Path) -> Size:
     """Width and height of an image file; errors as ``photograph_bytes``'s and ``open``'s."""
     if not path.is_file():
         photograph_bytes(path)  # raises the error of a missing file
-    with guarded(path, "an image", fix=COPY_AGAIN), open_file(path) as file:
+    with translate_errors(path, "an image", fix=COPY_AGAIN), open_file(path) as file:
         return PilImage.open(file).size
 
 
@@ -153,7 +153,7 @@ def image_warnings(images: Sequence[Image], image_dir: Path | None, root: Path) 
 
 def _missing_warning(missing: Sequence[str], count: int, image_dir: Path) -> str:
     first, are = missing[0], agreeing(len(missing), "is", "are")
-    near, kind = other_spelling(image_dir / first), odd_kind(image_dir / first)
+    near, kind = similar_name(image_dir / first), special_kind(image_dir / first)
     hint = f"; {near} is there, but names must be equal to the letter" if near else ""
     hint = f"; {first} is {kind}" if kind else hint
     hint = "; folders are separated by /, as on Linux, not by \\" if "\\" in first else hint

@@ -18,7 +18,7 @@ from jaxtyping import Float32, Float64, UInt8
 
 from splatseed.errors import SceneFormatError
 from splatseed.io.cloud_file import RGB, XYZ, CloudFile, LineCloud, RowCloud
-from splatseed.io.files import StrPath, check_room, open_file, readable
+from splatseed.io.files import StrPath, check_fits_memory, open_file, translate_read_errors
 from splatseed.io.staging import atomic_file
 from splatseed.pointcloud import PointCloud
 from splatseed.text import beginning
@@ -113,7 +113,7 @@ def open_ply(path: Path) -> CloudFile:
     with open_file(path) as file:
         header = parse_header(path, file.read(_MAX_HEADER))
     if any("packed_position" in each.types for each in header.elements):
-        refuse_model(path, "Gaussians compressed as PlayCanvas's .compressed.ply")
+        refuse_gaussians(path, "Gaussians compressed as PlayCanvas's .compressed.ply")
     vertex = header.elements[0] if header.elements else Element("no element", 0, {})
     names = list(vertex.types)
     if vertex.name != "vertex" or not set(XYZ) <= set(names) or vertex.has_lists:
@@ -144,16 +144,16 @@ def read_ply(path: StrPath) -> PointCloud:
         SceneFormatError: It is malformed, shorter than its header promises or larger than the free
             memory, or has no vertices with x, y, z.
     """
-    return read_exact_ply(path)[0]
+    return read_ply_float64(path)[0]
 
 
-def read_exact_ply(path: StrPath) -> tuple[PointCloud, Float64[np.ndarray, "N 3"]]:
+def read_ply_float64(path: StrPath) -> tuple[PointCloud, Float64[np.ndarray, "N 3"]]:
     """As ``read_ply``, and the positions in double precision."""
     path = Path(path)
-    with readable(path):
+    with translate_read_errors(path):
         cloud = open_ply(path)
-        check_room(path, path.stat().st_size)
-        whole = cloud.whole()
+        check_fits_memory(path, path.stat().st_size)
+        whole = cloud.read_all()
     with np.errstate(over="ignore"):  # beyond float32 is infinite, to be seen and dropped
         xyz = whole.xyz.astype(np.float32)
     rgb = np.full(xyz.shape, _GREY, np.uint8) if whole.rgb is None else whole.rgb
@@ -192,7 +192,7 @@ def ply_rows(xyz: Float32[np.ndarray, "n 3"], rgb: UInt8[np.ndarray, "n 3"]) -> 
     return rows.view(np.uint8).data
 
 
-def refuse_model(path: Path, packed: str = "") -> None:
+def refuse_gaussians(path: Path, packed: str = "") -> None:
     """Raise a ``SceneFormatError`` for trained Gaussians, by the file's name or as ``packed``."""
     kind = packed or _MODELS.get(path.suffix.lower())
     if kind and path.is_file():

@@ -20,7 +20,7 @@ from splatseed.text import counted
 
 _TOLERANCE = 1e-4
 """Of the points' extent: text and PLY files round positions."""
-_STARTS = {
+_USED_BY = {
     "points3D.ply": "graphdeco's trainer starts from it",
     "init.ply": "Brush starts from it",
     "pointcloud.ply": "LichtFeld Studio starts from it",
@@ -50,7 +50,7 @@ def first_with_points(paths: Sequence[Path]) -> Path | None:
     return next(iter(paths), None)
 
 
-def other_points(
+def differing_points_notes(
     read: Path, xyz: Float[np.ndarray, "N 3"], other: Path, use: str = ""
 ) -> list[str]:
     """A note on another file, if it holds other points than those that were read.
@@ -65,7 +65,7 @@ def other_points(
     if count is None or (count == len(xyz) and _same(other, xyz)):
         return []
     differ = f"{count:,}" if count != len(xyz) else f"{count:,} at other places"
-    fate = _STARTS.get(other.name, "is not used")
+    fate = _USED_BY.get(other.name, "is not used")
     way = f" To use it here, {use}." if use else ""
     used = f"{counted(len(xyz), 'point')} of {read.name} are used"
     return [f"{used}; {other.name}{_age(other, read)} has {differ}, and {fate}.{way}"]

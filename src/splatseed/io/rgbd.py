@@ -16,15 +16,15 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
-from PIL import Image as PilImage
 
 from splatseed.camera import Intrinsics, rotation_from_quat
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io import depth_maps
 from splatseed.io.camera_records import make_intrinsics, rigid_pose
-from splatseed.io.files import StrPath, guarded, numbered_lines, open_file, read_json
-from splatseed.io.origin import around_origin
+from splatseed.io.files import StrPath, numbered_lines, read_json, translate_errors
+from splatseed.io.origin import recentered
 from splatseed.io.photograph import lens_warnings
+from splatseed.io.photograph_checks import photograph_size
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene, SceneSource
 from splatseed.text import agreeing, counted
@@ -97,7 +97,7 @@ def _scene(
 ) -> Scene:
     source = SceneSource("rgbd", track.parent, track, image_dir=folder)
     points = PointCloud.empty()
-    return around_origin(Scene(points, tuple(images), (lens,), source=source, warnings=warnings))
+    return recentered(Scene(points, tuple(images), (lens,), source=source, warnings=warnings))
 
 
 def is_tum(root: Path) -> bool:
@@ -200,17 +200,18 @@ def _tum_camera(root: Path) -> tuple[Intrinsics, tuple[str, ...]]:
 def _read_intrinsics(path: Path) -> Intrinsics:
     """The pinhole camera in a camera file, whose corner is at (0, 0), as in COLMAP."""
     content = read_json(path)
-    with guarded(path, 'a file of {"camera": {w, h, fx, fy, cx, cy}}, as numbers in pixels'):
+    with translate_errors(
+        path, 'a file of {"camera": {w, h, fx, fy, cx, cy}}, as numbers in pixels'
+    ):
         camera = content["camera"]
         params = tuple(float(camera[key]) for key in ("fx", "fy", "cx", "cy"))
         return make_intrinsics(f"{path}", 1, "PINHOLE", int(camera["w"]), int(camera["h"]), params)
 
 
 def _check_image(path: Path, intrinsics: Intrinsics) -> None:
-    """Check that an image can be read and has the size of its camera; only its header is opened."""
+    """Check that an image has the size of its camera; only its header is read."""
     expected = (intrinsics.width, intrinsics.height)
-    with guarded(path, "a readable image"), open_file(path) as file, PilImage.open(file) as image:
-        size = image.size
+    size = photograph_size(path)
     if size != expected:
         raise SceneFormatError(
             f"{path} to have the size of the capture's camera, {expected[0]}x{expected[1]}",

@@ -27,7 +27,7 @@ _SHOWN = 3
 """Names that a warning shows."""
 
 
-def follow_lists(scene: Scene) -> Scene:
+def with_listed_split(scene: Scene) -> Scene:
     """The scene with the split of its lists, if it has some."""
     if scene.source is None or not scene.images or scene.listed is not None:
         return scene

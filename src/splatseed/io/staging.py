@@ -38,9 +38,9 @@ ABSENT = "absent"
 """The manifest's key for ``Scene.absent``."""
 """The file that marks a folder as written by splatseed."""
 
-_SETTLED = 5.0
+_MIN_LEFTOVER_AGE = 5.0
 """Seconds after which a partial that nobody holds is a leftover: it is held once it is made."""
-_NOBODYS = re.compile(
+_IGNORED = re.compile(
     r"preview(_methods|_maps|_cells|_origins)?\.png"  # ours, written after the manifest
     r"|(.*/)?(\.DS_Store|Thumbs\.db|\.[^/]+\.partial-[0-9a-f]{8}(\.\w+|/.*)?"
     r"|images_\d+_png/.*\.png)",  # gsplat's copies of the photographs
@@ -63,7 +63,7 @@ def output_folder(
     an earlier output of this kind; ``protect`` are files and folders that the output may not be,
     lie in or contain. An ``OutputError``: ``path`` is taken or protected, or writing failed.
     """
-    check_apart(path, protect)
+    check_separate(path, protect)
     target = _resolved(path)
     _check_replaceable(target, kind, overwrite=overwrite)
     with staged(target, folder=True) as partial:
@@ -107,11 +107,11 @@ def staged(target: Path, *, folder: bool) -> Iterator[Path]:
     old = target.with_name(f".{target.name}.old-{token}")
     partial = target.with_name(f".{target.name}.partial-{token}{'' if folder else target.suffix}")
     missing = [each for each in target.parents if not each.exists()]
-    with oserror_as_output_error(target):
+    with translate_write_errors(target):
         try:
             target.parent.mkdir(parents=True, exist_ok=True)
             partial.mkdir() if folder else partial.touch()
-            with held(partial):
+            with locked(partial):
                 yield partial
                 if folder and target.exists():
                     target.rename(old)
@@ -160,19 +160,19 @@ def unlisted_files(folder: Path) -> list[str]:
         return bool(re.match("images_[248]/", name)) and (folder / f"images{name[8:]}").is_file()
 
     names = _files(folder, {*_listed(folder), MANIFEST})
-    return sorted(name for name in names if not (_NOBODYS.fullmatch(name) or is_copy(name)))
+    return sorted(name for name in names if not (_IGNORED.fullmatch(name) or is_copy(name)))
 
 
 def check_output(
     path: Path, *, kind: str, overwrite: bool = False, protect: Sequence[Path] = ()
 ) -> None:
     """Refuse what ``output_folder`` and ``check_parents`` refuse, before any work is done."""
-    check_apart(path, protect)
+    check_separate(path, protect)
     check_parents(path)
     _check_replaceable(_resolved(path), kind, overwrite=overwrite)
 
 
-def check_apart(path: Path, protect: Sequence[Path]) -> None:
+def check_separate(path: Path, protect: Sequence[Path]) -> None:
     """Raise an ``OutputError`` for an output that is, lies in or contains one of ``protect``."""
     target, here = _resolved(path), Path.cwd()
     for source in (*map(_resolved, protect), here):
@@ -203,7 +203,7 @@ def check_parents(path: Path) -> None:
 
 
 @contextmanager
-def oserror_as_output_error(target: Path) -> Iterator[None]:
+def translate_write_errors(target: Path) -> Iterator[None]:
     """Let an ``OSError`` in the block become an ``OutputError`` that says what to do."""
     try:
         yield
@@ -240,7 +240,7 @@ def _resolved(path: Path) -> Path:
 
 def _check_replaceable(target: Path, kind: str, *, overwrite: bool) -> None:
     found, fix = "", "Choose another name, or move what is there elsewhere."
-    with oserror_as_output_error(target):
+    with translate_write_errors(target):
         if not os.path.lexists(target) or (target.is_dir() and not any(target.iterdir())):
             return
         manifest, ours = read_manifest(target), "files that splatseed did not write"
@@ -287,14 +287,14 @@ def _remove_leftovers(target: Path) -> None:
     )
     for path in list(target.parent.iterdir()) if fcntl and target.parent.is_dir() else []:
         with suppress(OSError):  # another process writes to it, or has removed it
-            if name.fullmatch(path.name) and time.time() - path.stat().st_mtime > _SETTLED:
-                with held(path):
+            if name.fullmatch(path.name) and time.time() - path.stat().st_mtime > _MIN_LEFTOVER_AGE:
+                with locked(path):
                     remove(path)
                 _LOG.warning("Removed %s, left by a run that was killed.", path)
 
 
 @contextmanager
-def held(path: Path) -> Iterator[None]:
+def locked(path: Path) -> Iterator[None]:
     """Lock a file or folder while the block runs; an OSError if another process has."""
     with ExitStack() as stack:
         if fcntl is not None:

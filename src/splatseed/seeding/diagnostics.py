@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Float64
 from scipy.spatial import cKDTree
 
 from splatseed.errors import PointCloudError, SplatseedError
-from splatseed.io.files import odd_kind
+from splatseed.io.files import special_kind
 from splatseed.io.masks import read_mask
 from splatseed.progress import Progress, silent
 from splatseed.scene import NO_POINT, Image, Scene
@@ -284,7 +284,7 @@ def untrainable(scene: Scene) -> str:
     if 2 * len(missing) <= len(scene.images):
         return ""
     needs = f"Training needs at least half of the {len(scene.images):,} photographs"
-    if kind := odd_kind(folder / missing[0]):
+    if kind := special_kind(folder / missing[0]):
         return f"{needs}: {visible(missing[0])} is {kind}."
     which = agreeing(len(missing), "", f"and {len(missing) - 1:,} more ")
     return f"{needs}: put {visible(missing[0])} {which}into {visible(folder)}."

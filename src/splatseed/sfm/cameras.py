@@ -30,11 +30,11 @@ _MAKE, _MODEL, _IFD = 0x010F, 0x0110, 0x8769
 _FOCAL, _FOCAL_35, _LENS, _ZOOM = 0x920A, 0xA405, 0xA434, 0xA404
 _ROUNDING = 0.75
 """Millimetres by which a 35 mm equivalent, a whole number, differs from the focal length's."""
-_SAME = 1.01
+_SAME_RATIO = 1.01
 """Ratio of focal lengths up to which they count as one setting."""
-_NEAR = 1.06
+_NEAR_RATIO = 1.06
 """The same where one of them has few photographs."""
-_ENOUGH = 4
+_MIN_GROUP = 4
 """Photographs that determine a camera of their own."""
 
 
@@ -157,7 +157,8 @@ def _settings(names: Sequence[str], lengths: Mapping[str, float | None]) -> list
         joined = [
             (span, i)
             for i, span in enumerate(spans)
-            if span <= _SAME or (span <= _NEAR and min(map(len, groups[i : i + 2])) < _ENOUGH)
+            if span <= _SAME_RATIO
+            or (span <= _NEAR_RATIO and min(map(len, groups[i : i + 2])) < _MIN_GROUP)
         ]
         if not joined:
             break
@@ -169,8 +170,8 @@ def _settings(names: Sequence[str], lengths: Mapping[str, float | None]) -> list
 def _by_folder(names: Sequence[str]) -> list[list[str]]:
     """Photographs of one setting by folder; folders of few are one group."""
     folders = _grouped(names, lambda name: PurePosixPath(name).parent)
-    rest = [name for each in folders if len(each) < _ENOUGH for name in each]
-    return [*(each for each in folders if len(each) >= _ENOUGH), *([rest] if rest else [])]
+    rest = [name for each in folders if len(each) < _MIN_GROUP for name in each]
+    return [*(each for each in folders if len(each) >= _MIN_GROUP), *([rest] if rest else [])]
 
 
 def _without_strays(groups: Sequence[list[str]], photos: Photos) -> list[list[str]]:
@@ -179,7 +180,7 @@ def _without_strays(groups: Sequence[list[str]], photos: Photos) -> list[list[st
     for group in groups:
         size, exif = photos[group[0]][:2]
         others = [each for each in kept if photos[each[0]].size == size and each != group]
-        if len(group) < _ENOUGH and exif == Exif() and len(others) == 1:
+        if len(group) < _MIN_GROUP and exif == Exif() and len(others) == 1:
             kept.remove(group)
             others[0] += group
     return kept

@@ -30,14 +30,14 @@ from splatseed.requirements import install_command
 from splatseed.runtime.torch_device import DeviceName
 from splatseed.scene import Image, Masks
 from splatseed.sfm.cameras import SharedCamera
-from splatseed.sfm.kept import DATABASE, MODELS, Kept
+from splatseed.sfm.work_folder import DATABASE, MODELS, WorkFolder
 from splatseed.text import counted, name_some
 
 MatcherName: TypeAlias = Literal["exhaustive", "sequential"]
 T = TypeVar("T")
 
-_OLDEST = 4  # the first to pose an image and its rig in one call
-_LARGEST = 2**31 - 1  # pycolmap takes a 32-bit int
+_MIN_VERSION = 4  # the first to pose an image and its rig in one call
+_MAX_INT = 2**31 - 1  # pycolmap takes a 32-bit int
 _BLOCK_IMAGES = 16  # matches are committed, and progress is visible, per block of 16 x 16 pairs
 _POLL_SECONDS = 0.1
 _SIMPLE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL")
@@ -59,9 +59,9 @@ class Settings:
         check_choice("device", self.device, get_args(DeviceName))
         for name, low in (("max_image_size", 1), ("seed", 0), ("threads", 1)):
             value = getattr(self, name)
-            if not low <= value <= _LARGEST and (name, value) != ("threads", -1):
+            if not low <= value <= _MAX_INT and (name, value) != ("threads", -1):
                 raise errors.ParameterError(
-                    f"{name} from {low} to {_LARGEST}", found=f"{value}", fix="Choose another."
+                    f"{name} from {low} to {_MAX_INT}", found=f"{value}", fix="Choose another."
                 )
 
 
@@ -89,8 +89,10 @@ def require_pycolmap(device: DeviceName = "auto") -> Any:
         found = str(error).strip()
         raise errors.MissingDependencyError("pycolmap to load", found=found, fix=fix) from error
     found = f"pycolmap {pycolmap.__version__}"
-    if int(pycolmap.__version__.split(".")[0]) < _OLDEST:
-        raise errors.MissingDependencyError(f"pycolmap {_OLDEST} or newer", found=found, fix=fix)
+    if int(pycolmap.__version__.split(".")[0]) < _MIN_VERSION:
+        raise errors.MissingDependencyError(
+            f"pycolmap {_MIN_VERSION} or newer", found=found, fix=fix
+        )
     if device == "cuda" and not pycolmap.has_cuda:
         raise errors.MissingDependencyError(
             "a pycolmap that can use CUDA, as device='cuda' asks",
@@ -109,7 +111,7 @@ class Run:
     image_dir: Path
     work: Path  # a scratch folder, removed at the end
     on_progress: Progress
-    kept: Kept | None = None  # where features, matches and models outlive a failure
+    kept: WorkFolder | None = None  # where features, matches and models outlive a failure
     seconds: dict[str, float] = field(default_factory=dict)  # wall time of the stages so far
 
     @property

@@ -15,7 +15,7 @@ from splatseed.sfm.colmap import Run
 
 _ORIENTATION, _SHORT, _UPRIGHT = 0x0112, 3, 1  # the tag, its type, the value that turns nothing
 _HEAD_BYTES = 1 << 17  # the EXIF segment, at most 64 KiB, comes first or after a small one
-_BARELY = 2e-7  # a coefficient that pycolmap takes for distortion, and that moves no pixel
+_NEGLIGIBLE = 2e-7  # a coefficient that pycolmap takes for distortion, and that moves no pixel
 
 
 def export_scene(run: Run, model_dir: Path, staging: Path, *, distinct: bool = True) -> None:
@@ -77,7 +77,7 @@ def name_distortion(camera: Any) -> None:
     models = type(camera.model)
     if lens.is_fisheye and camera.is_undistorted():
         camera.model = models.OPENCV_FISHEYE
-        camera.params = [*lens.pinhole.params, _BARELY, 0.0, 0.0, 0.0]
+        camera.params = [*lens.pinhole.params, _NEGLIGIBLE, 0.0, 0.0, 0.0]
     elif not lens.has_distortion and not lens.is_pinhole:
         camera.model = models.PINHOLE
         camera.params = list(lens.pinhole.params)

@@ -51,11 +51,11 @@ _GREY_MODES = ("L", "1", "LA")
 _MAPS = re.compile(r"(^|[/_.-])(conf|confidence|depth|disparity|masks?)([/_.\d-]|$)", re.IGNORECASE)
 """Names of the maps that phones' scanning apps write beside photographs."""
 
-_LOOK_WIDTH, _BLOCK = 256, 64
+_ANALYSIS_WIDTH, _BLOCK = 256, 64
 """Width at which frames are analysed, and the side of the blocks whose shifts are measured, px."""
-_LEAST_STEP = 0.02
+_MIN_STEP = 0.02
 """Least distance, in widths, that the picture moves between chosen frames."""
-_LEAST_FRAMES = 3
+_MIN_FRAMES = 3
 """Fewer photographs make no scene."""
 
 
@@ -175,22 +175,22 @@ def pick_frames(
         SceneFormatError: It cannot be read, or the picture hardly moves.
         ParameterError: ``most`` is too small.
     """
-    if most < _LEAST_FRAMES:
-        expected = f"--frames of {_LEAST_FRAMES} or more"
+    if most < _MIN_FRAMES:
+        expected = f"--frames of {_MIN_FRAMES} or more"
         raise ParameterError(expected, found=f"{most}", fix="Try 150.")
     if not video.is_file():
         raise SceneNotFoundError(f"a video {video}", found="none", fix="Check the path.")
     sharpness, steps = [], []
     before: Float32[np.ndarray, "H W"] | None = None
-    for frame, part in _frames(video, ["-vf", f"scale={_LOOK_WIDTH}:-2"], "gray"):
+    for frame, part in _frames(video, ["-vf", f"scale={_ANALYSIS_WIDTH}:-2"], "gray"):
         grey = frame[..., 0].astype(np.float32)
         sharpness.append(float(laplace(grey).var()))
-        steps.append(0.0 if before is None else shift(before, grey) / _LOOK_WIDTH)
+        steps.append(0.0 if before is None else shift(before, grey) / _ANALYSIS_WIDTH)
         before = grey
         progress("look at video", part)
     way = np.cumsum(steps)
     numbers = choose_frames(np.array(sharpness), way, most).tolist()
-    if len(numbers) < _LEAST_FRAMES:
+    if len(numbers) < _MIN_FRAMES:
         raise SceneFormatError(
             f"{video} to move, for photographs from several places",
             found=f"{len(way)} frames whose picture moves by {way[-1] if len(way) else 0:.1%} of "
@@ -211,7 +211,7 @@ def choose_frames(
     """The sharpest frame in each of at most ``most`` equal stretches of the (ascending) way."""
     if not len(way):
         return np.empty(0, np.int64)
-    step = max(way[-1] / most, _LEAST_STEP)
+    step = max(way[-1] / most, _MIN_STEP)
     stretch = np.minimum((way / step).astype(np.int64), max(int(way[-1] / step) - 1, 0))
     order = np.lexsort((-sharpness, stretch))
     return np.sort(order[np.unique(stretch[order], return_index=True)[1]])

@@ -41,9 +41,9 @@ from splatseed.sfm import colmap
 from splatseed.sfm.cameras import SharedCamera, describe_cameras, share_cameras
 from splatseed.sfm.colmap import Run, Settings
 from splatseed.sfm.export import export_scene
-from splatseed.sfm.kept import Kept, kept_work, work_key
 from splatseed.sfm.photos import find_photos, match_poses
 from splatseed.sfm.refinement import Refinement, refine
+from splatseed.sfm.work_folder import WorkFolder, resumable_work, work_key
 
 OnPhotos: TypeAlias = Callable[[Sequence[str], Mapping[str, Sequence[str]], str], None]
 _DEFAULT = Settings()
@@ -79,7 +79,7 @@ def reconstruct(
     shared_camera: bool = True,
     poses_from: Scene | None = None,
     refine_poses: bool = False,
-    held_out: Collection[str] = (),
+    test_names: Collection[str] = (),
     masks: Masks | None = None,
     partial: bool = False,
     keep: bool = True,
@@ -108,12 +108,12 @@ def reconstruct(
         refine_poses: Refine these poses, if they are off by a few degrees or per cent of the
             cameras' extent, as those of phones and SLAM are. They stay exactly as given where
             refinement would lower the mean reprojection error by less than 0.1 px.
-        held_out: Photographs of known pose, by name, that have no part in the points and are not in
-            the scene, but are refined with the others: those of a test, say.
+        test_names: Posed photographs, by name, whose poses are refined with the others but which
+            neither contribute points nor appear in the scene, such as test views.
         masks: Where no features are looked for; the scene gets them, undistorted.
         partial: Accept a model of fewer than half of the photographs.
         keep: Keep features, matches and models in ``OUTPUT_sfm`` if this fails, and go on from
-            those that an earlier call left there (``sfm.kept``).
+            those that an earlier call left there (``sfm.work_folder``).
         overwrite: Replace ``output`` if it exists.
         on_progress: Called with the stage and the fraction done.
         on_photos: Called before work begins with the photographs' names, with those of other
@@ -144,8 +144,8 @@ def reconstruct(
         lenses = _lenses(cameras, camera_model, poses)
         matching = (settings.matcher, settings.seed)
         key = work_key(photos, lenses, masks, settings.max_image_size, matching)
-        asked = camera_model, poses, refine_poses, held_out, masks, partial
-        with kept_work(Path(output), key, on_note) if keep else nullcontext() as kept:
+        asked = camera_model, poses, refine_poses, test_names, masks, partial
+        with resumable_work(Path(output), key, on_note) if keep else nullcontext() as kept:
             how = (images, staging, settings, on_progress, kept, _reconstruct)
             report = _call(*how, list(photos), cameras, *asked)
         if poses_from is not None:
@@ -182,7 +182,7 @@ def _reconstruct(
     camera_model: str,
     poses: Sequence[Image] | None,
     refine_poses: bool,
-    held_out: Collection[str],
+    test_names: Collection[str],
     masks: Masks | None,
     partial: bool,
 ) -> SfmReport:
@@ -195,7 +195,7 @@ def _reconstruct(
         colmap.match_photographs(run, colmap.posed_model(run.pycolmap, poses), masks)
         if refine_poses:
             poses, refinement = refine(run, poses)
-        model_dir = colmap.triangulate_points(run, poses, held_out)
+        model_dir = colmap.triangulate_points(run, poses, test_names)
     _export(run, model_dir, staging, masks)
     report = _report(run, staging, names)
     return replace(report, refinement=refinement, poses=tuple(poses or ()))
@@ -277,7 +277,7 @@ def refined(
             *(folder, Path(name) / "scene", Settings(seed=seed)),
             poses_from=scene,
             refine_poses=True,
-            held_out=frozenset(image.name for image in test),
+            test_names=frozenset(image.name for image in test),
             masks=scene.masks,
             keep=False,
             on_progress=progress,
@@ -326,7 +326,7 @@ def _call(
     staging: Path,
     settings: Settings,
     progress: Progress,
-    kept: Kept | None,
+    kept: WorkFolder | None,
     job: Job,
     *arguments: Any,
 ) -> SfmReport:
@@ -351,7 +351,7 @@ def _work(
     images: Path,
     staging: Path,
     settings: Settings,
-    kept: Kept | None,
+    kept: WorkFolder | None,
     job: Job,
     arguments: Sequence[Any],
     progress: Progress,

@@ -39,13 +39,13 @@ STILL = 0.1
 """Poses are at rest when a round turns every camera by less than this, in px of its image."""
 FIRST_NOISE = 0.03
 """Standard deviation of given positions that is assumed first, of the cameras' spread."""
-LEAST_NOISE, LEAST_ERROR = 1e-4, 0.05
+MIN_NOISE, MIN_ERROR = 1e-4, 0.05
 """The smallest that is believed, and the smallest reprojection error, px."""
 GAIN = 0.1
 """Given poses are kept when refinement lowers the mean reprojection error by less, in px."""
-LEAST_POINTS = 10
+MIN_POINTS = 10
 """A photograph that sees fewer points takes no part: they pin its pose down too loosely."""
-LEAST_KEPT = 0.95
+MIN_KEPT = 0.95
 """Observations that refined poses fit, of those that fit before: a few wrong ones always go."""
 MAX_TURN, MAX_SHIFT = 10.0, 0.5
 """A camera that turned by more degrees has drifted, as devices err by one or two; likewise one that
@@ -166,7 +166,7 @@ def refine(run: Run, given: Sequence[Image]) -> tuple[list[Image], Refinement]:
     names = np.array([image.name for image in given])
     if not _enough(after.seeing):
         raise _refused(
-            f"at least half of the {len(names)} posed images to see {LEAST_POINTS} points or more, "
+            f"at least half of the {len(names)} posed images to see {MIN_POINTS} points or more, "
             "so that their poses can be refined",
             f"{after.seeing.sum()}; too few in {name_some(names[~after.seeing].tolist())}",
         )
@@ -175,7 +175,7 @@ def refine(run: Run, given: Sequence[Image]) -> tuple[list[Image], Refinement]:
     lost = names[strict.seeing & ~after.seeing].tolist()
     if (
         after.seeing.sum() < strict.seeing.sum()
-        or after.observations < LEAST_KEPT * strict.observations
+        or after.observations < MIN_KEPT * strict.observations
     ):
         raise _refused(
             f"refined poses to fit the {strict.seeing.sum()} images and {strict.observations:,} "
@@ -251,8 +251,8 @@ class _Solver:
                 break
             old, poses = poses, self._aligned(fit.seeing)
             # A little too large on purpose: a prior too tight would prove itself right
-            noise = max(float(np.median(shifts(poses, self._given))), LEAST_NOISE * size)
-            noise /= max(fit.error, LEAST_ERROR)  # adjustment takes features' noise for 1 px
+            noise = max(float(np.median(shifts(poses, self._given))), MIN_NOISE * size)
+            noise /= max(fit.error, MIN_ERROR)  # adjustment takes features' noise for 1 px
             self.rounds += 1
             if pixels == FINE[-1] and np.radians(turns(poses, old).max()) * self._focal < STILL:
                 break
@@ -341,7 +341,7 @@ class _Solver:
         self._model.update_point_3d_errors()
         points = self._model.num_points3D()
         return _Fit(
-            np.array([self._model.image(i).num_points3D >= LEAST_POINTS for i in self._ids]),
+            np.array([self._model.image(i).num_points3D >= MIN_POINTS for i in self._ids]),
             self._model.compute_num_observations(),
             float(self._model.compute_mean_reprojection_error()) if points else math.inf,
         )

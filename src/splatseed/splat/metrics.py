@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from torch.nn.functional import conv2d, conv_transpose2d, pad
 
 from splatseed.errors import MissingDependencyError, SceneNotFoundError
-from splatseed.io.files import guarded, odd_kind
+from splatseed.io.files import special_kind, translate_errors
 from splatseed.requirements import require
 from splatseed.splat.ssim import C1, C2, WINDOW, l1_and_ssim, window_weights
 
@@ -248,7 +248,9 @@ def load_lpips(weights: Path | None = None) -> Lpips:
                 before = channels
             layers.append(nn.MaxPool2d(2))
     features = nn.Sequential(*layers)
-    with guarded(path, f"the weights of {LPIPS_NET} for LPIPS", fix="Download the file again."):
+    with translate_errors(
+        path, f"the weights of {LPIPS_NET} for LPIPS", fix="Download the file again."
+    ):
         named = [(name.partition("."), value) for name, value in _read(path).items()]
         own = {name: value.float() for (part, _, name), value in named if part == "features"}
         features.load_state_dict(own, assign=True)
@@ -274,7 +276,9 @@ def _weights_path(given: Path | None) -> Path:
         place = f"{folder}, or a folder" if given is None else "a folder"
         raise SceneNotFoundError(
             f"the weights for LPIPS, {path.name}",
-            found="none" if given is None else f"{odd_kind(given) or 'no such file'} at {given}",
+            found="none"
+            if given is None
+            else f"{special_kind(given) or 'no such file'} at {given}",
             fix=f"Download {_URL}{path.name}, put it into {place}; pass its path as "
             "`lpips_weights`.",
         )

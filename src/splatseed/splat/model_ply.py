@@ -20,7 +20,7 @@ from jaxtyping import Float32
 from numpy.lib.recfunctions import structured_to_unstructured
 
 from splatseed.errors import SceneFormatError
-from splatseed.io.files import ByteReader, guarded
+from splatseed.io.files import ByteReader, translate_errors
 from splatseed.io.ply import EXPORT_PLY_AGAIN, Element, Header, parse_header
 from splatseed.progress import Note, silent_note
 from splatseed.splat.gaussians import SH_C0, Gaussians
@@ -173,7 +173,7 @@ def _ascii_rows(reader: ByteReader, skipped: int, element: Element) -> np.ndarra
     """The vertices of an ascii file, after some lines of other elements."""
     # What is not a byte is kept as float64, whatever is declared: a float32 as text is exact there.
     dtype = np.dtype([(n, kind if kind == "u1" else "f8") for n, kind in element.types.items()])
-    with guarded(reader.path, "rows of numbers after its header", fix=EXPORT_PLY_AGAIN):
+    with translate_errors(reader.path, "rows of numbers after its header", fix=EXPORT_PLY_AGAIN):
         text = reader.data[reader.offset :].replace(b"nan(ind)", b"nan")  # as Windows writes it
         table = np.loadtxt(
             io.BytesIO(text),

@@ -23,7 +23,7 @@ from jaxtyping import Bool, Float32, Int64, UInt8, UInt32
 from numpy.lib.recfunctions import structured_to_unstructured
 
 from splatseed.errors import ParameterError
-from splatseed.io.files import COPY_AGAIN, ByteReader, guarded, read_bytes
+from splatseed.io.files import COPY_AGAIN, ByteReader, read_bytes, translate_errors
 from splatseed.io.ply import parse_header
 from splatseed.progress import Note, silent_note
 from splatseed.requirements import require
@@ -276,7 +276,7 @@ def decode_compressed_ply(path: Path, _: Note = silent_note) -> Gaussians:
     header = parse_header(path, reader.data)
     reader.offset = header.size
     tables: dict[str, np.ndarray[Any, Any]] = {}
-    with guarded(path, "a whole compressed PLY"):
+    with translate_errors(path, "a whole compressed PLY"):
         for element in header.elements:
             reader.record = f"element {element.name}"
             tables[element.name] = reader.array(header.dtype(element), element.num_rows)
@@ -414,7 +414,7 @@ def _fixed_point(gaussians: Gaussians, note: Note) -> tuple[Gaussians, int]:
 def decode_spz(path: Path, note: Note = silent_note) -> Gaussians:
     """Of any version; 4 needs zstandard."""
     data = read_bytes(path)
-    with guarded(path, "a whole .spz"):
+    with translate_errors(path, "a whole .spz"):
         stream = zlib.decompressobj(wbits=31)
         in_zstd = data.startswith(SPZ_MAGIC)
         header = data if in_zstd else stream.decompress(data, _SPZ_HEADER.size)

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt8
 
 from splatseed.errors import SceneFormatError
-from splatseed.io.files import guarded, read_bytes
+from splatseed.io.files import read_bytes, translate_errors
 from splatseed.progress import Note, Progress, silent, silent_note
 from splatseed.splat import packed
 from splatseed.splat.cleaning import MAX_LOG_SCALE
@@ -144,7 +144,7 @@ def decode(path: Path, _: Note = silent_note) -> Gaussians:
     """The Gaussians in a file, or in the unpacked folder that a ``meta.json`` lies in."""
     from PIL import Image  # noqa: PLC0415  (slow to import)
 
-    with guarded(path, "a whole SOG"):
+    with translate_errors(path, "a whole SOG"):
         content = _opened(path)
         meta = json.loads(content(_META))
         if "means" not in meta:  # of every version; a run's metrics.json has none

@@ -22,7 +22,7 @@ from splatseed.camera import quat_from_rotation
 from splatseed.errors import ParameterError, SceneFormatError
 from splatseed.io.files import read_json
 from splatseed.io.nerfstudio import NERFSTUDIO, similarity_in
-from splatseed.io.origin import offset_beside, place_words, shift_to
+from splatseed.io.origin import find_shift, format_offset, offset_beside
 from splatseed.photos.view import View
 from splatseed.scene import Scene
 from splatseed.similarity import Similarity, fit_similarity, similarity_of
@@ -74,10 +74,10 @@ def around_scene(
 ) -> Gaussians:
     """Gaussians, read from a path, moved to the origin that the scene is worked on around.
 
-    By the offset beside the file, else as ``shift_to`` finds; ``note`` says so where it is guessed.
+    The offset is the one beside the file, else that of ``find_shift``; ``note`` tells a guess.
     """
     recorded = offset_beside(path)
-    shift = shift_to(scene, gaussians.means, recorded, unrecorded=True)
+    shift = find_shift(scene, gaussians.means, recorded, unrecorded=True)
     if not shift.any():
         return gaussians
     if recorded is None:
@@ -86,7 +86,7 @@ def around_scene(
 
 
 def _moved_by(shift: Float64[np.ndarray, " 3"]) -> str:
-    return f"they were moved by {place_words(shift)} to it"
+    return f"they were moved by {format_offset(shift)} to it"
 
 
 def shifted(gaussians: Gaussians, shift: Float64[np.ndarray, " 3"]) -> Gaussians:

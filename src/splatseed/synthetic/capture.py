@@ -23,7 +23,14 @@ from splatseed.io.files import StrPath
 from splatseed.io.staging import output_folder
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Observations, Scene, Tracks
-from splatseed.synthetic.room import BARE, Room, build_room, orbit_cameras, render_views, visible
+from splatseed.synthetic.room import (
+    TEXTURELESS,
+    Room,
+    build_room,
+    orbit_cameras,
+    render_views,
+    visible,
+)
 from splatseed.synthetic.surfaces import Union
 from splatseed.synthetic.tracks import TrackedPoints, track_points
 
@@ -55,7 +62,7 @@ class Capture:
         ``bare`` wall there are no points to upsample, so it would outweigh everything else, and a
         method that scatters points at random would win.
         """
-        surfaces = self.surfaces if bare else self.room.without(BARE)
+        surfaces = self.surfaces if bare else self.room.without(TEXTURELESS)
         batches: list[np.ndarray] = []
         while sum(len(batch) for batch in batches) < num:
             xyz = surfaces.sample(num, rng)

@@ -35,7 +35,7 @@ from splatseed.synthetic.surfaces import (
 )
 from splatseed.synthetic.texture import Mottled, Plain, Texture, Tiles
 
-BARE = "bare wall"
+TEXTURELESS = "bare wall"
 """Name of the surface without texture."""
 
 CORNER = -1.6
@@ -107,7 +107,7 @@ def _walls() -> dict[str, tuple[Surface, Texture]]:
             Rectangle(corner, along_x, up),
             Tiles(brick, (0.26, 9.0, 0.12), _grain(11.0, 2), joint=0.022, seed=2),
         ),
-        BARE: (Rectangle(corner, along_y, up), Plain((0.83, 0.84, 0.82))),
+        TEXTURELESS: (Rectangle(corner, along_y, up), Plain((0.83, 0.84, 0.82))),
     }
 
 

@@ -55,7 +55,7 @@ class RunFolder:
                 fix="See its metrics.json, or pass `overwrite=True` to train again.",
             )
         if resume and self.is_run:
-            staging.check_apart(self.path, protect)
+            staging.check_separate(self.path, protect)
             return
         staging.check_output(
             self.path, kind=KIND, overwrite=overwrite or self.is_run, protect=protect
@@ -82,7 +82,7 @@ class RunFolder:
         # The manifest first: a run that is interrupted here can be replaced.
         files = [self.config, self.checkpoint, self.metrics, self.gaussians, self.curve_csv]
         files += [self.curve_png, *([] if refined is None else [self.scene])]
-        with staging.oserror_as_output_error(self.path):
+        with staging.translate_write_errors(self.path):
             staging.remove(self.path)
         manifest = {"command": KIND, "version": config["splatseed"]}
         write_json(self.path / MANIFEST, {**manifest, "files": [path.name for path in files]})

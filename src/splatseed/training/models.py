@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
-from splatseed.io.files import odd_kind
+from splatseed.io.files import special_kind
 from splatseed.io.load import is_scene
 from splatseed.io.masks import NONE
 from splatseed.text import quoted
@@ -25,7 +25,7 @@ def model_file(path: Path) -> Path:
     for file in (path, folder.gaussians):
         if file.is_file():
             return file
-    found, fix = odd_kind(path) or "nothing there", "Check the path."
+    found, fix = special_kind(path) or "nothing there", "Check the path."
     if folder.is_run:
         found = "a run that has not finished"
         fix = "Finish it: train with the same output and `resume=True`."

@@ -20,7 +20,7 @@ from scipy.interpolate import interp1d
 from scipy.ndimage import gaussian_filter1d
 
 from splatseed.errors import OutputError, ParameterError, SceneFormatError
-from splatseed.io.files import guarded, read_bytes
+from splatseed.io.files import read_bytes, translate_errors
 from splatseed.io.staging import atomic_file
 from splatseed.photos.view import View
 from splatseed.photos.viewpoint import look_at
@@ -142,7 +142,7 @@ def path_of_file(
         SceneNotFoundError: There is no such file.
         SceneFormatError: It is not a camera path.
     """
-    with guarded(
+    with translate_errors(
         path,
         "a camera path as nerfstudio's viewer writes it: camera_path, with camera_to_world and fov",
         fix="Export the path again.",

@@ -12,7 +12,7 @@ from jaxtyping import Float64
 from splatseed.commands.upsample.options import Options
 from splatseed.io.clouds import open_cloud
 from splatseed.io.nerfstudio import read_cloud_transform
-from splatseed.io.origin import shift_to
+from splatseed.io.origin import find_shift
 from splatseed.io.staging import add_files, write_json
 from splatseed.progress import Progress
 from splatseed.runtime.memory import words_of
@@ -66,7 +66,7 @@ def load_cloud(options: Options, scene: Scene, method: Cloud, progress: Progress
     if options.cloud_transform is not None:
         transform = read_cloud_transform(options.cloud_transform, scene)
         transform = transform.then(Similarity(1.0, np.eye(3), -scene.origin))
-    elif not options.align and (shift := shift_to(scene, _sample(files))).any():
+    elif not options.align and (shift := find_shift(scene, _sample(files))).any():
         transform = Similarity(1.0, np.eye(3), shift)
     if options.align:
         from splatseed.seeding.clouds.align import align

@@ -16,7 +16,7 @@ from splatseed.io.clouds import open_cloud
 from splatseed.io.colmap_model import scene_root
 from splatseed.io.load import with_own_depths
 from splatseed.io.masks import with_masks
-from splatseed.io.origin import RECENTER, middle_of_cameras, moved_by, place_words
+from splatseed.io.origin import RECENTER, format_offset, middle_of_cameras, translated
 from splatseed.io.staging import check_output
 from splatseed.methods import Upsampler, configure, number_of_new, planned_size, traits_of
 from splatseed.photos.sight import stray_notes
@@ -58,8 +58,8 @@ def _upsample(options: Options, methods: dict[str, Any]) -> None:
             scene, note = refined(scene, options.seed, clock, test_every=test_every)
             notes.append(note)
         if options.recenter:
-            scene = moved_by(scene, middle_of_cameras(scene))
-            where = f"written around {place_words(scene.offset)}, as {RECENTER} has it."
+            scene = translated(scene, middle_of_cameras(scene))
+            where = f"written around {format_offset(scene.offset)}, as {RECENTER} has it."
             unchanged = "around 0 already: --recenter changes nothing."
             notes.append(f"The scene is {where if scene.offset.any() else unchanged}")
         if options.method == DEFAULT_METHOD:  # it needs photographs

@@ -13,8 +13,8 @@ from pathlib import Path
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io.cloud_file import CloudChunk, CloudFile
-from splatseed.io.files import StrPath, readable
-from splatseed.io.ply import refuse_model
+from splatseed.io.files import StrPath, translate_read_errors
+from splatseed.io.ply import refuse_gaussians
 
 __all__ = ["CloudChunk", "CloudFile", "open_cloud"]
 
@@ -43,7 +43,7 @@ def open_cloud(path: StrPath) -> CloudFile:
     path = Path(path)
     if not path.exists():
         raise SceneNotFoundError(f"a cloud at {path}", found="no such file", fix="Check the path.")
-    refuse_model(path)
+    refuse_gaussians(path)
     reader = _READERS.get(path.suffix.lower())
     if reader is None or not path.is_file():
         raise SceneFormatError(
@@ -54,5 +54,5 @@ def open_cloud(path: StrPath) -> CloudFile:
     module, _, name = reader.partition(":")
     # Readers load with their use: each needs packages that others do without.
     opened: Callable[[Path], CloudFile] = getattr(import_module(module), name)
-    with readable(path):
+    with translate_read_errors(path):
         return opened(path)

@@ -1,11 +1,11 @@
-"""Point maps that networks export: NPZ archives of DUSt3R, MASt3R, VGGT and their kin, and GLB.
+"""Point maps that networks export: NPZ archives of DUSt3R, MASt3R, VGGT and similar, and GLB.
 
-NPZ: positions are the first of ``POSITIONS`` that is there, of shape [..., 3]; colours the first of
-``COLORS`` with as many values, which may hold channels before rows and columns; ``MASKS`` say which
-points count, and of ``CONFIDENCES`` those below ``LEAST`` are left out. GLB (binary glTF): where
-some primitives are points, only those are read, as exporters draw cameras as triangles beside them;
-else the vertices of all meshes. (trimesh reads a GLB whole, and takes vertices that it cannot
-decompress for zeros: here they are refused.)
+NPZ: positions are the first array of ``POSITIONS`` found, of shape [..., 3]; colours the first of
+``COLORS`` of the same size, with channels last or before rows and columns. ``MASKS`` select points;
+points whose ``CONFIDENCES`` are below ``MIN_CONFIDENCE`` are dropped. GLB (binary glTF): if any
+primitive is of points, only those are read, since exporters draw cameras as triangles beside them;
+otherwise the vertices of all meshes. (trimesh loads the whole file into memory, and turns vertices
+that it cannot decompress into zeros; here they are refused.)
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from jaxtyping import Float64
 
 from splatseed.camera import rotation_from_quat
 from splatseed.errors import SceneFormatError
-from splatseed.io.cloud_file import RGB, XYZ, Block, CloudFile, RowCloud, color_bytes
-from splatseed.io.files import guarded, open_file, read_npy, read_npy_header
+from splatseed.io.cloud_file import RGB, XYZ, Block, CloudFile, RowCloud, to_uint8
+from splatseed.io.files import open_file, read_npy, read_npy_header, translate_errors
 from splatseed.runtime.memory import check_memory
 
 POSITIONS = ("world_points", "pts3d", "points3d", "points", "xyz", "point_map", "pointmap")
 COLORS = ("rgb", "colors", "colours", "color", "images", "imgs", "image", "rgb_img")
 MASKS = ("mask", "masks", "valid", "valid_mask")
 CONFIDENCES = ("world_points_conf", "conf", "confs", "confidence")
-LEAST = 1.5
+MIN_CONFIDENCE = 1.5
 """Least confidence that counts: these networks give 1 where they know nothing, and 3 to 30 on
 surfaces."""
 _FEWER = "Save fewer views in one archive, or the points as a binary PLY, which is read in parts."
@@ -42,8 +42,8 @@ _GLTF = (b"glTF", 2, 0x4E4F534A)
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"VEC3": 3, "VEC4": 4}
 _POINTS, _TRIANGLES = 0, 4
-_WHOLE_NPZ = "an archive of NumPy arrays"
-_WHOLE_GLB = "a complete .glb file with vertices"
+_NPZ = "an archive of NumPy arrays"
+_GLB = "a complete .glb file with vertices"
 
 
 class NpzCloud(CloudFile):
@@ -51,7 +51,7 @@ class NpzCloud(CloudFile):
 
     def __init__(self, path: Path) -> None:
         shapes: dict[str, tuple[int, ...]] = {}
-        with guarded(path, _WHOLE_NPZ), zipfile.ZipFile(path) as archive:
+        with translate_errors(path, _NPZ), zipfile.ZipFile(path) as archive:
             for name in archive.namelist():
                 with archive.open(name) as file:
                     shape, _, dtype = read_npy_header(file) if name.endswith(".npy") else _NONE
@@ -87,7 +87,7 @@ class NpzCloud(CloudFile):
         if mask is not None:
             valid &= mask[:, 0] != 0
         if confidence is not None:
-            valid &= confidence[:, 0] >= LEAST
+            valid &= confidence[:, 0] >= MIN_CONFIDENCE
         for start in range(0, len(points), size):
             part = slice(start, start + size)
             block = dict(zip(XYZ, points[part][valid[part]].T, strict=True))
@@ -99,7 +99,7 @@ class NpzCloud(CloudFile):
         """The values of an array, a row a point."""
         if name is None:
             return None
-        with guarded(self.path, _WHOLE_NPZ), zipfile.ZipFile(self.path) as archive:
+        with translate_errors(self.path, _NPZ), zipfile.ZipFile(self.path) as archive:
             info = archive.getinfo(f"{name}.npy")
             check_memory(2 * info.file_size, 1, "bytes of arrays", fix=_FEWER)
             with archive.open(info) as file:
@@ -123,7 +123,7 @@ class GlbCloud(CloudFile):
     """A .glb file."""
 
     def __init__(self, path: Path) -> None:
-        with guarded(path, _WHOLE_GLB), open_file(path) as file:
+        with translate_errors(path, _GLB), open_file(path) as file:
             magic, version, _, length, kind = struct.unpack("<4sIIII", file.read(20))
             if (magic, version, kind) != _GLTF or length > path.stat().st_size:
                 raise ValueError("no binary glTF of version 2")
@@ -143,7 +143,7 @@ class GlbCloud(CloudFile):
         return dict.fromkeys(RGB, np.empty(0, np.uint8))  # blocks have bytes
 
     def _blocks(self, size: int) -> Iterator[Block]:
-        with guarded(self.path, _WHOLE_GLB):
+        with translate_errors(self.path, _GLB):
             for part in self._parts:
                 for start in range(0, part.position.num_rows, size):
                     with np.errstate(invalid="ignore", over="ignore"):
@@ -154,7 +154,7 @@ class GlbCloud(CloudFile):
                         values = part.color.rows(start, size)["values"][:, :3]
                         # Integers are normalised to their range, as glTF has them.
                         full = 1 if values.dtype.kind == "f" else np.iinfo(values.dtype).max
-                        block |= zip(RGB, color_bytes(values, full).T, strict=True)
+                        block |= zip(RGB, to_uint8(values, full).T, strict=True)
                     yield block
 
 

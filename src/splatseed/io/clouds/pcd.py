@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from splatseed.io.cloud_file import PACKED, XYZ, Block, CloudFile, LineCloud, RowCloud
+from splatseed.io.cloud_file import PACKED_RGB, XYZ, Block, CloudFile, LineCloud, RowCloud
 from splatseed.io.clouds._kernels import decompress_lzf
-from splatseed.io.files import guarded, open_file
+from splatseed.io.files import open_file, translate_errors
 from splatseed.runtime.memory import check_memory
 
 _HEADER_BYTES = 1 << 16
@@ -26,7 +26,7 @@ _KINDS = {"F": "f", "I": "i", "U": "u"}
 
 def open_pcd(path: Path) -> CloudFile:
     """Open a PCD file."""
-    with guarded(path, "a PCD: FIELDS, SIZE, TYPE, POINTS, DATA"), open_file(path) as file:
+    with translate_errors(path, "a PCD: FIELDS, SIZE, TYPE, POINTS, DATA"), open_file(path) as file:
         dtype, rows, body, offset = _parse_header(file.read(_HEADER_BYTES))
     if body == "binary":
         return RowCloud(path, dtype, offset, rows)
@@ -34,7 +34,7 @@ def open_pcd(path: Path) -> CloudFile:
         return _ColumnCloud(path, _decompressed(path, dtype, rows, offset), rows)
     fields = [(name, int(np.prod(dtype[name].shape, dtype=int))) for name in dtype.names or ()]
     names = [name if i == 0 else f"{name} {i}" for name, count in fields for i in range(count)]
-    types = {PACKED: dtype[PACKED]} if PACKED in names else {}
+    types = {PACKED_RGB: dtype[PACKED_RGB]} if PACKED_RGB in names else {}
     return LineCloud(path, names, offset, rows, types=types)
 
 
@@ -67,7 +67,9 @@ def _parse_header(data: bytes) -> tuple[np.dtype[Any], int, str, int]:
     packed = next((name for name in ("rgb", "rgba") if name in names), None)
     fields: list[Any] = []
     for i, (name, kind, size, count) in enumerate(zip(names, kinds, sizes, counts, strict=True)):
-        known_as = f"pad {i}" if name == "_" else PACKED if (name, size) == (packed, "4") else name
+        known_as = (
+            f"pad {i}" if name == "_" else PACKED_RGB if (name, size) == (packed, "4") else name
+        )
         shape = () if count == 1 else (count,)
         fields.append(
             (f"{known_as}[]" if shape else known_as, f"<{_KINDS[kind]}{int(size)}", shape)
@@ -90,7 +92,7 @@ def _decompressed(
     fix = "Save the cloud as a binary PCD or PLY, which is read in parts."
     # It is in memory packed and unpacked.
     check_memory(2 * needed, 1, "bytes of a compressed PCD", fix=fix)
-    with guarded(path, "a PCD compressed by LZF"), open_file(path) as file:
+    with translate_errors(path, "a PCD compressed by LZF"), open_file(path) as file:
         file.seek(offset)
         size, promised = struct.unpack("<II", file.read(8))
         packed = file.read(min(size, path.stat().st_size))

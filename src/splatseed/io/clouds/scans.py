@@ -20,13 +20,13 @@ import numpy as np
 
 from splatseed.io import cloud_file
 from splatseed.io.cloud_file import RGB, XYZ, Block, CloudFile
-from splatseed.io.files import guarded
+from splatseed.io.files import translate_errors
 from splatseed.requirements import require
 
 _WHERE_POINTS, _RECORD = 96, 54
 """Where a header has the offset of the points, followed by the number of variable length records;
 bytes of each of these, at least."""
-_MOST_BYTES = 1 << 30
+_MAX_BYTES = 1 << 30
 """Of a chunk of points, unpacked; writers use 50,000 points, of 20 to some 100 bytes."""
 _SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 _PLACES = (("cartesianX", "cartesianY", "cartesianZ"), _SPHERICAL)
@@ -80,7 +80,7 @@ def _opened_las(path: Path) -> Iterator[Any]:
     """A laspy reader; what it raises becomes one of our errors."""
     import laspy  # noqa: PLC0415  (an optional package)
 
-    with guarded(path, "a complete LAS or LAZ file"):
+    with translate_errors(path, "a complete LAS or LAZ file"):
         # laspy makes room for all that a header promises in front of the points, whatever the
         # file's size. Source: LAS 1.4 R15, tables 3 and 7.
         size = path.stat().st_size
@@ -95,7 +95,7 @@ def _opened_las(path: Path) -> Iterator[Any]:
                 _check_chunks(path, header)
             else:
                 bodies = header.point_count * header.point_format.size
-                cloud_file.check_size(path, header.offset_to_point_data + bodies)
+                cloud_file.check_min_size(path, header.offset_to_point_data + bodies)
             yield reader
 
 
@@ -121,7 +121,7 @@ def _check_chunks(path: Path, header: Any) -> None:
         chunks = np.array(lazrs.read_chunk_table(file, vlr), np.float64).reshape(number, 2)
     points, packed = chunks.sum(axis=0)
     most = chunks[:, 0].max() * bytes_each
-    if packed > size or points < header.point_count or most > _MOST_BYTES:
+    if packed > size or points < header.point_count or most > _MAX_BYTES:
         found = f"chunks of {points:,.0f} points in {packed:,.0f} bytes"
         raise ValueError(f"{found}, for {header.point_count:,} points in {size:,} bytes")
 
@@ -171,7 +171,7 @@ def _opened_e57(path: Path) -> Iterator[tuple[Any, list[Any]]]:
     """An open file and the headers of its scans; failures become one of our errors."""
     from pye57 import ScanHeader, libe57  # noqa: PLC0415  (an optional package)
 
-    with guarded(path, "a complete E57 file"):
+    with translate_errors(path, "a complete E57 file"):
         image = libe57.ImageFile(str(path), "r")  # pye57.E57 removes files that it fails to open
         try:
             scans = image.root()["data3D"]

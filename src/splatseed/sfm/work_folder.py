@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from splatseed.camera import Intrinsics
-from splatseed.io.staging import MANIFEST, held, read_manifest, remove, write_json
+from splatseed.io.staging import MANIFEST, locked, read_manifest, remove, write_json
 from splatseed.runtime.fingerprint import fingerprint
 from splatseed.scene import Masks
 from splatseed.sfm.cameras import Photos
@@ -24,7 +24,7 @@ KIND = "sfm work"
 DATABASE, MODELS = "database.db", "models"
 
 
-class Kept(NamedTuple):
+class WorkFolder(NamedTuple):
     """The folder of such work, and whether its matches are of other settings."""
 
     folder: Path
@@ -65,9 +65,9 @@ def _digest(facts: Sequence[object]) -> str:
 
 
 @contextmanager
-def kept_work(
+def resumable_work(
     output: Path, key: Mapping[str, str], on_note: Callable[[str], None]
-) -> Iterator[Kept | None]:
+) -> Iterator[WorkFolder | None]:
     """The folder for the work of an output; it stays if the block fails after work began.
 
     None where something else has its name, or another run holds it.
@@ -80,13 +80,13 @@ def kept_work(
     with ExitStack() as stack:
         folder.mkdir(exist_ok=True)
         try:
-            stack.enter_context(held(folder))
+            stack.enter_context(locked(folder))
         except OSError:
             yield None
             return
         stale = _prepare(folder, key, lambda text: on_note(text.format(quoted(folder))))
         try:
-            yield Kept(folder, stale)
+            yield WorkFolder(folder, stale)
         except BaseException as error:
             if not (folder / DATABASE).exists():
                 remove(folder)

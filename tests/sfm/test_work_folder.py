@@ -6,10 +6,10 @@ import pytest
 
 pytest.importorskip("pycolmap", reason="needs pycolmap")
 
-from splatseed.io.staging import held
+from splatseed.io.staging import locked
 from splatseed.scene import Masks
 from splatseed.sfm.cameras import Photo
-from splatseed.sfm.kept import kept_work, work_key
+from splatseed.sfm.work_folder import resumable_work, work_key
 
 PHOTOS = {name: Photo((40, 30), digest=name) for name in ("a.jpg", "b.jpg", "c.jpg")}
 
@@ -26,7 +26,7 @@ def fail(output, key):
     notes = []
     with (  # noqa: PT012  (what the block does is the run)
         pytest.raises(KeyboardInterrupt),
-        kept_work(output, key, notes.append) as kept,
+        resumable_work(output, key, notes.append) as kept,
     ):
         found = (kept.folder / "models" / "0").is_dir()
         stale = kept.stale_matches, (kept.folder / "database.db").exists()
@@ -44,7 +44,7 @@ def test_the_same_run_goes_on_and_success_removes_what_was_kept(tmp_path):
     assert len(notes) == 1
     assert notes[0].startswith("Goes on")
     assert str(tmp_path / "out_sfm") in notes[0]
-    with kept_work(tmp_path / "out", key(), notes.append):
+    with resumable_work(tmp_path / "out", key(), notes.append):
         pass
     assert not list(tmp_path.iterdir())
 
@@ -80,14 +80,14 @@ def test_other_photographs_masks_or_cameras_begin_anew(other, tmp_path):
 
 
 def test_nothing_is_kept_before_work_began_or_where_it_is_not_ours(tmp_path):
-    with pytest.raises(KeyboardInterrupt), kept_work(tmp_path / "out", key(), print):
+    with pytest.raises(KeyboardInterrupt), resumable_work(tmp_path / "out", key(), print):
         raise KeyboardInterrupt
     assert not list(tmp_path.iterdir())
     (tmp_path / "out_sfm").mkdir()
     (tmp_path / "out_sfm" / "mine.txt").touch()
-    with kept_work(tmp_path / "out", key(), print) as kept:
+    with resumable_work(tmp_path / "out", key(), print) as kept:
         assert kept is None
     assert (tmp_path / "out_sfm" / "mine.txt").exists()
     fail(tmp_path / "other", key())
-    with held(tmp_path / "other_sfm"), kept_work(tmp_path / "other", key(), print) as kept:
+    with locked(tmp_path / "other_sfm"), resumable_work(tmp_path / "other", key(), print) as kept:
         assert kept is None  # another run works there
