@@ -12,6 +12,26 @@ from splatseed.synthetic import make_capture, write_capture
 from splatseed.training.settings import TrainSettings
 
 
+class InProcess:
+    """``Workers`` that run tasks in this process, which spares them the import of PyTorch."""
+
+    jobs, retries = 1, 0
+
+    def call(self, function, arguments, progress):
+        return function(*arguments, **({} if progress is None else {"progress": progress}))
+
+    def stop(self):
+        pass
+
+    kill = stop
+
+
+@pytest.fixture
+def in_process():
+    """``InProcess`` workers."""
+    return InProcess()
+
+
 @pytest.fixture(scope="session")
 def room_path(tmp_path_factory):
     """A COLMAP scene of 9 views of 64 x 48 with depth maps, not to be written to."""

@@ -24,7 +24,6 @@ from splatseed.bench.runs import begin, read_calls, read_runs
 from splatseed.bench.scenes import DEMO, PlannedScene, survey
 from splatseed.commands import bench as command
 from splatseed.io import load_scene
-from splatseed.runtime.tasks import HereTasks
 from splatseed.synthetic import make_capture
 
 PAPER_PLAN = Path(__file__).parents[2] / "benchmarks" / "paper" / "small.toml"
@@ -51,9 +50,9 @@ def bench(splatseed):
 
 
 @pytest.fixture
-def here(monkeypatch):
-    """Runs that need no process, nor its import of PyTorch, are done in this one."""
-    monkeypatch.setattr(command, "ProcessTasks", lambda *_, **__: HereTasks())
+def here(monkeypatch, in_process):
+    """Runs take place in this process, which spares the import of PyTorch."""
+    monkeypatch.setattr(command, "ProcessWorkers", lambda _: in_process)
 
 
 def test_runs_everything_once_and_a_failed_run_ends_nothing_else(here, bench, plan_path, tmp_path):

@@ -21,7 +21,6 @@ from splatseed.cli import main
 from splatseed.errors import ParameterError, SceneNotFoundError
 from splatseed.io import load_scene
 from splatseed.io.ply import write_ply
-from splatseed.runtime.tasks import HereTasks
 from splatseed.splat.covisible import read_covisible
 from splatseed.synthetic import make_capture
 from splatseed.training.seeds import seeds_digest
@@ -139,36 +138,40 @@ def test_points_of_photographs_are_made_once_for_all_budgets(
     assert later > 0.3 * seconds
 
 
-def test_a_scene_that_has_changed_fails_its_run_alone_and_is_recorded(specs, own_room, tmp_path):
+def test_a_scene_that_has_changed_fails_its_run_alone_and_is_recorded(
+    specs, own_room, tmp_path, in_process
+):
     broken = _moved(specs["sfm"], path=str(own_room))
     photograph = next((own_room / "images").iterdir())
     photograph.write_bytes(photograph.read_bytes() + b"\0")
     todo = [broken, specs["linear"]]
-    failed, done = do_runs(tmp_path, todo, HereTasks(), JobOptions())
+    failed, done = do_runs(tmp_path, todo, in_process, JobOptions())
     assert "as they were when the benchmark was planned" in failed.error
     assert "\n" not in failed.error
     assert done.result is not None
     assert read_run(tmp_path, broken) == failed
     error = json.loads((run_folder(tmp_path, broken) / "error.json").read_text())
     assert "open_unchanged" in error["traceback"]
-    (done,) = do_runs(tmp_path, [specs["sfm"]], HereTasks(), JobOptions())
+    (done,) = do_runs(tmp_path, [specs["sfm"]], in_process, JobOptions())
     assert read_run(tmp_path, broken).result == done.result  # which takes the error's place
 
 
-def test_files_of_the_users_are_left_alone(specs, tmp_path):
+def test_files_of_the_users_are_left_alone(specs, tmp_path, in_process):
     mine = run_folder(tmp_path, specs["sfm"]) / "thesis.txt"
     mine.parent.mkdir(parents=True)
     mine.write_text("keep")
-    (failed,) = do_runs(tmp_path, [specs["sfm"]], HereTasks(), JobOptions())
+    (failed,) = do_runs(tmp_path, [specs["sfm"]], in_process, JobOptions())
     assert mine.parent.name in failed.error
     assert [path.name for path in mine.parent.iterdir()] == ["thesis.txt"]
 
 
-def test_a_run_elsewhere_comes_back_as_files_and_leaves_nothing(specs, tmp_path, monkeypatch):
+def test_a_run_elsewhere_comes_back_as_files_and_leaves_nothing(
+    specs, tmp_path, monkeypatch, in_process
+):
     nodes = tmp_path / "nodes"
     nodes.mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(nodes))
-    (run,) = do_runs(tmp_path, [specs["sfm"]], HereTasks(), JobOptions(), away=True)
+    (run,) = do_runs(tmp_path, [specs["sfm"]], in_process, JobOptions(), away=True)
     assert read_run(tmp_path, specs["sfm"]) == run
     assert list(nodes.iterdir()) == []
     far = _moved(specs["sfm"], path="elsewhere/room")

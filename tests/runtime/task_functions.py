@@ -1,10 +1,11 @@
-"""What children call in ``test_tasks``; that they import it costs no PyTest."""
+"""Functions that children call in ``test_tasks``; they do not import pytest."""
 
 from __future__ import annotations
 
 import os
 import signal
 import time
+from importlib import import_module
 
 from splatseed.errors import OutputError, ParameterError
 from splatseed.progress import silent
@@ -44,3 +45,7 @@ def raise_unpicklable():
     error = OutputError("a", found="b", fix="c")
     error.fix = lambda: None
     raise error
+
+
+def import_all(names):
+    return [import_module(name) for name in names] and import_module("splatseed").__file__

@@ -11,7 +11,8 @@ import pytest
 pytest.importorskip("ray", reason="Ray is an extra: pip install -e '.[cluster]'")
 
 from splatseed.errors import ParameterError
-from splatseed.runtime.ray_tasks import RayTasks, ray_cluster
+from splatseed.runtime.ray_tasks import RayWorkers, ray_cluster
+from splatseed.runtime.tasks import run_tasks
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1:{}", "ray://127.0.0.1:{}", "127.0.0.1:{}0000"])
@@ -50,12 +51,12 @@ def test_workers_import_nothing_of_the_working_directory(tmp_path, monkeypatch):
         return callable(splatseed.upsample)
 
     with ray_cluster(None):
-        tasks = RayTasks(1, jobs=1)
-        assert [each.value for each in tasks.run(task, [()])] == [True]
+        workers = RayWorkers(1, limit=1)
+        assert [each.value for each in run_tasks(workers, task, [()])] == [True]
         assert not mark.exists()
         monkeypatch.syspath_prepend(tmp_path / "unknown")
         function = importlib.import_module("elsewhere").task
-        (result,) = tasks.run(function, [()])
+        (result,) = run_tasks(RayWorkers(1, limit=1), function, [()])
         assert isinstance(result.error, ParameterError)
         assert "splatseed on every node" in str(result.error)
         assert "'elsewhere'" in str(result.error)

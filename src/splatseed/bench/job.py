@@ -42,7 +42,7 @@ from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.runtime.compilation import watched
 from splatseed.runtime.memory import peak_bytes
-from splatseed.runtime.tasks import Report, Tasks
+from splatseed.runtime.tasks import Report, Workers, run_tasks
 from splatseed.scene import Scene
 from splatseed.scores import EvalResult
 from splatseed.seeding.advice import DEFAULT_METHOD
@@ -69,14 +69,14 @@ class JobOptions:
 def do_runs(
     bench: Path,
     specs: Sequence[RunSpec],
-    tasks: Tasks,
+    workers: Workers,
     options: JobOptions,
     away: bool = False,
     report: Report | None = None,
 ) -> Iterator[Run]:
     """Carry out unfinished runs; gives each as it ends. A failure is recorded, and ends no other.
 
-    ``away`` is whether ``tasks`` run elsewhere, so that folders come back as bytes; ``report`` is
+    ``away`` is whether ``workers`` are elsewhere, so that folders come back as bytes; ``report`` is
     told how far each is, by its place in ``specs``.
 
     Raises:
@@ -86,7 +86,7 @@ def do_runs(
     function = run_away if away else run_job
     calls = [(spec, options) if away else (spec, options, bench) for spec in specs]
     try:
-        for ended in tasks.run(function, calls, report):
+        for ended in run_tasks(workers, function, calls, report):
             spec, value = specs[ended.index], ended.value
             if ended.error is not None:
                 yield Run(spec, error=_keep_error(bench, spec, ended.error))

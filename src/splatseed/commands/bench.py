@@ -38,7 +38,7 @@ from splatseed.methods import Profile
 from splatseed.requirements import require
 from splatseed.runtime.interruption import exit_code
 from splatseed.runtime.memory import check_memory
-from splatseed.runtime.tasks import ProcessTasks, Tasks, cores, slot_environment
+from splatseed.runtime.tasks import ProcessWorkers, Workers, available_cpus, worker_env
 from splatseed.text import counted, did_you_mean, quoted, visible
 from splatseed.training.settings import BYTES_EACH, Backend, StrategyName
 
@@ -226,13 +226,13 @@ def _scenes(plan: Plan, options: Options) -> list[PlannedScene]:
 class Machine:
     """Where runs are carried out: how many ``jobs`` at a time, of so many threads on the CPU each.
 
-    ``backend`` is not "auto"; ``away`` is whether ``tasks`` are carried out on other machines.
+    ``backend`` is not "auto"; ``away`` is whether ``workers`` are other machines.
     """
 
     backend: Backend
     jobs: int
     threads: int
-    tasks: Tasks
+    workers: Workers
     away: bool = False
 
     @property
@@ -250,12 +250,13 @@ def open_machine(options: Options, backend: Backend) -> Iterator[Machine]:
     if options.executor == "local":
         yield _local_machine(options.jobs, backend)
         return
-    from splatseed.runtime.ray_tasks import RayTasks, ray_cluster
+    from splatseed.runtime.ray_tasks import RayWorkers, ray_cluster
 
     with ray_cluster(options.address):
-        tasks = RayTasks(gpu=None if backend == "auto" else backend == "cuda", jobs=options.jobs)
-        on_gpu: Backend = "cuda" if tasks.gpu else "cpu"
-        yield Machine(on_gpu, tasks.jobs, tasks.threads, tasks, away=True)
+        gpu = None if backend == "auto" else backend == "cuda"
+        workers = RayWorkers(gpu=gpu, limit=options.jobs)
+        chosen: Backend = "cuda" if workers.gpu else "cpu"
+        yield Machine(chosen, workers.jobs, workers.threads, workers, away=True)
 
 
 def _local_machine(jobs: int | None, backend: Backend) -> Machine:
@@ -273,9 +274,9 @@ def _local_machine(jobs: int | None, backend: Backend) -> Machine:
         named = [each for each in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if each]
         gpus = named or [f"{i}" for i in range(torch.cuda.device_count())]
     jobs = jobs or len(gpus)
-    threads = max(1, cores() // jobs)
-    slots = [slot_environment(threads, gpus[slot % len(gpus)]) for slot in range(jobs)]
-    return Machine(chosen, jobs, threads, ProcessTasks(slots, fresh=True))
+    threads = max(1, available_cpus() // jobs)
+    slots = [worker_env(threads, gpus[slot % len(gpus)]) for slot in range(jobs)]
+    return Machine(chosen, jobs, threads, ProcessWorkers(slots))
 
 
 def _prepare(
@@ -415,7 +416,7 @@ def carry_out(bench: Path, runs: Sequence[Run], machine: Machine, options: JobOp
             tasks[key] = bar.add_task(label, total=1.0)
         bar.update(tasks[key], completed=fraction, description=label)
 
-    ended = do_runs(bench, left, machine.tasks, options, machine.away, report)
+    ended = do_runs(bench, left, machine.workers, options, machine.away, report)
     try:
         with bar:
             for number, run in enumerate(ended, start=before + 1):

@@ -38,8 +38,8 @@ from splatseed.io.staging import add_files, atomic_file, output_folder, read_man
 from splatseed.methods import METHODS, chooses_number, configure, methods_for
 from splatseed.pointcloud import PointCloud
 from splatseed.requirements import require
+from splatseed.runtime.child import Child
 from splatseed.runtime.compilation import watched
-from splatseed.runtime.tasks import Child
 from splatseed.scene import Scene
 from splatseed.seeding.upsampling import upsample
 from splatseed.text import quoted
@@ -139,13 +139,13 @@ def compiled_ahead(parts: Sequence[str]) -> Iterator[Callable[[], None]]:
     def start(begins: bool) -> None:
         nonlocal child
         if begins and child is None:
-            child = Child(log=Path(os.devnull).open("wb"))  # noqa: SIM115  (the child's to close)
-            child.start(compile_ahead, parts)
+            nowhere = Path(os.devnull).open("wb")  # noqa: SIM115  (the child closes it)
+            child = Child(compile_ahead, parts, log=nowhere)
 
     def finish() -> None:
         with suppress(Exception):  # what it could not do, we shall do, and report
             if child is not None and (TRAINING not in parts or _has_pytorch()):
-                child.wait()
+                child.result()
 
     try:
         with watched(start):

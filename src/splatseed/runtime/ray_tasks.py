@@ -1,8 +1,4 @@
-"""Tasks on the nodes of a Ray cluster, for benchmarks and for clouds in tiles.
-
-Promise: a task whose node or worker is lost is started again on another, up to ``LOSSES`` times;
-Ray is imported only when a cluster is used.
-"""
+"""Run tasks on the nodes of a Ray cluster; Ray is an extra, imported only when it is used."""
 
 from __future__ import annotations
 
@@ -10,30 +6,25 @@ import logging
 import os
 import socket
 import sys
-from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import chdir, contextmanager, suppress
 from typing import Any
 
 from splatseed.errors import ParameterError, TaskLostError
-from splatseed.progress import thread_limit
+from splatseed.progress import Progress, thread_limit
 from splatseed.requirements import require
-from splatseed.runtime.interruption import interruption
-from splatseed.runtime.tasks import Function, Report, Result, Tasks
+from splatseed.runtime.child import Function
 
-LOSSES = 3
-"""How often a task is restarted whose node or worker was lost."""
-POLL_SECONDS = 0.5
 GRACE_SECONDS = 10.0
-"""Seconds for cancelled tasks to end."""
+"""Time for cancelled tasks to end."""
 ANSWER_SECONDS = 5.0
-"""Seconds in which the machine at a cluster's address must answer."""
+"""Timeout of the first connection to a cluster's address."""
 ATTEMPTS = 2
-"""Ray's attempts, 40 s each, to find a cluster where something answers; its own default is 20."""
+"""Ray's attempts, 40 s each, to connect to an address that answers; Ray's default is 20."""
 UNIMPORTED = "remote function failed to import"
-"""What Ray says of a task whose function a worker could not import."""
-MOST_THREADS = 8
-"""Default threads of a task: with more, they wait for each other."""
+"""Ray's message for a task whose function a worker could not import."""
+MAX_THREADS = 8
+"""Maximum default threads of a task; with more, they wait for each other."""
 
 
 @contextmanager
@@ -53,7 +44,7 @@ def ray_cluster(address: str | None) -> Iterator[None]:
         os.environ.setdefault("RAY_NUM_REDIS_GET_RETRIES", str(ATTEMPTS))  # Ray's name is older
     else:
         options["include_dashboard"] = False
-    import ray  # noqa: PLC0415  (an extra, and slow to import)
+    import ray  # noqa: PLC0415  (an extra)
 
     try:
         # Workers import from the directory that Ray is started in, before all else.
@@ -87,84 +78,95 @@ def _no_cluster(address: str | None, found: str) -> ParameterError:
     )
 
 
-class RayTasks(Tasks):
-    """Tasks on the cluster that this process is connected to.
+class RayWorkers:
+    """Tasks on the cluster that this process is connected to; they report no progress.
 
     Args:
-        threads: CPUs of each; left out, as many as let every node work on one for each of its GPUs.
-        gpu: Whether each needs a GPU; None for yes if any node has one.
-        jobs: Most tasks at a time; as many as fit, when left out.
+        threads: CPUs per task; by default as many as leave one task per GPU to every node.
+        gpu: Whether a task needs a GPU; None for yes if any node has one.
+        limit: Maximum tasks at a time; by default as many as fit.
 
     Raises:
-        ParameterError: No node has enough.
+        ParameterError: No node has these resources.
     """
 
+    retries = 3
+
     def __init__(
-        self, threads: int | None = None, *, gpu: bool | None = False, jobs: int | None = None
+        self, threads: int | None = None, *, gpu: bool | None = False, limit: int | None = None
     ) -> None:
         nodes = _nodes()
         self.gpu = any(gpus >= 1 for _, gpus in nodes) if gpu is None else gpu
         fitting = [cpus // max(gpus, 1) for cpus, gpus in nodes if cpus >= 1 and gpus >= self.gpu]
-        self.threads = threads or max(1, min(int(min(fitting, default=1)), MOST_THREADS))
-        self._jobs = jobs
-        if not self._fitting():
+        self.threads = threads or max(1, min(int(min(fitting, default=1)), MAX_THREADS))
+        self._limit = limit
+        self._running = set[Any]()
+        self._stopped = False
+        if not self._capacity():
             raise ParameterError(
                 f"a node of the cluster with {self.threads} CPUs{' and a GPU' * self.gpu}",
-                found=f"{len(fitting)} nodes, none with so much",
-                fix="Pass fewer `threads`, or add nodes.",
+                found=f"{len(fitting)} nodes, none of that size",
+                fix="Add nodes to the cluster.",
             )
-        self.words = f"Ray, {self.jobs} tasks at a time"
 
     @property
     def jobs(self) -> int:
-        """Tasks at a time, on the nodes that are there now."""
-        fitting = max(self._fitting(), 1)
-        return min(self._jobs or fitting, fitting)
+        """See ``Workers``; nodes may join or leave the cluster."""
+        capacity = max(self._capacity(), 1)
+        return min(self._limit or capacity, capacity)
 
-    def _fitting(self) -> int:
-        most = [(cpus // self.threads, gpus if self.gpu else cpus) for cpus, gpus in _nodes()]
-        return sum(int(min(each)) for each in most)
+    def _capacity(self) -> int:
+        """The number of tasks for which the nodes have CPUs and GPUs."""
+        fitting = [(cpus // self.threads, gpus if self.gpu else cpus) for cpus, gpus in _nodes()]
+        return sum(int(min(node)) for node in fitting)
 
-    def run(
-        self, function: Function, calls: Sequence[tuple[Any, ...]], report: Report | None = None
-    ) -> Iterator[Result]:
-        """See ``Tasks``; the function is given no ``progress``."""
-        import ray  # noqa: PLC0415  (an extra, and slow to import)
+    def call(self, function: Function, arguments: Sequence[Any], _: Progress | None) -> Any:
+        """See ``Workers``."""
+        import ray  # noqa: PLC0415  (an extra)
 
-        task = ray.remote(num_cpus=self.threads, num_gpus=int(self.gpu), max_retries=LOSSES)(
-            _limited
-        )
-        waiting, running = deque(range(len(calls))), dict[Any, int]()
-        with interruption() as stop:
-            try:
-                while (waiting or running) and not stop.requested:
-                    while waiting and len(running) < self.jobs:  # nodes may have come or gone
-                        index = waiting.popleft()
-                        running[task.remote(self.threads, function, calls[index])] = index
-                        if report is not None:
-                            report(index, "start", 0.0)
-                    for each in ray.wait(list(running), timeout=POLL_SECONDS)[0]:
-                        yield _result(running.pop(each), each)
-            finally:
-                for force in (False, True) if running else ():  # asked first, a task cleans up
-                    for each in running:
-                        with suppress(ray.exceptions.RayError):
-                            ray.cancel(each, force=force)
-                    ray.wait(list(running), num_returns=len(running), timeout=GRACE_SECONDS)
-        if stop.requested:
-            raise KeyboardInterrupt
+        task = ray.remote(num_cpus=self.threads, num_gpus=int(self.gpu), max_retries=0)(_limited)
+        reference = task.remote(self.threads, function, tuple(arguments))
+        self._running.add(reference)
+        try:
+            if self._stopped:  # since the task was submitted
+                ray.cancel(reference)
+            return _value(reference)
+        finally:
+            self._running.discard(reference)
+
+    def stop(self) -> None:
+        """See ``Workers``."""
+        self._cancel(force=False)
+
+    def kill(self) -> None:
+        """See ``Workers``; asks first, so that tasks can clean up."""
+        import ray  # noqa: PLC0415  (an extra)
+
+        for force in (False, True) if self._running else ():
+            self._cancel(force=force)
+            running = list(self._running)
+            if running:
+                ray.wait(running, num_returns=len(running), timeout=GRACE_SECONDS)
+
+    def _cancel(self, *, force: bool) -> None:
+        import ray  # noqa: PLC0415  (an extra)
+
+        self._stopped = True
+        for reference in list(self._running):
+            with suppress(ray.exceptions.RayError):
+                ray.cancel(reference, force=force)
 
 
 def _nodes() -> list[tuple[float, float]]:
     """CPUs and GPUs of each node."""
-    import ray  # noqa: PLC0415  (an extra, and slow to import)
+    import ray  # noqa: PLC0415  (an extra)
 
     resources = [node["Resources"] for node in ray.nodes() if node["Alive"]]
     return [(each.get("CPU", 0.0), each.get("GPU", 0.0)) for each in resources]
 
 
 def _limited(threads: int, function: Function, call: tuple[Any, ...]) -> Any:
-    """A task, whose kernels and ``in_threads`` use its share of a node, in a worker's process."""
+    """Make a call with as many threads of Numba and ``in_threads``, in a worker's process."""
     import numba  # noqa: PLC0415  (slow to import)
 
     before = numba.get_num_threads()
@@ -177,25 +179,24 @@ def _limited(threads: int, function: Function, call: tuple[Any, ...]) -> Any:
         numba.set_num_threads(before)
 
 
-def _result(index: int, reference: Any) -> Result:
-    import ray  # noqa: PLC0415  (an extra, and slow to import)
+def _value(reference: Any) -> Any:
+    """Wait for a task's value, or raise its error."""
+    import ray  # noqa: PLC0415  (an extra)
 
     try:
-        return Result(index, ray.get(reference))
+        return ray.get(reference)
     except ray.exceptions.RayTaskError as error:
-        told = str(error.cause)
-        if not isinstance(error.cause, ray.exceptions.RaySystemError) and UNIMPORTED not in told:
-            return Result(index, error=error.cause)
-        missing = ParameterError(
+        message = str(error.cause)
+        if not isinstance(error.cause, ray.exceptions.RaySystemError) and UNIMPORTED not in message:
+            raise error.cause from None
+        raise ParameterError(
             "splatseed on every node of the cluster, in the Python that ray start ran in",
-            found=next(filter(None, map(str.strip, reversed(told.splitlines()))), "no reason"),
+            found=next(filter(None, map(str.strip, reversed(message.splitlines()))), "no reason"),
             fix="Install the same version of splatseed there, and run the same command again.",
-        )
-        return Result(index, error=missing)
+        ) from None
     except ray.exceptions.RayError as error:
-        lost = TaskLostError(
-            "a node that lives until its work is done",
-            found=f"{1 + LOSSES} losses, the last: {' '.join(str(error).split())}",
-            fix="Check the cluster's memory and disks, and run the same command to go on.",
-        )
-        return Result(index, error=lost)
+        raise TaskLostError(
+            "a node that lives until its task is done",
+            found=" ".join(str(error).split()),
+            fix="Check the cluster's memory and disks, and run the same command again.",
+        ) from None

@@ -35,7 +35,7 @@ from splatseed.photos.view import at_file_size
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.requirements import require
-from splatseed.runtime.tasks import Child
+from splatseed.runtime.child import Child
 from splatseed.scene import Image, Masks, Scene
 from splatseed.sfm import colmap
 from splatseed.sfm.cameras import SharedCamera, describe_cameras, share_cameras
@@ -333,9 +333,9 @@ def _call(
     """Do a job, with arguments of its own, in a child process."""
     log = staging / ".work" / "log.txt"
     call = (_work, images, staging, settings, kept, job, arguments)
-    with closing(Child(log=log.open("w+b"))) as child:
+    with closing(Child(*call, reports=True, log=log.open("w+b"))) as child:
         try:
-            report: SfmReport = child.call(*call, progress=progress)
+            report: SfmReport = child.result(progress)
         except errors.TaskLostError as error:
             reasons, found = _REASON.findall(log.read_text("utf-8", "replace")), error.found
             if reasons:
