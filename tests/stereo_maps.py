@@ -40,4 +40,5 @@ def _true_map(capture, i, factor):
         confidence=known.astype(np.float32),
         sources=tuple(source.name for source in sources),
         agreeing=agreeing.reshape(shape),
+        rgb=np.full((*shape, 3), 128, np.uint8),
     )

@@ -133,7 +133,7 @@ def test_what_makes_seeds_needs_little(part):
     allowed = {"splatseed", "numpy", "jaxtyping", "numba", "scipy"}
     more = {
         "photos": {"PIL", "platformdirs"},
-        "depth": {"PIL", "llvmlite"},
+        "depth": {"PIL", "llvmlite", "lazy_loader"},
         "methods": {"filelock"},
     }
     allowed |= more.get(part, set())

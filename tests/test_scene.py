@@ -166,7 +166,13 @@ def test_maps_in_memory_are_a_scenes_depths():
     """As stereo returns them, or by name; anything else is refused at once."""
     scene = Scene(PointCloud.empty(), (_image("a.jpg"),))
     depth = np.array([[2.0, np.nan], [0.0, 3.0]], np.float32)
-    more = (np.zeros((2, 2, 3)), np.ones((2, 2)), (), np.zeros((2, 2), np.uint8))
+    more = (
+        np.zeros((2, 2, 3)),
+        np.ones((2, 2)),
+        (),
+        np.zeros((2, 2), np.uint8),
+        np.zeros((2, 2, 3), np.uint8),
+    )
     stereo = StereoMap("a.jpg", scene.images[0].camera, depth, *more)
     for given in ((stereo,), [stereo], {"a.jpg": depth}, {"a.jpg": DepthMap(depth)}):
         depths = scene.replace(depths=given).depths

@@ -1,6 +1,6 @@
 """The photometric cost of planes as a scalar Numba loop: pixels, planes, views and samples.
 
-Notation: as in ``splatseed.depth.stereo.cost``. Promise: the same cost up to rounding. It is
+Notation: as in ``depth.stereo._kernels.cost``. Promise: the same cost up to rounding. It is
 given what costs nothing to give: weights and likeness of a window are computed once a pixel, not
 once a plane.
 """
@@ -9,16 +9,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from splatseed.depth.stereo.cost import (
+from splatseed.depth.stereo._kernels.cost import (
     LEAST,
     NOISE,
     RADIUS,
     SAMPLES,
     SIDE,
     SIGMA_GREY,
-    SIGMA_PLACE,
+    SIGMA_SPACE,
     STRIDE,
-    UNSEEN,
+    UNSEEN_COST,
 )
 from splatseed.runtime.jit import inline
 
@@ -62,7 +62,7 @@ def _window(image, u, v, weights, likeness):
     for k in range(SAMPLES):
         x, y = STRIDE * (k % SIDE - RADIUS), STRIDE * (k // SIDE - RADIUS)
         r = _bilinear(image, u + x - 0.5, v + y - 0.5)
-        exponent = -0.5 * ((r - center) / SIGMA_GREY) ** 2 - 0.5 * (x * x + y * y) / SIGMA_PLACE**2
+        exponent = -0.5 * ((r - center) / SIGMA_GREY) ** 2 - 0.5 * (x * x + y * y) / SIGMA_SPACE**2
         c = np.exp(max(exponent, 8 * LEAST))
         weights[k], likeness[k] = c, r
         total, mean, square = total + c, mean + c * r, square + c * r * r
@@ -79,7 +79,7 @@ def _cost(image, m, u, v, plane, weights, likeness):
     x, y, z = _moved(m, u, v, plane[0])
     height, width = image.shape
     if not (z > 0 and 0 < x < z * width and 0 < y < z * height):
-        return UNSEEN
+        return UNSEEN_COST
     like, mean, square = 0.0, 0.0, 0.0
     for k in range(SAMPLES):
         right, down = STRIDE * (k % SIDE - RADIUS), STRIDE * (k // SIDE - RADIUS)

@@ -16,8 +16,8 @@ import numpy as np
 from benchmarks.common.clouds import find_scenes
 
 import splatseed as ss
-from splatseed.depth.stereo.depths import find_stereo
 from splatseed.depth.stereo.maps import StereoResult, StereoSettings
+from splatseed.depth.stereo.pipeline import find_stereo
 from splatseed.photos.view import data_factor, load_views
 from splatseed.photos.visibility import Visibility, find_visibility
 
@@ -88,7 +88,7 @@ def score_few(name: str, limit: int) -> list[list[float]]:
         stereo = find_stereo(views, images, told, settings)
         seconds = time.process_time() - started
         seen = float(np.median([told.count.get(image.image_id, 0) for image in images]))
-        kept = np.mean([stereo.kept(i).mean() for i in range(len(views))])
+        kept = np.mean([stereo.confirmed(i).mean() for i in range(len(views))])
         rows.append([seen, float(kept), seconds])
     return rows
 
@@ -107,7 +107,7 @@ def _score(name: str, settings: StereoSettings, limit: int) -> PointScore:
     errors = [_errors(stereo, i, held_out.of(image)) for i, image in enumerate(images)]
     error = np.concatenate(errors)
     known = np.isfinite(error)
-    kept = np.concatenate([stereo.kept(i).ravel() for i in range(len(views))]).mean()
+    kept = np.concatenate([stereo.confirmed(i).ravel() for i in range(len(views))]).mean()
     return PointScore(
         float(kept),
         float(known.mean()),
@@ -139,4 +139,4 @@ def _errors(stereo: StereoResult, i: int, xyz: np.ndarray) -> np.ndarray:
     w, gx, gy = stereo.planes[i][:, row, column]
     across, down = (uv - (np.stack([column, row], axis=1) + 0.5) * grid).T
     error = np.abs(1 / (z * (w + gx * across + gy * down)) - 1)
-    return np.where(stereo.kept(i)[row, column], error, np.nan)
+    return np.where(stereo.confirmed(i)[row, column], error, np.nan)

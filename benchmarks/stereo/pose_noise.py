@@ -29,7 +29,7 @@ from scipy.spatial.transform import Rotation
 
 import splatseed as ss
 from splatseed.camera import quat_from_rotation
-from splatseed.depth.stereo.maps import stereo_depths
+from splatseed.depth.stereo import stereo_depths
 from splatseed.errors import ReconstructionError, SplatseedError
 from splatseed.photos.view import user_cache_dir
 from splatseed.pointcloud import PointCloud

@@ -21,8 +21,8 @@ from benchmarks.seeds.depth import CAPTURES, HELD_OUT, Truth
 from benchmarks.stereo.truth import MADE_STEP, Score, first, load, reached, relative_error
 from jaxtyping import Float, Int, UInt8
 
-from splatseed.depth.stereo.depths import known_visibility
 from splatseed.depth.stereo.maps import StereoSettings
+from splatseed.depth.stereo.pipeline import known_visibility
 from splatseed.photos.sources import choose_sources
 from splatseed.photos.view import View, data_factor, load_views
 from splatseed.scene import Scene

@@ -18,10 +18,11 @@ from benchmarks.common.memory import status_bytes
 from benchmarks.stereo.peer import costs_of_planes
 
 import splatseed as ss
-from splatseed.depth.stereo.cost import make_quads
-from splatseed.depth.stereo.depths import find_stereo, fuse
+from splatseed.depth.stereo._kernels.patchmatch import QuadImages, initialise, red_black_sweep
+from splatseed.depth.stereo.fusion import fuse
 from splatseed.depth.stereo.maps import StereoSettings
-from splatseed.depth.stereo.patchmatch import QuadImages, begin, sweep
+from splatseed.depth.stereo.pipeline import find_stereo
+from splatseed.depth.stereo.quads import make_quads
 from splatseed.photos.view import load_views
 from splatseed.photos.visibility import find_visibility
 from splatseed.pointcloud import PointCloud
@@ -56,20 +57,21 @@ def hypothesis_seconds(peer_rows: int) -> dict[str, float]:
     few = np.ascontiguousarray(guesses[:, :, :peer_rows])
     peer_costs = np.empty((PLANES, peer_rows, shape[1]), np.float32)
     seconds = {
-        "planes": _best(lambda: begin(quad_images, guesses, planes, costs)) / guesses[:, 0].size,
+        "planes": _best(lambda: initialise(quad_images, guesses, planes, costs))
+        / guesses[:, 0].size,
         "sweep": _best(lambda: _sweeps(quad_images, planes, costs)) / guesses[:, 0].size,
         "peer": _best(
             lambda: costs_of_planes(images[0], images[1:], warps, GRID, few, peer_costs), 2
         ) / peer_costs.size,
     }  # fmt: skip
-    begin(quad_images, guesses[:1].copy(), planes, costs)
+    initialise(quad_images, guesses[:1].copy(), planes, costs)
     gap = np.abs(costs[:peer_rows] - peer_costs[0])
     return {**seconds, "gap": float(gap[np.isfinite(gap)].max())}
 
 
 def _sweeps(quad_images: QuadImages, planes: np.ndarray, costs: np.ndarray) -> None:
     for color in range(2):
-        sweep(quad_images, color, 1, np.uint64(1), planes, costs)
+        red_black_sweep(quad_images, color, 1, np.uint64(1), planes, costs)
 
 
 def _workload() -> tuple[np.ndarray, np.ndarray, np.ndarray]:

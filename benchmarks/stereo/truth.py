@@ -19,8 +19,9 @@ from benchmarks.seeds.depth import CAPTURES, FAR, HELD_OUT, Truth, query, triang
 from scipy.spatial import cKDTree
 
 import splatseed as ss
-from splatseed.depth.stereo.depths import find_stereo, fuse, known_visibility
+from splatseed.depth.stereo.fusion import fuse
 from splatseed.depth.stereo.maps import StereoResult, StereoSettings
+from splatseed.depth.stereo.pipeline import find_stereo, known_visibility
 from splatseed.io import find_depths
 from splatseed.photos.view import data_factor, load_views
 from splatseed.pointcloud import PointCloud

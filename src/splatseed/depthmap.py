@@ -37,6 +37,7 @@ class DepthMap:
 
     values: Float32[np.ndarray, "H W"]
     kind: DepthKind = "z"  # what a value is
+    K: Float64[np.ndarray, "3 3"] | None = None  # in pixels of the map; None: the image's, scaled
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "values", read_only(self.values))
@@ -52,11 +53,13 @@ class DepthMap:
         return int(self.values.shape[0])
 
     def camera(self, camera: Camera) -> Camera:
-        """The image's camera scaled to the map's pixels: same pose, K scaled.
+        """The image's camera in the map's pixels: same pose, and ``K`` or the image's, scaled.
 
         Raises:
             SceneFormatError: The map and the image differ in aspect ratio.
         """
+        if self.K is not None:
+            return Camera(self.K, self.width, self.height, camera.cam_from_world)
         scale = np.array([self.width / camera.width, self.height / camera.height])
         if abs(scale[0] / scale[1] - 1) > ASPECT_SLACK:
             raise SceneFormatError(
@@ -107,7 +110,8 @@ def maps_by_name(maps: Any, distorted: Collection[str] = ()) -> DepthMaps:
 
     Args:
         maps: ``DepthMaps``; a mapping from image names to a ``DepthMap`` or an array of planar
-            depth; or records with a ``name`` and planar ``depth``, as ``stereo_depths`` returns.
+            depth; or records with a ``name``, planar ``depth`` and ``camera``, as
+            ``stereo_depths`` returns.
         distorted: Names of images whose cameras have lens distortion. Stereo's maps are of
             photographs without it, so they do not fit.
 
@@ -119,7 +123,7 @@ def maps_by_name(maps: Any, distorted: Collection[str] = ()) -> DepthMaps:
     try:
         if isinstance(maps, Mapping):
             return HeldDepths({name: _as_map(each) for name, each in maps.items()})
-        held = HeldDepths({each.name: _as_map(each.depth) for each in maps})
+        held = HeldDepths({each.name: _as_map(each.depth, each.camera.K) for each in maps})
     except (AttributeError, TypeError, ValueError):
         raise ParameterError(
             "depth maps by image name, such as find_depths gives, or what stereo_depths returns",
@@ -135,10 +139,10 @@ def maps_by_name(maps: Any, distorted: Collection[str] = ()) -> DepthMaps:
     return held
 
 
-def _as_map(values: Any) -> DepthMap:
+def _as_map(values: Any, K: Float64[np.ndarray, "3 3"] | None = None) -> DepthMap:
     if isinstance(values, DepthMap):
         return values
     array = np.asarray(values, np.float32)
     if array.ndim != 2:
         raise ValueError
-    return DepthMap(np.where(array > 0, array, np.float32(np.nan)))
+    return DepthMap(np.where(array > 0, array, np.float32(np.nan)), K=K)

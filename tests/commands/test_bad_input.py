@@ -113,12 +113,8 @@ WORDS = [
     ((*EVALUATE, "--data-factor", "0"), "--data-factor"),
     ((*EVALUATE, "--test-every", "1"), "--test-every"),
     (("evaluate", "model.ply"), "--scene"),
-    (DEPTH, "--stereo"),
-    ((*DEPTH, "--stereo", "--model", "some"), "--model"),
-    ((*DEPTH, "--stereo", "--max-size", "5"), "--max-size"),
-    ((*DEPTH, "--stereo", "--grid", "99"), "--grid"),
-    ((*DEPTH, "--stereo", "--test-every", "1"), "--test-every"),
-    ((*DEPTH, "--stereo", "--depth-kind", "z"), "--depth-kind"),
+    ((*DEPTH, "--max-size", "5"), "--max-size"),
+    ((*DEPTH, "--depth-kind", "z"), "--depth-kind"),
     ((*DEPTH, "--model", "some", "--colmap"), "--colmap"),
     ((*DEPTH, "--model", "nobody/Depth-Nothing-hf"), "nobody/Depth-Nothing-hf"),
     ((*DEPTH, "--model", "gone.onnx"), "gone.onnx"),
@@ -216,7 +212,7 @@ def test_what_makes_no_sense_is_refused_by_name(words, named, refused):
 
 THINGS = {"sfm": ["ROOM/images"], "bench": QUICK[1:], "evaluate": EVALUATE[1:]}
 MODELS = {"flight": "out.mp4", "export": "out.splat"}
-ALSO = {"upsample": ["--method", "mls"], "depth": ["--stereo"]}
+ALSO = {"upsample": ["--method", "mls"]}
 ANY = {("sfm", "--threads")}
 """Where -1 stands for all."""
 
@@ -268,7 +264,7 @@ JUNK = {"bytes": bytes([137, 3, 0, 255, 13]) * 40, "text": b"some words\n" * 9, 
         "upsample room -o out",
         "train room -o out --max-steps 1",
         "sfm room/images -o out",
-        "depth room --stereo -o out",
+        "depth room -o out",
         "info room --depth maps",
         "info transforms",
         "export junk.ply -o out.splat",
@@ -364,7 +360,7 @@ def test_memory_that_ran_out_is_said_so_whatever_the_error_says(splatseed, monke
 
 def test_a_link_to_itself(room, tmp_path, splatseed):
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
-    for verb in (["upsample", room], ["depth", room, "--stereo"], ["train", room]):
+    for verb in (["upsample", room], ["depth", room], ["train", room]):
         _refused(splatseed(*verb, "-o", tmp_path / "loop"), "leads back to itself")
     _refused(splatseed("info", tmp_path / "loop"), "loop")
     with pytest.raises(OutputError, match="loop"), atomic_file(tmp_path / "loop"):
@@ -403,7 +399,7 @@ def _notes(path):
 
 WRITERS = {
     "upsample": ["ROOM", "--overwrite"],
-    "depth": ["ROOM", "--stereo", "--overwrite"],
+    "depth": ["ROOM", "--overwrite"],
     "sfm": ["ROOM/images", "--overwrite"],
     "undistort": ["ROOM", "--overwrite"],
     "demo": ["--overwrite"],

@@ -88,9 +88,11 @@ def test_what_is_planted_in_every_image_is_found(kind, tracked, exact, make_maps
         assert found.scale == pytest.approx(scale, rel=0.02 if kind == "inverse" else 0.005)
         assert 0 < found.residual < 0.05
         unit = {"unit_ray": False}
-        planar = PlanarDepth.of(maps[image.name], image.camera, found.scale, found.shift, **unit)
+        planar = PlanarDepth.from_map(
+            maps[image.name], image.camera, found.scale, found.shift, **unit
+        )
         z = exact.depths.read(image.name).values
-        assert np.nanmedian(np.abs(planar.whole() / z - 1)) < 0.005
+        assert np.nanmedian(np.abs(planar.full() / z - 1)) < 0.005
 
 
 def test_a_point_takes_the_pixel_it_falls_into(exact):
@@ -130,7 +132,7 @@ def test_images_are_left_out_for_a_reason(exact, make_maps):
     scene = exact.replace(depths=make_maps("z", change))
     reasons = [alignment.rejected for alignment in align(scene).values()]
     assert reasons[0] == "the map has no depth at any pixel"
-    assert "SfM points see depth; 20 are needed" in reasons[1]
+    assert "SfM points on known depth; 20 are needed" in reasons[1]
     assert "at half of the SfM points" in reasons[2]
     assert "typically" in reasons[3]
     assert "one value" in reasons[4]
@@ -166,9 +168,9 @@ def test_planar_depth_knows_every_kind(kind, exact):
     values = {"z": z / 2, "ray": z * length / 2, "inverse": (1 / z - 0.1) / 2}[kind]
     shift = 0.1 if kind == "inverse" else 0.0
     depth = DepthMap(values.astype(np.float32), kind)
-    planar = PlanarDepth.of(depth, camera, 2.0, shift, unit_ray=False)
-    np.testing.assert_allclose(planar.whole(), z, rtol=2e-6)
-    np.testing.assert_allclose(planar.every(1, 3) * planar.scale, z[1::3, 1::3], rtol=2e-6)
-    np.testing.assert_allclose(planar.at(np.array([0, 166])), [z[0, 0], z[1, 6]], rtol=2e-6)
+    planar = PlanarDepth.from_map(depth, camera, 2.0, shift, unit_ray=False)
+    np.testing.assert_allclose(planar.full(), z, rtol=2e-6)
+    np.testing.assert_allclose(planar.strided(1, 3) * planar.scale, z[1::3, 1::3], rtol=2e-6)
+    np.testing.assert_allclose(planar.at_pixels(np.array([0, 166])), [z[0, 0], z[1, 6]], rtol=2e-6)
     behind = DepthMap(np.full((120, 160), -1.0, np.float32), "inverse")
-    assert np.isnan(PlanarDepth.of(behind, camera, 1.0, 0.5, unit_ray=False).whole()).all()
+    assert np.isnan(PlanarDepth.from_map(behind, camera, 1.0, 0.5, unit_ray=False).full()).all()

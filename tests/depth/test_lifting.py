@@ -14,7 +14,7 @@ import splatseed as ss
 from splatseed.camera import Intrinsics
 from splatseed.depth import lifting
 from splatseed.depth.alignment import PlanarDepth, lift_pixels
-from splatseed.depth.lifting import Cubes, thin
+from splatseed.depth.thinning import Cubes, spread_evenly
 from splatseed.errors import ParameterError, PointCloudError, SceneFormatError, SceneNotFoundError
 from splatseed.scene import Split
 
@@ -47,8 +47,8 @@ def test_equation_9_is_a_loop_over_pixels(exact, rng):
     pixel = rng.choice(np.flatnonzero(depth.values > 0), 50, replace=False)
     scale = 1.7
     for unit_ray in (False, True):
-        planar = PlanarDepth.of(depth, camera, scale, 0.0, unit_ray=unit_ray)
-        lifted = lift_pixels(pixel, planar.at(pixel), camera)
+        planar = PlanarDepth.from_map(depth, camera, scale, 0.0, unit_ray=unit_ray)
+        lifted = lift_pixels(pixel, planar.at_pixels(pixel), camera)
         for number, point in zip(pixel.tolist(), lifted, strict=True):
             v, u = number // 160 + 0.5, number % 160 + 0.5
             ray = camera.cam_from_world[:3, :3].T @ np.linalg.inv(camera.K) @ [u, v, 1.0]
@@ -122,7 +122,7 @@ def test_a_second_reading_comes_when_the_first_was_not_enough(exact, make_maps, 
     notes = []
     lifted(scene, 3000, align=False, note=notes.append)
     assert len(set(reads)) > 1
-    assert max(reads) <= lifting.MAX_OVERSAMPLING * 3000 / 12 + 1
+    assert max(reads) <= lifting.OVERSAMPLING.limit * 3000 / 12 + 1
     assert any("confirmed by fewer than 2 other views" in note for note in notes)
 
 
@@ -182,14 +182,14 @@ def test_what_cannot_be_lifted_is_refused(own, make_maps):
 
     large = own.replace(depths=make_maps("z", lambda z, _: 1000 * z))
     for scene, write, error, said in (
-        (own.points, None, SceneNotFoundError, "--depth DIR"),
-        (own.replace(depths=None), None, SceneNotFoundError, "--depth DIR"),
-        (own.replace(images=()), None, SceneNotFoundError, "--depth DIR"),
+        (own.points, None, SceneNotFoundError, "`depth`"),
+        (own.replace(depths=None), None, SceneNotFoundError, "`depth`"),
+        (own.replace(images=()), None, SceneNotFoundError, "`depth`"),
         (own.replace(source=None), None, SceneNotFoundError, "photographs"),
         (with_bend(0.1), None, SceneFormatError, "SIMPLE_RADIAL for view_000"),
         (own, lambda: photograph.write_bytes(b"no image"), SceneFormatError, "view_004.png"),
         (own, lambda: resized(photograph, (120, 160)), SceneFormatError, "120 x 160"),
-        (large, lambda: resized(photograph, (320, 240)), SceneFormatError, "--depth-scale"),
+        (large, lambda: resized(photograph, (320, 240)), SceneFormatError, "`depth_scale`"),
     ):
         if write is not None:
             write()
@@ -238,7 +238,7 @@ def test_cubes_are_those_of_a_dictionary(seed, side):
 def test_exactly_so_many_come_out_and_of_many_they_are_estimated(num, rng):
     total = 5000 if num <= 5000 else 100_000
     xyz, every = sheet(rng, total), np.ones(total, bool)
-    taken = thin(xyz, every.astype(np.float32), every, xyz[:0], num, rng)
+    taken = spread_evenly(xyz, every.astype(np.float32), every, xyz[:0], num, rng)
     assert np.count_nonzero(taken) == num
     cubes = Cubes(xyz, every.astype(np.float32), every, xyz[:0])
     for side in (0.5, 0.02, 0.001):

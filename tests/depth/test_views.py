@@ -7,9 +7,10 @@ import pytest
 from scipy.spatial import cKDTree
 
 from splatseed.camera import Camera
-from splatseed.depth.alignment import Alignment, Settings
+from splatseed.depth.alignment import Alignment
 from splatseed.depth.comparison import choose_neighbors, find_support, synchronize_scales
-from splatseed.depth.views import DepthView, Reduced, counting, sample_pixels
+from splatseed.depth.settings import DepthSettings
+from splatseed.depth.views import DepthView, Reduced, pixels_within, sample_pixels
 from splatseed.depthmap import DepthMap
 from splatseed.progress import silent
 
@@ -55,8 +56,8 @@ def test_a_pixel_of_a_smaller_map_counts_only_if_all_that_it_covers_do():
     mask, shown = np.ones((50, 80), bool), np.ones((7, 10), bool)
     mask[31, 47], shown[31 * 7 // 50, 47 * 10 // 80] = False, False
     kinds = (DepthMap(np.ones((7, 10), np.float32)), DepthMap(np.ones((100, 160), np.float32)))
-    np.testing.assert_array_equal(counting(mask, kinds[0]), shown)
-    assert np.argwhere(~counting(mask, kinds[1])).tolist() == [
+    np.testing.assert_array_equal(pixels_within(mask, kinds[0]), shown)
+    assert np.argwhere(~pixels_within(mask, kinds[1])).tolist() == [
         [row, column] for row in (62, 63) for column in (94, 95)
     ]
 
@@ -80,7 +81,9 @@ THROUGH = [0, 0, 0, 1, 0, 0]
 def test_a_view_confirms_hides_or_looks_through(unit):
     camera = camera_at(0.05 * unit)
     other = reduced(camera, wall(camera, 2.0 * unit))
-    agreeing, seen_through = find_support(POINTS * np.float32(unit), other, [other], Settings())
+    agreeing, seen_through = find_support(
+        POINTS * np.float32(unit), other, [other], DepthSettings()
+    )
     np.testing.assert_array_equal(agreeing, CONFIRMED)
     np.testing.assert_array_equal(seen_through, THROUGH)
 
@@ -90,20 +93,20 @@ def test_a_view_of_another_color_confirms_nothing():
     own = reduced(camera, wall(camera))
     for change, agrees in ((30, 1), (60, 0)):
         other = reduced(camera, wall(camera), GRAY + np.uint8(change))
-        (agreeing,), (seen_through,) = find_support(POINTS[:1], own, [other], Settings())
+        (agreeing,), (seen_through,) = find_support(POINTS[:1], own, [other], DepthSettings())
         assert (agreeing, seen_through) == (agrees, False)
-        assert find_support(POINTS[:1], own, [other], Settings(color_tolerance=None))[0][0]
+        assert find_support(POINTS[:1], own, [other], DepthSettings(color_tolerance=None))[0][0]
 
 
 def test_what_a_view_does_not_know_says_nothing():
     camera = camera_at(0.0)
     nothing = np.full((HEIGHT, WIDTH), np.nan, np.float32)
     own = reduced(camera, nothing)
-    assert not np.any(find_support(POINTS, own, [own], Settings()))
+    assert not np.any(find_support(POINTS, own, [own], DepthSettings()))
     half = wall(camera)
     half[:, ::2] = np.nan  # beside the unknown, known pixels may confirm but not look through
     own = reduced(camera, half)
-    agreeing, seen_through = find_support(POINTS, own, [own], Settings())
+    agreeing, seen_through = find_support(POINTS, own, [own], DepthSettings())
     np.testing.assert_array_equal(agreeing, CONFIRMED)
     assert not seen_through.any()
 
@@ -148,7 +151,7 @@ def test_maps_are_scaled_to_agree():
 
 SHAPE = (60, 80)
 NOWHERE = np.empty((0, 2))
-PLAIN = Settings(placement="uniform", edge_tolerance=None)
+PLAIN = DepthSettings(placement="uniform", edge_tolerance=None)
 
 
 def slanted(rng, holes=0.2):
@@ -164,7 +167,7 @@ def slanted(rng, holes=0.2):
 def test_pixels_are_known_and_distinct(placement, num, rng):
     values = slanted(rng)
     points = rng.uniform(0, SHAPE[::-1], (40, 2))
-    settings = Settings(placement=placement)
+    settings = DepthSettings(placement=placement)
     pixel, edge = sample_pixels(values, num, points, settings, rng)
     known = int((values > 0).sum())
     assert min(num, known) <= len(pixel) <= max(1.2 * num + 2, known)
@@ -177,7 +180,7 @@ def test_pixels_go_where_points_are_far(rng):
     points = np.stack([rng.uniform(0, 40, 500), rng.uniform(0, 60, 500)], axis=1)  # the left half
     mean = {}
     for placement in ("uniform", "empty"):
-        settings = Settings(placement=placement, edge_tolerance=None)
+        settings = DepthSettings(placement=placement, edge_tolerance=None)
         pixel = sample_pixels(values, 400, points, settings, rng)[0]
         row, column = np.divmod(pixel, SHAPE[1])
         mean[placement] = cKDTree(points).query(np.stack([column, row], axis=1))[0].mean()
@@ -191,7 +194,7 @@ def test_pixels_keep_off_the_jumps_of_depth(radius, rng):
     values = slanted(rng, holes=0.0)
     values[:, 40:] *= 1.1
     values[30:, :20] *= 0.9
-    settings = Settings(placement="uniform", edge_radius=radius)
+    settings = DepthSettings(placement="uniform", edge_radius=radius)
     pixel, edge = sample_pixels(values, 1500, NOWHERE, settings, rng)
     row, column = np.divmod(pixel, SHAPE[1])
     assert not edge.any()
@@ -206,7 +209,7 @@ def test_what_is_mostly_unknown_around_comes_last(rng):
     values = slanted(rng, holes=0.0)
     values[:, 40:] = np.nan
     values[::6, 43:79:6] = 2.0  # sparse, as a lidar's
-    settings = Settings(placement="uniform")
+    settings = DepthSettings(placement="uniform")
     known = int((values > 0).sum())
     some, _ = sample_pixels(values, known // 2, NOWHERE, settings, rng)
     assert (some % 80 < 40).all()

@@ -9,7 +9,7 @@ import pytest
 
 from splatseed import upsample
 from splatseed.depth.stereo import StereoSettings, stereo_depths
-from splatseed.depth.stereo.matching import BYTES_A_DEPTH, check_stereo_memory
+from splatseed.depth.stereo.matching import BYTES_PER_DEPTH, check_stereo_memory
 from splatseed.errors import ParameterError
 from splatseed.io import load_scene
 from splatseed.methods import number_of_new
@@ -56,9 +56,9 @@ def test_photographs_of_a_scene_and_what_stereo_holds_beside_them(free, scene):
     with pytest.raises(ParameterError, match=r"found 4 of 60 x 40.*--data-factor"):
         load_views(scene, scene.images)
     assert len(load_views(scene, scene.images, data_factor=2)) == 4
-    free(pixels + pixels * BYTES_A_DEPTH + threads * 60 * 40 * 4 * 4)
+    free(pixels + pixels * BYTES_PER_DEPTH + threads * 60 * 40 * 4 * 4)
     check_stereo_memory(views, StereoSettings(grid=1))
-    free(pixels * BYTES_A_DEPTH)
+    free(pixels * BYTES_PER_DEPTH)
     with pytest.raises(ParameterError, match=r"found 9,600, at a grid of 1.*larger grid"):
         stereo_depths(scene, grid=1)
     check_stereo_memory(views, StereoSettings(grid=4))

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from splatseed.depth.stereo.cost import make_quads
-from splatseed.depth.stereo.patchmatch import QuadImages
+from splatseed.depth.stereo._kernels.patchmatch import QuadImages
+from splatseed.depth.stereo.quads import make_quads
 from splatseed.seeding.verify import FLOOR, OFFSETS, REACH, REFINEMENTS, TEXTURE, slide
 
 from ..depth.stereo.references import OFFSETS as WINDOW, best_of, bilinear, cost_in, window_weights

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 from splatseed.camera import Intrinsics
-from splatseed.depth.stereo.depths import find_stereo
+from splatseed.depth.stereo.pipeline import find_stereo
 from splatseed.scene import Image
 from splatseed.training.run import prepare_run
 from splatseed.training.seeds import (
@@ -69,7 +69,7 @@ def test_photographs_are_compared_once_for_seeds_and_growth(room, tmp_path, monk
         calls.append(1)
         return find_stereo(*arguments, **options)
 
-    monkeypatch.setattr("splatseed.depth.stereo.depths.find_stereo", counted)
+    monkeypatch.setattr("splatseed.depth.stereo.pipeline.find_stereo", counted)
     settings = dataclasses.replace(GROW, data_factor=2, seeding="auto")
     run = prepare_run(room, tmp_path / "run", settings)
     assert len(calls) == 1

@@ -141,7 +141,9 @@ def maps():
     depth = np.tile(np.linspace(8.0, 2.0, 40, dtype=np.float32), (30, 1))
     normal = np.tile(np.array([0, 0, -1], np.float32), (30, 40, 1))
     depth[:, :20] = normal[:, :20] = np.nan
-    return StereoMap("a.png", CAMERA, depth, normal, np.nan_to_num(depth / 8), (), np.empty(0))
+    return StereoMap(
+        "a.png", CAMERA, depth, normal, np.nan_to_num(depth / 8), (), *[np.empty(0)] * 2
+    )
 
 
 def test_unknown_is_grey_and_near_is_brighter_than_far(maps):

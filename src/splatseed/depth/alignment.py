@@ -1,4 +1,4 @@
-"""Depth maps in a scene's units: the scale (and shift) of each, by its SfM points; lifting pixels.
+"""Align depth maps to a scene's units by SfM points, and lift their pixels.
 
 Notation: at an SfM point that falls into a pixel, ``value`` is the map's and ``z`` the point's
 planar depth, float64 [M]. For maps of the kinds "z" and "ray" z = scale value (value divided by the
@@ -6,143 +6,92 @@ length of the pixel's ray for "ray"; the shift is 0), for "inverse" 1 / z = scal
 *line* that networks of the MiDaS kind leave open. A ray has unit z in camera axes, so that its
 length is distance over planar depth, and passes through its pixel's centre, at +0.5. With
 ``unit_ray``, as in the paper's equation 9, depth of any kind counts as distance along the ray, both
-where the scale is fitted and where pixels are lifted.
-Promise: an image is left out when too few of its points see depth, or when it fits much worse than
-the others; each such image is reported with the reason. Nothing is random; multiplying ``z`` by a
+in the fit of the scale and in the lifting of pixels.
+Promise: an image is rejected if too few of its points fall on known depth, or if it fits much worse
+than the others; its ``Alignment`` states the reason. Nothing is random; multiplying ``z`` by a
 power of two divides or multiplies the result by it exactly.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int, Int64
 
 from splatseed.camera import Camera
+from splatseed.depth._kernels import SIGMA_OF_MEDIAN
+from splatseed.depth.settings import DepthSettings, Fit
 from splatseed.depthmap import DepthMap
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.photos.visibility import PointsInImage, find_visibility, points_in_image
 from splatseed.progress import Progress, in_threads, silent
 from splatseed.scene import Image, Scene
-from splatseed.settings import Range
-
-Fit = Literal["robust", "least-squares"]
-"""Medians and reweighting, or the paper's equation 7."""
-PAIRS = 256
-"""Pairs of points whose lines are tried; nothing is random, as they follow the R2 sequence."""
-GOLDEN = np.array([0.7548776662466927, 0.5698402909980532])
-"""Steps of the R2 sequence, which fills a square evenly (Roberts, 2018)."""
-TUKEY = 4.685
-"""Tukey's biweight at 95% efficiency, in standard deviations."""
-STEPS = 20
-"""Most steps of reweighting."""
-SIGMA_OF_MEDIAN = 1.4826
-"""Standard deviation of a normal variable over the median of its absolute value."""
-GOOD_RESIDUAL = 0.01
-"""An image that fits this well is never an outlier, however well the others fit."""
-MAX_RESIDUAL = 0.25
-"""An image whose median error exceeds this is not aligned at all."""
-NO_DEPTH = "the map has no depth at any pixel"
-UNIT_POINTS = 20
-UNIT_SLACK = 1.25
-"""A map in scene units is refused if at least this many SfM points show it off by this factor."""
-
-MAX_VIEWS = 255
-"""Other views that a point can be compared with: 8 bits count them."""
-
-Values = Float64[np.ndarray, " M"]
 
 
 @dataclass(frozen=True)
-class Settings:
-    """The choices of depth-guided lifting; the defaults avoid the traps of the paper's text."""
+class _RobustFit:
+    """Robust fit of a line to SfM points."""
 
-    align: bool = True
-    """Fit the scale (for inverse depth, and shift) of each map to the SfM points."""
-    fit: Fit = "robust"
-    """How to fit: medians and reweighting, or the paper's equation 7 (paper: least-squares)."""
-    min_points: Annotated[int, Range(1)] = 20
-    """Fewest SfM points that an image must see, else it is left out (paper: 1)."""
-    max_residual_ratio: Annotated[float | None, Range(1)] = 3.0
-    """Leave out images that fit this many times worse than the median one (paper: none)."""
-    synchronize_scales: bool = True
-    """Then scale the maps, each by one factor, to agree with each other (paper: no)."""
-    unit_ray: bool = False
-    """Take z for the distance along the ray, as equation 9 says; this bends walls (paper: yes)."""
-    region: Annotated[float, Range(above=0, maximum=1)] = 1.0
-    """Central fraction of the width and of the height that pixels are drawn from (paper: 0.5)."""
-    placement: Literal["empty", "uniform"] = "empty"
-    """Draw pixels by their distance to the nearest SfM point, or uniformly (paper: uniform)."""
-    edge_tolerance: Annotated[float | None, Range(above=0)] = 0.03
-    """Avoid pixels near discontinuities larger than this fraction of depth (paper: none)."""
-    edge_radius: Annotated[int, Range(1, 100)] = 3
-    """Radius of the discontinuity test, in pixels of the map."""
-    min_agreeing: Annotated[int, Range(0, "num_neighbors")] = 2
-    """Other views whose depth and colour must confirm a point; 0 = none (paper: 0)."""
-    see_through: bool = False
-    """Keep points that another view looks through (paper: yes)."""
-    num_neighbors: Annotated[int, Range(1, MAX_VIEWS)] = 12
-    """Most other views that are compared with a point."""
-    tolerance: Annotated[float, Range(above=0, below=1)] = 0.02
-    """Relative difference up to which two depths agree."""
-    color_tolerance: Annotated[float | None, Range(above=0, maximum=1)] = 0.15
-    """Mean colour difference, 0 to 1, up to which two views agree; none = not compared."""
-    spread: bool = True
-    """Spread points as evenly as their number allows, whatever image they come from (paper:
-    no)."""
-    test_every: Annotated[int, Range(2, also=0)] = 0
-    """Leave out every n-th image by name, as trainers do for testing (8); 0 = use all but
-    test images that the scene lists."""
+    num_pairs: int = 256  # pairs of points whose lines are tried
+    tukey: float = 4.685  # Tukey's biweight at 95% efficiency, in standard deviations
+    max_steps: int = 20  # of reweighting
+    min_sigma: float = 1e-6  # relative depth: an exact fit must not divide by zero
 
-    @property
-    def synchronizes(self) -> bool:
-        """Whether maps are scaled to agree with each other; maps in scene units are left alone."""
-        return self.align and self.synchronize_scales
 
-    @property
-    def compares_views(self) -> bool:
-        """Whether points are compared with other views at all."""
-        return self.min_agreeing > 0 or not self.see_through
+@dataclass(frozen=True)
+class _Limits:
+    """Limits beyond which a map is rejected, relative to depth."""
+
+    good_residual: float = 0.01  # never an outlier, however well other images fit
+    max_residual: float = 0.25  # of the median point
+    unit_points: int = 20  # SfM points needed to check a map in scene units
+    unit_factor: float = 1.25  # by which such a map may be off
+
+
+ROBUST, LIMITS = _RobustFit(), _Limits()
+R2_STEPS = np.array([0.7548776662466927, 0.5698402909980532])
+"""Steps of the R2 sequence, which fills a square evenly (Roberts, 2018); replaces random pairs."""
+NO_DEPTH = "the map has no depth at any pixel"
+
+Values = Float64[np.ndarray, " M"]
 
 
 def least_squares_scale(
     raw: Float64[np.ndarray, " M ..."], sfm: Float64[np.ndarray, " M ..."]
 ) -> float:
-    """The s that minimises sum |s raw - sfm|^2: the paper's equation 7.
+    """Find the s that minimises sum |s raw - sfm|^2: the paper's equation 7.
 
-    ``raw`` are lifted pixels before scaling, p_raw, and ``sfm`` the SfM points that fall into them,
-    both relative to the camera's centre.
+    ``raw`` are lifted pixels before scaling, p_raw, and ``sfm`` the SfM points that project into
+    them, both relative to the camera's centre.
     """
     return float(np.vdot(raw, sfm) / np.vdot(raw, raw))
 
 
 def median_scale(value: Values, z: Values) -> float:
-    """The median of z / value: up to half of the points may be wrong."""
+    """Median of z / value, robust to up to half of the points."""
     return float(np.median(z / value))
 
 
 def least_squares_line(value: Values, z: Values) -> tuple[float, float]:
-    """The (a, b) that minimise sum (a value + b - 1 / z)^2."""
+    """Find the (a, b) that minimise sum (a value + b - 1 / z)^2."""
     return _weighted_line(value, 1.0 / z, np.ones_like(z))
 
 
 def robust_line(value: Values, z: Values) -> tuple[float, float]:
-    """The (a, b) that most points agree with, by relative error r = z (a value + b) - 1.
+    """Fit (a, b) robustly, by the relative error r = z (a value + b) - 1.
 
-    Of the lines through 256 pairs of points, the one whose errors have the least median is refined
-    by iteratively reweighted least squares with Tukey's biweight, as LO-RANSAC refines its best
+    Of the lines through 256 pairs of points, the one with the smallest median error is refined by
+    iteratively reweighted least squares with Tukey's biweight, as LO-RANSAC refines its best
     sample.
     """
     line = _best_of_pairs(value, 1.0 / z)
-    floor = 1e-6  # an exact fit must not divide by zero
-    for _ in range(STEPS):
+    for _ in range(ROBUST.max_steps):
         r = z * (line[0] * value + line[1]) - 1.0
-        sigma = max(SIGMA_OF_MEDIAN * float(np.median(np.abs(r))), floor)
+        sigma = max(SIGMA_OF_MEDIAN * float(np.median(np.abs(r))), ROBUST.min_sigma)
         # Tukey's biweight (1 - u^2)^2, 0 from 4.685 sigma on
-        u = np.minimum(np.abs(r) / (TUKEY * sigma), 1.0)
-        # The residual is relative, so a point's weight on 1 / z also has the factor z squared.
+        u = np.minimum(np.abs(r) / (ROBUST.tukey * sigma), 1.0)
+        # The residual is relative, so weights on 1 / z also have the factor z squared.
         line, before = _weighted_line(value, 1.0 / z, (1.0 - u * u) ** 2 * z * z), line
         if np.allclose(line, before, rtol=1e-9, atol=0.0):
             break
@@ -150,9 +99,9 @@ def robust_line(value: Values, z: Values) -> tuple[float, float]:
 
 
 def _best_of_pairs(value: Values, inverse: Values) -> tuple[float, float]:
-    """The line through two points with the smallest median of relative errors."""
+    """Find the line through two points with the smallest median relative error."""
     order = np.argsort(value, kind="stable")
-    steps = (np.arange(1, PAIRS + 1)[:, None] * GOLDEN) % 1.0
+    steps = (np.arange(1, ROBUST.num_pairs + 1)[:, None] * R2_STEPS) % 1.0
     first, second = order[(steps * len(value)).astype(np.int64)].T
     run = value[first] - value[second]
     usable = run != 0
@@ -180,7 +129,7 @@ def _weighted_line(value: Values, target: Values, weight: Values) -> tuple[float
 
 
 def map_camera(depth: DepthMap, image: Image) -> Camera:
-    """The camera of an image in the pixels of its map.
+    """Scale the camera of an image to the pixels of its map.
 
     Raises:
         SceneFormatError: The map and the image differ in aspect ratio.
@@ -203,7 +152,7 @@ def ray_length(
 
 @dataclass(frozen=True, eq=False)
 class PlanarDepth:
-    """A map whose planar depth is computed only at the few pixels that need it."""
+    """A map whose planar depth is computed on demand, at the pixels that are used."""
 
     values: Float32[np.ndarray, "H W"]  # NaN, or not above 0, where depth is unknown
     scale: float  # scene units per unit of ``values``
@@ -211,12 +160,12 @@ class PlanarDepth:
     camera: Camera  # the image's, in pixels of the map
 
     @classmethod
-    def of(
+    def from_map(
         cls, depth: DepthMap, camera: Camera, scale: float, shift: float, *, unit_ray: bool
     ) -> PlanarDepth:
-        """A map by its ``Alignment``'s scale and shift.
+        """Apply an ``Alignment``'s scale and shift to a map.
 
-        With ``unit_ray``, planar depth is taken for distance along the ray: equation 9's letter.
+        With ``unit_ray``, planar depth counts as distance along the ray, as equation 9 has it.
         """
         if depth.kind != "inverse":
             return cls(depth.values, scale, depth.kind == "ray" or unit_ray, camera)
@@ -225,8 +174,8 @@ class PlanarDepth:
             values = np.where(inverse > 0, 1.0 / inverse, np.nan).astype(np.float32)
         return cls(values, 1.0, unit_ray, camera)
 
-    def every(self, first: int, step: int) -> Float32[np.ndarray, "h w"]:
-        """Planar depth, before multiplication by the scale, at every ``step``-th row and column."""
+    def strided(self, first: int, step: int) -> Float32[np.ndarray, "h w"]:
+        """Planar depth, without the scale, at every ``step``-th row and column."""
         z = self.values[first::step, first::step].copy()
         if self.along_ray:
             row, column = (np.arange(first, size, step) for size in self.values.shape)
@@ -234,12 +183,12 @@ class PlanarDepth:
         z[~(z < np.inf)] = np.nan
         return np.asarray(z)
 
-    def whole(self) -> Float64[np.ndarray, "H W"]:
-        """Planar depth in scene units of every pixel."""
-        return self.every(0, 1) * np.float64(self.scale)
+    def full(self) -> Float64[np.ndarray, "H W"]:
+        """Planar depth of all pixels in scene units."""
+        return self.strided(0, 1) * np.float64(self.scale)
 
-    def at(self, pixel: Int64[np.ndarray, " C"]) -> Float32[np.ndarray, " C"]:
-        """Planar depth in scene units of pixels numbered row * W + column."""
+    def at_pixels(self, pixel: Int64[np.ndarray, " C"]) -> Float32[np.ndarray, " C"]:
+        """Planar depth of pixels (row * W + column) in scene units."""
         z = self.values.ravel()[pixel] * self.scale
         if self.along_ray:
             row, column = np.divmod(pixel, self.camera.width)
@@ -253,7 +202,7 @@ def lift_pixels(
     camera: Camera,
     factor: float = 1.0,
 ) -> Float32[np.ndarray, "C 3"]:
-    """The world positions of pixels (row * W + column) at depth ``factor * z``.
+    """Lift pixels (row * W + column) at depth ``factor * z`` to world positions.
 
     Equation 9: P = c + z v, where v is the ray through the pixel's centre, with unit z in camera
     axes; the text's P = c + s d v / |v| is the same with z = s d / |v|.
@@ -270,21 +219,21 @@ def lift_pixels(
 
 @dataclass(frozen=True)
 class Alignment:
-    """How an image's depth map is taken to scene units."""
+    """Scale and shift from an image's depth map to scene units."""
 
     scale: float  # scene units per unit of the map; of inverse depth, inverse ones
     shift: float  # added after scaling; 0 except for inverse depth
-    num_points: int  # SfM points that see depth
+    num_points: int  # SfM points on known depth
     residual: float  # median of their |aligned depth / depth of the point - 1|; NaN without any
-    rejected: str | None = None  # why the image is left out, in one sentence; None = it is used
+    rejected: str | None = None  # reason why the map is not used; None = it is used
 
 
 def align(
     scene: Scene, *, max_residual_ratio: float | None = 3.0, progress: Progress = silent
 ) -> dict[str, Alignment]:
-    """How the depth map of each image that has one fits its SfM points, by name; rejected ones too.
+    """Align each depth map of a scene to its SfM points, by image name; rejected maps included.
 
-    ``max_residual_ratio`` is as in ``Settings``.
+    ``max_residual_ratio`` is as in ``DepthSettings``.
 
     Raises:
         SceneNotFoundError: The scene has no maps, or a map's file is gone.
@@ -292,7 +241,7 @@ def align(
     """
     if scene.depths is None:
         raise SceneNotFoundError(
-            "a scene with depth maps", found="none", fix="Name their folder with --depth."
+            "a scene with depth maps", found="none", fix="Pass their folder as `depth`."
         )
     depths, visibility = scene.depths, find_visibility(scene)
     images = [image for image in scene.images if image.name in depths]
@@ -313,29 +262,29 @@ def align_map(
     depth: DepthMap,
     camera: Camera,
     points: PointsInImage,
-    fit: Fit = Settings.fit,
-    min_points: int = Settings.min_points,
+    fit: Fit = DepthSettings.fit,
+    min_points: int = DepthSettings.min_points,
     *,
     unit_ray: bool | None = None,
 ) -> Alignment:
-    """Align one map, whose camera is in its own pixels, with the SfM points that its image sees.
+    """Align one map to the SfM points that its image sees.
 
-    Without ``unit_ray``, depth is along rays for least squares, as equation 7 fits what equation 9
-    lifts, and planar otherwise.
+    ``camera`` is in pixels of the map. By default, ``unit_ray`` is set for least squares only, so
+    that equation 7 fits the points that equation 9 lifts.
     """
     if unit_ray is None:
         unit_ray = fit == "least-squares"
     value, z, points = _values_at(depth, camera, points, unit_ray=unit_ray)
     known = depth.values[np.isfinite(depth.values)]
-    refused = None
+    rejected = None
     if not known.size:
-        refused = NO_DEPTH
+        rejected = NO_DEPTH
     elif len(value) < max(min_points, 1):
-        refused = f"{len(value)} SfM points see depth; {max(min_points, 1)} are needed"
+        rejected = f"{len(value)} SfM points on known depth; {max(min_points, 1)} are needed"
     elif np.ptp(known) == 0:
-        refused = "the map has one value everywhere: its estimation failed on this image"
-    if refused is not None:
-        return Alignment(np.nan, 0.0, len(value), np.nan, refused)
+        rejected = "the map has one value everywhere: its estimation failed on this image"
+    if rejected is not None:
+        return Alignment(np.nan, 0.0, len(value), np.nan, rejected)
     if depth.kind == "inverse":
         scale, shift = (robust_line if fit == "robust" else least_squares_line)(value, z)
     elif fit == "robust":
@@ -347,38 +296,42 @@ def align_map(
         scale, shift = least_squares_scale(raw, target), 0.0
     residual = _residual(depth, value, z, scale, shift)
     if depth.kind == "inverse" and not scale > 0:
-        refused = "values rise with depth, so they are not its inverse"
-    elif not residual <= MAX_RESIDUAL:
-        refused = f"depth is off by {residual:.0%} at half of the SfM points"
-    return Alignment(scale, shift, len(value), residual, refused)
+        rejected = "values rise with depth, so they are not its inverse"
+    elif not residual <= LIMITS.max_residual:
+        rejected = f"depth is off by {residual:.0%} at half of the SfM points"
+    return Alignment(scale, shift, len(value), residual, rejected)
 
 
-def trust_units(
-    depth: DepthMap, camera: Camera, points: PointsInImage, *, unit_ray: bool = Settings.unit_ray
+def check_units(
+    depth: DepthMap,
+    camera: Camera,
+    points: PointsInImage,
+    *,
+    unit_ray: bool = DepthSettings.unit_ray,
 ) -> Alignment:
-    """Take a map as being in scene units, checked against the SfM points if there are any."""
+    """Check a map in scene units against the SfM points, if there are enough; its scale is 1."""
     value, z, _ = _values_at(depth, camera, points, unit_ray=unit_ray)
-    residual, refused = np.nan, None
+    residual, rejected = np.nan, None
     if not np.isfinite(depth.values).any():
-        refused = NO_DEPTH
-    elif len(value) >= UNIT_POINTS:
+        rejected = NO_DEPTH
+    elif len(value) >= LIMITS.unit_points:
         residual = _residual(depth, value, z, 1.0, 0.0)
         with np.errstate(divide="ignore"):
             ratio = float(np.median((1.0 / value if depth.kind == "inverse" else value) / z))
         # Depth in millimetres, or of another scene, is off by far more.
-        if not 1.0 / UNIT_SLACK < ratio < UNIT_SLACK:
-            refused = f"its depth is {ratio:.3g} times that of the SfM points"
-    return Alignment(1.0, 0.0, len(value), residual, refused)
+        if not 1.0 / LIMITS.unit_factor < ratio < LIMITS.unit_factor:
+            rejected = f"its depth is {ratio:.3g} times that of the SfM points"
+    return Alignment(1.0, 0.0, len(value), residual, rejected)
 
 
 def _values_at(
     depth: DepthMap, camera: Camera, points: PointsInImage, *, unit_ray: bool
 ) -> tuple[Values, Values, PointsInImage]:
-    """The map's values at the points that see depth, the depths to compare, and these points.
+    """Map values at the points on known depth, the depths to compare, and these points.
 
-    A point takes the value of the pixel it falls into. Distances along the ray are turned into
-    planar depth by the ray through that pixel's centre. Their inverses cannot be, as their shift is
-    not known yet: the points' planar depths become distances instead.
+    A point takes the value of the pixel it projects into. Distances along the ray are converted to
+    planar depth by the ray through that pixel's centre. Inverse distances cannot be converted
+    before their shift is known: the points' planar depths become distances instead.
     """
     column, row = points.uv.astype(np.int64).T
     value, z = depth.values[row, column].astype(np.float64), points.depth
@@ -408,13 +361,13 @@ def _residual(depth: DepthMap, value: Values, z: Values, scale: float, shift: fl
 def reject_outliers(
     alignments: dict[str, Alignment], max_ratio: float | None
 ) -> dict[str, Alignment]:
-    """Reject the images that fit much worse than the median of those not yet rejected."""
+    """Reject images that fit much worse than the median of those not yet rejected."""
     residuals = [a.residual for a in alignments.values() if a.rejected is None]
     if max_ratio is None or not residuals:
         return alignments
     typical = float(np.median(residuals))
-    # The median image is not an outlier; 1% is good whatever the others do.
-    limit = max(max_ratio * typical, GOOD_RESIDUAL)
+    # The median image is no outlier, and neither is one off by 1%.
+    limit = max(max_ratio * typical, LIMITS.good_residual)
     return {
         name: replace(a, rejected=f"depth is off by {a.residual:.1%}, typically {typical:.1%}")
         if a.rejected is None and a.residual > limit

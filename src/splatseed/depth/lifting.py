@@ -1,16 +1,12 @@
 """Depth-guided lifting, from the images of a scene to new points.
 
-Notation: every image gives *candidates*, C in all; a candidate is *sound* (``tier`` 0) if enough
-views confirm it, none looks through it, and no depth discontinuity is near. To spread points, space
-is cut into cubes of one *side*; the key of a cube is its position, three numbers of 21 bits,
-scrambled so that all its bits are as good as random.
-Promise: exactly the number asked for, or one error that says how many are possible. Sound
-candidates come first, then those that too few views confirm, then those near discontinuities; none
-that a view looks through is used, unless that is allowed. A note says how many of the less certain
-ones were needed. Within one tier, points are spread evenly in space, or every image gives the same
-number as far as it can. Each cube gives at most one candidate, the one with the finest footprint,
-and none if an original lies in it; the side is the largest that gives the number, to about a
-fiftieth; the result does not depend on threads.
+Notation: images give C *candidates* in all. A candidate is *sound* (``tier`` 0) if enough views
+confirm it, no view sees through it, and no depth discontinuity is near. Promise: ``lift`` returns
+exactly the number asked for, or raises one error with the number that is possible. Sound candidates
+come first, then those that too few views confirm, then those near discontinuities; a note counts
+the latter two. Points that a view sees through are used only if the settings allow it. Within a
+tier, points are spread evenly in space, or images give equal numbers as far as they can. Results do
+not depend on threads.
 """
 
 from __future__ import annotations
@@ -21,67 +17,59 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int64, UInt8, UInt64
+from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
-from splatseed.depth.alignment import Settings, lift_pixels, reject_outliers
+from splatseed.depth.alignment import lift_pixels, reject_outliers
 from splatseed.depth.comparison import choose_neighbors, find_support, synchronize_scales
+from splatseed.depth.settings import DepthSettings
+from splatseed.depth.thinning import spread_evenly
 from splatseed.depth.views import DepthView, read_view
 from splatseed.errors import PointCloudError, SceneFormatError, SceneNotFoundError
 from splatseed.io.photograph import photograph_folder
 from splatseed.io.photograph_checks import with_photographs
 from splatseed.photos.visibility import find_visibility
 from splatseed.progress import Progress, in_threads, silent
-from splatseed.runtime.hashing import scramble
-from splatseed.runtime.jit import kernel, parallel_range
 from splatseed.scene import Image, Scene
 from splatseed.text import agreeing
 
-SOUND, UNCONFIRMED, NEAR_EDGE, DISTRUSTED = range(4)
-"""Tiers, in the order in which they are used up; the last is never used."""
-OVERSAMPLING = 1.4
-"""Candidates per new point, when views are compared or points spread."""
-MAX_OVERSAMPLING, MAX_GROWTH = 16.0, 8.0
-"""Most candidates per new point, and the most by which a round of reading multiplies them."""
-SURPLUS = 1.25
-"""Candidates are overdrawn by this factor, to save another round."""
-NAMED = 3
-"""Most images that a note names."""
-PIECE = 4
-"""Views per task of a thread."""
-PARTS, SAMPLED, FEW = 32, 2, 1 << 16
-"""Parts of the hash range, by a key's top 5 bits; those whose cubes are counted to find the side,
-unless there are few candidates."""
-STEPS = 24
-"""Most trials of a side."""
-LEAST_POWER = 0.2
-"""Least exponent e assumed in: number of cubes ~ (1 / side)^e; bounds the length of a step."""
-SLACK = 0.02
-"""Surplus of cubes that is accepted: it is then dropped at random."""
-BITS = 21
-"""Bits of a cube's position along one axis: three fit into 64."""
-OUTSIDE = 2.0**20 + 2
-"""Positions beyond every cube of a candidate, as no side is below ``FINEST``."""
-FINEST = 2.0**-20
-"""The smallest side, as a fraction of the candidates' extent: positions fit into the bits."""
+SOUND, UNCONFIRMED, NEAR_EDGE, SEEN_THROUGH = range(4)
+"""Tiers, in the order in which they are used; the last is never used."""
+VIEWS_PER_TASK = 4
+MAX_NAMED = 3
+"""Images that a note names."""
+
+
+@dataclass(frozen=True)
+class _Oversampling:
+    """Candidates drawn per new point."""
+
+    compared: float = 1.4  # at first, if views are compared or points spread
+    plain: float = 1.25  # at first otherwise, and the surplus of a further round
+    limit: float = 16.0
+    max_growth: float = 8.0  # of a further round
+
+
+OVERSAMPLING = _Oversampling()
 
 
 def lift(
     scene: Scene,
     num: int,
-    settings: Settings,
+    settings: DepthSettings,
     rng: np.random.Generator,
     progress: Progress = silent,
 ) -> tuple[Float32[np.ndarray, "M 3"], UInt8[np.ndarray, "M 3"], tuple[str, ...]]:
     """Lift ``num`` pixels of a scene's images into its world.
 
-    Each image and its map are read once, and again only if too few of the candidates are sound.
-    Returns world positions and colours, image after image, and what was left out or replaced, one
-    sentence each.
+    Each image and its map are read once, and again only if too few candidates are sound.
+
+    Returns:
+        World positions and colours, image after image, and notes on what was left out.
 
     Raises:
         SceneNotFoundError: There are no maps or no photographs, or a file is gone.
         SceneFormatError: A file is damaged or does not fit, or no map can be aligned.
-        PointCloudError: The maps cannot give so many points.
+        PointCloudError: The maps cannot give that many points.
     """
     scene, center = _centered(scene)
     depths, visibility = scene.depths, find_visibility(scene)
@@ -93,20 +81,17 @@ def lift(
         raise SceneNotFoundError(
             "a scene with depth maps of its images",
             found=f"{len(scene.images)} images, and maps of none of them",
-            fix="Name the folder with the maps: --depth DIR.",
+            fix="Pass the folder with the maps as `depth`, or maps to scene.with_depths.",
         )
-    folder, notes, there = (
-        photograph_folder(scene),
-        [],
-        {i.name for i in with_photographs(scene).images},
-    )
-    images = [image for image in images if image.name in there]
+    folder, notes = photograph_folder(scene), list[str]()
+    readable = {image.name for image in with_photographs(scene).images}
+    images = [image for image in images if image.name in readable]
     if lacking := sum(image.name not in depths for image in used):
         what = agreeing(lacking, "has no depth map and gives", "have no depth map and give")
         notes.append(f"{lacking} of {len(used)} images {what} no points.")
 
     def read_all(num: float) -> list[DepthView]:
-        """The views of all images, which share the number of candidates equally."""
+        """Read all images, each with an equal number of candidates."""
         views: dict[int, DepthView] = {}
         # One seed per image, drawn in order, so that threads do not matter.
         seeds = rng.integers(0, 1 << 63, len(images))
@@ -122,18 +107,20 @@ def lift(
         in_threads(work, len(images), 1, "read images", progress)
         return [views[i] for i in range(len(images))]
 
-    factor = OVERSAMPLING if settings.compares_views or settings.spread else SURPLUS
+    factor = OVERSAMPLING.plain
+    if settings.compares_views or settings.spread:
+        factor = OVERSAMPLING.compared
     views = read_all(factor * num)
     images, views = _leave_out(images, views, settings.max_residual_ratio, notes)
     candidates = _gather(views, settings, progress)
     while (
         (sound := int(np.count_nonzero(candidates.tier == SOUND))) < num
-        and factor < MAX_OVERSAMPLING
+        and factor < OVERSAMPLING.limit
         and not all(v.exhausted for v in views)
     ):
-        # In proportion to what was sound, so that one more round mostly suffices.
-        growth = SURPLUS * num / max(sound, 1)
-        factor = min(factor * min(growth, MAX_GROWTH), MAX_OVERSAMPLING)
+        # In proportion to the sound ones, so that one more round mostly suffices.
+        growth = OVERSAMPLING.plain * num / max(sound, 1)
+        factor = min(factor * min(growth, OVERSAMPLING.max_growth), OVERSAMPLING.limit)
         views = read_all(factor * num)
         candidates = _gather(views, settings, progress)
     progress("choose points", 0.0)
@@ -154,10 +141,9 @@ def lift(
 
 
 def _centered(scene: Scene) -> tuple[Scene, Float64[np.ndarray, " 3"]]:
-    """The scene with the mean of its cameras moved to the origin, and that mean.
+    """Move the mean of the cameras to the origin; returns the scene and that mean.
 
-    Candidates are float32, which far from the origin (UTM coordinates) would be too coarse to
-    compare.
+    Candidates are float32: far from the origin (UTM coordinates) they would be too coarse.
     """
     if not scene.images:
         return scene, np.zeros(3)
@@ -173,7 +159,7 @@ def _centered(scene: Scene) -> tuple[Scene, Float64[np.ndarray, " 3"]]:
 def _leave_out(
     images: list[Image], views: list[DepthView], max_ratio: float | None, notes: list[str]
 ) -> tuple[list[Image], list[DepthView]]:
-    """The images and views whose maps are aligned; a note is added on the others."""
+    """Keep the images and views whose maps are aligned; adds a note on the others."""
     alignments = reject_outliers(
         {image.name: view.alignment for image, view in zip(images, views, strict=True)}, max_ratio
     )
@@ -183,19 +169,19 @@ def _leave_out(
         raise SceneFormatError(
             "depth maps that fit the SfM points of their images",
             found=f"none among {len(images)}; {name}: {reason}",
-            fix="Look at them with splatseed info SCENE --depth DIR; check --depth-kind and "
-            "--depth-scale.",
+            fix="View them with splatseed info SCENE --depth DIR; check `depth_kind` and "
+            "`depth_scale`.",
         )
     if reasons:
-        named = "; ".join(f"{name}: {reason}" for name, reason in list(reasons.items())[:NAMED])
-        more = ", ..." if len(reasons) > NAMED else ""
+        named = "; ".join(f"{name}: {reason}" for name, reason in list(reasons.items())[:MAX_NAMED])
+        more = ", ..." if len(reasons) > MAX_NAMED else ""
         notes.append(f"{len(reasons)} of {len(images)} depth maps are left out ({named}{more}).")
     kept = [i for i, image in enumerate(images) if image.name not in reasons]
     return [images[i] for i in kept], [views[i] for i in kept]
 
 
 class _Candidates(NamedTuple):
-    """Points that could be added, view after view."""
+    """Candidates of all views, view after view."""
 
     xyz: Float32[np.ndarray, "C 3"]
     rgb: UInt8[np.ndarray, "C 3"]
@@ -204,8 +190,8 @@ class _Candidates(NamedTuple):
     view_idx: Int64[np.ndarray, " C"]
 
 
-def _gather(views: Sequence[DepthView], settings: Settings, progress: Progress) -> _Candidates:
-    """Lift the views' candidates, and compare them with other views if the settings say so."""
+def _gather(views: Sequence[DepthView], settings: DepthSettings, progress: Progress) -> _Candidates:
+    """Lift the views' candidates, and compare them with other views if the settings ask for it."""
     counts = np.array([len(view) for view in views])
     neighbors = choose_neighbors(views, settings.num_neighbors, progress)
     factors = np.ones(len(views))
@@ -228,7 +214,7 @@ def _gather(views: Sequence[DepthView], settings: Settings, progress: Progress) 
         for i in range(first, last):
             view, own, factor = views[i], copies[i], float(factors[i])
             xyz, _, footprint, tier, _ = (
-                each[stop_of[i] - counts[i] : stop_of[i]] for each in candidates
+                column[stop_of[i] - counts[i] : stop_of[i]] for column in candidates
             )
             xyz[:] = lift_pixels(view.pixel, view.z, view.camera, factor)
             # A pixel at depth z is z / focal wide.
@@ -236,14 +222,14 @@ def _gather(views: Sequence[DepthView], settings: Settings, progress: Progress) 
             tier[:] = SOUND
             seen_through: Bool[np.ndarray, " C"] | None = None
             if settings.compares_views and own is not None:
-                asked = [copy for j in neighbors[i] if j >= 0 and (copy := copies[j]) is not None]
-                confirming, seen_through = find_support(xyz, own, asked, settings)
+                others = [copy for j in neighbors[i] if j >= 0 and (copy := copies[j]) is not None]
+                confirming, seen_through = find_support(xyz, own, others, settings)
                 tier[confirming < settings.min_agreeing] = UNCONFIRMED
             tier[view.edge] = NEAR_EDGE  # the worst tier counts
             if seen_through is not None and not settings.see_through:
-                tier[seen_through] = DISTRUSTED
+                tier[seen_through] = SEEN_THROUGH
 
-    in_threads(work, len(views), PIECE, "compare views", progress)
+    in_threads(work, len(views), VIEWS_PER_TASK, "compare views", progress)
     return candidates
 
 
@@ -251,27 +237,29 @@ def _choose(
     candidates: _Candidates,
     originals: Float32[np.ndarray, "N 3"],
     num: int,
-    settings: Settings,
+    settings: DepthSettings,
     rng: np.random.Generator,
 ) -> Int64[np.ndarray, " num"]:
-    """Exactly ``num`` candidates, ascending indices, beside originals that exist already."""
-    usable = int(np.count_nonzero(candidates.tier < DISTRUSTED))
+    """Choose ``num`` candidates, ascending indices, away from the originals if spread."""
+    usable = int(np.count_nonzero(candidates.tier < SEEN_THROUGH))
     if usable < num:
-        larger = " or a larger --depth.region" if settings.region < 1 else ""
+        larger = " or a larger `depth.region`" if settings.region < 1 else ""
         raise PointCloudError(
             f"depth maps that can give {num:,} points",
-            found=f"{usable:,} that no other view looks through" if usable else "none",
-            fix=f"Ask for fewer, or allow more with --depth.see-through{larger}.",
+            found=f"{usable:,} that no other view sees through" if usable else "none",
+            fix=f"Ask for fewer, or allow more with `depth.see_through=True`{larger}.",
         )
     taken = np.zeros(len(candidates.tier), bool)
-    for tier in range(DISTRUSTED):
+    for tier in range(SEEN_THROUGH):
         members, missing = candidates.tier == tier, num - int(np.count_nonzero(taken))
         if missing >= np.count_nonzero(members):
             taken |= members
         elif settings.spread:
             there = np.concatenate([originals, candidates.xyz[taken]])
             xyz, footprint = candidates.xyz, candidates.footprint
-            return np.flatnonzero(taken | thin(xyz, footprint, members, there, missing, rng))
+            return np.flatnonzero(
+                taken | spread_evenly(xyz, footprint, members, there, missing, rng)
+            )
         else:
             which = np.flatnonzero(members)
             taken[which[_even_shares(candidates.view_idx[which], missing, rng)]] = True
@@ -282,106 +270,10 @@ def _choose(
 def _even_shares(
     view_idx: Int64[np.ndarray, " C"], num: int, rng: np.random.Generator
 ) -> Int64[np.ndarray, " num"]:
-    """``num`` of C indices, as many from every view as it and the others have."""
+    """Choose ``num`` of C indices at random, in equal numbers from each view as far as they go."""
     order = rng.permutation(len(view_idx))
     order = order[np.argsort(view_idx[order], kind="stable")]
     counts = np.bincount(view_idx)
-    place = np.arange(len(order)) - np.repeat(np.cumsum(counts) - counts, counts)
-    # The first of every view, then the second of every view, and so on.
-    return np.asarray(order[np.argsort(place, kind="stable")[:num]])
-
-
-def thin(
-    xyz: Float32[np.ndarray, "C 3"],
-    footprint: Float32[np.ndarray, " C"],
-    eligible: Bool[np.ndarray, " C"],
-    originals: Float32[np.ndarray, "N 3"],
-    num: int,
-    rng: np.random.Generator,
-) -> Bool[np.ndarray, " C"]:
-    """Mark ``num`` of the eligible candidates, one per cube, the finest; none beside an original.
-
-    ``rng`` draws which of a small surplus are dropped, and fills up where candidates coincide.
-    """
-    cubes = Cubes(xyz, footprint, eligible, originals)
-    side = _largest_side(cubes, num)
-    taken = cubes.take(side)
-    if np.count_nonzero(taken) < num:  # the estimate was a little too large
-        taken = cubes.take(side * (1.0 - 2 * SLACK))
-    surplus = np.count_nonzero(taken) - num
-    if surplus > 0:
-        taken[rng.choice(np.flatnonzero(taken), surplus, replace=False, shuffle=False)] = False
-    else:
-        rest = np.flatnonzero(eligible & ~taken)
-        taken[rng.choice(rest, -surplus, replace=False, shuffle=False)] = True
-    return taken
-
-
-def _largest_side(cubes: Cubes, num: int) -> float:
-    """The largest side at which about ``num`` cubes hold a candidate."""
-    extent = float(np.ptp(cubes.xyz.astype(np.float64), axis=0).max()) or 1.0
-    least, most = FINEST * extent, extent
-    side, power = extent / math.sqrt(num), 2.0  # points on surfaces; fewer when saturated
-    known: tuple[float, float] | None = None
-    for _ in range(STEPS):
-        count = max(cubes.count(side), 1.0)
-        if num <= count <= num * (1.0 + SLACK):
-            return side
-        least, most = (side, most) if count > num else (least, side)
-        if known is not None and count != known[1]:
-            power = math.log(count / known[1]) / math.log(known[0] / side)
-        known = side, count
-        # Secant step in log side: count ~ side^-power, aimed at the middle of the slack.
-        guess = side * (count / (num * (1.0 + 0.5 * SLACK))) ** (1.0 / max(power, LEAST_POWER))
-        # A step out of the bracket is replaced by bisection, in log side.
-        side = guess if least < guess < most else math.sqrt(least * most)
-    return least
-
-
-@dataclass(frozen=True, eq=False)
-class Cubes:
-    """Candidates and originals, sorted into cubes of any side; arguments as ``thin`` has them."""
-
-    xyz: Float32[np.ndarray, "C 3"]
-    footprint: Float32[np.ndarray, " C"]
-    eligible: Bool[np.ndarray, " C"]
-    originals: Float32[np.ndarray, "N 3"]
-
-    def count(self, side: float) -> float:
-        """Estimate how many cubes hold a candidate and no original."""
-        parts = PARTS if len(self.xyz) < FEW else SAMPLED
-        keys, blocked = self._keys(side)
-        some = keys[self.eligible & (keys >> np.uint64(59) < parts)]
-        return len(np.setdiff1d(some, blocked)) * (PARTS / parts)
-
-    def take(self, side: float) -> Bool[np.ndarray, " C"]:
-        """Mark the candidate that each cube gives: the finest, of equals the first."""
-        keys, blocked = self._keys(side)
-        candidates = np.flatnonzero(self.eligible & ~np.isin(keys, blocked))
-        order = candidates[np.lexsort((self.footprint[candidates], keys[candidates]))]
-        taken = np.zeros(len(keys), np.bool_)
-        taken[order[np.unique(keys[order], return_index=True)[1]]] = True
-        return taken
-
-    def _keys(self, side: float) -> list[UInt64[np.ndarray, " C"]]:
-        """The keys of the candidates' cubes, and of the originals'."""
-        low = self.xyz.min(axis=0).astype(np.float64)
-        keys = [np.empty(len(points), np.uint64) for points in (self.xyz, self.originals)]
-        _find_cubes(self.xyz, low, side, keys[0])
-        _find_cubes(self.originals, low, side, keys[1])
-        return keys
-
-
-@kernel
-def _find_cubes(xyz, low, side, out):  # type: ignore[no-untyped-def]  # Numba's types
-    """The key of each point's cube.
-
-    Points outside the candidates' box get keys that no other cube has.
-    """
-    for k in parallel_range(len(xyz)):
-        key = np.uint64(0)
-        for axis in range(3):
-            place = np.floor((np.float64(xyz[k, axis]) - low[axis]) / side)
-            inside = min(max(place, -1.0), OUTSIDE)
-            key = (key << np.uint64(BITS)) | np.uint64(inside + 1.0)
-        out[k] = scramble(key)
+    rank = np.arange(len(order)) - np.repeat(np.cumsum(counts) - counts, counts)
+    # The first of each view, then the second of each view, and so on.
+    return np.asarray(order[np.argsort(rank, kind="stable")[:num]])

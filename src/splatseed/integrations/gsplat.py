@@ -34,7 +34,7 @@ from splatseed.training.device import Capacity
 from splatseed.training.growing import BASES, FAINT, Growing
 
 REQUIRED = ("means", "scales", "quats", "opacities")
-MAKE_MAPS = "Make them with splatseed depth SCENE --stereo -o FOLDER."
+MAKE_MAPS = "Make them with splatseed depth SCENE -o FOLDER."
 UNSEEN = np.empty((0, 0, 3), np.uint8)  # a view's photograph, where only its camera matters
 
 
@@ -58,7 +58,7 @@ class GrowStrategy(MCMCStrategy):  # type: ignore[misc]  # gsplat has no types
     refine_every: int = GROW_EVERY
     """Steps between such rounds."""
     depths: Path | None = None
-    """The folder that ``splatseed depth SCENE --stereo`` wrote; without it, growth only splits."""
+    """The folder that ``splatseed depth SCENE`` wrote; without it, growth only splits."""
     depth_scale: float | None = None
     """Training units per unit of the depth maps, which are in the scene's: the scale by which the
     trainer normalises the world."""

@@ -13,7 +13,7 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from splatseed.depth.alignment import Settings
+from splatseed.depth.settings import DepthSettings
 from splatseed.methods.contract import NewPoints, Traits
 from splatseed.progress import Progress
 from splatseed.scene import Scene
@@ -21,7 +21,7 @@ from splatseed.settings import check_settings
 
 
 @dataclass(frozen=True)
-class Depth(Settings):
+class Depth(DepthSettings):
     """Pixels lifted by depth maps (eqs. 7-9), which also fills untextured areas."""
 
     name: ClassVar[str] = "depth"

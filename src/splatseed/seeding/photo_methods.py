@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
 
-from splatseed.depth.stereo.maps import MOST_GRID, TOO_FEW, StereoSettings
+from splatseed.depth.stereo.maps import MAX_GRID, MIN_POINTS, StereoSettings
 from splatseed.errors import PointCloudError, SceneNotFoundError
 from splatseed.methods import as_cloud, source_code
 from splatseed.methods.contract import NewPoints, Traits
@@ -52,7 +52,7 @@ class Stereo(PhotographMethod):
 
     spacing: Annotated[float, Range(1, 256)] = 8.0
     """Pixels between stereo's seeds in the photographs; at least the grid."""
-    grid: Annotated[int, Range(1, MOST_GRID)] = 4
+    grid: Annotated[int, Range(1, MAX_GRID)] = 4
     """Pixels between depths, along a row and a column."""
 
     name: ClassVar[str] = "stereo"
@@ -83,7 +83,7 @@ class Stereo(PhotographMethod):
 
         Without points, the scene's poses are checked first.
         """
-        from splatseed.depth.stereo.depths import fuse  # noqa: PLC0415  (kernels load with use)
+        from splatseed.depth.stereo.fusion import fuse  # noqa: PLC0415  (kernels load with use)
 
         images = photographed(scene, self.test_every)
         warnings: tuple[str, ...] = ()
@@ -156,15 +156,15 @@ class Auto(Stereo):
 def has_points(scene: Scene) -> bool:
     """Whether there are points that vouch for the poses, as far as points can."""
     points = scene.points.originals
-    return int(np.count_nonzero(points.distinct)) >= TOO_FEW
+    return int(np.count_nonzero(points.distinct)) >= MIN_POINTS
 
 
 def begins_from_points(scene: Scene) -> bool:
     """Whether there are enough points for stereo to search around; else photographs must do."""
-    from splatseed.depth.stereo.depths import enough_points  # noqa: PLC0415  (kernels load with use)
+    from splatseed.depth.stereo.pipeline import has_enough_points  # noqa: PLC0415  (kernels load with use)
     from splatseed.photos.visibility import find_visibility  # noqa: PLC0415  (loads with its use)
 
-    return enough_points(find_visibility(scene), scene.images)
+    return has_enough_points(find_visibility(scene), scene.images)
 
 
 def photographed(
@@ -214,7 +214,7 @@ def compare(
     only: Sequence[int] | None = None,
 ) -> StereoResult:
     """Stereo of the photographs, or what ``only`` some need; depths are ``grid`` pixels apart."""
-    from splatseed.depth.stereo.depths import find_stereo, known_visibility  # noqa: PLC0415  (loads Numba)
+    from splatseed.depth.stereo.pipeline import find_stereo, known_visibility  # noqa: PLC0415  (loads Numba)
 
     settings, seed = StereoSettings(grid=grid), int(rng.integers(1 << 32))
     return find_stereo(views, images, known_visibility(scene), settings, seed, progress, only)
@@ -250,7 +250,7 @@ def _found(scene: Scene, stereo: StereoResult, seconds: float) -> tuple[str, ...
     if begins_from_points(scene):
         return ()
     points = "too few" if has_points(scene) else "no"
-    share = np.mean([stereo.kept(i).mean() for i in range(len(stereo.views))])
+    share = np.mean([stereo.confirmed(i).mean() for i in range(len(stereo.views))])
     told = (
         f"There were {points} points to begin from: comparing the photographs gave {share:.0%} of "
         f"their pixels a confirmed depth, in {seconds:.0f} s."

@@ -22,9 +22,9 @@ from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter, sobe
 from scipy.signal import correlate
 
 from splatseed.camera import Camera
-from splatseed.depth.stereo.depths import any_depth
+from splatseed.depth.stereo.coarse import prior_from_baseline
 from splatseed.depth.stereo.maps import StereoSettings
-from splatseed.depth.stereo.matching import blocks_known, match_views
+from splatseed.depth.stereo.matching import match_views, valid_blocks
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.photos.sources import choose_by_pose
 from splatseed.photos.view import View, data_factor, load_views
@@ -354,12 +354,12 @@ def _look(scene: Scene, images: Sequence[Image], poses: Poses, number: int) -> f
     read = load_views(scene, some, data_factor=data_factor(some, SIDE), undistort=True)
     views = [replace(view, cam_from_world=poses[i]) for view, i in zip(read, chosen, strict=True)]
     sources = choose_by_pose(poses[chosen], PARTNERS)
-    hints = [any_depth(views, i, others) for i, others in enumerate(sources)]
-    stereo = match_views(views, hints, sources, SETTINGS, 0, silent)
+    priors = [prior_from_baseline(views, i, others) for i, others in enumerate(sources)]
+    stereo = match_views(views, priors, sources, SETTINGS, 0, silent)
     shares = []
     for i, view in enumerate(views):
-        kept = stereo.kept(i)
-        counts = None if view.mask is None else blocks_known(view.mask, SETTINGS.grid)
+        kept = stereo.confirmed(i)
+        counts = None if view.mask is None else valid_blocks(view.mask, SETTINGS.grid)
         shares += [kept.mean()] if counts is None else [kept[counts].mean()] * bool(counts.any())
     return float(np.mean(shares)) if shares else 0.0
 

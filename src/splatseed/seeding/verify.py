@@ -27,8 +27,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
-from splatseed.depth.stereo.cost import NOISE, SAMPLES, best_cost, grey_image, prepare_window
-from splatseed.depth.stereo.matching import make_quad_images
+from splatseed.depth.stereo._kernels.cost import NOISE, SAMPLES, best_cost, prepare_window
+from splatseed.depth.stereo.quads import grey_image, make_quad_images
 from splatseed.methods.contract import NewPoints
 from splatseed.methods.neighbors import Neighbors, PreparedCloud, prepare
 from splatseed.methods.patches import local_frames

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-from splatseed.depth.stereo.maps import StereoResult, StereoSettings, stereo_depths
+from splatseed.depth.stereo import StereoResult, StereoSettings, stereo_depths
 from splatseed.io.files import ARCHIVE_FAILURES
 from splatseed.io.seeds import saw_all_photographs, was_upsampled
 from splatseed.io.staging import atomic_file

@@ -113,7 +113,7 @@ def _checked(
         words = "depth, not aligned"
     else:
         scale, shift = (alignment.scale, alignment.shift) if aligned else (1.0, 0.0)
-        z = PlanarDepth.of(depth, camera, scale, shift, unit_ray=False).whole()
+        z = PlanarDepth.from_map(depth, camera, scale, shift, unit_ray=False).full()
         low, high = page.usual_range(z)
         seen = page.depth_picture(z)
         words = f"depth {low:.3g} to {high:.3g}" + ("" if aligned else ", not aligned")

@@ -6,8 +6,8 @@ from collections import namedtuple
 
 import pytest
 
-from splatseed.depth.stereo.depths import find_stereo
 from splatseed.depth.stereo.maps import StereoSettings
+from splatseed.depth.stereo.pipeline import find_stereo
 from splatseed.photos.view import load_views
 from splatseed.photos.visibility import find_visibility
 

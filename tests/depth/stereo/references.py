@@ -6,7 +6,15 @@ import math
 
 import numpy as np
 
-from splatseed.depth.stereo.cost import BEST, NOISE, RADIUS, SIGMA_GREY, SIGMA_PLACE, STRIDE, UNSEEN
+from splatseed.depth.stereo._kernels.cost import (
+    NOISE,
+    NUM_BEST,
+    RADIUS,
+    SIGMA_GREY,
+    SIGMA_SPACE,
+    STRIDE,
+    UNSEEN_COST,
+)
 
 OFFSETS = [
     (STRIDE * i, STRIDE * j) for j in range(-RADIUS, RADIUS + 1) for i in range(-RADIUS, RADIUS + 1)
@@ -34,7 +42,7 @@ def window_weights(image: np.ndarray, u: float, v: float) -> np.ndarray:
     weights = []
     for dx, dy in OFFSETS:
         apart = bilinear(image, u + dx - 0.5, v + dy - 0.5) - center
-        exponent = -(apart**2) / (2 * SIGMA_GREY**2) - (dx**2 + dy**2) / (2 * SIGMA_PLACE**2)
+        exponent = -(apart**2) / (2 * SIGMA_GREY**2) - (dx**2 + dy**2) / (2 * SIGMA_SPACE**2)
         weights.append(math.exp(max(exponent, FARTHEST)))
     return np.array(weights) / sum(weights)
 
@@ -51,7 +59,7 @@ def cost_in(
     if center[2] <= 0 or not (
         0 < center[0] / center[2] < width and 0 < center[1] / center[2] < height
     ):
-        return UNSEEN
+        return UNSEEN_COST
     c = window_weights(image, u, v)
     r, s = [], []
     for dx, dy in OFFSETS:
@@ -66,8 +74,8 @@ def cost_in(
 
 
 def best_of(costs: list[float]) -> float:
-    """The mean of the lowest ``BEST``."""
-    return float(np.mean(sorted(costs)[:BEST]))
+    """The mean of the lowest ``NUM_BEST``."""
+    return float(np.mean(sorted(costs)[:NUM_BEST]))
 
 
 def agrees(

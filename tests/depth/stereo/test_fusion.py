@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from splatseed.depth.stereo.depths import SAME, fuse
+from splatseed.depth.stereo.fusion import SAME_DEPTH, fuse
 
 CELL = 6.0
 
@@ -34,7 +34,7 @@ def test_a_cell_of_a_view_has_one_seed_at_a_depth(seeds, ball):
         cells = np.floor(uv / CELL).astype(int)
         for cell in np.unique(cells, axis=0):
             here = np.sort(1.0 / z[(cells == cell).all(axis=1)])
-            assert (np.diff(here) / here[:-1] > SAME / (1 + SAME) - 1e-4).all()
+            assert (np.diff(here) / here[:-1] > SAME_DEPTH / (1 + SAME_DEPTH) - 1e-4).all()
 
 
 def test_every_kept_pixel_has_a_seed_near_it(seeds, ball):
@@ -42,7 +42,7 @@ def test_every_kept_pixel_has_a_seed_near_it(seeds, ball):
     stereo, xyz = ball.stereo, seeds.xyz.astype(float)
     for i, view in enumerate(stereo.views):
         stereo_map = stereo.map(i)
-        row, column = np.nonzero(stereo.kept(i))
+        row, column = np.nonzero(stereo.confirmed(i))
         depth = stereo_map.depth[row, column]
         points = stereo_map.camera.unproject(np.stack([column, row], axis=1) + 0.5, depth)
         gap = np.linalg.norm(points[:, None] - xyz, axis=2).min(axis=1)

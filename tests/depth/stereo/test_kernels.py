@@ -6,18 +6,22 @@ import numpy as np
 import pytest
 from numba import njit
 
-from splatseed.depth.stereo.cost import (
+from splatseed.depth.stereo._kernels.agreement import confirm
+from splatseed.depth.stereo._kernels.cost import (
     NOISE,
     SAMPLES,
-    UNSEEN,
+    UNSEEN_COST,
     best_cost,
-    grey_image,
-    make_quads,
     prepare_window,
     sample,
 )
-from splatseed.depth.stereo.matching import confirm
-from splatseed.depth.stereo.patchmatch import STEEPEST, QuadImages, begin, sweep
+from splatseed.depth.stereo._kernels.patchmatch import (
+    MAX_SLOPE,
+    QuadImages,
+    initialise,
+    red_black_sweep,
+)
+from splatseed.depth.stereo.quads import grey_image, make_quads
 from splatseed.runtime.simd import LANES, load, store
 
 from .references import OFFSETS, agrees, best_of, bilinear, cost_in, window_weights
@@ -165,7 +169,7 @@ def test_a_view_that_does_not_hold_the_point_says_nothing(rough, places, planes)
     image = rough(*SIZE[::-1])
     beside = IDENTITY + np.array([[0, 0, 500.0, 0], [0, 0, 0, 0], [0, 0, 0, 0]])
     for warp in (BEHIND, beside, np.zeros((3, 4))):
-        assert (costs_of(image, [image], [warp], places, planes) == UNSEEN).all()
+        assert (costs_of(image, [image], [warp], places, planes) == UNSEEN_COST).all()
     ours = costs_of(image, [image] * 3, [BEHIND, IDENTITY, IDENTITY], places, planes)
     assert ours.max() < 0.02  # the best two count
 
@@ -201,7 +205,7 @@ def state(quad_images, rng):
     guesses = np.zeros((2, 3, ROWS, COLUMNS), np.float32)
     guesses[:, 0] = rng.uniform(*BOUNDS, (2, ROWS, COLUMNS))
     planes, costs = np.zeros(guesses.shape[1:], np.float32), np.empty((ROWS, COLUMNS), np.float32)
-    begin(quad_images, guesses, planes, costs)
+    initialise(quad_images, guesses, planes, costs)
     return guesses, planes, costs
 
 
@@ -225,12 +229,12 @@ def test_sweeps_lower_costs_and_keep_to_the_bounds(images, quad_images, state):
     before = costs.copy()
     for number in range(2):
         for color in range(2):
-            sweep(quad_images, color, number, KEY, planes, costs)
+            red_black_sweep(quad_images, color, number, KEY, planes, costs)
     assert (costs <= before).all()
     assert costs.mean() < 0.9 * before.mean()
     w, slope = planes[0], np.hypot(planes[1], planes[2])
     assert ((w >= BOUNDS[0]) & (w <= BOUNDS[1])).all()
-    assert (slope <= STEEPEST * w / FOCAL * (1 + 1e-6)).all()
+    assert (slope <= MAX_SLOPE * w / FOCAL * (1 + 1e-6)).all()
     for row, column in [(0, 0), (ROWS - 1, COLUMNS - 1), (3, 8), (8, 30)]:
         assert costs[row, column] == pytest.approx(cost_at(images, planes, row, column), abs=2e-3)
 
@@ -241,7 +245,7 @@ def test_a_half_sweep_changes_one_colour_only_by_its_key(color, quad_images, sta
     runs = []
     for key in (KEY, KEY, np.uint64(7)):
         runs.append(before.copy())
-        sweep(quad_images, color, 0, key, runs[-1], costs.copy())
+        red_black_sweep(quad_images, color, 0, key, runs[-1], costs.copy())
     changed = (runs[0] != before).any(axis=0)
     visited = np.indices(costs.shape).sum(axis=0) % 2 == color
     assert not changed[~visited].any()

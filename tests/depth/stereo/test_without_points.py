@@ -8,8 +8,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from splatseed.depth.stereo import depths as without_points, stereo_depths
-from splatseed.depth.stereo.depths import SAMPLES, known_visibility
+from splatseed.depth.stereo import pipeline, stereo_depths
+from splatseed.depth.stereo.pipeline import MAP_SAMPLES, known_visibility
 from splatseed.depthmap import DepthMap
 from splatseed.photos.sources import choose_by_pose
 from splatseed.photos.visibility import find_visibility
@@ -34,7 +34,7 @@ def test_maps_are_as_good_as_with_points_in_any_unit(planted, request):
     for i, found in enumerate(stereo_depths(bare(made.scene).replace(images=images), SETTINGS)):
         truth = true_depth(made.surfaces, made.stereo.map(i).camera)
         error = np.abs(found.depth / unit / truth - 1.0)[np.isfinite(found.depth)]
-        assert found.known_share > 0.85 * made.stereo.map(i).known_share
+        assert found.known_fraction > 0.85 * made.stereo.map(i).known_fraction
         assert (error < 0.01).mean() > 0.85
 
 
@@ -42,7 +42,7 @@ def test_maps_are_as_good_as_with_points_in_any_unit(planted, request):
 def test_views_that_cannot_tell_depth_say_nothing(angles, tmp_path):
     scene = bare(photograph(tmp_path, tilted_plane(0.0), arc(angles)))
     for stereo_map in stereo_depths(scene, SETTINGS):
-        assert stereo_map.known_share == 0.0
+        assert stereo_map.known_fraction == 0.0
 
 
 @pytest.mark.parametrize("kind", ["z", "inverse"])
@@ -55,7 +55,7 @@ def test_depth_maps_stand_in_for_points(kind, plane):
     if kind == "inverse":
         assert not len(visibility.xyz)  # its unit is nobody's
     else:
-        assert len(visibility.xyz) == 4 * SAMPLES**2
+        assert len(visibility.xyz) == 4 * MAP_SAMPLES**2
         assert plane.surfaces.distance(visibility.xyz).max() < 1e-4
 
 
@@ -63,13 +63,13 @@ def test_depth_maps_stand_in_for_points(kind, plane):
 def test_points_are_taken_where_half_of_the_images_see_enough(plane, enough, monkeypatch):
     seen = find_visibility(plane.scene)
     counts = [len(seen.rows_of(image)) for image in plane.scene.images]
-    monkeypatch.setattr(without_points, "LEAST_SEEN", np.median(counts) + (not enough))
+    monkeypatch.setattr(pipeline, "MIN_SEEN", np.median(counts) + (not enough))
     maps = MemoryMaps({plane.scene.images[0].name: DepthMap(np.ones((80, 96), np.float32))})
     instead = known_visibility(plane.scene.replace(depths=maps))
     if enough:
         np.testing.assert_array_equal(instead.xyz, seen.xyz)
     else:
-        assert len(instead.xyz) == SAMPLES**2
+        assert len(instead.xyz) == MAP_SAMPLES**2
         assert not len(known_visibility(plane.scene).xyz)
 
 

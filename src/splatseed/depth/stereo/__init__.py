@@ -1,8 +1,9 @@
 """Depth and normal maps from photographs alone, on the CPU.
 
-Promise: NumPy and Numba only; importing this package loads neither Numba nor SciPy.
+Promise: NumPy, SciPy and Numba only; importing this package loads none of them.
 """
 
-from splatseed.depth.stereo.maps import StereoMap, StereoSettings, stereo_depths
+import lazy_loader
 
-__all__ = ["StereoMap", "StereoSettings", "stereo_depths"]
+# The names, with their types, stand in __init__.pyi; each is loaded when it is first used.
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

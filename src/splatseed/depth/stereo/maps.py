@@ -1,75 +1,56 @@
-"""Stereo's choices and its maps: depth and normals at the pixels of each photograph of a scene.
+"""Stereo's settings and results: depth and normals at the pixels of each photograph of a scene.
 
-Notation: V views of W x H pixels; a map has one pixel per block of g x g pixels, and ``camera`` is
-the photograph's, scaled to the map's pixels, with the centre of the first at (0.5, 0.5). Promise: a
-depth is kept only where other views' independently computed maps agree; what they do not confirm is
-NaN, and its confidence 0.
+Notation: V views of W x H pixels; a map has one pixel per block of g x g pixels. Its ``camera`` is
+the photograph's, scaled to the map's pixels, with the centre of the first at (0.5, 0.5). Promise:
+every depth of a map is confirmed by independently computed maps of other views; the depth of all
+other pixels is NaN and their confidence 0.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
-from jaxtyping import Float32, Int64, UInt8
+from jaxtyping import Bool, Float32, Int64, UInt8
 
 from splatseed.camera import Camera
-from splatseed.errors import ParameterError, SceneNotFoundError
 from splatseed.photos.view import View
-from splatseed.progress import Progress, silent
-from splatseed.scene import Scene
+from splatseed.pointcloud import PointCloud
+from splatseed.settings import Range, check_settings
 
-TOO_FEW = 30
-"""Points that are not worth being searched around, and vouch for no pose."""
-LEAST_SIZE = 32
-MOST_GRID = 32
-MOST_SOURCES = 8
+MIN_POINTS = 30
+"""With fewer points, neither depth ranges nor poses can be inferred from them."""
+MIN_SIZE = 32
+"""Smallest ``max_size``, in pixels."""
+MAX_GRID = 32
+MAX_SOURCES = 8
 """Bits of the byte that records which views agree."""
 
 
 @dataclass(frozen=True)
 class StereoSettings:
-    """The choices of stereo: depth from photographs alone."""
+    """Settings of stereo."""
 
-    max_size: int = 800
+    max_size: Annotated[int, Range(MIN_SIZE)] = 800
     """Photographs are downsampled by a whole factor to at most this many pixels a side."""
-    grid: int = 4
+    grid: Annotated[int, Range(1, MAX_GRID)] = 4
     """Pixels between depths, along a row and a column."""
-    sweeps: int = 4
+    sweeps: Annotated[int, Range(1)] = 4
     """PatchMatch iterations: each propagates and refines all planes."""
-    num_sources: int = 5
-    """Views in which a plane is compared."""
-    num_witnesses: int = 8
+    num_sources: Annotated[int, Range(1, MAX_SOURCES)] = 5
+    """Views that a plane is matched against."""
+    num_check_views: Annotated[int, Range(1, MAX_SOURCES)] = 8
     """Views that may confirm a depth."""
-    min_agreeing: int = 2
+    min_agreeing: Annotated[int, Range(1, "num_check_views")] = 2
     """How many of these views must confirm it."""
-    tolerance: float = 0.01
+    tolerance: Annotated[float, Range(above=0, below=1)] = 0.01
     """Relative difference at which two depths agree."""
-    max_cost: float = 0.5
+    max_cost: Annotated[float, Range(above=0, maximum=2)] = 0.5
     """Pixels of higher cost (one minus correlation, 0 to 2) are left out."""
 
     def __post_init__(self) -> None:
-        for name, good, expected in (
-            ("max_size", self.max_size >= LEAST_SIZE, f"at least {LEAST_SIZE}"),
-            ("grid", 1 <= self.grid <= MOST_GRID, f"1 to {MOST_GRID}"),
-            ("sweeps", self.sweeps >= 1, "at least 1"),
-            ("num_sources", 1 <= self.num_sources <= MOST_SOURCES, f"1 to {MOST_SOURCES}"),
-            ("num_witnesses", 1 <= self.num_witnesses <= MOST_SOURCES, f"1 to {MOST_SOURCES}"),
-            (
-                "min_agreeing",
-                1 <= self.min_agreeing <= self.num_witnesses,
-                f"1 to {self.num_witnesses}",
-            ),
-            ("tolerance", 0 < self.tolerance < 1, "more than 0 and less than 1"),
-            ("max_cost", 0 < self.max_cost <= 2, "more than 0, 2 at most"),
-        ):
-            if not good:
-                raise ParameterError(
-                    f"stereo.{name} of {expected}",
-                    found=repr(getattr(self, name)),
-                    fix="Choose such a value.",
-                )
+        check_settings(self, "stereo")
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +66,7 @@ class StereoMap:
         confidence: From 0, unknown, to 1, float32 [H, W].
         sources: Names of the views it was compared with, best first; 8 at most.
         agreeing: Bit k is set where source k confirms the depth, uint8 [H, W].
+        rgb: Mean colour of the photograph in each pixel of the map, uint8 [H, W, 3].
     """
 
     name: str
@@ -94,25 +76,32 @@ class StereoMap:
     confidence: Float32[np.ndarray, "H W"]
     sources: tuple[str, ...]
     agreeing: UInt8[np.ndarray, "H W"]
+    rgb: UInt8[np.ndarray, "H W 3"]
 
     @property
-    def known_share(self) -> float:
-        """The fraction of pixels that have a depth."""
+    def known_fraction(self) -> float:
+        """Fraction of the pixels that have a depth."""
         return float(np.isfinite(self.depth).mean())
+
+    def points(self) -> PointCloud:
+        """Unproject the pixels that have a depth to world points with their colours, row by row."""
+        row, column = np.nonzero(np.isfinite(self.depth))
+        uv = np.stack([column, row], axis=1) + 0.5
+        xyz = self.camera.unproject(uv, self.depth[row, column].astype(np.float64))
+        return PointCloud(xyz.astype(np.float32), self.rgb[row, column])
 
 
 @dataclass(frozen=True, eq=False)
 class StereoResult:
-    """The result of stereo.
+    """Planes and costs of all views, from which maps and seeds are made.
 
     Args:
         views: The photographs at the size that was compared.
         planes: Of each view, float32 [3, h, w]: inverse depth and its slopes per pixel of the view.
         costs: Of each view, float32 [h, w].
-        agreeing: Which of a view's witnesses confirm each pixel, one bit per witness, uint8
-            [h, w].
+        agreeing: Bit k is set where source k of a view confirms its depth, uint8 [h, w] of each.
         sources: The views that each was compared with, best first, int64 [V, K]; -1 = none.
-        settings: The choices of stereo.
+        settings: The settings.
     """
 
     views: tuple[View, ...]
@@ -122,30 +111,35 @@ class StereoResult:
     sources: Int64[np.ndarray, "V K"]
     settings: StereoSettings
 
-    def kept(self, i: int) -> np.ndarray:
-        """Which pixels of view i have a depth that enough others confirm, bool [h, w]."""
-        asked = int((self.sources[i] >= 0).sum())
-        # A view with a single source can be confirmed by no more than that one.
-        needed = max(1, min(self.settings.min_agreeing, asked))
+    def confirmed(self, i: int) -> Bool[np.ndarray, "h w"]:
+        """Pixels of view i whose depth enough other views confirm."""
+        # A view with a single source can be confirmed by that one only.
+        num_sources = int((self.sources[i] >= 0).sum())
+        needed = max(1, min(self.settings.min_agreeing, num_sources))
         return np.asarray(np.bitwise_count(self.agreeing[i]) >= needed)
 
     def map(self, i: int) -> StereoMap:
         """The map of view i."""
-        view, kept = self.views[i], self.kept(i)
-        height, width = kept.shape
-        K = np.diag([1 / self.settings.grid, 1 / self.settings.grid, 1.0]) @ view.K
-        depth = np.where(kept, 1.0 / self.planes[i][0], np.nan).astype(np.float32)
-        normal = np.where(kept[..., None], self.normals(i), np.nan).astype(np.float32)
+        view, valid, grid = self.views[i], self.confirmed(i), self.settings.grid
+        height, width = valid.shape
+        K = np.diag([1 / grid, 1 / grid, 1.0]) @ view.K
+        depth = np.where(valid, 1.0 / self.planes[i][0], np.nan).astype(np.float32)
+        normal = np.where(valid[..., None], self.normals(i), np.nan).astype(np.float32)
         names = tuple(self.views[j].name for j in self.sources[i] if j >= 0)
         camera = Camera(K, width, height, view.cam_from_world)
-        agreeing = np.where(kept, self.agreeing[i], 0).astype(np.uint8)
-        return StereoMap(view.name, camera, depth, normal, self.confidence(i), names, agreeing)
+        agreeing = np.where(valid, self.agreeing[i], 0).astype(np.uint8)
+        rgb = block_means(view.photograph, grid)
+        return StereoMap(view.name, camera, depth, normal, self.confidence(i), names, agreeing, rgb)
+
+    def maps(self) -> tuple[StereoMap, ...]:
+        """The maps of all views."""
+        return tuple(self.map(i) for i in range(len(self.views)))
 
     def confidence(self, i: int) -> Float32[np.ndarray, "h w"]:
-        """The correlation, with doubt halved by each view that agrees; 0 where not kept."""
+        """Correlation times 1 - 2^-n where n views agree; 0 where a depth is not confirmed."""
         correlation = np.clip(1.0 - self.costs[i], 0.0, 1.0)
         belief = 1.0 - 0.5 ** np.bitwise_count(self.agreeing[i])
-        return np.where(self.kept(i), correlation * belief, 0.0).astype(np.float32)
+        return np.where(self.confirmed(i), correlation * belief, 0.0).astype(np.float32)
 
     def normals(self, i: int) -> Float32[np.ndarray, "h w 3"]:
         """Unit normals towards the camera, in its axes.
@@ -154,52 +148,15 @@ class StereoResult:
         normal is along -K' m, as 1 / z > 0 along every ray.
         """
         w, gx, gy = self.planes[i].astype(np.float64)
-        place = (np.indices(w.shape)[::-1] + 0.5) * self.settings.grid
-        m = np.stack([gx, gy, w - gx * place[0] - gy * place[1]], axis=-1)
+        u, v = (np.indices(w.shape)[::-1] + 0.5) * self.settings.grid
+        m = np.stack([gx, gy, w - gx * u - gy * v], axis=-1)
         normal = -m @ self.views[i].K
         return np.asarray(normal / np.linalg.norm(normal, axis=-1, keepdims=True), np.float32)
 
 
-def stereo_depths(
-    scene: Scene,
-    settings: StereoSettings | None = None,
-    *,
-    seed: int = 0,
-    progress: Progress = silent,
-    **choices: Any,
-) -> tuple[StereoMap, ...]:
-    """Depth, normals and confidence of every photograph of a scene.
-
-    Args:
-        scene: A scene with photographs.
-        settings: The choices of stereo; the defaults when left out.
-        seed: The same seed gives the same bytes.
-        progress: Called with the stage and the fraction done.
-        choices: Fields of the settings, such as ``grid=2``.
-
-    Raises:
-        ParameterError: A choice is out of range.
-        SceneNotFoundError: There are fewer than two photographs, or than half of the scene's.
-        SceneFormatError: A photograph cannot be used.
-    """
-    from splatseed.depth.stereo.depths import find_stereo, known_visibility  # noqa: PLC0415  (loads Numba)
-    from splatseed.io.photograph_checks import with_photographs  # noqa: PLC0415  (loads with its use)
-    from splatseed.photos.view import at_file_size, data_factor, load_views  # noqa: PLC0415  (loads with its use)
-
-    settings = replace(settings or StereoSettings(), **choices)
-    if len(scene.images) < 2:
-        raise SceneNotFoundError(
-            "at least two photographs with a pose",
-            found=f"{len(scene.images)}",
-            fix="Name a scene with photographs: depth comes from comparing them.",
-        )
-    scene = at_file_size(with_photographs(scene))
-    views = load_views(
-        scene,
-        scene.images,
-        data_factor=data_factor(scene.images, settings.max_size),
-        undistort=True,
-        progress=progress,
-    )
-    stereo = find_stereo(views, scene.images, known_visibility(scene), settings, seed, progress)
-    return tuple(stereo.map(i) for i in range(len(stereo.views)))
+def block_means(image: UInt8[np.ndarray, "H W C"], grid: int) -> UInt8[np.ndarray, "h w C"]:
+    """Mean of each block of grid x grid pixels, rounded; incomplete blocks are left out."""
+    rows, columns = image.shape[0] // grid, image.shape[1] // grid
+    blocks = image[: rows * grid, : columns * grid]
+    blocks = blocks.reshape(rows, grid, columns, grid, image.shape[2])
+    return np.asarray(np.rint(blocks.mean(axis=(1, 3))), np.uint8)

@@ -1,15 +1,17 @@
-"""Planes for every view, by comparing it with others, and which views confirm them.
+"""Match each view with its sources: a plane per grid point, and the views that confirm it.
 
-*Start.* A view sees M Structure-from-Motion points at pixels uv [M, 2] with inverse depth w [M];
-the grid has h x w points. There are K guesses per grid point, finite and positive; if a view sees
-too few points, they are inverse depths drawn uniformly between the bounds.
+Notation: the grid of a view has h x w points, g pixels apart, and planes [3, h, w]: inverse depth w
+and its slopes per pixel.
 
-*Confirmation.* View i has planes [3, h, w] on its grid; point X at one of its grid points falls on
-the grid of view j at (column, row), where j's own plane at the nearest grid point says inverse
-depth w_j. Both *agree* if |z_ij w_j - 1| <= tolerance, z_ij the depth of X in j. Every pair is
-compared in one direction at a time, so the order of views is irrelevant.
-Promise: a view's planes depend only on the photographs, its hints and the seed: threads take whole
-views.
+*Initial planes.* A view sees M points at pixels uv [M, 2] with inverse depth w [M], from
+Structure-from-Motion or coarse stereo. Each grid point starts with K candidates; where a view sees
+too few points, they are inverse depths drawn uniformly from its depth range.
+
+*Confirmation.* Point X at a grid point of view i projects into view j, whose plane at the nearest
+grid point has inverse depth w_j there. The views *agree* if |z_ij w_j - 1| <= tolerance, with z_ij
+the depth of X in j. Each pair is compared in both directions independently.
+Promise: a view's planes depend only on the photographs, its prior and the seed. Each view is
+matched by one thread, so results do not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -19,137 +21,104 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int32, Int64, UInt8
+from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 from scipy.spatial import cKDTree
 
-from splatseed.depth.stereo.cost import grey_image, make_quads
+from splatseed.depth.stereo._kernels.agreement import confirm
+from splatseed.depth.stereo._kernels.patchmatch import initialise, red_black_sweep
 from splatseed.depth.stereo.maps import StereoResult, StereoSettings
-from splatseed.depth.stereo.patchmatch import QuadImages, begin, sweep
+from splatseed.depth.stereo.quads import Grey, grey_image, make_quad_images, other_from_view
 from splatseed.photos.view import View
 from splatseed.progress import Progress, in_threads
-from splatseed.runtime.jit import inline
 from splatseed.runtime.memory import check_memory
 
-NEAREST = 3
-"""Points whose depth is tried as a fronto-parallel plane."""
-FITTED = 8
-"""Points that a plane is fitted through."""
-RANDOM = 16
-"""Guesses where nothing is known."""
-MARGIN = 1.3
-"""Bounds reach this many times beyond the nearest and the farthest point."""
-RIDGE = 1e-3
-"""Shrinks slopes, relative to the spread of the points: a few in a line do not determine them."""
+BYTES_PER_DEPTH = 3 * 4 + 4 + 1
+"""A plane, a cost and agreement bits."""
+
+Matched = tuple[Float32[np.ndarray, "3 h w"], Float32[np.ndarray, "h w"]]
+"""Planes and costs of a view."""
+
+
+@dataclass(frozen=True)
+class _InitialPlanes:
+    """Candidates that PatchMatch starts from."""
+
+    num_nearest: int = 3  # nearest points whose depth gives a fronto-parallel plane
+    num_fitted: int = 8  # nearest points that a plane is fitted to
+    num_random: int = 16  # candidates where a view sees fewer points than that
+    margin: float = 1.3  # depth ranges extend beyond the points by this factor
+    ridge: float = 1e-3  # shrinks slopes, relative to the points' spread: they may be collinear
+
+
+INITIAL = _InitialPlanes()
 
 
 @dataclass(frozen=True, eq=False)
-class Hints:
-    """What is known about the depth in a view before stereo."""
+class DepthPrior:
+    """Known points and depth range of a view before stereo."""
 
-    uv: Float64[np.ndarray, "M 2"]  # pixels of points that it sees
+    uv: Float64[np.ndarray, "M 2"]  # pixels of the points that it sees
     w: Float64[np.ndarray, " M"]  # their inverse depths
-    bounds: Float32[np.ndarray, " 2"]  # smallest and largest inverse depth that is searched
+    bounds: Float32[np.ndarray, " 2"]  # smallest and largest inverse depth of the search
+
+    @classmethod
+    def from_points(
+        cls, uv: Float64[np.ndarray, "M 2"], w: Float64[np.ndarray, " M"]
+    ) -> DepthPrior:
+        """Prior from at least one point: the range extends a little beyond the points."""
+        # Percentiles, as a few of SfM's points float in front of the cameras.
+        low, high = np.percentile(w, [0.5, 99.5])
+        return cls(uv, w, np.array([low / INITIAL.margin, high * INITIAL.margin], np.float32))
+
+    @classmethod
+    def from_range(cls, low: float, high: float) -> DepthPrior:
+        """Prior without points, from the smallest and the largest inverse depth."""
+        return cls(np.empty((0, 2)), np.empty(0), np.array([low, high], np.float32))
 
 
-def hints_from(uv: Float64[np.ndarray, "M 2"], w: Float64[np.ndarray, " M"]) -> Hints:
-    """Hints from at least one point: planes are searched a little beyond the points."""
-    # Percentiles, as a few of SfM's points float in front of the cameras.
-    low, high = np.percentile(w, [0.5, 99.5])
-    return Hints(uv, w, np.array([low / MARGIN, high * MARGIN], np.float32))
-
-
-def first_planes(
-    hints: Hints, shape: tuple[int, int], grid: int, rng: np.random.Generator
+def initial_planes(
+    prior: DepthPrior, shape: tuple[int, int], grid: int, rng: np.random.Generator
 ) -> Float32[np.ndarray, "K 3 h w"]:
-    """The planes to try first at each grid point, random where too few points are seen."""
+    """Candidate planes for each grid point, random where the view sees too few points."""
     rows, columns = shape
-    w = hints.w
-    if len(w) < FITTED:
-        guesses = np.zeros((RANDOM, 3, rows, columns), np.float32)
-        guesses[:, 0] = rng.uniform(hints.bounds[0], hints.bounds[1], (RANDOM, rows, columns))
-        return guesses
-    place = (np.indices(shape)[::-1].reshape(2, -1).T + 0.5) * grid
-    nearest = cKDTree(hints.uv).query(place, FITTED)[1]
-    guesses = np.zeros((NEAREST + 1, 3, rows * columns), np.float32)
-    guesses[:NEAREST, 0] = w[nearest[:, :NEAREST]].T
-    guesses[NEAREST] = _fit(hints.uv[nearest] - place[:, None], w[nearest])
-    return np.ascontiguousarray(guesses.reshape(-1, 3, rows, columns))
+    w = prior.w
+    if len(w) < INITIAL.num_fitted:
+        low, high = prior.bounds
+        planes = np.zeros((INITIAL.num_random, 3, rows, columns), np.float32)
+        planes[:, 0] = rng.uniform(low, high, (INITIAL.num_random, rows, columns))
+        return planes
+    uv = (np.indices(shape)[::-1].reshape(2, -1).T + 0.5) * grid
+    nearest = cKDTree(prior.uv).query(uv, INITIAL.num_fitted)[1]
+    num = INITIAL.num_nearest
+    planes = np.zeros((num + 1, 3, rows * columns), np.float32)
+    planes[:num, 0] = w[nearest[:, :num]].T
+    planes[num] = _fit_planes(prior.uv[nearest] - uv[:, None], w[nearest])
+    return np.ascontiguousarray(planes.reshape(-1, 3, rows, columns))
 
 
-def _fit(
-    apart: Float64[np.ndarray, "G K 2"], w: Float64[np.ndarray, "G K"]
+def _fit_planes(
+    offsets: Float64[np.ndarray, "G K 2"], w: Float64[np.ndarray, "G K"]
 ) -> Float64[np.ndarray, "3 G"]:
-    """Least-squares w + gx du + gy dv through K points each, slopes shrunk a little to 0."""
-    design = np.concatenate([np.ones((*w.shape, 1)), apart], axis=2)
+    """Fit w + gx du + gy dv to K points each by least squares, with slopes shrunk towards 0."""
+    design = np.concatenate([np.ones((*w.shape, 1)), offsets], axis=2)
     normal = np.swapaxes(design, 1, 2) @ design
     spread = np.trace(normal[:, 1:, 1:], axis1=1, axis2=2)
     # Normal equations of w0 + gx du + gy dv; only the slopes are shrunk.
-    normal[:, [1, 2], [1, 2]] += RIDGE * (1.0 + spread)[:, None]
+    normal[:, [1, 2], [1, 2]] += INITIAL.ridge * (1.0 + spread)[:, None]
     right = np.swapaxes(design, 1, 2) @ w[..., None]
     fitted = np.linalg.solve(normal, right)[..., 0].T
     low, high = w.min(axis=1), w.max(axis=1)
-    # Extrapolated planes can leave the points' depths, or end behind the camera.
-    outside = (fitted[0] < low / MARGIN) | (fitted[0] > high * MARGIN)
+    # Extrapolated planes can leave the points' range of depth, or end behind the camera.
+    outside = (fitted[0] < low / INITIAL.margin) | (fitted[0] > high * INITIAL.margin)
     fitted[:, outside] = [w[outside].mean(axis=1), np.zeros(outside.sum()), np.zeros(outside.sum())]
     return np.asarray(fitted)
-
-
-@inline
-def confirm(  # type: ignore[no-untyped-def]  # Numba\'s types
-    planes, costs, max_cost, grid, j_from_i, other_planes, other_costs, tolerance, bit, out
-):
-    """Set a bit where another view's map agrees with a view's.
-
-    ``planes`` [3, h, w] and ``costs`` [h, w] are float32, ``out`` uint8 [h, w]; planes above
-    ``max_cost`` neither ask nor answer; ``j_from_i`` [3, 4] is ``other_from_view``'s.
-    """
-    height, width = costs.shape
-    m = j_from_i
-    for row in range(height):
-        for column in range(width):
-            if costs[row, column] > max_cost:
-                continue
-            # X at depth z on the pixel's ray, and its depth and pixel in the other view.
-            z = 1.0 / planes[0, row, column]
-            u, v = (column + 0.5) * grid * z, (row + 0.5) * grid * z
-            depth = m[2, 0] * u + m[2, 1] * v + m[2, 2] * z + m[2, 3]
-            if not depth > 0.0:
-                continue
-            x = (m[0, 0] * u + m[0, 1] * v + m[0, 2] * z + m[0, 3]) / depth
-            y = (m[1, 0] * u + m[1, 1] * v + m[1, 2] * z + m[1, 3]) / depth
-            if _agrees(x, y, depth, grid, other_planes, other_costs, max_cost, tolerance):
-                out[row, column] |= bit
-
-
-@inline
-def _agrees(x, y, depth, grid, planes, costs, max_cost, tolerance):  # type: ignore[no-untyped-def]  # Numba's types
-    """Whether a map has this depth at pixel (x, y)."""
-    rows, columns = costs.shape
-    if not (0.0 <= x < columns * grid and 0.0 <= y < rows * grid):
-        return False
-    # The nearest grid point: (p, q) lies at pixel ((q + 0.5) g, (p + 0.5) g).
-    q, p = int(x / grid), int(y / grid)
-    if costs[p, q] > max_cost:
-        return False
-    # w(u, v) = w0 + gx (u - u0) + gy (v - v0)
-    across, down = x - (q + 0.5) * grid, y - (p + 0.5) * grid
-    w = planes[0, p, q] + planes[1, p, q] * across + planes[2, p, q] * down
-    # |z_ij w_j - 1|: a relative difference of depth, with one multiplication.
-    return abs(depth * w - 1.0) <= tolerance
-
-
-BYTES_A_DEPTH = 3 * 4 + 4 + 1
-"""A view's planes, costs, and agreement bits."""
-
-Matched = tuple[Float32[np.ndarray, "3 h w"], Float32[np.ndarray, "h w"]]
-Grey = UInt8[np.ndarray, "H W"]
 
 
 def check_stereo_memory(views: Sequence[View], settings: StereoSettings) -> None:
     """Refuse photographs whose comparison does not fit into memory.
 
-    It holds all photographs in grey, the planes at each grid point, and for each thread the quads
-    (4 bytes per pixel) of its view and of the views that it is compared with.
+    Memory holds all grey photographs, the planes at each grid point, and for each thread the quad
+    images (4 bytes per pixel) of a view and its sources.
 
     Raises:
         ParameterError: It does not fit.
@@ -160,7 +129,7 @@ def check_stereo_memory(views: Sequence[View], settings: StereoSettings) -> None
     quads = threads * max(sizes) * 4 * (1 + min(settings.num_sources, len(views) - 1))
     check_memory(
         depths,
-        BYTES_A_DEPTH + -(-(sum(sizes) + quads) // max(depths, 1)),
+        BYTES_PER_DEPTH + -(-(sum(sizes) + quads) // max(depths, 1)),
         "depths held at once",
         found=f"{depths:,}, at a grid of {grid} in {len(views)} photographs",
         fix="Choose a larger grid, smaller or fewer photographs, or free some memory.",
@@ -169,21 +138,24 @@ def check_stereo_memory(views: Sequence[View], settings: StereoSettings) -> None
 
 def match_views(
     views: Sequence[View],
-    hints: Sequence[Hints | None],
+    priors: Sequence[DepthPrior | None],
     sources: Int64[np.ndarray, "V K"],
     settings: StereoSettings,
     seed: int,
     progress: Progress,
 ) -> StereoResult:
-    """Compare photographs with each other.
+    """Find planes for each view by PatchMatch, and the sources that confirm them.
 
     Args:
         views: The photographs.
-        hints: What is known of each photograph's depth; one with None gets no map.
+        priors: What is known of each view's depth; a view with None gets no map.
         sources: The views to compare each with, best first, int64 [V, K]; -1 = none.
-        settings: The choices of stereo.
+        settings: Settings of stereo.
         seed: The same seed gives the same bytes.
         progress: Called with the stage and the fraction done.
+
+    Raises:
+        ParameterError: The photographs do not fit into memory.
     """
     check_stereo_memory(views, settings)
     greys = [grey_image(view.photograph) for view in views]
@@ -193,87 +165,48 @@ def match_views(
         for i in range(start, stop):
             others = sources[i][sources[i] >= 0][: settings.num_sources].tolist()
             rng = np.random.default_rng([seed, i])
-            matched[i] = _match(i, others, views, greys, hints[i], settings, rng)
+            matched[i] = _match_view(i, others, views, greys, priors[i], settings, rng)
 
     in_threads(work, len(views), 1, "compare photographs", progress)
-    planes, costs = [each[0] for each in matched], [each[1] for each in matched]
+    planes, costs = [pair[0] for pair in matched], [pair[1] for pair in matched]
     agreeing = _confirm_all(views, planes, costs, sources, settings, progress)
     return StereoResult(tuple(views), planes, costs, agreeing, sources, settings)
 
 
-def _match(
+def _match_view(
     i: int,
     others: Sequence[int],
     views: Sequence[View],
     greys: Sequence[Grey],
-    hints: Hints | None,
+    prior: DepthPrior | None,
     settings: StereoSettings,
     rng: np.random.Generator,
 ) -> Matched:
-    """The planes of one view."""
+    """Find the planes of view i; NaN with infinite costs without sources or prior."""
     view, grid = views[i], settings.grid
     shape = (view.height // grid, view.width // grid)
     planes, costs = np.full((3, *shape), np.nan, np.float32), np.full(shape, np.inf, np.float32)
-    if not others or hints is None or not costs.size:
+    if not others or prior is None or not costs.size:
         return planes, costs
     quad_images = make_quad_images(
-        view, greys[i], [views[j] for j in others], [greys[j] for j in others], grid, hints.bounds
+        view, greys[i], [views[j] for j in others], [greys[j] for j in others], grid, prior.bounds
     )
-    begin(quad_images, first_planes(hints, shape, grid, rng), planes, costs)
+    initialise(quad_images, initial_planes(prior, shape, grid, rng), planes, costs)
     for number in range(settings.sweeps):
         for color in range(2):
-            sweep(quad_images, color, number, rng.integers(1 << 63, dtype=np.uint64), planes, costs)
+            key = rng.integers(1 << 63, dtype=np.uint64)
+            red_black_sweep(quad_images, color, number, key, planes, costs)
     if view.mask is not None:
-        # Undistortion leaves borders without pixels, whose planes mean nothing.
-        costs[~blocks_known(view.mask, grid)] = np.inf
+        # Undistortion leaves borders without pixels, where planes are meaningless.
+        costs[~valid_blocks(view.mask, grid)] = np.inf
     return planes, costs
 
 
-def blocks_known(mask: Bool[np.ndarray, "H W"], grid: int) -> Bool[np.ndarray, "h w"]:
-    """Which blocks of grid x grid pixels lie entirely in the photograph."""
+def valid_blocks(mask: Bool[np.ndarray, "H W"], grid: int) -> Bool[np.ndarray, "h w"]:
+    """Blocks of grid x grid pixels that lie entirely within the mask."""
     rows, columns = mask.shape[0] // grid, mask.shape[1] // grid
     blocks = mask[: rows * grid, : columns * grid].reshape(rows, grid, columns, grid)
     return np.asarray(blocks.all(axis=(1, 3)))
-
-
-def make_quad_images(
-    view: View,
-    grey: Grey,
-    others: Sequence[View],
-    greys: Sequence[Grey],
-    grid: int,
-    bounds: Float32[np.ndarray, " 2"],
-) -> QuadImages:
-    """A view and its sources, as kernels take them.
-
-    Args:
-        view: The reference.
-        grey: Its brightness.
-        others: Its sources.
-        greys: Their brightness.
-        grid: Pixels between grid points.
-        bounds: Smallest and largest inverse depth that is tried.
-    """
-    offsets = np.cumsum([0, *(each.size for each in greys)])
-    sources: Int32[np.ndarray, " Q"] = np.empty(offsets[-1], np.int32)
-    for start, stop, each in zip(offsets, offsets[1:], greys, strict=False):
-        sources[start:stop] = make_quads(each).ravel()
-    warps = [other_from_view(view, other) for other in others]
-    packed = [np.concatenate([warp[:, :3].ravel(), warp[:, 3]]) for warp in warps]
-    sizes = np.array([(other.width, other.height) for other in others], np.int64)
-    return QuadImages(
-        make_quads(grey).ravel(), np.array([view.width, view.height], np.int64),
-        sources, sizes, offsets, np.array(packed, np.float32), grid, float(view.K[0, 0]), bounds,
-    )  # fmt: skip
-
-
-def other_from_view(view: View, other: View) -> Float64[np.ndarray, "3 4"]:
-    """Maps pixels (u, v, 1) of a view times depth, and 1, to another's: K_s [R K_r^-1, t]."""
-    # source from reference: x_s = R x_r + t with x_r = z K_r^-1 (u, v, 1)
-    relative = other.cam_from_world @ np.linalg.inv(view.cam_from_world)
-    return np.asarray(
-        other.K @ np.hstack([relative[:3, :3] @ np.linalg.inv(view.K), relative[:3, 3:]])
-    )
 
 
 def _confirm_all(
@@ -284,9 +217,9 @@ def _confirm_all(
     settings: StereoSettings,
     progress: Progress,
 ) -> list[UInt8[np.ndarray, "h w"]]:
-    """Which witnesses of each view confirm each of its pixels."""
-    # Bit k: the k-th source confirms. Its own map was found without this view's.
-    agreeing = [np.zeros(each.shape, np.uint8) for each in costs]
+    """Set bit k at each pixel of a view whose depth its source k confirms."""
+    # A source's map is computed without this view's, so its agreement is evidence.
+    agreeing = [np.zeros(cost.shape, np.uint8) for cost in costs]
 
     def work(start: int, stop: int) -> None:
         for i in range(start, stop):

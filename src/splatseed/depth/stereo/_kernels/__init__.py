@@ -1,0 +1,1 @@
+"""Stereo's Numba kernels: photometric cost, PatchMatch, and comparisons between views' maps."""
