@@ -103,7 +103,7 @@ def _run_network(options: Options, model: str) -> None:
         network = load_network(model, depth_kind=options.depth_kind)
         kind, reason = network.meaning
         facts = {"kind": kind, "kind_because": reason, "device": network.device}
-        size = {} if options.max_size is None else {"max_size": options.max_size}
+        size: dict[str, Any] = {} if options.max_size is None else {"max_size": options.max_size}
         report = estimate_depths(
             scene, network, options.output, overwrite=options.overwrite,
             provenance={**_provenance(options), **facts}, progress=clock, **size,
@@ -138,7 +138,7 @@ def _run_stereo(options: Options) -> None:
         scene = with_photographs(scene) if scene.images else scene
         if options.colmap:
             dense.check_dense_scene(scene, undistorts=True)
-        size = {} if options.max_size is None else {"max_size": options.max_size}
+        size: dict[str, Any] = {} if options.max_size is None else {"max_size": options.max_size}
         maps = stereo_depths(scene, progress=clock, **size)
         how: dict[str, Any] = {
             "overwrite": options.overwrite,
