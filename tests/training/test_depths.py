@@ -46,7 +46,7 @@ def test_depths_are_those_of_the_surfaces_and_kept_with_the_time_they_took(
     assert np.median(errors) < 0.02
     assert "only splits" in notes[0]
     with monkeypatch.context() as patch:
-        patch.setattr("splatseed.training.seeds.stereo_depths", None)
+        patch.setattr("splatseed.depth.stereo.stereo_depths", None)
         again, same = known_depths(scene, SCALE, GROW, "cpu", kept=kept)
     assert same == seconds > 0
     assert depths.keys() == again.keys()

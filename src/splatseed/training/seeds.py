@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-from splatseed.depth.stereo import StereoResult, StereoSettings, stereo_depths
+from splatseed.depth.stereo.maps import StereoResult, StereoSettings
 from splatseed.io.files import ARCHIVE_FAILURES
 from splatseed.io.seeds import saw_all_photographs, was_upsampled
 from splatseed.io.staging import atomic_file
@@ -316,6 +316,8 @@ def known_depths(
         else:
             compared = scene.replace(images=compared_images(images, settings, device))
             size = stereo_size(images, settings, device)
+            from splatseed.depth.stereo import stereo_depths  # noqa: PLC0415  (loads Numba)
+
             maps = stereo_depths(
                 compared, seed=settings.seed, progress=progress, max_size=size, sweeps=SWEEPS
             )
