@@ -73,6 +73,20 @@ def test_originals_that_stay_keep_their_tracks(scene):
     np.testing.assert_array_equal(changed.tracks.xyz, scene.tracks.xyz[keep])
 
 
+def test_tracks_follow_rows_through_selections(scene):
+    """Not positions: of two originals at one place each has its own track."""
+    twins = scene.points.replace(xyz=scene.points.xyz[[0, 1, 1, 1, 4]])
+    scene = scene.replace(points=twins, tracks=scene.tracks)
+    kept = PointCloud.concatenate(scene.points.select(slice(2)), scene.points.select([3]))
+    more = kept.with_added(np.ones((2, 3)), np.zeros((2, 3), np.uint8))
+    changed = scene.with_points(more)
+    np.testing.assert_array_equal(changed.tracks.point_ids, [0, 1, 3])
+    again = changed.with_points(changed.points.select([0, 2]))  # rows count in the new scene
+    np.testing.assert_array_equal(again.tracks.point_ids, [0, 3])
+    other = PointCloud(scene.points.xyz[[3, 1]], scene.points.rgb[[3, 1]])  # from nowhere
+    assert scene.with_points(other).tracks is None
+
+
 def test_features_of_points_that_went_belong_to_none(scene):
     seen = Observations(np.zeros((4, 2)), np.array([0, 1, NO_POINT, 4]))
     scene = scene.replace(images=(dataclasses.replace(_image("a"), observations=seen),))

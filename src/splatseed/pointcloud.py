@@ -1,7 +1,9 @@
 """PointCloud: coloured points, where each came from, and what is known about them.
 
 Notation: N points; ``xyz`` in scene units and the scene's world frame; ``rgb`` 8-bit sRGB as stored
-by COLMAP; ``source`` is 0 for an original point, otherwise the code of the method that made it.
+by COLMAP; ``source`` is 0 for an original point, otherwise the code of the method that made it:
+the one record of a point's origin, which ``seeds.npz`` keeps in files. ``original_idx`` is the row
+of an original in the cloud that it was selected from; by it a scene's tracks follow their points.
 The *attributes* normals, sizes and confidence are optional, and NaN where unknown for a point.
 Promise: arrays have the shapes and dtypes below, are read-only, and change with no array of the
 caller's; methods return new clouds, in which every point keeps all its attributes.
@@ -15,7 +17,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int, UInt8
+from jaxtyping import Bool, Float, Float32, Int, Int32, UInt8
 
 from splatseed.errors import PointCloudError
 from splatseed.frozen import read_only
@@ -53,6 +55,8 @@ class PointCloud:
         sizes: Initial radius of a Gaussian there, float32 [N], scene units, above 0;
             NaN where unknown.
         confidence: Confidence that a surface is there, float32 [N], 0 to 1; NaN where unknown.
+        original_idx: Rows that ``select`` and ``concatenate`` keep, int32 [N], -1 for other points.
+            None: an original's own row.
 
     Raises:
         PointCloudError: The shapes or the colour type do not fit, or an attribute is out of range.
@@ -70,6 +74,7 @@ class PointCloud:
     normals: Float32[np.ndarray, "N 3"] | None = None
     sizes: Float32[np.ndarray, " N"] | None = None
     confidence: Float32[np.ndarray, " N"] | None = None
+    original_idx: Int32[np.ndarray, " N"] | None = None
 
     def __post_init__(self) -> None:
         xyz = np.asarray(self.xyz)
@@ -90,6 +95,8 @@ class PointCloud:
             values = np.asarray(value)
             _check_attribute(name, values, len(xyz))
             object.__setattr__(self, name, read_only(values, np.float32))
+        if self.original_idx is not None:
+            object.__setattr__(self, "original_idx", read_only(self.original_idx, np.int32))
 
     def __len__(self) -> int:
         return len(self.xyz)
@@ -151,13 +158,21 @@ class PointCloud:
     def distinct(self) -> Bool[np.ndarray, " N"]:
         """Which points are finite and the first at their exact position (-0.0 equals 0.0)."""
         distinct = self.finite
-        distinct[distinct] = _first_of_equals(self.xyz[distinct])
+        distinct[distinct] = first_of_equals(self.xyz[distinct])
         return distinct
+
+    @property
+    def rows_of_originals(self) -> Int32[np.ndarray, " N"]:
+        """``original_idx``, also where it is None."""
+        if self.original_idx is not None:
+            return self.original_idx
+        rows = np.arange(len(self), dtype=np.int32)
+        return np.where(self.source == ORIGINAL, rows, np.int32(-1))
 
     def select(self, which: Bool[np.ndarray, " N"] | Int[np.ndarray, " M"] | slice) -> PointCloud:
         """The points at ``which`` (a mask, indices or a slice), in that order."""
         chosen = {name: _unwritable(values[which]) for name, values in self._arrays.items()}
-        return PointCloud(**chosen)
+        return PointCloud(**chosen, original_idx=_unwritable(self.rows_of_originals[which]))
 
     def replace(self, **changes: np.ndarray | None) -> PointCloud:
         """A copy with some of its arrays replaced; None removes an attribute."""
@@ -208,13 +223,17 @@ class PointCloud:
 
     @staticmethod
     def concatenate(*clouds: PointCloud) -> PointCloud:
-        """The clouds one after another; attributes that one lacks and another has become NaN."""
+        """Join clouds; attributes that one lacks and another has become NaN.
+
+        Originals keep their ``original_idx``; of clouds after the first that have none, it is -1.
+        """
         known = [name for name in ATTRIBUTES if any(name in c.attributes for c in clouds)]
         return PointCloud(
             _unwritable(np.concatenate([c.xyz for c in clouds])),
             _unwritable(np.concatenate([c.rgb for c in clouds])),
             _unwritable(np.concatenate([c.source for c in clouds])),
             **{name: _unwritable(_joined(clouds, name)) for name in known},
+            original_idx=_joined_rows(clouds),
         )
 
 
@@ -232,9 +251,21 @@ def _joined(clouds: Sequence[PointCloud], name: str) -> Float32[np.ndarray, "N .
     )
 
 
-def _first_of_equals(xyz: Float32[np.ndarray, "N 3"]) -> Bool[np.ndarray, " N"]:
-    """Which of the finite rows equal no earlier row; exact, as a hash only narrows the search."""
-    xyz = np.ascontiguousarray(xyz + np.float32(0.0))  # adding turns -0.0 into 0.0
+def _joined_rows(clouds: Sequence[PointCloud]) -> Int32[np.ndarray, " N"] | None:
+    """``original_idx`` of several clouds; None where an original's own row is meant throughout."""
+    first, *others = clouds
+    if first.original_idx is None and not any(cloud.num_original for cloud in others):
+        return None
+    later = (np.full(len(c), -1) if c.original_idx is None else c.original_idx for c in others)
+    return _unwritable(np.concatenate([first.rows_of_originals, *later], dtype=np.int32))
+
+
+def first_of_equals(xyz: Float[np.ndarray, "N 3"]) -> Bool[np.ndarray, " N"]:
+    """Mark the finite rows that equal no earlier row; -0.0 equals 0.0.
+
+    Exact: a hash only narrows the search.
+    """
+    xyz = np.ascontiguousarray(xyz + xyz.dtype.type(0))  # adding turns -0.0 into 0.0
     suspects = np.flatnonzero(_hash_collides(xyz))
     rows = xyz[suspects].view(np.dtype((np.void, 3 * xyz.itemsize))).ravel()
     first = np.ones(len(xyz), bool)
@@ -243,9 +274,10 @@ def _first_of_equals(xyz: Float32[np.ndarray, "N 3"]) -> Bool[np.ndarray, " N"]:
     return first
 
 
-def _hash_collides(xyz: Float32[np.ndarray, "N 3"]) -> Bool[np.ndarray, " N"]:
-    """Which rows share a 64-bit hash with another: ten times faster than sorting rows."""
-    products = xyz.view(np.uint32).astype(np.uint64) * _MULTIPLIERS  # modulo 2^64
+def _hash_collides(xyz: Float[np.ndarray, "N 3"]) -> Bool[np.ndarray, " N"]:
+    """Mark rows that share a 64-bit hash with another: ten times faster than sorting rows."""
+    bits = xyz.view(f"u{xyz.itemsize}").astype(np.uint64)
+    products = bits * _MULTIPLIERS  # modulo 2^64
     hashes = products[:, 0] ^ (products[:, 1] >> np.uint64(17)) ^ (products[:, 2] << np.uint64(13))
     ordered = np.sort(hashes)
     repeated = ordered[1:][ordered[1:] == ordered[:-1]]

@@ -16,13 +16,13 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int64, UInt8, UInt32, UInt64
+from jaxtyping import Bool, Float64, Int64, UInt8, UInt32
 
 from splatseed.camera import Camera, Intrinsics, rotation_from_quat
 from splatseed.depthmap import DepthMaps, maps_by_name
 from splatseed.errors import ParameterError, SceneNotFoundError, UnknownNameError
 from splatseed.frozen import read_only
-from splatseed.pointcloud import ORIGINAL, PointCloud
+from splatseed.pointcloud import PointCloud
 
 NO_POINT = -1
 """The point id of a feature that belongs to no point."""
@@ -262,6 +262,8 @@ class Scene:
         if self.depths is not None:
             distorted = {im.name for im in self.images if im.intrinsics.has_distortion}
             object.__setattr__(self, "depths", maps_by_name(self.depths, distorted))
+        if self.points.original_idx is not None:  # from here on, rows count in this cloud
+            object.__setattr__(self, "points", self.points.replace(original_idx=None))
         folder = self.source.image_dir if self.source else None
         if folder is not None:
             images = tuple(image.in_folder(folder, self.white) for image in self.images)
@@ -324,8 +326,8 @@ class Scene:
     def replace(self, **changes: Any) -> Scene:
         """A copy with some fields replaced.
 
-        When ``points`` are replaced and ``tracks`` are not, the originals among the new points
-        keep their tracks if they stand first and in the same order, as ``upsample`` puts them.
+        When ``points`` are replaced and ``tracks`` are not, originals keep their tracks if they
+        come first, in the scene's order and at the same positions, as ``upsample`` puts them.
         Features of other points then belong to none.
         """
         if "points" in changes and "tracks" not in changes and self.tracks is not None:
@@ -337,15 +339,16 @@ class Scene:
         return dataclass_replace(self, **changes)
 
     def _kept_originals(self, points: PointCloud) -> Bool[np.ndarray, " N"]:
-        """Which of the points with tracks begin another cloud; none if it begins otherwise."""
-        tracked = self.points.xyz[: len(self.tracks or ())]
-        if np.array_equal(points.xyz[: len(tracked)], tracked, equal_nan=True):
-            return np.ones(len(tracked), bool)
-        first_new = int(np.append(points.source != ORIGINAL, True).argmax())
-        kept = np.isin(_keys(tracked), _keys(points.xyz[:first_new]))
-        first = points.xyz[: np.count_nonzero(kept)]
-        same = np.array_equal(tracked[kept], first, equal_nan=True)
-        return kept if same else np.zeros(len(tracked), bool)
+        """Mark the points with tracks that another cloud has first and in order; else none."""
+        kept = np.zeros(len(self.tracks or ()), bool)
+        rows = points.rows_of_originals
+        rising = np.append(np.diff(rows, prepend=-1) <= 0, True)
+        num = min(int(rising.argmax()), int(np.append(rows >= len(kept), True).argmax()))
+        kept[rows[:num]] = True
+        others = rows[num:][(rows[num:] >= 0) & (rows[num:] < len(kept))]
+        # A row of another scene's cloud may have the same number, but seldom the same position.
+        same = np.array_equal(points.xyz[:num], self.points.xyz[rows[:num]], equal_nan=True)
+        return kept if same and kept[others].all() else np.zeros_like(kept)
 
     @property
     def offset(self) -> Float64[np.ndarray, " 3"]:
@@ -400,10 +403,3 @@ def _without(image: Image, point_ids: Int64[np.ndarray, " P"] | None) -> Image:
     if image.observations is None:
         return image
     return dataclass_replace(image, observations=image.observations.without(point_ids))
-
-
-def _keys(xyz: Float32[np.ndarray, "n 3"]) -> UInt64[np.ndarray, " n"]:
-    """A number for each position, the same for the same bits; others seldom share one."""
-    bits = np.ascontiguousarray(xyz, np.float32).view(np.uint32).astype(np.uint64)
-    # Odd factors spread the bits over 64; a shared number only costs tracks, for rows are compared.
-    return bits @ np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)

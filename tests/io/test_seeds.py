@@ -13,7 +13,7 @@ from splatseed import load_scene, upsample, write_scene
 from splatseed.errors import SceneNotFoundError
 from splatseed.io import load_originals
 from splatseed.io.seeds import SEEDS, _read_seeds, saw_all_photographs, was_upsampled, write_seeds
-from splatseed.pointcloud import ATTRIBUTES, GENERATED, PointCloud
+from splatseed.pointcloud import ATTRIBUTES, PointCloud
 from splatseed.progress import silent
 from splatseed.synthetic import make_capture
 from splatseed.training.seeds import seeded
@@ -124,21 +124,26 @@ def test_damage_anywhere_never_escapes(tmp_path_factory, data):
     assert sizes is None or np.array_equal(sizes, np.ones(3))  # a checksum guards each array
 
 
-@pytest.mark.parametrize("known", [True, False])
-def test_a_scene_without_originals_keeps_what_its_points_are(scene, tmp_path, known):
+def test_without_its_record_every_point_is_an_original(scene, tmp_path):
+    """The counts in splatseed.json are not read back."""
+    seeds = upsample(scene, "linear", ratio=2)
+    write_scene(scene.with_points(seeds), tmp_path / "out")
+    assert load_scene(tmp_path / "out").points.num_original == len(scene.points)
+    (tmp_path / "out" / SEEDS).unlink()
+    assert load_scene(tmp_path / "out").points.num_original == len(seeds)
+
+
+def test_a_scene_without_originals_keeps_what_its_points_are(scene, tmp_path):
     new = scene.points.replace(source=np.full(len(scene.points), 6, np.uint8))
     report = write_scene(scene.replace(points=new, tracks=None), tmp_path / "out")
-    if not known:
-        (tmp_path / "out" / SEEDS).unlink()
     again = load_scene(tmp_path / "out")
-    assert set(again.points.source) == {6 if known else GENERATED}
+    assert set(again.points.source) == {6}
     assert was_upsampled(again)
     assert len(again.points.references) == len(new)
-    if known:
-        write_scene(again, tmp_path / "again")
-        for name in set(report.files) - {"splatseed.json", "images"}:
-            there = (tmp_path / "again" / name).read_bytes()
-            assert there == (tmp_path / "out" / name).read_bytes()
+    write_scene(again, tmp_path / "again")
+    for name in set(report.files) - {"splatseed.json", "images"}:
+        there = (tmp_path / "again" / name).read_bytes()
+        assert there == (tmp_path / "out" / name).read_bytes()
     bare = load_originals(tmp_path / "out", require_points=False)
     assert not len(bare.points)
     assert f"the {len(new):,} points that splatseed added before are replaced" in bare.warnings[-1]

@@ -1,10 +1,10 @@
-"""Which points of a scene that splatseed wrote are originals, and what is known about the others.
+"""``seeds.npz``: origin and attributes of a scene's points, which point files have no field for.
 
-Point files have no field for a point's origin, but ``splatseed.json`` beside them counts the
-originals, which come first, and ``seeds.npz`` has, in their order, ``source`` uint8 [N],
-``normals`` float16 [N, 3], ``sizes`` float32 [N] and ``confidence`` float16 [N], each present if
-known for any point, and a ``digest`` of their positions. A file that is damaged or belongs to other
-points is reported and not used.
+It holds, in the order of the points, ``source`` uint8 [N] if any point was added, ``normals``
+float16 [N, 3], ``sizes`` float32 [N] and ``confidence`` float16 [N] where known for any point, and
+a ``digest`` of the positions. ``source`` is the only record of a point's origin: without it all
+points are originals; counts in ``splatseed.json`` are for people. A file that is damaged or belongs
+to other points is ignored with a warning.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from jaxtyping import Float32
 from splatseed.errors import PointCloudError
 from splatseed.io.files import ARCHIVE_FAILURES, read_npy
 from splatseed.io.staging import ABSENT, MANIFEST, read_manifest, write_json
-from splatseed.pointcloud import ATTRIBUTES, GENERATED, ORIGINAL, PointCloud
+from splatseed.pointcloud import ATTRIBUTES, ORIGINAL, PointCloud
 from splatseed.runtime.fingerprint import fingerprint
 from splatseed.scene import Scene
 
@@ -49,9 +49,9 @@ def _position_digest(xyz: Float32[np.ndarray, "n 3"]) -> bytes:
 
 
 def write_seeds(folder: Path, points: PointCloud) -> None:
-    """Write ``seeds.npz`` into an output, if it says more than the other files."""
+    """Write ``seeds.npz`` into an output, if any point was added or has attributes."""
     known = {n: values for n, values in points.attributes.items() if not np.isnan(values).all()}
-    if not np.isin(points.source, (ORIGINAL, GENERATED)).all():
+    if (points.source != ORIGINAL).any():
         known = {"source": points.source, **known}
     if known:
         arrays = {name: values.astype(_STORED[name][1]) for name, values in known.items()}
@@ -60,14 +60,10 @@ def write_seeds(folder: Path, points: PointCloud) -> None:
 
 
 def recall_seeds(scene: Scene) -> Scene:
-    """The scene with the attributes from ``seeds.npz`` and its manifest, if they match."""
+    """Give a scene's points the origin and the attributes in its ``seeds.npz``, if they match."""
     if scene.source is None or not len(scene.points):
         return scene
-    root, total = scene.source.root, len(scene.points)
-    arrays, warnings = _read_seeds(root, scene.points)
-    if "source" not in arrays:
-        arrays["source"] = np.full(total, GENERATED, np.uint8)
-        arrays["source"][: number_of_originals(root, total)] = ORIGINAL
+    arrays, warnings = _read_seeds(scene.source.root, scene.points)
     points = scene.points.replace(**arrays)
     # Tracks belong to the first points, and a new point has none.
     first_new = int(np.append(points.source != ORIGINAL, True).argmax())
@@ -75,18 +71,6 @@ def recall_seeds(scene: Scene) -> Scene:
     if tracks is not None:
         tracks = tracks.select(np.arange(len(tracks)) < first_new)
     return replace(scene, points=points, tracks=tracks, warnings=(*scene.warnings, *warnings))
-
-
-def number_of_originals(root: Path, total: int) -> int:
-    """How many points of a file in this folder, which has ``total``, are originals.
-
-    All are, unless the manifest is for so many and says otherwise.
-    """
-    facts = read_manifest(root)
-    originals = facts.get("num_original")
-    if facts.get("num_points") == total and isinstance(originals, int) and 0 <= originals < total:
-        return originals
-    return total
 
 
 def _upsampling(scene: Scene) -> dict[str, Any] | None:
@@ -121,9 +105,8 @@ def carry_seeds(scene: Scene, written: Path, folder: Path) -> None:
     """
     if (written / SEEDS).is_file():
         shutil.copyfile(written / SEEDS, folder / SEEDS)
-    counts = {key: read_manifest(written)[key] for key in ("num_points", "num_original")}
     absent = {ABSENT: list(scene.absent)} if scene.absent else {}
-    write_json(folder / MANIFEST, {**counts, **absent, UPSAMPLED: _upsampling(scene)})
+    write_json(folder / MANIFEST, {**absent, UPSAMPLED: _upsampling(scene)})
 
 
 def _read_seeds(folder: Path, points: PointCloud) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
@@ -135,7 +118,8 @@ def _read_seeds(folder: Path, points: PointCloud) -> tuple[dict[str, np.ndarray]
         with zipfile.ZipFile(path) as archive:
             digest = _member(archive, "digest", (_DIGEST_BYTES,), np.dtype("u1"))
             if digest.tobytes() != _position_digest(points.xyz):
-                return {}, (f"{SEEDS} was ignored: it belongs to other points than the scene's.",)
+                found = "it belongs to other points than the scene's, which all count as originals"
+                return {}, (f"{SEEDS} was ignored: {found}.",)
             there = {name.removesuffix(".npy") for name in archive.namelist()}
             arrays = {
                 name: _member(archive, name, (len(points), *shape), dtype)

@@ -21,6 +21,7 @@ from scipy.spatial import cKDTree
 from splatseed.errors import PointCloudError, SplatseedError
 from splatseed.io.files import special_kind
 from splatseed.io.masks import read_mask
+from splatseed.pointcloud import first_of_equals
 from splatseed.progress import Progress, silent
 from splatseed.scene import NO_POINT, Image, Scene
 from splatseed.text import agreeing, visible
@@ -356,10 +357,10 @@ def spacing(xyz: Float[np.ndarray, "N 3"]) -> float:
 
 
 def _distinct(xyz: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "M 3"]:
-    """The finite points, each once; in their order if none is there twice."""
+    """The finite points without repeats, in their order."""
     finite = xyz[np.isfinite(xyz).all(axis=1)]
-    once = np.unique(finite, axis=0)
-    return once if len(once) < len(finite) else finite
+    distinct: Float[np.ndarray, "M 3"] = finite[first_of_equals(finite)]
+    return distinct
 
 
 def _spacing(tree: cKDTree, xyz: Float[np.ndarray, "M 3"]) -> Float64[np.ndarray, " M"]:

@@ -11,6 +11,7 @@ from PIL import Image as PilImage
 
 from splatseed.camera import Intrinsics
 from splatseed.errors import OutputError
+from splatseed.pointcloud import first_of_equals
 from splatseed.sfm.colmap import Run
 
 _ORIENTATION, _SHORT, _UPRIGHT = 0x0112, 3, 1  # the tag, its type, the value that turns nothing
@@ -88,8 +89,8 @@ def drop_repeats(model: Any) -> None:
     points = model.points3D
     longest_first = sorted(points, key=lambda i: (-points[i].track.length(), i))
     xyz = np.array([points[i].xyz for i in longest_first], np.float32).reshape(-1, 3)
-    kept = np.unique(xyz + np.float32(0), axis=0, return_index=True)[1]  # -0.0 equals 0.0
-    for repeat in sorted(set(longest_first) - {longest_first[k] for k in kept}):
+    repeats = np.flatnonzero(~first_of_equals(xyz))
+    for repeat in sorted(longest_first[k] for k in repeats):
         model.delete_point3D(repeat)
 
 
