@@ -250,7 +250,7 @@ def _assert_explained(each, where):
 
 def test_the_front_door_lists_what_the_packages_promise():
     promised = "METHODS Camera PointCloud Scene SplatseedError add_cover load_scene stereo_depths"
-    promised += " upsample write_scene Run evaluate train"
+    promised += " upsample write_scene Run evaluate train Gaussians read_gaussians render"
     assert sorted(splatseed.__all__) == sorted(promised.split())
     assert all(getattr(splatseed, name) for name in splatseed.__all__)
 

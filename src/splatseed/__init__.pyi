@@ -6,4 +6,7 @@ from .methods import METHODS as METHODS
 from .pointcloud import PointCloud as PointCloud
 from .scene import Scene as Scene
 from .seeding.upsampling import add_cover as add_cover, upsample as upsample
+from .splat.api import render as render
+from .splat.formats import read_gaussians as read_gaussians
+from .splat.gaussians import Gaussians as Gaussians
 from .training.api import Run as Run, evaluate as evaluate, train as train

@@ -24,7 +24,7 @@ from splatseed.io import colmap, load_scene
 from splatseed.io.ply import write_ply
 from splatseed.io.staging import MANIFEST, atomic_file, output_folder
 from splatseed.pointcloud import PointCloud
-from splatseed.splat.formats import write_model
+from splatseed.splat.formats import write_gaussians
 from splatseed.splat.gaussians import initial_gaussians
 from splatseed.training.folder import RunFolder
 from splatseed.training.settings import TrainSettings
@@ -184,7 +184,7 @@ def refused(room, tmp_path, monkeypatch, splatseed):
     """Checks that words are refused, where ROOM is a scene and SCAN a cloud."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "junk.ply").write_bytes(b"ply\n")
-    write_model(tmp_path / "model.ply", initial_gaussians(load_scene(room).points))
+    write_gaussians(tmp_path / "model.ply", initial_gaussians(load_scene(room).points))
     (tmp_path / "film.mp4").write_bytes(b"\0" * 999)
     np.savez(tmp_path / "scan.npz", xyz=np.random.default_rng(0).random((99, 3)))
     before = _contents(tmp_path)

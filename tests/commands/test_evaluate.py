@@ -11,7 +11,7 @@ pytest.importorskip("gsplat", reason="training needs gsplat's strategies")
 
 from splatseed.io import load_scene
 from splatseed.splat.evaluate import evaluate_views
-from splatseed.splat.formats import write_model
+from splatseed.splat.formats import write_gaussians
 from splatseed.splat.gaussians import initial_gaussians
 from splatseed.training.run import prepare_run
 from splatseed.training.settings import TrainSettings
@@ -31,7 +31,7 @@ def run_folder(room, tmp_path_factory):
 @pytest.fixture
 def model(room, tmp_path):
     path = tmp_path / "model.ply"
-    write_model(path, initial_gaussians(load_scene(room).points))
+    write_gaussians(path, initial_gaussians(load_scene(room).points))
     return path
 
 

@@ -29,7 +29,7 @@ from splatseed.methods import METHODS, SOURCE_CODES, chooses_number, configure
 from splatseed.pointcloud import PointCloud
 from splatseed.sfm.refinement import poses_of, turns
 from splatseed.similarity import Similarity
-from splatseed.splat.formats import read_model
+from splatseed.splat.formats import read_gaussians
 from splatseed.synthetic import make_capture
 
 from ..command_line import exit_code
@@ -185,7 +185,7 @@ def test_the_first_gaussians_stand_where_the_seeds_are(room, tmp_path, splatseed
     run = splatseed(*words)
     assert run.code == 0, run.err
     assert str(start) in run.out + run.err
-    gaussians, seeds = read_model(start), load_scene(out).points
+    gaussians, seeds = read_gaussians(start), load_scene(out).points
     extent = np.ptp(seeds.xyz, axis=0).max()
     np.testing.assert_allclose(gaussians.means, seeds.xyz, atol=1e-6 * extent)
 

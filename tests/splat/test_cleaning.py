@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from splatseed.errors import SceneFormatError
-from splatseed.splat.formats import FORMATS, read_model, write_model
+from splatseed.splat.formats import FORMATS, read_gaussians, write_gaussians
 from splatseed.splat.gaussians import Gaussians
 
 SUFFIXES = [each.suffix for each in FORMATS.values()]
@@ -48,12 +48,12 @@ def _with(model, name, rows, value):
 
 def _read(path):
     notes = []
-    return read_model(path, notes.append), notes
+    return read_gaussians(path, notes.append), notes
 
 
 @pytest.mark.parametrize(("name", "value"), BAD)
 def test_a_number_that_no_renderer_can_use_leaves_its_gaussian_out(model, name, value, tmp_path):
-    write_model(tmp_path / "m.ply", _with(model, name, [5], value))
+    write_gaussians(tmp_path / "m.ply", _with(model, name, [5], value))
     kept, notes = _read(tmp_path / "m.ply")
     assert np.array_equal(kept.means, np.delete(model.means, 5, axis=0))
     assert len(notes) == 1
@@ -61,7 +61,7 @@ def test_a_number_that_no_renderer_can_use_leaves_its_gaussian_out(model, name, 
         f"1 Gaussian of 40 in {tmp_path / 'm.ply'} has no usable {WORDS[name]} and was" in notes[0]
     )
     for suffix in SUFFIXES:  # and so of every file made from it
-        write_model(tmp_path / f"out{suffix}", kept)
+        write_gaussians(tmp_path / f"out{suffix}", kept)
         again, notes = _read(tmp_path / f"out{suffix}")
         assert (len(again), notes) == (39, [])
         assert all(np.isfinite(array).all() for array in again.arrays().values())
@@ -69,25 +69,26 @@ def test_a_number_that_no_renderer_can_use_leaves_its_gaussian_out(model, name, 
 
 def test_several_kinds_are_counted_apart_and_a_model_of_nothing_else_is_refused(model, tmp_path):
     bad = _with(_with(model, "means", [1, 2, 3], np.nan), "quats", [3, 4], np.inf)
-    write_model(tmp_path / "m.ply", bad)
+    write_gaussians(tmp_path / "m.ply", bad)
     kept, (note,) = _read(tmp_path / "m.ply")
     assert len(kept) == 36
     assert "4 Gaussians of 40" in note
     assert "have no usable position (3), rotation (2) and were left out" in note
-    write_model(tmp_path / "m.ply", _with(model, "scales", slice(None), np.nan))
+    write_gaussians(tmp_path / "m.ply", _with(model, "scales", slice(None), np.nan))
     with pytest.raises(SceneFormatError, match="40 Gaussians without a usable size"):
-        read_model(tmp_path / "m.ply")
+        read_gaussians(tmp_path / "m.ply")
 
 
 def test_opacities_of_0_and_1_sizes_of_0_and_turns_of_a_ball_are_kept(model, tmp_path):
     odd = _with(_with(model, "opacities", [0], np.inf), "opacities", [1], -np.inf)
     odd = _with(odd, "scales", [2], -np.inf)
-    odd.scales[3] = -4.0  # round
+    scales = odd.scales.copy()
+    scales[3] = -4.0  # round
     quats = model.quats.copy()
     quats[3:5] = 0.0  # of a ball, which may have it, and of another
     quats[6] *= 1e-30  # the square underflows
-    odd = dataclasses.replace(odd, quats=quats)
-    write_model(tmp_path / "m.ply", odd)
+    odd = dataclasses.replace(odd, quats=quats, scales=scales)
+    write_gaussians(tmp_path / "m.ply", odd)
     kept, (note,) = _read(tmp_path / "m.ply")
     assert "1 Gaussian of 40" in note
     assert "rotation" in note
@@ -103,7 +104,7 @@ def test_opacities_of_0_and_1_sizes_of_0_and_turns_of_a_ball_are_kept(model, tmp
 def test_numbers_of_a_packed_file_that_are_not_finite_are_left_out_too(model, tmp_path):
     """Other writers put a NaN into a record, a chunk's bounds, a half float or a codebook."""
     for suffix in SUFFIXES:
-        write_model(tmp_path / f"m{suffix}", model)
+        write_gaussians(tmp_path / f"m{suffix}", model)
     content = {suffix: bytearray((tmp_path / f"m{suffix}").read_bytes()) for suffix in SUFFIXES}
     nan = np.float32(np.nan).tobytes()
     splat = content[".splat"]
@@ -118,7 +119,7 @@ def test_numbers_of_a_packed_file_that_are_not_finite_are_left_out_too(model, tm
     two[start : start + 4] = nan
     (tmp_path / "m.compressed.ply").write_bytes(two)
     with pytest.raises(SceneFormatError, match="40 Gaussians without a usable position"):
-        read_model(tmp_path / "m.compressed.ply")
+        read_gaussians(tmp_path / "m.compressed.ply")
     halves = np.zeros((2, 3), "<f2")
     halves[1, 2] = np.inf
     rest = bytes([200] * 2) + bytes([128] * 6) + bytes([100] * 6) + bytes([128] * 6)

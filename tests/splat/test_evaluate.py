@@ -19,7 +19,7 @@ from splatseed.io.photograph_checks import with_photographs
 from splatseed.photos.view import View, at_file_size, poses_of
 from splatseed.scores import EvalResult, ViewScore
 from splatseed.splat.evaluate import evaluate_model, evaluate_views, load_model
-from splatseed.splat.formats import write_model
+from splatseed.splat.formats import write_gaussians
 from splatseed.splat.gaussians import initial_gaussians, training_frame
 from splatseed.splat.rendering import ModelRenderer
 
@@ -102,9 +102,11 @@ def test_json_is_valid_also_for_a_perfect_render():
 def model_path(larger_room_path, tmp_path_factory):
     """The seeds themselves as Gaussians of the world, with some colour by direction."""
     gaussians = initial_gaussians(load_scene(larger_room_path).points, opacity=0.9)
-    gaussians.shN[:, :3] = np.random.default_rng(0).normal(0, 0.1, (len(gaussians), 3, 3))
+    harmonics = gaussians.shN.copy()
+    harmonics[:, :3] = np.random.default_rng(0).normal(0, 0.1, (len(gaussians), 3, 3))
+    gaussians = dataclasses.replace(gaussians, shN=harmonics)
     path = tmp_path_factory.mktemp("model") / "seeds.ply"
-    write_model(path, gaussians)
+    write_gaussians(path, gaussians)
     return path
 
 
@@ -119,10 +121,11 @@ def test_a_ply_of_the_world_is_scored_on_the_test_views(larger_room_path, model_
     with pytest.raises(SceneNotFoundError, match="to have images"):
         load_model(model_path, larger_room_path / "sparse/0/points3D.ply")
     # A Gaussian that is broken changes no score, and is said.
-    broken = dataclasses.replace(model.gaussians, scales=model.gaussians.scales.copy())
-    broken.scales[9] = np.nan
+    scales = model.gaussians.scales.copy()
+    scales[9] = np.nan
+    broken = dataclasses.replace(model.gaussians, scales=scales)
     path = tmp_path / "broken.ply"
-    write_model(path, broken)
+    write_gaussians(path, broken)
     whole = load_model(path, larger_room_path)
     assert (model.notes, len(whole.notes), len(whole.gaussians)) == ((), 1, len(broken) - 1)
     cut = load_model(model_path, larger_room_path, near_plane=1e3)  # all is nearer

@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 
 from splatseed.errors import ParameterError
 from splatseed.splat.extent import morton_order, shells_of
-from splatseed.splat.formats import FORMATS, read_model, write_model
+from splatseed.splat.formats import FORMATS, read_gaussians, write_gaussians
 from splatseed.splat.gaussians import Gaussians
 
 SUFFIXES = [each.suffix for each in FORMATS.values()]
@@ -47,8 +47,8 @@ def near():
 def _written(path, model):
     """What comes back from a file, and the notes of its writer."""
     notes = []
-    write_model(path, model, note=notes.append)
-    return read_model(path), notes
+    write_gaussians(path, model, note=notes.append)
+    return read_gaussians(path), notes
 
 
 @pytest.mark.parametrize("case", FAR)
@@ -89,7 +89,7 @@ def test_an_spz_keeps_far_gaussians_that_fill_the_view_and_refuses_what_it_canno
     assert "in steps of 0.0312, too coarse for this model" in note
     assert "sizes from 4.5e-05 to 379 units: 60 Gaussians" in sizes
     with pytest.raises(ParameterError, match="of the origin"):
-        write_model(
+        write_gaussians(
             tmp_path / "m.spz", dataclasses.replace(near, means=near.means + np.float32(9e6))
         )
 
@@ -112,7 +112,7 @@ def test_fillers_of_chunks_are_invisible_to_other_readers_and_absent_in_ours(nea
     """PlayCanvas's layout: 18 bounds a chunk of 256, then four words a Gaussian."""
     means = near.means.copy()
     means[5] = 1e4
-    write_model(tmp_path / "m.compressed.ply", dataclasses.replace(near, means=means))
+    write_gaussians(tmp_path / "m.compressed.ply", dataclasses.replace(near, means=means))
     header, body = (tmp_path / "m.compressed.ply").read_bytes().split(b"end_header\n")
     assert b"element chunk 4\n" in header
     assert b"element vertex 769\n" in header  # 599 filled up to 768, and the far one
@@ -121,7 +121,7 @@ def test_fillers_of_chunks_are_invisible_to_other_readers_and_absent_in_ours(nea
     assert bounds[3, :6].tolist() == [1e4] * 6
     words = np.frombuffer(body, "<u4", offset=bounds.nbytes).reshape(769, 4)
     assert np.count_nonzero(words[:, 3] & 255) == 600  # opacities
-    assert len(read_model(tmp_path / "m.compressed.ply")) == 600
+    assert len(read_gaussians(tmp_path / "m.compressed.ply")) == 600
 
 
 def test_shells_and_the_curve_follow_the_bulk():

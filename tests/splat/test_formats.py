@@ -17,7 +17,7 @@ from hypothesis import given, settings, strategies as st
 
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError, SplatseedError
 from splatseed.splat import formats
-from splatseed.splat.formats import FORMATS, read_model, write_model
+from splatseed.splat.formats import FORMATS, read_gaussians, write_gaussians
 from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.sog import _MOST_META
 
@@ -75,12 +75,12 @@ def _assert_close(model, truth, limits):
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_a_model_comes_back_but_for_fine_detail(suffix, rest, tmp_path):
     truth = _gaussians(rest=rest)
-    write_model(tmp_path / f"m{suffix}", truth)
+    write_gaussians(tmp_path / f"m{suffix}", truth)
     content = (tmp_path / f"m{suffix}").read_bytes()
-    write_model(tmp_path / f"m{suffix}", truth)
+    write_gaussians(tmp_path / f"m{suffix}", truth)
     assert (tmp_path / f"m{suffix}").read_bytes() == content
     (tmp_path / f"m{suffix}").rename(tmp_path / "m.splat")  # the content says what a file is
-    model = read_model(tmp_path / "m.splat")
+    model = read_gaussians(tmp_path / "m.splat")
     assert all(array.dtype == np.float32 for array in model.arrays().values())
     _assert_close(model, truth, LIMITS[suffix])
     if suffix == ".ply":
@@ -90,7 +90,7 @@ def test_a_model_comes_back_but_for_fine_detail(suffix, rest, tmp_path):
 
 def test_a_ply_has_the_layout_of_3dgs(tmp_path):
     model = _gaussians(2)
-    write_model(tmp_path / "g.ply", model)
+    write_gaussians(tmp_path / "g.ply", model)
     header, body = (tmp_path / "g.ply").read_bytes().split(b"end_header\n")
     names = [line.split()[-1].decode() for line in header.splitlines() if b"property" in line]
     assert names == (
@@ -106,31 +106,31 @@ def test_a_ply_has_the_layout_of_3dgs(tmp_path):
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_one_gaussian_equal_ones_and_far_off_ones_are_models_too(suffix, tmp_path):
     path, one, near = tmp_path / f"m{suffix}", _gaussians(1), _gaussians()
-    write_model(path, one)
-    assert len(read_model(path)) == 1
-    write_model(path, one.select(np.zeros(300, int)))
-    np.testing.assert_allclose(read_model(path).means, one.means.repeat(300, 0), atol=1e-3)
+    write_gaussians(path, one)
+    assert len(read_gaussians(path)) == 1
+    write_gaussians(path, one.select(np.zeros(300, int)))
+    np.testing.assert_allclose(read_gaussians(path).means, one.means.repeat(300, 0), atol=1e-3)
     far = replace(near, means=near.means + np.float32(1e4))
-    write_model(path, far)
-    found = np.sort(read_model(path).means, axis=0)
+    write_gaussians(path, far)
+    found = np.sort(read_gaussians(path).means, axis=0)
     np.testing.assert_allclose(found, np.sort(far.means, axis=0), atol=0.02)
 
 
 def test_what_a_format_cannot_hold_is_told_or_harms_nothing_else(tmp_path):
     near = _gaussians()
     with pytest.raises(ParameterError, match="of the origin"):
-        write_model(tmp_path / "m.spz", replace(near, means=near.means + np.float32(9e6)))
+        write_gaussians(tmp_path / "m.spz", replace(near, means=near.means + np.float32(9e6)))
     scales = near.scales.copy()
     scales[5, 0] = -np.inf
-    write_model(tmp_path / "m.sog", replace(near, scales=scales))
-    assert np.isfinite(read_model(tmp_path / "m.sog").scales).all()
+    write_gaussians(tmp_path / "m.sog", replace(near, scales=scales))
+    assert np.isfinite(read_gaussians(tmp_path / "m.sog").scales).all()
 
 
 def test_opacities_of_0_and_1_stay_finite(tmp_path):
     sure = replace(_gaussians(), opacities=np.full(700, np.inf, np.float32))
     for suffix in SUFFIXES[:1] + SUFFIXES[2:]:
-        write_model(tmp_path / f"m{suffix}", sure)
-        opacities = read_model(tmp_path / f"m{suffix}").opacities
+        write_gaussians(tmp_path / f"m{suffix}", sure)
+        opacities = read_gaussians(tmp_path / f"m{suffix}").opacities
         assert (np.isfinite(opacities) & (opacities > 5)).all()
 
 
@@ -142,7 +142,7 @@ def files(tmp_path_factory):
     """A small model in each format, as bytes."""
     folder = tmp_path_factory.mktemp("models")
     for suffix in SUFFIXES:
-        write_model(folder / f"m{suffix}", _gaussians(300))
+        write_gaussians(folder / f"m{suffix}", _gaussians(300))
     return {suffix: (folder / f"m{suffix}").read_bytes() for suffix in SUFFIXES}
 
 
@@ -160,7 +160,7 @@ def test_damage_is_told_or_harmless(files, tmp_path_factory, suffix, data):
     path = tmp_path_factory.mktemp("damaged") / f"m{suffix}"
     path.write_bytes(content)
     with suppress(SplatseedError):
-        assert len(read_model(path)) > 0
+        assert len(read_gaussians(path)) > 0
 
 
 def test_what_is_no_model_is_named(files, tmp_path):
@@ -170,7 +170,7 @@ def test_what_is_no_model_is_named(files, tmp_path):
     turned = bytearray(files[".spz"])
     turned[len(turned) // 3] ^= 255  # what is unpacked may be longer
     broken = replace(_gaussians(9), opacities=np.full(9, np.nan, np.float32))
-    write_model(tmp_path / "nan.ply", broken)
+    write_gaussians(tmp_path / "nan.ply", broken)
     for name, content, word in (
         ("a.spz", b"", "an empty file"),
         ("a.splat", bytes(33), "33 bytes"),
@@ -187,7 +187,7 @@ def test_what_is_no_model_is_named(files, tmp_path):
     ):
         (tmp_path / name).write_bytes(content)
         with pytest.raises(SplatseedError, match=word):
-            read_model(tmp_path / name)
+            read_gaussians(tmp_path / name)
 
 
 def test_notes_that_would_burst_are_refused_unread(tmp_path, monkeypatch):
@@ -195,17 +195,17 @@ def test_notes_that_would_burst_are_refused_unread(tmp_path, monkeypatch):
         archive.writestr("meta.json", b" " * (_MOST_META + 1))
     monkeypatch.setattr(zipfile.ZipFile, "read", None)  # must not be called
     with pytest.raises(SceneFormatError, match=r"meta\.json of 16,777,217 bytes"):
-        read_model(tmp_path / "m.sog")
+        read_gaussians(tmp_path / "m.sog")
 
 
 def test_an_unpacked_sog_is_read(files, tmp_path):
     (tmp_path / "m.sog").write_bytes(files[".sog"])
     zipfile.ZipFile(tmp_path / "m.sog").extractall(tmp_path)
     assert json.loads((tmp_path / "meta.json").read_text())["version"] == 2
-    assert len(read_model(tmp_path / "meta.json")) == 300
+    assert len(read_gaussians(tmp_path / "meta.json")) == 300
     (tmp_path / "quats.webp").unlink()
     with pytest.raises(SceneNotFoundError, match=r"quats\.webp"):
-        read_model(tmp_path / "meta.json")
+        read_gaussians(tmp_path / "meta.json")
 
 
 # Crop and clean ----------------------------------------------------------------------------------
@@ -246,22 +246,22 @@ def converter():
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_the_formats_own_tool_reads_ours(suffix, converter, tmp_path):
     truth = _gaussians()
-    write_model(tmp_path / f"ours{suffix}", truth)
+    write_gaussians(tmp_path / f"ours{suffix}", truth)
     converter(tmp_path / f"ours{suffix}", tmp_path / "theirs.ply")
     limits = [None if limit is None else limit + 1e-6 for limit in LIMITS[suffix]]
     limits[2] = 2 * limits[2] + 0.01  # it takes 127.5 for the middle of a byte, not 128
-    _assert_close(read_model(tmp_path / "theirs.ply"), truth, limits)
+    _assert_close(read_gaussians(tmp_path / "theirs.ply"), truth, limits)
 
 
 @pytest.mark.parametrize("suffix", [".compressed.ply", ".spz", ".sog"])
 def test_we_read_what_the_formats_own_tool_writes(suffix, converter, tmp_path):
     truth = _gaussians()
-    write_model(tmp_path / "ours.ply", truth)
+    write_gaussians(tmp_path / "ours.ply", truth)
     converter("-g", "cpu", tmp_path / "ours.ply", tmp_path / f"theirs{suffix}")
     if suffix == ".spz":
         pytest.importorskip("zstandard", reason="version 4 needs zstandard")
     converter(tmp_path / f"theirs{suffix}", tmp_path / "as_they_read_it.ply")
     same = (1e-5, 1e-5, 0.1, 0.002, 1e-5, 1e-5)
-    theirs = read_model(tmp_path / f"theirs{suffix}")
-    _assert_close(theirs, read_model(tmp_path / "as_they_read_it.ply"), same)
+    theirs = read_gaussians(tmp_path / f"theirs{suffix}")
+    _assert_close(theirs, read_gaussians(tmp_path / "as_they_read_it.ply"), same)
     assert np.abs(np.sort(theirs.means, axis=0) - np.sort(truth.means, axis=0)).max() < 0.02

@@ -11,7 +11,7 @@ from splatseed.errors import PointCloudError
 from splatseed.io.ply import read_ply
 from splatseed.photos.view import View, load_split
 from splatseed.pointcloud import PointCloud
-from splatseed.splat.formats import write_model
+from splatseed.splat.formats import write_gaussians
 from splatseed.splat.gaussians import (
     EVEN,
     OWN,
@@ -35,7 +35,7 @@ def _cloud(xyz, rgb=(100, 100, 100)):
 
 def test_a_written_cloud_shows_the_seeds_colours(tmp_path, rng):
     seeds = PointCloud(rng.random((50, 3)), rng.integers(0, 256, (50, 3), np.uint8))
-    write_model(tmp_path / "g.ply", initial_gaussians(seeds))
+    write_gaussians(tmp_path / "g.ply", initial_gaussians(seeds))
     assert np.array_equal(read_ply(tmp_path / "g.ply").rgb, seeds.rgb)
 
 

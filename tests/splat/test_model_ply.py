@@ -13,7 +13,7 @@ import pytest
 
 from splatseed.errors import SceneFormatError
 from splatseed.photos.view import View
-from splatseed.splat.formats import read_model, write_model
+from splatseed.splat.formats import read_gaussians, write_gaussians
 from splatseed.splat.gaussians import Gaussians, TrainingFrame
 
 C0 = 0.28209479177387814  # 3DGS, utils/sh_utils.py
@@ -46,7 +46,7 @@ def _write(path, columns, form="binary_little_endian", before="", head=b"", afte
 
 def _read(path):
     notes = []
-    return read_model(path, notes.append), notes
+    return read_gaussians(path, notes.append), notes
 
 
 def _same(model, other):
@@ -61,7 +61,7 @@ def _same(model, other):
 def plain(tmp_path_factory):
     """The columns of a model, and how they are read in 3DGS's layout."""
     columns = _columns()
-    return columns, read_model(_write(tmp_path_factory.mktemp("plain") / "m.ply", columns))
+    return columns, read_gaussians(_write(tmp_path_factory.mktemp("plain") / "m.ply", columns))
 
 
 def test_order_types_and_further_columns_do_not_matter(plain, tmp_path):
@@ -97,7 +97,7 @@ def test_numbers_beyond_float32_and_an_ascii_nan_are_left_out(plain, tmp_path):
     short = (tmp_path / "m.ply").read_bytes().rsplit(b"\n", 2)[0]
     (tmp_path / "m.ply").write_bytes(short)
     with pytest.raises(SceneFormatError, match="5 rows"):
-        read_model(tmp_path / "m.ply")
+        read_gaussians(tmp_path / "m.ply")
 
 
 @pytest.mark.parametrize(("rest", "degree"), [(0, 0), (9, 1), (24, 2), (45, 3), (72, 3)])
@@ -148,13 +148,13 @@ def test_what_cannot_be_drawn_is_refused_by_name(plain, change, word, tmp_path):
         else:
             columns[name] = columns[source]
     with pytest.raises(SceneFormatError, match=word):
-        read_model(_write(tmp_path / "m.ply", columns))
+        read_gaussians(_write(tmp_path / "m.ply", columns))
 
 
 def test_a_list_is_refused_by_name(plain, tmp_path):
     listed = "property list uchar int views\n"
     with pytest.raises(SceneFormatError, match="the list property views"):
-        read_model(_write(tmp_path / "m.ply", plain[0], after=listed))
+        read_gaussians(_write(tmp_path / "m.ply", plain[0], after=listed))
 
 
 # Other kinds of Gaussians ------------------------------------------------------------------------
@@ -176,7 +176,7 @@ def test_mip_splattings_filter_is_applied(plain, tmp_path):
         assert 1 / (1 + math.exp(-model.opacities[i])) == pytest.approx(alpha, rel=1e-5)
     assert model.opacities[3] == 5  # f = 0 changes no bit
     assert model.scales[3].tolist() == [columns[f"scale_{k}"][3] for k in range(3)]
-    write_model(tmp_path / "out.ply", model)  # applied once
+    write_gaussians(tmp_path / "out.ply", model)  # applied once
     _same(_read(tmp_path / "out.ply")[0], model)
     columns["filter_3D"][2] = np.nan
     assert len(_read(_write(tmp_path / "m.ply", columns))[0]) == 5
@@ -222,7 +222,7 @@ def test_a_disc_looks_as_2dgs_draws_it(tmp_path):
     """Huang et al., 2024: a ray meets the disc's plane at (u, v), in sizes; alpha o exp(-r^2/2)."""
     turn = np.deg2rad(55) / 2  # about y
     disc = _white([0.5, 0.25, 1], 0.8, (np.cos(turn), 0, np.sin(turn), 0))
-    write_model(tmp_path / "m.ply", disc)
+    write_gaussians(tmp_path / "m.ply", disc)
     content = (tmp_path / "m.ply").read_bytes().replace(b"scale_2", b"unknown")
     (tmp_path / "m.ply").write_bytes(content)
     image = _seen(_read(tmp_path / "m.ply")[0])
@@ -245,14 +245,14 @@ def test_an_antialiased_model_stays_one_and_is_rendered_so(tmp_path):
     """A Gaussian of 0.1 px in a blur of 0.3 px^2 keeps its integral instead of its opacity."""
     model = dataclasses.replace(_white([0.1 / 12] * 3, 0.9), antialiased=True)
     for suffix in (".ply", ".compressed.ply", ".spz", ".sog"):
-        write_model(tmp_path / f"m{suffix}", model)
-        assert read_model(tmp_path / f"m{suffix}").antialiased, suffix
-        write_model(tmp_path / f"m{suffix}", dataclasses.replace(model, antialiased=False))
-        assert not read_model(tmp_path / f"m{suffix}").antialiased, suffix
+        write_gaussians(tmp_path / f"m{suffix}", model)
+        assert read_gaussians(tmp_path / f"m{suffix}").antialiased, suffix
+        write_gaussians(tmp_path / f"m{suffix}", dataclasses.replace(model, antialiased=False))
+        assert not read_gaussians(tmp_path / f"m{suffix}").antialiased, suffix
     plain, faint = (_seen(dataclasses.replace(model, antialiased=each)) for each in (False, True))
     np.testing.assert_allclose(faint.max() / plain.max(), 0.01 / 0.31, rtol=0.02)
     notes = []
-    write_model(tmp_path / "m.splat", model, note=notes.append)
+    write_gaussians(tmp_path / "m.splat", model, note=notes.append)
     assert "antialiasing" in notes[0]
 
 
@@ -266,14 +266,14 @@ def test_where_other_programs_say_that_a_model_is_antialiased(plain, tmp_path):
         ("comment is not antialiased 1", False),
     ):
         path = _write(tmp_path / "m.ply", columns, before=f"{comments}\n")
-        assert read_model(path).antialiased is said, comments
+        assert read_gaussians(path).antialiased is said, comments
     model = _white([0.1] * 3, 0.9)
-    write_model(tmp_path / "m.spz", model)
+    write_gaussians(tmp_path / "m.spz", model)
     raw = bytearray(gzip.decompress((tmp_path / "m.spz").read_bytes()))
     raw[14] |= 1  # flags: magic, version, count, degree, fractional bits before them
     (tmp_path / "m.spz").write_bytes(gzip.compress(bytes(raw)))
-    assert read_model(tmp_path / "m.spz").antialiased
-    write_model(tmp_path / "m.sog", dataclasses.replace(model, antialiased=True))
+    assert read_gaussians(tmp_path / "m.spz").antialiased
+    write_gaussians(tmp_path / "m.sog", dataclasses.replace(model, antialiased=True))
     with zipfile.ZipFile(tmp_path / "m.sog") as archive:
         assert json.loads(archive.read("meta.json"))["model"] == "antialiased"
     with (tmp_path / "m.sog").open("rb") as file:

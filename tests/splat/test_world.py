@@ -16,7 +16,7 @@ from splatseed.io import load_scene, write_scene
 from splatseed.io.origin import translated
 from splatseed.similarity import Similarity, fit_similarity
 from splatseed.splat.evaluate import evaluate_model, load_model
-from splatseed.splat.formats import write_model
+from splatseed.splat.formats import write_gaussians
 from splatseed.splat.gaussians import initial_gaussians
 from splatseed.splat.world import check_world, find_transform, moved
 
@@ -42,7 +42,7 @@ def gaussians(room):
 @pytest.fixture(scope="module")
 def psnr(room, gaussians, tmp_path_factory):
     path = tmp_path_factory.mktemp("world") / "model.ply"
-    write_model(path, gaussians)
+    write_gaussians(path, gaussians)
     return evaluate_model(load_model(path, room)).psnr
 
 
@@ -54,13 +54,13 @@ def other(rng):
 
 def test_what_gsplats_examples_write_is_refused_and_scored_right(room, gaussians, psnr, tmp_path):
     path = tmp_path / "model.ply"
-    write_model(path, moved(gaussians, find_transform("gsplat", load_scene(room))))
+    write_gaussians(path, moved(gaussians, find_transform("gsplat", load_scene(room))))
     with pytest.raises(SceneFormatError, match=r"transform=.gsplat"):
         load_model(path, room)
     right, wrong = (evaluate_model(load_model(path, room, transform=t)) for t in ("gsplat", "none"))
     assert right.psnr == pytest.approx(psnr, abs=0.05)
     assert wrong.psnr < psnr - 1
-    write_model(path, gaussians)
+    write_gaussians(path, gaussians)
     with pytest.raises(SceneFormatError, match=r"transform=.none"):
         load_model(path, room, transform="gsplat")
 
@@ -71,7 +71,7 @@ def test_what_gsplats_examples_write_is_refused_and_scored_right(room, gaussians
 def test_a_file_tells_the_transform(kind, room, gaussians, psnr, other, tmp_path):
     path = tmp_path / "point_cloud/iteration_7/point_cloud.ply"
     path.parent.mkdir(parents=True)
-    write_model(path, moved(gaussians, other))
+    write_gaussians(path, moved(gaussians, other))
     rows = other.matrix.tolist()
     unscaled = np.column_stack([other.rotation, other.translation / other.scale]).tolist()
     images = load_scene(room).images
@@ -150,7 +150,7 @@ def test_a_model_that_lies_a_little_apart_is_scored_with_a_doubt(room, gaussians
     assert not check_world(tmp_path / "model.ply", scene, gaussians)
     gap = np.median(np.linalg.norm(np.diff(gaussians.means, axis=0), axis=1))
     beside = replace(gaussians, means=gaussians.means + np.float32([0, 0, 0.4 * gap]))
-    write_model(tmp_path / "model.ply", beside)
+    write_gaussians(tmp_path / "model.ply", beside)
     model = load_model(tmp_path / "model.ply", room)
     assert "times as far from the nearest Gaussian" in model.doubt
     assert not load_model(tmp_path / "model.ply", room, transform="none").doubt

@@ -11,7 +11,7 @@ pytest.importorskip("gsplat", reason="training needs gsplat's strategies")
 from splatseed.io import colmap, load_scene, write_scene
 from splatseed.io.origin import RECENTER, offset_beside, translated
 from splatseed.splat.evaluate import evaluate_model, evaluate_views, load_model
-from splatseed.splat.formats import read_model, write_model
+from splatseed.splat.formats import read_gaussians, write_gaussians
 from splatseed.splat.world import shifted
 from splatseed.training.run import prepare_run
 from splatseed.training.settings import TrainSettings
@@ -49,13 +49,13 @@ def test_the_written_model_scores_as_in_training_wherever_the_world_lies(runs, p
     assert psnr == pytest.approx(runs["here"][1], abs=0.05)
     assert scored(file, folder / "scene") == pytest.approx(psnr, abs=0.01)
     assert (folder / "run" / RECENTER).is_file() == (place != "here")
-    gaussians = read_model(file)
+    gaussians = read_gaussians(file)
     offset = np.zeros(3) if place == "here" else offset_beside(file)
-    middle = np.median(read_model(runs["here"][0] / "run" / "point_cloud.ply").means, axis=0)
+    middle = np.median(read_gaussians(runs["here"][0] / "run" / "point_cloud.ply").means, axis=0)
     there = np.median(gaussians.means, axis=0) + offset - PLACES[place]
     np.testing.assert_allclose(there, middle, atol=0.02)
     # Without the record, around another, and around the scene's as it is written again.
-    write_model(tmp_path / "lost.ply", gaussians)
+    write_gaussians(tmp_path / "lost.ply", gaussians)
     write_scene(scene, tmp_path / "again")
     for path, name in ((file, "again"), (tmp_path / "lost.ply", "again")):
         assert scored(path, tmp_path / name) == pytest.approx(psnr, abs=0.01)
@@ -66,8 +66,8 @@ def test_the_written_model_scores_as_in_training_wherever_the_world_lies(runs, p
 def test_a_model_in_the_coordinates_of_the_files_is_moved_and_it_is_said(runs, tmp_path):
     folder, psnr = runs["site"]
     file, notes = folder / "run" / "point_cloud.ply", []
-    gaussians = read_model(file)
-    write_model(tmp_path / "world.ply", shifted(gaussians, offset_beside(file)))
+    gaussians = read_gaussians(file)
+    write_gaussians(tmp_path / "world.ply", shifted(gaussians, offset_beside(file)))
     score = scored(tmp_path / "world.ply", folder / "scene")
     assert score == pytest.approx(psnr, abs=0.3)  # float32 has rounded it before
     started = read_start(tmp_path / "world.ply", load_scene(folder / "scene"), notes.append)

@@ -14,7 +14,7 @@ from splatseed.io import write_scene
 from splatseed.photos.view import View, poses_of
 from splatseed.pointcloud import PointCloud
 from splatseed.splat.evaluate import evaluate_model, load_model
-from splatseed.splat.formats import read_model, write_model
+from splatseed.splat.formats import read_gaussians, write_gaussians
 from splatseed.splat.gaussians import SH_C0, Gaussians, training_frame
 from splatseed.splat.rendering import ModelRenderer, as_bytes
 from splatseed.splat.world import find_transform, moved
@@ -116,7 +116,7 @@ def floating(sixteen_views, tmp_path_factory):
     whole, floaters = joined(*parts[::2]), joined(*wrong).select(np.arange(NUM_FLOATERS))
     folder = tmp_path_factory.mktemp("floating")
     for name, model in (("whole", whole), ("model", joined(whole, floaters))):
-        write_model(folder / f"{name}.ply", model)
+        write_gaussians(folder / f"{name}.ply", model)
     return folder / "model.ply", len(whole)
 
 
@@ -129,7 +129,7 @@ def test_export_finds_floaters_in_a_room(sixteen_views, floating, splatseed, tmp
     before, out = path.read_bytes(), tmp_path / "clean.ply"
     done = splatseed("export", path, "-o", out, "--clean", root)
     assert done.code == 0, done.err
-    kept, model = read_model(out).means, read_model(path).means
+    kept, model = read_gaussians(out).means, read_gaussians(path).means
     stays = np.isin(model[:, 0], kept[:, 0])
     assert f"{len(model) - len(kept):,} left out" in done.out
     assert (~stays[count:]).mean() > 0.6
@@ -141,10 +141,10 @@ def test_export_finds_floaters_in_a_room(sixteen_views, floating, splatseed, tmp
     fails = Mock(side_effect=MissingDependencyError("kernels", found="no nvcc", fix=""))
     monkeypatch.setattr(floaters, "pick_device", fails)
     world = find_transform("gsplat", sixteen_views[1])
-    write_model(tmp_path / "theirs.ply", moved(read_model(path), world))
+    write_gaussians(tmp_path / "theirs.ply", moved(read_gaussians(path), world))
     words = ("-o", tmp_path / "again.ply", "--clean", root)
     assert splatseed("export", tmp_path / "theirs.ply", *words).code == 0
-    again = read_model(tmp_path / "again.ply")
+    again = read_gaussians(tmp_path / "again.ply")
     assert abs(len(again) - len(kept)) <= 0.01 * len(kept)
 
 

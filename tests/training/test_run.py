@@ -19,7 +19,7 @@ from splatseed.errors import OutputError, ParameterError, PointCloudError, Scene
 from splatseed.io import load_scene
 from splatseed.pointcloud import PointCloud
 from splatseed.splat.evaluate import evaluate_views
-from splatseed.splat.formats import read_model
+from splatseed.splat.formats import read_gaussians
 from splatseed.splat.rendering import opacities_of
 from splatseed.training import device, run as run_module, trainer
 from splatseed.training.parameters import add_to_mean, gaussians_of, length_units
@@ -221,7 +221,7 @@ def test_results_are_whole_and_in_the_scenes_world(begin, room):
     assert [test.step for test in result.curve] == list(range(1, 21))
     last, end = result.curve[-1], result.scores
     assert (last.psnr, last.ssim) == pytest.approx((end.psnr, end.ssim), abs=1e-4)
-    assert len(read_model(folder.gaussians)) == result.scores.num_gaussians
+    assert len(read_gaussians(folder.gaussians)) == result.scores.num_gaussians
     assert json.loads(folder.config.read_text())["data_factor"] == 2
     rows = list(csv.DictReader(folder.curve_csv.open()))
     assert int(rows[-1]["step"]) == 20

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from splatseed.splat.evaluate import evaluate_views
-from splatseed.splat.formats import read_model, write_model
+from splatseed.splat.formats import read_gaussians, write_gaussians
 from splatseed.splat.world import find_transform, moved
 from splatseed.training.run import prepare_run
 from splatseed.training.settings import TrainSettings
@@ -42,7 +42,7 @@ def test_a_run_that_goes_on_keeps_what_was_learnt(room, first, tmp_path):
     before = path.read_bytes()
     further, run = trained(room, tmp_path / "run", going_on(path, 150, strategy="none"))
     assert further.psnr > scores.psnr - 0.1
-    assert run.count() == len(read_model(path))
+    assert run.count() == len(read_gaussians(path))
     assert path.read_bytes() == before
     config = run.folder.read_config()
     assert config["start"] == str(path)
@@ -50,21 +50,21 @@ def test_a_run_that_goes_on_keeps_what_was_learnt(room, first, tmp_path):
 
 def test_a_hole_is_filled_where_the_strategy_adds(room, first, tmp_path):
     path, _ = first
-    whole, corner = read_model(path), room.points.xyz[0]
+    whole, corner = read_gaussians(path), room.points.xyz[0]
     away = np.linalg.norm(whole.means - corner, axis=1)
     reach = np.quantile(away, 0.25)
-    write_model(tmp_path / "hole.ply", whole.select(away > reach))
+    write_gaussians(tmp_path / "hole.ply", whole.select(away > reach))
     for strategy, least, most in (("none", 0, 50), ("grow", 100, 300)):
         settings = going_on(tmp_path / "hole.ply", strategy=strategy)
         trained(room, tmp_path / strategy, settings)
-        means = read_model(tmp_path / strategy / "point_cloud.ply").means
+        means = read_gaussians(tmp_path / strategy / "point_cloud.ply").means
         assert least <= np.sum(np.linalg.norm(means - corner, axis=1) < reach) <= most
 
 
 def test_a_model_in_its_trainers_world_is_brought_into_the_scenes(room, first, tmp_path):
     path, scores = first
     world = find_transform("gsplat", room)
-    write_model(tmp_path / "theirs.ply", moved(read_model(path), world))
+    write_gaussians(tmp_path / "theirs.ply", moved(read_gaussians(path), world))
     notes = []
     run = prepare_run(room, tmp_path / "run", going_on(tmp_path / "theirs.ply"), note=notes.append)
     assert any("(gsplat)" in note for note in notes)
@@ -79,9 +79,9 @@ def test_a_smaller_budget_keeps_those_that_contribute_most(room, first, tmp_path
     run = prepare_run(room, tmp_path / "run", settings, note=notes.append)
     assert run.count() == 600
     assert any("the 600 that contribute most" in note for note in notes)
-    whole = read_model(path)
+    whole = read_gaussians(path)
     rng = np.random.default_rng(0)
-    write_model(tmp_path / "some.ply", whole.select(np.sort(rng.permutation(len(whole))[:600])))
+    write_gaussians(tmp_path / "some.ply", whole.select(np.sort(rng.permutation(len(whole))[:600])))
     other = prepare_run(room, tmp_path / "other", going_on(tmp_path / "some.ply"))
     best, any_ = (evaluate_views(r.trainer.render, r.trainer.test_views) for r in (run, other))
     assert best.psnr > any_.psnr + 1
@@ -90,8 +90,8 @@ def test_a_smaller_budget_keeps_those_that_contribute_most(room, first, tmp_path
 def test_a_run_is_in_its_scenes_world_whatever_its_clones(room_path, first, splatseed, tmp_path):
     """As mcmc makes them; a file of the same Gaussians may be of another scene."""
     run = shutil.copytree(first[0].parent, tmp_path / "run")
-    whole = read_model(run / "point_cloud.ply")
-    write_model(run / "point_cloud.ply", whole.select(np.arange(len(whole)) // 40))
+    whole = read_gaussians(run / "point_cloud.ply")
+    write_gaussians(run / "point_cloud.ply", whole.select(np.arange(len(whole)) // 40))
     file = shutil.copy(run / "point_cloud.ply", tmp_path / "file.ply")
     words = ["train", room_path, "--max-steps", 3, "--strategy", "none", "-o"]
     for model, code in ((run, 0), (file, 2)):
@@ -122,7 +122,7 @@ def test_the_command(room_path, first, splatseed, tmp_path):
     assert done.code == 0, done.err
     config = json.loads((tmp_path / "run" / "config.json").read_text())
     assert config["start"] == str(path)
-    assert config["seeds"]["count"] == len(read_model(path))
+    assert config["seeds"]["count"] == len(read_gaussians(path))
     for words_of, found in (
         (["--start", path, "--seeds", "auto"], "--start or --seeds"),
         (["--start", tmp_path / "none.ply"], "a file of Gaussians"),

@@ -11,7 +11,7 @@ from PIL import Image
 from splatseed.camera import CAMERA_MODELS, Intrinsics
 from splatseed.io import colmap, load_scene, write_scene
 from splatseed.splat.evaluate import evaluate_model, evaluate_views, load_model
-from splatseed.splat.formats import FORMATS, read_model, write_model
+from splatseed.splat.formats import FORMATS, read_gaussians, write_gaussians
 from splatseed.training.run import prepare_run
 from splatseed.training.settings import TrainSettings
 
@@ -53,8 +53,8 @@ def test_a_run_scores_as_its_file(model, size, room, tmp_path):
 
 def test_a_run_scores_as_its_exports(room_path, tmp_path):
     trained = run_of(room_path, tmp_path / "run", max_steps=40)
-    gaussians = read_model(tmp_path / "run/point_cloud.ply")
+    gaussians = read_gaussians(tmp_path / "run/point_cloud.ply")
     for name, each in FORMATS.items():
         path = tmp_path / f"model{each.suffix}"
-        write_model(path, gaussians)
+        write_gaussians(path, gaussians)
         assert score_of(path, room_path, 1) == pytest.approx(trained, abs=LOSSES[name]), name

@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip("torch", reason="rendering needs PyTorch")
 
 from splatseed.io import load_scene
-from splatseed.splat.formats import write_model
+from splatseed.splat.formats import write_gaussians
 from splatseed.splat.gaussians import initial_gaussians
 from splatseed.training.settings import TrainSettings
 
@@ -30,5 +30,5 @@ def run_folder(room, tmp_path_factory):
     for name in ("config.json", "splatseed.json"):
         (folder / name).write_text(json.dumps(config))
     gaussians = initial_gaussians(load_scene(room).points, opacity=0.9)
-    write_model(folder / "point_cloud.ply", gaussians)
+    write_gaussians(folder / "point_cloud.ply", gaussians)
     return folder

@@ -18,7 +18,7 @@ from splatseed.io import load_scene, write_scene
 from splatseed.photos.view import View, poses_of
 from splatseed.photos.viewpoint import look_at
 from splatseed.similarity import Similarity
-from splatseed.splat.formats import read_model
+from splatseed.splat.formats import read_gaussians
 from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.rendering import ModelRenderer
 from splatseed.viewer import flights
@@ -72,7 +72,7 @@ def test_a_path_follows_the_cameras_evenly(rng):
 def test_an_orbit_goes_around_what_the_cameras_look_at(run_folder):
     cameras = _ring()
     np.testing.assert_allclose(flights.focus_of(cameras), 0, atol=0.1)
-    gaussians = read_model(run_folder / "point_cloud.ply")
+    gaussians = read_gaussians(run_folder / "point_cloud.ply")
     centers = _centers(orbit(cameras, gaussians, 60, (160, 90)))
     np.testing.assert_allclose(np.linalg.norm(centers[:, :2], axis=1), 3, atol=0.2)
     np.testing.assert_allclose(centers[:, 2], 1, atol=0.1)
@@ -190,7 +190,7 @@ def test_a_path_through_nerfstudios_world_needs_its_transform(
     assert (said.code, "--transform" in said.err) == (2, True)
     said = splatseed(*words, "--transform", tmp_path / "dataparser_transforms.json")
     assert said.code == 0, said.err
-    gaussians = read_model(run_folder / "point_cloud.ply")
+    gaussians = read_gaussians(run_folder / "point_cloud.ply")
     renderer = ModelRenderer(gaussians, stage_frame(Shown("", None, gaussians)))
     wanted = renderer.color(poses_of([load_scene(room).images[3]])[0])
     shown = _frames(tmp_path / "flight.mp4")[0][0] / 255

@@ -19,8 +19,8 @@ from splatseed.splat.formats import (
     format_of_name,
     keep_gaussians,
     parse_crop,
-    read_model,
-    write_model,
+    read_gaussians,
+    write_gaussians,
 )
 from splatseed.splat.world import shifted
 from splatseed.text import quoted
@@ -81,7 +81,7 @@ def run(arguments: list[str]) -> None:
     notes: list[str] = []
     with stage_display() as clock:
         clock("read", 0.0)
-        gaussians = read_model(path, notes.append)
+        gaussians = read_gaussians(path, notes.append)
         # What leaves nothing is refused before photographs are compared.
         kept = keep_gaussians(gaussians, crop, options.min_opacity)
         floaters = np.zeros(len(gaussians), bool)
@@ -98,7 +98,7 @@ def run(arguments: list[str]) -> None:
         offset, far = offset_beside(path), choose_origin(kept.means)
         kept = shifted(kept, -far) if far.any() else kept
         offset = far if offset is None else offset + far
-        write_model(target, kept, clock, notes.append)
+        write_gaussians(target, kept, clock, notes.append)
         write_offset(target, offset)
     if offset.any():
         notes.append(

@@ -63,6 +63,17 @@ class View:
         return Camera(self.K, self.width, self.height, self.cam_from_world)
 
 
+def view_of(camera: Image | Camera | View) -> View:
+    """A camera as a view without pixels; a view as it is."""
+    if isinstance(camera, View):
+        return camera
+    name = ""
+    if isinstance(camera, Image):
+        name, camera = camera.name, camera.camera
+    unseen = np.empty((0, 0, 3), np.uint8)
+    return View(name, unseen, camera.K, camera.width, camera.height, camera.cam_from_world)
+
+
 def poses_of(images: Sequence[Image], data_factor: int = 1) -> tuple[View, ...]:
     """The views of some images without their pixels, where only their frames matter."""
     unseen, views = np.empty((0, 0, 3), np.uint8), []

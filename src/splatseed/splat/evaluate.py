@@ -36,7 +36,7 @@ from splatseed.photos.view import View, at_file_size, default_factor, load_views
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 from splatseed.scores import NOT_ASKED, EvalResult, ViewScore
-from splatseed.splat.formats import read_model
+from splatseed.splat.formats import read_gaussians
 from splatseed.splat.gaussians import Gaussians, frame_of_model
 from splatseed.splat.metrics import LPIPS_NET, Lpips, color_corrected, flip_map, psnr, ssim_of_all
 from splatseed.splat.rendering import ModelRenderer, fill_masked, mask_of, photograph_of
@@ -185,7 +185,7 @@ def load_model(
     """Read Gaussians that any trainer wrote, and the test views of their scene.
 
     Args:
-        model: A file that ``read_model`` reads, or Gaussians in the scene's frame.
+        model: A file that ``read_gaussians`` reads, or Gaussians in the scene's frame.
         scene: The scene, or its path.
         data_factor: The factor by which photographs are downsampled; when left out, as ``train``
             chooses it.
@@ -208,7 +208,7 @@ def load_model(
     """
     notes: list[str] = []
     path = None if isinstance(model, Gaussians) else Path(model)
-    gaussians = model if isinstance(model, Gaussians) else read_model(Path(model), notes.append)
+    gaussians = model if isinstance(model, Gaussians) else read_gaussians(Path(model), notes.append)
     if not isinstance(scene, Scene):
         scene = load_scene(Path(scene), require_points=False)
     scene = with_masks(scene, masks)

@@ -68,11 +68,17 @@ SUFFIXES = {each.suffix: name for name, each in FORMATS.items()}
 """The formats' names by file name suffix."""
 
 
-def read_model(path: StrPath, note: Note = silent_note) -> Gaussians:
-    """Read trained Gaussians: .ply, compressed .ply, .splat, .spz, .sog (or its meta.json).
+def read_gaussians(path: StrPath, note: Note = silent_note) -> Gaussians:
+    """Read the Gaussians that any trainer wrote.
 
-    Gaussians that cannot be drawn, as one of their numbers is NaN, are left out; ``note`` is called
-    with each sentence that the user should read about the model.
+    Args:
+        path: A .ply, compressed .ply, .splat, .spz, or .sog (or its meta.json); its content decides
+            which.
+        note: Called with notes for the user, one sentence each, such as on Gaussians that cannot be
+            drawn (a number is NaN) and are left out.
+
+    Returns:
+        The Gaussians in the file's order (packed formats have an order of their own) and frame.
 
     Raises:
         SceneNotFoundError: There is no such file.
@@ -87,7 +93,7 @@ def read_model(path: StrPath, note: Note = silent_note) -> Gaussians:
     return gaussians
 
 
-def write_model(
+def write_gaussians(
     path: StrPath, gaussians: Gaussians, progress: Progress = silent, note: Note = silent_note
 ) -> None:
     """Write at least one Gaussian, at finite positions, in the format that the file name asks for.

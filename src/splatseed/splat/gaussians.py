@@ -15,14 +15,19 @@ precision suffices there for distant origins.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int64
 from numpy.lib.stride_tricks import sliding_window_view
 
 from splatseed.errors import PointCloudError
+from splatseed.frozen import read_only
+from splatseed.io.files import StrPath
+from splatseed.io.staging import atomic_file
 from splatseed.photos.sight import camera_centers, sight_of
 from splatseed.photos.view import NEAR_PLANE, View
 from splatseed.pointcloud import PointCloud
@@ -57,22 +62,35 @@ NOWHERE = np.empty((0, 3), np.float32)  # no points are known
 
 @dataclass(frozen=True, eq=False)
 class Gaussians:
-    """The parameters of N Gaussians, float32; see the module for their conventions.
+    """N Gaussians, as 3DGS's .ply and gsplat's parameter dict hold them; float32, read-only.
 
-    ``antialiased``: they were trained with opacities compensated for the blur of the screen
-    (``rasterize_mode="antialiased"``) and must be rendered so.
+    ``ss.read_gaussians`` reads them, ``ss.render`` renders them; ``dataclasses.replace`` and
+    ``select`` make others. Spherical harmonics have degree 0 to 3: K = 0, 3, 8 or 15.
     """
 
-    means: Float32[np.ndarray, "N 3"]
-    scales: Float32[np.ndarray, "N 3"]
-    quats: Float32[np.ndarray, "N 4"]
-    opacities: Float32[np.ndarray, " N"]
-    sh0: Float32[np.ndarray, "N 1 3"]
-    shN: Float32[np.ndarray, "N K 3"]  # noqa: N815  (gsplat's name)
-    antialiased: bool = False
+    means: Float32[np.ndarray, "N 3"]  # positions
+    scales: Float32[np.ndarray, "N 3"]  # logarithms of standard deviations
+    quats: Float32[np.ndarray, "N 4"]  # wxyz, of any length but 0
+    opacities: Float32[np.ndarray, " N"]  # logits: 1 / (1 + exp(-x)) is the opacity
+    sh0: Float32[np.ndarray, "N 1 3"]  # of harmonics: 0.5 + 0.2821 sh0 is the mean sRGB colour
+    shN: Float32[np.ndarray, "N K 3"]  # noqa: N815  (gsplat's name)  # of higher degrees
+    antialiased: bool = False  # trained, and to be rendered, with ``rasterize_mode="antialiased"``
+
+    def __post_init__(self) -> None:
+        for name in PARAMETERS:
+            object.__setattr__(self, name, read_only(getattr(self, name)))
 
     def __len__(self) -> int:
         return len(self.means)
+
+    def __repr__(self) -> str:
+        blur = ", antialiased" if self.antialiased else ""
+        return f"Gaussians({len(self):,}, SH degree {self.sh_degree}{blur})"
+
+    @property
+    def sh_degree(self) -> int:
+        """The degree of the spherical harmonics."""
+        return math.isqrt(1 + self.shN.shape[1]) - 1
 
     @property
     def num_bytes(self) -> int:
@@ -87,6 +105,17 @@ class Gaussians:
         """Some of the Gaussians, by index or mask."""
         parts = {name: array[index] for name, array in self.arrays().items()}
         return dataclasses.replace(self, **parts)
+
+    def write_ply(self, path: StrPath) -> None:
+        """Write them as 3DGS's .ply, which every viewer and trainer reads; replaces a file there.
+
+        Raises:
+            OutputError: It cannot be written.
+        """
+        from splatseed.splat.model_ply import encode  # noqa: PLC0415  (it imports this file)
+
+        with atomic_file(Path(path)) as partial, partial.open("wb") as file:
+            file.writelines(encode(self))
 
 
 def initial_gaussians(

@@ -22,7 +22,7 @@ from splatseed.errors import ParameterError
 from splatseed.io import load_scene
 from splatseed.io.files import StrPath, read_text
 from splatseed.io.masks import with_masks
-from splatseed.photos.view import View, at_file_size, data_factor, poses_of, user_cache_dir
+from splatseed.photos.view import View, at_file_size, data_factor, poses_of, user_cache_dir, view_of
 from splatseed.progress import Note, Progress, silent, silent_note
 from splatseed.requirements import require
 from splatseed.scene import Image, Scene
@@ -37,7 +37,7 @@ require("torch", "gsplat", "flip_evaluator")  # before what imports them, for on
 
 from splatseed.camera import Camera
 from splatseed.splat.evaluate import evaluate_views
-from splatseed.splat.formats import read_model
+from splatseed.splat.formats import read_gaussians
 from splatseed.splat.gaussians import Gaussians, TrainingFrame
 from splatseed.splat.rendering import ModelRenderer
 from splatseed.training.device import pick_device
@@ -83,7 +83,7 @@ class Run:
     @cached_property
     def gaussians(self) -> Gaussians:
         """The trained Gaussians, in the scene's frame."""
-        return read_model(RunFolder(self.folder).gaussians)
+        return read_gaussians(RunFolder(self.folder).gaussians)
 
     def render(self, camera: Image | Camera | View) -> Float32[np.ndarray, "H W 3"]:
         """Render the Gaussians as a camera sees them.
@@ -95,7 +95,7 @@ class Run:
         Returns:
             sRGB colours in [0, 1], at the camera's width and height; the background is black.
         """
-        return self._renderer.color(_view_of(camera))
+        return self._renderer.color(view_of(camera))
 
     @cached_property
     def _renderer(self) -> ModelRenderer:
@@ -332,17 +332,7 @@ def _within_budget(
     cap = max(2, min(BUDGET, round(pixels)))
     reason = "one for each pixel of a photograph; `budget` sets another"
     if settings.start:  # a merge of two may be larger, and must not be thinned unless asked for
-        cap = max(cap, len(read_model(Path(settings.start))))
+        cap = max(cap, len(read_gaussians(Path(settings.start))))
         reason = "one for each pixel of a photograph, or as many as it starts with"
     note(f"At most {cap:,} Gaussians, {reason}.")
     return dataclasses.replace(settings, cap_max=cap)
-
-
-def _view_of(camera: Image | Camera | View) -> View:
-    """The camera as a view without pixels."""
-    if isinstance(camera, View):
-        return camera
-    if isinstance(camera, Image):
-        return poses_of([camera])[0]
-    unseen = np.empty((0, 0, 3), np.uint8)
-    return View("", unseen, camera.K, camera.width, camera.height, camera.cam_from_world)

@@ -40,7 +40,7 @@ from splatseed.progress import Progress, silent
 from splatseed.requirements import require
 from splatseed.scene import Scene
 from splatseed.scores import CurvePoint, EvalResult, TrainingResult
-from splatseed.splat.formats import read_model, write_model
+from splatseed.splat.formats import read_gaussians, write_gaussians
 from splatseed.splat.gaussians import Gaussians, TrainingFrame, frame_of_model
 from splatseed.splat.rendering import ModelRenderer, picture_names, write_render
 from splatseed.splat.ssim import WINDOW
@@ -461,9 +461,11 @@ class TrainingRun:
         with self.told():
             progress("score", 0.0)
             folder.claim([folder.renders / name for name in self._pictures.values()])
-            write_model(folder.gaussians, self.frame.gaussians_to_world(gaussians_of(state.params)))
+            write_gaussians(
+                folder.gaussians, self.frame.gaussians_to_world(gaussians_of(state.params))
+            )
             # What is scored is what the user gets: the file, read back.
-            world = read_model(folder.gaussians)
+            world = read_gaussians(folder.gaussians)
             render = ModelRenderer(world, self.frame, self.trainer.device).image
             scores = score(render, self._test_views, on_view=self._draw)
             result = TrainingResult(

@@ -20,7 +20,7 @@ from jaxtyping import Float32
 from splatseed.photos.view import View
 from splatseed.runtime.fingerprint import fingerprint
 from splatseed.scene import Scene
-from splatseed.splat.formats import read_model
+from splatseed.splat.formats import read_gaussians
 from splatseed.splat.gaussians import Gaussians, TrainingFrame
 from splatseed.splat.world import around_scene, in_scene_world
 from splatseed.training.growing import OPAQUE, contributions
@@ -41,7 +41,7 @@ def read_start(
         SceneNotFoundError: There is no such file.
         SceneFormatError: It holds no Gaussians, or they belong to another scene.
     """
-    gaussians, told = around_scene(path, scene, read_model(path, note), note), ""
+    gaussians, told = around_scene(path, scene, read_gaussians(path, note), note), ""
     if not trained:  # where mcmc's clones may seem to be in another world
         gaussians, told = in_scene_world(path, scene, gaussians)
     if told:

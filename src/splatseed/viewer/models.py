@@ -22,7 +22,7 @@ from splatseed.io.files import StrPath, read_bytes
 from splatseed.photos.sight import shown_points
 from splatseed.photos.view import View, poses_of
 from splatseed.scene import Scene
-from splatseed.splat.formats import detect_format, read_model
+from splatseed.splat.formats import detect_format, read_gaussians
 from splatseed.splat.gaussians import Gaussians, TrainingFrame, frame_of_model
 from splatseed.splat.world import around_scene
 from splatseed.text import quoted
@@ -88,7 +88,7 @@ def open_shown(path: StrPath, scene_path: Path | None = None) -> Shown:
     folder, notes = RunFolder(path), list[str]()
     if not path.is_dir() or not folder.is_run:
         if path.is_file() and _is_model(path):
-            gaussians, scene = read_model(path, notes.append), scene_at(scene_path)
+            gaussians, scene = read_gaussians(path, notes.append), scene_at(scene_path)
             if scene is not None:
                 gaussians = around_scene(path, scene, gaussians, notes.append)
             return Shown(path.name, scene, gaussians, notes=tuple(notes))
@@ -112,7 +112,7 @@ def open_shown(path: StrPath, scene_path: Path | None = None) -> Shown:
         with suppress(SceneNotFoundError, SceneFormatError):  # it is gone
             scene = scene_at(Path(named))
     factor, every = (int(config.get(n) or d) for n, d in (("data_factor", 1), ("test_every", 8)))
-    gaussians = read_model(folder.gaussians, notes.append)
+    gaussians = read_gaussians(folder.gaussians, notes.append)
     if scene is not None:
         gaussians = around_scene(folder.gaussians, scene, gaussians, notes.append)
     return Shown(folder.path.name, scene, gaussians, factor, every, tuple(notes))

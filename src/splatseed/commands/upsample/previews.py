@@ -16,7 +16,7 @@ from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
 from splatseed.seeding.photo_methods import MAX_SIZE, Stereo, photographed, read_views
 from splatseed.seeding.upsampling import CELL
-from splatseed.splat.formats import write_model
+from splatseed.splat.formats import write_gaussians
 from splatseed.training.seeds import gaussians_of_scene
 from splatseed.training.settings import TrainSettings
 
@@ -38,7 +38,7 @@ def write_start(path: Path, scene: Scene, method: Upsampler, progress: Progress)
     images = photographed(scene, getattr(method, "test_every", 0))
     views = read_views(scene, images, MAX_SIZE, progress)
     settings = TrainSettings(strategy="grow", seed_colors=True)
-    write_model(path, gaussians_of_scene(scene.points, views, settings))
+    write_gaussians(path, gaussians_of_scene(scene.points, views, settings))
     write_offset(path, scene.offset)
 
 

@@ -1,0 +1,52 @@
+"""``ss.render``: Gaussians from Python. Needs PyTorch (``pip install ".[train]"``)."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float32
+
+from splatseed.requirements import require
+
+require("torch")  # before what imports it, for one clear error
+
+from splatseed.camera import Camera
+from splatseed.photos.view import View, view_of
+from splatseed.runtime.torch_device import DeviceName, load_kernels, pick_torch_device
+from splatseed.scene import Image
+from splatseed.splat.gaussians import Gaussians, frame_of_model
+from splatseed.splat.rendering import ModelRenderer
+
+
+def render(
+    gaussians: Gaussians, camera: Image | Camera | View, *, backend: DeviceName = "auto"
+) -> Float32[np.ndarray, "H W 3"]:
+    """Render Gaussians as a camera sees them.
+
+    The near plane is a hundredth of the depth beyond which nine tenths of the Gaussians in the
+    image lie. For many pictures of a run, ``Run.render`` is faster: it keeps the Gaussians on the
+    device.
+
+    Args:
+        gaussians: The Gaussians, in the camera's world.
+        camera: An image of a scene (``scene["DSC07956.JPG"]``), without its lens distortion; a
+            ``Camera``; or a view.
+        backend: "cpu", "cuda", or "auto": a GPU if PyTorch sees one, else the CPU.
+
+    Returns:
+        sRGB colours in [0, 1], float32 [H, W, 3], of the camera's height and width; black where
+        there are no Gaussians.
+
+    Raises:
+        ParameterError: ``backend`` is "cuda" and there is no GPU.
+        MissingDependencyError: PyTorch is absent, or gsplat's kernels cannot be built.
+
+    Example:
+        splat = ss.read_gaussians("point_cloud.ply")
+        picture = ss.render(splat, scene["DSC07956.JPG"])
+    """
+    device = pick_torch_device(backend, "backend")
+    if device.type == "cuda":
+        load_kernels("backend")
+    view = view_of(camera)
+    frame = frame_of_model([view], np.empty((0, 3), np.float32), gaussians)
+    return ModelRenderer(gaussians, frame, device).color(view)
