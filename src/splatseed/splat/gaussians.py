@@ -31,6 +31,7 @@ from splatseed.io.staging import atomic_file
 from splatseed.photos.sight import camera_centers, sight_of
 from splatseed.photos.view import NEAR_PLANE, View
 from splatseed.pointcloud import PointCloud
+from splatseed.splat.ply_layout import encode_layout
 
 PARAMETERS = ("means", "scales", "quats", "opacities", "sh0", "shN")
 """The names of a Gaussian's arrays, in order."""
@@ -112,10 +113,8 @@ class Gaussians:
         Raises:
             OutputError: It cannot be written.
         """
-        from splatseed.splat.model_ply import encode  # noqa: PLC0415  (it imports this file)
-
         with atomic_file(Path(path)) as partial, partial.open("wb") as file:
-            file.writelines(encode(self))
+            file.writelines(encode_layout(self.arrays(), self.antialiased))
 
 
 def initial_gaussians(

@@ -1,6 +1,6 @@
 """Trained Gaussians in .ply files: 3DGS's layout, and what other trainers and tools make of it.
 
-A vertex is a Gaussian; of f_rest_* all of red comes first, then green, then blue. Properties are
+The layout stands in ``ply_layout``. Properties are
 found by name, in any order and type; those that are not known are ignored. Notation: s_i are a
 Gaussian's three sizes, f is Mip-Splatting's ``filter_3D``. Promise: what is written in 3DGS's
 layout is read back bit for bit; what needs more than its own numbers to be drawn (networks, a time)
@@ -24,11 +24,17 @@ from splatseed.io.files import ByteReader, translate_errors
 from splatseed.io.ply import EXPORT_PLY_AGAIN, Element, Header, parse_header
 from splatseed.progress import Note, silent_note
 from splatseed.splat.gaussians import SH_C0, Gaussians
-from splatseed.splat.packed import SH_COUNTS, antialiased_comment, is_antialiased
+from splatseed.splat.packed import SH_COUNTS
+from splatseed.splat.ply_layout import (
+    DC,
+    ROTATION,
+    SCALES,
+    XYZ,
+    encode_layout,
+    is_antialiased,
+    rest_names,
+)
 
-_XYZ, _DC = ("x", "y", "z"), ("f_dc_0", "f_dc_1", "f_dc_2")
-_SCALES = ("scale_0", "scale_1", "scale_2")
-_ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 _COLORS = ("red", "green", "blue")
 _FILTER = "filter_3D"
 _OTHER_KINDS = {
@@ -51,23 +57,7 @@ _LIST = re.compile(rb"^property[ \t]+list[ \t]+\S+[ \t]+\S+[ \t]+(\S+)", re.MULT
 
 def encode(gaussians: Gaussians, _: Note = silent_note) -> list[bytes | memoryview]:
     """All of the Gaussians, as 3DGS writes them."""
-    count, rest = len(gaussians), 3 * gaussians.shN.shape[1]
-    harmonics = gaussians.shN.transpose(0, 2, 1).reshape(count, rest)
-    columns = [
-        (_XYZ, gaussians.means),
-        (("nx", "ny", "nz"), np.zeros((count, 3), np.float32)),
-        (_DC, gaussians.sh0[:, 0]),
-        (_rest_names(rest), harmonics),
-        (("opacity",), gaussians.opacities[:, None]),
-        (_SCALES, gaussians.scales),
-        (_ROTATION, gaussians.quats),
-    ]
-    lines = ["ply", "format binary_little_endian 1.0"]
-    lines += antialiased_comment(gaussians)
-    lines += [f"element vertex {count}"]
-    lines += [f"property float {name}" for names, _ in columns for name in names]
-    table = np.concatenate([values for _, values in columns], axis=1, dtype="<f4")
-    return ["\n".join([*lines, "end_header\n"]).encode("ascii"), table.data]
+    return encode_layout(gaussians.arrays(), gaussians.antialiased)
 
 
 def decode(path: Path, note: Note = silent_note) -> Gaussians:
@@ -78,7 +68,7 @@ def decode(path: Path, note: Note = silent_note) -> Gaussians:
     _check(path, header, names, reader.data)
     rows = _rows(reader, header)
     arrays: dict[str, Any] = {
-        "means": _columns(rows, _XYZ),
+        "means": _columns(rows, XYZ),
         "opacities": _columns(rows, ["opacity"])[:, 0],
         "sh0": _first_colors(rows, names)[:, None],
         "shN": _harmonics(rows, names, note),
@@ -122,8 +112,8 @@ def filtered(
 def _check(path: Path, header: Header, names: set[str], data: bytes) -> None:
     """Refuse a file that holds no Gaussians, or none that can be drawn from their numbers alone."""
     rest = sum(name.startswith("f_rest_") for name in names)
-    needed = [*_XYZ, *(() if set(_COLORS) <= names else _DC), *_rest_names(rest), "opacity"]
-    needed += ["scale_0", *(_ROTATION if "scale_1" in names else ())]
+    needed = [*XYZ, *(() if set(_COLORS) <= names else DC), *rest_names(rest), "opacity"]
+    needed += ["scale_0", *(ROTATION if "scale_1" in names else ())]
     missing = [name for name in needed if name not in names]
     kinds = (
         f"{kind}: {name}"
@@ -198,8 +188,8 @@ def _columns(rows: np.ndarray, names: Sequence[str]) -> Float32[np.ndarray, "N K
 
 def _first_colors(rows: np.ndarray, names: set[str]) -> Float32[np.ndarray, "N 3"]:
     """f_dc_*; or red, green and blue, as integers or as floats from 0 to 1 or to 255."""
-    if set(_DC) <= names:
-        return _columns(rows, _DC)
+    if set(DC) <= names:
+        return _columns(rows, DC)
     kinds = [rows.dtype[name] for name in _COLORS]
     colors = _columns(rows, _COLORS).astype(np.float64)
     top = 255.0
@@ -218,7 +208,7 @@ def _harmonics(rows: np.ndarray, names: set[str], note: Note) -> Float32[np.ndar
     each, most = rest // 3, SH_COUNTS[-1]
     if each > most:
         note(f"Of {each} coefficients beyond the first, the {most} up to degree 3 are used.")
-    every = _rest_names(rest)
+    every = rest_names(rest)
     used = [name for color in range(3) for name in every[color * each :][: min(each, most)]]
     planes = _columns(rows, used).reshape(len(rows), 3, -1)
     return np.array(planes.transpose(0, 2, 1), np.float32, order="C")
@@ -228,7 +218,7 @@ def _shape(
     rows: np.ndarray, names: set[str], note: Note
 ) -> tuple[Float32[np.ndarray, "N 3"], Float32[np.ndarray, "N 4"]]:
     """Log-scales and rotations: of balls with one size, of discs with two, as of 2DGS."""
-    scales = _columns(rows, [name for name in _SCALES if name in names])
+    scales = _columns(rows, [name for name in SCALES if name in names])
     if scales.shape[1] == 1:
         note("Each Gaussian has one size, scale_0: it is read as round.")
         quats = np.tile(np.array([1, 0, 0, 0], np.float32), (len(rows), 1))
@@ -240,8 +230,4 @@ def _shape(
         )
         thin = scales.min(axis=1, keepdims=True) + np.float32(np.log(FLATNESS))
         scales = np.concatenate([scales, thin], axis=1)
-    return scales, _columns(rows, _ROTATION)
-
-
-def _rest_names(number: int) -> tuple[str, ...]:
-    return tuple(f"f_rest_{i}" for i in range(number))
+    return scales, _columns(rows, ROTATION)

@@ -12,7 +12,6 @@ PlayCanvas's splat-transform and engine; nianticlabs/spz (load-spz.cc, splat-typ
 from __future__ import annotations
 
 import gzip
-import re
 import struct
 import zlib
 from pathlib import Path
@@ -39,6 +38,7 @@ from splatseed.splat.extent import (
     shells_of,
 )
 from splatseed.splat.gaussians import SH_C0, Gaussians
+from splatseed.splat.ply_layout import antialiased_comment, is_antialiased
 from splatseed.text import agreeing, counted
 
 SH_COUNTS = (0, 3, 8, 15)
@@ -90,9 +90,6 @@ _SPZ_STEP = 4
 takes 8 for the first degree and 16 for the others: files are a quarter smaller, but coefficients of
 a short run vanish, and with them up to 2.8 dB (docs/formats.md)."""
 
-_RENDER_MODE = re.compile(
-    rb"^comment[ \t]+(?:SplatRenderMode:|antialiased)[ \t]+(\w+)", re.MULTILINE | re.IGNORECASE
-)
 
 # What formats share -------------------------------------------------------------------------------
 
@@ -130,17 +127,6 @@ def opacity_logits(values: UInt8[np.ndarray, " N"]) -> Float32[np.ndarray, " N"]
     """Logits of opacities in steps of 1/255; 0 and 1 move a quarter step inward to stay finite."""
     opacity = np.clip(values / 255, 0.25 / 255, 1 - 0.25 / 255)
     return np.log(opacity / (1 - opacity)).astype(np.float32)
-
-
-def antialiased_comment(gaussians: Gaussians) -> list[str]:
-    """The line of a PLY header, Brush's, that says how the Gaussians are to be rendered."""
-    return ["comment SplatRenderMode: mip"] if gaussians.antialiased else []
-
-
-def is_antialiased(header: bytes) -> bool:
-    """Whether a PLY header says so, by its last comment of Brush or Postshot about it."""
-    modes = _RENDER_MODE.findall(header)
-    return bool(modes) and modes[-1].lower() in {b"mip", b"1"}
 
 
 def rounded_bytes(values: np.ndarray) -> UInt8[np.ndarray, "..."]:
@@ -237,7 +223,7 @@ def encode_compressed_ply(gaussians: Gaussians, _: Note = silent_note) -> list[b
     coefficients = gaussians.shN[order].transpose(0, 2, 1).reshape(count, rest)
     # A coefficient c in [-4, 4] is the byte (c / 8 + 1/2) 256.
     sh = np.clip((coefficients / _SH_RANGE + 0.5) * 256, 0, 255).astype(np.uint8)
-    lines = ["ply", "format binary_little_endian 1.0", *antialiased_comment(gaussians)]
+    lines = ["ply", "format binary_little_endian 1.0", *antialiased_comment(gaussians.antialiased)]
     lines += [f"element chunk {len(starts)}"]
     lines += [f"property float {name}" for names in _BOUNDS for name in names]
     lines += [f"element vertex {count}", *(f"property uint {name}" for name in _PACKED)]
