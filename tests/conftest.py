@@ -6,8 +6,9 @@ import gc
 import math
 import os
 
-# Set before PyTorch loads its thread pool, as the command line does: see splatseed.cli.
-os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+from splatseed.runtime.environment import set_thread_defaults
+
+set_thread_defaults()  # before PyTorch and Numba load, as the command line does
 
 from collections.abc import Callable, Iterator
 from pathlib import Path

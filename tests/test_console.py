@@ -68,8 +68,8 @@ def test_a_log_is_told_once_of_compilation_that_takes_long(capsys, monkeypatch):
     with stage_display() as clock:
         clock("fit", 0.0)
         for _ in range(2):
-            compilation.tell(begins=True)
-            compilation.tell(begins=False)
+            compilation.notify(begins=True)
+            compilation.notify(begins=False)
     with stage_display(clock):
         clock("write", 0.0)
     out, err = capsys.readouterr()

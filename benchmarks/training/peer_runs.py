@@ -25,7 +25,7 @@ from splatseed.errors import SceneFormatError
 from splatseed.io.depth_maps import depth_folder
 from splatseed.photos.view import View, load_split
 from splatseed.rendering import mcmc_on_cpu
-from splatseed.runtime.memory import keep_freed_memory
+from splatseed.runtime.workarounds import keep_freed_memory
 from splatseed.splat.evaluate import Render, evaluate_views
 from splatseed.training import TrainSettings, prepare_run
 from splatseed.training.device import Capacity

@@ -16,6 +16,7 @@ from rich.table import Table
 
 from splatseed.console import ERR, OUT, with_options
 from splatseed.errors import SplatseedError
+from splatseed.runtime.environment import set_thread_defaults
 from splatseed.runtime.interruption import Termination, exit_code
 from splatseed.text import did_you_mean, visible
 
@@ -39,14 +40,7 @@ COMPLETION = "--tyro-print-completion"
 def main(arguments: list[str] | None = None) -> None:
     """Run ``splatseed VERB ...``; exits with 2 when the input is at fault."""
     words = sys.argv[1:] if arguments is None else arguments
-    # Idle threads sleep rather than spin; PyTorch's and Numba's OpenMP read this on loading. Each
-    # has its own pool: spinning, they take the cores from each other, and on a busy machine a
-    # training step took 5 to 20 times as long.
-    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-    # Who limits PyTorch's threads means Numba's too; each reads its own variable on loading.
-    threads = os.environ.get("OMP_NUM_THREADS", "")
-    if threads.isdigit() and "numba" not in sys.modules:
-        os.environ.setdefault("NUMBA_NUM_THREADS", threads)
+    set_thread_defaults()
     try:
         with _termination_raised():
             _act(words)

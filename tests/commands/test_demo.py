@@ -16,7 +16,7 @@ from splatseed.commands import demo
 from splatseed.errors import MissingDependencyError
 from splatseed.io import load_scene
 from splatseed.methods import METHODS
-from splatseed.runtime.compilation import tell
+from splatseed.runtime.compilation import notify
 from splatseed.synthetic import write_capture
 
 
@@ -97,7 +97,7 @@ def test_what_compiles_ahead_starts_with_the_first_compilation_and_ends(monkeypa
     with demo.compiled_ahead([]) as finish:
         assert not children
         for begins in (True, False, True):
-            tell(begins)
+            notify(begins)
         (child,) = children
         finish()  # a small capture is made, and nothing else
     assert child.process.poll() is not None

@@ -74,7 +74,7 @@ def test_freshly_compiled_and_loaded_from_the_cache(tmp_path):
 
 def _in_new_process(cache):
     run = subprocess.run(
-        [sys.executable, "-m", "tests.render.test_determinism"], cwd=Path(__file__).parents[2],
+        [sys.executable, "-m", "tests.rendering.test_determinism"], cwd=Path(__file__).parents[2],
         env={**os.environ, "NUMBA_CACHE_DIR": str(cache)}, capture_output=True, text=True,
         check=True,
     )  # fmt: skip

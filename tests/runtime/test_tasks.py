@@ -17,7 +17,8 @@ import pytest
 import splatseed
 from splatseed.errors import ParameterError, TaskLostError
 from splatseed.runtime.child import Child
-from splatseed.runtime.tasks import ProcessWorkers, run_tasks, worker_env
+from splatseed.runtime.environment import worker_env
+from splatseed.runtime.tasks import ProcessWorkers, run_tasks
 
 from .task_functions import die, fail, import_all, raise_unpicklable
 

@@ -36,9 +36,10 @@ from splatseed.errors import ParameterError, SceneNotFoundError
 from splatseed.io.staging import atomic_file, check_output, output_folder
 from splatseed.methods import Profile
 from splatseed.requirements import require
+from splatseed.runtime.environment import available_cpus, worker_env
 from splatseed.runtime.interruption import exit_code
 from splatseed.runtime.memory import check_memory
-from splatseed.runtime.tasks import ProcessWorkers, Workers, available_cpus, worker_env
+from splatseed.runtime.tasks import ProcessWorkers, Workers
 from splatseed.text import counted, did_you_mean, quoted, visible
 from splatseed.training.settings import BYTES_EACH, Backend, StrategyName
 

@@ -1,6 +1,6 @@
-"""Telling who waits that a kernel is being compiled, without importing Numba.
+"""Notify watchers while a kernel compiles, without importing Numba.
 
-``splatseed.runtime.jit`` tells the watchers once it is imported.
+``splatseed.runtime.jit`` sends the notifications once it is imported.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ _watchers: list[Callable[[bool], None]] = []
 
 @contextmanager
 def watched(watcher: Callable[[bool], None]) -> Iterator[None]:
-    """Call ``watcher`` with True when a compilation begins, False when one ends; they can nest."""
+    """Call ``watcher`` with True when a compilation begins, False when it ends; they can nest."""
     _watchers.append(watcher)
     try:
         yield
@@ -21,7 +21,7 @@ def watched(watcher: Callable[[bool], None]) -> Iterator[None]:
         _watchers.remove(watcher)
 
 
-def tell(begins: bool) -> None:
-    """Tell all watchers that a compilation begins or ends."""
+def notify(begins: bool) -> None:
+    """Notify all watchers that a compilation begins or ends."""
     for watcher in tuple(_watchers):
         watcher(begins)

@@ -7,7 +7,6 @@ still fail.
 
 from __future__ import annotations
 
-import ctypes
 import math
 import os
 import sys
@@ -120,17 +119,3 @@ def peak_bytes() -> int | None:
         return None
     most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return most if sys.platform == "darwin" else most * 1024
-
-
-def keep_freed_memory() -> None:
-    """Let glibc keep the memory that a training step frees for the next one, in this process.
-
-    It returns large blocks to the system at once, and every step then waits for the system to clear
-    the pages again. Results stay the same. While Gaussians are added, blocks of earlier sizes lie
-    idle: a run that grew from 30,000 to 250,000 took 8 % more memory at its peak.
-    """
-    with suppress(OSError, AttributeError):  # another C library
-        mallopt = ctypes.CDLL("libc.so.6").mallopt
-        trim_threshold, mmap_threshold = -1, -3  # of mallopt(3)
-        for option in (trim_threshold, mmap_threshold):
-            any(mallopt(option, size) for size in (1 << 30, 1 << 25))  # older versions: 32 MiB

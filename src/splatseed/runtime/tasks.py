@@ -29,26 +29,6 @@ Report: TypeAlias = Callable[[int, str, float], None]
 _POLL_SECONDS = 0.2
 
 
-def available_cpus() -> int:
-    """The number of CPUs that this process may use."""
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:  # not on Windows and macOS
-        return os.cpu_count() or 1
-
-
-def worker_env(threads: int, gpu: str = "") -> dict[str, str]:
-    """Variables that limit a process to its share of the machine; results do not depend on them.
-
-    ``gpu`` is a value of ``CUDA_VISIBLE_DEVICES``; empty to leave the choice to PyTorch.
-    """
-    libraries = ("NUMBA", "OMP", "MKL", "OPENBLAS")
-    environment = {f"{library}_NUM_THREADS": str(threads) for library in libraries}
-    # Idle threads of one pool would take CPUs from another: see splatseed.cli.
-    environment["OMP_WAIT_POLICY"] = os.environ.get("OMP_WAIT_POLICY", "passive")
-    return {**environment, "CUDA_VISIBLE_DEVICES": gpu} if gpu else environment
-
-
 class Workers(Protocol):
     """Where tasks run."""
 

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from splatseed.photos.view import View
 from splatseed.runtime.interruption import interruption
-from splatseed.runtime.memory import keep_freed_memory
+from splatseed.runtime.workarounds import keep_freed_memory
 from splatseed.splat.metrics import l1_and_ssim_by_convolution, psnr, ssim_of_all
 from splatseed.splat.rendering import Photographs, fill_masked, mask_of, photograph_of, render_view
 from splatseed.splat.ssim import l1_and_ssim
@@ -53,13 +53,13 @@ class Trainer:
         self.on_record = on_record
         self.is_whole = True  # the state is one between two steps, which a checkpoint may keep
         self._photographs = Photographs(train_views, self.device)
-        keep_freed_memory()
 
     def run(self, on_step: Callable[[int], None] = lambda _: None) -> bool:
         """Train to the last step, or until the user interrupts; returns whether it is done.
 
         ``on_step`` is called with the number of steps done, after each.
         """
+        keep_freed_memory()
         state = self.state
         gpus = [self.device] if self.device.type == "cuda" else []
         with interruption() as stop, torch.random.fork_rng(gpus):
