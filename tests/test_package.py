@@ -12,6 +12,7 @@ import sys
 import tomllib
 from graphlib import TopologicalSorter
 from importlib.metadata import version
+from importlib.util import resolve_name
 from pathlib import Path
 
 import pytest
@@ -167,6 +168,31 @@ def test_help_does_not_wait_for_what_computes():
     run = subprocess.run(command, capture_output=True, check=False, text=True)
     assert (run.returncode, run.stderr) == (0, "")
     assert all(f"splatseed {verb}" in run.stdout for verb in VERBS)
+
+
+def test_files_import_each_other_in_no_circle():
+    """Also within functions, for type checkers alone, and in lists of lazy names (.pyi)."""
+    paths, imports = _paths(), {}
+    for name, path in paths.items():
+        parts = path.relative_to(SOURCE).with_suffix("").parts
+        found = _imported_files(path, name, paths) - DELEGATING.get(".".join(parts), set())
+        stub = path.with_suffix(".pyi")
+        imports[name] = found | (_imported_files(stub, name, paths) if stub.is_file() else set())
+    TopologicalSorter(imports).prepare()  # raises CycleError, which names the circle
+
+
+def _imported_files(path, name, modules):
+    """The modules of ours that a file imports anywhere, but itself."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            source = resolve_name("." * node.level + (node.module or ""), name)
+            found |= {source, *(f"{source}.{alias.name}" for alias in node.names)}
+            if any(f"{source}.{alias.name}" in modules for alias in node.names):
+                found.discard(source)  # the package of a module that is named
+    return (found & modules.keys()) - {name}
 
 
 def test_imports_close_no_circle():
