@@ -25,7 +25,7 @@ from PIL import Image
 from splatseed.photos.view import View
 from splatseed.splat.gaussians import training_frame
 from splatseed.viewer.flights import smooth_path
-from splatseed.viewer.models import Shown
+from splatseed.viewer.models import ViewerItem
 from splatseed.viewer.pictures import Entry
 from splatseed.viewer.session import FrameLoop
 
@@ -59,7 +59,7 @@ class Stage:
         """What ``Session`` does for a frame, but for the socket."""
         at = int((time.perf_counter() - self.began) * 60) % len(self.path)
         canvas = _scaled(self.path[at], scale)
-        picture, _ = self.entry.draw("Gaussians", canvas, None, quick=scale < 1)
+        picture, _ = self.entry.draw("Gaussians", canvas, None, fast=scale < 1)
         assert picture is not None  # noqa: S101  (it is a model)
         Image.fromarray(picture).save(io.BytesIO(), "JPEG", quality=QUALITY)
         self.sent.append((time.perf_counter() - self.began, scale))
@@ -100,11 +100,11 @@ def main(options: Options) -> None:
     """Print the tables."""
     warn_if_busy()
     workload = make_workload(options.gaussians, *options.size)
-    shown = Shown("room", None, workload.gaussians)
-    entry = Entry(shown, training_frame(workload.views))
+    item = ViewerItem("room", None, workload.gaussians)
+    entry = Entry(item, training_frame(workload.views))
     path = smooth_path(workload.views, 600, options.size)
-    for quick in (True, False):  # compiles, and prepares what is kept
-        entry.draw("Gaussians", _scaled(path[0], 0.3), None, quick=quick)
+    for fast in (True, False):  # compiles, and prepares what is kept
+        entry.draw("Gaussians", _scaled(path[0], 0.3), None, fast=fast)
     began = os.times()
     firsts = [_first_frame(entry, path) for _ in range(options.repeats)]
     fps, scale = _moving(entry, path, options.seconds)

@@ -19,7 +19,7 @@ from splatseed.sfm import Refinement, SfmReport
 pytest.importorskip("torch", reason="training needs PyTorch")
 pytest.importorskip("gsplat", reason="training needs gsplat's strategies")
 
-from splatseed.viewer.models import open_shown
+from splatseed.viewer.models import open_item
 
 SHORT = ("--max-steps", "3", "--data-factor", "2")
 
@@ -119,7 +119,7 @@ def test_refined_poses_are_what_is_trained_scored_and_shown(
     config = json.loads((tmp_path / "run/config.json").read_text())
     assert (config["scene"], config["refine_poses"]) == (str(bare), True)
     moved = (tmp_path / "run").rename(tmp_path / "moved")
-    shown = open_shown(moved).scene
+    shown = open_item(moved).scene
     assert _poses(shown) == _poses(load_scene(room))
     assert len(shown.points) == len(load_scene(room).points)
     assert splatseed("evaluate", moved, "-o", tmp_path / "scores.json").code == 0

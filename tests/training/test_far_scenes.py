@@ -16,7 +16,7 @@ from splatseed.splat.world import shifted
 from splatseed.training.run import prepare_run
 from splatseed.training.settings import TrainSettings
 from splatseed.training.start import read_start
-from splatseed.viewer.models import open_shown
+from splatseed.viewer.models import open_item
 
 PLACES = {"here": (0, 0, 0), "site": (3000.3, -9000.2, 12.7), "ecef": (-1.28e6, -4.72e6, 4e6)}
 SETTINGS = TrainSettings(strategy="none", max_steps=30, data_factor=2)
@@ -60,7 +60,7 @@ def test_the_written_model_scores_as_in_training_wherever_the_world_lies(runs, p
     for path, name in ((file, "again"), (tmp_path / "lost.ply", "again")):
         assert scored(path, tmp_path / name) == pytest.approx(psnr, abs=0.01)
     assert scored(tmp_path / "lost.ply", folder / "scene") == pytest.approx(psnr, abs=0.01)
-    assert np.array_equal(open_shown(folder / "run").model.means, gaussians.means)
+    assert np.array_equal(open_item(folder / "run").model.means, gaussians.means)
 
 
 def test_a_model_in_the_coordinates_of_the_files_is_moved_and_it_is_said(runs, tmp_path):

@@ -25,7 +25,7 @@ from splatseed.training import device, run as run_module, trainer
 from splatseed.training.parameters import add_to_mean, gaussians_of, length_units
 from splatseed.training.run import prepare_run
 from splatseed.training.settings import TrainSettings
-from splatseed.viewer.models import Shown, stage_frame
+from splatseed.viewer.models import ViewerItem, viewer_frame
 
 RESUME, CAP = {"resume": True}, 400
 
@@ -170,7 +170,7 @@ def test_a_walk_is_learnt_however_long_it_is(room, tmp_path):
         run = prepare_run(scene, tmp_path / f"{step}", asked, note=pytest.fail)
         assert run.train()
         scores.append(run.trainer.test_scores()[0])
-        config, stage = run.folder.read_config(), stage_frame(Shown("walk", scene))
+        config, stage = run.folder.read_config(), viewer_frame(ViewerItem("walk", scene))
         assert config["near_plane"] == pytest.approx(run.frame.near / run.frame.scale)
         assert (stage.near, stage.scale) == pytest.approx((run.frame.near, run.frame.scale))
     assert scores[1] == pytest.approx(scores[0], abs=0.05)

@@ -22,8 +22,8 @@ from splatseed.splat.formats import read_gaussians
 from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.rendering import ModelRenderer
 from splatseed.viewer import flights
-from splatseed.viewer.flights import orbit, path_of_file, smooth_path
-from splatseed.viewer.models import Shown, open_shown, pinhole_view, split_picture, stage_frame
+from splatseed.viewer.flights import orbit, read_path, smooth_path
+from splatseed.viewer.models import ViewerItem, open_item, pinhole_view, split_picture, viewer_frame
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -71,7 +71,7 @@ def test_a_path_follows_the_cameras_evenly(rng):
 
 def test_an_orbit_goes_around_what_the_cameras_look_at(run_folder):
     cameras = _ring()
-    np.testing.assert_allclose(flights.focus_of(cameras), 0, atol=0.1)
+    np.testing.assert_allclose(flights.focus_point(cameras), 0, atol=0.1)
     gaussians = read_gaussians(run_folder / "point_cloud.ply")
     centers = _centers(orbit(cameras, gaussians, 60, (160, 90)))
     np.testing.assert_allclose(np.linalg.norm(centers[:, :2], axis=1), 3, atol=0.2)
@@ -101,7 +101,7 @@ def test_cameras_that_are_upside_down_to_each_other_have_an_up():
 def test_what_is_no_path_is_refused(content, tmp_path):
     (tmp_path / "path.json").write_text(content)
     with pytest.raises(SceneFormatError, match="camera path"):
-        path_of_file(tmp_path / "path.json", (64, 48))
+        read_path(tmp_path / "path.json", (64, 48))
 
 
 # Renders ------------------------------------------------------------------------------------------
@@ -122,7 +122,7 @@ def test_depth_is_that_of_a_wall():
     pose = np.eye(4)
     pose[:3, 3] = -100
     view = pinhole_view((64, 48), 2 * np.arctan(24 / 50), pose)
-    renderer = ModelRenderer(wall, stage_frame(Shown("wall", None, wall)))
+    renderer = ModelRenderer(wall, viewer_frame(ViewerItem("wall", None, wall)))
     np.testing.assert_allclose(renderer.depth(view), 4, atol=0.02)
     np.testing.assert_allclose(renderer.color(view), 0.5, atol=0.03)
 
@@ -136,7 +136,7 @@ def test_pictures_are_split_where_asked():
 
 
 def test_a_ply_of_points_is_shown_as_points(room):
-    assert open_shown(room / "sparse/0/points3D.ply").gaussians is None
+    assert open_item(room / "sparse/0/points3D.ply").gaussians is None
 
 
 # The command --------------------------------------------------------------------------------------
@@ -191,7 +191,7 @@ def test_a_path_through_nerfstudios_world_needs_its_transform(
     said = splatseed(*words, "--transform", tmp_path / "dataparser_transforms.json")
     assert said.code == 0, said.err
     gaussians = read_gaussians(run_folder / "point_cloud.ply")
-    renderer = ModelRenderer(gaussians, stage_frame(Shown("", None, gaussians)))
+    renderer = ModelRenderer(gaussians, viewer_frame(ViewerItem("", None, gaussians)))
     wanted = renderer.color(poses_of([load_scene(room).images[3]])[0])
     shown = _frames(tmp_path / "flight.mp4")[0][0] / 255
     assert np.abs(shown - wanted).mean() < 0.01  # mirrored, it would be 0.02

@@ -28,14 +28,14 @@ from splatseed.splat.gaussians import TrainingFrame
 from splatseed.training.run import prepare_run
 from splatseed.training.settings import TrainSettings
 from splatseed.viewer import pictures, session as session_module
-from splatseed.viewer.models import Shown, open_shown, stage_frame
+from splatseed.viewer.models import ViewerItem, open_item, viewer_frame
 from splatseed.viewer.pictures import (
     Entry,
     canvas_view,
-    clouds_of,
+    clouds_by_origin,
     fitted_fov,
-    laid_onto,
-    stage_pose,
+    viewer_pose,
+    warp_to_canvas,
 )
 from splatseed.viewer.server import TrainingViewer, Viewer, free_port
 
@@ -46,8 +46,8 @@ needs_browser = pytest.mark.skipif(browser.CHROMIUM is None, reason="Chromium is
 BLANK = 15  # a picture whose values deviate by less shows nothing
 
 
-def _entry(shown):
-    return Entry(shown, stage_frame(shown))
+def _entry(item):
+    return Entry(item, viewer_frame(item))
 
 
 @contextmanager
@@ -68,7 +68,7 @@ def viewer(entry):
 
 @pytest.fixture
 def entry(run_folder):
-    return _entry(open_shown(run_folder))
+    return _entry(open_item(run_folder))
 
 
 FLAGS = (
@@ -116,7 +116,7 @@ def click_text(page, words, tag):
 
 
 def toggle(page, label):
-    """Click the checkbox that stands beside a label."""
+    """Click the checkbox of a label."""
     page.run(
         "(() => { let e = [...document.querySelectorAll('*')]"
         f".filter(e => e.innerText === {label!r}).at(-1);"
@@ -145,7 +145,7 @@ def _settled(session):
 def test_a_run_is_seen_offline_and_a_flight_ends_at_its_camera(viewer, run_folder, tmp_path):
     with served_page(tmp_path, viewer.url) as page:
         session = _session(viewer)
-        count = len(open_shown(run_folder).scene.points)
+        count = len(open_item(run_folder).scene.points)
         assert waits_for(lambda: f"original: {count:,}" in text(page)), text(page)
         assert _settled(session)
         # Not blank; the browser may still show the picture before, so it is waited for.
@@ -158,7 +158,7 @@ def test_a_run_is_seen_offline_and_a_flight_ends_at_its_camera(viewer, run_folde
         session._kind.value = "photograph"
         session.refresh()
         assert _settled(session)
-        _, position = stage_pose(image.camera, viewer.entries[0].frame)
+        _, position = viewer_pose(image.camera, viewer.entries[0].frame)
         np.testing.assert_allclose(session._client.camera.position, position, atol=1e-4)
         assert session._note.content == ""
         page.drag(100, 400, 200)  # it leaves the camera's place, and with it the photograph
@@ -168,10 +168,10 @@ def test_a_run_is_seen_offline_and_a_flight_ends_at_its_camera(viewer, run_folde
 
 @needs_browser
 def test_switches_act_and_a_browser_gets_as_many_points_as_it_draws(entry, tmp_path, monkeypatch):
-    monkeypatch.setattr(session_module, "FIRST_POINTS", 100)
+    monkeypatch.setattr(session_module, "POINTS", replace(session_module.POINTS, first=100))
     monkeypatch.setattr(session_module.Session, "_affordable_points", lambda _: 10**6)
-    other, total = _entry(replace(entry.shown, name="other")), len(entry.shown.scene.points)
-    with _served(entry, other, beside=other) as viewer, served_page(tmp_path, viewer.url) as page:
+    other, total = _entry(replace(entry.item, name="other")), len(entry.item.scene.points)
+    with _served(entry, other, second=other) as viewer, served_page(tmp_path, viewer.url) as page:
         session = _session(viewer)
         assert (session._second.value, session._split.visible) == ("other: Gaussians", True)
         assert waits_for(lambda: f"original: {total:,}" in text(page))
@@ -185,10 +185,10 @@ def test_switches_act_and_a_browser_gets_as_many_points_as_it_draws(entry, tmp_p
         assert waits_for(lambda: shots)
         assert shots[0][1].startswith(b"\x89PNG")
         monkeypatch.undo()
-        monkeypatch.setattr(session_module, "FIRST_POINTS", 100)
+        monkeypatch.setattr(session_module, "POINTS", replace(session_module.POINTS, first=100))
         assert session._affordable_points() > 0
-        # One that does not answer is left with the points that it has, shown.
-        monkeypatch.setattr(session_module, "MOST_PATIENCE", 0.0)
+        # A browser that does not answer keeps its points, visible.
+        monkeypatch.setattr(session_module, "POINTS", replace(session_module.POINTS, timeout=0.0))
         with pytest.raises(TimeoutError):
             session._affordable_points()
         session._points_on.value = True
@@ -223,25 +223,25 @@ def test_two_browsers_have_switches_of_their_own_and_may_go(viewer, tmp_path):
 
 
 def _canvas_at(entry, image, size):
-    wxyz, position = stage_pose(image.camera, entry.frame)
+    wxyz, position = viewer_pose(image.camera, entry.frame)
     fov = fitted_fov(image.camera, size[0] / size[1])
     return canvas_view(wxyz, position, fov, size, entry.frame)
 
 
 def test_a_canvas_at_a_camera_is_that_camera(entry):
-    image = entry.shown.scene.images[3]
+    image = entry.item.scene.images[3]
     canvas = _canvas_at(entry, image, (image.camera.width, image.camera.height))
     np.testing.assert_allclose(canvas.cam_from_world, image.camera.cam_from_world, atol=1e-9)
     np.testing.assert_allclose(canvas.K[1, 1], image.camera.K[1, 1])
     white = np.full((90, 120, 3), 255, np.uint8)  # of a wide one it fills the middle
-    wide = laid_onto(_canvas_at(entry, image, (400, 90)), white, image.camera, smooth=False)
+    wide = warp_to_canvas(_canvas_at(entry, image, (400, 90)), white, image.camera, smooth=False)
     columns = np.flatnonzero(wide[45, :, 0])
     assert abs(len(columns) - 120) <= 2
     assert abs(columns.mean() - 199.5) <= 1
 
 
 def test_every_picture_is_drawn_and_a_moving_one_keeps_what_shows_most(entry, monkeypatch):
-    image = entry.shown.scene.images[0]
+    image = entry.item.scene.images[0]
     canvas = _canvas_at(entry, image, (160, 120))
     kinds = ("Gaussians", "depth", "photograph", "error", "points", "origins", "uncovered cells")
     assert entry.kinds == kinds
@@ -253,17 +253,17 @@ def test_every_picture_is_drawn_and_a_moving_one_keeps_what_shows_most(entry, mo
     # What is drawn is what was photographed, as far as Gaussians nobody trained can be.
     photograph, full = drawn["photograph"].astype(int), drawn["Gaussians"].astype(int)
     assert np.abs(photograph - full).mean() < np.abs(photograph[:, ::-1] - full).mean()
-    half = len(entry.shown.gaussians) // 2
-    monkeypatch.setattr(pictures, "MOST_MOVING", half)
-    quick, _ = entry.draw("Gaussians", canvas, image, quick=True)
-    assert entry.quick_renderer.count == half
-    assert np.abs(full - quick).mean() < 0.6 * full.std()
+    half = len(entry.item.gaussians) // 2
+    monkeypatch.setattr(pictures, "MAX_MOVING", half)
+    fast, _ = entry.draw("Gaussians", canvas, image, fast=True)
+    assert entry.fast_renderer.count == half
+    assert np.abs(full - fast).mean() < 0.6 * full.std()
 
 
-def test_what_cannot_be_drawn_says_why(room, run_folder, tmp_path):
+def test_a_picture_that_cannot_be_drawn_has_a_reason(room, run_folder, tmp_path):
     own = shutil.copytree(room, tmp_path / "own")
-    entry = _entry(open_shown(run_folder, own))
-    image = entry.shown.scene.images[0]
+    entry = _entry(open_item(run_folder, own))
+    image = entry.item.scene.images[0]
     canvas = _canvas_at(entry, image, (64, 48))
     for kind in ("photograph", "error", "uncovered cells"):
         picture, why = entry.draw(kind, canvas, None)
@@ -274,26 +274,26 @@ def test_what_cannot_be_drawn_says_why(room, run_folder, tmp_path):
     assert entry.draw("uncovered cells", canvas, image)[0] is not None
 
 
-def test_points_of_several_origins_are_switched_apart(rng):
+def test_points_are_split_by_origin(rng):
     source = np.repeat(np.array([0, 2, 9], np.uint8), 50)
     rgb = rng.integers(0, 255, (150, 3), dtype=np.uint8)
     cloud = PointCloud(rng.random((150, 3)), rgb, source)
-    clouds = clouds_of(cloud, TrainingFrame(np.zeros(3), 2.0), 1000)
+    clouds = clouds_by_origin(cloud, TrainingFrame(np.zeros(3), 2.0), 1000)
     assert [each.count for each in clouds] == [50, 50, 50]
     assert len({each.color for each in clouds}) == 3
     np.testing.assert_allclose(clouds[0].xyz, 2 * cloud.xyz[:50], rtol=1e-6)
 
 
-def test_sizes_are_those_of_what_cameras_see(room, run_folder):
-    frame = stage_frame(shown := open_shown(run_folder, room))
+def test_sizes_follow_the_near_depth(room, run_folder):
+    frame = viewer_frame(item := open_item(run_folder, room))
     # On a long walk, on which all that cameras see is a thousandth of their extent away.
     walk = replace(frame, near=frame.near / 1000)
-    clouds = clouds_of(shown.scene.points, frame, 1000)
-    before, after = (pictures.point_size(clouds, shown.scene.images, f) for f in (frame, walk))
+    clouds = clouds_by_origin(item.scene.points, frame, 1000)
+    before, after = (pictures.point_size(clouds, item.scene.images, f) for f in (frame, walk))
     assert after < 0.02 * before
     gui = Mock()
     for each in (frame, walk):
-        pictures.add_cameras(gui, shown, each, print)
+        pictures.add_cameras(gui, item, each, print)
     sizes = [call.kwargs["scale"] for call in gui.add_camera_frustum.call_args_list]
     assert sizes[-1] < 0.02 * sizes[0]
 
@@ -301,19 +301,19 @@ def test_sizes_are_those_of_what_cameras_see(room, run_folder):
 def test_of_many_cameras_as_many_are_test_views_as_of_all(room):
     scene = load_scene(room)
     images = tuple(replace(scene.images[0], name=f"{i:04}.png") for i in range(3000))
-    shown = Shown("many", scene.replace(images=images))
-    drawn = pictures.add_cameras(Mock(), shown, stage_frame(shown), print)
+    item = ViewerItem("many", scene.replace(images=images))
+    drawn = pictures.add_cameras(Mock(), item, viewer_frame(item), print)
     tested = {image.name for image in scene.replace(images=images).split()[1]}
-    assert len(drawn) <= pictures.MOST_CAMERAS + 1
+    assert len(drawn) <= pictures.MAX_CAMERAS + 1
     assert sum(image.name in tested for image, _ in drawn) / len(drawn) == pytest.approx(
         0.125, 0.05
     )
 
 
-def test_names_are_shown_as_they_are():
+def test_names_are_escaped():
     session = object.__new__(session_module.Session)
     session._note = Mock(content="")
-    session._say("<img src=x onerror=alert(1)>.png cannot be read.")
+    session._show_note("<img src=x onerror=alert(1)>.png cannot be read.")
     assert "&lt;img src=x" in session._note.content
     assert "<img" not in session._note.content
 
@@ -396,28 +396,30 @@ def test_a_port_that_is_taken_is_an_error():
             free_port("127.0.0.1", taken.getsockname()[1])
 
 
-def test_a_folder_that_holds_many_says_which_are_shown(room, tmp_path, monkeypatch, capsys):
+def test_of_a_folder_with_many_items_the_first_are_shown_with_a_note(
+    room, tmp_path, monkeypatch, capsys
+):
     for name in "abc":
         (tmp_path / name).symlink_to(room)
-    assert [path.name for path in verb._within(tmp_path)] == ["a", "b", "c"]
-    monkeypatch.setattr(verb, "MOST_OPENED", 2)
-    assert [path.name for path in verb._within(tmp_path)] == ["a", "b"]
-    said = capsys.readouterr()
-    assert "holds 3" in said.out + said.err
+    assert [path.name for path in verb._items_in(tmp_path)] == ["a", "b", "c"]
+    monkeypatch.setattr(verb, "MAX_ITEMS", 2)
+    assert [path.name for path in verb._items_in(tmp_path)] == ["a", "b"]
+    printed = capsys.readouterr()
+    assert str(tmp_path) in printed.out + printed.err
 
 
-def test_runs_of_the_same_name_are_told_apart(run_folder, tmp_path):
+def test_runs_of_the_same_name_get_unique_names(run_folder, tmp_path):
     paths = [tmp_path / each / "fern" / "run" for each in "ab"]
     for path in paths:
         shutil.copytree(run_folder, path)
-    opened, beside = verb._opened(verb.Options(paths[0], compare=paths[1]))
-    assert ([each.name for each in opened], beside) == (["a/fern/run", "b/fern/run"], 1)
-    opened, beside = verb._opened(verb.Options(paths[0].parent, compare=paths[0]))
-    assert ([each.name for each in opened], beside) == (["run"], 0)
+    items, second = verb._open_items(verb.Options(paths[0], compare=paths[1]))
+    assert ([item.name for item in items], second) == (["a/fern/run", "b/fern/run"], 1)
+    items, second = verb._open_items(verb.Options(paths[0].parent, compare=paths[0]))
+    assert ([item.name for item in items], second) == (["run"], 0)
 
 
 def test_nothing_to_show_is_an_error(tmp_path):
     for name in ("cameras", "images", "points3D"):
         (tmp_path / f"{name}.txt").write_text("1 PINHOLE 4 3 2 2 2 1.5\n" * (name == "cameras"))
     with pytest.raises(SceneFormatError, match="something to show"):
-        open_shown(tmp_path)
+        open_item(tmp_path)

@@ -1,9 +1,9 @@
-"""Pages of clouds, as one of the scene's own cameras sees them if it has any.
+"""Pages of clouds, seen from a camera of the scene or, without cameras, from one made up.
 
 Notation: cell (i, j) of a ``covered`` grid [rows, columns] starts at pixel (``cell i``, ``cell j``)
-and has ``cell`` px a side; the last row and column may reach beyond the photograph. Promise: files
-appear whole or not at all, else ``OutputError`` is raised; ``PointCloudError`` if a scene that is
-to be looked at has no finite points; cells are coloured exactly.
+and has ``cell`` px a side; the last row and column may extend beyond the photograph. Promise: files
+appear complete, or ``OutputError`` is raised; a scene without finite points is a
+``PointCloudError``.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from splatseed.scene import Scene
 from splatseed.viewer import page
 from splatseed.viewer.points import origin_colors, points_over, render_points
 
-PAIR_SIDE = 800
+PAIR_SIDE = 800  # longer side of two or three pictures in a row, pixels
 GREY = 150
 NEAR, FAR = np.array([0, 114, 178]), np.array([213, 94, 0])
-"""Colours of points on an aligned cloud and of those off it."""
+"""Colours of points on an aligned cloud and off it."""
 EMPTY, BLEND = np.array([214.0, 20.0, 190.0]), 0.6
-"""Colour of cells without a seed, magenta, the rarest in photographs, and its opacity."""
-DIM = 0.75  # the photograph under cells
+"""Colour of cells without a seed (magenta is rare in photographs) and its opacity."""
+DIM = 0.75  # brightness of the photograph under cells
 
 
 class CoveredView(NamedTuple):
-    """A view's name and photograph, and which of its cells held a seed before and after."""
+    """A view and the cells that held a seed before and after."""
 
     name: str
     photograph: UInt8[np.ndarray, "H W 3"]
@@ -47,14 +47,14 @@ class CoveredView(NamedTuple):
 def preview_pair(
     scene: Scene, upsampled: PointCloud, path: StrPath, *, title: str = "upsampled"
 ) -> Path:
-    """Write a picture of the scene's points beside the upsampled ones, described by a title."""
+    """Write a picture of the scene's points and one of the upsampled points, with a title."""
     path = Path(path)
     clouds = {"original": scene.points, title: upsampled}
     return page.write_grid(_cloud_tiles(clouds, choose_camera(scene), PAIR_SIDE), path, columns=2)
 
 
 def preview_methods(scene: Scene, clouds: Mapping[str, PointCloud], path: StrPath) -> Path:
-    """Write a grid: the photograph if there is one, the scene's points, and clouds by label."""
+    """Write a grid of the photograph if there is one, the scene's points, and clouds by label."""
     path = Path(path)
     clouds, side = {"original": scene.points, **clouds}, page.GRID_SIDE
     tiles = _photograph(scene, side, "photograph")
@@ -67,9 +67,9 @@ def preview_errors(
     camera: Camera,
     path: StrPath,
 ) -> Path:
-    """Write a grid of clouds by label, their points coloured by their distance to the true surface.
+    """Write a grid of clouds by label, coloured by the points' distance to the true surface.
 
-    Distances are in spacings h of the originals; from 1 on points have the last colour.
+    Distances are in spacings h of the originals; colours end at 1.
     """
     path = Path(path)
     colored = {
@@ -84,7 +84,7 @@ def preview_errors(
 
 
 def preview_origins(scene: Scene, points: PointCloud, path: StrPath) -> Path:
-    """Write a page: the seeds in their own colours, and by origin over the photograph."""
+    """Write a page of the seeds in their own colours, and by origin over the photograph."""
     path = Path(path)
     camera = choose_camera(scene)
     scale = PAIR_SIDE / max(camera.width, camera.height)
@@ -95,15 +95,15 @@ def preview_origins(scene: Scene, points: PointCloud, path: StrPath) -> Path:
         page.Tile(f"{len(points):,} seeds", render_points(points, camera, scale=scale)),
         page.Tile("by origin", points_over(colored, camera, photograph, scale=scale)),
     ]
-    # Below them, the name of each origin after a dot of its colour.
+    # Legend: a dot in each origin's colour and its name.
     strip = PillowImage.new("RGB", (2 * size[0], page.STRIP_HEIGHT), page.PAPER)
     draw, letters, x = ImageDraw.Draw(strip), page.font(18), 8.0
     codes, counts = np.unique(points.source, return_counts=True)
     for code, count, color in zip(codes, counts, origin_colors(codes).tolist(), strict=True):
-        words = f"{source_name(int(code))} {count:,}"
+        text = f"{source_name(int(code))} {count:,}"
         draw.ellipse((x, 14, x + 16, 30), fill=tuple(color))
-        draw.text((x + 24, 22), words, fill=page.INK, font=letters, anchor="lm")
-        x += 24 + letters.getlength(words) + 28
+        draw.text((x + 24, 22), text, fill=page.INK, font=letters, anchor="lm")
+        x += 24 + letters.getlength(text) + 28
     return page.write_grid(tiles, path, columns=2, footer=np.asarray(strip))
 
 
@@ -111,23 +111,23 @@ def preview_alignment(
     scene: Scene,
     cloud: Float64[np.ndarray, "N 3"],
     rgb: UInt8[np.ndarray, "N 3"] | None,
-    marks: Float64[np.ndarray, "M 3"],
-    share: Float64[np.ndarray, " M"],
+    tie_points: Float64[np.ndarray, "M 3"],
+    residuals: Float64[np.ndarray, " M"],
     path: StrPath,
 ) -> Path:
-    """Write a page of photograph, aligned cloud and residuals, side by side.
+    """Write a page of photograph, aligned cloud and residuals.
 
-    The cloud is a sample in the scene's frame, grey without colours; ``marks`` are the scene's
-    points that it was aligned with, ``share`` of each 0 on the cloud to 1 where it does not count.
+    ``cloud`` is a sample in the scene's frame, drawn grey without colours; ``tie_points`` are the
+    scene's points that it was aligned to, with ``residuals`` from 0 (on the cloud) to 1 (outlier).
     """
     path = Path(path)
-    blend = np.clip(share, 0, 1)[:, None]
+    blend = np.clip(residuals, 0, 1)[:, None]
     shades = np.rint((1 - blend) * NEAR + blend * FAR).astype(np.uint8)
     clouds = {
         "the cloud from its camera, as aligned": PointCloud(
             cloud, np.full(cloud.shape, GREY, np.uint8) if rgb is None else rgb
         ),
-        "the scene's points: blue on the cloud, orange off it": PointCloud(marks, shades),
+        "the scene's points: blue on the cloud, orange off it": PointCloud(tie_points, shades),
     }
     drawn = _cloud_tiles(clouds, choose_camera(scene), PAIR_SIDE, counted=False)
     tiles = [*_photograph(scene, PAIR_SIDE, "a photograph"), *drawn]
@@ -135,7 +135,7 @@ def preview_alignment(
 
 
 def preview_cells(views: Sequence[CoveredView], path: StrPath) -> Path:
-    """Write a page: for each view, the cells covered by the originals, and by all seeds."""
+    """Write a page of the cells of each view that the originals cover, and that all seeds cover."""
     path = Path(path)
     tiles = []
     for view in views:
@@ -152,7 +152,7 @@ def preview_cells(views: Sequence[CoveredView], path: StrPath) -> Path:
 def cell_picture(
     photograph: UInt8[np.ndarray, "H W 3"], covered: Bool[np.ndarray, "rows columns"], cell: int
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """The dimmed photograph, as large as where cells were counted, with empty ones in magenta."""
+    """Dim a photograph and colour its empty cells magenta."""
     height, width = photograph.shape[:2]
     empty = ~np.kron(covered, np.ones((cell, cell), bool))[:height, :width, None]
     dimmed = DIM * photograph.astype(np.float64)
@@ -162,7 +162,7 @@ def cell_picture(
 
 
 def _photograph(scene: Scene, side: int, label: str) -> list[page.Tile]:
-    """The photograph of the camera that ``choose_camera`` takes, if it can be read."""
+    """Photograph of the camera that ``choose_camera`` returns, if it can be read."""
     camera = choose_camera(scene)
     size = page.fitted(camera.width, camera.height, side)
     photograph = page.photograph_at(scene, choose_image(scene), size)

@@ -1,8 +1,8 @@
-"""What a user names to look at: a scene, a run, or a file of Gaussians; and its stage.
+"""Items that the viewer shows (scenes, runs, files of Gaussians) and the viewer's frame.
 
-Notation: the *stage* is the world moved and scaled so that near planes and single precision work:
-the training frame if the scene is known, else one fitted to what is shown. Promise: a file's
-content decides what it is; a model knows its scene if the run or the user names it.
+Notation: the *viewer frame* is the world moved and scaled so that near planes and single precision
+suffice: the training frame if the scene is known, else a frame fitted to the item. Promise: a
+file's content determines its kind; a model has the scene that its run or the user names.
 """
 
 from __future__ import annotations
@@ -32,17 +32,21 @@ from splatseed.viewer.page import font, latin
 MODEL_SUFFIXES = (".spz", ".splat", ".sog", ".ksplat", ".glb")
 _HEADER = 1 << 16
 CORE = 0.6
-"""Share of the points, nearest to their median, that the stage is fitted to without cameras."""
-LINE = 2  # the border between two pictures
+"""Fraction of the points, nearest to their median, that the frame is fitted to without cameras."""
+LINE = 2  # pixels of the border between two pictures
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
-    """What a viewer shows: a scene, a model, or a model with its scene, in the scene's world.
+class ViewerItem:
+    """A scene, a model, or a model with its scene, in the scene's world.
 
-    ``data_factor`` downsampled the photographs of the model's run; every ``test_every``-th image,
-    sorted by name, is a test view. ``notes`` says what of the model was left out or changed on
-    reading.
+    Args:
+        name: Its label.
+        scene: The scene.
+        gaussians: The model.
+        data_factor: By which the model's run downsampled photographs.
+        test_every: Every n-th image by name is a test view.
+        notes: Changes to the model on reading, for the user.
     """
 
     name: str
@@ -54,36 +58,36 @@ class Shown:
 
     @property
     def model(self) -> Gaussians:
-        """The Gaussians, where there are some."""
-        assert self.gaussians is not None  # noqa: S101  (whoever asks has checked)
+        """The Gaussians of an item that has some."""
+        assert self.gaussians is not None  # noqa: S101  (callers check)
         return self.gaussians
 
     @property
     def train_views(self) -> tuple[View, ...]:
-        """The training cameras, as large as the run's photographs; none without a scene."""
+        """Training cameras, in pixels of the run's photographs; none without a scene."""
         images = self.scene.split(self.test_every)[0] if self.scene else ()
         return poses_of(images, self.data_factor)
 
     @property
-    def usual_views(self) -> tuple[View, ...]:
-        """The training cameras without those that stray from all others."""
-        views, strays = self.train_views, stage_frame(self).strays
+    def central_views(self) -> tuple[View, ...]:
+        """Training cameras without strays far from all others."""
+        views, strays = self.train_views, viewer_frame(self).strays
         return tuple(view for view in views if view.name not in strays)
 
 
-def open_shown(path: StrPath, scene_path: Path | None = None) -> Shown:
-    """Read what a user names: a scene, a run folder, or a file of Gaussians or points.
+def open_item(path: StrPath, scene_path: Path | None = None) -> ViewerItem:
+    """Read a scene, a run folder, or a file of Gaussians or points.
 
-    A model's scene is that at ``scene_path``, by default the one that its run names, if it exists.
+    A model's scene is at ``scene_path``, by default where its run's config has it, if it exists.
 
     Raises:
-        SceneNotFoundError: ``path``, or the scene that the user names, does not exist.
+        SceneNotFoundError: ``path`` or ``scene_path`` does not exist.
         SceneFormatError: It is damaged, or cannot be shown.
     """
     path = Path(path)
 
-    def scene_at(place: Path | None) -> Scene | None:
-        return None if place is None else load_scene(place, require_points=False)
+    def scene_at(folder: Path | None) -> Scene | None:
+        return None if folder is None else load_scene(folder, require_points=False)
 
     folder, notes = RunFolder(path), list[str]()
     if not path.is_dir() or not folder.is_run:
@@ -91,15 +95,15 @@ def open_shown(path: StrPath, scene_path: Path | None = None) -> Shown:
             gaussians, scene = read_gaussians(path, notes.append), scene_at(scene_path)
             if scene is not None:
                 gaussians = around_scene(path, scene, gaussians, notes.append)
-            return Shown(path.name, scene, gaussians, notes=tuple(notes))
-        bare = load_scene(path, require_points=False)
-        if not bare.images and not len(bare.points):
+            return ViewerItem(path.name, scene, gaussians, notes=tuple(notes))
+        scene = load_scene(path, require_points=False)
+        if not scene.images and not len(scene.points):
             raise SceneFormatError(
                 f"something to show at {path}",
                 found="no images, points or Gaussians",
                 fix="Name a scene, a run, or a file of points or Gaussians.",
             )
-        return Shown(path.name, bare)
+        return ViewerItem(path.name, scene)
     if not folder.gaussians.is_file():
         raise SceneNotFoundError(
             f"{folder.path} to be a finished run of splatseed train",
@@ -107,30 +111,30 @@ def open_shown(path: StrPath, scene_path: Path | None = None) -> Shown:
             fix=f"Continue it: splatseed train SCENE -o {quoted(folder.path)} --resume.",
         )
     config, scene = folder.read_config(), scene_at(scene_path)
-    named = folder.scene_of(config)
-    if scene is None and named is not None:
-        with suppress(SceneNotFoundError, SceneFormatError):  # it is gone
-            scene = scene_at(Path(named))
+    own = folder.scene_of(config)
+    if scene is None and own is not None:
+        with suppress(SceneNotFoundError, SceneFormatError):  # it was moved or deleted
+            scene = scene_at(Path(own))
     factor, every = (int(config.get(n) or d) for n, d in (("data_factor", 1), ("test_every", 8)))
     gaussians = read_gaussians(folder.gaussians, notes.append)
     if scene is not None:
         gaussians = around_scene(folder.gaussians, scene, gaussians, notes.append)
-    return Shown(folder.path.name, scene, gaussians, factor, every, tuple(notes))
+    return ViewerItem(folder.path.name, scene, gaussians, factor, every, tuple(notes))
 
 
-def names_of(paths: Sequence[Path]) -> list[str]:
-    """A name for each path: its own, after as many of its folders as tell it from the others."""
-    wholes = [path.absolute().parts for path in paths]
+def unique_names(paths: Sequence[Path]) -> list[str]:
+    """Shortest unique suffix of each path."""
+    absolute = [path.absolute().parts for path in paths]
     names = []
-    for whole in wholes:
-        ends = (whole[start:] for start in reversed(range(len(whole))))
-        own = (end for end in ends if sum(each[-len(end) :] == end for each in wholes) == 1)
-        names.append("/".join(next(own, whole[-1:])))
+    for parts in absolute:
+        suffixes = (parts[start:] for start in reversed(range(len(parts))))
+        unique = (s for s in suffixes if sum(other[-len(s) :] == s for other in absolute) == 1)
+        names.append("/".join(next(unique, parts[-1:])))
     return names
 
 
 def _is_model(path: Path) -> bool:
-    """Whether a file holds Gaussians: a .ply of points is a scene."""
+    """Whether a file holds Gaussians; a .ply of points is a scene."""
     if path.suffix.lower() in MODEL_SUFFIXES:
         return True
     data = read_bytes(path)
@@ -143,10 +147,10 @@ def _is_model(path: Path) -> bool:
     return kind != "ply" or b" scale_0\n" in data[:_HEADER].replace(b"\r", b"")
 
 
-def share_a_world(first: Shown, second: Shown) -> bool:
-    """Whether the cameras of one also see the other: a photograph has the same pose in both.
+def same_world(first: ViewerItem, second: ViewerItem) -> bool:
+    """Whether two items share a world: a photograph has the same pose in both.
 
-    Also where the scene of one is unknown, as nothing speaks against it.
+    True if the scene of either is unknown.
     """
     if not (first.scene and first.scene.images and second.scene):
         return True
@@ -158,14 +162,14 @@ def share_a_world(first: Shown, second: Shown) -> bool:
     )
 
 
-def stage_frame(shown: Shown) -> TrainingFrame:
-    """The training frame or, with fewer than two cameras, one fitted to the model or the points."""
-    scene = shown.scene
+def viewer_frame(item: ViewerItem) -> TrainingFrame:
+    """Training frame, or with fewer than two cameras a frame fitted to the model or the points."""
+    scene = item.scene
     if scene is not None and len(scene.images) > 1:
-        poses = poses_of(scene.split(shown.test_every)[0])
-        return frame_of_model(poses, shown_points(scene), shown.gaussians)
-    if shown.gaussians is not None:
-        xyz = shown.gaussians.means.astype(np.float64)
+        poses = poses_of(scene.split(item.test_every)[0])
+        return frame_of_model(poses, shown_points(scene), item.gaussians)
+    if item.gaussians is not None:
+        xyz = item.gaussians.means.astype(np.float64)
     else:
         assert scene is not None  # noqa: S101  (there is a model or a scene)
         xyz = scene.points.xyz[scene.points.finite].astype(np.float64)
@@ -179,7 +183,7 @@ def stage_frame(shown: Shown) -> TrainingFrame:
 def pinhole_view(
     size: tuple[int, int], fov: float, cam_from_world: Float64[np.ndarray, "4 4"]
 ) -> View:
-    """A view without pixels, of this width and height; the field of view is vertical, radians."""
+    """Make a view without pixels of a width and height; ``fov`` is vertical, radians."""
     width, height = size
     focal = height / 2 / np.tan(fov / 2)
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
@@ -194,7 +198,7 @@ def split_picture(
     *,
     at: float = 0.5,
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """The left of one picture and the right of another, labelled, with a white line between."""
+    """Join the left of one picture and the right of another, labelled, with a white border."""
     column, size = round(at * left.shape[1]), max(10, min(len(left) // 28, 28))
     pictures = []
     for picture, name, start in ((left, left_name, 0), (right, right_name, column)):

@@ -1,9 +1,8 @@
-"""Pages of labelled pictures, colours for numbers, and the photographs beside them.
+"""Write pages of labelled pictures, map numbers to colours, and read photographs for them.
 
 Notation: a picture is uint8 [H, W, 3]; a tile is a picture with its label; a page is tiles in rows.
-Promise: the same input gives the same bytes; files appear whole, or ``OutputError`` is raised;
-unknown values are grey; an unreadable photograph is no error, as a scene without photographs still
-has much to show.
+Promise: the same input gives the same bytes; files appear complete, or ``OutputError`` is raised;
+unknown values are grey; an unreadable photograph is no error, as pages have other pictures, too.
 """
 
 from __future__ import annotations
@@ -24,34 +23,34 @@ from splatseed.scene import Image, Scene
 
 GRID_SIDE = 600
 """Longer side of a picture in a grid, in pixels."""
-LABEL_SIZES = (20, 11)  # usual and smallest, of letters
+LABEL_SIZES = (20, 11)  # font size by default, and the smallest for long labels
 GAP, LABEL_HEIGHT, STRIP_HEIGHT = 12, 34, 44
 PAPER, INK, UNKNOWN = (255, 255, 255), (20, 20, 20), (150, 150, 150)
-BLANK = (230, 230, 230)  # stands in for a photograph
+BLANK = (230, 230, 230)  # in place of a photograph
 RANGE = (2, 98)
-"""Percentiles of a map's values between which its colours vary."""
+"""Percentiles of a map's values at the ends of its colours."""
 
 
 class Tile(NamedTuple):
-    """One of a page's pictures."""
+    """A picture of a page."""
 
     label: str
     picture: UInt8[np.ndarray, "H W 3"]
 
 
 def fitted(width: int, height: int, side: float = GRID_SIDE) -> tuple[int, int]:
-    """Width and height that keep the aspect ratio and whose longer side is ``side``."""
+    """Width and height scaled so that the longer side is ``side``."""
     factor = side / max(width, height)
     return max(round(width * factor), 1), max(round(height * factor), 1)
 
 
 def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    """The font of labels, which has the letters of Latin-1."""
+    """Font of labels, which has the letters of Latin-1."""
     return ImageFont.load_default(size=size)
 
 
 def latin(text: str) -> str:
-    r"""The text as ``font`` can show it, other characters as \u...."""
+    r"""Escape characters that ``font`` does not have, as \u...."""
     return text.encode("latin-1", "backslashreplace").decode("latin-1")
 
 
@@ -64,8 +63,8 @@ def write_grid(
 ) -> Path:
     """Arrange one or more pictures in rows, each with its label above, and write the PNG.
 
-    Without ``columns`` a row has three or four, whichever leaves fewer gaps; smaller pictures are
-    centred. The footer, no wider than the page, is below all.
+    By default a row has three or four columns, whichever leaves fewer gaps; smaller pictures are
+    centred. The footer, no wider than the page, is at the bottom.
     """
     if columns is None:
         columns = min(len(tiles), min((3, 4), key=lambda count: -len(tiles) % count))
@@ -74,15 +73,15 @@ def write_grid(
     foot = 0 if footer is None else len(footer)
     page_height = rows * (height + LABEL_HEIGHT) + GAP + foot
     page = PillowImage.new("RGB", (columns * (width + GAP) + GAP, page_height), PAPER)
-    draw, (usual, least) = ImageDraw.Draw(page), LABEL_SIZES
+    draw, (default, smallest) = ImageDraw.Draw(page), LABEL_SIZES
     for i, (label, picture) in enumerate(tiles):
         x = GAP + (i % columns) * (width + GAP)
         y = (i // columns) * (height + LABEL_HEIGHT)
-        words = latin(label)
-        # Letters are smaller, but legible, where a label would be wider than its tile.
-        size = int(usual * width / max(font(usual).getlength(words), 1.0))
-        letters = font(max(min(usual, size), least))
-        draw.text((x, y + LABEL_HEIGHT / 2), words, fill=INK, font=letters, anchor="lm")
+        text = latin(label)
+        # A smaller, legible font where a label would be wider than its tile.
+        size = int(default * width / max(font(default).getlength(text), 1.0))
+        letters = font(max(min(default, size), smallest))
+        draw.text((x, y + LABEL_HEIGHT / 2), text, fill=INK, font=letters, anchor="lm")
         left, top = (width - picture.shape[1]) // 2, (height - len(picture)) // 2
         page.paste(PillowImage.fromarray(picture), (x + left, y + LABEL_HEIGHT + top))
     if footer is not None:
@@ -95,9 +94,9 @@ def write_grid(
 def resized(
     picture: UInt8[np.ndarray, "h w 3"], size: tuple[int, int], *, smooth: bool = True
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """A picture at a width and height; where pixels must not blend, pass ``smooth=False``."""
-    how = PillowImage.Resampling.LANCZOS if smooth else PillowImage.Resampling.NEAREST
-    return np.asarray(PillowImage.fromarray(picture).resize(size, how))
+    """Resize a picture to a width and height; ``smooth=False`` repeats pixels."""
+    method = PillowImage.Resampling.LANCZOS if smooth else PillowImage.Resampling.NEAREST
+    return np.asarray(PillowImage.fromarray(picture).resize(size, method))
 
 
 # Colours ------------------------------------------------------------------------------------------
@@ -106,11 +105,11 @@ def resized(
 def map_colors(
     values: Float[np.ndarray, "*S"], low: float, high: float, colormap: str = "viridis"
 ) -> UInt8[np.ndarray, "*S 3"]:
-    """Colours of values from ``low`` to ``high``; grey where they are not finite.
+    """Map values from ``low`` to ``high`` to colours; grey where they are not finite.
 
-    The maps viridis (dark is low) and plasma (blue is low) remain distinct in grey print.
+    The colour maps viridis (dark is low) and plasma (blue is low) stay legible in grey print.
     """
-    from matplotlib import colormaps  # noqa: PLC0415  (slow to import, needed here alone)
+    from matplotlib import colormaps  # noqa: PLC0415  (of an optional extra, and slow to import)
 
     known = np.isfinite(values)
     share = (np.where(known, values, low) - low) / max(high - low, 1e-12)
@@ -118,15 +117,15 @@ def map_colors(
     return np.asarray(np.where(known[..., None], colors, np.array(UNKNOWN, np.uint8)))
 
 
-def usual_range(values: Float[np.ndarray, "*S"]) -> tuple[float, float]:
-    """The range of the finite values without their extremes; 0 to 0 if there are none."""
+def value_range(values: Float[np.ndarray, "*S"]) -> tuple[float, float]:
+    """Range of the finite values without their extremes; 0 to 0 if there are none."""
     finite = values[np.isfinite(values)]
     low, high = np.percentile(finite, RANGE) if finite.size else (0.0, 0.0)
     return float(low), float(high)
 
 
 def nearness(depth: Float[np.ndarray, "*S"]) -> Float[np.ndarray, "*S"]:
-    """What colours of depth are spaced evenly in, -log(depth); not finite where none is known."""
+    """-log(depth), in which colours are evenly spaced; not finite where depth is unknown."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(-np.log(depth))
 
@@ -134,16 +133,16 @@ def nearness(depth: Float[np.ndarray, "*S"]) -> Float[np.ndarray, "*S"]:
 def depth_picture(
     depth: Float[np.ndarray, "H W"], limits: tuple[float, float] | None = None
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Planar depth in colours: near is yellow, far is violet, 0 and NaN are grey.
+    """Map planar depth to colours: near is yellow, far is violet, 0 and NaN are grey.
 
-    ``limits`` are of its ``nearness``, by default ``usual_range``.
+    ``limits`` are those of its ``nearness``, by default its ``value_range``.
     """
     near = nearness(depth)
-    return map_colors(near, *(limits or usual_range(near)))
+    return map_colors(near, *(limits or value_range(near)))
 
 
 def color_bar(low: str, high: str, colormap: str = "plasma") -> UInt8[np.ndarray, "H W 3"]:
-    """A strip of colours with labels at its ends."""
+    """Strip of colours with labels at its ends."""
     letters = font(18)
     left, right = (round(letters.getlength(label)) + 24 for label in (low, high))
     values = np.tile(np.linspace(0.0, 1.0, GRID_SIDE - left - right), (20, 1))
@@ -161,7 +160,7 @@ def color_bar(low: str, high: str, colormap: str = "plasma") -> UInt8[np.ndarray
 def photograph_at(
     scene: Scene, image: Image | None, size: tuple[int, int]
 ) -> UInt8[np.ndarray, "H W 3"] | None:
-    """An image's photograph, scaled to width and height; None if it cannot be read."""
+    """Read an image's photograph at a width and height; None if it cannot be read."""
     folder = scene.source.image_dir if scene.source else None
     if folder is None or image is None:
         return None
@@ -176,6 +175,6 @@ def photograph_at(
 def photograph_or_blank(
     scene: Scene, image: Image | None, size: tuple[int, int]
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """The photograph, or plain light grey if it cannot be read."""
+    """Read the photograph, or make a light grey picture if it cannot be read."""
     photograph = photograph_at(scene, image, size)
     return np.full((size[1], size[0], 3), BLANK, np.uint8) if photograph is None else photograph

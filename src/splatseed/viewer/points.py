@@ -1,10 +1,10 @@
-"""Drawing points as a camera sees them, in their own colours or in those of their origins.
+"""Draw points as a camera sees them, in their own colours or by origin.
 
 Notation: a picture is uint8 [H, W, 3], ``uv`` are pixels [N, 2]; an origin is a
 ``PointCloud.source`` code. Promise: points are drawn with a depth test, as small discs sized
-relative to the picture and not to the cloud, so that a denser cloud looks denser; the same input
-gives the same bytes; the same origin has the same colour in every picture, and the methods that are
-mixed in one cloud have colours that the colour-blind can tell apart (Okabe and Ito).
+relative to the picture, so that a denser cloud looks denser; the same input gives the same bytes;
+an origin has the same colour in every picture, and methods mixed in one cloud have colours that are
+safe for colour-blind readers (Okabe and Ito).
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from PIL import Image as PillowImage
 from splatseed.camera import Camera
 from splatseed.methods import SOURCE_CODES
 from splatseed.pointcloud import GENERATED, ORIGINAL, PointCloud
-from splatseed.runtime.jit import inline
+from splatseed.viewer._kernels import draw_discs
 from splatseed.viewer.page import PAPER, fitted, resized
 
 DISCS_PER_SIDE = 340
 """A disc at the median depth is the picture's longer side divided by this: 2.4 px at 800."""
 SMOOTHING = 2
-"""Pictures are drawn this much larger and averaged down, so that discs are round."""
-ORIGIN_POINT_SIZE = 3.0
+"""Supersampling per axis, so that discs are round."""
+ORIGIN_POINT_SIZE = 3.0  # pixels
 PALE = 0.7
-"""How far a photograph behind points is bleached."""
+"""Weight of white in a photograph behind points."""
 COLORS: dict[int, tuple[int, int, int]] = {
     ORIGINAL: (0, 0, 0),
     SOURCE_CODES["linear"]: (230, 159, 0),
@@ -40,7 +40,7 @@ COLORS: dict[int, tuple[int, int, int]] = {
     SOURCE_CODES["cloud"]: (240, 228, 66),
     GENERATED: (140, 86, 75),
 }
-"""The colour of each origin; others have that of ``GENERATED``."""
+"""Colour of each origin; other origins get that of ``GENERATED``."""
 
 
 def render_points(
@@ -51,18 +51,17 @@ def render_points(
     background: tuple[int, int, int] | UInt8[np.ndarray, "H W 3"] = PAPER,
     scale: float = 1.0,
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Draw a cloud: every pixel shows the nearest point whose disc covers it.
+    """Draw a cloud: each pixel shows the nearest point whose disc covers it.
 
-    Points behind the camera, outside the image or not finite are left out. A point at half the
-    median depth is drawn up to twice as large.
+    Points behind the camera, outside the image or not finite are left out. Nearer points are drawn
+    larger, up to twice the size at the median depth.
 
     Args:
         points: The cloud, world coordinates.
         camera: The camera to look from; its lens distortion is ignored.
-        point_size: Diameter of a disc at the median depth, in pixels of the picture; chosen from
-            the picture's size when left out.
-        background: Colour where there are no points, 0..255, or a picture of the same size to draw
-            on.
+        point_size: Diameter of a disc at the median depth, in pixels of the picture; by
+            default a 340th of the picture's longer side.
+        background: Colour where there are no points, 0..255, or a picture of the same size.
         scale: Size of the picture relative to the camera's.
 
     Returns:
@@ -83,8 +82,7 @@ def render_points(
     uv = uv * (SMOOTHING * np.array([width / camera.width, height / camera.height]))
     large = np.array([width, height]) * SMOOTHING
     margin = 2 * size * SMOOTHING
-    # NaN pixels of points behind the camera compare false.
-    # A disc just outside the picture still reaches in.
+    # A disc just outside the picture reaches in. NaN, behind the camera, compares false.
     drawn = ((uv > -margin) & (uv < large + margin)).all(axis=1)
     uv, depth, rgb = uv[drawn], depth[drawn], rgb[drawn]
     radii = depth
@@ -92,7 +90,7 @@ def render_points(
         radii = size * SMOOTHING / 2 * np.clip(np.median(depth) / depth, 0.75, 2.0)
     # The nearest point whose disc covers each pixel; -1 where there is none.
     front = np.full((SMOOTHING * height, SMOOTHING * width), -1)
-    _draw_discs(uv, depth, radii, np.full(front.shape, np.inf), front)
+    draw_discs(uv, depth, radii, np.full(front.shape, np.inf), front)
     colors = np.concatenate([rgb, [PAPER]]).astype(np.float64)[front]
     blocks = (height, SMOOTHING, width, SMOOTHING)
     behind = np.broadcast_to(np.asarray(background, np.float64), (height, width, 3))
@@ -102,7 +100,7 @@ def render_points(
 
 
 def origin_colors(source: UInt8[np.ndarray, " N"]) -> UInt8[np.ndarray, "N 3"]:
-    """The colour of each point's origin."""
+    """Colour of each point's origin."""
     table = np.tile(np.array(COLORS[GENERATED], np.uint8), (256, 1))
     for code, color in COLORS.items():
         table[code] = color
@@ -117,9 +115,9 @@ def points_over(
     point_size: float = ORIGIN_POINT_SIZE,
     scale: float = 1.0,
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """The points over the photograph, of any size, grey and pale so that their colours stand out.
+    """Draw points over a pale grey photograph of any size; without one, on white.
 
-    Other arguments as of ``render_points``; without a photograph it is white.
+    Other arguments as for ``render_points``.
     """
     background: tuple[int, int, int] | UInt8[np.ndarray, "H W 3"] = PAPER
     if photograph is not None:
@@ -129,19 +127,3 @@ def points_over(
         pale = np.round(PALE * 255 + (1 - PALE) * shown).astype(np.uint8)
         background = np.repeat(pale[..., None], 3, axis=2)
     return render_points(points, camera, point_size=point_size, background=background, scale=scale)
-
-
-@inline
-def _draw_discs(uv, depth, radii, nearest, front):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202  (a Numba kernel)
-    """Draw every disc into the depth buffer ``nearest``; at equal depth the first point stays."""
-    height, width = front.shape
-    for i in range(len(depth)):
-        u, v, r = uv[i, 0], uv[i, 1], radii[i]
-        column, row = int(np.floor(u)), int(np.floor(v))
-        for y in range(max(int(v - r), 0), min(int(v + r) + 1, height)):
-            for x in range(max(int(u - r), 0), min(int(u + r) + 1, width)):
-                covered = (x + 0.5 - u) ** 2 + (y + 0.5 - v) ** 2 <= r * r
-                own = x == column and y == row  # however small, a point is visible
-                if (covered or own) and depth[i] < nearest[y, x]:
-                    nearest[y, x] = depth[i]
-                    front[y, x] = i

@@ -1,9 +1,9 @@
-"""The viewer's server: one page, any number of browsers; and the viewer of a run while it trains.
+"""The viewer's server for any number of browsers, and the viewer of a run while it trains.
 
-Promise: of the network, only the host and port to listen on are used; a taken port is an error, and
-no other port is tried. In training, the training thread itself draws, between two steps, so nothing
-changes under a render, and training steps are the same as without a viewer; time spent on browsers
-does not count as training.
+Promise: the server listens on the given host and port and uses no other network; a taken port is an
+error. During training the training thread draws, between two steps, so Gaussians do not change
+during a render and training steps are the same as without a viewer; time spent on browsers does not
+count as training.
 """
 
 from __future__ import annotations
@@ -30,22 +30,22 @@ from splatseed.photos.viewpoint import choose_camera, choose_image
 from splatseed.requirements import require
 from splatseed.scene import Image, Scene
 from splatseed.viewer.flights import orbit, upward
-from splatseed.viewer.models import Shown
-from splatseed.viewer.pictures import Drawn, Entry, fitted_fov, stage_pose
+from splatseed.viewer.models import ViewerItem
+from splatseed.viewer.pictures import Drawn, Entry, fitted_fov, viewer_pose
 from splatseed.viewer.session import Session
 
 if TYPE_CHECKING:
     from splatseed.training.run import TrainingRun
 
-STEP_BACK = 0.6  # on the stage, behind the first camera, so that a browser sees it
-REFRESH_SECONDS, PATIENCE, PAUSED_POLL = 2.0, 60.0, 0.05
-"""Seconds between pictures of a run that are sent unasked; that a picture waits for a step; and
-between looks for requests while a run is paused."""
-ENDED = "The training has ended: look at the run with splatseed view."
+STEP_BACK = 0.6  # in the viewer frame, behind the first camera, so that it is visible
+REFRESH_SECONDS = 2.0  # between updates of a run's pictures
+STEP_TIMEOUT = 60.0  # seconds that a picture waits for a training step
+PAUSED_POLL = 0.05  # seconds between checks for requests while a run is paused
+ENDED = "The training has ended: open the run with splatseed view."
 
 
 def free_port(host: str, port: int) -> int:
-    """A port of a host that can be listened on: the one asked for, or any free port for 0.
+    """Check that a port can be listened on; 0 finds a free port.
 
     Raises:
         ParameterError: The port is taken or out of range, or the host is not this machine's.
@@ -57,32 +57,32 @@ def free_port(host: str, port: int) -> int:
             return int(probe.getsockname()[1])
     except (OSError, OverflowError) as error:  # the latter beyond 65535
         raise ParameterError(
-            f"to listen on --host {host}, --port {port}",
+            f"to listen on `host={host!r}`, `port={port}`",
             found=getattr(error, "strerror", None) or str(error),
-            fix="Pass another --port (0: any free one); --host 127.0.0.1 is this machine alone.",
+            fix="Pass another `port` (0: any free port); `host='127.0.0.1'` is this machine alone.",
         ) from None
 
 
 class Viewer:
-    """Serves what was opened on a port that ``free_port`` returned.
+    """Serves entries on a port from ``free_port``.
 
-    Browsers begin where the first entry shows most, with ``beside`` beside it.
+    Browsers start at the camera of the first entry that sees most, with ``second`` to the right.
 
     Raises:
         MissingDependencyError: viser is absent.
     """
 
     def __init__(
-        self, entries: list[Entry], host: str, port: int, beside: Entry | None = None
+        self, entries: list[Entry], host: str, port: int, second: Entry | None = None
     ) -> None:
         require("viser")
         import viser  # noqa: PLC0415  (of the extra view)
 
-        self.entries, self._beside = entries, beside
+        self.entries, self._second = entries, second
         self._sessions: dict[int, Session] = {}
-        self._left = set[int]()  # browsers that left before they were welcomed
+        self._left = set[int]()  # browsers that disconnected before they got a session
         self._lock = threading.Lock()
-        # A browser may disconnect at any moment: no warning that it missed the rest.
+        # A browser may disconnect at any moment, which needs no warning.
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
         with redirect_stdout(io.StringIO()):  # viser prints its own address
             self.server: Any = viser.ViserServer(host, port, label="splatseed", verbose=False)
@@ -90,8 +90,8 @@ class Viewer:
             show_logo=False, show_share_button=False, control_width="large"
         )
         self._place_camera(entries[0])
-        self.server.on_client_connect(self._welcome)
-        self.server.on_client_disconnect(self._leave)
+        self.server.on_client_connect(self._connect)
+        self.server.on_client_disconnect(self._disconnect)
 
     def stop(self) -> None:
         """Close all connections."""
@@ -106,19 +106,19 @@ class Viewer:
         with self._lock:
             return list(self._sessions.values())
 
-    def greet(self, gui: Any, session: Session) -> None:
-        """Called for each new browser; subclasses add controls here."""
+    def add_controls(self, gui: Any, session: Session) -> None:
+        """Add controls for a new browser; for subclasses."""
 
-    def _welcome(self, client: Any) -> None:
-        session = Session(client, self.entries, self._beside)
-        self.greet(client.gui, session)
+    def _connect(self, client: Any) -> None:
+        session = Session(client, self.entries, self._second)
+        self.add_controls(client.gui, session)
         with self._lock:
             if client.client_id not in self._left:
                 self._sessions[client.client_id] = session
                 return
         session.close()
 
-    def _leave(self, client: Any) -> None:
+    def _disconnect(self, client: Any) -> None:
         with self._lock:
             session = self._sessions.pop(client.client_id, None)
             if session is None:
@@ -127,19 +127,19 @@ class Viewer:
             session.close()
 
     def _place_camera(self, entry: Entry) -> None:
-        """Begin where the scene shows most, or outside the model."""
-        scene, frame = entry.shown.scene, entry.frame
+        """Start at the camera that sees most, or outside of the model."""
+        scene, frame = entry.item.scene, entry.frame
         if scene is not None and (scene.images or len(scene.points)):
             image = choose_image(scene) if len(scene.points) else scene.images[0]
             camera = choose_camera(scene) if image is None else image.camera
-            cameras = [each.camera for each in scene.images] or [camera]
-            up = -np.mean([each.cam_from_world[1, :3] for each in cameras], axis=0)
-            fov, (_, position) = fitted_fov(camera, 1.5), stage_pose(camera, frame)
-            step = 0.0 if entry.has_model else STEP_BACK  # its cameras are shown too
+            cameras = [image.camera for image in scene.images] or [camera]
+            up = -np.mean([c.cam_from_world[1, :3] for c in cameras], axis=0)
+            fov, (_, position) = fitted_fov(camera, 1.5), viewer_pose(camera, frame)
+            step = 0.0 if entry.has_model else STEP_BACK  # to see the cameras
             position = position - step * camera.world_from_cam[:3, 2]
         else:
-            camera = orbit([], entry.shown.model, 1, (600, 400))[0].camera
-            up, fov, (_, position) = np.zeros(3), 0.9, stage_pose(camera, frame)
+            camera = orbit([], entry.item.model, 1, (600, 400))[0].camera
+            up, fov, (_, position) = np.zeros(3), 0.9, viewer_pose(camera, frame)
         ahead = camera.world_from_cam[:3, 2]
         self.server.scene.set_up_direction(tuple(upward(up)))
         start = self.server.initial_camera
@@ -148,17 +148,17 @@ class Viewer:
 
 
 class _LiveEntry(Entry):
-    """A run's scene and its current Gaussians, drawn by the thread that calls ``serve``."""
+    """Entry of a run's current Gaussians, drawn by the thread that calls ``serve``."""
 
-    def __init__(self, shown: Shown, run: TrainingRun) -> None:
-        super().__init__(shown, run.frame)
+    def __init__(self, item: ViewerItem, run: TrainingRun) -> None:
+        super().__init__(item, run.frame)
 
         def color(view: View) -> Float32[np.ndarray, "H W 3"]:
             image = run.trainer.render(self.frame.view(view))
             return np.asarray(image.clamp(0, 1).cpu().numpy())
 
         self.renderer = SimpleNamespace(color=color)  # type: ignore[assignment]  # as Entry calls it
-        self._asked = queue.SimpleQueue[tuple[Future[Drawn], Callable[[], Drawn]]]()
+        self._requests = queue.SimpleQueue[tuple[Future[Drawn], Callable[[], Drawn]]]()
         del self._painters["depth"]
         self._open = True
 
@@ -166,52 +166,54 @@ class _LiveEntry(Entry):
     def has_model(self) -> bool:
         return True
 
-    def draw(self, kind: str, canvas: View, at: Image | None, *, quick: bool = False) -> Drawn:
-        """Have the training thread draw, and wait for it."""
-        del quick  # the Gaussians change from step to step
+    def draw(self, kind: str, canvas: View, at: Image | None, *, fast: bool = False) -> Drawn:
+        """Let the training thread draw, and wait for it."""
+        del fast  # the Gaussians change from step to step
         if not self._open:
             return None, ENDED
         future: Future[Drawn] = Future()
         draw = super().draw
-        self._asked.put((future, lambda: draw(kind, canvas, at)))
+        self._requests.put((future, lambda: draw(kind, canvas, at)))
         try:
-            return future.result(PATIENCE)
+            return future.result(STEP_TIMEOUT)
         except (TimeoutError, CancelledError):
             return None, ENDED if not self._open else "The current step is slow."
 
     def serve(self, wait: float = 0.0) -> None:
-        """Draw what was asked for, waiting up to ``wait`` seconds for the first request."""
+        """Draw the requested pictures, waiting up to ``wait`` seconds for the first request."""
         while True:
             try:
-                future, draw = self._asked.get(timeout=wait) if wait else self._asked.get_nowait()
+                future, draw = (
+                    self._requests.get(timeout=wait) if wait else self._requests.get_nowait()
+                )
             except queue.Empty:
                 return
             wait = 0.0
             try:
                 future.set_result(draw())
-            except Exception as error:  # noqa: BLE001  (told to whoever asked; training goes on)
+            except Exception as error:  # noqa: BLE001  (passed to the request; training goes on)
                 future.set_exception(error)
 
     def close(self) -> None:
         """Stop answering requests."""
         self._open = False
-        while not self._asked.empty():
-            self._asked.get()[0].cancel()
+        while not self._requests.empty():
+            self._requests.get()[0].cancel()
 
 
 class TrainingViewer(Viewer):
-    """Serves a run of a scene while it trains, under a name; else as ``Viewer``."""
+    """Serves a run while it trains, labelled ``name``."""
 
     def __init__(self, run: TrainingRun, scene: Scene, name: str, host: str, port: int) -> None:
-        shown = Shown(name, scene, None, run.settings.factor, run.settings.test_every)
-        self._run, self._live = run, _LiveEntry(shown, run)
+        item = ViewerItem(name, scene, None, run.settings.factor, run.settings.test_every)
+        self._run, self._live = run, _LiveEntry(item, run)
         self._paused, self.kept = False, False
         self._panels: list[tuple[Session, Any, Any]] = []
         self._next = 0.0
         super().__init__([self._live], host, port)
 
-    def greet(self, gui: Any, session: Session) -> None:
-        """Add the run's progress, a pause and a stop button."""
+    def add_controls(self, gui: Any, session: Session) -> None:
+        """Add the run's progress and buttons to pause and stop."""
         with gui.add_folder("Training", order=-1.0):
             numbers = gui.add_markdown(self._numbers())
             pause = gui.add_checkbox("Pause", self._paused)
@@ -228,11 +230,11 @@ class TrainingViewer(Viewer):
                 box.value = on
 
     def stop_and_keep(self) -> None:
-        """End after the current step, and finish the run as it is."""
+        """End training after the current step, and keep the result."""
         self.kept = True
 
     def on_step(self, step: int) -> None:
-        """Between two steps, draw for the browsers, wait while paused, and stop on request."""
+        """Draw for the browsers between two steps, wait while paused, and stop on request."""
         del step
         if not self.sessions and not self.kept and not self._paused:
             return
@@ -253,11 +255,11 @@ class TrainingViewer(Viewer):
         self.stop()
 
     def _refresh(self) -> None:
-        """Update the numbers and ask for new pictures, now and then."""
+        """Update numbers and pictures every ``REFRESH_SECONDS``."""
         if time.monotonic() < self._next:
             return
-        looking = self.sessions
-        self._panels = [panel for panel in self._panels if panel[0] in looking]
+        connected = self.sessions
+        self._panels = [panel for panel in self._panels if panel[0] in connected]
         for session, numbers, _ in self._panels:
             numbers.content = self._numbers()
             session.refresh()

@@ -1,9 +1,8 @@
-"""One connected browser: its controls, its camera, and the pictures sent to it.
+"""A connected browser: its controls, its camera, and the pictures sent to it.
 
-Notation: a *frame* is one picture sent; the scale of a frame is its size divided by the canvas's.
-Promise: the newest camera is drawn, never a queue of old ones, coarsely while it moves and in full
-when it is still; two browsers share nothing but what is shown; when a browser disconnects, only its
-own thread ends.
+Notation: a *frame* is a picture sent; its scale is its size relative to the canvas. Promise: the
+newest camera is drawn, never a queue of old ones, coarsely while it moves and at full size when it
+is still; browsers share the entries only; when a browser disconnects, only its own thread ends.
 """
 
 from __future__ import annotations
@@ -14,6 +13,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -27,32 +27,53 @@ from splatseed.viewer.models import split_picture
 from splatseed.viewer.page import fitted, photograph_at
 from splatseed.viewer.pictures import Entry
 
-MOVING_SECONDS, STILL_AFTER = 0.12, 0.2
-"""Seconds a frame may take while the camera moves, and without movement until the full picture."""
-LEAST_SCALE, FIRST_SCALE = 0.12, 0.3
-"""Coarsest scale of a frame, and the scale before any frame has been timed."""
+NO_PICTURE, NO_SECOND = "points only", "nothing"
+THUMBNAIL = 96  # longer side in pixels
 CLOSE_SECONDS = 2.0  # to wait for the frame being drawn
-MEMORY = 0.5
-"""Weight of the latest frame in the running estimate of the cost per pixel."""
-MOST_PIXELS = 1_600_000  # of a full picture; on larger canvases it is stretched
-THUMBNAIL = 96
-FIRST_POINTS, ENOUGH_MORE, MOST_POINTS = 300_000, 1.5, 5_000_000
-"""Points sent at once, how many times as many are worth sending again, and the most that a quick
-browser gets; larger clouds are thinned evenly."""
-PATIENCE, MOST_PATIENCE = 0.3, 30.0
-"""Seconds that the points of a picture may take (without a GPU a million take some seconds), and
-the longest wait for an answer."""
-FLIGHT_SECONDS, FLIGHT_STEPS = 0.5, 15
-ARRIVED = 1e-3
-NOTHING, NO_SECOND = "points only", "nothing"
-CLEAR_OF_CONTROLS = 0.38
-"""Where the border between two pictures begins: the controls cover the right of the window."""
-JPEG_MOVING, JPEG_STILL = 70, 92
+BORDER = 0.38
+"""Initial border between two pictures: the controls cover the right of the window."""
+
+
+@dataclass(frozen=True)
+class _Frames:
+    """Size and quality of the pictures sent."""
+
+    moving_seconds: float = 0.12  # that a frame may take while the camera moves
+    still_after: float = 0.2  # seconds without movement until the full picture
+    min_scale: float = 0.12
+    first_scale: float = 0.3  # before any frame has been timed
+    smoothing: float = 0.5  # weight of the latest frame in the estimated cost per pixel
+    max_pixels: int = 1_600_000  # of a full picture; on larger canvases it is stretched
+    jpeg_moving: int = 70
+    jpeg_still: int = 92
+
+
+@dataclass(frozen=True)
+class _Points:
+    """Number of points sent; larger clouds are thinned evenly."""
+
+    first: int = 300_000  # sent at once
+    limit: int = 5_000_000  # for a fast browser
+    min_factor: float = 1.5  # of more points that are worth sending again
+    seconds: float = 0.3  # that a browser may take to draw them; a million take seconds on a CPU
+    timeout: float = 30.0  # of a browser's answer
+
+
+@dataclass(frozen=True)
+class _Flight:
+    """Flight of the browser's camera to an image's."""
+
+    seconds: float = 0.5
+    steps: int = 15
+    tolerance: float = 1e-3  # in the viewer frame, at which a camera counts as being there
+
+
+FRAMES, POINTS, FLIGHT = _Frames(), _Points(), _Flight()
 _LOG = logging.getLogger(__name__)
 
 
 class FrameLoop:
-    """Draws a frame after each call of ``change``: ``draw`` returns its pixels, 0 for none."""
+    """Thread that calls ``draw(scale)``, which returns the pixels drawn, after each ``change``."""
 
     def __init__(self, draw: Callable[[float], int]) -> None:
         self._draw = draw
@@ -64,11 +85,11 @@ class FrameLoop:
         self._thread.start()
 
     def change(self) -> None:
-        """The camera moved, or something else is shown."""
+        """Request a frame: the camera or the content has changed."""
         self._changed.set()
 
     def close(self) -> None:
-        """End the loop once the current frame is finished."""
+        """End the loop after the current frame."""
         self._closed = True
         self._changed.set()
         self._thread.join(CLOSE_SECONDS)
@@ -79,17 +100,18 @@ class FrameLoop:
             if self._closed:
                 return
             self._changed.clear()
-            scale = FIRST_SCALE
-            if self._pixel_seconds is not None:  # at which a frame just meets its time
-                affordable = MOVING_SECONDS / self._pixel_seconds / self._full_pixels
-                scale = float(np.clip(np.sqrt(affordable), LEAST_SCALE, 1.0))
-            began = time.perf_counter()
+            scale = FRAMES.first_scale
+            if self._pixel_seconds is not None:  # the largest within the time of a frame
+                affordable = FRAMES.moving_seconds / self._pixel_seconds / self._full_pixels
+                scale = float(np.clip(np.sqrt(affordable), FRAMES.min_scale, 1.0))
+            start = time.perf_counter()
             pixels = self._frame(scale)
-            if pixels:  # a full frame teaches nothing: it draws Gaussians that a coarse one skips
-                took = (time.perf_counter() - began) / pixels
-                before = took if self._pixel_seconds is None else self._pixel_seconds
-                self._pixel_seconds = MEMORY * took + (1 - MEMORY) * before
-            if scale < 1 and not self._changed.wait(STILL_AFTER):
+            if pixels:  # full frames are not timed: they draw Gaussians that coarse frames skip
+                cost = (time.perf_counter() - start) / pixels
+                before = cost if self._pixel_seconds is None else self._pixel_seconds
+                weight = FRAMES.smoothing
+                self._pixel_seconds = weight * cost + (1 - weight) * before
+            if scale < 1 and not self._changed.wait(FRAMES.still_after):
                 self._frame(1.0)
 
     def _frame(self, scale: float) -> int:
@@ -101,15 +123,15 @@ class FrameLoop:
 
 
 class Session:
-    """A browser's view of what was opened; viser's ``client`` is its handle.
+    """State of a browser; ``client`` is viser's handle of it.
 
-    The model of ``beside`` is shown beside that of the first entry, from the beginning.
+    At first the model of ``second``, if given, is shown to the right of the first entry's.
     """
 
-    def __init__(self, client: Any, entries: list[Entry], beside: Entry | None = None) -> None:
-        self._beside, self._client = beside, client
+    def __init__(self, client: Any, entries: list[Entry], second: Entry | None = None) -> None:
+        self._second_entry, self._client = second, client
         self._entries = {entry.name: entry for entry in entries}
-        self._goal: Image | None = None
+        self._target: Image | None = None
         self._picture: np.ndarray | None = None
         self._nodes: dict[str, Any] = {}
         self._cameras: list[tuple[Image, Any]] = []
@@ -118,15 +140,15 @@ class Session:
         self._build()
         client.camera.on_update(lambda _: self.refresh())
         self.refresh()
-        self._fill_stage()
+        self._fill_scene()
 
     def close(self) -> None:
-        """The browser has disconnected."""
+        """End the session of a disconnected browser."""
         self._closed = True
         self._loop.close()
 
     def refresh(self) -> None:
-        """The camera moved, or what is shown has changed."""
+        """Request a new picture."""
         self._loop.change()
 
     # Controls -----------------------------------------------------------------------------------
@@ -135,7 +157,7 @@ class Session:
         gui, names = self._client.gui, list(self._entries)
         first = self._entries[names[0]]
         self._what = gui.add_dropdown("Show", names, visible=len(names) > 1)
-        kinds = (NOTHING, *first.kinds)
+        kinds = (NO_PICTURE, *first.kinds)
         kind = kinds[1 if first.has_model else 0]
         self._kind = gui.add_dropdown("Picture", kinds, initial_value=kind)
         self._seconds = {
@@ -144,12 +166,12 @@ class Session:
             for kind in entry.kinds
         }
         second = NO_SECOND
-        if self._beside is not None and self._beside.has_model:
-            second = f"{self._beside.name}: {self._beside.kinds[0]}"
-        seconds, shown = (NO_SECOND, *self._seconds), second != NO_SECOND
-        self._second = gui.add_dropdown("Beside it", seconds, initial_value=second)
-        border = CLEAR_OF_CONTROLS if shown else 0.5
-        self._split = gui.add_slider("Border at", 0.05, 0.95, 0.01, border, visible=shown)
+        if self._second_entry is not None and self._second_entry.has_model:
+            second = f"{self._second_entry.name}: {self._second_entry.kinds[0]}"
+        seconds, split = (NO_SECOND, *self._seconds), second != NO_SECOND
+        self._second = gui.add_dropdown("Second picture", seconds, initial_value=second)
+        border = BORDER if split else 0.5
+        self._split = gui.add_slider("Border at", 0.05, 0.95, 0.01, border, visible=split)
         self._note = gui.add_html("", visible=False)
         shot = gui.add_button("Screenshot")
         with gui.add_folder("Points"):
@@ -177,44 +199,44 @@ class Session:
         return self._entries[self._what.value]
 
     def _switched(self) -> None:
-        """Another entry was chosen: its pictures, points and cameras come."""
-        kinds = (NOTHING, *self._entry.kinds)
+        """Show the pictures, points and cameras of another entry."""
+        kinds = (NO_PICTURE, *self._entry.kinds)
         self._kind.options = kinds
         if self._kind.value not in kinds:
             self._kind.value = kinds[-1] if not self._entry.has_model else kinds[1]
-        self._goal = None
-        self._fill_stage()
+        self._target = None
+        self._fill_scene()
         self.refresh()
 
     def _changed(self) -> None:
         self._split.visible = self._second.value != NO_SECOND
         self.refresh()
 
-    # The stage ----------------------------------------------------------------------------------
+    # Points and cameras -------------------------------------------------------------------------
 
-    def _fill_stage(self) -> None:
-        shown, frame = self._entry.shown, self._entry.frame
+    def _fill_scene(self) -> None:
+        item, frame = self._entry.item, self._entry.frame
         cameras = (handle for _, handle in self._cameras)
         for handle in (*self._nodes.values(), *cameras, *self._origins.values()):
             handle.remove()
         self._nodes, self._cameras, self._origins = {}, [], {}
         self._go.options, self._legend.content = ("-",), ""
-        if shown.scene is None:
+        if item.scene is None:
             return
-        if shown.scene.images:
-            self._cameras = pictures.add_cameras(self._client.scene, shown, frame, self._fly)
+        if item.scene.images:
+            self._cameras = pictures.add_cameras(self._client.scene, item, frame, self._fly)
             self._go.options = ("-", *(image.name for image, _ in self._cameras))
-        self._send_points(shown.scene, FIRST_POINTS)
+        self._send_points(item.scene, POINTS.first)
         with self._origin_folder:
             for name in self._nodes:
                 self._origins[name] = self._client.gui.add_checkbox(name, initial_value=True)
                 self._origins[name].on_update(lambda _: self._restyle())
         self._restyle()
-        threading.Thread(target=self._fill_in, daemon=True).start()
+        threading.Thread(target=self._send_rest, daemon=True).start()
 
-    def _send_points(self, scene: Scene, most: int) -> None:
-        """Send the browser at most ``most`` points, in place of those it has."""
-        clouds = pictures.clouds_of(scene.points, self._entry.frame, most)
+    def _send_points(self, scene: Scene, limit: int) -> None:
+        """Replace the browser's points by at most ``limit`` points of the scene."""
+        clouds = pictures.clouds_by_origin(scene.points, self._entry.frame, limit)
         if clouds:
             self._clouds = {cloud.name: cloud for cloud in clouds}
             self._base_size = pictures.point_size(clouds, scene.images, self._entry.frame)
@@ -231,9 +253,9 @@ class Session:
                 for cloud in clouds
             }
 
-    def _fill_in(self) -> None:
-        """Send what can wait: photographs, and as many more points as the browser draws quickly."""
-        scene, nodes, cameras = self._entry.shown.scene, self._nodes, self._cameras
+    def _send_rest(self) -> None:
+        """Send photographs, and as many more points as the browser draws fast."""
+        scene, nodes, cameras = self._entry.item.scene, self._nodes, self._cameras
         for image, handle in cameras:
             if self._closed or scene is None or cameras is not self._cameras:
                 return
@@ -241,33 +263,34 @@ class Session:
             thumbnail = photograph_at(scene, image, size)
             if thumbnail is not None:
                 handle.image = thumbnail
-        if scene is None or len(scene.points) <= FIRST_POINTS:
+        if scene is None or len(scene.points) <= POINTS.first:
             return
         try:
-            wanted = min(MOST_POINTS, self._affordable_points())
-        except Exception:  # noqa: BLE001  (the browser went away, or hides its page)
+            affordable = min(POINTS.limit, self._affordable_points())
+        except Exception:  # noqa: BLE001  (the browser disconnected, or hides its page)
             return
-        if wanted > ENOUGH_MORE * FIRST_POINTS and nodes is self._nodes and not self._closed:
-            self._send_points(scene, wanted)
+        more = affordable > POINTS.min_factor * POINTS.first
+        if more and nodes is self._nodes and not self._closed:
+            self._send_points(scene, affordable)
             self._restyle()
 
     def _affordable_points(self) -> int:
-        """How many points the browser draws in reasonable time, measured on its first points."""
+        """Estimate how many points the browser can draw in time, from its first points."""
         seconds = {}
         try:
             for shown in (False, True):
                 for node in self._nodes.values():
                     node.visible = shown
-                for _ in range(2):  # the first may still show the points as they were
+                for _ in range(2):  # the first may still draw the previous points
                     start = time.perf_counter()
-                    self._client.get_render(48, 64, transport_format="jpeg", timeout=MOST_PATIENCE)
+                    self._client.get_render(48, 64, transport_format="jpeg", timeout=POINTS.timeout)
                     seconds[shown] = time.perf_counter() - start
-        finally:  # it may not have answered
+        finally:  # also after a timeout
             self._restyle()
-        return round(FIRST_POINTS * PATIENCE / max(seconds[True] - seconds[False], 1e-3))
+        return round(POINTS.first * POINTS.seconds / max(seconds[True] - seconds[False], 1e-3))
 
     def _restyle(self) -> None:
-        """Style points and cameras as the switches say."""
+        """Apply the switches to points and cameras."""
         for name, node in self._nodes.items():
             node.visible = self._points_on.value and self._origins[name].value
             node.point_size = self._base_size * self._size.value
@@ -286,11 +309,11 @@ class Session:
         self._show_cameras()
 
     def _show_cameras(self) -> None:
-        """Hide the camera at which the browser stands: its photograph would block the view."""
+        """Show the cameras except the camera that the browser is at, which would block the view."""
         on, at = self._cameras_on.value, self.at
         for image, handle in self._cameras:
-            if handle.visible != (wanted := on and image is not at):
-                handle.visible = wanted
+            if handle.visible != (visible_now := on and image is not at):
+                handle.visible = visible_now
 
     # The camera ---------------------------------------------------------------------------------
 
@@ -300,61 +323,62 @@ class Session:
                 self._fly(image)
 
     def _fly(self, image: Image) -> None:
-        """Move to where an image was taken, in half a second."""
+        """Move the browser's camera to an image's, in half a second."""
         camera = self._client.camera
-        wxyz, position = pictures.stage_pose(image.camera, self._entry.frame)
+        wxyz, position = pictures.viewer_pose(image.camera, self._entry.frame)
         start, origin = np.array(camera.wxyz), np.array(camera.position)
         # q and -q are one rotation: the nearer one gives the shorter turn.
         wxyz = wxyz * (1 if wxyz @ start >= 0 else -1)
         fov, first = pictures.fitted_fov(image.camera, camera.aspect), camera.fov
-        self._goal = image
-        for step in range(1, FLIGHT_STEPS + 1):
-            part = step / FLIGHT_STEPS
-            # Smoothstep: starts and ends gently.
+        self._target = image
+        for step in range(1, FLIGHT.steps + 1):
+            part = step / FLIGHT.steps
+            # Smoothstep: speed 0 at both ends.
             ease = part * part * (3 - 2 * part)
             turn = (1 - ease) * start + ease * wxyz
             with self._client.atomic():
                 camera.wxyz = turn / np.linalg.norm(turn)
                 camera.position = (1 - ease) * origin + ease * position
                 camera.fov = (1 - ease) * first + ease * fov
-            time.sleep(FLIGHT_SECONDS / FLIGHT_STEPS)
+            time.sleep(FLIGHT.seconds / FLIGHT.steps)
         self.refresh()
 
     @property
     def at(self) -> Image | None:
-        """The image whose camera the browser flew to and still stands at, or None."""
-        if self._goal is None:
+        """The image whose camera the browser flew to and is still at, or None."""
+        if self._target is None:
             return None
         camera = self._client.camera
-        wxyz, position = pictures.stage_pose(self._goal.camera, self._entry.frame)
-        apart = np.abs(np.asarray(camera.position) - position).max()
-        there = apart < ARRIVED and abs(wxyz @ np.asarray(camera.wxyz)) > 1 - ARRIVED**2
-        return self._goal if there else None
+        wxyz, position = pictures.viewer_pose(self._target.camera, self._entry.frame)
+        distance = np.abs(np.asarray(camera.position) - position).max()
+        cosine = abs(wxyz @ np.asarray(camera.wxyz))
+        there = distance < FLIGHT.tolerance and cosine > 1 - FLIGHT.tolerance**2
+        return self._target if there else None
 
     # Pictures -----------------------------------------------------------------------------------
 
     def _draw(self, scale: float) -> int:
-        """Draw what is asked for and send it; returns the number of pixels drawn."""
+        """Draw the selected pictures and send them; returns the number of pixels drawn."""
         try:
-            return self._drawn(scale)
-        except Exception as error:  # noqa: BLE001  (the thread must live on)
-            if not self._closed:  # the browser is still there
+            return self._draw_selected(scale)
+        except Exception as error:  # noqa: BLE001  (the thread must go on)
+            if not self._closed:
                 _LOG.exception("a picture could not be drawn")
-                self._say(f"{type(error).__name__}: {error}")
+                self._show_note(f"{type(error).__name__}: {error}")
         return 0
 
-    def _drawn(self, scale: float) -> int:
+    def _draw_selected(self, scale: float) -> int:
         kind, second = self._kind.value, self._seconds.get(self._second.value)
         self._show_cameras()
-        asked = [(self._entry, kind)] if kind != NOTHING else []
-        asked += [second] if second is not None else []
+        selected = [(self._entry, kind)] if kind != NO_PICTURE else []
+        selected += [second] if second is not None else []
         canvas, at = self._canvas(scale), self.at
-        drawn = [entry.draw(kind, canvas, at, quick=scale < 1) for entry, kind in asked]
-        self._say(" ".join(dict.fromkeys(why for _, why in drawn if why)))
+        drawn = [entry.draw(kind, canvas, at, fast=scale < 1) for entry, kind in selected]
+        self._show_note(" ".join(dict.fromkeys(why for _, why in drawn if why)))
         picture = drawn[0][0] if drawn else None
         if second is not None:
-            picture = self._joined([(None, ""), *drawn][-2:], canvas, named=scale == 1)
-        self._picture, quality = picture, JPEG_STILL if scale == 1 else JPEG_MOVING
+            picture = self._join([(None, ""), *drawn][-2:], canvas, named=scale == 1)
+        self._picture, quality = picture, FRAMES.jpeg_still if scale == 1 else FRAMES.jpeg_moving
         self._client.scene.set_background_image(picture, format="jpeg", jpeg_quality=quality)
         self._client.flush()
         return canvas.width * canvas.height if drawn else 0
@@ -362,30 +386,29 @@ class Session:
     def _canvas(self, scale: float) -> View:
         camera = self._client.camera
         width, height = camera.image_width, camera.image_height
-        scale *= min(1.0, np.sqrt(MOST_PIXELS / (width * height)))
-        size, frame = (
-            tuple(max(8, round(scale * side)) for side in (width, height)),
-            self._entry.frame,
+        scale *= min(1.0, np.sqrt(FRAMES.max_pixels / (width * height)))
+        size = max(8, round(scale * width)), max(8, round(scale * height))
+        return pictures.canvas_view(
+            camera.wxyz, camera.position, camera.fov, size, self._entry.frame
         )
-        return pictures.canvas_view(camera.wxyz, camera.position, camera.fov, size, frame)
 
-    def _joined(self, drawn: list[pictures.Drawn], canvas: View, *, named: bool) -> np.ndarray:
+    def _join(self, drawn: list[pictures.Drawn], canvas: View, *, named: bool) -> np.ndarray:
         white = np.full((canvas.height, canvas.width, 3), 255, np.uint8)
         left, right = (white if picture is None else picture for picture, _ in drawn)
         names = (self._kind.value, self._second.value)
         if len(self._entries) > 1:
             names = (f"{self._entry.name}: {names[0]}", names[1])
-        names = names if named else ("", "")  # letters would be huge in a coarse picture
+        names = names if named else ("", "")  # in a coarse picture the font would be huge
         return split_picture(left, right, *names, at=float(self._split.value))
 
-    def _say(self, text: str) -> None:
-        # As text: names of photographs may be anything, and the page would run a script.
-        shown = f'<div style="padding:0 1em">{html.escape(visible(text))}</div>' if text else ""
-        if self._note.content != shown:
-            self._note.content, self._note.visible = shown, bool(shown)
+    def _show_note(self, text: str) -> None:
+        # Escaped: a photograph's name could contain a script.
+        content = f'<div style="padding:0 1em">{html.escape(visible(text))}</div>' if text else ""
+        if self._note.content != content:
+            self._note.content, self._note.visible = content, bool(content)
 
     def _screenshot(self) -> None:
-        """Send what the browser shows, points over picture, as a PNG to save."""
+        """Send the browser's view, points over picture, as a PNG to save."""
         camera = self._client.camera
         size = (camera.image_width, camera.image_height)
         over = PillowImage.fromarray(

@@ -38,7 +38,7 @@ from splatseed.training import TrainSettings, prepare_run, state, trainer
 from splatseed.training.device import Capacity
 from splatseed.training.parameters import as_parameters
 from splatseed.viewer import pictures
-from splatseed.viewer.models import Shown, stage_frame
+from splatseed.viewer.models import ViewerItem, viewer_frame
 from splatseed.photos.view import load_split
 
 STEPS = 12
@@ -267,13 +267,13 @@ def test_fused_ssim_is_taken_where_it_is_installed(monkeypatch):
 
 def test_the_viewer_renders_all_gaussians_while_the_camera_moves(room, monkeypatch):
     gaussians = initial_gaussians(room.points)
-    shown = Shown("room", room, gaussians)
-    frame = stage_frame(shown)
+    item = ViewerItem("room", room, gaussians)
+    frame = viewer_frame(item)
     monkeypatch.setattr(pictures, "MOST_MOVING", len(gaussians) // 2)
     view = load_split(room)[0][0]
     with pc.pretended_gpu():
-        entry = pictures.Entry(shown, frame, pc.GPU)
-        assert entry.quick_renderer is entry.renderer
+        entry = pictures.Entry(item, frame, pc.GPU)
+        assert entry.fast_renderer is entry.renderer
         found = entry.renderer.color(view)
-    expected = pictures.Entry(shown, frame).renderer.color(view)
+    expected = pictures.Entry(item, frame).renderer.color(view)
     np.testing.assert_allclose(found, expected, atol=1e-3)
