@@ -105,7 +105,7 @@ BAD = {
         (IMAGE[:-8] + struct.pack("<QddQ", 1, 0, 0, 2**63), "record 1"),
     ],
     "points3D.bin": [
-        (points_of(point(), POINT)[:-1], "record 2 of 2, byte 59; found 58 bytes"),
+        (points_of(point(), POINT)[:-1], "record 2 of 2, byte 59; found 58"),
         (MANY + POINT, "at most 1 points"),
         *((points_of(point(track_length=2**n)), "record 1") for n in (60, 63)),
         (points_of(point(4), point(5), point(4)), "record 3; found 4"),

@@ -35,10 +35,10 @@ Unusable: TypeAlias = dict[Any, NotFiniteError]
 def make_intrinsics(
     where: str, camera_id: int, model: str, width: int, height: int, params: Sequence[float]
 ) -> Intrinsics:
-    """A checked camera record; a ``NotFiniteError`` if its numbers make no camera."""
+    """Make a checked camera record; raise ``NotFiniteError`` for parameters that are not usable."""
     require(0 <= camera_id <= MAX_ID, f"a camera id from 0 to {MAX_ID}", where, camera_id)
     fits = 0 < width <= _MAX_SIZE and 0 < height <= _MAX_SIZE
-    require(fits, "a camera with a size in pixels", where, f"{width} x {height}")
+    require(fits, "a camera size in pixels", where, f"{width} x {height}")
     _require_finite(
         all(map(math.isfinite, params)), "finite camera parameters", where, tuple(params)
     )
@@ -63,9 +63,12 @@ def check_pose(pose: Sequence[float], of: str, where: str) -> None:
 def rigid_pose(
     where: str, world_from_cam: Float64[np.ndarray, "R 4"]
 ) -> tuple[Float64[np.ndarray, " 4"], Float64[np.ndarray, " 3"]]:
-    """Quaternion and translation of ``cam_from_world``; a fourth row must be 0, 0, 0, 1."""
+    """Convert ``world_from_cam`` to the quaternion and translation of ``cam_from_world``.
+
+    Raises ``SceneFormatError`` unless it is rigid; a fourth row must be 0, 0, 0, 1.
+    """
     rotation = world_from_cam[:3, :3].T
-    with np.errstate(over="ignore", invalid="ignore"):  # huge numbers are not rigid either
+    with np.errstate(over="ignore", invalid="ignore"):  # huge numbers fail the check below
         off = np.abs(rotation @ rotation.T - np.eye(3)).max()
         proper = np.linalg.det(rotation) > 0
     affine = np.allclose(world_from_cam[3:], [[0, 0, 0, 1]], atol=_RIGID_TOLERANCE)
@@ -77,13 +80,13 @@ def rigid_pose(
 
 
 def check_enough(unusable: Mapping[str, NotFiniteError], used: int) -> None:
-    """Raise what is wrong with the first unusable image, if fewer than half can be used."""
+    """Raise the first image's error if fewer than half of the images are usable."""
     if len(unusable) > used:
         raise next(iter(unusable.values()))
 
 
 def unusable_warning(unusable: Mapping[str, NotFiniteError], used: int) -> list[str]:
-    """A sentence on images that are left out, if there are any."""
+    """Warn of images that are left out, if any."""
     if not unusable:
         return []
     count, whose = len(unusable), agreeing(len(unusable), "its", "their")

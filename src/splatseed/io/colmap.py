@@ -1,8 +1,8 @@
-"""COLMAP's files: cameras, images and points3D, binary (read and written) and as text (read).
+"""COLMAP's cameras, images and points3D: binary files (read, written) and text files (read).
 
-``where`` is the place that an error names; of N binary points, ``starts`` [N + 1] are the records'
-byte offsets, ended by the end of the last. Promise: a binary file that was read is written back
-byte for byte; both forms of a model give the same, to the last bit.
+``where`` is the file and line or record that an error names; ``starts`` [N + 1] are the byte
+offsets of N point records, followed by the end of the last. Promise: writing what was read from a
+binary file gives the same bytes; text and binary files of a model give bit-identical values.
 """
 
 from __future__ import annotations
@@ -33,32 +33,32 @@ from splatseed.pointcloud import PointCloud
 from splatseed.scene import NO_POINT, Image, Observations, Tracks
 
 UNKNOWN_ERROR = -1.0
-"""COLMAP's reprojection error of a point that has none yet."""
+"""COLMAP's reprojection error of a point without one."""
 
 _MAX_MODEL_ID = 100
-"""An unknown camera model with a lower id is taken for a newer one, not for damage."""
+"""Unknown camera model ids below this are reported as newer models, others as damage."""
 _COUNT = struct.Struct("<Q")
 _CAMERA = struct.Struct("<IiQQ")  # camera id, model id, width, height; then the parameters
 _POSE = struct.Struct("<I7dI")  # image id, wxyz quaternion, translation, camera id; then the name
 MIN_IMAGE_BYTES = _POSE.size + 1 + 8
-"""Of a record in ``images.bin``: an empty name's end, and the number of features."""
+"""Smallest record of ``images.bin``: pose, an empty name's zero byte, feature count."""
 _FEATURE = np.dtype([("xy", "<f8", 2), ("point_id", "<u8")])
 _POINT = np.dtype(
     [("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("length", "<u8")]
 )
 _OBSERVATION = np.dtype([("image_id", "<u4"), ("point2d_idx", "<u4")])
-# A record of points3D.bin is a head of 51 bytes, whose last field is the track's length L, then L
-# observations of 8 bytes; nothing is aligned.
+# A record of points3D.bin: a head of 51 bytes that ends with the track length L, then L
+# observations of 8 bytes; unaligned.
 _HEAD_BYTES, _PAIR_BYTES = _POINT.itemsize, _OBSERVATION.itemsize
 _LENGTH_AT = 43  # of the track length within a head
 _Points: TypeAlias = tuple[UInt8[np.ndarray, "N 3"], Tracks, Callable[[int], str]]
-"""Colours, all else, and the place of point i in the file."""
+"""Colours, all other fields, and a function from point index to place in the file."""
 
 
 def read_cameras(path: StrPath, unusable: Unusable | None = None) -> tuple[Intrinsics, ...]:
-    """The camera records of a ``cameras.bin`` or ``cameras.txt``, in file order.
+    """Read ``cameras.bin`` or ``cameras.txt``, in file order.
 
-    Records that are not finite are left out and added to ``unusable``; without it they are errors.
+    Records that are not finite are moved to ``unusable``; if that is None, they raise.
     """
     path = Path(path)
     cameras: dict[int, Intrinsics] = {}
@@ -78,10 +78,10 @@ def read_cameras(path: StrPath, unusable: Unusable | None = None) -> tuple[Intri
 def read_images(
     path: StrPath, intrinsics: Sequence[Intrinsics], unusable: Unusable | None = None
 ) -> tuple[Image, ...]:
-    """The image records of an ``images.bin`` or ``images.txt``, in file order.
+    """Read ``images.bin`` or ``images.txt``, in file order.
 
-    Those whose pose is not finite, or whose camera is among ``unusable``, are left out and added to
-    it by name; without it they are errors.
+    Images whose pose is not finite, or whose camera is in ``unusable``, are moved to ``unusable``
+    by name; if that is None, they raise.
     """
     path = Path(path)
     cameras = {camera.camera_id: camera for camera in intrinsics}
@@ -117,9 +117,9 @@ def read_images(
 
 
 def read_points3d(path: StrPath) -> tuple[PointCloud, Tracks]:
-    """The points of a ``points3D.bin`` or ``points3D.txt`` in file order, and their tracks.
+    """Read ``points3D.bin`` or ``points3D.txt``: the points in file order, and their tracks.
 
-    Nothing is repaired; what is beyond float32 is infinite in the cloud, to be seen and dropped.
+    Nothing is repaired; positions beyond float32's range become infinite in the cloud.
     """
     path = Path(path)
     rgb, tracks, place = (_text_points if path.suffix == ".txt" else _binary_points)(path)
@@ -127,7 +127,7 @@ def read_points3d(path: StrPath) -> tuple[PointCloud, Tracks]:
     if (ids < 0).any():
         where = f"{path}, {place(int((ids < 0).argmax()))}"
         raise format_error(f"a point id from 0 to {2**63 - 1}", where, "one outside")
-    if not (ids[1:] > ids[:-1]).all():  # the usual order needs no sort
+    if not (ids[1:] > ids[:-1]).all():  # usually ascending: no sort needed
         order = np.argsort(ids, kind="stable")
         again = order[1:][ids[order[1:]] == ids[order[:-1]]]
         if len(again):
@@ -180,7 +180,7 @@ def _binary_points(path: Path) -> _Points:
     reader.offset = int(starts[complete])
     if complete < count:
         reader.record = f"record {complete + 1} of {count}"
-        raise reader.error("a whole point record", f"{reader.remaining} bytes to the file's end")
+        raise reader.error("a complete point record", f"{reader.remaining} remaining bytes")
     reader.finish()
     buffer = np.frombuffer(reader.data, np.uint8)
     points = _unaligned_view(buffer, _HEAD_BYTES)[starts[:-1]].view(_POINT)
@@ -197,11 +197,11 @@ def _binary_points(path: Path) -> _Points:
 
 
 def _scan_records(data: bytes, first: int, count: int) -> Int64[np.ndarray, " K+1"]:
-    """The offsets of ``count`` records that begin at ``first``, then the end of the last."""
+    """Return the offsets of ``count`` records from ``first`` on, and the end of the last."""
     at, last = first, len(data) - _HEAD_BYTES
     starts = [at]
     length_at = _COUNT.unpack_from
-    for _ in range(count):  # a record's place is known only from the one before it
+    for _ in range(count):  # each record's length is in its head
         if at > last:
             break
         at += _HEAD_BYTES + _PAIR_BYTES * length_at(data, at + _LENGTH_AT)[0]
@@ -212,12 +212,12 @@ def _scan_records(data: bytes, first: int, count: int) -> Int64[np.ndarray, " K+
 
 
 def _unaligned_view(buffer: UInt8[np.ndarray, " B"], size: int) -> np.ndarray:
-    """The ``size`` bytes from each byte of a buffer on, as one element: a view."""
+    """View a buffer as overlapping items of ``size`` bytes, one starting at each byte."""
     return np.ndarray(max(len(buffer) - size + 1, 0), f"V{size}", buffer, strides=(1,))
 
 
 def _pair_offsets(starts: Int64[np.ndarray, " N+1"]) -> Int64[np.ndarray, " T"]:
-    """Where each observation stands."""
+    """Return the byte offset of each observation."""
     lengths = (np.diff(starts) - _HEAD_BYTES) // _PAIR_BYTES
     before = np.cumsum(lengths) - lengths
     offsets = np.repeat(starts[:-1] + _HEAD_BYTES - _PAIR_BYTES * before, lengths)
@@ -226,7 +226,7 @@ def _pair_offsets(starts: Int64[np.ndarray, " N+1"]) -> Int64[np.ndarray, " T"]:
 
 
 def write_cameras(path: StrPath, intrinsics: Sequence[Intrinsics]) -> None:
-    """Write a ``cameras.bin``."""
+    """Write ``cameras.bin``."""
     path = Path(path)
     with path.open("wb") as file:
         file.write(_COUNT.pack(len(intrinsics)))
@@ -238,7 +238,7 @@ def write_cameras(path: StrPath, intrinsics: Sequence[Intrinsics]) -> None:
 
 
 def write_images(path: StrPath, images: Sequence[Image]) -> None:
-    """Write an ``images.bin``; images without observations get zero features."""
+    """Write ``images.bin``; images without observations get zero features."""
     path = Path(path)
     with path.open("wb") as file:
         file.write(_COUNT.pack(len(images)))
@@ -264,14 +264,14 @@ def _pack(layout: struct.Struct, where: str, *values: float) -> bytes:
         raise OutputError(
             f"values of {where} that COLMAP's binary form can hold",
             found=f"{values} ({error})",
-            fix="Ids and sizes are non-negative, ids below 2^32.",
+            fix="Ids and sizes must be non-negative, ids below 2^32.",
         ) from None
 
 
 def write_points3d(path: StrPath, points: PointCloud, tracks: Tracks | None) -> None:
-    """Write a ``points3D.bin``; tracks belong to the first points.
+    """Write ``points3D.bin``; tracks belong to the first points.
 
-    The others get the ids that follow the largest, error -1 (COLMAP's "unknown") and no track.
+    The other points get ids above the largest, error -1 (COLMAP's "unknown") and no track.
     """
     path = Path(path)
     check_tracks(points, tracks)
@@ -288,11 +288,11 @@ def write_points3d(path: StrPath, points: PointCloud, tracks: Tracks | None) -> 
         file.write(_COUNT.pack(len(points)))
         if tracks is not None:
             file.write(_joined_records(heads[:known], tracks).data)
-        file.write(heads[known:].view(np.uint8).data)  # a record without a track is its head
+        file.write(heads[known:].view(np.uint8).data)  # without a track, a record is just its head
 
 
 def _joined_records(heads: np.ndarray, tracks: Tracks) -> UInt8[np.ndarray, " B"]:
-    """The bytes of the records of points that have tracks."""
+    """Build the records of points with tracks."""
     observations = np.empty(len(tracks.image_ids), _OBSERVATION)
     observations["image_id"], observations["point2d_idx"] = tracks.image_ids, tracks.point2d_idx
     starts = tracks.offsets * _PAIR_BYTES + np.arange(len(heads) + 1) * _HEAD_BYTES
@@ -305,12 +305,12 @@ def _joined_records(heads: np.ndarray, tracks: Tracks) -> UInt8[np.ndarray, " B"
 
 
 def check_tracks(points: PointCloud, tracks: Tracks | None) -> None:
-    """Raise a ``PointCloudError`` if there are more tracks than points."""
+    """Raise ``PointCloudError`` if there are more tracks than points."""
     if tracks is not None and len(tracks) > len(points):
         raise PointCloudError(
             "at most one track per point",
             found=f"{len(tracks)} tracks for {len(points)} points",
-            fix="Replace the points by Scene.replace, which drops tracks that do not fit.",
+            fix="Replace points with Scene.replace, which drops the tracks of removed points.",
         )
 
 
@@ -326,7 +326,7 @@ def _text_cameras(path: Path) -> Iterator[tuple[Any, ...]]:
 
 
 def _text_images(path: Path) -> Iterator[tuple[Any, ...]]:
-    """As ``_binary_images``; the line after an image's is always its features, and may be blank."""
+    """Yield images as ``_binary_images`` does; each has a second line with its features."""
     lines = numbered_lines(path)
     for where, line in lines:
         if not _is_data(line):
@@ -335,7 +335,7 @@ def _text_images(path: Path) -> Iterator[tuple[Any, ...]]:
         with _parsed(where, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", row):
             pose = tuple(map(float, row[1:8]))
             image_id, camera_id, name = int(row[0]), int(row[8]), row[9]
-        # The last image of a file cut by an editor may lack its empty feature line.
+        # Editors may strip the last image's empty feature line.
         below, features = next(lines, (where, ""))
         fields = features.split()
         with _parsed(below, "X Y POINT3D_ID triples, or a blank line, after an image", fields):
@@ -375,12 +375,14 @@ def _text_points(path: Path) -> _Points:
 
 @contextmanager
 def _parsed(where: str, layout: str, row: Sequence[str]) -> Iterator[None]:
-    """Turn what a block raises over the words of a line into an error that shows the line."""
+    """Turn parse errors of a line into ``SceneFormatError`` that shows the line."""
     try:
         yield
     except (ValueError, IndexError, OverflowError):
         fields = " ".join(row)
-        line = repr(fields if len(fields) <= 80 else f"{fields[:77]}...") if row else "an empty one"
+        line = (
+            repr(fields if len(fields) <= 80 else f"{fields[:77]}...") if row else "an empty line"
+        )
         raise format_error(layout, where, line) from None
 
 

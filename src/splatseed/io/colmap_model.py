@@ -35,29 +35,29 @@ _UNKNOWN = -1
 
 
 def scene_model(root: Path) -> Path | None:
-    """The model of a scene's folder, of ``sparse``, or of a folder of numbered models."""
+    """Find the model of a scene folder, of ``sparse``, or of a folder of numbered models."""
     largest = largest_model(root / "sparse")
     return largest or find_model(root / "sparse", root) or largest_model(root)
 
 
 def nested_model(root: Path) -> Path | None:
-    """The model in ``colmap/sparse``, where nerfstudio puts it."""
+    """Find the model in ``colmap/sparse``, nerfstudio's place for it."""
     return largest_model(root / "colmap/sparse") or find_model(root / "colmap/sparse")
 
 
 def largest_model(folder: Path) -> Path | None:
-    """The model with most images in a folder's numbered ones; of equals, the first."""
+    """Return the numbered model with the most images; the first of equals."""
     return next(iter(ranked_models(folder)), None)
 
 
 def ranked_models(folder: Path) -> list[Path]:
-    """The models in a folder's numbered ones, those with most images first."""
+    """Return a folder's numbered models, most images first."""
     models = numbered_models(folder)
     return models if len(models) < 2 else sorted(models, key=lambda each: -count_images(each))
 
 
 def numbered_models(folder: Path) -> list[Path]:
-    """The folders ``0``, ``1`` and so on that hold a model, by number."""
+    """Return the subfolders ``0``, ``1``, ... that hold a model, by number."""
     if not folder.is_dir():
         return []
     numbered = [each for each in folder.iterdir() if each.name.isdecimal()]
@@ -65,7 +65,7 @@ def numbered_models(folder: Path) -> list[Path]:
 
 
 def count_images(model_dir: Path) -> int:
-    """How many images a model promises; -1 if the file is damaged."""
+    """Read a model's image count; -1 if the file is damaged."""
     path = model_file(model_dir, "images")
     if path is None:
         return 0
@@ -81,7 +81,7 @@ def count_images(model_dir: Path) -> int:
 
 
 def _count_lines(path: Path) -> int:
-    """Images of an ``images.txt``: each is a line, and one of features, which may be blank."""
+    """Count the images of ``images.txt``: two lines each, of which the second may be blank."""
     count, lines = 0, numbered_lines(path)
     for _, line in lines:
         if line.strip() and not line.lstrip().startswith("#"):
@@ -91,7 +91,7 @@ def _count_lines(path: Path) -> int:
 
 
 def read_model(model_dir: Path) -> Scene:
-    """The scene of a model, with a note if it is one of several."""
+    """Read a model as a scene; warn if it is one of several."""
     scene, models = read_colmap_scene(model_dir), numbered_models(model_dir.parent)
     if len(models) < 2 or not model_dir.name.isdecimal():
         return scene
@@ -101,18 +101,18 @@ def read_model(model_dir: Path) -> Scene:
         for name, count in counts.items()
     ]
     other = next(each for each in ranked_models(model_dir.parent) if each.name != model_dir.name)
-    there = f"{model_dir.parent} has {len(models)} models, {', '.join(shown)}"
-    note = f"{there}: {model_dir.name} is read. To read another, name it, such as {other}."
+    listed = f"{model_dir.parent} has {len(models)} models, {', '.join(shown)}"
+    note = f"{listed}: {model_dir.name} is read. To read another, pass its path, such as {other}."
     return scene.replace(warnings=(*scene.warnings, note))
 
 
 def find_model(*folders: Path) -> Path | None:
-    """The first of the given folders that holds a model."""
+    """Return the first folder that holds a model."""
     return next((f for f in folders if any(model_file(f, name) for name in _MODEL_FILES)), None)
 
 
 def model_file(model_dir: Path, name: str) -> Path | None:
-    """The file of a model that is read for cameras, images or points3D."""
+    """Return the file that is read for "cameras", "images" or "points3D"."""
     if name == "points3D":
         return first_with_points(_point_files(model_dir))
     candidates = (model_dir / f"{name}{suffix}" for suffix in (".bin", ".txt"))
@@ -125,7 +125,7 @@ def _point_files(model_dir: Path) -> list[Path]:
 
 
 def _other_points(model_dir: Path, root: Path, read: Path, points: PointCloud) -> list[str]:
-    """Notes on other files of points, from which other trainers may start."""
+    """Warn of other point files, from which other trainers may start."""
     files, notes = _point_files(model_dir), list[str]()
     for i, path in enumerate(files):
         before = " and ".join(each.name for each in files[:i])
@@ -137,7 +137,7 @@ def _other_points(model_dir: Path, root: Path, read: Path, points: PointCloud) -
 
 
 def scene_root(model_dir: Path) -> Path:
-    """The scene's folder: the model's without ``sparse/0`` or ``sparse``, or ``colmap`` above."""
+    """Return the scene folder of a model: without ``sparse/0`` or ``sparse``, and ``colmap``."""
     parts = model_dir.absolute().parts
     levels = 1 if parts[-1] == "sparse" else 2 if parts[-2:-1] == ("sparse",) else 0
     if not levels:
@@ -149,7 +149,7 @@ def scene_root(model_dir: Path) -> Path:
 
 
 def read_colmap_scene(model_dir: StrPath) -> Scene:
-    """The scene of a model: its images, its points, and warnings for the user."""
+    """Read a model as a scene, with warnings for the user."""
     model_dir = Path(model_dir)
     root = scene_root(model_dir)
     intrinsics, images, unusable = _read_model(model_dir)
@@ -159,13 +159,13 @@ def read_colmap_scene(model_dir: StrPath) -> Scene:
     warnings += unusable_warning(unusable, len(images))
     warnings += _other_points(model_dir, root, points_path, points)
     if (root / "transforms.json").is_file():
-        warnings.append(f"{root / 'transforms.json'} is there too; name it to read it instead.")
+        warnings.append(f"{root / 'transforms.json'} exists too; pass its path to read it instead.")
     if not images and (tracks is not None or intrinsics or image_dir is not None):
         tracks, path = None, model_file(model_dir, "images")  # tracks name images
         why = f"{path} lists no images" if path else f"{model_dir} has no images.bin or images.txt"
         warnings.append(
-            f"{why}, so no photograph has a pose: copy the whole model, or make one with splatseed"
-            " sfm IMAGES -o SCENE. Points can be interpolated, but nothing can be trained."
+            f"{why}, so no photograph has a pose: copy the complete model, or make one with"
+            " splatseed sfm IMAGES -o SCENE. Points can be interpolated, but not trained."
         )
     source = SceneSource("colmap", root, points_path, model_dir, image_dir)
     scene = Scene(
@@ -175,34 +175,34 @@ def read_colmap_scene(model_dir: StrPath) -> Scene:
 
 
 def _image_dir(root: Path, images: Sequence[Image]) -> Path | None:
-    """The first known folder with all images, else with the most; the first at all without any."""
+    """Return the first known folder with all images, else that with most, else the first one."""
     folders = [root / name for name in IMAGE_DIRS if (root / name).is_dir()]
-    held = dict[Path, int]()
+    counts_by_folder = dict[Path, int]()
     for folder in (*folders, root):
-        held[folder] = sum((folder / image.name).is_file() for image in images)
-        if held[folder] == len(images) > 0:
+        counts_by_folder[folder] = sum((folder / image.name).is_file() for image in images)
+        if counts_by_folder[folder] == len(images) > 0:
             break
-    best = max(held, key=lambda folder: held[folder])
-    return best if held[best] else next(iter(folders), None)
+    best = max(counts_by_folder, key=lambda folder: counts_by_folder[folder])
+    return best if counts_by_folder[best] else next(iter(folders), None)
 
 
 def read_model_cameras(model_dir: Path) -> tuple[tuple[Intrinsics, ...], tuple[Image, ...]]:
-    """The camera and the image records of a model that can be used."""
+    """Read the usable camera and image records of a model."""
     return _read_model(model_dir)[:2]
 
 
 def _read_model(
     model_dir: Path,
 ) -> tuple[tuple[Intrinsics, ...], tuple[Image, ...], Mapping[str, NotFiniteError]]:
-    """The same, and what is wrong with other images, by name.
+    """Read the usable cameras and images, and the errors of the other images by name.
 
     Raises:
-        NotFiniteError: Fewer than half of the images can be used.
+        NotFiniteError: Fewer than half of the images are usable.
     """
     cameras_path, images_path = model_file(model_dir, "cameras"), model_file(model_dir, "images")
     if cameras_path is None and images_path is not None:
         expected = f"cameras.bin or cameras.txt beside {images_path}"
-        raise SceneNotFoundError(expected, found="neither", fix="Copy the whole model.")
+        raise SceneNotFoundError(expected, found="neither", fix="Copy the complete model.")
     bad: Unusable = {}
     intrinsics = read_cameras(cameras_path, bad) if cameras_path else ()
     images = read_images(images_path, intrinsics, bad) if images_path else ()
@@ -214,9 +214,10 @@ def _read_model(
 def read_model_points(
     model_dir: Path,
 ) -> tuple[PointCloud, Float64[np.ndarray, "N 3"], Tracks | None, Path]:
-    """The points of a model, ``points3D.ply`` if need be, and their positions in double precision.
+    """Read a model's points, from ``points3D.ply`` if it has no other file.
 
-    Also their tracks, if any, and their file.
+    Returns:
+        The cloud, its positions in float64, the tracks if any, and the file.
     """
     path = model_file(model_dir, "points3D")
     if path is None:

@@ -1,9 +1,9 @@
-"""Opening files that a scene names, which may be anything, and walking binary ones.
+"""Safe reading of untrusted files: regular files only, bounded memory, parsing of binary records.
 
-Promise: only regular files are opened, so that nothing blocks or reads forever (a pipe,
-``/dev/zero``), and none larger than the free memory is read whole; a count in a file is checked
-against the bytes that are left before anything is allocated for it. ``open_file``, ``read_file``
-and ``read_text`` raise an ``OSError``; all else one of our errors, which names the file.
+Pipes and devices, which could block or never end, are refused, as is reading a file larger than
+the free memory. A count in a file is checked against the remaining bytes before memory is
+allocated for it. ``open_file``, ``read_file`` and ``read_text`` raise ``OSError``; the other
+functions raise ``SplatseedError`` with the file's name.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from splatseed.runtime.memory import free_memory
 from splatseed.text import beginning, describe_error
 
 StrPath = str | os.PathLike[str]
-"""A path, as functions that read or write files take it."""
+"""A path argument of a function that reads or writes files."""
 
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".mts", ".3gp"})
 COPY_AGAIN = "Copy the file again, or export it again."
@@ -42,59 +42,61 @@ ARCHIVE_FAILURES = (
     tokenize.TokenError,  # of headers that look like Python 2's: NumPy parses them as Python
     RuntimeError,  # encrypted, or compressed in a way that zipfile does not know
 )
-"""What a damaged ``.npy``, ``.npz`` or ``.zip`` can raise."""
+"""Exceptions from a damaged ``.npy``, ``.npz`` or ``.zip``."""
 
 _KINDS = {
     stat.S_IFDIR: "a folder",
     stat.S_IFIFO: "a pipe, not a file",
     stat.S_IFSOCK: "a socket, not a file",
 }
-_WAIT_NOT = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
+_OPEN_FLAGS = (
+    getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
+)
 _COUNT = struct.Struct("<Q")
 
 
 def files_below(folder: Path) -> list[Path]:
-    """The files in a folder and its subfolders, linked ones too, sorted."""
+    """List the files in a folder and its subfolders, sorted; links are followed."""
     found = list[Path]()
     for place, folders, names in os.walk(folder, followlinks=True):
         if os.path.realpath(place) in map(os.path.realpath, Path(place).parents):
-            folders.clear()  # a link that leads back
+            folders.clear()  # a link to a parent
         else:
             found += [Path(place, name) for name in names]
     return sorted(found)
 
 
 def is_video(path: Path) -> bool:
-    """Whether a path is a video file, by its name."""
+    """Whether a path is a file with a video suffix."""
     return path.suffix.lower() in VIDEO_SUFFIXES and path.is_file()
 
 
 def similar_name(path: Path) -> str | None:
-    """The name of a file beside a missing one that differs in its suffix or in case only."""
-    near: list[str] = []
+    """Find a file in the same folder whose name differs in suffix or case only."""
+    siblings: list[str] = []
     with suppress(OSError):
-        near = sorted(each.name for each in path.parent.iterdir() if each.name != path.name)
-    alike = [name for name in near if Path(name).stem.casefold() == path.stem.casefold()]
-    return min(alike, key=lambda name: name.casefold() != path.name.casefold(), default=None)
+        siblings = sorted(p.name for p in path.parent.iterdir() if p.name != path.name)
+    similar = [name for name in siblings if Path(name).stem.casefold() == path.stem.casefold()]
+    return min(similar, key=lambda name: name.casefold() != path.name.casefold(), default=None)
 
 
 def special_kind(path: Path) -> str:
-    """What a path is that is neither a regular file nor a folder; empty if it is, or is nothing."""
+    """Describe a path that is neither a file nor a folder (a pipe, a link loop); else return ""."""
     try:
         mode = path.stat().st_mode
     except OSError as error:
         return "a link that leads back to itself" if error.errno == errno.ELOOP else ""
-    except ValueError:  # a NUL, or half a character
+    except ValueError:  # a NUL or a lone surrogate
         return "a name that no file can have"
     return "" if stat.S_ISREG(mode) or stat.S_ISDIR(mode) else _kind(mode)
 
 
 def open_file(path: Path) -> BinaryIO:
-    """Open a regular file for reading; an ``OSError`` for anything else."""
-    _check(path, path.stat())  # opening alone can act on a device
-    file = os.fdopen(os.open(path, os.O_RDONLY | _WAIT_NOT), "rb")
+    """Open a regular file for reading; raise ``OSError`` for anything else."""
+    _check_regular(path, path.stat())  # opening a device can already act on it
+    file = os.fdopen(os.open(path, os.O_RDONLY | _OPEN_FLAGS), "rb")
     try:
-        _check(path, os.fstat(file.fileno()))  # it may have been replaced meanwhile
+        _check_regular(path, os.fstat(file.fileno()))  # it may have been replaced meanwhile
     except OSError:
         file.close()
         raise
@@ -102,34 +104,34 @@ def open_file(path: Path) -> BinaryIO:
 
 
 def read_file(path: Path) -> bytes:
-    """The whole content of a regular file; an ``OSError`` also if it exceeds the free memory."""
+    """Read a regular file; raise ``OSError`` also if it does not fit in free memory."""
     with open_file(path) as file:
         check_fits_memory(path, os.fstat(file.fileno()).st_size)
         return file.read()
 
 
 def check_fits_memory(path: Path, size: int) -> None:
-    """Raise an ``OSError`` for a file whose content takes more bytes than are free."""
+    """Raise ``OSError`` if a file of ``size`` bytes does not fit in free memory."""
     free = free_memory()
     if free is not None and size > free:
-        told = f"{size / 1e9:,.1f} GB, more than the {free / 1e9:,.1f} GB of free memory"
-        raise OSError(errno.EFBIG, told, str(path))
+        reason = f"{size / 1e9:,.1f} GB, more than the {free / 1e9:,.1f} GB of free memory"
+        raise OSError(errno.EFBIG, reason, str(path))
 
 
 def read_text(path: Path) -> str:
-    """The whole content of a regular file of UTF-8, such as JSON or TOML, as ``read_file``."""
+    """Read a UTF-8 text file; raises as ``read_file``."""
     return read_file(path).decode("utf-8")
 
 
 def read_bytes(path: Path) -> bytes:
-    """The whole content of a regular file; errors as ``translate_read_errors``'s."""
+    """Read a regular file; raises as ``translate_read_errors``."""
     with translate_read_errors(path):
         return read_file(path)
 
 
 @contextmanager
 def translate_read_errors(path: Path) -> Iterator[None]:
-    """Turn an ``OSError`` from reading a file into one of our errors.
+    """Turn an ``OSError`` from reading a file into a ``SplatseedError``.
 
     Raises:
         SceneNotFoundError: There is no such file.
@@ -151,9 +153,12 @@ def translate_read_errors(path: Path) -> Iterator[None]:
 
 @contextmanager
 def translate_errors(path: Path, expected: str, *, fix: str = COPY_AGAIN) -> Iterator[None]:
-    """Turn whatever reading a bad file raises, in a package or here, into a ``SceneFormatError``.
+    """Turn any exception from parsing a file into ``SceneFormatError``.
 
-    It says that the file at ``path`` should be what is ``expected``.
+    Args:
+        path: The file.
+        expected: The expected content, for the message "expected PATH to be ...".
+        fix: Advice for the user.
     """
     try:
         yield
@@ -162,17 +167,17 @@ def translate_errors(path: Path, expected: str, *, fix: str = COPY_AGAIN) -> Ite
     except MemoryError:
         found = "more than memory holds"
     except BaseException as error:
-        # Packages raise errors of many kinds; a panic of Rust is no Exception, as Ctrl-C is none.
+        # Libraries raise errors of many kinds. A Rust panic is a BaseException, as is Ctrl-C.
         if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
             raise
-        found = describe_error(error)  # type: ignore[arg-type]  # a panic has words, too
+        found = describe_error(error)  # type: ignore[arg-type]  # a panic has a message
     else:
         return
     raise SceneFormatError(f"{path} to be {expected}", found=found, fix=fix)
 
 
 def read_npy_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Shape, whether column by column, and type of the array at the start of a ``.npy``."""
+    """Read the header of a ``.npy`` file: shape, whether in Fortran order, and dtype."""
     magic = file.read(npy_format.MAGIC_LEN)
     if not magic.startswith(npy_format.MAGIC_PREFIX):
         raise ValueError(f"no NumPy array, but {beginning(magic)}")
@@ -181,20 +186,20 @@ def read_npy_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[An
     return npy_format.read_array_header_2_0(file)
 
 
-def read_npy(file: IO[bytes], most: float = np.inf) -> np.ndarray:
-    """The array of a ``.npy``; ``ValueError`` for one of objects or of more than ``most`` bytes."""
-    shape, turned, dtype = read_npy_header(file)
+def read_npy(file: IO[bytes], max_bytes: float = np.inf) -> np.ndarray:
+    """Read a ``.npy`` file; raise ``ValueError`` for objects or more than ``max_bytes``."""
+    shape, fortran_order, dtype = read_npy_header(file)
     size = math.prod(shape) * dtype.itemsize
-    if dtype.hasobject or min(shape, default=0) < 0 or size > most:
-        raise ValueError(f"{shape} values of {dtype} in {most:,.0f} bytes")
+    if dtype.hasobject or min(shape, default=0) < 0 or size > max_bytes:
+        raise ValueError(f"{shape} values of {dtype} in {max_bytes:,.0f} bytes")
     data = file.read(size + 1)
     if len(data) != size:
         raise ValueError(f"{len(data)} bytes for {shape} values of {dtype}")
-    return np.frombuffer(data, dtype).reshape(shape, order="F" if turned else "C")
+    return np.frombuffer(data, dtype).reshape(shape, order="F" if fortran_order else "C")
 
 
 def numbered_lines(path: Path) -> Iterator[tuple[str, str]]:
-    """The lines of a UTF-8 file with their places, its byte order mark left out."""
+    """Yield "PATH, line N" and the text of each line of a UTF-8 file, without a byte order mark."""
     raw = read_bytes(path)
     try:
         text = raw.decode("utf-8-sig")
@@ -218,9 +223,9 @@ def read_json(path: Path, expected: str = "JSON", *, fix: str = COPY_AGAIN) -> A
 
 
 class ByteReader:
-    """Reads a little-endian binary file, whole in memory, from front to back.
+    """Parses a little-endian binary file in memory, front to back.
 
-    What ends early, or cannot be, is a ``SceneFormatError`` that names file, byte and ``record``.
+    Truncated or impossible data raises ``SceneFormatError`` with file, record and byte offset.
     """
 
     def __init__(self, path: Path, fix: str = COPY_AGAIN) -> None:
@@ -229,40 +234,41 @@ class ByteReader:
 
     @property
     def remaining(self) -> int:
-        """Bytes not read yet."""
+        """Number of unread bytes."""
         return len(self.data) - self.offset
 
     @property
     def where(self) -> str:
-        """The current place, for errors."""
+        """The current position, for error messages."""
         return f"{self.path}, {self.record}, byte {self.offset}"
 
     def unpack(self, layout: struct.Struct) -> tuple[Any, ...]:
-        """The values of a fixed layout."""
+        """Read one struct."""
         return layout.unpack(self._take(layout.size))
 
     def array(self, dtype: np.dtype[Any], count: int) -> np.ndarray:
-        """The next ``count`` items, a read-only view of the file's bytes."""
+        """Read ``count`` items as a read-only view of the file's bytes."""
         return np.frombuffer(self._take(count * dtype.itemsize), dtype)
 
-    def count(self, least_bytes: int, what: str) -> int:
-        """A u64 count of items that take at least ``least_bytes`` each, checked to fit."""
+    def count(self, min_bytes: int, noun: str) -> int:
+        """Read a u64 count; check that as many items of ``min_bytes`` each fit in the file."""
         (count,) = self.unpack(_COUNT)
-        room = self.remaining // least_bytes
-        if count > room:
-            raise self.error(f"at most {room} {what} in the bytes that follow", f"{count} promised")
+        limit = self.remaining // min_bytes
+        if count > limit:
+            expected = f"at most {limit} {noun} in the remaining bytes"
+            raise self.error(expected, f"a count of {count}")
         return int(count)
 
-    def records(self, least_bytes: int, what: str) -> Iterator[str]:
-        """The place of each of as many records as a count promises, which end the file."""
-        count = self.count(least_bytes, what)
+    def records(self, min_bytes: int, noun: str) -> Iterator[str]:
+        """Read a count, then yield the position of each record; the last must end the file."""
+        count = self.count(min_bytes, noun)
         for idx in range(count):
             self.record = f"record {idx + 1} of {count}"
             yield self.where
         self.finish()
 
     def text(self) -> str:
-        """A NUL-terminated UTF-8 string."""
+        """Read a NUL-terminated UTF-8 string."""
         end = self.data.find(b"\0", self.offset)
         if end < 0:
             raise self.error("a name ended by a zero byte", "the end of the file")
@@ -275,13 +281,13 @@ class ByteReader:
         return text
 
     def finish(self) -> None:
-        """Check that no bytes are left."""
+        """Raise unless all bytes were read."""
         if self.remaining:
             self.record = "end"
             raise self.error("the end of the file", f"{self.remaining} more bytes")
 
     def error(self, expected: str, found: str) -> SceneFormatError:
-        """An error at the current place."""
+        """Make an error for the current position."""
         return SceneFormatError(f"{expected} in {self.where}", found=found, fix=self.fix)
 
     def _take(self, size: int) -> memoryview:
@@ -291,7 +297,7 @@ class ByteReader:
         return memoryview(self.data)[self.offset - size : self.offset]
 
 
-def _check(path: Path, status: os.stat_result) -> None:
+def _check_regular(path: Path, status: os.stat_result) -> None:
     if not stat.S_ISREG(status.st_mode):
         raise OSError(errno.EINVAL, _kind(status.st_mode), str(path))
 

@@ -1,6 +1,6 @@
-"""Reading a scene in any format, and finding its depth maps: by time in a capture, else by name.
+"""Load a scene of any format, and find depth maps for its images.
 
-What is odd but usable becomes a sentence in ``Scene.warnings``, anything else one error.
+Recoverable problems become ``Scene.warnings``; others raise one error.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from splatseed.text import name_some, quoted
 
 _TRANSFORMS = "transforms.json"
 _MAX_LEVELS_UP = 3
-"""Folders above a file in which its scene is looked for: images may lie in folders of their own."""
+"""How many parent folders of a file are searched for its scene."""
 _SCAN_SUFFIXES = frozenset({".las", ".laz", ".e57", ".pcd", ".xyz", ".asc", ".pts", ".glb"})
 _TRIANGULATE = (
     "Method auto needs none: splatseed upsample SCENE -o OUT. Or make points with: splatseed sfm"
@@ -42,27 +42,25 @@ _TRIANGULATE = (
 
 
 def load_scene(path: StrPath, *, require_points: bool = True) -> Scene:
-    """Read a scene.
+    """Load a scene.
 
     Args:
-        path: A folder with a COLMAP model (``sparse/0``, ``sparse``, ``colmap/sparse/0``, itself
-            the model, or ``0`` in it), with ``transforms.json``, with ``transforms_train.json`` and
-            ``transforms_test.json``, with LLFF's ``poses_bounds.npy``, or with an RGB-D capture
+        path: A folder with a COLMAP model (in ``sparse/0``, ``sparse``, ``colmap/sparse/0``, the
+            folder itself or its subfolder ``0``), ``transforms.json``, ``transforms_train.json``
+            and ``transforms_test.json``, LLFF's ``poses_bounds.npy``, or an RGB-D capture
             (``traj.txt``, or ``rgb.txt`` and ``groundtruth.txt``); or a ``.json`` or ``.ply`` file.
-            Where there are several, ``sparse`` precedes ``transforms.json``, which precedes
-            ``colmap/sparse/0``.
-        require_points: Whether a scene without points is an error; else its cloud is empty.
+            ``sparse`` takes precedence over ``transforms.json``, and that over ``colmap/sparse/0``.
+        require_points: Raise for a scene without points; if False, its cloud is empty.
 
     Returns:
-        The scene in the world frame of its files, around an ``origin`` if these lie far from 0;
-        cameras in OpenCV axes. Points are finite and
-        distinct: ``left_out`` counts the others. Points that splatseed added before have no tracks;
-        their ``source`` and attributes come from ``seeds.npz``, else ``source`` is 255
-        (``GENERATED``).
+        The scene, with cameras in OpenCV axes. Coordinates are those of its files, minus
+        ``origin`` if they are far from 0. Points are finite and distinct; ``left_out`` counts the
+        others. Points that splatseed added earlier have no tracks; ``source`` and attributes come
+        from ``seeds.npz``, else their ``source`` is 255 (``GENERATED``).
 
     Raises:
-        SceneNotFoundError: There is no scene, or it has no points.
-        SceneFormatError: A file is not what its format promises.
+        SceneNotFoundError: No scene there, or it has no points.
+        SceneFormatError: A file is malformed.
     """
     path = Path(path)
     try:
@@ -75,16 +73,16 @@ def load_scene(path: StrPath, *, require_points: bool = True) -> Scene:
             scene = scene.replace(source=replace(scene.source, named=path.absolute()))
     except SplatseedError:
         raise
-    except OSError as error:  # from looking for files; reading them raises our own
+    except OSError as error:  # from listing folders; reading files raises SplatseedError
         raise SceneFormatError(
-            f"a scene at {path} that can be read",
+            f"a readable scene at {path}",
             found=f"{error.strerror or type(error).__name__} at {error.filename or path}",
             fix="Check that you may read the folder and its files.",
         ) from None
     if require_points and not len(scene.points):
-        fix = _TRIANGULATE if scene.images else "Name a scene or a PLY that has points."
+        fix = _TRIANGULATE if scene.images else "Choose a scene or a PLY with points."
         raise SceneNotFoundError(f"points in {path}", found="none", fix=fix)
-    # seeds.npz and the manifest count the points as the files have them, so this comes first.
+    # seeds.npz and the manifest refer to the points as stored: restore before cleaning.
     scene = with_own_masks(clean_scene(with_listed_split(_restore_absent(recall_seeds(scene)))))
     folder, white, notes = scene.source.image_dir if scene.source else None, WHITE, list[str]()
     if folder is not None:
@@ -94,18 +92,18 @@ def load_scene(path: StrPath, *, require_points: bool = True) -> Scene:
 
 
 def _restore_absent(scene: Scene) -> Scene:
-    """The scene with the images that it lacked before splatseed wrote it, by its manifest."""
+    """Add the absent images that the manifest of a scene lists."""
     noted = read_manifest(scene.source.root).get(ABSENT) if scene.source else None
     if not isinstance(noted, list) or not all(isinstance(name, str) for name in noted):
         return scene
-    there = {*scene.absent, *(image.name for image in scene.images)}
-    return scene.replace(absent=(*scene.absent, *(name for name in noted if name not in there)))
+    known = {*scene.absent, *(image.name for image in scene.images)}
+    return scene.replace(absent=(*scene.absent, *(name for name in noted if name not in known)))
 
 
 def load_originals(path: StrPath, *, require_points: bool = True) -> Scene:
-    """As ``load_scene``, without the points that splatseed added before, of which a warning tells.
+    """Load a scene without the points that splatseed added earlier, and warn if there were any.
 
-    If no originals remain, it is a ``SceneNotFoundError``, too.
+    Raises as ``load_scene``, and ``SceneNotFoundError`` if no original points remain.
     """
     path = Path(path)
     scene = load_scene(path, require_points=require_points)
@@ -117,28 +115,27 @@ def load_originals(path: StrPath, *, require_points: bool = True) -> Scene:
         raise SceneNotFoundError(
             f"points in {path} that splatseed did not add",
             found=f"none: it made all {added:,}",
-            fix=_TRIANGULATE if scene.images else "Name a scene or a PLY that has other points.",
+            fix=_TRIANGULATE if scene.images else "Choose a scene or a PLY with other points.",
         )
-    which = f"Only the {len(points):,} originals are used" if len(points) else "No original points"
-    note = f"{which}: the {added:,} points that splatseed added before are replaced."
+    used = f"Only the {len(points):,} original points are used" if len(points) else "No originals"
+    note = f"{used}: the {added:,} points that splatseed added before are dropped."
     return scene.replace(points=points, warnings=(*scene.warnings, note))
 
 
 def check_exists(path: Path) -> None:
-    """Raise a ``SceneNotFoundError`` if there is neither a file nor a folder."""
+    """Raise ``SceneNotFoundError`` unless the path is a file or a folder."""
     if not path.is_file() and not path.is_dir():
         found = special_kind(path) or "no such file or folder"
         raise SceneNotFoundError(f"a scene at {path}", found=found, fix="Check the path.")
 
 
 def is_scene(folder: StrPath) -> bool:
-    """Whether a folder looks like a scene, by the names in it."""
-    folder = Path(folder)
-    return _reader(folder) is not None
+    """Whether a folder contains the files of a scene; their content is not read."""
+    return _reader(Path(folder)) is not None
 
 
 def _reader(folder: Path) -> Callable[[], Scene] | None:
-    """What reads the scene of a folder, by the names in it."""
+    """Choose the reader of a folder by the names of its files."""
     if (model := scene_model(folder)) is not None:
         return partial(read_model, model)
     if (folder / _TRANSFORMS).is_file():
@@ -160,8 +157,8 @@ def _read_file(path: Path) -> Scene:
         if is_scene(path.parent):
             raise SceneFormatError(
                 f"{path} to be a scene folder, a .ply or a .json file with frames",
-                found=f"notes on what splatseed {kind} wrote",
-                fix=f"Name the scene's folder: {path.parent}",
+                found=f"the manifest of an output of splatseed {kind}",
+                fix=f"Pass the scene's folder: {path.parent}",
             )
     if suffix == ".ply":
         points, exact = read_ply_float64(path)
@@ -170,22 +167,22 @@ def _read_file(path: Path) -> Scene:
     if suffix == ".json":
         return read_transforms_scene(path)
     if is_video(path):
-        found, fix = "a video", f"Make a scene of it first: splatseed sfm {quoted(path)} -o SCENE."
+        found, fix = "a video", f"Reconstruct a scene first: splatseed sfm {quoted(path)} -o SCENE."
     elif find_model(path.parent) is not None:
         found = "one file of a COLMAP model"
-        fix = f"Name the scene's folder: {scene_root(path.parent)}"
+        fix = f"Pass the scene's folder: {scene_root(path.parent)}"
     elif suffix in _SCAN_SUFFIXES:
         found = f"a {suffix} file, a scan"
-        fix = f"Make seeds of it: splatseed upsample SCENE --cloud {quoted(path)} -o OUT."
+        fix = f"Use it as seeds: splatseed upsample SCENE --cloud {quoted(path)} -o OUT."
     else:
         found, folder = f"a {path.suffix or 'nameless'} file", _scene_above(path)
-        fix = f"Name the scene's folder{f': {folder}' if folder else '.'}"
+        fix = f"Pass the scene's folder{f': {folder}' if folder else '.'}"
     expected = f"{path} to be a scene folder, a .ply or a .json file"
     raise SceneFormatError(expected, found=found, fix=fix)
 
 
 def _scene_above(path: Path) -> Path | None:
-    """The scene that a file or folder lies in, spelled as the path is."""
+    """Find the scene folder that contains a path; relative if the path is."""
     for level, folder in enumerate(path.absolute().parents[:_MAX_LEVELS_UP]):
         if is_scene(folder):
             return path.parents[level] if level < len(path.parents) else folder
@@ -195,17 +192,17 @@ def _scene_above(path: Path) -> Path | None:
 def _no_scene_error(path: Path) -> SceneNotFoundError:
     if read_manifest(path).get("command") == "train":
         return _run_error(path)
-    scenes = [each.name for each in sorted(path.iterdir()) if is_scene(each)]
-    files = {each.name for suffix in ("*.json", "*.ply") for each in path.glob(suffix)}
+    scenes = [child.name for child in sorted(path.iterdir()) if is_scene(child)]
+    files = {file.name for pattern in ("*.json", "*.ply") for file in path.glob(pattern)}
     names = scenes or sorted(files - {MANIFEST})
-    some = name_some(names, 5)
-    found = f"scenes in it: {some}" if scenes else f"only {some}" if names else "none of them"
+    listed = name_some(names, 5)
+    found = f"scenes in it: {listed}" if scenes else f"only {listed}" if names else "none of them"
     if scenes:
-        fix = f"Name one of them: {path / scenes[0]}"
+        fix = f"Choose one: {path / scenes[0]}"
     elif (above := _scene_above(path)) is not None:
-        fix = f"Name the scene's folder: {above}"
+        fix = f"Pass the scene's folder: {above}"
     else:
-        fix = "Name the scene's folder, or a .ply or .json file itself. For photographs alone, "
+        fix = "Pass the scene's folder, or a .ply or .json file. To reconstruct photographs, "
         fix += "run: splatseed sfm IMAGES -o SCENE."
     expected = f"sparse/0, sparse, colmap/sparse/0, {_TRANSFORMS}, poses_bounds.npy, "
     expected += "traj.txt or groundtruth.txt"
@@ -217,37 +214,40 @@ def _run_error(path: Path) -> SceneNotFoundError:
     return SceneNotFoundError(
         f"a scene at {path}",
         found="a run of splatseed train",
-        fix=f"Look at it: splatseed view {run}. Score it: splatseed evaluate {run}.",
+        fix=f"View it with splatseed view {run}, score it with splatseed evaluate {run}.",
     )
 
 
 def find_depths(
     scene: Scene, path: StrPath, *, kind: DepthKind | None = None, scale: float | None = None
 ) -> DepthFiles:
-    """The depth maps in a folder that belong to images of a scene, read one by one on demand.
+    """Find depth maps for a scene's images; each map is read on demand.
 
     Args:
         scene: The scene.
-        path: The folder: maps named like the images, with subfolders, or a COLMAP dense workspace,
-            an RGB-D capture in NICE-SLAM's or TUM's layout, or the output of ``splatseed depth``.
-        kind: What the values are; None: what the folder or file itself says, else planar z.
-        scale: Stored units per scene unit; None: what the folder itself says, else 1000 for
-            integers and 1 for floats.
+        path: A folder of maps named like the images, subfolders included; a COLMAP dense workspace;
+            an RGB-D capture in NICE-SLAM's or TUM's layout; or the output of ``splatseed depth``.
+        kind: Meaning of the values; None: as the folder or file declares, else planar z.
+        scale: Stored units per scene unit; None: as the folder declares, else 1000 for integers
+            and 1 for floats.
 
     Raises:
-        ParameterError: The kind is unknown, or the scale is not a positive number.
-        SceneNotFoundError: There is no such folder, or no image has a map in it.
-        SceneFormatError: Two images share a map, or the folder's description is damaged.
+        ParameterError: Unknown kind, or a scale that is not positive.
+        SceneNotFoundError: No such folder, or no image has a map in it.
+        SceneFormatError: Two images share a map, or the folder's description is malformed.
     """
     if kind is not None and kind not in KINDS:
-        expected = f"a kind of depth: {', '.join(KINDS)}"
+        expected = f"`kind` to be one of {', '.join(KINDS)}"
         raise ParameterError(expected, found=repr(kind), fix="Choose one of them.")
     if scale is not None and not 0 < scale < math.inf:
-        fix = "Give stored units per scene unit."
-        raise ParameterError("a scale of depth above 0", found=f"{scale}", fix=fix)
+        fix = "Pass the stored units per scene unit."
+        raise ParameterError("`scale` above 0", found=f"{scale}", fix=fix)
     root = Path(path)
     if not root.is_dir():
-        found, fix = "a file" if root.exists() else "nothing", "Name the folder that maps lie in."
+        found, fix = (
+            "a file" if root.exists() else "nothing",
+            "Pass the folder that contains the maps.",
+        )
         raise SceneNotFoundError(f"a folder of depth maps at {root}", found=found, fix=fix)
     maps = search_depths(scene, root)
     if maps is None:
@@ -256,23 +256,23 @@ def find_depths(
         raise SceneNotFoundError(
             f"depth maps of the scene's images in {root}{such_as}",
             found="none" if name else "a scene without images",
-            fix="Name maps as their images are, with subfolders and another suffix.",
+            fix="Give maps the names of their images, subfolders included, with another suffix.",
         )
     return replace(maps, kind=kind or maps.kind, scale=scale or maps.scale)
 
 
 def with_own_depths(scene: Scene) -> Scene:
-    """The scene with the depth maps in its own folder, if it has none and there are some."""
+    """Attach the depth maps found in the scene's own folder, unless it has maps already."""
     if scene.depths is not None or scene.source is None:
         return scene
     return scene.replace(depths=search_depths(scene, scene.source.root))
 
 
 def search_depths(scene: Scene, root: Path) -> DepthFiles | None:
-    """As ``find_depths``, but None where no image has a map."""
+    """Find depth maps as ``find_depths`` does; None if no image has one."""
     if is_tum(root) and (maps := find_tum_depths(scene, root)) is not None:
         return maps
     if (maps := match_by_name(scene, root)) is not None:
         return maps
-    capture = root.resolve().parent  # perhaps the folder of depth images was named
+    capture = root.resolve().parent  # the path may be the capture's folder of depth images
     return find_tum_depths(scene, capture) if is_tum(capture) else None
