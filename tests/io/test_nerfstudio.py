@@ -141,7 +141,7 @@ def test_instant_ngps_recentred_poses_are_fitted(content, scene_dir, model, rng)
         frame["transform_matrix"] = pose.tolist()
     scene = load_scene(write_json(scene_dir / "transforms.json", content))
     np.testing.assert_allclose(scene.points.xyz, moved.points(model.tracks.xyz), atol=2e-3)
-    assert any("turned, moved and scaled by 0.37" in text for text in scene.warnings)
+    assert any("0.37" in text for text in scene.warnings)
 
 
 def test_cameras_are_the_same_by_their_paths_or_by_names_that_are_unique(model):

@@ -1,20 +1,19 @@
-"""Poses in ``poses_bounds.npy`` of LLFF, beside a folder of photographs.
+"""LLFF scenes: ``poses_bounds.npy`` beside a folder of photographs.
 
-A row holds a 3 x 5 matrix, row by row, and the depths of the nearest and farthest points. The
-matrix has ``world_from_cam`` with camera axes down, right, back, and the column height, width,
-focal length; rows are in the order of the photographs' names. Source: LLFF's ``pose_utils.py`` and
-its description of the file. The centre of the image is the principal point, and lenses have no
-distortion.
+Each row is a row-major 3 x 5 matrix, then near and far depth. The matrix is ``world_from_cam``
+[3, 4] with camera axes down, right, back, and a column of height, width and focal length. Rows
+follow the photographs sorted by name. Principal points are image centres; there is no distortion.
+Source: LLFF's ``pose_utils.py`` and README.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64
-from PIL import Image as PilImage
 
 from splatseed.camera import Intrinsics
 from splatseed.errors import SceneFormatError, SceneNotFoundError
@@ -24,24 +23,24 @@ from splatseed.io.files import StrPath, open_file, read_npy, translate_errors
 from splatseed.io.frame_files import SUFFIXES
 from splatseed.io.mask_files import masks_among
 from splatseed.io.origin import recentered
-from splatseed.io.photograph_checks import image_warnings
+from splatseed.io.photograph_checks import image_warnings, photograph_size
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene, SceneSource
 from splatseed.text import counted
 
 POSES = "poses_bounds.npy"
 _OPENCV_FROM_LLFF = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
-"""Its columns are down, right and back in OpenCV's axes right, down, forward."""
+"""Columns: LLFF's axes (down, right, back) in OpenCV's (right, down, forward)."""
 _MAX_BYTES = 1 << 28
 
 
 def is_llff(folder: Path) -> bool:
-    """Whether a folder has LLFF's poses."""
+    """Whether a folder has ``poses_bounds.npy``."""
     return (folder / POSES).is_file()
 
 
 def read_llff(root: StrPath) -> Scene:
-    """The photographs and poses of a folder; the cloud is empty."""
+    """Read photographs and poses; the cloud is empty."""
     root = Path(root)
     path = root / POSES
     rows = _read_rows(path)
@@ -79,7 +78,7 @@ def _read_rows(path: Path) -> Float64[np.ndarray, "N 17"]:
 
 
 def _photographs(root: Path, count: int) -> tuple[Path, list[str]]:
-    """The first folder with as many photographs as there are poses, and their sorted names."""
+    """Find the first folder with one photograph per pose, and their sorted names."""
     found = dict[Path, list[str]]()
     for folder in (root / name for name in IMAGE_DIRS):
         files = [each.name for each in folder.iterdir()] if folder.is_dir() else []
@@ -87,29 +86,27 @@ def _photographs(root: Path, count: int) -> tuple[Path, list[str]]:
         found[folder] = sorted(set(names) - masks_among(names))
         if len(found[folder]) == count:
             return folder, found[folder]
-    there = [f"{len(names)} in {folder.name}" for folder, names in found.items() if names]
+    counts = [f"{len(names)} in {folder.name}" for folder, names in found.items() if names]
     expected = (
         f"{counted(count, 'photograph')} in {root / IMAGE_DIRS[0]}, one for each pose of {POSES}"
     )
-    fix = "Put back all photographs, and no others."
-    if not there:
+    fix = "Provide exactly the photographs of the poses."
+    if not counts:
         raise SceneNotFoundError(expected, found="none", fix=fix)
-    raise SceneFormatError(expected, found=" and ".join(there), fix=fix)
+    raise SceneFormatError(expected, found=" and ".join(counts), fix=fix)
 
 
 def _size(path: Path) -> tuple[int, int] | None:
-    """The size of a photograph; None if it cannot be read, which is reported later."""
-    try:
-        with open_file(path) as file, PilImage.open(file) as picture:
-            return picture.size
-    except (OSError, ValueError, PilImage.DecompressionBombError):
-        return None
+    """Read a photograph's size; None if unreadable, which is reported later."""
+    with suppress(SceneFormatError, SceneNotFoundError):
+        return photograph_size(path)
+    return None
 
 
 def _camera(
     where: str, camera_id: int, hwf: Sequence[float], size: tuple[int, int] | None
 ) -> Intrinsics:
-    """The camera of photographs of this size, which may be smaller than those of the poses."""
+    """Make the camera of photographs of a size that may be a reduced copy of the poses'."""
     height, width, focal = hwf
     if not (width > 0 and height > 0):
         return make_intrinsics(where, camera_id, "PINHOLE", int(width), int(height), (focal,) * 4)

@@ -1,8 +1,8 @@
-"""Scenes in ``transforms.json``, of nerfstudio, instant-ngp and Blender's data sets; similarities.
+"""Scenes in ``transforms.json`` (nerfstudio, instant-ngp, Blender data sets); similarity files.
 
 A *frame* is one posed image; its ``transform_matrix`` is ``world_from_cam`` in OpenGL axes (x
-right, y up, z back). The *transforms' space* is the world of the file's poses;
-``applied_transform`` [3, 4] takes the world of the Structure-from-Motion model there. Source:
+right, y up, z back). The *transforms' space* is the world frame of these poses;
+``applied_transform`` [3, 4] maps the world of the Structure-from-Motion model to it. Source:
 nerfstudio's "data conventions" page and instant-ngp's ``colmap2nerf`` output.
 """
 
@@ -64,28 +64,28 @@ from splatseed.similarity import Similarity, fit_similarity, similarity_of
 from splatseed.text import counted
 
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-"""Turns camera axes from OpenGL's to OpenCV's, and back."""
+"""Converts camera axes between OpenGL and OpenCV."""
 
 _PERSPECTIVE = {"OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"}
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 _FIX = "Correct the file, or export the scene again."
 NERFSTUDIO = "dataparser_transforms.json"
 _MATRIX_KEYS = ("transform", "matrix", "transform_matrix", "transformation")
-_MATRIX_FIX = "Give 3 or 4 rows of 4 numbers, as text or JSON."
+_MATRIX_FIX = "Write 3 or 4 rows of 4 numbers, as text or JSON."
 _BLENDER = ("transforms_train.json", "transforms_test.json")
 _POINT_FILES = ("sparse_pc.ply", "points3d.ply", "points3D.ply", "pointcloud.ply")
 _LEGACY_TRANSFORM = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]])
-"""What nerfstudio applied to a COLMAP model before it wrote ``applied_transform``."""
+"""The transform of nerfstudio versions that do not write ``applied_transform``."""
 _MIN_FITTED = 4
-"""Three camera centres do not suffice for a similarity: it fits any three nearly as well."""
+"""Fewest cameras to fit a similarity: it fits any three centres nearly exactly."""
 _POSE_TOLERANCE = 1e-2  # of the cameras' extent, between transforms.json and its COLMAP model
 
 
 @dataclass(frozen=True, eq=False)
 class Transforms:
-    """A ``transforms.json``, read and checked; images in the file's order, in OpenCV axes.
+    """A parsed ``transforms.json``: images in the file's order, in OpenCV axes.
 
-    Frames whose pose or camera is not finite are left out of images and frames.
+    Images and frames omit those whose pose or camera is not finite.
     """
 
     path: Path
@@ -96,19 +96,19 @@ class Transforms:
     image_dir: Path  # names are relative to it
     applied_transform: Float64[np.ndarray, "3 4"] | None
     warnings: tuple[str, ...]
-    absent: tuple[str, ...] = ()  # the images of frames that are left out
+    absent: tuple[str, ...] = ()  # images of omitted frames
 
     @property
     def listed(self) -> Split | None:
         """The split of ``frames`` and ``test_frames``."""
         pairs = list(zip(self.images, self.frames, strict=True))
-        test = frozenset(image.name for image, frame in pairs if frame.tests)
-        train = frozenset(image.name for image, frame in pairs if not frame.tests)
+        test = frozenset(image.name for image, frame in pairs if frame.is_test)
+        train = frozenset(image.name for image, frame in pairs if not frame.is_test)
         return Split(train, test, f"test_frames in {self.path.name}") if train and test else None
 
 
 def read_transforms_scene(path: StrPath) -> Scene:
-    """Read a ``transforms.json`` and what belongs to it; the cloud may be empty."""
+    """Read a ``transforms.json`` with its points, masks and depth maps; the cloud may be empty."""
     path = Path(path)
     transforms = read_transforms(path)
     points, exact, points_path, notes = _find_points(transforms)
@@ -130,15 +130,15 @@ def read_transforms_scene(path: StrPath) -> Scene:
 
 
 def is_blender(folder: Path) -> bool:
-    """Whether a folder has a ``transforms_train.json``, as Blender's data sets do."""
+    """Whether a folder has ``transforms_train.json``, the layout of Blender data sets."""
     return (folder / _BLENDER[0]).is_file()
 
 
 def read_blender(folder: StrPath) -> Scene:
-    """Read training and test images as one scene, whose split is theirs, and points in their space.
+    """Read training and test images as one scene with their split, and points in their space.
 
-    Images are named with their folders (``train/r_0.png``); those of ``transforms_val.json`` are
-    left out. Test images without any photograph, as BlenderNeRF writes them, are left out.
+    Image names include their folders (``train/r_0.png``). ``transforms_val.json`` is ignored, and
+    so is a ``transforms_test.json`` without photographs, as BlenderNeRF writes it.
     """
     folder = Path(folder)
     parts, notes, split = [read_transforms(folder / _BLENDER[0])], list[str](), True
@@ -146,7 +146,7 @@ def read_blender(folder: StrPath) -> Scene:
         parts.append(read_transforms(path))
     else:
         split, lacking = False, "there is none" if not path.is_file() else "it has no photographs"
-        notes = [f"{path}: {lacking}, so training images are held out for testing."]
+        notes = [f"{path}: {lacking}, so some training images become test views."]
     cameras: dict[tuple[object, ...], Intrinsics] = {}
     images: list[Image] = []
     for part in parts:
@@ -168,17 +168,17 @@ def read_blender(folder: StrPath) -> Scene:
         source=SceneSource("transforms", folder, points_path, image_dir=folder),
         warnings=(*notes, *image_warnings(images, folder, folder), *lens_warnings(images)),
         listed=Split(train, test, f"pair of {_BLENDER[0]} and {_BLENDER[1]}") if split else None,
-        masks=Masks({}, alpha=False),  # what is transparent is empty, and black
+        masks=Masks({}, alpha=False),  # transparent pixels are empty space, trained as black
     )
     return recentered(scene, exact)
 
 
 def read_transforms(path: Path) -> Transforms:
-    """Read the cameras of a ``transforms.json``; its points are read by ``load_scene``."""
+    """Read the cameras and frames of a ``transforms.json``, without points."""
     meta = read_json(path, fix=_FIX)
     frames, notes = find_frames(path, meta)
-    # The folder beside the file that holds all images, else the deepest one that does. Links are
-    # not followed, so that names are as in COLMAP.
+    # The subfolder that contains all images, else the deepest common folder. Links are not
+    # followed, so that names are as in COLMAP.
     image_dir = Path(os.path.commonpath([frame.file.parent for frame in frames]))
     root = Path(os.path.abspath(path)).parent  # noqa: PTH100
     if root in image_dir.parents:
@@ -219,10 +219,10 @@ def read_transforms(path: Path) -> Transforms:
         applied = _matrix(f"{path}, applied_transform", applied)
     if odd:
         notes.append(
-            f"k4 of {odd} frames is not used: COLMAP's perspective models have no such term."
+            f"k4 of {odd} frames is ignored: COLMAP's perspective models have no such term."
         )
     if repeated:
-        notes.append(f"{counted(repeated, 'frame')} of {path.name} repeat others and are left out.")
+        notes.append(f"{counted(repeated, 'frame')} of {path.name} are duplicates and left out.")
     notes += unusable_warning(unusable, len(images))
     return Transforms(
         path, meta, tuple(images.values()), tuple(kept), tuple(cameras.values()), image_dir,
@@ -231,7 +231,7 @@ def read_transforms(path: Path) -> Transforms:
 
 
 def _check_repeated(where: str, first: Image, again: Image) -> None:
-    """Raise an error if an image has two poses or cameras."""
+    """Raise ``SceneFormatError`` if frames give an image two poses or cameras."""
     same = np.allclose(first.quat, again.quat) and np.allclose(first.translation, again.translation)
     if not same or first.intrinsics != again.intrinsics:
         expected = f"{where} to have an image of its own"
@@ -241,7 +241,7 @@ def _check_repeated(where: str, first: Image, again: Image) -> None:
 def apply_transform(
     transform: Float64[np.ndarray, "3 4"], xyz: np.ndarray
 ) -> Float64[np.ndarray, "N 3"]:
-    """Points [N, 3] taken through an affine map [3, 4], float64."""
+    """Apply an affine map [3, 4] to points [N, 3] in float64."""
     with np.errstate(invalid="ignore"):  # infinite points stay infinite or NaN
         return np.asarray(np.asarray(xyz, np.float64) @ transform[:, :3].T + transform[:, 3])
 
@@ -260,7 +260,7 @@ def _number(where: str, values: Mapping[str, Any], key: str, default: float | No
 def _camera(
     where: str, values: Mapping[str, Any], file: Path
 ) -> tuple[str, int, int, tuple[float, ...]]:
-    """COLMAP's model, width, height and parameters of a frame's camera."""
+    """Return COLMAP's model name, width, height and parameters of a frame's camera."""
     if values.get("w") is not None and values.get("h") is not None:
         width, height = int(_number(where, values, "w")), int(_number(where, values, "h"))
     else:
@@ -290,7 +290,7 @@ def _focal_length(
 
 
 def _lens(where: str, values: Mapping[str, Any]) -> tuple[str, tuple[float, ...]]:
-    """COLMAP's model and distortion parameters; COLMAP has no k4 of a perspective lens."""
+    """Return COLMAP's model and distortion; COLMAP has no k4 for perspective lenses."""
     model = str(values.get("camera_model", "OPENCV"))
     k1, k2, k3, k4, p1, p2 = (_number(where, values, key, 0.0) for key in _DISTORTION)
     if model == "OPENCV_FISHEYE" or values.get("is_fisheye") is True:
@@ -309,16 +309,16 @@ def _lens(where: str, values: Mapping[str, Any]) -> tuple[str, tuple[float, ...]
 
 
 def _matrix(where: str, value: Any) -> Float64[np.ndarray, "3 4"]:
-    """The first three rows of a matrix."""
+    """Return the first three rows of a pose matrix; raise unless finite and not all zero."""
     matrix: np.ndarray = np.empty(0)
     with suppress(TypeError, ValueError, OverflowError):
         matrix = np.array(value, np.float64)
     fits = matrix.shape in {(3, 4), (4, 4)}
     if fits and not (np.isfinite(matrix[:3]).all() and matrix[:3, :3].any()):
-        found = "zeros alone" if np.isfinite(matrix[:3]).all() else "NaN or infinity"
+        found = "only zeros" if np.isfinite(matrix[:3]).all() else "NaN or infinity"
         raise NotFiniteError(f"a matrix of finite numbers in {where}", found=found, fix=_FIX)
     if not fits:
-        found = "none" if value is None else "something else"
+        found = "none" if value is None else "another shape"
         raise SceneFormatError(f"a matrix of 3 x 4 numbers in {where}", found=found, fix=_FIX)
     return matrix[:3]
 
@@ -326,34 +326,37 @@ def _matrix(where: str, value: Any) -> Float64[np.ndarray, "3 4"]:
 def _find_points(
     transforms: Transforms,
 ) -> tuple[PointCloud, Float64[np.ndarray, "N 3"], Path, list[str]]:
-    """The cloud, its positions in double precision, the file it came from, and notes for the user.
+    """Find the points of a ``transforms.json``.
 
-    It is the PLY that the JSON names, else one known to lie in the transforms' space, else the
-    points of a COLMAP model whose cameras determine the map into that space.
+    They are those of the PLY that it names, else of a PLY known to be in the transforms' space,
+    else of a COLMAP model, whose cameras determine the map into that space.
+
+    Returns:
+        The cloud, its positions in float64, its file, and warnings.
     """
     root, notes = transforms.path.parent, []
     named = transforms.json.get("ply_file_path")
     names = [name for name in (named, *_POINT_FILES) if isinstance(name, str)]
     if isinstance(named, str) and not (root / named).is_file():
-        notes.append(f"ply_file_path {named} is {special_kind(root / named) or 'not there'}.")
+        notes.append(f"ply_file_path {named} is {special_kind(root / named) or 'missing'}.")
     ply = next((root / name for name in names if (root / name).is_file()), None)
     if ply is not None:
         points, exact = read_ply_float64(ply)
         for name in (*names, "init.ply"):
-            use = f"name it as ply_file_path in {transforms.path.name}"
+            use = f"set it as ply_file_path in {transforms.path.name}"
             notes += differing_points_notes(ply, points.xyz, root / name, use)
         return points, exact, ply, notes
     models = _models(root)
     if not models:
         return PointCloud.empty(), np.empty((0, 3)), root / _POINT_FILES[0], notes
-    for model_dir in models[:-1]:  # the file may be of one that is not the largest
+    for model_dir in models[:-1]:  # the poses may come from a smaller model
         with suppress(SceneFormatError):
             return _points_of_model(transforms, model_dir, notes)
     return _points_of_model(transforms, models[-1], notes)
 
 
 def _models(root: Path) -> list[Path]:
-    """COLMAP models near a ``transforms.json``, the likeliest first."""
+    """List the COLMAP models near a ``transforms.json``, most likely first."""
     places = (root / "colmap/sparse", root / "sparse")
     found = next(filter(None, map(ranked_models, places)), [])
     flat = find_model(*places)
@@ -363,19 +366,19 @@ def _models(root: Path) -> list[Path]:
 def _points_of_model(
     transforms: Transforms, model_dir: Path, notes: list[str]
 ) -> tuple[PointCloud, Float64[np.ndarray, "N 3"], Path, list[str]]:
-    """The points of a COLMAP model, in the transforms' space."""
+    """Read the points of a COLMAP model and map them into the transforms' space."""
     points, exact, _, points_path = read_model_points(model_dir)
     _, model_images = read_model_cameras(model_dir)
     transform, doubts = _transform_of_model(transforms, model_dir, model_images)
     xyz = apply_transform(transform, exact)
-    with np.errstate(over="ignore"):  # beyond float32 is infinite, to be seen and dropped
+    with np.errstate(over="ignore"):  # beyond float32's range: infinite, dropped later
         return points.replace(xyz=xyz.astype(np.float32)), xyz, points_path, notes + doubts
 
 
 def _transform_of_model(
     transforms: Transforms, model_dir: Path, model_images: Sequence[Image]
 ) -> tuple[Float64[np.ndarray, "3 4"], list[str]]:
-    """The map [3, 4] from the model's world that takes its cameras onto the frames'."""
+    """Find the map [3, 4] from the model's world that aligns its cameras with the frames'."""
     candidates = [_LEGACY_TRANSFORM, np.eye(4)[:3]]
     if transforms.applied_transform is not None:
         candidates = [transforms.applied_transform]
@@ -383,16 +386,16 @@ def _transform_of_model(
         candidates.reverse()
     pairs = _same_cameras(transforms.images, model_images)
     if not pairs:
-        doubt = f"no image of {model_dir} is in {transforms.path.name}; its points may lie askew."
+        doubt = f"no image of {model_dir} is in {transforms.path.name}: points may be misaligned."
         return candidates[0], [doubt]
     centers, model_centers = (np.array(each) for each in zip(*pairs, strict=True))
     extent = max(float(np.ptp(centers, axis=0).max()), 1e-6 * float(np.abs(centers).max()))
     maps: list[tuple[np.ndarray, list[str]]] = [(each, []) for each in candidates]
     fitted = fit_similarity(model_centers, centers)
     if fitted is not None and len(pairs) >= _MIN_FITTED:
-        poses = f"The poses of {transforms.path.name} are those of {model_dir} turned, moved and"
-        by = f"scaled by {fitted.scale:.3g}, as instant-ngp writes them"
-        maps.append((fitted.matrix, [f"{poses} {by}; its points were brought there."]))
+        poses = f"The poses of {transforms.path.name} are a similarity transform of {model_dir}'s"
+        by = f"(scale {fitted.scale:.3g}), as instant-ngp writes them"
+        maps.append((fitted.matrix, [f"{poses} {by}; the points were transformed likewise."]))
     for matrix, notes in maps:
         off = np.abs(apply_transform(matrix, model_centers) - centers).max(axis=1)
         if np.median(off) <= _POSE_TOLERANCE * extent:
@@ -400,14 +403,14 @@ def _transform_of_model(
     raise SceneFormatError(
         f"the cameras of {model_dir} to be those of {transforms.path} after applied_transform",
         found=f"cameras {np.median(off):.3g} apart in a scene of extent {extent:.3g}",
-        fix="Name a PLY in the space of the poses as ply_file_path, or read the COLMAP scene.",
+        fix="Set ply_file_path to a PLY in the space of the poses, or load the COLMAP scene.",
     )
 
 
 def _same_cameras(
     images: Sequence[Image], others: Sequence[Image]
 ) -> list[tuple[Float64[np.ndarray, " 3"], Float64[np.ndarray, " 3"]]]:
-    """Centres of cameras of the same name in both, by paths, else by file names that are unique."""
+    """Pair camera centres by image path, else by unique file name."""
     for path in (lambda n: n.removeprefix("images/"), lambda n: PurePath(n).name):
         centers: list[dict[str, Any]] = []
         for each in (images, others):
@@ -421,10 +424,10 @@ def _same_cameras(
 
 
 def read_cloud_transform(path: StrPath, scene: Scene) -> Similarity:
-    """The transform from a cloud's frame to the scene's; a ``SceneFormatError`` if it is none.
+    """Read a similarity from a cloud's frame to the scene's; else raise ``SceneFormatError``.
 
-    Nerfstudio's file leads from the scene to the world that it trains and exports in, so a cloud
-    from there goes the other way.
+    Nerfstudio's file maps the scene to the world in which it trains and exports, so for a cloud
+    exported there the inverse is returned.
     """
     path = Path(path)
     with suppress(ValueError):  # not plain numbers
@@ -436,16 +439,16 @@ def read_cloud_transform(path: StrPath, scene: Scene) -> Similarity:
 
 
 def similarity_in(path: Path, content: Any, scene: Scene, fix: str) -> Similarity:
-    """The similarity in a file: the rows of a matrix, or a mapping with these and a scale.
+    """Parse a similarity: the rows of a matrix, or a mapping with a matrix and a scale.
 
-    The transform of nerfstudio's file, known by its name, begins from COLMAP's own world; a scene
-    read from transforms.json is in that file's world, to which ``applied_transform`` leads. A
-    ``SceneFormatError`` with this ``fix``: the file holds none.
+    Nerfstudio's file, recognised by its name, maps from COLMAP's own world; for a scene read from
+    transforms.json, the inverse of ``applied_transform`` is applied first. Raises
+    ``SceneFormatError`` with this ``fix`` if the content is no similarity.
     """
     scale, rows = 1.0, content
     if isinstance(content, dict):
         rows = next((content[key] for key in _MATRIX_KEYS if key in content), None)
-        # Beside a matrix it repeats that of the matrix, as in alignment.json.
+        # Beside other matrices it repeats the matrix's own scale, as in alignment.json.
         scale = content.get("scale", 1.0) if "transform" in content else 1.0
     try:
         matrix = np.atleast_1d(np.array(rows, np.float64))

@@ -1,11 +1,11 @@
-"""RGB-D captures: NICE-SLAM's layout of Replica, and TUM's RGB-D benchmark (also 7-Scenes').
+"""RGB-D captures: Replica in NICE-SLAM's layout, and TUM's RGB-D benchmark (also 7-Scenes).
 
-Replica: ``results/frame*.jpg`` (or .png) and ``results/depth*.png``, ``traj.txt`` with a row-major
-4x4 ``world_from_cam`` a line, in the order of the frames' numbers, and ``cam_params.json``, here or
-one folder up. The principal point counts from the corner of the image: Replica's own renderer gives
-OpenGL (w - 1) / 2, and its depth maps agree with each other there. TUM: ``rgb.txt`` and
-``depth.txt`` (``time path``, in seconds), ``groundtruth.txt`` (``time tx ty tz qx qy qz qw`` of
-``world_from_cam``); depth PNGs hold planar z times 5000. OpenCV axes and metres in both.
+Replica: ``results/frame*.jpg`` (or .png), ``results/depth*.png``, ``traj.txt`` with a row-major
+4 x 4 ``world_from_cam`` per line in the order of frame numbers, and ``cam_params.json`` in the
+folder or its parent. The principal point is measured from the image corner: Replica's renderer uses
+(w - 1) / 2 in OpenGL, and its depth maps are consistent with that. TUM: ``rgb.txt`` and
+``depth.txt`` (``time path``, seconds), ``groundtruth.txt`` (``time tx ty tz qx qy qz qw`` of
+``world_from_cam``); depth PNGs hold planar z times 5000. Both: OpenCV axes, metres.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from splatseed.text import agreeing, counted
 
 _FRAME = re.compile(r"frame(\d+)\.(?:jpe?g|png)", re.IGNORECASE)
 _TOLERANCE = 0.02
-"""Seconds by which an image, its depth and its pose may differ."""
-_NORM_SLACK = 0.01  # of a quaternion, which is written with four digits
+"""Largest difference in time between an image and its depth map or pose, seconds."""
+_NORM_SLACK = 0.01  # of a quaternion with four digits
 _DEPTH_SCALE = 5000.0
 """TUM's stored units per metre."""
 _SIZE = (640, 480)
@@ -42,36 +42,36 @@ _COLOR_CAMERAS: dict[str, tuple[float, ...]] = {
     "2": (520.9, 521.0, 325.1, 249.7, 0.2312, -0.7849, -0.0033, -0.0001, 0.9172),
     "3": (535.4, 539.2, 320.1, 247.6),
 }
-"""fx fy cx cy k1 k2 p1 p2 k3 of the colour cameras, as the benchmark's page "File formats" gives
-them (the images of freiburg3 are undistorted already). The first pixel's centre is (0, 0) there."""
-_DEFAULT_CAMERA = (525.0, 525.0, 319.5, 239.5)  # ROS's, which that page gives too
+"""fx fy cx cy k1 k2 p1 p2 k3 of the colour cameras, from the benchmark's page "File formats" (the
+images of freiburg3 are undistorted). The first pixel's centre is (0, 0) there."""
+_DEFAULT_CAMERA = (525.0, 525.0, 319.5, 239.5)  # the ROS default, on the same page
 
 
 def is_replica(root: Path) -> bool:
-    """Whether a folder has the trajectory of Replica's layout."""
+    """Whether a folder has the trajectory file of Replica's layout."""
     return (root / "traj.txt").is_file()
 
 
 def load_rgbd(root: StrPath) -> Scene:
-    """Read images, poses and depth maps in Replica's layout; frames without a pose are left out."""
+    """Read Replica's layout; frames without a finite pose are left out."""
     root = Path(root)
     folder, track = root / "results", root / "traj.txt"
     listed = folder.iterdir() if folder.is_dir() else ()
-    there = [(int(m[1]), p.name, p) for p in listed if (m := _FRAME.fullmatch(p.name))]
-    frames = [path for *_, path in sorted(there)]
+    numbered = [(int(m[1]), p.name, p) for p in listed if (m := _FRAME.fullmatch(p.name))]
+    frames = [path for *_, path in sorted(numbered)]
     if not frames:
         raise SceneNotFoundError(
             f"images {folder / 'frame000000.jpg'}, ...",
             found="none" if folder.is_dir() else f"no folder {folder}",
-            fix="Give the folder that holds traj.txt and results/.",
+            fix="Pass the folder that contains traj.txt and results/.",
         )
-    rows = [_numbers(where, words) for where, words in _records(track, 16)]
+    rows = [_numbers(where, fields) for where, fields in _records(track, 16)]
     poses = np.array(rows).reshape(-1, 4, 4)
     if len(frames) != len(poses):
         raise SceneFormatError(
             f"{track} to have one line per frame, {len(frames)} for {folder}",
             found=f"{len(poses)} lines",
-            fix="Put back the missing frames or lines.",
+            fix="Restore the missing frames or lines.",
         )
     camera = depth_maps.camera_file(root)
     if camera is None:
@@ -101,15 +101,15 @@ def _scene(
 
 
 def is_tum(root: Path) -> bool:
-    """Whether a folder has the lists of TUM's layout."""
+    """Whether a folder has the list files of TUM's layout."""
     return (root / "rgb.txt").is_file() and (root / "groundtruth.txt").is_file()
 
 
 def load_tum(root: StrPath) -> Scene:
-    """Read images, poses and depth maps in TUM's layout.
+    """Read TUM's layout.
 
-    A pose is interpolated between the records before and after the image if both are near, else it
-    is the nearest record's. Images without a pose or a file are left out with a warning.
+    Poses are interpolated between the records before and after an image if both are close in time,
+    else taken from the nearest. Images without a pose or a file are left out, with a warning.
     """
     root = Path(root)
     track = root / "groundtruth.txt"
@@ -122,9 +122,9 @@ def load_tum(root: StrPath) -> Scene:
         raise SceneNotFoundError(
             f"images of {root / 'rgb.txt'} with a pose in groundtruth.txt within {_TOLERANCE} s",
             found=f"{int(present.sum())} of {len(names)} images, {int(near.sum())} with a pose",
-            fix="Put the images back, and check that both files count time alike.",
+            fix="Restore the images, and check that both files use the same clock.",
         )
-    # Names omit the folder that all images lie in.
+    # Names omit a folder that all images share.
     folders = {PurePosixPath(name).parent for name in names}
     folder = folders.pop() if len(folders) == 1 else PurePosixPath()
     images = []
@@ -136,24 +136,25 @@ def load_tum(root: StrPath) -> Scene:
         images.append(Image(name, i + 1, intrinsics, quat, translation))
     lost = [names[i] for i in np.flatnonzero(~near)]
     missing = [names[i] for i in np.flatnonzero(near & ~present)]
-    told = _left_out("image", "a pose close in time", lost) + _left_out("image", "a file", missing)
-    warnings = (*guessed, *told, *lens_warnings(images))
+    left_out = _left_out("image", "a pose close in time", lost)
+    left_out += _left_out("image", "a file", missing)
+    warnings = (*guessed, *left_out, *lens_warnings(images))
     scene = _scene(track, root / folder, images, intrinsics, *warnings)
     return scene.replace(depths=find_tum_depths(scene, root))
 
 
 def find_tum_depths(scene: Scene, root: Path) -> depth_maps.DepthFiles | None:
-    """The maps nearest in time to the images of a scene that was made from a capture; or None.
+    """Find the depth maps nearest in time to the images of a scene made from a capture.
 
-    Images are known by the last part of their paths. Where the capture's lens is distorted and the
-    scene's photographs are not the capture's own, as ``splatseed sfm`` and COLMAP undistort them,
-    the maps are undistorted likewise.
+    Images are matched by file name. If the capture's lens has distortion and the scene's
+    photographs are undistorted copies (by ``splatseed sfm`` or COLMAP), the maps are undistorted
+    on reading. None if no image has a map.
     """
     if not (root / "depth.txt").is_file():
         return None
     times, names = _read_list(root / "rgb.txt")
     depth_times, depth_names = _read_list(root / "depth.txt")
-    _, nearest = _places(depth_times, times)
+    _, nearest = _locate(depth_times, times)
     entries = {PurePosixPath(name).name: i for i, name in enumerate(names) if nearest[i] >= 0}
     paths, originals = dict[str, Path](), dict[str, Path]()
     for image in scene.images:
@@ -166,21 +167,21 @@ def find_tum_depths(scene: Scene, root: Path) -> depth_maps.DepthFiles | None:
     scale = depth_maps.read_capture_scale(camera) if camera else None
     posed = {image.name: image.intrinsics for image in scene.images if image.name in paths}
     lens = _tum_camera(root)[0]
-    bent = lens.has_distortion and not any(each.has_distortion for each in posed.values())
+    undistorted = lens.has_distortion and not any(each.has_distortion for each in posed.values())
     folder = scene.source.image_dir if scene.source else None
-    if bent and folder is not None:
+    if undistorted and folder is not None:
         name, original = next(iter(originals.items()))
         both = (folder / name, original)
-        bent = not all(p.is_file() for p in both) or len({p.read_bytes() for p in both}) > 1
-    moved = depth_maps.Undistortion(lens, posed) if bent else None
+        undistorted = not all(p.is_file() for p in both) or len({p.read_bytes() for p in both}) > 1
+    moved = depth_maps.Undistortion(lens, posed) if undistorted else None
     return depth_maps.DepthFiles(paths, "z", scale or _DEPTH_SCALE, moved)
 
 
 def _tum_camera(root: Path) -> tuple[Intrinsics, tuple[str, ...]]:
-    """The capture's camera, and a warning if it is a guess.
+    """Return the capture's camera, and a warning if it is a guess.
 
-    It is that of ``cam_params.json``, else the published one of the series in the folder's name,
-    else ROS's default.
+    From ``cam_params.json``, else published values for the series in the folder's name, else the
+    ROS default.
     """
     if (path := depth_maps.camera_file(root)) is not None:
         return _read_intrinsics(path), ()
@@ -192,13 +193,13 @@ def _tum_camera(root: Path) -> tuple[Intrinsics, tuple[str, ...]]:
         return Intrinsics(1, "FULL_OPENCV", *_SIZE, params), ()
     guess = (
         f"{root} has no cam_params.json and no freiburg1, 2 or 3 in its name: focal length 525"
-        " and the middle of the image are assumed."
+        " and a central principal point are assumed."
     )
     return Intrinsics(1, "PINHOLE", *_SIZE, pinhole), () if series else (guess,)
 
 
 def _read_intrinsics(path: Path) -> Intrinsics:
-    """The pinhole camera in a camera file, whose corner is at (0, 0), as in COLMAP."""
+    """Read the pinhole camera of a camera file; the image corner is at (0, 0), as in COLMAP."""
     content = read_json(path)
     with translate_errors(
         path, 'a file of {"camera": {w, h, fx, fy, cx, cy}}, as numbers in pixels'
@@ -216,91 +217,91 @@ def _check_image(path: Path, intrinsics: Intrinsics) -> None:
         raise SceneFormatError(
             f"{path} to have the size of the capture's camera, {expected[0]}x{expected[1]}",
             found=f"{size[0]}x{size[1]}",
-            fix=f"Write these images' own camera into {depth_maps.CAMERA_FILE}.",
+            fix=f"Write the camera of these images into {depth_maps.CAMERA_FILE}.",
         )
 
 
 def _left_out(noun: str, lacking: str, names: Sequence[str]) -> tuple[str, ...]:
     are = agreeing(len(names), "is", "are")
-    what = f"{counted(len(names), noun)} without {lacking}"
-    return (f"{what} {are} left out, the first is {names[0]}.",) if names else ()
+    subject = f"{counted(len(names), noun)} without {lacking}"
+    return (f"{subject} {are} left out, such as {names[0]}.",) if names else ()
 
 
 def _read_list(path: Path) -> tuple[Float64[np.ndarray, " N"], tuple[str, ...]]:
-    """The times and the relative paths of ``rgb.txt`` or ``depth.txt``, sorted by time."""
+    """Read times and relative paths of ``rgb.txt`` or ``depth.txt``, sorted by time."""
     records = []
-    for where, words in _records(path, 2):
-        name = PurePosixPath(words[1].replace("\\", "/"))
-        time = _numbers(where, words[:1])[0]
+    for where, fields in _records(path, 2):
+        name = PurePosixPath(fields[1].replace("\\", "/"))
+        time = _numbers(where, fields[:1])[0]
         if name.is_absolute() or ".." in name.parts or not name.name or not np.isfinite(time):
-            raise _bad(where, "a time and a path inside the folder", " ".join(words))
+            raise _bad(where, "a time and a path inside the folder", " ".join(fields))
         records.append((time, str(name)))
     records.sort()
     return np.array([time for time, _ in records], np.float64), tuple(name for _, name in records)
 
 
 def _read_track(path: Path) -> Float64[np.ndarray, "M 8"]:
-    """Seconds, positions and unit wxyz of ``world_from_cam`` in ``groundtruth.txt``, by time.
+    """Read ``groundtruth.txt``: seconds, positions and unit wxyz of ``world_from_cam``, by time.
 
-    Records that are not finite, where tracking was lost, are left out.
+    Records that are not finite (lost tracking) are skipped.
     """
     rows = []
-    for where, words in _records(path, 8):
-        row = _numbers(where, words)
+    for where, fields in _records(path, 8):
+        row = _numbers(where, fields)
         if not np.isfinite(row).all():
             continue
         if abs(np.linalg.norm(row[4:]) - 1) > _NORM_SLACK:
-            raise _bad(where, "a quaternion of length 1", " ".join(words[4:]))
+            raise _bad(where, "a quaternion of length 1", " ".join(fields[4:]))
         rows.append(row)
     table = np.array(sorted(rows), np.float64).reshape(-1, 8)[:, [0, 1, 2, 3, 7, 4, 5, 6]]
     table[:, 4:] /= np.linalg.norm(table[:, 4:], axis=1, keepdims=True)
     return table
 
 
-def _places(
+def _locate(
     times: Float64[np.ndarray, " M"], wanted: Float64[np.ndarray, " N"]
 ) -> tuple[Float64[np.ndarray, " N"], Int64[np.ndarray, " N"]]:
-    """Where wanted times lie among sorted ones: a fractional index, and the nearest one's.
+    """Locate times among sorted ones: fractional index, and index of the nearest.
 
-    The nearest is -1 beyond the tolerance.
+    The latter is -1 if further away than the tolerance.
     """
     if not len(times):
         return np.zeros(len(wanted)), np.full(len(wanted), -1)
-    place = np.interp(wanted, times, np.arange(len(times)))
-    nearest = np.ceil(place - 0.5).astype(np.int64)
-    return place, np.where(np.abs(times[nearest] - wanted) <= _TOLERANCE, nearest, -1)
+    index = np.interp(wanted, times, np.arange(len(times)))
+    nearest = np.ceil(index - 0.5).astype(np.int64)
+    return index, np.where(np.abs(times[nearest] - wanted) <= _TOLERANCE, nearest, -1)
 
 
 def _poses_at(
     track: Float64[np.ndarray, "M 8"], times: Float64[np.ndarray, " N"]
 ) -> tuple[Float64[np.ndarray, "N 4"], Float64[np.ndarray, "N 3"], Bool[np.ndarray, " N"]]:
-    """Quaternions and centres at given times, and which are known."""
-    place, nearest = _places(track[:, 0], times)
+    """Interpolate quaternions and centres at given times, and return which are known."""
+    index, nearest = _locate(track[:, 0], times)
     if not len(track):
         return np.ones((len(times), 4)), np.zeros((len(times), 3)), nearest >= 0
-    start, end = track[np.floor(place).astype(int)], track[np.ceil(place).astype(int)]
-    share = np.where(end[:, 0] - start[:, 0] <= 2 * _TOLERANCE, place % 1, np.rint(place % 1))
-    flip = np.where((start[:, 4:] * end[:, 4:]).sum(axis=1) < 0, -1, 1)  # the shorter way round
+    start, end = track[np.floor(index).astype(int)], track[np.ceil(index).astype(int)]
+    share = np.where(end[:, 0] - start[:, 0] <= 2 * _TOLERANCE, index % 1, np.rint(index % 1))
+    flip = np.where((start[:, 4:] * end[:, 4:]).sum(axis=1) < 0, -1, 1)  # the shorter rotation
     end[:, 4:] *= flip[:, None]
-    mixed = (1 - share[:, None]) * start + share[:, None] * end  # as good as slerp over hundredths
+    mixed = (1 - share[:, None]) * start + share[:, None] * end  # as exact as slerp here
     quats = mixed[:, 4:] / np.linalg.norm(mixed[:, 4:], axis=1, keepdims=True)
     return quats, mixed[:, 1:4], nearest >= 0
 
 
 def _records(path: Path, count: int) -> Iterator[tuple[str, list[str]]]:
-    """The place and the ``count`` words of each line that has any, and is no comment."""
+    """Yield the place and the ``count`` fields of each line that is neither empty nor a comment."""
     for where, line in numbered_lines(path):
-        words = line.split()
-        if not words or words[0].startswith("#"):
+        fields = line.split()
+        if not fields or fields[0].startswith("#"):
             continue
-        if len(words) != count:
-            raise _bad(where, f"{count} words", f"{len(words)}")
-        yield where, words
+        if len(fields) != count:
+            raise _bad(where, f"{count} fields", f"{len(fields)}")
+        yield where, fields
 
 
-def _numbers(where: str, words: list[str]) -> list[float]:
+def _numbers(where: str, fields: list[str]) -> list[float]:
     try:
-        return [float(word) for word in words]
+        return [float(field) for field in fields]
     except ValueError as error:
         raise _bad(where, "numbers", str(error)) from None
 

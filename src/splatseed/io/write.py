@@ -300,7 +300,7 @@ def _write_transforms(scene: Scene, folder: Path) -> Written:
         if chosen or _rewrites_masks(scene, "transforms"):
             pairs = list(zip(transforms.images, transforms.frames, strict=True))
             for key, tests in (("frames", False), ("test_frames", True)):
-                kept = [i.name for i, f in pairs if i.name in names and f.tests == tests]
+                kept = [i.name for i, f in pairs if i.name in names and f.is_test == tests]
                 _name_masks(scene, content.get(key, ()), kept)
         frames = (*content["frames"], *content.get("test_frames", ()))
         found = (frame.get(key) for frame in frames for key in _PATH_KEYS)
@@ -405,9 +405,9 @@ def _kept_json(transforms: nerfstudio.Transforms, names: Collection[str]) -> dic
         if image.name in names:
             fields = frame.fields
             moved = {key: portable(fields[key], key) for key in _PATH_KEYS if key in fields}
-            frames[frame.tests].append({**fields, **moved})
+            frames[frame.is_test].append({**fields, **moved})
             used.add(os.path.normpath(str(fields["file_path"])))
-    all_of = (*content["frames"], *(f.fields for f in transforms.frames if f.tests))
+    all_of = (*content["frames"], *(f.fields for f in transforms.frames if f.is_test))
     gone = {os.path.normpath(str(frame.get("file_path"))) for frame in all_of} - used
     lists: dict[str, list[Any]] = {}
     for key in (key for key in _LIST_KEYS if isinstance(content.get(key), list)):
