@@ -93,7 +93,7 @@ def test_what_cannot_be_a_mask_is_named(scene_path):
     with pytest.raises(SceneFormatError, match=r"view_000.png.* 96 x 72; found 48 x 40"):
         masks_of(load_scene(scene_path))
     paint(path, box=np.s_[:, :])
-    with pytest.raises(SceneFormatError, match=r"view_000.png that count.*found none"):
+    with pytest.raises(SceneFormatError, match=r"view_000\.png.*found none"):
         masks_of(load_scene(scene_path))
     path.write_bytes(b"no image")
     with pytest.raises(SceneFormatError, match=r"view_000.png to be an image"):
@@ -204,7 +204,7 @@ def test_masks_of_unknown_meaning_are_mentioned_and_can_be_named(scene_path, nam
     scene = load_scene(scene_path)
     way = way.format(scene_path)
     assert not scene.masks.files
-    assert sum(f"--masks {way}" in each for each in scene.warnings) == 1
+    assert sum(f"`masks={way!r}`" in each for each in scene.warnings) == 1
     assert with_masks(scene, way).masks.files.keys() == {"view_003.png"}
 
 

@@ -1,8 +1,8 @@
-"""Photographs of 16 bits a channel: their values, and how many of the bits a capture uses.
+"""Photographs of 16 bits per channel: decoding, and the number of bits that a capture uses.
 
-Raw converters and machine-vision cameras store 10, 12 or 14 bits in files of 16. Shown as they are,
-these are nearly black. All photographs of a capture are stretched alike, so that exposures stay
-comparable: *white* is the largest value of as many bits as any of them uses.
+Raw converters and machine-vision cameras store 10, 12 or 14 bits in 16-bit files, which look nearly
+black. All photographs of a capture are scaled alike, to keep exposures comparable: *white* is the
+largest value of the bit depth that any of them uses.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from splatseed.io.files import open_file, read_bytes, translate_errors
 from splatseed.text import counted
 
 WHITE = 65535
-"""White where all 16 bits are used."""
+"""White if all 16 bits are used."""
 _BITS = (8, 10, 12, 14)
-"""Other depths that cameras and converters have."""
+"""Smaller bit depths of cameras and converters."""
 _NATIVE, _OTHER = ("L", "B") if sys.byteorder == "little" else ("B", "L")
 _LOW_BYTES = {
     "LA;16B": "RGBA",  # both bytes of grey, then of alpha, as four channels
@@ -35,19 +35,19 @@ _LOW_BYTES = {
         for order, swapped in (("B", "L"), ("L", "B"), ("N", _OTHER))
     },
 }
-"""Pillow unpacks the upper byte of 16-bit colours; in the other byte order that is the lower."""
+"""Pillow unpacks only the upper byte of 16-bit colours; the other byte order gives the lower."""
 _EIGHT_BITS = frozenset({".jpg", ".jpeg", ".bmp", ".webp"})  # formats without 16 bits
-_AT_ONCE = 4  # photographs that are decoded at a time
+_AT_ONCE = 4  # photographs decoded in parallel
 
 
 def is_16_bit(photograph: PilImage.Image) -> bool:
-    """Whether an opened image has 16 bits a channel."""
+    """Whether an opened image has 16 bits per channel."""
     grey = photograph.mode == "I" and photograph.format == "PNG"  # Pillow before version 11
     return grey or photograph.mode.startswith("I;16") or _layout(photograph) in _LOW_BYTES
 
 
 def _layout(photograph: PilImage.Image) -> str:
-    """How the file stores pixels, in Pillow's terms."""
+    """Return Pillow's raw mode of the file."""
     tiles: list[Any] = getattr(photograph, "tile", None) or [None]
     if tiles[0] is None:
         return ""
@@ -57,7 +57,7 @@ def _layout(photograph: PilImage.Image) -> str:
 
 
 def read_16_bit(encoded: bytes) -> UInt16[np.ndarray, "H W C"]:
-    """The values of an image that ``is_16_bit``; C = 1 (grey), 2 (grey, alpha), 3 or 4."""
+    """Decode a 16-bit image; C is 1 (grey), 2 (grey, alpha), 3 or 4."""
     picture = PilImage.open(BytesIO(encoded))
     layout = _layout(picture)
     if layout not in _LOW_BYTES:
@@ -79,19 +79,19 @@ def _as_layout(tile: Any, layout: str) -> Any:
 
 
 def white_of(largest: int) -> int:
-    """The largest value of the bits that hold ``largest``."""
+    """Return the largest value of the smallest bit depth that contains ``largest``."""
     return next((2**bits - 1 for bits in _BITS if 0 < largest < 2**bits), WHITE)
 
 
 def opaque_value(alpha: UInt16[np.ndarray, "H W"]) -> int:
-    """The value of opaque pixels in a photograph's alpha channel of 16 bits."""
+    """Return the value of opaque pixels in a 16-bit alpha channel."""
     return white_of(int(alpha.max(initial=0)))
 
 
 def find_white(paths: Sequence[Path]) -> tuple[int, list[str]]:
-    """White of a capture's photographs, and a note where they do not use all bits of 16.
+    """Find the white of a capture, and note if its photographs use fewer than 16 bits.
 
-    Files of 8 bits, and those that cannot be read, have no part in it.
+    8-bit and unreadable files are ignored.
     """
     wide = [
         path for path in paths if path.suffix.lower() not in _EIGHT_BITS and _is_16_bit_file(path)
@@ -100,15 +100,15 @@ def find_white(paths: Sequence[Path]) -> tuple[int, list[str]]:
     with ThreadPoolExecutor(_AT_ONCE) as pool:
         for first in range(0, len(wide), _AT_ONCE):
             largest = max(largest, *pool.map(_largest, wide[first : first + _AT_ONCE]))
-            if white_of(largest) == WHITE and largest:  # mostly known from the first few
+            if white_of(largest) == WHITE and largest:  # usually known after the first few
                 return WHITE, []
     white = white_of(largest)
     if white == WHITE:
         return WHITE, []
     bits = (white + 1).bit_length() - 1
-    which = f"{counted(len(wide), 'photograph')} of 16 bits a channel only use {bits}"
+    subject = f"{counted(len(wide), 'photograph')} of 16 bits per channel only use {bits}"
     values = f"(values up to {largest:,})"
-    return white, [f"{which} {values}: all are stretched alike, with {white:,} as white."]
+    return white, [f"{subject} {values}: all are scaled alike, with {white:,} as white."]
 
 
 def _is_16_bit_file(path: Path) -> bool:
@@ -120,7 +120,7 @@ def _is_16_bit_file(path: Path) -> bool:
 
 
 def _largest(path: Path) -> int:
-    """The largest value of a photograph's colours; 0 if it cannot be read."""
+    """Return the largest colour value of a photograph; 0 if unreadable."""
     try:
         with translate_errors(path, "an image"):
             values = read_16_bit(read_bytes(path))

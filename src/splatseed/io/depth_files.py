@@ -1,8 +1,8 @@
-"""Depth maps as files store them: NumPy's, ``.pfm``, COLMAP's ``.bin``, PNG, TIFF and OpenEXR.
+"""Read depth files: NumPy, ``.pfm``, COLMAP's ``.bin``, PNG, TIFF and OpenEXR.
 
-A stored map is H x W real numbers, top row first, still in the file's own units. Promise: a header
-is checked against the bytes that follow before anything is allocated for it, no pickle is loaded,
-and only one-channel pictures count as depth.
+A stored map is H x W real numbers, top row first, in the file's own units. Headers are checked
+against the bytes that follow before memory is allocated; pickles are not loaded; pictures must have
+one channel.
 """
 
 from __future__ import annotations
@@ -27,32 +27,32 @@ from splatseed.text import beginning
 KINDS: tuple[DepthKind, ...] = get_args(DepthKind)
 
 _MAX_PIXELS = 2**28
-"""The largest plausible map: a header that promises more is damaged or hostile."""
+"""Largest plausible map; larger headers are damaged or hostile."""
 _MAX_INFLATION = 100
-"""How many times larger than in its archive a map can be: measured values hardly compress."""
+"""Largest compression factor of a map in an archive: measured values hardly compress."""
 _SMALL = 1 << 26
-"""Maps of up to this many bytes are harmless at any compression: a map can be constant."""
+"""Bytes up to which any compression factor is accepted: a map can be constant."""
 _NPZ_KEYS = ("depth", "arr_0")
 _PFM_HEADER = re.compile(rb"Pf\s+(\d{1,9})\s+(\d{1,9})\s+([-+.\deE]{1,32})[ \t]*\r?\n")
 _BIN_HEADER = re.compile(rb"(\d{1,9})&(\d{1,9})&1&")
 _GREY = {"L", "I", "F", "I;16", "I;16B", "I;16L", "I;16N"}
 _EXR_CHANNELS = ("Z", "depth", "Depth", "D", "Y", "V", "R")
-"""Where renderers put depth, first match first; R only if it is grey, without G and B beside it."""
+"""Channels in which renderers store depth, in order of preference."""
 
 
 class StoredDepth(NamedTuple):
-    """Real numbers [H, W] as stored in a file, and what they are if the file says so."""
+    """Stored values [H, W], and their kind if the file declares one."""
 
     values: np.ndarray
     kind: DepthKind | None = None
 
 
 def read_stored(path: StrPath) -> StoredDepth:
-    """Read a depth map; its suffix, one of ``SUFFIXES``, tells the format.
+    """Read a depth map; the suffix, one of ``SUFFIXES``, determines the format.
 
     ``.npy``: an array [H, W], or with an axis of length 1 before or after. ``.npz``: the array
     ``depth``, else ``arr_0``, else the only one; a text ``kind`` in it ("z", "ray" or "inverse")
-    says what the values are. ``.pfm``: one channel (Debevec's format; rows are kept bottom first;
+    declares their meaning. ``.pfm``: one channel (Debevec's format; rows are kept bottom first;
     the sign of the scale is the byte order, its size is not used). ``.bin``: COLMAP's ``W&H&1&``,
     then float32 rows (mvs/mat.h). PNG of 8 or 16 bits, TIFF of 8, 16 or 32 bits or floats.
     OpenEXR: the channel Z, else depth, D, Y, V or R, else the only one.
@@ -73,7 +73,7 @@ def read_stored(path: StrPath) -> StoredDepth:
 
 
 def check_stored(shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
-    """Raise a ``ValueError`` unless an array can be a depth map: not empty, real numbers."""
+    """Raise ``ValueError`` unless an array is a depth map: two axes, not empty, real numbers."""
     if len(shape) != 2 or not 0 < math.prod(shape) <= _MAX_PIXELS or dtype.kind not in "uif":
         size = "x".join(map(str, shape)) or "one number"
         raise ValueError(f"{size} of {dtype}, not height x width real numbers")
@@ -86,7 +86,7 @@ def _read_npz(data: bytes) -> StoredDepth:
             info = archive.getinfo(f"{name}.npy")
             packed, size = info.compress_size, info.file_size
             if size > min(max(_SMALL, _MAX_INFLATION * packed), 8 * _MAX_PIXELS):
-                raise ValueError(f"{packed:,} bytes that would become {size:,}")
+                raise ValueError(f"{packed:,} bytes that expand to {size:,}")
             with archive.open(info) as file:
                 return read_npy(file, size)
 
@@ -97,7 +97,7 @@ def _read_npz(data: bytes) -> StoredDepth:
         arrays = sorted(names - {"kind"})
         wanted = [key for key in _NPZ_KEYS if key in arrays] or arrays
         if not wanted or (wanted[0] not in _NPZ_KEYS and len(arrays) > 1):
-            raise ValueError(f"arrays {', '.join(arrays[:5])}: not one, and none named depth")
+            raise ValueError(f"arrays {', '.join(arrays[:5])}: several, and none named depth")
         return StoredDepth(member(wanted[0]), kind)
 
 
@@ -117,7 +117,7 @@ def _read_colmap(_: Path, data: bytes) -> np.ndarray:
 
 
 def _body(data: bytes, header: re.Match[bytes], dtype: str) -> np.ndarray:
-    """The values that follow a header with width and height, a view of the file's bytes."""
+    """Return the values after a header with width and height, as a view."""
     shape, body = (int(header[2]), int(header[1])), memoryview(data)[header.end() :]
     check_stored(shape, np.dtype(dtype))
     if len(body) != math.prod(shape) * np.dtype(dtype).itemsize:
@@ -131,7 +131,7 @@ def _read_picture(_: Path, data: bytes) -> np.ndarray:
             raise ValueError(f"a picture of mode {picture.mode}, not one channel")
         values = np.asarray(picture)
         if picture.format == "PNG" and values.dtype == np.int32:
-            values = values.astype(np.uint16)  # how some versions of Pillow open 16 bits
+            values = values.astype(np.uint16)  # some versions of Pillow open 16 bits so
     return values
 
 
@@ -139,7 +139,7 @@ def _read_exr(path: Path, _: bytes) -> np.ndarray:
     require("OpenEXR")
     openexr = importlib.import_module("OpenEXR")
     with openexr.File(str(path), header_only=True) as file:
-        # Before decoding: every pixel is stored, and their number can be believed.
+        # Check before decoding that every pixel is stored and their number is plausible.
         header: Mapping[str, Any] = file.header()
         data, display = np.array(header["dataWindow"]), np.array(header["displayWindow"])
         check_stored(tuple((data[1] - data[0] + 1)[::-1].tolist()), np.dtype(np.float32))
@@ -147,12 +147,12 @@ def _read_exr(path: Path, _: bytes) -> np.ndarray:
             raise ValueError(f"pixels {data.tolist()} of a picture {display.tolist()}")
     with openexr.File(str(path), separate_channels=True) as file:
         channels = {name: each.pixels for name, each in sorted(file.channels().items())}
-    # Layers ("ViewLayer.Depth.Z") are known by their last word.
-    by_word = {name.rpartition(".")[2]: pixels for name, pixels in channels.items()}
-    found = next((word for word in _EXR_CHANNELS if word in by_word), None)
+    # Match layers ("ViewLayer.Depth.Z") by the last part.
+    by_part = {name.rpartition(".")[2]: pixels for name, pixels in channels.items()}
+    found = next((part for part in _EXR_CHANNELS if part in by_part), None)
     if found is None and len(channels) != 1:
         raise ValueError(f"channels {', '.join(channels)}, none of {', '.join(_EXR_CHANNELS)}")
-    return by_word[found] if found else next(iter(channels.values()))
+    return by_part[found] if found else next(iter(channels.values()))
 
 
 _READERS: dict[str, Callable[[Path, bytes], np.ndarray]] = {
@@ -165,5 +165,4 @@ _READERS: dict[str, Callable[[Path, bytes], np.ndarray]] = {
     ".png": _read_picture,
 }
 SUFFIXES = (".npy", ".npz", *[suffix for suffix in _READERS if suffix != ".npy"])
-"""Suffixes of readable files. PNG comes last: beside a file of exact numbers it is their
-picture."""
+"""Suffixes of depth files, in order of preference: a PNG beside another file is its preview."""

@@ -1,11 +1,10 @@
-"""Folders of depth maps: which map belongs to which image, reading it on demand, writing a folder.
+"""Folders of depth maps: match maps to images by name, read them on demand, write a folder.
 
-``scale`` is stored units per scene unit, by which a file's numbers are divided. A *stem* is a map's
-path without suffix. For the image ``a/b.jpg`` the stems are tried in this order: ``a/b.jpg``,
-``a/b.jpg.geometric`` and ``.photometric`` (COLMAP's dense stereo), ``a/depthN`` for
-``a/frameN.jpg`` (NICE-SLAM), ``a/X.depth`` for ``a/X.color.png`` (7-Scenes), ``a/b`` and
-``a/b_depth``; for each, the suffixes in the order of ``SUFFIXES``. Promise: a map is float32 with
-NaN where unknown; reading is safe from several threads; matching depends on names only.
+``scale`` is stored units per scene unit; stored values are divided by it. For the image
+``a/b.jpg``, the stems ``a/b.jpg``, ``a/b.jpg.geometric`` and ``.photometric`` (COLMAP's dense
+stereo), ``a/depthN`` for ``a/frameN.jpg`` (NICE-SLAM), ``a/X.depth`` for ``a/X.color.png``
+(7-Scenes), ``a/b`` and ``a/b_depth`` are tried in this order, each with ``SUFFIXES``. Promise: maps
+are float32 with NaN where unknown; reading is thread-safe.
 """
 
 from __future__ import annotations
@@ -31,30 +30,30 @@ from splatseed.lens import image_points
 from splatseed.scene import Scene
 
 CAMERA_FILE = "cam_params.json"
-"""The camera of an RGB-D capture, and the scale of its maps, in its folder or the one above."""
+"""Camera and depth scale of an RGB-D capture, in its folder or the parent."""
 DESCRIPTION = "depths.json"
-"""The file beside depth maps that describes them."""
+"""The file that describes the maps of a folder."""
 
 _INTEGER_SCALE = 1000.0
 """Default scale of integer maps: millimetres in a scene in metres."""
 _NO_HIT = 1e9
-"""From this distance on, a value means that a renderer's ray hit nothing; Blender writes 1e10."""
+"""Values from here on mean that a renderer's ray hit nothing; Blender writes 1e10."""
 _SATURATED = 65535
 _FOLDERS = ("", "stereo/depth_maps", "depth_maps", "results", "depths", "depth")
-"""Subfolders searched for maps; the first with a map of any image is used."""
+"""Subfolders searched for maps; the first with a match is used."""
 _FRAME = re.compile(r"frame(\d+)", re.IGNORECASE)
 _CAPTURED = re.compile(r"depth(\d+)", re.IGNORECASE)
 
 
 @dataclass(frozen=True, eq=False)
 class Undistortion:
-    """Moves the values of a planar map to where undistorted photographs have them."""
+    """Resamples maps of planar depth to the pixels of undistorted photographs."""
 
     lens: Intrinsics
     cameras: Mapping[str, Intrinsics]
 
     def apply(self, name: str, values: Float32[np.ndarray, "H W"]) -> Float32[np.ndarray, "h w"]:
-        """A map taken with the lens, or a resized copy, in the pixels of one photograph."""
+        """Resample a map of the distorted camera, of any size, to the pixels of a photograph."""
         camera = self.cameras[name]
         height, width = values.shape
         column, row = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
@@ -68,19 +67,19 @@ class Undistortion:
 
 @dataclass(frozen=True, eq=False)
 class DepthFiles:
-    """Depth maps in files; what ``Scene.depths`` holds for a scene that was read.
+    """Depth maps in files; the type of ``Scene.depths`` of a loaded scene.
 
-    A collection of the names of images that have one, sorted.
+    Iterates over the names of images with a map, sorted.
     """
 
     paths: Mapping[str, Path]
-    """The file of each image that has one, by the image's name."""
+    """The maps' files by image name."""
     kind: DepthKind | None = None
-    """What the values are; None: what the file itself says, else planar z."""
+    """Meaning of the values; None: as the file declares, else planar z."""
     scale: float | None = None
     """Stored units per scene unit; None: 1000 for integers, 1 for floats."""
     lens: Undistortion | None = None
-    """Moves the values to the pixels of undistorted photographs; None: no need to."""
+    """Resamples maps for undistorted photographs; None: not needed."""
 
     def __contains__(self, name: object) -> bool:
         return name in self.paths
@@ -92,23 +91,23 @@ class DepthFiles:
         return len(self.paths)
 
     def read(self, name: str) -> DepthMap:
-        """The map of an image; safe to call from several threads.
+        """Read the map of an image; thread-safe.
 
-        NaN stands where nothing is known: the file has NaN, an infinity, or 1e9 and more; 0 or less
-        (for inverse depth only integer zeros, since a network may predict 0 for far pixels); or
-        65535 in 16 bits, the end of the sensor's range.
+        Unknown pixels are NaN: stored NaN, infinity, values of 1e9 or more, 65535 in 16 bits (a
+        sensor's limit), and values of 0 or less (for inverse depth, only integer zeros, since a
+        network may predict 0 for far pixels).
 
         Raises:
-            SceneNotFoundError: The image has no file, or it is gone.
-            SceneFormatError: The file is not what its format promises.
-            MissingDependencyError: It is an OpenEXR file, and that package is absent.
+            SceneNotFoundError: The image has no map, or its file is missing.
+            SceneFormatError: The file is malformed.
+            MissingDependencyError: An OpenEXR file, without the package OpenEXR.
         """
         path = self.paths.get(name)
         if path is None:
-            fix = "Leave this image out."
+            fix = "Skip this image."
             raise SceneNotFoundError(f"a depth map of {name}", found="none", fix=fix)
-        stored, said = read_stored(path)
-        kind, is_integer = self.kind or said or "z", stored.dtype.kind in "ui"
+        stored, declared = read_stored(path)
+        kind, is_integer = self.kind or declared or "z", stored.dtype.kind in "ui"
         divisor = self.scale or (_INTEGER_SCALE if is_integer else 1.0)
         with np.errstate(over="ignore", invalid="ignore"):  # becomes infinite, and so NaN
             values: np.ndarray = (stored / np.float64(divisor)).astype(np.float32)
@@ -122,7 +121,7 @@ class DepthFiles:
 
 
 def match_by_name(scene: Scene, root: Path) -> DepthFiles | None:
-    """The depth maps in a folder whose names match a scene's images; None if there are none."""
+    """Match the maps of a folder to a scene's images by name; None without a match."""
     for folder in (root / name for name in _FOLDERS):
         if not folder.is_dir() or not (paths := _match(scene, folder)):
             continue
@@ -137,11 +136,11 @@ def match_by_name(scene: Scene, root: Path) -> DepthFiles | None:
 
 
 def _match(scene: Scene, folder: Path) -> dict[str, Path]:
-    """The map of each image in one folder; folders that map names lack are dropped."""
+    """Match maps in one folder; leading folders of image names are dropped as needed."""
     parts = {image.name: safe_parts(image.name) for image in scene.images}
     taken, true_folder = set[Path](), cache(Path.resolve)
     if scene.source and (image_dir := scene.source.image_dir):
-        photographs = (image_dir / image.name for image in scene.images)  # perhaps in this folder
+        photographs = (image_dir / image.name for image in scene.images)  # may be in this folder
         taken = {true_folder(path.parent) / path.name for path in photographs}
     listing = cache(lambda parents: _listing(folder.joinpath(*parents), taken))
     for drop in range(max(map(len, parts.values()), default=0)):
@@ -155,7 +154,7 @@ def _match(scene: Scene, folder: Path) -> dict[str, Path]:
                     raise SceneFormatError(
                         "a depth map of its own for each image",
                         found=f"{path} for {other} and for {name}",
-                        fix=f"Name maps in full, with subfolders: {name}.npy or {name}.png.",
+                        fix=f"Give maps full names, with subfolders: {name}.npy or {name}.png.",
                     )
         if owners:
             return {name: path for path, name in owners.items()}
@@ -163,7 +162,7 @@ def _match(scene: Scene, folder: Path) -> dict[str, Path]:
 
 
 def _listing(folder: Path, taken: Collection[Path]) -> dict[str, Path]:
-    """The maps of a folder by name, suffixes in lower case, numbers also unpadded."""
+    """List the maps of a folder by name, with suffixes in lower case and numbers also unpadded."""
     files: dict[str, Path] = {}
     if not folder.is_dir():
         return files
@@ -178,10 +177,10 @@ def _listing(folder: Path, taken: Collection[Path]) -> dict[str, Path]:
 
 
 def _stems(file_name: str) -> Iterator[str]:
-    """The stems that a map of this image may have, in order of preference."""
+    """Yield the stems of an image's map, in order of preference."""
     stem = PurePosixPath(file_name).stem
     yield from (file_name, f"{file_name}.geometric", f"{file_name}.photometric")
-    # Before the image's own name, by which its file may lie beside them.
+    # Before the image's own stem, which the photograph itself may have here.
     if number := _FRAME.fullmatch(stem):
         yield f"depth{int(number[1])}"
     if stem.endswith(".color"):
@@ -190,7 +189,7 @@ def _stems(file_name: str) -> Iterator[str]:
 
 
 def read_description(path: Path) -> tuple[DepthKind | None, float | None]:
-    """Kind and scale that a ``depths.json`` gives; None for what it does not say."""
+    """Read kind and scale of a ``depths.json``; None if not given."""
     content = read_json(path)
     with translate_errors(path, "a description of depth maps", fix="Correct it, or leave it out."):
         scale, kind = _scale_in(content), content.get("kind")
@@ -200,13 +199,13 @@ def read_description(path: Path) -> tuple[DepthKind | None, float | None]:
 
 
 def camera_file(folder: Path, above: int = 1) -> Path | None:
-    """The file of a capture's camera in a folder or in the ``above`` folders that hold it."""
+    """Find the camera file of a capture in a folder or its ``above`` next parents."""
     places = (folder, *folder.resolve().parents[:above])
     return next((path for each in places if (path := each / CAMERA_FILE).is_file()), None)
 
 
 def read_capture_scale(path: Path) -> float | None:
-    """Stored units per metre that the ``cam_params.json`` of an RGB-D capture gives, if it does."""
+    """Read the stored units per metre of a ``cam_params.json``; None if not given."""
     content = read_json(path)
     with translate_errors(path, "the camera of a capture", fix="Correct it."):
         camera = content.get("camera") if isinstance(content, dict) else content
@@ -224,24 +223,24 @@ def _scale_in(content: Any) -> float | None:
 
 
 def safe_parts(name: str) -> tuple[str, ...]:
-    """The folders and the file name of an image, without parts that lead out of a folder."""
+    """Split an image name into parts, without those that lead out of a folder (``..``, ``/``)."""
     pure = PurePosixPath(name)
     return tuple(part for part in pure.parts if part not in {"..", pure.anchor})
 
 
 def write_description(folder: Path, kind: DepthKind, scale: float = 1.0, **more: object) -> None:
-    """Write a ``depths.json`` into a folder of maps; ``more``, for people, is never read back."""
+    """Write ``depths.json`` into a folder of maps; ``more`` is informative only."""
     write_json(folder / DESCRIPTION, {"kind": kind, "scale": scale, **more})
 
 
 @dataclass(frozen=True)
 class DepthWriter:
-    """Writes the maps of a folder in the making."""
+    """Writes maps into a staged folder."""
 
     folder: Path
 
     def write(self, name: str, values: Float32[np.ndarray, "H W"]) -> None:
-        """Keep the map of one image, NaN where nothing is known; safe from several threads."""
+        """Write the map of one image, NaN where unknown; thread-safe."""
         path = self.folder.joinpath(*safe_parts(f"{name}.npy"))
         with translate_errors(path, "a depth map"):
             check_stored(values.shape, values.dtype)
@@ -261,10 +260,10 @@ def depth_folder(
     protect: tuple[Path, ...] = (),
     provenance: Mapping[str, object] | None = None,
 ) -> Iterator[DepthWriter]:
-    """A folder of depth maps of a kind, to write to, that appears when the block ends well.
+    """Write a folder of depth maps, which appears when the block succeeds.
 
-    ``provenance``, how they were made, is for ``splatseed.json``; all else is as for
-    ``output_folder``.
+    ``provenance`` (how the maps were made) goes to ``splatseed.json``; other arguments and errors
+    are those of ``output_folder``.
     """
     with output_folder(path, kind="depth", overwrite=overwrite, protect=protect) as partial:
         yield DepthWriter(partial)

@@ -1,11 +1,10 @@
-"""Where masks lie and what they are called: which file is the mask of which photograph.
+"""Match mask files to photographs by name.
 
-For the photograph ``a/b.jpg`` these are its masks in a folder of masks, first match first:
-``a/b.jpg.png`` (COLMAP), ``a/b.png`` (nerfstudio), ``a/b.jpg.mask.png`` (RealityScan),
-``a/b.mask.png`` (OpenMVS), ``a/b_mask.png`` (3DGRUT), each also as JPEG, in any case; else a file
-of such a name without the subfolder, if no other photograph is called so. The last three may also
-lie beside the photograph. Promise: matching depends on names only; a photograph of the scene is
-never a mask.
+In a folder of masks, the mask of ``a/b.jpg`` is the first of ``a/b.jpg.png`` (COLMAP), ``a/b.png``
+(nerfstudio), ``a/b.jpg.mask.png`` (RealityScan), ``a/b.mask.png`` (OpenMVS) and ``a/b_mask.png``
+(3DGRUT), each also as JPEG and in any case; else such a file without the subfolder, if the name is
+unique. The last three may also lie beside the photograph. A photograph of the scene is never a
+mask.
 """
 
 from __future__ import annotations
@@ -20,16 +19,16 @@ from splatseed.text import agreeing, counted
 FOLDER = "masks"
 SUFFIXES = (".png", ".jpg", ".jpeg")
 _FOLDERS = ("masks", "mask")
-_UNCLEAR = ("mask", "segment")
-"""Parts of the names of folders whose pictures may be masks, of unknown meaning."""
+_MASK_LIKE = ("mask", "segment")
+"""Parts of folder names that suggest masks of unknown polarity."""
 _INVERTED = "dynamic_mask_"
-"""Before the name of a mask of instant-ngp, in which 0 is what counts."""
+"""Prefix of instant-ngp's masks, in which 0 marks valid pixels."""
 
 
 def find_own_masks(
     names: Collection[str], image_dir: Path, root: Path
 ) -> tuple[dict[str, Path], list[str]]:
-    """The masks near a folder of photographs, by the photographs' names, and notes for the user."""
+    """Find the masks near a folder of photographs, by photograph, and notes for the user."""
     alone = image_dir.absolute() != root.absolute()
     parents = [image_dir.parent, root, image_dir] if alone else [image_dir]
     folders = list(dict.fromkeys(each for parent in parents for each in _folders(parent)))
@@ -45,15 +44,16 @@ def find_own_masks(
     for folder in folders:
         if folder not in known and (found := find_masks(names, folder, image_dir)[0]):
             unused.append(
-                f"{folder} holds pictures named as {counted(len(found), 'photograph')}, which are"
-                f" not used: pass --masks {folder} if 0 masks there, --masks inverted:{folder} if"
-                " it is what counts."
+                f"{folder} has pictures named like {counted(len(found), 'photograph')}, which are"
+                f" not used: pass `masks={str(folder)!r}` if 0 means masked, or"
+                f" `masks={f'inverted:{folder}'!r}` if 0 means valid."
             )
     marked = {PurePosixPath(_dynamic(name)).name.casefold() for name in names}
     if dynamic := [path for path in _listing(names, image_dir) if path.stem.casefold() in marked]:
         unused.append(
             f"{counted(len(dynamic), 'mask')} of instant-ngp beside the photographs, such as"
-            f" {dynamic[0].name}, are not used: --masks inverted:{image_dir} uses them."
+            f" {dynamic[0].name}, are not used: pass `masks={f'inverted:{image_dir}'!r}` to use"
+            " them."
         )
     return {}, unused
 
@@ -61,9 +61,9 @@ def find_own_masks(
 def find_masks(
     names: Collection[str], folder: Path, image_dir: Path | None = None, *, named: bool = False
 ) -> tuple[dict[str, Path], list[str]]:
-    """The masks in a folder by the names of their images, and notes on those without one.
+    """Find the masks in a folder by image name, and note masks and images that have no match.
 
-    If the folder is ``named`` by the user, masks of instant-ngp count too.
+    ``named``: the user chose the folder, so masks of instant-ngp are included.
     """
     is_own = image_dir is not None and folder.resolve() == image_dir.resolve()
     taken = set(names) if is_own else set()
@@ -74,7 +74,7 @@ def find_masks(
     same = Counter(PurePosixPath(name).stem.casefold() for name in names)
     files, used = dict[str, Path](), set[Path]()
     for name in names:
-        short = name.removeprefix("images/")  # where photographs are named from the scene's folder
+        short = name.removeprefix("images/")  # names relative to the scene's folder
         stems = [*_mask_stems(short), *([_dynamic(short)] if named else [])]
         exact = (there.get(stem + suffix) for stem in stems for suffix in SUFFIXES)
         any_case = (folded.get((s + suffix).casefold()) for s in stems for suffix in SUFFIXES)
@@ -92,21 +92,21 @@ def find_masks(
 def _notes(
     names: Collection[str], files: Collection[str], left: list[Path], folder: Path
 ) -> list[str]:
-    """On masks without an image, and on images without a mask where others have one."""
-    said = []
+    """Note masks without an image, and images without a mask if others have one."""
+    notes = []
     if left:
         belong = f"{agreeing(len(left), 'belongs', 'belong')} to no image of the scene"
         such = left[0].relative_to(folder)
-        said.append(f"{counted(len(left), 'mask')} in {folder} {belong}, such as {such}")
-    if files and (whole := [name for name in names if name not in files]):
-        have = agreeing(len(whole), "has none and is", "have none and are")
+        notes.append(f"{counted(len(left), 'mask')} in {folder} {belong}, such as {such}")
+    if files and (unmasked := [name for name in names if name not in files]):
+        count, lack = counted(len(unmasked), "image"), agreeing(len(unmasked), "has", "have")
         where = "" if left else f" of {len(names)} with masks in {folder}"
-        said.append(f"{counted(len(whole), 'image')}{where} {have} used whole, such as {whole[0]}")
-    return [f"{'; '.join(said)}."] if said else []
+        notes.append(f"{count}{where} {lack} no mask, such as {unmasked[0]}")
+    return [f"{'; '.join(notes)}."] if notes else []
 
 
 def masks_among(names: Collection[str]) -> set[str]:
-    """Which files of a folder of photographs are masks of others, by their names."""
+    """Return the names in a folder of photographs that are masks of others."""
     folders = {*_FOLDERS, "dynamic_masks", "segmentation"}
     inside = {n for n in names if {p.casefold() for p in PurePosixPath(n).parts[:-1]} & folders}
     inside = inside if len(inside) < len(names) else set()
@@ -124,19 +124,19 @@ def _stem(name: str) -> str:
 
 
 def _mask_stems(name: str) -> list[str]:
-    """The paths, but for the suffix, of a photograph's mask; the first two only in a folder."""
+    """List possible mask paths without suffix; the first two apply only in a folder of masks."""
     stem = PurePosixPath(name).with_suffix("").as_posix()
     return [name, stem, f"{name}.mask", f"{stem}.mask", f"{stem}_mask"]
 
 
 def _dynamic(name: str) -> str:
-    """The path, but for the suffix, of a photograph's mask of instant-ngp."""
+    """Return the path without suffix of a photograph's instant-ngp mask."""
     pure = PurePosixPath(name)
     return pure.with_name(f"{_INVERTED}{pure.stem}").as_posix()
 
 
 def _listing(names: Collection[str], image_dir: Path) -> list[Path]:
-    """Files beside photographs that are none of these and may be masks."""
+    """List image files in the photographs' folders that are not photographs of the scene."""
     folders = sorted({(image_dir / name).parent for name in names})
     files = (f for folder in folders if folder.is_dir() for f in sorted(folder.iterdir()))
     taken = {image_dir / name for name in names}
@@ -144,7 +144,7 @@ def _listing(names: Collection[str], image_dir: Path) -> list[Path]:
 
 
 def _beside(names: Collection[str], image_dir: Path) -> dict[str, Path]:
-    """The masks that lie beside photographs."""
+    """Find masks in the photographs' own folders."""
     there = {f.relative_to(image_dir).as_posix().casefold(): f for f in _listing(names, image_dir)}
     files = {}
     for name in names:
@@ -155,8 +155,10 @@ def _beside(names: Collection[str], image_dir: Path) -> dict[str, Path]:
 
 
 def _folders(parent: Path) -> list[Path]:
-    """Subfolders whose names suggest masks, that named masks first."""
+    """List subfolders whose names suggest masks, ``masks`` first."""
     if not parent.is_dir():
         return []
-    named = [each for each in parent.iterdir() if any(p in each.name.casefold() for p in _UNCLEAR)]
+    named = [
+        each for each in parent.iterdir() if any(p in each.name.casefold() for p in _MASK_LIKE)
+    ]
     return sorted((f for f in named if f.is_dir()), key=lambda f: (f.name != FOLDER, f.name))

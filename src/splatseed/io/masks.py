@@ -1,9 +1,9 @@
-"""Masks: which pixels of photographs count; reading and writing them.
+"""Read and write masks of photographs.
 
-A mask is an image of its photograph's shape, 0 where a pixel is masked, as COLMAP and nerfstudio
-take it; ``mask_files`` finds them. Pixels of a photograph that are not opaque are masked, too.
-Promise: a pixel of a smaller copy, or of an undistorted one, counts only if all that it was made
-from count.
+A mask is an image of its photograph's aspect ratio; 0 means masked, as in COLMAP and nerfstudio.
+Pixels that are not opaque are masked, too. In code, True marks valid pixels. Promise: a pixel of a
+reduced or undistorted copy is valid only if all of its source pixels are. ``mask_files`` finds
+the files.
 """
 
 from __future__ import annotations
@@ -22,30 +22,31 @@ from splatseed.camera import Intrinsics
 from splatseed.errors import SceneFormatError, SceneNotFoundError, SplatseedError
 from splatseed.io.bit_depth import is_16_bit, opaque_value, read_16_bit
 from splatseed.io.depth_maps import Undistortion
-from splatseed.io.files import files_below, open_file, read_bytes, translate_errors
+from splatseed.io.files import files_below, read_bytes, translate_errors
 from splatseed.io.mask_files import find_masks, find_own_masks, masks_among
 from splatseed.io.photograph import has_alpha, open_photograph, photograph_bytes
+from splatseed.io.photograph_checks import photograph_size
 from splatseed.scene import Masks, Scene
 from splatseed.text import counted
 
 NONE, INVERTED = "none", "inverted"
-"""Choices of masks besides a folder; ``inverted:DIR`` inverts those of a folder."""
+"""Values of ``masks`` besides a folder; ``inverted:DIR`` inverts the masks of a folder."""
 _LISTED = "masks of the scene's images, named a.jpg.png or a.png for a.jpg,"
 
 
 def with_masks(scene: Scene, choice: str | None) -> Scene:
-    """The scene with the masks of a choice, as ``--masks`` takes it; None: as it is.
+    """Attach masks: those of a folder, inverted ones, or none; ``choice=None`` changes nothing.
 
     Raises:
-        SceneNotFoundError: There are no such masks.
+        SceneNotFoundError: No image has a mask there.
     """
     if choice is None or choice == NONE:
         return scene if choice is None else scene.replace(masks=None)
     inverted = choice == INVERTED or choice.startswith(f"{INVERTED}:")
-    place = choice.removeprefix(INVERTED).removeprefix(":") if inverted else choice
+    location = choice.removeprefix(INVERTED).removeprefix(":") if inverted else choice
     own, notes = scene.masks or Masks({}), list[str]()
     files: Mapping[str, Path] = own.files
-    folder = Path(place).absolute() if place else None
+    folder = Path(location).absolute() if location else None
     if folder is not None:
         names = [image.name for image in scene.images]
         image_dir = scene.source.image_dir if scene.source else None
@@ -54,19 +55,19 @@ def with_masks(scene: Scene, choice: str | None) -> Scene:
     if not files:
         where = f"in {folder}" if folder else "beside its photographs"
         found = "none" if folder is None or folder.is_dir() else "no such folder"
-        fix = "Name the folder that masks lie in, or leave --masks out."
+        fix = "Pass a folder of masks, or omit `masks`."
         raise SceneNotFoundError(f"{_LISTED} {where}", found=found, fix=fix)
     masks = replace(own, files=files, inverted=inverted, choice=choice)
     return scene.replace(masks=masks, warnings=(*scene.warnings, *notes))
 
 
 def mask_choice(scene: Scene) -> str | None:
-    """The choice with which ``with_masks`` gives a scene read anew the masks of this one."""
+    """Return the ``choice`` that makes ``with_masks`` attach this scene's masks again."""
     return NONE if scene.masks is None else scene.masks.choice
 
 
 def with_own_masks(scene: Scene) -> Scene:
-    """A scene that was just read, with the masks near its photographs."""
+    """Attach the masks found near the photographs of a scene that was just read."""
     folder = scene.source.image_dir if scene.source else None
     if scene.source is None or folder is None or scene.masks is not None:
         return scene
@@ -77,7 +78,7 @@ def with_own_masks(scene: Scene) -> Scene:
 
 
 def masks_near(photographs: Path) -> tuple[Masks, list[str]]:
-    """The masks near a folder of photographs, and notes for the user."""
+    """Find the masks near a folder of photographs, and notes for the user."""
     folder = photographs.absolute()
     if not photographs.is_dir():
         return Masks({}), []
@@ -92,10 +93,10 @@ def masks_near(photographs: Path) -> tuple[Masks, list[str]]:
 
 
 def _resized(files: Mapping[str, Path], folder: Path) -> list[str]:
-    """A note if masks have another size than their photographs; only two headers are opened."""
+    """Note masks of another size than their photographs, by the first readable pair."""
     for name, path in files.items():
         with suppress(SplatseedError, OSError, ValueError):
-            sizes = [_size(path), _size(folder / name)]
+            sizes = [photograph_size(path), photograph_size(folder / name)]
             if sizes[0] == sizes[1]:
                 return []
             mask, photograph = (f"{width} x {height}" for width, height in sizes)
@@ -103,25 +104,20 @@ def _resized(files: Mapping[str, Path], folder: Path) -> list[str]:
     return []
 
 
-def _size(path: Path) -> tuple[int, int]:
-    with open_file(path) as file, PilImage.open(file) as picture:
-        return picture.size
-
-
 def read_mask(
     masks: Masks | None, name: str, photograph: Path, factor: int = 1
 ) -> Bool[np.ndarray, "h w"] | None:
-    """Which pixels of a photograph, reduced by a whole factor, count; None: all.
+    """Read which pixels of a photograph are valid; None if all are.
 
     Args:
-        masks: The scene's.
+        masks: The scene's masks.
         name: The image's name.
-        photograph: Its file.
-        factor: Each pixel is a block of ``factor``^2 of the file.
+        photograph: The image's file.
+        factor: Integer reduction; a reduced pixel is valid if its ``factor``^2 block is.
 
     Raises:
-        SceneNotFoundError: The mask's file is gone.
-        SceneFormatError: It is no image, has another size than the photograph, or masks all of it.
+        SceneNotFoundError: The mask's file is missing.
+        SceneFormatError: It is no image, has another aspect ratio, or masks every pixel.
     """
     if masks is None:
         return None
@@ -135,7 +131,7 @@ def read_mask(
             raise SceneFormatError(
                 f"the mask {path} to have the size of {name}, {size[0]} x {size[1]}",
                 found=f"{picture.size[0]} x {picture.size[1]}",
-                fix="Make it from that photograph, without cropping or turning.",
+                fix="Make it from that photograph, without cropping or rotating it.",
             )
         parts.append(_fitted(marked, size))
     if masks.alpha and (opaque := _opaque(photograph)) is not None:
@@ -149,32 +145,32 @@ def read_mask(
     if counts.size and not counts.any():
         reduced = "" if factor == 1 else f", reduced by a factor of {factor}"
         raise SceneFormatError(
-            f"pixels of {name} that count by its mask, {path or photograph}{reduced}",
+            f"unmasked pixels of {name} by its mask, {path or photograph}{reduced}",
             found="none",
-            fix="Correct the mask, or take the photograph out of the scene. If 0 is what counts, "
-            f"pass --masks {INVERTED}.",
+            fix="Correct the mask, or remove the photograph from the scene. If 0 marks valid "
+            f"pixels, pass `masks={INVERTED!r}`.",
         )
     return None if counts.all() else np.asarray(counts)
 
 
 def _read_counts(picture: PilImage.Image) -> Bool[np.ndarray, "H W"]:
-    """Which pixels of a mask are neither 0 nor transparent."""
-    if picture.mode.startswith(("I", "F")):  # which Pillow's conversion clips
+    """Return the pixels of a mask that are neither 0 nor transparent."""
+    if picture.mode.startswith(("I", "F")):  # Pillow's conversion would clip
         return np.asarray(np.asarray(picture) > 0)
-    least = 128 if picture.format == "JPEG" else 1  # whose 0 may be stored as a little more
-    counts = np.asarray(picture.convert("L")) >= least
+    threshold = 128 if picture.format == "JPEG" else 1  # JPEG may store 0 as slightly more
+    counts = np.asarray(picture.convert("L")) >= threshold
     if has_alpha(picture):
         counts &= np.asarray(picture.convert("RGBA").getchannel("A")) > 0
     return np.asarray(counts)
 
 
 def _same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
-    """Whether two sizes differ by a scale, within a pixel."""
+    """Whether two sizes have one aspect ratio, within a pixel."""
     return abs(size[0] * other[1] - size[1] * other[0]) <= max(*size, *other)
 
 
 def _fitted(counts: Bool[np.ndarray, "H W"], size: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
-    """A mask at another size: a pixel counts if all those of the mask in it do."""
+    """Resize a mask; a pixel is valid if all mask pixels that it overlaps are."""
     for axis, length in enumerate(size[::-1]):
         count = counts.shape[axis]
         if count != length:
@@ -186,8 +182,8 @@ def _fitted(counts: Bool[np.ndarray, "H W"], size: tuple[int, int]) -> Bool[np.n
 
 
 def _opaque(photograph: Path) -> Bool[np.ndarray, "H W"] | None:
-    """Which pixels are fully opaque; None where none can be otherwise."""
-    if photograph.suffix.lower() in {".jpg", ".jpeg"}:  # not worth reading
+    """Return the fully opaque pixels; None for files without transparency."""
+    if photograph.suffix.lower() in {".jpg", ".jpeg"}:  # never transparent: skip reading
         return None
     picture = open_photograph(photograph, photograph_bytes(photograph))
     if not has_alpha(picture) or picture.mode.startswith(("I", "F")):
@@ -206,21 +202,20 @@ def write_masks(
     folder: Path,
     lenses: Mapping[str, tuple[Intrinsics, Intrinsics]] | None = None,
 ) -> None:
-    """Write the masks of some images as COLMAP names them, 0 or 255.
+    """Write masks of 0 and 255 under COLMAP's names.
 
-    If any has pixels that do not count, all get a mask: COLMAP fails and nerfstudio stops where one
-    is missing. With ``lenses``, that of each photograph and that of its undistorted copy, they fit
-    the copies.
+    If any image has masked pixels, all get a mask: COLMAP and nerfstudio fail where one is missing.
+    ``lenses`` (the camera of each photograph, and of its undistorted copy) undistorts the masks.
     """
-    whole = []
+    unmasked = []
     for name in names:
         counts = read_mask(masks, name, image_dir / name)
         if counts is None:
-            whole.append(name)
+            unmasked.append(name)
         else:
             fitting = _undistorted(counts, *lenses[name]) if lenses else counts
             _write(folder / f"{name}.png", fitting)
-    for name in whole if folder.is_dir() else ():
+    for name in unmasked if folder.is_dir() else ():
         width, height = open_photograph(image_dir / name, photograph_bytes(image_dir / name)).size
         if lenses:
             width, height = lenses[name][1].width, lenses[name][1].height
@@ -235,11 +230,11 @@ def _write(path: Path, counts: Bool[np.ndarray, "H W"]) -> None:
 def _undistorted(
     counts: Bool[np.ndarray, "H W"], lens: Intrinsics, pinhole: Intrinsics
 ) -> Bool[np.ndarray, "h w"]:
-    """A mask in the pixels of an undistorted photograph."""
+    """Undistort a mask."""
     if lens == pinhole:  # the photograph is a copy
         return counts
-    # Colours come from the four pixels around a place, which lie within one pixel of the nearest.
+    # Undistortion interpolates four pixels, all within one pixel of the nearest.
     windows = sliding_window_view(np.pad(counts, 1, constant_values=True), (3, 3))
     sure = np.asarray(windows.all(axis=(2, 3)))
     moved = Undistortion(lens, {"": pinhole}).apply("", sure.astype(np.float32))
-    return np.asarray(moved == 1)  # NaN beyond the image, where the copy is black
+    return np.asarray(moved == 1)  # NaN outside of the image, where the copy is black

@@ -1,8 +1,8 @@
-"""Photographs: a file's bytes, size and pixels; and what is wrong with a scene's, before training.
+"""Read photographs: bytes, size and pixels.
 
-Promise: pixels are as stored, before any EXIF rotation, because COLMAP counts them so; transparent
-ones are composited over black, the background of renders; 16 bits a channel, and floats in [0, 1],
-are rounded to 8 bits, of which the capture's *white* (``io.bit_depth``) becomes 255.
+Promise: pixels are as stored, without EXIF rotation, as in COLMAP; transparent pixels are
+composited over black, the background of renders; 16 bits per channel and floats in [0, 1] are
+rounded to 8 bits, with the capture's *white* (``io.bit_depth``) as 255.
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ from splatseed.runtime.fingerprint import fingerprint
 from splatseed.scene import Image, Scene
 
 _CHECK_SCALE = 8
-"""JPEGs are checked at an eighth of their size: all bytes are read, few pixels are computed."""
+"""JPEGs are checked at 1/8 of their size: all bytes are read, few pixels are computed."""
 _WIDE_GREY = ("I", "F")
-"""Pillow's modes for one channel of more than 8 bits, which its own conversion clips at 255."""
+"""Pillow's modes for one channel of more than 8 bits, which Pillow's conversion clips at 255."""
 _INKS = ("CMYK", "LAB")
-"""Pillow's modes that are not RGB or grey; it would convert inks by a rule of thumb."""
+"""Pillow's modes other than RGB and grey; Pillow ignores colour profiles when converting."""
 COPY_AGAIN = "Copy or export the image again."
-_COMPLETE_IMAGE = "an image, neither cut short nor damaged"
+_COMPLETE_IMAGE = "an image, neither truncated nor damaged"
 
 
 def photograph_folder(scene: Scene) -> Path:
-    """The folder of a scene's photographs; a ``SceneNotFoundError`` without photographs."""
+    """Return the folder of a scene's photographs; raise ``SceneNotFoundError`` without any."""
     folder = scene.source.image_dir if scene.source else None
     if folder is None or not scene.images:
         raise SceneNotFoundError(
             "a scene with photographs",
             found="no images" if folder else "no folder of images",
-            fix="Name a scene with poses (a COLMAP model has them in images.bin), and put its "
-            "photographs into a folder named images.",
+            fix="Choose a scene with poses (in COLMAP models, images.bin), and put its photographs "
+            "into a folder named images.",
         )
     return folder
 
@@ -61,35 +61,34 @@ def photographs_digest(scene: Scene) -> str:
 
 
 def photograph_bytes(path: Path) -> bytes:
-    """The file's bytes; errors as ``readable``'s."""
+    """Read a photograph's file; raises as read_bytes, with advice for a missing file."""
     try:
         return read_bytes(path)
     except SceneNotFoundError:
-        found, fix = "no such file", "Put it there, or drop it from the model."
+        found, fix = "no such file", "Restore it, or remove it from the model."
         if near := similar_name(path):
-            found, fix = f"{near} in its place", "Name it as the model does, to the letter."
+            found, fix = f"only {near}", "Rename it to the exact name in the model."
         raise SceneNotFoundError(f"the image {path}", found=found, fix=fix) from None
 
 
 def open_photograph(path: Path, encoded: bytes) -> PilImage.Image:
-    """The photograph in a file's bytes; only its header is decoded yet."""
+    """Open encoded bytes as a photograph; only the header is decoded."""
     with translate_errors(path, "an image", fix=COPY_AGAIN):
         return PilImage.open(BytesIO(encoded))
 
 
 def decode_photograph(path: Path, encoded: bytes, white: int = WHITE) -> PilImage.Image:
-    """The pixels in a file's bytes, as RGB; of 16 bits, ``white`` becomes 255.
+    """Decode a photograph to RGB; in 16 bits, ``white`` becomes 255.
 
     Raises:
-        SceneFormatError: It is no image, is cut short or damaged, is in inks (CMYK), or has numbers
-            of unknown range.
+        SceneFormatError: No image, truncated or damaged, CMYK or LAB, or of unknown value range.
     """
     photograph = open_photograph(path, encoded)
     if photograph.mode in _INKS:
         raise SceneFormatError(
             f"{path} to be in RGB or grey",
             found=photograph.mode,
-            fix="Export it as sRGB: the look of its colours depends on a printer's profile.",
+            fix="Export it as sRGB: CMYK and LAB colours depend on a profile.",
         )
     if photograph.mode.startswith(_WIDE_GREY):
         return _grey_of(path, photograph, white).convert("RGB")
@@ -111,12 +110,12 @@ def read_photograph(path: Path, white: int = WHITE) -> UInt8[np.ndarray, "H W 3"
 
 
 def has_alpha(photograph: PilImage.Image) -> bool:
-    """Whether pixels may be transparent."""
+    """Whether an image can have transparent pixels."""
     return "A" in photograph.getbands() or "transparency" in photograph.info
 
 
 def check_photograph(path: Path) -> tuple[int, int]:
-    """Read a photograph to its last byte, keep nothing, and return its width and height."""
+    """Decode a photograph completely to find damage; return its width and height."""
     photograph = open_photograph(path, photograph_bytes(path))
     size = photograph.size
     photograph.draft(None, (size[0] // _CHECK_SCALE, size[1] // _CHECK_SCALE))
@@ -128,7 +127,7 @@ def check_photograph(path: Path) -> tuple[int, int]:
 def _colors_of(
     values: UInt16[np.ndarray, "H W C"], photograph: PilImage.Image, white: int
 ) -> PilImage.Image:
-    """Colours, or grey, of 16 bits as RGB over black."""
+    """Convert 16-bit colours or grey to RGB over black."""
     channels = values.shape[-1]
     colors = values[..., : channels - (channels in {2, 4})]
     shown = np.minimum(colors.astype(np.float32) * np.float32(255 / white), 255)
@@ -142,17 +141,17 @@ def _colors_of(
 
 
 def _grey_of(path: Path, photograph: PilImage.Image, white: int) -> PilImage.Image:
-    """Grey of 16 bits or of floats, as 8 bits."""
+    """Convert 16-bit or float grey to 8 bits."""
     with translate_errors(path, _COMPLETE_IMAGE, fix=COPY_AGAIN):
         values = np.asarray(photograph)
-    most = 1.0 if photograph.mode == "F" else 65535.0
-    # 32-bit integers can have any range; some versions of Pillow open 16-bit PNGs as such.
+    limit = 1.0 if photograph.mode == "F" else 65535.0
+    # 32-bit integers have no known range, but some versions of Pillow open 16-bit PNGs so.
     known = photograph.mode != "I" or photograph.format == "PNG"
-    if not (known and values.min() >= 0 and values.max() <= most):  # NaN compares false
+    if not (known and values.min() >= 0 and values.max() <= limit):  # NaN compares false
         raise SceneFormatError(
-            f"{path} to have 8 or 16 bits a channel, or floats of 0 to 1",
+            f"{path} to have 8 or 16 bits per channel, or floats from 0 to 1",
             found=f"{values.dtype} from {values.min():g} to {values.max():g}",
-            fix="Export the photograph with 8 bits a channel.",
+            fix="Export the photograph with 8 bits per channel.",
         )
     scale = np.float32(255 / (1.0 if photograph.mode == "F" else white))
     grey = np.rint(np.minimum(values.astype(np.float32) * scale, 255)).astype(np.uint8)
@@ -163,13 +162,13 @@ def _grey_of(path: Path, photograph: PilImage.Image, white: int) -> PilImage.Ima
 
 
 def warnings_without_lens(scene: Scene) -> list[str]:
-    """What is wrong with a scene for a command that takes lens distortion out."""
+    """Return a scene's warnings except those of lens distortion."""
     lens = lens_warnings(scene.images)
     return [warning for warning in scene.warnings if warning not in lens]
 
 
 def lens_warnings(images: Sequence[Image]) -> list[str]:
-    """A sentence on lens distortion, which not every trainer supports."""
+    """Warn of lens distortion, which not every trainer supports."""
     models = sorted({im.intrinsics.model for im in images if im.intrinsics.has_distortion})
     if not models:
         return []

@@ -1,8 +1,7 @@
-"""Photographs against their camera records: which are there, and whether they have the right size.
+"""Check that photographs exist and fit their camera records.
 
-A photograph *fits* its camera record if it has its size, or is a resized copy. Promise: sizes are
-of pixels as stored, as COLMAP and trainers take them: EXIF's orientation is ignored; only headers
-of files are read.
+A photograph *fits* its camera if it has its size or is a resized copy. Sizes are of stored pixels,
+as in COLMAP: EXIF orientation is ignored. Only headers are read.
 """
 
 from __future__ import annotations
@@ -27,142 +26,149 @@ Size = tuple[int, int]
 """Width and height."""
 
 ASPECT_SLACK = 0.02
-"""By how much the aspect ratio of a resized copy may differ from its camera's."""
+"""Largest relative difference in aspect ratio between a resized copy and its camera."""
 ROUNDING = 2.0
-"""A copy that is off by more pixels was not just resized, as each side is rounded by 1 at most."""
+"""Pixels by which a side may be off after resizing; rounding gives 1 at most."""
 _SIDEWAYS = frozenset({5, 6, 7, 8})
-"""EXIF's orientations that swap width and height when a viewer shows the photograph."""
-_NAMED = 3  # photographs that a sentence names
+"""EXIF orientations that swap width and height."""
+_NAMED = 3  # photographs listed in a message
 
 
 def with_photographs(scene: Scene) -> Scene:
-    """The scene with those images whose photographs are there; others become ``absent``.
+    """Drop images without a photograph; they become ``absent``.
 
     Raises:
-        SceneNotFoundError: Fewer than half of the photographs are there.
+        SceneNotFoundError: Fewer than half of the photographs exist.
     """
     folder = photograph_folder(scene)
-    gone = tuple(image.name for image in scene.images if not (folder / image.name).is_file())
-    if not gone:
+    missing = tuple(image.name for image in scene.images if not (folder / image.name).is_file())
+    if not missing:
         return scene
-    if 2 * len(gone) > len(scene.images):
+    if 2 * len(missing) > len(scene.images):
         raise SceneNotFoundError(
             f"at least half of the scene's {len(scene.images)} photographs in {folder}",
-            found=f"{len(scene.images) - len(gone) or 'none'}; missing: {name_some(gone, _NAMED)}",
-            fix="Put them there, under the names that the model has.",
+            found=f"{len(scene.images) - len(missing) or 'none'}; "
+            f"missing: {name_some(missing, _NAMED)}",
+            fix="Copy them there, with the names of the model.",
         )
-    there = tuple(image for image in scene.images if image.name not in {*gone})
-    return scene.replace(images=there, absent=(*scene.absent, *gone))
+    present = tuple(image for image in scene.images if image.name not in {*missing})
+    return scene.replace(images=present, absent=(*scene.absent, *missing))
 
 
 def photograph_size(path: Path) -> Size:
-    """Width and height of an image file; errors as ``photograph_bytes``'s and ``open``'s."""
+    """Read width and height of an image file.
+
+    Raises:
+        SceneNotFoundError: No such file.
+        SceneFormatError: Unreadable, or no image.
+    """
     if not path.is_file():
-        photograph_bytes(path)  # raises the error of a missing file
+        photograph_bytes(path)  # raises with advice for a missing file
     with translate_errors(path, "an image", fix=COPY_AGAIN), open_file(path) as file:
         return PilImage.open(file).size
 
 
 def fits(lens: Intrinsics, size: Size) -> bool:
-    """Whether a photograph of this size can be its camera's, or a resized copy."""
+    """Whether a photograph of this size has its camera's size or is a resized copy."""
     record = (lens.width, lens.height)
-    if size == record[::-1] != record:  # turned, even if it is nearly square
+    if size == record[::-1] != record:  # rotated, even if nearly square
         return False
     stretch = size[0] * lens.height / (size[1] * lens.width)
     return abs(stretch - 1) <= ASPECT_SLACK or _off(lens, size) <= ROUNDING / 2
 
 
 def _off(lens: Intrinsics, size: Size) -> float:
-    """By how many pixels of the file one of its sides differs from that of a resized copy."""
+    """Return how far a photograph's size is from that of a resized copy, px."""
     width, height = size[1] * lens.width / lens.height, size[0] * lens.height / lens.width
     return min(abs(size[0] - width), abs(size[1] - height))
 
 
 def check_sizes(images: Sequence[Image], folder: Path) -> dict[str, Size]:
-    """The sizes of the photographs of some images, all of which fit their records.
+    """Read the sizes of photographs, and check that all fit their cameras.
 
     Raises:
         SceneNotFoundError: One is missing.
-        SceneFormatError: One does not fit, or is no image.
+        SceneFormatError: One does not fit, or is not an image.
     """
     sizes = {image.name: photograph_size(folder / image.name) for image in images}
     wrong = [image for image in images if not fits(image.intrinsics, sizes[image.name])]
     if wrong:
         lens, (width, height) = wrong[0].intrinsics, sizes[wrong[0].name]
-        what, fix = _misfit(lens, (width, height), folder / wrong[0].name)
+        reason, fix = _misfit(lens, (width, height), folder / wrong[0].name)
         more = len(wrong) - 1
         others = f"; {more} more of {counted(len(images), 'photograph')} do not fit either"
         raise SceneFormatError(
             f"{folder / wrong[0].name} to have the size of its camera {lens.camera_id}, "
             f"{lens.width} x {lens.height}, or to be a resized copy",
-            found=f"{width} x {height}: {what}{others if more else ''}",
+            found=f"{width} x {height}: {reason}{others if more else ''}",
             fix=fix,
         )
     return sizes
 
 
 def _misfit(lens: Intrinsics, size: Size, path: Path) -> tuple[str, str]:
-    """Why a photograph does not fit its camera record, and what to do about it."""
+    """Explain why a photograph does not fit its camera, and how to fix it."""
     if not fits(lens, size[::-1]):
         return "cropped, or stretched", (
-            "Use the photographs that the poses were made from, or resized copies of them. A crop "
+            "Use the photographs of the reconstruction, or resized copies. A crop "
             "needs a camera record of its own: width, height and principal point."
         )
     if orientation := _sideways(path):
-        return f"stored turned, with EXIF orientation {orientation}", (
-            "The poses are of upright pixels: turn copies as EXIF says (mogrify -auto-orient, of "
-            "ImageMagick), or find poses of the files as they are (splatseed sfm)."
+        return f"stored rotated, with EXIF orientation {orientation}", (
+            "The poses are for upright pixels: rotate copies as EXIF says (ImageMagick: mogrify "
+            "-auto-orient), or estimate poses for the files as stored (splatseed sfm)."
         )
-    return "turned, width and height are swapped", (
-        "Turn them back, or find poses of the files as they are (splatseed sfm)."
+    return "rotated, with width and height swapped", (
+        "Rotate them back, or estimate poses for the files as stored (splatseed sfm)."
     )
 
 
 def _sideways(path: Path) -> int:
-    """EXIF's orientation if it swaps width and height, else 0."""
+    """Return EXIF's orientation if it swaps width and height, else 0."""
     try:
         with open_file(path) as file, PilImage.open(file) as picture:
             orientation = int(picture.getexif().get(0x0112, 0))
-    except Exception:  # noqa: BLE001  (EXIF is whatever a camera wrote; Pillow raises anything)
+    except Exception:  # noqa: BLE001  (damaged EXIF makes Pillow raise anything)
         return 0
     return orientation if orientation in _SIDEWAYS else 0
 
 
 def image_warnings(images: Sequence[Image], image_dir: Path | None, root: Path) -> list[str]:
-    """What is wrong with the image files against their records; only headers are read."""
+    """Warn of missing photographs and of sizes that do not fit their cameras."""
     if not images:
         return []
     if image_dir is None:
         dead = root / "images" if (root / "images").is_symlink() else None
-        gone = f"{dead} leads to {dead.readlink()}, which is not there" if dead else "is missing"
-        return [f"The images folder {gone}; points can be made, but nothing can be trained."]
-    missing = {im.name: None for im in images if not (image_dir / im.name).is_file()}
-    warnings = [_missing_warning([*missing], len(images), image_dir)] if missing else []
-    # Links, which somebody made on purpose, may lead anywhere: they are not followed.
+        missing = (
+            f"{dead} links to {dead.readlink()}, which does not exist" if dead else "is missing"
+        )
+        return [f"The images folder {missing}; points can be made, but not trained."]
+    absent = {im.name: None for im in images if not (image_dir / im.name).is_file()}
+    warnings = [_missing_warning([*absent], len(images), image_dir)] if absent else []
+    # Links are not followed: users make them on purpose.
     around = os.path.abspath(root)  # noqa: PTH100
     paths = {im.name: os.path.abspath(image_dir / im.name) for im in images}  # noqa: PTH100
     outside = [n for n, path in paths.items() if os.path.commonpath([path, around]) != around]
     if outside:
         lie = agreeing(len(outside), "lies", "lie")
         warnings.append(
-            f"{len(outside)} of {len(images)} images {lie} outside of {root}, the first is "
-            f"{outside[0]}."
+            f"{len(outside)} of {len(images)} images {lie} outside of {root}, such as {outside[0]}."
         )
-    return [*warnings, *_size_warnings([im for im in images if im.name not in missing], image_dir)]
+    return [*warnings, *_size_warnings([im for im in images if im.name not in absent], image_dir)]
 
 
 def _missing_warning(missing: Sequence[str], count: int, image_dir: Path) -> str:
     first, are = missing[0], agreeing(len(missing), "is", "are")
     near, kind = similar_name(image_dir / first), special_kind(image_dir / first)
-    hint = f"; {near} is there, but names must be equal to the letter" if near else ""
+    hint = f"; {near} exists, but names must match exactly" if near else ""
     hint = f"; {first} is {kind}" if kind else hint
-    hint = "; folders are separated by /, as on Linux, not by \\" if "\\" in first else hint
-    which = f"{len(missing)} of {count} images {are} missing in {image_dir}, and left out"
-    return f"{which} ({name_some(missing, _NAMED)}){hint}."
+    hint = "; separate folders by /, not by \\" if "\\" in first else hint
+    subject = f"{len(missing)} of {count} images {are} missing in {image_dir}, and left out"
+    return f"{subject} ({name_some(missing, _NAMED)}){hint}."
 
 
 def _size_warnings(images: Sequence[Image], image_dir: Path) -> list[str]:
-    """A sentence on each way in which files differ from their records, about the first such."""
+    """Warn of each kind of mismatch between files and cameras, with the first example."""
     sizes, warnings = file_sizes(images, image_dir), list[str]()
     if len(sizes) < len(images):
         first = next(image.name for image in images if image.name not in sizes)
@@ -175,18 +181,19 @@ def _size_warnings(images: Sequence[Image], image_dir: Path) -> list[str]:
     stretched = [im for im in fitting if _off(im.intrinsics, sizes[im.name]) > ROUNDING]
     all_of = counted(len(images), "photograph")
     if wrong := [im for im in other if im not in fitting]:
-        what = _misfit(wrong[0].intrinsics, sizes[wrong[0].name], image_dir / wrong[0].name)[0]
+        reason = _misfit(wrong[0].intrinsics, sizes[wrong[0].name], image_dir / wrong[0].name)[0]
         warnings.append(
             f"{len(wrong)} of {all_of} {agreeing(len(wrong), 'does', 'do')} not fit the camera: "
-            f"{_against(wrong[0], sizes)} ({what}). Nothing can be trained on them."
+            f"{_against(wrong[0], sizes)} ({reason}). They cannot be used for training."
         )
     if stretched:
         (width, height), lens = sizes[stretched[0].name], stretched[0].intrinsics
+        stretch = abs(width * lens.height / (height * lens.width) - 1)
+        have = agreeing(len(stretched), "has", "have")
         warnings.append(
-            f"{len(stretched)} of {all_of} {agreeing(len(stretched), 'has', 'have')} another shape "
-            f"than the camera: {_against(stretched[0], sizes)}. They are taken as resized, and "
-            f"stretched by {abs(width * lens.height / (height * lens.width) - 1):.1%}; if they were"
-            " cropped, give them a camera of their own size."
+            f"{len(stretched)} of {all_of} {have} another aspect ratio than the camera: "
+            f"{_against(stretched[0], sizes)}. They count as resized and stretched by "
+            f"{stretch:.1%}; if they were cropped, give them a camera of their own size."
         )
     elif fitting:
         warnings.append(f"{_against(fitting[0], sizes)}; some trainers rescale, others fail.")
@@ -204,7 +211,7 @@ def _against(image: Image, sizes: Mapping[str, Size]) -> str:
 
 
 def file_sizes(images: Sequence[Image], folder: Path) -> Mapping[str, Size]:
-    """The sizes of those photographs that are there and can be read, by name."""
+    """Read the sizes of readable photographs, by name."""
     sizes = {}
     for image in images:
         try:
@@ -215,10 +222,10 @@ def file_sizes(images: Sequence[Image], folder: Path) -> Mapping[str, Size]:
 
 
 def resized_to(images: Sequence[Image], sizes: Mapping[str, Size]) -> tuple[Image, ...]:
-    """Images with cameras and features in pixels of photographs of these sizes, by name.
+    """Scale cameras and features to photographs of these sizes, by name.
 
-    Where photographs of several sizes share a camera record, each size gets a record of its own,
-    with an id above all others. An image without a size, or whose photograph does not fit, stays.
+    If photographs of several sizes share a camera, each further size gets a new camera with an id
+    above all others. Images without a size, or whose photograph does not fit, are unchanged.
     """
     free = itertools.count(1 + max((image.intrinsics.camera_id for image in images), default=0))
     records: dict[tuple[Intrinsics, Size], Intrinsics] = {}
