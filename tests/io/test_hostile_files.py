@@ -97,7 +97,7 @@ def test_copies_are_of_files_and_end(scene_dir, tmp_path, target):
 def test_an_archive_that_would_burst_is_refused_by_its_header(tmp_path):
     np.savez_compressed(tmp_path / "bomb.npz", depth=np.zeros((5000, 5000), np.float32))
     assert (tmp_path / "bomb.npz").stat().st_size < 200_000
-    with little_memory(), pytest.raises(SceneFormatError, match=r"would become 100,000,"):
+    with little_memory(), pytest.raises(SceneFormatError, match=r"100,000,"):
         read_stored(tmp_path / "bomb.npz")
     constant, unread = np.zeros((48, 64), np.float32), np.zeros(1 << 22)
     np.savez_compressed(tmp_path / "more.npz", depth=constant, normals=unread)

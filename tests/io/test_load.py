@@ -95,7 +95,7 @@ def test_model_without_images_keeps_cameras_and_drops_tracks(scene_dir, model):
 def test_missing_photographs_are_counted_and_the_first_is_named(scene_dir, model):
     path = scene_dir / "images" / model.images[1].name
     path = path.rename(path.with_name(path.name.upper()))
-    assert f"({model.images[1].name}); IMAGE001.JPG is there" in warnings_of(scene_dir)
+    assert f"({model.images[1].name}); IMAGE001.JPG " in warnings_of(scene_dir)
     path.unlink()
     assert "1 of 4 images is missing" in warnings_of(scene_dir)
     first = scene_dir / "images" / model.images[0].name
