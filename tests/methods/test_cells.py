@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from splatseed import PointCloud
-from splatseed.methods.cells import MAX_NEIGHBORS, Cells, box_cells, build_cells
+from splatseed.methods._kernels.cells import MAX_NEIGHBORS, build_cells
+from splatseed.methods.cells import Cells, box_cells
 from splatseed.methods.neighbors import prepare
 from splatseed.methods.patches import local_frames
 from splatseed.progress import silent
@@ -22,7 +23,7 @@ def meshless(cloud, k):
     neighbors, n = cloud.neighbors(k), len(cloud)
     cells = Cells(np.empty((n, 3)), np.empty(n), np.empty(n), np.empty(n, bool))
     frames, _ = local_frames(cloud.xyz, neighbors.idx)
-    build_cells(cloud.xyz, neighbors.idx, neighbors.distance, frames, 0, n, cells)
+    build_cells(cloud.xyz, neighbors.idx, neighbors.distance, frames, 0, n, *cells)
     return cells, neighbors
 
 

@@ -1,32 +1,28 @@
 """B-spline surfaces (paper, eq. 3): a smooth tensor-product cubic at every base point.
 
-Default: a P-spline. Over the 6 x 6 control values c of ``splines``, minimise
+Default: a P-spline. Over the 6 x 6 control values c of ``_kernels.splines``, minimise
 sum_j (S(u_j, v_j) - z_j)^2 + lambda c' P c; the penalty makes the problem well-posed for 26 points
-and 36 unknowns. lambda is fixed for all patches.
+and 36 unknowns. P is a discrete thin plate, D2'D2 x I + 2 D1'D1 x D1'D1 + I x D2'D2 (after P.
+Eilers and B. Marx, Flexible smoothing with B-splines and penalties, 1996, with the cross term of a
+thin plate). It is 0 for planes, so strong smoothing tends to the least-squares plane.
 
-Paper: FITPACK with smoothing s = 0.1 k at k = 25. Its smoothing is inert there: no fit gets an
-inner knot, so the result is the least-squares bicubic polynomial in world axes, which is what
-``basis="bicubic"`` computes.
+Paper: FITPACK with smoothing s = 0.1 k at k = 25. ``SmoothBivariateSpline`` has no room for an
+inner knot there, so s never acts, and the spline is the tensor-product cubic polynomial of 16 terms
+in world axes. ``basis="bicubic"`` fits it by LAPACK's minimum-norm least squares.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float32, Float64, Int8
 
-from splatseed.methods import splines
+from splatseed.methods._kernels import splines as kernels
+from splatseed.methods._kernels.splines import COEFFICIENTS, CONTROL
 from splatseed.methods.patches import FitSize, Patches, PatchMethod
-from splatseed.methods.splines import COEFFICIENTS, CONTROL, PatchBasis
-from splatseed.runtime.jit import inline, kernel, parallel_range
 from splatseed.settings import Range
-
-BAND = 3 * CONTROL + 3
-"""Bandwidth: two overlapping basis functions are at most this far apart in the flat order."""
-RIDGE = 1e-9  # ridge for control values that no data and, for a plane, no penalty determines
 
 
 @dataclass(frozen=True)
@@ -44,7 +40,7 @@ class Spline(PatchMethod):
 
     @classmethod
     def paper(cls) -> Self:
-        """With k = 25, z = S(x, y) in world axes, positions in the neighbourhood's bounding box."""
+        """Return k = 25, z = S(x, y) in world axes, positions in the bounding box."""
         return cls(
             basis="bicubic", frame="world", placement="box", clamp=None, reject_isolated=False
         )
@@ -53,74 +49,50 @@ class Spline(PatchMethod):
         self, patches: Patches, first: int, last: int, out: Float32[np.ndarray, " M"]
     ) -> None:
         """Fit rows ``first:last`` and write S(u, v) of all their new points into ``out`` [M]."""
+        bases = patches.bases
         if self.basis == "bicubic":
-            splines.bicubic_heights(patches, first, last, out)
+            kernels.bicubic_heights(
+                patches.cloud.xyz, patches.neighbors.idx, patches.neighbors.distance,
+                patches.frames, bases.start, bases.count, patches.uv, first, last, out,
+            )  # fmt: skip
             return
-        basis = splines.patch_basis(patches, first, last)
-        count = patches.bases.count[first:last]
-        coefficients = fit(basis, count, self.smoothing)
-        splines.evaluate(patches, coefficients, basis.scale, first, last, out)
+        basis = _patch_basis(patches, first, last)
+        coefficients = np.zeros((last - first, COEFFICIENTS))
+        kernels.fit(
+            basis.weight, basis.cell, basis.z, bases.count[first:last], float(self.smoothing),
+            penalty(), coefficients,
+        )  # fmt: skip
+        kernels.evaluate(
+            bases.start, bases.count, patches.uv, coefficients, basis.scale, first, last, out
+        )
 
 
-def fit(basis: PatchBasis, count: np.ndarray, smoothing: float) -> Float64[np.ndarray, "rows 36"]:
-    """Control values of every row with new points (``count`` > 0), [rows, 36]; else 0."""
-    coefficients = np.zeros((len(basis.z), COEFFICIENTS))
-    _fit(
-        basis.weight, basis.cell, basis.z, count, float(smoothing), splines.penalty(), coefficients
+def penalty() -> Float64[np.ndarray, "36 36"]:
+    """Return P, with which the roughness of control values c is c' P c."""
+    identity = np.eye(CONTROL)
+    first, second = np.diff(identity, axis=0), np.diff(identity, n=2, axis=0)
+    slopes, bends = first.T @ first, second.T @ second
+    return np.asarray(
+        np.kron(bends, identity) + 2.0 * np.kron(slopes, slopes) + np.kron(identity, bends)
     )
-    return coefficients
 
 
-@kernel
-def _fit(weight, cell, z, count, smoothing, roughness, coefficients):  # type: ignore[no-untyped-def]  # Numba's types
-    for row in parallel_range(len(z)):
-        if count[row] > 0:
-            normal = np.empty((COEFFICIENTS, COEFFICIENTS))
-            for a in range(COEFFICIENTS):
-                for b in range(a, min(COEFFICIENTS, a + BAND + 1)):
-                    normal[a, b] = smoothing * roughness[a, b]
-                normal[a, a] += RIDGE
-            _accumulate(weight[row], cell[row], z[row], normal, coefficients[row])
-            _solve(normal, coefficients[row])
+class _PatchBasis(NamedTuple):
+    """The basis at the m = k + 1 data points of some rows; the base point is the last of a row."""
+
+    weight: Float64[np.ndarray, "rows m 2 4"]  # the four non-zero B-splines along u and along v
+    cell: Int8[np.ndarray, "rows m 2"]  # index of the first of them
+    z: Float64[np.ndarray, "rows m"]  # scaled heights
+    scale: Float64[np.ndarray, "rows 3"]  # scene units per unit of u, v and z
 
 
-@inline
-def _accumulate(weight, cell, z, normal, rhs):  # type: ignore[no-untyped-def]  # Numba's types
-    """Add B'B (upper triangle) and B'z; every data point touches 4 x 4 control values."""
-    product = np.empty((4, 4))
-    for j in range(z.size):
-        corner = CONTROL * cell[j, 0] + cell[j, 1]
-        for a in range(4):
-            for b in range(4):
-                product[a, b] = weight[j, 0, a] * weight[j, 1, b]
-        for a in range(4):
-            for b in range(4):
-                w, p = product[a, b], corner + CONTROL * a + b
-                rhs[p] += w * z[j]
-                for c in range(b, 4):
-                    normal[p, p - b + c] += w * product[a, c]
-                for d in range(a + 1, 4):
-                    q = corner + CONTROL * d
-                    for c in range(4):
-                        normal[p, q + c] += w * product[d, c]
-
-
-@inline
-def _solve(normal, rhs):  # type: ignore[no-untyped-def]  # Numba's types
-    """Solve in place by a banded Cholesky factor U'U; whole rows are updated, to vectorise."""
-    n = rhs.size
-    for a in range(n):
-        end = min(n, a + BAND + 1)
-        pivot = 1.0 / math.sqrt(normal[a, a])
-        rhs[a] *= pivot
-        for b in range(a, end):
-            normal[a, b] *= pivot
-        for b in range(a + 1, end):
-            factor = normal[a, b]
-            rhs[b] -= factor * rhs[a]
-            for c in range(b, end):
-                normal[b, c] -= factor * normal[a, c]
-    for a in range(n - 1, -1, -1):
-        for c in range(a + 1, min(n, a + BAND + 1)):
-            rhs[a] -= normal[a, c] * rhs[c]
-        rhs[a] /= normal[a, a]
+def _patch_basis(patches: Patches, first: int, last: int) -> _PatchBasis:
+    """Evaluate the basis for rows ``first:last``; rows without new points stay empty."""
+    rows, m = last - first, patches.neighbors.k + 1
+    cell, z = np.zeros((rows, m, 2), np.int8), np.zeros((rows, m))
+    basis = _PatchBasis(np.zeros((rows, m, 2, 4)), cell, z, np.ones((rows, 3)))
+    kernels.fill_basis(
+        patches.cloud.xyz, patches.neighbors.idx, patches.neighbors.distance, patches.frames,
+        patches.bases.count, first, last, *basis,
+    )  # fmt: skip
+    return basis

@@ -14,20 +14,20 @@ those of the new point.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
 from jaxtyping import Float64
 
-from splatseed.methods.cells import MAX_NEIGHBORS, Cells, box_cells, build_cells
+from splatseed.methods._kernels import cells as kernels
+from splatseed.methods._kernels.cells import MAX_NEIGHBORS
+from splatseed.methods.cells import Cells, box_cells
 from splatseed.methods.contract import NewPoints
 from splatseed.methods.nearest import Aux, NearestMethod, colors_of_nearest, interpolate_colors
 from splatseed.methods.neighbors import Bases, Neighbors, PreparedCloud
 from splatseed.methods.patches import local_frames
 from splatseed.progress import Progress, blocks
-from splatseed.runtime.jit import kernel, parallel_range
 from splatseed.settings import Range
 
 BLOCK = 1 << 14
@@ -73,7 +73,7 @@ class Voronoi(NearestMethod):
             return weight * volume, {"center": center, "radius": radius}
         center, radius, volume, _ = _clamped_cells(cloud, neighbors, progress)
         relative = np.empty(len(cloud))
-        _relative_volume(volume, neighbors.idx, float(self.max_weight), relative)
+        kernels.relative_volume(volume, neighbors.idx, float(self.max_weight), relative)
         weight = weight * relative
         return weight, {"center": center, "radius": radius}
 
@@ -91,9 +91,9 @@ class Voronoi(NearestMethod):
         xyz = rng.random((bases.total, 3), dtype=np.float32)
         local = xyz.copy() if self.cells == "box" else xyz[:0]
         balls = aux["center"], self.ball * aux["radius"], frames, bases.start, bases.count
-        _place(cloud.xyz, cloud.center, *balls, xyz)
+        kernels.sample_balls(cloud.xyz, cloud.center, *balls, xyz)
         if self.cells == "box":
-            _place(cloud.xyz, np.zeros(3), *balls, local)
+            kernels.sample_balls(cloud.xyz, np.zeros(3), *balls, local)
             rgb = colors_of_nearest(cloud, neighbors, local, self.color_k, progress)
         else:
             rgb = interpolate_colors(cloud, neighbors.nearest(self.color_k), bases, xyz)
@@ -106,30 +106,7 @@ def _clamped_cells(cloud: PreparedCloud, neighbors: Neighbors, progress: Progres
     n = len(neighbors.idx)
     cells = Cells(np.empty((n, 3)), np.empty(n), np.empty(n), np.empty(n, bool))
     for first, last in blocks(n, BLOCK, "voronoi", progress):
-        build_cells(cloud.xyz, neighbors.idx, neighbors.distance, frames, first, last, cells)
+        kernels.build_cells(
+            cloud.xyz, neighbors.idx, neighbors.distance, frames, first, last, *cells
+        )
     return cells
-
-
-@kernel
-def _relative_volume(volume, idx, cap, relative):  # type: ignore[no-untyped-def]  # Numba's types
-    """Each volume relative to the median of its neighbours', at most ``cap``."""
-    for i in parallel_range(len(relative)):
-        around = np.sort(volume[idx[i]])
-        median = 0.5 * (around[(around.size - 1) // 2] + around[around.size // 2])
-        relative[i] = min(volume[i] / median, cap) if median > 0.0 else 1.0
-
-
-@kernel
-def _place(xyz, site_center, center, radius, frames, start, count, out):  # type: ignore[no-untyped-def]  # Numba's types
-    """Uniform in each cell's ball, replacing the draws in ``out``; directions turn with frames."""
-    for i in parallel_range(len(count)):
-        for m in range(start[i], start[i] + count[i]):
-            r = radius[i] * np.float64(out[m, 0]) ** (1.0 / 3.0)
-            n = 2.0 * np.float64(out[m, 1]) - 1.0
-            angle = 2.0 * math.pi * np.float64(out[m, 2])
-            ring = math.sqrt(max(1.0 - n * n, 0.0))
-            u, v = ring * math.cos(angle), ring * math.sin(angle)
-            for axis in range(3):
-                direction = u * frames[i, 0, axis] + v * frames[i, 1, axis] + n * frames[i, 2, axis]
-                local = xyz[i, axis] + center[i, axis] + r * direction
-                out[m, axis] = site_center[axis] + local

@@ -1,0 +1,1 @@
+"""Numba kernels of the methods that interpolate, a file per subject."""
