@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 import splatseed as ss
-from splatseed.seeding.diagnostics import measure, spacing
+from splatseed.seeding.geometry_score import measure, spacing
 from splatseed.synthetic import SHAPES, Surface
 
 NUM_POINTS = 2000

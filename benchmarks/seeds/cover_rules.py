@@ -53,14 +53,14 @@ class Hole:
     cell: tuple[int, int]
     truth: float
     view: View
-    witnesses: cover.Witnesses
+    witnesses: cover.ReferenceDepths
 
     def sectors(self, num_witnesses: int) -> float:
         """The rule of ``cover``, asking some of the other views."""
         depths, _ = cover.guess_depths(
             self.quartiles,
             np.array([self.cell[0] * self.quartiles.shape[1] + self.cell[1]]),
-            cover.world_from_grid(self.view, CELL),
+            cover.world_from_cells(self.view, CELL),
             self.witnesses,
             np.arange(num_witnesses),
         )
@@ -177,7 +177,7 @@ def _make_hole(
         (int(target[0]), int(target[1])),
         float(depth[row]),
         view,
-        cover.depth_maps_of_views(asked, rest, CELL, silent),
+        cover.reference_depths(asked, rest, CELL, silent),
     )
 
 

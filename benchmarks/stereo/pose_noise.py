@@ -34,7 +34,7 @@ from splatseed.errors import ReconstructionError, SplatseedError
 from splatseed.photos.view import user_cache_dir
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
-from splatseed.seeding.poses import pose_error
+from splatseed.seeding.pose_accuracy import estimate_pose_error
 from splatseed.sfm import refined
 from splatseed.similarity import fit_similarity
 
@@ -105,7 +105,7 @@ def _with_noise(scene: Scene, degrees: float, rng: np.random.Generator) -> Scene
 
 def _seen(scene: Scene, truth: Scene) -> list[str]:
     """What photographs tell of their poses, and what stereo makes of them."""
-    told = pose_error(scene, scene.images)
+    told = estimate_pose_error(scene, scene.images)
     known, errors = [], []
     for each in stereo_depths(scene):
         found = np.isfinite(each.depth)

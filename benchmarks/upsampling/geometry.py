@@ -1,7 +1,7 @@
 """How close new points come to known surfaces, and how well they fill them.
 
 Notation: h is the spacing of a case's originals (mean distance to the 6 nearest); error, p95 and
-coverage are in units of h and mean what ``splatseed.seeding.diagnostics`` says, sum = error +
+coverage are in units of h and mean what ``splatseed.seeding.geometry_score`` says, sum = error +
 coverage. A *case* is a shape, a noise level and a seed; an *arm* is a method with its parameters.
 Promise: nothing here depends on the clock; the same code gives the same tables.
 """
@@ -23,7 +23,7 @@ from benchmarks.upsampling.outliers import outlier_table
 from benchmarks.upsampling.spline_smoothing import smoothing_table
 
 import splatseed as ss
-from splatseed.seeding.diagnostics import GeometryScore, far_share, measure, spacing
+from splatseed.seeding.geometry_score import GeometryScore, far_share, measure, spacing
 from splatseed.synthetic import SHAPES, Surface
 from splatseed.synthetic.shapes import plane, sine_sheet
 from splatseed.synthetic.surfaces import SineSheet

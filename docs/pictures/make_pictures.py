@@ -31,7 +31,7 @@ from splatseed.methods import methods_for
 from splatseed.photos.viewpoint import choose_camera, choose_image, look_at
 from splatseed.photos.visibility import find_visibility
 from splatseed.scene import Image
-from splatseed.seeding.diagnostics import spacing
+from splatseed.seeding.geometry_score import spacing
 from splatseed.synthetic import Capture, make_capture, write_capture
 from splatseed.viewer.maps import preview_depth
 from splatseed.viewer.points import render_points

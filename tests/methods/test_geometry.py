@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 import splatseed as ss
 from splatseed.methods.patches import local_frames
-from splatseed.seeding.diagnostics import far_share, spacing
+from splatseed.seeding.geometry_score import far_share, spacing
 from splatseed.synthetic import SHAPES
 from splatseed.synthetic.shapes import parallel_plates, plane
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings, strategies as st
 from splatseed.errors import ParameterError, PointCloudError
 from splatseed.photos.zbuffer import cell_depths
 from splatseed.progress import silent
-from splatseed.seeding.cover import cover, depth_maps_of_views, guess_depths, world_from_grid
+from splatseed.seeding.cover import cover, guess_depths, reference_depths, world_from_cells
 from splatseed.seeding.coverage import covered_share
 
 from . import references as slow
@@ -90,12 +90,12 @@ def test_of_two_surfaces_a_seed_takes_the_one_that_no_view_looks_through(rng):
         pose = view.cam_from_world.copy()
         pose[0, 3] += step
         aside.append(dataclasses.replace(view, cam_from_world=pose))
-    witnesses = depth_maps_of_views(aside, points, 8, silent)
+    reference = reference_depths(aside, points, 8, silent)
     depths = cell_depths(view.camera, points, 8)
     gap = np.flatnonzero(np.isinf(depths))
-    back = world_from_grid(view, 8)
-    for asked, expected in ((0, [2, 4]), (3, [4, 4])):
-        guesses, reach = guess_depths(depths, gap, back, witnesses, np.arange(asked))
+    back = world_from_cells(view, 8)
+    for checked, expected in ((0, [2, 4]), (3, [4, 4])):
+        guesses, reach = guess_depths(depths, gap, back, reference, np.arange(checked))
         inner = guesses.reshape(6, 2)[1:5]  # the first and last row have fewer around them
         np.testing.assert_allclose(inner, [expected] * 4, rtol=1e-5)
         assert (reach == 1).all()

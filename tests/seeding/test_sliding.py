@@ -1,4 +1,4 @@
-"""Sliding points to where photographs agree, held to the search and its cost as literal loops."""
+"""The slide to where photographs agree, against the search and its cost as literal loops."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ import pytest
 
 from splatseed.depth.stereo._kernels.patchmatch import QuadImages
 from splatseed.depth.stereo.quads import make_quads
-from splatseed.seeding.verify import FLOOR, OFFSETS, REACH, REFINEMENTS, TEXTURE, slide
+from splatseed.seeding._kernels import FLOOR, MAX_MOVE, OFFSETS, REFINEMENTS, slide
+from splatseed.seeding.verify import SETTINGS
 
 from ..depth.stereo.references import OFFSETS as WINDOW, best_of, bilinear, cost_in, window_weights
 
@@ -74,7 +75,7 @@ def search(cost):
             values.setdefault(t, (cost(t) + FLOOR) * (1 + t * t))
         return min(values, key=values.__getitem__)
 
-    step = 2 * REACH / (OFFSETS - 1)
+    step = 2 * MAX_MOVE / (OFFSETS - 1)
     t = best([step * (k - OFFSETS // 2) for k in range(OFFSETS)])
     for _ in range(REFINEMENTS):
         step /= 2
@@ -83,7 +84,7 @@ def search(cost):
 
 
 @pytest.mark.parametrize("num_sources", [1, 3])
-def test_the_place_is_that_of_the_loop(num_sources, images, points):
+def test_the_offset_equals_the_loop(num_sources, images, points):
     images = images[: num_sources + 1]
     moves, costs, _ = run(images, *points)
     same = 0
@@ -101,10 +102,10 @@ def test_the_place_is_that_of_the_loop(num_sources, images, points):
     assert np.ptp(moves) > 1.0  # the loop above compared different things
 
 
-def test_the_variance_is_that_of_the_window(images, points):
-    faint = (images[0] // 10).astype(np.uint8)  # as faint as what has to be told from no texture
+def test_the_variance_equals_the_window(images, points):
+    faint = (images[0] // 10).astype(np.uint8)  # about as faint as no texture
     _, _, variances = run([faint, *images[1:]], *points)
-    assert variances.min() < TEXTURE < variances.max()
+    assert variances.min() < SETTINGS.min_variance < variances.max()
     for (u, v), found in zip(points[0].astype(float), variances, strict=True):
         c = window_weights(faint, u, v)
         r = np.array([bilinear(faint, u + dx - 0.5, v + dy - 0.5) for dx, dy in WINDOW])

@@ -1,8 +1,8 @@
-"""verify: points beside a planted plane go back onto it, points far from it go, nothing is made up.
+"""verify: points near a planted plane return to it, others are dropped, nothing is invented.
 
 The plane goes through the world's origin, ``NORMAL`` towards the cameras; originals lie on it in
 rows and columns, ``STEP`` metres apart. New points carry their numbers in their colours, so that
-what is left can be told. Who judges a point is held to literal loops.
+those that stay are known. Reference views and local geometry are compared with literal loops.
 """
 
 from __future__ import annotations
@@ -19,12 +19,14 @@ from splatseed.methods.contract import NewPoints
 from splatseed.photos.view import View
 from splatseed.photos.visibility import Visibility
 from splatseed.scene import Image
-from splatseed.seeding import verify as module
+from splatseed.seeding import _kernels, verify as module
+from splatseed.seeding.local_geometry import NEIGHBORS, LocalGeometry, local_geometry
 from splatseed.synthetic.room import Room, render_view
 
 from ..depth.stereo.made import DOWN, STONE, WIDTH, arc, tilted_plane
 from .references import make_view, matrix_of, project
 
+SETTINGS = module.SETTINGS
 STEP = 0.12
 ALONG = np.array([np.cos(np.pi / 6), 0.0, np.sin(np.pi / 6)])
 NORMAL = np.array([ALONG[2], 0.0, -ALONG[0]])
@@ -69,8 +71,8 @@ def shifted(places, spacings_off):
     return places + (np.asarray(spacings_off) * spacings(KNOWN, places))[:, None] * NORMAL
 
 
-def hold(views, known, new, seen=None):
-    """``verify`` of new points [M, 3]; ``seen``: the originals of each view, all when left out."""
+def run_verify(views, known, new, seen=None):
+    """``verify`` of new points [M, 3]; ``seen``: the originals of each view, by default all."""
     seen = [range(len(known))] * len(views) if seen is None else seen
     starts = np.cumsum([0, *map(len, seen)]).tolist()
     rows = np.array([row for each in seen for row in each], np.int64)
@@ -86,21 +88,21 @@ def hold(views, known, new, seen=None):
 
 
 def numbered(xyz):
-    """Points whose colours say which they are."""
+    """Points whose colours encode their numbers."""
     number = np.arange(len(xyz))
     rgb = np.stack([number % 256, number // 256, 0 * number], axis=1).astype(np.uint8)
     return NewPoints(np.asarray(xyz, np.float32), rgb, source=np.full(len(xyz), 4, np.uint8))
 
 
 def numbers(points):
-    """Which of the points that were given are left, [K]."""
+    """The numbers of the points that are left, [K]."""
     return points.rgb[:, 0].astype(int) + 256 * points.rgb[:, 1].astype(int)
 
 
-def test_points_beside_a_plane_slide_back_onto_it(places, rng):
+def test_points_near_a_plane_slide_back_onto_it(places, rng):
     off = rng.uniform(0.3, 1.2, len(places)) * rng.choice([-1, 1], len(places))
     new = shifted(places, off)
-    kept = hold(VIEWS, KNOWN, new)
+    kept = run_verify(VIEWS, KNOWN, new)
     assert len(kept.xyz) > 0.95 * len(new)
     before = np.abs(new[numbers(kept)] @ NORMAL) / spacings(KNOWN, new[numbers(kept)])
     after = np.abs(kept.xyz @ NORMAL) / spacings(KNOWN, new[numbers(kept)])
@@ -111,36 +113,36 @@ def test_points_beside_a_plane_slide_back_onto_it(places, rng):
     np.testing.assert_allclose(kept.normals, np.tile(NORMAL, (len(kept.xyz), 1)), atol=1e-3)
 
 
-def test_without_texture_flat_places_stay_and_others_go(places, rng):
+def test_without_texture_flat_places_stay_and_others_are_dropped(places, rng):
     grey = [constant(view) for view in VIEWS]
-    flat = hold(grey, KNOWN, places)
+    flat = run_verify(grey, KNOWN, places)
     np.testing.assert_array_equal(flat.xyz, places.astype(np.float32))
-    assert (flat.confidence == np.float32(module.BARE_CONFIDENCE)).all()
+    assert (flat.confidence == np.float32(SETTINGS.textureless_confidence)).all()
     rough = KNOWN + rng.normal(scale=0.3, size=(len(KNOWN), 3))
-    assert len(hold(grey, rough, places).xyz) < 0.1 * len(places)
+    assert len(run_verify(grey, rough, places).xyz) < 0.1 * len(places)
 
 
-def test_what_no_pair_of_photographs_sees_is_kept_unchecked(places):
+def test_points_that_no_pair_of_photographs_sees_stay_unchecked(places):
     beside = shifted(places, np.full(len(places), 0.8))
     half = len(KNOWN) // 2
     apart = [range(half), range(half, len(KNOWN))]
     dark = [dataclasses.replace(v, mask=np.zeros((v.height, v.width), bool)) for v in VIEWS]
     for kept in (
-        hold(VIEWS[:1], KNOWN, beside),
-        hold(VIEWS[:2], KNOWN, beside, apart),
-        hold([VIEWS[0]] * 2, KNOWN, beside),
-        hold(dark, KNOWN, beside),
-        hold([], KNOWN, beside),
-        hold(VIEWS, KNOWN[:1], beside),
-        hold(VIEWS, KNOWN[:0], beside),
+        run_verify(VIEWS[:1], KNOWN, beside),
+        run_verify(VIEWS[:2], KNOWN, beside, apart),
+        run_verify([VIEWS[0]] * 2, KNOWN, beside),
+        run_verify(dark, KNOWN, beside),
+        run_verify([], KNOWN, beside),
+        run_verify(VIEWS, KNOWN[:1], beside),
+        run_verify(VIEWS, KNOWN[:0], beside),
     ):
         np.testing.assert_array_equal(kept.xyz, beside.astype(np.float32))
         assert np.isnan(kept.confidence).all()
-        assert "unchecked" in kept.notes[-1]
+        assert f"{len(beside)}" in kept.notes[-1]
 
 
-def test_of_a_photograph_only_what_it_shows_judges(places):
-    """The half that is black tells nothing: points there are not dropped for it."""
+def test_mothers_pixels_drop_no_point(places):
+    """Half of every photograph is mothers: points there stay, unchecked."""
     cut = []
     for view in VIEWS:
         mask = np.arange(view.width) < np.full((view.height, 1), view.width // 2)
@@ -150,7 +152,7 @@ def test_of_a_photograph_only_what_it_shows_judges(places):
     columns = np.array([v.camera.project(far)[0][:, 0] for v in VIEWS])
     black, lit = (columns > WIDTH // 2).all(axis=0), (columns < WIDTH // 2 - 5).all(axis=0)
     assert min(black.sum(), lit.sum()) > 20
-    kept = hold(cut, KNOWN, far)
+    kept = run_verify(cut, KNOWN, far)
     left = numbers(kept)
     assert black[left].sum() == black.sum()
     assert np.isnan(kept.confidence[black[left]]).all()
@@ -168,7 +170,7 @@ SHAPES = {"apart": [1, 1, 1], "at one place": 0, "on a line": [1, 0, 0], "on a p
     st.sampled_from(["noise", "constant", "one of each"]),
 )
 @settings(max_examples=30, deadline=None)
-def test_nothing_is_made_up_from_degenerate_input(seed, num_views, num_known, shape, look):
+def test_degenerate_input_gives_only_confirmed_points(seed, num_views, num_known, shape, look):
     rng = np.random.default_rng(seed)
     known = rng.normal(scale=0.2, size=(num_known, 3)) * SHAPES[shape]
     views = VIEWS[:num_views]
@@ -177,20 +179,22 @@ def test_nothing_is_made_up_from_degenerate_input(seed, num_views, num_known, sh
     new = rng.normal(scale=0.3, size=(rng.integers(0, 12), 3)).astype(np.float32)
     seen = [rng.permutation(num_known)[: rng.integers(num_known + 1)].tolist() for _ in views]
     known = np.unique(known, axis=0)
-    kept = hold(views, known, new, [[row for row in each if row < len(known)] for each in seen])
+    kept = run_verify(
+        views, known, new, [[row for row in each if row < len(known)] for each in seen]
+    )
     left = numbers(kept)
     assert (np.diff(left) > 0).all()
     assert np.isfinite(kept.xyz).all()
-    sure = kept.confidence > module.BARE_CONFIDENCE
-    assert ((kept.confidence[sure] >= 1 - module.MAX_COST) & (kept.confidence[sure] <= 1)).all()
+    sure = kept.confidence > SETTINGS.textureless_confidence
+    assert ((kept.confidence[sure] >= 1 - SETTINGS.max_cost) & (kept.confidence[sure] <= 1)).all()
     np.testing.assert_array_equal(kept.xyz[~sure], new[left[~sure]])
     if len(known) > 1:  # at most so many spacings along a normal of 73 degrees at most
         moved = np.linalg.norm(kept.xyz - new[left], axis=1)
-        assert (moved <= module.REACH / 0.29 * spacings(known, new[left]) + 1e-5).all()
+        assert (moved <= _kernels.MAX_MOVE / 0.29 * spacings(known, new[left]) + 1e-5).all()
 
 
-GOOD, BAD, NONE = module.MAX_COST - 0.3, module.MAX_COST + 0.1, np.inf
-RICH, TEXTURELESS = 10 * module.TEXTURE, 0.1 * module.TEXTURE
+GOOD, BAD, NONE = SETTINGS.max_cost - 0.3, SETTINGS.max_cost + 0.1, np.inf
+RICH, POOR = 10 * SETTINGS.min_variance, 0.1 * SETTINGS.min_variance
 
 
 @pytest.mark.parametrize(
@@ -200,67 +204,67 @@ RICH, TEXTURELESS = 10 * module.TEXTURE, 0.1 * module.TEXTURE
         ((BAD, GOOD), (RICH, RICH), False, 2, 1 - GOOD),
         ((-0.01, BAD), (RICH, RICH), False, 1, 1.0),
         ((GOOD, NONE), (RICH, 0.0), True, 1, 1 - GOOD),
-        ((0.0, GOOD), (TEXTURELESS, RICH), True, 2, 1 - GOOD),
-        ((0.0, BAD), (TEXTURELESS, RICH), True, None, None),
+        ((0.0, GOOD), (POOR, RICH), True, 2, 1 - GOOD),
+        ((0.0, BAD), (POOR, RICH), True, None, None),
         ((BAD, NONE), (RICH, 0.0), True, None, None),
-        ((GOOD, GOOD), (TEXTURELESS, TEXTURELESS), False, None, None),
-        ((GOOD, NONE), (TEXTURELESS, 0.0), True, 0, module.BARE_CONFIDENCE),
+        ((GOOD, GOOD), (POOR, POOR), False, None, None),
+        ((GOOD, NONE), (POOR, 0.0), True, 0, SETTINGS.textureless_confidence),
         ((NONE, NONE), (0.0, 0.0), False, 0, np.nan),
         ((NONE, NONE), (0.0, 0.0), True, 0, np.nan),
     ],
 )
-def test_the_fate_of_a_point(costs, variances, flat, xyz, confidence):
-    """Of one at 0, which two judges put at (1, 1, 1) and (2, 2, 2)."""
+def test_the_outcome_of_a_point(costs, variances, flat, xyz, confidence):
+    """For a point at 0 that two reference views move to (1, 1, 1) and (2, 2, 2)."""
     normal = np.array([[0.0, 0.0, 1.0]])
-    around = module.Surroundings(np.zeros(1, int), np.ones(1), normal, np.array([flat]))
+    geometry = LocalGeometry(np.zeros(1, int), np.ones(1), normal, np.array([flat]))
     put = np.array([[[1.0] * 3, [2.0] * 3]])
-    found = module._Trials(
+    found = module.PhotoChecks(
         *(np.array(e, np.float32) for e in (put, [[0, 0]], [costs], [variances]))
     )
     centers = np.array([[[0.0, 0.0, -3.0]] * 2])
-    decided = module._decide(numbered(np.zeros((1, 3))), around, found, centers)
+    decided = module._apply_checks(numbered(np.zeros((1, 3))), geometry, found, centers)
     if xyz is None:
         assert len(decided.xyz) == 0
         return
     np.testing.assert_array_equal(decided.xyz, np.full((1, 3), xyz, np.float32))
     np.testing.assert_allclose(decided.confidence, [confidence], rtol=1e-6)
     if not np.isnan(confidence):
-        np.testing.assert_array_equal(decided.normals, -normal)  # towards the judge
+        np.testing.assert_array_equal(decided.normals, -normal)  # towards the reference view
 
 
-def holds(view, point):
+def in_frame(view, point):
     """Whether a point falls into a view, away from its edge."""
     at = project(point, matrix_of(view, 1)[0])
     sizes = (view.width, view.height)
     return at is not None and all(
-        module.MARGIN <= x <= s - module.MARGIN for x, s in zip(at, sizes, strict=False)
+        _kernels.MARGIN <= x <= s - _kernels.MARGIN for x, s in zip(at, sizes, strict=False)
     )
 
 
-def worth(view, point, normal):
+def quality(view, point, normal):
     """How well a view sees a surface."""
     ray = point.astype(float) - view.camera.center
     distance = np.linalg.norm(ray)
     cosine = 0.0 if np.isnan(normal).any() else abs(ray @ normal) / distance
-    return view.K[0, 0] * (cosine + module.OBLIQUE) / distance
+    return view.K[0, 0] * (cosine + _kernels.OBLIQUE_WEIGHT) / distance
 
 
-def judges_of(point, base, normal, views, seen, sources):
-    """The views that judge a point, best first."""
+def reference_views_of(point, base, normal, views, seen, sources):
+    """The views that check a point, best first."""
     able = []
     for k, view in enumerate(views):
-        asked = [j for j in sources[k] if j >= 0]
-        holding = sum(holds(views[j], point) for j in asked)
-        enough = holding >= min(len(asked), module.WITNESSES) and holding > 0
-        if base in seen[k] and holds(view, point) and enough:
-            able.append((-worth(view, point, normal), k))
-    best = [k for _, k in sorted(able)[: module.REFERENCE_VIEWS]]
-    return best + [-1] * (module.REFERENCE_VIEWS - len(best))
+        others = [j for j in sources[k] if j >= 0]
+        inside = sum(in_frame(views[j], point) for j in others)
+        enough = inside >= min(len(others), _kernels.MIN_SOURCES) and inside > 0
+        if base in seen[k] and in_frame(view, point) and enough:
+            able.append((-quality(view, point, normal), k))
+    best = [k for _, k in sorted(able)[: _kernels.REFERENCE_VIEWS]]
+    return best + [-1] * (_kernels.REFERENCE_VIEWS - len(best))
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 5), st.integers(0, 3))
 @settings(max_examples=30, deadline=None)
-def test_judges_are_those_of_the_loop(seed, num_views, num_sources):
+def test_reference_views_equal_the_loop(seed, num_views, num_sources):
     rng = np.random.default_rng(seed)
     views = [make_view(rng, *rng.integers(12, 60, 2).tolist()) for _ in range(num_views)]
     xyz = rng.normal(scale=0.7, size=(25, 3)).astype(np.float32)
@@ -273,24 +277,24 @@ def test_judges_are_those_of_the_loop(seed, num_views, num_sources):
         others = rng.permutation(np.delete(np.arange(num_views), k))[:num_sources]
         sources[k, : len(others)] = others
     base = rng.integers(0, 8, 25)
-    around = module.Surroundings(base, np.ones(25), normals, np.ones(25, bool))
-    found = module.choose_reference_views(xyz, around, views, seen, 8, sources)
+    geometry = LocalGeometry(base, np.ones(25), normals, np.ones(25, bool))
+    found = module.choose_reference_views(xyz, geometry, views, seen, 8, sources)
     expected = [
-        judges_of(point, b, n, views, seen, sources.tolist())
+        reference_views_of(point, b, n, views, seen, sources.tolist())
         for point, b, n in zip(xyz, base, normals, strict=True)
     ]
     np.testing.assert_array_equal(found, expected)
 
 
-def test_surroundings_are_those_of_the_loop(rng):
+def test_local_geometry_equals_the_loop(rng):
     known = rng.normal(size=(60, 3)).astype(np.float32).astype(float)
     xyz = rng.normal(size=(40, 3)).astype(np.float32)
-    around = module.survey(known, xyz)
+    geometry = local_geometry(known, xyz)
     for i, point in enumerate(xyz):
         base = int(np.argmin([math.dist(point, each) for each in known]))
-        assert around.base[i] == base
+        assert geometry.base[i] == base
         near = known[np.argsort([math.dist(known[base], each) for each in known])]
         apart = [math.dist(known[base], each) for each in near[1:7]]
-        assert around.spacing[i] == pytest.approx(np.mean(apart))
-        axes = np.linalg.eigh(np.cov(near[: module.NEIGHBORS + 1].T))[1]
-        assert abs(axes[:, 0] @ around.normals[i]) == pytest.approx(1.0, abs=1e-6)
+        assert geometry.spacing[i] == pytest.approx(np.mean(apart))
+        axes = np.linalg.eigh(np.cov(near[: NEIGHBORS + 1].T))[1]
+        assert abs(axes[:, 0] @ geometry.normals[i]) == pytest.approx(1.0, abs=1e-6)

@@ -46,7 +46,7 @@ from splatseed.text import quoted
 
 if TYPE_CHECKING:  # they load Numba, or PyTorch, which may be absent
     from splatseed.scores import TrainingResult
-    from splatseed.seeding.diagnostics import GeometryScore
+    from splatseed.seeding.geometry_score import GeometryScore
     from splatseed.training.settings import TrainSettings
     from splatseed.viewer.page import Tile
 
@@ -205,7 +205,7 @@ def _has_pytorch() -> bool:
 def _make_points(options: Options) -> None:
     """The capture, its points by every method, their errors, and pictures."""
     from splatseed.photos.viewpoint import choose_camera
-    from splatseed.seeding.diagnostics import measure, spacing
+    from splatseed.seeding.geometry_score import measure, spacing
     from splatseed.synthetic import make_capture, write_capture
     from splatseed.viewer import clouds as pictures
 

@@ -23,7 +23,15 @@ from splatseed.commands import next_steps
 from splatseed.commands.next_steps import Commands, Planned
 from splatseed.commands.options import parse_options, refuse
 from splatseed.commands.outputs import check_free
-from splatseed.console import OUT, StageClock, print_note, print_pairs, print_table, stage_display
+from splatseed.console import (
+    OUT,
+    StageClock,
+    print_note,
+    print_pairs,
+    print_table,
+    stage_display,
+    with_options,
+)
 from splatseed.depthmap import DepthKind, DepthMaps
 from splatseed.errors import SplatseedError
 from splatseed.io import find_depths, load_scene
@@ -34,6 +42,7 @@ from splatseed.scene import Scene
 from splatseed.seeding import diagnostics
 from splatseed.seeding.advice import Advice, advice_for
 from splatseed.seeding.photo_methods import has_points, photographed
+from splatseed.seeding.trainability import is_distorted, untrainable
 from splatseed.text import counted, quoted, visible
 from splatseed.training.schedule import FULL_RUN
 
@@ -116,7 +125,7 @@ def run(arguments: list[str]) -> None:
     if options.picture is not None:
         print_pairs("picture", [("of depth", str(options.picture))])
     if len(scene.points) or scene.images:
-        if missing := diagnostics.untrainable(scene):
+        if missing := untrainable(scene):
             print_note(missing)
         print_pairs("next", _next(options, usable, advice, planned, known, doubt))
 
@@ -187,18 +196,19 @@ def _look_at_poses(
     """
     if has_points(scene) or not scene.has_photographs:
         return None, ""
-    from splatseed.seeding.poses import check_poses, low_agreement, pose_error
+    from splatseed.seeding.pose_accuracy import estimate_pose_error
+    from splatseed.seeding.poses import agreement_warning, check_poses
 
     try:
         images = photographed(scene)
         agreement = check_poses(scene, images, progress)
     except SplatseedError as refused:
-        problem = f"The photographs cannot be compared: {refused}"
+        problem = with_options(f"The photographs cannot be compared: {refused}")
         return {"agreement": 0.0, "error": None, "problem": problem}, ""
-    error = pose_error(scene, images, progress)
-    problem = error.warning if error else ""
+    error = estimate_pose_error(scene, images, progress)
+    problem = with_options(error.warning) if error else ""
     facts = {"agreement": agreement, "error": error, "problem": problem}
-    return facts, low_agreement(agreement, masked)
+    return facts, agreement_warning(agreement, masked)
 
 
 def _next(
@@ -207,7 +217,7 @@ def _next(
     """What to do next with the scene, or what there is to choose from."""
     any_points, refine = len(scene.points) > 0, "--refine-poses" in problem
     lifted = ""
-    if options.depth is not None and scene.depths and not diagnostics.is_distorted(scene):
+    if options.depth is not None and scene.depths and not is_distorted(scene):
         how = "" if options.depth_kind is None else f"--depth-kind {options.depth_kind} "
         how += "" if options.depth_scale is None else f"--depth-scale {options.depth_scale:g} "
         how += "" if any_points else "--depth.no-align "

@@ -12,7 +12,7 @@ from splatseed.lens import undistort_command, undistorted
 from splatseed.photos.view import at_file_size
 from splatseed.scene import Scene, SceneFormat
 from splatseed.seeding.advice import AS_IT_IS, SEEDED, Advice
-from splatseed.seeding.diagnostics import is_distorted, untrainable
+from splatseed.seeding.trainability import is_distorted, untrainable
 from splatseed.text import quoted
 from splatseed.training.schedule import FULL_RUN
 from splatseed.training.seeds import most_seeds

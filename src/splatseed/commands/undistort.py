@@ -14,7 +14,7 @@ from splatseed.io import load_scene
 from splatseed.io.photograph import warnings_without_lens
 from splatseed.io.seeds import was_upsampled
 from splatseed.io.staging import check_output
-from splatseed.seeding.diagnostics import is_distorted
+from splatseed.seeding.trainability import is_distorted
 from splatseed.sfm import undistort
 from splatseed.text import quoted
 

@@ -1,15 +1,15 @@
 """Cover: a seed in every part of every photograph that no point covers.
 
-Notation: cells, their depths and *covered* are defined in ``coverage``. Views are taken in random
-order, each seeing the seeds of the views before. An empty cell gets one seed on the ray through its
-centre. For its depth, in each of eight sectors of 45 degrees around it the nearest covered cell is
-consulted, up to ``2 r + 1`` cells away, where r is the distance of the first one. A seed at that
-depth is *contradicted* by another view if it lies in front of a covered cell there, nearer by more
-than ``SURFACE``: that view looks through it. The guess is the median of the sectors' depths,
-weighted by ``1 / ((1 + contradictions) distance^2)``. If a view has no covered cell, the median
-depth of all views is used.
-Promise: a cover seed is a guess and says so by its confidence; its depth is one of the view's; the
-same seed gives the same bytes on any number of cores: views are processed one after another.
+Notation: cells are those of ``photos.zbuffer``; an *empty* cell is one that is not covered
+(``coverage``). Views are taken in random order, each with the seeds of the views before. An empty
+cell gets one seed on the ray through its centre. Its depth is a guess from covered cells of the
+same view: in each of eight sectors of 45 degrees the nearest one, up to ``2 r + 1`` cells away,
+where r is the distance of the nearest of all. Another view *contradicts* a seed that lies in front
+of the view's covered cell, nearer by more than ``SURFACE``: it sees through the seed. The guess is
+the median of the sectors' depths, weighted by ``1 / ((1 + contradictions) distance^2)``. In a view
+without covered cells it is the median depth of all views.
+Promise: confidence is low, at most ``MAX_CONFIDENCE``; the same seed gives the same bytes on any
+number of cores, as views are processed one after another.
 
 benchmarks/seeds/README.md says how the rule was chosen.
 """
@@ -23,35 +23,37 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64, UInt8
 
 from splatseed.errors import ParameterError, PointCloudError
-from splatseed.photos._kernels import project_point
 from splatseed.photos.projection import cells_from_world, grid_shape
 from splatseed.photos.view import View
 from splatseed.photos.visibility import SURFACE
 from splatseed.photos.zbuffer import cell_depths
 from splatseed.progress import Progress, silent
-from splatseed.runtime.jit import inline
-from splatseed.seeding.coverage import check_points, depths_of_views
+from splatseed.seeding import _kernels
+from splatseed.seeding.coverage import cell_depths_of_views, check_points
 
-SECTORS = 8
+CHECKED_VIEWS = 12  # other views that may contradict a seed
+MIN_CHECK_CELL = 8  # minimum side of these views' cells, in pixels
+MAX_CONFIDENCE, MIN_CONFIDENCE = 0.3, 0.1
+"""Confidence of a seed beside a covered cell, and of one far from all."""
 
 
 @dataclass(frozen=True, eq=False)
-class Witnesses:
-    """The depths at which each of V views sees the initial points."""
+class ReferenceDepths:
+    """The cell depths of the initial points in each of V views."""
 
-    grid_from_world: Float64[np.ndarray, "V 3 4"]  # to columns and rows of cells, and depth
+    cells_from_world: Float64[np.ndarray, "V 3 4"]
     shapes: Int64[np.ndarray, "V 2"]  # rows and columns of each view
-    starts: Int64[np.ndarray, " V"]  # where each view's depths begin
+    starts: Int64[np.ndarray, " V"]  # of each view in ``depths``
     depths: Float32[np.ndarray, " C"]  # of all cells, row by row; infinite where not covered
 
 
-def depth_maps_of_views(
+def reference_depths(
     views: Sequence[View], xyz: Float32[np.ndarray, "N 3"], cell: float, progress: Progress
-) -> Witnesses:
-    """The depths at which each view sees the points, on cells of ``cell`` pixels."""
-    maps = depths_of_views(views, xyz, cell, progress, "look for uncovered cells")
+) -> ReferenceDepths:
+    """Compute the depths of the points in each view, on cells of ``cell`` pixels."""
+    maps = cell_depths_of_views(views, xyz, cell, progress, "find uncovered cells")
     sizes = np.array([depths.size for depths in maps])
-    return Witnesses(
+    return ReferenceDepths(
         np.stack([cells_from_world(view.camera, cell) for view in views]),
         np.array([depths.shape for depths in maps]),
         np.cumsum(sizes) - sizes,
@@ -59,8 +61,8 @@ def depth_maps_of_views(
     )
 
 
-def world_from_grid(view: View, cell: float) -> Float64[np.ndarray, "3 4"]:
-    """(column depth, row depth, depth, 1) to the world, columns and rows in cells."""
+def world_from_cells(view: View, cell: float) -> Float64[np.ndarray, "3 4"]:
+    """Return the matrix from (column depth, row depth, depth, 1), in cells, to the world."""
     forward = np.vstack([cells_from_world(view.camera, cell), [0.0, 0.0, 0.0, 1.0]])
     return np.asarray(np.linalg.inv(forward)[:3])
 
@@ -68,133 +70,41 @@ def world_from_grid(view: View, cell: float) -> Float64[np.ndarray, "3 4"]:
 def guess_depths(
     depths: Float32[np.ndarray, "rows cols"],
     empty: Int64[np.ndarray, " M"],
-    back: Float64[np.ndarray, "3 4"],
-    witnesses: Witnesses,
-    asked: Int64[np.ndarray, " K"],
+    world_from_cells: Float64[np.ndarray, "3 4"],
+    reference: ReferenceDepths,
+    checked: Int64[np.ndarray, " K"],
 ) -> tuple[Float32[np.ndarray, " M"], Float32[np.ndarray, " M"]]:
-    """Depths of empty cells, given as row * cols + column, and distances to covered ones, in cells.
+    """Guess the depths of a view's empty cells.
 
-    At least one is covered; ``back`` is the view's ``world_from_grid``, and ``asked`` views may
-    contradict.
+    Args:
+        depths: The view's cell depths, at least one of them finite.
+        empty: The cells, as row * cols + column.
+        world_from_cells: As the function of that name returns.
+        reference: The depths of all views.
+        checked: The views that may contradict.
+
+    Returns:
+        The depths, and the distances to the nearest covered cells, in cells.
     """
-    guesses, reach = np.empty(len(empty), np.float32), np.empty(len(empty), np.float32)
-    _guess(
-        depths, empty, back, witnesses.grid_from_world[asked], witnesses.shapes[asked],
-        witnesses.starts[asked], witnesses.depths, guesses, reach,
+    guesses, distances = np.empty(len(empty), np.float32), np.empty(len(empty), np.float32)
+    _kernels.guess_depths(
+        depths, empty, world_from_cells, reference.cells_from_world[checked],
+        reference.shapes[checked], reference.starts[checked], reference.depths, SURFACE,
+        guesses, distances,
     )  # fmt: skip
-    return guesses, reach
+    return guesses, distances
 
-
-@inline
-def _guess(depths, empty, back, matrices, shapes, starts, seen, guesses, reach):  # type: ignore[no-untyped-def]  # Numba's types
-    nearest, depth_of = np.empty(SECTORS), np.empty(SECTORS, np.float32)
-    weights, point = np.empty(SECTORS), np.empty(3)
-    for k in range(len(empty)):
-        i, j = divmod(empty[k], depths.shape[1])
-        _look_around(depths, i, j, nearest, depth_of)
-        for s in range(SECTORS):
-            weights[s] = 0.0
-            if nearest[s] < np.inf:
-                lift(back, i, j, depth_of[s], point)
-                against = _contradictions(point, matrices, shapes, starts, seen)
-                # 1 / ((1 + contradictions) distance^2)
-                weights[s] = 1.0 / ((1.0 + against) * nearest[s])
-        guesses[k] = _weighted_median(depth_of, weights)
-        reach[k] = np.sqrt(nearest.min())
-
-
-@inline
-def lift(m, i, j, depth, point):  # type: ignore[no-untyped-def]  # Numba's types
-    """The point at a depth on the ray through the centre of cell (i, j)."""
-    z = np.float64(depth)
-    x, y = (j + 0.5) * z, (i + 0.5) * z
-    for axis in range(3):
-        # X = A z (j + 1/2, i + 1/2, 1) + b
-        point[axis] = m[axis, 0] * x + m[axis, 1] * y + m[axis, 2] * z + m[axis, 3]
-
-
-@inline
-def _contradictions(point, matrices, shapes, starts, seen):  # type: ignore[no-untyped-def]  # Numba's types
-    """How many views look through a point."""
-    count = 0
-    for v in range(len(matrices)):
-        column, row, depth = project_point(point, matrices[v])
-        if depth > 0.0:
-            rows, cols = shapes[v]
-            if 0.0 <= column < cols and 0.0 <= row < rows:
-                there = seen[starts[v] + int(row) * cols + int(column)]
-                # In front of a covered cell by more than SURFACE: that view sees past it.
-                count += there < np.inf and depth < there * (1.0 - SURFACE)
-    return count
-
-
-@inline
-def _look_around(depths, i, j, nearest, depth_of):  # type: ignore[no-untyped-def]  # Numba's types
-    """The nearest covered cell of each sector, by squared distance; of equals, ring by ring."""
-    for s in range(SECTORS):
-        nearest[s] = depth_of[s] = np.inf
-    rows, cols = depths.shape
-    last = max(i, rows - 1 - i, j, cols - 1 - j)
-    ring, seen = 1, False
-    while ring <= last:
-        for a in range(max(i - ring, 0), min(i + ring + 1, rows)):
-            # The first and last row of a ring are whole, of the others only both ends belong to it.
-            step = 1 if abs(a - i) == ring else 2 * ring
-            for b in range(j - ring, j + ring + 1, step):
-                if 0 <= b < cols and depths[a, b] < np.inf:
-                    if not seen:
-                        # The first covered cell, r = ring away, bounds the search to 2 r + 1.
-                        seen, last = True, min(last, 2 * ring + 1)
-                    sector, square = _sector(a - i, b - j), (a - i) ** 2 + (b - j) ** 2
-                    if square < nearest[sector]:
-                        nearest[sector], depth_of[sector] = square, depths[a, b]
-        ring += 1
-
-
-@inline
-def _sector(dy, dx):  # type: ignore[no-untyped-def]  # Numba's types
-    """The sector of 45 degrees, each including one of its borders; dy and dx are not both 0."""
-    if dx > 0 and dy >= 0:
-        quarter, u, v = 0, dx, dy
-    elif dy > 0:
-        quarter, u, v = 1, dy, -dx
-    elif dx < 0:
-        quarter, u, v = 2, -dx, -dy
-    else:
-        quarter, u, v = 3, -dy, dx
-    return 2 * quarter + (v >= u)
-
-
-@inline
-def _weighted_median(values, weights):  # type: ignore[no-untyped-def]  # Numba's types
-    """The smallest value such that it and the values below it hold half of the weight."""
-    order = np.argsort(values)
-    half = 0.0
-    for k in order:
-        half += 0.5 * weights[k]
-    below = 0.0
-    for k in order:
-        below += weights[k]
-        if below >= half:
-            return values[k]
-    return values[order[0]]  # never: half of a sum in the same order is no more than the sum
-
-
-WITNESSES = 12  # other views that are asked whether they look through a seed
-WITNESS_CELL = 8  # smallest cell of these views, in pixels
-MOST_CONFIDENT, LEAST_CONFIDENT = 0.3, 0.1
-"""Confidence of a seed beside a covered cell, and of one far from all."""
 
 Mask = Bool[np.ndarray, "H W"]
 
 
 @dataclass(frozen=True, eq=False)
 class CoverSeeds:
-    """Seeds in cells that no point covered, in the order in which the views were taken."""
+    """Seeds, in the order in which the views were taken."""
 
     xyz: Float32[np.ndarray, "M 3"]  # world
     rgb: UInt8[np.ndarray, "M 3"]  # mean of the cell
-    view: Int32[np.ndarray, " M"]  # the view each was made for
+    view: Int32[np.ndarray, " M"]  # the index of its view
     size: Float32[np.ndarray, " M"]  # side of the cell at the seed's depth, scene units
     confidence: Float32[np.ndarray, " M"]  # 0.3 beside a covered cell, falling to 0.1
 
@@ -203,7 +113,7 @@ class CoverSeeds:
 
     @staticmethod
     def concatenate(parts: Sequence[CoverSeeds]) -> CoverSeeds:
-        """The seeds of the parts, one after another."""
+        """Join parts, one after another."""
         names = [field.name for field in fields(CoverSeeds)]
         return CoverSeeds(*(np.concatenate([getattr(part, n) for part in parts]) for n in names))
 
@@ -217,40 +127,47 @@ def cover(
     masks: Sequence[Mask | None] | None = None,
     progress: Progress = silent,
 ) -> CoverSeeds:
-    """A seed in every cell, ``cell`` pixels wide, of every view that no point covers.
+    """Seed every empty cell of every view.
 
-    Masks tell which pixels of each view count, None: all; a cell needs half of its pixels. Points
-    that are not finite are in no cell. ``rng`` draws the order of the views.
+    Args:
+        views: Photographs with their pixels.
+        xyz: The points; those that are not finite are in no cell.
+        cell: Side of a cell, in pixels.
+        rng: Draws the order of the views, and those that may contradict.
+        masks: For each view the pixels that count, None for all; a cell needs half of its pixels.
+        progress: Called with the stage and the fraction done.
 
     Raises:
-        ParameterError: There is no view, one has no pixels, ``cell`` is below 1, or masks misfit.
+        ParameterError: There is no view, one has no pixels, ``cell`` is below 1, or a mask has
+            another size.
         PointCloudError: ``xyz`` is not of shape [N, 3], or no point lies in any view.
     """
     xyz = check_points(views, xyz, cell)
     masks = _check_pixels(views, masks)
-    witnesses = depth_maps_of_views(views, xyz, max(cell, WITNESS_CELL), progress)
-    typical = _typical_depth(witnesses, len(xyz))
-    cloud = _Growing(xyz)
+    reference = reference_depths(views, xyz, max(cell, MIN_CHECK_CELL), progress)
+    typical = _typical_depth(reference, len(xyz))
+    cloud = _GrowableArray(xyz)
     parts = []
     for v in rng.permutation(len(views)):
         # Drawn for every view, empty cells or not: one view's gaps do not change the next's draw.
-        asked = _draw_others(int(v), len(views), rng)
-        depths = cell_depths(views[v].camera, cloud.xyz, cell)
+        checked = _draw_others(int(v), len(views), rng)
+        depths = cell_depths(views[v].camera, cloud.values, cell)
         empty = np.flatnonzero(np.isinf(depths))
         if len(empty) < depths.size:
-            guess = guess_depths(depths, empty, world_from_grid(views[v], cell), witnesses, asked)
+            lift = world_from_cells(views[v], cell)
+            guess = guess_depths(depths, empty, lift, reference, checked)
         else:
             guess = np.full(len(empty), typical), np.full(len(empty), np.inf, np.float32)
         seeds = _make_seeds(views[v], int(v), cell, empty, guess, masks[v])
-        cloud.add(seeds.xyz)
+        cloud.append(seeds.xyz)
         parts.append(seeds)
         progress("cover", len(parts) / len(views))
     return CoverSeeds.concatenate(parts)
 
 
 def _draw_others(v: int, num: int, rng: np.random.Generator) -> Int64[np.ndarray, " K"]:
-    """Some of the other views, drawn at random."""
-    others = rng.choice(num - 1, min(WITNESSES, num - 1), replace=False)
+    """Draw some of the other views."""
+    others = rng.choice(num - 1, min(CHECKED_VIEWS, num - 1), replace=False)
     # Numbers from v on move up by one: v itself is left out.
     return others + (others >= v)
 
@@ -279,9 +196,9 @@ def _check_size(what: str, view: View, size: tuple[int, ...]) -> None:
         )
 
 
-def _typical_depth(witnesses: Witnesses, num: int) -> np.float32:
-    """The median depth of all covered cells, for views that see none."""
-    depths = witnesses.depths[np.isfinite(witnesses.depths)]
+def _typical_depth(reference: ReferenceDepths, num: int) -> np.float32:
+    """Return the median depth of all covered cells, for views without any."""
+    depths = reference.depths[np.isfinite(reference.depths)]
     if not len(depths):
         raise PointCloudError(
             "a point that lies in one of the views",
@@ -291,25 +208,25 @@ def _typical_depth(witnesses: Witnesses, num: int) -> np.float32:
     return np.float32(np.median(depths))
 
 
-class _Growing:
-    """A growing cloud, without a copy of everything for each view."""
+class _GrowableArray:
+    """An array of points with amortised appending."""
 
-    def __init__(self, xyz: Float32[np.ndarray, "N 3"]) -> None:
-        self._room = xyz
-        self._num = len(xyz)
+    def __init__(self, values: Float32[np.ndarray, "N 3"]) -> None:
+        self._buffer = values
+        self._num = len(values)
 
     @property
-    def xyz(self) -> Float32[np.ndarray, "N 3"]:
-        return self._room[: self._num]
+    def values(self) -> Float32[np.ndarray, "N 3"]:
+        return self._buffer[: self._num]
 
-    def add(self, more: Float32[np.ndarray, "M 3"]) -> None:
+    def append(self, more: Float32[np.ndarray, "M 3"]) -> None:
         num = self._num + len(more)
-        if num > len(self._room):
+        if num > len(self._buffer):
             # Doubled, so that all copies together are linear in the number of points.
-            room = np.empty((2 * num, 3), np.float32)
-            room[: self._num] = self.xyz
-            self._room = room
-        self._room[self._num : num] = more
+            buffer = np.empty((2 * num, 3), np.float32)
+            buffer[: self._num] = self.values
+            self._buffer = buffer
+        self._buffer[self._num : num] = more
         self._num = num
 
 
@@ -321,55 +238,23 @@ def _make_seeds(
     guess: tuple[Float32[np.ndarray, " M"], Float32[np.ndarray, " M"]],
     mask: Mask | None,
 ) -> CoverSeeds:
-    """Seeds in empty cells at the guessed depths, except where too few pixels count."""
-    depths, reach = guess
+    """Place seeds in empty cells at the guessed depths, except where too few pixels count."""
+    depths, distances = guess
     shape = grid_shape(view.camera, cell)
     used = np.ones((1, 1), np.bool_) if mask is None else np.asarray(mask, np.bool_)
     rgb, usable = np.empty((len(empty), 3), np.uint8), np.empty(len(empty), np.bool_)
-    _mean_colors(view.photograph, used, shape, empty, rgb, usable)
+    _kernels.mean_colors(view.photograph, used, shape, empty, rgb, usable)
     xyz = np.empty((len(empty), 3), np.float32)
-    _lift_all(world_from_grid(view, cell), shape[1], empty, depths, xyz)
+    _kernels.lift_cells(world_from_cells(view, cell), shape[1], empty, depths, xyz)
     usable &= np.isfinite(xyz).all(axis=1)
     sides = depths * np.float32(_side_at_one(view, shape))
-    # reach is 1 beside a covered cell.
-    confidence = np.maximum(np.float32(MOST_CONFIDENT) / reach, np.float32(LEAST_CONFIDENT))
+    # The distance is 1 beside a covered cell.
+    confidence = np.maximum(np.float32(MAX_CONFIDENCE) / distances, np.float32(MIN_CONFIDENCE))
     of = np.full(len(empty), idx, np.int32)
-    return CoverSeeds(*(each[usable] for each in (xyz, rgb, of, sides, confidence)))
+    return CoverSeeds(*(values[usable] for values in (xyz, rgb, of, sides, confidence)))
 
 
 def _side_at_one(view: View, shape: tuple[int, ...]) -> float:
-    """Side of a cell at depth 1: the square root of its area."""
+    """Return the side of a cell at depth 1: the square root of its area."""
     width, height = view.width / shape[1] / view.K[0, 0], view.height / shape[0] / view.K[1, 1]
     return float(np.sqrt(abs(width * height)))
-
-
-@inline
-def _mean_colors(image, used, shape, empty, rgb, usable):  # type: ignore[no-untyped-def]  # Numba's types
-    """The mean of each cell's pixels that count, and whether they make up half of it."""
-    rows, cols = shape
-    height, width = image.shape[:2]
-    for k in range(len(empty)):
-        i, j = divmod(empty[k], cols)
-        total = np.zeros(3, np.int64)
-        count, size = 0, 0
-        for y in range(i * height // rows, (i + 1) * height // rows):
-            for x in range(j * width // cols, (j + 1) * width // cols):
-                size += 1
-                if used.size == 1 or used[y, x]:
-                    count += 1
-                    for channel in range(3):
-                        total[channel] += image[y, x, channel]
-        usable[k] = count > 0 and 2 * count >= size
-        for channel in range(3):
-            # The mean rounded to the nearest, in whole numbers.
-            rgb[k, channel] = (2 * total[channel] + count) // (2 * max(count, 1))
-
-
-@inline
-def _lift_all(m, cols, empty, depths, xyz):  # type: ignore[no-untyped-def]  # Numba's types
-    """The points at these depths on the rays through the cells' centres."""
-    point = np.empty(3)
-    for k in range(len(empty)):
-        i, j = divmod(empty[k], cols)
-        lift(m, i, j, depths[k], point)
-        xyz[k] = point

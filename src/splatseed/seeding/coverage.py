@@ -1,8 +1,8 @@
-"""Which parts of the photographs hold a point: the depths of a cloud on coarse cells.
+"""Coverage: which cells of the photographs show a point.
 
-Notation: views are divided into the cells of ``photos.zbuffer``; a cell is *covered* if its
-depth there is finite: it holds a point, and its neighbours do not hide it.
-Promise: the bytes depend neither on the order of the points nor on the threads.
+Notation: views are divided into the cells of ``photos.zbuffer``; a cell is *covered* if it holds a
+point and its neighbours do not hide it, so that its depth is finite.
+Promise: results depend neither on the order of the points nor on the number of threads.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ def covered_share(
     cell: float = 8,
     progress: Progress = silent,
 ) -> float:
-    """The fraction of a view's cells, ``cell`` pixels wide, that points cover: the mean over views.
+    """Return the mean over views of the fraction of cells, ``cell`` pixels wide, that are covered.
 
-    Only their cameras and sizes matter.
+    Views need no pixels.
 
     Raises:
         ParameterError: There is no view, or ``cell`` is below 1.
@@ -41,35 +41,40 @@ def covered_cells(
     cell: float = 8,
     progress: Progress = silent,
 ) -> tuple[Bool[np.ndarray, "rows cols"], ...]:
-    """Which cells of each view are covered; arguments and errors as in ``covered_share``."""
+    """Tell which cells of each view are covered; arguments and errors as in ``covered_share``."""
     xyz = check_points(views, xyz, cell)
-    depths = depths_of_views(views, xyz, cell, progress, "look for uncovered cells")
-    return tuple(np.isfinite(each) for each in depths)
+    depths = cell_depths_of_views(views, xyz, cell, progress, "find uncovered cells")
+    return tuple(np.isfinite(cells) for cells in depths)
 
 
-def depths_of_views(
+def cell_depths_of_views(
     views: Sequence[View],
     xyz: Float32[np.ndarray, "N 3"],
     cell: float,
     progress: Progress,
     stage: str,
 ) -> list[Float32[np.ndarray, "rows cols"]]:
-    """``cell_depths`` of each view, on all threads."""
-    found = [np.empty((0, 0), np.float32)] * len(views)
+    """Compute ``cell_depths`` of each view, on all threads."""
+    maps = [np.empty((0, 0), np.float32)] * len(views)
 
     def work(start: int, _stop: int) -> None:
-        found[start] = cell_depths(views[start].camera, xyz, cell)
+        maps[start] = cell_depths(views[start].camera, xyz, cell)
 
     in_threads(work, len(views), 1, stage, progress)
-    return found
+    return maps
 
 
 def check_points(
     views: Sequence[View], xyz: Float32[np.ndarray, "N 3"], cell: float
 ) -> Float32[np.ndarray, "N 3"]:
-    """The points as the kernels need them; errors are those of ``covered_share``."""
+    """Return the points as kernels need them: float32, contiguous.
+
+    Raises:
+        ParameterError: There is no view, or ``cell`` is below 1.
+        PointCloudError: ``xyz`` is not of shape [N, 3].
+    """
     if not views:
-        raise ParameterError("at least one view", found="none", fix="Name a scene with images.")
+        raise ParameterError("at least one view", found="none", fix="Pass a scene with images.")
     if not (np.isfinite(cell) and cell >= 1):
         raise ParameterError("a cell of at least 1 pixel", found=f"{cell}", fix="Choose 4 to 16.")
     xyz = np.asarray(xyz)

@@ -88,10 +88,11 @@ class Stereo(PhotographMethod):
         images = photographed(scene, self.test_every)
         warnings: tuple[str, ...] = ()
         if not has_points(scene):
-            from splatseed.seeding.poses import check_poses, low_agreement, pose_error  # noqa: PLC0415  (loads Numba)
+            from splatseed.seeding.pose_accuracy import estimate_pose_error  # noqa: PLC0415  (loads Numba)
+            from splatseed.seeding.poses import agreement_warning, check_poses  # noqa: PLC0415  (loads Numba)
 
-            faint = low_agreement(check_poses(scene, images, progress))
-            error = pose_error(scene, images, progress)
+            faint = agreement_warning(check_poses(scene, images, progress))
+            error = estimate_pose_error(scene, images, progress)
             warnings = tuple(each for each in (error.warning if error else "", faint) if each)
         views = read_views(scene, images, self.max_size, progress)
         start = time.perf_counter()

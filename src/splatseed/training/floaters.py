@@ -2,10 +2,10 @@
 
 Notation: a *suspect* is a Gaussian that at least two training views see past at its centre, and
 more than confirm it: stereo finds the surface there clearly behind
-(``seeding.clouds.judging``). E is the sum of the training views' squared errors, a the opacity of a
-suspect. Promise: only suspects go, and only those that the photographs do not need: thin, soft and
-transparent things stay. With every suspect at a quarter of its opacity, so that one hardly hides
-another, the photographs need it if dE/da is negative. Test views have no part.
+(``seeding.clouds.photo_consistency``). E is the sum of the training views' squared errors, a the
+opacity of a suspect. Promise: only suspects go, and only those that the photographs do not need:
+thin, soft and transparent things stay. With every suspect at a quarter of its opacity, so that one
+hardly hides another, the photographs need it if dE/da is negative. Test views have no part.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from splatseed.photos.view import (
     user_cache_dir,
 )
 from splatseed.progress import Progress, silent
-from splatseed.seeding.clouds.judging import find_evidence
+from splatseed.seeding.clouds.photo_consistency import find_evidence
 from splatseed.seeding.photo_methods import photographed
 from splatseed.splat.gaussians import Gaussians, frame_of_model
 from splatseed.splat.rendering import fill_masked, mask_of, photograph_of, render_view
@@ -128,8 +128,8 @@ def find_floaters(
     compared = [view for view in views if view.name in depths]
     rays, surfaces = [_free(depths[view.name]) for view in compared], [NO_SURFACE] * len(compared)
     evidence = find_evidence(compared, gaussians.means, surfaces, 1, rays, progress)
-    asked = int(np.count_nonzero(evidence.through + evidence.confirmed))
-    confirmed = int(np.count_nonzero(evidence.confirmed))
+    asked = int(np.count_nonzero(evidence.violations + evidence.confirmations))
+    confirmed = int(np.count_nonzero(evidence.confirmations))
     if confirmed <= max(LEAST_CONFIRMED * asked, LEAST_OF_ALL * len(gaussians)):
         raise SceneFormatError(
             "Gaussians at the depths that stereo finds in the photographs",
@@ -137,7 +137,7 @@ def find_floaters(
             fix="Name the scene that the model was trained on; a model whose Gaussians do not lie "
             "on surfaces cannot be cleaned.",
         )
-    suspects = evidence.seen_past
+    suspects = evidence.free_space_violation
     return np.asarray(suspects & ~_needed(gaussians, suspects, views, device, progress))
 
 

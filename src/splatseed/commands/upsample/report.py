@@ -17,7 +17,7 @@ from splatseed.io import WriteReport
 from splatseed.methods import Profile, Upsampler, chooses_number, configure, source_name
 from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.scene import Scene
-from splatseed.seeding.diagnostics import far_share
+from splatseed.seeding.geometry_score import far_share
 from splatseed.seeding.upsampling import share_covered
 
 CLOUD_PARAMETERS = {"files", "transform", "memory", "alone"}

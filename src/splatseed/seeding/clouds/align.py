@@ -26,6 +26,7 @@ from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 from splatseed.seeding.clouds.global_search import SEARCH, SearchSettings, find_starts, to_unit_size
 from splatseed.seeding.clouds.icp import Alignment, RefinedAlignment, Stage, Surface, fit, refine
+from splatseed.seeding.clouds.reading import sample_cloud
 from splatseed.seeding.clouds.tie_points import (
     MAX_TIE_POINTS,
     MIN_TIE_POINTS,
@@ -33,7 +34,6 @@ from splatseed.seeding.clouds.tie_points import (
     TiePoints,
     select_tie_points,
 )
-from splatseed.seeding.clouds.voxels import sample_cloud
 from splatseed.similarity import Similarity
 
 MAX_ROTATION_ERROR = 0.1  # degrees above which (at two standard errors) the summary warns
@@ -194,7 +194,7 @@ def align(
 
 
 def _unreliable(found: str) -> PointCloudError:
-    fix = "Pass a transform, or cover more of the scene in both."
+    fix = "Pass `transform`, or cover more of the scene in both."
     return PointCloudError("one reliable alignment of the cloud", found=found, fix=fix)
 
 

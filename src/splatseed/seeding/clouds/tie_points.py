@@ -65,7 +65,7 @@ def select_tie_points(scene: Scene) -> TiePoints:
         raise PointCloudError(
             f"at least {MIN_TIE_POINTS} points of the scene's own, to align a cloud with",
             found=f"{len(rows):,}",
-            fix="Make some: splatseed sfm IMAGES --poses-from SCENE; or pass a transform.",
+            fix="Make some: splatseed sfm IMAGES --poses-from SCENE; or pass `transform`.",
         )
     rows = rows[:: -(-len(rows) // MAX_TIE_POINTS)]
     xyz = points.xyz[rows].astype(np.float64)

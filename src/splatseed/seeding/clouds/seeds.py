@@ -1,0 +1,196 @@
+"""Seeds from clouds: merge the points, keep those that photographs see, check the frame.
+
+Points are merged in voxels while they are read (``reading``); voxels that a photograph sees and
+none contradicts become seeds (``photo_consistency``). A cloud that is far from the cameras, or does
+not fit the scene's own points, is refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64, UInt8
+
+from splatseed.depth.stereo.maps import StereoSettings
+from splatseed.errors import PointCloudError
+from splatseed.io.origin import ELSEWHERE
+from splatseed.methods import source_code
+from splatseed.methods.contract import NewPoints
+from splatseed.photos.view import View
+from splatseed.photos.visibility import find_visibility
+from splatseed.progress import Progress, silent
+from splatseed.scene import Image, Scene
+from splatseed.seeding.clouds.method import GivenClouds
+from splatseed.seeding.clouds.photo_consistency import (
+    ConsistentVoxels,
+    Surface,
+    consistent_voxels,
+    free_space,
+)
+from splatseed.seeding.clouds.reading import MergedCloud, read_clouds
+from splatseed.seeding.coverage import covered_share
+from splatseed.seeding.photo_methods import MAX_SIZE, compare, photographed, read_views
+from splatseed.seeding.upsampling import CELL, frames_of
+
+MIN_FIT, DOUBTFUL_FIT = 0.2, 0.55
+"""Minimum fraction of the scene's own points at the cloud's depth, and the fraction below which a
+note warns: a cloud of another place has 0 to 0.1, one in the right place 0.36 (red kitchen, noisy)
+to 0.92 (room0)."""
+MIN_COMPARED = 50  # points of the scene below which this fraction is not meaningful
+UNKNOWN_CONFIDENCE = 0.5  # of a point that fewer than two photographs see
+LOW_COVERAGE = 0.5  # fraction of the photographs' cells below which a note says so
+NATIONAL_GRID = 1e5  # coordinates from here on, in metres, are printed in full
+
+
+def cloud_seeds(
+    method: GivenClouds, scene: Scene, rng: np.random.Generator, progress: Progress
+) -> NewPoints:
+    """Make seeds from a method's files.
+
+    Raises:
+        ParameterError: The scene has no cameras, or the memory is not enough.
+        PointCloudError: A file has no finite point, or the cloud lies elsewhere.
+        SceneNotFoundError: A file is missing.
+        SceneFormatError: A file or photograph is damaged.
+    """
+    capacity, frames = method.plan(scene).capacity, frames_of(scene)
+    paths = [Path(file) for file in method.files]
+    merged = read_clouds(paths, method.transform, frames, method.pixels, capacity, progress)
+    voxels, images, views = merged.voxels, scene.images, frames
+    if not len(voxels) or _is_elsewhere(merged, scene):
+        raise _out_of_view(merged, scene)
+    if scene.has_photographs:
+        images = photographed(scene, method.test_every)
+        views = read_views(scene, images, MAX_SIZE, progress)
+    visibility = find_visibility(scene)
+    none = np.empty((0, 3))
+    visible = [visibility.of(image) if len(visibility.xyz) else none for image in images]
+    has_rgb = all(file.colors == "rgb" for file in merged.files)
+    free = _free_space(scene, images, views, visible, rng, progress) if method.clean else None
+    selected = consistent_voxels(
+        views, visible, voxels, voxels.rgb if has_rgb else None, progress,
+        clean=method.clean, free=free,
+    )  # fmt: skip
+    xyz = voxels.xyz[selected.kept]
+    share = covered_share(frames, xyz, CELL, silent)
+    notes = [*_reading_notes(merged), *_check_fit(selected), _kept_note(selected, len(voxels))]
+    if scene.has_photographs and not has_rgb:
+        notes.append(f"The cloud has {_found_colors(merged)}: colours are from the photographs.")
+    if share < LOW_COVERAGE:
+        hint = ": `method='auto'` with `cloud` seeds the rest" if method.alone else ""
+        notes.append(f"The cloud covers {share:.0%} of the photographs{hint}.")
+    return NewPoints(
+        xyz, _colors(method, scene, merged, selected), tuple(notes),
+        confidence=np.nan_to_num(selected.evidence.agreement, nan=UNKNOWN_CONFIDENCE),
+        source=np.full(len(xyz), source_code("cloud"), np.uint8),
+    )  # fmt: skip
+
+
+def _colors(
+    method: GivenClouds, scene: Scene, merged: MergedCloud, selected: ConsistentVoxels
+) -> UInt8[np.ndarray, "K 3"]:
+    """Return the cloud's own colours, or those of the photographs where these are better."""
+    has_rgb = all(file.colors == "rgb" for file in merged.files)
+    has_any = all(file.colors != "none" for file in merged.files)
+    if not has_any or (scene.has_photographs and (method.recolor or not has_rgb)):
+        return selected.evidence.rgb
+    return np.asarray(merged.voxels.rgb[selected.kept])
+
+
+def _found_colors(merged: MergedCloud) -> str:
+    """Describe the colours of files that do not all have some."""
+    if all(file.colors != "none" for file in merged.files):
+        return "intensity only"
+    if any(file.colors != "none" for file in merged.files):
+        return "colours in some files only"
+    return "no colours"
+
+
+def _kept_note(selected: ConsistentVoxels, total: int) -> str:
+    dropped = [f"{selected.num_hidden:,} are hidden in every photograph"]
+    dropped += [f"{count:,} {reason}" for reason, count in selected.dropped.items() if count]
+    return f"Kept {len(selected.kept):,} of {total:,} merged points: {', '.join(dropped)}."
+
+
+def _free_space(
+    scene: Scene,
+    images: Sequence[Image],
+    views: Sequence[View],
+    visible: Sequence[Float64[np.ndarray, "M 3"]],
+    rng: np.random.Generator,
+    progress: Progress,
+) -> Sequence[Surface] | None:
+    """Return how far rays are free: up to tracked points, and up to what stereo confirms."""
+    certain = visible if scene.tracks is not None else [np.empty((0, 3))] * len(views)
+    if not scene.has_photographs or len(views) < 2:
+        return free_space(views, certain) if scene.tracks is not None else None
+    stereo = compare(scene, images, views, StereoSettings.grid, rng, progress)
+    maps = [stereo.map(i).depth for i in range(len(views))]
+    return free_space(views, certain, [np.nan_to_num(depth, nan=np.inf) for depth in maps])
+
+
+def _is_elsewhere(merged: MergedCloud, scene: Scene) -> bool:
+    """Whether a cloud is so far from the cameras that one of them contains it only by chance."""
+    centers = np.array([image.camera.center for image in scene.images])
+    first, last = centers.min(axis=0), centers.max(axis=0)
+    gap = np.maximum(merged.low - last, first - merged.high).max()
+    extent = max((merged.high - merged.low).max(), (last - first).max())
+    return bool(gap > ELSEWHERE * extent > 0)
+
+
+def _out_of_view(merged: MergedCloud, scene: Scene) -> PointCloudError:
+    """Return the error for clouds of which no point is in a photograph, or none near a camera."""
+    centers = np.array([image.camera.center for image in scene.images])
+    return PointCloudError(
+        "points of the cloud in view of the scene's cameras, which stand "
+        f"{_span(centers.min(axis=0), centers.max(axis=0))}",
+        found=f"none of {merged.voxels.total:,}, which lie {_span(merged.low, merged.high)}",
+        fix="They are in different frames: find the transform with `align=True`, or pass "
+        "`transform`.",
+    )
+
+
+def _span(*corners: Float64[np.ndarray, " 3"]) -> str:
+    """Format a box, without exponents for the coordinates of a national grid."""
+    first, last = (
+        ", ".join(f"{x:.0f}" if NATIONAL_GRID <= abs(x) < 1e12 else f"{x:.6g}" for x in corner)
+        for corner in corners
+    )
+    return f"from ({first}) to ({last})"
+
+
+def _check_fit(selected: ConsistentVoxels) -> tuple[str, ...]:
+    """Return a note on how well the cloud fits the scene's own points.
+
+    Raises:
+        PointCloudError: It does not.
+    """
+    if selected.num_compared < MIN_COMPARED:
+        return ()
+    share = f"{selected.fit:.0%} of the scene's own points seen there"
+    if selected.fit < MIN_FIT:
+        raise PointCloudError(
+            "a cloud that fits the scene's own points",
+            found=f"{share} at its depth",
+            fix="It shows another place, or is in another frame: try `align=True`, or pass "
+            "`transform`.",
+        )
+    doubt = ": check its frame and its unit" if selected.fit < DOUBTFUL_FIT else ""
+    return (f"The cloud fits: {share} lie at its depth, within 3%{doubt}.",)
+
+
+def _reading_notes(merged: MergedCloud) -> list[str]:
+    voxels = merged.voxels
+    outside = f"{voxels.num_outside:,} of them outside of every photograph"
+    notes = [f"{voxels.total + merged.non_finite:,} points were read, {outside}."]
+    notes += [warning for file in merged.files for warning in file.warnings]
+    if merged.non_finite:
+        notes.append(f"{merged.non_finite:,} points of the cloud are not finite and were left out.")
+    if voxels.coarsening:
+        notes.append(
+            f"The cloud was merged at {2**voxels.coarsening} times the spacing asked for, to stay "
+            "within the memory: pass more `memory`."
+        )
+    return notes

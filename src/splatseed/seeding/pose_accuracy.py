@@ -1,0 +1,231 @@
+"""How exact the poses of photographs are, measured without points, in a few seconds.
+
+Errors of pose move points off their epipolar lines. Corners of view i are searched for in view j,
+which is first rotated into i's orientation, so that a point at inverse depth w moves from pixel p
+to ``K (K^-1 p + w c)``, c the translation: a straight line. A corner's *miss* is the distance from
+this line at which it is found, in pixels, where one place correlates clearly best. The median over
+a pair's corners, and then over the pairs, is the error. Masked pixels are no corners.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float64
+from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter, sobel, uniform_filter
+from scipy.signal import correlate
+
+from splatseed.depth.stereo.maps import StereoSettings
+from splatseed.photos.sources import choose_by_pose
+from splatseed.photos.view import View, data_factor, load_views
+from splatseed.progress import Progress, silent
+from splatseed.scene import Image, Scene
+
+Gray = Float64[np.ndarray, "H W"]
+Pixel = Float64[np.ndarray, " 2"]
+
+MAX_EXACT = 0.5
+"""Maximum error of exact poses, in pixels at the size of stereo. COLMAP's are 0.1 to 0.5 on eight
+captures; at 0.55, a tenth of a degree of noise, fern keeps 0.6 of its depths
+(benchmarks/stereo)."""
+
+
+@dataclass(frozen=True)
+class _Settings:
+    """How corners are found and matched; pixels are those of the reduced photographs."""
+
+    side: int = 400
+    """Maximum longer side of the photographs, in pixels."""
+    photographs: int = 5
+    partners: int = 2
+    """Views that each photograph is compared with."""
+    corners: int = 100
+    """Maximum number per photograph."""
+    corner_spacing: int = 9
+    half_patch: int = 5
+    """A patch is ``2 half_patch + 1`` pixels wide."""
+    max_miss: int = 24
+    max_motion: float = 0.3
+    """Maximum motion along the line, in widths of a photograph."""
+    min_correlation: float = 0.85
+    min_lead: float = 0.1
+    """Minimum correlation above that of any other place."""
+    min_found: int = 8
+    """Corners of a pair that must be found for it to count."""
+    min_pairs: float = 1 / 3
+    """Fraction of pairs that must count; at sound poses of eight captures 0.6 and more do."""
+    max_median: float = 10.0
+    """A larger median error may be chance: wrong matches are spread over ``max_miss``."""
+
+
+_SETTINGS = _Settings()
+_HALF, _REACH = _SETTINGS.half_patch, _SETTINGS.max_miss
+
+
+@dataclass(frozen=True)
+class PoseErrorEstimate:
+    """By how much points miss their epipolar lines."""
+
+    px: float  # median over pairs, in pixels at the size at which stereo compares photographs
+    degrees: float  # the rotation of a camera that moves its image as far
+    exact: bool  # at most ``MAX_EXACT`` pixels
+    side: int  # longer side of that size
+
+    def __str__(self) -> str:
+        return f"{self.px:.2g} px ({self.degrees:.2g} degrees) at {self.side:,} px a side"
+
+    @property
+    def warning(self) -> str:
+        """A sentence with advice; empty if the poses are exact."""
+        if self.exact:
+            return ""
+        return (
+            f"The photographs are misaligned by about {self}, the size at which stereo compares "
+            f"them; above {MAX_EXACT:g} px, `refine_poses=True` may help."
+        )
+
+
+def estimate_pose_error(
+    scene: Scene, images: Sequence[Image], progress: Progress = silent
+) -> PoseErrorEstimate | None:
+    """Estimate the error of the poses of two or more photographs.
+
+    Returns None if too few corners are found again, as on plain walls or with poses that are far
+    off.
+
+    Raises:
+        SceneFormatError: A photograph cannot be used.
+    """
+    poses = np.array([image.camera.cam_from_world for image in images])
+    partners = choose_by_pose(poses, _SETTINGS.partners)
+    factor = data_factor(images, _SETTINGS.side)
+    spread = np.linspace(0, len(images) - 1, _SETTINGS.photographs).round().astype(int)
+    chosen = np.unique(spread).tolist()
+    errors, pairs = [], 0
+    for number, i in enumerate(chosen):
+        compared = [images[i], *(images[j] for j in partners[i].tolist() if j >= 0)]
+        view, *others = load_views(scene, compared, data_factor=factor, undistort=True)
+        pairs += len(others)
+        for other in others:
+            misses = np.abs(_misses(view, other))
+            if len(misses) >= _SETTINGS.min_found:
+                px = float(np.median(misses))
+                errors.append((px, np.degrees(np.arctan(px / view.K[0, 0]))))
+        progress("measure poses", (number + 1) / len(chosen))
+    if len(errors) < max(1.0, _SETTINGS.min_pairs * pairs):
+        return None
+    px, degrees = np.median(errors, axis=0).tolist()
+    if px > _SETTINGS.max_median:
+        return None
+    stereo_factor = data_factor(images, StereoSettings.max_size)
+    px *= factor / stereo_factor
+    side = max(max(image.camera.width, image.camera.height) for image in images)
+    return PoseErrorEstimate(px, degrees, round(px, 2) <= MAX_EXACT, side // stereo_factor)
+
+
+def _misses(view: View, other: View) -> Float64[np.ndarray, " M"]:
+    """Return the signed distances from their epipolar lines at which corners are found."""
+    j_from_i = other.cam_from_world @ np.linalg.inv(view.cam_from_world)
+    max_motion = _SETTINGS.max_motion * view.width
+    margin = int(max_motion) + _REACH + 2 * _HALF
+    image = _gray(view)
+    homography = other.K @ j_from_i[:3, :3] @ np.linalg.inv(view.K)
+    rotated = _rotated(_gray(other), homography, view, margin)
+    # c: the translation in i's axes, as R d + w t = R (d + w R' t).
+    step = view.K @ (j_from_i[:3, :3].T @ j_from_i[:3, 3])
+    misses = []
+    for p in _corners(image, view.mask):
+        # d/dw of K (K^-1 p + w c) at w = 0, where a far point starts to move.
+        along = step[:2] - step[2] * p
+        length = np.linalg.norm(along)
+        if length >= 1e-9 * max(1.0, abs(step[2])):
+            miss = _miss(image, rotated, p, along / length, margin, max_motion)
+            misses += [] if miss is None else [miss]
+    return np.array(misses)
+
+
+def _gray(view: View) -> Gray:
+    return np.asarray(view.photograph.mean(axis=2))
+
+
+def _rotated(image: Gray, homography: Float64[np.ndarray, "3 3"], view: View, margin: int) -> Gray:
+    """Resample a photograph in the view's orientation, with a margin; NaN outside of it."""
+    rows, columns = view.height + 2 * margin, view.width + 2 * margin
+    v, u = np.indices((rows, columns)) - margin + 0.5
+    rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ homography.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x, y = rays[..., 0] / rays[..., 2], rays[..., 1] / rays[..., 2]
+    return _bilinear(image, *np.where(rays[..., 2] <= 0, -1.0, [x - 0.5, y - 0.5]))
+
+
+def _bilinear(image: Gray, x: np.ndarray, y: np.ndarray) -> Gray:
+    """Interpolate, with the centre of the first pixel at 0; NaN outside."""
+    return np.asarray(map_coordinates(image, [y, x], order=1, cval=np.nan))
+
+
+def _corners(image: Gray, mask: Bool[np.ndarray, "H W"] | None) -> Float64[np.ndarray, "N 2"]:
+    """Return the strongest Shi-Tomasi corners (column, row), strongest first.
+
+    Masked ones are left out: a turntable's background does not turn with it.
+    """
+    x, y = sobel(image, axis=1), sobel(image, axis=0)
+    xx, xy, yy = (gaussian_filter(product, 2.0) for product in (x * x, x * y, y * y))
+    # The smaller eigenvalue of the structure tensor.
+    strength = 0.5 * (xx + yy - np.hypot(xx - yy, 2 * xy))
+    peaks = (strength == maximum_filter(strength, _SETTINGS.corner_spacing)) & (strength > 0)
+    if mask is not None:
+        peaks &= mask
+    row, column = np.nonzero(peaks)
+    best = np.argsort(-strength[peaks], kind="stable")[: _SETTINGS.corners]
+    return np.stack([column[best], row[best]], axis=1) + 0.5
+
+
+def _miss(
+    image: Gray, rotated: Gray, p: Pixel, along: Pixel, margin: int, max_motion: float
+) -> float | None:
+    """Return a corner's signed distance from its line; None unless one place is clearly best."""
+    patch = _sample(image, p, along, (-_HALF, _HALF), _HALF)
+    if not np.isfinite(patch).all():  # beyond the image border
+        return None
+    # Slightly backwards, too: with wrong poses a far point may seem to be behind infinity.
+    length = -_HALF - _REACH, _HALF + int(max_motion)
+    scores = _correlation(patch, _sample(rotated, p + margin, along, length, _HALF + _REACH))
+    at = np.unravel_index(np.argmax(scores), scores.shape)
+    best, (column, row) = scores[at], at
+    rest = scores.copy()
+    columns = slice(max(column - _HALF, 0), column + _HALF + 1)
+    rest[columns, max(row - _HALF, 0) : row + _HALF + 1] = -1.0
+    inside = 0 < row < scores.shape[1] - 1
+    unclear = best < _SETTINGS.min_correlation or best - rest.max() < _SETTINGS.min_lead
+    if unclear or not inside:
+        return None
+    before, after = scores[column, row - 1], scores[column, row + 1]
+    # The peak of a parabola through three correlations.
+    bend = 2 * best - before - after
+    return float(row - _REACH + (0.5 * (after - before) / bend if bend > 0 else 0.0))
+
+
+def _sample(image: Gray, p: Pixel, along: Pixel, length: tuple[int, int], width: int) -> Gray:
+    """Sample a band along a line through p, ``width`` pixels to both sides; NaN outside."""
+    a = np.arange(length[0], length[1] + 1)[:, None]
+    b = np.arange(-width, width + 1)[None]
+    x = p[0] - 0.5 + a * along[0] - b * along[1]
+    return _bilinear(image, x, p[1] - 0.5 + a * along[1] + b * along[0])
+
+
+def _correlation(patch: Gray, band: Gray) -> Gray:
+    """Correlate a patch with each place of a band, normalised; -1 where the band is unknown."""
+    known = np.isfinite(band)
+    filled = np.where(known, band, 0.0)
+    centred = patch - patch.mean()
+    # sum (b - mean b) a = sum b a, as the sum of a is 0.
+    product = correlate(filled, centred, mode="valid", method="fft")
+    inner = (slice(_HALF, -_HALF), slice(_HALF, -_HALF))
+    mean, square, share = (
+        uniform_filter(values, 2 * _HALF + 1)[inner]
+        for values in (filled, filled * filled, known.astype(np.float64))
+    )
+    spread = np.sqrt(np.maximum(square - mean * mean, 1e-6) * patch.size)
+    return np.where(share > 1 - 1e-9, product / (spread * np.linalg.norm(centred)), -1.0)

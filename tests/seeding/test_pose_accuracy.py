@@ -1,0 +1,75 @@
+"""The error of poses, measured by epipolar lines, against noise of known size."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from splatseed.camera import quat_from_rotation
+from splatseed.pointcloud import PointCloud
+from splatseed.seeding import pose_accuracy as module
+from splatseed.seeding.pose_accuracy import estimate_pose_error
+
+
+def _posed(scene, poses):
+    """The scene without points, at other poses."""
+    images = tuple(
+        replace(im, quat=quat_from_rotation(p[:3, :3]), translation=p[:3, 3], observations=None)
+        for im, p in zip(scene.images, poses, strict=False)
+    )
+    return scene.replace(points=PointCloud.empty(), tracks=None, images=images)
+
+
+@pytest.fixture
+def poses(room):
+    return np.array([image.camera.cam_from_world for image in room.images])
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1e3])
+def test_sound_poses_are_exact_in_any_unit(unit, room, poses):
+    poses[:, :3, 3] *= unit
+    scene = _posed(room, poses)
+    error = estimate_pose_error(scene, scene.images)
+    assert error.exact
+    assert error.px < 0.5
+    assert not error.warning
+
+
+def test_noise_is_measured(room, poses):
+    rng, found = np.random.default_rng(0), []
+    axes = rng.normal(size=(len(poses), 3))
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    for degrees in (1.0, 4.0):
+        rotations = np.tile(np.eye(4), (len(poses), 1, 1))
+        rotations[:, :3, :3] = Rotation.from_rotvec(np.radians(degrees) * axes).as_matrix()
+        scene = _posed(room, rotations @ poses)
+        found.append(estimate_pose_error(scene, scene.images))
+    assert found[0].px < found[1].px
+    assert found[0].degrees < found[1].degrees
+    # Two rotations by an angle about random axes differ by 1.3 of it; half lies along the lines.
+    focal = room.images[0].camera.K[0, 0]
+    for error, degrees in zip(found, (1.0, 4.0), strict=True):
+        assert 0.3 * degrees < error.degrees < 1.3 * degrees
+        assert error.px == pytest.approx(focal * np.tan(np.radians(error.degrees)), rel=0.1)
+    assert "`refine_poses=True`" in found[-1].warning
+
+
+def test_the_error_is_in_pixels_of_the_size_of_stereo(room, poses, monkeypatch):
+    """A larger photograph is reduced first; the printed number is the one that decides."""
+    rotations = np.tile(np.eye(4), (len(poses), 1, 1))
+    angles = np.radians(0.6) * np.random.default_rng(0).normal(size=(len(poses), 3))
+    rotations[:, :3, :3] = Rotation.from_rotvec(angles).as_matrix()
+    scene = _posed(room, rotations @ poses)
+    full = estimate_pose_error(scene, scene.images)
+    monkeypatch.setattr(module.StereoSettings, "max_size", 80)
+    half = estimate_pose_error(scene, scene.images)
+    assert (full.side, half.side) == (160, 80)
+    assert half.px == pytest.approx(full.px / 2)
+    assert half.degrees == full.degrees
+    for error in (full, half):
+        assert error.exact == (round(error.px, 2) <= 0.5) == (error.warning == "")
+        assert f"{error.px:.2g} px" in str(error)
+        assert f"at {error.side} px a side" in str(error)
