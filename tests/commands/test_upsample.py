@@ -416,7 +416,13 @@ def test_what_is_wrong_with_a_scan_is_one_line(splatseed, room, xyz, tmp_path, s
 
 def test_the_files_of_an_alignment_are_listed(splatseed, room, scan, tmp_path, monkeypatch):
     found = SimpleNamespace(
-        report={}, residuals=np.zeros(1), extent=1.0, sample=None, rgb=None, marks=None, sentence=""
+        report={},
+        residuals=np.zeros(1),
+        extent=1.0,
+        sample=None,
+        rgb=None,
+        tie_points=None,
+        summary="",
     )
     monkeypatch.setattr(
         "splatseed.commands.upsample.command.load_cloud",
