@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -13,23 +13,15 @@ from splatseed.methods.contract import NewPoints, Traits
 from splatseed.progress import Progress
 from splatseed.scene import Scene
 from splatseed.seeding.clouds.memory_plan import MemoryPlan, plan_memory
+from splatseed.seeding.clouds.settings import CloudInputs, CloudSettings
 from splatseed.seeding.upsampling import frames_of
-from splatseed.settings import Range, check_settings
+from splatseed.settings import check_settings
 from splatseed.similarity import Similarity
 
 
 @dataclass(frozen=True)
-class Cloud:
+class Cloud(CloudSettings):
     """Seeds from scans and dense clouds (--cloud), as many as the photographs resolve."""
-
-    pixels: Annotated[float, Range(0.25, 64)] = 2.0
-    """Side of the voxels that merge points, in pixels of the closest photograph."""
-    recolor: bool = False
-    """Take colours from the photographs even if the cloud has some."""
-    clean: bool = True
-    """Leave out points that the photographs contradict, and isolated ones."""
-    test_every: Annotated[int, Range(2, also=0)] = 0
-    """Leave out every n-th image by name, as trainers do for testing (8); 0 = use all."""
 
     name: ClassVar[str] = "cloud"
     traits: ClassVar[Traits] = Traits(frozenset({"cloud"}), chooses_number=True)
@@ -88,4 +80,6 @@ class GivenClouds(Cloud):
         """Make the seeds."""
         from splatseed.seeding.clouds.seeds import cloud_seeds  # noqa: PLC0415  (loads Numba)
 
-        return cloud_seeds(self, scene, rng, progress)
+        paths, capacity = tuple(map(Path, self.files)), self.plan(scene).capacity
+        inputs = CloudInputs(paths, self.transform, capacity, self.alone)
+        return cloud_seeds(scene, self, inputs, rng, progress)

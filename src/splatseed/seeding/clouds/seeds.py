@@ -8,7 +8,6 @@ not fit the scene's own points, is refused.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64, UInt8
@@ -22,7 +21,6 @@ from splatseed.photos.view import View
 from splatseed.photos.visibility import find_visibility
 from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
-from splatseed.seeding.clouds.method import GivenClouds
 from splatseed.seeding.clouds.photo_consistency import (
     ConsistentVoxels,
     Surface,
@@ -30,6 +28,7 @@ from splatseed.seeding.clouds.photo_consistency import (
     free_space,
 )
 from splatseed.seeding.clouds.reading import MergedCloud, read_clouds
+from splatseed.seeding.clouds.settings import CloudInputs, CloudSettings
 from splatseed.seeding.coverage import covered_share
 from splatseed.seeding.photo_methods import MAX_SIZE, compare, photographed, read_views
 from splatseed.seeding.upsampling import CELL, frames_of
@@ -45,33 +44,37 @@ NATIONAL_GRID = 1e5  # coordinates from here on, in metres, are printed in full
 
 
 def cloud_seeds(
-    method: GivenClouds, scene: Scene, rng: np.random.Generator, progress: Progress
+    scene: Scene,
+    settings: CloudSettings,
+    inputs: CloudInputs,
+    rng: np.random.Generator,
+    progress: Progress,
 ) -> NewPoints:
-    """Make seeds from a method's files.
+    """Make seeds from files, for a scene with cameras.
 
     Raises:
-        ParameterError: The scene has no cameras, or the memory is not enough.
         PointCloudError: A file has no finite point, or the cloud lies elsewhere.
         SceneNotFoundError: A file is missing.
         SceneFormatError: A file or photograph is damaged.
     """
-    capacity, frames = method.plan(scene).capacity, frames_of(scene)
-    paths = [Path(file) for file in method.files]
-    merged = read_clouds(paths, method.transform, frames, method.pixels, capacity, progress)
+    frames = frames_of(scene)
+    merged = read_clouds(
+        inputs.paths, inputs.scene_from_cloud, frames, settings.pixels, inputs.capacity, progress
+    )
     voxels, images, views = merged.voxels, scene.images, frames
     if not len(voxels) or _is_elsewhere(merged, scene):
         raise _out_of_view(merged, scene)
     if scene.has_photographs:
-        images = photographed(scene, method.test_every)
+        images = photographed(scene, settings.test_every)
         views = read_views(scene, images, MAX_SIZE, progress)
     visibility = find_visibility(scene)
     none = np.empty((0, 3))
     visible = [visibility.of(image) if len(visibility.xyz) else none for image in images]
     has_rgb = all(file.colors == "rgb" for file in merged.files)
-    free = _free_space(scene, images, views, visible, rng, progress) if method.clean else None
+    free = _free_space(scene, images, views, visible, rng, progress) if settings.clean else None
     selected = consistent_voxels(
         views, visible, voxels, voxels.rgb if has_rgb else None, progress,
-        clean=method.clean, free=free,
+        clean=settings.clean, free=free,
     )  # fmt: skip
     xyz = voxels.xyz[selected.kept]
     share = covered_share(frames, xyz, CELL, silent)
@@ -79,22 +82,22 @@ def cloud_seeds(
     if scene.has_photographs and not has_rgb:
         notes.append(f"The cloud has {_found_colors(merged)}: colours are from the photographs.")
     if share < LOW_COVERAGE:
-        hint = ": `method='auto'` with `cloud` seeds the rest" if method.alone else ""
+        hint = ": `method='auto'` with `cloud` seeds the rest" if inputs.alone else ""
         notes.append(f"The cloud covers {share:.0%} of the photographs{hint}.")
     return NewPoints(
-        xyz, _colors(method, scene, merged, selected), tuple(notes),
+        xyz, _colors(settings, scene, merged, selected), tuple(notes),
         confidence=np.nan_to_num(selected.evidence.agreement, nan=UNKNOWN_CONFIDENCE),
         source=np.full(len(xyz), source_code("cloud"), np.uint8),
     )  # fmt: skip
 
 
 def _colors(
-    method: GivenClouds, scene: Scene, merged: MergedCloud, selected: ConsistentVoxels
+    settings: CloudSettings, scene: Scene, merged: MergedCloud, selected: ConsistentVoxels
 ) -> UInt8[np.ndarray, "K 3"]:
     """Return the cloud's own colours, or those of the photographs where these are better."""
     has_rgb = all(file.colors == "rgb" for file in merged.files)
     has_any = all(file.colors != "none" for file in merged.files)
-    if not has_any or (scene.has_photographs and (method.recolor or not has_rgb)):
+    if not has_any or (scene.has_photographs and (settings.recolor or not has_rgb)):
         return selected.evidence.rgb
     return np.asarray(merged.voxels.rgb[selected.kept])
 
