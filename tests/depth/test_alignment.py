@@ -30,7 +30,7 @@ def planted(rng, num=300, outliers=0.2, noise=0.005):
     return clean, z
 
 
-def test_equation_7_is_a_loop_over_points(rng):
+def test_equation_7_equals_a_loop_over_points(rng):
     value, z = rng.uniform(1.0, 5.0, (2, 40))
     numerator = denominator = 0.0
     for d, t in zip(value.tolist(), z.tolist(), strict=True):
@@ -41,7 +41,7 @@ def test_equation_7_is_a_loop_over_points(rng):
 
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize(("a", "b"), [(2.0, 0.1), (1e-3, -0.05), (0.5, 0.0)])
-def test_a_planted_scale_and_shift_survive_outliers(seed, a, b):
+def test_robust_line_recovers_scale_and_shift_despite_outliers(seed, a, b):
     clean, z = planted(np.random.default_rng(seed))
     assert median_scale(clean / a, z) == pytest.approx(a, rel=0.005)
     assert abs(least_squares_scale(clean / a, z) / a - 1) > 0.05
@@ -52,7 +52,7 @@ def test_a_planted_scale_and_shift_survive_outliers(seed, a, b):
     assert abs(least_squares_line(value, z)[0] / a - 1) > 0.02
 
 
-def test_without_outliers_the_line_is_that_of_least_squares(rng):
+def test_without_outliers_the_robust_line_is_least_squares(rng):
     clean = rng.uniform(1.0, 6.0, 50)
     value = (1.0 / clean - 0.1) / 2.0
     assert robust_line(value, clean) == pytest.approx((2.0, 0.1), rel=1e-9)
@@ -71,7 +71,7 @@ def with_outliers(scene, share=0.2):
 
 @pytest.mark.parametrize("tracked", [True, False], ids=["tracks", "projected"])
 @pytest.mark.parametrize("kind", ["z", "ray", "inverse"])
-def test_what_is_planted_in_every_image_is_found(kind, tracked, exact, make_maps):
+def test_alignment_recovers_the_scale_of_each_image(kind, tracked, exact, make_maps):
     def change(z, i):
         if kind == "inverse":
             return (1.0 / z - 0.02 * i) / SCALES[i]
@@ -95,7 +95,7 @@ def test_what_is_planted_in_every_image_is_found(kind, tracked, exact, make_maps
         assert np.nanmedian(np.abs(planar.full() / z - 1)) < 0.005
 
 
-def test_a_point_takes_the_pixel_it_falls_into(exact):
+def test_a_point_takes_the_value_of_its_pixel(exact):
     """Centres are at +0.5: on a map of noise, half a pixel to any side is another value
     altogether."""
     image, rng = exact.images[0], np.random.default_rng(0)
@@ -116,7 +116,7 @@ def test_a_point_takes_the_pixel_it_falls_into(exact):
                 assert align_at(corner + inside + (dx, dy)).residual > 0.1
 
 
-def test_images_are_left_out_for_a_reason(exact, make_maps):
+def test_rejected_images_have_a_reason(exact, make_maps):
     def change(z, i):
         noise = np.random.default_rng(0)
         if i == 0:
@@ -140,7 +140,7 @@ def test_images_are_left_out_for_a_reason(exact, make_maps):
     assert list(align(scene, max_residual_ratio=None).values())[3].rejected is None
 
 
-def test_depth_given_for_its_inverse_is_refused(exact, make_maps):
+def test_depth_read_as_inverse_depth_is_rejected(exact, make_maps):
     alignments = align(exact.replace(depths=make_maps("inverse", lambda z, _: z)))
     assert all("rise with depth" in alignment.rejected for alignment in alignments.values())
     alignments = align(exact.replace(depths=make_maps("z", lambda z, _: 1 / z))).values()
@@ -148,7 +148,7 @@ def test_depth_given_for_its_inverse_is_refused(exact, make_maps):
     assert np.median([a.residual for a in alignments]) > 10 * np.median([a.residual for a in good])
 
 
-def test_of_points_that_hide_each_other_the_nearest_counts(exact):
+def test_occluded_points_do_not_count(exact):
     image = exact.images[0]
     uv = np.array([[80.2, 60.3], [80.4, 60.1], [20.0, 20.0], [80.2, 60.3]])
     xyz = image.camera.unproject(uv, np.array([2.0, 5.0, 5.0, -1.0])).astype(np.float32)
@@ -158,7 +158,7 @@ def test_of_points_that_hide_each_other_the_nearest_counts(exact):
 
 
 @pytest.mark.parametrize("kind", ["z", "ray", "inverse"])
-def test_planar_depth_knows_every_kind(kind, exact):
+def test_planar_depth_of_each_kind(kind, exact):
     camera = exact.images[0].camera
     z = 3.0 + np.linspace(0, 1, 120 * 160).reshape(120, 160)
     length = ray_length(camera, np.arange(160), np.arange(120)[:, None])

@@ -7,14 +7,12 @@ import shutil
 
 import numpy as np
 import pytest
-from hypothesis import given, settings, strategies as st
 from PIL import Image as PilImage
 
 import splatseed as ss
 from splatseed.camera import Intrinsics
 from splatseed.depth import lifting
 from splatseed.depth.alignment import PlanarDepth, lift_pixels
-from splatseed.depth.thinning import Cubes, spread_evenly
 from splatseed.errors import ParameterError, PointCloudError, SceneFormatError, SceneNotFoundError
 from splatseed.scene import Split
 
@@ -41,7 +39,7 @@ def test_lifted_points_lie_on_the_surfaces(kind, exact, capture, make_maps):
     assert np.median(capture.surfaces.distance(aligned.xyz.astype(np.float64))) < 0.002
 
 
-def test_equation_9_is_a_loop_over_pixels(exact, rng):
+def test_equation_9_equals_a_loop_over_pixels(exact, rng):
     image = exact.images[0]
     camera, depth = image.camera, exact.depths.read(image.name)
     pixel = rng.choice(np.flatnonzero(depth.values > 0), 50, replace=False)
@@ -71,7 +69,7 @@ def test_colors_are_those_of_the_pixels(exact, capture):
     assert seen.all()  # each is the centre of a pixel of its colour in some image
 
 
-def test_the_paper_takes_as_many_from_the_middle_of_every_image(exact):
+def test_the_paper_profile_takes_equal_numbers_from_the_middle_of_each_image(exact):
     new = lifted(exact, 1203, "paper", unit_ray=False, align=False)
     middle = np.zeros(12, int)
     for i, (image, part) in enumerate(zip(exact.images, np.array_split(new.xyz, 12), strict=True)):
@@ -81,7 +79,7 @@ def test_the_paper_takes_as_many_from_the_middle_of_every_image(exact):
 
 
 @pytest.mark.parametrize("profile", ["default", "paper"])
-def test_bytes_follow_from_the_seed_whatever_the_threads(profile, exact, set_threads):
+def test_bytes_depend_on_the_seed_and_not_on_threads(profile, exact, set_threads):
     results = []
     for threads in (1, 7):
         set_threads(threads)
@@ -91,7 +89,7 @@ def test_bytes_follow_from_the_seed_whatever_the_threads(profile, exact, set_thr
     assert lifted(exact, 3000, profile, seed=4).xyz.tobytes() not in results[0]
 
 
-def test_held_out_images_are_not_even_read(exact):
+def test_test_images_are_not_read(exact):
     class Watched(dict):
         def read(self, name):
             names.add(name)
@@ -108,7 +106,7 @@ def test_held_out_images_are_not_even_read(exact):
     assert names == used
 
 
-def test_a_second_reading_comes_when_the_first_was_not_enough(exact, make_maps, monkeypatch):
+def test_images_are_read_again_if_too_few_candidates_are_sound(exact, make_maps, monkeypatch):
     """Each map is off by its own tenth, unaligned: hardly a candidate is confirmed."""
     reads, plain = [], lifting.read_view
 
@@ -126,7 +124,7 @@ def test_a_second_reading_comes_when_the_first_was_not_enough(exact, make_maps, 
     assert any("confirmed by fewer than 2 other views" in note for note in notes)
 
 
-def test_every_pixel_can_be_had_but_no_more(exact):
+def test_all_pixels_can_be_lifted_but_no_more(exact):
     scene = exact.replace(images=exact.images[:2])
     pixels = sum(int((exact.depths.read(im.name).values > 0).sum()) for im in scene.images)
     options = {"min_agreeing": 0, "see_through": True, "edge_tolerance": None}
@@ -137,7 +135,7 @@ def test_every_pixel_can_be_had_but_no_more(exact):
             lifted(scene, pixels + 1, profile, **change)
 
 
-def test_without_points_metric_depth_will_do(exact, capture):
+def test_metric_depth_needs_no_points(exact, capture):
     empty = exact.replace(points=exact.points.select(slice(0)), tracks=None)
     seeds = ss.upsample(empty, "depth", num_points=1500, align=False)
     assert len(seeds) == 1500
@@ -170,7 +168,7 @@ def own(exact, tmp_path):
     return exact.replace(source=dataclasses.replace(exact.source, image_dir=folder))
 
 
-def test_what_cannot_be_lifted_is_refused(own, make_maps):
+def test_scenes_that_cannot_be_lifted_are_refused(own, make_maps):
     photograph = own.source.image_dir / "view_004.png"
     focal, _, cx, cy = own.images[0].intrinsics.params
 
@@ -205,42 +203,3 @@ def resized(path, size):
     path.unlink()
     with PilImage.open(path.with_name("view_003.png")) as picture:
         picture.resize(size).save(path)
-
-
-# Spreading: one point a cube ----------------------------------------------------------------------
-
-
-def sheet(rng, num):
-    """Points on a bent sheet 2 wide, dense on its left."""
-    u, v = rng.random((2, num)) ** [[2], [1]] * 2
-    return np.stack([u, v, 0.2 * np.sin(3 * u)], axis=1).astype(np.float32)
-
-
-@given(st.integers(0, 2**32 - 1), st.floats(0.003, 3.0))
-@settings(max_examples=30, deadline=None)
-def test_cubes_are_those_of_a_dictionary(seed, side):
-    rng = np.random.default_rng(seed)
-    xyz, originals = sheet(rng, 400), rng.normal(size=(60, 3)).astype(np.float32)
-    footprint = rng.integers(0, 5, 400).astype(np.float32)  # ties, which the first wins
-    low = xyz.min(axis=0).astype(np.float64)
-    there = {tuple(np.floor((p - low) / side)) for p in originals.astype(np.float64)}
-    best = {}
-    for k, point in enumerate(xyz.astype(np.float64)):
-        cube = tuple(np.floor((point - low) / side))
-        if cube not in there and (cube not in best or footprint[k] < footprint[best[cube]]):
-            best[cube] = k
-    cubes = Cubes(xyz, footprint, np.ones(400, bool), originals)
-    assert np.flatnonzero(cubes.take(side)).tolist() == sorted(best.values())
-    assert cubes.count(side) == len(best)
-
-
-@pytest.mark.parametrize("num", [1, 7, 500, 4000, 5000, 20_000, 100_000])
-def test_exactly_so_many_come_out_and_of_many_they_are_estimated(num, rng):
-    total = 5000 if num <= 5000 else 100_000
-    xyz, every = sheet(rng, total), np.ones(total, bool)
-    taken = spread_evenly(xyz, every.astype(np.float32), every, xyz[:0], num, rng)
-    assert np.count_nonzero(taken) == num
-    cubes = Cubes(xyz, every.astype(np.float32), every, xyz[:0])
-    for side in (0.5, 0.02, 0.001):
-        exact = np.count_nonzero(cubes.take(side))
-        assert cubes.count(side) == pytest.approx(exact, rel=0.15, abs=40)

@@ -137,7 +137,7 @@ def processor_of(path):
     return transformers.AutoImageProcessor.from_pretrained(path, backend="pil")
 
 
-def test_what_a_network_predicts_is_read_from_its_config_or_asked_for(saved, tmp_path):
+def test_the_kind_of_a_network_comes_from_its_config_or_an_argument(saved, tmp_path):
     for name in KINDS:
         assert load_network(str(saved[name]), device="cpu").meaning.kind == KINDS[name]
     assert load_network(str(saved["dpt"]), depth_kind="ray", device="cpu").meaning.kind == "ray"
@@ -213,7 +213,7 @@ def test_a_map_lies_on_its_photograph(name, saved, ramp):
         ("preprocessor_config.json", b"[1"),
     ],
 )
-def test_a_damaged_folder_is_one_error(file, content, saved, tmp_path):
+def test_a_damaged_folder_raises_one_error(file, content, saved, tmp_path):
     folder = shutil.copytree(saved["depth_anything"], tmp_path / "copy")
     with pytest.raises(SceneFormatError, match="a file"):
         load_network(str(folder / file))
@@ -225,7 +225,7 @@ def test_a_damaged_folder_is_one_error(file, content, saved, tmp_path):
     assert "\n" not in str(caught.value)
 
 
-def test_weights_must_be_there_but_for_those_that_dpt_never_uses(saved, tmp_path, photographs):
+def test_missing_weights_are_refused_except_those_that_dpt_never_uses(saved, tmp_path, photographs):
     """Which the files that Intel published omit."""
     unused = "neck.fusion_stage.layers.0.residual_layer1."
     for name, omitted in (("depth_anything", "head."), ("dpt", unused)):
@@ -241,7 +241,7 @@ def test_weights_must_be_there_but_for_those_that_dpt_never_uses(saved, tmp_path
 
 
 @pytest.mark.parametrize("model", ["nobody/Depth-Nothing-hf", "nothing", "a/b/c", "../x"])
-def test_a_network_that_is_not_here_is_never_looked_for_elsewhere(model, monkeypatch, tmp_path):
+def test_a_network_that_is_not_local_is_not_downloaded(model, monkeypatch, tmp_path):
     def refuse(*_, **__):
         raise AssertionError("a connection was tried")
 
@@ -286,7 +286,7 @@ def test_a_processor_that_needs_torchvision_is_refused_without(saved, tmp_path):
         (RuntimeError("sizes of tensors must match"), SceneFormatError),
     ],
 )
-def test_a_network_that_fails_is_one_error(error, raised, saved, ramp, monkeypatch):
+def test_a_network_that_fails_raises_one_error(error, raised, saved, ramp, monkeypatch):
     def fail(*_, **__):
         raise error
 
@@ -369,7 +369,7 @@ def test_a_bad_photograph_stops_before_the_network_is_run(damage, own, tmp_path)
     assert not (tmp_path / "maps").exists()
 
 
-def test_maps_are_never_written_among_what_is_read(exact):
+def test_maps_are_never_written_into_the_scene(exact):
     folder, network = exact.source.image_dir.parent, Brightness()
     for output in (folder, folder / "images" / "maps"):
         with pytest.raises(OutputError):

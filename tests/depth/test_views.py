@@ -52,7 +52,7 @@ def view(camera, z, rgb=GRAY, factor=1.0):
     return DepthView(Alignment(1.0, 0.0, 100, 0.05), camera, *drawn, exhausted=False, reduced=copy)
 
 
-def test_a_pixel_of_a_smaller_map_counts_only_if_all_that_it_covers_do():
+def test_a_map_pixel_is_valid_only_if_the_mask_covers_all_of_it():
     mask, shown = np.ones((50, 80), bool), np.ones((7, 10), bool)
     mask[31, 47], shown[31 * 7 // 50, 47 * 10 // 80] = False, False
     kinds = (DepthMap(np.ones((7, 10), np.float32)), DepthMap(np.ones((100, 160), np.float32)))
@@ -78,7 +78,7 @@ THROUGH = [0, 0, 0, 1, 0, 0]
 
 
 @pytest.mark.parametrize("unit", [1.0, 1000.0])
-def test_a_view_confirms_hides_or_looks_through(unit):
+def test_a_view_confirms_occludes_or_sees_through(unit):
     camera = camera_at(0.05 * unit)
     other = reduced(camera, wall(camera, 2.0 * unit))
     agreeing, seen_through = find_support(
@@ -98,7 +98,7 @@ def test_a_view_of_another_color_confirms_nothing():
         assert find_support(POINTS[:1], own, [other], DepthSettings(color_tolerance=None))[0][0]
 
 
-def test_what_a_view_does_not_know_says_nothing():
+def test_unknown_depth_decides_nothing():
     camera = camera_at(0.0)
     nothing = np.full((HEIGHT, WIDTH), np.nan, np.float32)
     own = reduced(camera, nothing)
@@ -111,7 +111,7 @@ def test_what_a_view_does_not_know_says_nothing():
     assert not seen_through.any()
 
 
-def test_neighbors_see_the_same_from_another_side():
+def test_neighbors_see_the_same_surface_from_another_angle():
     cameras = [
         camera_at(0.0),
         camera_at(0.001),  # coincides: confirms little
@@ -130,7 +130,7 @@ def test_neighbors_see_the_same_from_another_side():
     assert (choose_neighbors(views[:1], 3, silent) == -1).all()
 
 
-def test_maps_are_scaled_to_agree():
+def test_scales_are_synchronised():
     """Ten cameras before a wall and a nearer one beside it, each map wrong by a factor of its
     own."""
     rng = np.random.default_rng(0)
@@ -175,7 +175,7 @@ def test_pixels_are_known_and_distinct(placement, num, rng):
     assert (values.ravel()[pixel] > 0).all()
 
 
-def test_pixels_go_where_points_are_far(rng):
+def test_pixels_are_drawn_far_from_points(rng):
     values = slanted(rng, holes=0.0)
     points = np.stack([rng.uniform(0, 40, 500), rng.uniform(0, 60, 500)], axis=1)  # the left half
     mean = {}
@@ -190,7 +190,7 @@ def test_pixels_go_where_points_are_far(rng):
 
 
 @pytest.mark.parametrize("radius", [1, 3])
-def test_pixels_keep_off_the_jumps_of_depth(radius, rng):
+def test_pixels_avoid_depth_discontinuities(radius, rng):
     values = slanted(rng, holes=0.0)
     values[:, 40:] *= 1.1
     values[30:, :20] *= 0.9
@@ -205,7 +205,7 @@ def test_pixels_keep_off_the_jumps_of_depth(radius, rng):
     assert ((plain >= 40 - radius) & (plain < 40 + radius)).any()
 
 
-def test_what_is_mostly_unknown_around_comes_last(rng):
+def test_pixels_with_mostly_unknown_surroundings_come_last(rng):
     values = slanted(rng, holes=0.0)
     values[:, 40:] = np.nan
     values[::6, 43:79:6] = 2.0  # sparse, as a lidar's

@@ -69,7 +69,7 @@ def test_a_path_follows_the_cameras_evenly(rng):
         smooth_path(cameras[:1], 10, (64, 48))
 
 
-def test_an_orbit_goes_around_what_the_cameras_look_at(run_folder):
+def test_an_orbit_circles_the_focus_of_the_cameras(run_folder):
     cameras = _ring()
     np.testing.assert_allclose(flights.focus_point(cameras), 0, atol=0.1)
     gaussians = read_gaussians(run_folder / "point_cloud.ply")
@@ -98,7 +98,7 @@ def test_cameras_that_are_upside_down_to_each_other_have_an_up():
         '{"camera_path": [{"camera_to_world": [1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1], "fov": 200}]}',
     ],
 )
-def test_what_is_no_path_is_refused(content, tmp_path):
+def test_files_that_are_no_path_are_refused(content, tmp_path):
     (tmp_path / "path.json").write_text(content)
     with pytest.raises(SceneFormatError, match="camera path"):
         read_path(tmp_path / "path.json", (64, 48))
@@ -107,7 +107,7 @@ def test_what_is_no_path_is_refused(content, tmp_path):
 # Renders ------------------------------------------------------------------------------------------
 
 
-def test_depth_is_that_of_a_wall():
+def test_depth_of_a_wall():
     """A wall of Gaussians 4 units ahead, in a world 100 units large."""
     xy = np.stack(np.meshgrid(*2 * [np.linspace(-4, 4, 41)]), axis=-1).reshape(-1, 2)
     ones = np.ones((len(xy), 1), np.float32)
@@ -127,7 +127,7 @@ def test_depth_is_that_of_a_wall():
     np.testing.assert_allclose(renderer.color(view), 0.5, atol=0.03)
 
 
-def test_pictures_are_split_where_asked():
+def test_pictures_are_split_at_the_border():
     red, blue = np.zeros((20, 40, 3), np.uint8), np.zeros((20, 40, 3), np.uint8)
     red[..., 0], blue[..., 2] = 255, 255
     split = split_picture(red, blue, at=0.25)
@@ -161,7 +161,7 @@ def test_a_flight_is_a_video_of_the_scene(run_folder, tmp_path, splatseed):
     assert np.abs(np.diff(frames.astype(int), axis=0)).mean() > 0.5  # it moves
 
 
-def test_without_cameras_the_video_circles_and_says_so(run_folder, tmp_path, splatseed):
+def test_without_cameras_the_video_circles_with_a_note(run_folder, tmp_path, splatseed):
     ply = shutil.copy(run_folder / "point_cloud.ply", tmp_path / "model.ply")
     words = ("flight", ply, "--seconds", 0.05, "--size", "48x32", "-o")
     assert "circles" in splatseed(*words, tmp_path / "a.mp4").out
@@ -220,7 +220,7 @@ def test_models_of_other_places_are_refused(run_folder, room, tmp_path, splatsee
     assert (frames[:, 10:60, 49:51].mean(axis=(0, 2, 3)) > 150).all()  # the line between them
 
 
-def test_a_stopped_video_leaves_nothing_and_ffmpeg_says_nothing(tmp_path, capfd):
+def test_a_stopped_video_leaves_no_file_and_prints_nothing(tmp_path, capfd):
     def stopped():
         yield np.zeros((32, 48, 3), np.uint8)
         raise KeyboardInterrupt

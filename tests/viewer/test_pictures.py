@@ -158,7 +158,7 @@ def test_unknown_is_grey_and_near_is_brighter_than_far(maps):
         assert depth_picture(np.full((3, 4), value)).shape == (3, 4, 3)
 
 
-def test_labels_at_the_ends_of_a_colour_bar_are_whole():
+def test_labels_of_a_colour_bar_are_complete():
     bar = color_bar("0 spacings", "1 spacing or more from the surface")
     assert bar.min() < 50
     assert (bar[:, :8] == 255).all()

@@ -167,7 +167,7 @@ def test_a_run_is_seen_offline_and_a_flight_ends_at_its_camera(viewer, run_folde
 
 
 @needs_browser
-def test_switches_act_and_a_browser_gets_as_many_points_as_it_draws(entry, tmp_path, monkeypatch):
+def test_switches_work_and_a_fast_browser_gets_more_points(entry, tmp_path, monkeypatch):
     monkeypatch.setattr(session_module, "POINTS", replace(session_module.POINTS, first=100))
     monkeypatch.setattr(session_module.Session, "_affordable_points", lambda _: 10**6)
     other, total = _entry(replace(entry.item, name="other")), len(entry.item.scene.points)
@@ -197,7 +197,7 @@ def test_switches_act_and_a_browser_gets_as_many_points_as_it_draws(entry, tmp_p
 
 
 @needs_browser
-def test_two_browsers_have_switches_of_their_own_and_may_go(viewer, tmp_path):
+def test_two_browsers_have_their_own_switches_and_may_disconnect(viewer, tmp_path):
     with served_page(tmp_path / "a", viewer.url) as first:
         one = _session(viewer)
         with served_page(tmp_path / "b", viewer.url):
@@ -240,7 +240,7 @@ def test_a_canvas_at_a_camera_is_that_camera(entry):
     assert abs(columns.mean() - 199.5) <= 1
 
 
-def test_every_picture_is_drawn_and_a_moving_one_keeps_what_shows_most(entry, monkeypatch):
+def test_each_picture_is_drawn_and_a_moving_one_keeps_the_most_visible(entry, monkeypatch):
     image = entry.item.scene.images[0]
     canvas = _canvas_at(entry, image, (160, 120))
     kinds = ("Gaussians", "depth", "photograph", "error", "points", "origins", "uncovered cells")

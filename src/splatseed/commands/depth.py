@@ -28,7 +28,7 @@ from splatseed.scene import Scene
 from splatseed.seeding.trainability import is_distorted
 from splatseed.text import name_some, quoted, visible
 
-if TYPE_CHECKING:  # for --help: loads NumPy's users only with its use
+if TYPE_CHECKING:  # stereo is loaded after the options are parsed
     from splatseed.depth.stereo import StereoMap
 
 NAMES_SHOWN = 5

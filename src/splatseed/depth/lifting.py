@@ -27,7 +27,7 @@ from splatseed.depth.views import DepthView, read_view
 from splatseed.errors import PointCloudError, SceneFormatError, SceneNotFoundError
 from splatseed.io.photograph import photograph_folder
 from splatseed.io.photograph_checks import with_photographs
-from splatseed.photos.visibility import find_visibility
+from splatseed.photos.visibility import Visibility, find_visibility
 from splatseed.progress import Progress, in_threads, silent
 from splatseed.scene import Image, Scene
 from splatseed.text import agreeing
@@ -72,45 +72,12 @@ def lift(
         PointCloudError: The maps cannot give that many points.
     """
     scene, center = _centered(scene)
-    depths, visibility = scene.depths, find_visibility(scene)
-    used = scene.images
-    if settings.test_every or scene.listed:
-        used = scene.split(settings.test_every)[0]
-    images = [image for image in used if depths is not None and image.name in depths]
-    if depths is None or not images:
-        raise SceneNotFoundError(
-            "a scene with depth maps of its images",
-            found=f"{len(scene.images)} images, and maps of none of them",
-            fix="Pass the folder with the maps as `depth`, or maps to scene.with_depths.",
-        )
-    folder, notes = photograph_folder(scene), list[str]()
-    readable = {image.name for image in with_photographs(scene).images}
-    images = [image for image in images if image.name in readable]
-    if lacking := sum(image.name not in depths for image in used):
-        what = agreeing(lacking, "has no depth map and gives", "have no depth map and give")
-        notes.append(f"{lacking} of {len(used)} images {what} no points.")
-
-    def read_all(num: float) -> list[DepthView]:
-        """Read all images, each with an equal number of candidates."""
-        views: dict[int, DepthView] = {}
-        # One seed per image, drawn in order, so that threads do not matter.
-        seeds = rng.integers(0, 1 << 63, len(images))
-
-        def work(start: int, stop: int) -> None:
-            for i in range(start, stop):
-                own, share = np.random.default_rng(seeds[i]), math.ceil(num / len(images))
-                views[i] = read_view(
-                    images[i], folder, scene.masks, depths, visibility, settings, share, own,
-                    scene.white,
-                )  # fmt: skip
-
-        in_threads(work, len(images), 1, "read images", progress)
-        return [views[i] for i in range(len(images))]
-
+    visibility, notes = find_visibility(scene), list[str]()
+    images = _images_with_maps(scene, settings, notes)
     factor = OVERSAMPLING.plain
     if settings.compares_views or settings.spread:
         factor = OVERSAMPLING.compared
-    views = read_all(factor * num)
+    views = _read_views(scene, images, visibility, factor * num, settings, rng, progress)
     images, views = _leave_out(images, views, settings.max_residual_ratio, notes)
     candidates = _gather(views, settings, progress)
     while (
@@ -121,7 +88,7 @@ def lift(
         # In proportion to the sound ones, so that one more round mostly suffices.
         growth = OVERSAMPLING.plain * num / max(sound, 1)
         factor = min(factor * min(growth, OVERSAMPLING.max_growth), OVERSAMPLING.limit)
-        views = read_all(factor * num)
+        views = _read_views(scene, images, visibility, factor * num, settings, rng, progress)
         candidates = _gather(views, settings, progress)
     progress("choose points", 0.0)
     points = scene.points.originals
@@ -138,6 +105,57 @@ def lift(
     xyz = candidates.xyz[chosen]
     np.add(xyz, center, out=xyz, casting="same_kind")  # in float64, then rounded
     return xyz, candidates.rgb[chosen], tuple(notes)
+
+
+def _images_with_maps(scene: Scene, settings: DepthSettings, notes: list[str]) -> list[Image]:
+    """Images with a depth map and a photograph, without test images; adds a note on the others.
+
+    Raises:
+        SceneNotFoundError: There are none.
+    """
+    depths, used = scene.depths, scene.images
+    if settings.test_every or scene.listed:
+        used = scene.split(settings.test_every)[0]
+    images = [image for image in used if depths is not None and image.name in depths]
+    if depths is None or not images:
+        raise SceneNotFoundError(
+            "a scene with depth maps of its images",
+            found=f"{len(scene.images)} images, and maps of none of them",
+            fix="Pass the folder with the maps as `depth`, or maps to scene.with_depths.",
+        )
+    if lacking := sum(image.name not in depths for image in used):
+        verbs = agreeing(lacking, "has no depth map and gives", "have no depth map and give")
+        notes.append(f"{lacking} of {len(used)} images {verbs} no points.")
+    photograph_folder(scene)  # raises if there is none
+    readable = {image.name for image in with_photographs(scene).images}
+    return [image for image in images if image.name in readable]
+
+
+def _read_views(
+    scene: Scene,
+    images: list[Image],
+    visibility: Visibility,
+    num: float,
+    settings: DepthSettings,
+    rng: np.random.Generator,
+    progress: Progress,
+) -> list[DepthView]:
+    """Read all images, which share ``num`` candidates equally."""
+    depths, folder = scene.depths, photograph_folder(scene)
+    assert depths is not None  # noqa: S101  (these images have maps)
+    views: dict[int, DepthView] = {}
+    # A seed per image, drawn in order, so that threads do not matter.
+    seeds, per_image = rng.integers(0, 1 << 63, len(images)), math.ceil(num / len(images))
+
+    def work(start: int, stop: int) -> None:
+        for i in range(start, stop):
+            views[i] = read_view(
+                images[i], folder, scene.masks, depths, visibility, settings, per_image,
+                np.random.default_rng(seeds[i]), scene.white,
+            )  # fmt: skip
+
+    in_threads(work, len(images), 1, "read images", progress)
+    return [views[i] for i in range(len(images))]
 
 
 def _centered(scene: Scene) -> tuple[Scene, Float64[np.ndarray, " 3"]]:

@@ -109,7 +109,7 @@ def map_colors(
 
     The colour maps viridis (dark is low) and plasma (blue is low) stay legible in grey print.
     """
-    from matplotlib import colormaps  # noqa: PLC0415  (of an optional extra, and slow to import)
+    from matplotlib import colormaps  # noqa: PLC0415  (slow to import)
 
     known = np.isfinite(values)
     share = (np.where(known, values, low) - low) / max(high - low, 1e-12)

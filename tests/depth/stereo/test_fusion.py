@@ -15,7 +15,7 @@ def seeds(ball):
     return fuse(ball.stereo, CELL)
 
 
-def test_seeds_lie_on_the_surface_and_know_its_normals_best_first(seeds, ball):
+def test_seeds_lie_on_the_surface_with_its_normals_most_confident_first(seeds, ball):
     xyz = seeds.xyz.astype(np.float64)
     assert np.quantile(ball.surfaces.distance(xyz), 0.9) < 0.04
     cosine = np.abs((ball.surfaces.normals(xyz) * seeds.normals).sum(axis=1))
@@ -37,7 +37,7 @@ def test_a_cell_of_a_view_has_one_seed_at_a_depth(seeds, ball):
             assert (np.diff(here) / here[:-1] > SAME_DEPTH / (1 + SAME_DEPTH) - 1e-4).all()
 
 
-def test_every_kept_pixel_has_a_seed_near_it(seeds, ball):
+def test_each_confirmed_pixel_has_a_seed_near_it(seeds, ball):
     """What was left out has a seed in its cell, in its own view or a confirming one."""
     stereo, xyz = ball.stereo, seeds.xyz.astype(float)
     for i, view in enumerate(stereo.views):

@@ -60,7 +60,7 @@ def sampled(image, columns, rows):
 
 
 @pytest.mark.parametrize("shape", [(7, 9), (1, 5), (6, 1), (1, 1)])
-def test_between_pixels_and_beyond_the_border(shape, rough, rng):
+def test_sampling_interpolates_and_clamps_at_the_border(shape, rough, rng):
     image = rough(*shape)
     for _ in range(20):
         columns = rng.uniform(-3, shape[1] + 2, LANES).astype(np.float32)
@@ -129,7 +129,7 @@ def make_warps(rng, num):
     return list(np.concatenate([turned, moved[:, :, None]], axis=2))
 
 
-def test_weights_and_normalised_samples_are_those_of_the_formula(rough, places):
+def test_weights_and_normalised_samples_equal_the_formula(rough, places):
     image = rough(*SIZE[::-1])
     weights, samples = window(image, places).reshape(2, SAMPLES, LANES)
     for lane, (u, v) in enumerate(places.T.astype(float)):
@@ -142,7 +142,7 @@ def test_weights_and_normalised_samples_are_those_of_the_formula(rough, places):
 
 
 @pytest.mark.parametrize("num", [1, 2, 5])
-def test_cost_is_that_of_the_formula(num, rough, rng, places, planes):
+def test_cost_equals_the_formula(num, rough, rng, places, planes):
     image, others = rough(*SIZE[::-1]), [rough(25 + 3 * i, 45 - 2 * i) for i in range(num)]
     warps = make_warps(rng, num)
     ours = costs_of(image, others, warps, places, planes)
@@ -155,7 +155,7 @@ def test_cost_is_that_of_the_formula(num, rough, rng, places, planes):
     assert np.ptp(ours) > 0.1  # the loop above compared different things
 
 
-def test_the_negative_costs_most_and_grey_is_like_nothing(rough, places, planes):
+def test_the_negative_costs_most_and_grey_costs_one(rough, places, planes):
     image = rough(*SIZE[::-1])
     assert costs_of(image, [255 - image], [IDENTITY], places, planes).min() > 1.9
     for level in (0, 128, 255):
@@ -165,7 +165,7 @@ def test_the_negative_costs_most_and_grey_is_like_nothing(rough, places, planes)
             np.testing.assert_allclose(ours, 1.0, atol=5e-3)
 
 
-def test_a_view_that_does_not_hold_the_point_says_nothing(rough, places, planes):
+def test_a_view_without_the_point_has_the_unseen_cost(rough, places, planes):
     image = rough(*SIZE[::-1])
     beside = IDENTITY + np.array([[0, 0, 500.0, 0], [0, 0, 0, 0], [0, 0, 0, 0]])
     for warp in (BEHIND, beside, np.zeros((3, 4))):
@@ -216,7 +216,7 @@ def cost_at(images, planes, row, column):
     return best_of([cost_in(images[0], image, warp, u, v, plane) for image, warp in pairs])
 
 
-def test_the_best_guess_is_taken(images, state):
+def test_initialise_takes_the_cheapest_plane(images, state):
     guesses, planes, costs = state
     for row, column in [(0, 0), (ROWS - 1, COLUMNS - 1), (4, 16), (5, 17)]:
         each = [cost_at(images, guess, row, column) for guess in guesses]
@@ -224,7 +224,7 @@ def test_the_best_guess_is_taken(images, state):
         assert planes[0, row, column] in guesses[:, 0, row, column]
 
 
-def test_sweeps_lower_costs_and_keep_to_the_bounds(images, quad_images, state):
+def test_sweeps_lower_costs_within_the_bounds(images, quad_images, state):
     _, planes, costs = state
     before = costs.copy()
     for number in range(2):
@@ -240,7 +240,7 @@ def test_sweeps_lower_costs_and_keep_to_the_bounds(images, quad_images, state):
 
 
 @pytest.mark.parametrize("color", [0, 1])
-def test_a_half_sweep_changes_one_colour_only_by_its_key(color, quad_images, state):
+def test_a_half_sweep_changes_one_colour_and_depends_on_its_key(color, quad_images, state):
     _, before, costs = state
     runs = []
     for key in (KEY, KEY, np.uint64(7)):
@@ -275,7 +275,7 @@ def make_map(rng, rows, columns):
     ],
     ids=["moved", "turned", "behind"],
 )
-def test_confirmation_is_the_loop(warp, rng):
+def test_confirmation_equals_a_loop(warp, rng):
     (planes, costs), (other, other_costs) = make_map(rng, 12, 15), make_map(rng, 10, 17)
     bit, out = np.uint8(4), np.ones(costs.shape, np.uint8)  # an earlier witness has said something
     confirm(planes, costs, MAX_COST, 4, warp, other, other_costs, TOLERANCE, bit, out)

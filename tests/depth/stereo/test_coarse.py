@@ -39,14 +39,14 @@ def test_maps_are_as_good_as_with_points_in_any_unit(planted, request):
 
 
 @pytest.mark.parametrize("angles", [(0.0, 180.0), (0.0, 0.0, 0.0)], ids=["back to back", "at one"])
-def test_views_that_cannot_tell_depth_say_nothing(angles, tmp_path):
+def test_views_without_parallax_have_empty_maps(angles, tmp_path):
     scene = bare(photograph(tmp_path, tilted_plane(0.0), arc(angles)))
     for stereo_map in stereo_depths(scene, SETTINGS):
         assert stereo_map.known_fraction == 0.0
 
 
 @pytest.mark.parametrize("kind", ["z", "inverse"])
-def test_depth_maps_stand_in_for_points(kind, plane):
+def test_depth_maps_replace_points(kind, plane):
     maps = MemoryMaps()
     for image in plane.scene.images[1:]:
         depth = true_depth(plane.surfaces, image.camera)
@@ -60,7 +60,7 @@ def test_depth_maps_stand_in_for_points(kind, plane):
 
 
 @pytest.mark.parametrize("enough", [True, False])
-def test_points_are_taken_where_half_of_the_images_see_enough(plane, enough, monkeypatch):
+def test_points_are_used_if_half_of_the_images_see_enough(plane, enough, monkeypatch):
     seen = find_visibility(plane.scene)
     counts = [len(seen.rows_of(image)) for image in plane.scene.images]
     monkeypatch.setattr(pipeline, "MIN_SEEN", np.median(counts) + (not enough))

@@ -57,7 +57,7 @@ def test_a_ball_before_a_wall(ball):
         assert np.median(angle) < 10
 
 
-def test_a_map_says_where_it_is_and_what_it_knows(ball):
+def test_fields_of_a_map_are_consistent(ball):
     for image, stereo_map in zip(ball.scene.images, maps_of(ball), strict=True):
         known = np.isfinite(stereo_map.depth)
         assert stereo_map.name == image.name
@@ -119,7 +119,7 @@ def test_confidence_is_higher_where_depth_is_right(ball):
     assert confidence[right].mean() > confidence[~right].mean()
 
 
-def test_the_same_bytes_on_any_number_of_threads(ball, monkeypatch):
+def test_bytes_do_not_depend_on_threads(ball, monkeypatch):
     before = numba.get_num_threads()
     monkeypatch.setattr(pipeline, "MIN_SEEN", 1)  # so that priors are its points
     try:
@@ -133,7 +133,7 @@ def test_the_same_bytes_on_any_number_of_threads(ball, monkeypatch):
         numba.set_num_threads(before)
 
 
-def test_another_seed_gives_other_bytes_as_good(plane):
+def test_another_seed_gives_other_bytes_of_equal_quality(plane):
     stereo_map = stereo_depths(plane.scene, SETTINGS, seed=1)[0]
     assert stereo_map.depth.tobytes() != maps_of(plane)[0].depth.tobytes()
     assert (relative_error(plane.surfaces, stereo_map) < 0.01).mean() > 0.95
@@ -148,13 +148,13 @@ def test_two_views_confirm_each_other(tmp_path):
 
 
 @pytest.mark.parametrize("num", [0, 1])
-def test_stereo_takes_two(num, tmp_path):
+def test_stereo_needs_two_photographs(num, tmp_path):
     scene = photograph(tmp_path, tilted_plane(), arc((0.0,)))
     with pytest.raises(SceneNotFoundError, match="two"):
         stereo_depths(scene.replace(images=scene.images[:num]))
 
 
-def test_views_that_see_nothing_of_each_other_keep_nothing(tmp_path):
+def test_views_without_overlap_have_empty_maps(tmp_path):
     front, back = arc((0.0, 180.0))
     scene = photograph(tmp_path, tilted_plane(0.0), [front, back])
     for stereo_map in stereo_depths(scene, SETTINGS):
@@ -162,7 +162,7 @@ def test_views_that_see_nothing_of_each_other_keep_nothing(tmp_path):
         assert not stereo_map.confidence.any()
 
 
-def test_grey_walls_get_no_invented_depth(tmp_path):
+def test_textureless_walls_have_no_depth(tmp_path):
     scene = photograph(tmp_path, tilted_plane(), arc(), texture=GREY)
     for stereo_map in stereo_depths(scene, SETTINGS):
         assert stereo_map.known_fraction < 0.02
@@ -198,7 +198,7 @@ def test_points_at_and_behind_the_cameras(shift, tmp_path):
         assert (relative_error(surfaces, stereo_map) < 0.01).mean() > 0.9
 
 
-def test_the_yardstick_itself(plane):
+def test_the_ground_truth_satisfies_the_planes_equation(plane):
     """The truth of the made plane, by its equation: normal . x = 0."""
     for stereo_map in maps_of(plane):
         depth = true_depth(plane.surfaces, stereo_map.camera)
@@ -225,7 +225,7 @@ def test_settings_out_of_range_are_refused(changes):
         StereoSettings(**changes)
 
 
-def test_the_maps_of_some_views_are_those_of_all(ball):
+def test_maps_of_some_views_equal_those_of_all(ball):
     scene, only = ball.scene, [3, 0]
     views = load_views(scene, scene.images)
     settings = dataclasses.replace(SETTINGS, num_check_views=2)
