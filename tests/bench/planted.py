@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from splatseed.bench.plan import SFM, SHARED, Arm, RunResult, RunSpec
-from splatseed.bench.runs import ERROR, RESULT, Run, begin, run_folder
+from splatseed.bench.runs import ERROR, RESULT, Run, record_plan, run_folder
 from splatseed.bench.scenes import PlannedScene, SceneFacts, survey
 from splatseed.scores import CurvePoint, EvalResult, ViewScore
 from splatseed.training.settings import TrainSettings
@@ -74,7 +74,7 @@ def runs(
 
 def write_bench(bench, planned, words=("--scenes", "<A>", "b c")):
     """A benchmark's folder with these runs."""
-    begin(bench, "bench", [run.spec for run in planned], words)
+    record_plan(bench, "bench", [run.spec for run in planned], words)
     for run in planned:
         told = {"spec": run.spec.to_dict()}
         if run.result or run.error:

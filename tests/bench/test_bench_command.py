@@ -20,7 +20,7 @@ pytest.importorskip("gsplat", reason="training needs gsplat's strategies")
 
 from splatseed import synthetic
 from splatseed.bench.plan_file import plan_text, read_plan
-from splatseed.bench.runs import begin, read_calls, read_runs
+from splatseed.bench.runs import read_calls, read_runs, record_plan
 from splatseed.bench.scenes import DEMO, PlannedScene, survey
 from splatseed.commands import bench as command
 from splatseed.io import load_scene
@@ -117,14 +117,14 @@ def test_a_dry_run_prints_a_plan_and_writes_nothing(bench, plan_path, tmp_path, 
     assert not (tmp_path / "B").exists()
 
 
-def test_presets_leave_out_what_is_not_there(bench, own_room, tmp_path):
+def test_missing_scenes_of_a_preset_are_skipped(bench, own_room, tmp_path):
     data = tmp_path / "360"
     for name, images in (("garden", "images_4"), ("bonsai", "images_2"), ("room", "images_8")):
         shutil.copytree(own_room, data / name)
         (data / name / "images").rename(data / name / images)
     code, out, _ = bench("--preset", "mipnerf360", "--data", data, "--dry-run", "--repeats", 1)
     assert code == 0
-    left_out = re.findall(r"^# (\w+) is left out: .*(bicycle|images_2)", out, re.MULTILINE)
+    left_out = re.findall(r"^# (\w+) is skipped: .*(bicycle|images_2)", out, re.MULTILINE)
     assert left_out == [("bicycle", "bicycle"), ("room", "images_2")]
     assert "# 32 runs" in out  # 2 scenes, and sfm and 5 methods at 3 ratios
     (tmp_path / "plan.toml").write_text(out)
@@ -170,7 +170,7 @@ def test_a_dry_run_of_the_quick_preset_loads_nothing_heavy():
     [
         ((), "-o BENCH"),
         (("-o", "B"), "--scenes"),
-        (("-o", "B", "--scenes", "ROOM", "--methods", "cloud"), "without a scan"),
+        (("-o", "B", "--scenes", "ROOM", "--methods", "cloud"), "--clouds"),
         (("-o", "B", "--scenes", "ROOM", "--address", "auto"), "--executor ray"),
         (("-o", "B", "--scenes", "ROOM", "--methods", "depth", "--depth", "a", "b"), "--depth"),
         (("-o", "ROOM/B", "--scenes", "ROOM"), "apart from the input"),
@@ -189,7 +189,7 @@ def test_bad_words_are_refused_and_nothing_is_written(
     bench, room_path, tmp_path, monkeypatch, words, said
 ):
     monkeypatch.chdir(tmp_path)
-    begin(tmp_path / "OTHER", "upsample", [], [])
+    record_plan(tmp_path / "OTHER", "upsample", [], [])
     (tmp_path / "lpips.toml").write_text(f"lpips = true\n[[scenes]]\npath = '{room_path}'\n")
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     before = sorted(tmp_path.rglob("*"))

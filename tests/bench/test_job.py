@@ -14,7 +14,14 @@ pytest.importorskip("torch", reason="training needs PyTorch")
 pytest.importorskip("gsplat", reason="training needs gsplat's strategies")
 
 from splatseed.bench import job
-from splatseed.bench.job import JobOptions, do_runs, make_seeds, open_unchanged, run_away, run_job
+from splatseed.bench.job import (
+    RunOptions,
+    execute_runs,
+    make_seeds,
+    open_unchanged,
+    run_job,
+    run_remotely,
+)
 from splatseed.bench.plan import plan_runs
 from splatseed.bench.runs import package_version, read_run, run_folder
 from splatseed.cli import main
@@ -44,7 +51,7 @@ def specs(small_plan, room_path):
 
 def test_a_result_says_what_was_measured_and_a_little_is_kept(specs, tmp_path):
     spec = specs["linear"]
-    result = run_job(spec, JobOptions(), tmp_path)
+    result = run_job(spec, RunOptions(), tmp_path)
     kept = run_folder(tmp_path, spec)
     metrics = json.loads((kept / "metrics.json").read_text())
     assert result.psnr == metrics["psnr"]
@@ -61,7 +68,7 @@ def test_a_result_says_what_was_measured_and_a_little_is_kept(specs, tmp_path):
     assert set(seen) == {view.name for view in result.scores.per_image}
     assert 0.3 < result.scores.covisible_share <= 1
     assert not (kept / "point_cloud.ply").exists()
-    run_job(spec, JobOptions(keep_models=True), tmp_path)
+    run_job(spec, RunOptions(keep_models=True), tmp_path)
     assert (kept / "point_cloud.ply").stat().st_size > 1000
 
 
@@ -120,7 +127,7 @@ def test_seeds_are_thinned_to_the_budget_or_fill_it(small_plan, room_path):
     ):  # fmt: skip
         spec = _budgeted(small_plan, room_path, method, budget, strategy)
         seeds, _ = make_seeds(open_unchanged(spec.scene), spec)
-        assert len(seeds) == spec.most_seeds == number
+        assert len(seeds) == spec.max_seeds == number
 
 
 def test_points_of_photographs_are_made_once_for_all_budgets(
@@ -145,14 +152,14 @@ def test_a_scene_that_has_changed_fails_its_run_alone_and_is_recorded(
     photograph = next((own_room / "images").iterdir())
     photograph.write_bytes(photograph.read_bytes() + b"\0")
     todo = [broken, specs["linear"]]
-    failed, done = do_runs(tmp_path, todo, in_process, JobOptions())
+    failed, done = execute_runs(tmp_path, todo, in_process, RunOptions())
     assert "as they were when the benchmark was planned" in failed.error
     assert "\n" not in failed.error
     assert done.result is not None
     assert read_run(tmp_path, broken) == failed
     error = json.loads((run_folder(tmp_path, broken) / "error.json").read_text())
     assert "open_unchanged" in error["traceback"]
-    (done,) = do_runs(tmp_path, [specs["sfm"]], in_process, JobOptions())
+    (done,) = execute_runs(tmp_path, [specs["sfm"]], in_process, RunOptions())
     assert read_run(tmp_path, broken).result == done.result  # which takes the error's place
 
 
@@ -160,7 +167,7 @@ def test_files_of_the_users_are_left_alone(specs, tmp_path, in_process):
     mine = run_folder(tmp_path, specs["sfm"]) / "thesis.txt"
     mine.parent.mkdir(parents=True)
     mine.write_text("keep")
-    (failed,) = do_runs(tmp_path, [specs["sfm"]], in_process, JobOptions())
+    (failed,) = execute_runs(tmp_path, [specs["sfm"]], in_process, RunOptions())
     assert mine.parent.name in failed.error
     assert [path.name for path in mine.parent.iterdir()] == ["thesis.txt"]
 
@@ -171,11 +178,11 @@ def test_a_run_elsewhere_comes_back_as_files_and_leaves_nothing(
     nodes = tmp_path / "nodes"
     nodes.mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(nodes))
-    (run,) = do_runs(tmp_path, [specs["sfm"]], in_process, JobOptions(), away=True)
+    (run,) = execute_runs(tmp_path, [specs["sfm"]], in_process, RunOptions(), remote=True)
     assert read_run(tmp_path, specs["sfm"]) == run
     assert list(nodes.iterdir()) == []
     far = _moved(specs["sfm"], path="elsewhere/room")
     with pytest.raises(SceneNotFoundError, match="elsewhere/room"):
-        run_away(far, JobOptions())
+        run_remotely(far, RunOptions())
     with pytest.raises(ParameterError, match=r"0\.0\.1"):
-        run_away(dataclasses.replace(specs["sfm"], version="0.0.1"), JobOptions())
+        run_remotely(dataclasses.replace(specs["sfm"], version="0.0.1"), RunOptions())

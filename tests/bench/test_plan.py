@@ -97,7 +97,7 @@ def test_paths_in_a_file_are_beside_it(tmp_path):
         ("ratios = []\nbudgets = [0.25]", "Did you mean 0.25rho?"),
         ("long_side = 400\ndata_factor = 2", "both"),
         ('strategies = ["mcmcm"]', "mcmcm"),
-        ("max_steps = 0", "max-steps"),
+        ("max_steps = 0", "max_steps"),
         ("scenes = [1]", "scenes"),
         ("[[scenes]]\nname = 'x'", "path"),
         ("[[scenes]]\npath = 'x'\nfolder = 'y'", "scenes.folder"),
@@ -224,7 +224,7 @@ def test_a_budget_is_the_same_number_for_every_arm_of_a_scene():
         ("bonsai", "0.25rho"): 26_600, ("bonsai", "20000"): 20_000,
     }  # fmt: skip
     assert {run.training.data_factor for run in runs} == {2}  # 533 rows become 266
-    seeds = {(r.arm.strategy, r.most_seeds) for r in runs if r.scene.name == "fern"}
+    seeds = {(r.arm.strategy, r.max_seeds) for r in runs if r.scene.name == "fern"}
     assert seeds == {("default", 21_000), ("default", 14_000), ("grow", 30_000), ("grow", 20_000)}
 
 
@@ -270,5 +270,5 @@ def test_budgets_leave_uncapped_strategies_alone():
     assert {arm.budget for arm in free} == {""}
     assert {arm.budget for arm in equal} == set(plan.budgets)
     assert len(free) == len(equal) == 1 + 5 * 3 * 2 + 3  # sfm, methods, and random's one profile
-    with pytest.raises(ParameterError, match="ratios of at least one"):
+    with pytest.raises(ParameterError, match="at least one of ratios"):
         dataclasses.replace(plan, ratios=())

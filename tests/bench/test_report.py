@@ -18,7 +18,7 @@ from splatseed.bench import pictures as pictures_module
 from splatseed.bench.figures import arm_figure, curve_figure, scene_figure, seconds_figure
 from splatseed.bench.plan import SFM
 from splatseed.bench.report import REPORT, write_report
-from splatseed.bench.runs import Run, alone_in, run_folder
+from splatseed.bench.runs import Run, locked_bench, run_folder
 from splatseed.bench.scenes import scene_digest
 from splatseed.bench.study import studies
 from splatseed.cli import main
@@ -74,14 +74,14 @@ ONE = {"scenes": ("fox",), "gains": {(SFM, 1): 0.0, ("mls", 8): 0.5}, "repeats":
     [
         (runs(**ONE), "over repeats and 95% interval for this scene trained"),
         (runs(**{**ONE, "repeats": 1}), "which a single run cannot confirm"),
-        (runs(**{**ONE, "gains": {("mls", 8): 0.1}}), "Nothing can be compared yet"),
+        (runs(**{**ONE, "gains": {("mls", 8): 0.1}}), "There is no comparison yet"),
         ([], "0 runs"),
         ([*runs(**ONE), *runs(**ONE, max_steps=2000)], "Set 2: 2,000 steps"),
         ([*runs(**ONE), Run(spec("fox", "mls", 8, repeat=7, **GONE), result(math.inf))],
          "fox, mls 8x, none, repeat 8"),
         ([*runs(**ONE), Run(spec("fox", SFM, 1, repeat=8, **GONE), result(25.0, curve=()))],
          "2 to 3 repeats"),
-        ([*runs(**ONE), Run(spec("fox", "mls", 8, repeat=6, **GONE))], "Runs still missing: 1"),
+        ([*runs(**ONE), Run(spec("fox", "mls", 8, repeat=6, **GONE))], "Missing runs: 1"),
         ([*runs(**ONE), Run(spec("fox", "linear", 8, **GONE), error="a <b>cat</b>, not a dog")],
          "a <b>cat</b>, not a dog"),  # as text: tags were escaped
     ],
@@ -109,16 +109,20 @@ def test_others_files_are_not_replaced_and_bad_folders_are_one_error(tmp_path):
     (bench / "planned.json").write_text('{"calls": [], "runs": [{}]}')
     with pytest.raises(SceneFormatError, match=r"planned\.json"):
         write_report(bench)
-    with alone_in(bench), pytest.raises(OutputError, match="no other process"), alone_in(bench):
+    with (
+        locked_bench(bench),
+        pytest.raises(OutputError, match="no other process"),
+        locked_bench(bench),
+    ):
         pass
 
 
 def test_the_commands_say_what_they_found(tmp_path, capsys):
     bench = write_bench(tmp_path / "b", runs(**ONE))
     main(["bench", "report", str(bench)])
-    said = " ".join(capsys.readouterr().out.split())
-    assert "On 1 scene, mls 8x + none comes out best" in said
-    assert str(bench / REPORT) in said
+    output = " ".join(capsys.readouterr().out.split())
+    assert "On 1 scene, mls 8x + none is best" in output
+    assert str(bench / REPORT) in output
     other = write_bench(tmp_path / "c", runs(scenes=("fox", "fern"), gains=GAINS, seed=1))
     words = ["bench", "compare", str(bench), str(other), "-o", str(tmp_path / "out")]
     main(words)

@@ -16,7 +16,7 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="some verbs import PyTorch")
 
-from splatseed.bench.runs import begin
+from splatseed.bench.runs import record_plan
 from splatseed.cli import VERBS
 from splatseed.commands import info
 from splatseed.errors import OutputError, SceneFormatError
@@ -387,7 +387,7 @@ def _run_folder(path):
 
 
 def _bench(path):
-    begin(path, "bench", [], [])
+    record_plan(path, "bench", [], [])
     (path / "plan.toml").touch()
 
 

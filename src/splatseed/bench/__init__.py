@@ -1,4 +1,4 @@
-"""The benchmark: does upsampling help on these scenes, by which method, at what cost?"""
+"""Benchmarks: plan, run, analyse and report which seeds help, and at what cost."""
 
 from __future__ import annotations
 

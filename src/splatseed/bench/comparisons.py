@@ -1,8 +1,8 @@
-"""Comparisons between runs: gains of variants, arms at equal cost, two benchmarks.
+"""Compare runs: gains of variants, arms at equal cost, and two benchmarks.
 
-A *gain* is the PSNR of a run less that of its baseline, dB, paired by scene and repeat; an *arm* is
-a variant with a strategy. A run *reaches* a target when its test PSNR, linear between tests, first
-equals it; seconds count making the seeds. Runs that never do are counted, as a mean would flatter.
+A *gain* is the PSNR of a run minus that of its baseline in dB, paired by scene and repeat. An *arm*
+is a variant with a strategy. A run *reaches* a target when its test PSNR, interpolated linearly
+between tests, first equals it. Seconds include seeding.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ Key = TypeVar("Key", bound=Hashable)
 
 @dataclass(frozen=True)
 class Gains:
-    """What every variant gains over the original cloud under one strategy.
+    """The gains of all variants over the baseline under one strategy.
 
-    ``on_scene``: by scene and label; absent where no repeat has both. ``on_these`` and ``on_like``:
-    by label, the mean over its scenes, for these scenes alone and for scenes like these.
+    ``on_scene``: by scene and label, if some repeat has both runs. ``on_these``, ``on_like``: by
+    label, the mean over scenes, with the error for these scenes and for scenes like these.
     """
 
     strategy: StrategyName
@@ -43,49 +43,49 @@ class Gains:
 
     @property
     def scenes(self) -> tuple[str, ...]:
-        """Scenes on which anything can be compared."""
+        """The scenes with a gain."""
         return tuple(dict.fromkeys(scene for scene, _ in self.on_scene))
 
     @property
     def seeds(self) -> tuple[str, ...]:
-        """Labels of the variants that can be compared on some scene."""
+        """The labels of the variants with a gain."""
         return tuple(self.on_these)
 
     def means(self, scene: str) -> dict[str, float]:
-        """Each variant's mean gain on a scene."""
-        return {of: each.mean for (where, of), each in self.on_scene.items() if where == scene}
+        """The mean gain of each variant on a scene."""
+        return {label: gain.mean for (of, label), gain in self.on_scene.items() if of == scene}
 
     def top(self, scene: str) -> str:
-        """The variant with the greatest gain, or the least loss, ignoring noise; SFM if none."""
+        """The variant with the highest mean gain on a scene; SFM if there are no gains."""
         means = self.means(scene)
-        return max(means, key=lambda each: means[each], default=SFM)
+        return max(means, key=lambda label: means[label], default=SFM)
 
 
 @lru_cache(maxsize=64)
 def gains(study: Study, strategy: StrategyName) -> Gains:
-    """The gains under a strategy."""
+    """Compute the gains under a strategy."""
     on_scene = {}
     for scene in study.scenes_under(strategy):
         scores = study.scores(strategy, scene)
         differences = statistics.paired_differences(scores.to_numpy())
-        for label, each in zip(scores.index[1:], differences, strict=True):
-            if each is not None:
-                on_scene[scene, label] = each
+        for label, gain in zip(scores.index[1:], differences, strict=True):
+            if gain is not None:
+                on_scene[scene, label] = gain
     on_these, on_like = {}, {}
     for label in study.seeded:
-        if known := [each for (_, of), each in on_scene.items() if of == label]:
+        if known := [gain for (_, of), gain in on_scene.items() if of == label]:
             on_these[label] = statistics.these_scenes(known)
-            on_like[label] = statistics.over_scenes([each.mean for each in known])
+            on_like[label] = statistics.over_scenes([gain.mean for gain in known])
     return Gains(strategy, _adjusted(on_scene), _adjusted(on_these), _adjusted(on_like))
 
 
 def _adjusted(family: Mapping[Key, Difference | None]) -> dict[Key, Difference]:
     known = statistics.adjusted(list(family.values()))
-    return {key: each for key, each in zip(family, known, strict=True) if each is not None}
+    return {key: gain for key, gain in zip(family, known, strict=True) if gain is not None}
 
 
 def clear_best(study: Study, strategy: StrategyName, scene: str) -> bool:
-    """Whether a scene's best arm beats all others beyond noise; False while runs are missing."""
+    """Whether the best arm of a scene is significantly better than the second; needs all runs."""
     scores = study.scores(strategy, scene)
     noise, df = statistics.pooled_noise(scores.to_numpy())
     complete = scores.dropna()
@@ -93,14 +93,14 @@ def clear_best(study: Study, strategy: StrategyName, scene: str) -> bool:
         return False
     second, first = complete.mean(axis=1).sort_values().iloc[-2:]
     lead = difference(first - second, noise * math.sqrt(2 / complete.shape[1]), df, 1)
-    # Holm's smallest step: the second is one of all the others.
+    # The first step of Holm: the second arm was chosen among all others.
     return lead.p * (len(complete) - 1) <= statistics.LEVEL
 
 
 def reach(result: RunResult, target: float) -> tuple[float, float]:
-    """Steps and seconds after which a run's test PSNR first is at least ``target``, dB.
+    """Compute the steps and seconds at which a run first reaches a test PSNR of ``target`` dB.
 
-    A run above it at its first test has reached it there at the latest; NaN if it never does.
+    Those of the first test if it is above the target there; NaN if it never is.
     """
     psnr = np.array([point.psnr for point in result.curve])
     times = np.array([(point.step, point.seconds) for point in result.curve])
@@ -108,14 +108,14 @@ def reach(result: RunResult, target: float) -> tuple[float, float]:
     if not len(above):
         return math.nan, math.nan
     around = slice(max(above[0] - 1, 0), above[0] + 1)
-    steps, seconds = (np.interp(target, psnr[around], each) for each in times[around].T)
+    steps, seconds = (np.interp(target, psnr[around], axis) for axis in times[around].T)
     return float(steps), float(seconds) + result.upsample_seconds
 
 
 def psnr_at(result: RunResult, seconds: float) -> float:
-    """A run's test PSNR so many seconds after it began to make seeds, dB.
+    """Interpolate the test PSNR of a run at a time since the start of seeding, in dB.
 
-    NaN before its first test; its last PSNR once it has ended.
+    NaN before its first test; its final PSNR after its end.
     """
     times = [result.upsample_seconds + point.seconds for point in result.curve]
     psnr = [point.psnr for point in result.curve]
@@ -123,14 +123,14 @@ def psnr_at(result: RunResult, seconds: float) -> float:
 
 
 class ArmKey(NamedTuple):
-    """A strategy, and a variant by its label."""
+    """A strategy, and the label of a variant."""
 
     strategy: StrategyName
     seeds: str
 
     @property
     def label(self) -> str:
-        """In a few words."""
+        """The name in reports."""
         return f"{self.seeds} + {self.strategy}"
 
 
@@ -140,14 +140,14 @@ _TIMED = ("in_time", "steps", "seconds")
 
 @dataclass(frozen=True)
 class ComparedArm:
-    """An arm compared with the baseline, over the scenes and the pairs of runs that both have.
+    """An arm compared with the baseline, over the pairs of runs that both have.
 
-    ``means``: scores (``SCORES``), numbers of Gaussians and seconds of seeding and training; NaN if
-    unknown on some scene. ``gains``: differences of the scores; ``in_time``: PSNR at the seconds at
-    which the baseline ends, less its final PSNR, dB; ``steps`` and ``seconds``: mean logarithm of
-    those to that PSNR, relative to the baseline's total; None unless all runs tell. ``on_scene``:
-    mean difference of PSNR by scene, dB, the lowest first. ``reached``: pairs whose arm reaches
-    that PSNR.
+    ``means``: ``SCORES``, numbers of Gaussians, and seconds of seeding and training; NaN if unknown
+    on some scene. ``gains``, None if unknown in some pair: differences of the scores; ``in_time``,
+    PSNR when the baseline ends minus the baseline's final PSNR, in dB; ``steps`` and ``seconds``,
+    the mean logarithm of those to the baseline's final PSNR, relative to the baseline's total.
+    ``on_scene``: gain in PSNR by scene in dB, the lowest first. ``reached``: number of pairs in
+    which the arm reaches the baseline's final PSNR.
     """
 
     arm: ArmKey
@@ -160,31 +160,31 @@ class ComparedArm:
 
     @property
     def gain(self) -> Difference:
-        """Difference of PSNR, dB."""
+        """The gain in PSNR, in dB."""
         gain = self.gains["psnr"]
         assert gain is not None  # noqa: S101  (PSNR is always known)
         return gain
 
 
 def baseline_of(study: Study) -> ArmKey | None:
-    """The scene's own points with ``default``, or with the first strategy they were run with."""
+    """The arm of the original points under ``default``, or else under the first strategy run."""
     present = set(study.runs.loc[study.runs["seeds"] == SFM, "strategy"])
-    known = [each for each in study.strategies if each in present]
+    known = [strategy for strategy in study.strategies if strategy in present]
     return ArmKey("default" if "default" in known else known[0], SFM) if known else None
 
 
 @lru_cache(maxsize=64)
 def compared_arms(study: Study) -> tuple[ComparedArm, ...]:
-    """Every arm compared with the baseline, the one with the highest mean gain first.
+    """Compare every arm with the baseline; returns them in order of mean gain.
 
-    The p values of each kind of difference are adjusted together over the arms.
+    The p values of each score are adjusted over the arms.
     """
     base = baseline_of(study)
     if base is None:
         return ()
-    beside = study.under(base.strategy)
-    beside = beside[beside["seeds"] == SFM]
-    pairs = study.runs.merge(beside, on=["scene", "repeat"], suffixes=("", "_base"))
+    baseline = study.under(base.strategy)
+    baseline = baseline[baseline["seeds"] == SFM]
+    pairs = study.runs.merge(baseline, on=["scene", "repeat"], suffixes=("", "_base"))
     both = zip(pairs["result_base"], pairs["result"], pairs["spec"], strict=True)
     pairs[[f"{name}_gain" for name in _TIMED]] = [_timed(*each) for each in both]
     for name in SCORES:
@@ -194,40 +194,40 @@ def compared_arms(study: Study) -> tuple[ComparedArm, ...]:
     gained = {}
     for name in (*SCORES, *_TIMED):
         known = {arm: _over_scenes(part, f"{name}_gain") for arm, part in by_arm.items()}
-        own = known.pop(base)  # no comparison
-        gained[name] = {base: own, **_adjusted(known)}
+        unadjusted = known.pop(base)  # with itself: not in the family
+        gained[name] = {base: unadjusted, **_adjusted(known)}
     columns = [*SCORES, "gaussians", "seeding", "training"]
     compared = []
     for arm, part in by_arm.items():
         scenes, reached = tuple(sorted(set(part["scene"]))), int(part["seconds_gain"].count())
         means = dict(part.groupby("scene")[columns].mean().mean(skipna=False))
-        of_arm = {name: each.get(arm) for name, each in gained.items()}
+        of_arm = {name: by_name.get(arm) for name, by_name in gained.items()}
         on_scene = dict(part.groupby("scene")["psnr_gain"].mean().sort_values(kind="stable"))
         compared.append(ComparedArm(arm, scenes, len(part), means, of_arm, on_scene, reached))
-    return tuple(sorted(compared, key=lambda each: -each.gain.mean))
+    return tuple(sorted(compared, key=lambda arm: -arm.gain.mean))
 
 
 def rivals(study: Study) -> list[ComparedArm]:
-    """The arms but the baseline that were run on as many scenes as any, the best first.
+    """The arms other than the baseline with runs on most scenes, in order of mean gain.
 
-    The mean of an arm that was run on some scenes only says nothing about it beside the others.
+    Means over different scenes are not comparable.
     """
-    others = [each for each in compared_arms(study) if each.arm != baseline_of(study)]
-    widest = max(others, key=lambda each: len(each.scenes), default=None)
-    return [each for each in others if widest and each.scenes == widest.scenes]
+    others = [arm for arm in compared_arms(study) if arm.arm != baseline_of(study)]
+    widest = max(others, key=lambda arm: len(arm.scenes), default=None)
+    return [arm for arm in others if widest and arm.scenes == widest.scenes]
 
 
 def _timed(base: RunResult, own: RunResult, spec: RunSpec) -> tuple[float, float, float]:
-    """A pair's values of ``_TIMED``; NaN if unknown."""
-    most, (steps, seconds) = spec.training.max_steps, reach(own, base.psnr)
-    if math.isnan(seconds) and own.psnr >= base.psnr:  # also the baseline at its own
-        steps, seconds = most, own.seconds
+    """Compute the values of ``_TIMED`` for a pair of runs; NaN if unknown."""
+    max_steps, (steps, seconds) = spec.training.max_steps, reach(own, base.psnr)
+    if math.isnan(seconds) and own.psnr >= base.psnr:  # at its end, as does the baseline
+        steps, seconds = max_steps, own.seconds
     lead = psnr_at(own, base.seconds) - base.psnr
-    return lead, math.log(steps / most), math.log(seconds / base.seconds)
+    return lead, math.log(steps / max_steps), math.log(seconds / base.seconds)
 
 
 def _over_scenes(frame: pd.DataFrame, column: str) -> Difference | None:
-    """Mean over scenes with its error over scenes, or over the repeats of one; None if unknown."""
+    """Average over scenes, or over the repeats of a single scene; None if a value is unknown."""
     if frame[column].isna().any():
         return None
     means = frame.groupby("scene")[column].mean()
@@ -235,17 +235,16 @@ def _over_scenes(frame: pd.DataFrame, column: str) -> Difference | None:
 
 
 Place = tuple[StrategyName, str, str]
-"""Strategy, variant's label and scene."""
+"""Strategy, label of the variant, and scene."""
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """What changed from benchmark A to B, dB: by place, and by arm over the scenes of both.
+    """The changes of PSNR from benchmark A to B in dB, by place, and by arm over common scenes.
 
-    Runs of the two are not paired, as a seed need not mean the same in another version: the noise
-    of each is taken from what its own repeats do (of all arms of a scene together), and the test is
-    Welch's, adjusted after Holm over all changes. ``settings`` are those that differ, with both
-    values; ``only`` are places of "A" or "B" alone; ``notes`` say the rest.
+    Runs are not paired, as a random seed may differ in effect between versions. The noise of each
+    benchmark is pooled over all arms of a scene, and tested by Welch's test, adjusted after Holm.
+    ``settings`` lists different settings with both values, ``only`` the places of "A" or "B" alone.
     """
 
     settings: tuple[tuple[str, str, str], ...]
@@ -256,19 +255,19 @@ class Comparison:
 
 
 def compare(a: Sequence[Run], b: Sequence[Run]) -> Comparison | None:
-    """Compare two benchmarks: from each, the set of runs whose settings differ least.
+    """Compare the two studies of two benchmarks whose settings differ least.
 
-    None if one of them has no finished run.
+    Returns None if a benchmark has no finished run.
     """
     sets = studies(a), studies(b)
     pairs = list(product(*sets))
     if not pairs:
         return None
-    # Among sets that differ equally, the ones with most in common.
+    # In a tie, the pair with the most places in common.
     first, second = both = min(
         pairs, key=lambda pair: (len(_differing(*pair)), -len(_places(pair[0]) & _places(pair[1])))
     )
-    apart = [len(each) - 1 for each in sets]
+    unused = [len(found) - 1 for found in sets]
     variants = {**first.variants, **second.variants}
 
     def ordered(places: set[Place]) -> list[Place]:
@@ -282,20 +281,20 @@ def compare(a: Sequence[Run], b: Sequence[Run]) -> Comparison | None:
     settings = _differing(*both)
     scores = [{(r.spec.key, r.result.psnr) for r in runs if r.result} for runs in (a, b)]
     same = len(scores[0] & scores[1])
-    digests, beside = [dict[str, str](), dict[str, str]()], [dict[str, str](), dict[str, str]()]
+    digests, extra = [dict[str, str](), dict[str, str]()], [dict[str, str](), dict[str, str]()]
     for i, study in enumerate(both):
         for scene, label, spec in study.runs[["scene", "seeds", "spec"]].to_numpy():
             digests[i][scene] = spec.scene.digest
-            beside[i][f"{scene}, {label}"] = spec.scene.depth_digest + spec.scene.cloud_digest
+            extra[i][f"{scene}, {label}"] = spec.scene.depth_digest + spec.scene.cloud_digest
     notes = [
         "" if settings else "All settings are the same.",
-        "" if changes else "They have no scene and method in common.",
-        f"{counted(same, 'run')} in both, with the same key and score." if same else "",
-        *(f"{scene} is not the same in both: its points, cameras or photographs differ."
+        "" if changes else "They have no arm on the same scene in common.",
+        f"{counted(same, 'run')} with equal key and score in both." if same else "",
+        *(f"{scene} differs: its points, cameras or photographs are not the same."
           for scene in _unequal(*digests)),
-        *(f"{place}: its depth maps or its scan are not the same in both."
-          for place in _unequal(*beside)),
-        f"Other sets of runs are not compared: {apart[0]} of A, {apart[1]} of B." if any(apart)
+        *(f"{place} differs: its depth maps or its scan are not the same."
+          for place in _unequal(*extra)),
+        f"Other sets of runs are not compared: {unused[0]} of A, {unused[1]} of B." if any(unused)
         else "",
     ]  # fmt: skip
     return Comparison(
@@ -323,24 +322,24 @@ def _differing(a: Study, b: Study) -> tuple[tuple[str, str, str], ...]:
 
 
 def _settings(study: Study, scenes: Iterable[str]) -> dict[str, object]:
-    """A study's settings, with the sizes of some scenes alone."""
-    told, factors = dict(study.settings), study.settings["data_factor"]
+    """The settings of a study, with the data factors of some scenes."""
+    settings, factors = dict(study.settings), study.settings["data_factor"]
     if isinstance(factors, Mapping):
         sizes = {scene: factors[scene] for scene in sorted(scenes)}
-        told["data_factor"] = sizes if len(set(sizes.values())) != 1 else min(sizes.values())
-    return told
+        settings["data_factor"] = sizes if len(set(sizes.values())) != 1 else min(sizes.values())
+    return settings
 
 
 def _change(a: Study, b: Study, place: Place) -> Difference:
-    """B less A, by Welch's test with each benchmark's own noise."""
+    """Test the difference B - A of a place by Welch's test."""
     strategy, label, scene = place
     parts = []
     for study, sign in ((a, -1), (b, 1)):
         scores = study.scores(strategy, scene)
         rest = scores.sub(scores.mean(axis=1), axis=0).to_numpy()
         df = int(np.isfinite(rest).sum() - scores.notna().any(axis=1).sum())
-        own = scores.loc[label].dropna()
-        se = math.sqrt(float(np.nansum(rest**2)) / df / len(own)) if df else math.nan
-        parts.append(Difference(sign * float(own.mean()), se, df, len(own), math.nan))
+        psnr = scores.loc[label].dropna()
+        se = math.sqrt(float(np.nansum(rest**2)) / df / len(psnr)) if df else math.nan
+        parts.append(Difference(sign * float(psnr.mean()), se, df, len(psnr), math.nan))
     half = statistics.these_scenes(parts)  # a mean of two, with Welch's degrees of freedom
     return difference(2 * half.mean, 2 * half.se, half.df, half.n)

@@ -1,7 +1,7 @@
-"""Figures: PSNR over steps and seconds, gains by scene, arms at equal cost.
+"""Figures: PSNR over steps and seconds, gains by scene, gains of all arms.
 
-In all of them a colour is a method, a mark's shape a ratio, a dashed line or a hollow mark the
-profile "paper"; the baseline is thick and black. Equal data give equal bytes.
+Colours are methods, marker shapes are ratios; dashed lines and hollow markers are the profile
+"paper"; the baseline is thick and black. Equal data give equal bytes.
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ _COLORS = {
     "cover": "#B8860B", "stereo": "#1B7837", "auto": "#7B4FA3",
 }  # fmt: skip
 """Colours that the colour-blind can tell apart (Okabe and Ito)."""
-_MARKS = {2.0: "v", 4.0: "s", 8.0: "o", 16.0: "^", 32.0: "D"}  # others have a cross
+_MARKERS = {2.0: "v", 4.0: "s", 8.0: "o", 16.0: "^", 32.0: "D"}  # others: a cross
 _DASHES = {"default": "-", "mcmc": "--", "grow": "-.", "none": ":"}
 _AS_3DGS = (0, (1, 3))
 _HIGHEST = " Of each method, the highest ratio."
-_MANY = 8  # more curves than this in one picture cannot be told apart
-_LATE = 0.2  # curves are scaled to what is after this share: before it, all rise equally steeply
+_MAX_CURVES = 8  # in one panel
+_LATE = 0.2  # the y axis fits the part of the curves after this share of the run
 
 Style = Mapping[str, Any]
 
 
 class Plot(NamedTuple):
-    """A figure: its file's name without suffix, what it shows, and its PNG."""
+    """A figure: file name without suffix, caption, and PNG."""
 
     name: str
     caption: str
@@ -49,14 +49,14 @@ class Plot(NamedTuple):
 
 
 def shown_seeds(study: Study, seeds: Sequence[str]) -> tuple[str, ...]:
-    """All variants, or if they are too many the highest ratio of each method and profile."""
-    if len(seeds) <= _MANY:
+    """All variants, or if there are too many, the highest ratio of each method and profile."""
+    if len(seeds) <= _MAX_CURVES:
         return tuple(seeds)
     return tuple({study.family(label): label for label in seeds}.values())
 
 
 def _new_figure(width: float, height: float, count: int = 1) -> tuple[Figure, list[Axes]]:
-    """A figure of ``count`` panels, up to two per row, of a size in inches each."""
+    """Make a figure of ``count`` panels, up to two per row; the size of a panel is in inches."""
     columns = min(count, 2)  # three would be illegible on a phone
     rows = -(-count // columns)
     size = max(width * columns, 5.0), height * rows + 0.4
@@ -69,7 +69,7 @@ def _new_figure(width: float, height: float, count: int = 1) -> tuple[Figure, li
 
 
 def _plot(name: str, caption: str, figure: Figure, named: Mapping[str, Style]) -> Plot:
-    """The finished figure, with names above its panels at the left."""
+    """Encode a figure as PNG, with a legend above its panels."""
     if named:
         handles = [Line2D([], [], label=name, **style) for name, style in named.items()]
         longest = 0.5 + 0.08 * max(map(len, named))  # inches
@@ -88,7 +88,7 @@ def _style(study: Study, label: str, *, line: bool = True, mark: bool = True) ->
     style = {"color": color, "linestyle": ("--" if paper else "-") if line else "none"}
     if not mark or (line and label == SFM):
         return style
-    shape, hollow = _MARKS.get(arm.ratio, "P"), "white" if paper else color
+    shape, hollow = _MARKERS.get(arm.ratio, "P"), "white" if paper else color
     return {**style, "marker": shape, "markersize": 5.0, "markerfacecolor": hollow}
 
 
@@ -109,7 +109,7 @@ def seconds_figure(study: Study) -> Plot | None:
     base, compared = baseline_of(study), compared_arms(study)
     if base is None or len(compared) < 2:
         return None
-    shown = [base, *(each.arm for each in compared if each.arm != base)][:_MANY]
+    shown = [base, *(each.arm for each in compared if each.arm != base)][:_MAX_CURVES]
     arms = {}
     for arm in shown:
         dashes = _DASHES.get(arm.strategy, _AS_3DGS if arm.strategy.endswith("-3dgs") else "-")

@@ -1,7 +1,7 @@
-"""Pictures of a report: each method's seeds from one camera, and test views of the best arm.
+"""Pictures of a report: the seeds of each method from one camera, and test views of the best arm.
 
-Seeds are made exactly as in the runs, and only if the scene's files are unchanged; a scene is
-opened only for what an earlier report has not kept; if it is gone, only its pictures are missing.
+Seeds equal those of the runs. A scene is opened only for pictures that no earlier report drew; a
+missing or changed scene has none.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from splatseed.scene import Scene
 from splatseed.viewer.clouds import preview_methods
 
 FIGURES = "figures"
-_MOST = 10  # clouds in a picture
+_MAX_CLOUDS = 10  # in a picture
 _SIDE, _CLOUD_SIDE = 960, 1800
 
 
@@ -53,21 +53,23 @@ def scene_pictures(bench: Path, study: Study, progress: Progress = silent) -> Sc
         runs = study.runs[study.runs["scene"] == scene].sort_values("repeat", kind="stable")
         first = runs.drop_duplicates("seeds").set_index("seeds")["spec"].to_dict()
         shown = shown_seeds(study, [label for label in study.seeded if label in first])
-        specs: dict[str, RunSpec] = {label: first[label] for label in shown[:_MOST]}
+        specs: dict[str, RunSpec] = {label: first[label] for label in shown[:_MAX_CLOUDS]}
         digest = runs["spec"].iloc[0].scene.digest
-        told = [digest, *((name, each.key) for name, each in specs.items())]
-        key = fingerprint(json.dumps(told).encode())[:16]
-        name = re.sub(r"[^\w.-]+", "_", f"clouds_{scene}_{key}")  # a scene's can have slashes
+        content = [digest, *((name, spec.key) for name, spec in specs.items())]
+        key = fingerprint(json.dumps(content).encode())[:16]
+        name = re.sub(
+            r"[^\w.-]+", "_", f"clouds_{scene}_{key}"
+        )  # the scene's name may have slashes
         with suppress(OSError):
             pictures.clouds[scene] = name, read_file(bench / FIGURES / f"{name}.png")
         if not specs or scene in pictures.clouds:
             continue
         facts = [spec.scene for spec in specs.values()]
         try:
-            opened = open_unchanged(next((each for each in facts if each.depth), facts[0]))
+            opened = open_unchanged(next((scene for scene in facts if scene.depth), facts[0]))
             pictures.clouds[scene] = name, _draw_seeds(opened, specs, progress, bench)
         except SplatseedError as error:
-            pictures.notes.append(f"{scene}: its points are not shown: {error}")
+            pictures.notes.append(f"{scene}: no picture of its points: {error}")
     return pictures
 
 
@@ -81,7 +83,7 @@ def _draw_seeds(
 
 
 def cloud_jpeg(png: bytes) -> bytes:
-    """A picture of seeds as JPEG, small enough for a page."""
+    """Convert a picture of seeds to a small JPEG for the page."""
     from PIL import Image  # noqa: PLC0415  (slow to import)
 
     with Image.open(BytesIO(png)) as picture:
@@ -89,10 +91,10 @@ def cloud_jpeg(png: bytes) -> bytes:
 
 
 class ComparedView(NamedTuple):
-    """A test view of a scene, rendered by the baseline and by the arm with the highest gain.
+    """A test view of a scene, as rendered by the baseline and by the best arm.
 
-    ``gain`` is that arm's on the scene, dB. ``pictures`` and ``errors`` (maps of FLIP) are JPEG by
-    name; ``shape`` is their width over their height.
+    ``gain`` is that of the best arm on the scene, in dB. ``pictures`` and ``errors`` (FLIP maps)
+    are JPEGs by name; ``shape`` is their aspect ratio.
     """
 
     scene: str
@@ -104,7 +106,7 @@ class ComparedView(NamedTuple):
 
 
 def compared_views(study: Study, bench: Path) -> list[ComparedView]:
-    """A view of each scene, the lowest gain first; none where the runs' pictures are gone."""
+    """Choose a view per scene for which both runs have renders, in order of gain."""
     base, views = baseline_of(study), []
     best = next(iter(rivals(study)), None)
     if base is None or best is None:
@@ -125,9 +127,9 @@ def compared_views(study: Study, bench: Path) -> list[ComparedView]:
 
 
 def _pictures(paths: Mapping[str, Path]) -> tuple[dict[str, bytes], dict[str, bytes], float] | None:
-    """A view's pictures, error maps and shape; None where they cannot be read or do not fit."""
+    """Read the pictures, error maps and aspect ratio of a view; None if any is unusable."""
     try:
-        parts = {label: _apart(path) for label, path in paths.items()}
+        parts = {label: _split(path) for label, path in paths.items()}
     except SplatseedError:
         return None
     if len({part.shape for part in parts.values()}) > 1:
@@ -139,8 +141,8 @@ def _pictures(paths: Mapping[str, Path]) -> tuple[dict[str, bytes], dict[str, by
     return pictures, errors, photograph.shape[1] / photograph.shape[0]
 
 
-def _apart(path: Path) -> UInt8[np.ndarray, "3 H W 3"]:
-    """Photograph, render and error map of a picture that has them in a row."""
+def _split(path: Path) -> UInt8[np.ndarray, "3 H W 3"]:
+    """Split a picture into the photograph, render and error map that it has side by side."""
     from splatseed.splat.rendering import GAP  # noqa: PLC0415  (imports PyTorch)
 
     pixels = np.asarray(decode_photograph(path, photograph_bytes(path)))
@@ -149,7 +151,7 @@ def _apart(path: Path) -> UInt8[np.ndarray, "3 H W 3"]:
 
 
 def _jpeg(pixels: UInt8[np.ndarray, "H W 3"], side: int) -> bytes:
-    """A picture as JPEG, downsampled if its longer side exceeds ``side``."""
+    """Encode a picture as JPEG, downsampled to ``side`` pixels if it is larger."""
     from PIL import Image  # noqa: PLC0415  (slow to import)
 
     picture = Image.fromarray(np.ascontiguousarray(pixels))

@@ -1,7 +1,7 @@
-"""A plan: which scenes, which arms, how often, how each run is trained; and the runs that follow.
+"""Plans of a benchmark, and the runs that they unroll to.
 
-An *arm* is everything about a run except its scene and its repeat. A plan that exists is valid;
-its runs are ordered so that all arms of all scenes have been run once before any is repeated.
+An *arm* is everything about a run except its scene and its repeat. A ``Plan`` validates itself. Its
+runs are ordered by repeat, so that every arm runs once on every scene before any runs again.
 """
 
 from __future__ import annotations
@@ -26,44 +26,61 @@ from splatseed.training.seeds import most_seeds
 from splatseed.training.settings import Backend, StrategyName, TrainSettings
 
 SFM = "sfm"
-"""The method that leaves the cloud of Structure-from-Motion as it is; its ratio is 1."""
+"""The baseline: the unchanged points of Structure-from-Motion, at ratio 1."""
 ANY_RATIO = 0.0
-"""The ratio of methods that choose their number of seeds, and of all if a budget determines it."""
+"""The ratio of an arm whose number of seeds the method or the budget determines."""
 DEPTH, CLOUD = "depth", "cloud"
-"""The methods that need a scene's depth maps, and its scan."""
+"""The methods that need the depth maps and the scan of a scene."""
 WITH_CLOUD = ("cloud+auto", "cloud+stereo", "cloud+cover")
-"""A scan's seeds, and those that another method puts where it has none."""
-SEE = "See splatseed bench --help."
+"""Methods that add the seeds of another method where the scan has gaps."""
+HELP = "See splatseed bench --help."
 SHARED = tuple(
-    each.name
-    for each in fields(TrainSettings)
-    if each.name not in {"strategy", "seed", "seeding", "start"}
+    setting.name
+    for setting in fields(TrainSettings)
+    if setting.name not in {"strategy", "seed", "seeding", "start"}
 )
-"""Settings that all runs of a plan share; arms and repeats determine the others."""
-_WHAT = ("name", "digest", "depth_digest", "cloud_digest")
-"""What of a scene determines results; the rest says where it lies, or follows from it."""
+"""Training settings that all runs of a plan share; the arm and the repeat set the others."""
+_SCENE_KEY = ("name", "digest", "depth_digest", "cloud_digest")
+"""Fields of ``SceneFacts`` that enter a run's key; paths and sizes do not."""
 _LISTS = ("methods", "strategies", "profiles", "ratios", "budgets")
 _DEFAULT = TrainSettings()
-_ADDED, _ADDED_PER_PIXEL = 3e5, 3.0
-"""And those that 3DGS's conventions add in runs of any length: fern's 6,000 SfM points were 265,000
-after 60 steps at 75 x 100 pixels, 570,000 in the first quarter of 7,000 at 300 x 400."""
-_LIKELY_RATIO = 3.0
-"""Seeds per original, for methods that look at photographs."""
-_TESTS = 21
-"""How often the test views are rendered: during training, and at the end."""
-_LARGEST_IMAGE = 1e9
-"""Pixels; a budget per pixel that allows not one Gaussian of such an image is none."""
-_LEAST_SIDE = 11
-"""Least side of a photograph in pixels, for SSIM's window."""
+_MAX_IMAGE_PIXELS = 1e9
+"""A budget per pixel is invalid if it allows no Gaussian in an image of this size."""
+_MIN_SIDE = 11
+"""Minimum side of a photograph in pixels: the window of SSIM."""
 
 
-def plain(method: str) -> str:
-    """The method, without the scan that its seeds come beside."""
+@dataclass(frozen=True)
+class _CostModel:
+    """Constants of the rough estimates of ``RunSpec.gaussians`` and ``RunSpec.seconds``."""
+
+    ratio: float = 3.0
+    """Seeds per original of methods that choose their number."""
+    added: float = 3e5
+    """Gaussians that 3DGS's own schedule adds in a run of any length: fern's 6,000 SfM points grew
+    to 265,000 after 60 steps at 75 x 100 pixels, to 570,000 in 1,750 steps at 300 x 400."""
+    added_per_pixel: float = 3.0
+    """The same, per pixel of a photograph."""
+    tests: int = 21
+    """Evaluations of the test views, the final one included."""
+    render_share: float = 0.3
+    """Time of a render, as a share of a training step."""
+    startup_seconds: tuple[float, float] = (6.0, 20.0)
+    """Time of a run outside of training, on a CPU and on a GPU."""
+    stereo_seconds: float = 0.8
+    """Time to match a photograph with its neighbours on two threads."""
+
+
+_COST = _CostModel()
+
+
+def seeding_method(method: str) -> str:
+    """Strip the prefix of a method that is combined with a scan: ``cloud+auto`` gives ``auto``."""
     return method.removeprefix(f"{CLOUD}+")
 
 
 def needs_cloud(method: str) -> bool:
-    """Whether a method needs the scene's scan."""
+    """Whether a method needs the scan of a scene."""
     return method == CLOUD or method in WITH_CLOUD
 
 
@@ -75,18 +92,18 @@ class Arm:
     """``SFM``, a key of ``splatseed.METHODS``, or one of ``WITH_CLOUD``."""
     profile: Profile
     ratio: float
-    """Points in all, per original; ``ANY_RATIO`` if photographs or the budget decide."""
+    """Total points per original; ``ANY_RATIO`` if the method or the budget determines them."""
     strategy: StrategyName
     budget: str = ""
-    """As in ``Plan``, one of them; empty for no limit."""
+    """One of ``Plan.budgets``; empty for no limit."""
 
     def __post_init__(self) -> None:
-        # 8 and 8.0 are the same ratio, and must give the same key.
+        # 8 and 8.0 must give the same key.
         object.__setattr__(self, "ratio", float(self.ratio))
 
     @property
     def label(self) -> str:
-        """In a few words, such as ``mls 8x`` or ``mls 8x (paper)``; the strategy is left out."""
+        """A short name without the strategy, such as ``mls 8x`` or ``mls 8x (paper)``."""
         if self.method == SFM:
             return SFM
         ratio = f" {self.ratio:g}x" if self.ratio else ""
@@ -95,71 +112,69 @@ class Arm:
 
 @dataclass(frozen=True)
 class RunSpec:
-    """One run: everything that determines its result, and where its scene is."""
+    """Everything that determines the result of one run, and the paths of its scene."""
 
     scene: SceneFacts
-    """With depth maps or a scan only where the method needs them."""
+    """Has depth maps or a scan only if the method needs them."""
     arm: Arm
     repeat: int
-    """From 0; seeds both upsampling and training."""
+    """From 0; the random seed of upsampling and of training."""
     training: TrainSettings = _DEFAULT
-    """The settings; the arm gives the strategy, the repeat the seed."""
+    """The shared settings; ``settings`` adds the strategy and the seed."""
     parameters: Mapping[str, Any] = field(default_factory=dict)
     """The method's parameters that differ from its profile's."""
     version: str = ""
 
     @property
     def key(self) -> str:
-        """The fingerprint of everything that determines the result: 32 hexadecimal digits."""
-        told = {**self.to_dict(), "scene": [getattr(self.scene, name) for name in _WHAT]}
-        text = json.dumps(told, sort_keys=True, separators=(",", ":"))
+        """The fingerprint of everything that determines the result."""
+        values = {**self.to_dict(), "scene": [getattr(self.scene, name) for name in _SCENE_KEY]}
+        text = json.dumps(values, sort_keys=True, separators=(",", ":"))
         return fingerprint(text.encode())
 
     @property
     def settings(self) -> TrainSettings:
-        """How to train, with the arm's strategy and the repeat's seed."""
+        """The training settings, with the strategy of the arm and the seed of the repeat."""
         return replace(self.training, strategy=self.arm.strategy, seed=self.repeat)
 
     @property
-    def most_seeds(self) -> int | None:
-        """The number that seeds are thinned to under a budget; None without one."""
+    def max_seeds(self) -> int | None:
+        """The number to which a budget thins the seeds; None without a budget."""
         if not self.arm.budget or self.training.cap_max is None:
             return None
         return most_seeds(self.settings, self.training.cap_max)
 
     @property
     def gaussians(self) -> tuple[float, float]:
-        """Gaussians at the start and at the end, as far as is known before."""
+        """Estimates of the number of Gaussians at the start and at the end."""
         cap = self.settings.cap or math.inf
-        made = self.scene.num_points * (self.arm.ratio or _LIKELY_RATIO)
-        seeds = min(made, self.most_seeds or cap)
+        num_seeds = self.scene.num_points * (self.arm.ratio or _COST.ratio)
+        seeds = min(num_seeds, self.max_seeds or cap)
         grown = seeds if self.settings.densification == "none" else seeds * GROWTH
         if self.arm.strategy == "default-3dgs":
             pixels = self.scene.pixels_at(self.training.factor)
-            grown = seeds + _ADDED + _ADDED_PER_PIXEL * pixels
+            grown = seeds + _COST.added + _COST.added_per_pixel * pixels
         return seeds, min(grown, cap)
 
     def seconds(self, threads: int) -> float:
-        """Seconds on so many threads by a rough model, which can be several times off.
-
-        A step's are those of ``train.duration``.
-        """
+        """Estimate the wall time on this many threads; it can be several times off."""
         on_gpu = self.training.backend == "cuda"
-        around = 20.0 if on_gpu else 6.0
         pixels = self.scene.pixels_at(self.training.factor)
         step = step_seconds("cuda" if on_gpu else "cpu", sum(self.gaussians) / 2, pixels)
-        renders = 0.3 * _TESTS * self.scene.num_images / self.training.test_every
-        grows, method = self.settings.densification == "grow", plain(self.arm.method)
-        compares = grows or (method != SFM and chooses_number(method))
-        compared = 0.8 * self.scene.num_images if compares else 0.0
-        slower = 1.0 if on_gpu else 2 / threads
-        return around + slower * (step * (self.training.max_steps + renders) + compared)
+        renders = _COST.tests * self.scene.num_images / self.training.test_every
+        method = seeding_method(self.arm.method)
+        uses_stereo = method != SFM and chooses_number(method)
+        uses_stereo |= self.settings.densification == "grow"
+        stereo = _COST.stereo_seconds * self.scene.num_images * uses_stereo
+        training = step * (self.training.max_steps + _COST.render_share * renders)
+        slowdown = 1.0 if on_gpu else 2 / threads
+        return _COST.startup_seconds[on_gpu] + slowdown * (training + stereo)
 
     def to_dict(self) -> dict[str, Any]:
-        """As plain values; of the settings, those that differ from their defaults."""
+        """Convert to JSON values; settings with default values are omitted."""
         settings = vars(self.training).items()
-        told = {name: value for name, value in settings if value != getattr(_DEFAULT, name)}
-        return {**asdict(self), "parameters": dict(self.parameters), "training": told}
+        changed = {name: value for name, value in settings if value != getattr(_DEFAULT, name)}
+        return {**asdict(self), "parameters": dict(self.parameters), "training": changed}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
@@ -171,54 +186,54 @@ class RunSpec:
 
 @dataclass(frozen=True)
 class RunResult:
-    """The result of a run: ``scores`` of the test views at the end, ``curve`` during training."""
+    """The final ``scores`` of a run, its ``curve`` of test scores, and its costs."""
 
     scores: EvalResult
     curve: tuple[CurvePoint, ...]
     num_seeds: int
-    """Points that training began with."""
+    """Points from which training started."""
     upsample_seconds: float
-    """Wall time of making the seeds, thinning included; 0 for plain ``SFM``."""
+    """Wall time of seeding and thinning; 0 for ``SFM`` without a budget."""
     train_seconds: float
     """Wall time of the training steps alone."""
     peak_bytes: int | None
-    """Peak memory of the process; None where the system does not tell."""
+    """Peak memory of the process; None where the system does not report it."""
     device: str
     peak_gpu_bytes: int | None = None
     wall_seconds: float = 0.0
-    """Wall time of the whole run, with reading, tests and pictures."""
+    """Wall time of the run, including reading, tests and pictures."""
 
     @property
     def psnr(self) -> float:
-        """Mean over test images of each one's PSNR, dB."""
+        """PSNR in dB, mean over the test images."""
         return self.scores.psnr
 
     @property
     def num_gaussians(self) -> int:
-        """Gaussians at the end."""
+        """Final number of Gaussians."""
         return self.scores.num_gaussians or 0
 
     @property
     def seconds(self) -> float:
-        """Seconds of making the seeds and training from them."""
+        """Time of seeding and training."""
         return self.upsample_seconds + self.train_seconds
 
     def to_dict(self) -> dict[str, Any]:
-        """As plain values."""
-        own = {each.name: getattr(self, each.name) for each in fields(self)}
-        return {**own, "scores": self.scores.to_dict(), "curve": list(map(asdict, self.curve))}
+        """Convert to JSON values."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {**values, "scores": self.scores.to_dict(), "curve": list(map(asdict, self.curve))}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
         """The inverse of ``to_dict``."""
         scores = EvalResult.from_dict(values["scores"])
-        curve = tuple(CurvePoint(**each) for each in values["curve"])
+        curve = tuple(CurvePoint(**point) for point in values["curve"])
         return cls(**{**values, "scores": scores, "curve": curve})
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What a benchmark should run.
+    """The scenes, arms and settings of a benchmark.
 
     Raises:
         ParameterError: A value is out of its range, or given twice.
@@ -226,32 +241,32 @@ class Plan:
 
     scenes: tuple[PlannedScene, ...] = ()
     methods: tuple[str, ...] = (SFM, "linear", "mls")
-    """How new points are made; ``sfm`` for none, with which all others are compared; ``cloud+auto``
-    for those of a scan and, where it has none, of ``auto``."""
+    """Seeding methods. ``sfm``, the baseline, adds no points. ``cloud+auto`` takes the points of a
+    scan, and fills its gaps by ``auto``."""
     ratios: tuple[float, ...] = (8.0,)
-    """Points in all, per original; empty if budgets determine the number."""
+    """Total points per original; empty if budgets determine the number."""
     budgets: tuple[str, ...] = ()
-    """Most Gaussians at the end, the same for every arm: numbers, or such as "0.25rho", per pixel
-    of a photograph at training size. Seeds are thinned to them, or for strategies that add
-    Gaussians to the fraction they begin with."""
+    """Maximum final Gaussians, equal for all arms: a number, or "0.25rho" for 0.25 per pixel of a
+    photograph at training size. Seeds are thinned to the budget, or for strategies that add
+    Gaussians to the share of it at which they start."""
     strategies: tuple[StrategyName, ...] = ("default",)
     """Densification strategies."""
     uncapped: tuple[StrategyName, ...] = ()
-    """Strategies to which budgets do not apply: they end with as many Gaussians as they make."""
+    """Strategies to which budgets do not apply."""
     profiles: tuple[Profile, ...] = ("default",)
-    """Parameters of the methods: improved ones, and those of the paper's text."""
+    """Parameter sets of the methods: improved (``default``), or as in the paper."""
     repeats: int = 3
-    """Number of repeats, with another seed each time."""
+    """Number of repeats, with random seeds 0, 1, ..."""
     training: TrainSettings = _DEFAULT
-    """How each run is trained; strategy and seed are those of its arm and its repeat."""
+    """Training settings; strategy and seed are set per run."""
     long_side: int | None = None
-    """Pixels of the longer side of photographs, at most: for each scene its own data factor."""
+    """Maximum longer side of the photographs in pixels; determines a data factor per scene."""
     keep_models: bool = False
-    """Whether trained models are kept."""
+    """Whether to keep the trained Gaussians."""
     lpips: bool = False
-    """Whether LPIPS must be measured; else it is if its weights are there."""
+    """Whether LPIPS is required; otherwise it is measured only if its weights are found."""
     parameters: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    """Parameters that differ from the profile's, by method."""
+    """Parameters by method that differ from the profile."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "ratios", tuple(float(ratio) for ratio in self.ratios))
@@ -260,57 +275,58 @@ class Plan:
                  "uncapped": get_args(StrategyName), "profiles": get_args(Profile),
                  "parameters": tuple(METHODS)}  # fmt: skip
         for name, choices in known.items():
-            for each in getattr(self, name):
-                if each not in choices:
-                    fix = did_you_mean(each, choices).strip() or SEE
-                    raise ParameterError(f"{name} among {', '.join(choices)}", found=each, fix=fix)
+            for value in getattr(self, name):
+                if value not in choices:
+                    fix = did_you_mean(value, choices).strip() or HELP
+                    raise ParameterError(f"{name} among {', '.join(choices)}", found=value, fix=fix)
         lists: dict[str, Any] = {name: getattr(self, name) for name in _LISTS}
-        for name, given in {**lists, "scenes": [each.label for each in self.scenes]}.items():
-            for each, times in Counter(given).items():
-                if times > 1:
-                    fix = "Drop one, or give scenes names in a plan (see --dry-run)."
-                    raise ParameterError(f"{name} that differ", found=f"{each} twice", fix=fix)
+        for name, given in {**lists, "scenes": [scene.label for scene in self.scenes]}.items():
+            for value, count in Counter(given).items():
+                if count > 1:
+                    fix = "Drop one, or name the scenes in a plan."
+                    raise ParameterError(f"different {name}", found=f"{value} twice", fix=fix)
         training, long_side = self.training, self.long_side
-        for fits, expected, found in (
-            *((lists[name], f"{name} of at least one", "none") for name in _LISTS[:3]),
-            (self.ratios or (self.budgets and not self.uncapped), "ratios of at least one", "none"),
-            (all(1 < each < math.inf for each in self.ratios),
-             "ratios above 1 (points in all, per original)", self.ratios),
+        for valid, expected, found in (
+            *((lists[name], f"at least one of {name}", "none") for name in _LISTS[:3]),
+            (self.ratios or (self.budgets and not self.uncapped), "at least one of ratios", "none"),
+            (all(1 < ratio < math.inf for ratio in self.ratios),
+             "ratios above 1 (total points per original)", self.ratios),
             (not self.budgets or training.cap_max is None, "budgets or cap_max", "both"),
-            (long_side is None or long_side >= _LEAST_SIDE,
-             f"long_side of {_LEAST_SIDE} or more", long_side),
+            (long_side is None or long_side >= _MIN_SIDE,
+             f"long_side of {_MIN_SIDE} or more", long_side),
             (long_side is None or training.factor == 1, "long_side or data_factor", "both"),
             (self.repeats >= 1, "repeats of 1 or more", self.repeats),
         ):  # fmt: skip
-            if not fits:
-                raise ParameterError(expected, found=f"{found}", fix=SEE)
+            if not valid:
+                raise ParameterError(expected, found=f"{found}", fix=HELP)
         for method, parameters in self.parameters.items():
             configure(method, **parameters)
 
     def parameters_of(self, method: str) -> dict[str, Any]:
-        """Differences from the profile; those of the scan beside a method begin with ``cloud.``."""
+        """Parameters that differ from the profile; those of a scan start with ``cloud.``."""
         scan = self._own_parameters(CLOUD) if method in WITH_CLOUD else {}
-        beside = {f"{CLOUD}.{name}": value for name, value in scan.items()}
-        return {} if method == SFM else self._own_parameters(method) | beside
+        prefixed = {f"{CLOUD}.{name}": value for name, value in scan.items()}
+        return {} if method == SFM else self._own_parameters(method) | prefixed
 
     def _own_parameters(self, method: str) -> dict[str, Any]:
-        """A method's own parameters, and what keeps the test photographs from it."""
-        looks = hasattr(METHODS[plain(method)], "test_every")
-        held = {"test_every": self.training.test_every} if looks else {}
-        return {**held, **self.parameters.get(plain(method), {})}
+        """The parameters of a method; ``test_every`` hides the test photographs from it."""
+        name = seeding_method(method)
+        uses_photos = hasattr(METHODS[name], "test_every")
+        split = {"test_every": self.training.test_every} if uses_photos else {}
+        return {**split, **self.parameters.get(name, {})}
 
     def arms(self, strategy: StrategyName) -> tuple[Arm, ...]:
-        """The arms of one strategy: for each budget, the original cloud first.
+        """List the arms of a strategy: for each budget, the baseline first.
 
-        A method whose profiles are identical has one arm, of the first profile; one that chooses
+        A method whose profiles are equal has one arm, of the first profile. A method that chooses
         its number of seeds has no ratio.
         """
         arms = []
         for budget in (() if strategy in self.uncapped else self.budgets) or ("",):
             if SFM in self.methods:
                 arms.append(Arm(SFM, "default", 1, strategy, budget))
-            for method in (each for each in self.methods if each != SFM):
-                ratios = () if chooses_number(plain(method)) else self.ratios
+            for method in (name for name in self.methods if name != SFM):
+                ratios = () if chooses_number(seeding_method(method)) else self.ratios
                 arms += [
                     Arm(method, profile, ratio, strategy, budget)
                     for profile in self._profiles_of(method)
@@ -320,17 +336,19 @@ class Plan:
 
     def _profiles_of(self, method: str) -> list[Profile]:
         named = self._own_parameters(method)
-        seen: list[Upsampler] = [configure(plain(method), p, **named) for p in self.profiles]
+        seen: list[Upsampler] = [
+            configure(seeding_method(method), p, **named) for p in self.profiles
+        ]
         return [p for i, p in enumerate(self.profiles) if seen[i] not in seen[:i]]
 
 
 def plan_runs(
     plan: Plan, scenes: Sequence[SceneFacts], backend: Backend, version: str
 ) -> list[RunSpec]:
-    """The runs of a plan on a backend (not "auto"), in the order in which they should be run.
+    """Unroll a plan to its runs, in the order in which to run them.
 
-    Arms of the method depth are left out for scenes without depth maps, and those that need a scan
-    for scenes without one.
+    Scenes without depth maps or a scan get no runs of methods that need them. ``backend`` is not
+    "auto".
     """
     return [
         RunSpec(
@@ -347,7 +365,7 @@ def plan_runs(
 
 
 def _needed(scene: SceneFacts, method: str) -> SceneFacts:
-    """The scene without files that a method does not read, and without what is told before."""
+    """Drop the files that a method does not read, and the warnings, which are shown before."""
     if method != DEPTH:
         scene = replace(scene, depth="", depth_digest="")
     if not needs_cloud(method):
@@ -356,7 +374,7 @@ def _needed(scene: SceneFacts, method: str) -> SceneFacts:
 
 
 def _training(plan: Plan, scene: SceneFacts, arm: Arm, backend: Backend) -> TrainSettings:
-    """The plan's settings, at the size and with the number of Gaussians that this scene has."""
+    """The settings of the plan, with the data factor and the budget for this scene."""
     factor = plan.training.data_factor
     if plan.long_side is not None or factor is None:
         factor = max(1, -(-scene.long_side // (plan.long_side or TRAINED_SIDE)))
@@ -367,11 +385,11 @@ def _training(plan: Plan, scene: SceneFacts, arm: Arm, backend: Backend) -> Trai
 
 
 def _budget(given: object) -> str:
-    """A budget in the plan's form, so that 20000, "20k" and "20000.0" are the same."""
+    """Normalise a budget, so that 20000, "20k" and "20000.0" are equal."""
     text = str(given).strip().lower()
-    number = parse_budget(text, pixels=_LARGEST_IMAGE)
+    number = parse_budget(text, pixels=_MAX_IMAGE_PIXELS)
     if text.endswith(RHO):
         return f"{float(text.removesuffix(RHO)):g}{RHO}"
     if number < 2:
-        raise ParameterError("budgets of at least 2 Gaussians", found=f"{given}", fix=SEE)
+        raise ParameterError("budgets of at least 2 Gaussians", found=f"{given}", fix=HELP)
     return f"{number}"

@@ -1,7 +1,7 @@
-"""Plans as TOML files, and ready-made ones: the paper's tables, and two that a laptop can run.
+"""Read and write plans as TOML, and read the presets.
 
-``read_plan`` reads what ``plan_text`` writes back as the same plan; a misspelt key, or a value of
-the wrong kind, is an error. Paths in a file are relative to it.
+``read_plan`` inverts ``plan_text``. An unknown key or a value of the wrong type is an error. Paths
+are relative to the file.
 """
 
 from __future__ import annotations
@@ -23,28 +23,32 @@ from splatseed.training.settings import TrainSettings
 
 PresetName = Literal["mipnerf360", "replica", "laptop", "quick"]
 PLAN = "plan.toml"
-"""The name of the plan in the folder of a benchmark."""
+"""The name of the plan in a benchmark's folder."""
 _FILES = ("path", "depth", "cloud")
-"""Keys of a scene that are paths, relative to the plan's file."""
+"""Keys of a scene that are paths."""
 _HINTS: dict[str, Any] = {
     **get_type_hints(Plan), **get_type_hints(TrainSettings),
-    "scenes": tuple[dict, ...],  # type: ignore[type-arg]  # whose keys have their own check
+    "scenes": tuple[dict, ...],  # type: ignore[type-arg]  # their keys are checked apart
     "budgets": tuple[str | float, ...], "parameters": dict,
 }  # fmt: skip
 KINDS: Mapping[str, Any] = {
     name: _HINTS[name]
-    for each in fields(Plan)
-    for name in (SHARED if each.name == "training" else [each.name])
+    for field in fields(Plan)
+    for name in (SHARED if field.name == "training" else [field.name])
 }
-"""The type of each key of a plan: those of ``Plan``, except that ``training`` is flat."""
+"""The types of a plan's keys: the fields of ``Plan``, with those of ``training`` beside them."""
 
 
 def read_plan(path: StrPath, folder: Path | None = None) -> Plan:
-    """Read a plan; its paths are relative to a folder, the file's own when left out.
+    """Read a plan.
+
+    Args:
+        path: The TOML file.
+        folder: The folder to which its paths are relative; by default the file's.
 
     Raises:
         SceneNotFoundError: There is no such file.
-        SceneFormatError: It is no TOML, or a key or a value is not one of a plan.
+        SceneFormatError: The file is no TOML, or a key or a value is invalid.
     """
     path = Path(path)
     content = _read_toml(path)
@@ -54,7 +58,7 @@ def read_plan(path: StrPath, folder: Path | None = None) -> Plan:
     values: dict[str, Any]
     values = {key: tuple(v) if isinstance(v, list) else v for key, v in content.items()}
     folder = folder or path.parent
-    values["scenes"] = tuple(_scene(path, folder, each) for each in content.get("scenes", ()))
+    values["scenes"] = tuple(_scene(path, folder, scene) for scene in content.get("scenes", ()))
     try:
         training = TrainSettings(**{name: values.pop(name) for name in SHARED if name in values})
         return Plan(**values, training=training)
@@ -64,7 +68,7 @@ def read_plan(path: StrPath, folder: Path | None = None) -> Plan:
 
 
 def plan_text(plan: Plan) -> str:
-    """A plan as TOML, with absolute paths, so that the text can be kept anywhere."""
+    """Write a plan as TOML with absolute paths."""
     lines = []
     for key in KINDS:
         value = getattr(plan.training if key in SHARED else plan, key)
@@ -75,11 +79,11 @@ def plan_text(plan: Plan) -> str:
         for key in _FILES:
             if values[key] and values[key] != DEMO:
                 values[key] = str(Path(values[key]).absolute())
-        told = [f"{key} = {_value(value)}" for key, value in values.items() if value]
-        lines += ["", "[[scenes]]", *told]
+        pairs = [f"{key} = {_value(value)}" for key, value in values.items() if value]
+        lines += ["", "[[scenes]]", *pairs]
     for method, parameters in plan.parameters.items():
-        told = [f"{_key(name)} = {_value(value)}" for name, value in parameters.items()]
-        lines += ["", f"[parameters.{_key(method)}]", *told]
+        pairs = [f"{_key(name)} = {_value(value)}" for name, value in parameters.items()]
+        lines += ["", f"[parameters.{_key(method)}]", *pairs]
     return "\n".join(lines) + "\n"
 
 
@@ -106,17 +110,17 @@ def _check(
         kind = get_args(hint)[0] if listed else hint
         parts = value if listed and isinstance(value, list) else [value]
         if isinstance(value, list) != listed or not all(fits(part, kind) for part in parts):
-            words = f"{'a list, each ' if listed else ''}{describe_type(kind)}"
+            expected = f"{'a list of items that are ' if listed else ''}{describe_type(kind)}"
             raise SceneFormatError(
-                f"{within}{key} in {path} to be {words}", found=repr(value), fix="Correct the plan."
+                f"{within}{key} = {expected} in {path}", found=repr(value), fix="Correct the plan."
             )
 
 
 def _scene(path: Path, folder: Path, content: Mapping[str, Any]) -> PlannedScene:
     _check(path, content, get_type_hints(PlannedScene), "scenes.")
     if not content.get("path"):
-        all_have = f"a path for each of the scenes in {path}"
-        raise SceneFormatError(all_have, found="none", fix="Say where it lies.")
+        expected = f"scenes.path for every scene in {path}"
+        raise SceneFormatError(expected, found="none", fix="Add the scene's folder.")
     named = {key: content[key] for key in _FILES if content.get(key) and content[key] != DEMO}
     return PlannedScene(**{**content, **{key: str(folder / file) for key, file in named.items()}})
 
@@ -125,10 +129,10 @@ def _value(value: object) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):
-        # JSON's escapes are TOML's, but that TOML wants one for DEL as well.
+        # TOML has the escapes of JSON, and requires one for DEL.
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     if isinstance(value, tuple | list):
-        return f"[{', '.join(_value(each) for each in value)}]"
+        return f"[{', '.join(map(_value, value))}]"
     return repr(value)
 
 
@@ -137,5 +141,5 @@ def _key(name: str) -> str:
 
 
 def preset_plan(name: PresetName, data: Path | None) -> Plan:
-    """A preset's plan for the scenes in a folder, such as those of the paper's tables 1 and 2."""
+    """Read a preset, for the scenes in a folder."""
     return read_plan(Path(str(files("splatseed.bench") / "data" / f"{name}.toml")), data)

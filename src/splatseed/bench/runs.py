@@ -1,8 +1,8 @@
-"""The folder of a benchmark, whose runs are folders: reading them, and what is left to do.
+"""Read and lock a benchmark's folder, and record what is planned.
 
-``planned.json`` has the calls of the command and the runs of the last plan, ``runs/KEY`` each run
-that ended: with a ``result.json`` it is finished and never repeated, with an ``error.json`` it
-failed. A folder that is not a benchmark's is never written to.
+``planned.json`` records the calls of the command and the runs of the last plan. A folder
+``runs/KEY`` with a ``result.json`` is a finished run, which is not repeated; with an ``error.json``
+it is a failed one.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ from splatseed.text import counted
 RESULT, ERROR = "result.json", "error.json"
 _PLANNED = "planned.json"
 _OTHER_LAYOUT = (ValueError, KeyError, TypeError, AttributeError)
-"""What reading JSON of another version raises."""
+"""Errors of reading the JSON of another version."""
 _PACKAGES = ("splatseed", "torch", "gsplat", "torchmetrics", "numpy", "scipy", "numba", "ray")
 
 
 @dataclass(frozen=True)
 class Run:
-    """A run of a benchmark: finished if it has a result, failed if it has an error, else to do."""
+    """A run: finished if it has a result, failed if it has an error, else pending."""
 
     spec: RunSpec
     result: RunResult | None = None
@@ -51,34 +51,34 @@ class Run:
 
 
 def run_folder(bench: Path, spec: RunSpec) -> Path:
-    """Where a run is kept."""
+    """Return the folder of a run."""
     return bench / "runs" / spec.key
 
 
 def read_run(bench: Path, spec: RunSpec) -> Run:
-    """A run as its folder tells of it."""
+    """Read a run from its folder; it is pending if there is none."""
     return _read(run_folder(bench, spec), spec)
 
 
 def _read(folder: Path, spec: RunSpec | None = None) -> Run:
-    """What a run's folder tells; of an unfinished run whose specification is given, that."""
+    """Read a run from a folder, which may be missing only if ``spec`` is given."""
     for name in (RESULT, ERROR):
         with suppress(FileNotFoundError, NotADirectoryError):
             text = read_text(folder / name)
             try:
                 content = json.loads(text)
-                own = spec or RunSpec.from_dict(content["spec"])
+                known = spec or RunSpec.from_dict(content["spec"])
                 if name == ERROR:
-                    return Run(own, error=str(content["error"]))
-                return Run(own, RunResult.from_dict(content["result"]))
+                    return Run(known, error=str(content["error"]))
+                return Run(known, RunResult.from_dict(content["result"]))
             except _OTHER_LAYOUT as error:
-                fix = "Remove that folder to have its run repeated, or begin a new benchmark."
-                raise _not_ours(folder / name, error, fix) from None
+                fix = "Remove that folder to repeat its run, or start a new benchmark."
+                raise _layout_error(folder / name, error, fix) from None
     assert spec is not None  # noqa: S101  (folders are listed by these files)
     return Run(spec)
 
 
-def _not_ours(path: Path, error: Exception, fix: str) -> SceneFormatError:
+def _layout_error(path: Path, error: Exception, fix: str) -> SceneFormatError:
     expected = f"{path} as this version of splatseed writes it"
     return SceneFormatError(
         expected, found=f"another layout ({type(error).__name__}: {error})", fix=fix
@@ -87,18 +87,18 @@ def _not_ours(path: Path, error: Exception, fix: str) -> SceneFormatError:
 
 def _planned_runs(bench: Path) -> list[RunSpec]:
     try:
-        return [RunSpec.from_dict(each) for each in _planned(bench)["runs"]]
+        return [RunSpec.from_dict(spec) for spec in _planned(bench)["runs"]]
     except _OTHER_LAYOUT as error:
-        fix = "Plan it again with splatseed bench, or begin a new one."
-        raise _not_ours(bench / _PLANNED, error, fix) from None
+        fix = "Plan it again with splatseed bench, or start a new one."
+        raise _layout_error(bench / _PLANNED, error, fix) from None
 
 
 def read_runs(bench: StrPath) -> list[Run]:
-    """All runs of a benchmark: those of the last plan, in its order, then others that are finished.
+    """Read the runs of the last plan, in its order, and the finished runs of earlier plans.
 
     Raises:
         SceneNotFoundError: There is no benchmark.
-        SceneFormatError: A file is not of the layout that this version writes.
+        SceneFormatError: Another version wrote a file.
     """
     bench = Path(bench)
     kind = read_manifest(bench).get("command")
@@ -107,26 +107,26 @@ def read_runs(bench: StrPath) -> list[Run]:
         raise SceneNotFoundError(f"a benchmark at {bench}", found=kind or "none", fix=fix)
     runs = [read_run(bench, spec) for spec in _planned_runs(bench)]
     known = {run_folder(bench, run.spec).name for run in runs}
-    # What failed in an earlier plan is no longer asked for.
+    # Failed runs of earlier plans are dropped.
     finished = sorted(path.parent for path in bench.glob(f"runs/*/{RESULT}"))
-    return [*runs, *(_read(each) for each in finished if each.name not in known)]
+    return [*runs, *(_read(folder) for folder in finished if folder.name not in known)]
 
 
-def counts(runs: Sequence[Run]) -> str:
-    """How many runs there are of each kind, in words."""
+def count_runs(runs: Sequence[Run]) -> str:
+    """Describe the numbers of finished, failed and pending runs."""
     done = sum(run.result is not None for run in runs)
     failed = sum(bool(run.error) for run in runs)
-    left = len(runs) - done - failed
-    kinds = {"done": done, "failed": failed, "to do": left if done or failed else 0}
-    told = [f"{number:,} {kind}" for kind, number in kinds.items() if number]
-    return ", ".join([counted(len(runs), "run"), *told])
+    pending = len(runs) - done - failed
+    kinds = {"done": done, "failed": failed, "pending": pending if done or failed else 0}
+    parts = [f"{number:,} {kind}" for kind, number in kinds.items() if number]
+    return ", ".join([counted(len(runs), "run"), *parts])
 
 
 def check_bench_folder(folder: Path, protect: Sequence[Path]) -> None:
-    """Refuse a folder that ``bench`` did not write, before any work is done.
+    """Check that ``bench`` may write to a folder.
 
     Raises:
-        OutputError: It is another's, or lies in a scene of ``protect`` or around one.
+        OutputError: Something else wrote it, or it overlaps a scene of ``protect``.
     """
     kind = read_manifest(folder).get("command")
     if kind == "bench":
@@ -140,37 +140,37 @@ def check_bench_folder(folder: Path, protect: Sequence[Path]) -> None:
 
 
 @contextmanager
-def alone_in(bench: Path) -> Iterator[None]:
-    """Keep other processes from carrying out runs of a benchmark's folder while the block runs.
+def locked_bench(bench: Path) -> Iterator[None]:
+    """Lock a benchmark's folder against other processes.
 
     Raises:
-        OutputError: Another process is at it.
+        OutputError: Another process holds the lock.
     """
     with ExitStack() as stack:
         try:
             stack.enter_context(locked(bench))
         except BlockingIOError:
             fix = "Wait until it ends, stop it, or name another folder."
-            expected = f"no other process that carries out runs in {bench}"
+            expected = f"no other process that runs {bench}"
             raise OutputError(expected, found="one", fix=fix) from None
         yield
 
 
-def begin(bench: Path, verb: str, specs: Iterable[RunSpec], words: Sequence[str]) -> None:
-    """Make the folder unless it exists, and record a call of the command and its runs.
+def record_plan(bench: Path, verb: str, specs: Iterable[RunSpec], arguments: Sequence[str]) -> None:
+    """Record a call of the command and the runs that it plans; creates the folder.
 
     Raises:
-        OutputError: It cannot be written.
+        OutputError: The folder cannot be written.
     """
     if not (bench / MANIFEST).is_file():
         write_json(bench / MANIFEST, {"command": verb})
-    calls = [*read_calls(bench), _describe_call(verb, words)]
+    calls = [*read_calls(bench), _describe_call(verb, arguments)]
     planned = [spec.to_dict() for spec in specs]
     write_json(bench / _PLANNED, {"calls": calls, "runs": planned})
 
 
 def read_calls(bench: Path) -> list[dict[str, Any]]:
-    """The recorded calls of the command, oldest first: words, time, machine, and versions."""
+    """Read the recorded calls: command, time, machine and versions, the oldest first."""
     return _planned(bench)["calls"]
 
 
@@ -180,13 +180,13 @@ def _planned(bench: Path) -> dict[str, list[Any]]:
     return {"calls": [], "runs": []}
 
 
-def _describe_call(verb: str, words: Sequence[str]) -> dict[str, Any]:
+def _describe_call(verb: str, arguments: Sequence[str]) -> dict[str, Any]:
     cpu = platform.processor() or platform.machine()
     with suppress(OSError, StopIteration):
         lines = Path("/proc/cpuinfo").read_text("utf-8", "replace").splitlines()
         cpu = next(line.partition(": ")[2] for line in lines if line.startswith("model name"))
     return {
-        "command": shlex.join(["splatseed", verb, *words]),
+        "command": shlex.join(["splatseed", verb, *arguments]),
         "started": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         "folder": str(Path.cwd()),
         "host": socket.gethostname(),
@@ -199,14 +199,14 @@ def _describe_call(verb: str, words: Sequence[str]) -> dict[str, Any]:
 
 
 def package_version(package: str) -> str:
-    """An installed package's version; empty if it is not installed or runs from its source."""
+    """Return the version of an installed package; empty if it is not installed."""
     try:
         return version(package)
     except PackageNotFoundError:
         return ""
 
 
-def estimate(specs: Sequence[RunSpec], runs: Iterable[Run], threads: int) -> float:
-    """Seconds of runs one after another, each on so many threads, at the pace of finished ones."""
+def estimate_seconds(specs: Sequence[RunSpec], runs: Iterable[Run], threads: int) -> float:
+    """Estimate the time of runs in sequence, corrected by the times of finished runs."""
     paces = [run.result.wall_seconds / run.spec.seconds(threads) for run in runs if run.result]
     return median(paces or [1.0]) * sum(spec.seconds(threads) for spec in specs)

@@ -1,8 +1,8 @@
-"""Scenes of a benchmark: opening one, checking it before it is run, and its fingerprints.
+"""Scenes of a benchmark: open, check and fingerprint them.
 
-Whatever would make every run on a scene fail is detected here, before any run. A fingerprint
-depends on content alone: not on where files are, or the order in which a system lists them;
-photographs and scans count byte for byte, depth maps as read.
+``survey`` detects before any run what would make every run on a scene fail. A fingerprint depends
+on content, not on paths or on the order of files: the bytes of photographs and scans, the values of
+depth maps.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from splatseed.runtime.fingerprint import fingerprint, fingerprint_all
 from splatseed.scene import Scene
 
 DEMO = "demo:"
-"""The path of the synthetic room, which is made in the benchmark's folder on demand."""
+"""The path of the synthetic room, which is written to the benchmark's folder on demand."""
 
 
 @dataclass(frozen=True)
@@ -37,38 +37,38 @@ class PlannedScene:
     """A scene of a plan."""
 
     path: str
-    """Its folder; ``DEMO`` for the synthetic room."""
+    """The scene's folder; ``DEMO`` for the synthetic room."""
     name: str = ""
-    """Its name in tables; the folder's name when left empty."""
+    """The name in tables; if empty, that of the folder."""
     images: str = ""
-    """The folder of photographs within it, such as ``images_4``; detected when left empty."""
+    """The folder of photographs in the scene, such as ``images_4``; detected if empty."""
     depth: str = ""
-    """The folder of its depth maps; looked for in the scene when left out."""
+    """The folder of depth maps; searched in the scene if empty."""
     cloud: str = ""
-    """The file of its scan, in the scene's frame."""
+    """The file of a scan in the scene's frame."""
 
     @property
     def is_demo(self) -> bool:
-        """Whether it is the synthetic room."""
+        """Whether the scene is the synthetic room."""
         return self.path == DEMO
 
     @property
     def label(self) -> str:
-        """Its name, or its folder's."""
+        """The name in tables."""
         return self.name or ("demo" if self.is_demo else self.root.name)
 
     @property
     def root(self) -> Path:
-        """Its folder, also where that of its model is named."""
+        """The scene's folder, even if ``path`` is the folder of the COLMAP model."""
         return scene_root(Path(self.path).resolve())
 
 
 @dataclass(frozen=True)
 class SceneFacts(PlannedScene):
-    """A scene after ``survey``: with its name, absolute paths, and what they hold.
+    """A surveyed scene: its name, absolute paths, sizes and fingerprints.
 
-    ``num_points`` are distinct finite ones, which plain ``SFM`` trains from; ``pixels`` and
-    ``long_side`` are the first photograph's; digests are fingerprints, empty without such files.
+    ``num_points`` counts the distinct finite points. ``pixels`` and ``long_side`` are those of the
+    first photograph. A digest is empty if the scene has no such files.
     """
 
     digest: str = ""
@@ -81,7 +81,7 @@ class SceneFacts(PlannedScene):
     warnings: tuple[str, ...] = ()
 
     def pixels_at(self, factor: int) -> int:
-        """Pixels of the first photograph, downsampled by a whole factor."""
+        """The pixels of the first photograph, downsampled by a whole factor."""
         short_side = self.pixels // self.long_side
         return (self.long_side // factor) * (short_side // factor)
 
@@ -90,15 +90,15 @@ _DEMO_FACTS = SceneFacts(
     DEMO, "demo", digest="not made yet", num_points=11_364, num_images=40, pixels=400 * 300,
     long_side=400, depth_digest="not made yet",
 )  # fmt: skip
-"""Facts about the synthetic room before it is made; the number of points is approximate."""
+"""The synthetic room before it is written; ``num_points`` is approximate."""
 
 
 def open_scene(scene: PlannedScene) -> Scene:
-    """A scene with its original points, and with the depth maps that are named.
+    """Open a scene with its original points, and with depth maps if their folder is given.
 
     Raises:
-        SceneNotFoundError: There is no scene, no such folder, or less than half its photographs.
-        SceneFormatError: A file is not what its format promises.
+        SceneNotFoundError: There is no scene or folder, or half of the photographs are missing.
+        SceneFormatError: A file is invalid.
     """
     opened = load_originals(Path(scene.path))
     if scene.images:
@@ -120,14 +120,19 @@ def survey(
     with_cloud: bool = False,
     progress: Progress = silent,
 ) -> SceneFacts:
-    """Check a scene and all files that a run on it reads.
+    """Check a scene and all files that runs on it read.
 
-    ``demo`` is where the synthetic room is, or is to be made; None for its known facts. Depth maps
-    are looked for if they are needed and none are named.
+    Args:
+        planned: The scene.
+        demo: The folder of the synthetic room, which is written if missing; None to use its known
+            facts.
+        with_depth: Whether a method needs depth maps.
+        with_cloud: Whether a method needs the scan.
+        progress: Reports progress.
 
     Raises:
         SceneNotFoundError: There is no scene, or a file is missing.
-        SceneFormatError: A file is not what its format promises, or cameras have distortion.
+        SceneFormatError: A file is invalid, or cameras have distortion.
     """
     if planned.is_demo:
         if demo is None:
@@ -150,23 +155,23 @@ def survey(
     maps = scan = ""
     if with_cloud and planned.cloud:
         scan = str(Path(planned.cloud).resolve())
-        open_cloud(Path(planned.cloud))  # a header that makes no sense is told now
+        open_cloud(Path(planned.cloud))  # reports an invalid header now
     depth = Path(planned.depth) if planned.depth else scene.source.root
     if with_depth and (planned.depth or search_depths(scene, depth) is not None):
         maps, scene = str(depth.resolve()), scene.replace(depths=find_depths(scene, depth))
-    told = [*scene.warnings, *([scene.listed.sentence] if scene.listed else [])]
-    told += stray_notes(scene)
+    notes = [*scene.warnings, *([scene.listed.sentence] if scene.listed else [])]
+    notes += stray_notes(scene)
     return SceneFacts(
         str(path.resolve()), planned.label, planned.images, maps, scan,
         num_points=len(scene.points), num_images=len(scene.images), pixels=size[0] * size[1],
-        long_side=max(size), **fingerprints(scene, maps, scan, progress), warnings=tuple(told),
+        long_side=max(size), **fingerprints(scene, maps, scan, progress), warnings=tuple(notes),
     )  # fmt: skip
 
 
 def fingerprints(
     scene: Scene, depth: str, cloud: str, progress: Progress = silent
 ) -> dict[str, str]:
-    """The digests of ``SceneFacts``, as files are now; empty without a path of depth or scan."""
+    """Compute the digests of ``SceneFacts``; empty if the path of depth maps or scan is."""
     folder = scene.source.image_dir if scene.source else None
     maps = scene.depths if depth else None
     return {

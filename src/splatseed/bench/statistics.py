@@ -1,13 +1,12 @@
-"""Whether a difference is more than noise.
+"""Test whether differences exceed the noise.
 
 Notation: ``values`` [A, R] are one scene's scores, arm by repeat, NaN where there is no run; row 0
-is the baseline. A *difference* is between two arms, paired by repeat. Three means of differences
-answer three questions: on one scene (``paired_differences``), on these scenes if trained again
-(``these_scenes``), and on scenes like these (``over_scenes``).
+is the baseline. A *difference* is between two arms, paired by repeat. Its mean is tested on one
+scene (``paired_differences``), on the same scenes trained again (``these_scenes``), and on scenes
+like these (``over_scenes``).
 
-Promise: p values are two-sided; over a family of comparisons they are adjusted after Holm (1979),
-which bounds the chance of any false claim in it; where nothing can be said, p is NaN and no claim
-is made.
+p values are two-sided, and adjusted over a family of comparisons after Holm (1979), which bounds
+the chance of any false claim in the family. An unknown p is NaN, and makes no claim.
 """
 
 from __future__ import annotations
@@ -23,22 +22,22 @@ from jaxtyping import Float, Float64
 LEVEL = 0.05
 """A difference is a claim when its adjusted p is at most this."""
 EXACT = 1e-9
-"""Standard errors below this are rounding: the runs are equal bit for bit."""
+"""Standard errors below this are rounding errors of equal runs."""
 
 Verdict = Literal["better", "worse", "within noise", "unknown"]
 
 
 @dataclass(frozen=True)
 class Difference:
-    """A mean difference and how sure it is.
+    """A mean difference and its significance.
 
     Args:
         mean: In the unit of the scores.
-        se: Standard error of the mean; NaN where one sample leaves it unknown.
+        se: Standard error of the mean; NaN for one sample.
         df: Degrees of freedom of the standard error.
         n: Samples that the mean is over: pairs of runs, or scenes.
-        p: Two-sided p value of a mean of 0; NaN where unknown.
-        adjusted: The same after Holm over the family that it was tested in.
+        p: Two-sided p value of a mean of 0; NaN if unknown.
+        adjusted: The p value after Holm's adjustment over its family.
     """
 
     mean: float
@@ -50,7 +49,7 @@ class Difference:
 
     @property
     def verdict(self) -> Verdict:
-        """What may be claimed, at ``LEVEL`` of the adjusted p."""
+        """The claim at ``LEVEL`` of the adjusted p."""
         if math.isnan(self.adjusted):
             return "unknown"
         if self.adjusted > LEVEL:
@@ -58,7 +57,7 @@ class Difference:
         return "better" if self.mean > 0 else "worse"
 
     def interval(self, level: float = 1 - LEVEL) -> tuple[float, float]:
-        """Confidence interval of the mean, not adjusted; NaN where unknown.
+        """The confidence interval of the mean, not adjusted; NaN if unknown.
 
         Args:
             level: The share of such intervals that hold the true mean.
@@ -72,11 +71,11 @@ class Difference:
 
 
 def difference(mean: float, se: float, df: float, n: int) -> Difference:
-    """A difference with the p value of its t statistic.
+    """Make a difference with the p value of its t statistic.
 
     Args:
         mean: The mean.
-        se: Its standard error; NaN where unknown.
+        se: Its standard error; NaN if unknown.
         df: Degrees of freedom of the standard error.
         n: Samples behind the mean.
     """
@@ -84,22 +83,22 @@ def difference(mean: float, se: float, df: float, n: int) -> Difference:
 
     if math.isnan(se) or df <= 0:
         return Difference(mean, math.nan, 0.0, n, math.nan)
-    if se <= EXACT:  # no noise at all: a difference is there or it is not
+    if se <= EXACT:  # no noise
         return Difference(mean, 0.0, df, n, 1.0 if abs(mean) <= EXACT else 0.0)
     return Difference(mean, se, df, n, float(2 * t.sf(abs(mean) / se, df)))
 
 
 def paired_differences(values: Float[np.ndarray, "A R"]) -> tuple[Difference | None, ...]:
-    """What each arm of a scene gains over row 0: the mean over repeats of paired differences.
+    """Compute the gain of each arm of a scene over row 0, the mean of paired differences.
 
-    For two arms this is the paired t-test; with more, all of them tell of the noise.
+    For two arms this is the paired t-test; more arms improve the estimate of the noise.
 
     Args:
         values: Scores by arm and repeat, NaN where there is no run, [A, R].
 
     Returns:
-        One for each of rows 1 to A - 1; None where it and row 0 have no repeat in common. ``p`` is
-        not adjusted yet.
+        A difference for each of rows 1 to A - 1, None without a repeat in common with row 0.
+        ``p`` is not adjusted.
     """
     noise, df = pooled_noise(values)
     return tuple(_paired(row - values[0], noise, df) for row in values[1:])
@@ -113,19 +112,19 @@ def _paired(differences: Float[np.ndarray, " R"], noise: float, df: float) -> Di
 
 
 def pooled_noise(values: Float[np.ndarray, "A R"]) -> tuple[float, int]:
-    """Standard deviation of a score about its arm's and its repeat's mean, and degrees of freedom.
+    """Estimate the noise of a score from all arms of a scene, which share it.
 
-    With two or three repeats a pair of arms alone says little about the noise, so it is estimated
-    from all arms of the scene together: what is left when every arm and every repeat has its own
-    mean (the analysis of variance of a randomised block design; Montgomery, Design and Analysis of
-    Experiments, ch. 4). That assumes that all arms are equally noisy: of six, one at twice the
-    noise of the rest is falsely claimed in 12% of tests rather than 5, the others in 3%.
+    Two or three repeats of a pair of arms would determine it poorly. It is the residual after
+    fitting a mean per arm and per repeat (analysis of variance of a randomised block design;
+    Montgomery, Design and Analysis of Experiments, ch. 4). The estimate assumes that all arms are
+    equally noisy: of six, one with twice the noise of the others is falsely claimed in 12% of tests
+    rather than 5%, the others in 3%.
 
     Args:
         values: Scores by arm and repeat, NaN where there is no run, [A, R].
 
     Returns:
-        The deviation, NaN where there are no degrees of freedom, and these.
+        The standard deviation, NaN without degrees of freedom; and the degrees of freedom.
     """
     arm, repeat = np.nonzero(np.isfinite(values))
     design = np.hstack([np.eye(values.shape[0])[arm], np.eye(values.shape[1])[repeat]])
@@ -142,33 +141,30 @@ def pooled_noise(values: Float[np.ndarray, "A R"]) -> tuple[float, int]:
 
 
 def these_scenes(scenes: Sequence[Difference]) -> Difference:
-    """The mean of differences on several scenes: what training again on the same scenes gives.
-
-    Its noise is the scenes' own, added up.
+    """Average differences over scenes, with the noise of training the same scenes again.
 
     Args:
-        scenes: One per scene, at least one.
+        scenes: A difference per scene, at least one.
     """
-    mean = float(np.mean([each.mean for each in scenes]))
-    variance = np.array([each.se**2 for each in scenes])
+    mean = float(np.mean([scene.mean for scene in scenes]))
+    variance = np.array([scene.se**2 for scene in scenes])
     total = variance.sum()
-    n = sum(each.n for each in scenes)
+    n = sum(scene.n for scene in scenes)
     if math.isnan(total):
         return difference(mean, math.nan, 0, n)
-    freedom = np.array([each.df for each in scenes])
-    # Welch-Satterthwaite; without any noise the degrees of freedom are the scenes' own, added up.
+    freedom = np.array([scene.df for scene in scenes])
+    # Welch-Satterthwaite; without noise, the sum of the degrees of freedom.
     df = float(total**2 / (variance**2 / freedom).sum()) if total > 0 else float(freedom.sum())
     return difference(mean, math.sqrt(total) / len(scenes), df, n)
 
 
 def over_scenes(means: Sequence[float] | Float64[np.ndarray, " S"]) -> Difference:
-    """The mean of differences over scenes, for scenes like these: a one-sample t-test.
+    """Average differences over scenes, with the error for scenes like these: a one-sample t-test.
 
-    Repeats of one scene are not independent evidence about another: counting every run as a sample
-    would find gains that are not there. So repeats are averaged within a scene first.
+    The samples are scenes, not runs, as the repeats of a scene are not independent.
 
     Args:
-        means: Each scene's mean difference over its repeats, [S], at least one.
+        means: The mean difference of each scene over its repeats, [S], at least one.
     """
     values = np.asarray(means, np.float64)
     n = len(values)
@@ -177,7 +173,7 @@ def over_scenes(means: Sequence[float] | Float64[np.ndarray, " S"]) -> Differenc
 
 
 def holm(p: Sequence[float]) -> tuple[float, ...]:
-    """Holm's adjustment of p values for their number; NaN stay so and do not count.
+    """Adjust p values for their number after Holm; NaN are kept, and not counted.
 
     Args:
         p: The p values of a family.
@@ -188,21 +184,21 @@ def holm(p: Sequence[float]) -> tuple[float, ...]:
     """
     result = [math.nan] * len(p)
     known = sorted((value, i) for i, value in enumerate(p) if not math.isnan(value))
-    least = 0.0
+    minimum = 0.0
     for rank, (value, i) in enumerate(known):
-        least = max(least, min(1.0, (len(known) - rank) * value))
-        result[i] = least
+        minimum = max(minimum, min(1.0, (len(known) - rank) * value))
+        result[i] = minimum
     return tuple(result)
 
 
 def adjusted(family: Sequence[Difference | None]) -> tuple[Difference | None, ...]:
-    """The differences of a family with their p values adjusted after Holm.
+    """Adjust the p values of a family after Holm.
 
     Args:
-        family: All that is compared in one table; None where there is nothing to compare.
+        family: All differences of one table; None for missing ones.
     """
-    p = holm([math.nan if each is None else each.p for each in family])
+    p = holm([math.nan if member is None else member.p for member in family])
     return tuple(
-        None if each is None else replace(each, adjusted=value)
-        for each, value in zip(family, p, strict=True)
+        None if member is None else replace(member, adjusted=value)
+        for member, value in zip(family, p, strict=True)
     )

@@ -1,8 +1,8 @@
-"""Studies: sets of finished runs that differ only in their seeds and so can be compared.
+"""Studies: sets of finished runs that can be compared, as only seeds and strategies differ.
 
-A *variant* is what makes the seeds (method, profile, ratio, parameters), known by its label, such
-as ``mls 8x``. Runs of different settings or versions are never compared; a run whose PSNR is not
-finite is set aside and counted, not averaged.
+A *variant* is a way to make seeds (method, profile, ratio, parameters), named by a label such as
+``mls 8x``. Runs with different settings or versions are in different studies. Runs with infinite or
+NaN PSNR are listed, but are in no mean.
 """
 
 from __future__ import annotations
@@ -22,21 +22,20 @@ from splatseed.methods import METHODS
 from splatseed.training.settings import StrategyName, TrainSettings
 
 _COLUMNS = ("strategy", "scene", "seeds", "repeat", "spec", "result")
-_BESIDE = {"maps": "depth_digest", "scan": "cloud_digest"}
-"""What a scene can have beside its photographs, and its fingerprint in ``SceneFacts``."""
+_EXTRA_DIGESTS = {"maps": "depth_digest", "scan": "cloud_digest"}
+"""Optional data of a scene, and the field of ``SceneFacts`` with its fingerprint."""
 _DEFAULT = TrainSettings()
-_NAMED = ("exposure", "placing")
-"""Settings that are told by their names, where they are not the default."""
+_SHOWN_SETTINGS = ("exposure", "placing")
+"""Settings shown by name and value if they differ from the default."""
 
 
 @dataclass(frozen=True, eq=False)
 class Study:
-    """Runs that can be compared: with the same training settings, budget and version.
+    """Runs with the same training settings, budget and version.
 
-    ``runs`` has a row for each, with the columns strategy, scene, seeds (the variant's label),
-    repeat, spec, result, and those of ``_measures``, NaN where it was not measured; ``variants``
-    one of each variant's arms by its label, in order, the baseline first. ``not_finite``: finished
-    runs whose PSNR is infinite or NaN, in words.
+    ``runs`` has a row per run, with the columns strategy, scene, seeds (the variant's label),
+    repeat, spec, result, and those of ``_measures``, NaN if not measured. ``variants`` maps labels
+    to an arm, the baseline first. ``not_finite`` describes the runs whose PSNR is not finite.
     """
 
     settings: Mapping[str, object]
@@ -51,7 +50,7 @@ class Study:
 
     @cached_property
     def scenes(self) -> tuple[str, ...]:
-        """All scenes, in alphabetical order."""
+        """The scenes in alphabetical order."""
         return tuple(sorted(set(self.runs["scene"])))
 
     @property
@@ -60,31 +59,31 @@ class Study:
         return tuple(label for label in self.variants if label != SFM)
 
     def family(self, label: str) -> str:
-        """A variant's label without the ratio: that of variants which differ in nothing else."""
+        """Drop the ratio from a variant's label."""
         arm = self.variants[label]
         return replace(arm, ratio=0.0).label + label.removeprefix(arm.label)
 
     def under(self, strategy: StrategyName) -> pd.DataFrame:
-        """The runs under a strategy."""
+        """Select the runs of a strategy."""
         return self.runs[self.runs["strategy"] == strategy]
 
     def seeded_under(self, strategy: StrategyName) -> tuple[str, ...]:
-        """The labels of the variants but the baseline that were run under a strategy."""
+        """The labels of a strategy's variants, without the baseline."""
         present = set(self.under(strategy)["seeds"])
         return tuple(label for label in self.seeded if label in present)
 
     def scenes_under(self, strategy: StrategyName) -> tuple[str, ...]:
-        """The scenes that were run under a strategy."""
+        """The scenes of a strategy's runs."""
         return tuple(sorted(set(self.under(strategy)["scene"])))
 
     def results(self, strategy: StrategyName, scene: str, label: str) -> dict[int, RunResult]:
-        """The results of a variant on a scene by repeat; empty where there are none."""
+        """The results of a variant on a scene by repeat."""
         part = self.under(strategy)
         part = part[(part["scene"] == scene) & (part["seeds"] == label)].sort_values("repeat")
         return dict(zip(part["repeat"], part["result"], strict=True))
 
     def scores(self, strategy: StrategyName, scene: str) -> pd.DataFrame:
-        """PSNR of a scene, [A, R]: a row per variant, the baseline first, NaN without a run."""
+        """PSNR of a scene, a row per variant, the baseline first, and a column per repeat."""
         part = self.under(strategy)
         scores = part[part["scene"] == scene].pivot_table(
             index="seeds", columns="repeat", values="psnr"
@@ -93,49 +92,59 @@ class Study:
 
     @property
     def description(self) -> str:
-        """The settings in words."""
-        told, factors = self.settings, self.settings["data_factor"]
+        """The settings, for the reader of a report."""
+        settings, factors = self.settings, self.settings["data_factor"]
         if not isinstance(factors, Mapping):
             factors = {"photographs": factors}
         sized: dict[str, list[str]] = defaultdict(list)
-        for of, each in factors.items():
-            sized[f"1/{each} of their" if each != 1 else "full"].append(of)
-        budget, is_share = str(told["budget"]), str(told["budget"]).endswith("rho")
-        share = f"{budget.removesuffix('rho')} for each pixel of a photograph"
-        most = share if is_share else f"{int(budget or 0):,}"
+        for name, factor in factors.items():
+            sized[f"1/{factor} of their" if factor != 1 else "full"].append(name)
+        budget, is_share = str(settings["budget"]), str(settings["budget"]).endswith("rho")
+        share = f"{budget.removesuffix('rho')} per pixel of a photograph"
+        limit = share if is_share else f"{int(budget or 0):,}"
         counts = self.runs.groupby(["strategy", "scene", "seeds"]).size()
         low, high = counts.min(), counts.max()
         repeats = f"{high}" if low == high else f"{low} to {high}"
-        words = [
-            f"{told['max_steps']:,} steps",
+        parts = [
+            f"{settings['max_steps']:,} steps",
             *(f"{', '.join(names)} at {size} size" for size, names in sized.items()),
-            f"one view in {told['test_every']} tested",
-            f"Gaussians: at most {told['cap_max']:,}" if told["cap_max"] else "",
-            f"Gaussians: at most {most}" if budget else "",
-            f"spherical harmonics of degree {told['sh_degree']}" if told["sh_degree"] != 3 else "",
-            "opacities reset" if told["opacity_reset"] else "",
-            *(name.replace("_", " ") for name in SHARED if name.startswith("seed_") and told[name]),
-            *(f"{name} {told[name]}" for name in _NAMED if told[name] != getattr(_DEFAULT, name)),
-            f"backend {told['backend']}",
-            f"splatseed {told['version']}" if told["version"] else "",
+            f"test_every {settings['test_every']}",
+            f"Gaussians: at most {settings['cap_max']:,}" if settings["cap_max"] else "",
+            f"Gaussians: at most {limit}" if budget else "",
+            f"spherical harmonics of degree {settings['sh_degree']}"
+            if settings["sh_degree"] != 3
+            else "",
+            "opacities reset" if settings["opacity_reset"] else "",
+            *(
+                name.replace("_", " ")
+                for name in SHARED
+                if name.startswith("seed_") and settings[name]
+            ),
+            *(
+                f"{name} {settings[name]}"
+                for name in _SHOWN_SETTINGS
+                if settings[name] != getattr(_DEFAULT, name)
+            ),
+            f"backend {settings['backend']}",
+            f"splatseed {settings['version']}" if settings["version"] else "",
             f"{repeats} repeat{'' if high == 1 else 's'}" if len(counts) else "",
         ]
-        return ", ".join(filter(None, words))
+        return ", ".join(filter(None, parts))
 
 
 def variant_order(variant: tuple[str, Arm]) -> tuple[object, ...]:
-    """Sorts variants with their labels: the baseline, then methods in the registry's order."""
+    """Sort key of variants: the baseline first, then methods in the order of the registry."""
     (label, arm), names = variant, [SFM, *METHODS]
     place = names.index(arm.method) if arm.method in names else len(names)
     return place, arm.method, arm.profile, arm.ratio, label
 
 
 def studies(runs: Iterable[Run]) -> tuple[Study, ...]:
-    """The studies in some runs, those that are finished; the one with the most runs first.
+    """Group finished runs into studies, the one with the most runs first.
 
-    Scenes may differ in size; only where one scene was run at several ``data_factor`` are these
-    kept apart. If a scene's name stands for different content, its label says which; content that
-    has had several names is one scene, and a run that is there twice counts once.
+    Different scenes may have different ``data_factor``; several for one scene make several studies.
+    Scenes with the same name but different content get different labels; the same content under
+    several names is one scene. Duplicate runs count once.
     """
     groups: dict[tuple[tuple[str, object], ...], list[Run]] = defaultdict(list)
     for run in runs:
@@ -145,17 +154,17 @@ def studies(runs: Iterable[Run]) -> tuple[Study, ...]:
     for key, group in groups.items():
         sizes = {(run.spec.scene.digest, run.spec.training.data_factor) for run in group}
         parts: dict[int, list[Run]] = defaultdict(list)
-        for run in group:  # apart where a scene has several sizes
-            alone = len(sizes) > len({digest for digest, _ in sizes})
-            parts[run.spec.training.factor if alone else 0].append(run)
+        for run in group:  # by size if a scene has several
+            by_size = len(sizes) > len({digest for digest, _ in sizes})
+            parts[run.spec.training.factor if by_size else 0].append(run)
         grouped += [_study(dict(key), part) for part in parts.values()]
     return tuple(sorted(grouped, key=lambda study: -len(study.runs)))
 
 
 def _common(spec: RunSpec) -> dict[str, object]:
-    """What all runs of a study share; their size may differ from scene to scene."""
+    """The settings that all runs of a study share."""
     settings = {name: getattr(spec.training, name) for name in SHARED if name != "data_factor"}
-    if spec.arm.budget:  # in Gaussians it may differ from scene to scene
+    if spec.arm.budget:  # its number of Gaussians may differ between scenes
         settings["cap_max"] = None
     return {**settings, "budget": spec.arm.budget, "version": spec.version}
 
@@ -163,11 +172,11 @@ def _common(spec: RunSpec) -> dict[str, object]:
 def _study(settings: Mapping[str, object], runs: Sequence[Run]) -> Study:
     names: dict[str, str] = {}
     digests = defaultdict[str, set[str]](set)
-    beside = {kind: defaultdict[str, set[str]](set) for kind in _BESIDE}
+    beside = {kind: defaultdict[str, set[str]](set) for kind in _EXTRA_DIGESTS}
     for of in (run.spec.scene for run in runs):
         digests[names.setdefault(of.digest, of.name)].add(of.digest)
         for kind, found in beside.items():
-            found[of.digest].add(getattr(of, _BESIDE[kind]))
+            found[of.digest].add(getattr(of, _EXTRA_DIGESTS[kind]))
     several = [kind for kind in beside if any(len(e - {""}) > 1 for e in beside[kind].values())]
     variants: dict[str, Arm] = {}
     factors: dict[str, int] = {}
@@ -184,8 +193,8 @@ def _study(settings: Mapping[str, object], runs: Sequence[Run]) -> Study:
         label = _label(spec, several)
         variants.setdefault(label, arm)
         factors[scene] = min(spec.training.factor, factors.get(scene, 10**9))
-        told: tuple[object, ...] = (arm.strategy, scene, label, spec.repeat, spec, result)
-        rows.append({**dict(zip(_COLUMNS, told, strict=True)), **_measures(result)})
+        values: tuple[object, ...] = (arm.strategy, scene, label, spec.repeat, spec, result)
+        rows.append({**dict(zip(_COLUMNS, values, strict=True)), **_measures(result)})
     sizes = set(factors.values())
     factor = sizes.pop() if len(sizes) == 1 else dict(sorted(factors.items()))
     frame = pd.DataFrame(rows, columns=None if rows else _COLUMNS)
@@ -195,7 +204,7 @@ def _study(settings: Mapping[str, object], runs: Sequence[Run]) -> Study:
 
 
 def _measures(result: RunResult) -> dict[str, float]:
-    """What is compared and averaged; MB are 1,000,000 bytes."""
+    """The measures of a run that are compared and averaged; MB are 1,000,000 bytes."""
     scores = result.scores
     measures = {
         "psnr": scores.psnr,
@@ -218,15 +227,15 @@ def _measures(result: RunResult) -> dict[str, float]:
 
 
 def _label(spec: RunSpec, several: Sequence[str]) -> str:
-    """A variant's label; it tells depth maps or scans apart where a scene has several."""
+    """Label a variant; adds digests of depth maps or scans if a scene has ``several``."""
     if spec.arm.method == SFM:
         return SFM
-    # A plan asks every method that looks at photographs to hold out the test views.
+    # A plan sets these for every method that uses photographs.
     usual = [
         ("test_every", spec.training.test_every),
         ("cloud.test_every", spec.training.test_every),
     ]
-    told = [f"{k}={v}" for k, v in sorted(spec.parameters.items()) if (k, v) not in usual]
-    digests = {kind: getattr(spec.scene, _BESIDE[kind])[:4] for kind in several}
-    told += [f"{kind}={digest}" for kind, digest in digests.items() if digest]
-    return " ".join([spec.arm.label, *told])
+    changed = [f"{k}={v}" for k, v in sorted(spec.parameters.items()) if (k, v) not in usual]
+    digests = {kind: getattr(spec.scene, _EXTRA_DIGESTS[kind])[:4] for kind in several}
+    changed += [f"{kind}={digest}" for kind, digest in digests.items() if digest]
+    return " ".join([spec.arm.label, *changed])

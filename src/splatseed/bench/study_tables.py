@@ -25,7 +25,7 @@ _COSTS = {
     "memory": ("peak memory, MB", 0), "gpu_memory": ("peak GPU memory, MB", 0),
     "gaussians": ("Gaussians", 0), "model": ("model, MB", 1), "render": ("render a view, ms", 1),
 }  # fmt: skip
-"""Heading and digits by measure."""
+"""Heading and decimals by measure."""
 _ARM_COLUMNS = {
     "psnr": ("PSNR, dB", "gain, dB", 2, 3),
     "cc_psnr": ("colour-corrected, dB", "its gain, dB", 2, 3),
@@ -33,17 +33,17 @@ _ARM_COLUMNS = {
     "ssim": ("SSIM", "its gain", 4, 4), "flip": ("FLIP", "its gain", 4, 4),
     "lpips": ("LPIPS", "its gain", 4, 4),
 }  # fmt: skip
-"""Headings of a score and its gain, and the digits of both."""
+"""Headings of a score and of its gain, and the decimals of both."""
 
 Rows = list[Row]
 
 
-def _gain_cell(gain: Difference | None, digits: int = 3, alone: str = "") -> Cell:
-    """A gain with its standard error, or with ``alone`` if it is of one sample; ~: within noise."""
+def _gain_cell(gain: Difference | None, digits: int = 3, single: str = "") -> Cell:
+    """Format a gain with its standard error, or with ``single`` if it has one sample."""
     if gain is None:
         return ""
     mark = NOISE if gain.verdict == "within noise" else ""
-    text = alone if math.isnan(gain.se) and gain.n == 1 else ""
+    text = single if math.isnan(gain.se) and gain.n == 1 else ""
     return Number(gain.mean, digits, gain.se, signed=True, mark=mark, text=text)
 
 
@@ -54,7 +54,7 @@ def _ratio_cell(log: Difference | None) -> Cell:
 
 
 def psnr_table(study: Study, strategy: StrategyName) -> Table:
-    """PSNR by scene and variant."""
+    """Tabulate PSNR by scene and variant."""
     columns = (SFM, *study.seeded_under(strategy))
     rows = [_psnr_row(study, strategy, s, columns) for s in study.scenes_under(strategy)]
     return make_table("psnr", ("scene", *columns), rows, strategy=strategy,
@@ -83,7 +83,7 @@ def _psnr_row(study: Study, strategy: StrategyName, scene: str, labels: Sequence
 
 
 def cost_table(study: Study, strategy: StrategyName) -> Table:
-    """Time, memory and size by variant, over the scenes that sfm has too."""
+    """Tabulate time, memory and size by variant, over the scenes with runs of the baseline."""
     part = study.under(strategy)
     part = part[part["scene"].isin(part.loc[part["seeds"] == SFM, "scene"])]
     means = part.groupby(["seeds", "scene"])[list(_COSTS)].mean().groupby("seeds").mean()
@@ -105,13 +105,13 @@ def cost_table(study: Study, strategy: StrategyName) -> Table:
 
 
 def gain_table(study: Study, strategy: StrategyName) -> Table:
-    """What each variant gains: on each scene, on these, and on scenes like these."""
+    """Tabulate the gains of each variant by scene, and their two means."""
     gained = gains(study, strategy)
     rows: Rows = [
         (
             scene,
             *(
-                _gain_cell(gained.on_scene.get((scene, label)), alone=ONE_RUN)
+                _gain_cell(gained.on_scene.get((scene, label)), single=ONE_RUN)
                 for label in gained.seeds
             ),
         )
@@ -119,14 +119,14 @@ def gain_table(study: Study, strategy: StrategyName) -> Table:
     ]
     rows.append(("mean, these scenes", *map(_gain_cell, gained.on_these.values())))
     if len(gained.scenes) > 1:
-        like = (_gain_cell(each, alone="(1 scene)") for each in gained.on_like.values())
+        like = (_gain_cell(each, single="(1 scene)") for each in gained.on_like.values())
         rows.append(("mean, scenes like these", *like))
     return make_table("gains", ("scene", *gained.seeds), rows, strategy=strategy,
                       description=study.description)  # fmt: skip
 
 
 def arm_table(study: Study) -> Table:
-    """Every arm's scores, cost and gain over the baseline, the highest gain first."""
+    """Tabulate the scores, costs and gains of all arms, in order of gain."""
     base, compared, rows = comparisons.baseline_of(study), compared_arms(study), Rows()
     shown = {
         name: columns
@@ -144,10 +144,8 @@ def arm_table(study: Study) -> Table:
         rows.append((each.arm.seeds, each.arm.strategy, *cells, f"{len(each.scenes)}"))
     share = study.runs.dropna(subset="share").drop_duplicates("scene")["share"].mean()
     scores = (
-        "Co-visible PSNR counts the pixels that at least two training views see "
-        f"({share:.0%} of them here). PSNR and SSIM are better when higher, FLIP and "
-        "LPIPS when lower. "
-        "Seconds are wall time, of making the seeds and of training."
+        f"Co-visible PSNR counts the pixels that at least two training views see ({share:.0%} of "
+        "them here). Higher PSNR and SSIM are better, lower FLIP and LPIPS. Seconds are wall time."
     )
     header = ("seeds", "strategy", *(word for columns in shown.values() for word in columns[:2]),
               "Gaussians", "seeding, s", "training, s", "scenes")  # fmt: skip
@@ -159,7 +157,7 @@ def arm_table(study: Study) -> Table:
 
 
 def scene_arm_table(study: Study, base: ArmKey) -> Table:
-    """Each arm's gain on each scene, mean over repeats, and on the baseline's row its PSNR."""
+    """Tabulate the gain of each arm on each scene; the row of the baseline has its PSNR."""
 
     def cell(arm: ArmKey, scene: str) -> Cell:
         first = study.results(base.strategy, scene, base.seeds)
@@ -180,7 +178,7 @@ def scene_arm_table(study: Study, base: ArmKey) -> Table:
 
 
 def seconds_table(study: Study, base: ArmKey) -> Table:
-    """Quality at the baseline's seconds, and steps and seconds to the baseline's quality."""
+    """Tabulate PSNR at the baseline's time, and time and steps to the baseline's PSNR."""
     rows = [
         (each.arm.seeds, each.arm.strategy,
          Number(each.means["seeding"] + each.means["training"], 1),
@@ -189,13 +187,21 @@ def seconds_table(study: Study, base: ArmKey) -> Table:
          *(_ratio_cell(each.gains[name]) for name in ("seconds", "steps")))
         for each in compared_arms(study)
     ]  # fmt: skip
-    header = ("seeds", "strategy", "seconds in all", f"gain at {base.label}'s seconds, dB",
-              f"runs that reach {base.label}'s PSNR", "time to it", "steps to it")  # fmt: skip
+    gain, reached = f"gain at the time of {base.label}, dB", f"runs that reach {base.label}"
+    header = (
+        "seeds",
+        "strategy",
+        "total seconds",
+        gain,
+        reached,
+        "relative time",
+        "relative steps",
+    )
     return make_table("seconds", header, rows, base=base.label)
 
 
 def comparison_tables(comparison: comparisons.Comparison) -> tuple[Table, Table, Table]:
-    """The settings of two benchmarks that differ, the changes, and what only one of them has."""
+    """Tabulate different settings, changes, and arms of only one benchmark."""
     scenes = sorted({scene for _, _, scene in comparison.changes})
     changes = [
         (*arm, *(_change_cell(comparison.changes.get((*arm, scene)), ONE_RUN) for scene in scenes),
@@ -208,9 +214,9 @@ def comparison_tables(comparison: comparisons.Comparison) -> tuple[Table, Table,
     return settings, changed, only
 
 
-def _change_cell(change: Difference | None, alone: str = "") -> Cell:
+def _change_cell(change: Difference | None, single: str = "") -> Cell:
     if change is None:
         return ""
     mark = {"within noise": NOISE, "unknown": ""}.get(change.verdict, "*")
-    text = alone if change.verdict == "unknown" else ""
+    text = single if change.verdict == "unknown" else ""
     return Number(change.mean, 3, change.se, signed=True, mark=mark, text=text, bold=mark == "*")

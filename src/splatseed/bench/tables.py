@@ -1,6 +1,6 @@
 """Tables as CSV, Markdown, LaTeX and HTML; ``data/tables.toml`` has their titles and notes.
 
-CSV has unrounded numbers, with separate columns for standard errors and marks; names are escaped.
+CSV has unrounded numbers, and columns for standard errors and marks.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ _TEX = str.maketrans({
 
 @dataclass(frozen=True)
 class Number:
-    """A number in a table, NaN where it is unknown, shown with so many decimals.
+    """A number in a table; NaN, if unknown, is blank.
 
-    ``se`` is its standard error, NaN where one sample leaves it unknown, None where it has none;
-    ``signed`` is for gains; ``text`` and a ``mark``, which the notes explain, stand behind it.
+    ``digits`` are its decimals. ``se`` is its standard error, NaN for a single sample, None if it
+    has none. ``signed`` shows a plus sign. ``text`` and ``mark``, which notes explain, follow it.
     """
 
     value: float
@@ -44,7 +44,7 @@ class Number:
     bold: bool = False
 
     def __str__(self) -> str:
-        """Without the mark."""
+        """Format the number without its mark."""
         if math.isnan(self.value):
             return ""
         shown = _rounded(self.value, self.digits, signed=self.signed)
@@ -59,7 +59,7 @@ Row: TypeAlias = tuple[Cell, ...]
 
 @dataclass(frozen=True)
 class Table:
-    """A table; ``name`` is its file's without suffix, and the first cell of a row names the row."""
+    """A table; ``name`` is the file name without suffix; the first cell of a row is its heading."""
 
     name: str
     title: str
@@ -70,7 +70,7 @@ class Table:
     def shown(
         self, escape: Callable[[str], str] = str, bold: str = "{}", mark: str = " {}"
     ) -> pd.DataFrame:
-        """The cells as text, with templates for bold ones and for marks."""
+        """Format the cells, with templates for bold cells and for marks."""
 
         def text_of(cell: Cell) -> str:
             text = escape(str(cell))
@@ -84,14 +84,14 @@ class Table:
 
 
 def make_table(
-    kind: str, header: Sequence[str], rows: Sequence[Row], *, strategy: str = "", **words: object
+    kind: str, header: Sequence[str], rows: Sequence[Row], *, strategy: str = "", **values: object
 ) -> Table:
-    """A table named by its kind and the strategy, if any, with its kind's title and notes.
+    """Make a table with the title and notes of its kind.
 
-    In these, ``words`` take the place of braces; what they leave empty is left out.
+    ``values`` fill the braces in title and notes; empty notes are dropped.
     """
     texts = [_texts()[kind]["title"], *_texts()[kind]["notes"]]
-    title, *notes = (text.format(strategy=strategy, **words) for text in texts)
+    title, *notes = (text.format(strategy=strategy, **values) for text in texts)
     name = f"{kind}_{strategy}" if strategy else kind
     return Table(name, title, header, rows, list(filter(None, notes)))
 
@@ -105,12 +105,12 @@ def _rounded(value: float, digits: int, *, signed: bool = False) -> str:
     if math.isinf(value):
         return "∞" if value > 0 else "-∞"
     text = f"{value:{'+' if signed else ''},.{digits}f}"
-    # A gain of -0.001 is shown as 0.00, not as a loss that the digits do not show.
+    # A gain of -0.001 is shown as 0.00, not as -0.00.
     return text.lstrip("+-") if not text.strip("+-0.,") else text
 
 
 def to_csv(table: Table) -> str:
-    """The table as CSV: numbers in full, and columns for standard errors and marks, if any."""
+    """Convert to CSV, with columns for standard errors and marks if there are any."""
     columns: list[tuple[str, list[str]]] = []
     for i, name in enumerate(table.header):
         cells = [row[i] for row in table.rows]
@@ -130,7 +130,7 @@ def _full(value: float | None) -> str:
 
 
 def to_markdown(table: Table) -> str:
-    """The table in Markdown, with its title above and its notes below."""
+    """Convert to Markdown, with the title above and the notes below."""
     shown = table.shown(_escape_markdown, "**{}**")
     right = ["---", *(["---:"] * (len(table.header) - 1))]
     lines = [list(shown.columns), right, *shown.itertuples(index=False, name=None)]
@@ -144,7 +144,7 @@ def _escape_markdown(text: str) -> str:
 
 
 def to_tex(table: Table) -> str:
-    """The table as a LaTeX ``table``, for the package booktabs."""
+    """Convert to a LaTeX ``table`` that needs the package booktabs."""
     text = table.shown(_escape_tex, r"\textbf{{{}}}").to_latex(
         index=False,
         escape=False,
@@ -161,10 +161,10 @@ def _escape_tex(text: str) -> str:
 
 
 def to_html(table: Table) -> str:
-    """The table in HTML, without title and notes; the first column heads the rows."""
+    """Convert to an HTML table without title and notes."""
     mark = ' <span class="mark">{}</span>'
     shown = table.shown(html.escape, "<strong>{}</strong>", mark)
-    first = shown.columns[0]  # by place, as a scene may have its name
+    first = shown.columns[0]  # by position, as a scene may have the same name
     shown = shown.iloc[:, 1:].set_axis(shown.iloc[:, 0]).rename_axis(index=None, columns=first)
     return str(shown.to_html(escape=False, border=0, justify="right"))
 

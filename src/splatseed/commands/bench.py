@@ -15,19 +15,19 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 from rich.progress import BarColumn, Progress as Bar, TaskID, TextColumn, TimeRemainingColumn
 
-from splatseed.bench.job import JobOptions, do_runs
+from splatseed.bench.job import RunOptions, execute_runs
 from splatseed.bench.plan import DEPTH, SFM, Plan, RunSpec, needs_cloud, plan_runs
 from splatseed.bench.plan_file import PLAN, PresetName, plan_text, preset_plan, read_plan
 from splatseed.bench.runs import (
     Run,
-    alone_in,
-    begin,
     check_bench_folder,
-    counts,
-    estimate,
+    count_runs,
+    estimate_seconds,
+    locked_bench,
     package_version,
     read_run,
     read_runs,
+    record_plan,
 )
 from splatseed.bench.scenes import PlannedScene, SceneFacts, survey
 from splatseed.commands.options import check_minimum, parse_options, refuse
@@ -52,85 +52,83 @@ _DEFAULT = Plan()
 
 
 def _default(values: Sequence[object]) -> Any:
-    """A list that is empty when not given, with its default in words."""
+    """An empty tuple for an option that is not given; the help shows the actual default."""
     return tyro.conf.arg(help_behavior_hint=f"(default: {' '.join(map(str, values))})")
 
 
 @dataclass(frozen=True)
 class Options:
-    """Train from every method's seeds, several times each, on one machine or many, and compare.
+    """Train from the seeds of several methods, with repeats, and compare the results.
 
-    Stop it at any time: the same command, or ``splatseed bench -o BENCH`` alone, resumes. Then see
-    ``splatseed bench report BENCH``, and ``splatseed bench compare A B`` for two benchmarks. A plan
-    sets more: other settings of training, names of scenes, parameters of methods (see --dry-run).
+    Stop it at any time; the same command or ``splatseed bench -o BENCH`` resumes. ``splatseed bench
+    report BENCH`` writes a report, ``splatseed bench compare A B`` compares two benchmarks. A plan
+    file (--dry-run prints one) has further settings: training, scene names, method parameters.
     """
 
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="DIR")] = None
-    """The folder of the benchmark, new or to be resumed."""
+    """The benchmark's folder: a new one, or one to resume."""
     scenes: tuple[str, ...] = ()
-    """Scenes with photographs; demo: is a synthetic room. With --data, names of the preset's."""
+    """Scene folders with photographs; demo: is a synthetic room. With --data: names of scenes."""
     methods: Annotated[tuple[str, ...], _default(_DEFAULT.methods)] = ()
-    """Upsampling methods; sfm is the original cloud, with which the others are compared."""
+    """Seeding methods; sfm, the original points, is the baseline."""
     ratios: Annotated[tuple[float, ...], _default([f"{r:g}" for r in _DEFAULT.ratios])] = ()
-    """Total points per original."""
+    """Total points per original point."""
     budgets: tuple[str, ...] = ()
-    """Maximum Gaussians at the end, the same for every arm: 50k, or 0.25rho for a quarter of a
-    photograph's pixels at training size. Methods then fill the budget, unless --ratios are given
-    too."""
+    """Maximum final Gaussians, equal for all arms: 50k, or 0.25rho for 0.25 per photograph pixel at
+    training size. Methods fill the budget, unless --ratios are given."""
     strategies: Annotated[tuple[StrategyName, ...], _default(_DEFAULT.strategies)] = ()
-    """Densification strategies; -3dgs: in 3DGS's own conventions of rates and schedules."""
+    """Densification strategies; -3dgs keeps the rates and schedules of 3DGS."""
     profiles: Annotated[tuple[Profile, ...], _default(_DEFAULT.profiles)] = ()
-    """Parameter sets of the methods: improved ones, and those of the paper's text."""
+    """Parameter sets of the methods: improved (default), or as in the paper."""
     repeats: int | None = None
-    """Number of repeats (3), with another seed each time; error bars need at least 2."""
+    """Number of repeats (3), with different random seeds; error bars need at least 2."""
     max_steps: int | None = None
-    """Training steps (30000); schedules and learning rates adapt to them."""
+    """Training steps (30000); schedules scale with them."""
     data_factor: int | None = None
-    """Divide the width and height of the photographs by this whole number; by default by the
-    smallest that leaves at most 1600 pixels on their longer side, per scene."""
+    """Downsample the photographs by this whole factor; by default, per scene, by the smallest that
+    leaves at most 1600 pixels on the longer side."""
     long_side: int | None = None
-    """Downsample photographs by a whole factor, per scene, to at most this many pixels on their
-    longer side; instead of --data-factor."""
+    """Maximum longer side of the photographs in pixels; sets --data-factor per scene."""
     depth: tuple[Path, ...] = ()
-    """For method depth: a folder of maps per scene, or one folder with a subfolder of each one's
-    name; the scene's own by default."""
+    """Depth maps for method depth: a folder per scene, or one folder with a subfolder for each; by
+    default those of the scene."""
     clouds: tuple[Path, ...] = ()
-    """For methods cloud and cloud+auto: the scan of each scene, in its frame (docs/scans.md)."""
+    """Scans for cloud and cloud+auto: a file per scene, in its frame (docs/scans.md)."""
     preset: PresetName | None = None
     """A ready-made plan: the scenes of Mip-NeRF360 or Replica, or four for one core (laptop), each
     with --data; or quick, on a synthetic room."""
     data: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """The folder of the scenes of a preset or a plan; missing scenes are skipped."""
     plan: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """A plan as printed by --dry-run; other options change it."""
+    """A plan file, as --dry-run prints; options override it."""
     dry_run: bool = False
-    """Print the plan, the number of runs, and an estimate of hours and disk; run nothing."""
+    """Print the plan, the number of runs, and estimates of time and disk; run nothing."""
     executor: Literal["local", "ray"] = "local"
-    """Processes on this machine, or tasks on a Ray cluster (extra cluster)."""
+    """Processes on this machine, or a Ray cluster (extra cluster)."""
     address: str | None = None
-    """The cluster's address, or auto on its head node; by default a cluster on this machine."""
+    """The cluster's address, or auto on its head node; by default Ray starts on this machine."""
     jobs: int | None = None
-    """Runs at a time: by default one per GPU, else 1; on Ray what fits."""
+    """Runs at a time: by default one per GPU, or 1; on Ray as many as fit."""
 
 
 @dataclass(frozen=True)
 class ReportOptions:
-    """Write report.html, tables and figures of a benchmark, as far as it has run."""
+    """Write report.html, tables and figures from the finished runs of a benchmark."""
 
     bench: Annotated[Path, tyro.conf.Positional]
-    """The folder of splatseed bench."""
+    """The benchmark's folder."""
 
 
 @dataclass(frozen=True)
 class CompareOptions:
-    """Show what changed from one benchmark to another, and whether it is more than noise."""
+    """Show the changes from benchmark A to B, and whether they exceed the noise."""
 
     a: Annotated[Path, tyro.conf.Positional]
-    """The folder of the first benchmark."""
+    """The folder of benchmark A."""
     b: Annotated[Path, tyro.conf.Positional]
-    """The folder of the second."""
+    """The folder of benchmark B."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="DIR")] = None
-    """A new folder to write the tables to, as CSV, Markdown, LaTeX and HTML."""
+    """A new folder for the tables, as CSV, Markdown, LaTeX and HTML."""
 
 
 def run(arguments: list[str]) -> None:
@@ -149,24 +147,23 @@ def run(arguments: list[str]) -> None:
 
 
 def parse_plan(arguments: Sequence[str]) -> tuple[Options, Plan]:
-    """The options of a command line, and the plan that they ask for.
+    """Parse options, and apply them to a plan.
 
-    An option that is not given leaves the plan unchanged: that of a preset, of a file, of the
-    folder to resume, or the default one.
+    The plan is that of the preset, of the file, of the folder to resume, or the default one.
     """
     options = parse_options(Options, "bench", arguments)
     check_minimum(options, 1, "jobs", "repeats", "long_side", "max_steps", "data_factor")
     output, preset, data = options.output, options.preset, options.data
-    named = preset not in {None, "quick"}
+    needs_data = preset not in {None, "quick"}
     refuse(
         (not (output or options.dry_run), "-o BENCH, the folder of the benchmark", "none",
-         "Name one, or --dry-run."),
-        (options.plan and preset, "--plan or --preset", "both", "Leave one of them out."),
+         "Name a folder, or pass --dry-run."),
+        (options.plan and preset, "--plan or --preset", "both", "Drop one."),
         (data and not (preset or options.plan), "--preset or --plan with --data", "neither",
          "Name the preset."),
         (data and preset == "quick", "--scenes for the preset quick", "--data",
-         "Name scenes, or none."),
-        (named and not data, f"--data DIR, the folder of the scenes of {preset}", "none",
+         "Drop --data."),
+        (needs_data and not data, f"--data DIR, the folder of the scenes of {preset}", "none",
          "Name it."),
         (options.address and options.executor != "ray", "--executor ray with --address", "local",
          "Add --executor ray."),
@@ -185,6 +182,7 @@ def parse_plan(arguments: Sequence[str]) -> tuple[Options, Plan]:
 
 
 def _changed(plan: Plan, options: Options) -> Plan:
+    """Apply the options to a plan."""
 
     def given(*names: str) -> dict[str, Any]:
         return {n: value for n in names if (value := getattr(options, n)) not in (None, ())}
@@ -195,7 +193,7 @@ def _changed(plan: Plan, options: Options) -> Plan:
         changes["ratios"] = options.ratios
     scenes = _scenes(plan, options)
     labels = Counter(scene.label for scene in scenes)
-    for i, scene in enumerate(scenes):  # folders of the same name are told apart by their parents
+    for i, scene in enumerate(scenes):  # prefix equal folder names with their parents'
         if labels[scene.label] > 1 and not scene.is_demo and not scene.name:
             scenes[i] = replace(scene, name="_".join(scene.root.parts[-2:]))
     depth = [str(folder) for folder in options.depth]
@@ -203,8 +201,8 @@ def _changed(plan: Plan, options: Options) -> Plan:
         below = [Path(depth[0], scene.label) for scene in scenes]
         depth = [str(folder) if folder.is_dir() else "" for folder in below]
     for option, what, files in (("--depth", "depth", depth), ("--clouds", "cloud", options.clouds)):
-        expected = f"{option} with one for each of {len(scenes)} scenes"
-        fix = "--dry-run has their order, and a plan may have one for some of them only."
+        expected = f"{option} with a path for each of {len(scenes)} scenes"
+        fix = "--dry-run prints their order; a plan file may give paths for some scenes only."
         refuse((len(files) not in {0, len(scenes)}, expected, len(files), fix))
         if files:
             pairs = zip(scenes, map(str, files), strict=True)
@@ -213,7 +211,7 @@ def _changed(plan: Plan, options: Options) -> Plan:
 
 
 def _scenes(plan: Plan, options: Options) -> list[PlannedScene]:
-    """The folders that are named, or with ``--data`` those of the preset's scenes; else all."""
+    """The scenes named by ``--scenes`` (with ``--data`` those of the plan), or all of the plan."""
     if not (options.data and options.scenes):
         return [PlannedScene(path) for path in options.scenes] or list(plan.scenes)
     own = {scene.label: scene for scene in plan.scenes}
@@ -225,28 +223,28 @@ def _scenes(plan: Plan, options: Options) -> list[PlannedScene]:
 
 @dataclass(frozen=True)
 class Machine:
-    """Where runs are carried out: how many ``jobs`` at a time, of so many threads on the CPU each.
+    """The workers of a benchmark: how many ``jobs`` at a time, with ``threads`` CPU threads each.
 
-    ``backend`` is not "auto"; ``away`` is whether ``workers`` are other machines.
+    ``backend`` is not "auto"; ``remote`` workers are other machines.
     """
 
     backend: Backend
     jobs: int
     threads: int
     workers: Workers
-    away: bool = False
+    remote: bool = False
 
     @property
-    def words(self) -> str:
-        """A description."""
-        where = "Ray" if self.away else "this machine"
+    def description(self) -> str:
+        """The machine, for the user."""
+        where = "Ray" if self.remote else "this machine"
         on = "on a GPU" if self.backend == "cuda" else "on the CPU"
         return f"{where}, {self.jobs} at a time, {on}, {counted(self.threads, 'thread')} each"
 
 
 @contextmanager
 def open_machine(options: Options, backend: Backend) -> Iterator[Machine]:
-    """The machine to run on, for a plan's backend, while the block runs."""
+    """Open the workers for a backend."""
     require("torch", "gsplat", "flip_evaluator", "pandas")
     if options.executor == "local":
         yield _local_machine(options.jobs, backend)
@@ -257,7 +255,7 @@ def open_machine(options: Options, backend: Backend) -> Iterator[Machine]:
         gpu = None if backend == "auto" else backend == "cuda"
         workers = RayWorkers(gpu=gpu, limit=options.jobs)
         chosen: Backend = "cuda" if workers.gpu else "cpu"
-        yield Machine(chosen, workers.jobs, workers.threads, workers, away=True)
+        yield Machine(chosen, workers.jobs, workers.threads, workers, remote=True)
 
 
 def _local_machine(jobs: int | None, backend: Backend) -> Machine:
@@ -283,10 +281,10 @@ def _local_machine(jobs: int | None, backend: Backend) -> Machine:
 def _prepare(
     options: Options, plan: Plan, machine: Machine, demo: Path | None
 ) -> tuple[Plan, list[SceneFacts], list[RunSpec], list[str]]:
-    """Check all scenes of a plan: the plan of those that can be used, these, its runs, and notes.
+    """Survey the scenes of a plan; returns the plan of those present, these, its runs, and notes.
 
-    Some of a preset may be missing. ``demo`` is where to put a synthetic scene; None to use its
-    known facts without making it.
+    With ``--data``, scenes may be missing. ``demo`` is the folder of the synthetic scene; None to
+    use its known facts.
     """
     notes, present = list[str](), list[tuple[PlannedScene, SceneFacts]]()
     needs = {"with_depth": DEPTH in plan.methods, "with_cloud": any(map(needs_cloud, plan.methods))}
@@ -297,7 +295,7 @@ def _prepare(
             except SceneNotFoundError as error:
                 if options.data is None:
                     raise
-                notes.append(f"{scene.label} is left out: {error}")
+                notes.append(f"{scene.label} is skipped: {error}")
     if not present:
         expected = f"scenes of {options.preset or options.plan} in {options.data}"
         found = f"none of {', '.join(scene.label for scene in plan.scenes)}"
@@ -308,43 +306,45 @@ def _prepare(
     notes += _notes(plan, scenes, specs)
     fix = "Name other methods, or what these need."
     refuse((not specs, "a plan with runs", "; ".join(notes) or "none", fix))
-    if machine.backend == "cpu" and not machine.away:  # the memory of a cluster's nodes is unknown
-        most, jobs = int(max(spec.gaussians[0] for spec in specs)), machine.jobs
+    if (
+        machine.backend == "cpu" and not machine.remote
+    ):  # the memory of a cluster's nodes is unknown
+        num_seeds, jobs = int(max(spec.gaussians[0] for spec in specs)), machine.jobs
         fix = "Pass smaller --ratios or --budgets, or fewer --jobs."
-        check_memory(most, BYTES_EACH * jobs, f"seeds per run with {jobs} at a time", fix=fix)
+        check_memory(num_seeds, BYTES_EACH * jobs, f"seeds per run with {jobs} at a time", fix=fix)
     return plan, scenes, specs, notes
 
 
 def _notes(plan: Plan, scenes: Sequence[SceneFacts], specs: Sequence[RunSpec]) -> Iterator[str]:
     for scene in scenes:
         yield from (f"{scene.name}: {warning}" for warning in scene.warnings)
-    bare = ", ".join(scene.name for scene in scenes if not scene.depth_digest)
-    if DEPTH in plan.methods and bare:
-        yield f"without depth maps, and so without the method depth: {bare} (--depth DIR)"
-    unscanned = ", ".join(scene.name for scene in scenes if not scene.cloud_digest)
+    without_depth = ", ".join(scene.name for scene in scenes if not scene.depth_digest)
+    if DEPTH in plan.methods and without_depth:
+        yield f"no depth maps, so method depth is skipped: {without_depth} (--depth DIR)"
+    without_scan = ", ".join(scene.name for scene in scenes if not scene.cloud_digest)
     scans = any(map(needs_cloud, plan.methods))
-    if scans and unscanned:
-        yield f"without a scan, and so without the methods that need one: {unscanned} (--clouds)"
+    if scans and without_scan:
+        yield f"no scan, so methods that need one are skipped: {without_scan} (--clouds)"
     if not scans and any(scene.cloud for scene in plan.scenes):
-        yield "No method needs the scans: name cloud or cloud+auto among --methods."
+        yield "No method uses the scans: add cloud or cloud+auto to --methods."
     if SFM not in plan.methods:
-        yield "Without sfm among the methods there is nothing to compare with."
-    begins = defaultdict[tuple[str, str, int, int], dict[str, None]](dict)
+        yield "Without sfm among the methods there is no baseline."
+    full = defaultdict[tuple[str, str, int, int], dict[str, None]](dict)
     for spec in specs:
-        if spec.most_seeds is not None and spec.most_seeds <= spec.scene.num_points:
-            key = spec.scene.name, spec.arm.budget, spec.most_seeds, spec.scene.num_points
-            begins[key][spec.arm.strategy] = None
-    for (name, budget, most, there), strategies in begins.items():
+        if spec.max_seeds is not None and spec.max_seeds <= spec.scene.num_points:
+            key = spec.scene.name, spec.arm.budget, spec.max_seeds, spec.scene.num_points
+            full[key][spec.arm.strategy] = None
+    for (name, budget, limit, num_points), strategies in full.items():
         if set(plan.methods) != {SFM}:
             yield (
-                f"{name}: under {budget} runs with {', '.join(strategies)} begin with {most:,} "
-                f"seeds at most, and it has {there:,} points: auto and the methods that "
+                f"{name}: under {budget}, runs with {', '.join(strategies)} start from at most "
+                f"{limit:,} seeds, and it has {num_points:,} points: auto and the methods that "
                 "interpolate add none."
             )
 
 
 def _bench(options: Options, plan: Plan, machine: Machine, arguments: Sequence[str]) -> None:
-    """Run a plan; or print it as TOML with all else in comments, so that both can be saved."""
+    """Run a plan; or print it as TOML, with everything else in comments."""
     bench = options.output
     demo = bench / "scenes" / "demo" if bench else None
     if bench is not None and not options.dry_run:
@@ -352,85 +352,86 @@ def _bench(options: Options, plan: Plan, machine: Machine, arguments: Sequence[s
     if plan.lpips:
         from splatseed.splat.metrics import load_lpips
 
-        load_lpips()  # refuses now what every run would
+        load_lpips()  # fails now rather than in every run
     if bench is None or options.dry_run:
         demo = demo if demo and demo.is_dir() else None
         plan, _, specs, notes = _prepare(options, plan, machine, demo)
         runs = [read_run(bench, spec) if bench else Run(spec) for spec in specs]
-        told = [*notes, *_announcement(plan, runs, machine)]
-        comments = "".join(f"# {' '.join(line.split())}\n" for line in told)
+        lines = [*notes, *_announcement(plan, runs, machine)]
+        comments = "".join(f"# {' '.join(line.split())}\n" for line in lines)
         OUT.print(f"{plan_text(plan)}\n{comments}", end="", soft_wrap=True)
         return
     from splatseed.splat.metrics import lpips_is_here
 
     plan, scenes, specs, notes = _prepare(options, plan, machine, demo)
-    begin(bench, "bench", specs, arguments)
-    with atomic_file(bench / PLAN) as partial:  # names that are no text are escaped
+    record_plan(bench, "bench", specs, arguments)
+    with atomic_file(bench / PLAN) as partial:  # escapes file names that are no text
         partial.write_text(plan_text(plan), "utf-8", "backslashreplace")
     runs = [read_run(bench, spec) for spec in specs]
     for note in notes:
         print_note(note)
-    named = ", ".join(f"{visible(s.name)} ({s.num_points:,} points)" for s in scenes)
-    told = [*_announcement(plan, runs, machine), visible(bench)]
-    OUT.print("\n  -> ".join([named, *told]), soft_wrap=True)
-    with alone_in(bench):
-        ended = carry_out(bench, runs, machine, JobOptions(plan.keep_models, lpips_is_here()))
+    names = ", ".join(f"{visible(s.name)} ({s.num_points:,} points)" for s in scenes)
+    lines = [names, *_announcement(plan, runs, machine), visible(bench)]
+    OUT.print("\n  -> ".join(lines), soft_wrap=True)
+    with locked_bench(bench):
+        completed = execute(bench, runs, machine, RunOptions(plan.keep_models, lpips_is_here()))
     runs = [read_run(bench, spec) for spec in specs]
     _print_summary(bench, runs)
-    if not ended:
+    if not completed:
         sys.exit(exit_code())
     if any(run.error for run in runs):
         sys.exit(_SOME_FAILED)
 
 
 def _announcement(plan: Plan, runs: Sequence[Run], machine: Machine) -> Iterator[str]:
-    """What will be done, and hours and disk for the remaining runs."""
-    yield f"{counts(runs)}; {machine.words}"
-    left = [run.spec for run in runs if run.result is None]
-    if left:
-        measured = len(runs) - len(left)
-        by = f"by {counted(measured, 'finished run')}" if measured else "by a rule of thumb"
-        time_left = estimate(left, runs, machine.threads) / min(machine.jobs, len(left))
+    """Describe the runs, and estimate time and disk of the pending ones."""
+    yield f"{count_runs(runs)}; {machine.description}"
+    pending = [run.spec for run in runs if run.result is None]
+    if pending:
+        measured = len(runs) - len(pending)
+        by = f"from {counted(measured, 'finished run')}" if measured else "a rough estimate"
+        total = estimate_seconds(pending, runs, machine.threads)
+        remaining = total / min(machine.jobs, len(pending))
         disk = 0.0
-        for spec in left:
+        for spec in pending:
             disk += 60e3 + 18 * spec.scene.pixels_at(spec.training.factor)  # three pictures
             disk += 236 * spec.gaussians[1] * plan.keep_models
-        yield f"about {spoken_time(time_left)} ({by}), {disk / 1e6:,.1f} MB kept"
+        yield f"about {format_duration(remaining)} ({by}), {disk / 1e6:,.1f} MB of results"
 
 
-def carry_out(bench: Path, runs: Sequence[Run], machine: Machine, options: JobOptions) -> bool:
-    """Carry out the unfinished ones among some runs; whether all ended, else the user stopped.
+def execute(bench: Path, runs: Sequence[Run], machine: Machine, options: RunOptions) -> bool:
+    """Carry out the pending runs; returns False if the user stopped them.
 
-    Shows bars where stderr is a terminal, and prints a line for each run that ended.
+    Prints a line per run, and shows bars if stderr is a terminal.
     """
-    left, tasks = [run.spec for run in runs if run.result is None], dict[str, TaskID]()
+    pending, tasks = [run.spec for run in runs if run.result is None], dict[str, TaskID]()
     columns = (BarColumn(20), TextColumn("{task.description}", markup=False), TimeRemainingColumn())
-    # What goes into a file on stdout must not end up on the terminal.
+    # Output that goes to a file must not be redirected to the terminal.
     bar = Bar(*columns, console=ERR, transient=True, redirect_stdout=sys.stdout.isatty(),
               disable=not ERR.is_terminal)  # fmt: skip
-    before = len(runs) - len(left)
-    whole = bar.add_task("runs", total=len(runs), completed=before)
+    before = len(runs) - len(pending)
+    overall = bar.add_task("runs", total=len(runs), completed=before)
 
     def report(index: int, stage: str, fraction: float) -> None:
-        key, label = left[index].key, f"  {_describe(left[index])}: {stage}"
+        key, label = pending[index].key, f"  {_describe(pending[index])}: {stage}"
         if key not in tasks:
             tasks[key] = bar.add_task(label, total=1.0)
         bar.update(tasks[key], completed=fraction, description=label)
 
-    ended = do_runs(bench, left, machine.workers, options, machine.away, report)
+    ended = execute_runs(bench, pending, machine.workers, options, machine.remote, report)
     try:
         with bar:
             for number, run in enumerate(ended, start=before + 1):
                 if run.spec.key in tasks:
                     bar.remove_task(tasks.pop(run.spec.key))
-                said = f" failed: {run.error}"
+                outcome = f" failed: {run.error}"
                 if run.result:
                     count, seconds = run.result.num_gaussians, run.result.wall_seconds
-                    said = f": {run.result.psnr:.2f} dB, {count:,} Gaussians, {seconds:.0f} s"
-                OUT.print(f"[{number}/{len(runs)}] {_describe(run.spec)}{said}", soft_wrap=True)
-                bar.advance(whole)
+                    outcome = f": {run.result.psnr:.2f} dB, {count:,} Gaussians, {seconds:.0f} s"
+                OUT.print(f"[{number}/{len(runs)}] {_describe(run.spec)}{outcome}", soft_wrap=True)
+                bar.advance(overall)
     except KeyboardInterrupt:
-        ERR.print("stopped: runs under way start anew next time")
+        ERR.print("stopped: interrupted runs start anew next time")
         return False
     return True
 
@@ -441,8 +442,8 @@ def _describe(spec: RunSpec) -> str:
     return f"{visible(spec.scene.name)}, {arm}, repeat {spec.repeat + 1}"
 
 
-def spoken_time(seconds: float) -> str:
-    """A duration in words, as roughly as an estimate deserves."""
+def format_duration(seconds: float) -> str:
+    """Format an estimated duration."""
     if seconds < 90:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
@@ -455,19 +456,19 @@ def _print_summary(bench: Path, runs: Sequence[Run]) -> None:
     for study in studies(runs):
         _print_table(arm_table(study))
     print_failures(bench, runs)
-    left = sum(run.result is None for run in runs)
-    again = [(f"the other {counted(left, 'run')}", f"splatseed bench -o {quoted(bench)}")]
+    pending = sum(run.result is None for run in runs)
+    resume = [(f"the other {counted(pending, 'run')}", f"splatseed bench -o {quoted(bench)}")]
     report = ("tables and pictures", f"splatseed bench report {quoted(bench)}")
-    print_pairs("next", [*(again if left else []), report])
+    print_pairs("next", [*(resume if pending else []), report])
 
 
 def print_failures(bench: Path, runs: Sequence[Run]) -> None:
-    """Print the errors of failed runs, if there are any."""
+    """Print the errors of failed runs."""
     failed = [run for run in runs if run.error]
     if failed:
         shown = [(_describe(run.spec), run.error) for run in failed[:_FAILURES_SHOWN]]
         print_pairs(f"failed: {len(failed)}", shown)
-        print_note(f"Errors in full: {bench / 'runs' / failed[0].spec.key / 'error.json'}")
+        print_note(f"Full errors: {bench / 'runs' / failed[0].spec.key / 'error.json'}")
 
 
 def _report(arguments: list[str]) -> None:
@@ -502,7 +503,7 @@ def _compare(arguments: list[str]) -> None:
     comparison = compare(read_runs(options.a), read_runs(options.b))
     if comparison is None:
         expected = f"finished runs in both {options.a} and {options.b}"
-        fix = "Let splatseed bench finish some."
+        fix = "Finish runs of both with splatseed bench."
         raise SceneNotFoundError(expected, found="none in one of them", fix=fix)
     tables = comparison_tables(comparison)
     for table in tables:
