@@ -1,4 +1,4 @@
-"""Coverage, cover and thinning as literal loops, and made views to try them on."""
+"""Coverage, cover and thinning as literal loops, and made views to test them with."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from splatseed.photos.view import View
 from splatseed.photos.viewpoint import look_at
 
-NEARER, HIDING, WITNESSES = 0.1, 5, 12
+SURFACE, MIN_NEARER, CHECKED_VIEWS = 0.1, 5, 12
 
 
 def make_view(rng, width=40, height=32, focal=30.0, eye=None, target=(0.0, 0.0, 0.0), name="view"):
@@ -46,7 +46,7 @@ def cell_depths(view, xyz, cell):
     depths = np.full((rows, cols), np.inf, np.float32)
     for (i, j), depth in quartiles.items():
         around = [quartiles.get((i + a, j + b), np.inf) for a in (-1, 0, 1) for b in (-1, 0, 1)]
-        if sum(each < depth * np.float32(1 - NEARER) for each in around) < HIDING:
+        if sum(other < depth * np.float32(1 - SURFACE) for other in around) < MIN_NEARER:
             depths[i, j] = depth
     return depths
 
@@ -63,13 +63,13 @@ def lift(view, cell, i, j, depth):
 
 
 def contradictions(point, others):
-    """How many of (matrix, depths of cells) look through a point."""
+    """How many of (matrix, depths of cells) see through a point."""
     count = 0
     for m, seen in others:
         at = project(point, m)
         if at and 0 <= at[0] < seen.shape[1] and 0 <= at[1] < seen.shape[0]:
             there = float(seen[int(at[1]), int(at[0])])
-            count += there < math.inf and at[2] < there * (1 - NEARER)
+            count += there < math.inf and at[2] < there * (1 - SURFACE)
     return count
 
 
@@ -104,7 +104,7 @@ def cover(views, xyz, cell, rng):
     cloud, seeds, coarse = list(xyz), [], max(cell, 8)
     seen = [(matrix_of(view, coarse)[0], cell_depths(view, xyz, coarse)) for view in views]
     for v in rng.permutation(len(views)):
-        others = rng.choice(len(views) - 1, min(WITNESSES, len(views) - 1), replace=False)
+        others = rng.choice(len(views) - 1, min(CHECKED_VIEWS, len(views) - 1), replace=False)
         others = [seen[o + (o >= v)] for o in others]
         view, depths = views[v], cell_depths(views[v], cloud, cell)
         rows, cols = depths.shape

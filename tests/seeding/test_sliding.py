@@ -7,7 +7,7 @@ import pytest
 
 from splatseed.depth.stereo._kernels.patchmatch import QuadImages
 from splatseed.depth.stereo.quads import make_quads
-from splatseed.seeding._kernels import FLOOR, MAX_MOVE, OFFSETS, REFINEMENTS, slide
+from splatseed.seeding._kernels.verify import FLOOR, MAX_MOVE, OFFSETS, REFINEMENTS, slide
 from splatseed.seeding.verify import SETTINGS
 
 from ..depth.stereo.references import OFFSETS as WINDOW, best_of, bilinear, cost_in, window_weights

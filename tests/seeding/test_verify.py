@@ -19,7 +19,8 @@ from splatseed.methods.contract import NewPoints
 from splatseed.photos.view import View
 from splatseed.photos.visibility import Visibility
 from splatseed.scene import Image
-from splatseed.seeding import _kernels, verify as module
+from splatseed.seeding import verify as module
+from splatseed.seeding._kernels import verify as kernels
 from splatseed.seeding.local_geometry import NEIGHBORS, LocalGeometry, local_geometry
 from splatseed.synthetic.room import Room, render_view
 
@@ -190,7 +191,7 @@ def test_degenerate_input_gives_only_confirmed_points(seed, num_views, num_known
     np.testing.assert_array_equal(kept.xyz[~sure], new[left[~sure]])
     if len(known) > 1:  # at most so many spacings along a normal of 73 degrees at most
         moved = np.linalg.norm(kept.xyz - new[left], axis=1)
-        assert (moved <= _kernels.MAX_MOVE / 0.29 * spacings(known, new[left]) + 1e-5).all()
+        assert (moved <= kernels.MAX_MOVE / 0.29 * spacings(known, new[left]) + 1e-5).all()
 
 
 GOOD, BAD, NONE = SETTINGS.max_cost - 0.3, SETTINGS.max_cost + 0.1, np.inf
@@ -237,7 +238,7 @@ def in_frame(view, point):
     at = project(point, matrix_of(view, 1)[0])
     sizes = (view.width, view.height)
     return at is not None and all(
-        _kernels.MARGIN <= x <= s - _kernels.MARGIN for x, s in zip(at, sizes, strict=False)
+        kernels.MARGIN <= x <= s - kernels.MARGIN for x, s in zip(at, sizes, strict=False)
     )
 
 
@@ -246,7 +247,7 @@ def quality(view, point, normal):
     ray = point.astype(float) - view.camera.center
     distance = np.linalg.norm(ray)
     cosine = 0.0 if np.isnan(normal).any() else abs(ray @ normal) / distance
-    return view.K[0, 0] * (cosine + _kernels.OBLIQUE_WEIGHT) / distance
+    return view.K[0, 0] * (cosine + kernels.OBLIQUE_WEIGHT) / distance
 
 
 def reference_views_of(point, base, normal, views, seen, sources):
@@ -255,11 +256,11 @@ def reference_views_of(point, base, normal, views, seen, sources):
     for k, view in enumerate(views):
         others = [j for j in sources[k] if j >= 0]
         inside = sum(in_frame(views[j], point) for j in others)
-        enough = inside >= min(len(others), _kernels.MIN_SOURCES) and inside > 0
+        enough = inside >= min(len(others), kernels.MIN_SOURCES) and inside > 0
         if base in seen[k] and in_frame(view, point) and enough:
             able.append((-quality(view, point, normal), k))
-    best = [k for _, k in sorted(able)[: _kernels.REFERENCE_VIEWS]]
-    return best + [-1] * (_kernels.REFERENCE_VIEWS - len(best))
+    best = [k for _, k in sorted(able)[: kernels.REFERENCE_VIEWS]]
+    return best + [-1] * (kernels.REFERENCE_VIEWS - len(best))
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 5), st.integers(0, 3))

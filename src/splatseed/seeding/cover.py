@@ -28,7 +28,7 @@ from splatseed.photos.view import View
 from splatseed.photos.visibility import SURFACE
 from splatseed.photos.zbuffer import cell_depths
 from splatseed.progress import Progress, silent
-from splatseed.seeding import _kernels
+from splatseed.seeding._kernels.cover import guess_cell_depths, lift_cells, mean_colors
 from splatseed.seeding.coverage import cell_depths_of_views, check_points
 
 CHECKED_VIEWS = 12  # other views that may contradict a seed
@@ -87,7 +87,7 @@ def guess_depths(
         The depths, and the distances to the nearest covered cells, in cells.
     """
     guesses, distances = np.empty(len(empty), np.float32), np.empty(len(empty), np.float32)
-    _kernels.guess_depths(
+    guess_cell_depths(
         depths, empty, world_from_cells, reference.cells_from_world[checked],
         reference.shapes[checked], reference.starts[checked], reference.depths, SURFACE,
         guesses, distances,
@@ -243,9 +243,9 @@ def _make_seeds(
     shape = grid_shape(view.camera, cell)
     used = np.ones((1, 1), np.bool_) if mask is None else np.asarray(mask, np.bool_)
     rgb, usable = np.empty((len(empty), 3), np.uint8), np.empty(len(empty), np.bool_)
-    _kernels.mean_colors(view.photograph, used, shape, empty, rgb, usable)
+    mean_colors(view.photograph, used, shape, empty, rgb, usable)
     xyz = np.empty((len(empty), 3), np.float32)
-    _kernels.lift_cells(world_from_cells(view, cell), shape[1], empty, depths, xyz)
+    lift_cells(world_from_cells(view, cell), shape[1], empty, depths, xyz)
     usable &= np.isfinite(xyz).all(axis=1)
     sides = depths * np.float32(_side_at_one(view, shape))
     # The distance is 1 beside a covered cell.

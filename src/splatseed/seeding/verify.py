@@ -33,7 +33,7 @@ from splatseed.photos.view import View
 from splatseed.photos.visibility import Visibility
 from splatseed.progress import Progress, in_threads, silent
 from splatseed.scene import Image
-from splatseed.seeding._kernels import REFERENCE_VIEWS, rank_reference_views, slide
+from splatseed.seeding._kernels.verify import REFERENCE_VIEWS, rank_reference_views, slide
 from splatseed.seeding.local_geometry import LocalGeometry, local_geometry
 
 

@@ -1,0 +1,1 @@
+"""Numba kernels of seeding, a file per subject."""
