@@ -1,4 +1,4 @@
-"""Cover: a seed in every empty cell, held to literal loops and to a room of known depth."""
+"""Cover: a seed in every empty cell, compared with literal loops and a room of known depth."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def ring(rng, num, width=48, height=36):
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("cell", [5, 8])
-def test_seeds_are_those_of_the_loop(seed, cell):
+def test_seeds_equal_the_loop(seed, cell):
     rng = np.random.default_rng(seed)
     views, xyz = ring(rng, 3), rng.normal(size=(40, 3)).astype(np.float32)
     seeds = cover(views, xyz, cell=cell, rng=np.random.default_rng(seed))
@@ -78,27 +78,26 @@ def test_seeds_of_a_wall_lie_on_it(rng):
     np.testing.assert_allclose(seeds.size, 8 * depth / np.sqrt(50 * 55), rtol=1e-5)
 
 
-def test_of_two_surfaces_a_seed_takes_the_one_that_no_view_looks_through(rng):
-    """Between a near and a far half, seeds beside the near one hang before the far one from
-    aside."""
+def test_a_seed_takes_the_surface_that_no_view_sees_through(rng):
+    """Near the edge of a near surface, other views see through seeds at its depth to a far one."""
     view = slow.make_view(rng, 80, 48, 60, eye=(0, -1, 0))
     left = [slow.lift(view, 8, i, j, 2.0) for i in range(6) for j in range(4)]
     right = [slow.lift(view, 8, i, j, 4.0) for i in range(6) for j in range(6, 10)]
     points = np.float32([*left, *right])
-    aside = []
+    others = []
     for step in (1.0, 1.05, 1.1):
         pose = view.cam_from_world.copy()
         pose[0, 3] += step
-        aside.append(dataclasses.replace(view, cam_from_world=pose))
-    reference = reference_depths(aside, points, 8, silent)
+        others.append(dataclasses.replace(view, cam_from_world=pose))
+    reference = reference_depths(others, points, 8, silent)
     depths = cell_depths(view.camera, points, 8)
     gap = np.flatnonzero(np.isinf(depths))
     back = world_from_cells(view, 8)
     for checked, expected in ((0, [2, 4]), (3, [4, 4])):
-        guesses, reach = guess_depths(depths, gap, back, reference, np.arange(checked))
+        guesses, distances = guess_depths(depths, gap, back, reference, np.arange(checked))
         inner = guesses.reshape(6, 2)[1:5]  # the first and last row have fewer around them
         np.testing.assert_allclose(inner, [expected] * 4, rtol=1e-5)
-        assert (reach == 1).all()
+        assert (distances == 1).all()
 
 
 def test_the_room_is_covered_near_its_surfaces(room_capture, room_views, rng):
@@ -128,7 +127,7 @@ def test_the_same_seed_gives_the_same_bytes(room_capture, room_views):
     assert first.xyz.tobytes() != other.xyz.tobytes()
 
 
-def test_a_view_of_nothing_takes_the_depth_of_the_others(rng):
+def test_a_view_without_points_takes_the_depth_of_the_others(rng):
     seeing = slow.make_view(rng, eye=(0, -1, 0))
     blind = slow.make_view(rng, eye=(0, -1, 0), target=(0, -20, 0))
     xyz = (0.1 * rng.normal(size=(50, 3))).astype(np.float32)

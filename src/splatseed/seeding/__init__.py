@@ -1,4 +1,4 @@
-"""Seeding: as many seeds as asked for, where the photographs need them.
+"""Seeding: new points where the photographs need them, within a budget.
 
-Import from the modules, so that none is loaded before it is needed.
+The package itself loads none of its modules.
 """

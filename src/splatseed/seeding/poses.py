@@ -231,9 +231,9 @@ def random_start(
 ) -> PointCloud:
     """Draw the points that a trainer starts from if a scene has none: uniform position and colour.
 
-    gsplat 1.5.3's simple_trainer (``init_type`` random) draws 100,000 in a cube that reaches 3.3
-    times as far as the cameras, of which there are at least two; nerfstudio 1.1.5's splatfacto
-    50,000 in a cube that reaches 5 times as far as their coordinates.
+    gsplat 1.5.3's simple_trainer (``init_type`` random) draws 100,000 in a cube whose half side is
+    3.3 times the largest distance of a camera from their mean; nerfstudio 1.1.5's splatfacto draws
+    50,000 in a cube whose half side is 5 times the largest offset along an axis. Needs two cameras.
     """
     centers = np.stack([image.camera.center for image in scene.images])
     middle, num = centers.mean(axis=0), 50_000

@@ -248,7 +248,7 @@ def _apply_checks(
     checks: PhotoChecks,
     centers: Float64[np.ndarray, "M J 3"],
 ) -> NewPoints:
-    """Keep, move and drop points; ``centers`` are those of their reference views."""
+    """Keep, move and drop points; ``centers`` are the centers of their reference views."""
     checked, textured = np.isfinite(checks.costs), checks.variances >= SETTINGS.min_variance
     # Where there is no texture a low cost is chance.
     costs = np.where(textured, checks.costs, np.inf)

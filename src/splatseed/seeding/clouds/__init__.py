@@ -1,1 +1,1 @@
-"""Seeds from clouds of any size: aligned, streamed, thinned to what photographs show, checked."""
+"""Seeds from scans and dense clouds: alignment, merging in voxels, photo-consistency."""
