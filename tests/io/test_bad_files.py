@@ -189,13 +189,13 @@ BAD = {
     ],
     "groundtruth.txt": [f"1 {rest}\n" for rest in ("2 3", "0 0 0 0 0 0 one", "0 0 0 0 0 0 2")],
     # Clouds
-    "b.ply": [(HEAD.replace("vertex 1", "vertex 3") + 35 * "x", "cut short"), (ASCII, "found 1")],
+    "b.ply": [(HEAD.replace("vertex 1", "vertex 3") + 35 * "x", "truncated"), (ASCII, "found 1")],
     "a.e57": [b"no scan" * 1000],
     "a.xyz": [(12_000 * "1 2 3\n" + "1 two 3", "row 12,001 of .*'1 two 3'")],
     "a.txt": [b"", b"hello\nworld\n", b"1 2\n3 4\n"],
     "b.npz": [(saved(np.savez, np.zeros((3, 4))), "arr_0"), saved(np.savez, np.ones((3, 3)))[:100]],
     "a.glb": [b"", b"glTF", b"glTF\2\0\0\0" + bytes(60)],
-    "a.pcd": [b"", (f"{PCD}binary\n", "cut short")],
+    "a.pcd": [b"", (f"{PCD}binary\n", "truncated")],
     "a.jpg": [b""],
 }
 

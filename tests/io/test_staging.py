@@ -130,7 +130,7 @@ def test_only_an_earlier_output_is_replaced_and_only_when_asked(tmp_path):
     target = tmp_path / "out"
     target.mkdir()
     write_output(target, "first")  # an empty folder is free
-    with pytest.raises(OutputError, match="--overwrite"):
+    with pytest.raises(OutputError, match="overwrite=True"):
         write_output(target)
     write_output(target, overwrite=True)
     with pytest.raises(OutputError, match="what splatseed test wrote, not train"):

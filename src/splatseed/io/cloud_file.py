@@ -1,9 +1,8 @@
-"""Clouds from elsewhere: what every reader offers, and tables of rows and of lines.
+"""Point files read in chunks: the reader interface, and tables of binary rows and text lines.
 
-A *block* is some rows (points) as values by the names of columns; *full* is the value that means
-255: 1, 255 or 65535. Many writers fill 16-bit colours with 8-bit values, so the values decide, not
-the type; they are looked at in a sample before the first chunk, so that chunks of any size give the
-same points.
+A *block* is consecutive rows (points) as columns by name. Colours are scaled by their white level:
+1, 255 or 65535. It is detected from values, not types, since many writers store 8-bit values in 16
+bits; a sample of the file is read first, so that results do not depend on the chunk size.
 """
 
 from __future__ import annotations
@@ -23,14 +22,14 @@ from splatseed.errors import SceneFormatError
 from splatseed.io.files import COPY_AGAIN, open_file
 
 CHUNK = 1 << 20
-"""Rows read at once unless the caller says otherwise: 50 to 100 MB while they are read."""
+"""Default rows per chunk; reading one takes 50 to 100 MB."""
 Block: TypeAlias = Mapping[str, Any] | np.ndarray
 XYZ = ("x", "y", "z")
 RGB = ("red", "green", "blue")
 PACKED_RGB = "packed rgb"
-"""The column of colours in four bytes: blue, green, red, and one that is not used."""
+"""A column of four bytes: blue, green, red, unused."""
 SAMPLES, SAMPLE_ROWS, SAMPLE_BYTES = 16, 4096, 1 << 16
-"""Places in a file that are looked at to find ranges, and rows, or bytes of text, at each."""
+"""Number of samples for finding value ranges, and rows or bytes of text in each."""
 
 _SH_NAMES = ("f_dc_0", "f_dc_1", "f_dc_2")
 _SH0 = 0.28209479177387814  # 1 / (2 sqrt(pi)); colour = 0.5 + SH0 * f_dc in 3DGS
@@ -44,17 +43,17 @@ _INTENSITY_NAMES = (
 )
 _GREY = 128
 _BLACK_PERCENTILE, _WHITE_PERCENTILE = 1.0, 99.0
-"""Percentiles of intensity that become black and white: single mirrors outshine a whole scan."""
+"""Percentiles of intensity mapped to black and white; few specular points can dominate a scan."""
 _TEXT_BYTES = 1 << 22
-"""Bytes of text read at once."""
+"""Bytes of text per read."""
 
 
 @dataclass(frozen=True, eq=False)
 class CloudChunk:
-    """Consecutive rows of a file.
+    """Consecutive points of a file.
 
-    ``xyz`` are in the file's coordinates, and may hold NaN or infinity; ``rgb`` are grey where the
-    file has intensity only, None without either.
+    ``xyz`` are in the file's coordinates and may be NaN or infinite. ``rgb`` are grey if the file
+    only has intensity, None if it has neither.
     """
 
     xyz: Float64[np.ndarray, "n 3"]
@@ -65,23 +64,23 @@ class CloudChunk:
 
     @property
     def finite(self) -> Bool[np.ndarray, " n"]:
-        """Which rows have three finite coordinates."""
+        """Whether each point has finite coordinates."""
         return np.asarray(np.isfinite(self.xyz).all(axis=1))
 
     def select(self, which: np.ndarray | slice) -> CloudChunk:
-        """The rows at ``which`` (a mask, indices or a slice)."""
+        """Select points by a mask, indices or a slice."""
         return CloudChunk(self.xyz[which], None if self.rgb is None else self.rgb[which])
 
 
 class CloudFile(ABC):
-    """A file of points, opened but not read; readers of formats give ``_blocks`` and ``_sample``.
+    """A point file, opened but not yet read; formats implement ``_blocks`` and ``_sample``.
 
     Attributes:
         path: The file.
-        count: Rows that its header promises; None where only reading tells. ``chunks`` may give
-            fewer, as rows that the file itself marks as invalid are left out.
-        warnings: What is odd about the file, one sentence each.
-        used: The columns that are read, of those that are named: positions and colours.
+        count: Rows by the header; None if unknown. ``chunks`` may yield fewer points, since rows
+            marked invalid are skipped.
+        warnings: Problems of the file, one sentence each.
+        used: Names of the columns that are read: positions and colours.
     """
 
     warnings: tuple[str, ...] = ()
@@ -97,22 +96,22 @@ class CloudFile(ABC):
 
     @abstractmethod
     def _blocks(self, size: int) -> Iterator[Block]:
-        """The columns that are used, at most ``size`` rows at a time, in file order."""
+        """Yield the used columns, at most ``size`` rows at a time, in file order."""
 
     @abstractmethod
     def _sample(self) -> Block:
-        """The same of rows from places spread over the file."""
+        """Return the used columns of rows spread over the file."""
 
     @property
     def colors(self) -> Literal["rgb", "intensity", "none"]:
-        """Where colours come from."""
+        """Source of colours."""
         return "rgb" if self._rgb else "intensity" if self._intensity else "none"
 
     def chunks(self, size: int = CHUNK) -> Iterator[CloudChunk]:
-        """The rows in file order, at most ``size`` at a time; no chunk is empty.
+        """Yield the points in file order, at most ``size`` at a time; no chunk is empty.
 
         Raises:
-            SceneFormatError: The file ends early, or a row makes no sense.
+            SceneFormatError: The file is truncated, or a row is malformed.
         """
         if self.colors != "none" and self._range is None:
             self._range = self._range_of(self._sample())
@@ -121,14 +120,14 @@ class CloudFile(ABC):
                 yield self._chunk(block, self._range)
 
     def read_all(self) -> CloudChunk:
-        """All rows at once, with ranges found in all of them; intensity is not used."""
-        blocks = list(self._blocks(max(self.count or 0, 1)))  # one, or none of no rows
+        """Read all points; the white level is that of all rows, and intensity is ignored."""
+        blocks = list(self._blocks(max(self.count or 0, 1)))  # one block, or none
         if not blocks:
             return CloudChunk(np.empty((0, 3)))
         return self._chunk(blocks[0], self._range_of(blocks[0]) if self._rgb else None)
 
     def _range_of(self, sample: Block) -> tuple[float, float]:
-        """The values that become black and white."""
+        """Return the values that become black and white."""
         if self._rgb:
             return 0.0, white_level(_columns(sample, self._rgb))
         known = np.asarray(sample[str(self._intensity)], np.float64)
@@ -157,24 +156,24 @@ class CloudFile(ABC):
 
 
 def _columns(block: Block, names: Sequence[str]) -> np.ndarray:
-    """The columns of colours, side by side."""
+    """Stack the columns of colours."""
     if names == (PACKED_RGB,):
         return np.ascontiguousarray(block[PACKED_RGB]).view(np.uint8).reshape(-1, 4)[:, 2::-1]
     return np.stack([np.asarray(block[name]) for name in names], axis=1)
 
 
 def white_level(sample: Shaped[np.ndarray, "..."]) -> float:
-    """The value that means 255, as a sample of colours suggests."""
+    """Detect the value that means 255 from a sample of colours."""
     if sample.dtype == np.uint8 or not sample.size:
         return 255.0
-    greatest = float(np.nanmax(np.asarray(sample, np.float64), initial=0.0))
-    if greatest > 255.0:
+    largest = float(np.nanmax(np.asarray(sample, np.float64), initial=0.0))
+    if largest > 255.0:
         return 65535.0
-    return 1.0 if sample.dtype.kind == "f" and greatest <= 1.0 else 255.0
+    return 1.0 if sample.dtype.kind == "f" and largest <= 1.0 else 255.0
 
 
 def to_uint8(values: Shaped[np.ndarray, "..."], full: float) -> UInt8[np.ndarray, "..."]:
-    """Colours of any numeric type as bytes, rounded."""
+    """Convert colours of any numeric type to bytes, rounded; ``full`` becomes 255."""
     if values.dtype == np.uint8:
         return np.ascontiguousarray(values)
     known = np.nan_to_num(np.asarray(values, np.float64) * (255.0 / full), nan=_GREY)
@@ -182,24 +181,24 @@ def to_uint8(values: Shaped[np.ndarray, "..."], full: float) -> UInt8[np.ndarray
 
 
 def check_min_size(path: Path, needed: int) -> None:
-    """Raise a ``SceneFormatError`` for a file of fewer bytes than are needed."""
+    """Raise ``SceneFormatError`` if a file has fewer bytes than its header requires."""
     size = path.stat().st_size
     if size < needed:
         raise SceneFormatError(
             f"{path} to have {needed:,} bytes, as its header promises",
-            found=f"{size:,}: the file is cut short",
+            found=f"{size:,}: the file is truncated",
             fix=COPY_AGAIN,
         )
 
 
 def sample_starts(count: int) -> list[int]:
-    """First rows of the places that are looked at, spread over a file of ``count`` rows."""
+    """Return the first rows of samples spread over ``count`` rows."""
     last = max(count - SAMPLE_ROWS, 0)
     return sorted({last * i // (SAMPLES - 1) for i in range(SAMPLES)}) if count else []
 
 
 class RowCloud(CloudFile):
-    """Binary rows of one length within a file, read by offset."""
+    """Binary rows of fixed length, read by offset."""
 
     def __init__(self, path: Path, dtype: np.dtype[Any], offset: int, count: int) -> None:
         super().__init__(path, dtype.names or (), count)
@@ -215,7 +214,7 @@ class RowCloud(CloudFile):
         return np.concatenate([np.empty(0, self._dtype), *parts])
 
     def rows(self, start: int, size: int) -> np.ndarray:
-        """Some rows, fewer at the end."""
+        """Read rows from ``start``, at most ``size``."""
         wanted = min(size, self.num_rows - start)
         with open_file(self.path) as file:
             file.seek(self._offset + start * self._dtype.itemsize)
@@ -224,13 +223,13 @@ class RowCloud(CloudFile):
 
 @dataclass(frozen=True)
 class Dialect:
-    """How numbers are written in a line: what stands between them (None: spaces or tabs)."""
+    """How a line is written: delimiter (None: whitespace) and decimal comma."""
 
     delimiter: str | None = None
     decimal_comma: bool = False
 
     def parse(self, lines: Sequence[str], places: Sequence[int]) -> Float64[np.ndarray, "n C"]:
-        """Numbers at ``places`` of each line; raises ``ValueError`` where there is none."""
+        """Parse the columns ``places`` of each line; raise ``ValueError`` if one is no number."""
         if self.decimal_comma:
             lines = [line.replace(",", ".") for line in lines]
         return np.loadtxt(
@@ -239,7 +238,7 @@ class Dialect:
 
 
 class LineCloud(CloudFile):
-    """Lines of numbers within a file: XYZ, CSV, ascii PLY and PCD, read in blocks of lines."""
+    """Lines of numbers (XYZ, CSV, ascii PLY and PCD), read in blocks."""
 
     def __init__(
         self,
@@ -256,14 +255,14 @@ class LineCloud(CloudFile):
         self._offset, self._dialect, self._types = offset, dialect or Dialect(), types or {}
 
     def _blocks(self, size: int) -> Iterator[Block]:
-        given, lines = 0, islice(chain.from_iterable(self._lines()), self.count)
+        num_read, lines = 0, islice(chain.from_iterable(self._lines()), self.count)
         while rows := list(islice(lines, size)):
-            yield self._block(rows, given)
-            given += len(rows)
-        if self.count is not None and given < self.count:
+            yield self._block(rows, num_read)
+            num_read += len(rows)
+        if self.count is not None and num_read < self.count:
             raise SceneFormatError(
                 f"{self.count:,} points in {self.path}, as its header promises",
-                found=f"{given:,}: the file is cut short",
+                found=f"{num_read:,}: the file is truncated",
                 fix=COPY_AGAIN,
             )
 
@@ -278,15 +277,15 @@ class LineCloud(CloudFile):
                 lines += _numbers(block[place > first : -1] or block[:1])
         return self._block(lines[: self.count], 0)
 
-    def _block(self, lines: Sequence[str], given: int) -> Block:
-        """The columns of some lines, which follow ``given`` others."""
+    def _block(self, lines: Sequence[str], num_before: int) -> Block:
+        """Parse lines that follow ``num_before`` others."""
         table = np.empty((0, len(self._places)))
         try:
             table = self._dialect.parse(lines, self._places) if lines else table
         except ValueError:
             wrong = next((i for i, line in enumerate(lines) if not self._parses(line)), 0)
             raise SceneFormatError(
-                f"{max(self._places) + 1} numbers in row {given + wrong + 1:,} of {self.path}",
+                f"{max(self._places) + 1} numbers in row {num_before + wrong + 1:,} of {self.path}",
                 found=repr(lines[wrong][:80]),
                 fix="Remove the line, or export the cloud again.",
             ) from None
@@ -298,7 +297,7 @@ class LineCloud(CloudFile):
                 if kind == np.uint8 and (values != values.astype(kind)).any():
                     wrong = int((values != values.astype(kind)).argmax())
                     raise SceneFormatError(
-                        f"{name} from 0 to 255 in row {given + wrong + 1:,} of {self.path}",
+                        f"{name} from 0 to 255 in row {num_before + wrong + 1:,} of {self.path}",
                         found=f"{values[wrong]}",
                         fix="Correct the row, or export the cloud again.",
                     )
@@ -311,7 +310,7 @@ class LineCloud(CloudFile):
         return False
 
     def _lines(self) -> Iterator[list[str]]:
-        """The lines of numbers, a block at a time."""
+        """Yield lists of data lines."""
         rest = b""
         with open_file(self.path) as file:
             file.seek(self._offset)
@@ -323,5 +322,5 @@ class LineCloud(CloudFile):
 
 
 def _numbers(lines: Sequence[str]) -> list[str]:
-    """The lines that are neither empty nor comments."""
+    """Drop empty lines and comments."""
     return [s for line in lines if (s := line.strip()) and s[0] != "#"]

@@ -1,9 +1,8 @@
-"""PLY files: reading points of any writer, and the form of them that every 3DGS loader takes.
+"""Read point PLY files of any writer; write the layout that every 3DGS loader accepts.
 
-An *element* is a table of rows; a *property* is a column, a scalar or a list with its length in
-front. Files with lists in their vertices, or another element before them, are refused: nobody
-writes them. Counts are checked against the file before anything is allocated; what follows the
-vertices is not read.
+An *element* is a table; a *property* is a column of scalars or of lists. The vertices must be the
+first element and have no lists, as in practice. Counts are checked against the file before memory
+is allocated; elements after the vertices are ignored.
 """
 
 from __future__ import annotations
@@ -33,9 +32,9 @@ _TYPES = (
 _BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _END = re.compile(rb"^end_header[ \t]*(\r?\n|\Z)", re.MULTILINE)
 _COUNT = re.compile("[0-9]{1,19}")
-_MAX_HEADER = 1 << 20  # a longer search would only crawl through a body
+_MAX_HEADER = 1 << 20  # bytes searched for the end of the header
 _GREY = 128
-_DROP_IN = np.dtype(
+_ROW = np.dtype(
     [(name, "<f4") for name in (*XYZ, "nx", "ny", "nz")] + [(name, "u1") for name in RGB]
 )
 _MODELS = {
@@ -47,7 +46,7 @@ _MODELS = {
 
 
 class Element(NamedTuple):
-    """One table of a file: NumPy's types of its columns by name, and whether one is of lists."""
+    """A table: NumPy types of its columns by name, and whether any holds lists."""
 
     name: str
     num_rows: int
@@ -56,21 +55,21 @@ class Element(NamedTuple):
 
 
 class Header(NamedTuple):
-    """What a PLY file promises to hold."""
+    """The parsed header of a PLY file."""
 
     byte_order: str
-    """NumPy's character for it; empty for an ascii body."""
+    """NumPy's character; empty for ascii."""
     elements: tuple[Element, ...]
     size: int
-    """Length of the header in bytes: the offset of the body."""
+    """Bytes of the header, the offset of the body."""
 
     def dtype(self, element: Element) -> np.dtype[Any]:
-        """The layout of a row of scalars."""
+        """Return the dtype of a row of scalars."""
         return np.dtype([(name, self.byte_order + kind) for name, kind in element.types.items()])
 
 
 def parse_header(path: Path, data: bytes) -> Header:
-    """The header in a file's first bytes: known types, unique names, counts of zero or more."""
+    """Parse the header in a file's first bytes; raise ``SceneFormatError`` if malformed."""
     end = _END.search(data, 0, _MAX_HEADER)
     if not re.match(rb"ply[ \t]*\r?\n", data) or end is None:
         raise SceneFormatError(
@@ -109,7 +108,7 @@ def parse_header(path: Path, data: bytes) -> Header:
 
 
 def open_ply(path: Path) -> CloudFile:
-    """Open a PLY file of points, of any size."""
+    """Open a PLY file of points."""
     with open_file(path) as file:
         header = parse_header(path, file.read(_MAX_HEADER))
     if any("packed_position" in each.types for each in header.elements):
@@ -125,43 +124,42 @@ def open_ply(path: Path) -> CloudFile:
     dtype = header.dtype(vertex)
     if header.byte_order:
         return RowCloud(path, dtype, header.size, vertex.num_rows)
-    # Bytes stay so; what is declared wider may hold any range.
-    whole = {
+    # Keep bytes; wider integer types may hold any range.
+    integers = {
         n: dtype[n] if dtype[n] == np.uint8 else np.dtype(np.int64)
         for n in names
         if dtype[n].kind in "iu" and n not in XYZ
     }
-    return LineCloud(path, names, header.size, vertex.num_rows, types=whole)
+    return LineCloud(path, names, header.size, vertex.num_rows, types=integers)
 
 
 def read_ply(path: StrPath) -> PointCloud:
-    """The vertices of a PLY file as a cloud; nothing is repaired.
+    """Read the vertices of a PLY file; nothing is repaired.
 
-    Colours that are not a number are mid grey, and so are all without colours.
+    Missing or NaN colours become mid grey.
 
     Raises:
-        SceneNotFoundError: There is no such file.
-        SceneFormatError: It is malformed, shorter than its header promises or larger than the free
-            memory, or has no vertices with x, y, z.
+        SceneNotFoundError: No such file.
+        SceneFormatError: Malformed, truncated, larger than free memory, or without x, y, z.
     """
     return read_ply_float64(path)[0]
 
 
 def read_ply_float64(path: StrPath) -> tuple[PointCloud, Float64[np.ndarray, "N 3"]]:
-    """As ``read_ply``, and the positions in double precision."""
+    """Read a PLY file as ``read_ply`` does, and its positions in float64."""
     path = Path(path)
     with translate_read_errors(path):
         cloud = open_ply(path)
         check_fits_memory(path, path.stat().st_size)
-        whole = cloud.read_all()
-    with np.errstate(over="ignore"):  # beyond float32 is infinite, to be seen and dropped
-        xyz = whole.xyz.astype(np.float32)
-    rgb = np.full(xyz.shape, _GREY, np.uint8) if whole.rgb is None else whole.rgb
-    return PointCloud(xyz, rgb), whole.xyz
+        chunk = cloud.read_all()
+    with np.errstate(over="ignore"):  # beyond float32's range: infinite, dropped later
+        xyz = chunk.xyz.astype(np.float32)
+    rgb = np.full(xyz.shape, _GREY, np.uint8) if chunk.rgb is None else chunk.rgb
+    return PointCloud(xyz, rgb), chunk.xyz
 
 
 def write_ply(path: StrPath, points: PointCloud) -> None:
-    """Write binary float32 x, y, z and zero normals, uchar red, green, blue; nothing else."""
+    """Write a binary PLY: float32 x, y, z and zero normals, uchar red, green, blue."""
     path = Path(path)
     with path.open("wb") as file:
         file.write(ply_header(len(points)))
@@ -175,30 +173,28 @@ def write_ply_file(path: StrPath, points: PointCloud) -> None:
 
 
 def ply_header(count: int) -> bytes:
-    """The header of a PLY as ``write_ply`` writes it, of ``count`` points."""
+    """Return the header that ``write_ply`` writes for ``count`` points."""
     kinds = {"f": "float", "u": "uchar"}
-    properties = "".join(
-        f"property {kinds[_DROP_IN[name].kind]} {name}\n" for name in _DROP_IN.names or ()
-    )
+    properties = "".join(f"property {kinds[_ROW[name].kind]} {name}\n" for name in _ROW.names or ())
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex {count}\n{properties}"
     return f"{header}end_header\n".encode("ascii")
 
 
 def ply_rows(xyz: Float32[np.ndarray, "n 3"], rgb: UInt8[np.ndarray, "n 3"]) -> memoryview:
-    """The body of such a PLY: some of its points."""
-    rows = np.zeros(len(xyz), _DROP_IN)
+    """Return the rows that ``write_ply`` writes."""
+    rows = np.zeros(len(xyz), _ROW)
     for i, (axis, channel) in enumerate(zip(XYZ, RGB, strict=True)):
         rows[axis], rows[channel] = xyz[:, i], rgb[:, i]
     return rows.view(np.uint8).data
 
 
 def refuse_gaussians(path: Path, packed: str = "") -> None:
-    """Raise a ``SceneFormatError`` for trained Gaussians, by the file's name or as ``packed``."""
+    """Raise ``SceneFormatError`` for a file of Gaussians, by suffix or as ``packed`` describes."""
     kind = packed or _MODELS.get(path.suffix.lower())
     if kind and path.is_file():
         raise SceneFormatError(
             f"{path} to be a scene, or a .ply of points",
             found=f"{kind}: a trained model",
-            fix="Score it with splatseed evaluate MODEL --scene SCENE, look at it with splatseed "
-            "view MODEL; a .ply, which splatseed export MODEL -o OUT.ply makes, is read as points.",
+            fix="Score it with splatseed evaluate MODEL --scene SCENE, view it with splatseed view "
+            "MODEL, or make a .ply of it with splatseed export MODEL -o OUT.ply.",
         )

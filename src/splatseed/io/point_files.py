@@ -1,7 +1,7 @@
-"""Files that hold a scene's points a second time, which another trainer may start from instead.
+"""Find other point files of a scene, with different points, from which other trainers would start.
 
-Somebody may have cleaned one of them. Promise: files whose points are those that are read, in any
-order and as float32, are not mentioned.
+For example, the user may have cleaned one of them. Files with the same float32 points in any order
+are not reported.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from splatseed.io.ply import open_ply, read_ply
 from splatseed.text import counted
 
 _TOLERANCE = 1e-4
-"""Of the points' extent: text and PLY files round positions."""
+"""Tolerance as a share of the points' extent: text and PLY files round positions."""
 _USED_BY = {
     "points3D.ply": "graphdeco's trainer starts from it",
     "init.ply": "Brush starts from it",
@@ -29,7 +29,7 @@ _USED_BY = {
 
 
 def count_points(path: Path) -> int | None:
-    """How many points a file promises; None if it is damaged or no file of points."""
+    """Read the number of points of a file; None if damaged or no point file."""
     with suppress(SplatseedError, OSError):
         if path.suffix == ".ply":
             return open_ply(path).count
@@ -43,9 +43,9 @@ def count_points(path: Path) -> int | None:
 
 
 def first_with_points(paths: Sequence[Path]) -> Path | None:
-    """The first file that holds points, else the first; None without any."""
+    """Return the first file with points, else the first file; None without any."""
     if len(paths) > 1:
-        # A damaged file is no empty one: it is read, and its error names it.
+        # A damaged file (count None) is chosen, so that reading it reports the error.
         return next((path for path in paths if count_points(path) != 0), paths[0])
     return next(iter(paths), None)
 
@@ -53,9 +53,13 @@ def first_with_points(paths: Sequence[Path]) -> Path | None:
 def differing_points_notes(
     read: Path, xyz: Float[np.ndarray, "N 3"], other: Path, use: str = ""
 ) -> list[str]:
-    """A note on another file, if it holds other points than those that were read.
+    """Warn of another point file if its points differ from those read.
 
-    ``use`` says what to do to have the other file read.
+    Args:
+        read: The file that was read.
+        xyz: Its positions.
+        other: The other file.
+        use: How to have the other file read, such as "move A out of B".
     """
     if not other.is_file() or not read.is_file() or other.samefile(read):
         return []
@@ -64,21 +68,21 @@ def differing_points_notes(
         return [f"{other} holds no points; {read.name} is read."] if len(xyz) else []
     if count is None or (count == len(xyz) and _same(other, xyz)):
         return []
-    differ = f"{count:,}" if count != len(xyz) else f"{count:,} at other places"
-    fate = _USED_BY.get(other.name, "is not used")
-    way = f" To use it here, {use}." if use else ""
+    differ = f"{count:,}" if count != len(xyz) else f"{count:,} at other positions"
+    effect = _USED_BY.get(other.name, "is not used")
+    advice = f" To use it here, {use}." if use else ""
     used = f"{counted(len(xyz), 'point')} of {read.name} are used"
-    return [f"{used}; {other.name}{_age(other, read)} has {differ}, and {fate}.{way}"]
+    return [f"{used}; {other.name}{_age(other, read)} has {differ}, and {effect}.{advice}"]
 
 
 def _same(path: Path, xyz: Float[np.ndarray, "N 3"]) -> bool:
-    """Whether a file has the same positions; true of text, which is slow to read."""
+    """Whether a file has the same positions; assumed for text, which is slow to read."""
     if path.suffix != ".ply" or not len(xyz):
         return True
     try:
         other = read_ply(path).xyz.astype(np.float64)
     except SplatseedError:
-        return True  # its promise may be kept or not: another trainer will see
+        return True  # damaged: nothing to compare
     finite = xyz[np.isfinite(xyz).all(axis=1)]
     close = _TOLERANCE * float(np.ptp(finite, axis=0).max()) if len(finite) else 0.0
 
@@ -86,12 +90,12 @@ def _same(path: Path, xyz: Float[np.ndarray, "N 3"]) -> bool:
         with np.errstate(invalid="ignore"):
             return bool(np.allclose(a, b, rtol=1e-5, atol=close, equal_nan=True))
 
-    # In any order: one point that moved changes a sorted column.
+    # Compare sorted columns, since the order may differ.
     return near(other, xyz) or near(np.sort(other, axis=0), np.sort(xyz, axis=0))
 
 
 def _age(other: Path, read: Path) -> str:
-    """Which of two files is newer, if their times tell."""
+    """Describe whether a file is newer or older than the one read."""
     seconds = other.stat().st_mtime - read.stat().st_mtime
     newer = "newer" if seconds > 0 else "older"
     return "" if abs(seconds) < 1 else f", which is {newer},"

@@ -1,10 +1,9 @@
-"""Output that appears whole or not at all, and replaces only what splatseed wrote.
+"""Atomic output: files and folders appear complete or not at all, and replace only own outputs.
 
-The *target* is what the user named; the *partial* is a hidden sibling ``.NAME.partial-XXXX`` that
-is written first and renamed at the end, or removed, after a kill by the next process that writes
-the same target. A folder's *manifest*, ``splatseed.json``, says what wrote it, its *kind*
-(``command``), and lists its files; an entry that names a folder with a manifest of its own stands
-for that one's list.
+The *target* is the user's path. The *partial* is a hidden sibling ``.NAME.partial-XXXX``, written
+first and renamed at the end, or removed on failure (after a kill, by the next process that writes
+the target). A folder's *manifest*, ``splatseed.json``, records its *kind* (``command``) and lists
+its files; an entry that is a folder with its own manifest stands for the files listed there.
 """
 
 from __future__ import annotations
@@ -30,18 +29,18 @@ from splatseed.io.files import read_text
 
 try:
     import fcntl
-except ImportError:  # on Windows nothing can be locked, so leftovers stay
+except ImportError:  # Windows has no file locks, so leftovers stay
     fcntl = None  # type: ignore[assignment]
 
 MANIFEST = "splatseed.json"
+"""The file that marks a folder as written by splatseed."""
 ABSENT = "absent"
 """The manifest's key for ``Scene.absent``."""
-"""The file that marks a folder as written by splatseed."""
 
 _MIN_LEFTOVER_AGE = 5.0
-"""Seconds after which a partial that nobody holds is a leftover: it is held once it is made."""
+"""Age in seconds from which an unlocked partial is a leftover; new ones are locked at once."""
 _IGNORED = re.compile(
-    r"preview(_methods|_maps|_cells|_origins)?\.png"  # ours, written after the manifest
+    r"preview(_methods|_maps|_cells|_origins)?\.png"  # written by splatseed after the manifest
     r"|(.*/)?(\.DS_Store|Thumbs\.db|\.[^/]+\.partial-[0-9a-f]{8}(\.\w+|/.*)?"
     r"|images_\d+_png/.*\.png)",  # gsplat's copies of the photographs
     re.IGNORECASE,
@@ -57,11 +56,16 @@ _LOG = logging.getLogger(__name__)
 def output_folder(
     path: Path, *, kind: str, overwrite: bool = False, protect: Sequence[Path] = ()
 ) -> Iterator[Path]:
-    """An empty folder to write into that appears at ``path`` when the block ends without an error.
+    """Yield an empty folder that appears at ``path`` when the block succeeds.
 
-    Missing parents are made. The manifest is completed at the end. ``overwrite`` allows to replace
-    an earlier output of this kind; ``protect`` are files and folders that the output may not be,
-    lie in or contain. An ``OutputError``: ``path`` is taken or protected, or writing failed.
+    Args:
+        path: The output; missing parents are made.
+        kind: What writes it, for the manifest.
+        overwrite: Replace an earlier output of this kind.
+        protect: Paths that the output may not equal, contain or be inside of.
+
+    Raises:
+        OutputError: ``path`` is taken or protected, or writing failed.
     """
     check_separate(path, protect)
     target = _resolved(path)
@@ -74,13 +78,15 @@ def output_folder(
 
 @contextmanager
 def atomic_file(path: Path) -> Iterator[Path]:
-    """The name of an empty partial file; it appears at ``path`` when the block ends without error.
+    """Yield an empty partial file that appears at ``path`` when the block succeeds.
 
-    Its name keeps the suffix. Missing parents are made, and an existing file is replaced. An
-    ``OutputError``: ``path`` is a folder or a device, or writing failed.
+    It has the same suffix. Missing parents are made; an existing file is replaced.
+
+    Raises:
+        OutputError: ``path`` is a folder or a device, or writing failed.
     """
     target = _resolved(path)
-    if os.path.lexists(target) and not target.is_file():  # a device would be replaced by a file
+    if os.path.lexists(target) and not target.is_file():  # do not replace a device by a file
         other = "a folder" if target.is_dir() else "a device, a pipe or a link to itself"
         raise OutputError(f"a file name at {target}", found=other, fix="Choose another name.")
     with staged(target, folder=False) as partial:
@@ -88,7 +94,7 @@ def atomic_file(path: Path) -> Iterator[Path]:
 
 
 def write_json(path: Path, content: Mapping[str, object]) -> None:
-    """Write readable JSON as an ``atomic_file``; NumPy scalars become numbers, paths text."""
+    """Write indented JSON atomically; NumPy scalars become numbers, paths text."""
     text = json.dumps(
         content, indent=2, default=lambda v: v.item() if isinstance(v, np.generic) else str(v)
     )
@@ -98,9 +104,10 @@ def write_json(path: Path, content: Mapping[str, object]) -> None:
 
 @contextmanager
 def staged(target: Path, *, folder: bool) -> Iterator[Path]:
-    """An empty partial, a folder or a file, that replaces ``target``, whatever that is, at the end.
+    """Yield an empty partial file or folder that replaces ``target`` at the end, whatever it is.
 
-    Missing parents are made. If the block or the writing (an ``OutputError``) fails, all stays.
+    Missing parents are made. On any failure the target is unchanged; failed writes raise
+    ``OutputError``.
     """
     _remove_leftovers(target)
     token = secrets.token_hex(4)
@@ -119,23 +126,23 @@ def staged(target: Path, *, folder: bool) -> Iterator[Path]:
         except BaseException:
             if old.exists() and not target.exists():
                 old.rename(target)
-            with suppress(OSError):  # the next process tries again
+            with suppress(OSError):  # the next process retries
                 remove(partial)
                 for each in missing:
                     each.rmdir()
             raise
         finally:
-            if (old / MANIFEST).is_file() and (names := unlisted_files(old)):  # put there meanwhile
-                _LOG.warning("%s is complete; %s has what it held: %s.", target, old, names)
+            if (old / MANIFEST).is_file() and (names := unlisted_files(old)):  # added meanwhile
+                _LOG.warning("%s is complete; its earlier files are in %s: %s.", target, old, names)
             elif old.exists():
                 remove(old)
 
 
 def add_files(folder: Path, names: Iterable[str]) -> None:
-    """List more of an output's files in its manifest, so that ``--overwrite`` may replace them.
+    """Add files to an output's manifest, so that ``overwrite=True`` may replace them.
 
-    They are paths inside the folder, with forward slashes, which need not exist yet. A folder
-    without a manifest stands for the files in it now.
+    Names are relative with forward slashes and need not exist yet. A folder without a manifest
+    stands for its current files.
     """
     listed = _listed(folder)
     for name in names:
@@ -145,7 +152,7 @@ def add_files(folder: Path, names: Iterable[str]) -> None:
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
-    """What a folder's manifest says; nothing where none can be read."""
+    """Read a folder's manifest; empty if there is none or it is damaged."""
     try:
         content = json.loads(read_text(folder / MANIFEST))
     except (OSError, ValueError, RecursionError):
@@ -154,7 +161,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 
 
 def unlisted_files(folder: Path) -> list[str]:
-    """Files in ``folder`` that its manifest does not list."""
+    """List the files of a folder that its manifest does not list."""
 
     def is_copy(name: str) -> bool:  # nerfstudio's smaller photographs
         return bool(re.match("images_[248]/", name)) and (folder / f"images{name[8:]}").is_file()
@@ -166,33 +173,33 @@ def unlisted_files(folder: Path) -> list[str]:
 def check_output(
     path: Path, *, kind: str, overwrite: bool = False, protect: Sequence[Path] = ()
 ) -> None:
-    """Refuse what ``output_folder`` and ``check_parents`` refuse, before any work is done."""
+    """Raise as ``output_folder`` and ``check_parents``, before any work is done."""
     check_separate(path, protect)
     check_parents(path)
     _check_replaceable(_resolved(path), kind, overwrite=overwrite)
 
 
 def check_separate(path: Path, protect: Sequence[Path]) -> None:
-    """Raise an ``OutputError`` for an output that is, lies in or contains one of ``protect``."""
+    """Raise ``OutputError`` if the output equals, contains or is inside of a protected path."""
     target, here = _resolved(path), Path.cwd()
     for source in (*map(_resolved, protect), here):
-        held = target == source or target in source.parents
-        if held or (source in target.parents and source != here):
+        contains = target == source or target in source.parents
+        if contains or (source in target.parents and source != here):
             raise OutputError(
                 "an output apart from the input and the working directory",
-                found=f"{target}, which {'holds or is' if held else 'lies in'} {source}",
-                fix="Choose a place outside of it.",
+                found=f"{target}, which {'contains or is' if contains else 'is in'} {source}",
+                fix="Choose a path outside of it.",
             )
 
 
 def check_parents(path: Path) -> None:
-    """Raise an ``OutputError`` where nothing can be made, or a parent's parent is missing."""
+    """Raise ``OutputError`` if the output cannot be made, or its parent's parent is missing."""
     target = _resolved(path)
-    if os.path.lexists(target):  # perhaps a run that goes on, in a write-protected folder
+    if os.path.lexists(target):  # may be a resumed run in a write-protected folder
         return
     missing = [each for each in target.parents if not each.exists()]
     above = target.parents[len(missing)]
-    try:  # permissions do not tell, least of all to root
+    try:  # permission bits are unreliable, above all for root
         Path(tempfile.mkdtemp(prefix=".splatseed-", dir=above)).rmdir()
         found = f"no {missing[-1]}" if len(missing) > 1 else ""
     except OSError:
@@ -204,7 +211,7 @@ def check_parents(path: Path) -> None:
 
 @contextmanager
 def translate_write_errors(target: Path) -> Iterator[None]:
-    """Let an ``OSError`` in the block become an ``OutputError`` that says what to do."""
+    """Turn an ``OSError`` into ``OutputError`` with advice."""
     try:
         yield
     except SplatseedError:
@@ -217,16 +224,16 @@ def translate_write_errors(target: Path) -> Iterator[None]:
 
 
 def remove(path: Path) -> None:
-    """Remove one of our own files or folders, if it is there, with read-only folders in it."""
+    """Remove a file or folder of splatseed's, if it exists, including read-only subfolders."""
     if path.is_symlink() or not path.is_dir():
         path.unlink(missing_ok=True)
         return
     path.chmod(0o700)
     for parent, names, _ in os.walk(path):
         for child in (Path(parent, name) for name in names):
-            if not child.is_symlink():  # what a link names is the user's
+            if not child.is_symlink():  # the target of a link is the user's
                 child.chmod(0o700)
-    for child in path.iterdir():  # the manifest last: what a kill leaves can still be replaced
+    for child in path.iterdir():  # the manifest last, so that removal can be resumed
         if child.is_dir() and not child.is_symlink():
             shutil.rmtree(child)
         elif child.name != MANIFEST:
@@ -239,7 +246,7 @@ def _resolved(path: Path) -> Path:
 
 
 def _check_replaceable(target: Path, kind: str, *, overwrite: bool) -> None:
-    found, fix = "", "Choose another name, or move what is there elsewhere."
+    found, fix = "", "Choose another name, or move the existing files."
     with translate_write_errors(target):
         if not os.path.lexists(target) or (target.is_dir() and not any(target.iterdir())):
             return
@@ -255,47 +262,47 @@ def _check_replaceable(target: Path, kind: str, *, overwrite: bool) -> None:
             found = f"an earlier output with {ours}: {', '.join(names[:3])}{more}"
         elif not overwrite:
             found = "an earlier output"
-            fix = "Pass --overwrite (from Python, overwrite=True) to replace it, or choose another."
+            fix = "Pass `overwrite=True` to replace it, or choose another name."
     if found:
         raise OutputError(f"no folder, or an empty one, at {target}", found=found, fix=fix)
 
 
 def _listed(folder: Path) -> set[str]:
-    """What its manifest lists."""
+    """Return the entries of a folder's manifest."""
     files = read_manifest(folder).get("files")
     return {name for name in files if isinstance(name, str)} if isinstance(files, list) else set()
 
 
 def _files(folder: Path, ours: Collection[str] = (), prefix: str = "") -> Iterator[str]:
-    """Paths of the files and links in a folder that are not in ``ours``."""
+    """Yield the files and links in a folder that are not in ``ours``."""
     with os.scandir(folder / prefix) as entries:
         for entry in entries:
             name = prefix + entry.name
             if not entry.is_dir(follow_symlinks=False):
                 if name not in ours:
                     yield name
-            elif name in ours:  # itself an output
+            elif name in ours:  # an output with its own manifest
                 yield from (f"{name}/{each}" for each in unlisted_files(folder / name))
             else:
                 yield from _files(folder, ours, name + "/")
 
 
 def _remove_leftovers(target: Path) -> None:
-    """Remove, and log, the partials of processes that were killed while they wrote ``target``."""
+    """Remove and log partials of processes killed while writing ``target``."""
     name = re.compile(
         re.escape(f".{target.name}.partial-") + f"[0-9a-f]{{8}}({re.escape(target.suffix)})?"
     )
     for path in list(target.parent.iterdir()) if fcntl and target.parent.is_dir() else []:
-        with suppress(OSError):  # another process writes to it, or has removed it
+        with suppress(OSError):  # another process writes or removed it
             if name.fullmatch(path.name) and time.time() - path.stat().st_mtime > _MIN_LEFTOVER_AGE:
                 with locked(path):
                     remove(path)
-                _LOG.warning("Removed %s, left by a run that was killed.", path)
+                _LOG.warning("Removed %s, left by a killed process.", path)
 
 
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Lock a file or folder while the block runs; an OSError if another process has."""
+    """Lock a file or folder; raise ``OSError`` if another process holds the lock."""
     with ExitStack() as stack:
         if fcntl is not None:
             descriptor = os.open(path, os.O_RDONLY)

@@ -1,8 +1,7 @@
-"""Clouds from elsewhere: scans, dense reconstructions, point maps, read in chunks at any size.
+"""Read external clouds (scans, dense reconstructions, point maps) of any size in chunks.
 
-``open_cloud`` recognises the format; a ``CloudFile`` says what its header promises and gives its
-points in chunks, in the file's own coordinates. Promise: importing this package loads none of the
-optional packages that read formats.
+``open_cloud`` detects the format. A ``CloudFile`` yields points in chunks, in the file's own
+coordinates. Optional packages are imported only when a file needs them.
 """
 
 from __future__ import annotations
@@ -30,15 +29,15 @@ _READERS = {
 
 
 def open_cloud(path: StrPath) -> CloudFile:
-    """Open a cloud; the ending of its name tells the format.
+    """Open a point file; the suffix determines the format.
 
     Args:
         path: A .las, .laz, .e57, .ply, .pcd, .xyz, .txt, .csv, .asc, .pts, .npz or .glb file.
 
     Raises:
-        SceneNotFoundError: There is no such file.
-        SceneFormatError: Its name ends in something else, or it is not what its name says.
-        MissingDependencyError: The package that reads this format is not installed.
+        SceneNotFoundError: No such file.
+        SceneFormatError: Another suffix, or malformed content.
+        MissingDependencyError: The package for this format is not installed.
     """
     path = Path(path)
     if not path.exists():
@@ -49,10 +48,10 @@ def open_cloud(path: StrPath) -> CloudFile:
         raise SceneFormatError(
             f"{path} to be a cloud: {', '.join(_READERS)}",
             found="a folder" if path.is_dir() else f"a {path.suffix or 'nameless'} file",
-            fix="Name a file of points; a scene that splatseed reads goes in SCENE's place.",
+            fix="Pass a file of points; a folder or scene is not one.",
         )
     module, _, name = reader.partition(":")
-    # Readers load with their use: each needs packages that others do without.
+    # Import readers on use: each needs other optional packages.
     opened: Callable[[Path], CloudFile] = getattr(import_module(module), name)
     with translate_read_errors(path):
         return opened(path)

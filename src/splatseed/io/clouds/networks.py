@@ -32,13 +32,12 @@ COLORS = ("rgb", "colors", "colours", "color", "images", "imgs", "image", "rgb_i
 MASKS = ("mask", "masks", "valid", "valid_mask")
 CONFIDENCES = ("world_points_conf", "conf", "confs", "confidence")
 MIN_CONFIDENCE = 1.5
-"""Least confidence that counts: these networks give 1 where they know nothing, and 3 to 30 on
-surfaces."""
-_FEWER = "Save fewer views in one archive, or the points as a binary PLY, which is read in parts."
+"""Lowest confidence kept: these networks give 1 where they are uncertain, 3 to 30 on surfaces."""
+_FEWER = "Save fewer views per archive, or the points as a binary PLY, which is read in chunks."
 _NONE = ((), False, np.dtype(object))
 _SAMPLED = 1 << 18
 _GLTF = (b"glTF", 2, 0x4E4F534A)
-"""Magic, version, and the mark of the description."""
+"""Magic, version, and the type of the JSON chunk."""
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"VEC3": 3, "VEC4": 4}
 _POINTS, _TRIANGLES = 0, 4
@@ -47,7 +46,7 @@ _GLB = "a complete .glb file with vertices"
 
 
 class NpzCloud(CloudFile):
-    """An .npz archive with an array of points; arrays are in memory whole while they are read."""
+    """An .npz archive with an array of points; one array at a time must fit in memory."""
 
     def __init__(self, path: Path) -> None:
         shapes: dict[str, tuple[int, ...]] = {}
@@ -96,7 +95,7 @@ class NpzCloud(CloudFile):
             yield block
 
     def _array(self, name: str | None) -> np.ndarray | None:
-        """The values of an array, a row a point."""
+        """Read an array, one row per point."""
         if name is None:
             return None
         with translate_errors(self.path, _NPZ), zipfile.ZipFile(self.path) as archive:
@@ -104,14 +103,14 @@ class NpzCloud(CloudFile):
             check_memory(2 * info.file_size, 1, "bytes of arrays", fix=_FEWER)
             with archive.open(info) as file:
                 array = read_npy(file, info.file_size)
-            if name in COLORS and array.shape[-1] != 3:  # channels stand before rows and columns
+            if name in COLORS and array.shape[-1] != 3:  # channels come before rows and columns
                 array = np.moveaxis(array, -3, -1)
             width = 3 if name in (*POSITIONS, *COLORS) else 1
             return array.reshape(-1, width)
 
 
 class _Part(NamedTuple):
-    """Vertices of one primitive under one node, whose transform is ``matrix``."""
+    """Vertices of a primitive of a node; ``matrix`` maps them to the scene."""
 
     mode: int
     matrix: Float64[np.ndarray, "4 4"]
@@ -129,14 +128,14 @@ class GlbCloud(CloudFile):
                 raise ValueError("no binary glTF of version 2")
             content = json.loads(file.read(length))
             parts = list(_primitives(path, content, file.tell() + 8))
-            drawn = [part for part in parts if part.mode == _POINTS]
-            self._parts = drawn or parts
+            points = [part for part in parts if part.mode == _POINTS]
+            self._parts = points or parts
             if not self._parts:
                 raise ValueError("no vertices")
         colored = all(part.color for part in self._parts)
         count = sum(part.position.num_rows for part in self._parts)
         super().__init__(path, (*XYZ, *RGB) if colored else XYZ, count)
-        if drawn and len(drawn) < len(parts):
+        if points and len(points) < len(parts):
             self.warnings = ("It holds points and meshes: the meshes are left out.",)
 
     def _sample(self) -> Block:
@@ -152,14 +151,14 @@ class GlbCloud(CloudFile):
                     block = dict(zip(XYZ, xyz.T, strict=True))
                     if part.color and self._rgb:
                         values = part.color.rows(start, size)["values"][:, :3]
-                        # Integers are normalised to their range, as glTF has them.
+                        # glTF normalises integers by their largest value.
                         full = 1 if values.dtype.kind == "f" else np.iinfo(values.dtype).max
                         block |= zip(RGB, to_uint8(values, full).T, strict=True)
                     yield block
 
 
 def _primitives(path: Path, content: Mapping[str, Any], body: int) -> Iterator[_Part]:
-    """The primitives of the scene's nodes; the binary part begins at ``body``."""
+    """Yield the primitives of the scene's nodes; the binary chunk starts at byte ``body``."""
     for mesh, matrix in _placed(content):
         for primitive in content["meshes"][mesh]["primitives"]:
             if "KHR_draco_mesh_compression" in primitive.get("extensions", {}):
@@ -171,12 +170,12 @@ def _primitives(path: Path, content: Mapping[str, Any], body: int) -> Iterator[_
             }
             mode, color = int(primitive.get("mode", _TRIANGLES)), tables.get("COLOR_0")
             if color and color.num_rows != tables["POSITION"].num_rows:
-                raise ValueError("not a colour for each vertex")
+                raise ValueError("not one colour per vertex")
             yield _Part(mode, matrix, tables["POSITION"], color)
 
 
 def _placed(content: Mapping[str, Any]) -> Iterator[tuple[int, Float64[np.ndarray, "4 4"]]]:
-    """Meshes with the transform from their own frame to the scene's."""
+    """Yield meshes with the transform from their frame to the scene's."""
     nodes, scenes = content.get("nodes", []), content.get("scenes")
     children = {child for node in nodes for child in node.get("children", [])}
     roots = [i for i in range(len(nodes)) if i not in children]
@@ -196,7 +195,7 @@ def _placed(content: Mapping[str, Any]) -> Iterator[tuple[int, Float64[np.ndarra
 
 
 def _matrix(node: Mapping[str, Any]) -> Float64[np.ndarray, "4 4"]:
-    """A node's transform: a matrix by columns, or translation, rotation xyzw and scale."""
+    """Return a node's transform, stored as a column-major matrix or as translation, xyzw, scale."""
     if "matrix" in node:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T
     matrix = np.eye(4)
@@ -207,7 +206,7 @@ def _matrix(node: Mapping[str, Any]) -> Float64[np.ndarray, "4 4"]:
 
 
 def _table(path: Path, content: Mapping[str, Any], index: int, body: int) -> RowCloud:
-    """The rows of an accessor, which may lie between those of others."""
+    """Return the rows of an accessor, which may be interleaved with others."""
     accessor = content["accessors"][index]
     view = content["bufferViews"][accessor["bufferView"]]
     if view.get("buffer", 0) != 0 or "sparse" in accessor:

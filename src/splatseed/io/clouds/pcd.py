@@ -1,8 +1,8 @@
-"""PCD, the format of the Point Cloud Library: ascii, binary and binary_compressed.
+"""PCD files of the Point Cloud Library: ascii, binary and binary_compressed.
 
 Colours are ``rgb`` or ``rgba`` packed into 32 bits, or columns r, g, b; else intensity. A
-compressed body is one LZF block, which has to be in memory whole. (pypcd4 reads every body whole
-and needs two more packages.)
+compressed body is one LZF block that must fit in memory. (pypcd4 would load every body at once and
+needs two more packages.)
 """
 
 from __future__ import annotations
@@ -54,43 +54,43 @@ class _ColumnCloud(CloudFile):
 
 
 def _parse_header(data: bytes) -> tuple[np.dtype[Any], int, str, int]:
-    """The layout of a row, the number of rows, the kind of the body, and where it begins."""
+    """Parse a header: dtype of a row, number of rows, format and offset of the body."""
     known: dict[str, list[str]] = {}
     at = 0
     while "DATA" not in known and (end := data.find(b"\n", at)) >= 0:
-        words = data[at:end].decode("latin-1").split()
-        if words and not words[0].startswith("#"):
-            known[words[0].upper()] = words[1:]
+        fields = data[at:end].decode("latin-1").split()
+        if fields and not fields[0].startswith("#"):
+            known[fields[0].upper()] = fields[1:]
         at = end + 1
     names, sizes, kinds = known["FIELDS"], known["SIZE"], known["TYPE"]
     counts = [int(each) for each in known.get("COUNT", ["1"] * len(names))]
     packed = next((name for name in ("rgb", "rgba") if name in names), None)
-    fields: list[Any] = []
+    layout: list[Any] = []
     for i, (name, kind, size, count) in enumerate(zip(names, kinds, sizes, counts, strict=True)):
         known_as = (
             f"pad {i}" if name == "_" else PACKED_RGB if (name, size) == (packed, "4") else name
         )
         shape = () if count == 1 else (count,)
-        fields.append(
+        layout.append(
             (f"{known_as}[]" if shape else known_as, f"<{_KINDS[kind]}{int(size)}", shape)
         )
-    if missing := set(XYZ) - {name for name, *_ in fields}:
+    if missing := set(XYZ) - {name for name, *_ in layout}:
         raise ValueError(f"no fields {', '.join(sorted(missing))} of one value (COUNT 1)")
     size_keys = ["POINTS"] if "POINTS" in known else ["WIDTH", "HEIGHT"]
     rows = math.prod(int(known[key][0]) for key in size_keys)
-    (body,) = (word.lower() for word in known["DATA"])
+    (body,) = (value.lower() for value in known["DATA"])
     if body not in {"ascii", "binary", "binary_compressed"} or rows < 0:
         raise ValueError(f"{rows} points, DATA {body}")
-    return np.dtype(fields), rows, body, at
+    return np.dtype(layout), rows, body, at
 
 
 def _decompressed(
     path: Path, dtype: np.dtype[Any], rows: int, offset: int
 ) -> dict[str, np.ndarray]:
-    """The columns of a compressed body, which holds them one after another."""
+    """Decompress a body, which stores one column after another."""
     needed = rows * dtype.itemsize
-    fix = "Save the cloud as a binary PCD or PLY, which is read in parts."
-    # It is in memory packed and unpacked.
+    fix = "Save the cloud as a binary PCD or PLY, which is read in chunks."
+    # Both compressed and decompressed bytes are in memory.
     check_memory(2 * needed, 1, "bytes of a compressed PCD", fix=fix)
     with translate_errors(path, "a PCD compressed by LZF"), open_file(path) as file:
         file.seek(offset)
@@ -100,7 +100,7 @@ def _decompressed(
             raise ValueError(f"{len(packed):,} bytes for {needed:,}")
         data = np.empty(needed, np.uint8)
         if not decompress_lzf(np.frombuffer(packed, np.uint8), data):
-            raise ValueError("bytes that are not")
+            raise ValueError("a damaged LZF block")
     columns, at = {}, 0
     for name in dtype.names or ():
         stop = at + rows * dtype[name].itemsize

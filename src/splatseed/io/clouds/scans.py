@@ -1,10 +1,9 @@
-"""Scans of surveyors: LAS and LAZ by laspy with lazrs, E57 by pye57 (libE57Format).
+"""Laser scans: LAS and LAZ by laspy with lazrs, E57 by pye57 (libE57Format).
 
-LAS: points that it marks as withheld are left out; colours that are all 0 are none, and then
-intensity that varies is used. E57: the points of all scans, in the frame that the scans' poses lead
-to; points marked invalid are left out. Promise: a LAZ file that ends early is an error, not a
-shorter cloud; what it says of its chunks is checked before lazrs, which would end the process,
-allocates for it.
+LAS: withheld points are skipped; if all colours are 0, varying intensity is used instead. E57: the
+points of all scans, moved to the common frame by the scans' poses; invalid points are skipped.
+Promise: a truncated LAZ file is an error, not a shorter cloud. Its chunk table is checked before
+lazrs, which aborts the process on huge allocations, reads it.
 """
 
 from __future__ import annotations
@@ -24,12 +23,12 @@ from splatseed.io.files import translate_errors
 from splatseed.requirements import require
 
 _WHERE_POINTS, _RECORD = 96, 54
-"""Where a header has the offset of the points, followed by the number of variable length records;
-bytes of each of these, at least."""
+"""Offset in the header of the points' offset and the number of variable length records; smallest
+size of such a record, bytes."""
 _MAX_BYTES = 1 << 30
-"""Of a chunk of points, unpacked; writers use 50,000 points, of 20 to some 100 bytes."""
+"""Largest decompressed chunk; writers use 50,000 points of 20 to about 100 bytes."""
 _SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
-_PLACES = (("cartesianX", "cartesianY", "cartesianZ"), _SPHERICAL)
+_AXES = (("cartesianX", "cartesianY", "cartesianZ"), _SPHERICAL)
 _E57_COLORS = {"colorRed": "red", "colorGreen": "green", "colorBlue": "blue"}
 _INVALID = ("cartesianInvalidState", "sphericalInvalidState")
 
@@ -77,12 +76,12 @@ class LasCloud(CloudFile):
 
 @contextmanager
 def _opened_las(path: Path) -> Iterator[Any]:
-    """A laspy reader; what it raises becomes one of our errors."""
+    """Open a laspy reader; its exceptions become ``SceneFormatError``."""
     import laspy  # noqa: PLC0415  (an optional package)
 
     with translate_errors(path, "a complete LAS or LAZ file"):
-        # laspy makes room for all that a header promises in front of the points, whatever the
-        # file's size. Source: LAS 1.4 R15, tables 3 and 7.
+        # laspy allocates the header's records before the points, whatever the file's size.
+        # Source: LAS 1.4 R15, tables 3 and 7.
         size = path.stat().st_size
         with path.open("rb") as file:
             file.seek(_WHERE_POINTS)
@@ -100,37 +99,37 @@ def _opened_las(path: Path) -> Iterator[Any]:
 
 
 def _check_chunks(path: Path, header: Any) -> None:
-    """Refuse a LAZ file whose description or table of chunks cannot be true.
+    """Raise ``ValueError`` for a LAZ file with an impossible header or chunk table.
 
     Source: the LAZ specification (rapidlasso), "LASzip VLR" and "Chunk table".
     """
     import lazrs  # noqa: PLC0415  (an optional package)
 
     if not header.point_count:
-        return  # there need not be a table
+        return  # the table is optional
     size, bytes_each = path.stat().st_size, header.point_format.size
     vlr = lazrs.LazVlr(header.vlrs[header.vlrs.index("LasZipVlr")].record_data)
     if vlr.item_size() != bytes_each:
         raise ValueError(f"points of {vlr.item_size():,} bytes, not {bytes_each:,}")
     with path.open("rb") as file:
         number = _number_of_chunks(file, header.offset_to_point_data)
-        # A chunk begins with a point as it is.
+        # A chunk starts with an uncompressed point.
         if number * bytes_each > size:
             raise ValueError(f"{number:,} chunks in {size:,} bytes")
         file.seek(header.offset_to_point_data)
         chunks = np.array(lazrs.read_chunk_table(file, vlr), np.float64).reshape(number, 2)
     points, packed = chunks.sum(axis=0)
-    most = chunks[:, 0].max() * bytes_each
-    if packed > size or points < header.point_count or most > _MAX_BYTES:
+    largest = chunks[:, 0].max() * bytes_each
+    if packed > size or points < header.point_count or largest > _MAX_BYTES:
         found = f"chunks of {points:,.0f} points in {packed:,.0f} bytes"
         raise ValueError(f"{found}, for {header.point_count:,} points in {size:,} bytes")
 
 
 def _number_of_chunks(file: IO[bytes], start: int) -> int:
-    """The number that stands before the table of chunks."""
+    """Read the number of chunks, which precedes their table."""
     file.seek(start)
     (offset,) = struct.unpack("<q", file.read(8))
-    if offset <= start:  # written in one go: the offset follows the table
+    if offset <= start:  # a streaming writer puts the offset at the end
         file.seek(-8, os.SEEK_END)
         (offset,) = struct.unpack("<q", file.read(8))
     file.seek(offset)
@@ -151,7 +150,7 @@ class E57Cloud(CloudFile):
         super().__init__(path, (_E57_COLORS.get(name, name) for name in (*XYZ, *shared)), count)
 
     def _sample(self) -> Block:
-        """The beginning of each scan."""
+        """Read the start of each scan."""
         with _opened_e57(self.path) as (image, headers):
             heads = [
                 next(_read_scan(image, h, cloud_file.SAMPLES * cloud_file.SAMPLE_ROWS), {})
@@ -168,11 +167,11 @@ class E57Cloud(CloudFile):
 
 @contextmanager
 def _opened_e57(path: Path) -> Iterator[tuple[Any, list[Any]]]:
-    """An open file and the headers of its scans; failures become one of our errors."""
+    """Open a file; yield it and its scans' headers; exceptions become ``SceneFormatError``."""
     from pye57 import ScanHeader, libe57  # noqa: PLC0415  (an optional package)
 
     with translate_errors(path, "a complete E57 file"):
-        image = libe57.ImageFile(str(path), "r")  # pye57.E57 removes files that it fails to open
+        image = libe57.ImageFile(str(path), "r")  # pye57.E57 deletes files that it fails to open
         try:
             scans = image.root()["data3D"]
             yield image, [ScanHeader(scans[i]) for i in range(len(scans))]
@@ -181,16 +180,16 @@ def _opened_e57(path: Path) -> Iterator[tuple[Any, list[Any]]]:
 
 
 def _read_scan(image: Any, header: Any, size: int) -> Iterator[dict[str, np.ndarray]]:
-    """The valid points of a scan in the file's common frame, at most ``size`` at a time."""
+    """Yield the valid points of a scan in the common frame, at most ``size`` at a time."""
     from pye57 import libe57  # noqa: PLC0415  (an optional package)
 
-    place = next((p for p in _PLACES if set(p) <= set(header.point_fields)), None)
-    if place is None:
+    axes = next((p for p in _AXES if set(p) <= set(header.point_fields)), None)
+    if axes is None:
         raise ValueError(f"neither cartesian nor spherical coordinates: {header.point_fields}")
     count, optional = int(header.point_count), (*_E57_COLORS, "intensity", *_INVALID)
-    fields = (*place, *(name for name in optional if name in header.point_fields))
+    fields = (*axes, *(name for name in optional if name in header.point_fields))
     room = min(size, max(count, 1))
-    # Colours may be bytes, 16-bit or 0 to 1: the values tell.
+    # Colours may be 8-bit, 16-bit or 0 to 1; the white level is detected later.
     kinds = {name: np.int8 if name in _INVALID else np.float64 for name in fields}
     arrays: dict[str, np.ndarray] = {name: np.empty(room, kind) for name, kind in kinds.items()}
     buffers = libe57.VectorSourceDestBuffer()
@@ -205,8 +204,8 @@ def _read_scan(image: Any, header: Any, size: int) -> Iterator[dict[str, np.ndar
             if name in arrays:
                 valid &= arrays[name][:number] == 0
         data = {name: array[:number][valid] for name, array in arrays.items()}
-        xyz = np.stack([data[name] for name in place], axis=1)
-        if place == _SPHERICAL:
+        xyz = np.stack([data[name] for name in axes], axis=1)
+        if axes == _SPHERICAL:
             distance, azimuth, elevation = xyz.T
             flat, height = distance * np.cos(elevation), distance * np.sin(elevation)
             xyz = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), height], axis=1)

@@ -1,9 +1,9 @@
-"""XYZ, CSV, TXT, ASC and PTS: a point per line, whatever stands between the numbers.
+"""Text clouds (XYZ, CSV, TXT, ASC, PTS): one point per line, with any delimiter.
 
-The delimiter, a decimal comma, and a line of names are recognised from the first lines. Without
-names, columns 1 to 3 are the position; of the others, three whole numbers from 0 to 65535 in a row,
-or three numbers from 0 to 1 that are not unit normals, are the colour, and the fourth of four is
-intensity; ``warnings`` tell it. A PTS file begins with the number of its points and has intensity
+Delimiter, decimal comma and header line are detected from the first lines. Without a header,
+columns 1 to 3 are the position. The colour is the first run of three columns with integers from 0
+to 65535, or with numbers from 0 to 1 that are not unit normals; a fourth and last column is
+intensity. ``warnings`` report the guess. PTS files start with the point count and have intensity
 before colours.
 """
 
@@ -26,10 +26,10 @@ _NAMES = (
     | {"r": "red", "g": "green", "b": "blue", "rf": "red", "gf": "green", "bf": "blue"}
     | {"i": "intensity"}
 )
-"""What columns are called elsewhere, in lower case."""
-_MARKS = re.compile(r"^(//|#|%|;)+\s*")
+"""Other names of columns, in lower case."""
+_COMMENT = re.compile(r"^(//|#|%|;)+\s*")
 _UNIT = 1e-2
-"""By how much the length of a triple may differ from 1 for it to count as a normal."""
+"""Largest difference from 1 in the length of a normal."""
 
 
 def open_text(path: Path) -> CloudFile:
@@ -39,10 +39,10 @@ def open_text(path: Path) -> CloudFile:
     lines = head.split("\n")[: None if len(head) < SAMPLE_BYTES else -1]
     first, dialect = _first_line(path, lines)
     rows = [line.strip() for line in lines[first:] if line.strip()]
-    num = len(_words(rows[0], dialect))
-    try:  # rows of another length than the first are left to the reader
-        even = [row for row in rows if len(_words(row, dialect)) == num]
-        sample = dialect.parse(even, range(num))
+    num = len(_fields(rows[0], dialect))
+    try:  # the reader reports rows of another length than the first
+        complete = [row for row in rows if len(_fields(row, dialect)) == num]
+        sample = dialect.parse(complete, range(num))
     except ValueError as error:
         raise SceneFormatError(
             f"numbers in every row of {path}", found=str(error)[:120], fix="Export it again."
@@ -52,27 +52,27 @@ def open_text(path: Path) -> CloudFile:
     offset = sum(len(line) + 1 for line in lines[:first])  # latin-1: a byte per character
     cloud = LineCloud(path, names, offset, dialect=dialect)
     if named is None:
-        what = "none as colours"
+        colors = "none as colours"
         if cloud.colors == "rgb":
-            at = names.index(RGB[0]) + 1
-            what = f"{at} to {at + 2} as red, green, blue"
+            column = names.index(RGB[0]) + 1
+            colors = f"{column} to {column + 2} as red, green, blue"
         elif cloud.colors == "intensity":
-            what = "4 as intensity"
-        taken = f"columns 1 to 3 of {path.name} are taken as x, y, z, {what}"
-        cloud.warnings = (f"It has no line of names: {taken}.",)
+            colors = "4 as intensity"
+        guess = f"columns 1 to 3 of {path.name} are taken as x, y, z, {colors}"
+        cloud.warnings = (f"It has no header line: {guess}.",)
     return cloud
 
 
 def _first_line(path: Path, lines: Sequence[str]) -> tuple[int, Dialect]:
-    """The first line of at least three numbers, and how it is written."""
+    """Find the first line of three or more numbers, and its dialect."""
     for i, line in enumerate(lines):
         for dialect in _dialects(line):
             with suppress(ValueError):
-                if len([float(word) for word in _words(line, dialect)]) >= 3:
+                if len([float(field) for field in _fields(line, dialect)]) >= 3:
                     return i, dialect
     found = next((repr(line.strip()[:60]) for line in lines if line.strip()), "an empty file")
     raise SceneFormatError(
-        f"{path} to hold a point per line, x y z first or under a line of names",
+        f"{path} to have one point per line, x y z first or below a header line",
         found=found,
         fix="Export the cloud as text with x, y, z, or in another format.",
     )
@@ -88,29 +88,29 @@ def _dialects(line: str) -> Iterator[Dialect]:
         yield Dialect(None, decimal_comma=True)
 
 
-def _words(line: str, dialect: Dialect) -> list[str]:
+def _fields(line: str, dialect: Dialect) -> list[str]:
     text = line.strip().replace(",", ".") if dialect.decimal_comma else line.strip()
-    return [word.strip().strip('"') for word in text.split(dialect.delimiter)]
+    return [field.strip().strip('"') for field in text.split(dialect.delimiter)]
 
 
 def _named(lines: Sequence[str], dialect: Dialect, count: int) -> list[str] | None:
-    """Names of the columns, from the last line before the numbers that has as many words."""
+    """Read column names from the last line before the numbers with as many fields."""
     for line in reversed(lines):
-        bare = _MARKS.sub("", line.strip())
+        header = _COMMENT.sub("", line.strip())
         for delimiter in (dialect.delimiter, None, ",", ";", "\t"):
-            words = [word.strip().strip('"').lower() for word in bare.split(delimiter)]
-            names = [_NAMES.get(word, word) for word in words]
+            fields = [field.strip().strip('"').lower() for field in header.split(delimiter)]
+            names = [_NAMES.get(field, field) for field in fields]
             if len(names) == count and set(XYZ) <= set(names):
                 return names
     return None
 
 
 def _guessed(sample: Float64[np.ndarray, "N C"], is_pts: bool) -> list[str]:
-    """Names for columns that have none, from their values."""
+    """Guess column names from values."""
     count = sample.shape[1]
     names = [*XYZ, *(f"column {i + 1}" for i in range(3, count))]
     starts = range(4, 5) if is_pts and count == 7 else range(3, count - 2)
-    start = next((i for i in starts if _like_colors(sample[:, i : i + 3])), None)
+    start = next((i for i in starts if _are_colors(sample[:, i : i + 3])), None)
     if start is not None:
         names[start : start + 3] = RGB
     elif count == 4:
@@ -118,7 +118,7 @@ def _guessed(sample: Float64[np.ndarray, "N C"], is_pts: bool) -> list[str]:
     return names
 
 
-def _like_colors(values: Float64[np.ndarray, "N 3"]) -> bool:
+def _are_colors(values: Float64[np.ndarray, "N 3"]) -> bool:
     known = values[np.isfinite(values).all(axis=1)]
     if not len(known) or known.min() < 0:
         return False
