@@ -203,7 +203,7 @@ def test_scenes_that_cannot_be_fused_are_refused(maps, room, tmp_path):
     bent = replace(lens, model="SIMPLE_RADIAL", params=(100.0, 60.0, 45.0, 0.1))
     for error, said, changes in (
         (SceneFormatError, "distortion", {"intrinsics": bent}),
-        (OutputError, "stay inside", {"name": "../view_000.png"}),
+        (OutputError, "inside their folder", {"name": "../view_000.png"}),
         (SceneNotFoundError, "gone.png", {"name": "gone.png"}),
     ):
         scene = room.replace(images=(replace(room.images[0], **changes), *room.images[1:]))

@@ -1,8 +1,8 @@
-"""Points that training can use: distinct, finite, near 0, and numbered as COLMAP's files want them.
+"""Clean points for training (finite, distinct) and renumber them for COLMAP's files.
 
-A duplicate has the float32 position of an earlier point. A *feature* is one observation slot of an
-image; all features of all images in a row are numbered by *slot*. A track element (image id,
-feature index) and a feature's point id state the same fact twice.
+A duplicate has the float32 position of an earlier point. A *slot* numbers the 2D features of all
+images consecutively. A track element (image id, feature index) and a feature's point id are
+redundant records of one observation.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from splatseed.pointcloud import PointCloud
 from splatseed.scene import NO_POINT, Image, LeftOut, Observations, Scene, Tracks
 
 _FAR_OUT = 1e4
-"""Times the inner half of the points: the sky of outdoor scenes is at some hundred times."""
-_FEW = 0.01  # of the points at most can be so far
+"""Interquartile extents from which points are outliers; skies are at some hundred."""
+_FEW = 0.01  # largest share of outliers
 
 
 def clean_scene(scene: Scene) -> Scene:
-    """The scene with its distinct finite points only, and with their tracks and observations.
+    """Keep distinct finite points, with their tracks and observations.
 
-    ``left_out`` counts the others, and ``warnings`` report them.
+    ``left_out`` counts the other points, and ``warnings`` report them.
     """
     points, known = scene.points, scene.left_out
     keep = points.distinct
@@ -49,7 +49,7 @@ def clean_scene(scene: Scene) -> Scene:
 
 
 def without_points(scene: Scene, keep: Bool[np.ndarray, " N"]) -> Scene:
-    """The scene with some points removed; their features then belong to no point."""
+    """Keep the points of a mask; features of the other points lose their point id."""
     points, tracks = scene.points.select(keep), scene.tracks
     if tracks is None:
         return replace(scene, points=points)
@@ -62,12 +62,11 @@ def without_points(scene: Scene, keep: Bool[np.ndarray, " N"]) -> Scene:
 
 
 def renumber(scene: Scene) -> tuple[Tracks | None, tuple[Image, ...], int]:
-    """Number the points 1, 2, ... in their order; tracks belong to the first of them.
+    """Number the points 1, 2, ... in their order; tracks belong to the first points.
 
     Returns:
-        The tracks, None if there are none; the images, with the features' point ids renewed; and
-        how many references between points and features were removed because one side did not
-        confirm them.
+        The tracks, if any; the images with new point ids; and the number of references between
+        points and features that were removed because only one side has them.
     """
     old_ids, tracks = _feature_ids(scene.images), scene.tracks
     new_ids = np.full(len(old_ids), NO_POINT, np.int64)
@@ -94,7 +93,7 @@ def renumber(scene: Scene) -> tuple[Tracks | None, tuple[Image, ...], int]:
 
 
 def _feature_ids(images: Sequence[Image]) -> Int64[np.ndarray, " S"]:
-    """The point id of every slot."""
+    """Return the point id of every slot."""
     ids = [im.observations.point_ids for im in images if im.observations is not None]
     return np.concatenate([np.empty(0, np.int64), *ids])
 
@@ -104,7 +103,7 @@ def _feature_counts(images: Sequence[Image]) -> Int64[np.ndarray, " I"]:
 
 
 def _slots(images: Sequence[Image], tracks: Tracks) -> Int64[np.ndarray, " T"]:
-    """The slot of every track element; -1 where there is no such image or feature."""
+    """Return the slot of every track element; -1 without such an image or feature."""
     if not images:
         return np.full(len(tracks.image_ids), -1, np.int64)
     counts = _feature_counts(images)
@@ -121,18 +120,19 @@ def _slots(images: Sequence[Image], tracks: Tracks) -> Int64[np.ndarray, " T"]:
 def _with_point_ids(
     images: Sequence[Image], point_ids: Int64[np.ndarray, " S"]
 ) -> tuple[Image, ...]:
-    """The images with the point ids of their slots."""
+    """Set the point ids of all slots."""
     pieces = np.split(point_ids, np.cumsum(_feature_counts(images))[:-1])
+    # zip is not strict: without images, np.split returns one empty piece.
     return tuple(
         image
         if image.observations is None
         else replace(image, observations=Observations(image.observations.xy, piece))
-        for image, piece in zip(images, pieces, strict=False)  # no image still makes one piece
+        for image, piece in zip(images, pieces, strict=False)
     )
 
 
 def cloud_warnings(points: PointCloud) -> tuple[str, ...]:
-    """A sentence on each problem of the cloud as a whole."""
+    """Warn of points far outside of the cloud."""
     warnings = []
     xyz = points.xyz[points.finite]
     if len(xyz) < 2:

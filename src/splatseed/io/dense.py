@@ -1,11 +1,11 @@
-"""Writing stereo's depth and normal maps: a COLMAP dense workspace, or a plain folder.
+"""Write stereo depth and normal maps as a COLMAP dense workspace or a plain folder.
 
-COLMAP places pixel (column, row) of a map at (column, row) of its camera, whereas everyone else,
-its own sparse model included, has (column + 0.5, row + 0.5). Maps (mvs/mat.h) and consistency
-graphs (mvs/consistency_graph.h), little-endian, begin with the text ``W&H&C&``; a map follows with
-C x H x W float32, a graph with int32: column, row, n and n image indices (places in the model,
-ascending by id) for each pixel that has any. Promise: depths are those along COLMAP's rays, so
-fused points lie where the scene has them; no depth is mixed with its neighbours'.
+COLMAP's dense tools put the centre of pixel (column, row) at (column, row), whereas its sparse
+model and other tools use (column + 0.5, row + 0.5). Maps (mvs/mat.h) and consistency graphs
+(mvs/consistency_graph.h) are little-endian and start with the text ``W&H&C&``. A map continues with
+C x H x W float32; a graph with int32 column, row, n and n image indices (in the model's order of
+ids) per confirmed pixel. Promise: depths are along COLMAP's rays, so that fused points have the
+scene's positions; depths are never interpolated between pixels.
 """
 
 from __future__ import annotations
@@ -35,30 +35,28 @@ from splatseed.progress import Progress, in_threads, silent
 from splatseed.scene import Image, Observations, Scene, Tracks
 
 DenseMap: TypeAlias = Any
-"""A ``splatseed.depth.stereo.StereoMap``: name, camera, depth, normal, confidence, sources and
-agreeing of one image."""
+"""A ``splatseed.depth.stereo.StereoMap`` of one image."""
 Undistort: TypeAlias = Callable[
     [UInt8[np.ndarray, "H W 3"], Intrinsics, Float64[np.ndarray, "3 3"]],
     tuple[UInt8[np.ndarray, "H W 3"], Bool[np.ndarray, "H W"]],
 ]
-"""``splatseed.photos.projection.undistort`` or an equivalent: takes pixels, lens and matrix, and
-returns pixels and which of them are known."""
+"""``splatseed.photos.projection.undistort``: (pixels, camera, K) to (pixels, valid mask)."""
 
 _MAX_SOURCES = 8
 """``agreeing`` has one bit per source."""
 _MAX_CHANGE = 1.25
-"""Planes seen at so grazing an angle that depth changes by more than this factor are left out."""
+"""Largest change of depth by half a pixel; planes at more grazing angles are dropped."""
 _SAME_POSE = 1e-6
 _KINDS = ("photometric", "geometric")
-"""COLMAP's two passes; stereo_fusion reads the second unless told otherwise."""
+"""COLMAP's two passes; stereo_fusion reads the second by default."""
 _POINTS_PER_MAP = 200
-"""Points of a map: enough to tell which views overlap much and which little."""
+"""Points per map in the sparse model, from which COLMAP derives the overlap of views."""
 _GREY = 128
 
 
 @dataclass(frozen=True)
 class DenseReport:
-    """What was written: maps, their pixels, those with a depth, and images without any."""
+    """Counts of written maps, pixels and pixels with depth; ``empty`` are maps without any."""
 
     path: Path
     num_maps: int = 0
@@ -68,7 +66,7 @@ class DenseReport:
 
     @property
     def share_known(self) -> float:
-        """The share of pixels with a depth, 0 to 1."""
+        """Share of pixels with a depth, 0 to 1."""
         return self.num_known / max(self.num_pixels, 1)
 
 
@@ -81,22 +79,21 @@ def write_dense_maps(
     provenance: Mapping[str, object] | None = None,
     progress: Progress = silent,
 ) -> DenseReport:
-    """Write a folder of depth maps of kind "z"; ``splatseed.io.find_depths`` reads them.
+    """Write a folder of planar depth maps for ``splatseed.io.find_depths``.
 
-    Beside the planar depth of the image ``a/b.jpg``, ``a/b.jpg.npy``, the rest is in
-    ``a/b.jpg.stereo.npz``.
+    The depth of ``a/b.jpg`` is in ``a/b.jpg.npy``, all else in ``a/b.jpg.stereo.npz``.
 
     Args:
         scene: The scene of the maps.
-        maps: The maps of some of its images, in any order and of any size; consumed one by one.
-        path: The folder to make.
-        overwrite: Whether an earlier output of splatseed may be replaced.
-        provenance: How the maps came about, for ``splatseed.json``.
+        maps: Maps of some of its images, in any order and size; consumed one by one.
+        path: The output folder.
+        overwrite: Replace an earlier output of splatseed.
+        provenance: How the maps were made, for ``splatseed.json``.
         progress: Called with the stage and the fraction done.
 
     Raises:
-        ParameterError: There is no map, or one does not belong to the scene.
-        OutputError: The folder is taken or cannot be written.
+        ParameterError: No map, or one does not belong to the scene.
+        OutputError: The folder exists or cannot be written.
     """
     path, images = Path(path), {image.name: image for image in scene.images}
     protect = scene.source.inputs if scene.source else ()
@@ -130,29 +127,29 @@ def write_dense_workspace(  # noqa: D417  (the rest is as for maps)
     provenance: Mapping[str, object] | None = None,
     progress: Progress = silent,
 ) -> DenseReport:
-    """Write a folder that ``colmap stereo_fusion --workspace_path`` turns into a point cloud.
+    """Write a workspace for ``colmap stereo_fusion --workspace_path``.
 
-    A map is written under both of COLMAP's names, photometric and geometric, and once more as
-    ``.npy`` with depths at pixel centres, which ``find_depths`` prefers.
+    Each map gets both of COLMAP's names, photometric and geometric, and is also written as ``.npy``
+    with depths at pixel centres, which ``find_depths`` prefers.
 
     Args:
         scene: A scene with photographs.
-        maps: As for ``write_dense_maps``, as are all arguments and errors not named here.
-        path: The folder to make.
+        maps: Maps; this and arguments and errors not listed are those of ``write_dense_maps``.
+        path: The output folder.
         copy_images: Copy the photographs instead of linking them.
-        undistort: Removes lens distortion from a photograph; the workspace then holds the
-            undistorted photographs and pinhole cameras of the same matrix, which the maps belong
-            to. Without it, distorted cameras are refused.
+        undistort: Undistorts a photograph. The workspace then has undistorted photographs and
+            pinhole cameras with the same K, to which the maps belong. If None, cameras with
+            distortion are refused.
 
     Raises:
-        InputError: What ``check_dense_scene`` refuses.
+        InputError: As ``check_dense_scene``.
     """
     path, sizes = Path(path), check_dense_scene(scene, undistorts=undistort is not None)
     cameras, images = _photograph_model(scene, sizes)
     idxs = {name: idx for idx, name in enumerate(images)}
     inputs = scene.source.inputs if scene.source else ()
     with output_folder(path, kind="depth", overwrite=overwrite, protect=inputs) as folder:
-        _bring_photographs(scene, folder, undistort, progress, copy=copy_images)
+        _write_photographs(scene, folder, undistort, progress, copy=copy_images)
         stereo = folder / "stereo"
         for name in ("depth_maps", "normal_maps", "consistency_graphs"):
             (stereo / name).mkdir(parents=True)
@@ -167,12 +164,12 @@ def write_dense_workspace(  # noqa: D417  (the rest is as for maps)
 
         progress("write maps", 0.0)
         report = _write_each(maps, images, write, path, progress)
-        # Which images to match with which, and which to fuse, in the model's order.
+        # Image pairs to match, and images to fuse, in the model's order.
         names = [name for name in images if name in sources]
         matches = [f"{name}\n{_matches(sources[name])}\n" for name in names]
         (stereo / "patch-match.cfg").write_text("".join(matches), encoding="utf-8")
         (stereo / "fusion.cfg").write_text("".join(f"{n}\n" for n in names), encoding="utf-8")
-        # The finite, distinct points with tracks; added points have none.
+        # Only points with tracks; added points have none.
         points = scene.points.select(slice(0, len(scene.tracks or ())))
         originals = clean_scene(replace(scene, points=points, images=tuple(images.values())))
         points, (tracks, featured, _) = originals.points, renumber(originals)
@@ -187,13 +184,13 @@ def write_dense_workspace(  # noqa: D417  (the rest is as for maps)
 
 
 def check_dense_scene(scene: Scene, *, undistorts: bool = False) -> dict[str, Size]:
-    """Width and height of each photograph, by name, of a scene that can become a workspace.
+    """Check that a scene can become a workspace; return the sizes of its photographs by name.
 
     Raises:
-        SceneNotFoundError: It has no photographs, or one is missing.
-        SceneFormatError: A camera has distortion that stays (not ``undistorts``), or a photograph
-            differs from it in aspect ratio.
-        OutputError: An image's name leads out of its folder.
+        SceneNotFoundError: No photographs, or one is missing.
+        SceneFormatError: A camera has distortion and ``undistorts`` is False, or a photograph has
+            another aspect ratio than its camera.
+        OutputError: An image name leads out of the folder.
     """
     folder = photograph.photograph_folder(scene)
     return {image.name: _size_of(image, folder, undistorts=undistorts) for image in scene.images}
@@ -210,12 +207,12 @@ def _size_of(image: Image, folder: Path, *, undistorts: bool) -> Size:
     kind = PilImage.registered_extensions().get(Path(image.name).suffix.lower())
     if lens.has_distortion and kind not in PilImage.SAVE:
         raise SceneFormatError(
-            "photographs that can be written again once they are undistorted (.jpg, .png, .tif)",
+            "photographs in a format that can be written after undistortion (.jpg, .png, .tif)",
             found=image.name,
-            fix="Export them as one of these, or undistort the scene first.",
+            fix="Convert them, or undistort the scene first.",
         )
     if "/".join(safe_parts(image.name)) != image.name or "\n" in image.name:
-        expected = "image names that stay inside their folder"
+        expected = "image names inside their folder"
         raise OutputError(expected, found=repr(image.name), fix="Rename the image.")
     return check_sizes([image], folder)[image.name]
 
@@ -227,14 +224,14 @@ def _write_each(
     path: Path,
     progress: Progress,
 ) -> DenseReport:
-    """Check and write the maps one by one."""
+    """Check and write maps one by one."""
     report, total = DenseReport(path), length_hint(maps, len(images)) or 1
     seen = set[str]()
     for dense in maps:
         _check_map(dense, images)
         if dense.name in seen:
             raise ParameterError(
-                "one depth map per image", found=f"two for {dense.name}", fix="Leave one out."
+                "one depth map per image", found=f"two for {dense.name}", fix="Remove one."
             )
         seen.add(dense.name)
         write(dense)
@@ -244,12 +241,12 @@ def _write_each(
         report = DenseReport(path, len(seen), pixels, report.num_known + known, empty)
         progress("write maps", min(len(seen) / total, 1.0))
     if not seen:
-        raise ParameterError("at least one depth map", found="none", fix="Make some first.")
+        raise ParameterError("at least one depth map", found="none", fix="Make maps first.")
     return report
 
 
 def _check_map(dense: DenseMap, images: Mapping[str, Image]) -> None:
-    """Check that a map belongs to an image of the scene, and that its arrays match."""
+    """Raise ``ParameterError`` unless a map fits an image of the scene."""
     unknown = [name for name in (dense.name, *dense.sources) if name not in images]
     size = (dense.camera.height, dense.camera.width)
     arrays = (dense.depth, dense.normal[..., 0], dense.confidence, dense.agreeing)
@@ -271,7 +268,7 @@ def _check_map(dense: DenseMap, images: Mapping[str, Image]) -> None:
 
 
 def scaled_K(camera: Camera, width: int, height: int) -> Float64[np.ndarray, "3 3"]:  # noqa: N802  (K is the field's name)
-    """The pinhole matrix of a camera whose image is resized to ``width`` x ``height``, [3, 3]."""
+    """Return K [3, 3] of a camera for an image resized to ``width`` x ``height``."""
     scaled: np.ndarray = np.diag([width / camera.width, height / camera.height, 1.0]) @ camera.K
     return scaled
 
@@ -279,9 +276,9 @@ def scaled_K(camera: Camera, width: int, height: int) -> Float64[np.ndarray, "3 
 def depth_along(
     dense: DenseMap, K: Float64[np.ndarray, "3 3"], at: float
 ) -> Float32[np.ndarray, "H W"]:
-    """The depth of each pixel's plane along another ray nearby; NaN where unknown.
+    """Intersect each pixel's plane with the ray through (column + at, row + at) of K.
 
-    Pixel (column, row) gets that along the ray through (column + at, row + at) of the grid of K.
+    Returns depths, NaN where unknown.
     """
     own = _toward_plane(dense, dense.camera.K, 0.5)
     other = _toward_plane(dense, K, at)
@@ -295,7 +292,7 @@ def depth_along(
 def _toward_plane(
     dense: DenseMap, K: Float64[np.ndarray, "3 3"], at: float
 ) -> Float64[np.ndarray, "H W"]:
-    """The product n . r of each pixel's normal and the ray through (column + at, row + at)."""
+    """Return n . r of each pixel's normal and the ray through (column + at, row + at)."""
     height, width = dense.depth.shape
     rows, columns = np.mgrid[0:height, 0:width] + at
     rays = np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ np.linalg.inv(K).T
@@ -303,7 +300,7 @@ def _toward_plane(
 
 
 def _write_stereo(folder: Path, camera: Camera, dense: DenseMap, sources: Sequence[int]) -> None:
-    """Write one map into the folder ``stereo``."""
+    """Write a map into the folder ``stereo``."""
     height, width = dense.depth.shape
     K = scaled_K(camera, width, height)  # as COLMAP scales it
     depth = depth_along(dense, K, 0.0)
@@ -320,14 +317,14 @@ def _write_stereo(folder: Path, camera: Camera, dense: DenseMap, sources: Sequen
 
 
 def _matches(sources: tuple[str, ...]) -> str:
-    """The line of sources; COLMAP's own choice if there are none or a comma would split names."""
+    """Format the line of source views; ``__auto__`` without any, or if a name has a comma."""
     if not sources or any("," in name for name in sources):
         return "__auto__, 20"
     return ", ".join(sources)
 
 
 def write_map(path: Path, values: Float32[np.ndarray, "H W *C"]) -> None:
-    """Write a new file of depths [H, W] or normals [H, W, 3]; NaN becomes 0, "unknown"."""
+    """Write depths [H, W] or normals [H, W, 3] to a new file; NaN becomes 0, COLMAP's "unknown"."""
     height, width = values.shape[:2]
     planes = np.moveaxis(values.reshape(height, width, -1), -1, 0)
     known = np.nan_to_num(planes, nan=0.0).astype("<f4")
@@ -337,7 +334,7 @@ def write_map(path: Path, values: Float32[np.ndarray, "H W *C"]) -> None:
 def write_consistency_graph(
     path: Path, agreeing: UInt8[np.ndarray, "H W"], image_idxs: Sequence[int]
 ) -> None:
-    """Write a new file of which images confirm each pixel: bit k stands for ``image_idxs[k]``."""
+    """Write the images that confirm each pixel to a new file; bit k means ``image_idxs[k]``."""
     bits = (agreeing[..., None] >> np.arange(len(image_idxs), dtype=np.uint8)) & 1
     rows, columns = np.nonzero(bits.any(axis=-1))
     confirming = bits[rows, columns].astype(bool)  # [pixels, sources]
@@ -356,13 +353,13 @@ def _write(path: Path, size: tuple[int, int, int], body: bytes) -> None:
         file.write(body)
 
 
-def _bring_photographs(
+def _write_photographs(
     scene: Scene, folder: Path, undistort: Undistort | None, progress: Progress, *, copy: bool
 ) -> None:
-    """Fill ``images`` in a folder with the photographs of a scene that was checked."""
-    bent = [image for image in scene.images if image.intrinsics.has_distortion]
+    """Link, copy or undistort a checked scene's photographs into ``images``."""
+    distorted = [image for image in scene.images if image.intrinsics.has_distortion]
     source = scene.source.image_dir if scene.source else None
-    if undistort is None or not bent or source is None:
+    if undistort is None or not distorted or source is None:
         folders = image_folders(scene)
         wanted = {n: p for n, p in folders.items() if n == "images" or n.startswith("images/")}
         bring(wanted, folder, copy=copy)
@@ -371,7 +368,7 @@ def _bring_photographs(
     bring({f"images/{name}": source / name for name in straight}, folder, copy=copy)
 
     def work(start: int, stop: int) -> None:
-        for image in bent[start:stop]:
+        for image in distorted[start:stop]:
             path, target = source / image.name, folder / "images" / image.name
             encoded = photograph.photograph_bytes(path)
             pixels = np.asarray(photograph.decode_photograph(path, encoded, scene.white))
@@ -379,20 +376,20 @@ def _bring_photographs(
             straight = PilImage.fromarray(undistort(pixels, lens, lens.K)[0])
             target.parent.mkdir(parents=True, exist_ok=True)
             jpeg = PilImage.registered_extensions()[target.suffix.lower()] == "JPEG"
-            # The pixels of a JPEG come from one already.
+            # High quality, since JPEG pixels are compressed a second time.
             options: dict[str, Any] = {"quality": 95, "subsampling": 0} if jpeg else {}
             straight.save(target, **options)
 
-    in_threads(work, len(bent), 1, "undistort", progress)
+    in_threads(work, len(distorted), 1, "undistort", progress)
 
 
 def _photograph_model(
     scene: Scene, sizes: Mapping[str, Size]
 ) -> tuple[tuple[Intrinsics, ...], dict[str, Image]]:
-    """The pinhole cameras and the images, by id, in pixels of the photographs as on disk.
+    """Return pinhole cameras and images, sorted by id, in pixels of the photographs on disk.
 
-    A record may be larger than its photographs (a folder of reduced copies), and COLMAP samples
-    colours at the record's pixels: there is one for each camera and size of photograph.
+    COLMAP samples colours at camera pixels, but photographs may be reduced copies, so each pair of
+    camera and photograph size gets a camera.
     """
     cameras: dict[tuple[int, Size], Intrinsics] = {}
     images = {}
@@ -403,7 +400,7 @@ def _photograph_model(
         record = cameras.setdefault((lens.camera_id, size), pinhole)
         if seen is not None:
             uv = seen.xy
-            if lens.has_distortion:  # a feature that no ray of the lens reaches stays
+            if lens.has_distortion:  # features outside of the lens model stay
                 straight = rays_through(lens, uv) * lens.K[[0, 1], [0, 1]] + lens.K[:2, 2]
                 uv = np.where(np.isnan(straight), uv, straight)
             scale = np.array([record.width / lens.width, record.height / lens.height])
@@ -413,7 +410,7 @@ def _photograph_model(
 
 
 def _overlap_points(dense: DenseMap, views: Sequence[int]) -> tuple[np.ndarray, list[list[int]]]:
-    """Points [n, 3] evenly over a map's pixels that a source confirms, and the views of each."""
+    """Sample confirmed pixels of a map evenly; return points [n, 3] and the views of each."""
     rows, columns = np.nonzero(np.isfinite(dense.depth) & (dense.agreeing > 0))
     chosen = np.linspace(0, len(rows) - 1, min(_POINTS_PER_MAP, len(rows))).astype(np.intp)
     rows, columns = rows[chosen], columns[chosen]
@@ -429,7 +426,7 @@ def _overlap_points(dense: DenseMap, views: Sequence[int]) -> tuple[np.ndarray, 
 def _overlap_model(
     overlap: Sequence[tuple[np.ndarray, list[list[int]]]], images: Sequence[Image]
 ) -> tuple[PointCloud, Tracks, tuple[Image, ...]]:
-    """Points of the maps with tracks, and the images with features where they see them."""
+    """Make a sparse model of the maps' points: cloud, tracks, and images with features."""
     xyz = np.concatenate([np.empty((0, 3)), *(xyz for xyz, _ in overlap)])
     views = [seen for _, each in overlap for seen in each]
     lengths = np.array([len(seen) for seen in views], np.int64)
@@ -439,7 +436,7 @@ def _overlap_model(
     for idx, image in enumerate(images):
         mine = np.flatnonzero(image_idx == idx)
         places[mine], seen = np.arange(len(mine)), point_idx[mine]
-        uv = np.nan_to_num(image.camera.project(xyz[seen])[0])  # perhaps behind it: a wrong map
+        uv = np.nan_to_num(image.camera.project(xyz[seen])[0])  # NaN behind a camera
         featured.append(replace(image, observations=Observations(uv, seen + 1)))
     tracks = Tracks(
         point_ids=np.arange(1, len(xyz) + 1),

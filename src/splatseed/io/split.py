@@ -1,8 +1,8 @@
-"""Which images train and which test, for scenes with files that say so.
+"""Train/test splits from files of a scene.
 
-The first of these that fits is used, and reported: ``train_filenames`` and ``test_filenames`` (else
-``val_filenames``) of a transforms.json, as nerfstudio writes them; text files with one image name
-per line, as nerfstudio's COLMAP reader, graphdeco (beside the model) and others have them.
+The first valid source is used: ``train_filenames`` and ``test_filenames`` (else
+``val_filenames``) of a transforms.json, as in nerfstudio; or text files with one image name per
+line, as in nerfstudio's COLMAP reader, graphdeco (beside the model) and others.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ ROOT_LISTS = (
     *("train_list.txt", "test_list.txt", "val_list.txt", "validation_list.txt"),
     *("train.txt", "test.txt"),
 )
-"""Lists in a scene's folder: for training, test and validation (nerfstudio checks for the last of
-these names, and reads the one before); for training and test."""
+"""Lists in a scene folder: training, test, validation (nerfstudio checks for the last name but
+reads the one before); and training, test."""
 MODEL_LISTS = ("test.txt",)
 """Lists beside a COLMAP model."""
 _SHOWN = 3
-"""Names that a warning shows."""
+"""Names listed in a warning."""
 
 
 def with_listed_split(scene: Scene) -> Scene:
-    """The scene with the split of its lists, if it has some."""
+    """Set a scene's split from its lists, if it has any."""
     if scene.source is None or not scene.images or scene.listed is not None:
         return scene
     warnings = list(scene.warnings)
     for origin, parts in _lists(scene):
         split, unknown = _split(scene, origin, parts)
         if split is not None:
-            if unknown:  # a slip, or lost by SfM
+            if unknown:  # typing errors, or images that SfM lost
                 shown = ", ".join(unknown[:_SHOWN]) + (", ..." if len(unknown) > _SHOWN else "")
                 match = agreeing(len(unknown), "matches", "match")
                 names = counted(len(unknown), "name")
@@ -46,7 +46,7 @@ def with_listed_split(scene: Scene) -> Scene:
 
 
 def _lists(scene: Scene) -> Iterator[tuple[str, list[list[str]]]]:
-    """What each list is called, and its names for training, test and perhaps validation."""
+    """Yield each list's description, and its names for training, test and maybe validation."""
     source = scene.source
     assert source is not None  # noqa: S101  (checked by the caller)
     if source.transforms_path is not None:
@@ -74,7 +74,7 @@ def _read(path: Path) -> list[str]:
 
 
 def _split(scene: Scene, origin: str, parts: list[list[str]]) -> tuple[Split | None, list[str]]:
-    """The split of the images, None if one part would be empty; and the names of no image."""
+    """Make the split (None if a part is empty), and return names that match no image."""
     names = [image.name for image in scene.images]
     folder = scene.source.image_dir if scene.source else None
     prefixes = ("", "images/", f"{folder.name}/" if folder else "")
@@ -92,13 +92,13 @@ def _split(scene: Scene, origin: str, parts: list[list[str]]) -> tuple[Split | N
 
 
 def _known(names: Sequence[str], listed: Sequence[str], prefixes: Sequence[str]) -> dict[str, str]:
-    """The images that are listed: by name as it is or within their folder, or by file or stem."""
+    """Match listed names to images: by full or folder-relative name, else by file name or stem."""
     exact = {f"{prefix}{name}": name for prefix in reversed(prefixes) for name in names}
     plain = {each: each.replace("\\", "/").removeprefix("./") for each in listed}
     known = {each: exact[name] for each, name in plain.items() if name in exact}
     for field in () if known else ("name", "stem"):
         parts = {getattr(PurePosixPath(name), field): name for name in names}
-        if len(parts) == len(names):  # else a name would be ambiguous
+        if len(parts) == len(names):  # unless ambiguous
             wanted = {each: getattr(PurePosixPath(name), field) for each, name in plain.items()}
             known = {each: parts[part] for each, part in wanted.items() if part in parts}
         if known:
