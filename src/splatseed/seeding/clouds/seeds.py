@@ -14,7 +14,7 @@ from jaxtyping import Float64, UInt8
 
 from splatseed.depth.stereo.maps import StereoSettings
 from splatseed.errors import PointCloudError
-from splatseed.io.origin import ELSEWHERE
+from splatseed.io.origin import LIMITS
 from splatseed.methods import source_code
 from splatseed.methods.contract import NewPoints
 from splatseed.photos.view import View
@@ -140,7 +140,7 @@ def _is_elsewhere(merged: MergedCloud, scene: Scene) -> bool:
     first, last = centers.min(axis=0), centers.max(axis=0)
     gap = np.maximum(merged.low - last, first - merged.high).max()
     extent = max((merged.high - merged.low).max(), (last - first).max())
-    return bool(gap > ELSEWHERE * extent > 0)
+    return bool(gap > LIMITS.other_frame * extent > 0)
 
 
 def _out_of_view(merged: MergedCloud, scene: Scene) -> PointCloudError:
