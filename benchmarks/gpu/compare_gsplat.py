@@ -17,7 +17,7 @@ import torch
 from splatseed.photos.view import View
 from splatseed.rendering import rasterization
 from splatseed.training.device import pick_device
-from splatseed.training.growing import contributions
+from splatseed.training.strategies.grow import contributions
 
 __all__ = ["ODD_ONES", "TOLERANCE", "compare"]
 

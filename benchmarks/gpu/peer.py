@@ -21,7 +21,7 @@ from torch import Tensor
 from splatseed import load_scene
 from splatseed.photos.view import View, load_split
 from splatseed.splat.evaluate import evaluate_views
-from splatseed.splat.metrics import l1_and_ssim_by_convolution
+from splatseed.splat.ssim_conv import l1_and_ssim_by_convolution
 from splatseed.training import TrainSettings
 from splatseed.training.device import pick_device
 from splatseed.training.seeds import usable_seeds

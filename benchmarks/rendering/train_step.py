@@ -34,8 +34,9 @@ from splatseed.errors import SplatseedError
 from splatseed.photos.view import load_split
 from splatseed.splat.gaussians import Gaussians, TrainingFrame, initial_gaussians, training_frame
 from splatseed.splat.rendering import render_view
+from splatseed.training.initialization import min_view_depths
 from splatseed.training.parameters import make_optimizers, make_parameters
-from splatseed.training.seeds import near_depths, usable_seeds
+from splatseed.training.seeds import usable_seeds
 from splatseed.training.settings import TrainSettings
 from splatseed.training.state import TrainState, make_strategy
 from splatseed.training.trainer import Trainer, _Loss
@@ -121,7 +122,7 @@ def _trainer(workload: Workload) -> Trainer:
     frame = training_frame(workload.views)
     views = [frame.view(view) for view in workload.views]
     gaussians = _in_frame(workload.gaussians, frame)
-    lengths = near_depths(gaussians.means, views)
+    lengths = min_view_depths(gaussians.means, views)
     params = make_parameters(gaussians, torch.device("cpu"), lengths)
     optimizers = make_optimizers(params, settings.schedule)
     return Trainer(TrainState(params, optimizers, make_strategy(settings)), settings, views, [])

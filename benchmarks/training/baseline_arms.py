@@ -99,7 +99,7 @@ ARMS: Mapping[str, Arm] = {
     "default as it was": Arm("default-3dgs", _before()),
     "the same, nothing pruned by size": Arm("default-3dgs", _before(UNBOUNDED)),
     "default": Arm("default"),
-    "- near depths": Arm("default", _set(near_depths=False)),
+    "- near depths": Arm("default", _set(depth_units=False)),
     "+ pruning by size": Arm("default", _set(prune_size=0.1)),
     "- faster harmonics": Arm("default", _times(shN=4.0)),
     "- faster positions": Arm("default", _times(means=1.0)),

@@ -35,9 +35,9 @@ from splatseed.splat.gaussians import SH_C0, Gaussians, TrainingFrame, training_
 from splatseed.splat.rendering import ModelRenderer, as_bytes
 from splatseed.synthetic import make_capture, write_capture
 from splatseed.training import TrainSettings, prepare_run
+from splatseed.training.depths import known_depths
 from splatseed.training.floaters import find_floaters
 from splatseed.training.parameters import gaussians_of
-from splatseed.training.seeds import known_depths
 from splatseed.training.settings import StrategyName
 
 __all__: list[str] = []

@@ -28,10 +28,11 @@ from splatseed.rendering import mcmc_on_cpu
 from splatseed.runtime.workarounds import keep_freed_memory
 from splatseed.splat.evaluate import Render, evaluate_views
 from splatseed.training import TrainSettings, prepare_run
+from splatseed.training.depths import known_depths
 from splatseed.training.device import Capacity
 from splatseed.training.schedule import FULL_RUN
-from splatseed.training.seeds import known_depths, usable_seeds
-from splatseed.training.strategies import Capped
+from splatseed.training.seeds import usable_seeds
+from splatseed.training.strategies.default import Capped
 
 __all__ = ["Split", "read_scene", "train_ours", "train_peer"]
 

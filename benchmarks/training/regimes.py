@@ -22,7 +22,7 @@ from benchmarks.training.baseline import read_ledger
 
 from splatseed.errors import SplatseedError
 from splatseed.seeding.advice import AS_IT_IS, ROOM, Measured, advise
-from splatseed.training.seeds import SEEDS_SHARE
+from splatseed.training.settings import SEED_SHARE
 
 __all__: list[str] = []
 
@@ -146,7 +146,7 @@ def advice(ledger: Ledger, strategy: str) -> Iterable[list[str]]:
 def _room(ledger: Ledger, capture: str, strategy: str, plan: Plan) -> float:
     """The number of seeds with which training can begin, per point of the capture."""
     run = next(iter(ledger.runs[capture, SFM, strategy, plan].values()))
-    return float(run["cap"] * SEEDS_SHARE.get(strategy, 1.0) / run["points"])
+    return float(run["cap"] * SEED_SHARE.get(strategy, 1.0) / run["points"])
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from splatseed.seeding.poses import random_start
 from splatseed.sfm import refined
 from splatseed.splat.evaluate import evaluate_views
 from splatseed.training import TrainSettings, prepare_run
-from splatseed.training.seeds import most_seeds, stereo_size
+from splatseed.training.depths import stereo_size
 
 __all__ = ["ARMS", "TEST_EVERY", "train", "triangulated", "validation_split"]
 
@@ -117,7 +117,7 @@ def _seeds(scene: Scene, arm: str, settings: TrainSettings) -> PointCloud:
     known = {field.name for field in dataclasses.fields(ss.METHODS[name])}
     given = {"test_every": TEST_EVERY, "max_size": size}
     method = configure(name, **{option: given[option] for option in known & given.keys()})
-    points = ss.upsample(scene, method, budget=most_seeds(settings, settings.cap or 0), **chosen)
+    points = ss.upsample(scene, method, budget=settings.max_seeds(settings.cap or 0), **chosen)
     return points.select(points.distinct)
 
 

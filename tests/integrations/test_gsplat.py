@@ -26,7 +26,7 @@ from splatseed.rendering import rasterization
 from splatseed.similarity import Similarity
 from splatseed.splat.gaussians import initial_gaussians
 from splatseed.splat.rendering import photograph_of
-from splatseed.training.parameters import NEAR_DEPTHS, as_parameters
+from splatseed.training.parameters import MIN_VIEW_DEPTH, as_parameters
 from splatseed.training.settings import TrainSettings
 from splatseed.training.state import make_strategy
 
@@ -78,7 +78,7 @@ def grow(strategy, params, optimizers, names=None, steps=21):
 
 def test_it_grows_what_splatseeds_trainer_grows(tmp_path):
     """The same Gaussians to the bit, new ones at the map's depth in training units."""
-    ours, optimizers = planted(12, **{NEAR_DEPTHS: torch.ones(12)})
+    ours, optimizers = planted(12, **{MIN_VIEW_DEPTH: torch.ones(12)})
     asked = TrainSettings(strategy="grow", max_steps=300, cap_max=100)
     inner = make_strategy(asked, depths={"a": np.full((8, 8), 3.0, np.float32)})
     pixels = np.zeros((SIDE, SIDE, 3), np.uint8)
@@ -86,7 +86,7 @@ def test_it_grows_what_splatseeds_trainer_grows(tmp_path):
     torch.manual_seed(0)
     for step in range(21):
         inner.observe(ours, view, GREY, TRUTH, step)
-        inner.after(ours, optimizers, step, {})
+        inner.after_step(ours, optimizers, step, {})
     theirs, optimizers = planted(12)
     folder = maps_of(tmp_path / "maps", a=np.full((8, 8), 6.0))
     grow(GrowStrategy(100, **STEPS, depths=folder, depth_scale=0.5), theirs, optimizers, ["a"])

@@ -36,7 +36,7 @@ def test_what_is_there_decides_the_method(measured, most, strategy, method, says
 
 
 def test_scoring_may_ask_for_another_room():
-    assert advise(FERN, most_seeds=6_500, room=1.0).method == "auto"
+    assert advise(FERN, max_seeds=6_500, room=1.0).method == "auto"
 
 
 ANGLES = np.linspace(0, 2 * np.pi, 8, endpoint=False)

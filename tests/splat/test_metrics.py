@@ -13,15 +13,10 @@ from PIL import Image as PillowImage
 from torch import nn
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
-from splatseed.splat.metrics import (
-    LPIPS_FILE,
-    color_corrected,
-    flip_map,
-    l1_and_ssim_by_convolution,
-    load_lpips,
-    psnr,
-)
+from splatseed.splat.lpips import LPIPS_FILE, load_lpips
+from splatseed.splat.metrics import color_corrected, flip_map, psnr
 from splatseed.splat.ssim import l1_and_ssim
+from splatseed.splat.ssim_conv import l1_and_ssim_by_convolution
 from splatseed.training.trainer import photometric_loss
 
 # L1, SSIM, PSNR -----------------------------------------------------------------------------------

@@ -7,7 +7,7 @@ import pytest
 pytest.importorskip("torch", reason="training needs PyTorch")
 pytest.importorskip("gsplat", reason="training needs gsplat's strategies")
 
-from splatseed.training.run import prepare_run
+from splatseed.training.prepare import PrepareOptions, prepare_run
 from splatseed.training.settings import TrainSettings
 
 
@@ -17,6 +17,6 @@ def begin(room, tmp_path):
 
     def prepare(name="run", ways=None, **settings):
         asked = TrainSettings(**{"max_steps": 60, "data_factor": 2, **settings})
-        return prepare_run(room, tmp_path / name, asked, **(ways or {}))
+        return prepare_run(room, tmp_path / name, asked, PrepareOptions(**(ways or {})))
 
     return prepare

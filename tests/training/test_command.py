@@ -17,8 +17,8 @@ from splatseed.errors import ParameterError
 from splatseed.io import load_scene
 from splatseed.io.ply import write_ply
 from splatseed.pointcloud import PointCloud
+from splatseed.training.config import make_config, resumed_settings
 from splatseed.training.folder import RunFolder
-from splatseed.training.run import make_config, resumed
 from splatseed.training.seeds import seeds_facts, usable_seeds
 from splatseed.training.settings import TrainSettings
 from splatseed.training.trainer import Trainer
@@ -61,9 +61,9 @@ def test_trains_by_the_best_strategy_and_says_what_and_where(room_path, tmp_path
     asked = TrainSettings()
     again = replace(asked, max_steps=3, data_factor=2)
     begun = replace(again, strategy="none", seeding="advised", cap_max=quarter)
-    assert resumed(config, again, refine_poses=False) == (begun, False)
+    assert resumed_settings(config, again, refine_poses=False) == (begun, False)
     with pytest.raises(ParameterError, match="max_steps=3"):
-        resumed(config, asked, {"max_steps"}, refine_poses=False)
+        resumed_settings(config, asked, {"max_steps"}, refine_poses=False)
 
 
 def test_interrupted_it_saves_and_says_how_to_go_on(room_path, tmp_path, capsys, monkeypatch):
@@ -102,7 +102,7 @@ def begun(room_path, tmp_path_factory):
     config = make_config(scene, seeds, settings, "cpu")
     for name in ("placing", "seed_sizes", "seed_normals", "seed_colors", "seeding"):
         del config[name]
-    RunFolder(run).begin(config)
+    RunFolder(run).create(config)
     return run
 
 
@@ -119,7 +119,7 @@ def test_a_run_of_an_older_version_resumes_with_its_own_settings(room_path, begu
     [
         ({"strategy": "absgrad"}, "--strategy"),
         ({"max_steps": "3"}, "config.json"),
-        ({"seeds": {"count": 1, "digest": "0"}}, "the scene that the run began with"),
+        ({"seeds": {"count": 1, "digest": "0"}}, "the scene of the run"),
         ({"photographs": "0"}, "photographs or poses"),
         (None, "checkpoint.pt"),
     ],

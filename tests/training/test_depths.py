@@ -11,14 +11,8 @@ from hypothesis import given, strategies as st
 from splatseed.camera import Intrinsics
 from splatseed.depth.stereo.pipeline import find_stereo
 from splatseed.scene import Image
-from splatseed.training.run import prepare_run
-from splatseed.training.seeds import (
-    LEAST_COMPARED,
-    PER_RENDERED,
-    compared_images,
-    known_depths,
-    stereo_size,
-)
+from splatseed.training.depths import COSTS, MIN_VIEWS, compared_images, known_depths, stereo_size
+from splatseed.training.prepare import prepare_run
 from splatseed.training.settings import TrainSettings
 
 SCALE = 0.25
@@ -30,7 +24,7 @@ def test_depths_are_those_of_the_surfaces_and_kept_with_the_time_they_took(
 ):
     capture, scene = sixteen_views
     kept, notes = tmp_path / "bench" / "depths.npz", []
-    depths, seconds = known_depths(scene, SCALE, GROW, "cpu", kept=kept, note=notes.append)
+    depths, seconds = known_depths(scene, SCALE, GROW, "cpu", cache=kept, note=notes.append)
     truths = {image.name: truth for image, truth in zip(scene.images, capture.depths, strict=True)}
     errors = []
     for name, depth in depths.items():
@@ -46,13 +40,13 @@ def test_depths_are_those_of_the_surfaces_and_kept_with_the_time_they_took(
     assert np.median(errors) < 0.02
     assert "only splits" in notes[0]
     with monkeypatch.context() as patch:
-        patch.setattr("splatseed.depth.stereo.stereo_depths", None)
-        again, same = known_depths(scene, SCALE, GROW, "cpu", kept=kept)
+        patch.setattr("splatseed.training.depths.stereo_depths", None)
+        again, same = known_depths(scene, SCALE, GROW, "cpu", cache=kept)
     assert same == seconds > 0
     assert depths.keys() == again.keys()
     assert all(np.array_equal(depths[name], again[name]) for name in depths)
     kept.write_bytes(b"damaged")
-    assert known_depths(scene, SCALE, GROW, "cpu", kept=kept)[0].keys() == depths.keys()
+    assert known_depths(scene, SCALE, GROW, "cpu", cache=kept)[0].keys() == depths.keys()
 
 
 @pytest.mark.parametrize("settings", [{"strategy": "default"}, {"placing": "none"}, {}])
@@ -96,7 +90,7 @@ def test_comparing_takes_a_part_of_training_unless_few_views_are_compared_at_its
     compared = len(chosen) * min(size, width) ** 2 * 3 / 4
     rendered = steps * (width / factor) ** 2 * 3 / 4
     least = max(64, width // factor) if device == "cpu" else 200
-    fits = compared <= 1.05 * PER_RENDERED[device] * rendered
-    assert fits or (size <= least and len(chosen) == min(count, LEAST_COMPARED))
+    fits = compared <= 1.05 * COSTS[device].pixels * rendered
+    assert fits or (size <= least and len(chosen) == min(count, MIN_VIEWS))
     assert len(chosen) == count or size <= least
     assert count or size == 800

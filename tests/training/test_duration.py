@@ -12,10 +12,10 @@ from splatseed.scene import Image, Scene
 from splatseed.seeding.upsampling import points_within
 from splatseed.training.duration import (
     HOUR,
-    Progressed,
-    about_an_hour,
-    in_words,
+    RunSpeed,
+    format_duration,
     mean_gaussians,
+    options_for_an_hour,
     seconds_left,
     step_seconds,
 )
@@ -23,7 +23,7 @@ from splatseed.training.schedule import FULL_AT
 from splatseed.training.settings import TrainSettings
 
 GROW = TrainSettings(strategy="auto", max_steps=10_000, cap_max=400_000, data_factor=3)
-EARLY = Progressed(100, 0.5, 20_000, 1344 * 1008)
+EARLY = RunSpeed(100, 0.5, 20_000, 1344 * 1008)
 
 
 @pytest.mark.parametrize(
@@ -55,7 +55,7 @@ def test_later_steps_are_slower_and_the_machine_is_the_runs_own():
 @pytest.mark.parametrize(("seconds", "steps"), [(0.3, 10_000), (2.4, 30_000), (40.0, 30_000)])
 def test_what_is_advised_takes_about_an_hour(seconds, steps, per_pixel):
     settings, now = replace(GROW, max_steps=steps), EARLY._replace(seconds=seconds)
-    words = about_an_hour(settings, now, 4032, per_pixel=per_pixel).split()
+    words = options_for_an_hour(settings, now, 4032, per_pixel=per_pixel).split()
     options = dict(zip(words[::2], map(int, words[1::2]), strict=True))
     factor = -(-4032 // options["--long-side"])  # as --long-side is understood
     assert factor >= 3
@@ -65,12 +65,12 @@ def test_what_is_advised_takes_about_an_hour(seconds, steps, per_pixel):
     count = min(20_000, round(cap))
     slower = seconds / step_seconds("cpu", 20_000, now.pixels)
     each = slower * step_seconds("cpu", count, pixels)
-    expected = seconds_left(chosen, Progressed(0, each, count, round(pixels)))
+    expected = seconds_left(chosen, RunSpeed(0, each, count, round(pixels)))
     assert HOUR / 3 < expected < 1.05 * HOUR  # and no less than need be
 
 
 def test_durations_in_words():
-    assert [in_words(s) for s in (20, 3600, 5300, 86_400)] == [
+    assert [format_duration(s) for s in (20, 3600, 5300, 86_400)] == [
         "1 minute", "60 minutes", "88 minutes", "24 hours"
     ]  # fmt: skip
 
@@ -80,9 +80,9 @@ def test_photographs_are_1600_pixels_a_side_at_most_unless_asked(side, factor, r
     lens = Intrinsics(1, "PINHOLE", side, side // 2, (900.0, 900.0, side / 2, side / 4))
     image = Image("a.jpg", 1, lens, rng.normal(size=4), rng.normal(size=3))
     notes: list[str] = []
-    settings = TrainSettings().sized((image,), notes.append)
+    settings = TrainSettings().with_data_factor((image,), notes.append)
     assert (settings.data_factor, len(notes)) == (factor, factor > 1)
-    assert TrainSettings(data_factor=1).sized((image,), notes.append).data_factor == 1
+    assert TrainSettings(data_factor=1).with_data_factor((image,), notes.append).data_factor == 1
     if factor > 1:
         assert f"{side // factor:,} x" in notes[0]
     # Budgets in rho count pixels at that size, in whatever verb.

@@ -12,7 +12,7 @@ from splatseed.io import load_scene
 from splatseed.splat.metrics import color_corrected, psnr
 from splatseed.splat.rendering import photograph_of
 from splatseed.training.exposure import Exposures
-from splatseed.training.run import prepare_run
+from splatseed.training.prepare import prepare_run
 from splatseed.training.settings import TrainSettings
 
 CPU = torch.device("cpu")
@@ -32,26 +32,26 @@ def test_transforms_are_found_up_to_their_mean_and_undone(rng):
     renders = _images(rng, 4)
     planted = torch.eye(3, 4, dtype=torch.float64) + torch.from_numpy(rng.normal(0, 0.1, (4, 3, 4)))
     planted -= planted.mean(dim=0) - torch.eye(3, 4)
-    photographs = [Exposures(planted).applied(i, each) for i, each in enumerate(renders)]
-    exposures = Exposures.unchanged(4, CPU)
+    photographs = [Exposures(planted).apply(i, each) for i, each in enumerate(renders)]
+    exposures = Exposures.identity(4, CPU)
     _fit(exposures, renders, photographs)
     torch.testing.assert_close(exposures.transforms, planted, atol=0.03, rtol=0)
     mean = exposures.transforms.mean(dim=0)
     torch.testing.assert_close(mean, torch.eye(3, 4, dtype=torch.float64), atol=1e-12, rtol=0)
     for i, photograph in enumerate(photographs):
-        undone = exposures.undone(i, photograph)
-        torch.testing.assert_close(exposures.applied(i, undone), photograph, atol=1e-5, rtol=0)
+        undone = exposures.to_mean(i, photograph)
+        torch.testing.assert_close(exposures.apply(i, undone), photograph, atol=1e-5, rtol=0)
         assert (undone - renders[i]).abs().mean() < 0.02
 
 
 def test_photographs_that_tell_nothing_leave_all_finite(rng):
     renders = _images(rng, 3)
     photographs = [torch.zeros(60, 80, 3), torch.ones(60, 80, 3), torch.full((60, 80, 3), 0.5)]
-    exposures = Exposures.unchanged(3, CPU)
+    exposures = Exposures.identity(3, CPU)
     _fit(exposures, renders, photographs)
     assert exposures.transforms.isfinite().all()
     for i, photograph in enumerate(photographs):
-        undone = exposures.undone(i, photograph)
+        undone = exposures.to_mean(i, photograph)
         assert 0 <= undone.min() <= undone.max() <= 1
 
 
@@ -59,7 +59,7 @@ def test_a_fit_is_the_same_to_the_bit_whatever_the_threads(rng):
     renders, before, found = _images(rng, 2, 400, 300), torch.get_num_threads(), []
     for threads in (1, 2, 5):
         torch.set_num_threads(threads)
-        exposures = Exposures.unchanged(2, CPU)
+        exposures = Exposures.identity(2, CPU)
         _fit(exposures, renders, renders.flip(0), 2)
         found.append(exposures.transforms.numpy().tobytes())
     torch.set_num_threads(before)

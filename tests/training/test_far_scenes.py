@@ -13,7 +13,7 @@ from splatseed.io.origin import RECENTER, offset_beside, translated
 from splatseed.splat.evaluate import evaluate_model, evaluate_views, load_model
 from splatseed.splat.formats import read_gaussians, write_gaussians
 from splatseed.splat.world import shifted
-from splatseed.training.run import prepare_run
+from splatseed.training.prepare import prepare_run
 from splatseed.training.settings import TrainSettings
 from splatseed.training.start import read_start
 from splatseed.viewer.models import open_item

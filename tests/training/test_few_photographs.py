@@ -41,7 +41,7 @@ def test_dropout_rises_and_3dgs_has_none():
 @pytest.mark.parametrize(("few", "differs"), [(7, True), (6, False)])
 def test_only_runs_with_few_photographs_are_changed(begin, monkeypatch, few, differs):
     def trained(name, most):
-        monkeypatch.setattr(trainer, "FEW", most)
+        monkeypatch.setattr(trainer, "MAX_DROPOUT_VIEWS", most)
         run = begin(name, strategy="none", max_steps=9)
         assert len(run.trainer.train_views) == 7
         run.train()

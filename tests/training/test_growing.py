@@ -11,10 +11,11 @@ from scipy.spatial.transform import Rotation
 from splatseed.photos.view import View
 from splatseed.splat.gaussians import SH_C0, Gaussians
 from splatseed.splat.rendering import render_features
-from splatseed.training.growing import PLACED, contributions, draw_candidates, join_candidates
 from splatseed.training.parameters import make_optimizers, make_parameters
 from splatseed.training.settings import TrainSettings
 from splatseed.training.state import make_strategy
+from splatseed.training.strategies.candidates import draw_candidates, join_candidates
+from splatseed.training.strategies.grow import GROWTH, contributions
 
 SIDE = 32
 
@@ -57,7 +58,7 @@ def grow(params, view, truth, budget, steps=range(101), depth=None):
     grey = torch.full((SIDE, SIDE, 3), 0.5)
     for step in steps:
         strategy.observe(params, view, grey, truth, step)
-        strategy.after(params, optimizers, step, {})
+        strategy.after_step(params, optimizers, step, {})
     return strategy
 
 
@@ -166,14 +167,14 @@ def test_most_of_what_is_added_goes_to_wrong_pixels_at_their_depth(view):
     placed = (means[:, 2] - 3.0).abs() < 1e-4
     added = len(means) - len(before)
     assert added >= 4
-    assert int(placed.sum()) == round(PLACED * added)
+    assert int(placed.sum()) == round(GROWTH.placed * added)
     u = SIDE * means[placed, 0] / 3.0 + SIDE / 2
     assert u.max() < SIDE // 4
     colors = 0.5 + SH_C0 * params["sh0"].detach()[placed, 0]
     torch.testing.assert_close(colors, torch.ones_like(colors))
     sizes = torch.exp(params["scales"].detach())[placed]
     torch.testing.assert_close(sizes, torch.full_like(sizes, 3.0 / SIDE))  # a pixel, at depth 3
-    torch.testing.assert_close(params["near_depths"].detach()[placed], means[placed, 2])
+    torch.testing.assert_close(params["min_view_depth"].detach()[placed], means[placed, 2])
 
 
 def test_nothing_is_placed_where_the_depth_is_unknown(view):

@@ -17,7 +17,7 @@ from splatseed.photos.view import load_views
 from splatseed.splat.evaluate import evaluate_views
 from splatseed.splat.metrics import ssim_of_all
 from splatseed.splat.rendering import fill_masked
-from splatseed.training.growing import contributions
+from splatseed.training.strategies.grow import contributions
 from splatseed.training.trainer import photometric_loss
 
 
@@ -92,13 +92,15 @@ def test_masked_pixels_have_no_part_in_loss_growth_and_scores(occluded_path, beg
 
 
 def test_a_resumed_run_keeps_its_masks(occluded_path, tmp_path, begin):
-    from splatseed.training.run import prepare_run
+    from splatseed.training.prepare import PrepareOptions, prepare_run
     from splatseed.training.settings import TrainSettings
 
     scene, settings = load_scene(occluded_path), TrainSettings(max_steps=30, strategy="none")
     prepare_run(with_masks(scene, "inverted"), tmp_path / "run", settings)
-    resumed = prepare_run(scene, tmp_path / "run", settings, resume=True)
+    resumed = prepare_run(scene, tmp_path / "run", settings, PrepareOptions(resume=True))
     (view, *_) = (v for v in resumed.trainer.train_views if v.name == "view_001.png")
     assert 0 < view.mask.mean() < 0.5
     with pytest.raises(ParameterError, match=r"masks=.inverted"):
-        prepare_run(with_masks(scene, "none"), tmp_path / "run", settings, resume=True)
+        prepare_run(
+            with_masks(scene, "none"), tmp_path / "run", settings, PrepareOptions(resume=True)
+        )

@@ -21,9 +21,9 @@ from splatseed.pointcloud import PointCloud
 from splatseed.splat.evaluate import evaluate_views
 from splatseed.splat.formats import read_gaussians
 from splatseed.splat.rendering import opacities_of
-from splatseed.training import device, run as run_module, trainer
-from splatseed.training.parameters import add_to_mean, gaussians_of, length_units
-from splatseed.training.run import prepare_run
+from splatseed.training import device, prepare, run as run_module, trainer
+from splatseed.training.parameters import add_to_mean, gaussians_of, size_unit
+from splatseed.training.prepare import PrepareOptions, prepare_run
 from splatseed.training.settings import TrainSettings
 from splatseed.viewer.models import ViewerItem, viewer_frame
 
@@ -198,7 +198,7 @@ def test_3dgs_conventions_end_with_the_last_step_and_have_one_length_unit(begin)
     count = len(run.state.params["means"])
     run.train()
     assert not run.state.mean
-    assert length_units(run.state.params).tolist() == pytest.approx([1.1])
+    assert size_unit(run.state.params).tolist() == pytest.approx([1.1])
     assert len(run.state.params["means"]) > count
 
 
@@ -263,16 +263,16 @@ def test_an_earlier_run_is_neither_replaced_nor_repeated_by_accident(begin, room
 def test_a_run_goes_on_with_its_own_settings_and_seeds(begin, room, tmp_path):
     run = begin(max_steps=30, strategy="none", sh_degree=1)
     run.train(_stop_after(4))
-    resumed = prepare_run(room, tmp_path / "run", TrainSettings(), **RESUME)
+    resumed = prepare_run(room, tmp_path / "run", TrainSettings(), PrepareOptions(**RESUME))
     assert resumed.settings == run.settings
     with pytest.raises(ParameterError, match="max_steps=30"):
         begin(ways=RESUME, max_steps=31, strategy="none")
     fewer = room.replace(points=room.points.select(slice(50)))
     with pytest.raises(ParameterError, match="other points"):
-        prepare_run(fewer, tmp_path / "run", TrainSettings(), **RESUME)
+        prepare_run(fewer, tmp_path / "run", TrainSettings(), PrepareOptions(**RESUME))
     run.folder.checkpoint.write_bytes(b"damaged")
     with pytest.raises(SceneFormatError, match="checkpoint"):
-        prepare_run(room, tmp_path / "run", TrainSettings(), **RESUME)
+        prepare_run(room, tmp_path / "run", TrainSettings(), PrepareOptions(**RESUME))
 
 
 def test_a_disk_that_is_full_among_the_results_costs_nothing(begin, monkeypatch):
@@ -298,7 +298,7 @@ def test_a_disk_that_is_full_among_the_results_costs_nothing(begin, monkeypatch)
 
 
 def test_what_does_not_fit_the_memory_is_refused_with_what_would(begin, monkeypatch, tmp_path):
-    monkeypatch.setattr(device, "free_bytes", lambda _: 100 * device.BYTES_EACH)
+    monkeypatch.setattr(device, "free_bytes", lambda _: 100 * device.BYTES_PER_GAUSSIAN)
     with pytest.raises(PointCloudError, match="budget=100"):
         begin()
     assert not (tmp_path / "run").exists()
@@ -307,7 +307,7 @@ def test_what_does_not_fit_the_memory_is_refused_with_what_would(begin, monkeypa
 @pytest.mark.parametrize("strategy", ["default", "grow", "mcmc"])
 def test_memory_holds_growth_and_the_run_says_so(begin, monkeypatch, strategy):
     run = begin(strategy=strategy, cap_max=4000)
-    begun, each = run.count(), device.BYTES_EACH
+    begun, each = run.count(), device.BYTES_PER_GAUSSIAN
     monkeypatch.setattr(device, "free_bytes", lambda _: each * (begun + 9 - run.count()))
     assert run.train()
     assert begun < max(r.num_gaussians for r in run.state.records) <= begun + 9
@@ -321,7 +321,7 @@ def test_a_gpu_that_is_not_there_is_not_replaced_in_silence(begin, monkeypatch):
 
 
 def test_a_distorted_lens_is_refused_before_seeds_are_made(room, tmp_path, monkeypatch):
-    monkeypatch.setattr(run_module, "seeded", None)
+    monkeypatch.setattr(prepare, "seeded", None)
     first = room.images[0]
     params = *first.intrinsics.params, 0.1, 0, 0, 0
     lens = dataclasses.replace(first.intrinsics, model="OPENCV", params=params)

@@ -32,7 +32,7 @@ def test_a_full_run_has_3dgs_schedule(as_3dgs):
 @pytest.mark.parametrize("steps", [1, 7, 300, 1500, 7000])
 def test_3dgs_schedule_shrinks_as_by_the_steps_scaler_of_gsplats_trainer(steps):
     short = make_schedule("default", steps, as_3dgs=True)
-    assert (short.near_depths, short.learning_rates) == (False, LEARNING_RATES)
+    assert (short.depth_units, short.learning_rates) == (False, LEARNING_RATES)
     assert abs(short.refine_stop - steps / 2) <= 0.5
     assert short.decay("means", steps) == pytest.approx(0.01)
     assert short.refine_every == max(1, round(steps / 300))
@@ -97,9 +97,9 @@ def test_running_sums_are_gsplats_own(cameras):
         image, _, info = rasterization(
             means, quats, sizes, opacities, colors, views, K, 50, 40, packed=False
         )
-        ours.before({"means": means}, {}, step, info)
+        ours.before_backward({"means": means}, {}, step, info)
         image.square().sum().backward()
-        ours.after({"means": means}, {}, step, info)
+        ours.after_step({"means": means}, {}, step, info)
         theirs.step_post_backward({"means": means}, {}, expected, step, info)
     assert 0 < int((expected["count"] > 0).sum()) < 500
     for name in ("grad2d", "count"):

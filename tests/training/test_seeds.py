@@ -15,9 +15,10 @@ from splatseed.photos.view import load_split
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import silent
 from splatseed.splat.gaussians import initial_gaussians
+from splatseed.training.initialization import MARGIN, min_view_depths
 from splatseed.training.parameters import make_optimizers, make_parameters, optimize
 from splatseed.training.schedule import make_schedule
-from splatseed.training.seeds import MARGIN, near_depths, seeded, seeds_digest, usable_seeds
+from splatseed.training.seeds import seeded, seeds_digest, usable_seeds
 from splatseed.training.settings import TrainSettings
 
 ORIGINALS, NEW = 40, 60
@@ -80,7 +81,7 @@ def test_a_plain_scene_is_seeded_on_request_and_the_user_told(room):
     assert len(scene.points) > len(room.points)
     assert np.array_equal(scene.points.originals.xyz, room.points.xyz)
     assert [view.name for view in stereo.views] == [image.name for image in room.split(8)[0]]
-    assert "--seeds scene" in notes[-1]
+    assert "`seeding=" in notes[-1]
     bounded = TrainSettings(seeding="auto", strategy="none", cap_max=100)
     empty = room.replace(points=room.points.select(slice(0)), tracks=None)
     assert len(seeded(empty, bounded, "cpu", notes.append, silent)[0].points) == 100
@@ -139,16 +140,16 @@ def _literal(xyz, views):
 def test_they_are_what_a_literal_loop_finds(room, rng):
     train, _ = load_split(room)
     xyz = np.concatenate([room.points.xyz[::20], rng.normal(scale=5.0, size=(50, 3))])
-    assert np.allclose(near_depths(xyz, train), _literal(xyz, train), rtol=1e-5)
+    assert np.allclose(min_view_depths(xyz, train), _literal(xyz, train), rtol=1e-5)
 
 
 @pytest.mark.parametrize("strategy", ["default", "mcmc"])
 def test_whatever_adds_or_moves_gaussians_hands_them_on(begin, strategy):
     run = begin(strategy=strategy, max_steps=60, cap_max=3000)
-    first = set(run.state.params["near_depths"].tolist())
+    first = set(run.state.params["min_view_depth"].tolist())
     count = len(run.state.params["means"])
     run.train()
-    lengths = run.state.params["near_depths"]
+    lengths = run.state.params["min_view_depth"]
     assert len(lengths) == len(run.state.params["means"]) > count
     assert set(lengths.tolist()) <= first
     assert not lengths.requires_grad

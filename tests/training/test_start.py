@@ -12,7 +12,7 @@ import pytest
 from splatseed.splat.evaluate import evaluate_views
 from splatseed.splat.formats import read_gaussians, write_gaussians
 from splatseed.splat.world import find_transform, moved
-from splatseed.training.run import prepare_run
+from splatseed.training.prepare import prepare_run
 from splatseed.training.settings import TrainSettings
 
 FIRST = TrainSettings(strategy="grow", max_steps=200, cap_max=1200, backend="cpu")
@@ -78,7 +78,7 @@ def test_a_smaller_budget_keeps_those_that_contribute_most(room, first, tmp_path
     settings = going_on(path, cap_max=600)
     run = prepare_run(room, tmp_path / "run", settings, note=notes.append)
     assert run.count() == 600
-    assert any("the 600 that contribute most" in note for note in notes)
+    assert any("600 of 1,200 Gaussians" in note for note in notes)
     whole = read_gaussians(path)
     rng = np.random.default_rng(0)
     write_gaussians(tmp_path / "some.ply", whole.select(np.sort(rng.permutation(len(whole))[:600])))

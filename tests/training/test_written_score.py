@@ -12,7 +12,7 @@ from splatseed.camera import CAMERA_MODELS, Intrinsics
 from splatseed.io import colmap, load_scene, write_scene
 from splatseed.splat.evaluate import evaluate_model, evaluate_views, load_model
 from splatseed.splat.formats import FORMATS, read_gaussians, write_gaussians
-from splatseed.training.run import prepare_run
+from splatseed.training.prepare import prepare_run
 from splatseed.training.settings import TrainSettings
 
 STRAIGHT = [name for name in CAMERA_MODELS if "FISHEYE" not in name]

@@ -25,7 +25,7 @@ from splatseed.io import load_scene
 from splatseed.pointcloud import PointCloud
 from splatseed.splat.evaluate import evaluate_views
 from splatseed.splat.gaussians import TrainingFrame
-from splatseed.training.run import prepare_run
+from splatseed.training.prepare import prepare_run
 from splatseed.training.settings import TrainSettings
 from splatseed.viewer import pictures, session as session_module
 from splatseed.viewer.models import ViewerItem, open_item, viewer_frame

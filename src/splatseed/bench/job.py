@@ -48,7 +48,6 @@ from splatseed.scores import EvalResult
 from splatseed.seeding.advice import DEFAULT_METHOD
 from splatseed.seeding.clouds.method import Cloud
 from splatseed.seeding.upsampling import thin_to, upsample
-from splatseed.training.seeds import compared_images, stereo_size
 from splatseed.training.settings import TrainSettings
 
 if TYPE_CHECKING:  # PyTorch, which takes a while
@@ -126,8 +125,9 @@ def run_job(
     spec: RunSpec, options: RunOptions, bench: Path, progress: Progress = silent
 ) -> RunResult:
     """Carry out a run, and write its folder."""
-    from splatseed.splat.metrics import load_lpips  # noqa: PLC0415  (PyTorch)
-    from splatseed.training.run import prepare_run  # noqa: PLC0415  (PyTorch)
+    from splatseed.splat.lpips import load_lpips  # noqa: PLC0415  (PyTorch)
+    from splatseed.training.depths import DepthCache, compared_images, stereo_size  # noqa: PLC0415  (Numba)
+    from splatseed.training.prepare import PrepareOptions, prepare_run  # noqa: PLC0415  (PyTorch)
 
     start = time.perf_counter()
     with output_folder(run_folder(bench, spec), kind="bench", overwrite=True) as folder:
@@ -145,12 +145,15 @@ def run_job(
             scene.replace(points=seeds),
             folder / "work",
             spec.settings,
-            cache_dir=user_cache_dir(),
-            depths=bench
-            / "depths"
-            / f"{spec.scene.digest}_{every}_{size}_{count}_{spec.repeat}.npz",
-            seeding_knew=seeding_method(spec.arm.method) == DEFAULT_METHOD
-            and not _is_full(scene, spec),
+            PrepareOptions(
+                cache_dir=user_cache_dir(),
+                depth_cache=DepthCache(
+                    bench
+                    / "depths"
+                    / f"{spec.scene.digest}_{every}_{size}_{count}_{spec.repeat}.npz",
+                    seeding_method(spec.arm.method) == DEFAULT_METHOD and not _is_full(scene, spec),
+                ),
+            ),
             progress=progress,
         )
         if not run.train(lambda step: progress("train", step / spec.training.max_steps)):

@@ -22,7 +22,6 @@ from splatseed.scores import CurvePoint, EvalResult
 from splatseed.seeding.upsampling import RHO, parse_budget
 from splatseed.text import did_you_mean
 from splatseed.training.duration import GROWTH, step_seconds
-from splatseed.training.seeds import most_seeds
 from splatseed.training.settings import Backend, StrategyName, TrainSettings
 
 SFM = "sfm"
@@ -142,7 +141,7 @@ class RunSpec:
         """The number to which a budget thins the seeds; None without a budget."""
         if not self.arm.budget or self.training.cap_max is None:
             return None
-        return most_seeds(self.settings, self.training.cap_max)
+        return self.settings.max_seeds(self.training.cap_max)
 
     @property
     def gaussians(self) -> tuple[float, float]:

@@ -41,7 +41,7 @@ from splatseed.runtime.interruption import exit_code
 from splatseed.runtime.memory import check_memory
 from splatseed.runtime.tasks import ProcessWorkers, Workers
 from splatseed.text import counted, did_you_mean, quoted, visible
-from splatseed.training.settings import BYTES_EACH, Backend, StrategyName
+from splatseed.training.settings import BYTES_PER_GAUSSIAN, Backend, StrategyName
 
 if TYPE_CHECKING:
     from splatseed.bench.tables import Table
@@ -311,7 +311,9 @@ def _prepare(
     ):  # the memory of a cluster's nodes is unknown
         num_seeds, jobs = int(max(spec.gaussians[0] for spec in specs)), machine.jobs
         fix = "Pass smaller --ratios or --budgets, or fewer --jobs."
-        check_memory(num_seeds, BYTES_EACH * jobs, f"seeds per run with {jobs} at a time", fix=fix)
+        check_memory(
+            num_seeds, BYTES_PER_GAUSSIAN * jobs, f"seeds per run with {jobs} at a time", fix=fix
+        )
     return plan, scenes, specs, notes
 
 
@@ -350,7 +352,7 @@ def _bench(options: Options, plan: Plan, machine: Machine, arguments: Sequence[s
     if bench is not None and not options.dry_run:
         check_bench_folder(bench, [Path(s.path) for s in plan.scenes if not s.is_demo])
     if plan.lpips:
-        from splatseed.splat.metrics import load_lpips
+        from splatseed.splat.lpips import load_lpips
 
         load_lpips()  # fails now rather than in every run
     if bench is None or options.dry_run:
@@ -361,7 +363,7 @@ def _bench(options: Options, plan: Plan, machine: Machine, arguments: Sequence[s
         comments = "".join(f"# {' '.join(line.split())}\n" for line in lines)
         OUT.print(f"{plan_text(plan)}\n{comments}", end="", soft_wrap=True)
         return
-    from splatseed.splat.metrics import lpips_is_here
+    from splatseed.splat.lpips import lpips_is_here
 
     plan, scenes, specs, notes = _prepare(options, plan, machine, demo)
     record_plan(bench, "bench", specs, arguments)

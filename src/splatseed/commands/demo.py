@@ -349,12 +349,14 @@ def _train_arm(
     from splatseed.splat.evaluate import evaluate_views
     from splatseed.splat.metrics import flip_map
     from splatseed.splat.rendering import as_bytes, error_picture, photograph_of
-    from splatseed.training.run import prepare_run
+    from splatseed.training.prepare import PrepareOptions, prepare_run
     from splatseed.viewer.page import Tile
 
     stage = f"train {ARMS[name]}"
     scene = load_scene(folder / ("scene" if name == SFM else f"scene_{name}"))
-    run = prepare_run(scene, folder / f"run_{name}", settings, overwrite=True, progress=clock)
+    run = prepare_run(
+        scene, folder / f"run_{name}", settings, PrepareOptions(overwrite=True), progress=clock
+    )
     clock(stage, 0.0)
     if not run.train(lambda step: clock(stage, step / settings.max_steps)):
         raise KeyboardInterrupt

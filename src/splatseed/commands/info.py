@@ -114,7 +114,7 @@ def run(arguments: list[str]) -> None:
         usable = scene.replace(depths=None)  # nothing follows from maps that cannot be used
     planned = Planned.of(usable, options.budget, options.max_steps)
     share = None if regions is None else regions.mean
-    advice = advice_for(usable, planned.most_seeds, strategy=planned.strategy, empty=share)
+    advice = advice_for(usable, planned.max_seeds, strategy=planned.strategy, empty=share)
     rows = [*_source_rows(scene), *_cloud_rows(cloud), *_track_rows(tracks)]
     rows += _photograph_rows(regions, poses, masks)
     rows += _advice_rows(advice, planned) if len(scene.points) else []
@@ -221,7 +221,7 @@ def _next(
         how = "" if options.depth_kind is None else f"--depth-kind {options.depth_kind} "
         how += "" if options.depth_scale is None else f"--depth-scale {options.depth_scale:g} "
         how += "" if any_points else "--depth.no-align "
-        how += next_steps.number_for(len(scene.points), known, planned.most_seeds)
+        how += next_steps.number_for(len(scene.points), known, planned.max_seeds)
         lifted = next_steps.use(options.scene, options.depth, how)
     if any_points and lifted:
         return [("", lifted)]

@@ -15,7 +15,6 @@ from splatseed.seeding.advice import AS_IT_IS, SEEDED, Advice
 from splatseed.seeding.trainability import is_distorted, untrainable
 from splatseed.text import quoted
 from splatseed.training.schedule import FULL_RUN
-from splatseed.training.seeds import most_seeds
 from splatseed.training.settings import BUDGET, TrainSettings
 
 RATIO = 16
@@ -40,14 +39,14 @@ class Planned(NamedTuple):
     budget: int
     max_steps: int
     strategy: str
-    most_seeds: int
+    max_seeds: int
     flags: str
 
     @classmethod
     def of(cls, scene: Scene, budget: str | None = None, max_steps: int = FULL_RUN) -> Planned:
         """A scene's plan, from the options."""
         images = at_file_size(scene).images
-        factor = TrainSettings().sized(images).factor
+        factor = TrainSettings().with_data_factor(images).factor
         lenses = [image.intrinsics for image in images]
         sizes = [(lens.width // factor) * (lens.height // factor) for lens in lenses]
         pixels = round(float(np.median(sizes))) if sizes else BUDGET
@@ -60,7 +59,7 @@ class Planned(NamedTuple):
         if max_steps != FULL_RUN:
             flags = f"{flags}--max-steps {max_steps} "
         settings = TrainSettings(strategy="auto", max_steps=max_steps, cap_max=number)
-        most = most_seeds(settings, number)
+        most = settings.max_seeds(number)
         return cls(number, max_steps, settings.densification, most, flags)
 
 
@@ -80,7 +79,7 @@ def advice_commands(
         train = f"splatseed train {source} --seeds scene {training}"
     else:
         how = f"--method {advice.method} --ratio 4"
-        how = f"--budget {planned.most_seeds}" if advice.method == "auto" else how
+        how = f"--budget {planned.max_seeds}" if advice.method == "auto" else how
         how = f"{how} --refine-poses" if refine else how
         first.append(("seeds", f"splatseed upsample {source} {how} -o OUT"))
         train = f"splatseed train OUT {training}"
@@ -96,7 +95,7 @@ def after_depth(path: Path, scene: Scene, maps: Path, known: int, *, aligned: bo
     are and a network's are not.
     """
     looking = look(path, maps)
-    number = number_for(len(scene.points), known, Planned.of(scene).most_seeds)
+    number = number_for(len(scene.points), known, Planned.of(scene).max_seeds)
     if is_distorted(scene):  # seeds are lifted along the rays of a pinhole camera
         begin = ("for seeds, begin with", undistort_command(path))
         return [looking] if aligned else [looking, begin]

@@ -31,9 +31,15 @@ from splatseed.scores import TrainingResult
 from splatseed.seeding.upsampling import RHO
 from splatseed.settings import fits
 from splatseed.text import did_you_mean, quoted, visible
-from splatseed.training.duration import TOO_LONG, Progressed, about_an_hour, in_words, seconds_left
+from splatseed.training.duration import (
+    TOO_LONG,
+    RunSpeed,
+    format_duration,
+    options_for_an_hour,
+    seconds_left,
+)
 from splatseed.training.folder import RunFolder
-from splatseed.training.settings import OPTIONS, Seeding, StrategyName, TrainSettings
+from splatseed.training.settings import Seeding, StrategyName, TrainSettings
 
 if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
     from splatseed.training.run import TrainingRun
@@ -53,8 +59,6 @@ WORTH_SAYING = 120.0
 RUN_NOTES = {"splatseed", "points", "photographs", "device", "versions", "near_plane",
     "frame"}  # fmt: skip
 """What config.json records besides options."""
-_SETTINGS = {option: name for name, option in OPTIONS.items()} | {"long_side": "data_factor"}
-"""Settings by the options that stand for them, where these have other names."""
 RIVALS = (("start", "seeds"), ("start", "refine_poses"), ("long_side", "data_factor"))
 """Options of which one alone can be given: on the command line it takes the place of the other."""
 BEST_SETTINGS = replace(DEFAULT, strategy=BEST)
@@ -234,7 +238,7 @@ def run(arguments: list[str]) -> None:
 def _announce(options: Options, training: TrainingRun) -> None:
     """Print what will be done."""
     settings, views = training.settings, training.trainer.train_views
-    for name in settings.idle:
+    for name in settings.unused:
         print_note(f"{name} has no effect with strategy {settings.densification}.")
     chosen = settings.strategy == BEST
     strategy = f"{settings.densification} ({BEST})" if chosen else settings.strategy
@@ -297,7 +301,7 @@ class _TimeLeft:
         training = self._training
         view, device = training.trainer.train_views[0], training.trainer.device.type
         each, pixels = begun / (len(self._steps) - 1), view.width * view.height
-        now = Progressed(step, each, training.count(), pixels, device)
+        now = RunSpeed(step, each, training.count(), pixels, device)
         self.seconds = seconds_left(training.settings, now)
         if not self._is_said and begun > SURE_AFTER:
             self._is_said = True
@@ -310,15 +314,15 @@ class _TimeLeft:
         """For the progress bar; empty until it is known."""
         return "" if self.seconds is None else f"{timedelta(seconds=round(self.seconds))} left"
 
-    def _notes(self, now: Progressed, left: float) -> Iterator[str]:
+    def _notes(self, now: RunSpeed, left: float) -> Iterator[str]:
         settings, view = self._training.settings, self._training.trainer.train_views[0]
         steps = f"{settings.max_steps - now.step:,} steps that are left"
         slow = now.device == "cpu" and left > TOO_LONG
         if slow or (left > WORTH_SAYING and not ERR.is_terminal):
-            yield f"The {steps} take about {in_words(left)}."
+            yield f"The {steps} take about {format_duration(left)}."
         if slow:
             side = max(view.width, view.height) * settings.factor
-            flags = about_an_hour(settings, now, side, per_pixel=self._per_pixel)
+            flags = options_for_an_hour(settings, now, side, per_pixel=self._per_pixel)
             yield f"On this CPU, training with {flags} takes about an hour; a GPU is much faster."
 
 
@@ -392,7 +396,7 @@ def _summarise(options: Options, training: TrainingRun, result: TrainingResult) 
 
 def _next_commands(output: Path) -> list[tuple[str, str]]:
     """What to do with a finished run; LPIPS only where its weights are."""
-    from splatseed.splat.metrics import lpips_is_here
+    from splatseed.splat.lpips import lpips_is_here
 
     score = ("score again, with LPIPS", f"splatseed evaluate {quoted(output)}")
     return [("look at it", f"splatseed view {quoted(output)}"), *[score] * lpips_is_here()]

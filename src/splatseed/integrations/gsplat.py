@@ -2,9 +2,9 @@
 
 Notation: gsplat's: ``params`` holds ``means``, ``scales`` (logarithms), ``quats``, ``opacities``
 (logits) and ``sh0``, ``shN``, or nerfstudio's names of these, ``features_dc``, ``features_rest``;
-``viewmats`` are cam_from_world with OpenCV axes. Lengths are the trainer's, whose world is often
-the scene's turned, moved and scaled. Promise: what grows, and where, is decided by the class that
-``splatseed train`` runs, ``train.growing.Growing``.
+``viewmats`` are cam_from_world with OpenCV axes. Lengths are the trainer's, whose frame is often
+the scene's rotated, moved and scaled. Promise: the class decides what grows, and where, that
+``splatseed train`` runs, ``training.strategies.grow.ErrorDensification``.
 """
 
 from __future__ import annotations
@@ -31,30 +31,31 @@ from gsplat import MCMCStrategy
 from torch import Tensor
 
 from splatseed.training.device import Capacity
-from splatseed.training.growing import BASES, FAINT, Growing
+from splatseed.training.strategies.candidates import SH0_NAMES
+from splatseed.training.strategies.grow import GROWTH, ErrorDensification
 
 REQUIRED = ("means", "scales", "quats", "opacities")
 MAKE_MAPS = "Make them with splatseed depth SCENE -o FOLDER."
-UNSEEN = np.empty((0, 0, 3), np.uint8)  # a view's photograph, where only its camera matters
+NO_PIXELS = np.empty((0, 0, 3), np.uint8)  # a view's photograph, where only its camera matters
 
 
 @dataclass
 class GrowStrategy(MCMCStrategy):  # type: ignore[misc]  # gsplat has no types
     """Spend a budget of Gaussians where renders are still wrong: ``splatseed train``'s ``grow``.
 
-    Trainers choose what to do by a strategy's class: as a subclass of gsplat's ``MCMCStrategy``,
-    this one is called as that is, but it neither relocates Gaussians nor adds noise. In addition,
-    ``observe`` must be called at each step. Cameras must be pinholes, photographs whole, and all
-    Gaussians on one device. The defaults are for 30,000 steps: scale them with the run's.
+    Trainers recognise strategies by class: as a subclass of gsplat's ``MCMCStrategy``, this one is
+    called in the same way, but it neither relocates Gaussians nor adds noise. In addition, call
+    ``observe`` at each step. Cameras must be pinholes, photographs complete, and all Gaussians on
+    one device. The defaults are for 30,000 steps: scale them with the length of the run.
     """
 
     absgrad: ClassVar[bool] = False  # nerfstudio 1.1.5 asks every strategy
     noise_lr: float = field(default=0.0, init=False)
-    min_opacity: float = field(default=FAINT, init=False)
+    min_opacity: float = field(default=GROWTH.min_opacity, init=False)
     refine_start_iter: int = GROW_EVERY
     """First step after which Gaussians are added and removed."""
     refine_stop_iter: int = FULL_RUN // 2
-    """Last step after which they may be; the budget is spent at 0.7 of it."""
+    """Last step after which Gaussians are added and removed; the budget is spent at 0.7 of it."""
     refine_every: int = GROW_EVERY
     """Steps between such rounds."""
     depths: Path | None = None
@@ -68,18 +69,18 @@ class GrowStrategy(MCMCStrategy):  # type: ignore[misc]  # gsplat has no types
         params: Mapping[str, Tensor] | torch.nn.ParameterDict,
         optimizers: Mapping[str, torch.optim.Optimizer],
     ) -> None:
-        """Check that there is all that growth needs.
+        """Check that growth has all parameters.
 
         Raises:
             ParameterError: Parameters are missing.
             AssertionError: gsplat's: an optimiser is missing, or has several groups.
         """
         missing = [name for name in REQUIRED if name not in params]
-        if not any(name in params for name in BASES):
-            missing.append(" or ".join(BASES))
+        if not any(name in params for name in SH0_NAMES):
+            missing.append(" or ".join(SH0_NAMES))
         if missing:
             raise ParameterError(
-                f"the parameters {', '.join(REQUIRED)} and {' or '.join(BASES)}",
+                f"the parameters {', '.join(REQUIRED)} and {' or '.join(SH0_NAMES)}",
                 found=f"no {', no '.join(missing)}",
                 fix="Train spherical harmonics (gsplat's trainer: without --app-opt).",
             )
@@ -115,16 +116,16 @@ class GrowStrategy(MCMCStrategy):  # type: ignore[misc]  # gsplat has no types
         photographs: Float[Tensor, "C H W 3"],
         names: Sequence[str] | None = None,
     ) -> None:
-        """Look at a step's result; to be called at each, before ``step_post_backward``.
+        """Measure the result of a step; to be called at each, before ``step_post_backward``.
 
         Args:
             params: The parameters.
-            state: What ``initialize_state`` returned.
+            state: The state of ``initialize_state``.
             step: The number of steps done before this one.
             viewmats: Poses of the cameras, cam_from_world in training units.
             Ks: Their intrinsics, in pixels of the photographs.
-            renders: What was rendered.
-            photographs: What it should be, 0 to 1.
+            renders: The renders.
+            photographs: The photographs, 0 to 1.
             names: Of the images, as in the folder of depth maps, ``NAME.npy``; None: no depth is
                 known.
 
@@ -132,12 +133,12 @@ class GrowStrategy(MCMCStrategy):  # type: ignore[misc]  # gsplat has no types
             SceneFormatError: A depth map cannot be read, or has not its photograph's aspect ratio.
         """
         growing = self._growing(params, state)
-        if not growing.looks(step):
+        if not growing.should_accumulate(step):
             return
         height, width = photographs.shape[1:3]
         for i, photograph in enumerate(photographs):
             K, pose = (each[i].detach().cpu().double().numpy() for each in (Ks, viewmats))
-            view = View(names[i] if names else "", UNSEEN, K, width, height, pose)
+            view = View(names[i] if names else "", NO_PIXELS, K, width, height, pose)
             growing.depths = self._depth_of(view, state, photograph.device)
             growing.observe(params, view, renders[i], photograph, step)
 
@@ -151,15 +152,15 @@ class GrowStrategy(MCMCStrategy):  # type: ignore[misc]  # gsplat has no types
         lr: float | None = None,  # noqa: ARG002  (what MCMCStrategy is called with)
         packed: bool = False,  # noqa: ARG002  (what nerfstudio 1.1.5 calls every strategy with)
     ) -> None:
-        """At the end of a round, remove, place and split Gaussians.
+        """At the end of a round, prune, place and split Gaussians.
 
         Raises:
             ParameterError: ``observe`` was not called, or with names of which none has a depth map.
         """
         growing = self._growing(params, state)
-        if not growing.ends_round(step):
+        if not growing.should_densify(step):
             return
-        if "first" not in state:
+        if "num_initial" not in state:
             raise ParameterError(
                 "a call of observe at each step, before step_post_backward",
                 found=f"none up to step {step}",
@@ -171,26 +172,26 @@ class GrowStrategy(MCMCStrategy):  # type: ignore[misc]  # gsplat has no types
                 found=f"{state.get('unmatched') or 'none'}",
                 fix=f"Pass each file's path in it, without .npy: {next(iter(state['depths']))}.",
             )
-        growing.after(params, optimizers, step, info)
+        growing.after_step(params, optimizers, step, info)
         if self.verbose:
             print(f"Step {step}: {len(params['means'])} GSs.")  # noqa: T201  (as gsplat's do)
 
-    def _growing(self, params: torch.nn.ParameterDict, state: dict[str, Any]) -> Growing:
-        """What ``splatseed train`` grows with, at this state."""
+    def _growing(self, params: torch.nn.ParameterDict, state: dict[str, Any]) -> ErrorDensification:
+        """Return the strategy of ``splatseed train`` at this state."""
         schedule = dataclasses.replace(
             make_schedule("grow", 2 * self.refine_stop_iter, as_3dgs=False),
             refine_start=self.refine_start_iter,
             refine_stop=self.refine_stop_iter,
             refine_every=self.refine_every,
         )
-        growing = Growing(schedule, Capacity(self.cap_max, params["means"].device))
+        growing = ErrorDensification(schedule, Capacity(self.cap_max, params["means"].device))
         growing.state = state
         return growing
 
     def _depth_of(
         self, view: View, state: dict[str, Any], device: torch.device
     ) -> dict[str, Float[Tensor, "h w"]]:
-        """The view's depth in training units, 0 where unknown, by its name; empty without one."""
+        """Return the view's depth by its name, in training units, 0 where unknown; or nothing."""
         files: DepthFiles | None = state["depths"]
         if files is None or view.name not in files:
             state["unmatched"] = view.name
@@ -205,7 +206,7 @@ class GrowStrategy(MCMCStrategy):  # type: ignore[misc]  # gsplat has no types
 
 
 def _maps_in(folder: Path) -> DepthFiles:
-    """The planar depth maps in a folder that ``splatseed depth`` wrote, by their images' names."""
+    """Return the planar depth maps in a folder of ``splatseed depth``, by their images' names."""
     paths = {
         path.relative_to(folder).with_suffix("").as_posix(): path
         for path in sorted(folder.rglob("*.npy"))

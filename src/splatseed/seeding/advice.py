@@ -66,11 +66,11 @@ class Advice:
 
 
 def advice_for(
-    scene: Scene, most_seeds: int, *, strategy: str = "default", empty: float | None = None
+    scene: Scene, max_seeds: int, *, strategy: str = "default", empty: float | None = None
 ) -> Advice:
     """What to do with a scene's points before training; no photograph is opened.
 
-    Training can begin with ``most_seeds`` under its budget; ``empty`` is the share of the
+    Training can begin with ``max_seeds`` under its budget; ``empty`` is the share of the
     photographs' cells without points, if known.
     """
     measured = measure(scene, empty)
@@ -79,7 +79,7 @@ def advice_for(
         new = f"{len(scene.points) - kept:,} of its points and kept {kept:,}"
         made = f"splatseed upsample made {new}."
         return Advice(SEEDED if scene.has_photographs else AS_IT_IS, (made,), measured)
-    return advise(measured, most_seeds, strategy=strategy)
+    return advise(measured, max_seeds, strategy=strategy)
 
 
 def method_for(
@@ -95,7 +95,7 @@ def method_for(
 
 
 def advise(
-    measured: Measured, most_seeds: int, *, strategy: str = "default", room: float = ROOM
+    measured: Measured, max_seeds: int, *, strategy: str = "default", room: float = ROOM
 ) -> Advice:
     """The rule behind ``advice_for``, which scoring calls with other values of ``room``."""
     if not measured.num_points:
@@ -107,13 +107,13 @@ def advise(
         return Advice(
             FALLBACK, ("Without photographs and their poses, points are interpolated.",), measured
         )
-    has = most_seeds / measured.num_points
+    has = max_seeds / measured.num_points
     share = measured.num_points / measured.pixels if measured.pixels else 0.0
     share_said = f"{share:.2f}" if share >= 0.01 or not share else f"{share:.1g}"
     per_pixel = f"{measured.num_points:,} points, {share_said} per pixel"
     if has < room:
         full = (
-            f"Training begins with {most_seeds:,} at most, so there is no room for more: adding "
+            f"Training begins with {max_seeds:,} at most, so there is no room for more: adding "
             "some cost up to 0.4 dB where that was measured."
         )
         return Advice(AS_IT_IS, (f"It has {per_pixel}.", full), measured)

@@ -38,7 +38,8 @@ from splatseed.scene import Scene
 from splatseed.scores import NOT_ASKED, EvalResult, ViewScore
 from splatseed.splat.formats import read_gaussians
 from splatseed.splat.gaussians import Gaussians, frame_of_model
-from splatseed.splat.metrics import LPIPS_NET, Lpips, color_corrected, flip_map, psnr, ssim_of_all
+from splatseed.splat.lpips import LPIPS_NET, Lpips
+from splatseed.splat.metrics import color_corrected, flip_map, psnr, ssim_of_all
 from splatseed.splat.rendering import ModelRenderer, fill_masked, mask_of, photograph_of
 from splatseed.splat.ssim import WINDOW
 from splatseed.splat.world import NO_TRANSFORM, around_scene, check_world, find_transform, view_in

@@ -14,9 +14,10 @@ from splatseed.requirements import require
 from splatseed.training.settings import TrainSettings
 
 if TYPE_CHECKING:
-    from splatseed.training.run import TrainingRun, prepare_run
+    from splatseed.training.prepare import PrepareOptions, prepare_run
+    from splatseed.training.run import TrainingRun
 
-__all__ = ["TrainSettings", "TrainingRun", "prepare_run"]
+__all__ = ["PrepareOptions", "TrainSettings", "TrainingRun", "prepare_run"]
 
 
 def __getattr__(name: str) -> Any:
@@ -28,4 +29,4 @@ def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     require("torch", "gsplat", "flip_evaluator")
-    return getattr(import_module("splatseed.training.run"), name)
+    return getattr(import_module("splatseed.training.prepare"), name)

@@ -27,11 +27,12 @@ from splatseed.progress import Note, Progress, silent, silent_note
 from splatseed.requirements import require
 from splatseed.scene import Image, Scene
 from splatseed.scores import EvalResult
+from splatseed.seeding.budget import median_pixels
 from splatseed.seeding.upsampling import parse_budget
 from splatseed.text import did_you_mean
 from splatseed.training.folder import RunFolder
 from splatseed.training.models import config_of, model_file, near_plane_of
-from splatseed.training.settings import BUDGET, LEAST_GAUSSIANS, Backend, TrainSettings
+from splatseed.training.settings import BUDGET, MIN_GAUSSIANS, Backend, TrainSettings
 
 require("torch", "gsplat", "flip_evaluator")  # before what imports them, for one clear error
 
@@ -42,8 +43,9 @@ from splatseed.splat.gaussians import Gaussians, TrainingFrame
 from splatseed.splat.rendering import ModelRenderer
 from splatseed.training.device import pick_device
 from splatseed.training.evaluation import Evaluation
-from splatseed.training.run import TrainingRun, prepare_run
-from splatseed.training.seeds import why_not_seeded
+from splatseed.training.prepare import PrepareOptions, prepare_run
+from splatseed.training.run import TrainingRun
+from splatseed.training.seeds import no_seeding_reason
 
 DEFAULTS = TrainSettings(strategy="auto", seeding="advised")
 """The settings of a new run; a resumed run has its own."""
@@ -202,22 +204,23 @@ def prepare_training(
         note(scene.listed.sentence)
     asked = _sized(asked, scene, long_side, folder if resumes else None, note)
     asked = _within_budget(asked, budget, scene, note)
-    if settings.get("seeding") == "auto" and (why := why_not_seeded(scene, asked)):
+    if settings.get("seeding") == "auto" and (why := no_seeding_reason(scene, asked)):
         note(f"`seeding='auto'` has no effect: {why}.")
+    explicit = {*settings}
+    explicit |= {"cap_max"} if budget is not None else set()
+    explicit |= {"data_factor"} if long_side is not None else set()
     return prepare_run(
         scene,
         output,
         asked,
-        resume=resume,
-        named={
-            *settings,
-            *(["cap_max"] if budget is not None else ()),
-            *(["data_factor"] if long_side is not None else ()),
-        },
-        overwrite=overwrite,
-        refine_poses=refine_poses,
-        tensorboard=tensorboard,
-        cache_dir=user_cache_dir(),
+        PrepareOptions(
+            resume=resume,
+            overwrite=overwrite,
+            refine_poses=refine_poses,
+            tensorboard=tensorboard,
+            explicit=explicit,
+            cache_dir=user_cache_dir(),
+        ),
         note=note,
         progress=progress,
     )
@@ -303,7 +306,7 @@ def _sized(
         if settings.data_factor is None and resumed is not None:
             kept = resumed.read_config().get("data_factor")
             return dataclasses.replace(settings, data_factor=kept if isinstance(kept, int) else 1)
-        return settings.sized(scene.images, note)
+        return settings.with_data_factor(scene.images, note)
     if settings.data_factor is not None:
         raise ParameterError("`long_side` or `data_factor`", found="both", fix="Leave one out.")
     if long_side < 1:
@@ -319,14 +322,12 @@ def _within_budget(
     chosen = settings.strategy == "auto" and settings.cap_max is None
     if budget is None and not (chosen and scene.images):
         return settings
-    from splatseed.seeding.budget import median_pixels  # noqa: PLC0415  (kernels)
-
     views = poses_of(scene.images, settings.factor)
     pixels = median_pixels(views) if views else 0
     if budget is not None:
         cap = parse_budget(budget, pixels)
-        if cap < LEAST_GAUSSIANS:
-            expected = f"`budget` of {LEAST_GAUSSIANS} Gaussians or more"
+        if cap < MIN_GAUSSIANS:
+            expected = f"`budget` of {MIN_GAUSSIANS} Gaussians or more"
             raise ParameterError(expected, found=str(budget), fix="Try 0.25rho.")
         return dataclasses.replace(settings, cap_max=cap)
     cap = max(2, min(BUDGET, round(pixels)))

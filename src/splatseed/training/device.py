@@ -14,13 +14,14 @@ import torch
 from splatseed.errors import PointCloudError
 from splatseed.progress import Progress, silent
 from splatseed.runtime.torch_device import free_bytes, load_kernels, pick_torch_device
-from splatseed.training.settings import BYTES_EACH, Backend
+from splatseed.text import counted
+from splatseed.training.settings import BYTES_PER_GAUSSIAN, Backend
 
 
 def pick_device(backend: Backend, progress: Progress = silent) -> torch.device:
-    """The device that a backend stands for, ready to render; ``auto`` takes a GPU if there is one.
+    """Return the device of a backend, ready to render; ``auto`` takes a GPU if there is one.
 
-    The first time gsplat's kernels are built, which ``progress`` is told.
+    The first call on a GPU builds gsplat's kernels and reports it to ``progress``.
 
     Raises:
         ParameterError: CUDA is asked for and there is none.
@@ -32,15 +33,22 @@ def pick_device(backend: Backend, progress: Progress = silent) -> torch.device:
     return device
 
 
+def device_name(device: torch.device) -> str:
+    """Return the name of a GPU, or the number of the CPU's threads."""
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    return f"CPU, {counted(torch.get_num_threads(), 'thread')}"
+
+
 def check_fits(count: int, device: torch.device) -> None:
     """Refuse more Gaussians than can be trained."""
     free = free_bytes(device)
-    if free is not None and count * BYTES_EACH > free:
-        most = free // BYTES_EACH
+    if free is not None and count * BYTES_PER_GAUSSIAN > free:
+        limit = free // BYTES_PER_GAUSSIAN
         raise PointCloudError(
-            f"at most {most:,} points, which the {free / 1e9:.1f} GB of free memory hold",
+            f"at most {limit:,} points, which the {free / 1e9:.1f} GB of free memory hold",
             found=f"{count:,}",
-            fix=f"Pass `budget={most}`, upsample less, or free some memory.",
+            fix=f"Pass `budget={limit}`, upsample less, or free some memory.",
         )
 
 
@@ -69,11 +77,11 @@ class Capacity:
         """The number at which memory first stopped a run, which then depends on the machine."""
 
     def limit(self, count: int, wanted: int) -> int:
-        """The most that ``count`` Gaussians may become if the strategy wants ``wanted``."""
-        most = wanted if self.cap is None else min(self.cap, wanted)
+        """Return up to how many Gaussians ``count`` may grow, if ``wanted`` are wanted."""
+        limit = wanted if self.cap is None else min(self.cap, wanted)
         free = free_bytes(self._device)
-        if free is None or most - count <= free // BYTES_EACH:
-            return most
-        fits = count + free // BYTES_EACH
+        if free is None or limit - count <= free // BYTES_PER_GAUSSIAN:
+            return limit
+        fits = count + free // BYTES_PER_GAUSSIAN
         self.held_at = self.held_at or fits
         return fits

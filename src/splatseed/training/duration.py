@@ -1,7 +1,7 @@
-"""How long training takes: a rough model of a step, which a run's own first steps calibrate.
+"""How long training takes: a rough model of a step, calibrated by the run's own first steps.
 
 Notation: a step takes a + b G + c P seconds for G Gaussians and P pixels of a photograph. Promise:
-later steps are slower because there are more Gaussians, and that is counted.
+the estimate includes the growth of G.
 """
 
 from __future__ import annotations
@@ -19,33 +19,33 @@ Gaussians. Another machine may be several times off, its proportions less."""
 GROWTH = 3.0
 """Gaussians at the end of a run per seed, with densification and without a cap: a guess."""
 HOUR, TOO_LONG = 3600.0, 5400.0
-"""Seconds of the run that is advised, and of a run beyond which that is."""
-LEAST_SIDE = 400
-"""Longer side down to which smaller photographs are advised, before fewer steps."""
-FEWER_STEPS, STEPS_OF = 7000, 100
-"""Steps that are advised then; if these take long, too, fewer hundreds."""
+"""Seconds of the run that is suggested, and of a run beyond which it is suggested."""
+MIN_SIDE = 400
+"""Longer side, px, down to which smaller photographs are suggested before fewer steps."""
+FEWER_STEPS, STEP_UNIT = 7000, 100
+"""Steps that are suggested then; if they take too long, a smaller multiple of the unit."""
 
 
 def step_seconds(device: str, gaussians: float, pixels: float) -> float:
-    """Seconds of a step on ``cpu`` or ``cuda``, by the model alone."""
+    """Return the model's seconds of a step on ``cpu`` or ``cuda``."""
     a, b, c = COSTS[device]
     return a + b * gaussians + c * pixels
 
 
-class Progressed(NamedTuple):
-    """How far a run is, and how fast."""
+class RunSpeed(NamedTuple):
+    """The position of a run, and its speed."""
 
     step: int  # steps done
-    seconds: float  # that a step takes now
+    seconds: float  # per step, now
     gaussians: int
     pixels: int  # of a photograph as it is trained
     device: str = "cpu"  # or cuda
 
 
-def mean_gaussians(settings: TrainSettings, now: Progressed) -> float:
-    """The mean number of Gaussians over the steps that are left.
+def mean_gaussians(settings: TrainSettings, now: RunSpeed) -> float:
+    """Return the mean number of Gaussians over the remaining steps.
 
-    It rises linearly until growth ends, and stays: the budget is spent then, if there is one.
+    The number rises linearly until growth ends, where it reaches the budget if there is one.
     """
     growth, count, left = settings.densification, now.gaussians, settings.max_steps - now.step
     stop = FULL_AT * settings.max_steps if growth == "grow" else settings.schedule.refine_stop
@@ -60,8 +60,8 @@ def mean_gaussians(settings: TrainSettings, now: Progressed) -> float:
     return count + max(0.0, last - count) * (1 - rising / 2)
 
 
-def seconds_left(settings: TrainSettings, now: Progressed) -> float:
-    """Seconds until the last step."""
+def seconds_left(settings: TrainSettings, now: RunSpeed) -> float:
+    """Return the seconds until the last step."""
     left = settings.max_steps - now.step
     if left <= 0:
         return 0.0
@@ -69,19 +69,19 @@ def seconds_left(settings: TrainSettings, now: Progressed) -> float:
     return left * slower * step_seconds(now.device, mean_gaussians(settings, now), now.pixels)
 
 
-def about_an_hour(
-    settings: TrainSettings, now: Progressed, long_side: int, *, per_pixel: bool
+def options_for_an_hour(
+    settings: TrainSettings, now: RunSpeed, long_side: int, *, per_pixel: bool
 ) -> str:
-    """The options with which the whole run would take about an hour at most on this machine.
+    """Return options with which the run would take at most about an hour on this machine.
 
     Args:
         settings: The run's.
-        now: How far it is.
+        now: Its position and speed.
         long_side: Longer side of the photographs as they are stored.
         per_pixel: Whether the budget follows the pixels of the photographs.
     """
     slower = now.seconds / step_seconds(now.device, now.gaussians, now.pixels)
-    factors = range(settings.factor, max(settings.factor, long_side // LEAST_SIDE) + 1)
+    factors = range(settings.factor, max(settings.factor, long_side // MIN_SIDE) + 1)
     fewer = min(FEWER_STEPS, settings.max_steps)
     tried = [(steps, factor) for steps in (settings.max_steps, fewer) for factor in factors]
     for steps, factor in tried:
@@ -92,21 +92,21 @@ def about_an_hour(
         count = min(now.gaussians, cap or now.gaussians)
         planned = replace(settings, max_steps=steps, cap_max=cap)
         seconds = slower * step_seconds(now.device, count, pixels)
-        needed = seconds_left(planned, Progressed(0, seconds, count, pixels, now.device))
+        needed = seconds_left(planned, RunSpeed(0, seconds, count, pixels, now.device))
         if needed <= HOUR:
             break
     else:  # the budget alone takes longer
-        steps = max(STEPS_OF, int(steps * HOUR / needed) // STEPS_OF * STEPS_OF)
+        steps = max(STEP_UNIT, int(steps * HOUR / needed) // STEP_UNIT * STEP_UNIT)
     flags = f"--long-side {math.ceil(long_side / factor)}"
     return flags if steps == settings.max_steps else f"{flags} --max-steps {steps}"
 
 
-def in_words(seconds: float) -> str:
-    """A duration, as people say it.
+def format_duration(seconds: float) -> str:
+    """Return a duration in minutes or hours.
 
     Example:
-        >>> in_words(100), in_words(3000), in_words(19_000), in_words(200_000)
-        ('2 minutes', '50 minutes', '5 hours', '56 hours')
+        >>> format_duration(100), format_duration(3000), format_duration(19_000),
+        format_duration(200_000) ('2 minutes', '50 minutes', '5 hours', '56 hours')
     """
     if seconds < HOUR * 1.5:
         minutes = max(1, round(seconds / 60))

@@ -20,7 +20,7 @@ from splatseed.scores import EvalResult
 from splatseed.splat.covisible import find_covisible, pixel_masks
 from splatseed.splat.evaluate import OnView, TrainedModel, evaluate_model, load_model
 from splatseed.splat.gaussians import Gaussians
-from splatseed.splat.metrics import load_lpips
+from splatseed.splat.lpips import load_lpips
 from splatseed.training.device import pick_device
 from splatseed.training.models import config_of, model_file, near_plane_of
 from splatseed.training.settings import Backend, TrainSettings

@@ -1,11 +1,11 @@
-"""Floaters: Gaussians that stand in space that views see through, and that no photograph needs.
+"""Floaters: Gaussians in free space that no photograph needs.
 
 Notation: a *suspect* is a Gaussian that at least two training views see past at its centre, and
-more than confirm it: stereo finds the surface there clearly behind
+more than confirm it: stereo finds the surface clearly behind it
 (``seeding.clouds.photo_consistency``). E is the sum of the training views' squared errors, a the
-opacity of a suspect. Promise: only suspects go, and only those that the photographs do not need:
-thin, soft and transparent things stay. With every suspect at a quarter of its opacity, so that one
-hardly hides another, the photographs need it if dE/da is negative. Test views have no part.
+opacity of a suspect. Every suspect is reduced to a quarter of its opacity, so that one hardly hides
+another; the photographs need it if dE/da is negative. Promise: only suspects that are not needed
+are floaters, so thin, soft and transparent things stay. Test views have no part.
 """
 
 from __future__ import annotations
@@ -38,22 +38,23 @@ from splatseed.seeding.clouds.photo_consistency import find_evidence
 from splatseed.seeding.photo_methods import photographed
 from splatseed.splat.gaussians import Gaussians, frame_of_model
 from splatseed.splat.rendering import fill_masked, mask_of, photograph_of, render_view
+from splatseed.training.depths import DepthMaps, known_depths
 from splatseed.training.device import pick_device
 from splatseed.training.parameters import make_parameters
-from splatseed.training.seeds import DepthMaps, known_depths
 from splatseed.training.settings import TrainSettings
 from splatseed.training.start import read_start
 
 FADED = 0.25
-"""Part of its opacity that a suspect is judged at. At half, 101 of 4,000 Gaussians of the synthetic
-room went with 200 opaque ones that were put before them, at a quarter 38, at a tenth 66."""
-LEAST_KNOWN = 5
-"""Depths that must be known among the nine pixels of a map around a centre."""
-LEAST_CONFIRMED, LEAST_OF_ALL = 0.1, 0.02
-"""A model belongs to another scene if views confirm at most the first as a share of the Gaussians
-that are at a known depth or in front of it, or the second of all: six captures' own have 0.33 to
-0.99 and 0.09 to 0.81."""
-NO_SURFACE = np.full((1, 1), np.inf, np.float32)  # the photographs' colours are not asked for
+"""The fraction of its opacity at which a suspect is tested. At half, 101 of 4,000 Gaussians of the
+synthetic room went with 200 opaque ones that were put before them, at a quarter 38, at a tenth
+66."""
+MIN_KNOWN = 5
+"""Minimum known depths among the nine pixels of a map around a centre."""
+MIN_CONFIRMED, MIN_CONFIRMED_OF_ALL = 0.1, 0.02
+"""A model belongs to another scene if views confirm at most the first fraction of the Gaussians at
+a known depth or in front of it, or the second of all: models of six captures have 0.33 to 0.99 and
+0.09 to 0.81."""
+NO_SURFACE = np.full((1, 1), np.inf, np.float32)  # colours are not compared
 
 
 def floaters_of_model(
@@ -65,17 +66,17 @@ def floaters_of_model(
     masks: str | None = None,
     progress: Progress = silent,
 ) -> Bool[np.ndarray, " N"]:
-    """Which Gaussians of a file are floaters, in its order.
+    """Find the floaters of a file, in its order.
 
     Args:
-        path: A file of Gaussians of any trainer, also in the world of gsplat's examples, nerfstudio
+        path: A file of Gaussians of any trainer, also in the frame of gsplat's examples, nerfstudio
             or graphdeco.
         scene_path: The scene that it was trained on.
         data_factor: The factor by which photographs are downsampled; when left out, to the size at
             which stereo compares them.
         test_every: Every n-th image, sorted by name, is a test view.
         masks: Which masks, as for ``io.masks.with_masks``.
-        progress: Called with the stage and the fraction done.
+        progress: Called with the name of a stage and its fraction done.
 
     Raises:
         SceneNotFoundError: The model, the scene or its photographs are missing.
@@ -99,7 +100,7 @@ def floaters_of_model(
 
 
 def _device(progress: Progress) -> torch.device:
-    """A GPU, if gsplat's kernels are there or can be built; the CPU finds the same floaters."""
+    """Return a GPU if gsplat has kernels for it; the CPU finds the same floaters."""
     try:
         return pick_device("auto", progress)
     except MissingDependencyError:
@@ -113,27 +114,31 @@ def find_floaters(
     device: torch.device,
     progress: Progress = silent,
 ) -> Bool[np.ndarray, " N"]:
-    """Which Gaussians are floaters.
+    """Find floaters among Gaussians.
 
     Args:
         gaussians: In the training frame.
         views: The training views, in the training frame.
         depths: As of ``known_depths``.
         device: Where to render.
-        progress: Called with the stage and the fraction done.
+        progress: Called with the name of a stage and its fraction done.
 
     Raises:
         SceneFormatError: Hardly any Gaussian lies at a depth that stereo finds.
     """
     compared = [view for view in views if view.name in depths]
-    rays, surfaces = [_free(depths[view.name]) for view in compared], [NO_SURFACE] * len(compared)
+    rays, surfaces = (
+        [_free_depth(depths[view.name]) for view in compared],
+        [NO_SURFACE] * len(compared),
+    )
     evidence = find_evidence(compared, gaussians.means, surfaces, 1, rays, progress)
-    asked = int(np.count_nonzero(evidence.violations + evidence.confirmations))
+    measured = int(np.count_nonzero(evidence.violations + evidence.confirmations))
     confirmed = int(np.count_nonzero(evidence.confirmations))
-    if confirmed <= max(LEAST_CONFIRMED * asked, LEAST_OF_ALL * len(gaussians)):
+    if confirmed <= max(MIN_CONFIRMED * measured, MIN_CONFIRMED_OF_ALL * len(gaussians)):
         raise SceneFormatError(
             "Gaussians at the depths that stereo finds in the photographs",
-            found=f"{confirmed:,} of {len(gaussians):,}, and {asked - confirmed:,} before them",
+            found=f"{confirmed:,} of {len(gaussians):,}, and {measured - confirmed:,} in front of "
+            "them",
             fix="Name the scene that the model was trained on; a model whose Gaussians do not lie "
             "on surfaces cannot be cleaned.",
         )
@@ -141,11 +146,11 @@ def find_floaters(
     return np.asarray(suspects & ~_needed(gaussians, suspects, views, device, progress))
 
 
-def _free(depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
-    """The least depth of the pixels around each; infinite where too few are known."""
+def _free_depth(depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
+    """Return the minimum depth of the 3 x 3 pixels; infinite where too few are known."""
     known = np.where(depth > 0, depth, np.inf)
     around = sliding_window_view(np.pad(known, 1, constant_values=np.inf), (3, 3), axis=(0, 1))
-    enough = (depth > 0) & (np.isfinite(around).sum(axis=(2, 3)) >= LEAST_KNOWN)
+    enough = (depth > 0) & (np.isfinite(around).sum(axis=(2, 3)) >= MIN_KNOWN)
     return np.where(enough, around.min(axis=(2, 3)), np.inf).astype(np.float32)
 
 
@@ -156,7 +161,7 @@ def _needed(
     device: torch.device,
     progress: Progress,
 ) -> Bool[np.ndarray, " N"]:
-    """Of which Gaussians the photographs ask for more, with suspects faded."""
+    """Find the Gaussians whose opacity the photographs would raise, with suspects faded."""
     params: dict[str, Tensor] = {
         name: value.detach() for name, value in make_parameters(gaussians, device).items()
     }

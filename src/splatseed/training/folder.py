@@ -1,8 +1,8 @@
-"""The folder of a run: its files, permission to write them, and the curve.
+"""The folder of a run: its files, checks before they are written, and the curve.
 
-Promise: a folder that splatseed did not write is never touched; an earlier run is replaced only on
-request, and not before the new one is ready to start; the curve's files appear whole or not at all,
-so that a run can be watched while it trains.
+Promise: a folder that splatseed did not write is never changed; an earlier run is replaced only on
+request, and only when the new run is ready to start; the curve is written atomically, so that it
+can be read while the run trains.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ KIND = "train"  # in a run folder's manifest
 
 
 class RunFolder:
-    """A run's folder: the paths in it, whether or not they are there."""
+    """The paths in a run's folder, whether or not they exist."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -42,11 +42,11 @@ class RunFolder:
 
     @property
     def is_run(self) -> bool:
-        """Whether a run has begun here."""
+        """Whether a run has started here."""
         return (self.path / MANIFEST).is_file() and self.config.is_file()
 
     def check(self, *, overwrite: bool, resume: bool, protect: Sequence[Path]) -> None:
-        """Refuse a folder that is taken or protected, before any work is done."""
+        """Refuse a folder that is taken or protected; to be called before any work."""
         ended = self.metrics.is_file()
         if resume and ended:
             raise OutputError(
@@ -61,25 +61,29 @@ class RunFolder:
             self.path, kind=KIND, overwrite=overwrite or self.is_run, protect=protect
         )
         if self.is_run and not overwrite:
-            go_on = "" if ended else "`resume=True`, without settings that differ, to continue it, "
+            resume_hint = (
+                "" if ended else "`resume=True`, without settings that differ, to continue it, "
+            )
             raise OutputError(
                 f"no folder, or an empty one, at {self.path}",
                 found="a finished run" if ended else "an unfinished run",
-                fix=f"Pass {go_on}`overwrite=True` to replace it, or choose another.",
+                fix=f"Pass {resume_hint}`overwrite=True` to replace it, or choose another.",
             )
 
-    def begin(
+    def create(
         self,
         config: Mapping[str, object],
         refined: Scene | None = None,
         offset: Float64[np.ndarray, " 3"] | None = None,
     ) -> None:
-        """Make the folder, empty but for the config, and the scene if its poses were refined.
+        """Create the folder with the config, replacing what ``check`` allowed to replace.
 
-        ``offset`` is the scene's, which its Gaussians will be around. Removes what ``check``
-        allowed to replace.
+        Args:
+            config: The content of config.json.
+            refined: The scene at refined poses, to be written too.
+            offset: The offset of the scene, and so of its Gaussians.
         """
-        # The manifest first: a run that is interrupted here can be replaced.
+        # The manifest first, so that a run interrupted here can be replaced.
         files = [self.config, self.checkpoint, self.metrics, self.gaussians, self.curve_csv]
         files += [self.curve_png, *([] if refined is None else [self.scene])]
         with staging.translate_write_errors(self.path):
@@ -94,11 +98,11 @@ class RunFolder:
         write_json(self.config, config)
 
     def claim(self, paths: Iterable[Path]) -> None:
-        """List files in the folder as the run's own, before or after they are written."""
+        """List files in the folder's manifest as the run's, before or after they are written."""
         staging.add_files(self.path, [path.relative_to(self.path).as_posix() for path in paths])
 
     def read_config(self) -> dict[str, Any]:
-        """What ``begin`` wrote.
+        """Read config.json.
 
         Raises:
             SceneFormatError: It is no JSON object.
@@ -117,7 +121,7 @@ class RunFolder:
         return config
 
     def scene_of(self, config: Mapping[str, Any]) -> Any:
-        """Where the scene lies that a run of this config trained: here if poses were refined."""
+        """Return the path of the trained scene: in this folder if poses were refined."""
         refined = config.get("refine_poses") is True
         return str(self.scene.resolve()) if refined else config.get("scene")
 

@@ -2,9 +2,9 @@
 
 Notation: gsplat's parameter dict: ``means``, ``scales`` (logarithms), ``quats``, ``opacities``
 (logits), ``sh0``, ``shN``; one Adam each, as gsplat's strategies need them. In splatseed's
-conventions they are accompanied by ``near_depths`` [N], which are not learnt: whatever adds, moves
-or removes Gaussians treats them like the rest. Steps on single photographs keep the parameters
-oscillating; their mean does not oscillate (Polyak and Juditsky, 1992).
+conventions the dict also has ``min_view_depth`` [N], which is constant: operations that add, move
+or remove Gaussians treat it like the other parameters. Steps on single photographs keep the
+parameters oscillating; their mean does not oscillate (Polyak and Juditsky, 1992).
 """
 
 from __future__ import annotations
@@ -29,47 +29,52 @@ ADAM_BETA1 = 0.9
 """Decay of Adam's mean gradient, PyTorch's default."""
 ADAM_EPSILON = 1e-15
 """3DGS's: far below any gradient, so that rarely seen Gaussians take full steps too."""
-NEAR_DEPTHS = "near_depths"
-DROPPED, MOST_OPAQUE = -20.0, 0.995
-"""The logit of an opacity that no pixel shows, and the highest opacity of a Gaussian that stays."""
+MIN_VIEW_DEPTH = "min_view_depth"
+DROPPED, MAX_RAISED = -20.0, 0.995
+"""The logit of a dropped Gaussian, which no pixel shows, and the highest opacity of another."""
+MAX_LOGIT = 15.0
+"""Largest logit of an opacity that is split: from 17 on its sigmoid is 1 in float32, and the
+logits of the halves infinite."""
 
 
 def make_parameters(
-    gaussians: Gaussians, device: torch.device, near_depths: Float32[np.ndarray, " N"] | None = None
+    gaussians: Gaussians,
+    device: torch.device,
+    min_view_depths: Float32[np.ndarray, " N"] | None = None,
 ) -> Parameters:
-    """Trainable copies of the Gaussians' arrays on a device.
+    """Copy the Gaussians' arrays to a device as trainable parameters.
 
-    Without ``near_depths``, their length units, the cameras' extent is the unit for all.
+    Without ``min_view_depths`` the cameras' extent is the size unit of all.
     """
     arrays = gaussians.arrays()
-    if near_depths is not None:
-        arrays[NEAR_DEPTHS] = near_depths
+    if min_view_depths is not None:
+        arrays[MIN_VIEW_DEPTH] = min_view_depths
     return as_parameters({name: torch.tensor(each, device=device) for name, each in arrays.items()})
 
 
 def as_parameters(tensors: Mapping[str, Tensor]) -> Parameters:
-    """The parameter dict of these tensors: near depths are constant, all else is learnt."""
+    """Return the parameter dict of these tensors; all but the min view depth are learnt."""
     return Parameters(
         {
-            name: torch.nn.Parameter(value, requires_grad=name != NEAR_DEPTHS)
+            name: torch.nn.Parameter(value, requires_grad=name != MIN_VIEW_DEPTH)
             for name, value in tensors.items()
         }
     )
 
 
 def gaussians_of(params: Parameters | Mapping[str, Tensor]) -> Gaussians:
-    """The parameters as NumPy arrays (sharing memory on the CPU)."""
+    """Return the parameters as NumPy arrays (sharing memory on the CPU)."""
     arrays: dict[str, Any] = {name: params[name].detach().cpu().numpy() for name in PARAMETERS}
     return Gaussians(**arrays)
 
 
-def length_units(params: Parameters) -> Float[Tensor, "#N"]:
-    """The unit of each Gaussian's size and learning rate; a single number if all share it."""
-    if NEAR_DEPTHS in params:
-        lengths: Tensor = params[NEAR_DEPTHS].detach()
+def size_unit(params: Parameters) -> Float[Tensor, "#N"]:
+    """Return the unit of each Gaussian's size and learning rate, [N], or [1] if all share it."""
+    if MIN_VIEW_DEPTH in params:
+        unit: Tensor = params[MIN_VIEW_DEPTH].detach()
     else:
-        lengths = params["means"].new_full((1,), SCENE_SCALE)
-    return lengths
+        unit = params["means"].new_full((1,), SCENE_SCALE)
+    return unit
 
 
 class _Adam(torch.optim.Adam):
@@ -86,7 +91,7 @@ class _Adam(torch.optim.Adam):
 
 
 def make_optimizers(params: Parameters, schedule: Schedule) -> Optimizers:
-    """One Adam per parameter, with the schedule's learning rates."""
+    """Make one Adam per parameter, with the schedule's learning rates."""
     betas = ADAM_BETA1, schedule.beta2
     return {
         name: _Adam([value], schedule.learning_rates[name], betas, ADAM_EPSILON, fused=True)
@@ -96,8 +101,8 @@ def make_optimizers(params: Parameters, schedule: Schedule) -> Optimizers:
 
 
 def optimize(params: Parameters, optimizers: Optimizers, rates: Mapping[str, float]) -> None:
-    """Take an optimiser step at these rates, in length units for positions; clear gradients."""
-    means, lengths = params["means"], length_units(params)
+    """Take an optimiser step at these rates, for positions in size units, and clear gradients."""
+    means, unit = params["means"], size_unit(params)
     positions = means.data
     # A step from 0 loses no digits, however distant the position.
     means.data = torch.zeros_like(positions)
@@ -108,12 +113,12 @@ def optimize(params: Parameters, optimizers: Optimizers, rates: Mapping[str, flo
     # Adam's step is proportional to its rate, so it can be scaled afterwards; one axis at a time,
     # because PyTorch broadcasts over rows of three at half the speed.
     for axis in range(3):
-        positions[:, axis].addcmul_(means.data[:, axis], lengths)
+        positions[:, axis].addcmul_(means.data[:, axis], unit)
     means.data = positions
 
 
 def with_dropout(params: Parameters, fraction: float) -> Parameters | Mapping[str, Tensor]:
-    """The parameters with a random ``fraction`` of the Gaussians dropped, by PyTorch's generator.
+    """Drop a random ``fraction`` of the Gaussians, by PyTorch's generator.
 
     The other opacities are multiplied by 1 / (1 - fraction), which keeps their mean; only they
     receive gradients (H. Park et al., "DropGaussian", 2025).
@@ -122,7 +127,7 @@ def with_dropout(params: Parameters, fraction: float) -> Parameters | Mapping[st
         return params
     opacities = opacities_of(params["opacities"])
     kept = torch.rand_like(opacities) >= fraction
-    raised = torch.logit((opacities / (1 - fraction)).clamp(max=MOST_OPAQUE))
+    raised = torch.logit((opacities / (1 - fraction)).clamp(max=MAX_RAISED))
     return {**params, "opacities": torch.where(kept, raised, DROPPED)}
 
 

@@ -1,11 +1,11 @@
 """The hyperparameters of a run and their timing: splatseed's own, and 3DGS's.
 
 Notation: a *full* run has 30,000 steps, for which all of 3DGS's numbers are stated; T is the number
-of steps of the run at hand. Lengths, and so the rates of positions, are in *length units*: a
-Gaussian's near depth (``near_depths``) in splatseed's conventions, the cameras' extent in 3DGS's.
-Promise: a full run of splatseed's differs from 3DGS's in the length unit, the bound on initial
-sizes, that on later ones, which it lacks, and MCMC's start; these and each departure in short runs
-were chosen on held-out training views: see benchmarks/training/README.md.
+of steps of the run. Lengths, and so the rates of positions, are in *size units*: a Gaussian's min
+view depth (``initialization``) in splatseed's conventions, the cameras' extent in 3DGS's. Promise:
+a full run of splatseed's differs from 3DGS's in the size unit, in bounds on sizes (initial sizes
+have one, later sizes have none), and in MCMC's start; these and each departure in short runs were
+chosen on held-out training views: see benchmarks/training/README.md.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Densification = Literal["default", "grow", "mcmc", "none"]
 FULL_RUN = 30_000
 LEARNING_RATES: Mapping[str, float] = MappingProxyType(
     {
-        "means": 1.6e-4,  # times the length unit
+        "means": 1.6e-4,  # times the size unit
         "scales": 5e-3,
         "quats": 1e-3,
         "opacities": 5e-2,
@@ -34,43 +34,41 @@ DECAYS: Mapping[str, float] = MappingProxyType({"means": 0.01})
 """Final learning rates as a fraction of the initial ones; exponential in between."""
 GROWTH = 1.05
 """Factor by which MCMC grows the number of Gaussians at a time, up to the cap."""
-LEAST_ROUNDS: Mapping[Densification, int] = MappingProxyType(
+MIN_ROUNDS: Mapping[Densification, int] = MappingProxyType(
     {"default": 6, "grow": 1, "mcmc": 24, "none": 1}
 )
-"""Number of densifications in a short run, which may come more often than every 100 steps, but not
-too often: gradients averaged over few photographs are noise."""
-MOST_SPEEDUP: Mapping[str, float] = MappingProxyType(
+"""Minimum number of densifications. A short run densifies more often than every 100 steps, but not
+much more: gradients averaged over few photographs are noise."""
+MAX_SPEEDUP: Mapping[str, float] = MappingProxyType(
     {"means": 20.0, "scales": 4.0, "quats": 4.0, "opacities": 1.0, "sh0": 4.0, "shN": 16.0}
 )
-"""A short run's learning rates are multiplied by how many times shorter it is than a full one, but
-at most by this. Positions have as far to go in a short run as in a long one, and 3DGS's rate of
-higher harmonics is a twentieth of the colour's; with a higher rate of opacities, Gaussians die that
-are needed later."""
+"""A run n times shorter than a full run has n times its learning rates, but at most so many times.
+Positions have as far to go in a short run as in a long one, and 3DGS's rate of higher harmonics is
+a twentieth of the colour's; a higher rate of opacities removes Gaussians that are needed later."""
 FORGETTING = 1e-3
 """1 - beta2 of Adam, the fraction of the squared gradients forgotten per step, as in 3DGS."""
-MOST_FORGETTING = 1e-2
-"""A short run forgets faster in proportion to how much shorter it is than a full one, but at most
-by this factor: its gradients shrink within some hundred steps, and steps are divided by the
-remembered ones."""
+MAX_FORGETTING = 1e-2
+"""A run n times shorter forgets n times faster, but at most this fraction per step: gradients
+shrink within some hundred steps, and Adam divides steps by the remembered gradients."""
 FULL_AT = 0.35
 """Fraction of the run by which ``grow`` has spent its budget."""
 GROW_EVERY = FULL_RUN // 15
-"""Steps of a full run between rounds of ``grow``, and before the first: each round looks at
-contributions for as many photographs as it can."""
-LEAST_ROUND = 20
-"""Steps per round of ``grow`` in the shortest run: splitting halves again before they have found
-their places is noise."""
+"""Steps of a full run between rounds of ``grow``, and before the first: a long round measures
+contributions to many photographs."""
+MIN_ROUND_STEPS = 20
+"""Minimum steps per round of ``grow``: splitting halves again before they have settled is noise."""
 MEAN_FROM = 0.8
 """Fraction of a run after which the mean of the Gaussians is taken."""
 DROPOUT = 0.2
 """Fraction of the Gaussians that the last step of a run with few photographs drops, as in
 DropGaussian (H. Park et al., 2025); linear from 0 at its first."""
-FEW = 16
-"""Most training photographs with which Gaussians are dropped. A few photographs are fitted by
-Gaussians that no other view confirms; with more, close to each other, dropout loses."""
-LARGEST = 0.05
-"""Largest initial size of a Gaussian, in near depths. Where SfM has few points the gaps between
-them are wide, and a Gaussian that fills one hides all that lies behind it."""
+MAX_DROPOUT_VIEWS = 16
+"""Maximum number of training photographs with which Gaussians are dropped. Few photographs are
+fitted by Gaussians that no other view confirms; with more photographs, close to each other, dropout
+loses."""
+MAX_SIZE = 0.05
+"""Maximum initial size of a Gaussian, in min view depths. Where SfM has few points the gaps between
+them are wide, and a Gaussian that fills a gap hides everything behind it."""
 
 
 @dataclass(frozen=True)
@@ -78,8 +76,8 @@ class Schedule:
     """The hyperparameters of a run."""
 
     max_steps: int  # T
-    near_depths: bool  # are the length units, not the cameras' extent
-    learning_rates: Mapping[str, float]  # initial ones; for positions in length units
+    depth_units: bool  # size units are min view depths, not the cameras' extent
+    learning_rates: Mapping[str, float]  # initial ones; for positions in size units
     decays: Mapping[str, float]  # final fraction of those rates that decay
     beta2: float  # Adam's: the fraction of the mean squared gradient kept at each step
     sh_every: int  # steps between degrees of the spherical harmonics; 0: all at once
@@ -90,48 +88,48 @@ class Schedule:
     """Steps between resets of the opacities, if enabled; also the step after which Gaussians that
     are too large are pruned."""
     prune_size: float = 0.1
-    """That is too large, in length units. Never, in splatseed's conventions: a bare wall or the sky
-    is best shown by large Gaussians, and taking them away cost 2.8 dB in a room."""
+    """Scale above which Gaussians are pruned, in size units; infinite in splatseed's conventions:
+    large Gaussians show a bare wall or the sky best, and pruning them cost 2.8 dB in a room."""
     growth: float = GROWTH  # factor by which MCMC grows the number of Gaussians at a time
     noise: float = 5e5  # factor on 3DGS's learning rate of positions, for MCMC's noise
     penalty: float = 0.01  # weight of mean opacity and of mean size in MCMC's loss
     opacity: float = 0.1  # initial one
     scale_factor: float = 1.0  # initial size, as a multiple of the gap between Gaussians
-    largest: float = math.inf  # upper bound of the initial size, in near depths
+    max_size: float = math.inf  # upper bound of the initial size, in min view depths
     flatness: float = 0.1  # initial thickness of Gaussians with normals, relative to their size
-    recycles: bool = True  # strategy grow takes Gaussians from a budget that seeds filled
+    recycles: bool = True  # strategy grow replaces Gaussians where seeds fill the budget
     dropout: float = 0.0  # fraction of the Gaussians that the last step drops, if views are few
     mean_from: int | None = None
-    """Step after which the mean of the Gaussians is taken as the run's result; None to end with the
-    last step's."""
+    """Step from which on the Gaussians are averaged to the run's result; None: the last step's are
+    the result."""
 
     def sh_degree(self, step: int, highest: int) -> int:
-        """The degree of spherical harmonics in use."""
+        """Return the degree of the spherical harmonics at a step."""
         return min(step // self.sh_every, highest) if self.sh_every else highest
 
     def dropout_at(self, step: int) -> float:
-        """The fraction of the Gaussians that a step drops."""
+        """Return the fraction of the Gaussians that a step drops."""
         return self.dropout * step / self.max_steps
 
     def rates(self, step: int) -> dict[str, float]:
-        """The learning rate of each parameter; positions' in length units."""
+        """Return the learning rate of each parameter; of positions in size units."""
         return {name: rate * self.decay(name, step) for name, rate in self.learning_rates.items()}
 
     def decay(self, name: str, step: int) -> float:
-        """The fraction of the initial learning rate at a step."""
+        """Return the fraction of the initial learning rate at a step."""
         return float(self.decays.get(name, 1.0) ** (step / self.max_steps))
 
 
 def make_schedule(densification: Densification, max_steps: int, *, as_3dgs: bool) -> Schedule:
-    """The schedule of a run of T steps.
+    """Return the schedule of a run of T steps.
 
-    In 3DGS's conventions it is as of gsplat's trainer with its ``steps_scaler``: every step number
-    shrinks with T, no other number does.
+    3DGS's conventions are those of gsplat's trainer with its ``steps_scaler``: step numbers are
+    proportional to T, other numbers are not.
     """
     mcmc = densification == "mcmc"
     schedule = Schedule(
         max_steps=max_steps,
-        near_depths=False,
+        depth_units=False,
         learning_rates=LEARNING_RATES,
         decays=DECAYS,
         beta2=1 - FORGETTING,
@@ -146,36 +144,36 @@ def make_schedule(densification: Densification, max_steps: int, *, as_3dgs: bool
     return schedule if as_3dgs else _own(schedule, densification)
 
 
-def started(schedule: Schedule) -> Schedule:
-    """The schedule of a run that goes on from trained Gaussians: all harmonics from the first step.
+def continued(schedule: Schedule) -> Schedule:
+    """Return the schedule of a run that continues from Gaussians: all harmonics at once.
 
-    Rates are a new run's: lower ones lose (benchmarks/training/README.md).
+    Rates are those of a new run: lower rates lose (benchmarks/training/README.md).
     """
     return replace(schedule, sh_every=0, recycles=False)
 
 
 def _own(theirs: Schedule, densification: Densification) -> Schedule:
-    """Splatseed's schedule: where it departs from 3DGS's."""
+    """Return splatseed's schedule: its departures from 3DGS's."""
     speedup, stop = max(FULL_RUN / theirs.max_steps, 1.0), theirs.refine_stop
     # 3DGS densifies every 100 steps of 30,000.
     shrunk, start = 100 * theirs.max_steps / FULL_RUN, theirs.refine_start
-    every = max(1, round(shrunk), min(100, stop // LEAST_ROUNDS[densification]))
+    every = max(1, round(shrunk), min(100, stop // MIN_ROUNDS[densification]))
     if densification == "grow":
-        every = start = max(LEAST_ROUND, _scaled(GROW_EVERY, theirs.max_steps))
-    rates = {n: rate * min(speedup, MOST_SPEEDUP[n]) for n, rate in LEARNING_RATES.items()}
+        every = start = max(MIN_ROUND_STEPS, _scaled(GROW_EVERY, theirs.max_steps))
+    rates = {n: rate * min(speedup, MAX_SPEEDUP[n]) for n, rate in LEARNING_RATES.items()}
     return replace(
         theirs,
-        near_depths=True,
+        depth_units=True,
         learning_rates=rates,
         # 0.999 in a full run, 0.99 from a tenth of it down.
-        beta2=1 - min(FORGETTING * speedup, MOST_FORGETTING),
+        beta2=1 - min(FORGETTING * speedup, MAX_FORGETTING),
         refine_start=start,
         refine_every=every,
         prune_size=math.inf,
         # Fewer rounds than 3DGS has grow by more each, so that the cap is reached as early.
         growth=GROWTH ** (every / shrunk),
         scale_factor=1.0,
-        largest=LARGEST,
+        max_size=MAX_SIZE,
         dropout=DROPOUT,
         # Only once the number of Gaussians no longer changes.
         mean_from=max(stop, round(MEAN_FROM * theirs.max_steps)),
@@ -183,5 +181,5 @@ def _own(theirs: Schedule, densification: Densification) -> Schedule:
 
 
 def _scaled(steps: int, max_steps: int) -> int:
-    """The steps of this run that correspond to ``steps`` of a full run, at least 1."""
+    """Return the steps of this run that correspond to ``steps`` of a full run, at least 1."""
     return max(1, round(steps * max_steps / FULL_RUN))

@@ -1,7 +1,8 @@
-"""The settings of a run: what a user may choose.
+"""The settings of a run.
 
-Notation: a *step* shows one photograph. A strategy whose name ends in ``-3dgs`` trains in 3DGS's
-conventions, as gsplat's trainer has them, for comparison with published numbers; see ``schedule``.
+Notation: a *step* renders one training view. A strategy whose name ends in ``-3dgs`` trains in
+3DGS's conventions, as gsplat's trainer has them, for comparison with published numbers; see
+``schedule``.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import tyro
 from splatseed.errors import ParameterError
 from splatseed.photos.view import TRAINED_SIDE, default_factor
 from splatseed.scene import Image
-from splatseed.training.schedule import FULL_RUN, Densification, Schedule, make_schedule, started
+from splatseed.training.schedule import FULL_RUN, Densification, Schedule, continued, make_schedule
 
 StrategyName = Literal[
     "auto", "default", "grow", "mcmc", "none", "default-3dgs", "mcmc-3dgs", "none-3dgs"
@@ -25,14 +26,14 @@ Placing = Literal["stereo", "none"]
 Seeding = Literal["advised", "auto", "scene"]
 Exposure = Literal["none", "affine"]
 
-LEAST_GAUSSIANS = 2
+MIN_GAUSSIANS = 2
 BUDGET = 1_000_000
 """Default cap of the strategies that have a budget."""
 AS_3DGS = "-3dgs"
-OPTIONS = {"seeding": "seeds", "cap_max": "budget"}
-"""Command-line names of settings, where they differ."""
+SEED_SHARE = {"default": 0.7, "mcmc": 0.7}
+"""Maximum seeds as a fraction of the budget, for strategies that add Gaussians; else 1."""
 
-BYTES_EACH = 2000
+BYTES_PER_GAUSSIAN = 2000
 """Memory per Gaussian in training: its 59 numbers, their gradients and two moments (944 bytes),
 and as much again for the rasteriser's lists and for copies while Gaussians are added."""
 ALLOWED: dict[str, int | Sequence[object]] = {
@@ -46,28 +47,27 @@ ALLOWED: dict[str, int | Sequence[object]] = {
     "data_factor": 1,
     "seed": 0,
     "test_every": 2,
-    "cap_max": LEAST_GAUSSIANS,
+    "cap_max": MIN_GAUSSIANS,
 }
-"""Choices, or the least number, of settings."""
+"""Choices, or the minimum, of settings."""
 
 
 @dataclass(frozen=True)
 class TrainSettings:
     """How to train.
 
-    A setting is declared only here, besides the code that uses it: the options of ``train``, the
-    plans of ``bench`` and ``config.json`` take these fields as they are, with defaults and
-    docstrings. Suppressed ones are no options: a file of ``train --config`` or a plan sets them.
+    Options of ``train``, arguments of ``ss.train``, plans of ``bench`` and ``config.json`` have
+    these fields, with their defaults and docstrings. Suppressed fields are not options; files of
+    ``train --config``, plans, and ``ss.train`` set them.
 
     Raises:
         ParameterError: A value is out of its range.
     """
 
     strategy: StrategyName = "default"
-    """Densify as 3DGS does (default), grow within a budget where renders are wrong, densify as MCMC
-    does up to a cap, keep the number of seeds, or do what did best in our measurements, which is
-    grow (auto); -3dgs: in 3DGS's own conventions for rates, sizes and schedules, to compare with
-    published numbers."""
+    """Densify as 3DGS does (default), grow within a budget where renders are wrong (grow), densify
+    as MCMC does up to a budget (mcmc), keep the number of seeds (none), or what measured best, grow
+    (auto); -3dgs: 3DGS's own rates, sizes and schedules, to compare with published numbers."""
     max_steps: int = FULL_RUN
     """Training steps; schedules and learning rates adapt to them."""
     data_factor: int | None = None
@@ -120,12 +120,12 @@ class TrainSettings:
                     f"`{name}` {expected}", found=f"{value}", fix="Leave it out for the default."
                 )
 
-    def sized(
+    def with_data_factor(
         self, images: Sequence[Image], note: Callable[[str], None] = lambda _: None
     ) -> TrainSettings:
-        """With the factor that photographs are divided by, and a note if that is not the user's.
+        """Set the default data factor where the user set none; note it if it downsamples.
 
-        ``images`` are the scene's, with cameras in pixels of the files.
+        The cameras of ``images`` are in pixels of the files.
         """
         if self.data_factor is not None:
             return self
@@ -144,19 +144,19 @@ class TrainSettings:
 
     @property
     def factor(self) -> int:
-        """What photographs are divided by, 1 before ``sized``."""
+        """The data factor; 1 before ``with_data_factor``."""
         return self.data_factor or 1
 
     @property
     def densification(self) -> Densification:
-        """The strategy, whatever the conventions; for ``auto`` the one that did best."""
+        """The strategy without its conventions; for ``auto`` the one that measured best."""
         if self.strategy == "auto":
             return "grow"
         return cast("Densification", self.strategy.removesuffix(AS_3DGS))
 
     @property
-    def idle(self) -> tuple[str, ...]:
-        """Names of settings that differ from their defaults, but not for this strategy."""
+    def unused(self) -> tuple[str, ...]:
+        """Settings that differ from their defaults but have no effect on this strategy."""
         given = (
             ("opacity_reset", self.opacity_reset, "default"),
             ("placing", self.placing != "stereo", "grow"),
@@ -168,11 +168,15 @@ class TrainSettings:
         """The run's hyperparameters and their timing."""
         as_3dgs = self.strategy.endswith(AS_3DGS)
         schedule = make_schedule(self.densification, self.max_steps, as_3dgs=as_3dgs)
-        return started(schedule) if self.start else schedule
+        return continued(schedule) if self.start else schedule
+
+    def max_seeds(self, cap: int) -> int:
+        """Return the maximum number of seeds of a run of up to ``cap`` Gaussians."""
+        return max(2, round(SEED_SHARE.get(self.densification, 1.0) * cap))
 
     @property
     def cap(self) -> int | None:
-        """Most Gaussians; None for no limit."""
+        """The maximum number of Gaussians; None for no limit."""
         if self.cap_max is None and self.densification in ("grow", "mcmc"):
             return BUDGET
         return self.cap_max

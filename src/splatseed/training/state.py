@@ -1,8 +1,8 @@
 """Everything that changes during a run, and its checkpoints.
 
-Promise: a resumed run takes, on the CPU, bit for bit the steps that it would have taken: randomness
-depends only on the seed and the step, so no generator is stored. A checkpoint appears whole or not
-at all, and loading one executes nothing in it.
+Promise: on the CPU a resumed run repeats, bit for bit, the steps of an uninterrupted one:
+randomness depends only on the seed and the step, so no generator is stored. Checkpoints are written
+atomically, and loading one executes nothing in it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,6 @@ from splatseed.splat.gaussians import Gaussians
 from splatseed.training.device import Capacity
 from splatseed.training.exposure import Exposures
 from splatseed.training.folder import Record
-from splatseed.training.growing import Growing
 from splatseed.training.parameters import (
     Optimizers,
     Parameters,
@@ -36,9 +35,12 @@ from splatseed.training.parameters import (
 )
 from splatseed.training.schedule import Schedule
 from splatseed.training.settings import TrainSettings
-from splatseed.training.strategies import Default, Mcmc, Strategy
+from splatseed.training.strategies.base import Strategy
+from splatseed.training.strategies.default import Default
+from splatseed.training.strategies.grow import ErrorDensification
+from splatseed.training.strategies.mcmc import Mcmc
 
-FORMAT = 4
+FORMAT = 5
 """Version of the checkpoint's content."""
 
 
@@ -62,7 +64,7 @@ class Stopwatch:
 
 @dataclass
 class TrainState:
-    """A run when ``step`` steps are done."""
+    """A run after ``step`` steps."""
 
     params: Parameters
     optimizers: Optimizers
@@ -85,10 +87,10 @@ def make_strategy(
     depths: Mapping[str, Float32[np.ndarray, "h w"]] = MappingProxyType({}),
     share: float = 1.0,
 ) -> Strategy:
-    """The strategy named by the settings, on their schedule.
+    """Make the strategy of the settings.
 
-    The memory of ``device``, by default the CPU, limits it; ``depths`` and ``share`` are
-    ``Growing``'s.
+    The memory of ``device``, by default the CPU, limits growth; see ``ErrorDensification`` for
+    ``depths`` and ``share``.
     """
     device = device or torch.device("cpu")
     capacity = Capacity(settings.cap, device)
@@ -99,7 +101,7 @@ def make_strategy(
             return Mcmc(settings, capacity)
         case "grow":
             maps = {name: torch.as_tensor(each).to(device) for name, each in depths.items()}
-            return Growing(settings.schedule, capacity, maps, share)
+            return ErrorDensification(settings.schedule, capacity, maps, share)
         case "none":
             return Strategy(capacity)
 
@@ -111,22 +113,21 @@ def first_state(
     strategy: Strategy,
     device: torch.device,
 ) -> TrainState:
-    """The state before the first step.
+    """Return the state before the first step of a run with ``num_views`` training views.
 
-    ``first`` are Gaussians in the training frame and their near depths; there are ``num_views``
-    training views.
+    ``first`` are Gaussians in the training frame and their min view depths.
     """
-    gaussians, lengths = first
+    gaussians, depths = first
     schedule = settings.schedule
-    params = make_parameters(gaussians, device, lengths if schedule.near_depths else None)
+    params = make_parameters(gaussians, device, depths if schedule.depth_units else None)
     state = TrainState(params, make_optimizers(params, schedule), strategy)
     if settings.exposure == "affine":
-        state.exposures = Exposures.unchanged(num_views, device)
+        state.exposures = Exposures.identity(num_views, device)
     return state
 
 
 def save_checkpoint(path: Path, state: TrainState) -> None:
-    """Write the whole state of a run, replacing an older checkpoint."""
+    """Write the state of a run, replacing an older checkpoint."""
     content = {
         "format": FORMAT,
         "step": state.step,
@@ -152,7 +153,7 @@ def save_checkpoint(path: Path, state: TrainState) -> None:
 def load_checkpoint(
     path: Path, strategy: Strategy, schedule: Schedule, device: torch.device
 ) -> TrainState:
-    """The state that ``save_checkpoint`` wrote, on a device; replaces that of a new strategy.
+    """Read the state that ``save_checkpoint`` wrote to a device, and the strategy's own.
 
     Raises:
         SceneFormatError: The file is damaged, or of another version.

@@ -1,10 +1,10 @@
 """The training loop: render a view, compare it with its photograph, optimise, densify.
 
-Notation: a step shows one training view; images are [H, W, 3], values about 0..1. Promise: on the
-CPU equal settings and seeds give equal bytes, whatever the number of threads and however often the
-run was interrupted: the order of the photographs is drawn from (seed, epoch), and PyTorch's
-generator, which the strategies use, is set from (seed, step) before each step. On a GPU a step
-waits for it only where gsplat does.
+Notation: a step renders one training view; images are [H, W, 3], values about 0..1. Promise: on the
+CPU equal settings and seeds give equal bytes, whatever the number of threads and interruptions: the
+order of the photographs is drawn from (seed, epoch), and PyTorch's generator, which the strategies
+use, is seeded from (seed, step) before each step. On a GPU a step synchronises only where gsplat
+does.
 """
 
 from __future__ import annotations
@@ -21,17 +21,18 @@ from torch import Tensor
 from splatseed.photos.view import View
 from splatseed.runtime.interruption import interruption
 from splatseed.runtime.workarounds import keep_freed_memory
-from splatseed.splat.metrics import l1_and_ssim_by_convolution, psnr, ssim_of_all
+from splatseed.splat.metrics import psnr, ssim_of_all
 from splatseed.splat.rendering import Photographs, fill_masked, mask_of, photograph_of, render_view
 from splatseed.splat.ssim import l1_and_ssim
+from splatseed.splat.ssim_conv import l1_and_ssim_by_convolution
 from splatseed.training.folder import Record
 from splatseed.training.parameters import add_to_mean, optimize, take_mean, with_dropout
-from splatseed.training.schedule import FEW
+from splatseed.training.schedule import MAX_DROPOUT_VIEWS
 from splatseed.training.settings import TrainSettings
 from splatseed.training.state import TrainState
 
-RECORDS, TESTS = 200, 20
-"""How many records the curve of a run has, and how often the test views are rendered for it."""
+NUM_RECORDS, NUM_TESTS = 200, 20
+"""Records in the curve of a run, and how many of them have the scores of the test views."""
 SSIM_WEIGHT = 0.2
 
 
@@ -51,13 +52,13 @@ class Trainer:
         self.train_views = train_views
         self.test_views = test_views
         self.on_record = on_record
-        self.is_whole = True  # the state is one between two steps, which a checkpoint may keep
+        self.is_consistent = True  # the state is that between two steps, and may be saved
         self._photographs = Photographs(train_views, self.device)
 
     def run(self, on_step: Callable[[int], None] = lambda _: None) -> bool:
-        """Train to the last step, or until the user interrupts; returns whether it is done.
+        """Train to the last step, or until the user interrupts; return whether the last is done.
 
-        ``on_step`` is called with the number of steps done, after each.
+        ``on_step`` is called after each step with the number of steps done.
         """
         keep_freed_memory()
         state = self.state
@@ -68,35 +69,35 @@ class Trainer:
                 shown = self._advance(state.step)
                 state.step += 1
                 on_step(state.step)
-                if self._is_due(RECORDS) or self._is_due(TESTS):
+                if self._is_due(NUM_RECORDS) or self._is_due(NUM_TESTS):
                     self._record(*shown)
             state.watch.stop()
         return state.step >= self.settings.max_steps
 
     def warm_up(self) -> None:
-        """Render and compare once, so that kernels are compiled before the clock runs."""
+        """Render and compare once, to compile kernels before the clock runs."""
         view = self.train_views[0]
         render, _ = render_view(self.state.params, view, self.settings.sh_degree)
         photometric_loss(render, self._photographs.of(view)).backward()
         self.clear_gradients()
 
     def clear_gradients(self) -> None:
-        """Forget a step that did not reach its end."""
+        """Clear the gradients of an unfinished step."""
         for value in self.state.params.values():
             value.grad = None
 
     @torch.no_grad()
     def render(self, view: View) -> Float[Tensor, "H W 3"]:
-        """The current render of a view."""
+        """Render a view with the current Gaussians."""
         degree = self.settings.schedule.sh_degree(self.state.step, self.settings.sh_degree)
         return render_view(self.state.params, view, degree)[0]
 
     def _advance(self, step: int) -> tuple[View, Float[Tensor, "H W 3"], Float[Tensor, "H W 3"]]:
-        """Take one step; returns the view, its render at its exposure, and its photograph."""
+        """Take one step; return the view, its render at its exposure, and its photograph."""
         state, schedule = self.state, self.settings.schedule
         params, optimizers, strategy = state.params, state.optimizers, state.strategy
-        words = np.random.SeedSequence([self.settings.seed, step]).generate_state(1, np.uint64)
-        random = int(words[0] >> 1)  # 63 bits: PyTorch's seeds are signed
+        drawn = np.random.SeedSequence([self.settings.seed, step]).generate_state(1, np.uint64)
+        random = int(drawn[0] >> 1)  # 63 bits: PyTorch's seeds are signed
         # torch.manual_seed would also note a stack trace for each kind of device that is not here.
         torch.default_generator.manual_seed(random)
         if self.device.type == "cuda":
@@ -107,54 +108,54 @@ class Trainer:
         view = self.train_views[index]
         photograph = self._photographs.of(view)
         # The recorded loss and PSNR are with dropout.
-        sparse = len(self.train_views) <= FEW
+        sparse = len(self.train_views) <= MAX_DROPOUT_VIEWS
         shown = with_dropout(params, schedule.dropout_at(step)) if sparse else params
         plain, info = render_view(shown, view, schedule.sh_degree(step, self.settings.sh_degree))
         render, mask = plain, mask_of(view, self.device)
         if state.exposures is not None:
             state.exposures.fit(index, plain, photograph, mask)
-            render = state.exposures.applied(index, plain)
+            render = state.exposures.apply(index, plain)
         # gsplat's strategies ask PyTorch to retain the gradient of the 2D means here.
-        strategy.before(params, optimizers, step, info)
+        strategy.before_backward(params, optimizers, step, info)
         loss = photometric_loss(fill_masked(render, photograph, mask), photograph)
         state.losses.append(loss.detach())
         penalty = strategy.regularization(params)
         # The recorded loss is without the penalty, so that strategies can be compared.
         (loss if penalty is None else loss + penalty).backward()
-        self.is_whole = False
+        self.is_consistent = False
         optimize(params, optimizers, schedule.rates(step))
         if state.exposures is None:
             strategy.observe(params, view, render, photograph, step)
-        else:  # at the mean exposure, which is that of the Gaussians it may add
-            undone = state.exposures.undone(index, photograph)
-            strategy.observe(params, view, plain, undone, step)
-        strategy.after(params, optimizers, step, info)
+        else:  # at the mean exposure, as the Gaussians that it adds
+            at_mean = state.exposures.to_mean(index, photograph)
+            strategy.observe(params, view, plain, at_mean, step)
+        strategy.after_step(params, optimizers, step, info)
         if schedule.mean_from is not None and step >= schedule.mean_from:
             add_to_mean(state.mean, params)
             if step + 1 == self.settings.max_steps:
                 take_mean(params, state.mean)
-        self.is_whole = True
+        self.is_consistent = True
         return view, render.detach(), photograph
 
     def _record(
         self, view: View, render: Float[Tensor, "H W 3"], photograph: Float[Tensor, "H W 3"]
     ) -> None:
-        """Note how far the run is; the clock stands still meanwhile."""
+        """Add a record to the curve, with the clock stopped."""
         state = self.state
         loss = float(torch.stack(state.losses).mean(dtype=torch.float64))
         state.watch.stop()
         state.losses.clear()
-        tested_psnr, tested_ssim = self.test_scores() if self._is_due(TESTS) else (None, None)
+        test_psnr, test_ssim = self.test_scores() if self._is_due(NUM_TESTS) else (None, None)
         seconds = round(state.watch.seconds, 3)
         shown = round(psnr(render, photograph, mask_of(view, self.device)), 4)
         count = len(state.params["means"])
-        record = Record(state.step, seconds, loss, shown, tested_psnr, count, tested_ssim)
+        record = Record(state.step, seconds, loss, shown, test_psnr, count, test_ssim)
         state.records.append(record)
         self.on_record(record)
         state.watch.start()
 
     def test_scores(self) -> tuple[float, float]:
-        """Means over the test views of each one's PSNR, dB, and SSIM."""
+        """Return the mean PSNR, dB, and mean SSIM of the test views."""
         scores = []
         for view in self.test_views:
             photograph, mask = photograph_of(view, self.device), mask_of(view, self.device)
@@ -164,7 +165,7 @@ class Trainer:
         return round(sum(psnrs) / len(psnrs), 4), round(sum(ssims) / len(ssims), 5)
 
     def _is_due(self, times: int) -> bool:
-        """Whether something that happens ``times`` times in a run is due after this step."""
+        """Whether an event that happens ``times`` times in a run is due after this step."""
         step, last = self.state.step, self.settings.max_steps
         # Evenly spread over the run, and always at its last step.
         return step * times // last > (step - 1) * times // last
@@ -178,7 +179,7 @@ class Trainer:
 
 @lru_cache(maxsize=2)
 def _epoch_order(seed: int, epoch: int, count: int) -> Int[np.ndarray, " V"]:
-    """The order of the photographs in one pass over them."""
+    """Draw the order of the photographs in an epoch."""
     return np.random.default_rng([seed, epoch]).permutation(count)
 
 
@@ -187,8 +188,8 @@ def photometric_loss(
 ) -> Float[Tensor, ""]:
     """0.8 L1 + 0.2 (1 - SSIM), differentiable in ``render`` (Kerbl et al. 2023, eq. 7).
 
-    On a GPU the fused kernel of the package ``fused-ssim`` serves where it is installed. Both are
-    float32, at least 11 pixels a side.
+    On a GPU the fused kernel of the package ``fused-ssim`` is used where installed. Images are
+    float32, of at least 11 pixels a side.
     """
     fused = _fused_ssim() if render.is_cuda else None
     if fused is None:
@@ -201,7 +202,7 @@ def photometric_loss(
 
 @lru_cache
 def _fused_ssim() -> Callable[..., Tensor] | None:
-    """The function of the package fused-ssim, None without it."""
+    """Return the function of the package fused-ssim; None without it."""
     try:
         from fused_ssim import fused_ssim  # noqa: PLC0415  (optional)
     except ImportError:
@@ -210,7 +211,7 @@ def _fused_ssim() -> Callable[..., Tensor] | None:
 
 
 class _Loss(torch.autograd.Function):
-    """The loss and its analytic gradient: a Numba pass, on a GPU convolutions without TF32."""
+    """The loss and its analytic gradient: a Numba pass; on a GPU convolutions without TF32."""
 
     @staticmethod
     def forward(ctx: Any, render: Tensor, photograph: Tensor) -> Tensor:

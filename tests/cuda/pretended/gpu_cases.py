@@ -34,7 +34,8 @@ from splatseed.runtime import torch_device
 from splatseed.splat import rendering
 from splatseed.splat.gaussians import initial_gaussians
 from splatseed.synthetic import make_capture, write_capture
-from splatseed.training import TrainSettings, prepare_run, state, trainer
+from splatseed.training import PrepareOptions, TrainSettings, prepare_run, state, trainer
+from splatseed.training.depths import DepthCache
 from splatseed.training.device import Capacity
 from splatseed.training.parameters import as_parameters
 from splatseed.viewer import pictures
@@ -55,13 +56,14 @@ def room(tmp_path_factory):
 
 @pytest.fixture(autouse=True)
 def few_records(monkeypatch):
-    monkeypatch.setattr(trainer, "TESTS", 1)
-    monkeypatch.setattr(trainer, "RECORDS", 2)
+    monkeypatch.setattr(trainer, "NUM_TESTS", 1)
+    monkeypatch.setattr(trainer, "NUM_RECORDS", 2)
 
 
 def _begin(room, output, strategy, backend, max_steps=STEPS, **ways):
     settings = TrainSettings(strategy=strategy, backend=backend, max_steps=max_steps, cap_max=400)
-    return prepare_run(room, output, settings, depths=output.parent / "depths.npz", **ways)
+    options = PrepareOptions(depth_cache=DepthCache(output.parent / "depths.npz"), **ways)
+    return prepare_run(room, output, settings, options)
 
 
 def _waits():
@@ -181,7 +183,7 @@ def test_the_end_of_memory_is_told_and_keeps_the_last_whole_step(
         with pytest.raises(torch.cuda.OutOfMemoryError):  # not a damaged checkpoint
             _begin(room, tmp_path / "run", "default", "cuda", resume=True)
         monkeypatch.undo()
-        monkeypatch.setattr(trainer, "TESTS", 1)
+        monkeypatch.setattr(trainer, "NUM_TESTS", 1)
         again = _begin(room, tmp_path / "run", "default", "cuda", resume=True)
         assert again.state.step == kept
         assert again.train()

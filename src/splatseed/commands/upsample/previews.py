@@ -17,7 +17,7 @@ from splatseed.scene import Image, Scene
 from splatseed.seeding.photo_methods import MAX_SIZE, Stereo, photographed, read_views
 from splatseed.seeding.upsampling import CELL
 from splatseed.splat.formats import write_gaussians
-from splatseed.training.seeds import gaussians_of_scene
+from splatseed.training.initialization import gaussians_of_scene
 from splatseed.training.settings import TrainSettings
 
 PAIR, ORIGINS, CELLS, MAPS = PICTURES = (

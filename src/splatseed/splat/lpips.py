@@ -1,0 +1,114 @@
+"""LPIPS, version 0.1: the distance of two images in the features of a network.
+
+f_l is the output of the l-th of 5 stages, scaled to unit length over its channels; w_l >= 0 are
+learnt from human judgements, and d(x, y) = sum_l mean_places sum_c w_lc (f_lc(x) - f_lc(y))^2
+(Zhang et al. 2018, eq. 1). The weights of the network are torchvision's, the w_l torchmetrics'. The
+network is built here, because torchmetrics builds it by torchvision, which is tied to one version
+of PyTorch. Nothing is downloaded.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from splatseed.errors import MissingDependencyError, SceneNotFoundError
+from splatseed.io.files import special_kind, translate_errors
+from splatseed.requirements import require
+
+LPIPS_NET, LPIPS_FILE = "vgg", "vgg16-397923af.pth"
+"""The network of LPIPS, which papers on 3DGS report, and PyTorch's name for the file of weights."""
+_URL = "https://download.pytorch.org/models/"
+_TAPS = (3, 8, 15, 22, 29)  # the layers whose output is compared
+# Each channel of an image in [-1, 1] becomes (value - SHIFT) / SCALE, as in the metric's code.
+_SHIFT = (-0.030, -0.088, -0.188)
+_SCALE = (0.458, 0.448, 0.450)
+_EPSILON = 1e-8
+"""Added to the squared length, so that features that are all 0 can be scaled."""
+
+
+@dataclass(frozen=True, eq=False)
+class Lpips:
+    """LPIPS with its weights, ready to compare images."""
+
+    features: nn.Sequential  # the network's convolutions, in torchvision's order
+    heads: list[Tensor]  # w_l of each stage, [1, C_l, 1, 1]
+
+    @torch.no_grad()
+    @torch.backends.cudnn.flags(enabled=True, allow_tf32=False)  # the score of any other device
+    def __call__(self, render: Float[Tensor, "H W 3"], photograph: Float[Tensor, "H W 3"]) -> float:
+        """The distance of two images of values 0..1; 0 where they are equal."""
+        pair = torch.stack([render, photograph]).permute(0, 3, 1, 2)
+        shift, scale = (pair.new_tensor(values).view(1, 3, 1, 1) for values in (_SHIFT, _SCALE))
+        x, total, heads = (2 * pair - 1 - shift) / scale, 0.0, iter(self.heads)
+        for i, layer in enumerate(self.features.to(render.device)):
+            x = layer(x)
+            if i in _TAPS:
+                unit = x / torch.sqrt(_EPSILON + x.square().sum(dim=1, keepdim=True))
+                head = next(heads).to(render.device)
+                total += float((head * (unit[:1] - unit[1:]).square()).sum(dim=1).mean())
+        return total
+
+
+def load_lpips(weights: Path | None = None) -> Lpips:
+    """LPIPS with VGG's weights, a file or the folder it lies in, by default in PyTorch's cache.
+
+    Raises:
+        MissingDependencyError: torchmetrics, which brings the w_l, is absent.
+        SceneNotFoundError: There are no weights; says what to fetch, and where to put it.
+        SceneFormatError: The file does not hold this network's weights.
+    """
+    path, layers, before = _weights_path(weights), list[nn.Module](), 3
+    with torch.device("meta"):  # no random weights first: they would change PyTorch's generator
+        for channels, count in ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3)):
+            for _ in range(count):
+                layers += [nn.Conv2d(before, channels, 3, padding=1), nn.ReLU(inplace=True)]
+                before = channels
+            layers.append(nn.MaxPool2d(2))
+    features = nn.Sequential(*layers)
+    with translate_errors(
+        path, f"the weights of {LPIPS_NET} for LPIPS", fix="Download the file again."
+    ):
+        named = [(name.partition("."), value) for name, value in _read(path).items()]
+        own = {name: value.float() for (part, _, name), value in named if part == "features"}
+        features.load_state_dict(own, assign=True)
+    package = find_spec("torchmetrics")  # importing it takes a second
+    folder = Path(str(package.origin)).parent / "functional" / "image" / "lpips_models"  # type: ignore[union-attr]  # required above
+    heads = _read(folder / f"{LPIPS_NET}.pth")
+    return Lpips(features, [heads[f"lin{i}.model.1.weight"] for i in range(len(_TAPS))])
+
+
+def lpips_is_here() -> bool:
+    """Whether all that ``load_lpips`` needs is on this machine; no file is opened."""
+    try:
+        return _weights_path(None).is_file()
+    except (MissingDependencyError, SceneNotFoundError):
+        return False
+
+
+def _weights_path(given: Path | None) -> Path:
+    require("torchmetrics")
+    folder = Path(torch.hub.get_dir()) / "checkpoints" if given is None else given
+    path = folder if folder.is_file() else folder / LPIPS_FILE
+    if not path.is_file():
+        place = f"{folder}, or a folder" if given is None else "a folder"
+        raise SceneNotFoundError(
+            f"the weights for LPIPS, {path.name}",
+            found="none"
+            if given is None
+            else f"{special_kind(given) or 'no such file'} at {given}",
+            fix=f"Download {_URL}{path.name}, put it into {place}; pass its path as "
+            "`lpips_weights`.",
+        )
+    return path
+
+
+def _read(path: Path) -> dict[str, Tensor]:
+    with warnings.catch_warnings(action="ignore"):  # about what a foreign file might be
+        return dict(torch.load(path, map_location="cpu", weights_only=True))

@@ -1,0 +1,145 @@
+"""The config of a run (config.json): its scene and settings, and what a resumed run must repeat.
+
+Promise: an interrupted run resumes only with its own settings, seeds, photographs and poses.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import platform
+from collections.abc import Collection, Mapping
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+from splatseed.errors import ParameterError, SceneFormatError
+from splatseed.io.masks import mask_choice, with_masks
+from splatseed.io.photograph import photographs_digest
+from splatseed.io.staging import write_json
+from splatseed.scene import Scene
+from splatseed.splat.gaussians import TrainingFrame
+from splatseed.training.folder import RunFolder
+from splatseed.training.settings import TrainSettings
+
+_PLACES = ("scene", "points")
+"""The scene's paths: a resumed run's scene may have moved, but must have the same content."""
+
+
+def make_config(
+    scene: Scene,
+    initial: Mapping[str, Any],
+    settings: TrainSettings,
+    device: str,
+    frame: TrainingFrame | None = None,
+    *,
+    refine_poses: bool = False,
+) -> dict[str, Any]:
+    """Return the content of config.json; ``initial`` are the facts of the seeds or of the start."""
+    source = scene.source
+    points = source.points_path if source and not refine_poses else None
+    config = {
+        "splatseed": _version("splatseed"),
+        "scene": str(source.again) if source else None,
+        "points": str(points.resolve()) if points else None,
+        "refine_poses": refine_poses,
+        "masks": mask_choice(scene),
+        **dataclasses.asdict(settings),
+        "device": device,
+        "seeds": dict(initial),
+        "photographs": photographs_digest(scene),
+        "versions": {
+            "python": platform.python_version(),
+            **{name: _version(name) for name in ("torch", "gsplat", "numba", "numpy")},
+        },
+    }
+    if frame is not None:  # in which the run is rendered; lengths are the scene's
+        config["near_plane"] = frame.near / frame.scale
+        config["frame"] = {"origin": frame.origin.tolist(), "scale": frame.scale}
+    return config
+
+
+def _version(package: str) -> str | None:
+    """Return a package's version; None if it is run from its source tree."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def resumed_settings(
+    config: Mapping[str, Any],
+    settings: TrainSettings,
+    explicit: Collection[str] = (),
+    *,
+    refine_poses: bool,
+) -> tuple[TrainSettings, bool]:
+    """Return the settings of the run to resume, and whether it refined poses.
+
+    Settings that are neither ``explicit`` nor differ from their defaults are the run's; others must
+    equal the run's. Only the backend may change. The config of an older version may lack a setting.
+
+    Raises:
+        ParameterError: A setting differs from the run's.
+        SceneFormatError: The config is damaged.
+    """
+    default = {**dataclasses.asdict(TrainSettings()), "refine_poses": False}
+    now = {**dataclasses.asdict(settings), "refine_poses": refine_poses}
+    then = {name: config.get(name, value) for name, value in default.items() if name != "backend"}
+    then["data_factor"] = config.get("data_factor", 1)  # older versions did not downsample
+    for name, value in then.items():
+        if now[name] != value and (name in explicit or now[name] != default[name]):
+            raise ParameterError(
+                f"`{name}={value!r}`, as when the run began",
+                found=f"{now[name]}",
+                fix="Leave it out to resume, or start again with `overwrite=True`.",
+            )
+    refined = then.pop("refine_poses") is True
+    try:
+        return dataclasses.replace(settings, **then), refined
+    except TypeError:
+        raise SceneFormatError(
+            "the settings of a run in the config.json of the run",
+            found="a text instead of a number",
+            fix="Start again with `overwrite=True`.",
+        ) from None
+
+
+def check_same_input(folder: RunFolder, config: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    """Refuse to resume from other seeds, or another start, than those of the run.
+
+    ``config`` is the run's, ``now`` what its config would be.
+    """
+    if config.get("seeds") != now["seeds"]:
+        found = f"Gaussians in {now['start']}" if now["start"] else f"points in {now['scene']}"
+        raise another_scene(folder, config, found)
+    if config.get("photographs") != now["photographs"]:
+        raise another_scene(folder, config, f"photographs or poses in {now['scene']}")
+
+
+def update_places(folder: RunFolder, config: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    """Record where the scene of a resumed run lies now, so that evaluate and view find it."""
+    moved = {name: now[name] for name in _PLACES if config.get(name) != now[name]}
+    if moved:
+        write_json(folder.config, {**config, **moved})
+
+
+def with_masks_of(scene: Scene, config: Mapping[str, Any]) -> Scene:
+    """Give the scene the masks of the run to resume; masks that the user chose must be the same."""
+    now, then = mask_choice(scene), config.get("masks")
+    if now is None and isinstance(then, str):
+        return with_masks(scene, then)
+    if now != then:
+        raise ParameterError(
+            f"`masks={then!r}`, as when the run began",
+            found=str(now),
+            fix="Leave it out to resume, or start again with `overwrite=True`.",
+        )
+    return scene
+
+
+def another_scene(folder: RunFolder, config: Mapping[str, Any], found: str) -> ParameterError:
+    """Return the error for a scene that is not the run's."""
+    return ParameterError(
+        f"the scene of the run ({config.get('scene')}, by {folder.config})",
+        found=f"other {found}",
+        fix="Name that scene, or start again with `overwrite=True`.",
+    )

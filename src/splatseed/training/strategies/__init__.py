@@ -1,0 +1,1 @@
+"""Densification strategies: ``base`` is their interface; ``default``, ``mcmc`` and ``grow``."""
