@@ -24,9 +24,9 @@ from splatseed.photos.view import View
 from splatseed.photos.viewpoint import look_at
 from splatseed.photos.visibility import SURFACE
 from splatseed.photos.zbuffer import MIN_NEARER
-from splatseed.seeding.budget import thin
 from splatseed.seeding.cover import cover
 from splatseed.seeding.coverage import covered_share
+from splatseed.seeding.thinning import thin
 
 __all__: list[str] = []
 

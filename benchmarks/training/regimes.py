@@ -21,7 +21,7 @@ from benchmarks.common.markdown import table
 from benchmarks.training.baseline import read_ledger
 
 from splatseed.errors import SplatseedError
-from splatseed.seeding.advice import AS_IT_IS, ROOM, Measured, advise
+from splatseed.seeding.advice import AS_IT_IS, MIN_ROOM, Measured, advise
 from splatseed.training.settings import SEED_SHARE
 
 __all__: list[str] = []
@@ -130,14 +130,14 @@ def advice(ledger: Ledger, strategy: str) -> Iterable[list[str]]:
             ROOMS,
             key=lambda room: (
                 round(sum(followed(*each, room) for each in others), 6),
-                room == ROOM,
+                room == MIN_ROOM,
             ),
         )
 
     for plan, gains in by_plan.items():
         if gains:
             left_out = [followed(plan, capture, chosen(capture)) for capture in gains]
-            in_use = [followed(plan, capture, ROOM) for capture in gains]
+            in_use = [followed(plan, capture, MIN_ROOM) for capture in gains]
             always = [each[0] for each in gains.values()]
             means = (f"{statistics.mean(each):+.2f}" for each in (left_out, in_use, always))
             yield [strategy, *str(plan).split(" | "), *means, f"{len(gains)}"]

@@ -205,7 +205,7 @@ class PointCloud:
             SceneNotFoundError: There is no such file.
             SceneFormatError: It is no PLY, cut short, or has no vertices with x, y and z.
         """
-        from splatseed.io.ply import read_ply  # noqa: PLC0415  (io imports clouds)
+        from splatseed.io.ply import read_ply
 
         return read_ply(path)
 
@@ -217,7 +217,7 @@ class PointCloud:
         Raises:
             OutputError: It cannot be written.
         """
-        from splatseed.io.ply import write_ply_file  # noqa: PLC0415  (io imports clouds)
+        from splatseed.io.ply import write_ply_file
 
         write_ply_file(path, self)
 

@@ -116,7 +116,7 @@ class Image:
             SceneNotFoundError: There is no such file.
             SceneFormatError: It is no image, or damaged.
         """
-        from splatseed.io.photograph import read_photograph  # noqa: PLC0415  (io imports scenes)
+        from splatseed.io.photograph import read_photograph
 
         return read_photograph(self.path, self.white)
 

@@ -213,7 +213,7 @@ def test_photographs_without_points_are_seeded_and_drawn(bare, tmp_path, splatse
     run = splatseed("upsample", bare, "--preview", "-o", out)
     assert (run.code, run.err) == (0, "")
     assert "-> auto: no points, so depth is found by comparing photographs\n" in run.out
-    assert "note: There were no points to begin from: comparing the photographs gave" in run.out
+    assert "a confirmed depth" in run.out
     seeds = load_scene(out).points
     assert len(seeds) > 500
     assert not seeds.num_original

@@ -17,7 +17,8 @@ from splatseed.lens import image_points
 from splatseed.photos.undistortion import undistort
 from splatseed.photos.view import at_file_size, load_photograph, load_split, load_views, poses_of
 from splatseed.scene import NO_POINT, Observations
-from splatseed.seeding.upsampling import frames_of, points_within
+from splatseed.seeding.budget import points_within
+from splatseed.seeding.photo_methods import frames_of
 
 
 @pytest.fixture

@@ -90,7 +90,7 @@ def test_only_poses_of_scenes_without_points_are_checked(room, poses, monkeypatc
     monkeypatch.setattr(module, "check_poses", None)
     upsample(room, "stereo", note=notes.append)
     assert len(notes) == 1
-    with pytest.raises(SceneNotFoundError, match=r"beside those held out.*all 1 are held out"):
+    with pytest.raises(SceneNotFoundError, match=r"other than test views.*all 1 are test views"):
         upsample(_posed(room, poses[:1]), test_every=8)
 
 

@@ -12,7 +12,9 @@ from splatseed.photos import view
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import silent
 from splatseed.scene import Split
-from splatseed.seeding.upsampling import parse_budget, share_covered, thin_to
+from splatseed.seeding.budget import parse_budget
+from splatseed.seeding.thinning import thin_to
+from splatseed.seeding.upsampling import share_covered
 
 by_photographs = pytest.mark.parametrize("method", ["stereo", "cover", "auto"])
 STEREO, COVER, CLOUD = (SOURCE_CODES[name] for name in ("stereo", "cover", "cloud"))

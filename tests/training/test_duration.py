@@ -9,7 +9,7 @@ import pytest
 from splatseed.camera import Intrinsics
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene
-from splatseed.seeding.upsampling import points_within
+from splatseed.seeding.budget import points_within
 from splatseed.training.duration import (
     HOUR,
     RunSpeed,

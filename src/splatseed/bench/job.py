@@ -47,7 +47,6 @@ from splatseed.scene import Scene
 from splatseed.scores import EvalResult
 from splatseed.seeding.advice import DEFAULT_METHOD
 from splatseed.seeding.clouds.method import Cloud
-from splatseed.seeding.upsampling import thin_to, upsample
 from splatseed.training.settings import TrainSettings
 
 if TYPE_CHECKING:  # PyTorch, which takes a while
@@ -256,6 +255,9 @@ def make_seeds(
     Arms that differ only in budget or strategy share points made from photographs, which take a
     minute or more: ``bench/seeds`` caches them with their time, which counts in each run.
     """
+    from splatseed.seeding.thinning import thin_to  # noqa: PLC0415  (--help reads this module)
+    from splatseed.seeding.upsampling import upsample  # noqa: PLC0415  (likewise)
+
     arm, limit, seed = spec.arm, spec.max_seeds, spec.repeat
     if arm.method == SFM and limit is None:
         return scene.points, 0.0

@@ -19,7 +19,7 @@ from splatseed.methods import METHODS, Profile, Upsampler, chooses_number, confi
 from splatseed.photos.view import TRAINED_SIDE
 from splatseed.runtime.fingerprint import fingerprint
 from splatseed.scores import CurvePoint, EvalResult
-from splatseed.seeding.upsampling import RHO, parse_budget
+from splatseed.seeding.budget import RHO, parse_budget
 from splatseed.text import did_you_mean
 from splatseed.training.duration import GROWTH, step_seconds
 from splatseed.training.settings import Backend, StrategyName, TrainSettings

@@ -41,7 +41,6 @@ from splatseed.requirements import require
 from splatseed.runtime.child import Child
 from splatseed.runtime.compilation import watched
 from splatseed.scene import Scene
-from splatseed.seeding.upsampling import upsample
 from splatseed.text import quoted
 
 if TYPE_CHECKING:  # they load Numba, or PyTorch, which may be absent
@@ -120,6 +119,8 @@ def run(arguments: list[str]) -> None:
 
 def _upsample_by(name: str, scene: Scene, ratio: float = RATIO) -> PointCloud:
     """The scene's points and new ones; methods that choose their number ignore the ratio."""
+    from splatseed.seeding.upsampling import upsample
+
     looks = hasattr(METHODS[name], "test_every")
     method = configure(name, test_every=TEST_EVERY) if looks else configure(name)
     return upsample(scene, method, ratio=None if chooses_number(name) else ratio, seed=SEED)

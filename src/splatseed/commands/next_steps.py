@@ -52,7 +52,7 @@ class Planned(NamedTuple):
         pixels = round(float(np.median(sizes))) if sizes else BUDGET
         number, flags = max(2, min(BUDGET, pixels)), ""
         if budget is not None:
-            from splatseed.seeding.upsampling import points_within
+            from splatseed.seeding.budget import points_within
 
             number = max(2, points_within(scene, budget))
             flags = f"--budget {number} "

@@ -28,7 +28,7 @@ from splatseed.io.files import read_text
 from splatseed.requirements import require
 from splatseed.runtime.interruption import exit_code
 from splatseed.scores import TrainingResult
-from splatseed.seeding.upsampling import RHO
+from splatseed.seeding.budget import RHO
 from splatseed.settings import fits
 from splatseed.text import did_you_mean, quoted, visible
 from splatseed.training.duration import (

@@ -47,6 +47,6 @@ class Depth(DepthSettings):
         self, scene: Scene, num_new: int, rng: np.random.Generator, progress: Progress
     ) -> NewPoints:
         """Lift ``num_new`` pixels."""
-        from splatseed.depth.lifting import lift  # noqa: PLC0415  (its kernels load with its use)
+        from splatseed.depth.lifting import lift
 
         return NewPoints(*lift(scene, num_new, self, rng, progress))

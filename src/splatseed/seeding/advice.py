@@ -1,8 +1,8 @@
-"""Which seeds? The one answer: what to do with a scene's points before training, and why.
+"""Advice: whether to add points to a scene before training, by which method, and why.
 
-*Room* is the number of seeds with which training can begin under its budget, per point of the
-scene. ``advise`` depends only on the measurements and the plan, so that it can be tested against a
-benchmark's runs. The rules rest on validation views of eight captures at 1,500 steps
+*Room* is the number of seeds that training starts with under its budget, per point of the scene.
+``advise`` depends on the measurements and the plan alone, so benchmark runs can test it. The rules
+rest on validation views of eight captures at 1,500 steps
 (benchmarks/README.md): where Structure-from-Motion left room, on six, ``auto`` gained -0.12 to 0.50
 dB under 3DGS's densification, 0.24 on average, and -0.30 to 0.28 under strategy ``grow``, -0.02 on
 average, with a quarter of a Gaussian per pixel; with one per pixel 0.27 and 0.28 on average, the
@@ -24,35 +24,34 @@ from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
 
 DEFAULT_METHOD, FALLBACK = "auto", "mls"
-"""The default method, and its replacement for scenes without photographs."""
+"""The default method, and the method for scenes without photographs."""
 AS_IT_IS, SEEDED = "sfm", "seeded"
-"""The advice to leave the points as they are; and to train, as splatseed has made them already."""
-ROOM = 1.1
-"""Least room at which new points are worth making. On validation views fox gained 0.5 dB and face
+"""Advice to leave the points as they are, and to train points that splatseed made before."""
+MIN_ROOM = 1.1
+"""Smallest room at which new points help. On validation views fox gained 0.5 dB and face
 lost 0.12, both with a room of 1.15, and scenes with a room of 1.0 lost."""
-SAME_WAY = 0.95  # least length of the mean viewing direction at which cameras face one way
-INWARD = 0.7
-"""Least share of cameras that look towards the point nearest to all optical axes in an orbit."""
+MIN_MEAN_DIRECTION = 0.95
+"""Length of the mean viewing direction from which on cameras face one way."""
+MIN_INWARD = 0.7
+"""Smallest cosine at which a camera looks at the point nearest to all optical axes, and smallest
+share of such cameras in an orbit."""
 
 
 @dataclass(frozen=True)
 class Measured:
-    """Measurements of a scene."""
+    """Measurements of a scene that advice depends on."""
 
-    num_points: int  # distinct ones
-    pixels: float  # of one photograph
-    empty: float | None = None  # share of the photographs' cells without a point, if known
-    layout: str | None = None  # of its cameras; None for fewer than three
-    photographs: bool = True  # whether they exist
-    depth_maps: bool = False  # whether there are any
+    num_points: int  # distinct originals
+    pixels: float  # median pixels of a photograph
+    empty: float | None = None  # share of the photographs' cells without a point; None: unknown
+    layout: str | None = None  # of the cameras; None for fewer than three
+    photographs: bool = True  # whether any exist
+    depth_maps: bool = False  # whether any exist
 
 
 @dataclass(frozen=True)
 class Advice:
-    """What to do, a sentence for each reason, and the numbers on which it rests.
-
-    ``method`` is the method for new points, ``AS_IT_IS`` or ``SEEDED``.
-    """
+    """A method for new points (or ``AS_IT_IS``, ``SEEDED``), its reasons, and the measurements."""
 
     method: str
     reasons: tuple[str, ...]
@@ -60,18 +59,21 @@ class Advice:
 
     @property
     def sentence(self) -> str:
-        """What to do, in a few words."""
-        told = {SEEDED: "train it", AS_IT_IS: "leave the points as they are"}
-        return told.get(self.method, f"add points by method {self.method}")
+        """The advice as an imperative, for messages."""
+        others = {SEEDED: "train it", AS_IT_IS: "leave the points as they are"}
+        return others.get(self.method, f"add points by method {self.method}")
 
 
 def advice_for(
     scene: Scene, max_seeds: int, *, strategy: str = "default", empty: float | None = None
 ) -> Advice:
-    """What to do with a scene's points before training; no photograph is opened.
+    """Advise on a scene's points before training, without opening a photograph.
 
-    Training can begin with ``max_seeds`` under its budget; ``empty`` is the share of the
-    photographs' cells without points, if known.
+    Args:
+        scene: The scene.
+        max_seeds: Seeds that training starts with under its budget.
+        strategy: Strategy of training.
+        empty: Share of the photographs' cells without points, if known.
     """
     measured = measure(scene, empty)
     if was_upsampled(scene) and len(scene.points):
@@ -87,7 +89,7 @@ def method_for(
     method: str | Upsampler = DEFAULT_METHOD,
     note: Callable[[str], None] = lambda _: None,
 ) -> str | Upsampler:
-    """The default method, or its replacement if there are no photographs."""
+    """Return ``method`` if there are photographs, else ``FALLBACK``, with a note."""
     if isinstance(scene, Scene) and scene.has_photographs:
         return method
     note(f"Without photographs, method {FALLBACK} is used instead of {DEFAULT_METHOD}.")
@@ -95,13 +97,13 @@ def method_for(
 
 
 def advise(
-    measured: Measured, max_seeds: int, *, strategy: str = "default", room: float = ROOM
+    measured: Measured, max_seeds: int, *, strategy: str = "default", room: float = MIN_ROOM
 ) -> Advice:
-    """The rule behind ``advice_for``, which scoring calls with other values of ``room``."""
+    """Apply the rules behind ``advice_for``; benchmarks vary ``room``."""
     if not measured.num_points:
         maps = "Its depth maps can give some, too: --method depth --depth.no-align --num-points N."
         how = ": depth comes from comparing the photographs" if measured.photographs else ""
-        none = f"There are no points to begin with{how}."
+        none = f"There are no points to start with{how}."
         return Advice(DEFAULT_METHOD, (none, *([maps] if measured.depth_maps else [])), measured)
     if not measured.photographs:
         return Advice(
@@ -109,12 +111,12 @@ def advise(
         )
     has = max_seeds / measured.num_points
     share = measured.num_points / measured.pixels if measured.pixels else 0.0
-    share_said = f"{share:.2f}" if share >= 0.01 or not share else f"{share:.1g}"
-    per_pixel = f"{measured.num_points:,} points, {share_said} per pixel"
+    shown = f"{share:.2f}" if share >= 0.01 or not share else f"{share:.1g}"
+    per_pixel = f"{measured.num_points:,} points, {shown} per pixel"
     if has < room:
         full = (
-            f"Training begins with {max_seeds:,} at most, so there is no room for more: adding "
-            "some cost up to 0.4 dB where that was measured."
+            f"Training starts with at most {max_seeds:,}, so there is no room for more: where that "
+            "was measured, adding points cost up to 0.4 dB."
         )
         return Advice(AS_IT_IS, (f"It has {per_pixel}.", full), measured)
     if strategy == "grow":
@@ -127,7 +129,7 @@ def advise(
         return Advice(AS_IT_IS, (f"It has {per_pixel}.", places_itself), measured)
     reasons = [f"It has {per_pixel}, and room for {has:.1f} times as many seeds."]
     if measured.depth_maps:
-        return Advice("depth", (*reasons, "Its depth maps say where the surfaces are."), measured)
+        return Advice("depth", (*reasons, "Its depth maps show the surfaces."), measured)
     if measured.empty is not None:
         cells = f"{measured.empty:.0%} of the cells of a coarse grid over the pictures"
         reasons.append(f"No point falls in {cells}.")
@@ -135,7 +137,7 @@ def advise(
 
 
 def measure(scene: Scene, empty: float | None = None) -> Measured:
-    """Measure a scene without looking at its photographs; ``empty`` as in ``advice_for``."""
+    """Measure a scene without opening a photograph; ``empty`` as in ``advice_for``."""
     points = scene.points.originals
     sizes = [image.intrinsics.width * image.intrinsics.height for image in scene.images]
     return Measured(
@@ -151,13 +153,13 @@ def measure(scene: Scene, empty: float | None = None) -> Measured:
 def camera_layout(
     scene: Scene,
 ) -> Literal["facing one way", "around something", "through a place"] | None:
-    """The layout of a scene's cameras; None for fewer than three."""
+    """Classify the layout of a scene's cameras; None for fewer than three."""
     if len(scene.images) < 3:
         return None
     world_from_cam = [np.linalg.inv(image.camera.cam_from_world) for image in scene.images]
     axes = np.array([pose[:3, 2] for pose in world_from_cam])
     centers = np.array([pose[:3, 3] for pose in world_from_cam])
-    if np.linalg.norm(axes.mean(axis=0)) >= SAME_WAY:
+    if np.linalg.norm(axes.mean(axis=0)) >= MIN_MEAN_DIRECTION:
         return "facing one way"
     # The point nearest to all axes: sum of (I - a a') (x - c) is 0.
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
@@ -165,5 +167,5 @@ def camera_layout(
     middle = np.linalg.lstsq(across.sum(axis=0), right, rcond=None)[0]
     towards = middle - centers
     towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
-    inward = (towards * axes).sum(axis=1) > INWARD
-    return "around something" if inward.mean() > INWARD else "through a place"
+    inward = (towards * axes).sum(axis=1) > MIN_INWARD
+    return "around something" if inward.mean() > MIN_INWARD else "through a place"

@@ -1,7 +1,9 @@
-"""Methods that look at the photographs, which determine the number of seeds: not a ratio.
+"""Methods that read the photographs and choose the number of seeds themselves.
 
-``stereo`` puts seeds on surfaces by comparing them; ``cover`` puts one in every part of every
-photograph that no point falls in; ``auto`` does both. Held-out views are never looked at.
+``stereo`` compares photographs and puts seeds on the surfaces it finds; ``cover`` puts a seed into
+every cell of every photograph that holds no point; ``auto`` does both. Photographs of test views
+are never read. ``--help`` reads the settings here, so that kernels are imported where a method
+runs.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ from splatseed.depth.stereo.maps import MAX_GRID, MIN_POINTS, StereoSettings
 from splatseed.errors import PointCloudError, SceneNotFoundError
 from splatseed.methods import as_cloud, source_code
 from splatseed.methods.contract import NewPoints, Traits
-from splatseed.photos.view import View, at_file_size, data_factor, load_views
+from splatseed.photos.view import View, at_file_size, data_factor, load_views, poses_of
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress
 from splatseed.scene import Image, Scene
@@ -26,15 +28,18 @@ from splatseed.settings import Range, check_settings
 if TYPE_CHECKING:
     from splatseed.depth.stereo.maps import StereoMap, StereoResult
 
-MAX_SIZE = 800  # longer side in pixels at which photographs are used
+MAX_SIZE = 800
+"""Longer side, in pixels, of the photographs that methods compare."""
+CELL = 8
+"""Side, in pixels, of the cells in which cover looks for points."""
 
 
 @dataclass(frozen=True)
 class PhotographMethod:
-    """The base of the three methods."""
+    """Settings that ``stereo``, ``cover`` and ``auto`` share."""
 
     max_size: Annotated[int, Range(64)] = MAX_SIZE
-    """Photographs are downsampled by a whole factor to at most this many pixels a side."""
+    """Maximum side of photographs in pixels; larger ones are reduced by a whole factor."""
     test_every: Annotated[int, Range(2, also=0)] = 0
     """Leave out every n-th image by name, as trainers do for testing (8); 0 = use all but
     test images that the scene lists."""
@@ -48,10 +53,10 @@ class PhotographMethod:
 
 @dataclass(frozen=True)
 class Stereo(PhotographMethod):
-    """Seeds on surfaces, from comparing photographs with each other."""
+    """Seeds on surfaces that are found by comparing the photographs."""
 
     spacing: Annotated[float, Range(1, 256)] = 8.0
-    """Pixels between stereo's seeds in the photographs; at least the grid."""
+    """Pixels between seeds in the photographs; at least the grid."""
     grid: Annotated[int, Range(1, MAX_GRID)] = 4
     """Pixels between depths, along a row and a column."""
 
@@ -60,9 +65,9 @@ class Stereo(PhotographMethod):
     def maps(
         self, scene: Scene, only: Sequence[int], seed: int, progress: Progress
     ) -> tuple[StereoMap, ...]:
-        """Depth and normals of photographs, as ``upsample`` computes them with this seed.
+        """Compute the depth maps that ``upsample`` makes with this seed.
 
-        ``only`` indexes ``photographed(scene, test_every)``.
+        ``only`` are indices into ``photographed(scene, test_every)``.
         """
         images = photographed(scene, self.test_every)
         views = read_views(scene, images, self.max_size, progress)
@@ -73,7 +78,7 @@ class Stereo(PhotographMethod):
     def __call__(
         self, scene: Scene, num_new: int, rng: np.random.Generator, progress: Progress
     ) -> NewPoints:
-        """Make the new points of a scene."""
+        """Make the points of a scene; ``num_new`` is ignored."""
         return self._with_stereo(scene, rng, progress)[0]
 
     def _with_stereo(
@@ -83,13 +88,13 @@ class Stereo(PhotographMethod):
 
         Without points, the scene's poses are checked first.
         """
-        from splatseed.depth.stereo.fusion import fuse  # noqa: PLC0415  (kernels load with use)
+        from splatseed.depth.stereo.fusion import fuse
 
         images = photographed(scene, self.test_every)
         warnings: tuple[str, ...] = ()
         if not has_points(scene):
-            from splatseed.seeding.pose_accuracy import estimate_pose_error  # noqa: PLC0415  (loads Numba)
-            from splatseed.seeding.poses import agreement_warning, check_poses  # noqa: PLC0415  (loads Numba)
+            from splatseed.seeding.pose_accuracy import estimate_pose_error
+            from splatseed.seeding.poses import agreement_warning, check_poses
 
             faint = agreement_warning(check_poses(scene, images, progress))
             error = estimate_pose_error(scene, images, progress)
@@ -98,7 +103,7 @@ class Stereo(PhotographMethod):
         start = time.perf_counter()
         stereo = compare(scene, images, views, self.grid, rng, progress)
         seeds = fuse(stereo, self.spacing, progress)
-        found = _found(scene, stereo, time.perf_counter() - start)
+        found = _stereo_note(scene, stereo, time.perf_counter() - start)
         source = np.full(len(seeds), source_code("stereo"), np.uint8)
         new = NewPoints(
             seeds.xyz, seeds.rgb, (*found, *warnings), seeds.normals, seeds.sizes,
@@ -109,23 +114,23 @@ class Stereo(PhotographMethod):
 
 @dataclass(frozen=True)
 class Cover(PhotographMethod):
-    """A seed for every cell of every photograph that no point falls in."""
+    """A seed for every cell of every photograph that holds no point."""
 
-    cell: Annotated[int, Range(1, 256)] = 8
-    """Side of such a cell, in pixels."""
+    cell: Annotated[int, Range(1, 256)] = CELL
+    """Side of a cell in pixels."""
 
     name: ClassVar[str] = "cover"
 
     def __call__(
         self, scene: Scene, num_new: int, rng: np.random.Generator, progress: Progress
     ) -> NewPoints:
-        """Make the new points of a scene, which needs some already: their depths are carried on."""
+        """Make the points of a scene from the depths of its originals; ``num_new`` is ignored."""
         originals = scene.points.originals
         if not originals.finite.any():
             raise PointCloudError(
-                "points for the method cover, which carries their depths into the gaps",
+                "points whose depths method 'cover' can carry into the gaps",
                 found="none",
-                fix="Choose --method auto, which compares the photographs first.",
+                fix="Choose `method='auto'`, which compares the photographs first.",
             )
         views = read_views(scene, photographed(scene, self.test_every), self.max_size, progress)
         return _cover(views, originals, self.cell, rng, progress)
@@ -135,8 +140,8 @@ class Cover(PhotographMethod):
 class Auto(Stereo):
     """Stereo, then cover: a seed for every cell of every photograph, on surfaces where possible."""
 
-    cell: Annotated[int, Range(1, 256)] = 8
-    """Side of a cell in pixels; a cell without points gets a seed."""
+    cell: Annotated[int, Range(1, 256)] = CELL
+    """Side in pixels of a cell that gets a seed if it holds no point."""
 
     name: ClassVar[str] = "auto"
 
@@ -155,34 +160,39 @@ class Auto(Stereo):
 
 
 def has_points(scene: Scene) -> bool:
-    """Whether there are points that vouch for the poses, as far as points can."""
+    """Whether there are enough points to trust the poses."""
     points = scene.points.originals
     return int(np.count_nonzero(points.distinct)) >= MIN_POINTS
 
 
-def begins_from_points(scene: Scene) -> bool:
-    """Whether there are enough points for stereo to search around; else photographs must do."""
-    from splatseed.depth.stereo.pipeline import has_enough_points  # noqa: PLC0415  (kernels load with use)
-    from splatseed.photos.visibility import find_visibility  # noqa: PLC0415  (loads with its use)
+def has_depth_hints(scene: Scene) -> bool:
+    """Whether there are enough points for stereo to take its depth ranges from them."""
+    from splatseed.depth.stereo.pipeline import has_enough_points
+    from splatseed.photos.visibility import find_visibility
 
     return has_enough_points(find_visibility(scene), scene.images)
 
 
 def photographed(
-    scene: Scene, test_every: int = 0, *, without: str = "choose --method mls"
+    scene: Scene, test_every: int = 0, *, without: str = "choose `method='mls'`"
 ) -> tuple[Image, ...]:
-    """The images whose photographs are used, by name; ``test_every`` as in ``PhotographMethod``.
+    """Return the images whose photographs methods read, by name; test views are left out.
+
+    Args:
+        scene: Images whose files are missing are left out.
+        test_every: As in ``PhotographMethod``.
+        without: What to do without photographs, for the message.
 
     Raises:
-        SceneNotFoundError: There are none; the message says to do ``without``.
+        SceneNotFoundError: There are none.
     """
     folder = scene.source.image_dir if scene.source else None
     ordered = sorted(scene.images, key=lambda image: image.name)
     used = list(scene.split(test_every)[0]) if test_every or scene.listed else ordered
     if ordered and not used:
         raise SceneNotFoundError(
-            "photographs beside those held out for testing",
-            found=f"none: all {len(ordered)} are held out",
+            "photographs other than test views",
+            found=f"none: all {len(ordered)} are test views",
             fix="Add photographs to the scene.",
         )
     if folder is not None:
@@ -191,7 +201,7 @@ def photographed(
         raise SceneNotFoundError(
             "photographs of the scene",
             found=f"none of {len(ordered)} images" if folder else "no folder with images",
-            fix=f"Put them beside the model in a folder named images, or {without}.",
+            fix=f"Put them into a folder named images beside the model, or {without}.",
         )
     return tuple(used)
 
@@ -199,10 +209,16 @@ def photographed(
 def read_views(
     scene: Scene, images: Sequence[Image], max_size: int, progress: Progress
 ) -> tuple[View, ...]:
-    """The photographs of some images, undistorted, at most ``max_size`` pixels a side."""
+    """Read the photographs of some images, undistorted, at most ``max_size`` pixels a side."""
     sized = at_file_size(scene.replace(images=tuple(images))).images
     factor = data_factor(sized, max_size)
     return load_views(scene, images, data_factor=factor, undistort=True, progress=progress)
+
+
+def frames_of(scene: Scene) -> tuple[View, ...]:
+    """Return the views of all images at ``MAX_SIZE``, without pixels."""
+    images = at_file_size(scene).images
+    return poses_of(images, data_factor(images, MAX_SIZE)) if images else ()
 
 
 def compare(
@@ -214,8 +230,8 @@ def compare(
     progress: Progress,
     only: Sequence[int] | None = None,
 ) -> StereoResult:
-    """Stereo of the photographs, or what ``only`` some need; depths are ``grid`` pixels apart."""
-    from splatseed.depth.stereo.pipeline import find_stereo, known_visibility  # noqa: PLC0415  (loads Numba)
+    """Run stereo with depths ``grid`` pixels apart; only as far as the views ``only`` need it."""
+    from splatseed.depth.stereo.pipeline import find_stereo, known_visibility
 
     settings, seed = StereoSettings(grid=grid), int(rng.integers(1 << 32))
     return find_stereo(views, images, known_visibility(scene), settings, seed, progress, only)
@@ -224,7 +240,7 @@ def compare(
 def with_cover(
     views: Sequence[View], points: PointCloud, cell: int, seed: int, progress: Progress
 ) -> PointCloud:
-    """The points, plus a seed in each cell (its side in pixels) of the views that they leave."""
+    """Add a seed for every cell of the views, ``cell`` pixels wide, that holds no point."""
     code = source_code("cover")
     new = _cover(views, points, cell, np.random.default_rng([seed, code]), progress)
     return PointCloud.concatenate(points, as_cloud(new, len(new.xyz), code))
@@ -237,7 +253,8 @@ def _cover(
     rng: np.random.Generator,
     progress: Progress,
 ) -> NewPoints:
-    from splatseed.seeding.cover import cover  # noqa: PLC0415  (kernels load with use)
+    """Make cover's seeds for the gaps between a cloud's finite points."""
+    from splatseed.seeding.cover import cover
 
     xyz, masks = cloud.xyz[cloud.finite], [view.mask for view in views]
     seeds = cover(views, xyz, cell=cell, rng=rng, masks=masks, progress=progress)
@@ -246,14 +263,14 @@ def _cover(
     return NewPoints(seeds.xyz, seeds.rgb, (), normals, seeds.size, seeds.confidence, source)
 
 
-def _found(scene: Scene, stereo: StereoResult, seconds: float) -> tuple[str, ...]:
-    """What comparing photographs found if points could not guide it, and how long it took."""
-    if begins_from_points(scene):
+def _stereo_note(scene: Scene, stereo: StereoResult, seconds: float) -> tuple[str, ...]:
+    """Report the share of pixels with depth, and the time, if points could not guide stereo."""
+    if has_depth_hints(scene):
         return ()
     points = "too few" if has_points(scene) else "no"
     share = np.mean([stereo.confirmed(i).mean() for i in range(len(stereo.views))])
-    told = (
-        f"There were {points} points to begin from: comparing the photographs gave {share:.0%} of "
-        f"their pixels a confirmed depth, in {seconds:.0f} s."
+    note = (
+        f"With {points} points to start from, stereo gave {share:.0%} of the photographs' pixels a "
+        f"confirmed depth, in {seconds:.0f} s."
     )
-    return (told,)
+    return (note,)

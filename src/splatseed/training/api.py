@@ -27,8 +27,7 @@ from splatseed.progress import Note, Progress, silent, silent_note
 from splatseed.requirements import require
 from splatseed.scene import Image, Scene
 from splatseed.scores import EvalResult
-from splatseed.seeding.budget import median_pixels
-from splatseed.seeding.upsampling import parse_budget
+from splatseed.seeding.budget import median_pixels, parse_budget
 from splatseed.text import did_you_mean
 from splatseed.training.folder import RunFolder
 from splatseed.training.models import config_of, model_file, near_plane_of

@@ -20,8 +20,8 @@ from splatseed.progress import Note, Progress
 from splatseed.runtime.fingerprint import fingerprint
 from splatseed.scene import Scene
 from splatseed.seeding.advice import AS_IT_IS, advice_for
-from splatseed.seeding.budget import thin
 from splatseed.seeding.photo_methods import Auto
+from splatseed.seeding.thinning import thin
 from splatseed.seeding.upsampling import upsample
 from splatseed.training.depths import stereo_size
 from splatseed.training.settings import AS_3DGS, BUDGET, TrainSettings

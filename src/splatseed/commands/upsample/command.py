@@ -23,7 +23,7 @@ from splatseed.photos.sight import stray_notes
 from splatseed.scene import Scene
 from splatseed.seeding import photo_methods
 from splatseed.seeding.advice import DEFAULT_METHOD, method_for
-from splatseed.seeding.upsampling import points_within, upsample
+from splatseed.seeding.budget import points_within
 from splatseed.text import counted, visible
 
 
@@ -44,6 +44,8 @@ def run(arguments: list[str]) -> None:
 
 
 def _upsample(options: Options, methods: dict[str, Any]) -> None:
+    from splatseed.seeding.upsampling import upsample
+
     notes: list[str] = []
     with stage_display() as clock:
         clock("read", 0.0)
@@ -76,8 +78,7 @@ def _upsample(options: Options, methods: dict[str, Any]) -> None:
         total = None if new is None else count + new
         limit = None if options.budget is None else points_within(scene, options.budget)
     changes = {"--verify": options.verify, "--cover": options.cover_cell is not None}
-    given = [name for name, is_given in changes.items() if is_given]
-    number = report.number_summary(total, limit, given)
+    number = report.number_summary(total, limit, [name for name in changes if changes[name]])
     _announce(options, scene, methods, number, "" if cloud is None else cloud.memory_note)
     with stage_display(clock):
         seeds = upsample(
@@ -85,10 +86,10 @@ def _upsample(options: Options, methods: dict[str, Any]) -> None:
             verify=options.verify, extra_method=extra_method, seed=options.seed, progress=clock,
             note=notes.append,
         )  # fmt: skip
+        seeded = scene.with_points(seeds)
         clock("check", 0.0)
         findings = report.findings(scene, seeds, method)
         clock("write", 0.0)
-        seeded = scene.replace(points=seeds)
         written = write_scene(
             seeded, options.output, format=options.format, overwrite=options.overwrite,
             copy_images=options.copy_images, provenance=report.provenance(options, scene, method),
@@ -149,7 +150,7 @@ def _announce(
     if options.profile == "paper" and configure(name, "paper") == configure(name):
         print_note(f"Profile paper changes nothing for method {name}.")
     how = ""
-    if isinstance(method, photo_methods.Stereo) and not photo_methods.begins_from_points(scene):
+    if isinstance(method, photo_methods.Stereo) and not photo_methods.has_depth_hints(scene):
         points = "too few" if photo_methods.has_points(scene) else "no"
         where = "" if scene.depths is None else ", around its depth maps"
         how = f": {points} points, so depth is found by comparing photographs{where}"

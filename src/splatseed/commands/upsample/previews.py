@@ -14,8 +14,7 @@ from splatseed.methods import Upsampler
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
-from splatseed.seeding.photo_methods import MAX_SIZE, Stereo, photographed, read_views
-from splatseed.seeding.upsampling import CELL
+from splatseed.seeding.photo_methods import CELL, MAX_SIZE, Stereo, photographed, read_views
 from splatseed.splat.formats import write_gaussians
 from splatseed.training.initialization import gaussians_of_scene
 from splatseed.training.settings import TrainSettings

@@ -18,7 +18,6 @@ from splatseed.methods import Profile, Upsampler, chooses_number, configure, sou
 from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.scene import Scene
 from splatseed.seeding.geometry_score import far_share
-from splatseed.seeding.upsampling import share_covered
 
 CLOUD_PARAMETERS = {"files", "transform", "memory", "alone"}
 """Parameters of the method cloud that other lines show."""
@@ -96,6 +95,8 @@ def findings(scene: Scene, seeds: PointCloud, method: Upsampler) -> list[tuple[s
         far = far_share(scene.points.xyz, new)
         rows.append(("far from any original", f"{far:.2%} of the new points, over 3 spacings"))
     if scene.images:
+        from splatseed.seeding.upsampling import share_covered
+
         before, after = share_covered(scene, scene.points), share_covered(scene, seeds)
         share = f"{after:.1%} of the 8 x 8 pixel cells of the photographs have a point"
         rows.append(("covered", f"{share}; {before:.1%} before"))

@@ -14,7 +14,7 @@ from splatseed.progress import Progress
 from splatseed.scene import Scene
 from splatseed.seeding.clouds.memory_plan import MemoryPlan, plan_memory
 from splatseed.seeding.clouds.settings import CloudInputs, CloudSettings
-from splatseed.seeding.upsampling import frames_of
+from splatseed.seeding.photo_methods import frames_of
 from splatseed.settings import check_settings
 from splatseed.similarity import Similarity
 

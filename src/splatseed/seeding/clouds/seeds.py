@@ -30,8 +30,14 @@ from splatseed.seeding.clouds.photo_consistency import (
 from splatseed.seeding.clouds.reading import MergedCloud, read_clouds
 from splatseed.seeding.clouds.settings import CloudInputs, CloudSettings
 from splatseed.seeding.coverage import covered_share
-from splatseed.seeding.photo_methods import MAX_SIZE, compare, photographed, read_views
-from splatseed.seeding.upsampling import CELL, frames_of
+from splatseed.seeding.photo_methods import (
+    CELL,
+    MAX_SIZE,
+    compare,
+    frames_of,
+    photographed,
+    read_views,
+)
 
 MIN_FIT, DOUBTFUL_FIT = 0.2, 0.55
 """Minimum fraction of the scene's own points at the cloud's depth, and the fraction below which a
