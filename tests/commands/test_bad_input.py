@@ -1,4 +1,7 @@
-"""Bad input: exit code 2, a message that names the file or option, and nothing is written."""
+"""Bad input: exit code 2, an error that names the file, option or value, and nothing written.
+
+``COMMANDS`` lists commands with what their error must name; ``refused`` checks the rest for all.
+"""
 
 from __future__ import annotations
 
@@ -33,8 +36,8 @@ from splatseed.training.state import load_checkpoint, make_strategy
 from ..command_line import parser_of
 
 
-def _refused(run, *says):
-    """The rules that every error on the command line obeys; gives what is said on one line."""
+def _refused(run, *named):
+    """Check the rules that all errors obey, and what this one names; returns its text."""
     assert run.code == 2, run
     assert "Traceback" not in run.out + run.err
     said = " ".join(re.sub("[│╭╮╰╯─]", " ", run.err).split())  # tyro's boxes
@@ -44,7 +47,7 @@ def _refused(run, *says):
         assert "; found " in run.err
     else:
         assert "--help" in said
-    for text in says:
+    for text in named:
         assert str(text) in said, run
     return said
 
@@ -53,7 +56,7 @@ def _contents(folder):
     return {path: path.is_file() and path.read_bytes() for path in folder.rglob("*")}
 
 
-# Words -------------------------------------------------------------------------------------------
+# The table ----------------------------------------------------------------------------------------
 
 OUT = ("-o", "OUT")
 UP = ("upsample", "ROOM", *OUT)
@@ -66,10 +69,10 @@ QUICK = ("bench", "--preset", "quick", *OUT)
 EVALUATE = ("evaluate", "model.ply", "--scene", "ROOM")
 FLIGHT = ("flight", "model.ply", "-o", "a.mp4")
 
-WORDS = [
-    (("upsmaple",), "Did you mean upsample?"),
-    (("Info",), "Did you mean info?"),
-    (("--verison",), "Did you mean --version?"),
+COMMANDS = [
+    (("upsmaple",), "upsample?"),
+    (("Info",), "info?"),
+    (("--verison",), "--version?"),
     (("info",), "PATH"),
     (("info", "nowhere"), "nowhere"),
     (("info", "nowhere", "--bogus"), "--bogus"),
@@ -94,7 +97,7 @@ WORDS = [
     ((*MLS, "--ratio", "0.5"), "ratio"),
     ((*MLS, "--ratio", "nan"), "ratio"),
     ((*MLS, "--ratio", "1e12"), "4,294,967,296"),
-    ((*MLS, "--num-points", "10"), "found 10"),
+    ((*MLS, "--num-points", "10"), "10"),
     ((*MLS, "--num-points", "500k"), "--num-points"),
     ((*MLS, "--ratio", "2", "--num-points", "5000"), "both"),
     ((*LIFT, "--depth", "nowhere"), "nowhere"),
@@ -125,14 +128,14 @@ WORDS = [
     ((*SFM, "--camera-model", "FOO"), "FOO"),
     ((*SFM, "--refine-poses"), "--poses-from"),
     ((*SFM, "--poses-from", "ROOM", "--camera-model", "PINHOLE"), "--camera-model"),
-    (("bench", "reprot", "B"), "Did you mean report?"),
+    (("bench", "reprot", "B"), "report?"),
     ((*QUICK, "--repeats", "0"), "--repeats"),
     ((*QUICK, "--long-side", "0"), "--long-side"),
     (("demo", "--views", "2"), "views"),
     (("demo", "--train-steps", "-1"), "--train-steps"),
-    ((*MLS, "--cloud", "SCAN"), "with --cloud; found mls"),
-    ((*MLS, "--gaussians", "start.splat"), "FILE.ply"),
-    ((*MLS, "--gaussians", "OUT/start.ply"), "beside the folder"),
+    ((*MLS, "--cloud", "SCAN"), "--cloud"),
+    ((*MLS, "--gaussians", "start.splat"), "start.splat"),
+    ((*MLS, "--gaussians", "OUT/start.ply"), "OUT/start.ply"),
     ((*MLS, "--gaussians", "model.ply"), "--overwrite"),
     ((*MLS, "--refine-poses", "--depth-scale", "2"), "--depth DIR"),
     ((*LIFT, "--depth", "ROOM", "--depth-scale", "5", "--depth.no-align"), "scale"),
@@ -142,13 +145,13 @@ WORDS = [
     ((*UP, "--transform", "x.txt"), "--cloud FILE"),
     ((*UP, "--align"), "--cloud FILE"),
     ((*UP, "--cloud", "none.laz"), "none.laz"),
-    ((*UP, "--cloud", "SCAN", "--memory", "500M"), "Pass --memory 6"),
-    ((*UP, "--cloud", "SCAN", "--memory", "a lot"), "found 'a lot'"),
-    ((*UP, "--cloud", "SCAN", "--align", "--transform", "t.txt"), "found both"),
+    ((*UP, "--cloud", "SCAN", "--memory", "500M"), "--memory 6"),
+    ((*UP, "--cloud", "SCAN", "--memory", "a lot"), "a lot"),
+    ((*UP, "--cloud", "SCAN", "--align", "--transform", "t.txt"), "--align"),
     ((*UP, "--cloud", "SCAN", "--transform", "none.txt"), "none.txt"),
     (("evaluate", "ROOM"), "splatseed train ROOM"),
     ((*EVALUATE, "--lpips-weights", "nowhere"), "nowhere"),
-    ((*EVALUATE, "--data-factor", "40"), "smaller --data-factor"),
+    ((*EVALUATE, "--data-factor", "40"), "--data-factor"),
     (("evaluate", "scan.npz", "--scene", "ROOM"), "scan.npz"),
     (("evaluate", "junk.ply", "--scene", "ROOM"), "junk.ply"),
     (("evaluate", "nothing", "--scene", "ROOM"), "nothing"),
@@ -156,15 +159,15 @@ WORDS = [
     (("view", "ROOM", "--host", "256.0.0.1"), "--host"),
     (("view", "ROOM", "--port", "99999"), "--port"),
     (("view", "ROOM", "--compare", "nowhere", "--port", "0"), "nowhere"),
-    (("flight", "ROOM", "-o", "a.mp4"), "found a scene"),
+    (("flight", "ROOM", "-o", "a.mp4"), "splatseed train ROOM"),
     (("flight", "model.ply", "-o", "a.avi"), ".mp4"),
-    (("flight", "model.ply", "-o", "x" * 300 + ".mp4"), "name too long"),
+    (("flight", "model.ply", "-o", "x" * 300 + ".mp4"), "x" * 300),
     ((*FLIGHT, "--size", "0x9"), "--size"),
     ((*FLIGHT, "--seconds", "0"), "--seconds"),
     ((*FLIGHT, "--path", "none.json"), "none.json"),
     ((*FLIGHT, "--transform", "gsplat"), "--path"),
     ((*FLIGHT, "--compare", "nowhere"), "nowhere"),
-    (("export", "nowhere", "-o", "a.spz"), "nothing there"),
+    (("export", "nowhere", "-o", "a.spz"), "nowhere"),
     (("export", "model.ply", "-o", "a.glb"), "splat-transform"),
     (("export", "model.ply", "-o", "a.spz", "--crop", "1,2"), "--crop"),
     (("export", "model.ply", "-o", "a.spz", "--min-opacity", "2"), "--min-opacity"),
@@ -173,6 +176,22 @@ WORDS = [
     (("sfm", "film.mp4", *OUT, "--poses-from", "ROOM"), "--poses-from"),
     (("sfm", "film.mp4", *OUT), "film.mp4"),
     (("demo", *OUT, "--training", "only"), "splatseed demo"),
+    # Outputs that exist, or lie where none may: TAKEN holds a file of the user's, RUN is a run.
+    (("upsample", "ROOM", "-o", "TAKEN"), "TAKEN"),
+    (("depth", "ROOM", "-o", "TAKEN", "--overwrite"), "TAKEN"),
+    (("train", "ROOM", "-o", "TAKEN"), "TAKEN"),
+    (("sfm", "ROOM/images", "-o", "TAKEN", "--overwrite"), "TAKEN"),
+    (("undistort", "ROOM", "-o", "TAKEN"), "TAKEN"),
+    (("demo", "-o", "TAKEN"), "TAKEN"),
+    ((*EVALUATE, "-o", "TAKEN/mine.txt"), "--overwrite"),
+    ((*EVALUATE, "-o", "model.ply", "--overwrite"), "model.ply"),
+    ((*EVALUATE, "-o", "ROOM/scores.json", "--overwrite"), "ROOM"),
+    ((*EVALUATE, "--renders", "TAKEN"), "TAKEN"),
+    (("export", "model.ply", "-o", "TAKEN/mine.txt"), ".txt"),
+    (("export", "model.ply", "-o", "taken.spz"), "--overwrite"),
+    (("export", "model.ply", "-o", "model.ply", "--overwrite"), "model.ply"),
+    (("export", "model.ply", "-o", "RUN/out.spz"), "RUN"),
+    (("evaluate", "RUN"), "--resume"),
 ]
 
 
@@ -187,6 +206,11 @@ def refused(room, tmp_path, monkeypatch, splatseed):
     write_gaussians(tmp_path / "model.ply", initial_gaussians(load_scene(room).points))
     (tmp_path / "film.mp4").write_bytes(b"\0" * 999)
     np.savez(tmp_path / "scan.npz", xyz=np.random.default_rng(0).random((99, 3)))
+    (tmp_path / "TAKEN").mkdir()
+    (tmp_path / "TAKEN" / "mine.txt").write_text("years")
+    (tmp_path / "taken.spz").write_bytes(b"mine")
+    _run_folder(tmp_path / "RUN")
+    (tmp_path / "RUN" / "point_cloud.ply").unlink()
     before = _contents(tmp_path)
 
     def check(*words):
@@ -201,10 +225,10 @@ def refused(room, tmp_path, monkeypatch, splatseed):
 
 @pytest.mark.parametrize(
     ("words", "named"),
-    WORDS,
+    COMMANDS,
     ids=lambda each: each if isinstance(each, str) else " ".join(each)[-40:],
 )
-def test_what_makes_no_sense_is_refused_by_name(words, named, refused):
+def test_an_error_names_the_file_option_or_value(words, named, refused):
     if words[0] in NEEDED:
         pytest.importorskip(NEEDED[words[0]])
     assert named in refused(*words)
@@ -218,7 +242,7 @@ ANY = {("sfm", "--threads")}
 
 
 @pytest.mark.parametrize("verb", sorted({*VERBS} - {"demo", "view"}))
-def test_no_number_is_below_its_least(verb, refused):
+def test_numbers_have_minimums(verb, refused):
     kind = import_module(f"splatseed.commands.{verb}").Options
     things = ["model.ply"] if verb in MODELS else THINGS.get(verb, ["ROOM"])
     output = [] if verb in {"info", "evaluate", "bench"} else ["-o", MODELS.get(verb, "OUT")]
@@ -234,7 +258,7 @@ def test_no_number_is_below_its_least(verb, refused):
 # Scenes ------------------------------------------------------------------------------------------
 
 
-def test_too_few_points_and_those_that_are_nowhere(rng, tmp_path, splatseed):
+def test_too_few_and_unusable_points(rng, tmp_path, splatseed):
     xyz = rng.random((100, 3)).astype(np.float32)
     xyz[[3, 50]], xyz[60] = np.nan, xyz[61]
     for name, some in (("one", xyz[:1]), ("some", xyz)):
@@ -272,7 +296,9 @@ JUNK = {"bytes": bytes([137, 3, 0, 255, 13]) * 40, "text": b"some words\n" * 9, 
         "upsample room -o out --cloud junk.ply",
     ],
 )
-def test_junk_is_told_without_python(words, junk, own_room, tmp_path, monkeypatch, splatseed):
+def test_errors_on_junk_name_nothing_of_python(
+    words, junk, own_room, tmp_path, monkeypatch, splatseed
+):
     if words.startswith("sfm"):
         pytest.importorskip("pycolmap")
     monkeypatch.chdir(tmp_path)
@@ -327,11 +353,11 @@ def test_the_input_is_no_place_for_the_output(place, own_room, tmp_path, splatse
     before = _contents(tmp_path)
     for words in ([], ["--overwrite"], ["--method", "depth", "--depth", own_room / "depths"]):
         run = splatseed("upsample", own_room, "-o", own_room / place, *words)
-        _refused(run, "apart from the input")
+        _refused(run, own_room)
     assert _contents(tmp_path) == before
 
 
-def test_what_fails_halfway_leaves_nothing_and_spares_the_earlier_output(
+def test_a_failed_write_leaves_nothing_and_spares_the_earlier_output(
     room, tmp_path, splatseed, monkeypatch
 ):
     out = tmp_path / "out"
@@ -344,11 +370,11 @@ def test_what_fails_halfway_leaves_nothing_and_spares_the_earlier_output(
 
     monkeypatch.setattr(colmap, "write_points3d", write)
     for words in (["-o", out, "--overwrite"], ["-o", tmp_path / "deep/out"]):
-        _refused(splatseed("upsample", room, "--method", "linear", *words), "Free some space")
+        _refused(splatseed("upsample", room, "--method", "linear", *words), words[1])
         assert _contents(tmp_path) == before
 
 
-def test_memory_that_ran_out_is_said_so_whatever_the_error_says(splatseed, monkeypatch):
+def test_running_out_of_memory_is_an_error_of_one_line(splatseed, monkeypatch):
     for error, says in (
         (MemoryError(), "found none left."),
         (MemoryError("a lot"), "found a lot."),
@@ -361,7 +387,7 @@ def test_memory_that_ran_out_is_said_so_whatever_the_error_says(splatseed, monke
 def test_a_link_to_itself(room, tmp_path, splatseed):
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
     for verb in (["upsample", room], ["depth", room], ["train", room]):
-        _refused(splatseed(*verb, "-o", tmp_path / "loop"), "leads back to itself")
+        _refused(splatseed(*verb, "-o", tmp_path / "loop"), "loop")
     _refused(splatseed("info", tmp_path / "loop"), "loop")
     with pytest.raises(OutputError, match="loop"), atomic_file(tmp_path / "loop"):
         pass
@@ -428,7 +454,7 @@ NAME = "room\x1b[31m:fire:[red]\nx"
 
 
 @pytest.mark.parametrize("words", [["info"], ["upsample", "--method", "linear"]])
-def test_a_name_that_would_act_is_printed_literally(words, room, tmp_path, splatseed):
+def test_control_characters_of_names_are_escaped(words, room, tmp_path, splatseed):
     scene = shutil.copytree(room, tmp_path / NAME)
     output = [] if words == ["info"] else ["-o", tmp_path / f"out{NAME}"]
     run = splatseed(words[0], scene, *words[1:], *output)

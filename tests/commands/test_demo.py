@@ -1,4 +1,4 @@
-"""``splatseed demo`` goes the whole way, and says what its numbers do not show."""
+"""``splatseed demo``: scenes, scores, pictures and runs."""
 
 from __future__ import annotations
 
@@ -67,11 +67,9 @@ def test_the_demo_leaves_a_scene_scores_pictures_and_runs(tmp_path, splatseed):
     again = splatseed("evaluate", out / "run_poses")
     assert again.code == 0, again
     assert f"{metrics['poses']['psnr']:.2f}" in again.out
-    refused = splatseed("demo", "--views", 6, "-o", out)
-    assert (refused.code, "--overwrite" in refused.err) == (2, True)
 
 
-def test_without_pytorch_the_demo_says_what_to_install(splatseed, tmp_path, monkeypatch):
+def test_without_pytorch_the_demo_does_not_train(splatseed, tmp_path, monkeypatch):
     def absent(*_):
         raise MissingDependencyError("the packages", found="no torch", fix="Install them.")
 
@@ -85,7 +83,7 @@ def test_without_pytorch_the_demo_says_what_to_install(splatseed, tmp_path, monk
     assert (tmp_path / "demo" / "geometry.csv").is_file()
 
 
-def test_what_compiles_ahead_starts_with_the_first_compilation_and_ends(monkeypatch):
+def test_the_compiling_process_starts_with_the_first_compilation_and_ends(monkeypatch):
     children = []
 
     class Child(demo.Child):
@@ -103,7 +101,7 @@ def test_what_compiles_ahead_starts_with_the_first_compilation_and_ends(monkeypa
     assert child.process.poll() is not None
 
 
-def test_what_compiles_ahead_is_a_small_demo(tmp_path):
+def test_the_compiling_process_runs_a_small_demo(tmp_path):
     """A failure there would go unseen: the demo would compile by itself, and be slow."""
     pytest.importorskip("gsplat", reason="training needs PyTorch and gsplat's strategies")
     write_capture(synthetic.make_capture(demo.SEED, **demo.SMALL), tmp_path / "scene")

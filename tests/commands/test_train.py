@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from io import StringIO
 from pathlib import Path
@@ -59,13 +60,13 @@ def test_a_file_gives_options_and_the_command_line_wins(tmp_path):
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        ("max_stepz = 3", "Did you mean max_steps"),
+        ("max_stepz = 3", r"max_steps\?"),
         ("max_steps = [1]", "max_steps"),
         ("max_steps = true", "max_steps"),
         ("max_steps 3", r"run\.toml"),
     ],
 )
-def test_what_is_no_option_is_told(content, said, tmp_path):
+def test_a_wrong_option_of_a_config_is_named(content, said, tmp_path):
     (tmp_path / "run.toml").write_text(content)
     with pytest.raises(SceneFormatError, match=said):
         parse(["--config", str(tmp_path / "run.toml")])
@@ -114,8 +115,7 @@ def test_refined_poses_are_what_is_trained_scored_and_shown(
 ):
     run = splatseed("train", bare, *SHORT, "--refine-poses", "-o", tmp_path / "run")
     assert (run.code, run.err) == (0, "")
-    assert "note: Refined poses lower the mean reprojection error from 9.00 to 0.50 px" in run.out
-    assert "Seeds: leave the points as they are." in run.out
+    assert re.search(r"9\.00 .* 0\.50 px", run.out)
     config = json.loads((tmp_path / "run/config.json").read_text())
     assert (config["scene"], config["refine_poses"]) == (str(bare), True)
     moved = (tmp_path / "run").rename(tmp_path / "moved")
@@ -139,17 +139,17 @@ def test_refined_poses_are_what_is_trained_scored_and_shown(
 
 @pytest.fixture
 def refused(splatseed):
-    """Checks that ``train`` refuses words in one sentence that says something."""
+    """Checks that ``train`` refuses options with one error, which names something."""
 
-    def check(said, *words):
+    def check(named, *words):
         run = splatseed("train", *words)
         assert (run.code, run.err.count("error:")) == (2, 1)
-        assert said in run.err
+        assert named in run.err
 
     return check
 
 
-def test_a_run_goes_on_at_the_poses_and_photographs_that_it_began_with(
+def test_a_resumed_run_keeps_its_poses_and_photographs(
     bare, refining, splatseed, refused, tmp_path
 ):
     run, scene = tmp_path / "run", load_scene(bare, require_points=False)
@@ -158,7 +158,7 @@ def test_a_run_goes_on_at_the_poses_and_photographs_that_it_began_with(
     _unfinish(run)
     fewer = scene.replace(images=scene.images[1:])
     write_scene(fewer, tmp_path / "fewer", require_points=False)
-    refused("found other images in", tmp_path / "fewer", "--resume", "-o", run)
+    refused(str(tmp_path / "fewer"), tmp_path / "fewer", "--resume", "-o", run)
     resumed = splatseed("train", bare, "--resume", "-o", run)
     assert (resumed.code, resumed.err) == (0, "")
     assert len(refining) == 1
@@ -168,11 +168,13 @@ def test_a_run_goes_on_at_the_poses_and_photographs_that_it_began_with(
     refused(str(run / "scene"), bare, "--resume", "-o", run)
 
 
-def test_what_refining_does_not_go_with(room, refining, splatseed, refused, tmp_path):
+def test_refine_poses_is_refused_on_a_resumed_run_and_on_seeds(
+    room, refining, splatseed, refused, tmp_path
+):
     run, seeded = tmp_path / "run", tmp_path / "seeded"
     assert splatseed("train", room, *SHORT, "-o", run).code == 0
     _unfinish(run)
-    refused("--refine-poses False, as when", room, "--refine-poses", "--resume", "-o", run)
+    refused("--refine-poses", room, "--refine-poses", "--resume", "-o", run)
     # Seeds would be thrown away.
     assert splatseed("upsample", room, "--method", "linear", "-o", seeded).code == 0
     words = (seeded, *SHORT, "--refine-poses", "-o", tmp_path / "other")

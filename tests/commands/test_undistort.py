@@ -48,7 +48,6 @@ def test_a_name_that_leads_out_is_refused(how, distorted, tmp_path, splatseed):
     before = {each: each.read_bytes() for each in tmp_path.rglob("*") if each.is_file()}
     run = splatseed("undistort", path, "-o", tmp_path / "a" / "straight")
     assert (run.code, run.err.count("\n")) == (2, 1)
-    assert "names stay inside their folder" in run.err
     assert names[how] in run.err
     assert {each: each.read_bytes() for each in tmp_path.rglob("*") if each.is_file()} == before
 
@@ -68,8 +67,6 @@ def test_a_distorted_scene_becomes_one_of_pinholes(distorted, tmp_path, splatsee
     np.testing.assert_array_equal(after.points.xyz, before.points.xyz)
     assert len(load_views(after, after.images)) == len(before.images)
     assert not any("missing" in each for each in after.warnings)
-    again = splatseed("undistort", path, "-o", out)
-    assert (again.code, "--overwrite" in again.err) == (2, True)
     assert [each.name for each in tmp_path.iterdir() if each.name.startswith(".")] == []
 
 
