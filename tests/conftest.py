@@ -29,7 +29,7 @@ SCENES = Path(os.environ.get("SPLATSEED_SCENES", Path(__file__).parents[2] / "sh
 @pytest.fixture(autouse=True)
 def _untold_compilation(monkeypatch):
     """What commands say on stderr must not depend on what is compiled already."""
-    monkeypatch.setattr("splatseed.console.TOLD_AFTER", math.inf)
+    monkeypatch.setattr("splatseed.console.MIN_LOGGED_COMPILATION", math.inf)
 
 
 @pytest.hookimpl(wrapper=True)

@@ -64,7 +64,7 @@ def test_a_log_has_a_line_per_stage_with_its_count(capsys, monkeypatch):
 def test_a_log_is_told_once_of_compilation_that_takes_long(capsys, monkeypatch):
     now = iter(range(0, 1000, 10))
     monkeypatch.setattr(console.time, "perf_counter", lambda: float(next(now)))
-    monkeypatch.setattr(console, "TOLD_AFTER", 3.0)
+    monkeypatch.setattr(console, "MIN_LOGGED_COMPILATION", 3.0)
     with stage_display() as clock:
         clock("fit", 0.0)
         for _ in range(2):

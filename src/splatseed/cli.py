@@ -1,4 +1,4 @@
-"""The command line: picks the verb, runs it, and turns our errors into one line and exit code 2."""
+"""Run a verb; print an error as one line, with exit code 2."""
 
 from __future__ import annotations
 
@@ -38,12 +38,15 @@ COMPLETION = "--tyro-print-completion"
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run ``splatseed VERB ...``; exits with 2 when the input is at fault."""
+    """Run ``splatseed VERB ...``.
+
+    Exit codes: 0, 2 for an error of the input or the machine, 130 or 143 after Ctrl-C or SIGTERM.
+    """
     words = sys.argv[1:] if arguments is None else arguments
     set_thread_defaults()
     try:
         with _termination_raised():
-            _act(words)
+            _run_verb(words)
             sys.stdout.flush()
     except SplatseedError as error:
         _fail(str(error))
@@ -60,7 +63,7 @@ def main(arguments: list[str] | None = None) -> None:
             "(--data-factor) or fewer Gaussians, close other programs on the GPU, or pass "
             "--backend cpu if the verb has it."
         )
-    except BrokenPipeError:  # who reads the output has read enough
+    except BrokenPipeError:  # the reader closed the pipe
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # or Python reports it once more at exit
         sys.exit(1)
     except OSError as error:
@@ -69,15 +72,15 @@ def main(arguments: list[str] | None = None) -> None:
         _fail(f"expected to read the input and write the output; found {found}. Check the disk.")
     except KeyboardInterrupt as stop:
         kept = " ".join(getattr(stop, "__notes__", ()))
-        told = f". {kept}" if kept else "; nothing was left half-written"
-        ERR.print(f"\ninterrupted{told}", soft_wrap=True)
+        state = f". {kept}" if kept else "; no incomplete output was left"
+        ERR.print(f"\ninterrupted{state}", soft_wrap=True)
         sys.exit(exit_code(stop))
 
 
-def _act(words: list[str]) -> None:
+def _run_verb(words: list[str]) -> None:
     verb = words[0] if words else "--help"
     if verb in VERBS:
-        # Import only this verb: --help must not wait for Numba.
+        # Only this verb is imported, so that --help does not wait for Numba.
         import_module(f"splatseed.commands.{verb}").run(words[1:])
     elif verb in {"-h", "--help"}:
         _print_help()
@@ -102,7 +105,7 @@ def _act(words: list[str]) -> None:
 
 @contextmanager
 def _termination_raised() -> Iterator[None]:
-    """Have SIGTERM raise an exception while the block runs, so that half-written files go."""
+    """Raise an exception on SIGTERM while the block runs, so that incomplete files are removed."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

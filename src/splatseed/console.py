@@ -1,8 +1,8 @@
-"""The terminal: progress bars on stderr, results on stdout.
+"""Print results to stdout, and progress bars to stderr.
 
-Promise: nothing is drawn when stderr is not a terminal, where long work prints a line per stage
-instead; a stage's time runs until the next begins;
-what is printed is shown as it is, so that no file name can colour, move or rewrite anything.
+If stderr is not a terminal, nothing is drawn; long work prints a line per stage. A stage's time
+runs until the next one starts. Control characters are escaped, so that no file name can colour the
+terminal, move its cursor or rewrite a line.
 """
 
 from __future__ import annotations
@@ -30,47 +30,48 @@ OPTIONS = {"cap_max": "budget", "seeding": "seeds", "depths": "depth"}
 
 
 class LiteralConsole(Console):
-    """A console without markup, emoji and highlighting, that escapes what terminals act on."""
+    """A console without markup, emoji and highlighting that escapes control characters."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(markup=False, emoji=False, highlight=False, **options)
 
     def render_str(self, text: str, **options: Any) -> Text:
-        """Text unchanged but for control characters; Rich calls this for every string."""
+        """Escape control characters but newlines; Rich calls this for every string."""
         return super().render_str(visible(text, keep="\n"), **options)
 
 
 OUT = LiteralConsole()
 ERR = LiteralConsole(stderr=True)
-WIDEST = 1000
-"""Most characters of a table's line in a file."""
-COMPILE = "compiling kernels"
-LINE_AFTER = 30.0
-"""Seconds between lines on a stage that goes on, off a terminal."""
-TOLD_AFTER = 3.0
-"""Compilations shorter than this many seconds are not logged."""
+FILE_WIDTH = 1000
+"""Width of tables in a file, in characters."""
+COMPILATION = "compiling kernels"
+"""The stage of compilation."""
+LINE_INTERVAL = 30.0
+"""Seconds between lines on a running stage, if stderr is not a terminal."""
+MIN_LOGGED_COMPILATION = 3.0
+"""Compilations of fewer seconds are not logged."""
 
 
 class _Bars(rich_progress.BarColumn):
     def render(self, task: rich_progress.Task) -> ProgressBar:
-        """A stage's bar, which stands still until it begins; Rich's would pulse."""
+        """Return a stage's bar; Rich's would pulse until the stage starts."""
         bar = super().render(task)
         bar.pulse = False
         return bar
 
 
 class _Lines:
-    """A ``Progress`` that prints a line when a stage ends, and now and then before."""
+    """A ``Progress`` that prints a line when a stage ends, and every ``LINE_INTERVAL`` before."""
 
     def __init__(self, items: Mapping[str, tuple[int, str]]) -> None:
-        self._items = items  # how many of what a stage goes through
-        self._times: dict[str, tuple[float, float]] = {}  # of a stage's start and its last line
+        self._items = items  # by stage: the number of items, and their noun
+        self._times: dict[str, tuple[float, float]] = {}  # by stage: its start, its last line
         self._ended = set[str]()
 
     def __call__(self, stage: str, fraction: float) -> None:
         now = time.perf_counter()
         start, last = self._times.setdefault(stage, (now, now))
-        if stage in self._ended or (fraction < 1 and now - last < LINE_AFTER):
+        if stage in self._ended or (fraction < 1 and now - last < LINE_INTERVAL):
             return
         self._times[stage] = start, now
         total, noun = self._items.get(stage, (0, ""))
@@ -82,7 +83,7 @@ class _Lines:
 
 
 class StageClock:
-    """A ``Progress`` that times the stages and, within ``stage_display``, shows them."""
+    """A ``Progress`` that times stages and, within ``stage_display``, shows them."""
 
     def __init__(self) -> None:
         self._lines: _Lines | None = None
@@ -91,11 +92,11 @@ class StageClock:
         self._tasks: dict[str, rich_progress.TaskID] = {}
         self._started: list[tuple[str, float]] = []
         self._compiling = 0
-        self._before = COMPILE
-        self._told = 0.0
+        self._before = COMPILATION
+        self._logged = 0.0
 
     def __call__(self, stage: str, fraction: float) -> None:
-        """Note that ``fraction`` of ``stage`` is done."""
+        """Record that ``fraction`` of ``stage`` is done."""
         if not self._started or self._started[-1][0] != stage:
             self._started.append((stage, time.perf_counter()))
         if self._lines is not None:
@@ -106,17 +107,17 @@ class StageClock:
             self._bar.update(self._tasks[stage], completed=fraction)
 
     def expect(self, *stages: str) -> None:
-        """Show stages that are still to come, so that the user sees what is left."""
+        """Show stages that are still to come."""
         for stage in stages:
             if self._bar is not None and stage not in self._tasks:
                 self._tasks[stage] = self._bar.add_task(stage, total=1.0, start=False)
 
     def count(self, number: int, noun: str, *stages: str) -> None:
-        """Say that stages go through so many items; lines off a terminal have their number."""
+        """Set the number of items of some stages, which lines off a terminal show."""
         self._items |= dict.fromkeys(stages, (number, noun))
 
     def seconds(self) -> dict[str, float]:
-        """Wall time of each stage so far, in order of first appearance."""
+        """Return the wall time of each stage so far, in order of first appearance."""
         if not self._started:
             return {}
         ends = [start for _, start in self._started[1:]] + [time.perf_counter()]
@@ -126,31 +127,31 @@ class StageClock:
         return total
 
     def compilation(self, begins: bool) -> None:
-        """Count time as compilation, and show it, until each that began has ended."""
+        """Count and show the time from the first compilation that begins to the last that ends."""
         self._compiling += 1 if begins else -1
-        if self._compiling != int(begins):  # within another
+        if self._compiling != int(begins):  # nested in another
             return
         if begins:
-            self._before = self._started[-1][0] if self._started else COMPILE
-        self._started.append((COMPILE if begins else self._before, time.perf_counter()))
+            self._before = self._started[-1][0] if self._started else COMPILATION
+        self._started.append((COMPILATION if begins else self._before, time.perf_counter()))
         if self._bar is not None and begins:
-            note = f"{COMPILE} (first use only, then cached)"
-            self._tasks[COMPILE] = self._bar.add_task(note, total=None)
-        elif self._bar is not None and COMPILE in self._tasks:
-            self._bar.remove_task(self._tasks.pop(COMPILE))
+            note = f"{COMPILATION} (first use only, then cached)"
+            self._tasks[COMPILATION] = self._bar.add_task(note, total=None)
+        elif self._bar is not None and COMPILATION in self._tasks:
+            self._bar.remove_task(self._tasks.pop(COMPILATION))
 
     @contextmanager
     def _shown(self, bar: rich_progress.Progress | None) -> Iterator[None]:
-        """Show the stages while the block runs; then tell how long compilation took, if long."""
+        """Show the stages while the block runs; then log the time of compilation if it was long."""
         self._bar, self._tasks = bar, {}
         try:
             yield
         finally:
             self._bar = None
-        since = self.seconds().get(COMPILE, 0.0) - self._told
-        if since > TOLD_AFTER:
-            self._told += since
-            ERR.print(f"{COMPILE} took {since:.0f} s; cached for the next run")
+        since = self.seconds().get(COMPILATION, 0.0) - self._logged
+        if since > MIN_LOGGED_COMPILATION:
+            self._logged += since
+            ERR.print(f"{COMPILATION} took {since:.0f} s; cached for the next run")
 
 
 @contextmanager
@@ -159,8 +160,10 @@ def stage_display(
 ) -> Iterator[StageClock]:
     """Show progress bars on stderr while the block runs; print to stdout only outside the block.
 
-    A ``clock`` that was shown before goes on; ``remaining`` shows the time left, too, for stages
-    that take minutes. With ``lines``, each stage prints a line where stderr is not a terminal.
+    Args:
+        clock: A clock of an earlier block, to continue.
+        remaining: Also show the time left, for stages that take minutes.
+        lines: Print a line per stage if stderr is not a terminal.
     """
     clock = StageClock() if clock is None else clock
     named, left = (
@@ -201,7 +204,7 @@ def _option(argument: re.Match[str]) -> str:
 
 
 def print_pairs(title: str, rows: Sequence[tuple[str, str]]) -> None:
-    """Print names and their values, or commands, unwrapped so that they can be copied."""
+    """Print labels with their values, unwrapped so that they can be copied."""
     _print_title(title)
     width = max((len(label) for label, _ in rows), default=0)
     for label, value in rows:
@@ -215,15 +218,15 @@ def print_note(note: str) -> None:
 
 
 def print_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print a table whose first column names the row."""
+    """Print a table; the first column is left-aligned, the others right-aligned."""
     table = Table(box=None, pad_edge=False)
     for i, name in enumerate(header):
         table.add_column(name, justify="left" if i == 0 else "right")
     for row in rows:
         table.add_row(*map(visible, row))
     _print_title(title)
-    # A file has no edge at which names would have to be cut short.
-    (OUT if OUT.is_terminal else LiteralConsole(file=OUT.file, width=WIDEST)).print(table)
+    # In a file, no name needs to be cut off at an edge.
+    (OUT if OUT.is_terminal else LiteralConsole(file=OUT.file, width=FILE_WIDTH)).print(table)
 
 
 def _print_title(title: str) -> None:

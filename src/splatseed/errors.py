@@ -1,6 +1,6 @@
-"""The errors that splatseed raises on purpose; anything else that escapes is a bug of ours.
+"""The errors that splatseed raises on purpose; any other is a bug.
 
-Each says what was expected, what was found and how to mend it, in one line a user can act on::
+The message says in one line what was expected, what was found, and how to fix it::
 
     SplatseedError
     ├── InputError    the user's data or options
@@ -14,8 +14,8 @@ A message names an argument in backticks, as Python code: `ratio`, `max_steps=70
 `--overwrite`; ``console.with_options``), so messages of the library contain no options. Text values
 are quoted: ``f"`masks={str(folder)!r}`"``. Notes follow the same rule.
 
-Those in parentheses are also Python's own, which callers may expect: an ``except OSError`` or
-``except ValueError`` around code that raises ours must let them pass first.
+The classes in parentheses are Python's, which callers may catch. Inside splatseed, an ``except
+OSError`` or ``except ValueError`` that converts errors must re-raise a ``SplatseedError``.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ class SplatseedError(Exception):
     """Base of every error raised on purpose.
 
     Args:
-        expected: What should have been there, naming the file, line or record.
-        found: What was there instead.
-        fix: What the user can do about it.
+        expected: What was expected, naming the file, line or record.
+        found: What was found instead.
+        fix: What the user can do.
     """
 
     def __init__(self, expected: str, *, found: str, fix: str) -> None:
@@ -39,24 +39,24 @@ class SplatseedError(Exception):
         self.fix = fix
 
     def __str__(self) -> str:
-        """The sentence; ``KeyError`` would quote it."""
+        """Return the message; ``KeyError`` would quote it."""
         return str(self.args[0])
 
     def __reduce__(self) -> tuple[partial[SplatseedError], tuple[str]]:
-        """Makes errors with keyword-only arguments picklable."""
+        """Make errors with keyword-only arguments picklable."""
         return partial(type(self), found=self.found, fix=self.fix), (self.expected,)
 
 
 class InputError(SplatseedError):
-    """The user's data or options are at fault."""
+    """The user's data or arguments are wrong."""
 
 
 class SceneNotFoundError(InputError, FileNotFoundError):
-    """There is no scene, model, image or file where one was named."""
+    """A scene, model, image or file does not exist."""
 
 
 class SceneFormatError(InputError):
-    """A file is there but is not what its format promises."""
+    """A file does not follow its format."""
 
 
 class PointCloudError(InputError, ValueError):
@@ -64,24 +64,24 @@ class PointCloudError(InputError, ValueError):
 
 
 class ParameterError(InputError, ValueError):
-    """An option or a method's parameter is out of its range."""
+    """An argument is out of its range."""
 
 
 class UnknownNameError(ParameterError, KeyError):
-    """There is nothing of that name to choose."""
+    """No choice has this name."""
 
 
 class OutputError(InputError):
-    """The output cannot, or must not, be written where it was asked for."""
+    """The output cannot or must not be written there."""
 
 
 class ReconstructionError(SplatseedError):
-    """Structure-from-Motion ran and did not succeed."""
+    """Structure-from-Motion failed."""
 
 
 class MissingDependencyError(SplatseedError):
-    """An optional package is needed and absent."""
+    """An optional package is not installed."""
 
 
 class TaskLostError(SplatseedError):
-    """A task was lost with its process or node too often."""
+    """The process or node of a task died too often."""

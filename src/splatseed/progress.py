@@ -1,8 +1,8 @@
-"""Progress: how long work tells a caller how far it is.
+"""Report progress and notes to the caller.
 
 A ``Progress`` is any callable that takes a stage's name and the fraction of it that is done, from
-0 to 1. Library functions take one and default to ``silent``; the command line passes a rich bar. A
-``Note`` is called with a sentence that the user should read.
+0 to 1. Library functions default to ``silent``; the command line passes a progress bar. A ``Note``
+takes a sentence for the user.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ Progress: TypeAlias = Callable[[str, float], None]
 Note: TypeAlias = Callable[[str], None]
 
 thread_limit: ContextVar[int | None] = ContextVar("thread_limit", default=None)
-"""Most threads of ``in_threads``; as many as there are cores if None."""
+"""Maximum threads of ``in_threads``; None for one per CPU."""
 
 
 def silent(stage: str, fraction: float) -> None:
-    """Report to nobody."""
+    """Ignore the progress."""
 
 
-def silent_note(sentence: str) -> None:
-    """Discard the sentence."""
+def silent_note(note: str) -> None:
+    """Ignore the note."""
 
 
 def blocks(total: int, size: int, stage: str, progress: Progress) -> Iterator[tuple[int, int]]:
-    """Consecutive ``(start, stop)`` pieces of ``range(total)``, reporting after each."""
+    """Yield consecutive ``(start, stop)`` pieces of ``range(total)``; report after each."""
     progress(stage, 0.0)
     for start in range(0, total, size):
         stop = min(start + size, total)
@@ -42,8 +42,8 @@ def in_threads(
 ) -> None:
     """Call ``work(start, stop)`` on pieces of ``range(total)`` on all cores; report after each.
 
-    For work that releases the GIL. An interrupt is raised only once the running pieces are done:
-    SciPy's own ``workers`` keep running on arrays that are then freed, which crashes.
+    ``work`` should release the GIL. An interrupt is raised once the running pieces are done: with
+    SciPy's own ``workers``, threads go on with arrays that are already freed, and crash.
     """
     progress(stage, 0.0)
     starts = range(0, total, size)

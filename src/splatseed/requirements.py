@@ -1,4 +1,4 @@
-"""Optional packages: checking that they are installed, and how to install them."""
+"""Check that optional packages are installed, and suggest how to install them."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ EXTRAS = {
     "exr": ("OpenEXR>=3.3",),
     "tensorboard": ("tensorboard>=2.14",),
 }
-"""What to ask pip for, as in pyproject.toml: splatseed's extras can only be installed from its
-folder. A package's own extra is the first that has it."""
+"""Requirements by extra, as in pyproject.toml; messages list them, since an extra can only be
+installed from splatseed's folder. A package belongs to the first extra that has it."""
 _TESTED = Path(__file__).parents[2] / "constraints.txt"
-"""The versions that were tested; there only if splatseed runs from its own folder."""
+"""The tested versions; absent unless splatseed runs from its own folder."""
 
 
 def require(*packages: str) -> None:
-    """Check that packages are installed, without importing them.
+    """Check that packages are installed; does not import them.
 
     Raises:
         MissingDependencyError: One is absent.
@@ -55,10 +55,10 @@ def require(*packages: str) -> None:
 
 
 def install_command(*packages: str, upgrade: bool = False) -> str:
-    """The command that installs packages, and what else their extra lacks, for this Python.
+    """Return the command that installs packages, and what else their extras lack, for this Python.
 
     Args:
-        packages: Names of modules that ``EXTRAS`` has.
+        packages: Names of modules of ``EXTRAS``.
         upgrade: Replace an older version.
     """
     wanted: dict[str, None] = {}

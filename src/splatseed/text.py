@@ -1,7 +1,7 @@
-"""Names, numbers, bytes and errors as text that terminals, shells and people take as it is meant.
+"""Format names, numbers, bytes and errors for terminals, shells and users.
 
-Promise: whatever characters a name has, it can neither move the cursor, colour the terminal, begin
-a new line, nor change the command it is printed in.
+A name, whatever its characters, can neither move the cursor, colour the terminal or start a line
+(``visible``), nor change the command it is printed in (``quoted``).
 """
 
 from __future__ import annotations
@@ -13,10 +13,11 @@ from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 
-MOST_TOLD = 160
+MAX_ERROR_LENGTH = 160
+"""Characters of an error of another library that messages repeat."""
 OBJECT = re.compile(r"<[\w.]+[^<>]*(?: at 0x[0-9a-f]+|name=[^<>]*)>")
-"""How Python shows an object that has no text of its own."""
-SAID = {
+"""The default ``repr`` of a Python object."""
+ERROR_TEXTS = {
     "builtins.IndexError": "fewer values than expected",
     "builtins.RecursionError": "values nested too deep",
     "builtins.TypeError": "a value of another kind",
@@ -24,17 +25,17 @@ SAID = {
     "PIL.UnidentifiedImageError": "no picture of a known format",
     "struct.error": "fewer bytes than expected",
 }
-"""Exceptions whose own words are meant for programmers."""
+"""Texts for exceptions whose own texts are meant for programmers."""
 
 
 def visible(text: object, keep: str = "") -> str:
-    r"""Text with every control character but those to ``keep`` written as an escape.
+    r"""Escape the control characters of a text, but those in ``keep``.
 
     Example:
         >>> print(visible("a\x1b[31mb"), visible("写真 1"))
         a\x1b[31mb 写真 1
     """
-    return "".join(each if each in keep or _shows(each) else _escape(each) for each in str(text))
+    return "".join(c if c in keep or _is_visible(c) else _escape(c) for c in str(text))
 
 
 def quoted(path: Path | str) -> str:
@@ -49,28 +50,28 @@ def quoted(path: Path | str) -> str:
 
 
 def describe_error(error: Exception) -> str:
-    """What the exception of a library says about a file, in words for its user.
+    """Describe another library's exception about a file, for the user.
 
     Example:
         >>> describe_error(KeyError("scale")), describe_error(ValueError("File is not a zip file"))
         ("no 'scale'", 'File is not a zip file')
     """
     kind = type(error).__name__
-    said = SAID.get(f"{type(error).__module__}.{kind}")
-    text = " ".join(OBJECT.sub("", str(error)).split())[:MOST_TOLD]
+    known = ERROR_TEXTS.get(f"{type(error).__module__}.{kind}")
+    text = " ".join(OBJECT.sub("", str(error)).split())[:MAX_ERROR_LENGTH]
     if isinstance(error, KeyError):
         return f"no {text}"
-    return said or (text if " " in text else f"{kind} {text}".strip())
+    return known or (text if " " in text else f"{kind} {text}".strip())
 
 
-def beginning(data: bytes, most: int = 16) -> str:
-    r"""The first bytes of a file: as text if they are text, else as hexadecimal numbers.
+def beginning(data: bytes, limit: int = 16) -> str:
+    r"""Show the first bytes of a file, as text if they are ASCII, else as hexadecimal numbers.
 
     Example:
         >>> print(beginning(b"solid\n"), "and", beginning(bytes([137, 80, 0])))
         'solid' and the bytes 89 50 00
     """
-    first = data[:most]
+    first = data[:limit]
     if not first:
         return "an empty file"
     text = first.decode("ascii", "replace").strip()
@@ -80,36 +81,36 @@ def beginning(data: bytes, most: int = 16) -> str:
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """A question with the known word most similar to another, and a space; empty if none is.
+    """Ask for the most similar known word, with a space at the end; empty if none is similar.
 
-    Dashes in front, which all options share, make no words similar.
+    Leading dashes do not count.
 
     Example:
         >>> did_you_mean("--ratoi", ["--ratio", "--seed"])
         'Did you mean --ratio? '
     """
-    bare = {each.lstrip("-"): each for each in known}
-    close = get_close_matches(word.lower().lstrip("-"), list(bare), n=1, cutoff=0.6)
-    return f"Did you mean {bare[close[0]]}? " if close else ""
+    by_name = {word.lstrip("-"): word for word in known}
+    close = get_close_matches(word.lower().lstrip("-"), list(by_name), n=1, cutoff=0.6)
+    return f"Did you mean {by_name[close[0]]}? " if close else ""
 
 
 def counted(number: int, noun: str) -> str:
-    """A number and what it counts: "1 test view", "2,300 points"."""
+    """Format a number of things: "1 test view", "2,300 points"."""
     return f"{number:,} {noun}{'' if number == 1 else 's'}"
 
 
-def name_some(names: Sequence[str], most: int = 8) -> str:
-    """The first few of some names, and how many more there are."""
-    more = len(names) - most
-    return ", ".join(names[:most]) + (f" and {more:,} more" if more > 0 else "")
+def name_some(names: Sequence[str], limit: int = 8) -> str:
+    """List the first names, and the number of the others."""
+    more = len(names) - limit
+    return ", ".join(names[:limit]) + (f" and {more:,} more" if more > 0 else "")
 
 
-def agreeing(number: int, one: str, more: str) -> str:
-    """The word that agrees with a number of things: ``one`` or ``more``."""
-    return one if number == 1 else more
+def agreeing(number: int, singular: str, plural: str) -> str:
+    """Choose the form of a word that agrees with a number."""
+    return singular if number == 1 else plural
 
 
-def _shows(character: str) -> bool:
+def _is_visible(character: str) -> bool:
     return character.isprintable() or unicodedata.category(character) == "Zs"
 
 

@@ -86,6 +86,6 @@ def test_a_container_has_less_than_its_machine(monkeypatch, tmp_path):
 
 
 def test_amounts_of_memory():
-    bytes_of = memory.bytes_of
-    assert bytes_of("4G") == bytes_of("4GB") == bytes_of(" 4gib ") == 4 << 30
-    assert (bytes_of("500M"), bytes_of("123"), bytes_of("1.5K")) == (500 << 20, 123, 1536)
+    parse_bytes = memory.parse_bytes
+    assert parse_bytes("4G") == parse_bytes("4GB") == parse_bytes(" 4gib ") == 4 << 30
+    assert (parse_bytes("500M"), parse_bytes("123"), parse_bytes("1.5K")) == (500 << 20, 123, 1536)

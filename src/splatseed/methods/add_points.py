@@ -89,7 +89,7 @@ def number_of_new(
                 found="none" if num_points is None else f"{num_points}",
                 fix="Say how many.",
             )
-        fix = "Ask for {most} in all, with `num_points` or a smaller `ratio`."
+        fix = "Ask for {limit} in all, with `num_points` or a smaller `ratio`."
         check_memory(total, BYTES_EACH, "points", fix=fix)
         return total - num_original
     if ratio is not None or num_points is not None:

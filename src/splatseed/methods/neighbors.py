@@ -95,7 +95,7 @@ class PreparedCloud:
             )
         check_memory(
             k, NEIGHBOR_BYTES * len(self), f"neighbours of each of {len(self):,} points",
-            fix="Pass a smaller k, {most} at most, or close other programs.",
+            fix="Pass a smaller k, {limit} at most, or close other programs.",
         )  # fmt: skip
         tree, idx = self.tree, np.empty((len(self), k), np.int32)
         row_of_rank = np.empty(len(self), np.int32)

@@ -1,7 +1,7 @@
-"""Ctrl-C that waits for the end of a step.
+"""Delay Ctrl-C to the end of a step.
 
-Promise: while the block runs, the first SIGINT or SIGTERM only sets a flag, so that a run stops
-between two steps; a second one interrupts at once, as usual. The previous handlers are restored.
+While the block runs, the first SIGINT or SIGTERM sets a flag, so that a run stops between steps; a
+second one raises KeyboardInterrupt at once. The previous handlers are restored.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from types import FrameType
 
 
 class Termination(KeyboardInterrupt):
-    """SIGTERM, as schedulers send it: cleanup runs as after Ctrl-C."""
+    """SIGTERM, as schedulers send it; cleanup runs as after Ctrl-C."""
 
 
 class Interruption:
-    """Whether the user asked to stop (``requested``); ``last`` is the last signal of any block."""
+    """A signal handler; ``requested`` is True after a signal, ``last`` is the last of any block."""
 
     last = signal.SIGINT
 
@@ -34,7 +34,7 @@ class Interruption:
 
 
 def exit_code(stop: KeyboardInterrupt | None = None) -> int:
-    """A shell's exit code of a process that was asked to stop, by what was raised if anything."""
+    """Return the shell's exit code for the signal that ended the process."""
     return 128 + (signal.SIGTERM if isinstance(stop, Termination) else Interruption.last)
 
 
@@ -45,7 +45,7 @@ def interruption() -> Iterator[Interruption]:
     if threading.current_thread() is not threading.main_thread():
         yield flag
         return
-    before = {each: signal.signal(each, flag) for each in (signal.SIGINT, signal.SIGTERM)}
+    before = {n: signal.signal(n, flag) for n in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield flag
     finally:

@@ -1,8 +1,7 @@
-"""Memory: how much is free, how much was taken, and refusing early what cannot fit.
+"""Measure free memory, and refuse requests that cannot fit.
 
-Promise: where the system does not tell how much is free, nothing is refused. An estimate counts
-only what is certainly held at once, so what is refused would have failed; what is admitted may
-still fail.
+Estimates are lower bounds: a refused request cannot fit, an accepted one may not. Where free memory
+is unknown, nothing is refused.
 """
 
 from __future__ import annotations
@@ -17,33 +16,37 @@ from splatseed.errors import ParameterError
 
 CGROUP = Path("/sys/fs/cgroup")
 PROCESS = 300 << 20
-"""Bytes of a process before it holds any points: libraries, compiled kernels, and their slack."""
+"""Bytes of a process without points: libraries, compiled kernels, and their slack."""
 UNITS = {"K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
 
 
 def check_memory(count: int, bytes_each: int, what: str, *, found: str = "", fix: str) -> None:
-    """Refuse, by a ``ParameterError``, things that do not fit into the free memory.
+    """Raise a ``ParameterError`` if a number of items does not fit into free memory.
 
     Args:
-        count: How many are wanted.
-        bytes_each: What each takes.
-        what: Their name.
-        found: What was asked for, in words; the count when left out.
-        fix: What the user can do; ``{most}`` in it becomes the number that fits.
+        count: The number of items.
+        bytes_each: Bytes per item.
+        what: The items' name.
+        found: The request, for the message; the count if empty.
+        fix: What the user can do; ``{limit}`` in it becomes the number that fits.
     """
     free = free_memory()
     if free is None or count * bytes_each <= free:
         return
-    most = max(free // bytes_each, 0)
+    limit = max(free // bytes_each, 0)
     raise ParameterError(
-        f"at most {most:,} {what}, which the {free / 1e9:.1f} GB of free memory hold",
+        f"at most {limit:,} {what}, which the {free / 1e9:.1f} GB of free memory hold",
         found=found or f"{count:,}",
-        fix=fix.replace("{most}", str(most)),
+        fix=fix.replace("{limit}", str(limit)),
     )
 
 
-def bytes_of(text: str) -> int:
-    """An amount of memory such as 4G, 500M or a number of bytes; else a ``ParameterError``."""
+def parse_bytes(text: str) -> int:
+    """Parse an amount of memory: 4G, 500M, or a number of bytes.
+
+    Raises:
+        ParameterError: It is none.
+    """
     plain = text.strip().upper().removesuffix("B").removesuffix("I")
     number, unit = (plain[:-1], UNITS[plain[-1]]) if plain[-1:] in UNITS else (plain, 1)
     with suppress(ValueError):
@@ -54,8 +57,8 @@ def bytes_of(text: str) -> int:
     )
 
 
-def words_of(amount: int, *, up: bool = False) -> str:
-    """Bytes in words: tenths of GB, or whole MB; rounded up on request."""
+def format_bytes(amount: int, *, up: bool = False) -> str:
+    """Format bytes as tenths of GB or whole MB; ``up`` rounds up."""
     unit, name, digits = (1 << 30, "GB", 1) if amount >= 1 << 30 else (1 << 20, "MB", 0)
     scaled = amount / unit * 10**digits
     rounded = (math.ceil(scaled) if up else round(scaled)) / 10**digits
@@ -69,17 +72,17 @@ def memory_argument(amount: int) -> str:
         >>> memory_argument(4_400_000_000)
         "`memory='4.1G'`"
     """
-    return f"`memory='{words_of(amount, up=True).replace(',', '')[:-1].replace(' ', '')}'`"
+    return f"`memory='{format_bytes(amount, up=True).replace(',', '')[:-1].replace(' ', '')}'`"
 
 
 def free_memory() -> int | None:
-    """Bytes that this process can still take; None where the system does not tell."""
+    """Return the bytes that this process can still allocate; None if unknown."""
     known = [free for free in (_of_machine(), _of_container()) if free is not None]
     return min(known, default=None)
 
 
 def _field(path: str, name: str) -> int | None:
-    """The number behind a name in a file of the system, such as ``VmHWM: 12 kB``."""
+    """Read the number after a name in a system file, such as ``VmHWM: 12 kB``."""
     with suppress(OSError):
         for line in Path(path).read_text("utf-8", "replace").splitlines():
             if line.startswith(name):
@@ -96,7 +99,7 @@ def _of_machine() -> int | None:
 
 
 def _of_container() -> int | None:
-    """What a container's limit leaves; cached files count as free, as the system drops them."""
+    """Return what a container's limit leaves; cached files, which can be dropped, count as free."""
     with suppress(OSError, ValueError):
         limit, used = (
             (CGROUP / f"memory.{name}").read_text("ascii").strip() for name in ("max", "current")
@@ -107,9 +110,9 @@ def _of_container() -> int | None:
 
 
 def peak_bytes() -> int | None:
-    """The peak memory of this process so far, in bytes; None where the system does not tell.
+    """Return the peak memory of this process in bytes; None if unknown.
 
-    On Linux, since the program was loaded: getrusage also counts the process that started it.
+    On Linux it is read from /proc, since getrusage includes the process that started this one.
     """
     if (kilobytes := _field("/proc/self/status", "VmHWM:")) is not None:
         return kilobytes * 1024
@@ -117,5 +120,5 @@ def peak_bytes() -> int | None:
         import resource  # noqa: PLC0415  (not on Windows)
     except ImportError:
         return None
-    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return most if sys.platform == "darwin" else most * 1024
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024

@@ -1,7 +1,6 @@
-"""The PyTorch device that a user's choice stands for, its free memory, and gsplat's kernels.
+"""Pick a PyTorch device, measure its free memory, and load gsplat's kernels.
 
-Promise: a requested GPU is used, or there is an error: it is never silently replaced. PyTorch is
-imported only when a device is picked.
+A requested GPU is used, or there is an error. PyTorch is imported only when a device is picked.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ def pick_torch_device(choice: DeviceName, argument: str) -> torch.device:
     Raises:
         ParameterError: CUDA is requested and PyTorch sees no GPU; the message names ``argument``.
     """
-    import torch  # noqa: PLC0415  (see the promise)
+    import torch  # noqa: PLC0415  (see the file's docstring)
 
     seen = torch.cuda.is_available()
     if choice == "cuda" and not seen:
@@ -54,12 +53,12 @@ def pick_torch_device(choice: DeviceName, argument: str) -> torch.device:
 
 
 def free_bytes(device: torch.device) -> int | None:
-    """Free memory of the device in bytes; None where the system does not tell."""
+    """Return the free memory of the device in bytes; None if unknown."""
     if device.type == "cuda":
-        import torch  # noqa: PLC0415  (see the promise)
+        import torch  # noqa: PLC0415  (see the file's docstring)
 
-        # PyTorch keeps freed blocks, which are free to us but for what the next render and its
-        # graph take again: as much as at the peak so far.
+        # PyTorch keeps freed blocks. They are free but for what the next render and its graph take
+        # again, which is as much as at the peak so far.
         kept = torch.cuda.memory_reserved(device) - torch.cuda.max_memory_allocated(device)
         return max(0, torch.cuda.mem_get_info(device)[0] + kept)
     return free_memory()
@@ -107,14 +106,14 @@ def load_kernels(argument: str, progress: Progress = silent) -> None:
                 loaded = getattr(import_module(BACKEND), "_C", None)
         except (ImportError, OSError, RuntimeError) as error:
             lines = [line for line in str(error).splitlines() if "error" in line.lower()]
-            told = (lines or [type(error).__name__])[0].strip()[:200]
-            raise _cannot_build(f"{told} ({tools['nvcc']})", argument) from error
+            reason = (lines or [type(error).__name__])[0].strip()[:200]
+            raise _cannot_build(f"{reason} ({tools['nvcc']})", argument) from error
     if loaded is None:
         raise _cannot_build("kernels that gsplat could not load", argument)
 
 
 def _cannot_build(found: str, argument: str) -> MissingDependencyError:
-    import torch  # noqa: PLC0415  (see the promise)
+    import torch  # noqa: PLC0415  (see the file's docstring)
 
     version = torch.version.cuda
     toolkit = f"the CUDA toolkit {version}" if version else "the CUDA toolkit of PyTorch's release"

@@ -15,7 +15,7 @@ from splatseed.io.nerfstudio import read_cloud_transform
 from splatseed.io.origin import find_shift
 from splatseed.io.staging import add_files, write_json
 from splatseed.progress import Progress
-from splatseed.runtime.memory import words_of
+from splatseed.runtime.memory import format_bytes
 from splatseed.scene import Scene
 from splatseed.similarity import Similarity
 from splatseed.text import visible
@@ -60,7 +60,7 @@ def load_cloud(options: Options, scene: Scene, method: Cloud, progress: Progress
     """Find the transform of the clouds into the scene's frame, and configure the method with it."""
     files, memory = options.cloud_files, options.memory_bytes
     plan = method.of(*files, memory=memory).plan(scene)
-    limit = f"at most {plan.capacity:,} voxels, {words_of(plan.memory)} of memory"
+    limit = f"at most {plan.capacity:,} voxels, {format_bytes(plan.memory)} of memory"
     memory_note = f"\n  -> {', '.join(visible(path) for path in files)}: {limit}"
     transform = alignment = None
     if options.cloud_transform is not None:

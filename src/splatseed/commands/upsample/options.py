@@ -13,7 +13,7 @@ import tyro
 from splatseed.commands.options import MaskChoice, check_minimum, parse_options, parse_some, refuse
 from splatseed.depthmap import DepthKind
 from splatseed.methods import METHODS, Profile, Upsampler, configure
-from splatseed.runtime.memory import bytes_of
+from splatseed.runtime.memory import parse_bytes
 from splatseed.seeding.advice import DEFAULT_METHOD
 from splatseed.text import quoted
 
@@ -97,7 +97,7 @@ class Options:
     @property
     def memory_bytes(self) -> int | None:
         """The memory limit in bytes; None if there is none."""
-        return None if self.memory is None else bytes_of(self.memory)
+        return None if self.memory is None else parse_bytes(self.memory)
 
 
 @dataclass(frozen=True)
