@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from splatseed.errors import ParameterError
 from splatseed.photos.view import View
-from splatseed.runtime.memory import free_memory, memory_argument, words_of
+from splatseed.runtime.memory import format_bytes, free_memory, memory_argument
 
 
 @dataclass(frozen=True)
@@ -55,9 +55,9 @@ def plan_memory(limit: int | None, views: Sequence[View]) -> MemoryPlan:
         by_user = limit is not None and allowed == limit
         argument = f"Pass {memory_argument(needed)}."
         raise ParameterError(
-            f"at least {words_of(needed, up=True)} of memory for a cloud and {len(views):,} "
+            f"at least {format_bytes(needed, up=True)} of memory for a cloud and {len(views):,} "
             "photographs",
-            found=words_of(allowed) + ("" if by_user else ", which are free"),
+            found=format_bytes(allowed) + ("" if by_user else ", which are free"),
             fix=argument if by_user else "Free some, or use a larger machine.",
         )
     capacity = min((allowed - fixed) // _MEMORY.per_voxel, _MEMORY.max_voxels)
