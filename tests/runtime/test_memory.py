@@ -19,7 +19,7 @@ from splatseed.photos.view import load_views
 from splatseed.pointcloud import PointCloud
 from splatseed.runtime import memory
 from splatseed.synthetic import make_capture, write_capture
-from splatseed.training.device import BYTES_EACH as BYTES_TRAINED
+from splatseed.training.settings import BYTES_PER_GAUSSIAN
 
 
 @pytest.fixture
@@ -67,9 +67,9 @@ def test_photographs_of_a_scene_and_what_stereo_holds_beside_them(free, scene):
 def test_the_runs_of_a_benchmark(free, scene, splatseed):
     words = ("bench", "--scenes", scene.source.root, "--methods", "sfm", "--jobs", 2, "--dry-run")
     points = len(scene.points)
-    free(points * 2 * BYTES_TRAINED)
+    free(points * 2 * BYTES_PER_GAUSSIAN)
     assert splatseed(*words).code == 0
-    free(points * 2 * BYTES_TRAINED - 1)
+    free(points * 2 * BYTES_PER_GAUSSIAN - 1)
     run = splatseed(*words)
     assert (run.code, f"at most {points - 1} seeds per run with 2" in run.err) == (2, True)
 
