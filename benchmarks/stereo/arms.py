@@ -22,7 +22,8 @@ import splatseed
 __all__ = ["ARMS", "FOLIAGE", "Arm", "apply_edits", "scores_of"]
 
 PACKAGE = Path(splatseed.__file__).parent
-COST, MATCH, START = "stereo/cost.py", "stereo/patchmatch.py", "stereo/start.py"
+COST, MATCH = "depth/stereo/_kernels/cost.py", "depth/stereo/_kernels/patchmatch.py"
+START = "depth/stereo/matching.py"
 THREADS = 2
 
 Edit = tuple[str, str, str]
@@ -37,9 +38,9 @@ class Arm:
 
 
 MEAN_OF_ALL = (
-    (COST, "least, second = broadcast(_WORST), broadcast(_WORST)", "least, second = broadcast(_NOTHING), broadcast(_NOTHING)"),  # noqa: E501  (the sources' own lines)
-    (COST, "least, second = minimum(least, cost), minimum(second, worse)", "least = add(least, cost)"),  # noqa: E501  (the sources' own lines)
-    (COST, "multiply(add(least, second), broadcast(_HALF))", "divide(least, broadcast(np.float32(len(sizes))))"),  # noqa: E501  (the sources' own lines)
+    (COST, "lowest, second = broadcast(_WORST), broadcast(_WORST)", "lowest, second = broadcast(_ZERO), broadcast(_ZERO)"),  # noqa: E501  (the sources' own lines)
+    (COST, "lowest, second = minimum(lowest, cost), minimum(second, higher)", "lowest = add(lowest, cost)"),  # noqa: E501  (the sources' own lines)
+    (COST, "multiply(add(lowest, second), broadcast(_HALF))", "divide(lowest, broadcast(np.float32(len(sizes))))"),  # noqa: E501  (the sources' own lines)
 )  # fmt: skip
 
 ARMS: dict[str, Arm] = {
@@ -53,7 +54,7 @@ ARMS: dict[str, Arm] = {
     "- no weights at all": Arm(
         edits=[
             (COST, "SIGMA_GREY = 25.0", "SIGMA_GREY = 1e6"),
-            (COST, "SIGMA_PLACE = 5.0", "SIGMA_PLACE = 1e6"),
+            (COST, "SIGMA_SPACE = 5.0", "SIGMA_SPACE = 1e6"),
         ]
     ),
     "- noise of 0.5": Arm(edits=[(COST, "NOISE = 0.1", "NOISE = 0.5")]),
@@ -62,15 +63,15 @@ ARMS: dict[str, Arm] = {
     "- no slopes": Arm(
         edits=[
             (MATCH, "DEPTH_CHANGE, SLOPE_CHANGE = 0.02, 0.5", "DEPTH_CHANGE, SLOPE_CHANGE = 0.02, 0.0"),  # noqa: E501  (the sources' own lines)
-            (START, "guesses[NEAREST] = _fit(", "guesses[NEAREST] = 0 * _fit("),
+            (START, "planes[num] = _fit_planes(", "planes[num] = 0 * _fit_planes("),
         ]
     ),
     "- slopes not refined": Arm(
         edits=[(MATCH, "DEPTH_CHANGE, SLOPE_CHANGE = 0.02, 0.5", "DEPTH_CHANGE, SLOPE_CHANGE = 0.02, 0.0")]  # noqa: E501  (the sources' own lines)
     ),
-    "- no arms": Arm(edits=[(MATCH, "for way in range(8):", "for way in range(4):")]),
+    "- no arms": Arm(edits=[(MATCH, "for direction in range(8):", "for direction in range(4):")]),
     "- start without the fitted plane": Arm(
-        edits=[(START, "guesses[NEAREST] = _fit(", "guesses[NEAREST] = 0 * _fit(")]
+        edits=[(START, "planes[num] = _fit_planes(", "planes[num] = 0 * _fit_planes(")]
     ),
     "- confirmed by 1": Arm({"min_agreeing": 1}),
     "- confirmed by 3": Arm({"min_agreeing": 3}),

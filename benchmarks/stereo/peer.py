@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from splatseed.depth.stereo._kernels.cost import (
-    LEAST,
+    MIN_EXPONENT,
     NOISE,
     RADIUS,
     SAMPLES,
@@ -63,7 +63,7 @@ def _window(image, u, v, weights, likeness):
         x, y = STRIDE * (k % SIDE - RADIUS), STRIDE * (k // SIDE - RADIUS)
         r = _bilinear(image, u + x - 0.5, v + y - 0.5)
         exponent = -0.5 * ((r - center) / SIGMA_GREY) ** 2 - 0.5 * (x * x + y * y) / SIGMA_SPACE**2
-        c = np.exp(max(exponent, 8 * LEAST))
+        c = np.exp(max(exponent, 8 * MIN_EXPONENT))
         weights[k], likeness[k] = c, r
         total, mean, square = total + c, mean + c * r, square + c * r * r
     mean, square = mean / total, square / total

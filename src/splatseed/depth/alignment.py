@@ -221,7 +221,7 @@ def lift_pixels(
 class Alignment:
     """Scale and shift from an image's depth map to scene units."""
 
-    scale: float  # scene units per unit of the map; of inverse depth, inverse ones
+    scale: float  # scene units per unit of the map; for inverse depth, 1 / scene units
     shift: float  # added after scaling; 0 except for inverse depth
     num_points: int  # SfM points on known depth
     residual: float  # median of their |aligned depth / depth of the point - 1|; NaN without any

@@ -64,7 +64,7 @@ def lift(
     Each image and its map are read once, and again only if too few candidates are sound.
 
     Returns:
-        World positions and colours, image after image, and notes on what was left out.
+        World positions and colours, image after image, and notes for the user.
 
     Raises:
         SceneNotFoundError: There are no maps or no photographs, or a file is gone.

@@ -29,7 +29,7 @@ class DepthSettings:
     synchronize_scales: bool = True
     """Then scale the maps, each by one factor, to agree with each other (paper: no)."""
     unit_ray: bool = False
-    """Take z for the distance along the ray, as equation 9 says; this bends walls (paper: yes)."""
+    """Take z for the distance along the ray, as in equation 9; this bends walls (paper: yes)."""
     region: Annotated[float, Range(above=0, maximum=1)] = 1.0
     """Central fraction of the width and of the height that pixels are drawn from (paper: 0.5)."""
     placement: Literal["empty", "uniform"] = "empty"

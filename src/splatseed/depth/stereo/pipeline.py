@@ -99,8 +99,8 @@ def find_stereo(
         settings: Settings of stereo.
         seed: The same seed gives the same bytes.
         progress: Called with the stage and the fraction done.
-        only: Views whose maps are wanted, all by default. Others are matched only if they may
-            confirm these; the bytes are the same as with all.
+        only: Views that need maps, all by default. Other views are matched only if they may
+            confirm these; the bytes do not depend on it.
     """
     if len(visibility.xyz) < MIN_POINTS:
         visibility = coarse_stereo(views, seed, progress)
