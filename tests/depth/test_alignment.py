@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
@@ -131,18 +133,17 @@ def test_rejected_images_have_a_reason(exact, make_maps):
 
     scene = exact.replace(depths=make_maps("z", change))
     reasons = [alignment.rejected for alignment in align(scene).values()]
-    assert reasons[0] == "the map has no depth at any pixel"
-    assert "SfM points on known depth; 20 are needed" in reasons[1]
-    assert "at half of the SfM points" in reasons[2]
-    assert "typically" in reasons[3]
-    assert "one value" in reasons[4]
+    assert None not in reasons[:5]
+    assert len(set(reasons[:5])) == 5  # a reason of its own for each
+    assert "20" in reasons[1]  # the points that are needed
+    assert all(re.search(r"\d%", reason) for reason in reasons[2:4])  # by how much
     assert set(reasons[5:]) == {None}
     assert list(align(scene, max_residual_ratio=None).values())[3].rejected is None
 
 
 def test_depth_read_as_inverse_depth_is_rejected(exact, make_maps):
     alignments = align(exact.replace(depths=make_maps("inverse", lambda z, _: z)))
-    assert all("rise with depth" in alignment.rejected for alignment in alignments.values())
+    assert all(alignment.rejected for alignment in alignments.values())
     alignments = align(exact.replace(depths=make_maps("z", lambda z, _: 1 / z))).values()
     good = align(exact).values()
     assert np.median([a.residual for a in alignments]) > 10 * np.median([a.residual for a in good])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import shutil
 
 import numpy as np
@@ -121,7 +122,7 @@ def test_images_are_read_again_if_too_few_candidates_are_sound(exact, make_maps,
     lifted(scene, 3000, align=False, note=notes.append)
     assert len(set(reads)) > 1
     assert max(reads) <= lifting.OVERSAMPLING.limit * 3000 / 12 + 1
-    assert any("confirmed by fewer than 2 other views" in note for note in notes)
+    assert any(re.match(r"[\d,]+ of 3,000 ", note) for note in notes)
 
 
 def test_all_pixels_can_be_lifted_but_no_more(exact):
@@ -131,7 +132,7 @@ def test_all_pixels_can_be_lifted_but_no_more(exact):
     new = lifted(scene, pixels, **options)
     assert len(np.unique(new.xyz, axis=0)) == pixels
     for profile, change in (("default", options), ("paper", {"region": 1.0})):
-        with pytest.raises(PointCloudError, match=rf"give {pixels + 1:,}.*{pixels:,}"):
+        with pytest.raises(PointCloudError, match=rf"{pixels + 1:,}.*{pixels:,}"):
             lifted(scene, pixels + 1, profile, **change)
 
 
@@ -140,9 +141,9 @@ def test_metric_depth_needs_no_points(exact, capture):
     seeds = ss.upsample(empty, "depth", num_points=1500, align=False)
     assert len(seeds) == 1500
     assert capture.surfaces.distance(seeds.xyz.astype(np.float64)).max() < FLOAT32
-    with pytest.raises(ParameterError, match="num_points of 1 or more"):
+    with pytest.raises(ParameterError, match="num_points"):
         ss.upsample(empty, "depth", ratio=4, align=False)
-    with pytest.raises(PointCloudError, match="at least one original"):
+    with pytest.raises(PointCloudError, match="original"):
         ss.upsample(empty, "depth", num_points=1500)
 
 

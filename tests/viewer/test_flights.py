@@ -65,7 +65,7 @@ def test_a_path_follows_the_cameras_evenly(rng):
     shuffled = [dataclasses.replace(v, name=f"{i}") for i, v in zip(names, cameras, strict=True)]
     again = _centers(smooth_path(shuffled, 90, (160, 90)))
     assert np.linalg.norm(np.diff(again, axis=0), axis=1).max() < 2 * steps.max()
-    with pytest.raises(ParameterError, match="two places"):
+    with pytest.raises(ParameterError, match="path"):
         smooth_path(cameras[:1], 10, (64, 48))
 
 
@@ -100,7 +100,7 @@ def test_cameras_that_are_upside_down_to_each_other_have_an_up():
 )
 def test_files_that_are_no_path_are_refused(content, tmp_path):
     (tmp_path / "path.json").write_text(content)
-    with pytest.raises(SceneFormatError, match="camera path"):
+    with pytest.raises(SceneFormatError, match=r"\.json"):
         read_path(tmp_path / "path.json", (64, 48))
 
 

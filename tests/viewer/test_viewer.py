@@ -37,7 +37,7 @@ from splatseed.viewer.pictures import (
     viewer_pose,
     warp_to_canvas,
 )
-from splatseed.viewer.server import TrainingViewer, Viewer, free_port
+from splatseed.viewer.server import ENDED, TrainingViewer, Viewer, free_port
 
 from ..bench import browser
 
@@ -267,10 +267,10 @@ def test_a_picture_that_cannot_be_drawn_has_a_reason(room, run_folder, tmp_path)
     canvas = _canvas_at(entry, image, (64, 48))
     for kind in ("photograph", "error", "uncovered cells"):
         picture, why = entry.draw(kind, canvas, None)
-        assert (picture, "Click a camera" in why) == (None, True)
+        assert (picture, why) == (None, pictures.CLICK_A_CAMERA)
     shutil.rmtree(own)
     picture, why = entry.draw("photograph", canvas, image)
-    assert (picture, "cannot be read" in why) == (None, True)
+    assert (picture, image.name in why) == (None, True)
     assert entry.draw("uncovered cells", canvas, image)[0] is not None
 
 
@@ -351,8 +351,8 @@ def test_renders_come_between_steps_and_change_nothing(watched, room, tmp_path):
     drawn = [picture for picture, _ in pictures if picture is not None]
     assert drawn
     assert all(picture.std() > 5 for picture in drawn)
-    picture, why = viewer._live.draw("Gaussians", canvas, None)  # who looks after the end is told
-    assert (picture, "ended" in why) == (None, True)
+    picture, why = viewer._live.draw("Gaussians", canvas, None)
+    assert (picture, why) == (None, ENDED)
     numbers = viewer._numbers()
     for told in (f"step {STEPS}", f"{len(run.state.params['means']):,} Gaussians", "test views"):
         assert told in numbers
@@ -392,7 +392,7 @@ def test_a_port_that_is_taken_is_an_error():
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
-        with pytest.raises(ParameterError, match="in use"):
+        with pytest.raises(ParameterError, match=str(taken.getsockname()[1])):
             free_port("127.0.0.1", taken.getsockname()[1])
 
 
@@ -421,5 +421,5 @@ def test_runs_of_the_same_name_get_unique_names(run_folder, tmp_path):
 def test_nothing_to_show_is_an_error(tmp_path):
     for name in ("cameras", "images", "points3D"):
         (tmp_path / f"{name}.txt").write_text("1 PINHOLE 4 3 2 2 2 1.5\n" * (name == "cameras"))
-    with pytest.raises(SceneFormatError, match="something to show"):
+    with pytest.raises(SceneFormatError, match=str(tmp_path)):
         open_item(tmp_path)

@@ -150,7 +150,7 @@ def test_two_views_confirm_each_other(tmp_path):
 @pytest.mark.parametrize("num", [0, 1])
 def test_stereo_needs_two_photographs(num, tmp_path):
     scene = photograph(tmp_path, tilted_plane(), arc((0.0,)))
-    with pytest.raises(SceneNotFoundError, match="two"):
+    with pytest.raises(SceneNotFoundError, match=str(num)):
         stereo_depths(scene.replace(images=scene.images[:num]))
 
 
