@@ -195,6 +195,32 @@ def _imported_files(path, name, modules):
     return (found & modules.keys()) - {name}
 
 
+OPTION = re.compile(r"(?<![\w-])--[a-z][\w.-]*")
+COMMAND = re.compile(r"\b(splatseed [a-z]+|hf|ray|colmap) ")
+
+
+@pytest.mark.parametrize(
+    "part", [part for part in ORDER if part not in {"requirements", "commands", "cli", "console"}]
+)
+def test_messages_of_the_library_name_arguments_not_options(part):
+    """But for whole commands: see splatseed.errors."""
+    for path in _files(part):
+        for line, text in _texts(ast.parse(path.read_text(encoding="utf-8"))):
+            assert COMMAND.search(text) or not OPTION.search(text), f"{path.name}:{line}: {text}"
+
+
+def _texts(node):
+    """The lines and contents of all strings below a node but docstrings."""
+    for each in ast.iter_child_nodes(node):
+        if isinstance(each, ast.JoinedStr):
+            parts = (str(getattr(part, "value", "")) for part in each.values)
+            yield each.lineno, "".join(parts)
+        elif isinstance(each, ast.Constant) and isinstance(each.value, str):
+            yield each.lineno, each.value
+        elif not (isinstance(each, ast.Expr) and isinstance(each.value, ast.Constant)):
+            yield from _texts(each)
+
+
 def test_imports_close_no_circle():
     """So any module can be imported first: none ever meets another that is half loaded.
 

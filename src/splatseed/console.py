@@ -204,11 +204,14 @@ def _option(argument: re.Match[str]) -> str:
 
 
 def print_pairs(title: str, rows: Sequence[tuple[str, str]]) -> None:
-    """Print labels with their values, unwrapped so that they can be copied."""
+    """Print labels with their values, unwrapped so that they can be copied.
+
+    Values get options for the library's arguments, as notes do.
+    """
     _print_title(title)
     width = max((len(label) for label, _ in rows), default=0)
     for label, value in rows:
-        OUT.print(f"  {label:<{width}}  {visible(value)}", soft_wrap=True)
+        OUT.print(f"  {label:<{width}}  {visible(with_options(value))}", soft_wrap=True)
 
 
 def print_note(note: str) -> None:

@@ -192,7 +192,7 @@ def test_what_cannot_be_read_is_said(room, tmp_path):
     ):
         with pytest.raises(error, match=says):
             read(*words)
-    with pytest.raises(SceneFormatError, match="smaller --data-factor"):
+    with pytest.raises(SceneFormatError, match="`data_factor`"):
         load_views(room, room.images[:1], data_factor=9, min_side=11)
     assert load_views(room, [bent(room, 0.0)])
 

@@ -53,7 +53,7 @@ def test_photographs_of_a_scene_and_what_stereo_holds_beside_them(free, scene):
     free(3 * pixels)
     views = load_views(scene, scene.images)
     free(3 * pixels - 1)
-    with pytest.raises(ParameterError, match=r"found 4 of 60 x 40.*--data-factor"):
+    with pytest.raises(ParameterError, match=r"found 4 of 60 x 40.*`data_factor`"):
         load_views(scene, scene.images)
     assert len(load_views(scene, scene.images, data_factor=2)) == 4
     free(pixels + pixels * BYTES_PER_DEPTH + threads * 60 * 40 * 4 * 4)

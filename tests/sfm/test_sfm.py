@@ -150,7 +150,7 @@ def test_too_few_registered_is_an_error_that_names_them(num, photos, tmp_path, m
         assert "6 in the largest" in caught.value.found
         assert "other0.png" in caught.value.found
         assert "view_000.png" not in caught.value.found
-        assert "--partial" in caught.value.fix
+        assert "`partial=True`" in caught.value.fix
         notes = []
         report = reconstruct(mixed, tmp_path / "scene", **how, partial=True, on_note=notes.append)
         assert (report.registered, len(report.unregistered)) == (6, 8)

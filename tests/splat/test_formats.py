@@ -221,7 +221,7 @@ def test_a_box_and_an_opacity_keep_what_they_say():
     with pytest.raises(ParameterError, match="none of 700"):
         formats.keep_gaussians(model, formats.parse_crop("90,90,90,91,91,91"))
     for text in ("0,0,0,1,1,0", "a,b,c,d,e,f", "0,0,0,1,1,nan"):
-        with pytest.raises(ParameterError, match="--crop"):
+        with pytest.raises(ParameterError, match="`crop"):
             formats.parse_crop(text)
 
 

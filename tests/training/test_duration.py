@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import pytest
@@ -55,13 +56,13 @@ def test_later_steps_are_slower_and_the_machine_is_the_runs_own():
 @pytest.mark.parametrize(("seconds", "steps"), [(0.3, 10_000), (2.4, 30_000), (40.0, 30_000)])
 def test_what_is_advised_takes_about_an_hour(seconds, steps, per_pixel):
     settings, now = replace(GROW, max_steps=steps), EARLY._replace(seconds=seconds)
-    words = options_for_an_hour(settings, now, 4032, per_pixel=per_pixel).split()
-    options = dict(zip(words[::2], map(int, words[1::2]), strict=True))
-    factor = -(-4032 // options["--long-side"])  # as --long-side is understood
+    text = options_for_an_hour(settings, now, 4032, per_pixel=per_pixel)
+    options = {name: int(value) for name, value in re.findall(r"`(\w+)=(\d+)`", text)}
+    factor = -(-4032 // options["long_side"])
     assert factor >= 3
     smaller = (3 / factor) ** 2
     pixels, cap = now.pixels * smaller, 400_000 * (smaller if per_pixel else 1)
-    chosen = replace(settings, max_steps=options.get("--max-steps", steps), cap_max=round(cap))
+    chosen = replace(settings, max_steps=options.get("max_steps", steps), cap_max=round(cap))
     count = min(20_000, round(cap))
     slower = seconds / step_seconds("cpu", 20_000, now.pixels)
     each = slower * step_seconds("cpu", count, pixels)

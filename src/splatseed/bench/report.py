@@ -159,7 +159,7 @@ def unequal_numbers(study: Study) -> str | None:
     scene = (ends["max"] / ends["min"]).idxmax() if len(ends) else ""
     if not scene or ends["max"][scene] <= ends["min"][scene] * (1 + _EQUAL):
         return None
-    hint = "" if study.settings["budget"] else "; --budgets gives all arms the same limit"
+    hint = "" if study.settings["budget"] else "; the option budgets gives all arms the same limit"
     return (
         f"On {scene} the arms end with {ends['min'][scene]:,.0f} to {ends['max'][scene]:,.0f} "
         f"Gaussians, and a larger number alone can raise PSNR{hint}."

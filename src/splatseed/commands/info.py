@@ -394,7 +394,7 @@ def _print_depth(title: str, scene: Scene, alignments: Mapping[str, Alignment]) 
 def _print_list(title: str, sentences: Sequence[str]) -> None:
     OUT.print(f"\n{title}", style="bold" if sentences else "")
     for sentence in sentences:
-        OUT.print(f"  - {sentence}", soft_wrap=True)
+        OUT.print(f"  - {with_options(sentence)}", soft_wrap=True)
 
 
 def _spread(values: Iterable[float], style: str) -> str:

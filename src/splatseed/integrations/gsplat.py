@@ -82,7 +82,7 @@ class GrowStrategy(MCMCStrategy):  # type: ignore[misc]  # gsplat has no types
             raise ParameterError(
                 f"the parameters {', '.join(REQUIRED)} and {' or '.join(SH0_NAMES)}",
                 found=f"no {', no '.join(missing)}",
-                fix="Train spherical harmonics (gsplat's trainer: without --app-opt).",
+                fix="Train spherical harmonics (gsplat's trainer: without app_opt).",
             )
         super().check_sanity(params, optimizers)
 

@@ -207,7 +207,7 @@ def _choose_layout(scene: Scene, wanted: str) -> Layout:
     if wanted == "transforms" and scene.images:
         return "transforms"
     known = "a format of auto, colmap or transforms, which needs images"
-    raise OutputError(known, found=repr(wanted), fix="Write the COLMAP layout (--format colmap).")
+    raise OutputError(known, found=repr(wanted), fix="Write the COLMAP layout (`format='colmap'`).")
 
 
 def _write_colmap(scene: Scene, folder: Path) -> Written:

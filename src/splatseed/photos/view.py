@@ -176,7 +176,7 @@ def load_views(
             sum(math.prod(size) for size in sizes.values()) // factor**2, 3,
             "pixels of photographs",
             found=f"{len(images)} of {width} x {height}, downsampled by {factor}",
-            fix="Downsample more (--data-factor), take fewer, or free some memory.",
+            fix="Downsample more (`data_factor`), take fewer, or free some memory.",
         )  # fmt: skip
     views = []
     with ThreadPoolExecutor(READERS) as pool:
@@ -241,7 +241,7 @@ def _too_small(
     return SceneFormatError(
         f"{name} to have at least {min_side} {pixels} a side, reduced by a factor of {data_factor}",
         found=f"{size[0]} x {size[1]}",
-        fix="Choose a smaller --data-factor, or a larger --long-side.",
+        fix="Choose a smaller `data_factor`, or a larger `long_side`.",
     )
 
 
@@ -259,7 +259,7 @@ def load_photograph(
     path = Path(path)
     if factor < 1:
         raise ParameterError(
-            "--data-factor of 1 or more", found=f"{factor}", fix="Images are never enlarged."
+            "`data_factor` of 1 or more", found=f"{factor}", fix="Images are never enlarged."
         )
     encoded = photograph_bytes(path)
     digest = hashlib.blake2b(encoded, digest_size=16, person=FILTER.encode()).hexdigest()

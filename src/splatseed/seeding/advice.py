@@ -101,7 +101,8 @@ def advise(
 ) -> Advice:
     """Apply the rules behind ``advice_for``; benchmarks vary ``room``."""
     if not measured.num_points:
-        maps = "Its depth maps can give some, too: --method depth --depth.no-align --num-points N."
+        maps = "Its depth maps can give some, too: `method='depth'`, `depth.align=False`, "
+        maps += "`num_points=N`."
         how = ": depth comes from comparing the photographs" if measured.photographs else ""
         none = f"There are no points to start with{how}."
         return Advice(DEFAULT_METHOD, (none, *([maps] if measured.depth_maps else [])), measured)

@@ -302,7 +302,7 @@ def map_images(run: Run, names: Sequence[str], camera_model: str, *, partial: bo
             f"at least half of the {len(names)} photographs to get a pose",
             found=f"{len(found)} in the largest of {counted(len(models), 'model')}; "
             f"without a pose: {name_some([name for name in names if name not in found])}",
-            fix=f"Add --partial (from Python, partial=True) to write the scene of these "
+            fix=f"Pass `partial=True` to write the scene of these "
             f"{len(found)}; for more, {advice}.",
         )
     return models_dir / str(best)

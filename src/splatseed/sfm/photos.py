@@ -176,7 +176,7 @@ def pick_frames(
         ParameterError: ``most`` is too small.
     """
     if most < _MIN_FRAMES:
-        expected = f"--frames of {_MIN_FRAMES} or more"
+        expected = f"`frames` of {_MIN_FRAMES} or more"
         raise ParameterError(expected, found=f"{most}", fix="Try 150.")
     if not video.is_file():
         raise SceneNotFoundError(f"a video {video}", found="none", fix="Check the path.")

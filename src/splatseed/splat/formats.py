@@ -180,7 +180,7 @@ def parse_crop(text: str) -> Float64[np.ndarray, "2 3"]:
         low = high = np.zeros(3)
     if not (low < high).all():
         raise ParameterError(
-            "--crop x0,y0,z0,x1,y1,z1, the minimum and maximum corners of a box",
+            "`crop=x0,y0,z0,x1,y1,z1`, the minimum and maximum corners of a box",
             found=repr(text),
             fix="splatseed info SCENE prints the bounding box of the points.",
         )
@@ -197,7 +197,7 @@ def keep_gaussians(
     """
     if not 0 <= min_opacity < 1:
         raise ParameterError(
-            "--min-opacity of 0 or more, less than 1", found=f"{min_opacity}", fix="Try 0.05."
+            "`min_opacity` of 0 or more, less than 1", found=f"{min_opacity}", fix="Try 0.05."
         )
     keep = np.ones(len(gaussians), bool)
     if min_opacity:
@@ -208,7 +208,7 @@ def keep_gaussians(
         ends = (end(gaussians.means, axis=0) for end in (np.min, np.max))
         low, high = (" ".join(f"{value:.4g}" for value in end) for end in ends)
         raise ParameterError(
-            "--crop and --min-opacity to leave some Gaussians",
+            "`crop` and `min_opacity` to leave some Gaussians",
             found=f"none of {len(gaussians):,}, whose centres lie from {low} to {high}",
             fix="Choose a larger box or a smaller opacity.",
         )

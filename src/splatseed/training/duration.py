@@ -97,8 +97,8 @@ def options_for_an_hour(
             break
     else:  # the budget alone takes longer
         steps = max(STEP_UNIT, int(steps * HOUR / needed) // STEP_UNIT * STEP_UNIT)
-    flags = f"--long-side {math.ceil(long_side / factor)}"
-    return flags if steps == settings.max_steps else f"{flags} --max-steps {steps}"
+    flags = f"`long_side={math.ceil(long_side / factor)}`"
+    return flags if steps == settings.max_steps else f"{flags} `max_steps={steps}`"
 
 
 def format_duration(seconds: float) -> str:

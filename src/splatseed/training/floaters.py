@@ -87,7 +87,7 @@ def floaters_of_model(
     scene = at_file_size(
         with_photographs(with_masks(load_scene(scene_path, require_points=False), masks))
     )
-    images = photographed(scene, test_every, without="leave --clean out")
+    images = photographed(scene, test_every, without="leave `clean` out")
     gaussians = read_start(path, scene, lambda _: None)
     if data_factor is None:
         settings = replace(settings, data_factor=factor_for(images, StereoSettings.max_size))
