@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -35,6 +35,7 @@ from splatseed.photos.visibility import find_visibility
 from splatseed.scene import Scene
 from splatseed.seeding import verify as module
 from splatseed.seeding.photo_methods import MAX_SIZE, read_views
+from splatseed.seeding.verify import SETTINGS
 from splatseed.synthetic.room import build_room
 
 __all__ = ["whole_run"]
@@ -91,7 +92,7 @@ def hold(scene: Scene, new: NewPoints) -> Held:
     given = new._replace(sizes=number)
     images = scene.split(HELD_OUT)[0]
     views = read_views(scene, images, MAX_SIZE, ss.progress.silent)
-    with patch.object(module, "MAX_COST", max(THRESHOLDS)):
+    with patch.object(module, "SETTINGS", replace(SETTINGS, max_cost=max(THRESHOLDS))):
         left = module.verify(views, images, find_visibility(scene), given)
     return Held(new.xyz, left.xyz, left.sizes.astype(int), left.confidence)
 
@@ -147,10 +148,10 @@ def load(name: str, cache: Path) -> tuple[Scene, Truth | Room]:
 
 def fates(truth: Truth | Room, held: Held) -> list[list[str]]:
     """Before and after, and the fates one by one, each where it was and where it is."""
-    bare = held.confidence == np.float32(module.BARE_CONFIDENCE)
+    textureless = held.confidence == np.float32(SETTINGS.textureless_confidence)
     unchecked = np.isnan(held.confidence)
-    agree = ~bare & (held.confidence >= 1.0 - module.MAX_COST)
-    kept = agree | bare | unchecked
+    agree = ~textureless & (held.confidence >= 1.0 - SETTINGS.max_cost)
+    kept = agree | textureless | unchecked
     dropped = np.setdiff1d(np.arange(len(held.before)), held.rows[kept])
     clouds = {
         "before": held.before,
@@ -158,7 +159,7 @@ def fates(truth: Truth | Room, held: Held) -> list[list[str]]:
         "- not moved": held.before[held.rows[kept]],
         "those that agree": held.after[agree],
         "the same, not moved": held.before[held.rows[agree]],
-        "bare": held.after[bare],
+        "textureless": held.after[textureless],
         "unchecked": held.after[unchecked],
         "dropped": held.before[dropped],
     }
@@ -168,11 +169,11 @@ def fates(truth: Truth | Room, held: Held) -> list[list[str]]:
 
 def thresholds(truth: Truth | Room, held: Held) -> list[list[str]]:
     """What agrees by each threshold; what has no cost is left out."""
-    bare = held.confidence == np.float32(module.BARE_CONFIDENCE)
+    textureless = held.confidence == np.float32(SETTINGS.textureless_confidence)
     rows = []
     for most in THRESHOLDS:
-        xyz = held.after[~bare & (held.confidence >= 1.0 - most)]
-        label = f"{most}{' (as it is)' if most == module.MAX_COST else ''}"
+        xyz = held.after[~textureless & (held.confidence >= 1.0 - most)]
+        label = f"{most}{' (as it is)' if most == SETTINGS.max_cost else ''}"
         rows.append([label, *cells(truth, xyz, len(xyz) / len(held.before))])
     return rows
 
