@@ -67,16 +67,20 @@ def cell_depths_of_views(
 def check_points(
     views: Sequence[View], xyz: Float32[np.ndarray, "N 3"], cell: float
 ) -> Float32[np.ndarray, "N 3"]:
-    """Return the points as kernels need them: float32, contiguous.
-
-    Raises:
-        ParameterError: There is no view, or ``cell`` is below 1.
-        PointCloudError: ``xyz`` is not of shape [N, 3].
-    """
+    """Return ``kernel_points``; errors are those of ``covered_share``."""
     if not views:
         raise ParameterError("at least one view", found="none", fix="Pass a scene with images.")
     if not (np.isfinite(cell) and cell >= 1):
         raise ParameterError("a cell of at least 1 pixel", found=f"{cell}", fix="Choose 4 to 16.")
+    return kernel_points(xyz)
+
+
+def kernel_points(xyz: Float32[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N 3"]:
+    """Return points as kernels need them: float32, contiguous.
+
+    Raises:
+        PointCloudError: ``xyz`` is not of shape [N, 3].
+    """
     xyz = np.asarray(xyz)
     if xyz.ndim != 2 or xyz.shape[1] != 3:
         raise PointCloudError(

@@ -30,7 +30,7 @@ from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.progress import Progress
 from splatseed.scene import Scene
 from splatseed.seeding._kernels import thinning as kernels
-from splatseed.seeding.coverage import check_points
+from splatseed.seeding.coverage import kernel_points
 from splatseed.seeding.photo_methods import (
     CELL,
     MAX_SIZE,
@@ -135,7 +135,7 @@ def thin(
         ParameterError: ``num`` is below 1.
         PointCloudError: ``xyz`` is not of shape [N, 3], or ``priority`` not of shape [N].
     """
-    xyz = check_points(views, xyz, 1) if views else _check_bare(xyz)
+    xyz = kernel_points(xyz)
     if num < 1:
         raise ParameterError("at least 1 point to keep", found=f"{num}", fix="Ask for more.")
     places = _places_in_views(xyz, views) if views else _places_in_space(xyz)
@@ -154,10 +154,6 @@ def thin(
     rest = rest[np.argsort(places.group[rest, 0] < 0, stable=True)]
     kept[rest[: num - np.count_nonzero(kept)]] = True
     return np.flatnonzero(kept)
-
-
-def _check_bare(xyz: Float32[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N 3"]:
-    return check_points((None,), xyz, 1)  # type: ignore[arg-type]  # no view is looked at
 
 
 def _order(

@@ -78,7 +78,7 @@ class GivenClouds(Cloud):
         self, scene: Scene, num_new: int, rng: np.random.Generator, progress: Progress
     ) -> NewPoints:
         """Make the seeds."""
-        from splatseed.seeding.clouds.seeds import cloud_seeds  # noqa: PLC0415  (loads Numba)
+        from splatseed.seeding.clouds.seeds import cloud_seeds
 
         paths, capacity = tuple(map(Path, self.files)), self.plan(scene).capacity
         inputs = CloudInputs(paths, self.transform, capacity, self.alone)
