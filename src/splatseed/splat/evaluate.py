@@ -1,8 +1,8 @@
-"""Scores of Gaussians: how close renders come to photographs that were not used for training.
+"""Scores of Gaussians: how close renders are to photographs that were not used for training.
 
 Promise: values are sRGB 0..1, not linearised, renders clamped and not rounded to 8 bits; each view
-is scored at its own size; SSIM has an 11 x 11 Gaussian window (sigma 1.5) and images mirrored at
-their edges, as torchmetrics' and so gsplat's trainer's. A model is rendered in the frame of the
+is scored at its own size; SSIM has an 11 x 11 Gaussian window (sigma 1.5) on images mirrored at
+their edges, as in torchmetrics and gsplat's trainer. A model is rendered in the frame of the
 scene's training cameras, as in training. Needs PyTorch (``pip install ".[train]"``).
 """
 
@@ -46,7 +46,7 @@ from splatseed.splat.world import NO_TRANSFORM, around_scene, check_world, find_
 from splatseed.text import agreeing, name_some
 
 Covisible: TypeAlias = Mapping[str, Bool[np.ndarray, "H W"]]
-"""Which pixels of each test view at least two training views see, by the view's name."""
+"""The pixels of each test view, by name, that at least two training views see."""
 Render: TypeAlias = Callable[[View], Float[Tensor, "H W 3"]]
 OnView: TypeAlias = Callable[[View, Float32[np.ndarray, "H W 3"], Float32[np.ndarray, "H W"]], None]
 """Called with each view scored, its render clamped to [0, 1], and FLIP of each pixel."""
@@ -65,8 +65,8 @@ def evaluate_views(
 ) -> EvalResult:
     """Score renders of views against their photographs, where pixels are not masked.
 
-    FLIP and LPIPS take the photograph for the render where they are. The first view is rendered
-    once more beforehand, untimed, because a first call may compile.
+    Masked pixels have the photograph's colours for FLIP and LPIPS. The first view is rendered once
+    before, untimed, because a first call may compile.
 
     Args:
         render: Renders a view as float [H, W, 3], values about 0..1, on any device.
@@ -74,8 +74,8 @@ def evaluate_views(
         lpips: The LPIPS metric; LPIPS is not measured when left out.
         lpips_reason: Why it is left out, for the reader of the result.
         covisible: The pixels over which PSNR is also computed, for the views it contains.
-        on_view: Called with each view, its render and FLIP, to draw them.
-        progress: Called with the stage and the fraction done.
+        on_view: Called with each view, its render and its FLIP, to draw them.
+        progress: Called with the name of a stage and its fraction done.
 
     Raises:
         ParameterError: There are no views, or a render has another size or is not finite.
@@ -146,7 +146,7 @@ def _score(
 
 
 def _now() -> float:
-    """The time, once the GPU, if one is in use, has finished its work."""
+    """Return the time once a GPU in use has finished its work."""
     if torch.cuda.is_initialized():  # type: ignore[no-untyped-call]  # PyTorch gives no types
         torch.cuda.synchronize()
     return time.perf_counter()
@@ -154,10 +154,10 @@ def _now() -> float:
 
 @dataclass(frozen=True, eq=False)
 class TrainedModel:
-    """Gaussians in the scene's world, its test views, and what renders a view of that world.
+    """Gaussians, the test views of their scene, and a function that renders a view of the scene.
 
-    ``doubt`` says why the Gaussians may not be in that world after all; empty if they surely are.
-    ``notes`` says what of the file was left out or changed on reading.
+    ``doubt`` explains why the Gaussians may be in another frame; empty if they are surely not.
+    ``notes`` are about what was left out or changed on reading.
     """
 
     gaussians: Gaussians
@@ -259,7 +259,7 @@ def load_model(
 
 
 def _with_test_photographs(scene: Scene, test_every: int) -> Scene:
-    """As ``with_photographs``, but where most are missing the test views' alone are needed."""
+    """As ``with_photographs``, but accept a scene that has the test photographs only."""
     try:
         return with_photographs(scene)
     except SceneNotFoundError:
@@ -271,7 +271,7 @@ def _with_test_photographs(scene: Scene, test_every: int) -> Scene:
 
 
 def evaluate_model(model: TrainedModel, **options: Any) -> EvalResult:
-    """Score a model on its test views and count its Gaussians; as of ``evaluate_views``."""
+    """Score a model on its test views and count its Gaussians; see ``evaluate_views``."""
     result = evaluate_views(model.render, model.views, **options)
     return dataclasses.replace(
         result, num_gaussians=len(model.gaussians), model_bytes=model.gaussians.num_bytes

@@ -43,7 +43,7 @@ class Lpips:
     @torch.no_grad()
     @torch.backends.cudnn.flags(enabled=True, allow_tf32=False)  # the score of any other device
     def __call__(self, render: Float[Tensor, "H W 3"], photograph: Float[Tensor, "H W 3"]) -> float:
-        """The distance of two images of values 0..1; 0 where they are equal."""
+        """Return the distance of two images of values 0..1; 0 for equal images."""
         pair = torch.stack([render, photograph]).permute(0, 3, 1, 2)
         shift, scale = (pair.new_tensor(values).view(1, 3, 1, 1) for values in (_SHIFT, _SCALE))
         x, total, heads = (2 * pair - 1 - shift) / scale, 0.0, iter(self.heads)
@@ -57,11 +57,11 @@ class Lpips:
 
 
 def load_lpips(weights: Path | None = None) -> Lpips:
-    """LPIPS with VGG's weights, a file or the folder it lies in, by default in PyTorch's cache.
+    """Load LPIPS with VGG's weights: a file or its folder, by default PyTorch's cache.
 
     Raises:
         MissingDependencyError: torchmetrics, which brings the w_l, is absent.
-        SceneNotFoundError: There are no weights; says what to fetch, and where to put it.
+        SceneNotFoundError: There are no weights; the message names the file to download.
         SceneFormatError: The file does not hold this network's weights.
     """
     path, layers, before = _weights_path(weights), list[nn.Module](), 3
@@ -84,8 +84,8 @@ def load_lpips(weights: Path | None = None) -> Lpips:
     return Lpips(features, [heads[f"lin{i}.model.1.weight"] for i in range(len(_TAPS))])
 
 
-def lpips_is_here() -> bool:
-    """Whether all that ``load_lpips`` needs is on this machine; no file is opened."""
+def has_lpips_weights() -> bool:
+    """Whether ``load_lpips`` can find its weights; no file is opened."""
     try:
         return _weights_path(None).is_file()
     except (MissingDependencyError, SceneNotFoundError):

@@ -18,7 +18,7 @@ from splatseed.splat.ssim import WINDOW, l1_and_ssim
 from splatseed.splat.ssim_conv import l1_and_ssim_by_convolution, ssim_map
 
 _UNSATURATED = 0.5 / 255
-"""Least distance of a value from 0 and from 1 at which a camera has not cut it off."""
+"""Minimum distance from 0 and from 1 of a value that the camera has not clipped."""
 _CORRECTIONS = 5
 """Fits of a render's colours to a photograph's: after each, other pixels are saturated."""
 
@@ -29,9 +29,9 @@ def psnr(
     photograph: Float[Tensor, "H W 3"],
     mask: Bool[Tensor, "H W"] | None = None,
 ) -> float:
-    """Peak signal-to-noise ratio in dB of a render clamped to [0, 1], over the pixels of a mask.
+    """Return the PSNR in dB of a render clamped to [0, 1], over the pixels of a mask.
 
-    NaN if there are none.
+    NaN if the mask is empty.
     """
     error = (render.clamp(0, 1) - photograph).square()
     error = error if mask is None else error[mask]
@@ -50,7 +50,7 @@ def color_corrected(
     photograph: Float[Tensor, "H W 3"],
     mask: Bool[Tensor, "H W"] | None = None,
 ) -> Float[Tensor, "H W 3"]:
-    """A render in [0, 1] with the change of its colours that brings it closest to a photograph.
+    """Return a render with its colours fitted to the photograph's.
 
     Each channel becomes the quadratic polynomial of the render's three that fits best in least
     squares, over the pixels of the mask whose channel is saturated in neither image; this is
@@ -84,7 +84,7 @@ def ssim_of_all(
     photograph: Float[Tensor, "H W 3"],
     mask: Bool[Tensor, "H W"] | None = None,
 ) -> float:
-    """SSIM averaged over all pixels, or those of a mask; a mirrored margin lets the window fit.
+    """Return the mean SSIM over all pixels, or those of a mask, with mirrored edges.
 
     Where masked, the render should have the photograph's pixels (``rendering.fill_masked``).
     """
@@ -104,7 +104,7 @@ def ssim_of_all(
 def flip_map(
     render: Float[Tensor, "H W 3"], photograph: Float[Tensor, "H W 3"]
 ) -> Float32[np.ndarray, "H W"]:
-    """FLIP of each pixel: how different two images look when one replaces the other, 0 to 1.
+    """Return FLIP of each pixel, 0 to 1: how different images look when one replaces the other.
 
     It is LDR-FLIP for a screen with 67 pixels per degree of the eye's field, computed on the CPU
     by its authors' package (Andersson et al. 2020). Images are sRGB, clamped to [0, 1].

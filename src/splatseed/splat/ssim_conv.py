@@ -22,7 +22,7 @@ def l1_and_ssim_by_convolution(
     l1_weight: float,
     ssim_weight: float,
 ) -> tuple[Float[Tensor, ""], Float[Tensor, ""], Float[Tensor, "H W 3"]]:
-    """``splat.ssim.l1_and_ssim`` on any device, by convolutions; its header has the equations."""
+    """Compute ``splat.ssim.l1_and_ssim`` by convolutions; its header has the equations."""
     x, y = render.permute(2, 0, 1), photograph.permute(2, 0, 1)
     c1, c2 = float(C1), float(C2)
     # cuDNN's TF32 would round inputs to ten bits, and E[x^2] - E[x]^2 cancel.
@@ -52,7 +52,7 @@ def l1_and_ssim_by_convolution(
 
 
 def ssim_map(x: Float[Tensor, "H W 3"], y: Float[Tensor, "H W 3"]) -> Float[Tensor, "3 H-10 W-10"]:
-    """SSIM wherever the window fits, as in ``splat.ssim``'s header."""
+    """Return SSIM wherever the window fits; ``splat.ssim`` has the equation."""
     x, y = x.permute(2, 0, 1), y.permute(2, 0, 1)
     with torch.backends.cudnn.flags(enabled=True, allow_tf32=False):
         mean_x, mean_y, e_xy, e_2 = _blur(torch.stack([x, y, x * y, x * x + y * y]))
@@ -64,14 +64,14 @@ def ssim_map(x: Float[Tensor, "H W 3"], y: Float[Tensor, "H W 3"]) -> Float[Tens
 
 
 def _blur(planes: Float[Tensor, "P 3 H W"]) -> Float[Tensor, "P 3 H-10 W-10"]:
-    """Windowed means where the window fits entirely."""
+    """Return windowed means wherever the window fits."""
     across, down = _window(planes.device)
     blurred = conv2d(conv2d(planes.flatten(0, 1).unsqueeze(1), down), across)
     return blurred.view(*planes.shape[:2], *blurred.shape[2:])
 
 
 def _spread(maps: Float[Tensor, "P 3 h w"]) -> Float[Tensor, "P 3 h+10 w+10"]:
-    """The transpose of ``_blur``."""
+    """Apply the transpose of ``_blur``."""
     across, down = _window(maps.device)
     spread = conv_transpose2d(conv_transpose2d(maps.flatten(0, 1).unsqueeze(1), across), down)
     return spread.view(*maps.shape[:2], *spread.shape[2:])
@@ -79,6 +79,6 @@ def _spread(maps: Float[Tensor, "P 3 h w"]) -> Float[Tensor, "P 3 h+10 w+10"]:
 
 @lru_cache
 def _window(device: torch.device) -> tuple[Float[Tensor, "1 1 1 11"], Float[Tensor, "1 1 11 1"]]:
-    """The window along x and along y, kept on the device: copying it there would wait."""
+    """Return the window along x and y on the device, cached: copying it would synchronise."""
     weights = torch.from_numpy(window_weights()).to(device)
     return weights.view(1, 1, 1, WINDOW), weights.view(1, 1, WINDOW, 1)

@@ -287,10 +287,10 @@ def _settings_from(given: Mapping[str, Any], *, resumes: bool) -> TrainSettings:
                 found=name,
                 fix=f"{did_you_mean(name, known)}The fields are {', '.join(known)}.",
             )
-    settings = dataclasses.replace(TrainSettings() if resumes else DEFAULTS, **given)
-    if settings.start is None:
-        return settings
-    return dataclasses.replace(settings, start=str(model_file(Path(settings.start)).resolve()))
+    start = given.get("start")
+    if start is not None:
+        given = {**given, "start": str(model_file(Path(start)).resolve())}
+    return dataclasses.replace(TrainSettings() if resumes else DEFAULTS, **given)
 
 
 def _sized(

@@ -95,10 +95,10 @@ def resumed_settings(
     refined = then.pop("refine_poses") is True
     try:
         return dataclasses.replace(settings, **then), refined
-    except TypeError:
+    except ParameterError as error:
         raise SceneFormatError(
-            "the settings of a run in the config.json of the run",
-            found="a text instead of a number",
+            f"{error.expected} in the config.json of the run",
+            found=error.found,
             fix="Start again with `overwrite=True`.",
         ) from None
 

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Literal, cast, get_args
+from typing import Annotated, Literal, cast
 
 import tyro
 
-from splatseed.errors import ParameterError
 from splatseed.photos.view import TRAINED_SIDE, default_factor
 from splatseed.scene import Image
+from splatseed.settings import Range, check_settings
 from splatseed.training.schedule import FULL_RUN, Densification, Schedule, continued, make_schedule
 
 StrategyName = Literal[
@@ -36,20 +36,6 @@ SEED_SHARE = {"default": 0.7, "mcmc": 0.7}
 BYTES_PER_GAUSSIAN = 2000
 """Memory per Gaussian in training: its 59 numbers, their gradients and two moments (944 bytes),
 and as much again for the rasteriser's lists and for copies while Gaussians are added."""
-ALLOWED: dict[str, int | Sequence[object]] = {
-    "strategy": get_args(StrategyName),
-    "backend": get_args(Backend),
-    "placing": get_args(Placing),
-    "seeding": get_args(Seeding),
-    "exposure": get_args(Exposure),
-    "sh_degree": range(4),
-    "max_steps": 1,
-    "data_factor": 1,
-    "seed": 0,
-    "test_every": 2,
-    "cap_max": MIN_GAUSSIANS,
-}
-"""Choices, or the minimum, of settings."""
 
 
 @dataclass(frozen=True)
@@ -61,29 +47,30 @@ class TrainSettings:
     ``train --config``, plans, and ``ss.train`` set them.
 
     Raises:
-        ParameterError: A value is out of its range.
+        ParameterError: A value has another type or is out of range.
     """
 
     strategy: StrategyName = "default"
     """Densify as 3DGS does (default), grow within a budget where renders are wrong (grow), densify
     as MCMC does up to a budget (mcmc), keep the number of seeds (none), or what measured best, grow
     (auto); -3dgs: 3DGS's own rates, sizes and schedules, to compare with published numbers."""
-    max_steps: int = FULL_RUN
+    max_steps: Annotated[int, Range(1)] = FULL_RUN
     """Training steps; schedules and learning rates adapt to them."""
-    data_factor: int | None = None
+    data_factor: Annotated[int | None, Range(1)] = None
     """Divide the width and height of the photographs by this whole number; by default by the
     smallest that leaves at most 1600 pixels on their longer side."""
-    seed: int = 0
+    seed: Annotated[int, Range(0)] = 0
     """Random seed; on the CPU, runs repeat exactly."""
-    cap_max: tyro.conf.Suppress[int | None] = None  # the option is --budget
+    # The option is --budget.
+    cap_max: tyro.conf.Suppress[Annotated[int | None, Range(MIN_GAUSSIANS)]] = None
     """Maximum Gaussians, by default 1000000 for grow and mcmc; if there are more seeds, they are
     thinned."""
     backend: Backend = "auto"
     """Where to train; auto takes a GPU if PyTorch sees one."""
-    sh_degree: tyro.conf.Suppress[int] = 3
+    sh_degree: tyro.conf.Suppress[Annotated[int, Range(0, 3)]] = 3
     """Degree of the spherical harmonics: how finely colours depend on the viewing direction, 0 to
     3."""
-    test_every: int = 8
+    test_every: Annotated[int, Range(2)] = 8
     """Keep every n-th image, sorted by name, for testing."""
     exposure: Exposure = "none"
     """Colour transform of each training photograph, learnt with the Gaussians, for photographs of
@@ -109,16 +96,7 @@ class TrainSettings:
     added already, and 3DGS's conventions, are left alone."""
 
     def __post_init__(self) -> None:
-        for name, allowed in ALLOWED.items():
-            value = getattr(self, name)
-            if isinstance(allowed, int):
-                fits, expected = value is None or value >= allowed, f"of {allowed} or more"
-            else:
-                fits, expected = value in allowed, f"among {', '.join(map(str, allowed))}"
-            if not fits:
-                raise ParameterError(
-                    f"`{name}` {expected}", found=f"{value}", fix="Leave it out for the default."
-                )
+        check_settings(self)
 
     def with_data_factor(
         self, images: Sequence[Image], note: Callable[[str], None] = lambda _: None
