@@ -41,11 +41,11 @@ def train(scene: str, settings: dict[str, Any], examples: str) -> dict[str, Any]
     start, device = time.perf_counter(), pick_device("cuda")
     wanted = TrainSettings(**settings, strategy="mcmc")
     whole = load_scene(Path(scene))
-    views, held_out = load_split(whole, data_factor=wanted.data_factor, test_every=TEST_EVERY)
-    capture = Capture((*views, *held_out), usable_seeds(whole.points, wanted, lambda _: None))
+    views, test_views = load_split(whole, data_factor=wanted.data_factor, test_every=TEST_EVERY)
+    capture = Capture((*views, *test_views), usable_seeds(whole.points, wanted, lambda _: None))
     with tempfile.TemporaryDirectory() as folder:
         runner = _runner(capture, wanted, Path(examples), Path(folder))
-        _step(runner, held_out[0]).mean().backward()  # loads its kernels
+        _step(runner, test_views[0]).mean().backward()  # loads its kernels
         for value in runner.splats.values():
             value.grad = None
         torch.cuda.synchronize()
@@ -54,7 +54,7 @@ def train(scene: str, settings: dict[str, Any], examples: str) -> dict[str, Any]
         torch.cuda.synchronize()
         ended = time.perf_counter()
     with torch.no_grad():
-        scores = evaluate_views(lambda view: _step(runner, view), held_out)
+        scores = evaluate_views(lambda view: _step(runner, view), test_views)
     return {
         "psnr": scores.psnr,
         "gaussians": len(runner.splats["means"]),

@@ -103,8 +103,8 @@ def _score(name: str, settings: StereoSettings, limit: int) -> PointScore:
     started = time.process_time()
     stereo = find_stereo(views, images, told, settings)
     seconds = time.process_time() - started
-    held_out = _only(visibility, visibility.point_idx % 2 == 1)
-    errors = [_errors(stereo, i, held_out.of(image)) for i, image in enumerate(images)]
+    check_visibility = _only(visibility, visibility.point_idx % 2 == 1)
+    errors = [_errors(stereo, i, check_visibility.of(image)) for i, image in enumerate(images)]
     error = np.concatenate(errors)
     known = np.isfinite(error)
     kept = np.concatenate([stereo.confirmed(i).ravel() for i in range(len(views))]).mean()

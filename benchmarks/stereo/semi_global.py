@@ -37,7 +37,7 @@ for one channel."""
 WIDER = 1.25
 """The range of depths is that of a view's points, from the 1st to the 99th percentile, and so much
 wider at both ends."""
-LEAST_SIDEWAYS = 0.3
+MIN_SIDEWAYS = 0.3
 """Sine of the angle between the baseline and the first camera's axis, below which a pair is left
 out."""
 LARGEST = 3
@@ -166,7 +166,7 @@ def rectify(view: View, other: View, nearest: float, farthest: float) -> Rectifi
     across = center / np.linalg.norm(center)
     across = across * np.sign(across[np.argmax(np.abs(across[:2]))])
     down = np.cross((0.0, 0.0, 1.0), across)
-    if np.linalg.norm(down) < LEAST_SIDEWAYS:
+    if np.linalg.norm(down) < MIN_SIDEWAYS:
         return None
     down /= np.linalg.norm(down)
     rotation = np.stack([across, down, np.cross(across, down)])

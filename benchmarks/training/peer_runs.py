@@ -82,8 +82,8 @@ def train_peer(
     """
     ours = TrainSettings(**settings)
     whole = read_scene(Path(scene), split)
-    train, held_out = load_split(whole, data_factor=ours.data_factor, test_every=TEST_EVERY)
-    capture = Capture((*train, *held_out), usable_seeds(whole.points, ours, print))
+    train, test_views = load_split(whole, data_factor=ours.data_factor, test_every=TEST_EVERY)
+    capture = Capture((*train, *test_views), usable_seeds(whole.points, ours, print))
     comparing, options = 0.0, _options(ours)
     with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryDirectory() as maps:
         if ours.strategy == "grow":
@@ -94,7 +94,7 @@ def train_peer(
         runner = _ready(peer, ours.seed, train)
         seconds = _train(runner, mcmc_on_cpu() if ours.strategy == "mcmc" else nullcontext())
     count = len(runner.splats["means"])
-    return _result(_renderer(runner), held_out, count, seconds + comparing)
+    return _result(_renderer(runner), test_views, count, seconds + comparing)
 
 
 def _write_depths(scene: Scene, settings: TrainSettings, folder: Path) -> float:
@@ -189,8 +189,8 @@ def _render(runner: Any, pose: Tensor, K: Tensor, width: int, height: int) -> Te
     return image
 
 
-def _result(render: Render, held_out: Sequence[View], count: int, seconds: float) -> Result:
-    scores = evaluate_views(render, held_out)
+def _result(render: Render, test_views: Sequence[View], count: int, seconds: float) -> Result:
+    scores = evaluate_views(render, test_views)
     return {
         "psnr": float(np.round(scores.psnr, 4)),
         "ssim": float(np.round(scores.ssim, 5)),

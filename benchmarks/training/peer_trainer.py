@@ -157,11 +157,11 @@ def heading(path: Path, settings: Settings) -> str:
         InputError: The capture cannot be trained on.
     """
     scene = read_scene(path, settings.split)
-    train, held_out = load_split(scene, data_factor=settings.data_factor)
+    train, test_views = load_split(scene, data_factor=settings.data_factor)
     cap = f"{settings.cap_max or BUDGET:,}{'' if settings.cap_default else ' for mcmc and grow'}"
     return (
         f"### Peer: gsplat's trainer, {path.name}, {settings.max_steps:,} steps\n\n"
-        f"{len(train)} training and {len(held_out)} {settings.split} views of {train[0].width} x "
+        f"{len(train)} training and {len(test_views)} {settings.split} views of {train[0].width} x "
         f"{train[0].height}; {len(scene.points):,} points; cap {cap}; runs of an arm: "
         f"{settings.repeats}; threads: {settings.threads}.\n"
     )

@@ -31,10 +31,10 @@ def test_validation_views_are_of_the_training_views(bench, room):
     whole = bench.peer_runs.read_scene(room, "test")
     within = bench.peer_runs.read_scene(room, "validation")
     train, test = load_split(whole)
-    kept, held_out = load_split(within)
+    kept, test_views = load_split(within)
     names = [view.name for view in train]
-    assert [view.name for view in held_out] == names[::8]
-    assert {view.name for view in (*kept, *held_out)} == set(names)
+    assert [view.name for view in test_views] == names[::8]
+    assert {view.name for view in (*kept, *test_views)} == set(names)
     assert not {view.name for view in test} & set(names)
 
 
