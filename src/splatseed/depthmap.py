@@ -1,4 +1,4 @@
-"""DepthMap: the distance of each pixel of an image, and the source of such maps.
+"""DepthMap: an image's depth per pixel, and the source of such maps.
 
 Notation: a map is H x W pixels and belongs to one image, of the same size or at least the same
 aspect ratio: its pixel (column u, row v) has its centre at ((u + 0.5) / W, (v + 0.5) / H) of the
@@ -20,16 +20,16 @@ from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundErro
 from splatseed.frozen import read_only
 
 DepthKind = Literal["z", "ray", "inverse"]
-"""What a value is: planar depth z along the camera's axis, distance along the pixel's ray, or an
+"""Meaning of a value: planar depth z along the camera's axis, distance along the pixel's ray, or an
 inverse depth of the form a / z + b (what most monocular networks predict)."""
 
 ASPECT_SLACK = 0.02
-"""By how much a map's aspect ratio may differ from its image's: the rounding of a resized copy."""
+"""Largest relative difference of a map's aspect ratio from its image's, by rounding of sizes."""
 
 
 @dataclass(frozen=True, eq=False)
 class DepthMap:
-    """The depth that one image sees.
+    """The depth map of one image.
 
     Values are NaN where unknown. Of the kinds "z" and "ray" they are positive, in scene units or in
     a multiple of them that alignment determines.
@@ -79,13 +79,13 @@ class DepthMaps(Protocol):
         """Whether the image of that name has a map."""
 
     def __iter__(self) -> Iterator[str]:
-        """The names of the images that have a map."""
+        """Iterate over the names of the images that have a map."""
 
     def __len__(self) -> int:
-        """How many images have a map."""
+        """Return the number of images that have a map."""
 
     def read(self, name: str) -> DepthMap:
-        """The map of an image; safe to call from several threads.
+        """Read the map of an image; threads may call this at once.
 
         Raises:
             SceneNotFoundError: The image has none, or its file is gone.
@@ -97,7 +97,7 @@ class HeldDepths(dict[str, DepthMap]):
     """Depth maps in memory, by image name."""
 
     def read(self, name: str) -> DepthMap:
-        """The map of an image."""
+        """Return the map of an image."""
         if name not in self:
             raise SceneNotFoundError(
                 f"a depth map of {name}", found=f"maps of {len(self):,} others", fix="Add one."
@@ -106,7 +106,7 @@ class HeldDepths(dict[str, DepthMap]):
 
 
 def maps_by_name(maps: Any, distorted: Collection[str] = ()) -> DepthMaps:
-    """Depth maps as a scene holds them, from these or from what a caller has in memory.
+    """Convert depth maps in memory to a scene's ``DepthMaps``.
 
     Args:
         maps: ``DepthMaps``; a mapping from image names to a ``DepthMap`` or an array of planar

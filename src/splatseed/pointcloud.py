@@ -1,4 +1,4 @@
-"""PointCloud: coloured points, where each came from, and what is known about them.
+"""PointCloud: coloured points with their origin and optional attributes.
 
 Notation: N points; ``xyz`` in scene units and the scene's world frame; ``rgb`` 8-bit sRGB as stored
 by COLMAP; ``source`` is 0 for an original point, otherwise the code of the method that made it:
@@ -24,20 +24,20 @@ from splatseed.frozen import read_only
 from splatseed.text import visible
 
 ORIGINAL = 0
-"""The ``source`` code of points that were in the input."""
+"""``source`` code of points in the input."""
 
 GENERATED = 255
-"""The ``source`` code of points whose method is unknown or has no code of its own."""
+"""``source`` code of added points whose method has no code of its own."""
 
 ATTRIBUTES: Mapping[str, tuple[int, ...]] = MappingProxyType(
     {"normals": (3,), "sizes": (), "confidence": ()}
 )
-"""Optional attributes of a point besides position, colour and origin: the shape of one value."""
+"""Optional attributes of a point: the shape of its value."""
 
 FARTHEST = np.float32(1e15)
 """Limit of valid coordinates: the squares of larger distances overflow single precision."""
 UNIT_TOLERANCE = 1e-2
-"""By how much a normal's length may differ from 1: half precision keeps it within 1e-3."""
+"""Largest deviation of a normal's length from 1; half precision keeps it within 1e-3."""
 
 _RANGES = {"normals": "of length 1", "sizes": "above 0 and finite", "confidence": "from 0 to 1"}
 _MULTIPLIERS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
@@ -106,7 +106,7 @@ class PointCloud:
         return f"PointCloud({len(self):,} points, {self.num_original:,} of them original{known})"
 
     def __eq__(self, other: object) -> bool:
-        """Whether two clouds have the same points, in the same order, with the same attributes."""
+        """Whether two clouds have the same points and attributes in the same order."""
         if not isinstance(other, PointCloud):
             return NotImplemented
         own, others = self._arrays, other._arrays
@@ -120,7 +120,7 @@ class PointCloud:
 
     @staticmethod
     def empty() -> PointCloud:
-        """No points."""
+        """Return a cloud without points."""
         return PointCloud(np.empty((0, 3), np.float32), np.empty((0, 3), np.uint8))
 
     @property
@@ -135,7 +135,7 @@ class PointCloud:
 
     @property
     def num_original(self) -> int:
-        """How many points come from the input."""
+        """Number of points from the input."""
         return int(np.count_nonzero(self.source == ORIGINAL))
 
     @property
@@ -145,18 +145,18 @@ class PointCloud:
 
     @property
     def references(self) -> PointCloud:
-        """The points that show where the scene is: the originals, or all if none is one."""
+        """The points that locate the scene: the originals, or all if there are none."""
         return self.originals if self.num_original else self
 
     @property
     def finite(self) -> Bool[np.ndarray, " N"]:
-        """Which points have three finite coordinates, so that distances can be computed."""
+        """Mask of points with three finite coordinates below ``FARTHEST``."""
         x, y, z = (np.abs(self.xyz[:, axis]) < FARTHEST for axis in range(3))  # NaN compares false
         return np.asarray(x & y & z)
 
     @property
     def distinct(self) -> Bool[np.ndarray, " N"]:
-        """Which points are finite and the first at their exact position (-0.0 equals 0.0)."""
+        """Mask of finite points that are the first at their position (-0.0 equals 0.0)."""
         distinct = self.finite
         distinct[distinct] = first_of_equals(self.xyz[distinct])
         return distinct
@@ -170,12 +170,12 @@ class PointCloud:
         return np.where(self.source == ORIGINAL, rows, np.int32(-1))
 
     def select(self, which: Bool[np.ndarray, " N"] | Int[np.ndarray, " M"] | slice) -> PointCloud:
-        """The points at ``which`` (a mask, indices or a slice), in that order."""
+        """Return the points at ``which`` (a mask, indices or a slice), in that order."""
         chosen = {name: _unwritable(values[which]) for name, values in self._arrays.items()}
         return PointCloud(**chosen, original_idx=_unwritable(self.rows_of_originals[which]))
 
     def replace(self, **changes: np.ndarray | None) -> PointCloud:
-        """A copy with some of its arrays replaced; None removes an attribute."""
+        """Return a copy with some arrays replaced; None removes an attribute."""
         return dataclass_replace(self, **changes)  # type: ignore[arg-type]  # None for attributes
 
     def with_added(
@@ -184,7 +184,7 @@ class PointCloud:
         rgb: UInt8[np.ndarray, "M 3"],
         **attributes: Float[np.ndarray, "M ..."],
     ) -> PointCloud:
-        """A copy with points of your own after these; their ``source`` is ``GENERATED``.
+        """Return a copy with points of your own appended; their ``source`` is ``GENERATED``.
 
         Args:
             xyz: Positions, [M, 3], scene units, world frame.
@@ -199,7 +199,7 @@ class PointCloud:
 
     @staticmethod
     def read_ply(path: str | Path) -> PointCloud:
-        """The vertices of a PLY file, all as originals; mid grey where it has no colours.
+        """Read the vertices of a PLY file as originals; mid grey without colours.
 
         Raises:
             SceneNotFoundError: There is no such file.
@@ -238,13 +238,13 @@ class PointCloud:
 
 
 def _unwritable(array: np.ndarray) -> np.ndarray:
-    """An array that only we hold, which a cloud need not copy once it is read-only."""
+    """Make an array read-only that nobody else holds, so that a cloud need not copy it."""
     array.flags.writeable = False
     return array
 
 
 def _joined(clouds: Sequence[PointCloud], name: str) -> Float32[np.ndarray, "N ..."]:
-    """An attribute of several clouds."""
+    """Join an attribute of several clouds."""
     shape = ATTRIBUTES[name]
     return np.concatenate(
         [c.attributes.get(name, np.full((len(c), *shape), np.nan, np.float32)) for c in clouds]
@@ -252,7 +252,7 @@ def _joined(clouds: Sequence[PointCloud], name: str) -> Float32[np.ndarray, "N .
 
 
 def _joined_rows(clouds: Sequence[PointCloud]) -> Int32[np.ndarray, " N"] | None:
-    """``original_idx`` of several clouds; None where an original's own row is meant throughout."""
+    """Join ``original_idx`` of several clouds; None if each original has its own row."""
     first, *others = clouds
     if first.original_idx is None and not any(cloud.num_original for cloud in others):
         return None
@@ -308,7 +308,7 @@ def _check_shapes(xyz: np.ndarray, rgb: np.ndarray, source: np.ndarray) -> None:
 
 
 def _kind(array: np.ndarray) -> str:
-    """What an array is, or the object that NumPy made no array of, such as None."""
+    """Describe an array, or the object that NumPy could not convert, such as None."""
     if array.dtype == object and not array.ndim:
         return visible(repr(array.item()))[:80]
     return f"{array.dtype} {list(array.shape)}"

@@ -25,7 +25,7 @@ from splatseed.frozen import read_only
 from splatseed.pointcloud import PointCloud
 
 NO_POINT = -1
-"""The point id of a feature that belongs to no point."""
+"""Point id of a feature without a point."""
 
 SceneFormat = Literal["colmap", "transforms", "ply", "rgbd", "llff"]
 
@@ -48,7 +48,7 @@ class Observations:
         return f"Observations({len(self):,} features, {belong:,} of them of points)"
 
     def without(self, point_ids: Int64[np.ndarray, " P"] | None) -> Observations:
-        """The same features, of which those of some points, or of all, belong to none."""
+        """Return the features with ``NO_POINT`` for those of some points, or of all (None)."""
         gone = True if point_ids is None else np.isin(self.point_ids, point_ids)
         return Observations(self.xy, np.where(gone, NO_POINT, self.point_ids))
 
@@ -80,7 +80,7 @@ class Image:
 
     @property
     def path(self) -> Path:
-        """The photograph's file, which need not exist.
+        """Path of the photograph, which need not exist.
 
         Raises:
             SceneNotFoundError: The image has no folder: its scene was made in memory.
@@ -94,23 +94,23 @@ class Image:
         return self.folder / self.name
 
     def in_folder(self, folder: Path, white: int) -> Image:
-        """The image with the folder of its photograph, and that one's value of white."""
+        """Return the image with the folder and the white value of its photograph."""
         if (self.folder, self.white) == (folder, white):
             return self
         return dataclass_replace(self, folder=folder, white=white)
 
     @property
     def K(self) -> Float64[np.ndarray, "3 3"]:  # noqa: N802  (the field's name)
-        """The pinhole matrix [3, 3] in pixels of a photograph of the camera record's size."""
+        """Pinhole matrix [3, 3] in pixels, for photographs of ``intrinsics``' width and height."""
         return self.camera.K
 
     @property
     def cam_from_world(self) -> Float64[np.ndarray, "4 4"]:
-        """The pose [4, 4]: world points to OpenCV camera axes (x right, y down, z forward)."""
+        """Pose [4, 4]: maps world points to OpenCV camera axes (x right, y down, z forward)."""
         return self.camera.cam_from_world
 
     def read(self) -> UInt8[np.ndarray, "H W 3"]:
-        """The photograph, sRGB, as stored: not rotated by EXIF, not resized, not undistorted.
+        """Read the photograph, sRGB, as stored: not rotated by EXIF, resized or undistorted.
 
         Raises:
             SceneNotFoundError: There is no such file.
@@ -133,7 +133,7 @@ class Image:
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
-    """What Structure-from-Motion knows about its points besides position and colour.
+    """The observations and reprojection errors of Structure-from-Motion's points.
 
     The observations of point i are ``image_ids[offsets[i]:offsets[i + 1]]`` and the features
     ``point2d_idx`` of those images.
@@ -161,7 +161,7 @@ class Tracks:
         return np.diff(self.offsets)
 
     def select(self, keep: Bool[np.ndarray, " N"]) -> Tracks:
-        """The tracks of some points, in their order."""
+        """Return the tracks of the points marked in ``keep``, in their order."""
         observed = np.repeat(keep, self.lengths)
         return Tracks(
             point_ids=self.point_ids[keep],
@@ -188,25 +188,25 @@ class SceneSource:
 
     @property
     def again(self) -> Path:
-        """What to name to read the same again, absolute."""
+        """Absolute path from which ``load_scene`` reads the same scene."""
         return (self.named or self.root).resolve()
 
     @property
     def inputs(self) -> tuple[Path, ...]:
-        """What was read, which outputs must stay apart from.
+        """Input paths that outputs must not overlap.
 
-        Not so a folder of images above the root: they lie apart, and an output may lie there too.
+        An image folder above the root is excluded, so outputs may be written beside it.
         """
         if self.format == "ply":
             return (self.points_path,)
         above = self.root.resolve().parents
         places = (self.root, self.model_dir, self.image_dir)
-        return tuple(each for each in places if each and each.resolve() not in above)
+        return tuple(path for path in places if path and path.resolve() not in above)
 
 
 @dataclass(frozen=True)
 class Split:
-    """Which images train and which test, from a list that came with the scene."""
+    """Training and test images by a list in the scene."""
 
     train: frozenset[str]  # names of the images to train on
     test: frozenset[str]  # names of the images to test; an image may be in neither
@@ -214,14 +214,14 @@ class Split:
 
     @property
     def sentence(self) -> str:
-        """What the user should know before training."""
+        """A note on the split, for messages."""
         count = f"{len(self.train):,} training and {len(self.test):,} test images"
         return f"The split is that of the scene's {self.origin}: {count}; `test_every` is ignored."
 
 
 @dataclass(frozen=True)
 class Masks:
-    """Which pixels of photographs do not count: where an image's mask file is 0."""
+    """Masks of photographs: pixels where an image's mask file is 0 are ignored."""
 
     files: Mapping[str, Path]  # by the image's name; an image without one is used whole
     inverted: bool = False  # whether pixels where the file is not 0 are masked instead
@@ -230,7 +230,7 @@ class Masks:
 
 
 class LeftOut(NamedTuple):
-    """How many points of its files a scene leaves out."""
+    """Numbers of points in the files that a scene excludes."""
 
     non_finite: int = 0  # without three finite coordinates, or beyond 1e15
     duplicates: int = 0  # at exactly the position of an earlier one
@@ -282,10 +282,10 @@ class Scene:
         return "\n".join(lines)
 
     def __getitem__(self, name: str) -> Image:
-        """The image of a name, as in ``scene["DSC07956.JPG"]``.
+        """Return the image of a name, as in ``scene["DSC07956.JPG"]``.
 
         Raises:
-            UnknownNameError: A ``KeyError``; it lists names that are near.
+            UnknownNameError: A ``KeyError``; the message lists similar names.
         """
         if name in self:
             return self._images_by_name[name]
@@ -311,11 +311,11 @@ class Scene:
         return {image.name: image for image in self.images}
 
     def with_points(self, points: PointCloud) -> Scene:
-        """A copy with other points; see ``replace`` for what becomes of tracks."""
+        """Return a copy with other points; ``replace`` describes which tracks are kept."""
         return self.replace(points=points)
 
     def with_depths(self, depths: Any) -> Scene:
-        """A copy with other depth maps.
+        """Return a copy with other depth maps.
 
         Args:
             depths: What ``stereo_depths`` returns, ``DepthMaps``, or a dict by image name of
@@ -324,7 +324,7 @@ class Scene:
         return self.replace(depths=depths)
 
     def replace(self, **changes: Any) -> Scene:
-        """A copy with some fields replaced.
+        """Return a copy with some fields replaced.
 
         When ``points`` are replaced and ``tracks`` are not, originals keep their tracks if they
         come first, in the scene's order and at the same positions, as ``upsample`` puts them.
@@ -339,7 +339,7 @@ class Scene:
         return dataclass_replace(self, **changes)
 
     def _kept_originals(self, points: PointCloud) -> Bool[np.ndarray, " N"]:
-        """Mark the points with tracks that another cloud has first and in order; else none."""
+        """Mark the tracked points that another cloud has first and in order, else none."""
         kept = np.zeros(len(self.tracks or ()), bool)
         rows = points.rows_of_originals
         rising = np.append(np.diff(rows, prepend=-1) <= 0, True)
@@ -352,23 +352,23 @@ class Scene:
 
     @property
     def offset(self) -> Float64[np.ndarray, " 3"]:
-        """What positions lack to the world: the origin, and the offset beside the files."""
+        """Offset from positions to the world: the origin plus the offset recorded in the files."""
         beside = self.source.offset if self.source else (0.0, 0.0, 0.0)
         return np.asarray(self.origin + np.array(beside))
 
     @property
     def has_photographs(self) -> bool:
-        """Whether the file of at least one image exists."""
+        """Whether at least one photograph exists."""
         folder = self.source.image_dir if self.source else None
-        return folder is not None and any((folder / each.name).is_file() for each in self.images)
+        return folder is not None and any((folder / im.name).is_file() for im in self.images)
 
     def split(self, test_every: int = 8) -> tuple[tuple[Image, ...], tuple[Image, ...]]:
-        """Training and test images by name: as listed, else every ``test_every``-th is tested.
+        """Return training and test images by name: as listed, else every ``test_every``-th tests.
 
-        Images that are ``absent`` are counted, so that the others keep their part without them.
+        Images that are ``absent`` count, so that the other images stay in their part.
 
         Raises:
-            ParameterError: ``test_every`` is no whole number of 2 or more, which leaves both some.
+            ParameterError: ``test_every`` is no whole number of 2 or more.
         """
         ordered = sorted(self.images, key=lambda image: image.name)
         if self.listed is not None:
@@ -387,14 +387,14 @@ class Scene:
 
 
 def _size_range(images: Sequence[Image]) -> str:
-    """The pixels of the smallest and the largest image; empty without images."""
+    """Format the pixels of the smallest and the largest image; empty without images."""
     sizes = sorted({(im.intrinsics.width, im.intrinsics.height) for im in images}, key=math.prod)
     ends = dict.fromkeys([*sizes[:1], *sizes[-1:]])
     return f", {' to '.join(f'{width} x {height}' for width, height in ends)} px" if ends else ""
 
 
 def _freeze(record: object, *names: str) -> None:
-    """Let a frozen record have arrays that nobody else can change."""
+    """Replace arrays of a frozen record by read-only ones."""
     for name in names:
         object.__setattr__(record, name, read_only(getattr(record, name)))
 

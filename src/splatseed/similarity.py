@@ -30,12 +30,12 @@ class Similarity:
             object.__setattr__(self, name, read_only(getattr(self, name)))
 
     def points(self, xyz: Float[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
-        """Points of the source in the target."""
+        """Map points of the source to the target."""
         turned = np.asarray(xyz, np.float64) @ self.rotation.T
         return np.asarray(self.scale * turned + self.translation)
 
     def camera(self, cam_from_source: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"]:
-        """``cam_from_target`` of a camera; its depths are then in the target's units."""
+        """Return ``cam_from_target`` of a camera; its depths are in the target's units."""
         cam_from_target = np.eye(4)
         rotation = cam_from_source[:3, :3] @ self.rotation.T
         cam_from_target[:3, :3] = rotation
@@ -44,12 +44,12 @@ class Similarity:
 
     @property
     def inverse(self) -> Similarity:
-        """From the target to the source."""
+        """The similarity from the target to the source."""
         rotation = self.rotation.T
         return Similarity(1 / self.scale, rotation, -rotation @ self.translation / self.scale)
 
     def then(self, second: Similarity) -> Similarity:
-        """This similarity, and another after it."""
+        """Return the composition: this similarity first, then ``second``."""
         return Similarity(
             second.scale * self.scale,
             second.rotation @ self.rotation,
@@ -58,12 +58,12 @@ class Similarity:
 
     @property
     def matrix(self) -> Float64[np.ndarray, "3 4"]:
-        """The similarity as an affine map."""
+        """The affine matrix [3, 4]."""
         return np.column_stack([self.scale * self.rotation, self.translation])
 
 
 def similarity_of(matrix: np.ndarray) -> Similarity | None:
-    """The similarity that an affine map [3, 4] or [4, 4] is, or None if it is not one."""
+    """Convert an affine matrix [3, 4] or [4, 4]; None if it is no similarity."""
     if matrix.shape not in {(3, 4), (4, 4)} or not np.isfinite(matrix).all():
         return None
     linear = np.asarray(matrix[:3, :3], np.float64)
@@ -80,7 +80,7 @@ def similarity_of(matrix: np.ndarray) -> Similarity | None:
 def fit_similarity(
     source: Float64[np.ndarray, "N 3"], target: Float64[np.ndarray, "N 3"]
 ) -> Similarity | None:
-    """The least-squares similarity that maps points to their partners.
+    """Fit the least-squares similarity from points to their partners.
 
     None if there are fewer than three, or all on a line.
     """

@@ -26,9 +26,9 @@ from splatseed.io import colmap, photograph
 from splatseed.io.cleaning import clean_scene, renumber
 from splatseed.io.depth_maps import depth_folder, safe_parts
 from splatseed.io.files import StrPath
+from splatseed.io.image_folders import image_folders, link_folders
 from splatseed.io.photograph_checks import Size, check_sizes
 from splatseed.io.staging import MANIFEST, output_folder, write_json
-from splatseed.io.write import bring, image_folders
 from splatseed.lens import rays_through
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, in_threads, silent
@@ -362,10 +362,10 @@ def _write_photographs(
     if undistort is None or not distorted or source is None:
         folders = image_folders(scene)
         wanted = {n: p for n, p in folders.items() if n == "images" or n.startswith("images/")}
-        bring(wanted, folder, copy=copy)
+        link_folders(wanted, folder, copy=copy)
         return
     straight = [image.name for image in scene.images if not image.intrinsics.has_distortion]
-    bring({f"images/{name}": source / name for name in straight}, folder, copy=copy)
+    link_folders({f"images/{name}": source / name for name in straight}, folder, copy=copy)
 
     def work(start: int, stop: int) -> None:
         for image in distorted[start:stop]:

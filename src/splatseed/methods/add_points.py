@@ -1,4 +1,4 @@
-"""One method's points after a scene's originals: ``add_points``, the first step of ``ss.upsample``.
+"""``add_points``, the first step of ``ss.upsample``: a scene's originals, then one method's points.
 
 Promise: the originals come first and unchanged; the same seed gives the same bytes whatever the
 number of threads; new points are finite.
@@ -41,7 +41,7 @@ def add_points(
     on_stereo: Callable[[StereoResult], None] | None = None,
     **parameters: Any,
 ) -> PointCloud:
-    """Make the new points of one method, with their attributes, and put the originals before them.
+    """Append the points of one method to a scene's originals.
 
     Arguments and errors are those of ``splatseed.upsample``.
     """
@@ -65,7 +65,7 @@ def add_points(
         return originals
     if "points" in traits_of(chosen).needs and not originals.finite.any():
         raise nothing_finite(len(originals))
-    new = NewPoints(*chosen(whole, num_new or 0, rng, progress))  # a plain tuple will do
+    new = NewPoints(*chosen(whole, num_new or 0, rng, progress))  # methods may return a plain tuple
     for sentence in new.notes:
         note(sentence)
     if on_stereo is not None and new.stereo is not None:
@@ -77,17 +77,18 @@ def add_points(
 def number_of_new(
     method: Upsampler, name: str, num_original: int, ratio: float | None, num_points: int | None
 ) -> int | None:
-    """How many points to make; None if the photographs determine it.
+    """Return the number of points to make; None if the method chooses it itself.
 
-    A ``ParameterError``: they do and a number is given, or it is out of range or beyond the memory.
+    Raises:
+        ParameterError: A number is given for such a method, out of range or too large for memory.
     """
     if not chooses_number(method):
         total = planned_size(num_original, ratio, num_points)
         if total == 0 and "points" not in traits_of(method).needs:
             raise ParameterError(
-                "num_points of 1 or more, as there are no originals that a ratio could multiply",
+                "`num_points` of 1 or more, as there are no originals for `ratio` to multiply",
                 found="none" if num_points is None else f"{num_points}",
-                fix="Say how many.",
+                fix="Pass `num_points`.",
             )
         fix = "Ask for {limit} in all, with `num_points` or a smaller `ratio`."
         check_memory(total, BYTES_EACH, "points", fix=fix)
@@ -103,18 +104,18 @@ def number_of_new(
 
 
 def check_seed(seed: int) -> None:
-    """Refuse what seeds no generator."""
+    """Raise a ``ParameterError`` unless a random generator accepts the seed."""
     if not isinstance(seed, (int, np.integer)) or seed < 0:
         raise ParameterError(
-            "a seed that is a whole number from 0", found=repr(seed), fix="Choose such a seed."
+            "a seed that is a whole number of 0 or more", found=repr(seed), fix="Choose another."
         )
 
 
 def planned_size(num_original: int, ratio: float | None, num_points: int | None) -> int:
-    """The number of points in all; a ``ParameterError`` if it cannot be, or both are given."""
+    """Return the number of points in all; raise a ``ParameterError`` if it is out of range."""
     if ratio is not None and num_points is not None:
         raise ParameterError(
-            "either a ratio or a number of points", found="both", fix="Leave one of them out."
+            "`ratio` or `num_points`, not both", found="both", fix="Drop one of them."
         )
     if num_points is None:
         ratio = DEFAULT_RATIO if ratio is None else ratio
@@ -143,9 +144,9 @@ def planned_size(num_original: int, ratio: float | None, num_points: int | None)
 
 
 def as_cloud(new: NewPoints, num_new: int, code: int) -> PointCloud:
-    """What a method returned that was to make ``num_new`` points, checked (``PointCloudError``).
+    """Check ``num_new`` points that a method returned, and make a cloud of them.
 
-    ``code`` is their ``source``, if the method gives none.
+    ``code`` is their ``source`` unless the method gives one. Raises ``PointCloudError``.
     """
     if not np.isfinite(new.xyz).all():
         bad = int(np.flatnonzero(~np.isfinite(new.xyz).all(axis=1))[0])

@@ -1,4 +1,4 @@
-"""Random points in the bounding box (the paper's ablation): the baseline of random positions.
+"""Random points in the bounding box: the paper's ablation.
 
 xyz uniform in the axis-aligned bounding box of the originals, rgb drawn from the originals.
 """
@@ -46,5 +46,5 @@ def in_box(
     high: Float64[np.ndarray, " 3"],
     center: Float64[np.ndarray, " 3"],
 ) -> Float64[np.ndarray, "m 3"]:
-    """Positions in the world, from numbers from 0 to 1 and a box relative to the centroid."""
+    """Map numbers from 0 to 1 to a box relative to ``center``; world positions."""
     return np.asarray(low + center + draws * (high - low))

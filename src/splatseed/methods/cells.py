@@ -38,7 +38,7 @@ ENLARGE = 0.1  # the paper's 10%
 def box_cells(
     cloud: PreparedCloud, progress: Progress
 ) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
-    """Centre relative to the site, radius and volume (equation 6) of each original's cell.
+    """Compute each cell's centre relative to the site, radius and volume (equation 6).
 
     The centre c_i is the mean of the vertices, the radius the largest distance of one from it.
 
@@ -74,7 +74,7 @@ def box_cells(
 
 
 def _corners(xyz: np.ndarray) -> np.ndarray:
-    """Corners [8, 3] of the bounding box enlarged by 10% about its middle."""
+    """Return the corners [8, 3] of the bounding box enlarged by 10%."""
     low, high = xyz.min(axis=0), xyz.max(axis=0)
     # A flat cloud gets a box of some thickness, or the corners would coincide.
     half = np.maximum((high - low) / 2, 1e-3 * (high - low).max()) * (1 + ENLARGE)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 class NewPoints(NamedTuple):
-    """What a method returns; attributes of points are NaN where unknown."""
+    """New points with their attributes, NaN where unknown."""
 
     xyz: Float32[np.ndarray, "M 3"]  # world
     rgb: UInt8[np.ndarray, "M 3"]
@@ -40,9 +40,9 @@ Need = Literal["points", "depth", "photographs", "cloud"]
 
 @dataclasses.dataclass(frozen=True)
 class Traits:
-    """What a method needs from a scene, and whether the photographs determine its number of points.
+    """The inputs that a method needs, and whether it chooses the number of points itself.
 
-    If so, the method is called with 0.
+    Such a method is called with ``num_new`` 0.
     """
 
     needs: frozenset[Need] = frozenset({"points"})
@@ -63,21 +63,21 @@ class Upsampler(Protocol):
     ) -> NewPoints:
         """Make exactly ``num_new`` finite points for a scene.
 
-        Every random number comes from ``rng``; ``progress`` is told the stages.
+        All random numbers come from ``rng``; ``progress`` is called with stage and fraction.
         """
         ...
 
 
 def traits_of(method: Upsampler) -> Traits:
-    """The method's traits, or the default ones."""
+    """Return a method's traits, or the default ones."""
     traits: Traits = getattr(method, "traits", Traits())
     return traits
 
 
 def nothing_finite(number: int) -> PointCloudError:
-    """The error for a cloud of so many points, none of them both finite and original."""
+    """Make the error for a cloud of ``number`` points without a finite original."""
     return PointCloudError(
         "at least one original point with finite coordinates",
         found=f"{number} points, none of them finite and original",
-        fix="Check that the scene holds the point cloud you meant.",
+        fix="Check that the scene holds points from Structure-from-Motion or a scan.",
     )

@@ -1,4 +1,4 @@
-"""Depth-guided lifting (paper, eqs. 7-9): pixels with known depth become points.
+"""Depth-guided lifting (paper, eqs. 7-9): points at pixels with known depth.
 
 P = c + z v, with c the camera's centre, v the ray through the pixel's centre and z its depth,
 scaled to the scene by the SfM points of the image. ``splatseed.depth`` does the work; here are the
@@ -31,12 +31,12 @@ class Depth(DepthSettings):
 
     @property
     def traits(self) -> Traits:
-        """Maps in scene units need no originals for alignment."""
+        """Need originals only to align maps that are not in scene units."""
         return Traits(frozenset({"points", "depth"} if self.align else {"depth"}))
 
     @classmethod
     def paper(cls) -> Self:
-        """The parameters that follow the paper to the letter."""
+        """Return the parameters of the paper's text."""
         return cls(
             fit="least-squares", min_points=1, max_residual_ratio=None, synchronize_scales=False,
             unit_ray=True, region=0.5, placement="uniform", edge_tolerance=None, min_agreeing=0,

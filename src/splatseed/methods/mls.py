@@ -20,8 +20,8 @@ from splatseed.methods._kernels.mls import mls_heights
 from splatseed.methods.patches import FitSize, Patches, PatchMethod
 
 RIDGE = {"local": 1e-6, "world": 1e-12}
-"""By frame, relative to the mean diagonal. In world axes neighbours are often nearly collinear: a
-ridge of 1e-6 would move 1.4% of fern's new points by over a tenth of the spacing."""
+"""Ridge by frame, relative to the mean diagonal. In world axes neighbours are often nearly
+collinear: a ridge of 1e-6 would move 1.4% of fern's new points by over a tenth of the spacing."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Mls(PatchMethod):
 
     @classmethod
     def paper(cls) -> Self:
-        """With k = 10, z = f(x, y) in world axes, positions in the neighbourhood's bounding box."""
+        """Return k = 10, z = f(x, y) in world axes, positions in the bounding box."""
         return cls(k=10, frame="world", placement="box", clamp=None, reject_isolated=False)
 
     def heights(

@@ -1,7 +1,7 @@
-"""The base of every method that starts from a base point and its nearest neighbours.
+"""NearestMethod: the base of methods that make points from a base point and its neighbours.
 
-Such a method has two steps with the draw of the bases between them: ``base_weights`` says how
-likely each row is a base, ``sample`` makes the points.
+``base_weights`` gives the probability of each row to be a base; bases are drawn; ``sample`` makes
+the points.
 
 Colours: c = sum_j w_j c_j / sum_j w_j over the base point and its neighbours, with
 w_j = 1 / max(|p - p_j|, 0.01 h), h the base point's spacing, in linear arithmetic on the 8-bit
@@ -38,15 +38,15 @@ from splatseed.settings import check_settings
 OUTLIER_CHECK_NEIGHBORS = 8
 
 Aux: TypeAlias = Mapping[str, np.ndarray]
-"""What ``base_weights`` has found out about rows and ``sample`` needs: arrays [n, ...] by name."""
+"""Arrays [n, ...] by name that ``base_weights`` computes and ``sample`` uses again."""
 
 
 @dataclass(frozen=True)
 class NearestMethod(ABC):
-    """Base of the methods that need only the nearest neighbours of a base point."""
+    """Base of methods that use only the nearest neighbours of a base point."""
 
     reject_isolated: bool = True
-    """Start nothing from isolated points, or from ones with a short, bad track (paper: no)."""
+    """Draw no bases from isolated points, or from points with a short and bad track (paper: no)."""
 
     min_points: ClassVar[int] = 2
 
@@ -55,7 +55,7 @@ class NearestMethod(ABC):
 
     @classmethod
     def paper(cls) -> Self:
-        """The parameters that follow the paper to the letter."""
+        """Return the parameters of the paper's text."""
         return cls(reject_isolated=False)
 
     @property
@@ -65,7 +65,7 @@ class NearestMethod(ABC):
 
     @property
     def num_queried(self) -> int:
-        """Neighbours to look for: those that points are made from, or that isolation shows in."""
+        """Neighbours to query: for the points, and for the test of isolation."""
         if not self.reject_isolated:
             return self.num_neighbors
         return max(self.num_neighbors, OUTLIER_CHECK_NEIGHBORS)
@@ -83,7 +83,7 @@ class NearestMethod(ABC):
         return self.sample(cloud, neighbors, aux, bases, rng, progress)
 
     def check_enough(self, number: int) -> None:
-        """Refuse a cloud with fewer distinct points than the method needs (PointCloudError)."""
+        """Raise a ``PointCloudError`` if there are fewer distinct points than the method needs."""
         if number < self.min_points:
             raise PointCloudError(
                 f"at least {self.min_points} distinct finite points for {type(self).__name__}",
@@ -94,9 +94,9 @@ class NearestMethod(ABC):
     def base_weights(
         self, cloud: PreparedCloud, neighbors: Neighbors, progress: Progress
     ) -> tuple[Float64[np.ndarray, " n"], Aux]:
-        """Each row's weight as a base, and what ``sample`` needs besides.
+        """Return each row's weight as a base, and arrays for ``sample``.
 
-        ``neighbors`` are ``num_queried`` a row.
+        ``neighbors`` has ``num_queried`` per row.
         """
         if not self.reject_isolated:
             return np.ones(len(cloud)), {}
@@ -112,10 +112,7 @@ class NearestMethod(ABC):
         rng: np.random.Generator,
         progress: Progress,
     ) -> NewPoints:
-        """Make the points of all bases; ``neighbors`` are ``num_neighbors`` a row.
-
-        ``aux`` is what ``base_weights`` has found.
-        """
+        """Make the points of all bases; ``neighbors`` has ``num_neighbors`` per row."""
 
 
 FLOOR = 0.01  # lower limit of distances, in units of the base point's spacing
@@ -124,7 +121,7 @@ FLOOR = 0.01  # lower limit of distances, in units of the base point's spacing
 def interpolate_colors(
     cloud: PreparedCloud, neighbors: Neighbors, bases: Bases, new_xyz: Float32[np.ndarray, "M 3"]
 ) -> UInt8[np.ndarray, "M 3"]:
-    """Colours uint8 [M, 3] of new points at world positions ``new_xyz``."""
+    """Blend the colours of base and neighbours at world positions ``new_xyz``."""
     rgb = np.empty((bases.total, 3), np.uint8)
     kernels.interpolate(
         cloud.xyz, cloud.rgb, cloud.center, neighbors.idx, FLOOR * neighbors.spacing,
@@ -140,9 +137,10 @@ def colors_of_nearest(
     k: int,
     progress: Progress,
 ) -> UInt8[np.ndarray, "M 3"]:
-    """Colours of new points from the k originals nearest to each.
+    """Blend the colours of the k originals nearest to each new point.
 
-    Positions are relative to the cloud's centre: rounded far from 0, they would have others.
+    Positions are relative to the cloud's centre: float32 world coordinates far from 0 are too
+    coarse.
     """
     rgb, spacing = np.empty_like(cloud.rgb), np.empty(len(cloud))
     rgb[cloud.rank], spacing[cloud.rank] = cloud.rgb, neighbors.spacing

@@ -1,4 +1,4 @@
-"""The originals, prepared once for every method: clean, centred, spatially sorted, with neighbours.
+"""Prepare a cloud for all methods: clean, centred, spatially sorted, with neighbours.
 
 Notation: n distinct finite originals in *rows* (kd-tree leaf order: neighbouring rows are
 neighbours in space, which keeps every later pass in cache); ``rank`` is a row's place among them
@@ -29,20 +29,19 @@ from splatseed.scene import Scene
 SPACING_NEIGHBORS = 6  # nearest points over which the spacing h is averaged
 OUTLIER_NEIGHBORS = 16  # neighbours that a point's spacing is compared with
 OUTLIER_FACTOR = 3.0
-"""Times their lower quartile, at which a point is isolated: catches 55% of planted outliers."""
+"""Spacing of an isolated point over the lower quartile of theirs: finds 55% of planted outliers."""
 NEIGHBOR_BYTES = 12
-"""What is held of each neighbour of each point: its row, int32, and its distance, float64."""
+"""Memory per neighbour: its row, int32, and its distance, float64."""
 QUERY_BLOCK = 1 << 13  # rows per task of a thread
 SHORT_TRACK = 3  # images, up to which a track counts as short
 BAD_ERROR = 2.0  # reprojection errors above this are bad, in units of the scene's median
 DRAW_BLOCK = 1 << 20
-"""Ranks whose bases are drawn together: first how many each block of ranks makes, then which in it
-make them."""
+"""Ranks per block: bases are drawn per block first, then within it."""
 
 
 @dataclass(frozen=True, eq=False)
 class Neighbors:
-    """Rows of the k nearest other originals of every row, nearest first, and their distances."""
+    """The k nearest other rows of each row, nearest first, and their distances."""
 
     idx: Int32[np.ndarray, "n k"]
     distance: Float64[np.ndarray, "n k"]
@@ -58,7 +57,7 @@ class Neighbors:
         return np.asarray(self.distance[:, :SPACING_NEIGHBORS].mean(axis=1))
 
     def nearest(self, k: int) -> Neighbors:
-        """The first ``k`` of the neighbours."""
+        """Return the first ``k`` neighbours of each row."""
         if k >= self.k:
             return self
         return Neighbors(
@@ -82,16 +81,18 @@ class PreparedCloud:
         return len(self.xyz)
 
     def neighbors(self, k: int) -> Neighbors:
-        """The ``k`` nearest other rows of every row (all of them if there are fewer).
+        """Find the ``k`` nearest other rows of each row, or all if there are fewer.
 
-        A lone point is a ``PointCloudError``, too many for the memory a ``ParameterError``.
+        Raises:
+            PointCloudError: There is one point only.
+            ParameterError: ``k`` neighbours of all points do not fit into memory.
         """
         k = min(k, len(self) - 1)
         if k < 1:
             raise PointCloudError(
                 "at least 2 distinct finite points",
                 found=f"{len(self)}",
-                fix="Check that the scene holds the point cloud you meant.",
+                fix="Check that the scene holds more than one point.",
             )
         check_memory(
             k, NEIGHBOR_BYTES * len(self), f"neighbours of each of {len(self):,} points",
@@ -111,9 +112,9 @@ class PreparedCloud:
 
 
 def least_distance(farthest: float) -> float:
-    """Least distance of two points of a cloud whose largest centred coordinate is ``farthest``.
+    """Return the smallest distance of points whose largest centred coordinate is ``farthest``.
 
-    Points that float64 cannot tell apart after centring must not end up at distance 0.
+    It replaces 0 for points that centring in float64 has made equal.
     """
     return float(np.finfo(np.float64).eps * farthest)
 
@@ -123,8 +124,8 @@ def prepare(
 ) -> PreparedCloud:
     """Mask, de-duplicate, centre and sort the originals of a cloud (``source`` 0).
 
-    ``trusted`` tells which of the N points may serve as bases: all when left out. The query for
-    neighbours tells ``progress``. Raises a ``PointCloudError`` where no finite original is left.
+    ``trusted`` marks the points that may be bases (all if None). Queries for neighbours report to
+    ``progress``. Raises ``PointCloudError`` if there is no finite original.
     """
     originals = np.flatnonzero(points.source == ORIGINAL)
     keep_idx = originals[points.select(originals).distinct]
@@ -141,19 +142,18 @@ def prepare(
 
 
 def prepare_scene(scene: Scene, progress: Progress = silent) -> PreparedCloud:
-    """``prepare`` the originals of a scene; only ``trusted_originals`` may serve as bases."""
+    """Prepare the originals of a scene; only ``trusted_originals`` may be bases."""
     return prepare(scene.points.originals, trusted_originals(scene), progress)
 
 
 def trusted_originals(scene: Scene) -> Bool[np.ndarray, " N"] | None:
-    """Which of the N originals may be bases, having a long track or a fair error; None: all.
+    """Mark the originals with a long track or a small error, which may be bases; None for all.
 
-    A point that few images saw and that reprojects badly is often a mismatch. On the demo capture,
-    whose outliers are planted, this rule catches 43% of them and costs 0.8% of the rest, and
-    together with the rule for isolated points (``sound_bases``) 75% and 0.9%. On real Kinect data
-    (7-Scenes red kitchen against its depth maps) it catches only 3% of the points over 40 cm off:
-    it is a safeguard, and therefore cautious. An untrusted point stays in the output; only nothing
-    is made from it.
+    A point in few images with a large reprojection error is often a mismatch. On the demo capture
+    this rule finds 43% of the planted outliers and 0.8% of the others; with the rule for isolated
+    points (``sound_bases``) 75% and 0.9%. On real Kinect data (7-Scenes red kitchen against its
+    depth maps) it finds only 3% of the points that are over 40 cm off. Untrusted points stay in the
+    output; no point is made from them.
     """
     tracks = scene.tracks
     if tracks is None or len(tracks) != scene.points.num_original or len(tracks) == 0:
@@ -167,9 +167,9 @@ def trusted_originals(scene: Scene) -> Bool[np.ndarray, " N"] | None:
 
 @dataclass(frozen=True, eq=False)
 class Bases:
-    """How many new points each row makes, and where they go (a CSR layout).
+    """Number and place of the new points of each row, in a CSR layout.
 
-    Row i makes the new points ``start[i] : start[i] + count[i]``, ordered by rank; all are M.
+    Row i makes the new points ``start[i] : start[i] + count[i]``, ordered by rank.
     """
 
     start: Int64[np.ndarray, " n"]
@@ -186,7 +186,7 @@ def draw_bases(
 ) -> Bases:
     """Draw ``num_new`` bases with probability proportional to ``weight`` [n], with replacement.
 
-    When no row has weight, every row is as likely as any other.
+    If all weights are 0, all rows are equally likely.
     """
     by_rank = np.empty(len(cloud))
     by_rank[cloud.rank] = weight if weight.any() else 1.0
@@ -204,10 +204,10 @@ def draw_bases(
 
 
 def sound_bases(cloud: PreparedCloud, neighbors: Neighbors) -> Float64[np.ndarray, " n"]:
-    """Weight 1 for rows that may serve as bases and are not isolated, else 0.
+    """Return weight 1 for trusted rows that are not isolated, else 0.
 
-    A row is isolated when its spacing is over 3 times the lower quartile of its neighbours'
-    spacings: local, so that a sparse background is not taken for noise as a global filter would.
+    An isolated row has a spacing of over 3 times the lower quartile of its neighbours' spacings.
+    The test is local; a global one would take a sparse background for noise.
     """
     spacing, idx = neighbors.spacing, neighbors.idx[:, :OUTLIER_NEIGHBORS]
     isolated = np.empty(len(idx), bool)
@@ -228,10 +228,16 @@ AT_ONCE = 1 << 20  # neighbours fetched at once for points at whose k-th distanc
 def nearest_others(
     tree: cKDTree, xyz: Float64[np.ndarray, "q 3"], own: Int64[np.ndarray, " q"], k: int
 ) -> tuple[Float64[np.ndarray, "q k"], Int64[np.ndarray, "q k"]]:
-    """Distances and numbers of the k points of a tree nearest to each query, itself left out.
+    """Find the k nearest points of a tree to each query, except the query itself.
 
-    ``own`` is the number of the tree's point that a query is, -1 if it is none of them. Where the
-    tree, of n points, has fewer, distances are infinite and numbers n.
+    Args:
+        tree: Of n points.
+        xyz: Queries.
+        own: Number of the tree's point that a query is, -1 if it is none.
+        k: Neighbours.
+
+    Returns:
+        Distances and numbers; infinite and n where the tree has fewer points.
     """
     # One for the query itself, and one to see whether another is as far as the k-th.
     distance, number = _others(tree, xyz, own, k + 2)
@@ -245,7 +251,7 @@ def nearest_others(
 def _others(
     tree: cKDTree, xyz: np.ndarray, own: np.ndarray, wanted: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The nearest ``wanted - 1`` points other than the query, ties in any order."""
+    """Find the ``wanted - 1`` nearest points other than the query, ties in any order."""
     if (own < 0).all():
         distance, number = tree.query(xyz, wanted - 1)
         return distance, number
@@ -266,7 +272,7 @@ def _others(
 def _resolved(
     tree: cKDTree, xyz: np.ndarray, own: np.ndarray, k: int, wanted: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The k nearest with ties by number: more are fetched until one is farther than the k-th."""
+    """Order ties by number: query more points until one is farther than the k-th."""
     distance, number = np.empty((len(xyz), k)), np.empty((len(xyz), k), np.int64)
     for start in range(0, len(xyz), max(AT_ONCE // wanted, 1)):
         part = slice(start, start + max(AT_ONCE // wanted, 1))
@@ -283,7 +289,7 @@ def _resolved(
 def sort_rows(
     distance: Float64[np.ndarray, "q m"], number: Int64[np.ndarray, "q m"]
 ) -> tuple[Float64[np.ndarray, "q m"], Int64[np.ndarray, "q m"]]:
-    """Every row by distance, and by number where distances are equal."""
+    """Sort each row by distance, then by number."""
     order = np.lexsort((number, distance), axis=1)
     return np.take_along_axis(distance, order, axis=1), np.take_along_axis(number, order, axis=1)
 
@@ -291,7 +297,7 @@ def sort_rows(
 def distances_of(
     xyz: Float64[np.ndarray, "n 3"], idx: Int32[np.ndarray, "m k"], least: float
 ) -> Float64[np.ndarray, "m k"]:
-    """The distances of the first m rows from their neighbours, at least ``least``."""
+    """Compute the distances of the first m rows from their neighbours, at least ``least``."""
     distance = np.empty(idx.shape)
 
     def fill(start: int, stop: int) -> None:

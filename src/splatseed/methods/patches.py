@@ -1,6 +1,6 @@
-"""Height-field patches: the steps of a method that fits a surface around every base point.
+"""PatchMethod: the base of methods that fit a height field around each base point.
 
-Around a base point p with k neighbours stands a frame: the rows e_u, e_v (the tangent plane, widest
+The frame of a base point p with k neighbours has the rows e_u, e_v (the tangent plane, widest
 axis first) and e_n (the normal) of ``frames[i]`` [3, 3], right-handed. A surface is a height
 z = S(u, v) over the plane through p, and the new point at (u, v) is p + u e_u + v e_v + z e_n.
 u, v and z are in scene units. The steps are frames, places (u, v), heights (a method's own
@@ -34,7 +34,7 @@ COLLINEAR = 1e-9
 def local_frames(
     xyz: Float64[np.ndarray, "n 3"], idx: Int32[np.ndarray, "m k"]
 ) -> tuple[Float64[np.ndarray, "m 3 3"], Bool[np.ndarray, " m"]]:
-    """Axes e_u, e_v, e_n of the first m rows and their neighbours, and which are collinear."""
+    """Compute the axes e_u, e_v, e_n of m neighbourhoods, and mark the collinear ones."""
     frames, collinear = np.empty((len(idx), 3, 3)), np.empty(len(idx), bool)
     fill_frames(xyz, idx, frames, collinear, COLLINEAR)
     return frames, collinear
@@ -50,7 +50,7 @@ def place_on_disc(
     radius: float,
     rng: np.random.Generator,
 ) -> Float32[np.ndarray, "M 2"]:
-    """Uniform in the disc of ``radius`` times the base point's spacing."""
+    """Draw positions uniform in the disc of ``radius`` times the base point's spacing."""
     uv = rng.random((bases.total, 2), dtype=np.float32)
     kernels.sample_disc(radius * neighbors.spacing, collinear, bases.start, bases.count, uv)
     return uv
@@ -63,7 +63,7 @@ def place_in_triangle(
     frames: Float64[np.ndarray, "n 3 3"],
     rng: np.random.Generator,
 ) -> Float32[np.ndarray, "M 2"]:
-    """Uniform in the triangle of the base and two of its 8 nearest, drawn at random."""
+    """Draw positions uniform in the triangle of the base and two random ones of its 8 nearest."""
     draws = rng.random((bases.total, 3), dtype=np.float32)
     uv = np.empty((bases.total, 2), np.float32)
     idx = neighbors.idx[:, :TRIANGLE_NEIGHBORS].copy()
@@ -78,7 +78,7 @@ def place_in_box(
     frames: Float64[np.ndarray, "n 3 3"],
     rng: np.random.Generator,
 ) -> Float32[np.ndarray, "M 2"]:
-    """Uniform in the bounding box of the neighbourhood along e_u and e_v (the paper's text)."""
+    """Draw positions uniform in the neighbourhood's bounding box along e_u and e_v (paper)."""
     uv = rng.random((bases.total, 2), dtype=np.float32)
     kernels.sample_box(cloud.xyz, neighbors.idx, frames, bases.start, bases.count, uv)
     return uv
@@ -91,7 +91,7 @@ FitSize = Annotated[int, Range(MIN_NEIGHBORS)]
 
 @dataclass(frozen=True, eq=False)
 class Patches:
-    """One patch per row, with its axes, and the places on it where new points go."""
+    """A patch per row: its axes, and the positions (u, v) of its new points."""
 
     cloud: PreparedCloud
     neighbors: Neighbors
@@ -102,19 +102,19 @@ class Patches:
 
 @dataclass(frozen=True)
 class PatchMethod(NearestMethod, ABC):
-    """Base of the methods that fit a height field to the neighbours of a base point."""
+    """Base of methods that fit a height field to the neighbours of a base point."""
 
     k: FitSize = 16
     """Neighbours in a fit."""
     frame: Literal["local", "world"] = "local"
     """Axes of the fit: the neighbourhood's principal axes, or the world's (paper: world)."""
     placement: Literal["disc", "triangle", "box"] = "disc"
-    """Where points are placed: a disc (best coverage), a triangle of neighbours (most exact), a
+    """Area of new points: a disc (best coverage), a triangle of neighbours (smallest error) or a
     box (paper: box)."""
     disc_radius: Annotated[float, Range(above=0)] = 1.5
     """Radius of the disc in units of the base point's spacing."""
     clamp: Annotated[float | None, Range(0)] = 0.25
-    """How far a height may leave the neighbours' range, as a fraction of it (paper: no limit)."""
+    """Maximum height beyond the neighbours' range, as a fraction of it (paper: none)."""
 
     min_points: ClassVar[int] = 4
     name: ClassVar[str]
@@ -139,7 +139,7 @@ class PatchMethod(NearestMethod, ABC):
         rng: np.random.Generator,
         progress: Progress,
     ) -> NewPoints:
-        """Fit a patch to every base and put its points on it."""
+        """Fit a patch to each base and put its points on it."""
         patches = self._patches(cloud, neighbors, bases, rng)
         height = np.empty(bases.total, np.float32)
         for first, last in blocks(len(cloud), BLOCK, self.name, progress):
@@ -150,7 +150,7 @@ class PatchMethod(NearestMethod, ABC):
     def _patches(
         self, cloud: PreparedCloud, neighbors: Neighbors, bases: Bases, rng: np.random.Generator
     ) -> Patches:
-        """Put a patch on every row and choose where its new points go."""
+        """Compute the axes of all patches and draw the positions of their points."""
         if self.frame == "local":
             frames, collinear = local_frames(cloud.xyz, neighbors.idx)
         else:
@@ -168,10 +168,10 @@ class PatchMethod(NearestMethod, ABC):
 def lift(
     patches: Patches, height: Float32[np.ndarray, " M"], clamp: float | None
 ) -> Float32[np.ndarray, "M 3"]:
-    """World positions of the new points at heights S(u, v).
+    """Compute world positions at heights S(u, v).
 
-    Heights are clamped to the neighbours' range, widened on both sides by the fraction ``clamp`` of
-    it; None leaves them unchanged.
+    Heights are clamped to the neighbours' range, extended on both sides by its fraction ``clamp``;
+    None for no limit.
     """
     cloud, bases = patches.cloud, patches.bases
     out = np.empty((bases.total, 3), np.float32)

@@ -1,4 +1,4 @@
-"""METHODS: every upsampling method by name, and how one is configured.
+"""METHODS: all upsampling methods by name, and their configuration.
 
 Built-in methods come first, then those that installed packages register under the entry-point group
 ``splatseed.methods`` (``name = "package.module:Class"``). A class is imported when it is first
@@ -41,7 +41,7 @@ SOURCE_CODES = {name: code for code, name in enumerate(_CODED.split(), start=1)}
 
 
 class MethodRegistry(Mapping[str, type[Upsampler]]):
-    """The methods by name; a class is imported when it is first looked up."""
+    """Methods by name; a class is imported when it is first looked up."""
 
     def __getitem__(self, name: str) -> type[Upsampler]:
         if name in BUILT_IN:
@@ -74,12 +74,12 @@ METHODS = MethodRegistry()
 
 
 def source_code(name: str) -> int:
-    """The ``PointCloud.source`` code of a method; 255 for every third-party method."""
+    """Return a method's ``PointCloud.source`` code; 255 for third-party methods."""
     return SOURCE_CODES.get(name, GENERATED)
 
 
 def source_name(code: int) -> str:
-    """The name of a ``PointCloud.source`` code."""
+    """Return the method's name, "original" or "other" for a ``PointCloud.source`` code."""
     names = {ORIGINAL: "original", **{code: name for name, code in SOURCE_CODES.items()}}
     return names.get(code, "other")
 
@@ -88,11 +88,11 @@ Profile = Literal["default", "paper"]
 
 
 def configure(method: str, profile: Profile = "default", **parameters: Any) -> Upsampler:
-    """An upsampling method with its parameters.
+    """Make a method with its parameters.
 
     Args:
         method: A key of ``METHODS``.
-        profile: "default" avoids the paper's traps, "paper" follows its text to the letter.
+        profile: "default" for the best parameters, "paper" for those of the paper's text.
         parameters: Fields of the method that differ from the profile's.
 
     Raises:
@@ -121,12 +121,12 @@ def configure(method: str, profile: Profile = "default", **parameters: Any) -> U
 
 
 def chooses_number(method: str | Upsampler) -> bool:
-    """Whether the photographs, not the caller, determine how many points a method makes."""
+    """Whether a method chooses the number of points itself, by the photographs."""
     return traits_of(configure(method) if isinstance(method, str) else method).chooses_number
 
 
 def methods_for(scene: Scene | PointCloud) -> tuple[str, ...]:
-    """The names of the methods for a scene: some need its depth maps, some its photographs.
+    """Return the names of methods that a scene has the points, photographs or depth maps for.
 
     Example:
         >>> import numpy as np

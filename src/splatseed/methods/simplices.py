@@ -2,7 +2,7 @@
 
 Linear: P = a P1 + (1 - a) P2 with a ~ U[0, 1], P1 a random original and P2 its nearest neighbour.
 Triangular: P = b0 P1 + b1 P2 + b2 P3 with the two nearest, (b0, b1, b2) uniform in the triangle:
-the barycentric weights come from the square-root map. Colours likewise. Promise: every new point
+the barycentric weights come from the square-root map. Colours likewise. Promise: each new point
 lies between two originals, or in the triangle of three.
 """
 
@@ -22,7 +22,7 @@ from splatseed.progress import Progress
 
 
 class _Simplex(NearestMethod):
-    """The base of both."""
+    """Base of ``Linear`` and ``Triangle``."""
 
     name: ClassVar[str]
 
@@ -50,7 +50,7 @@ class _Simplex(NearestMethod):
     @staticmethod
     @abstractmethod
     def _fill(*arrays: np.ndarray) -> None:
-        """The kernel that fills positions and colours."""
+        """Fill positions and colours by a kernel."""
 
 
 @dataclass(frozen=True)

@@ -54,7 +54,7 @@ class Voronoi(NearestMethod):
 
     @classmethod
     def paper(cls) -> Self:
-        """Cells in the bounding box enlarged by 10%, drawn by equation 6's volume alone."""
+        """Return cells in the bounding box enlarged by 10%, drawn by equation 6's volume."""
         return cls(cells="box", reject_isolated=False)
 
     @property
@@ -65,7 +65,7 @@ class Voronoi(NearestMethod):
     def base_weights(
         self, cloud: PreparedCloud, neighbors: Neighbors, progress: Progress
     ) -> tuple[Float64[np.ndarray, " n"], Aux]:
-        """Weights by volume, and the cells' centres [n, 3] and radii [n]."""
+        """Return weights by volume, and the cells' centres [n, 3] and radii [n]."""
         weight, _ = super().base_weights(cloud, neighbors, progress)
         neighbors = neighbors.nearest(self.k)
         if self.cells == "box":
@@ -86,7 +86,7 @@ class Voronoi(NearestMethod):
         rng: np.random.Generator,
         progress: Progress,
     ) -> NewPoints:
-        """Put the points of all bases in the balls of their cells."""
+        """Draw the points of all bases in the balls of their cells."""
         frames, _ = local_frames(cloud.xyz, neighbors.idx)
         xyz = rng.random((bases.total, 3), dtype=np.float32)
         local = xyz.copy() if self.cells == "box" else xyz[:0]
@@ -101,7 +101,7 @@ class Voronoi(NearestMethod):
 
 
 def _clamped_cells(cloud: PreparedCloud, neighbors: Neighbors, progress: Progress) -> Cells:
-    """The cells of all rows with neighbours, block by block."""
+    """Build the cells of all rows, block by block."""
     frames, _ = local_frames(cloud.xyz, neighbors.idx)
     n = len(neighbors.idx)
     cells = Cells(np.empty((n, 3)), np.empty(n), np.empty(n), np.empty(n, bool))

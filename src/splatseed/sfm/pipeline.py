@@ -21,6 +21,7 @@ from typing import Any, TypeAlias
 from splatseed import errors
 from splatseed.camera import CAMERA_MODELS, Intrinsics
 from splatseed.io import load_scene, write_scene
+from splatseed.io.colmap_layout import write_split
 from splatseed.io.colmap_model import read_model_cameras
 from splatseed.io.files import StrPath
 from splatseed.io.mask_files import FOLDER as MASKS
@@ -30,7 +31,6 @@ from splatseed.io.photograph import photograph_folder
 from splatseed.io.photograph_checks import check_sizes, with_photographs
 from splatseed.io.seeds import carry_seeds
 from splatseed.io.staging import MANIFEST, output_folder, write_json
-from splatseed.io.write import write_split
 from splatseed.photos.view import at_file_size
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent

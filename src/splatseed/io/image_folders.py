@@ -1,0 +1,89 @@
+"""Image folders of an output: where ``images`` and its siblings come from, linked or copied.
+
+A mapping from a path inside the output to the folder or file that it stands for.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path, PurePath
+
+from splatseed.io.files import open_file
+from splatseed.scene import Scene
+
+_SIBLINGS = tuple(
+    f"{kind}{scale}" for kind in ("images", "masks", "depths") for scale in ("", "_2", "_4", "_8")
+)
+"""Folders in which trainers look for photographs, by the resolution they ask for."""
+
+
+def image_folders(scene: Scene) -> dict[str, Path]:
+    """Map ``images`` and its siblings in an output to the scene's folders."""
+    source = scene.source
+    if source is None or not scene.images:
+        return {}
+    folders = sibling_folders(source.root)
+    if source.image_dir is None:
+        return folders
+    if source.image_dir.resolve() != source.root.resolve():
+        return {**folders, "images": source.image_dir}
+    folders.pop("images", None)
+    names = [n for n in (image.name for image in scene.images) if first_folders([n])]
+    # One by one: gsplat's examples do not enter a linked folder within images.
+    return {**folders, **{f"images/{name}": source.image_dir / name for name in names}}
+
+
+def first_folders(paths: Iterable[str]) -> list[str]:
+    """Return the first parts of relative paths; absolute ones and ``..`` have none."""
+    pure = (PurePath(path) for path in paths)
+    firsts = {path.parts[0] for path in pure if path.parts and not path.anchor}
+    return sorted(firsts - {".."})
+
+
+def sibling_folders(root: Path) -> dict[str, Path]:
+    """Return the folders of images, masks and depth maps, at any scale, in a scene's folder."""
+    return {name: root / name for name in _SIBLINGS if (root / name).is_dir()}
+
+
+def link_folders(folders: Mapping[str, Path], output: Path, *, copy: bool) -> list[str]:
+    """Link or copy image folders into ``output``; missing ones are left out."""
+    present = {name: source for name, source in folders.items() if source.exists()}
+    around = output.resolve().parent
+    for name, source in present.items():
+        target = output / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        goal = source.resolve()
+        # Relative if output and source are siblings, to move together.
+        if around in goal.parents and around != Path(around.anchor):
+            goal = Path(os.path.relpath(goal, target.parent.resolve()))
+        if not copy:
+            with suppress(OSError, NotImplementedError):  # a file system or system without links
+                target.symlink_to(goal, target_is_directory=source.is_dir())
+        if not target.is_symlink():
+            _copy(source.resolve(), target)
+    return sorted(present)
+
+
+def _copy(source: Path, target: Path) -> None:
+    """Copy contents without modes, as a copy of a read-only folder could not be removed."""
+    if not source.is_dir():
+        with open_file(source) as file, target.open("xb") as copy:
+            shutil.copyfileobj(file, copy)
+        return
+    above = {source.resolve(), *source.resolve().parents}
+    target.mkdir()
+    for each in source.iterdir():
+        if each.is_dir() and each.resolve() in above:
+            raise OSError(errno.ELOOP, "a link that leads back into itself", str(each))
+        _copy(each, target / each.name)
+
+
+def copy_files(source: Path, names: Sequence[str], target: Path) -> None:
+    """Copy the files of these names that exist."""
+    for name in names:
+        if (source / name).is_file():
+            shutil.copyfile(source / name, target / name)

@@ -1,0 +1,219 @@
+"""Nerfstudio's layout of an output: ``transforms.json`` and its PLY."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Collection, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float64
+
+from splatseed.camera import CAMERA_MODELS, Intrinsics
+from splatseed.errors import OutputError
+from splatseed.io import nerfstudio
+from splatseed.io.colmap_layout import Written, without_zero_distortion
+from splatseed.io.frame_files import FrameFiles
+from splatseed.io.image_folders import copy_files, first_folders, image_folders, sibling_folders
+from splatseed.io.mask_files import FOLDER as MASKS, find_masks
+from splatseed.io.ply import write_ply
+from splatseed.io.seeds import write_seeds
+from splatseed.io.split import ROOT_LISTS
+from splatseed.io.staging import write_json
+from splatseed.scene import Scene, SceneSource
+
+Layout = Literal["colmap", "transforms"]
+_NERFSTUDIO_FROM_COLMAP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]])
+"""The ``applied_transform`` that nerfstudio gives a COLMAP model: (x, y, z) -> (x, z, -y)."""
+_PATH_KEYS = ("file_path", "mask_path", "depth_file_path", "depth_path")
+_LIST_KEYS = ("train_filenames", "val_filenames", "test_filenames")
+_TERMS = {"OPENCV": ("k1", "k2", "p1", "p2"), "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4")}
+"""Nerfstudio's distortion terms, in the order of COLMAP's parameters."""
+_PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
+_FISHEYE = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+_MODELS = dict.fromkeys(_PERSPECTIVE, "OPENCV") | dict.fromkeys(_FISHEYE, "OPENCV_FISHEYE")
+
+
+def write_transforms_layout(scene: Scene, folder: Path) -> Written:
+    """Write ``transforms.json`` and its PLY into an output."""
+    source, points, offset = scene.source, scene.points, scene.offset
+    if source is not None and source.transforms_path is not None:
+        names = {image.name for image in scene.images}
+        transforms = nerfstudio.read_transforms(source.transforms_path)
+        content = _kept_json(transforms, names)
+        if scene.origin.any():
+            content = _moved_json(content, scene.origin)
+        chosen = scene.masks is not None and scene.masks.choice is not None
+        if chosen or rewrites_masks(scene, "transforms"):
+            pairs = list(zip(transforms.images, transforms.frames, strict=True))
+            for key, tests in (("frames", False), ("test_frames", True)):
+                kept = [i.name for i, f in pairs if i.name in names and f.is_test == tests]
+                _name_masks(scene, content.get(key, ()), kept)
+        frames = (*content["frames"], *content.get("test_frames", ()))
+        found = (frame.get(key) for frame in frames for key in _PATH_KEYS)
+        paths = [each for each in found if isinstance(each, str) and not Path(each).is_absolute()]
+        if source.image_dir is not None and source.image_dir.resolve() == source.root.resolve():
+            paths += names  # a frame's own path may lack the extension
+        # The first folders of relative paths, so that these resolve.
+        firsts = {first: source.root / first for first in first_folders(paths)}
+        folders = {**sibling_folders(source.root), **firsts}
+    else:
+        A = None if source and source.format == "transforms" else _NERFSTUDIO_FROM_COLMAP
+        content, folders = _new_json(scene, A), image_folders(scene)
+        _name_masks(scene, content["frames"], [image.name for image in scene.images])
+        if A is not None:
+            xyz = nerfstudio.apply_transform(A, points.xyz).astype(np.float32)
+            normals = None if points.normals is None else points.normals @ A[:, :3].T
+            points, offset = points.replace(xyz=xyz, normals=normals), A[:, :3] @ offset
+    write_json(folder / "transforms.json", {**content, "ply_file_path": "sparse_pc.ply"})
+    write_ply(folder / "sparse_pc.ply", points)
+    shutil.copyfile(folder / "sparse_pc.ply", folder / "pointcloud.ply")  # LichtFeld's name for it
+    write_seeds(folder, points)
+    if source is not None:
+        copy_files(source.root, ROOT_LISTS, folder)
+    return [], folders, offset
+
+
+def _new_json(scene: Scene, A: Float64[np.ndarray, "3 4"] | None) -> dict[str, Any]:
+    """Make the content of a new ``transforms.json``, with poses transformed by A."""
+    used = {image.intrinsics.camera_id: image.intrinsics for image in scene.images}
+    cameras = {camera_id: _camera_fields(camera) for camera_id, camera in used.items()}
+    models = sorted({fields["camera_model"] for fields in cameras.values()})
+    if len(models) > 1:  # nerfstudio takes one for all
+        raise OutputError(
+            "cameras of one kind, for transforms.json",
+            found=" and ".join(models),
+            fix="Undistort the scene first (splatseed undistort), or write the COLMAP layout.",
+        )
+    shared = next(iter(cameras.values()), {})
+    if len(used) != 1:
+        shared = {"camera_model": shared.get("camera_model", "OPENCV")}
+    frames = []
+    for image in scene.images:
+        pose = image.camera.world_from_cam @ nerfstudio.OPENCV_FROM_OPENGL
+        if A is not None:
+            pose[:3] = A @ pose
+        own = {} if len(used) == 1 else cameras[image.intrinsics.camera_id]
+        frame = {"file_path": f"images/{image.name}", "transform_matrix": pose.tolist()}
+        frames.append({**frame, "colmap_im_id": image.image_id, **own})
+    content = {**shared, "frames": frames}
+    if A is not None:
+        content["applied_transform"] = A.tolist()
+    if scene.listed is not None:
+        train, test = ([f"images/{image.name}" for image in part] for part in scene.split())
+        content |= {"train_filenames": train, "test_filenames": test, "val_filenames": test}
+    return content
+
+
+def _camera_fields(camera: Intrinsics) -> dict[str, Any]:
+    """Return a camera record's fields by nerfstudio's names."""
+    camera = without_zero_distortion(camera)
+    model = _MODELS.get(camera.model)
+    if model is None:
+        raise OutputError(
+            "cameras that transforms.json can express",
+            found=f"camera {camera.camera_id} of model {camera.model}",
+            fix="Undistort the scene first (splatseed undistort), or write the COLMAP layout.",
+        )
+    terms = camera.params[CAMERA_MODELS[camera.model].num_focal + 2 :]
+    matrix = camera.K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+    fields = {"camera_model": model, "w": camera.width, "h": camera.height}
+    fields |= zip(("fl_x", "fl_y", "cx", "cy"), matrix, strict=True)
+    return fields | dict(zip(_TERMS[model], (*terms, 0.0, 0.0, 0.0, 0.0), strict=False))
+
+
+def _kept_json(transforms: nerfstudio.Transforms, names: Collection[str]) -> dict[str, Any]:
+    """Return a file's content for another folder, with the named images only."""
+    root, content = transforms.path.parent, transforms.json
+    files = FrameFiles(transforms.path)
+    finders = dict(
+        zip(_PATH_KEYS, (files.photograph, files.mask, *[files.depth_map] * 2), strict=True)
+    )
+
+    def portable(path: Any, key: str = "file_path") -> Any:
+        """Return a path to the same file from another folder of this computer."""
+        if not isinstance(path, str):
+            return path
+        found, plain = finders[key](path), Path(os.path.abspath(root / path))  # noqa: PTH100
+        if found and found.path not in (plain, plain.with_name(plain.name + found.path.suffix)):
+            path = Path(os.path.relpath(found.path, root)).as_posix()
+        if os.path.normpath(path).startswith(".."):
+            return os.path.abspath(root / path)  # noqa: PTH100  (resolve would follow links)
+        return path
+
+    frames: dict[bool, list[dict[str, Any]]] = {False: [], True: []}
+    used = set()
+    for frame, image in zip(transforms.frames, transforms.images, strict=True):
+        if image.name in names:
+            fields = frame.fields
+            moved = {key: portable(fields[key], key) for key in _PATH_KEYS if key in fields}
+            frames[frame.is_test].append({**fields, **moved})
+            used.add(os.path.normpath(str(fields["file_path"])))
+    all_of = (*content["frames"], *(f.fields for f in transforms.frames if f.is_test))
+    gone = {os.path.normpath(str(frame.get("file_path"))) for frame in all_of} - used
+    lists: dict[str, list[Any]] = {}
+    for key in (key for key in _LIST_KEYS if isinstance(content.get(key), list)):
+        listed = [name for name in content[key] if isinstance(name, str)]
+        # Nerfstudio fails over names that no frame has.
+        lists[key] = [portable(name) for name in listed if os.path.normpath(name) not in gone]
+    kept = {key: value for key, value in content.items() if key != "test_frames"}
+    tests = {"test_frames": frames[True]} if frames[True] else {}
+    return {**kept, **lists, "frames": frames[False], **tests}
+
+
+def _moved_json(content: dict[str, Any], offset: Float64[np.ndarray, " 3"]) -> dict[str, Any]:
+    """Subtract an offset from the poses of a file's content."""
+
+    def moved(rows: Sequence[Sequence[float]]) -> list[list[float]]:
+        matrix = np.array(rows, np.float64)
+        matrix[:3, 3] -= offset
+        return [[float(value) for value in row] for row in matrix]
+
+    key = "transform_matrix"
+    more: dict[str, Any] = {
+        name: [{**frame, key: moved(frame[key])} for frame in content[name]]
+        for name in ("frames", "test_frames")
+        if name in content
+    }
+    if content.get("applied_transform") is not None:
+        more["applied_transform"] = moved(content["applied_transform"])
+    return {**content, **more}
+
+
+def rewrites_masks(scene: Scene, layout: Layout) -> bool:
+    """Whether masks must be written, as the scene's own folder cannot be linked."""
+    masks, source = scene.masks, scene.source
+    if masks is None or source is None or not masks.files:
+        return False
+    named = layout == "transforms" and masks.choice is None and _names_masks(source)
+    folder = (source.root / MASKS).absolute()
+    inside = all(folder in path.absolute().parents for path in masks.files.values())
+    if inside and layout == "colmap":  # where masks are known by their names alone
+        inside = find_masks([image.name for image in scene.images], folder)[0].keys() == (
+            masks.files.keys()
+        )
+    return masks.inverted or not (inside or named)
+
+
+def _names_masks(source: SceneSource) -> bool:
+    """Whether the scene's own ``transforms.json`` names masks."""
+    if source.transforms_path is None:
+        return False
+    frames = nerfstudio.read_transforms(source.transforms_path).frames
+    return any(isinstance(frame.fields.get("mask_path"), str) for frame in frames)
+
+
+def _name_masks(scene: Scene, frames: Sequence[dict[str, Any]], names: Sequence[str]) -> None:
+    """Set ``mask_path`` if all frames have a mask: nerfstudio takes masks of all or none."""
+    if scene.masks is None or scene.source is None:
+        return
+    files, root = scene.masks.files, scene.source.root
+    rewrites = rewrites_masks(scene, "transforms")
+    for frame, name in zip(frames, names, strict=True):
+        frame.pop("mask_path", None)
+        if rewrites:
+            frame["mask_path"] = f"{MASKS}/{name}.png"
+        elif all(each in files for each in names):
+            frame["mask_path"] = Path(os.path.relpath(files[name], root)).as_posix()
