@@ -38,7 +38,7 @@ def test_frames_are_sharp_spread_and_not_of_standing_still(wall, tmp_path):
     write_video(video, frames(), (WIDTH, HEIGHT), 30)
     picked = pick_frames(video, folder, 10)
     assert picked.total == 60
-    assert picked.way == pytest.approx(47 * 4 / 160, rel=0.15)  # 47 steps of 4 px of 160
+    assert picked.motion == pytest.approx(47 * 4 / 160, rel=0.15)  # 47 steps of 4 px of 160
     files = sorted(folder.iterdir())
     assert [f"walk_{number:06}.jpg" for number in picked.numbers] == [f.name for f in files]
     assert 8 <= len(files) <= 10

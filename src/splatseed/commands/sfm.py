@@ -98,7 +98,7 @@ def _from_video(options: Options, video: Path, clock: StageClock) -> SfmReport:
         report = _from_photographs(options, Path(name), clock)
     print_note(
         f"{len(picked.numbers)} of the video's {picked.total:,} frames were picked; the "
-        f"picture moves by {picked.way:.1f} times its width."
+        f"picture moves by {picked.motion:.1f} times its width."
     )
     return report
 

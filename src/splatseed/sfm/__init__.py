@@ -1,15 +1,14 @@
-"""Structure-from-Motion: photographs to a scene folder, by pycolmap.
+"""Structure-from-Motion by pycolmap: photographs to a scene folder.
 
-``reconstruct`` finds poses, lenses and points, or points alone for poses that are already known (an
-RGB-D capture, a simulator, another tool's calibration), and can refine those where a phone or SLAM
-made them; ``undistort`` removes lens distortion from a scene. Both write the folder that every 3DGS
-trainer reads: undistorted ``images/`` and ``sparse/0/*.bin`` with PINHOLE cameras.
+``reconstruct`` estimates poses, lenses and points, or triangulates points at known poses (RGB-D
+capture, simulator, calibration), which it can refine (phone, SLAM). ``undistort`` removes lens
+distortion. Both write undistorted ``images/`` and ``sparse/0/*.bin`` with PINHOLE cameras, which
+every 3DGS trainer reads.
 
-Promise: the output appears whole or not at all, and every failure is one of ``splatseed.errors``.
-With one version of pycolmap on the CPU of one machine, features and verified matches are the same
-for the same images, options and seed. Mapping with several threads sums in varying order, and
-bundle adjustment can amplify that: 20 photographs gave 4095 points or 4047. With ``threads=1`` the
-files are the same byte for byte. A GPU guarantees nothing.
+Output is atomic; failures raise ``splatseed.errors``. With one version of pycolmap on the CPU of
+one machine, features and verified matches depend only on images, options and seed. Mapping with
+several threads sums in varying order, which bundle adjustment can amplify: 20 photographs gave 4095
+or 4047 points. With ``threads=1`` the output is bit-identical. On a GPU nothing is guaranteed.
 """
 
 from splatseed.sfm.colmap import MatcherName, Settings

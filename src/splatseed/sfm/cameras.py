@@ -1,12 +1,12 @@
-"""Which photographs share a camera: by size, by what EXIF says of camera and lens, and by folder.
+"""Group photographs by camera: by size, EXIF camera and lens, focal length, and folder.
 
-A camera here is one setting of one lens, with one focal length to solve for. Photographs of a
-phone's two lenses have one size, and so have those of two zoom settings: one focal length for both
-fits neither. Too many cameras are a loss as well, since few photographs determine a focal length
-and distortion loosely; a zoom ring that was touched is still one setting.
+A camera is one setting of one lens, with one set of intrinsics to estimate. A phone's lenses and
+zoom settings give photographs of one size but need separate focal lengths. Too many cameras are
+also harmful, since few photographs constrain focal length and distortion poorly; slightly different
+zoom is one setting.
 
-Notation: a *focal length* in mm is the 35 mm equivalent, where EXIF has it: digital zoom changes
-it alone.
+Notation: *focal lengths* in mm are 35 mm equivalents if EXIF has them, because digital zoom only
+changes those.
 """
 
 from __future__ import annotations
@@ -24,33 +24,33 @@ from PIL import Image as PilImage
 from splatseed.text import agreeing, counted, name_some
 
 Size = tuple[int, int]
-"""Width and height in pixels as stored, before any EXIF rotation."""
+"""Width and height in stored pixels, before EXIF rotation."""
 
 _MAKE, _MODEL, _IFD = 0x010F, 0x0110, 0x8769
 _FOCAL, _FOCAL_35, _LENS, _ZOOM = 0x920A, 0xA405, 0xA434, 0xA404
 _ROUNDING = 0.75
-"""Millimetres by which a 35 mm equivalent, a whole number, differs from the focal length's."""
+"""Largest rounding error of a 35 mm equivalent, which EXIF stores as an integer, mm."""
 _SAME_RATIO = 1.01
-"""Ratio of focal lengths up to which they count as one setting."""
+"""Largest ratio of focal lengths of one setting."""
 _NEAR_RATIO = 1.06
-"""The same where one of them has few photographs."""
+"""The same if either has few photographs."""
 _MIN_GROUP = 4
-"""Photographs that determine a camera of their own."""
+"""Fewest photographs for a separate camera."""
 
 
 class Exif(NamedTuple):
-    """What EXIF says of the camera; empty or None where it says nothing."""
+    """EXIF fields of the camera; empty or None if absent."""
 
     make: str = ""
     model: str = ""
     lens: str = ""
     focal: float | None = None  # mm
     focal_35: float | None = None  # mm, equivalent
-    zoom: float | None = None  # digital; some phones change only this
+    zoom: float | None = None  # digital zoom; some phones only change this
 
 
 class Photo(NamedTuple):
-    """A photograph's facts that decide on its camera."""
+    """The properties of a photograph by which cameras are grouped."""
 
     size: Size
     exif: Exif = Exif()
@@ -58,20 +58,20 @@ class Photo(NamedTuple):
 
 
 Photos: TypeAlias = Mapping[str, Photo]
-"""By name, a path relative to the folder of all, with ``/``."""
+"""Photographs by name: the path relative to the images folder, with ``/``."""
 
 
 class SharedCamera(NamedTuple):
-    """Photographs that share a camera, by name; ``typical`` has the median focal length."""
+    """Names of photographs that share a camera; ``typical`` has the median focal length."""
 
     names: tuple[str, ...]
     typical: str
-    label: str  # for the user, such as "Apple iPhone 15 at 26 mm"; empty if EXIF says nothing
+    label: str  # such as "Apple iPhone 15 at 26 mm"; empty without EXIF
 
 
 def read_exif(image: PilImage.Image) -> Exif:
-    """The camera by the EXIF of a picture whose header was read; nothing where it is damaged."""
-    with suppress(Exception):  # Pillow raises what it likes for tags that are cut short
+    """Read the EXIF of an opened image; empty if damaged."""
+    with suppress(Exception):  # Pillow raises any exception for truncated tags
         tags = image.getexif()
         own = tags.get_ifd(_IFD)
         texts = (_text(tags.get(_MAKE)), _text(tags.get(_MODEL)), _text(own.get(_LENS)))
@@ -88,18 +88,18 @@ def _text(value: object) -> str:
 
 
 def _length(value: object) -> float | None:
-    """A tag's millimetres; 0, as cameras write for an unknown length, and 0 / 0 are none."""
+    """Return a tag's value in mm; None for 0 (unknown) and 0 / 0."""
     with suppress(TypeError, ValueError, ArithmeticError):
-        length = float(value)  # type: ignore[arg-type]  # what is no number raises
+        length = float(value)  # type: ignore[arg-type]  # others raise
         return length if 0 < length < math.inf else None
     return None
 
 
 def share_cameras(photos: Photos) -> tuple[SharedCamera, ...]:
-    """The cameras of photographs, in the order of their first one.
+    """Group photographs by camera, in the order of each camera's first photograph.
 
-    Photographs share a camera if size, make, model and lens are the same, focal lengths are nearly
-    so, and folders are, where each of these has photographs enough.
+    Photographs share a camera if size, make, model and lens are equal, focal lengths are nearly
+    equal, and folders are equal (folders with few photographs are merged).
     """
     lengths = _focal_lengths(photos)
     groups: list[list[str]] = []
@@ -107,12 +107,12 @@ def share_cameras(photos: Photos) -> tuple[SharedCamera, ...]:
         for known in _grouped(alike, lambda name: lengths[name] is not None):
             for setting in _settings(known, lengths):
                 groups += _by_folder(setting)
-    groups = sorted(map(sorted, _without_strays(groups, photos)))
+    groups = sorted(map(sorted, _merge_without_exif(groups, photos)))
     return tuple(_shared(names, photos, lengths) for names in groups)
 
 
 def describe_cameras(cameras: Sequence[SharedCamera]) -> str:
-    """How many cameras there are, and which, in a few words."""
+    """Describe the number and kinds of cameras."""
     labels = [
         f"{camera.label or 'unnamed'} ({counted(len(camera.names), 'photograph')})"
         for camera in cameras
@@ -130,7 +130,7 @@ def _lens_of(photo: Photo) -> tuple[object, ...]:
 
 
 def _focal_lengths(photos: Photos) -> dict[str, float | None]:
-    """The photographs' focal lengths, not rounded where EXIF's own says more."""
+    """Return focal lengths, more precise than rounded equivalents where possible."""
     found: dict[str, float | None] = {}
     for names in _grouped(photos, lambda name: _lens_of(photos[name])):
         both = [photos[name].exif for name in names]
@@ -140,19 +140,19 @@ def _focal_lengths(photos: Photos) -> dict[str, float | None]:
             exif = photos[name].exif
             exact = exif.focal * crop if exif.focal else None
             rounded = exif.focal_35 or exact
-            # Another lens of a phone, or digital zoom, has another equivalent.
-            apart = exact is None or rounded is None or abs(exact - rounded) > _ROUNDING
-            found[name] = rounded if apart else exact
+            # A phone's other lens or digital zoom changes the equivalent.
+            differ = exact is None or rounded is None or abs(exact - rounded) > _ROUNDING
+            found[name] = rounded if differ else exact
     return found
 
 
 def _settings(names: Sequence[str], lengths: Mapping[str, float | None]) -> list[list[str]]:
-    """Photographs of one lens, by settings of its focal length."""
+    """Group photographs of one lens by focal length."""
     groups = [
         list(same)
         for _, same in groupby(sorted(names, key=lambda n: lengths[n] or 0.0), lengths.__getitem__)
     ]
-    while len(groups) > 1:  # neighbours join, the nearest first
+    while len(groups) > 1:  # merge neighbours, most similar first
         spans = [(lengths[b[-1]] or 1.0) / (lengths[a[0]] or 1.0) for a, b in pairwise(groups)]
         joined = [
             (span, i)
@@ -168,14 +168,14 @@ def _settings(names: Sequence[str], lengths: Mapping[str, float | None]) -> list
 
 
 def _by_folder(names: Sequence[str]) -> list[list[str]]:
-    """Photographs of one setting by folder; folders of few are one group."""
+    """Group photographs of one setting by folder; small folders are merged."""
     folders = _grouped(names, lambda name: PurePosixPath(name).parent)
     rest = [name for each in folders if len(each) < _MIN_GROUP for name in each]
     return [*(each for each in folders if len(each) >= _MIN_GROUP), *([rest] if rest else [])]
 
 
-def _without_strays(groups: Sequence[list[str]], photos: Photos) -> list[list[str]]:
-    """A few photographs without EXIF join the others of their size if these are of one camera."""
+def _merge_without_exif(groups: Sequence[list[str]], photos: Photos) -> list[list[str]]:
+    """Merge few photographs without EXIF into the only other camera of their size."""
     kept = [list(each) for each in groups]
     for group in groups:
         size, exif = photos[group[0]][:2]

@@ -14,26 +14,26 @@ from splatseed.errors import OutputError
 from splatseed.pointcloud import first_of_equals
 from splatseed.sfm.colmap import Run
 
-_ORIENTATION, _SHORT, _UPRIGHT = 0x0112, 3, 1  # the tag, its type, the value that turns nothing
-_HEAD_BYTES = 1 << 17  # the EXIF segment, at most 64 KiB, comes first or after a small one
-_NEGLIGIBLE = 2e-7  # a coefficient that pycolmap takes for distortion, and that moves no pixel
+_ORIENTATION, _SHORT, _UPRIGHT = 0x0112, 3, 1  # the tag, its type, its value for upright
+_HEAD_BYTES = 1 << 17  # EXIF (at most 64 KiB) is the first or second segment
+_NEGLIGIBLE = 2e-7  # a coefficient that counts as distortion but moves no pixel
 
 
 def export_scene(run: Run, model_dir: Path, staging: Path, *, distinct: bool = True) -> None:
-    """Write a model's photographs and points to ``staging`` with distortion removed.
+    """Write a model's undistorted photographs and points to ``staging``.
 
-    Images whose camera is PINHOLE already are copied byte for byte, except that an EXIF orientation
-    is cleared. The points' reprojection errors are in pixels of the undistorted images. With
-    ``distinct``, points that COLMAP put exactly where another is are left out.
+    Photographs of PINHOLE cameras are copied, with the EXIF orientation cleared. Reprojection
+    errors are in pixels of the undistorted photographs. ``distinct`` drops points at the position
+    of another.
 
     Raises:
-        OutputError: Not all images could be written.
+        OutputError: Not all photographs could be written.
     """
     pycolmap, dense, straight = run.pycolmap, run.work / "dense", run.work / "straight"
     given = pycolmap.Reconstruction(model_dir)
     num_images = given.num_reg_images()
     for camera in given.cameras.values():
-        name_distortion(camera)
+        mark_distortion(camera)
     straight.mkdir()
     given.write(straight)
 
@@ -48,7 +48,7 @@ def export_scene(run: Run, model_dir: Path, staging: Path, *, distinct: bool = T
         num_written,
         num_images,
     )
-    if num_written() != num_images:  # pycolmap only logs an image that it could not read or write
+    if num_written() != num_images:  # pycolmap only logs images that it fails to read or write
         names = [image.name for image in pycolmap.Reconstruction(model_dir).images.values()]
         missing = sorted(name for name in names if not (dense / "images" / name).is_file())
         raise OutputError(
@@ -67,11 +67,11 @@ def export_scene(run: Run, model_dir: Path, staging: Path, *, distinct: bool = T
     model.write(staging / "sparse" / "0")
 
 
-def name_distortion(camera: Any) -> None:
-    """Make pycolmap undistort a camera if, and only if, it has distortion.
+def mark_distortion(camera: Any) -> None:
+    """Change a camera so that pycolmap undistorts its photographs if and only if needed.
 
-    It goes by the coefficients: it would copy a fisheye's photographs where they are all 0, and
-    resample those of an EUCM camera that is a pinhole.
+    pycolmap checks coefficients only: it would copy the photographs of a fisheye whose coefficients
+    are 0, and resample those of an EUCM camera that is a pinhole.
     """
     size, params = (camera.width, camera.height), tuple(camera.params)
     lens = Intrinsics(camera.camera_id, camera.model.name, *size, params)
@@ -85,7 +85,7 @@ def name_distortion(camera: Any) -> None:
 
 
 def drop_repeats(model: Any) -> None:
-    """Of a model's points at one float32 position, keep that with the longest track."""
+    """Of points at one float32 position, keep the one with the longest track."""
     points = model.points3D
     longest_first = sorted(points, key=lambda i: (-points[i].track.length(), i))
     xyz = np.array([points[i].xyz for i in longest_first], np.float32).reshape(-1, 3)
@@ -95,26 +95,25 @@ def drop_repeats(model: Any) -> None:
 
 
 def clear_orientation(folder: Path) -> None:
-    """Mark every JPEG below ``folder`` as upright in its stored orientation.
+    """Set the EXIF orientation of all JPEGs in a folder to upright.
 
-    COLMAP reads pixels as they are stored and keeps EXIF's orientation in what it writes; a trainer
-    whose image reader obeys that tag (as OpenCV's does) would see the photograph rotated relative
-    to its camera. The two bytes of the tag change and nothing else.
+    COLMAP uses stored pixels but copies the tag; a trainer whose image reader applies it (OpenCV
+    does) would rotate the photograph relative to its camera. Only the tag's two bytes change.
     """
     for path in folder.rglob("*"):
         if path.suffix.lower() not in {".jpg", ".jpeg"}:
             continue
         with PilImage.open(path) as image:
-            turned = image.getexif().get(_ORIENTATION, _UPRIGHT)
-        if turned not in range(_UPRIGHT + 1, 9):  # as stored, or no orientation
+            orientation = image.getexif().get(_ORIENTATION, _UPRIGHT)
+        if orientation not in range(_UPRIGHT + 1, 9):  # upright or invalid
             continue
         content = path.read_bytes()
-        # EXIF's entry of a tag (TIFF 6.0): tag, type, count and value, in one of two byte orders.
+        # A TIFF 6.0 entry: tag, type, count and value, in either byte order.
         for order in ("<HHIH", ">HHIH"):
-            entry = struct.pack(order, _ORIENTATION, _SHORT, 1, turned)
+            entry = struct.pack(order, _ORIENTATION, _SHORT, 1, orientation)
             at = content.find(entry, 0, _HEAD_BYTES)
             if at >= 0:
                 upright = struct.pack(order, _ORIENTATION, _SHORT, 1, _UPRIGHT)
-                path.unlink()  # a copy of a read-only photograph is read-only
+                path.unlink()  # copies of read-only photographs are read-only
                 path.write_bytes(content[:at] + upright + content[at + len(upright) :])
                 break

@@ -1,9 +1,8 @@
-"""Scenes by Structure-from-Motion: ``reconstruct``, ``undistort``, ``refined``.
+"""Run Structure-from-Motion: ``reconstruct``, ``undistort``, ``refined``.
 
-Here the input is checked and the output staged; pycolmap works in a process of its own. A failure
-deep in COLMAP (a full disk under SQLite, a broken image codec) aborts the process it happens in,
-and only a kill stops some of its loops: so an abort becomes a ``ReconstructionError``, and an
-interrupt a kill.
+Input is checked and output staged here; pycolmap runs in a child process. COLMAP aborts its process
+on some failures (a full disk under SQLite, a broken image codec), and some of its loops only stop
+by a kill: an abort of the child becomes ``ReconstructionError``, and an interrupt kills it.
 """
 
 from __future__ import annotations
@@ -52,22 +51,22 @@ _REASON = re.compile(r"what\(\):\s*(.*)|^[EF]\d{8}\s.*?\]\s*(.*)", re.MULTILINE)
 
 @dataclass(frozen=True)
 class SfmReport:
-    """The outcome of ``reconstruct`` or ``undistort``."""
+    """Result of ``reconstruct`` or ``undistort``."""
 
-    path: Path  # the scene folder that was written
-    registered: int  # images with a pose in the scene
-    total: int  # images that were given
-    unregistered: tuple[str, ...]  # names without a pose, sorted; not in the scene
+    path: Path  # the scene folder
+    registered: int  # images with a pose
+    total: int  # input images
+    unregistered: tuple[str, ...]  # images without a pose, sorted; not in the scene
     num_points: int
     mean_track_length: float  # observations per point
-    mean_reprojection_error: float  # over points, of their means; px, undistorted
-    seconds: Mapping[str, float]  # wall time of each stage, in the order in which they ran
-    refinement: Refinement | None = None  # what it changed; None where it was not asked for
-    poses: tuple[Image, ...] = ()  # the known poses, refined if that was asked for
+    mean_reprojection_error: float  # mean over points, undistorted px
+    seconds: Mapping[str, float]  # wall time by stage, in order
+    refinement: Refinement | None = None  # None without ``refine_poses``
+    poses: tuple[Image, ...] = ()  # the known poses, refined with ``refine_poses``
 
 
 Job: TypeAlias = Callable[..., SfmReport]
-"""Takes a run, the folder to make the scene in, and arguments of its own."""
+"""A job of the child process: (run, staging folder, *arguments) to report."""
 
 
 def reconstruct(
@@ -88,46 +87,44 @@ def reconstruct(
     on_photos: OnPhotos | None = None,
     on_note: Callable[[str], None] = lambda _: None,
 ) -> SfmReport:
-    """Make a scene from photographs: features, matching, mapping or triangulation, undistortion.
+    """Reconstruct a scene: features, matching, mapping or triangulation, undistortion.
 
-    Where poses are known, they and intrinsics stay exactly as given, and only points are estimated.
-    With ``refine_poses`` the poses move to where the photographs' matches agree, in the given world
-    frame and scale, and intrinsics stay. Photographs and poses are paired by name. Images without a
-    pose are left out, as are poses without an image. A scene that says which images test keeps its
-    lists.
+    Known poses and intrinsics stay exactly as given, and only points are estimated.
+    ``refine_poses`` adjusts the poses to the matches, in the given world frame and scale, but not
+    the intrinsics. Photographs and poses are paired by name; those without a partner are left out.
+    Lists of test images of ``poses_from`` are kept.
 
     Args:
-        image_dir: The photographs, also in subfolders.
-        output: The scene folder to write. Its images are those that got a pose, undistorted, at the
-            photographs' size.
-        settings: How features are detected and matched.
-        camera_model: COLMAP's model of the lens in the photographs, where poses are not known.
-        shared_camera: One camera for the photographs of a lens (``share_cameras``), or one for each
-            photograph; likewise.
-        poses_from: A scene whose ``images`` give poses and intrinsics; its points are not used.
-        refine_poses: Refine these poses, if they are off by a few degrees or per cent of the
-            cameras' extent, as those of phones and SLAM are. They stay exactly as given where
-            refinement would lower the mean reprojection error by less than 0.1 px.
+        image_dir: Folder of photographs, with subfolders.
+        output: The scene folder to write, with the undistorted photographs that have a pose, at
+            the input's size.
+        settings: Settings of features, matching and reconstruction.
+        camera_model: COLMAP's camera model, if poses are not known.
+        shared_camera: One camera per lens (``share_cameras``), or one per photograph, if poses are
+            not known.
+        poses_from: A scene with poses and intrinsics; its points are ignored.
+        refine_poses: Refine poses that are off by a few degrees or per cent of the cameras' extent
+            (phones, SLAM). They are unchanged if refinement would lower the mean reprojection
+            error by less than 0.1 px.
         test_names: Posed photographs, by name, whose poses are refined with the others but which
             neither contribute points nor appear in the scene, such as test views.
-        masks: Where no features are looked for; the scene gets them, undistorted.
+        masks: Masked pixels get no features; the scene gets undistorted masks.
         partial: Accept a model of fewer than half of the photographs.
-        keep: Keep features, matches and models in ``OUTPUT_sfm`` if this fails, and go on from
-            those that an earlier call left there (``sfm.work_folder``).
+        keep: On failure, keep features, matches and models in ``OUTPUT_sfm``, and resume from
+            those of an earlier call (``sfm.work_folder``).
         overwrite: Replace ``output`` if it exists.
         on_progress: Called with the stage and the fraction done.
-        on_photos: Called before work begins with the photographs' names, with those of other
-            images, by what they are, and with a description of the cameras, empty if poses are
-            known.
-        on_note: Called with a sentence on kept work.
+        on_photos: Called before work starts with the photographs' names, the names of skipped
+            images by reason, and a description of the cameras (empty if poses are known).
+        on_note: Called with a sentence on resumed work.
 
     Raises:
-        InputError: Images missing, unreadable or of another size than their known camera; fewer
-            than two with a known pose; an option out of range; output not writable.
-        ReconstructionError: No model came out, or fewer than half of the images got a pose and
-            ``partial`` is False; no point could be triangulated at known poses, or ``refine``
-            refused them.
-        MissingDependencyError: pycolmap is absent or cannot use the device.
+        InputError: Photographs missing, unreadable or of another size than their known camera;
+            fewer than two with a known pose; an argument out of range; output not writable.
+        ReconstructionError: No model, or fewer than half of the photographs got a pose and
+            ``partial`` is False; no point could be triangulated at known poses, or refinement
+            failed.
+        MissingDependencyError: pycolmap is not installed, or cannot use the device.
     """
     colmap.check_choice("camera_model", camera_model, tuple(CAMERA_MODELS))
     require("pycolmap")
@@ -144,10 +141,10 @@ def reconstruct(
         lenses = _lenses(cameras, camera_model, poses)
         matching = (settings.matcher, settings.seed)
         key = work_key(photos, lenses, masks, settings.max_image_size, matching)
-        asked = camera_model, poses, refine_poses, test_names, masks, partial
+        options = camera_model, poses, refine_poses, test_names, masks, partial
         with resumable_work(Path(output), key, on_note) if keep else nullcontext() as kept:
             how = (images, staging, settings, on_progress, kept, _reconstruct)
-            report = _call(*how, list(photos), cameras, *asked)
+            report = _call(*how, list(photos), cameras, *options)
         if poses_from is not None:
             write_split(poses_from, staging)
             write_offset(staging, poses_from.offset)
@@ -164,7 +161,7 @@ def reconstruct(
 def _lenses(
     cameras: Sequence[SharedCamera], camera_model: str, poses: Sequence[Image] | None
 ) -> list[tuple[Sequence[str], Intrinsics | str]]:
-    """The photographs that share a camera, and its lens, or the lens's model if it is unknown."""
+    """Return the photographs of each camera, and its intrinsics, or model name if unknown."""
     if poses is None:
         return [(camera.names, camera_model) for camera in cameras]
     lenses = {image.intrinsics.camera_id: image.intrinsics for image in poses}
@@ -204,7 +201,7 @@ def _reconstruct(
 def _export(
     run: Run, model_dir: Path, staging: Path, masks: Masks | None, *, distinct: bool = True
 ) -> None:
-    """Write a model's photographs, their masks and its points without distortion."""
+    """Write a model's undistorted photographs, masks and points."""
     export_scene(run, model_dir, staging, distinct=distinct)
     if masks is None:
         return
@@ -219,24 +216,24 @@ def _export(
 def undistort(
     scene: Scene, output: StrPath, *, overwrite: bool = False, on_progress: Progress = silent
 ) -> SfmReport:
-    """Write a scene with undistorted photographs and PINHOLE cameras.
+    """Write a scene with undistorted photographs and PINHOLE cameras, in COLMAP's layout.
 
-    Poses, points, their origins and tracks stay; features move with the pixels. The size of
-    photographs changes a little. The output has COLMAP's layout.
+    Poses, points, their origin and tracks stay; 2D features are undistorted. The size of
+    photographs may change slightly.
 
     Raises:
-        SceneNotFoundError: Fewer than half of the photographs are there.
-        SceneFormatError: The name of one leads out of their folder, or one does not fit its camera.
-        OutputError: ``output`` is taken or cannot be written.
+        SceneNotFoundError: Fewer than half of the photographs exist.
+        SceneFormatError: A name leads out of the folder, or a photograph does not fit its camera.
+        OutputError: ``output`` exists or cannot be written.
         ReconstructionError: pycolmap failed.
-        MissingDependencyError: pycolmap is absent.
+        MissingDependencyError: pycolmap is not installed.
     """
     require("pycolmap")
     _check_names(scene)
     scene = with_photographs(scene)
     images = photograph_folder(scene).absolute()
     check_sizes(scene.images, images)
-    scene = at_file_size(scene).replace(intrinsics=())  # pycolmap wants cameras of the files' size
+    scene = at_file_size(scene).replace(intrinsics=())  # pycolmap needs cameras of the files' size
     with _staged(images, Path(output), "undistort", overwrite=overwrite) as staging:
         work = staging / ".work" / "distorted"
         distorted = write_scene(scene, work, format="colmap", require_points=False).path
@@ -284,7 +281,7 @@ def refined(
         )
         found = load_scene(report.path).replace(images=report.poses)
     change, points = report.refinement, f"{report.num_points:,} points were triangulated"
-    assert change is not None  # noqa: S101  (it was asked for)
+    assert change is not None  # noqa: S101  (refine_poses is set)
     if change.kept:
         how = f"Poses are as given: refined, they would gain less than 0.1 px. {points}."
     else:
@@ -297,14 +294,14 @@ def refined(
 
 
 def with_refined(scene: Scene, found: Scene) -> Scene:
-    """The scene with the poses and the points of another of the same photographs.
+    """Replace poses and points by those of another scene of the same photographs.
 
-    Images that the other lacks keep their poses; its points count as originals without tracks.
+    Images missing there keep their poses; its points become originals without tracks.
     """
     posed = {image.name: image for image in found.images}
     pairs = [(image, posed.get(image.name, image)) for image in scene.images]
     images = tuple(
-        # Features were of the points that are gone.
+        # Drop observations of the replaced points.
         replace(i, quat=pose.quat, translation=pose.translation, observations=None)
         for i, pose in pairs
     )
@@ -314,7 +311,7 @@ def with_refined(scene: Scene, found: Scene) -> Scene:
 
 @contextmanager
 def _staged(images: Path, output: Path, kind: str, *, overwrite: bool) -> Iterator[Path]:
-    """The folder to make the scene in, with ``.work`` for scratch files, on the output's disk."""
+    """Yield the staging folder of the scene, with ``.work`` for temporary files on its disk."""
     with output_folder(output, kind=kind, overwrite=overwrite, protect=(images,)) as staging:
         (staging / ".work").mkdir()
         yield staging.absolute()
@@ -330,7 +327,7 @@ def _call(
     job: Job,
     *arguments: Any,
 ) -> SfmReport:
-    """Do a job, with arguments of its own, in a child process."""
+    """Run a job in a child process."""
     log = staging / ".work" / "log.txt"
     call = (_work, images, staging, settings, kept, job, arguments)
     with closing(Child(*call, reports=True, log=log.open("w+b"))) as child:
@@ -342,7 +339,7 @@ def _call(
                 found = f"{found.partition(':')[0]}: {''.join(reasons[-1])}"
             fix = "Check disk space and memory."
             if kept is not None:
-                fix = f"{fix[:-1]}, and run it again: what is done is kept in {kept.folder}."
+                fix = f"{fix[:-1]}, and run it again: finished work is in {kept.folder}."
             raise errors.ReconstructionError("pycolmap to finish", found=found, fix=fix) from error
     return report
 
@@ -357,14 +354,14 @@ def _work(
     progress: Progress,
 ) -> SfmReport:
     pycolmap = colmap.require_pycolmap(settings.device)
-    pycolmap.logging.logtostderr = True  # alone: it would leave files in the temporary folder
+    pycolmap.logging.logtostderr = True  # not to files in the temporary folder
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.ERROR)
     run = Run(pycolmap, settings, images, staging / ".work", progress, kept)
     return job(run, staging, *arguments)
 
 
 def _report(run: Run, staging: Path, names: Sequence[str]) -> SfmReport:
-    """The contents of the scene, read back from its files."""
+    """Summarise the written model."""
     model = run.pycolmap.Reconstruction(staging / "sparse" / "0")
     registered = {image.name for image in model.images.values() if image.has_pose}
     return SfmReport(
@@ -380,12 +377,12 @@ def _report(run: Run, staging: Path, names: Sequence[str]) -> SfmReport:
 
 
 def _check_names(scene: Scene) -> None:
-    """Refuse names of photographs that lead out of their folder."""
+    """Raise ``SceneFormatError`` for photograph names that lead out of their folder."""
     for name in (image.name for image in scene.images):
         path = PurePosixPath(name.replace("\\", "/"))
-        if path.is_absolute() or ".." in path.parts:  # pycolmap writes to a folder joined with it
+        if path.is_absolute() or ".." in path.parts:  # pycolmap joins it with the output folder
             raise errors.SceneFormatError(
-                "photographs whose names stay inside their folder, as copies get the same names",
+                "photograph names inside their folder",
                 found=repr(name),
                 fix="Move it into the folder and rename it in the model.",
             )

@@ -1,8 +1,7 @@
-"""Work that outlives a run that fails: features, matches and models, in a folder beside the output.
+"""Resumable work of a failed run: features, matches and models in ``OUTPUT_sfm``.
 
-Of an output ``NAME`` it is ``NAME_sfm``. The same command goes on from it; other settings of
-matching or of the lens use its features; other photographs, masks or groups of cameras start anew.
-A run that succeeds removes it.
+The same command resumes it. With other settings of matching or lenses, features are reused; with
+other photographs, masks or camera groups, nothing is. A successful run removes the folder.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ DATABASE, MODELS = "database.db", "models"
 
 
 class WorkFolder(NamedTuple):
-    """The folder of such work, and whether its matches are of other settings."""
+    """The folder, and whether its matches were made with other settings."""
 
     folder: Path
     stale_matches: bool = False
@@ -38,10 +37,14 @@ def work_key(
     max_image_size: int,
     matching: Sequence[object],
 ) -> dict[str, str]:
-    """Digests of what determines features, and of what determines matches beside them.
+    """Fingerprint the inputs of features, and the further inputs of matches.
 
-    ``cameras`` are the names of the photographs that share one, and the lens or its model;
-    ``matching`` are the settings that decide on pairs and on their verification.
+    Args:
+        photos: The photographs.
+        cameras: For each camera, the names of its photographs, and its intrinsics or model.
+        masks: Their masks.
+        max_image_size: The size at which features are detected.
+        matching: Settings of pairs and their verification.
     """
     features: list[object] = [version("pycolmap"), max_image_size]
     lenses = []
@@ -68,9 +71,9 @@ def _digest(facts: Sequence[object]) -> str:
 def resumable_work(
     output: Path, key: Mapping[str, str], on_note: Callable[[str], None]
 ) -> Iterator[WorkFolder | None]:
-    """The folder for the work of an output; it stays if the block fails after work began.
+    """Yield the work folder of an output; it is kept if the block fails after work started.
 
-    None where something else has its name, or another run holds it.
+    Yields None if the path is taken or another run has locked the folder.
     """
     target = output.resolve()
     folder = target.with_name(f"{target.name}_sfm")
@@ -91,13 +94,13 @@ def resumable_work(
             if not (folder / DATABASE).exists():
                 remove(folder)
             elif isinstance(error, KeyboardInterrupt):
-                on_note(f"The same command goes on from what is kept in {quoted(folder)}.")
+                on_note(f"The same command resumes from {quoted(folder)}.")
             raise
         remove(folder)
 
 
 def _prepare(folder: Path, key: Mapping[str, str], on_note: Callable[[str], None]) -> bool:
-    """Make a folder's content fit the key; whether its matches do not."""
+    """Remove content that does not match the key; return whether matches are stale."""
     before: Mapping[str, Any] = read_manifest(folder)
     found = (folder / DATABASE).is_file()
     stale = found and before.get("matches") != key["matches"]
@@ -106,11 +109,11 @@ def _prepare(folder: Path, key: Mapping[str, str], on_note: Callable[[str], None
         for name in (DATABASE, f"{DATABASE}-wal", f"{DATABASE}-shm", MODELS):
             remove(folder / name)
         if found:
-            on_note("The work kept in {} is of other photographs, masks or cameras: begun anew.")
+            on_note("The work in {} is of other photographs, masks or cameras: started again.")
     elif stale:
         remove(folder / MODELS)
-        on_note("The features kept in {} are used; other settings need other matches.")
+        on_note("The features in {} are used; the settings of matches differ.")
     else:
-        on_note("Goes on from the features, matches and models kept in {}.")
+        on_note("Resumes from the features, matches and models in {}.")
     write_json(folder / MANIFEST, {"command": KIND, **key})
     return stale
