@@ -1,7 +1,7 @@
-"""A synthetic capture with known surfaces, for the demo, the tests and the benchmarks.
+"""A synthetic capture with known surfaces, for the demo, tests and benchmarks.
 
-``make_capture`` photographs a small room by ray casting and finds points in the photographs as
-Structure-from-Motion would; ``SHAPES`` holds single surfaces to measure a method on.
+``make_capture`` renders photographs of a small room by ray casting and simulates Structure-from-
+Motion points; ``SHAPES`` are single surfaces on which methods are measured.
 """
 
 from splatseed.synthetic.capture import DEPTH_SCALE, Capture, make_capture, write_capture

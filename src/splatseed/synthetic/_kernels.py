@@ -7,7 +7,7 @@ from splatseed.runtime.jit import inline
 
 @inline
 def _lattice(x: int, y: int, z: int, seed: int) -> float:
-    """A value in 0..1 hashed from a lattice point (multiply-xorshift rounds on 64 bits)."""
+    """Hash a lattice point to 0..1 (multiply-xorshift rounds on 64 bits)."""
     h = np.uint64(x) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(seed)
     h = (h ^ (h >> np.uint64(29))) * np.uint64(0xBF58476D1CE4E5B9) + np.uint64(y)
     h = (h ^ (h >> np.uint64(32))) * np.uint64(0x94D049BB133111EB) + np.uint64(z)
@@ -17,7 +17,7 @@ def _lattice(x: int, y: int, z: int, seed: int) -> float:
 
 @inline
 def _octave(x: float, y: float, z: float, seed: int) -> float:
-    """Value noise of one octave at one point: a smoothed trilinear blend of 8 lattice values."""
+    """Return one octave of value noise: a smoothed trilinear blend of 8 lattice values."""
     fx, fy, fz = np.floor(x), np.floor(y), np.floor(z)
     ix, iy, iz = int(fx), int(fy), int(fz)
     u, v, w = x - fx, y - fy, z - fz
@@ -37,7 +37,7 @@ def noise_sum(
     octaves: int,
     seed: int,
 ) -> np.ndarray:  # float64 [N]
-    """The weighted mean of ``octaves`` octaves at each point."""
+    """Return the weighted mean of octaves at each point."""
     result = np.zeros(len(xyz))
     for i in range(len(xyz)):
         scale, strength, total = 1.0, 1.0, 0.0
@@ -58,7 +58,7 @@ def nearest_disc(
     axes: np.ndarray,  # float64 [L, 3]
     radii: np.ndarray,  # float64 [L]
 ) -> tuple[np.ndarray, np.ndarray]:  # float64 [N], int64 [N]
-    """Distance to the nearest disc and its index."""
+    """Return the distance to the nearest disc, and its index."""
     distances = np.empty(len(xyz))
     which = np.empty(len(xyz), np.int64)
     for i in range(len(xyz)):
@@ -69,7 +69,7 @@ def nearest_disc(
             z = xyz[i, 2] - centers[j, 2]
             off = x * axes[j, 0] + y * axes[j, 1] + z * axes[j, 2]
             x, y, z = x - off * axes[j, 0], y - off * axes[j, 1], z - off * axes[j, 2]
-            # Within the disc's plane: how far beyond its rim.
+            # Distance beyond the rim, in the disc's plane.
             beyond = max(np.sqrt(x * x + y * y + z * z) - radii[j], 0.0)
             squared = off * off + beyond * beyond
             if squared < best:
@@ -87,7 +87,7 @@ def first_disc(
     axes: np.ndarray,  # float64 [L, 3]
     radii: np.ndarray,  # float64 [L]
 ) -> np.ndarray:  # float64 [N]
-    """Smallest t > 0 at which each ray meets a disc; inf where none does."""
+    """Return the smallest t > 0 where each ray hits a disc; inf for a miss."""
     nearest = np.full(len(directions), np.inf)
     for j in range(len(radii)):
         nx, ny, nz = axes[j, 0], axes[j, 1], axes[j, 2]
@@ -96,7 +96,7 @@ def first_disc(
         limit = radii[j] * radii[j]
         for i in range(len(directions)):
             dx, dy, dz = directions[i, 0], directions[i, 1], directions[i, 2]
-            # Where the ray meets the disc's plane; infinite if parallel, and then no hit.
+            # Intersection with the disc's plane; infinite (a miss) if parallel.
             t = -height / (dx * nx + dy * ny + dz * nz)
             x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
             if t > 0.0 and t < nearest[i] and x * x + y * y + z * z <= limit:

@@ -1,8 +1,7 @@
-"""make_capture: the demo's photographs, depth and points, from a seed alone.
+"""make_capture: photographs, depth and points of the demo, determined by a seed.
 
-Notation: V views of H x W pixels; depth is planar z in metres, 0 where nothing was hit. Promise: a
-seed gives the same capture everywhere; the scene has a COLMAP model's parts (poses, features,
-tracks, reprojection errors) and its surfaces are known, so that any method can be measured.
+Notation: V views of H x W pixels; depth is planar z in metres, 0 where nothing was hit. The scene
+has all parts of a COLMAP model (poses, features, tracks, reprojection errors) and known surfaces.
 """
 
 from __future__ import annotations
@@ -44,30 +43,28 @@ class Capture:
 
     scene: Scene  # with features and tracks; ``source`` is None
     images: UInt8[np.ndarray, "V H W 3"]  # sRGB
-    depths: Float32[np.ndarray, "V H W"]  # planar z in metres; 0 = nothing there
+    depths: Float32[np.ndarray, "V H W"]  # planar z in metres; 0 = no hit
     room: Room
-    outliers: Bool[np.ndarray, " N"]  # which of the scene's points are mismatches
+    outliers: Bool[np.ndarray, " N"]  # points of wrong matches
 
     @property
     def surfaces(self) -> Union:
-        """All surfaces as one: ``surfaces.distance(xyz)`` is exact, [N, 3] to [N]."""
+        """The union of all surfaces; ``surfaces.distance(xyz)`` is exact, [N, 3] to [N]."""
         return self.room.surfaces
 
-    def sample_visible(
-        self, num: int, rng: np.random.Generator, *, bare: bool = False
-    ) -> Float64[np.ndarray, "num 3"]:
-        """Points uniform by area on the parts of the surfaces that some camera sees, [num, 3].
+    def sample_visible(self, num: int, rng: np.random.Generator) -> Float64[np.ndarray, "num 3"]:
+        """Sample points uniformly by area on the visible parts of the surfaces, [num, 3].
 
-        Coverage is measured on these alone: no method can know the inside of the flower pot. On the
-        ``bare`` wall there are no points to upsample, so it would outweigh everything else, and a
-        method that scatters points at random would win.
+        Coverage is measured on these, since no method can know hidden surfaces. The textureless
+        wall is excluded: it has no points to upsample, so it would dominate the score in favour of
+        methods that scatter points at random.
         """
-        surfaces = self.surfaces if bare else self.room.without(TEXTURELESS)
+        surfaces = self.room.without(TEXTURELESS)
         batches: list[np.ndarray] = []
         while sum(len(batch) for batch in batches) < num:
             xyz = surfaces.sample(num, rng)
             batches.append(xyz[self._seen_by_any(xyz)])
-        # Union samples part by part; whoever takes the first few must not depend on that order.
+        # Shuffle: Union samples part by part, and callers may use the first few points.
         return np.asarray(rng.permutation(np.concatenate(batches))[:num])
 
     def _seen_by_any(self, xyz: Float64[np.ndarray, "N 3"]) -> Bool[np.ndarray, " N"]:
@@ -81,16 +78,16 @@ class Capture:
 def make_capture(
     seed: int = 0, num_views: int = 40, width: int = 400, height: int = 300
 ) -> Capture:
-    """Build the demo room, photograph it, and find points in the photographs.
+    """Build the demo room, render photographs of it, and simulate Structure-from-Motion points.
 
-    ``seed`` places the leaves and draws the points' noise. There are at least 3 photographs of
-    32 x 32 pixels, else ParameterError.
+    ``seed`` determines the leaves and the points' noise. Raises ParameterError for fewer than 3
+    views or 32 x 32 pixels.
     """
     if num_views < 3 or min(width, height) < 32:
         raise ParameterError(
-            "at least 3 views of at least 32 x 32 pixels",
+            "`num_views` of 3 or more and a size of 32 x 32 pixels or more",
             found=f"{num_views} of {width} x {height}",
-            fix="Ask for more.",
+            fix="Pass larger values.",
         )
     rng = np.random.default_rng(seed)
     room = build_room(rng)
@@ -101,10 +98,11 @@ def make_capture(
 
 
 def write_capture(capture: Capture, path: StrPath, *, overwrite: bool = False) -> Path:
-    """Write a COLMAP scene: ``images/*.png``, ``sparse/0`` and, extra, ``depths/*.png``.
+    """Write a COLMAP scene (``images/*.png``, ``sparse/0``) and depth maps (``depths/*.png``).
 
-    A depth PNG has 16 bits and holds metres times ``DEPTH_SCALE``, as ``depths/depths.json`` says;
-    0 = none. Returns the folder; OutputError where it cannot or must not be written.
+    Depth PNGs have 16 bits and hold metres times ``DEPTH_SCALE`` (recorded in
+    ``depths/depths.json``), 0 for no depth. Returns the folder. Raises OutputError if it exists or
+    cannot be written.
     """
     with output_folder(Path(path), kind="capture", overwrite=overwrite) as partial:
         write_scene(capture.scene, partial / "scene")
@@ -123,7 +121,7 @@ def write_capture(capture: Capture, path: StrPath, *, overwrite: bool = False) -
 def _scene(
     cameras: Sequence[Camera], images: UInt8[np.ndarray, "V H W 3"], tracked: TrackedPoints
 ) -> Scene:
-    """The COLMAP model of the points; point i has id i + 1, view v has id v + 1."""
+    """Make the scene; point i has id i + 1, view v has id v + 1."""
     K, images_of_scene = cameras[0].K, []
     params = (K[0, 0], K[1, 1], K[0, 2], K[1, 2])
     intrinsics = Intrinsics(1, "PINHOLE", cameras[0].width, cameras[0].height, params)
@@ -137,7 +135,7 @@ def _scene(
 
 
 def _tracks(tracked: TrackedPoints) -> Tracks:
-    """Tracks in COLMAP's terms; a feature's index counts its image's observations in order."""
+    """Make tracks; features are numbered per image in the order of its observations."""
     by_view = np.argsort(tracked.view_idx, kind="stable")
     counts = np.bincount(tracked.view_idx)
     first = np.repeat(np.cumsum(counts) - counts, counts)
@@ -157,7 +155,7 @@ def _tracks(tracked: TrackedPoints) -> Tracks:
 def _point_colors(
     images: UInt8[np.ndarray, "V H W 3"], tracked: TrackedPoints
 ) -> UInt8[np.ndarray, "N 3"]:
-    """Mean colour of each point over the pixels that observed it."""
+    """Return each point's mean colour over its observations."""
     limits = np.array(images.shape[2:0:-1]) - 1
     column, row = np.clip(np.floor(tracked.uv), 0, limits).astype(np.int64).T
     pixels = images[tracked.view_idx, row, column].astype(np.float64)

@@ -1,12 +1,11 @@
-"""The demo's room, its cameras, and photographs of analytic surfaces by ray casting.
+"""The demo's room, its cameras, and ray-cast photographs of its analytic surfaces.
 
-Notation: world axes x and y along the floor, z up, in metres; the room's corner is at (-1.6, -1.6).
-V views of H x W pixels with centres at +0.5; ``pixel_rays`` have unit z in camera axes, so the ray
-parameter t of a hit is its planar z-depth. Promise: the room has every kind of surface on which
-upsampling behaves differently: flat with texture (floor, brick wall, box), curved (sphere,
-cylinder, wavy screen), foliage, and a bare wall; depth is that of the surface along the ray through
-the pixel's centre, exact up to float32; colour is the mean over a small grid of rays, so that edges
-are smooth.
+Notation: world axes x and y along the floor, z up, metres; the room's corner is at (-1.6, -1.6). V
+views of H x W pixels with centres at +0.5; ``pixel_rays`` have unit z in camera axes, so that the
+ray parameter t of a hit is planar z. The room has every kind of surface on which upsampling behaves
+differently: textured planes (floor, brick wall, box), curved surfaces (sphere, cylinder, wavy
+screen), foliage, and a textureless wall. Depth is exact to float32 at pixel centres; colours are
+means over a grid of rays, for antialiasing.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ from splatseed.synthetic.surfaces import (
 from splatseed.synthetic.texture import Mottled, Plain, Texture, Tiles
 
 TEXTURELESS = "bare wall"
-"""Name of the surface without texture."""
+"""The surface without texture."""
 
 CORNER = -1.6
 """x and y of the room's corner, metres."""
@@ -52,33 +51,32 @@ FOCAL = 0.95
 SUN = np.array([0.48, 0.30, 0.82]) / np.linalg.norm([0.48, 0.30, 0.82])
 """Direction to the sun."""
 AMBIENT = 0.45
-"""Share of the light that comes from everywhere."""
+"""Share of ambient light."""
 BACKGROUND = np.array([0.72, 0.78, 0.84])
 
 BUNDLE = 16_384
-"""Rays per bundle: temporaries stay in the cache, and products are too small for BLAS's own
-threads, which would compete with ours."""
+"""Rays per bundle: small enough for the cache, and for BLAS not to start threads of its own."""
 
 
 @dataclass(frozen=True)
 class Room:
-    """Surfaces and, for each, its texture."""
+    """Named surfaces with textures."""
 
     names: tuple[str, ...]  # of the surfaces, such as "bare wall"
     surfaces: Union
     textures: tuple[Texture, ...]  # of the surfaces, in their order
 
     def part(self, name: str) -> Surface:
-        """The surface of that name."""
+        """Return the surface of a name."""
         return self.surfaces.parts[self.names.index(name)]
 
     def without(self, name: str) -> Union:
-        """All surfaces but the one of that name."""
+        """Return all surfaces except one."""
         return Union(tuple(part for part in self.surfaces.parts if part is not self.part(name)))
 
 
 def build_room(rng: np.random.Generator) -> Room:
-    """The room; ``rng`` places the leaves, everything else is fixed."""
+    """Build the room; ``rng`` places the leaves, all else is fixed."""
     pieces = {**_walls(), **_furniture(), **_plant(rng)}
     return Room(
         tuple(pieces),
@@ -88,7 +86,7 @@ def build_room(rng: np.random.Generator) -> Room:
 
 
 def _grain(frequency: float, seed: int, stretch: tuple[float, float, float] = (1, 1, 1)) -> Mottled:
-    """Light and dark within a tile: a palette of grey factors."""
+    """Make a grey texture that modulates the brightness within tiles."""
     x, y, z = (frequency * s for s in stretch)
     return Mottled(((0.55,) * 3, (1.35,) * 3), (x, y, z), octaves=3, seed=seed)
 
@@ -139,10 +137,10 @@ def _furniture() -> dict[str, tuple[Surface, Texture]]:
 
 
 def _plant(rng: np.random.Generator) -> dict[str, tuple[Surface, Texture]]:
-    """Leaves in a ball above the cylinder, their pot; each turned at random."""
+    """Make leaves of random orientation in a ball above the cylinder, their pot."""
     direction = rng.normal(size=(NUM_LEAVES, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    # The cube root fills the ball evenly; starting at 0.5 leaves the middle to the stem.
+    # The cube root gives uniform density; a positive minimum leaves room for the stem.
     reach = 0.36 * np.cbrt(rng.uniform(0.15, 1.0, NUM_LEAVES))
     axes = direction + 0.8 * rng.normal(size=(NUM_LEAVES, 3))
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
@@ -153,9 +151,9 @@ def _plant(rng: np.random.Generator) -> dict[str, tuple[Surface, Texture]]:
 
 
 def orbit_cameras(num_views: int, width: int, height: int) -> tuple[Camera, ...]:
-    """Cameras on an arc around the open side of the room, low and high by turns.
+    """Place cameras on an arc around the open side of the room, at varying height.
 
-    Each looks at the middle of the room with its y axis down.
+    All face the middle of the room, with the y axis down.
     """
     K = np.array([[FOCAL * width, 0.0, width / 2], [0.0, FOCAL * width, height / 2], [0, 0, 1.0]])
     share = (np.arange(num_views) + 0.5) / num_views
@@ -174,9 +172,9 @@ def orbit_cameras(num_views: int, width: int, height: int) -> tuple[Camera, ...]
 
 
 def pixel_rays(camera: Camera, dx: float = 0.0, dy: float = 0.0) -> Points:
-    """World directions through the pixels, row by row, [H*W, 3], one unit along camera z each.
+    """Return world directions through the pixels, row by row, [H*W, 3], with unit camera z.
 
-    ``dx`` and ``dy`` move the ray off the pixel's centre, in pixels.
+    ``dx`` and ``dy`` offset the rays from pixel centres, px.
     """
     world_from_pixel = camera.cam_from_world[:3, :3].T @ np.linalg.inv(camera.K)
     u = (np.arange(camera.width) + (0.5 + dx))[:, None] * world_from_pixel[:, 0]
@@ -187,8 +185,8 @@ def pixel_rays(camera: Camera, dx: float = 0.0, dy: float = 0.0) -> Points:
 def render_views(
     room: Room, cameras: Sequence[Camera], supersample: int = 2
 ) -> tuple[UInt8[np.ndarray, "V H W 3"], Float32[np.ndarray, "V H W"]]:
-    """Images, uint8 sRGB [V, H, W, 3], and planar z-depths, float32 [V, H, W]; 0 = nothing hit."""
-    # The views are independent and the work releases the GIL, so threads change only the time.
+    """Render uint8 sRGB images [V, H, W, 3] and planar z float32 [V, H, W]; 0 = no hit."""
+    # Views are independent, so threads do not change the result.
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         views = list(pool.map(lambda camera: render_view(room, camera, supersample), cameras))
     return np.stack([image for image, _ in views]), np.stack([depth for _, depth in views])
@@ -197,7 +195,7 @@ def render_views(
 def render_view(
     room: Room, camera: Camera, supersample: int = 2
 ) -> tuple[UInt8[np.ndarray, "H W 3"], Float32[np.ndarray, "H W"]]:
-    """One photograph and its depth; ``supersample`` squared rays per pixel for the colour."""
+    """Render a photograph and its depth, with ``supersample``^2 rays per pixel for colour."""
     shape = (camera.height, camera.width)
     t = _in_bundles(lambda rays: room.surfaces.intersect(camera.center, rays), pixel_rays(camera))
     depth = np.where(np.isfinite(t), t, 0.0).astype(np.float32).reshape(shape)
@@ -212,13 +210,13 @@ def render_view(
 
 
 def _in_bundles(function: Callable[[np.ndarray], np.ndarray], directions: Points) -> np.ndarray:
-    """``function`` of the rays, ``BUNDLE`` at a time."""
+    """Apply a function to rays, ``BUNDLE`` at a time."""
     bundles = range(0, len(directions), BUNDLE)
     return np.concatenate([function(directions[start : start + BUNDLE]) for start in bundles])
 
 
 def _shade(room: Room, camera: Camera, directions: Points) -> Points:
-    """Colours 0..1 along rays: texture times Lambert's cosine under a distant sun."""
+    """Shade rays, colours 0..1: texture times Lambertian light of a distant sun."""
     t, which = room.surfaces.intersect_parts(camera.center, directions)
     colors = np.tile(BACKGROUND, (len(directions), 1))
     for i, (surface, texture) in enumerate(zip(room.surfaces.parts, room.textures, strict=True)):
@@ -226,14 +224,14 @@ def _shade(room: Room, camera: Camera, directions: Points) -> Points:
         if len(mine):
             xyz = camera.center + t[mine, None] * directions[mine]
             normals = surface.normals(xyz)
-            facing = -np.sign(np.einsum("ij,ij->i", normals, directions[mine]))  # of two sides
+            facing = -np.sign(np.einsum("ij,ij->i", normals, directions[mine]))  # two-sided
             light = AMBIENT + (1.0 - AMBIENT) * np.maximum(facing * (normals @ SUN), 0.0)
             colors[mine] = texture(xyz) * light[:, None]
     return colors
 
 
 def visible(surfaces: Surface, camera: Camera, xyz: Points) -> Bool[np.ndarray, " N"]:
-    """Which points on the surfaces the camera sees: in the image and not occluded, [N]."""
+    """Whether each surface point is in the image and not occluded, [N]."""
     uv, depth = camera.project(xyz)
     inside = (depth > 0) & (uv >= 0).all(axis=1) & (uv < [camera.width, camera.height]).all(axis=1)
     seen: Int64[np.ndarray, " M"] = np.flatnonzero(inside)

@@ -1,12 +1,9 @@
-"""Analytic surfaces that can be measured, sampled and rendered, and shapes made of them.
+"""Analytic surfaces with exact distances, uniform samples and ray intersections.
 
-Notation: a surface is a set of points in the world, scene units. A ray is ``origin`` [3] plus
-``t`` times ``directions`` [N, 3], which need not have unit length: with directions that advance one
-unit along the camera's z axis, ``t`` is planar z-depth. A ``frame`` [3, 3] holds three orthonormal
-axes as rows, so ``(xyz - center) @ frame.T`` are local coordinates. Promise: float64 throughout;
-distances are exact up to rounding (``SineSheet``: to 1e-10 of its size), unsigned, and measured to
-the finite surface with its edges; samples are uniform by area and lie on the surface up to
-rounding; ``SHAPES`` are fixed, nothing random.
+Notation: scene units. A ray is ``origin`` [3] + ``t`` * ``directions`` [N, 3], of any length: with
+unit camera z, ``t`` is planar depth. A ``frame`` [3, 3] has orthonormal axes as rows, so that
+``(xyz - center) @ frame.T`` are local coordinates. All is float64. Distances are unsigned, to the
+finite surface with its edges, and exact up to rounding (``SineSheet``: 1e-10 of its size).
 """
 
 from __future__ import annotations
@@ -23,42 +20,42 @@ from splatseed.synthetic._kernels import first_disc, nearest_disc
 Vector = Float64[np.ndarray, " 3"]
 Frame = Float64[np.ndarray, "3 3"]
 Points = Float[np.ndarray, "N 3"]
-"""Or directions, or normals."""
+"""Points, directions or normals."""
 Numbers = Float64[np.ndarray, " N"]
-"""One a point or ray."""
+"""One value per point or ray."""
 
 _BISECTIONS = 36
-"""Halvings of a bracket that starts as a small part of a sine sheet."""
+"""Bisection steps on a sine sheet."""
 _STEPS_PER_WAVE = 48
-"""Steps of the march along a ray, per wavelength of a sine sheet."""
+"""Ray marching steps per wavelength."""
 _GRID_PER_WAVE = 32
-"""Places along its profile from which the nearest point is bracketed."""
+"""Profile samples per wavelength, to bracket the nearest point."""
 _CHUNK = 20_000
-"""Points per pass, which bounds the memory of the grid of distances."""
+"""Points per pass, to bound the memory of the distance grid."""
 
 
 class Surface(Protocol):
-    """What the demo scene and the benchmarks need from a surface."""
+    """The interface of a surface."""
 
     @property
     def area(self) -> float:
-        """Area in squared scene units, each side of a sheet counted once."""
+        """Area in squared scene units; of sheets, one side."""
 
     def distance(self, xyz: Points) -> Numbers:
-        """Unsigned distance of each point to the nearest point of the surface, [N]."""
+        """Return each point's unsigned distance to the surface, [N]."""
 
     def sample(self, num: int, rng: np.random.Generator) -> Points:
-        """Points drawn uniformly by area, [num, 3]."""
+        """Sample points uniformly by area, [num, 3]."""
 
     def intersect(self, origin: Vector, directions: Points) -> Numbers:
-        """The smallest t > 0 at which each ray meets the surface, [N]; inf where it misses."""
+        """Return the smallest t > 0 where each ray hits the surface, [N]; inf for a miss."""
 
     def normals(self, xyz: Points) -> Points:
-        """Unit normals at points on the surface, [N, 3], of either sign."""
+        """Return unit normals at surface points, [N, 3], of either sign."""
 
 
 def yaw_frame(degrees: float) -> Frame:
-    """Axes turned by ``degrees`` about the world's z axis, as rows, [3, 3]."""
+    """Return axes rotated about world z, as rows, [3, 3]."""
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
 
@@ -245,7 +242,7 @@ class Union(Surface):
     def intersect_parts(
         self, origin: Vector, directions: Points
     ) -> tuple[Numbers, Int64[np.ndarray, " N"]]:
-        """As ``intersect``, and the index of the part that was hit, [N]; -1 where none was."""
+        """Intersect; also return the index of the part hit, [N], or -1."""
         nearest = np.full(len(directions), np.inf)
         which = np.full(len(directions), -1)
         for i, part in enumerate(self.parts):
@@ -267,8 +264,8 @@ class SineSheet(Surface):
     """A rectangle bent into a sine wave along its first axis.
 
     In its frame a point is (u, v, w), and the sheet is w = A sin(2 pi u / wavelength) for
-    0 <= u <= size[0], 0 <= v <= size[1]. A ray that only grazes a crest, entering and leaving
-    within a 48th of a wave, may count as a miss.
+    0 <= u <= size[0], 0 <= v <= size[1]. A ray that grazes a crest within 1/48 of a wave may
+    count as a miss.
     """
 
     corner: Vector  # the point u = v = w = 0
@@ -285,7 +282,7 @@ class SineSheet(Surface):
         return np.asarray(self.amplitude * k * np.cos(k * u))
 
     def _arc_length(self) -> tuple[np.ndarray, np.ndarray]:
-        """A fine table of u and the arc length from 0 to u."""
+        """Tabulate the arc length from 0 to u."""
         u = np.linspace(0.0, self.size[0], 4096)
         speed = np.hypot(1.0, self._slope((u[1:] + u[:-1]) / 2))
         return u, np.concatenate([[0.0], np.cumsum(speed * np.diff(u))])
@@ -304,7 +301,7 @@ class SineSheet(Surface):
         return np.asarray(np.hypot(in_profile, across))
 
     def _profile_distance(self, u: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Distance in the (u, w) plane to the curve: a grid finds the basin, bisection the foot."""
+        """Return the distance to the curve in the (u, w) plane: grid search, then bisection."""
         num = int(np.ceil(_GRID_PER_WAVE * self.size[0] / self.wavelength)) + 1
         grid = np.linspace(0.0, self.size[0], num)
         squared = (u[:, None] - grid) ** 2 + (w[:, None] - self._height(grid)) ** 2
@@ -338,10 +335,7 @@ class SineSheet(Surface):
     def _first_crossing(
         self, start: np.ndarray, directions: np.ndarray, near: np.ndarray, far: np.ndarray
     ) -> np.ndarray:
-        """March from near to far, then bisect the first step whose ends lie on different sides.
-
-        A step covers a fixed part of a wave, so that rays across the sheet need few.
-        """
+        """March from near to far in fractions of a wave, then bisect the first crossing."""
         at_start = self._above(start, directions, near)
         along_wave = np.maximum(np.abs(directions[:, 0]), 1e-12)
         step = self.wavelength / _STEPS_PER_WAVE / along_wave
@@ -363,7 +357,7 @@ class SineSheet(Surface):
         return high
 
     def _above(self, start: np.ndarray, directions: np.ndarray, t: np.ndarray) -> np.ndarray:
-        """Whether the rays are above the wave at t, along w."""
+        """Whether rays are above the wave (along w) at t."""
         u, w = (start[i] + t * directions[:, i] for i in (0, 2))
         return np.asarray(w > self._height(u))
 
@@ -387,7 +381,7 @@ class Discs(Surface):
 
     @cached_property
     def _bound(self) -> Sphere:
-        """A sphere around all leaves: most rays of a photograph miss it."""
+        """A sphere around all leaves, which most rays miss."""
         center = (self.centers.min(axis=0) + self.centers.max(axis=0)) / 2
         reach = np.linalg.norm(self.centers - center, axis=1) + self.radii
         return Sphere(center, float(reach.max()) * (1 + 1e-9))
@@ -402,7 +396,7 @@ class Discs(Surface):
     def sample(self, num: int, rng: np.random.Generator) -> Points:
         leaf = rng.choice(len(self.radii), num, p=self.radii**2 / (self.radii**2).sum())
         axis = self.axes[leaf]
-        # Any direction in the leaf's plane will do; one from a random vector is uniform in angle.
+        # The cross product with a random normal vector is uniform in angle.
         across = np.cross(axis, rng.normal(size=(num, 3)))
         across /= np.linalg.norm(across, axis=1, keepdims=True)
         radius = self.radii[leaf] * np.sqrt(rng.random(num))
@@ -419,9 +413,9 @@ class Discs(Surface):
 
 
 def _first_hit(*candidates: tuple[np.ndarray, np.ndarray]) -> Numbers:
-    """The smallest positive t [N] among pairs (t, whether it is a hit); inf if there is none.
+    """Return the smallest positive t [N] of pairs (t, is hit), else inf.
 
-    Pairs, not a table: NumPy's reductions over an axis of two are many times slower.
+    Pairs, since NumPy's reductions over an axis of two are slow.
     """
     hits = [np.where(ok & (t > 0), t, np.inf) for t, ok in candidates]
     return hits[0] if len(hits) == 1 else np.minimum(hits[0], hits[1])
@@ -430,14 +424,14 @@ def _first_hit(*candidates: tuple[np.ndarray, np.ndarray]) -> Numbers:
 def _slab_interval(
     origin: Vector, directions: Points, low: Vector, high: Vector
 ) -> tuple[Numbers, Numbers]:
-    """Where rays enter and leave the box low..high, in the box's axes; near > far for a miss."""
+    """Return t where rays enter and leave an axis-aligned box; near > far for a miss."""
     near = np.full(len(directions), -np.inf)
     far = np.full(len(directions), np.inf)
     for i in range(3):
         with np.errstate(divide="ignore", invalid="ignore"):
             a = (low[i] - origin[i]) / directions[:, i]
             b = (high[i] - origin[i]) / directions[:, i]
-        # A ray within a face's plane gives 0/0; fmin and fmax then let the other planes decide.
+        # A ray in a face's plane gives 0/0, which fmin and fmax ignore.
         near = np.fmax(near, np.fmin(a, b))
         far = np.fmin(far, np.fmax(a, b))
     return near, far
@@ -446,9 +440,9 @@ def _slab_interval(
 def _roots(
     a: Numbers, half_b: Numbers, c: float
 ) -> tuple[Numbers, Numbers, Bool[np.ndarray, " N"]]:
-    """Both roots of a t² + 2 half_b t + c, [N] each, and whether they are real, [N].
+    """Return both roots of a t² + 2 half_b t + c, and whether they are real, [N] each.
 
-    The product form of the smaller root avoids cancellation.
+    The smaller root follows from their product, to avoid cancellation.
     """
     discriminant = half_b * half_b - a * c
     real = discriminant >= 0

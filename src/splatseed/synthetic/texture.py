@@ -1,9 +1,8 @@
-"""Solid textures: colour as a function of the position in the world.
+"""Solid textures: colour as a function of world position.
 
-Notation: a texture maps points [N, 3] to colours [N, 3], 0..1, as they would be displayed. Palettes
-are [C, 3] and are read with a value in 0..1. Promise: the same point has the same colour from every
-view, so a corner in one image is a corner in the next; details end near a few pixels of the demo's
-photographs, so that they do not alias.
+Notation: a texture maps points [N, 3] to display colours [N, 3] in 0..1; palettes [C, 3] are
+indexed by 0..1. Colours do not depend on the view, so that corners match between images; the finest
+details span a few pixels of the demo's photographs, to avoid aliasing.
 """
 
 from __future__ import annotations
@@ -17,16 +16,14 @@ from jaxtyping import Float, Float64
 from splatseed.synthetic._kernels import noise_sum
 
 Color = tuple[float, float, float]
-
-
 Points = Float64[np.ndarray, "N 3"]
 Texture = Callable[[Points], Points]
-"""A colour, 0..1, for every point."""
+"""Maps points to colours in 0..1."""
 
 
 @dataclass(frozen=True)
 class Plain:
-    """One colour everywhere: no feature can be detected on it."""
+    """One colour everywhere, without features."""
 
     color: Color
 
@@ -36,11 +33,11 @@ class Plain:
 
 @dataclass(frozen=True)
 class Mottled:
-    """Noise of several octaves, through a palette."""
+    """Noise of several octaves, mapped to a palette."""
 
     palette: tuple[Color, ...]  # for noise from low to high
     frequency: Color  # cells per scene unit of the coarsest octave along x, y and z
-    octaves: int = 4  # each twice as fine and 0.7 times as strong as the one before
+    octaves: int = 4  # each of twice the frequency and 0.7 times the amplitude
     contrast: float = 2.2  # scales noise about its mean before the palette is read
     seed: int = 0  # selects the noise
 
@@ -51,9 +48,9 @@ class Mottled:
 
 @dataclass(frozen=True)
 class Tiles:
-    """Bricks, boards or checks: cells of one colour each, joints between them, grain on top."""
+    """Bricks, boards or checks: cells of uniform colour, with joints and grain."""
 
-    palette: tuple[Color, ...]  # each cell's colour is drawn from it
+    palette: tuple[Color, ...]  # of the cells
     cell: Color  # size along x, y and z in scene units
     grain: Mottled  # its palette is a factor on the colour
     joint: float = 0.0  # width of the dark joints in scene units
@@ -61,7 +58,7 @@ class Tiles:
 
     def __call__(self, xyz: Points) -> Points:
         size = np.array(self.cell)
-        # Offset by a fraction of a cell, so that no wall at a round coordinate lies on a joint.
+        # Offset, so that walls at round coordinates are not on a joint.
         position = xyz / size + 0.37
         colors = _read_palette(self.palette, value_noise(np.floor(position), 1, self.seed))
         from_joint = np.abs(position - np.round(position)) * size
@@ -78,9 +75,9 @@ def _read_palette(palette: tuple[Color, ...], values: np.ndarray) -> np.ndarray:
 def value_noise(
     xyz: Float[np.ndarray, "N 3"], octaves: int, seed: int
 ) -> Float64[np.ndarray, " N"]:
-    """Smooth noise in 0..1 with cells of size 1, 1/2, 1/4 ..., [N].
+    """Return value noise in 0..1 with cells of size 1, 1/2, 1/4 ..., [N].
 
-    Random values at integer lattice points are joined by smoothstep interpolation; each
-    octave is 0.7 times as strong as the one before.
+    Random values at lattice points are interpolated by smoothstep; each octave has 0.7 times the
+    amplitude of the previous one.
     """
     return np.asarray(noise_sum(np.ascontiguousarray(xyz, np.float64), octaves, seed))

@@ -1,10 +1,9 @@
-"""Points as Structure-from-Motion would have reconstructed them from rendered photographs.
+"""Simulated Structure-from-Motion points of rendered photographs.
 
-Notation: V views, N points, T observations; observation t says that view ``view_idx[t]`` saw point
-``point_idx[t]`` at pixel ``uv[t]``, and observations are sorted by point, then view. Promise:
-candidates are corners of the images, so texture decides where points are; positions are the
-least-squares triangulation of noisy observations, so errors are largest along the viewing rays and
-for short tracks, as in a real model; reprojection errors are those of the observations.
+Notation: V views, N points, T observations; view ``view_idx[t]`` observes point ``point_idx[t]`` at
+pixel ``uv[t]``, sorted by point, then view. Candidates are image corners, so that texture
+determines density. Positions are least-squares triangulations of noisy observations, so that, as in
+real models, errors are largest along viewing rays and for short tracks.
 """
 
 from __future__ import annotations
@@ -26,41 +25,41 @@ Indices = Int64[np.ndarray, " T"]
 Pixels = Float64[np.ndarray, "T 2"]
 
 MIN_STRENGTH = 6e-5
-"""Least corner strength of a feature, for grey values 0..1: above that of a bare wall, below that
-of texture."""
+"""Smallest corner strength of a feature, for grey values 0..1: between textureless and textured
+surfaces."""
 
 MERGE_PIXELS = 2.4
-"""Corners of different views that unproject to within this many pixels are one point."""
+"""Corners of different views within this many pixels in 3D are one point."""
 
 FULL_STRENGTH = 2e-3
-"""Corners at least this strong are always candidates, weaker ones in proportion to strength."""
+"""Strength from which corners are always candidates; probability is proportional below."""
 
 MIN_COSINE = 0.25
-"""Smallest cosine between ray and normal at which a surface can be matched: 75 degrees."""
+"""Smallest cosine between ray and normal for matching: 75 degrees."""
 
 PIXEL_SIGMA, MISMATCH_NOISE = 0.5, 2.5
-"""Standard deviation of an observation in pixels, per axis, and the factor on a mismatch's."""
+"""Standard deviation of observations per axis, px, and its factor for mismatches."""
 OUTLIER_SHARE = 0.025
-"""Share of points that are mismatches: wrong by 15-80% of their depth."""
+"""Share of mismatched points, wrong by 15-80% of their depth."""
 NEWTON_STEPS = 4
 MIN_TRACK = 3
-"""Fewest views of a point that is not a mismatch."""
+"""Fewest views of a point, except for mismatches."""
 
 
 @dataclass(frozen=True, eq=False)
 class TrackedPoints:
-    """Triangulated points and the observations they come from."""
+    """Triangulated points and their observations."""
 
     xyz: Points
     errors: Float64[np.ndarray, " N"]  # mean reprojection error of each point, px
-    outliers: Bool[np.ndarray, " N"]  # which points are mismatches
+    outliers: Bool[np.ndarray, " N"]  # mismatched points
     point_idx: Indices  # point of each observation, ascending
     view_idx: Indices  # view of each observation
     uv: Pixels  # pixel of each observation
 
 
 def _corner_strength(image: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W"]:
-    """The smaller eigenvalue of the structure tensor of the grey image, 0..1 per pixel, [H, W].
+    """Return the smaller eigenvalue of the grey image's structure tensor, [H, W].
 
     Source: Shi and Tomasi, Good Features to Track, 1994.
     """
@@ -73,7 +72,7 @@ def _corner_strength(image: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "
 
 
 def _find_corners(strength: Float32[np.ndarray, "H W"]) -> Int64[np.ndarray, "M 2"]:
-    """Row and column of the local maxima above ``MIN_STRENGTH``, [M, 2]."""
+    """Return row and column of local maxima above ``MIN_STRENGTH``, [M, 2]."""
     peak = (strength == ndimage.maximum_filter(strength, 3)) & (strength > MIN_STRENGTH)
     peak[:3], peak[-3:], peak[:, :3], peak[:, -3:] = (False,) * 4  # filters need neighbours
     rows, cols = np.nonzero(peak)
@@ -87,9 +86,9 @@ def track_points(
     depths: Maps,
     rng: np.random.Generator,
 ) -> TrackedPoints:
-    """Find corners, follow them through the views, and triangulate them.
+    """Find corners, track them through the views, and triangulate them.
 
-    ``rng`` decides which views see a corner, the noise and the mismatches; depths of 0 are none.
+    ``rng`` draws detections, noise and mismatches; depth 0 means no surface.
     """
     strengths = np.stack([_corner_strength(image) for image in images])
     truth = _candidates(cameras, strengths, depths, rng)
@@ -99,7 +98,7 @@ def track_points(
 
     outliers = rng.random(len(truth)) < OUTLIER_SHARE
     truth, kept = _displace(cameras, truth, outliers, point_idx, view_idx, rng)
-    # A mismatch that only one camera could have seen would never be triangulated.
+    # A mismatch in a single view could not be triangulated.
     keep = np.bincount(point_idx[kept], minlength=len(truth)) >= 2
     truth, outliers = truth[keep], outliers[keep]
     point_idx, view_idx = _renumber(keep, point_idx[kept], view_idx[kept])
@@ -116,7 +115,7 @@ def track_points(
 def _candidates(
     cameras: Sequence[Camera], strengths: Maps, depths: Maps, rng: np.random.Generator
 ) -> Points:
-    """Exact surface points under the corners of all views, near-duplicates merged."""
+    """Return exact surface points at the corners of all views, with near-duplicates merged."""
     per_view = []
     for camera, strength, depth in zip(cameras, strengths, depths, strict=True):
         corners = _find_corners(strength)
@@ -132,10 +131,10 @@ def _candidates(
 def _unproject_corners(
     camera: Camera, corners: Int64[np.ndarray, "M 2"], depth: Float32[np.ndarray, "H W"]
 ) -> tuple[Float64[np.ndarray, "K 3"], Float64[np.ndarray, " K"]]:
-    """Surface points under corners, and the size of a pixel there.
+    """Return surface points at corners, and the size of a pixel there.
 
-    A corner on a silhouette belongs to what is in front, so each moves to the nearest surface of
-    its 5 x 5 window.
+    Silhouette corners belong to the front surface, so each moves to the nearest surface in its
+    5 x 5 window.
     """
     shift = np.mgrid[-2:3, -2:3].reshape(2, -1).T
     window = corners[:, None] + shift  # [M, 25, 2]
@@ -154,10 +153,10 @@ def _observe(
     xyz: Points,
     rng: np.random.Generator,
 ) -> tuple[Indices, Indices]:
-    """Which views detect which points: (point_idx, view_idx), sorted by point, then view.
+    """Draw which views detect which points: (point_idx, view_idx), sorted by point, then view.
 
-    A view detects a point that it sees, not too obliquely, where its own image has a corner; and
-    then by chance, since some corners repeat well and others do not.
+    A detected point is visible, not too oblique, and a corner of the view's image. Detection is
+    then random, with a repeatability per point.
     """
     repeatability = rng.beta(1.5, 3.5, len(xyz))
     normals = surfaces.normals(xyz)
@@ -178,7 +177,7 @@ def _observe(
 def _renumber(
     keep: Bool[np.ndarray, " N"], point_idx: Indices, view_idx: np.ndarray
 ) -> tuple[Int64[np.ndarray, " S"], Int64[np.ndarray, " S"]]:
-    """The observations of the points kept, with the points renumbered."""
+    """Keep the observations of kept points, and renumber the points."""
     mine = keep[point_idx]
     return (np.cumsum(keep) - 1)[point_idx[mine]], view_idx[mine]
 
@@ -191,9 +190,9 @@ def _displace(
     view_idx: Indices,
     rng: np.random.Generator,
 ) -> tuple[Points, Bool[np.ndarray, " T"]]:
-    """Move mismatches along the ray of their first view, and cut their tracks to three views.
+    """Move mismatches along the ray of their first view, and limit their tracks to three views.
 
-    Returns the positions, and which observations remain: the moved point must be in the image.
+    Returns the positions, and a mask of observations whose point is still in the image.
     """
     first = np.searchsorted(point_idx, np.arange(len(xyz)))
     eyes = np.stack([camera.center for camera in cameras])[view_idx[first]]
@@ -209,7 +208,7 @@ def _displace(
 def _project(
     cameras: Sequence[Camera], xyz: Points, point_idx: Indices, view_idx: Indices
 ) -> Pixels:
-    """Pixel of each observation's point in its view."""
+    """Project each observation's point into its view."""
     uv = np.empty((len(point_idx), 2))
     for v, camera in enumerate(cameras):
         mine = view_idx == v
@@ -220,9 +219,9 @@ def _project(
 def _triangulate(
     cameras: Sequence[Camera], start: Points, point_idx: Indices, view_idx: Indices, uv: Pixels
 ) -> Points:
-    """Least-squares positions for all points at once, by Gauss-Newton from ``start``.
+    """Triangulate all points by Gauss-Newton from ``start``.
 
-    With J the derivative of a pixel by the point, each step solves (sum JᵀJ) dx = sum Jᵀ r.
+    Each step solves (sum JᵀJ) dx = sum Jᵀ r, with J the derivative of the pixel by the point.
     """
     rotations = np.stack([camera.cam_from_world[:3, :3] for camera in cameras])[view_idx]
     shifts = np.stack([camera.cam_from_world[:3, 3] for camera in cameras])[view_idx]
