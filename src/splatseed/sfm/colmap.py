@@ -1,12 +1,11 @@
-"""One run of pycolmap: its settings, features and matches, mapping, triangulation, and the export.
+"""Stages of a pycolmap run: settings, features and matches, mapping, triangulation.
 
-The database is written before any feature is detected, images with their cameras, so that ids are
-ours: camera i has rig i, image i has frame i, counted from 1. pycolmap then only adds to it.
-Progress is read from the database through pycolmap too: Python's sqlite3 is another copy of SQLite,
-and two copies in one process drop each other's file locks and corrupt the file.
+Images and cameras are written to the database before features are detected, so that ids are ours:
+camera i has rig i, image i has frame i, counted from 1. Progress is read from the database through
+pycolmap: Python's sqlite3 is another copy of SQLite, and two copies in one process release each
+other's file locks, which corrupts the file.
 
-Notation: a ``model`` is a ``pycolmap.Reconstruction``. Promise: a ``Settings`` that exists is
-valid, and pycolmap is imported only by ``require_pycolmap``.
+Notation: a ``model`` is a ``pycolmap.Reconstruction``. Only ``require_pycolmap`` imports pycolmap.
 """
 
 from __future__ import annotations
@@ -36,22 +35,22 @@ from splatseed.text import counted, name_some
 MatcherName: TypeAlias = Literal["exhaustive", "sequential"]
 T = TypeVar("T")
 
-_MIN_VERSION = 4  # the first to pose an image and its rig in one call
+_MIN_VERSION = 4  # the first that adds an image with its rig in one call
 _MAX_INT = 2**31 - 1  # pycolmap takes a 32-bit int
-_BLOCK_IMAGES = 16  # matches are committed, and progress is visible, per block of 16 x 16 pairs
+_BLOCK_IMAGES = 16  # matches are committed per block of 16 x 16 pairs
 _POLL_SECONDS = 0.1
 _SIMPLE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL")
-_COMPLETE = "complete"  # the file that ends a folder of models
+_COMPLETE = "complete"  # file that marks a finished folder of models
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How features are detected and matched, and how the scene is solved."""
+    """Settings of feature detection, matching and reconstruction; validated."""
 
-    matcher: MatcherName = "exhaustive"  # sequential: each with its successors by name, for a video
-    device: DeviceName = "auto"  # where features are detected and matched; all else runs on the CPU
-    max_image_size: int = 1600  # longer sides are reduced to this many pixels for features
-    seed: int = 0  # of RANSAC and of the order of bundle adjustment
+    matcher: MatcherName = "exhaustive"  # sequential: with successors by name, for video
+    device: DeviceName = "auto"  # of features and matching; the rest runs on the CPU
+    max_image_size: int = 1600  # px; larger photographs are reduced for features
+    seed: int = 0  # of RANSAC and bundle adjustment
     threads: int = -1  # -1 = all cores
 
     def __post_init__(self) -> None:
@@ -61,15 +60,15 @@ class Settings:
             value = getattr(self, name)
             if not low <= value <= _MAX_INT and (name, value) != ("threads", -1):
                 raise errors.ParameterError(
-                    f"{name} from {low} to {_MAX_INT}", found=f"{value}", fix="Choose another."
+                    f"`{name}` from {low} to {_MAX_INT}", found=f"{value}", fix="Choose another."
                 )
 
 
 def check_choice(name: str, value: str, choices: Sequence[str]) -> None:
-    """Raise ParameterError unless ``value`` is one of ``choices``."""
+    """Raise ``ParameterError`` unless ``value`` is one of ``choices``."""
     if value not in choices:
         raise errors.ParameterError(
-            f"{name} to be one of {', '.join(choices)}", found=repr(value), fix="Choose another."
+            f"`{name}` to be one of {', '.join(choices)}", found=repr(value), fix="Choose another."
         )
 
 
@@ -77,7 +76,7 @@ def require_pycolmap(device: DeviceName = "auto") -> Any:
     """Import pycolmap.
 
     Raises:
-        MissingDependencyError: It does not load, is too old, or cannot use ``device``.
+        MissingDependencyError: Not installed, too old, or without support for ``device``.
     """
     # pycolmap's wheel exports its own zlib. A system libz loaded after it binds to that and
     # corrupts the heap at the first compression (PNG, gzip); loaded before it, it does not.
@@ -95,24 +94,24 @@ def require_pycolmap(device: DeviceName = "auto") -> Any:
         )
     if device == "cuda" and not pycolmap.has_cuda:
         raise errors.MissingDependencyError(
-            "a pycolmap that can use CUDA, as device='cuda' asks",
+            "a pycolmap with CUDA, for `device='cuda'`",
             found=f"{found} built for the CPU",
-            fix="Use device='auto' or 'cpu', or install a CUDA build of pycolmap.",
+            fix="Pass `device='cpu'`, or install a CUDA build of pycolmap.",
         )
     return pycolmap
 
 
 @dataclass(frozen=True)
 class Run:
-    """What the stages of one run share."""
+    """Shared state of the stages of a run."""
 
     pycolmap: Any
     settings: Settings
     image_dir: Path
     work: Path  # a scratch folder, removed at the end
     on_progress: Progress
-    kept: WorkFolder | None = None  # where features, matches and models outlive a failure
-    seconds: dict[str, float] = field(default_factory=dict)  # wall time of the stages so far
+    kept: WorkFolder | None = None  # keeps features, matches and models after a failure
+    seconds: dict[str, float] = field(default_factory=dict)  # wall time of finished stages
 
     @property
     def database(self) -> Path:
@@ -120,9 +119,9 @@ class Run:
         return (self.kept.folder if self.kept else self.work) / DATABASE
 
     def stage(self, name: str, work: Callable[[], T], count: Callable[[], int], total: int) -> T:
-        """What ``work`` returns, a blocking call of pycolmap, which releases the GIL.
+        """Run ``work``, a blocking pycolmap call that releases the GIL, and report progress.
 
-        Meanwhile ``count`` says ten times a second how many of ``total`` items are done.
+        ``count`` is polled for the number of finished items of ``total``.
         """
 
         def seeded() -> T:
@@ -139,7 +138,7 @@ class Run:
         self.seconds[name] = time.perf_counter() - started
         try:
             return future.result()
-        except Exception as error:  # pycolmap throws whatever C++ type its libraries throw
+        except Exception as error:  # pycolmap raises any C++ exception of its libraries
             raise errors.ReconstructionError(
                 f"pycolmap to finish {name}",
                 found=f"{type(error).__name__}: {error}",
@@ -148,7 +147,7 @@ class Run:
 
 
 def guessed_model(run: Run, cameras: Sequence[SharedCamera], camera_model: str) -> Any:
-    """A model without poses, with cameras of EXIF's or a default focal length."""
+    """Make a model without poses; focal lengths are from EXIF or defaults."""
     pycolmap, model = run.pycolmap, run.pycolmap.Reconstruction()
     options = pycolmap.ImageReaderOptions(camera_model=camera_model)
     ids: dict[str, int] = {}
@@ -164,9 +163,9 @@ def guessed_model(run: Run, cameras: Sequence[SharedCamera], camera_model: str) 
 
 
 def posed_model(pycolmap: Any, poses: Sequence[Image], without: Collection[str] = ()) -> Any:
-    """A model with the poses and cameras of images, exactly as given; image i is the i-th.
+    """Make a model with the given poses and cameras; image id i is the i-th image.
 
-    Some can be left out, by name.
+    ``without``: names of images to omit.
     """
     model, ids = pycolmap.Reconstruction(), dict[int, int]()
     for number, posed in enumerate(poses, 1):
@@ -179,7 +178,7 @@ def posed_model(pycolmap: Any, poses: Sequence[Image], without: Collection[str] 
                 width=lens.width,
                 height=lens.height,
                 params=list(lens.params),
-                has_prior_focal_length=True,  # matches are verified with the true focal length
+                has_prior_focal_length=True,  # for the verification of matches
             )
             model.add_camera_with_trivial_rig(camera)
         if posed.name in without:
@@ -190,13 +189,13 @@ def posed_model(pycolmap: Any, poses: Sequence[Image], without: Collection[str] 
 
 
 def rigid(pycolmap: Any, image: Image) -> Any:
-    """The pose of ``image``, cam_from_world, as a ``pycolmap.Rigid3d``."""
+    """Convert ``cam_from_world`` of an image to ``pycolmap.Rigid3d``."""
     rotation = pycolmap.Rotation3d(np.roll(image.quat, -1))  # wxyz to xyzw
     return pycolmap.Rigid3d(rotation, image.translation)
 
 
 def match_photographs(run: Run, model: Any, masks: Masks | None = None) -> None:
-    """Create the database of a model's images, with their features and verified matches."""
+    """Fill the database with a model's images, features and verified matches."""
     pycolmap, settings = run.pycolmap, run.settings
     device = getattr(pycolmap.Device, settings.device)
     names = {image_id: image.name for image_id, image in sorted(model.images.items())}
@@ -224,7 +223,7 @@ def match_photographs(run: Run, model: Any, masks: Masks | None = None) -> None:
             raise errors.SceneFormatError(
                 f"pycolmap to read all images of {run.image_dir}",
                 found=f"{len(skipped)} that it skipped: {name_some(skipped)}",
-                fix="Export them again as 8-bit JPEG or PNG, or take them out of the folder.",
+                fix="Export them again as 8-bit JPEG or PNG, or remove them.",
             )
         if settings.matcher == "exhaustive":
             match, generator = pycolmap.match_exhaustive, pycolmap.ExhaustivePairGenerator
@@ -249,7 +248,7 @@ def match_photographs(run: Run, model: Any, masks: Masks | None = None) -> None:
 
 
 def _write_model(run: Run, database: Any, model: Any) -> None:
-    """Write a model's cameras and images to a database, unless it has them from an earlier run."""
+    """Write a model's cameras and images to the database, unless an earlier run did."""
     if database.num_images() == len(model.images):
         if run.kept is not None and run.kept.stale_matches:
             database.clear_two_view_geometries()
@@ -257,7 +256,7 @@ def _write_model(run: Run, database: Any, model: Any) -> None:
             for camera in model.cameras.values():
                 database.update_camera(camera)
         return
-    database.clear_all_tables()  # what a kill left half-written
+    database.clear_all_tables()  # may be incomplete after a kill
     for camera_id, camera in sorted(model.cameras.items()):
         database.write_camera(camera, use_camera_id=True)
         database.write_rig(model.rig(camera_id), use_rig_id=True)
@@ -273,15 +272,15 @@ def _options(run: Run) -> Any:
 
 
 def map_images(run: Run, names: Sequence[str], camera_model: str, *, partial: bool) -> Path:
-    """Solve for poses, lenses and points; the folder of the model with the most images.
+    """Estimate poses, lenses and points; return the folder of the model with the most images.
 
     Raises:
-        ReconstructionError: No model was found, or it has fewer than half of the photographs and
-            is not wanted ``partial``.
+        ReconstructionError: No model, or one of fewer than half of the photographs while
+            ``partial`` is False.
     """
     models_dir = (run.kept.folder if run.kept else run.work) / MODELS
     models = _mapped(run, models_dir, len(names))
-    more = ["take more overlapping photographs", "take out those of other places"]
+    more = ["take more overlapping photographs", "remove those of other places"]
     if run.settings.matcher != "exhaustive":
         more.append("use the exhaustive matcher")
     if camera_model not in _SIMPLE:
@@ -292,7 +291,7 @@ def map_images(run: Run, names: Sequence[str], camera_model: str, *, partial: bo
     if not models:
         raise errors.ReconstructionError(
             f"a model of the {len(names)} photographs",
-            found="no two that match well enough to begin one",
+            found="no two that match well enough to start one",
             fix=f"{advice[0].upper()}{advice[1:]}.",
         )
     best = max(models, key=lambda i: (models[i].num_reg_images(), models[i].num_points3D()))
@@ -302,20 +301,20 @@ def map_images(run: Run, names: Sequence[str], camera_model: str, *, partial: bo
             f"at least half of the {len(names)} photographs to get a pose",
             found=f"{len(found)} in the largest of {counted(len(models), 'model')}; "
             f"without a pose: {name_some([name for name in names if name not in found])}",
-            fix=f"Pass `partial=True` to write the scene of these "
-            f"{len(found)}; for more, {advice}.",
+            fix=f"Pass `partial=True` to write the scene of these {len(found)}. For more, "
+            f"{advice}.",
         )
     return models_dir / str(best)
 
 
 def _mapped(run: Run, models_dir: Path, total: int) -> dict[int, Any]:
-    """The models by the names of their folders, those of an earlier run if it finished them."""
+    """Map images, or load the finished models of an earlier run; return models by number."""
     if (models_dir / _COMPLETE).exists():
         folders = (path for path in models_dir.iterdir() if path.is_dir())
         return {int(path.name): run.pycolmap.Reconstruction(path) for path in folders}
     remove(models_dir)
     models_dir.mkdir()
-    registered: list[None] = []  # but for those with which a model begins
+    registered: list[None] = []  # except initial pairs
     models: dict[int, Any] = run.stage(
         "mapping",
         lambda: run.pycolmap.incremental_mapping(
@@ -333,14 +332,14 @@ def _mapped(run: Run, models_dir: Path, total: int) -> dict[int, Any]:
 
 
 def triangulate_points(run: Run, poses: Sequence[Image], without: Collection[str] = ()) -> Path:
-    """Triangulate points with cameras and poses held fixed; the folder of the model.
+    """Triangulate points at fixed cameras and poses; return the folder of the model.
 
-    Images can be left out, by name.
+    ``without``: names of images to omit.
     """
     model_dir = run.work / "model"
     model_dir.mkdir()
     options = _options(run)
-    options.max_extra_param = math.inf  # a known lens is trusted: Kinects have a k3 above 1
+    options.max_extra_param = math.inf  # known lenses are trusted: Kinects have a k3 above 1
     posed = posed_model(run.pycolmap, poses, without)
     model = run.stage(
         "triangulation",
@@ -353,7 +352,7 @@ def triangulate_points(run: Run, poses: Sequence[Image], without: Collection[str
     if model.num_points3D() == 0:
         raise errors.ReconstructionError(
             f"points from the {len(poses)} posed images in {run.image_dir}",
-            found="none on which two matching rays meet",
+            found="none where matching rays intersect",
             fix="Check that the poses belong to these images, in the same order and convention; "
             "a capture without sideways motion has no depth to triangulate.",
         )

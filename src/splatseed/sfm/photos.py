@@ -1,12 +1,12 @@
-"""Photographs: those of a folder, checked, those that have a pose, and the best frames of a video.
+"""Input of SfM: the photographs of a folder, those with known poses, or frames of a video.
 
-Every photograph is decoded to its last byte: pycolmap accepts a truncated JPEG as a picture with a
-grey lower half, and skips files that it cannot read. From a video come sharp frames, spaced by how
-far the picture moves, so that a camera that stands still gives one frame, not hundreds.
+Photographs are decoded completely, because pycolmap accepts a truncated JPEG (with a grey lower
+half) and skips unreadable files. Video frames are chosen sharp and spaced by image motion, so that
+a standing camera gives one frame.
 
-Notation: a video's *way* up to a frame is how far the picture has moved by then, in picture widths:
-the sum, over the frames so far, of the median shift of blocks from one frame to the next, by phase
-correlation (Kuglin and Hines 1975). A frame's *sharpness* is the variance of its Laplacian.
+Notation: the *motion* at a frame is the cumulative image motion in image widths: the sum of the
+median shifts of blocks between frames, by phase correlation (Kuglin and Hines 1975). *Sharpness* is
+the variance of the Laplacian.
 """
 
 from __future__ import annotations
@@ -43,36 +43,34 @@ _FOREIGN_SUFFIXES = frozenset(
      ".orf", ".rw2"}
 )  # fmt: skip
 _GREY = "of 16-bit or floating-point grey, as depth maps are"
-_FOREIGN = "of a format that is not read"
+_FOREIGN = "of an unsupported format"
 _MASK = "named as masks of others are"
 _MAP = "of grey, named as maps of depth or confidence are"
 _DEPTH_MODES = ("I", "F")  # Pillow's names for 16- and 32-bit grey
 _GREY_MODES = ("L", "1", "LA")
 _MAPS = re.compile(r"(^|[/_.-])(conf|confidence|depth|disparity|masks?)([/_.\d-]|$)", re.IGNORECASE)
-"""Names of the maps that phones' scanning apps write beside photographs."""
+"""Names of maps that scanning apps write beside photographs."""
 
 _ANALYSIS_WIDTH, _BLOCK = 256, 64
-"""Width at which frames are analysed, and the side of the blocks whose shifts are measured, px."""
+"""Width at which frames are analysed, and side of the blocks of phase correlation, px."""
 _MIN_STEP = 0.02
-"""Least distance, in widths, that the picture moves between chosen frames."""
+"""Smallest image motion between chosen frames, in widths."""
 _MIN_FRAMES = 3
-"""Fewer photographs make no scene."""
+"""Fewest frames of a scene."""
 
 
 def find_photos(image_dir: StrPath) -> tuple[dict[str, Photo], dict[str, list[str]]]:
-    """The photographs below ``image_dir``, at least two.
+    """Find the photographs of a folder and its subfolders, at least two.
 
-    Hidden files are left out, and so are 16-bit and floating-point grey images: those are the
-    depth maps of an RGB-D capture, and 8-bit grey ones that are named as an app's maps of
-    confidence or depth, beside photographs in colour. Formats such as HEIC and cameras' raw ones
-    are not read.
+    Skipped are hidden files, masks, depth maps (16-bit or float grey; next to colour photographs
+    also 8-bit grey with the name of a depth or confidence map), and unsupported formats such as
+    HEIC or raw.
 
     Returns:
-        The photographs by their names (paths relative to the folder), in order of names; and the
-        names of other images by what they are.
+        The photographs by name (relative path), sorted; and the names of skipped images by reason.
 
     Raises:
-        SceneNotFoundError: The folder is missing or holds fewer than two photographs.
+        SceneNotFoundError: No such folder, or fewer than two photographs.
         SceneFormatError: An image cannot be decoded.
     """
     image_dir = Path(image_dir)
@@ -80,14 +78,13 @@ def find_photos(image_dir: StrPath) -> tuple[dict[str, Photo], dict[str, list[st
         raise SceneNotFoundError(
             f"a folder of photographs or a video at {image_dir}",
             found="a file that is neither" if image_dir.exists() else "nothing",
-            fix="Name the folder that holds the photographs, or a video "
-            f"({', '.join(sorted(VIDEO_SUFFIXES))}).",
+            fix=f"Pass a folder of photographs, or a video ({', '.join(sorted(VIDEO_SUFFIXES))}).",
         )
     if (kind := read_manifest(image_dir).get("command")) is not None:
         raise SceneNotFoundError(
             f"a folder of photographs at {image_dir}",
-            found=f"what splatseed {kind} wrote, with pictures of its own",
-            fix=f"Name the folder of its photographs, such as {quoted(image_dir / 'images')}.",
+            found=f"an output of splatseed {kind}",
+            fix=f"Pass the folder of its photographs, such as {quoted(image_dir / 'images')}.",
         )
     relative = [path.relative_to(image_dir) for path in files_below(image_dir) if path.is_file()]
     files = [path for path in relative if not any(part.startswith(".") for part in path.parts)]
@@ -110,9 +107,11 @@ def find_photos(image_dir: StrPath) -> tuple[dict[str, Photo], dict[str, list[st
         (_FOREIGN, foreign),
         (_MASK, sorted(masks)),
     )
-    left_out = {what: them for what, them in kinds if them}
+    left_out = {reason: names for reason, names in kinds if names}
     if len(photos) < 2:
-        found = [f"{len(them)} {what} ({name_some(them)})" for what, them in left_out.items()]
+        found = [
+            f"{len(skipped)} {why} ({name_some(skipped)})" for why, skipped in left_out.items()
+        ]
         if others := len(files) - len(names) - len(foreign):
             found.append(f"{others} other files")
         raise SceneNotFoundError(
@@ -120,13 +119,13 @@ def find_photos(image_dir: StrPath) -> tuple[dict[str, Photo], dict[str, list[st
             found=" and ".join([f"{len(photos)}", *found]),
             fix="Save photographs as JPEG, or as PNG of 8 bits."
             if left_out
-            else "Name the folder that holds the photographs of a scene.",
+            else "Pass the folder with the photographs of a scene.",
         )
     return photos, left_out
 
 
 def _read(path: Path) -> tuple[Photo | None, bool]:
-    """A photograph, decoded and found whole, None for a depth map; and whether it has colours."""
+    """Decode an image; return the photograph (None for depth maps), and if it has colour."""
     encoded = photograph_bytes(path)
     with open_photograph(path, encoded) as image:
         mode, exif = image.mode, read_exif(image)
@@ -137,47 +136,47 @@ def _read(path: Path) -> tuple[Photo | None, bool]:
 
 
 def match_poses(photos: Photos, scene: Scene, image_dir: Path) -> tuple[Image, ...]:
-    """The images of ``scene`` that are among the photographs, in their order and at their sizes.
+    """Return the scene's images with photographs, in the photographs' order and sizes.
 
     Raises:
-        SceneNotFoundError: Fewer than two names are in both.
+        SceneNotFoundError: Fewer than two common names.
         SceneFormatError: A photograph is neither of its camera's size nor a resized copy.
     """
     posed = {image.name: image for image in scene.images}
-    # Observations are not needed where they go, in another process.
+    # Drop observations, which the child process does not need.
     images = [replace(posed[name], observations=None) for name in photos if name in posed]
     if len(images) < 2:
         raise SceneNotFoundError(
             f"two or more images of {image_dir} among the {len(posed)} posed images "
             f"({name_some(sorted(posed)[:3])}, ...)",
             found=f"{len(images)} of {len(photos)} ({name_some(list(photos)[:3])}, ...)",
-            fix="Names must be equal, relative to the images folder, suffix included.",
+            fix="Names must match exactly, relative to the images folder, suffix included.",
         )
     return resized_to(images, check_sizes(images, image_dir))
 
 
 class PickedFrames(NamedTuple):
-    """Which frames of a video were chosen."""
+    """The chosen frames of a video."""
 
     numbers: tuple[int, ...]  # from 0
-    total: int  # how many frames the video has
-    way: float  # how far the picture moves in total, in widths
+    total: int  # frames of the video
+    motion: float  # total image motion, in widths
 
 
 def pick_frames(
-    video: Path, folder: Path, most: int = 150, progress: Progress = silent
+    video: Path, folder: Path, frames: int = 150, progress: Progress = silent
 ) -> PickedFrames:
-    """Write the best frames of a video, ``most`` at most, as JPEGs; equal videos give equal frames.
+    """Write the best frames of a video, at most ``frames``, as JPEGs; deterministic.
 
     Raises:
-        MissingDependencyError: imageio-ffmpeg is absent.
-        SceneNotFoundError: There is no such file.
-        SceneFormatError: It cannot be read, or the picture hardly moves.
-        ParameterError: ``most`` is too small.
+        MissingDependencyError: imageio-ffmpeg is not installed.
+        SceneNotFoundError: No such file.
+        SceneFormatError: Unreadable, or with too little motion.
+        ParameterError: ``frames`` is too small.
     """
-    if most < _MIN_FRAMES:
-        expected = f"`frames` of {_MIN_FRAMES} or more"
-        raise ParameterError(expected, found=f"{most}", fix="Try 150.")
+    if frames < _MIN_FRAMES:
+        expected = f"`frames` to be {_MIN_FRAMES} or more"
+        raise ParameterError(expected, found=f"{frames}", fix="Try 150.")
     if not video.is_file():
         raise SceneNotFoundError(f"a video {video}", found="none", fix="Check the path.")
     sharpness, steps = [], []
@@ -187,38 +186,38 @@ def pick_frames(
         sharpness.append(float(laplace(grey).var()))
         steps.append(0.0 if before is None else shift(before, grey) / _ANALYSIS_WIDTH)
         before = grey
-        progress("look at video", part)
-    way = np.cumsum(steps)
-    numbers = choose_frames(np.array(sharpness), way, most).tolist()
+        progress("analyse video", part)
+    motion = np.cumsum(steps)
+    numbers = choose_frames(np.array(sharpness), motion, frames).tolist()
     if len(numbers) < _MIN_FRAMES:
         raise SceneFormatError(
-            f"{video} to move, for photographs from several places",
-            found=f"{len(way)} frames whose picture moves by {way[-1] if len(way) else 0:.1%} of "
-            "its width",
+            f"{video} to show the scene from several places",
+            found=f"{len(motion)} frames with image motion of "
+            f"{motion[-1] if len(motion) else 0:.1%} of the width",
             fix="Film while you walk around the scene.",
         )
     for number, (pixels, part) in enumerate(_frames(video, [], "rgb24")):
         if number in numbers:
             path = folder / f"{video.stem}_{number:06}.jpg"
             PilImage.fromarray(pixels).save(path, quality=95, subsampling=0)
-        progress("take frames", part)
-    return PickedFrames(tuple(numbers), len(way), float(way[-1]))
+        progress("write frames", part)
+    return PickedFrames(tuple(numbers), len(motion), float(motion[-1]))
 
 
 def choose_frames(
-    sharpness: Float64[np.ndarray, " F"], way: Float64[np.ndarray, " F"], most: int
+    sharpness: Float64[np.ndarray, " F"], motion: Float64[np.ndarray, " F"], limit: int
 ) -> Int64[np.ndarray, " P"]:
-    """The sharpest frame in each of at most ``most`` equal stretches of the (ascending) way."""
-    if not len(way):
+    """Choose the sharpest frame in each of at most ``limit`` equal intervals of motion."""
+    if not len(motion):
         return np.empty(0, np.int64)
-    step = max(way[-1] / most, _MIN_STEP)
-    stretch = np.minimum((way / step).astype(np.int64), max(int(way[-1] / step) - 1, 0))
-    order = np.lexsort((-sharpness, stretch))
-    return np.sort(order[np.unique(stretch[order], return_index=True)[1]])
+    step = max(motion[-1] / limit, _MIN_STEP)
+    interval = np.minimum((motion / step).astype(np.int64), max(int(motion[-1] / step) - 1, 0))
+    order = np.lexsort((-sharpness, interval))
+    return np.sort(order[np.unique(interval[order], return_index=True)[1]])
 
 
 def shift(before: Float32[np.ndarray, "H W"], now: Float32[np.ndarray, "H W"]) -> float:
-    """How far the picture moved: the median over blocks of the length of their shifts, px."""
+    """Measure image motion between frames: the median length of the blocks' shifts, px."""
     window = np.hanning(_BLOCK)[:, None] * np.hanning(_BLOCK)
     spectra = []
     for grey in (before, now):
@@ -231,7 +230,7 @@ def shift(before: Float32[np.ndarray, "H W"], now: Float32[np.ndarray, "H W"]) -
     cross = spectra[0] * np.conj(spectra[1])
     peaks = np.fft.irfft2(cross / np.maximum(np.abs(cross), 1e-6), s=(_BLOCK, _BLOCK))
     at = np.argmax(peaks.reshape(len(peaks), -1), axis=1)
-    # Shifts of more than half a block are negative ones.
+    # Shifts of more than half a block are negative.
     dy, dx = ((each + _BLOCK // 2) % _BLOCK - _BLOCK // 2 for each in np.divmod(at, _BLOCK))
     return float(np.median(np.hypot(dx, dy)))
 
@@ -239,12 +238,12 @@ def shift(before: Float32[np.ndarray, "H W"], now: Float32[np.ndarray, "H W"]) -
 def _frames(
     video: Path, parameters: list[str], pixels: Literal["gray", "rgb24"]
 ) -> Iterator[tuple[UInt8[np.ndarray, "H W C"], float]]:
-    """Frames of a video, with the fraction of it read so far."""
+    """Yield frames of a video, and the fraction read so far."""
     require("imageio_ffmpeg")
-    import imageio_ffmpeg  # noqa: PLC0415  (of the extras sfm and view)
+    import imageio_ffmpeg  # noqa: PLC0415  (an optional package)
 
     channels = 1 if pixels == "gray" else 3
-    # It warns about every video that is read at another size than its own.
+    # Silence its warning about reading at another size.
     logging.getLogger("imageio_ffmpeg").setLevel(logging.ERROR)
     try:
         reader = imageio_ffmpeg.read_frames(
@@ -258,9 +257,9 @@ def _frames(
             frame = np.frombuffer(raw, np.uint8).reshape(height, width, channels)
             yield frame, min(1.0, (i + 1) / total)
     except (OSError, RuntimeError, StopIteration, IndexError, ValueError) as error:
-        said = " ".join(str(error).split())
+        text = " ".join(str(error).split())
         raise SceneFormatError(
-            f"{video} to be a video that ffmpeg reads",
-            found=(said if len(said) <= 120 else f"...{said[-117:]}") or type(error).__name__,
+            f"{video} to be a video that ffmpeg can read",
+            found=(text if len(text) <= 120 else f"...{text[-117:]}") or type(error).__name__,
             fix="Convert it to .mp4 (H.264), or pass a folder of photographs.",
         ) from None
