@@ -1,9 +1,9 @@
-"""Compare every method on surfaces that are known, so that its errors can be measured.
+"""Compare all methods on known surfaces, where errors can be measured.
 
 python examples/03_compare_methods.py
 
-Distances are in units of the originals' spacing: *error* from the new points to the true surface,
-*coverage* from the surface to the nearest of all points. Less is better, and each alone is easy.
+Distances are in units of the spacing of the original points: *error* from the new points to the
+surface, *coverage* from the surface to the nearest point. Lower is better in both.
 """
 
 from __future__ import annotations
@@ -16,29 +16,29 @@ from splatseed.synthetic import SHAPES, Surface
 
 NUM_POINTS = 2000
 NOISE = 0.1
-"""Of the originals, in units of their spacing."""
+"""Standard deviation of the original points, in units of their spacing."""
 NEED_PHOTOGRAPHS = ("depth", "stereo", "cover", "auto", "cloud")
 
 
 def noisy_cloud(surface: Surface, rng: np.random.Generator) -> ss.PointCloud:
-    """Points near a surface, as Structure-from-Motion would find them."""
+    """Sample a surface with noise, as Structure-from-Motion would."""
     xyz = surface.sample(NUM_POINTS, rng)
     xyz += NOISE * spacing(xyz) * rng.normal(size=xyz.shape)
     return ss.PointCloud(xyz, np.full(xyz.shape, 128, np.uint8))
 
 
 def score(surface: Surface, method: str) -> tuple[float, float]:
-    """Error and coverage of a method at 8 times the points."""
+    """Measure the error and coverage of a method at ratio 8."""
     rng = np.random.default_rng(0)
     cloud = noisy_cloud(surface, rng)
-    seeds = ss.upsample(cloud, method=method, ratio=8, seed=0)
+    seeds = ss.upsample(cloud, method, ratio=8, seed=0)
     new = seeds.xyz[len(cloud) :]
     result = measure(new, seeds.xyz, surface, surface.sample(2000, rng), spacing(cloud.xyz))
     return result.error, result.coverage
 
 
 def main() -> None:
-    """Print one row a shape, one column a method."""
+    """Print a row per shape and a column per method."""
     methods = [name for name in ss.METHODS if name not in NEED_PHOTOGRAPHS]
     print("error / coverage".ljust(18) + "".join(f"{method:>15}" for method in methods))
     for name, make_shape in SHAPES.items():

@@ -1,8 +1,7 @@
-"""A measurement in a process of its own.
+"""Run a measurement in a fresh process.
 
-Promise: the child has the number of threads asked for from its first import on, in Numba, PyTorch
-and BLAS alike; idle threads sleep, as they do under the command line; nothing of the parent's
-caches, memory or settings is in what it measures.
+Numba, PyTorch and BLAS have the given number of threads from the first import on; idle threads
+sleep, as under the command line. The parent's caches, memory and settings do not affect the result.
 """
 
 from __future__ import annotations
@@ -35,16 +34,16 @@ class ChildError(SplatseedError):
 def call(
     function: str, *, threads: int, environment: Mapping[str, str] | None = None, **arguments: Any
 ) -> Any:
-    """What a function of these benchmarks returns in a fresh process.
+    """Call a function of these benchmarks in a fresh process, and return its value.
 
     Args:
-        function: ``package.module:name``; it takes and returns what JSON can hold.
-        threads: How many it may use.
+        function: ``package.module:name``; arguments and value are JSON values.
+        threads: Number of threads.
         environment: Further variables.
-        arguments: Its arguments.
+        arguments: Keyword arguments of the function.
 
     Raises:
-        ChildError: It failed; what it wrote to stderr is in the message.
+        ChildError: The call failed; the message has the end of its stderr.
     """
     done = subprocess.run(
         [sys.executable, "-m", __name__, function, json.dumps(arguments)],
@@ -59,13 +58,13 @@ def call(
 
 
 def _importing(environment: Mapping[str, str]) -> dict[str, str]:
-    """An environment in which the benchmarks are found, wherever the child is started."""
+    """Add the checkout to PYTHONPATH."""
     places = filter(None, [environment.get("PYTHONPATH"), str(ROOT)])
     return {**environment, "PYTHONPATH": os.pathsep.join(places)}
 
 
 def thread_settings(threads: int, *, awake: bool = False) -> dict[str, str]:
-    """Variables for so many threads, idle ones asleep unless told otherwise."""
+    """Return variables for a number of threads; ``awake`` makes idle threads spin."""
     policy = "active" if awake else "passive"
     return {name: str(threads) for name in THREADS} | {"OMP_WAIT_POLICY": policy}
 
@@ -77,7 +76,7 @@ def seconds_of(
     threads: int = 1,
     environment: Mapping[str, str] | None = None,
 ) -> float:
-    """How long a program runs; by clock ``cpu`` the time of all its threads over their number.
+    """Measure the time of a program; by clock ``cpu``, CPU time divided by the threads.
 
     Raises:
         OSError: There is no such program.
@@ -93,9 +92,9 @@ def seconds_of(
 
 
 def avx2_environment() -> dict[str, str] | None:
-    """Variables that have Numba and PyTorch compile for, and use, AVX2; None where that is no less.
+    """Return variables that limit Numba and PyTorch to AVX2; None on processors without AVX-512.
 
-    Kernels then go to a cache of their own: Numba keys its cache on the processor's features.
+    Numba caches these kernels apart, as its cache key has the processor's features.
     """
     from llvmlite.binding import get_host_cpu_features  # noqa: PLC0415  (asks the processor)
 

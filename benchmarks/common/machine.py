@@ -1,4 +1,4 @@
-"""What a benchmark ran on, in one line: numbers mean nothing without it."""
+"""Describe the machine of a benchmark in one line."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ IDLE_LOAD = 0.5
 
 
 def describe() -> str:
-    """Processor, cores and versions."""
+    """Return the processor, cores and versions."""
     libraries = ", ".join(f"{name} {version(name)}" for name in PACKAGES)
     return (
         f"{_processor()}, {os.cpu_count()} cores; Python {platform.python_version()}, {libraries}"
@@ -31,7 +31,7 @@ def _processor() -> str:
 
 
 def warn_if_busy() -> None:
-    """Say so when something else is running, which makes timings worthless."""
+    """Warn if the machine is busy, which invalidates timings."""
     load = os.getloadavg()[0]
     if load > IDLE_LOAD:
         print(

@@ -1,4 +1,4 @@
-"""Tables of results as Markdown, to paste into README.md and docs."""
+"""Format results as Markdown tables."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ __all__ = ["table"]
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A Markdown table with its columns padded, so that it reads well on a terminal too."""
+    """Format a Markdown table with padded columns."""
     cells = [list(header), *(list(row) for row in rows)]
     widths = [max(len(cell) for cell in column) for column in zip(*cells, strict=True)]
     cells.insert(1, ["-" * width for width in widths])
