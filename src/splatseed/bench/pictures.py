@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import UInt8
+from PIL import Image
 
 from splatseed.bench.comparisons import baseline_of, rivals
 from splatseed.bench.figures import shown_seeds
@@ -84,8 +85,6 @@ def _draw_seeds(
 
 def cloud_jpeg(png: bytes) -> bytes:
     """Convert a picture of seeds to a small JPEG for the page."""
-    from PIL import Image  # noqa: PLC0415  (slow to import)
-
     with Image.open(BytesIO(png)) as picture:
         return _jpeg(np.asarray(picture.convert("RGB")), _CLOUD_SIDE)
 
@@ -152,8 +151,6 @@ def _split(path: Path) -> UInt8[np.ndarray, "3 H W 3"]:
 
 def _jpeg(pixels: UInt8[np.ndarray, "H W 3"], side: int) -> bytes:
     """Encode a picture as JPEG, downsampled to ``side`` pixels if it is larger."""
-    from PIL import Image  # noqa: PLC0415  (slow to import)
-
     picture = Image.fromarray(np.ascontiguousarray(pixels))
     picture.thumbnail((side, side), Image.Resampling.LANCZOS)
     out = BytesIO()

@@ -18,6 +18,7 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Float64
+from scipy.stats import t
 
 LEVEL = 0.05
 """A difference is a claim when its adjusted p is at most this."""
@@ -62,8 +63,6 @@ class Difference:
         Args:
             level: The share of such intervals that hold the true mean.
         """
-        from scipy.stats import t  # noqa: PLC0415  (slow to import)
-
         if math.isnan(self.se):
             return math.nan, math.nan
         half = float(t.ppf((1 + level) / 2, self.df)) * self.se if self.se > EXACT else 0.0
@@ -79,8 +78,6 @@ def difference(mean: float, se: float, df: float, n: int) -> Difference:
         df: Degrees of freedom of the standard error.
         n: Samples behind the mean.
     """
-    from scipy.stats import t  # noqa: PLC0415  (slow to import)
-
     if math.isnan(se) or df <= 0:
         return Difference(mean, math.nan, 0.0, n, math.nan)
     if se <= EXACT:  # no noise

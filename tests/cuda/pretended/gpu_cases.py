@@ -177,7 +177,7 @@ def test_the_end_of_memory_is_told_and_keeps_the_last_whole_step(
         kept = 5 if during == "render" else 0
         with pytest.raises(PointCloudError, match=f"as of step {kept} is kept") as caught:
             run.train()
-        assert f"--budget {round(0.8 * run.count())}" in caught.value.fix
+        assert f"budget={round(0.8 * run.count())}" in caught.value.fix
         monkeypatch.undo()
         monkeypatch.setattr(state, "as_parameters", _ends)
         with pytest.raises(torch.cuda.OutOfMemoryError):  # not a damaged checkpoint
@@ -191,7 +191,7 @@ def test_the_end_of_memory_is_told_and_keeps_the_last_whole_step(
 
 def test_memory_that_ends_before_the_first_step_leaves_no_folder(room, tmp_path, monkeypatch):
     monkeypatch.setattr(trainer, "photometric_loss", _ends)
-    with pc.pretended_gpu(), pytest.raises(PointCloudError, match="--budget"):
+    with pc.pretended_gpu(), pytest.raises(PointCloudError, match="budget"):
         _begin(room, tmp_path / "run", "default", "cuda")
     assert not (tmp_path / "run").exists()
 
@@ -271,7 +271,7 @@ def test_the_viewer_renders_all_gaussians_while_the_camera_moves(room, monkeypat
     gaussians = initial_gaussians(room.points)
     item = ViewerItem("room", room, gaussians)
     frame = viewer_frame(item)
-    monkeypatch.setattr(pictures, "MOST_MOVING", len(gaussians) // 2)
+    monkeypatch.setattr(pictures, "MAX_MOVING", len(gaussians) // 2)
     view = load_split(room)[0][0]
     with pc.pretended_gpu():
         entry = pictures.Entry(item, frame, pc.GPU)
