@@ -14,7 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from splatseed.photos.view import View
+from splatseed.camera import Camera
+from splatseed.photos.view import view_of
 from splatseed.rendering import rasterization
 from splatseed.training.device import pick_device
 from splatseed.training.strategies.grow import contributions
@@ -153,7 +154,7 @@ def _shares(case: Case, device: str) -> Arrays:
     }
     width, height = case.options["width"], case.options["height"]
     pose, K = (case.inputs[name][0].astype(np.float64) for name in ("viewmats", "Ks"))
-    view = View("", np.empty((0, 0, 3), np.uint8), K, width, height, pose)
+    view = view_of(Camera(K, width, height, pose))
     ramp = torch.linspace(0, 1, width, device=device).expand(height, -1).contiguous()
     pixels, errors = contributions(params, view, ramp)
     return {"pixels": pixels.cpu().numpy(), "errors": errors.cpu().numpy()}

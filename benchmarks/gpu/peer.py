@@ -19,7 +19,8 @@ from benchmarks.training.peer_stand_ins import Capture, load_peer
 from torch import Tensor
 
 from splatseed import load_scene
-from splatseed.photos.view import View, load_split
+from splatseed.photos.loading import load_split
+from splatseed.photos.view import View
 from splatseed.splat.evaluate import evaluate_views
 from splatseed.splat.ssim_conv import l1_and_ssim_by_convolution
 from splatseed.training import TrainSettings

@@ -71,7 +71,7 @@ class Workload:
             gaussians = Gaussians(**{name: arrays[name] for name in PARAMETERS})
             rows = zip(*(arrays[name] for name in VIEW), strict=True)
             views = tuple(
-                View(f"{i:03d}.png", image, K, image.shape[1], image.shape[0], pose)
+                View(f"{i:03d}.png", image, Camera(K, image.shape[1], image.shape[0], pose))
                 for i, (image, K, pose) in enumerate(rows)
             )
         return Workload(gaussians, views)
@@ -86,7 +86,7 @@ def make_workload(num: int, width: int, height: int, seed: int = 0) -> Workload:
     gaussians = _gaussians(xyz, *_normals_and_colors(room, xyz), rng)
     images, _ = render_views(room, cameras)
     views = tuple(
-        View(f"{i:03d}.png", image, camera.K, width, height, camera.cam_from_world)
+        View(f"{i:03d}.png", image, camera)
         for i, (image, camera) in enumerate(zip(images, cameras, strict=True))
     )
     return Workload(gaussians, views)

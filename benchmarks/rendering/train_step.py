@@ -31,7 +31,7 @@ from benchmarks.rendering.stopwatch import RENDER_STAGES, Place, Stopwatch, time
 
 from splatseed import load_scene
 from splatseed.errors import SplatseedError
-from splatseed.photos.view import load_split
+from splatseed.photos.loading import load_split
 from splatseed.splat.gaussians import Gaussians, TrainingFrame, initial_gaussians, training_frame
 from splatseed.splat.rendering import render_view
 from splatseed.training.initialization import min_view_depths

@@ -22,6 +22,7 @@ from benchmarks.common.markdown import table
 from benchmarks.rendering.splats import make_workload
 from PIL import Image
 
+from splatseed.camera import Camera
 from splatseed.photos.view import View
 from splatseed.splat.gaussians import training_frame
 from splatseed.viewer.flights import smooth_path
@@ -70,7 +71,7 @@ class Stage:
 def _scaled(view: View, scale: float) -> View:
     size = (round(scale * view.width), round(scale * view.height))
     K = np.diag([size[0] / view.width, size[1] / view.height, 1.0]) @ view.K
-    return dataclasses.replace(view, K=K, width=size[0], height=size[1])
+    return dataclasses.replace(view, camera=Camera(K, *size, view.cam_from_world))
 
 
 def _first_frame(entry: Entry, path: list[View]) -> tuple[float, float]:

@@ -18,6 +18,7 @@ from benchmarks.common.machine import describe, warn_if_busy
 from benchmarks.common.markdown import table
 from benchmarks.seeds.cover_rules import rule_table
 
+from splatseed.camera import Camera
 from splatseed.errors import SplatseedError
 from splatseed.photos.projection import cells_from_world, grid_shape
 from splatseed.photos.view import View
@@ -62,7 +63,7 @@ def views_of_the_room(num: int) -> list[View]:
         eye = np.array([1.5 * np.cos(angle), 1.2 * np.sin(angle), 1.3])
         target = np.array([2.5 * np.cos(angle + 2.5), 2.0 * np.sin(angle + 2.5), 1.0])
         pose = look_at(eye, target, np.array([0.0, 0.0, 1.0]))
-        views.append(View(f"{k}", pixels, K, WIDTH, HEIGHT, pose))
+        views.append(View(f"{k}", pixels, Camera(K, WIDTH, HEIGHT, pose)))
     return views
 
 

@@ -18,7 +18,7 @@ from scipy.spatial import Delaunay, QhullError
 
 from splatseed.io import load_scene
 from splatseed.photos import projection, zbuffer
-from splatseed.photos.view import View, poses_of
+from splatseed.photos.view import View, camera_views
 from splatseed.progress import silent
 from splatseed.scene import Image, Scene
 from splatseed.seeding import cover
@@ -132,7 +132,7 @@ def make_holes(scene: Scene, num: int) -> Iterator[Hole]:
     rng = np.random.default_rng(0)
     rest = scene.split(TEST_EVERY)[0]
     images = [image for k, image in enumerate(rest) if k % TEST_EVERY]
-    views = poses_of(images, DATA_FACTOR)
+    views = camera_views(images, DATA_FACTOR)
     for v in rng.permutation(len(views))[:MOST_VIEWS]:
         others = [o for o in rng.permutation(len(views)) if o != v][:MOST_WITNESSES]
         asked = [views[o] for o in others]

@@ -18,7 +18,8 @@ from benchmarks.common.clouds import find_scenes
 import splatseed as ss
 from splatseed.depth.stereo.maps import StereoResult, StereoSettings
 from splatseed.depth.stereo.pipeline import find_stereo
-from splatseed.photos.view import data_factor, load_views
+from splatseed.photos.loading import load_views
+from splatseed.photos.sizes import factor_for_size
 from splatseed.photos.visibility import Visibility, find_visibility
 
 __all__ = ["FEW", "PointScore", "score_few", "score_points"]
@@ -96,7 +97,7 @@ def score_few(name: str, limit: int) -> list[list[float]]:
 def _score(name: str, settings: StereoSettings, limit: int) -> PointScore:
     scene = ss.load_scene(find_scenes() / name)
     images = scene.split()[0][:limit]
-    views = load_views(scene, images, data_factor=data_factor(images, settings.max_size))
+    views = load_views(scene, images, data_factor=factor_for_size(images, settings.max_size))
     visibility = find_visibility(scene)
     told = _only(visibility, visibility.point_idx % 2 == 0)
     find_stereo(views[:2], images[:2], told, settings)  # compiled

@@ -23,8 +23,10 @@ from jaxtyping import Float, Int, UInt8
 
 from splatseed.depth.stereo.maps import StereoSettings
 from splatseed.depth.stereo.pipeline import known_visibility
+from splatseed.photos.loading import load_views
+from splatseed.photos.sizes import factor_for_size
 from splatseed.photos.sources import choose_sources
-from splatseed.photos.view import View, data_factor, load_views
+from splatseed.photos.view import View
 from splatseed.scene import Scene
 
 __all__ = ["score_pairs"]
@@ -87,7 +89,9 @@ def _score(name: str, cache: Path, limit: int, pairs: int) -> Score:
     scene = first(load(name, cache), limit)
     truth = Truth.of(scene, CAPTURES.get(name, MADE_STEP))
     images = scene.split(HELD_OUT)[0]
-    views = load_views(scene, images, data_factor=data_factor(images, StereoSettings().max_size))
+    views = load_views(
+        scene, images, data_factor=factor_for_size(images, StereoSettings().max_size)
+    )
     started = time.process_time()
     maps = depth_maps(scene, views, pairs)
     xyz = np.concatenate([_seeds(*each) for each in zip(views, maps, strict=True)])

@@ -23,7 +23,7 @@ from splatseed.depth.stereo.fusion import fuse
 from splatseed.depth.stereo.maps import StereoSettings
 from splatseed.depth.stereo.pipeline import find_stereo
 from splatseed.depth.stereo.quads import make_quads
-from splatseed.photos.view import load_views
+from splatseed.photos.loading import load_views
 from splatseed.photos.visibility import find_visibility
 from splatseed.pointcloud import PointCloud
 from splatseed.synthetic import make_capture, write_capture

@@ -23,7 +23,8 @@ from splatseed.depth.stereo.fusion import fuse
 from splatseed.depth.stereo.maps import StereoResult, StereoSettings
 from splatseed.depth.stereo.pipeline import find_stereo, known_visibility
 from splatseed.io import find_depths
-from splatseed.photos.view import data_factor, load_views
+from splatseed.photos.loading import load_views
+from splatseed.photos.sizes import factor_for_size
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
 from splatseed.synthetic import make_capture, write_capture
@@ -117,7 +118,7 @@ def _score(name: str, cache: Path, settings: StereoSettings, limit: int, without
         )
     if without == "depths":
         seen = seen.replace(depths=None)
-    factor = data_factor(images, settings.max_size)
+    factor = factor_for_size(images, settings.max_size)
     views = load_views(scene, images, data_factor=factor)
     find_stereo(views[:2], images[:2], known_visibility(scene), settings)  # compiled
     started = time.process_time()

@@ -11,7 +11,6 @@ beside the first camera: the model with these floaters, and cleaned.
 
 from __future__ import annotations
 
-import dataclasses
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -28,7 +27,7 @@ from PIL import Image
 
 import splatseed as ss
 from splatseed.errors import SplatseedError
-from splatseed.photos.view import View, poses_of
+from splatseed.photos.view import View, camera_views
 from splatseed.scene import Scene
 from splatseed.splat.evaluate import evaluate_views
 from splatseed.splat.gaussians import SH_C0, Gaussians, TrainingFrame, training_frame
@@ -83,7 +82,7 @@ def measure(scene: Scene, name: str, strategy: StrategyName, settings: Settings)
         run = prepare_run(scene, Path(folder) / "run", how)
         run.train()
     views, held = run.trainer.train_views, run.trainer.test_views
-    scale = training_frame(poses_of(scene.split(TEST_EVERY)[0])).scale
+    scale = training_frame(camera_views(scene.split(TEST_EVERY)[0])).scale
     looking = TrainSettings(strategy="grow", data_factor=factor, test_every=TEST_EVERY)
     depths, _ = known_depths(scene, scale, looking, "cpu")
     model = gaussians_of(run.state.params)
@@ -139,7 +138,7 @@ def _draw(path: Path, view: View, models: Sequence[Gaussians]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     pose = view.cam_from_world.copy()
     pose[0, 3] -= ASIDE
-    beside = dataclasses.replace(view, cam_from_world=pose)
+    beside = view.posed(pose)
     pictures = [as_bytes(ModelRenderer(each, HERE).color(beside)) for each in models]
     Image.fromarray(np.concatenate(pictures, axis=1)).save(path)
 

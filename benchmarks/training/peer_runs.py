@@ -23,7 +23,8 @@ from torch import Tensor
 from splatseed import Scene, load_scene
 from splatseed.errors import SceneFormatError
 from splatseed.io.depth_maps import depth_folder
-from splatseed.photos.view import View, load_split
+from splatseed.photos.loading import load_split
+from splatseed.photos.view import View
 from splatseed.rendering import mcmc_on_cpu
 from splatseed.runtime.workarounds import keep_freed_memory
 from splatseed.splat.evaluate import Render, evaluate_views

@@ -26,7 +26,7 @@ from benchmarks.training.peer_runs import Split, read_scene
 from benchmarks.training.peer_stand_ins import check_examples
 
 from splatseed.errors import ParameterError, SplatseedError
-from splatseed.photos.view import load_split
+from splatseed.photos.loading import load_split
 from splatseed.training import TrainSettings
 from splatseed.training.settings import BUDGET, StrategyName
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from splatseed.errors import MissingDependencyError, ParameterError, SceneNotFoundError
-from splatseed.photos.view import load_split
+from splatseed.photos.loading import load_split
 from splatseed.splat.ssim_conv import l1_and_ssim_by_convolution
 from splatseed.synthetic import make_capture, write_capture
 

@@ -19,7 +19,7 @@ from splatseed.io.colmap import write_images
 from splatseed.io.photograph import lens_warnings
 from splatseed.io.seeds import saw_all_photographs, was_upsampled
 from splatseed.lens import image_points, rays_through
-from splatseed.photos.view import check_lens, load_views
+from splatseed.photos.loading import load_views, refuse_distortion
 from splatseed.sfm import undistort
 from splatseed.synthetic import make_capture, write_capture
 
@@ -56,7 +56,7 @@ def test_a_distorted_scene_becomes_one_of_pinholes(distorted, tmp_path, splatsee
     path, out = distorted, tmp_path / "straight"
     before = load_scene(path)
     with pytest.raises(SceneFormatError, match="splatseed undistort"):
-        check_lens(before.images[0])
+        refuse_distortion(before.images[0])
     run = splatseed("undistort", path, "-o", out)
     assert run.code == 0, run
     assert f"splatseed upsample {out}" in run.out

@@ -18,10 +18,12 @@ from gsplat.strategy import Strategy
 from hypothesis import given, settings, strategies as st
 from scipy.spatial.transform import Rotation
 
+from splatseed.camera import Camera
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.integrations.gsplat import GrowStrategy
 from splatseed.io.depth_maps import depth_folder
-from splatseed.photos.view import View, load_views
+from splatseed.photos.loading import load_views
+from splatseed.photos.view import View
 from splatseed.rendering import rasterization
 from splatseed.similarity import Similarity
 from splatseed.splat.gaussians import initial_gaussians
@@ -82,7 +84,7 @@ def test_it_grows_what_splatseeds_trainer_grows(tmp_path):
     asked = TrainSettings(strategy="grow", max_steps=300, cap_max=100)
     inner = make_strategy(asked, depths={"a": np.full((8, 8), 3.0, np.float32)})
     pixels = np.zeros((SIDE, SIDE, 3), np.uint8)
-    view = View("a", pixels, K.double().numpy(), SIDE, SIDE, POSE.double().numpy())
+    view = View("a", pixels, Camera(K.numpy(), SIDE, SIDE, POSE.numpy()))
     torch.manual_seed(0)
     for step in range(21):
         inner.observe(ours, view, GREY, TRUTH, step)

@@ -15,7 +15,7 @@ from splatseed.io import load_scene, write_scene
 from splatseed.io.load import with_own_depths
 from splatseed.io.mask_files import masks_among
 from splatseed.io.masks import masks_near, with_masks
-from splatseed.photos.view import load_views
+from splatseed.photos.loading import load_views
 from splatseed.sfm.photos import find_photos
 from splatseed.synthetic import write_capture
 

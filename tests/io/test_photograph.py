@@ -14,7 +14,7 @@ from splatseed.io import load_scene, write_scene
 from splatseed.io.bit_depth import find_white
 from splatseed.io.masks import read_mask
 from splatseed.io.photograph import check_photograph, decode_photograph, photograph_bytes
-from splatseed.photos.view import load_views
+from splatseed.photos.loading import load_views
 from splatseed.scene import Masks
 
 

@@ -7,20 +7,20 @@ import dataclasses
 import numpy as np
 import pytest
 
+from splatseed.camera import Camera
 from splatseed.photos.sight import notes_on, sight_of, stray_views
-from splatseed.photos.view import View
+from splatseed.photos.view import NO_PIXELS, View
 from splatseed.photos.viewpoint import look_at
 from splatseed.splat.gaussians import NEAR_SHARE, training_frame
 
 K = np.array([[140.0, 0, 80], [0, 140.0, 60], [0, 0, 1]])
 UP = np.array([0.0, 0.0, 1.0])
-UNSEEN = np.empty((0, 0, 3), np.uint8)
 NOWHERE = np.empty((0, 3))
 
 
 def _view(name, eye, target):
     pose = look_at(np.asarray(eye, float), np.asarray(target, float), UP)
-    return View(name, UNSEEN, K, 160, 120, pose)
+    return View(name, NO_PIXELS, Camera(K, 160, 120, pose))
 
 
 def _station(rng, at=(0.0, 0.0, 0.0), count=12, depth=3.0, points=300):
@@ -95,12 +95,11 @@ def test_no_honest_camera_is_a_stray(rng):
 def test_the_near_plane_is_what_cameras_see_not_how_far_they_stand_apart(step, rng):
     views, xyz = _station(rng)
     moved = np.array([step, 0, 0])
-    other = [
-        dataclasses.replace(view, name=f"{view.name}'", cam_from_world=view.cam_from_world.copy())
-        for view in views
-    ]
-    for view in other:
-        view.cam_from_world[:3, 3] -= view.cam_from_world[:3, :3] @ moved
+    other = []
+    for view in views:
+        pose = view.cam_from_world.copy()
+        pose[:3, 3] -= pose[:3, :3] @ moved
+        other.append(dataclasses.replace(view.posed(pose), name=f"{view.name}'"))
     frame = training_frame([*views, *other], np.concatenate([xyz, xyz + moved]))
     here = training_frame(views, xyz)
     assert frame.near / frame.scale <= here.near / here.scale * (1 + 1e-9)
@@ -141,7 +140,7 @@ def test_near_depth_and_strays_go_with_the_scene(rng):
             # x' = scale R x + shift: the same picture from cam_from_world' = [A R' | s t - A R' b]
             pose[:3, :3] = view.cam_from_world[:3, :3] @ turn.T
             pose[:3, 3] = scale * view.cam_from_world[:3, 3] - pose[:3, :3] @ shift
-            moved.append(dataclasses.replace(view, cam_from_world=pose))
+            moved.append(view.posed(pose))
         before, after = sight_of(views, xyz), sight_of(moved, scale * xyz @ turn.T + shift)
         assert after.strays.tolist() == before.strays.tolist()
         assert after.near == pytest.approx(scale * before.near, rel=1e-6)

@@ -14,8 +14,11 @@ from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundErro
 from splatseed.io import load_scene
 from splatseed.io.photograph_checks import ROUNDING, _off, fits
 from splatseed.lens import image_points
+from splatseed.photos.cache import load_photograph
+from splatseed.photos.loading import load_split, load_views
+from splatseed.photos.sizes import at_file_size
 from splatseed.photos.undistortion import undistort
-from splatseed.photos.view import at_file_size, load_photograph, load_split, load_views, poses_of
+from splatseed.photos.view import camera_views
 from splatseed.scene import NO_POINT, Observations
 from splatseed.seeding.budget import points_within
 from splatseed.seeding.photo_methods import frames_of
@@ -120,7 +123,7 @@ def test_a_point_has_the_same_relative_place_in_every_copy(name, room, tmp_path)
         one, other = (
             load_views(s, s.images, data_factor=factor, undistort=True) for s in (scene, sized)
         )
-        frames = poses_of(sized.images, factor)
+        frames = camera_views(sized.images, factor)
         for a, b, c, size in zip(one, other, frames, COPIES, strict=True):
             assert np.array_equal(a.K, b.K)
             assert np.array_equal(a.K, c.K)
@@ -137,8 +140,8 @@ def test_a_point_has_the_same_relative_place_in_every_copy(name, room, tmp_path)
 @pytest.mark.parametrize(
     ("size", "orientation", "says"),
     [
-        ((72, 96), 6, "found 72 x 96: stored turned, with EXIF orientation 6; 1 more of 9"),
-        ((36, 48), 8, "found 36 x 48: stored turned, with EXIF orientation 8"),
+        ((72, 96), 6, "found 72 x 96: stored rotated, with EXIF orientation 6; 1 more of 9"),
+        ((36, 48), 8, "found 36 x 48: stored rotated, with EXIF orientation 8"),
         ((72, 96), 1, "found 72 x 96: turned, width and height are swapped"),
         ((96, 60), 1, "found 96 x 60: cropped, or stretched"),
         ((48, 36), 6, ""),

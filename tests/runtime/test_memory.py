@@ -15,7 +15,7 @@ from splatseed.io import load_scene
 from splatseed.methods import number_of_new
 from splatseed.methods.add_points import BYTES_EACH
 from splatseed.methods.neighbors import NEIGHBOR_BYTES
-from splatseed.photos.view import load_views
+from splatseed.photos.loading import load_views
 from splatseed.pointcloud import PointCloud
 from splatseed.runtime import memory
 from splatseed.synthetic import make_capture, write_capture

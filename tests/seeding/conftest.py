@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from splatseed.photos.view import load_views
+from splatseed.photos.loading import load_views
 
 
 @pytest.fixture(scope="session")

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from splatseed.camera import Camera
 from splatseed.photos.view import View
 from splatseed.photos.viewpoint import look_at
 
@@ -19,7 +20,7 @@ def make_view(rng, width=40, height=32, focal=30.0, eye=None, target=(0.0, 0.0, 
     K = np.array([[focal, 0, width / 2], [0, focal * 1.1, height / 2], [0, 0, 1.0]])
     pixels = rng.integers(0, 256, (height, width, 3), dtype=np.uint8)
     pose = look_at(eye, np.asarray(target, float), np.array([0.1, 0.2, 1.0]))
-    return View(name, pixels, K, width, height, pose)
+    return View(name, pixels, Camera(K, width, height, pose))
 
 
 def matrix_of(view, cell):

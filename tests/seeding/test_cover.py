@@ -88,7 +88,7 @@ def test_a_seed_takes_the_surface_that_no_view_sees_through(rng):
     for step in (1.0, 1.05, 1.1):
         pose = view.cam_from_world.copy()
         pose[0, 3] += step
-        others.append(dataclasses.replace(view, cam_from_world=pose))
+        others.append(view.posed(pose))
     reference = reference_depths(others, points, 8, silent)
     depths = cell_depths(view.camera, points, 8)
     gap = np.flatnonzero(np.isinf(depths))

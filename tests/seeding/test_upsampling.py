@@ -8,7 +8,7 @@ import pytest
 import splatseed as ss
 from splatseed.errors import ParameterError
 from splatseed.methods import SOURCE_CODES
-from splatseed.photos import view
+from splatseed.photos import loading
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import silent
 from splatseed.scene import Split
@@ -69,9 +69,9 @@ def test_the_same_seed_gives_the_same_bytes_on_any_number_of_threads(
 
 @by_photographs
 def test_held_out_photographs_are_never_read(method, room, monkeypatch):
-    read, load = [], view.load_photograph
+    read, load = [], loading.load_photograph
     monkeypatch.setattr(
-        view, "load_photograph", lambda path, *a: (read.append(path.name), load(path, *a))[1]
+        loading, "load_photograph", lambda path, *a: (read.append(path.name), load(path, *a))[1]
     )
     ss.upsample(room, method, test_every=4, cover=12)
     names = sorted(image.name for image in room.images)

@@ -42,10 +42,7 @@ def on_plane(places):
 
 KNOWN = on_plane(np.stack(np.meshgrid(*[STEP * np.arange(-5, 6)] * 2), axis=-1).reshape(-1, 2))
 ROOM = Room(("plane",), tilted_plane(30.0), (STONE,))
-VIEWS = [
-    View(f"{k}", render_view(ROOM, c)[0], c.K, c.width, c.height, c.cam_from_world)
-    for k, c in enumerate(arc())
-]
+VIEWS = [View(f"{k}", render_view(ROOM, c)[0], c) for k, c in enumerate(arc())]
 """Five views of the plane, 96 x 80."""
 
 

@@ -10,7 +10,7 @@ import torch
 
 import splatseed as ss
 from splatseed.photos.sight import shown_points
-from splatseed.photos.view import poses_of
+from splatseed.photos.view import camera_views
 from splatseed.splat.gaussians import initial_gaussians, training_frame
 from splatseed.splat.rendering import render_view
 
@@ -33,10 +33,10 @@ def test_a_render_at_a_scenes_image_is_that_of_the_trainer(scene, splat):
     height, width = image.camera.height, image.camera.width
     assert (picture.dtype, picture.shape) == (np.float32, (height, width, 3))
     assert 0 <= picture.min() < 0.2 < picture.max() <= 1
-    frame = training_frame(poses_of(scene.split()[0]), shown_points(scene))
+    frame = training_frame(camera_views(scene.split()[0]), shown_points(scene))
     arrays = frame.gaussians_from_world(splat).arrays()
     params = {name: torch.tensor(array) for name, array in arrays.items()}
-    view = frame.view(poses_of([image])[0])
+    view = frame.view(camera_views([image])[0])
     theirs = render_view(params, view, 3)[0].clamp(0, 1).numpy()
     np.testing.assert_allclose(picture, theirs, atol=2e-3)
     assert np.abs(picture - theirs).mean() < 1e-5
@@ -45,7 +45,7 @@ def test_a_render_at_a_scenes_image_is_that_of_the_trainer(scene, splat):
 def test_images_views_and_cameras_give_the_same_picture(scene, splat):
     image = scene.images[0]
     picture = ss.render(splat, image, backend="cpu")
-    for camera in (image.camera, poses_of([image])[0]):
+    for camera in (image.camera, camera_views([image])[0]):
         np.testing.assert_array_equal(ss.render(splat, camera), picture)
     aside = np.array(image.camera.cam_from_world)
     aside[0, 3] += 0.1

@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip("torch", reason="scoring needs PyTorch")
 
-from splatseed.photos.view import poses_of
+from splatseed.photos.view import camera_views
 from splatseed.splat.covisible import find_covisible, pixel_masks, read_covisible, write_covisible
 
 
@@ -28,7 +28,7 @@ def _truth(depths, view, train):
 
 def test_agrees_with_the_true_depth_and_is_kept(sixteen_views, tmp_path):
     capture, scene = sixteen_views
-    train, test = (poses_of(part) for part in scene.split(8))
+    train, test = (camera_views(part) for part in scene.split(8))
     depths = {i.name: depth for i, depth in zip(scene.images, capture.depths, strict=True)}
     write_covisible(tmp_path / "a.npz", find_covisible(scene, 8))
     masks = pixel_masks(read_covisible(tmp_path / "a.npz"), test)

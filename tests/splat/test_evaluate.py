@@ -12,11 +12,13 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="evaluation needs PyTorch")
 
+from splatseed.camera import Camera
 from splatseed.errors import ParameterError, SceneNotFoundError
 from splatseed.io import load_scene
 from splatseed.io.photograph import photographs_digest
 from splatseed.io.photograph_checks import with_photographs
-from splatseed.photos.view import View, at_file_size, poses_of
+from splatseed.photos.sizes import at_file_size
+from splatseed.photos.view import View, camera_views
 from splatseed.scores import EvalResult, ViewScore
 from splatseed.splat.evaluate import evaluate_model, evaluate_views, load_model
 from splatseed.splat.formats import write_gaussians
@@ -31,7 +33,7 @@ def truth(rng):
 
 def _view(image, name="a.png"):
     height, width = image.shape[:2]
-    return View(name, image, np.eye(3), width, height, np.eye(4))
+    return View(name, image, Camera(np.eye(3), width, height, np.eye(4)))
 
 
 def test_scores_are_those_of_torchmetrics_on_clamped_renders(rng, truth):
@@ -131,7 +133,7 @@ def test_a_ply_of_the_world_is_scored_on_the_test_views(larger_room_path, model_
     cut = load_model(model_path, larger_room_path, near_plane=1e3)  # all is nearer
     assert not cut.render(cut.views[0]).any()
     # It looks the same in whatever frame it is rendered; nothing lies at the nearer near plane.
-    frame = training_frame(poses_of(scene.split()[0]))
+    frame = training_frame(camera_views(scene.split()[0]))
     other = dataclasses.replace(frame, origin=frame.origin + 0.5, scale=3 * frame.scale)
     moved = ModelRenderer(model.gaussians, other)
     for view in model.views:

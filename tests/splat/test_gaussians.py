@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from splatseed.camera import rotation_from_quat
+from splatseed.camera import Camera, rotation_from_quat
 from splatseed.errors import PointCloudError
 from splatseed.io.ply import read_ply
-from splatseed.photos.view import View, load_split
+from splatseed.photos.loading import load_split
+from splatseed.photos.view import View
 from splatseed.pointcloud import PointCloud
 from splatseed.splat.formats import write_gaussians
 from splatseed.splat.gaussians import (
@@ -107,7 +108,7 @@ def _view_from(x, value):
     """A photograph of one grey by a camera at (x, 0, -3) that looks along z."""
     pose, K = np.eye(4), np.array([[SIDE, 0, SIDE / 2], [0, SIDE, SIDE / 2], [0, 0, 1.0]])
     pose[:3, 3] = [-x, 0.0, 3.0]
-    return View(f"{x}.png", np.full((SIDE, SIDE, 3), value, np.uint8), K, SIDE, SIDE, pose)
+    return View(f"{x}.png", np.full((SIDE, SIDE, 3), value, np.uint8), Camera(K, SIDE, SIDE, pose))
 
 
 def test_the_fit_is_the_least_of_its_sum():

@@ -11,8 +11,9 @@ import zipfile
 import numpy as np
 import pytest
 
+from splatseed.camera import Camera
 from splatseed.errors import SceneFormatError
-from splatseed.photos.view import View
+from splatseed.photos.view import view_of
 from splatseed.splat.formats import read_gaussians, write_gaussians
 from splatseed.splat.gaussians import Gaussians, TrainingFrame
 
@@ -201,7 +202,7 @@ def _seen(gaussians, width=48):
     """The render from the origin along z, focal length as large as the picture."""
     rendering = pytest.importorskip("splatseed.splat.rendering", reason="needs PyTorch")
     K = np.array([[width, 0, width / 2], [0, width, width / 2], [0, 0, 1.0]])
-    view = View("", np.empty((0, 0, 3), np.uint8), K, width, width, np.eye(4))
+    view = view_of(Camera(K, width, width, np.eye(4)))
     frame = TrainingFrame(np.zeros(3), 1.0)
     return rendering.ModelRenderer(gaussians, frame).image(view).numpy()[..., 0]
 

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 import torch
 
+from splatseed.camera import Camera
 from splatseed.errors import MissingDependencyError, SceneFormatError
 from splatseed.io import write_scene
-from splatseed.photos.view import View, poses_of
+from splatseed.photos.view import View, camera_views
 from splatseed.pointcloud import PointCloud
 from splatseed.splat.evaluate import evaluate_model, load_model
 from splatseed.splat.formats import read_gaussians, write_gaussians
@@ -62,7 +63,7 @@ def wall(rng):
     for i in range(5):
         pose = np.eye(4)
         pose[0, 3] = 0.2 * (2 - i)
-        views.append(View(f"{i}.png", unseen.astype(np.uint8), K, 96, 72, pose))
+        views.append(View(f"{i}.png", unseen.astype(np.uint8), Camera(K, 96, 72, pose)))
     return model, views, {view.name: np.full((18, 24), 3.0, np.float32) for view in views}
 
 
@@ -100,7 +101,7 @@ def floating(sixteen_views, tmp_path_factory):
     capture, scene = sixteen_views
     rng, parts, wrong = np.random.default_rng(0), [], []
     arrays = {image.name: i for i, image in enumerate(capture.scene.images)}
-    for view in poses_of(scene.split()[0]):
+    for view in camera_views(scene.split()[0]):
         pixels, depth = (each[arrays[view.name]] for each in (capture.images, capture.depths))
         row, column = 1 + 3 * np.argwhere(depth[1::3, 1::3] > 0).T
         d = depth[row, column].astype(np.float64)

@@ -8,6 +8,7 @@ import torch
 from hypothesis import given, settings, strategies as st
 from scipy.spatial.transform import Rotation
 
+from splatseed.camera import Camera
 from splatseed.photos.view import View
 from splatseed.splat.gaussians import SH_C0, Gaussians
 from splatseed.splat.rendering import render_features
@@ -24,9 +25,7 @@ SIDE = 32
 def view():
     matrix = np.array([[SIDE, 0, SIDE / 2], [0, SIDE, SIDE / 2], [0, 0, 1.0]])
     pixels = np.zeros((SIDE, SIDE, 3), np.uint8)
-    return View(
-        name="a.png", K=matrix, cam_from_world=np.eye(4), width=SIDE, height=SIDE, photograph=pixels
-    )
+    return View("a.png", pixels, Camera(matrix, SIDE, SIDE, np.eye(4)))
 
 
 def planted(xyz, sizes, opacities=0.9):
@@ -143,9 +142,7 @@ def test_a_budget_that_growth_filled_is_not_spent_again(view):
 def test_the_budget_is_never_exceeded(count, budget):
     matrix = np.array([[SIDE, 0, SIDE / 2], [0, SIDE, SIDE / 2], [0, 0, 1.0]])
     image = np.zeros((SIDE, SIDE, 3), np.uint8)
-    view = View(
-        name="a.png", K=matrix, cam_from_world=np.eye(4), width=SIDE, height=SIDE, photograph=image
-    )
+    view = View("a.png", image, Camera(matrix, SIDE, SIDE, np.eye(4)))
     params = planted(row(count), [0.06] * count)
     rounds = [step for end in range(100, 800, 100) for step in (end - 4, end - 2, end)]
     grow(params, view, torch.ones((SIDE, SIDE, 3)), budget, rounds)
@@ -197,10 +194,7 @@ def test_candidates_lie_on_wrong_pixels_of_known_depth(height, width, count, see
     matrix = np.array([[7.0, 0, width / 3], [0, 5.0, height / 3], [0, 0, 1]])
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = Rotation.random(random_state=seed).as_matrix(), rng.normal(size=3)
-    view = View(
-        "a", K=matrix, cam_from_world=pose, width=width, height=height,
-        photograph=np.zeros((height, width, 3), np.uint8),
-    )  # fmt: skip
+    view = View("a", np.zeros((height, width, 3), np.uint8), Camera(matrix, width, height, pose))
     error = torch.as_tensor(rng.choice([0.0, 0.3, 1.0], (height, width)))
     depth = torch.as_tensor(rng.choice([0.0, 1.0, 2.5], (height, width)).astype(np.float32))
     photograph = torch.as_tensor(rng.random((height, width, 3)).astype(np.float32))

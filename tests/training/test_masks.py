@@ -13,7 +13,7 @@ from PIL import Image as PilImage
 from splatseed.errors import ParameterError
 from splatseed.io import load_scene
 from splatseed.io.masks import with_masks
-from splatseed.photos.view import load_views
+from splatseed.photos.loading import load_views
 from splatseed.splat.evaluate import evaluate_views
 from splatseed.splat.metrics import ssim_of_all
 from splatseed.splat.rendering import fill_masked

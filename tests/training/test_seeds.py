@@ -11,7 +11,7 @@ torch = pytest.importorskip("torch", reason="training needs PyTorch")
 
 from splatseed.io import load_scene, write_scene
 from splatseed.io.staging import MANIFEST
-from splatseed.photos.view import load_split
+from splatseed.photos.loading import load_split
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import silent
 from splatseed.splat.gaussians import initial_gaussians

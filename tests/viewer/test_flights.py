@@ -13,9 +13,10 @@ import pytest
 torch = pytest.importorskip("torch", reason="rendering needs PyTorch")
 ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="videos need imageio-ffmpeg (extra view)")
 
+from splatseed.camera import Camera
 from splatseed.errors import ParameterError, SceneFormatError
 from splatseed.io import load_scene, write_scene
-from splatseed.photos.view import View, poses_of
+from splatseed.photos.view import NO_PIXELS, View, camera_views
 from splatseed.photos.viewpoint import look_at
 from splatseed.similarity import Similarity
 from splatseed.splat.formats import read_gaussians
@@ -35,7 +36,7 @@ def _ring(count=24, radius=3.0, height=1.0):
         eye = np.array([radius * np.cos(angle), radius * np.sin(angle), height])
         K = np.array([[100.0, 0, 60], [0, 100.0, 45], [0, 0, 1]])
         pose = look_at(eye, np.zeros(3), UP)
-        views.append(View(f"{i:03}", np.empty((0, 0, 3), np.uint8), K, 120, 90, pose))
+        views.append(View(f"{i:03}", NO_PIXELS, Camera(K, 120, 90, pose)))
     return views
 
 
@@ -192,7 +193,7 @@ def test_a_path_through_nerfstudios_world_needs_its_transform(
     assert said.code == 0, said.err
     gaussians = read_gaussians(run_folder / "point_cloud.ply")
     renderer = ModelRenderer(gaussians, viewer_frame(ViewerItem("", None, gaussians)))
-    wanted = renderer.color(poses_of([load_scene(room).images[3]])[0])
+    wanted = renderer.color(camera_views([load_scene(room).images[3]])[0])
     shown = _frames(tmp_path / "flight.mp4")[0][0] / 255
     assert np.abs(shown - wanted).mean() < 0.01  # mirrored, it would be 0.02
     said = splatseed(*words, "--transform", "none", "--depth", "--overwrite")

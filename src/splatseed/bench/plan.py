@@ -16,7 +16,7 @@ from typing import Any, Self, get_args
 from splatseed.bench.scenes import PlannedScene, SceneFacts
 from splatseed.errors import ParameterError
 from splatseed.methods import METHODS, Profile, Upsampler, chooses_number, configure
-from splatseed.photos.view import TRAINED_SIDE
+from splatseed.photos.sizes import TRAINED_SIDE
 from splatseed.runtime.fingerprint import fingerprint
 from splatseed.scores import CurvePoint, EvalResult
 from splatseed.seeding.budget import RHO, parse_budget

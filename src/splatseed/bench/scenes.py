@@ -22,8 +22,8 @@ from splatseed.io.files import open_file, read_bytes
 from splatseed.io.load import search_depths
 from splatseed.io.photograph import photograph_bytes
 from splatseed.io.photograph_checks import check_sizes, with_photographs
+from splatseed.photos.loading import refuse_distortion
 from splatseed.photos.sight import stray_notes
-from splatseed.photos.view import check_lens
 from splatseed.progress import Progress, in_threads, silent
 from splatseed.runtime.fingerprint import fingerprint, fingerprint_all
 from splatseed.scene import Scene
@@ -150,7 +150,7 @@ def survey(
         fix = "Name a scene with images: a point cloud alone cannot be trained."
         raise SceneNotFoundError(f"photographs in {path}", found="none", fix=fix)
     for image in scene.images:
-        check_lens(image, path)
+        refuse_distortion(image, path)
     size = check_sizes(scene.images, folder)[scene.images[0].name]
     maps = scan = ""
     if with_cloud and planned.cloud:

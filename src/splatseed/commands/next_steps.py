@@ -9,7 +9,7 @@ import numpy as np
 
 from splatseed.console import print_note, print_pairs
 from splatseed.lens import undistort_command, undistorted
-from splatseed.photos.view import at_file_size
+from splatseed.photos.sizes import at_file_size
 from splatseed.scene import Scene, SceneFormat
 from splatseed.seeding.advice import AS_IT_IS, SEEDED, Advice
 from splatseed.seeding.trainability import is_distorted, untrainable

@@ -35,7 +35,7 @@ from splatseed.io.bit_depth import WHITE
 from splatseed.io.masks import read_mask
 from splatseed.io.photograph import decode_photograph, photograph_bytes
 from splatseed.io.photograph_checks import check_sizes
-from splatseed.photos.view import check_lens
+from splatseed.photos.loading import refuse_distortion
 from splatseed.photos.visibility import Visibility, points_in_image
 from splatseed.scene import Image, Masks
 
@@ -110,7 +110,7 @@ def read_view(
         SceneNotFoundError: A file is gone.
         SceneFormatError: A file is damaged, does not fit, or the camera has lens distortion.
     """
-    check_lens(image, reason="along whose rays pixels are lifted")
+    refuse_distortion(image, reason="along whose rays pixels are lifted")
     depth = depths.read(image.name)
     if (mask := read_mask(masks, image.name, folder / image.name)) is not None:
         values = np.where(pixels_within(mask, depth), depth.values, np.float32(np.nan))

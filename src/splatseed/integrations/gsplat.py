@@ -18,9 +18,10 @@ from typing import Any, ClassVar
 import numpy as np
 from jaxtyping import Float
 
+from splatseed.camera import Camera
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.io.depth_maps import DESCRIPTION, DepthFiles, read_description
-from splatseed.photos.view import View
+from splatseed.photos.view import NO_PIXELS, View
 from splatseed.requirements import require
 from splatseed.training.schedule import FULL_RUN, GROW_EVERY, make_schedule
 
@@ -36,7 +37,6 @@ from splatseed.training.strategies.grow import GROWTH, ErrorDensification
 
 REQUIRED = ("means", "scales", "quats", "opacities")
 MAKE_MAPS = "Make them with splatseed depth SCENE -o FOLDER."
-NO_PIXELS = np.empty((0, 0, 3), np.uint8)  # a view's photograph, where only its camera matters
 
 
 @dataclass
@@ -138,7 +138,7 @@ class GrowStrategy(MCMCStrategy):  # type: ignore[misc]  # gsplat has no types
         height, width = photographs.shape[1:3]
         for i, photograph in enumerate(photographs):
             K, pose = (each[i].detach().cpu().double().numpy() for each in (Ks, viewmats))
-            view = View(names[i] if names else "", NO_PIXELS, K, width, height, pose)
+            view = View(names[i] if names else "", NO_PIXELS, Camera(K, width, height, pose))
             growing.depths = self._depth_of(view, state, photograph.device)
             growing.observe(params, view, renders[i], photograph, step)
 

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64
 
-from splatseed.photos.view import View, poses_of
+from splatseed.photos.view import View, camera_views
 from splatseed.photos.visibility import points_in_image
 from splatseed.scene import Scene
 
@@ -87,7 +87,7 @@ def stray_views(views: Sequence[View], xyz: Float[np.ndarray, "P 3"]) -> tuple[s
 
 def stray_notes(scene: Scene) -> tuple[str, ...]:
     """A note for the user that names a scene's stray cameras; none without them."""
-    return notes_on(stray_views(poses_of(scene.images), shown_points(scene)))
+    return notes_on(stray_views(camera_views(scene.images), shown_points(scene)))
 
 
 def notes_on(names: Sequence[str]) -> tuple[str, ...]:

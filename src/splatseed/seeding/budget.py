@@ -8,7 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from splatseed.errors import ParameterError
-from splatseed.photos.view import TRAINED_SIDE, View, at_file_size, data_factor, poses_of
+from splatseed.photos.sizes import TRAINED_SIDE, at_file_size, factor_for_size
+from splatseed.photos.view import View, camera_views
 from splatseed.scene import Scene
 
 RHO = "rho"
@@ -20,7 +21,7 @@ MAX_BUDGET = 10**12
 def points_within(scene: Scene, budget: int | str) -> int:
     """Parse a budget; rho counts pixels of the scene's photographs at the default training size."""
     images = at_file_size(scene).images
-    photographs = poses_of(images, data_factor(images, TRAINED_SIDE)) if images else ()
+    photographs = camera_views(images, factor_for_size(images, TRAINED_SIDE)) if images else ()
     return parse_budget(budget, median_pixels(photographs) if photographs else 0)
 
 

@@ -19,7 +19,9 @@ from splatseed.depth.stereo.maps import MAX_GRID, MIN_POINTS, StereoSettings
 from splatseed.errors import PointCloudError, SceneNotFoundError
 from splatseed.methods import as_cloud, source_code
 from splatseed.methods.contract import NewPoints, Traits
-from splatseed.photos.view import View, at_file_size, data_factor, load_views, poses_of
+from splatseed.photos.loading import load_views
+from splatseed.photos.sizes import at_file_size, factor_for_size
+from splatseed.photos.view import View, camera_views
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress
 from splatseed.scene import Image, Scene
@@ -211,14 +213,14 @@ def read_views(
 ) -> tuple[View, ...]:
     """Read the photographs of some images, undistorted, at most ``max_size`` pixels a side."""
     sized = at_file_size(scene.replace(images=tuple(images))).images
-    factor = data_factor(sized, max_size)
+    factor = factor_for_size(sized, max_size)
     return load_views(scene, images, data_factor=factor, undistort=True, progress=progress)
 
 
 def frames_of(scene: Scene) -> tuple[View, ...]:
     """Return the views of all images at ``MAX_SIZE``, without pixels."""
     images = at_file_size(scene).images
-    return poses_of(images, data_factor(images, MAX_SIZE)) if images else ()
+    return camera_views(images, factor_for_size(images, MAX_SIZE)) if images else ()
 
 
 def compare(

@@ -18,8 +18,10 @@ from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter, sobe
 from scipy.signal import correlate
 
 from splatseed.depth.stereo.maps import StereoSettings
+from splatseed.photos.loading import load_views
+from splatseed.photos.sizes import factor_for_size
 from splatseed.photos.sources import choose_by_pose
-from splatseed.photos.view import View, data_factor, load_views
+from splatseed.photos.view import View
 from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
 
@@ -100,7 +102,7 @@ def estimate_pose_error(
     """
     poses = np.array([image.camera.cam_from_world for image in images])
     partners = choose_by_pose(poses, _SETTINGS.partners)
-    factor = data_factor(images, _SETTINGS.side)
+    factor = factor_for_size(images, _SETTINGS.side)
     spread = np.linspace(0, len(images) - 1, _SETTINGS.photographs).round().astype(int)
     chosen = np.unique(spread).tolist()
     errors, pairs = [], 0
@@ -119,7 +121,7 @@ def estimate_pose_error(
     px, degrees = np.median(errors, axis=0).tolist()
     if px > _SETTINGS.max_median:
         return None
-    stereo_factor = data_factor(images, StereoSettings.max_size)
+    stereo_factor = factor_for_size(images, StereoSettings.max_size)
     px *= factor / stereo_factor
     side = max(max(image.camera.width, image.camera.height) for image in images)
     return PoseErrorEstimate(px, degrees, round(px, 2) <= MAX_EXACT, side // stereo_factor)

@@ -9,7 +9,7 @@ mistake of convention (``CORRECTIONS``) is undone.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Literal
 
@@ -21,8 +21,9 @@ from splatseed.depth.stereo.coarse import prior_from_baseline
 from splatseed.depth.stereo.maps import StereoSettings
 from splatseed.depth.stereo.matching import match_views, valid_blocks
 from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.photos.loading import load_views
+from splatseed.photos.sizes import factor_for_size
 from splatseed.photos.sources import choose_by_pose
-from splatseed.photos.view import data_factor, load_views
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
@@ -196,9 +197,9 @@ def _agreement(scene: Scene, images: Sequence[Image], poses: Poses, sample: int)
     partners = choose_by_pose(poses, _SETTINGS.partners)[first]
     idx = [first, *partners[partners >= 0].tolist()]
     chosen = [images[i] for i in idx]
-    factor = data_factor(chosen, _SETTINGS.side)
+    factor = factor_for_size(chosen, _SETTINGS.side)
     loaded = load_views(scene, chosen, data_factor=factor, undistort=True)
-    views = [replace(view, cam_from_world=poses[i]) for view, i in zip(loaded, idx, strict=True)]
+    views = [view.posed(poses[i]) for view, i in zip(loaded, idx, strict=True)]
     sources = choose_by_pose(poses[idx], _SETTINGS.partners)
     priors = [prior_from_baseline(views, i, others) for i, others in enumerate(sources)]
     stereo = match_views(views, priors, sources, _SETTINGS.stereo, 0, silent)

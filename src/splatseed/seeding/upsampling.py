@@ -21,7 +21,7 @@ from splatseed.methods import (
     configure,
     source_code,
 )
-from splatseed.photos.view import at_file_size
+from splatseed.photos.sizes import at_file_size
 from splatseed.photos.visibility import find_visibility
 from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.progress import Progress, silent

@@ -22,7 +22,8 @@ from splatseed.depthmap import DepthMaps
 from splatseed.io.files import ARCHIVE_FAILURES
 from splatseed.io.staging import atomic_file
 from splatseed.photos.projection import grid_shape
-from splatseed.photos.view import View, data_factor, poses_of
+from splatseed.photos.sizes import factor_for_size
+from splatseed.photos.view import View, camera_views
 from splatseed.photos.visibility import SURFACE, points_in_image
 from splatseed.photos.zbuffer import cell_depths
 from splatseed.progress import Progress, silent
@@ -93,7 +94,7 @@ def _cell(view: View) -> float:
 def _frames(images: Sequence[Image], maps: DepthMaps | None) -> Sequence[View]:
     """The images' frames at the size that cells are stated for; with depth maps, those with one."""
     known = [image for image in images if maps is None or image.name in maps]
-    return poses_of(known, data_factor(known, _MAX_SIZE)) if known else ()
+    return camera_views(known, factor_for_size(known, _MAX_SIZE)) if known else ()
 
 
 def _depths(

@@ -31,8 +31,10 @@ from splatseed.io import load_scene
 from splatseed.io.masks import with_masks
 from splatseed.io.photograph import photographs_digest
 from splatseed.io.photograph_checks import with_photographs
+from splatseed.photos.loading import load_views
 from splatseed.photos.sight import shown_points
-from splatseed.photos.view import View, at_file_size, default_factor, load_views, poses_of
+from splatseed.photos.sizes import at_file_size, default_factor
+from splatseed.photos.view import View, camera_views
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 from splatseed.scores import NOT_ASKED, EvalResult, ViewScore
@@ -83,7 +85,7 @@ def evaluate_views(
     Example:
         >>> import numpy as np, torch
         >>> grey = np.full((16, 16, 3), 128, np.uint8)
-        >>> view = View("grey.png", grey, np.eye(3), 16, 16, np.eye(4))
+        >>> view = View("grey.png", grey, Camera(np.eye(3), 16, 16, np.eye(4)))
         >>> result = evaluate_views(lambda view: torch.zeros(16, 16, 3), [view])
         >>> round(result.psnr, 2)
         5.99
@@ -245,7 +247,7 @@ def load_model(
     doubt = "" if unasked else check_world(path, scene, gaussians, world)
     points = shown_points(scene)
     frame = frame_of_model(
-        [view_in(world, view) for view in poses_of(train)],
+        [view_in(world, view) for view in camera_views(train)],
         points if world is None else world.points(points),
         gaussians,
     )

@@ -279,11 +279,11 @@ class TrainingFrame:
 
     def view(self, view: View) -> View:
         """The same view, its camera posed in the training frame, with the frame's near plane."""
-        cam_from_train = view.cam_from_world.copy()
+        cam_from_train = np.array(view.cam_from_world)
         rotation, translation = view.cam_from_world[:3, :3], view.cam_from_world[:3, 3]
         # x_cam = R x + t = (R x_train + s (R o + t)) / s: the same image, depths times s.
         cam_from_train[:3, 3] = self.scale * (rotation @ self.origin + translation)
-        return dataclasses.replace(view, cam_from_world=cam_from_train, near=self.near)
+        return dataclasses.replace(view.posed(cam_from_train), near=self.near)
 
 
 def frame_of_model(

@@ -46,7 +46,7 @@ def view_in(world: Similarity | None, view: View) -> View:
     """A view of the scene, posed in the model's world."""
     if world is None:
         return view
-    return dataclasses.replace(view, cam_from_world=world.camera(view.cam_from_world))
+    return view.posed(world.camera(view.cam_from_world))
 
 
 def find_transform(word: str, scene: Scene) -> Similarity | None:

@@ -22,7 +22,9 @@ from splatseed.errors import ParameterError
 from splatseed.io import load_scene
 from splatseed.io.files import StrPath, read_text
 from splatseed.io.masks import with_masks
-from splatseed.photos.view import View, at_file_size, data_factor, poses_of, user_cache_dir, view_of
+from splatseed.photos.cache import user_cache_dir
+from splatseed.photos.sizes import at_file_size, factor_for_size
+from splatseed.photos.view import View, camera_views, view_of
 from splatseed.progress import Note, Progress, silent, silent_note
 from splatseed.requirements import require
 from splatseed.scene import Image, Scene
@@ -310,7 +312,7 @@ def _sized(
         raise ParameterError("`long_side` or `data_factor`", found="both", fix="Leave one out.")
     if long_side < 1:
         raise ParameterError("`long_side` of 1 or more", found=str(long_side), fix="Try 800.")
-    factor = data_factor(scene.images, long_side) if scene.images else 1
+    factor = factor_for_size(scene.images, long_side) if scene.images else 1
     return dataclasses.replace(settings, data_factor=factor)
 
 
@@ -321,7 +323,7 @@ def _within_budget(
     chosen = settings.strategy == "auto" and settings.cap_max is None
     if budget is None and not (chosen and scene.images):
         return settings
-    views = poses_of(scene.images, settings.factor)
+    views = camera_views(scene.images, settings.factor)
     pixels = median_pixels(views) if views else 0
     if budget is not None:
         cap = parse_budget(budget, pixels)

@@ -25,14 +25,11 @@ from splatseed.errors import MissingDependencyError, SceneFormatError
 from splatseed.io import load_scene
 from splatseed.io.masks import with_masks
 from splatseed.io.photograph_checks import with_photographs
+from splatseed.photos.cache import user_cache_dir
+from splatseed.photos.loading import load_views
 from splatseed.photos.sight import shown_points
-from splatseed.photos.view import (
-    View,
-    at_file_size,
-    data_factor as factor_for,
-    load_views,
-    user_cache_dir,
-)
+from splatseed.photos.sizes import at_file_size, factor_for_size as factor_for
+from splatseed.photos.view import View
 from splatseed.progress import Progress, silent
 from splatseed.seeding.clouds.photo_consistency import find_evidence
 from splatseed.seeding.photo_methods import photographed

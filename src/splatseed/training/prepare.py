@@ -21,8 +21,10 @@ from splatseed.io.files import StrPath
 from splatseed.io.photograph import photograph_folder, photographs_digest
 from splatseed.io.photograph_checks import check_sizes, with_photographs
 from splatseed.io.seeds import was_upsampled
+from splatseed.photos.loading import load_split, refuse_distortion
 from splatseed.photos.sight import notes_on, shown_points
-from splatseed.photos.view import View, at_file_size, check_lens, load_split, poses_of
+from splatseed.photos.sizes import at_file_size
+from splatseed.photos.view import View, camera_views
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Note, Progress, silent, silent_note
 from splatseed.requirements import require
@@ -177,7 +179,7 @@ def _initial(scene: Scene, settings: TrainSettings, note: Note) -> _Seeds | _Sta
     if settings.start is not None:
         return _Start(_start_gaussians(Path(settings.start), scene, note))
     trained = scene.split(settings.test_every)[0]
-    poses = poses_of(trained, settings.factor)
+    poses = camera_views(trained, settings.factor)
     return _Seeds(usable_seeds(scene.points, settings, note, poses))
 
 
@@ -231,7 +233,7 @@ class _Start:
 
 
 def _train_poses(scene: Scene, settings: TrainSettings) -> Sequence[View]:
-    return poses_of(scene.split(settings.test_every)[0])
+    return camera_views(scene.split(settings.test_every)[0])
 
 
 def _photographed(scene: Scene) -> Scene:
@@ -245,7 +247,7 @@ def _photographed(scene: Scene) -> Scene:
             "scan, add them to it: splatseed upsample SCENE --cloud FILE -o OUT.",
         )
     for image in scene.images:
-        check_lens(image, source.root if source else None)
+        refuse_distortion(image, source.root if source else None)
     scene = with_photographs(scene)
     check_sizes(scene.images, photograph_folder(scene))
     return at_file_size(scene)

@@ -13,7 +13,7 @@ from typing import Annotated, Literal, cast
 
 import tyro
 
-from splatseed.photos.view import TRAINED_SIDE, default_factor
+from splatseed.photos.sizes import TRAINED_SIDE, default_factor
 from splatseed.scene import Image
 from splatseed.settings import Range, check_settings
 from splatseed.training.schedule import FULL_RUN, Densification, Schedule, continued, make_schedule

@@ -18,6 +18,7 @@ from jaxtyping import Float64, UInt8
 from scipy.interpolate import interp1d
 from scipy.ndimage import gaussian_filter1d
 
+from splatseed.camera import Camera
 from splatseed.errors import OutputError, ParameterError, SceneFormatError
 from splatseed.io.files import read_bytes, translate_errors
 from splatseed.io.staging import atomic_file
@@ -229,7 +230,7 @@ def _poses(views: Sequence[View]) -> Float64[np.ndarray, "V 9"]:
 def _posed(lens: View, looks: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> list[View]:
     """Make views from (centre, target, up)."""
     poses = [look_at(*look) for look in looks]
-    return [dataclasses.replace(lens, name=f"{i}", cam_from_world=p) for i, p in enumerate(poses)]
+    return [dataclasses.replace(lens.posed(p), name=f"{i}") for i, p in enumerate(poses)]
 
 
 def _resampled(
@@ -247,7 +248,8 @@ def _lens(views: Sequence[View], size: tuple[int, int]) -> View:
     scale = height / view.height
     K = np.diag([scale, scale, 1.0]) @ view.K
     K[0, 2] += (width - scale * view.width) / 2
-    return dataclasses.replace(view, K=K, width=width, height=height)
+    camera = Camera(K, width, height, view.cam_from_world)
+    return dataclasses.replace(view, camera=camera)
 
 
 # Frames and videos --------------------------------------------------------------------------------

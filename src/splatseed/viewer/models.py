@@ -16,11 +16,12 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 from PIL import Image as PillowImage, ImageDraw
 
+from splatseed.camera import Camera
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io import load_scene
 from splatseed.io.files import StrPath, read_bytes
 from splatseed.photos.sight import shown_points
-from splatseed.photos.view import View, poses_of
+from splatseed.photos.view import View, camera_views, view_of
 from splatseed.scene import Scene
 from splatseed.splat.formats import detect_format, read_gaussians
 from splatseed.splat.gaussians import Gaussians, TrainingFrame, frame_of_model
@@ -66,7 +67,7 @@ class ViewerItem:
     def train_views(self) -> tuple[View, ...]:
         """Training cameras, in pixels of the run's photographs; none without a scene."""
         images = self.scene.split(self.test_every)[0] if self.scene else ()
-        return poses_of(images, self.data_factor)
+        return camera_views(images, self.data_factor)
 
     @property
     def central_views(self) -> tuple[View, ...]:
@@ -166,7 +167,7 @@ def viewer_frame(item: ViewerItem) -> TrainingFrame:
     """Training frame, or with fewer than two cameras a frame fitted to the model or the points."""
     scene = item.scene
     if scene is not None and len(scene.images) > 1:
-        poses = poses_of(scene.split(item.test_every)[0])
+        poses = camera_views(scene.split(item.test_every)[0])
         return frame_of_model(poses, shown_points(scene), item.gaussians)
     if item.gaussians is not None:
         xyz = item.gaussians.means.astype(np.float64)
@@ -187,7 +188,7 @@ def pinhole_view(
     width, height = size
     focal = height / 2 / np.tan(fov / 2)
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
-    return View("", np.empty((0, 0, 3), np.uint8), K, width, height, cam_from_world)
+    return view_of(Camera(K, width, height, cam_from_world))
 
 
 def split_picture(

@@ -23,7 +23,7 @@ from PIL import Image as PillowImage
 from splatseed.camera import Camera, quat_from_rotation, rotation_from_quat
 from splatseed.errors import SplatseedError
 from splatseed.methods import source_name
-from splatseed.photos.view import View, poses_of
+from splatseed.photos.view import View, camera_views
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene
 from splatseed.seeding.coverage import covered_cells
@@ -225,7 +225,9 @@ def _most_visible(gaussians: Gaussians, count: int) -> Gaussians:
 
 def _view_within(image: Image, side: int) -> View:
     """View of an image downsampled by a whole factor to at most ``side`` pixels."""
-    (view,) = poses_of([image], max(1, -(-max(image.camera.width, image.camera.height) // side)))
+    (view,) = camera_views(
+        [image], max(1, -(-max(image.camera.width, image.camera.height) // side))
+    )
     return view
 
 

@@ -40,7 +40,7 @@ from splatseed.training.device import Capacity
 from splatseed.training.parameters import as_parameters
 from splatseed.viewer import pictures
 from splatseed.viewer.models import ViewerItem, viewer_frame
-from splatseed.photos.view import load_split
+from splatseed.photos.loading import load_split
 
 STEPS = 12
 VIEWS = 4

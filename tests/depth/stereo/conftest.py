@@ -8,7 +8,7 @@ import pytest
 
 from splatseed.depth.stereo.maps import StereoSettings
 from splatseed.depth.stereo.pipeline import find_stereo
-from splatseed.photos.view import load_views
+from splatseed.photos.loading import load_views
 from splatseed.photos.visibility import find_visibility
 
 from .made import arc, ball_before_wall, photograph, tilted_plane

@@ -14,7 +14,7 @@ from splatseed.depth.stereo import pipeline, stereo_depths
 from splatseed.depth.stereo.maps import StereoSettings
 from splatseed.depth.stereo.pipeline import find_stereo
 from splatseed.errors import ParameterError, SceneNotFoundError
-from splatseed.photos.view import load_views
+from splatseed.photos.loading import load_views
 from splatseed.photos.visibility import find_visibility
 from splatseed.pointcloud import PointCloud
 

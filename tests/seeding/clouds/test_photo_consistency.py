@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from splatseed.camera import Camera
 from splatseed.photos.view import View
 from splatseed.progress import silent
 from splatseed.seeding.clouds.photo_consistency import (
@@ -21,7 +22,7 @@ def view(center, focal, width, height, shade=0):
     pose = np.eye(4)
     pose[:3, 3] = -np.asarray(center, float)
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
-    return View("", np.full((height, width, 3), shade, np.uint8), K, width, height, pose)
+    return View("", np.full((height, width, 3), shade, np.uint8), Camera(K, width, height, pose))
 
 
 def test_support_counts_the_points_around(rng):

@@ -7,6 +7,7 @@ from collections import defaultdict
 import numpy as np
 from hypothesis import given, settings, strategies as st
 
+from splatseed.camera import Camera
 from splatseed.photos.view import View
 from splatseed.seeding.clouds._kernels import VOXEL_ORIGIN
 from splatseed.seeding.clouds.voxels import Voxels
@@ -17,7 +18,7 @@ def view(center, focal, width, height, shade=0):
     pose = np.eye(4)
     pose[:3, 3] = -np.asarray(center, float)
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
-    return View("", np.full((height, width, 3), shade, np.uint8), K, width, height, pose)
+    return View("", np.full((height, width, 3), shade, np.uint8), Camera(K, width, height, pose))
 
 
 TWO = [view((0, 0, 0), 50.0, 40, 30), view((0.3, 0.1, -2), 80.0, 40, 30)]

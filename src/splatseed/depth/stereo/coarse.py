@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64, Int64
 
+from splatseed.camera import Camera
 from splatseed.depth.stereo.fusion import fuse
 from splatseed.depth.stereo.maps import StereoSettings, block_means
 from splatseed.depth.stereo.matching import DepthPrior, match_views
@@ -89,7 +90,8 @@ def _downsampled(view: View) -> View:
     mask = None
     if view.mask is not None:
         mask = block_means(view.mask[..., None].astype(np.uint8), factor)[..., 0] > 0
-    return View(view.name, image, K, image.shape[1], image.shape[0], view.cam_from_world, mask)
+    camera = Camera(K, image.shape[1], image.shape[0], view.cam_from_world)
+    return View(view.name, image, camera, mask)
 
 
 def _inverse_depth_quantiles(

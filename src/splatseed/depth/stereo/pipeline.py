@@ -19,8 +19,10 @@ from splatseed.depth.stereo.matching import DepthPrior, match_views
 from splatseed.depthmap import DepthMap
 from splatseed.errors import SceneNotFoundError
 from splatseed.io.photograph_checks import with_photographs
+from splatseed.photos.loading import load_views
+from splatseed.photos.sizes import at_file_size, factor_for_size
 from splatseed.photos.sources import choose_sources
-from splatseed.photos.view import View, at_file_size, data_factor, load_views
+from splatseed.photos.view import View
 from splatseed.photos.visibility import Visibility, find_visibility
 from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
@@ -71,7 +73,7 @@ def stereo_depths(
     views = load_views(
         scene,
         scene.images,
-        data_factor=data_factor(scene.images, settings.max_size),
+        data_factor=factor_for_size(scene.images, settings.max_size),
         undistort=True,
         progress=progress,
     )

@@ -1,0 +1,148 @@
+"""Loading of views: photographs, masks and cameras of a scene's images, at the size to use."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+
+from splatseed.camera import Camera
+from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.io.masks import read_mask
+from splatseed.io.photograph import photograph_folder
+from splatseed.io.photograph_checks import check_sizes
+from splatseed.lens import undistort_first
+from splatseed.photos.cache import load_photograph
+from splatseed.photos.sizes import check_side
+from splatseed.photos.view import View
+from splatseed.progress import Progress, silent
+from splatseed.runtime.memory import check_memory
+from splatseed.scene import Image, Scene
+
+READERS = 4  # threads that decode photographs
+
+
+def load_split(
+    scene: Scene,
+    *,
+    data_factor: int = 1,
+    test_every: int = 8,
+    min_side: int = 1,
+    cache_dir: Path | None = None,
+    progress: Progress = silent,
+) -> tuple[tuple[View, ...], tuple[View, ...]]:
+    """Load the training and the test views of a scene (``Scene.split``), each sorted by name.
+
+    The other arguments are those of ``load_views``.
+
+    Raises:
+        SceneNotFoundError: Images are missing, or too few.
+        SceneFormatError: A camera has distortion, or an image cannot be used.
+    """
+    train, test = scene.split(test_every)
+    if not train or not test:
+        raise SceneNotFoundError(
+            "at least two images with a pose, one to train on and one to test",
+            found=f"{len(scene.images)}",
+            fix="Name a scene with more photographs.",
+        )
+    views = load_views(
+        scene, (*train, *test), data_factor=data_factor, min_side=min_side, cache_dir=cache_dir,
+        progress=progress,
+    )  # fmt: skip
+    return views[: len(train)], views[len(train) :]
+
+
+def load_views(
+    scene: Scene,
+    images: Sequence[Image],
+    *,
+    data_factor: int = 1,
+    min_side: int = 1,
+    undistort: bool = False,
+    cache_dir: Path | None = None,
+    progress: Progress = silent,
+) -> tuple[View, ...]:
+    """Load the views of some of a scene's images, in their order, with the scene's masks.
+
+    Args:
+        scene: The scene.
+        images: Its images to load.
+        data_factor: Divide the width and height of photographs by this.
+        min_side: Refuse smaller results, in pixels.
+        undistort: Remove lens distortion instead of refusing it.
+        cache_dir: Where smaller photographs are cached; nowhere when left out.
+        progress: Called with the stage and the fraction done.
+
+    Raises:
+        ParameterError: Together they do not fit into memory.
+        SceneNotFoundError: An image or a mask is missing.
+        SceneFormatError: A camera has distortion that is not removed, or an image or a mask is
+            unusable.
+    """
+    folder = photograph_folder(scene)
+    for image in images if not undistort else ():
+        refuse_distortion(image, scene.source.root if scene.source else None)
+    if images:
+        sizes, factor = check_sizes(images, folder), max(data_factor, 1)
+        width, height = sizes[images[0].name]
+        check_memory(
+            sum(math.prod(size) for size in sizes.values()) // factor**2, 3,
+            "pixels of photographs",
+            found=f"{len(images)} of {width} x {height}, downsampled by {factor}",
+            fix="Downsample more (`data_factor`), take fewer, or free some memory.",
+        )  # fmt: skip
+    views = []
+    with ThreadPoolExecutor(READERS) as pool:
+        for view in pool.map(
+            lambda image: _load_view(scene, folder, image, data_factor, min_side, cache_dir), images
+        ):
+            views.append(view)
+            progress("read images", len(views) / len(images))
+    return tuple(views)
+
+
+def refuse_distortion(
+    image: Image, scene: Path | None = None, reason: str = "which Gaussians are drawn with"
+) -> None:
+    """Raise a SceneFormatError for an image whose camera has lens distortion.
+
+    ``scene`` is the scene's folder, for the command in the advice; ``reason`` says what needs such
+    cameras.
+    """
+    if image.intrinsics.has_distortion:
+        raise SceneFormatError(
+            f"cameras without lens distortion (PINHOLE), {reason}",
+            found=f"{image.intrinsics.model} for {image.name}",
+            fix=undistort_first(scene),
+        )
+
+
+def _load_view(
+    scene: Scene,
+    folder: Path,
+    image: Image,
+    data_factor: int,
+    min_side: int,
+    cache_dir: Path | None,
+) -> View:
+    path = folder / image.name
+    photograph, file_size = load_photograph(path, data_factor, cache_dir, scene.white)
+    height, width = photograph.shape[:2]
+    check_side(path, min_side, data_factor, (width, height))
+    lens = image.intrinsics.resized(*file_size)
+    K = np.diag([1 / data_factor, 1 / data_factor, 1.0]) @ lens.K
+    camera = Camera(K, width, height, image.camera.cam_from_world)
+    mask = read_mask(scene.masks, image.name, path, data_factor)
+    if not lens.has_distortion:
+        return View(image.name, photograph, camera, mask)
+    from splatseed.photos.undistortion import undistort  # noqa: PLC0415  (loads Numba)
+
+    photograph, known = undistort(photograph, lens, K)
+    if mask is not None:
+        counted = np.repeat(np.where(mask, 255, 0).astype(np.uint8)[..., None], 3, axis=2)
+        known &= undistort(counted, lens, K)[0][..., 0] == 255
+    return View(image.name, photograph, camera, known)
