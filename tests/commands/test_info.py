@@ -13,7 +13,7 @@ import pytest
 from PIL import Image as PilImage
 
 from splatseed import upsample
-from splatseed.commands.next_steps import number_for
+from splatseed.commands.next_steps import number_option
 from splatseed.depth.alignment import align
 from splatseed.io import find_depths, load_scene, write_scene
 from splatseed.io.colmap import write_points3d
@@ -175,7 +175,7 @@ def test_the_worst_are_listed_first_and_the_rest_on_demand(tour, tmp_path, splat
     ],
 )
 def test_the_number_of_points_suggested(points, known, most, said):
-    assert number_for(points, known, most) == said
+    assert number_option(points, known, most) == said
 
 
 def test_a_scenes_own_maps_are_counted_and_can_be_lifted(rgbd, tmp_path, splatseed):

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from splatseed.camera import Intrinsics
-from splatseed.commands.next_steps import tell_training
+from splatseed.commands.next_steps import print_training
 from splatseed.io import load_scene, write_scene
 from splatseed.pointcloud import PointCloud
 
@@ -99,11 +99,11 @@ def test_graphdecos_trainer_ignores_principal_points(off, told, room, capsys):
     fx, fy, cx, cy = lens.params
     lens = dataclasses.replace(lens, params=(fx, fy, cx, cy - off))
     images = tuple(dataclasses.replace(each, intrinsics=lens) for each in scene.images)
-    tell_training(room, scene.replace(images=images), Path("out"), "colmap")
+    print_training(room, scene.replace(images=images), Path("out"), "colmap")
     said = capsys.readouterr().out
     assert "graphdeco" in said
     assert (f"ignores principal points, which are up to {off} px off" in said) == told
-    tell_training(room, scene.replace(images=images), Path("out"), "transforms")
+    print_training(room, scene.replace(images=images), Path("out"), "transforms")
     assert "ignores" not in capsys.readouterr().out  # that trainer does not read it
 
 

@@ -52,11 +52,11 @@ if TYPE_CHECKING:  # they load Numba, or PyTorch, which may be absent
 SHOWN = "auto"
 SEED = 0
 RATIO = 8.0
-"""Points in all over originals, for methods that interpolate."""
+"""Total points per original point, for methods that interpolate."""
 TEST_EVERY = 8
-"""Photographs held out for testing: no method uses them."""
+"""Every n-th photograph is a test view, which no method uses."""
 SAMPLES = 20_000
-"""Samples of the surfaces at which coverage is measured."""
+"""Samples of the true surfaces at which coverage is measured."""
 PICTURES = ("preview.png", "preview_methods.png", "preview_errors.png")
 TABLE, TRAINED_PICTURE = "geometry.csv", "preview_trained.png"
 RANDOM, POSES, SFM = "random", "poses", "sfm"
@@ -64,12 +64,11 @@ ARMS = {RANDOM: "random start", POSES: f"{SHOWN}, poses alone", SFM: "SfM's poin
 """The trained arms, by the suffix of their folders; all but the last start without SfM's points."""
 TRAINING = "training"
 AHEAD = (SHOWN, TRAINING, "voronoi", "spline")
-"""What the second process compiles, in this order; training as early as possible after the
-first."""
+"""Parts that the second process compiles, in this order; training right after the first."""
 SMALL = {"num_views": 8, "width": 96, "height": 72}
-"""The capture on which it does."""
+"""The capture on which the second process runs them."""
 POLL = 0.5
-"""Seconds between its checks whether PyTorch has been installed."""
+"""Seconds between the second process's checks whether PyTorch is installed."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +117,7 @@ def run(arguments: list[str]) -> None:
 
 
 def _upsample_by(name: str, scene: Scene, ratio: float = RATIO) -> PointCloud:
-    """The scene's points and new ones; methods that choose their number ignore the ratio."""
+    """Upsample the scene; methods that choose their number ignore the ratio."""
     from splatseed.seeding.upsampling import upsample
 
     looks = hasattr(METHODS[name], "test_every")
@@ -131,7 +130,7 @@ def _upsample_by(name: str, scene: Scene, ratio: float = RATIO) -> PointCloud:
 
 @contextmanager
 def compiled_ahead(parts: Sequence[str]) -> Iterator[Callable[[], None]]:
-    """Have a process compile from the first compilation on; gives a function that waits for it.
+    """Start a process that compiles at the first compilation; yields a function to wait for it.
 
     It does not wait for a process that still waits for PyTorch.
     """
@@ -157,7 +156,7 @@ def compiled_ahead(parts: Sequence[str]) -> Iterator[Callable[[], None]]:
 
 
 def compile_ahead(parts: Sequence[str]) -> None:
-    """Compile what methods and training need by running a small demo; a second process does."""
+    """Compile the kernels of methods and training by running a small demo, in a second process."""
     from splatseed.synthetic import make_capture, write_capture
 
     waiting = list(parts)
@@ -190,7 +189,7 @@ def _compile(part: str, scene: Scene, folder: Path) -> None:
 
 
 def _has_pytorch() -> bool:
-    """Whether training's packages are completely installed."""
+    """Return whether training's packages are completely installed."""
     invalidate_caches()
     try:
         for package in ("torch", "gsplat", "torchmetrics", "flip-evaluator"):
@@ -204,7 +203,7 @@ def _has_pytorch() -> bool:
 
 
 def _make_points(options: Options) -> None:
-    """The capture, its points by every method, their errors, and pictures."""
+    """Write the capture, its points by every method, their errors, and pictures."""
     from splatseed.photos.viewpoint import choose_camera
     from splatseed.seeding.geometry_score import measure, spacing
     from splatseed.synthetic import make_capture, write_capture
@@ -328,7 +327,7 @@ def _train(options: Options) -> bool:
 
 
 def _seed_poses_alone(folder: Path, clock: StageClock) -> float:
-    """Write scenes whose seeds come from poses and photographs alone; the seconds of the method."""
+    """Write scenes whose seeds come from poses and photographs alone; return the seconds taken."""
     from splatseed.seeding.poses import random_start
 
     scene = load_scene(folder / "scene").replace(points=PointCloud.empty(), tracks=None)
@@ -346,7 +345,7 @@ def _seed_poses_alone(folder: Path, clock: StageClock) -> float:
 def _train_arm(
     folder: Path, name: str, settings: TrainSettings, clock: StageClock
 ) -> tuple[TrainingResult, tuple[Tile, ...]]:
-    """Train from an arm's seeds, and score; also a test view's photograph, render and errors."""
+    """Train an arm and score it; also return a test view's photograph, render and error."""
     from splatseed.splat.evaluate import evaluate_views
     from splatseed.splat.metrics import flip_map
     from splatseed.splat.rendering import as_bytes, error_picture, photograph_of
@@ -376,7 +375,7 @@ def _train_arm(
 def _summarise_training(
     picture: Path, seeding: float, results: Mapping[str, TrainingResult]
 ) -> None:
-    """The runs side by side, and what seeds gain."""
+    """Print the runs side by side, and the gain by seeds."""
     seconds = {name: each.train_seconds for name, each in results.items()}
     seconds[POSES] += seeding
     rows = [

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from splatseed.commands.next_steps import after_depth, look
+from splatseed.commands.next_steps import after_depth, show_maps
 from splatseed.commands.options import check_minimum, parse_options, refuse
 from splatseed.console import OUT, print_note, print_pairs, stage_display
 from splatseed.depth.stereo.maps import MIN_SIZE
@@ -175,7 +175,7 @@ def _summarise_stereo(
         fuse = f"--workspace_path {quoted(path)} --output_path {quoted(path / 'fused.ply')}"
         fuse = f"colmap stereo_fusion {fuse} --StereoFusion.min_num_pixels {MIN_PIXELS}"
         # The workspace is itself a scene, without distortion.
-        print_pairs("next", [look(path, path), ("fuse", fuse)])
+        print_pairs("next", [show_maps(path, path), ("fuse", fuse)])
         return
     if is_distorted(scene):
         print_note(

@@ -1,4 +1,4 @@
-"""``splatseed export``: trained Gaussians in the file formats of viewers and engines."""
+"""``splatseed export``: write trained Gaussians in the formats of viewers and engines."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from splatseed.training.models import config_of, model_file
 from splatseed.training.settings import TrainSettings
 
 OWN = "own"
-"""For --clean: the scene that the run names."""
+"""The value of --clean for the scene of the run."""
 
 
 @dataclass(frozen=True)
@@ -43,13 +43,13 @@ class Options:
     """The file to write; its suffix chooses the format: .ply, .compressed.ply, .splat, .spz,
     .sog."""
     crop: Annotated[str | None, tyro.conf.arg(metavar="x0,y0,z0,x1,y1,z1")] = None
-    """Keep the Gaussians whose centres lie in this box of the model's world; write --crop=-1,...
+    """Keep the Gaussians whose centres lie in this box, in world coordinates; write --crop=-1,...
     if the first number is negative."""
     min_opacity: float = 0.0
-    """Leave out Gaussians whose opacity is lower, 0 to 1."""
+    """Remove Gaussians of a lower opacity, 0 to 1."""
     clean: Annotated[str | None, tyro.conf.arg(metavar="SCENE|own")] = None
-    """Leave out floaters: Gaussians in space that the photographs of this scene see through, and do
-    not need; own: the scene of the run."""
+    """Remove floaters, Gaussians where the photographs of this scene show free space; own: the
+    scene of the run."""
     overwrite: bool = False
     """Replace an existing file."""
 
@@ -122,7 +122,7 @@ def run(arguments: list[str]) -> None:
 
 
 def _scoring_command(options: Options) -> str:
-    """How to score the file as its run was scored; what no run tells is left as a word."""
+    """Return the command that scores the file as its run was; unknown values are placeholders."""
     config = config_of(options.model)
     scene, factor, every = (config.get(name) for name in ("scene", "data_factor", "test_every"))
     scene = scene if options.clean in {None, OWN} else options.clean

@@ -1,8 +1,7 @@
-"""``splatseed info``: the contents of a scene, its problems, and what to do with it.
+"""``splatseed info``: the contents of a scene, its problems, and the next commands.
 
-Notation of ``--json``: lengths are in scene units; five numbers are percentiles 5, 25, 50, 75, 95.
-Promise: with ``--json`` standard output is one JSON object alone; a number that JSON does not know
-is null; keys are only ever added.
+With ``--json``, stdout is one JSON object: lengths are in scene units, five numbers are percentiles
+5, 25, 50, 75 and 95, and null is a number that is not finite. Keys are only ever added.
 """
 
 from __future__ import annotations
@@ -65,11 +64,11 @@ class Options:
     """Also compare a folder of depth maps, in any layout of docs/formats.md, with the SfM
     points."""
     depth_kind: DepthKind | None = None
-    """What the maps hold: planar depth, distance along the ray, or inverse depth; by default
-    what the folder says, else z."""
+    """Values of the maps: planar depth (z), distance along the ray, or inverse depth; by default
+    the folder's own statement, else z."""
     depth_scale: float | None = None
-    """Stored units per unit of depth: 1000 for millimetres in a scene in metres; by default what
-    the folder says."""
+    """Stored units per unit of depth: 1000 for millimetres in a scene in metres; by default the
+    folder's own statement."""
     picture: Path | None = None
     """Write a PNG of depth beside photographs, and of where the two disagree."""
     budget: Annotated[str | None, tyro.conf.arg(metavar="N|Xrho")] = None
@@ -97,7 +96,7 @@ def run(arguments: list[str]) -> None:
         problems = [*diagnostics.find_problems(scene, cloud, empty)]
         alignments = None if options.depth is None else _alignments(options, scene, clock)
         known = _known_depths(scene.depths, clock) if options.depth and scene.depths else 0
-        poses, faint = _look_at_poses(scene, masks.share, clock)
+        poses, faint = _check_poses(scene, masks.share, clock)
     doubt = poses["problem"] if poses else ""
     problems += [*stray_notes(scene), *([masks.problem] if masks.problem else [])]
     problems += [*_unfit_maps(scene, alignments or {}), *(each for each in (doubt, faint) if each)]
@@ -131,7 +130,7 @@ def run(arguments: list[str]) -> None:
 
 
 def _read(options: Options) -> Scene:
-    """The scene, with the depth maps that the user names, else with its own."""
+    """Read the scene, with the depth maps of ``--depth`` in place of its own."""
     about = options.depth_kind, options.depth_scale, options.picture
     refuse(
         (options.depth is None and any(each is not None for each in about),
@@ -153,7 +152,7 @@ def _read(options: Options) -> Scene:
 
 
 def _alignments(options: Options, scene: Scene, clock: StageClock) -> dict[str, Alignment]:
-    """How each map fits the SfM points, drawn if requested."""
+    """Align each map with the SfM points; draw the picture, if requested."""
     from splatseed.depth.alignment import align
 
     alignments = align(scene, progress=clock)
@@ -166,7 +165,7 @@ def _alignments(options: Options, scene: Scene, clock: StageClock) -> dict[str, 
 
 
 def _known_depths(depths: DepthMaps, clock: StageClock) -> int:
-    """How many pixels have a depth, of all maps."""
+    """Count the pixels with a depth, over all maps."""
     known = 0
     for i, name in enumerate(depths):
         known += int(np.count_nonzero(np.isfinite(depths.read(name).values)))
@@ -175,7 +174,7 @@ def _known_depths(depths: DepthMaps, clock: StageClock) -> int:
 
 
 def _unfit_maps(scene: Scene, alignments: Mapping[str, Alignment]) -> list[str]:
-    """What is wrong with the maps, in a sentence, if anything is."""
+    """Describe maps that cannot be aligned, as a list of at most one problem."""
     if alignments and not len(scene.points):
         unit = "only maps in the scene's unit can be used, with --depth.no-align"
         return [f"there are no points to align the depth maps with: {unit}"]
@@ -184,15 +183,15 @@ def _unfit_maps(scene: Scene, alignments: Mapping[str, Alignment]) -> list[str]:
     return [f"{maps} cannot be aligned with the points, and are left out"] if unfit else []
 
 
-def _look_at_poses(
+def _check_poses(
     scene: Scene, masked: float, progress: Progress
 ) -> tuple[dict[str, Any] | None, str]:
-    """Compare a few photographs of a scene without points; None with points or without any.
+    """Compare a few photographs of a scene without points.
 
-    Also a sentence if they agree at few pixels; masks leave out the share ``masked`` of all.
-
-    Gives the share of the pixels looked at whose depth others confirm (``agreement``), by how much
-    the photographs miss each other (``error``), and why they should not be used as they are.
+    ``masked`` is the share of pixels that masks exclude. Returns None for a scene with points or
+    without photographs; else the share of checked pixels whose depth other photographs confirm
+    (``agreement``), the pose error (``error``) and the resulting ``problem``. The second value is a
+    warning if photographs agree at few pixels, else empty.
     """
     if has_points(scene) or not scene.has_photographs:
         return None, ""
@@ -214,15 +213,15 @@ def _look_at_poses(
 def _next(
     options: Options, scene: Scene, advice: Advice, planned: Planned, known: int, problem: str
 ) -> Commands:
-    """What to do next with the scene, or what there is to choose from."""
+    """Return the next commands, or the choices if there are several."""
     any_points, refine = len(scene.points) > 0, "--refine-poses" in problem
     lifted = ""
     if options.depth is not None and scene.depths and not is_distorted(scene):
         how = "" if options.depth_kind is None else f"--depth-kind {options.depth_kind} "
         how += "" if options.depth_scale is None else f"--depth-scale {options.depth_scale:g} "
         how += "" if any_points else "--depth.no-align "
-        how += next_steps.number_for(len(scene.points), known, planned.max_seeds)
-        lifted = next_steps.use(options.scene, options.depth, how)
+        how += next_steps.number_option(len(scene.points), known, planned.max_seeds)
+        lifted = next_steps.lifting_command(options.scene, options.depth, how)
     if any_points and lifted:
         return [("", lifted)]
     advised: Commands = []
@@ -237,7 +236,7 @@ def _next(
 
 
 def _facts_of(scene: Scene) -> dict[str, Any]:
-    """Where a scene comes from and what it holds, for ``--json``."""
+    """Return the source and the contents of a scene, for ``--json``."""
     train, test = scene.split()
     return {
         "format": scene.source.format if scene.source else None,
@@ -255,7 +254,7 @@ def _facts_of(scene: Scene) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """A value as JSON takes it: a dataclass as a table, a number that is not finite as null."""
+    """Convert a value for JSON: a dataclass to an object, a number that is not finite to null."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         value = dataclasses.asdict(value)
     if isinstance(value, Mapping):
@@ -305,13 +304,13 @@ def _track_rows(tracks: diagnostics.TrackStatistics | None) -> list[tuple[str, s
     if tracks is None:
         return [("tracks", "none")]
 
-    def told(mean: float, percentiles: tuple[float, ...], style: str) -> str:
+    def summary(mean: float, percentiles: tuple[float, ...], style: str) -> str:
         spread = " ".join(f"{x:{style}}" for x in percentiles)
         return "unknown" if math.isnan(mean) else f"mean {mean:{style}}, 5/25/50/75/95% {spread}"
 
     return [
-        ("track length, images", told(tracks.mean_length, tracks.length, ".3g")),
-        ("reprojection error, px", told(tracks.mean_error, tracks.error, ".3f")),
+        ("track length, images", summary(tracks.mean_length, tracks.length, ".3g")),
+        ("reprojection error, px", summary(tracks.mean_error, tracks.error, ".3f")),
     ]
 
 
@@ -330,13 +329,13 @@ def _photograph_rows(
         rows.append(("image area without points", f"{regions.mean:.0%} on average, {worst} {grid}"))
     if poses and (poses["error"] is not None or not poses["problem"]):
         agreed = f"at {poses['agreement']:.0%} of the pixels looked at"
-        miss = "cannot be told" if poses["error"] is None else f"{poses['error']}"
+        miss = "unknown" if poses["error"] is None else f"{poses['error']}"
         rows += [("photographs agree", agreed), ("pose error", miss)]
     return rows
 
 
 def _advice_rows(advice: Advice, planned: Planned) -> list[tuple[str, str]]:
-    """What to do, why, and for which training."""
+    """Return the advice, its reasons, and the training it is for."""
     plan = f"{planned.budget:,} Gaussians at most, {planned.max_steps:,} steps, strategy"
     rows = [("planned", f"{plan} {planned.strategy}"), ("advice", advice.sentence)]
     if advice.measured.layout:

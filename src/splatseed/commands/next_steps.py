@@ -1,4 +1,4 @@
-"""The commands that verbs print as the next, each of which works on the scene it is printed for."""
+"""Suggest the next commands; each works on the scene for which it is printed."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ from splatseed.training.settings import BUDGET, TrainSettings
 
 RATIO = 16
 PER_POINT = 8
-"""Pixels of known depth per new point. Beyond that, lifting runs out of pixels that are free and
-away from depth discontinuities: on stereo's maps of a kitchen with 14% known, one in 8.2 was."""
+"""Pixels of known depth per new point. With fewer, lifting runs out of free pixels away from depth
+discontinuities: on stereo's maps of a kitchen with 14% known, one in 8.2 was."""
 COLMAP_ONLY = frozenset({"gsplat", "graphdeco", "LichtFeld"})
-"""Trainers that do not read transforms.json, or not as well."""
+"""Trainers that read COLMAP's layout better than transforms.json."""
 PINHOLE_ONLY = frozenset({"splatseed", "graphdeco", "OpenSplat", "LichtFeld"})
-"""Trainers that do not deal with lens distortion themselves, as far as we know."""
+"""Trainers that do not handle lens distortion, as far as we know."""
 COMMON_LENSES = frozenset({"SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"})
-"""The distortion that the others know."""
+"""Camera models with distortion that the other trainers handle."""
 CENTRED = 0.5
-"""Pixels by which a principal point may be off the centre without a word."""
+"""Offset of a principal point from the centre, in pixels, above which a note warns."""
 
 Commands = list[tuple[str, str]]
 
 
 class Planned(NamedTuple):
-    """How a scene will be trained, and the options of train that say so."""
+    """How a scene will be trained, and the options of train for it."""
 
     budget: int
     max_steps: int
@@ -44,7 +44,7 @@ class Planned(NamedTuple):
 
     @classmethod
     def of(cls, scene: Scene, budget: str | None = None, max_steps: int = FULL_RUN) -> Planned:
-        """A scene's plan, from the options."""
+        """Plan the training of a scene by the options of ``info``."""
         images = at_file_size(scene).images
         factor = TrainSettings().with_data_factor(images).factor
         lenses = [image.intrinsics for image in images]
@@ -66,7 +66,7 @@ class Planned(NamedTuple):
 def advice_commands(
     path: Path, scene: Scene, advice: Advice, planned: Planned, *, refine: bool
 ) -> Commands:
-    """The commands that follow the advice for a scene; ``refine``: its poses first."""
+    """Return the commands that follow the advice; with ``refine``, poses are refined first."""
     trains = not untrainable(scene)
     first: Commands = []
     if trains and is_distorted(scene):
@@ -89,53 +89,53 @@ def advice_commands(
 
 
 def after_depth(path: Path, scene: Scene, maps: Path, known: int, *, aligned: bool) -> Commands:
-    """What to do with the depth maps that were made of the photographs of a scene at ``path``.
+    """Return the commands that use the depth maps made for a scene at ``path``.
 
     ``known`` of their pixels have a depth; ``aligned``: they are in the scene's unit, as stereo's
     are and a network's are not.
     """
-    looking = look(path, maps)
-    number = number_for(len(scene.points), known, Planned.of(scene).max_seeds)
+    looking = show_maps(path, maps)
+    number = number_option(len(scene.points), known, Planned.of(scene).max_seeds)
     if is_distorted(scene):  # seeds are lifted along the rays of a pinhole camera
         begin = ("for seeds, begin with", undistort_command(path))
         return [looking] if aligned else [looking, begin]
     if len(scene.points) or aligned:
         how = number if len(scene.points) else f"--depth.no-align {number}"
-        return [looking, ("use", use(path, maps, how))]
+        return [looking, ("use", lifting_command(path, maps, how))]
     points = ("points to align to", triangulate_command(path, scene, "SCENE"))
-    return [looking, points, ("use", use(Path("SCENE"), maps, f"--ratio {RATIO}"))]
+    return [looking, points, ("use", lifting_command(Path("SCENE"), maps, f"--ratio {RATIO}"))]
 
 
-def look(path: Path, maps: Path) -> tuple[str, str]:
-    """The command that shows depth maps."""
+def show_maps(path: Path, maps: Path) -> tuple[str, str]:
+    """Return the command that shows depth maps."""
     picture = quoted(f"{maps.resolve().name}.png")
     return "look", f"splatseed info {quoted(path)} --depth {quoted(maps)} --picture {picture}"
 
 
-def number_for(points: int, known: int, most: int) -> str:
-    """The option for as many points as ``known`` pixels of depth give and training begins with.
+def number_option(points: int, known: int, limit: int) -> str:
+    """Return the option for as many points as ``known`` pixels of depth give, up to ``limit``.
 
     Of a scene with points, at most ``RATIO`` times as many.
     """
-    number = max(points + 1, min(most, points + known // PER_POINT))
+    number = max(points + 1, min(limit, points + known // PER_POINT))
     return f"--ratio {RATIO}" if 0 < RATIO * points <= number else f"--num-points {number}"
 
 
-def use(path: Path, maps: Path, how: str) -> str:
-    """The command that makes seeds of depth maps."""
+def lifting_command(path: Path, maps: Path, how: str) -> str:
+    """Return the command that makes seeds from depth maps."""
     seeds = f"splatseed upsample {quoted(path)} --method depth --depth {quoted(maps)}"
     return f"{seeds} {how} -o OUT"
 
 
 def triangulate_command(path: Path, scene: Scene, output: str) -> str:
-    """The command that finds points for a scene's poses."""
+    """Return the command that triangulates points for a scene's poses."""
     photographs = scene.source.image_dir if scene.source else None
     images = "IMAGES" if photographs is None else quoted(photographs)
     return f"splatseed sfm {images} --poses-from {quoted(path)} -o {output}"
 
 
-def tell_training(read_from: Path, scene: Scene, output: Path, layout: SceneFormat) -> None:
-    """Print the commands that train a scene that was written, and what some of them need first."""
+def print_training(read_from: Path, scene: Scene, output: Path, layout: SceneFormat) -> None:
+    """Print the commands that train a written scene, and what some of them need first."""
     if not scene.images:  # writing it said so
         return
     if missing := untrainable(scene):
@@ -159,14 +159,14 @@ def tell_training(read_from: Path, scene: Scene, output: Path, layout: SceneForm
 
 
 def off_centre(scene: Scene) -> float:
-    """How far principal points are off the photographs' centres, the largest distance in pixels."""
+    """Return the largest distance of a principal point from its photograph's centre, in pixels."""
     sizes = np.array([(im.camera.width, im.camera.height) for im in scene.images])
     points = np.array([im.camera.K[:2, 2] for im in scene.images])
     return float(np.linalg.norm(points - sizes / 2, axis=1).max(initial=0.0))
 
 
 def training_commands(path: Path, layout: SceneFormat, *, distorted: bool = False) -> Commands:
-    """(trainer, command) for every trainer that reads the scene at ``path`` unchanged.
+    """Return (trainer, command) for every trainer that reads the scene at ``path`` unchanged.
 
     Example:
         >>> dict(training_commands(Path("/data/out"), "colmap"))["graphdeco"]

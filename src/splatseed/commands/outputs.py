@@ -1,4 +1,4 @@
-"""Where the file of a trained model may be written."""
+"""Check that an output file may be written."""
 
 from __future__ import annotations
 
@@ -16,9 +16,13 @@ def check_free(
     protect: Sequence[Path] = (),
     fix: str = "Pass --overwrite to replace it, or choose another name.",
 ) -> None:
-    """Refuse a file that may not be written, before any work is done.
+    """Refuse an output file that may not be written, before any work is done.
 
-    It may not be one of ``protect`` or lie in one. ``fix`` is told where a file is there.
+    Args:
+        path: The file.
+        overwrite: Whether it may exist.
+        protect: Inputs, which it must neither equal nor lie in.
+        fix: What the user can do if the file exists.
     """
     check_separate(path, protect)
     check_parents(path)

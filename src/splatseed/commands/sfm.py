@@ -1,4 +1,4 @@
-"""``splatseed sfm``: a scene from photographs, by pycolmap."""
+"""``splatseed sfm``: reconstruct a scene from photographs with pycolmap."""
 
 from __future__ import annotations
 
@@ -31,26 +31,26 @@ class Options:
     """Make a scene from photographs: poses and points, undistorted, ready to upsample."""
 
     images: Annotated[Path, tyro.conf.Positional]
-    """The folder of photographs, or a video, from which sharp, evenly spread frames are taken. No
-    features are detected where masks (folder masks beside the photographs) are 0."""
+    """A folder of photographs, or a video, of which sharp frames at even distances are used. No
+    features are detected where masks (in a folder masks beside the photographs) are 0."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """The scene folder to write."""
     poses_from: Path | None = None
-    """A scene whose poses and intrinsics are kept, so that only points are triangulated."""
+    """Triangulate points for the poses and intrinsics of this scene."""
     refine_poses: bool = False
-    """Refine the poses of --poses-from, as a phone's or SLAM's that are off by a degree or two."""
+    """Refine the poses of --poses-from first, such as those of a phone or SLAM, which are off by a
+    degree or two."""
     matcher: MatcherName | None = None
-    """Compare every pair of images (the default for photographs), or each with its successors (for
-    a video)."""
+    """Match all pairs of images (the default for photographs), or each image with the next (the
+    default for a video)."""
     frames: int = 150
     """Maximum frames from a video."""
     camera_model: str = "OPENCV"
-    """COLMAP's model of the lens; not used with --poses-from."""
+    """COLMAP's camera model; not used with --poses-from."""
     shared_camera: bool = True
-    """One camera for the photographs of a lens, by their size and EXIF; not used with
-    --poses-from."""
+    """Photographs of the same size and EXIF lens share a camera; not used with --poses-from."""
     device: DeviceName = "auto"
-    """Where features are detected and matched; auto takes a GPU if pycolmap can use one."""
+    """Device for features and matching; auto takes a GPU if pycolmap can use one."""
     seed: int = 0
     """Seed of every random choice."""
     threads: int = -1
@@ -91,7 +91,7 @@ def run(arguments: list[str]) -> None:
 
 
 def _from_video(options: Options, video: Path, clock: StageClock) -> SfmReport:
-    """Pick frames, then treat them like photographs; the scene keeps those with a pose."""
+    """Pick frames and reconstruct from them; the scene contains those with a pose."""
     check_output(options.output, kind="sfm", overwrite=options.overwrite, protect=[video])
     with TemporaryDirectory(prefix="splatseed-frames-") as name:
         picked = pick_frames(video, Path(name), options.frames, clock)
@@ -149,7 +149,7 @@ def _tell_photographs(
     left_out: Mapping[str, Sequence[str]],
     cameras: str,
 ) -> None:
-    """Say what is read, since a folder named by mistake may hold pictures of other things below."""
+    """Print the images that are read, since subfolders may hold images of other scenes."""
     images, number = options.images, len(names)
     clock.count(number, "photographs", "features")
     if options.matcher != "sequential" and not is_video(images):

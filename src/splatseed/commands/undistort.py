@@ -1,4 +1,4 @@
-"""``splatseed undistort``: a scene without lens distortion, for trainers that need PINHOLE."""
+"""``splatseed undistort``: remove lens distortion, for trainers that need PINHOLE cameras."""
 
 from __future__ import annotations
 

@@ -45,10 +45,10 @@ class Options:
     budget: Annotated[str | None, tyro.conf.arg(metavar="N|Xrho")] = None
     """Maximum points: a number, or 0.25rho for a quarter of a full-size photograph's pixels."""
     cover_cell: Annotated[int | None, tyro.conf.arg(name="cover")] = None
-    """Cell side in pixels: each cell of a photograph that no point falls in gets a seed; auto and
-    cover have --auto.cell and --cover.cell instead."""
+    """Add a seed to every photograph cell without a point; the value is the cell's side in pixels.
+    Methods auto and cover have --auto.cell and --cover.cell instead."""
     verify: bool = False
-    """Move interpolated points to where the photographs agree; drop those that fit nowhere."""
+    """Move interpolated points to where the photographs agree; drop points without such a place."""
     seed: int = 0
     """Random seed: same seed, same bytes."""
     profile: Profile = "default"
@@ -57,16 +57,17 @@ class Options:
     """For --method depth: a folder of maps, as docs/formats.md lists them; by default the
     scene's own."""
     depth_kind: DepthKind | None = None
-    """What the maps hold: planar depth, distance along the ray, or inverse depth; by default
-    what the folder says, else z."""
+    """Values of the maps: planar depth (z), distance along the ray, or inverse depth; by default
+    the folder's own statement, else z."""
     depth_scale: float | None = None
-    """Stored units per unit of depth: 1000 for millimetres in a scene in metres; by default what
-    the folder says."""
+    """Stored units per unit of depth: 1000 for millimetres in a scene in metres; by default the
+    folder's own statement."""
     masks: MaskChoice = None
     """A folder of masks, where pixels of 0 do not count, or none; inverted: only they count. By
     default the folder masks beside the photographs, and transparency."""
     refine_poses: bool = False
-    """First refine a phone's or SLAM's poses and triangulate points; both replace the scene's."""
+    """First refine the poses, such as a phone's or SLAM's, and triangulate points; both replace the
+    scene's."""
     cloud_files: Annotated[
         tyro.conf.UseAppendAction[tuple[Path, ...]],
         tyro.conf.arg(name="cloud", metavar="FILE", help_behavior_hint="(repeatable)"),
@@ -77,9 +78,9 @@ class Options:
     """For --cloud: a 4x4 matrix from its frame to the scene's, as text or JSON, or nerfstudio's
     dataparser_transforms.json."""
     align: bool = False
-    """For --cloud: find --transform from the scene's points."""
+    """For --cloud: find the transform by aligning the cloud with the scene's points."""
     recenter: bool = False
-    """Write the scene, and a cloud in its frame, around 0, with the offset in recenter.json."""
+    """Move the scene, and a cloud in its frame, to the origin; recenter.json has the offset."""
     memory: Annotated[str | None, tyro.conf.arg(metavar="BYTES|4G")] = None
     """For --cloud: the memory within which scans are merged; by default what is free, at most
     4G."""
@@ -90,7 +91,7 @@ class Options:
     format: Literal["auto", "colmap", "transforms"] = "auto"
     """Layout to write: auto is the input's."""
     copy_images: bool = False
-    """Copy images, do not link them."""
+    """Copy images instead of linking them."""
     overwrite: bool = False
     """Replace an earlier output."""
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from splatseed.commands.next_steps import tell_training
+from splatseed.commands.next_steps import print_training
 from splatseed.commands.upsample.cloud import ALIGNMENT
 from splatseed.commands.upsample.options import Options
 from splatseed.commands.upsample.previews import PICTURES
@@ -153,4 +153,4 @@ def summarise(
             "The commands for gsplat's examples, graphdeco's code and LichtFeld need COLMAP's "
             "layout: --format colmap."
         )
-    tell_training(options.scene, scene, output, written.layout)
+    print_training(options.scene, scene, output, written.layout)
