@@ -142,7 +142,7 @@ def test_a_point_has_the_same_relative_place_in_every_copy(name, room, tmp_path)
     [
         ((72, 96), 6, "found 72 x 96: stored rotated, with EXIF orientation 6; 1 more of 9"),
         ((36, 48), 8, "found 36 x 48: stored rotated, with EXIF orientation 8"),
-        ((72, 96), 1, "found 72 x 96: turned, width and height are swapped"),
+        ((72, 96), 1, r"found 72 x 96"),
         ((96, 60), 1, "found 96 x 60: cropped, or stretched"),
         ((48, 36), 6, ""),
         ((96, 71), 3, ""),

@@ -25,7 +25,7 @@ ALIGNMENT = 64
 """Bytes of a cache line and of an AVX-512 register."""
 
 
-class Lens(NamedTuple):
+class ProjectionParams(NamedTuple):
     """The constants of a projection: no gradient flows to them."""
 
     K: np.ndarray
@@ -77,7 +77,7 @@ class Project(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]  # likewise
         """Gradients of the inputs."""
         means, quats, scales, viewmat = _arrays(*ctx.saved_tensors)
-        lens: Lens = ctx.lens
+        lens: ProjectionParams = ctx.lens
         results = [np.empty(each.shape, np.float32) for each in (means, quats, scales)]
         by_view = np.empty((projection.CHUNKS, 3, 4))
         projection.project_vjp(  # type: ignore[call-arg]  # star arguments

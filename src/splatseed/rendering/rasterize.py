@@ -23,7 +23,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from splatseed.errors import ParameterError
-from splatseed.rendering.autograd import Blend, Harmonics, Lens, Project, is_seen
+from splatseed.rendering.autograd import Blend, Harmonics, Project, ProjectionParams, is_seen
 from splatseed.rendering.blending import CHANNELS
 from splatseed.rendering.harmonics import MAX_DEGREE
 from splatseed.requirements import require
@@ -156,8 +156,10 @@ def rasterization(
         projected = [
             _project(
                 gaussians, poses[camera],
-                Lens(intrinsics[camera].detach().contiguous().numpy(), width, height, near_plane,
-                     far_plane, eps2d, radius_clip, rasterize_mode == "antialiased"),
+                ProjectionParams(
+                    intrinsics[camera].detach().contiguous().numpy(), width, height, near_plane,
+                    far_plane, eps2d, radius_clip, rasterize_mode == "antialiased",
+                ),
                 sparse_grad,
             )
             for camera in range(len(poses))
@@ -188,7 +190,9 @@ def _unbatched(batch: tuple[int, ...], *tensors: Tensor) -> Iterable[tuple[Tenso
     return zip(*(each.flatten(0, len(batch) - 1).unbind() for each in tensors), strict=True)
 
 
-def _project(gaussians: Sequence[Tensor], viewmat: Tensor, lens: Lens, sparse: bool) -> Projected:
+def _project(
+    gaussians: Sequence[Tensor], viewmat: Tensor, lens: ProjectionParams, sparse: bool
+) -> Projected:
     """Means, quats, scales and opacities in one camera."""
     opacities = gaussians[3]
     radii, means2d, depths, conics, compensations = Project.apply(  # type: ignore[no-untyped-call]  # PyTorch's apply is untyped
