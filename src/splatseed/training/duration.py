@@ -105,8 +105,8 @@ def format_duration(seconds: float) -> str:
     """Return a duration in minutes or hours.
 
     Example:
-        >>> format_duration(100), format_duration(3000), format_duration(19_000),
-        format_duration(200_000) ('2 minutes', '50 minutes', '5 hours', '56 hours')
+        >>> format_duration(100), format_duration(3000), format_duration(200_000)
+        ('2 minutes', '50 minutes', '56 hours')
     """
     if seconds < HOUR * 1.5:
         minutes = max(1, round(seconds / 60))
