@@ -8,7 +8,7 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from splatseed.camera import Intrinsics
-from splatseed.lens import image_points, rays_through
+from splatseed.lens import project_rays, unproject_pixels
 from splatseed.scene import Observations
 
 COEFFICIENTS = (-0.12, 0.02, 0.002, -0.003)
@@ -31,7 +31,7 @@ def _bent(image):
     lens = Intrinsics(old.camera_id, "OPENCV", old.width, old.height, (*four, *COEFFICIENTS))
     seen = image.observations
     if seen is not None:
-        moved = image_points(lens, (seen.xy - K[:2, 2]) / K[[0, 1], [0, 1]])
+        moved = project_rays(lens, (seen.xy - K[:2, 2]) / K[[0, 1], [0, 1]])
         seen = Observations(moved, seen.point_ids)
     return replace(image, intrinsics=lens, observations=seen)
 
@@ -39,7 +39,7 @@ def _bent(image):
 def _photograph(pixels, lens):
     """What the lens sees of a pinhole photograph; its edge goes on where that one ends."""
     column, row = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
-    xy = rays_through(lens, np.stack([column, row], axis=-1))
+    xy = unproject_pixels(lens, np.stack([column, row], axis=-1))
     uv = xy * lens.K[[0, 1], [0, 1]] + lens.K[:2, 2] - 0.5
     places = [uv[..., 1], uv[..., 0]]
     channels = [

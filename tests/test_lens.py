@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from splatseed.camera import CAMERA_MODELS, Intrinsics
-from splatseed.lens import distort, fold_radius, image_points, rays_through
+from splatseed.lens import distort, fold_radius, project_rays, unproject_pixels
 
 
 def make_lens(model, rng, size=0.03):
@@ -35,21 +35,21 @@ def test_pixels_are_colmaps(lens, rays):
         model=lens.model, width=lens.width, height=lens.height, params=list(lens.params)
     )
     expected = camera.img_from_cam(np.column_stack([rays, np.ones(len(rays))]))
-    np.testing.assert_allclose(image_points(lens, rays), expected, atol=1e-10)
+    np.testing.assert_allclose(project_rays(lens, rays), expected, atol=1e-10)
 
 
 def test_the_way_back_leads_to_the_ray(lens, rays):
-    np.testing.assert_allclose(rays_through(lens, image_points(lens, rays)), rays, atol=1e-7)
+    np.testing.assert_allclose(unproject_pixels(lens, project_rays(lens, rays)), rays, atol=1e-7)
     grid = rays[:200].reshape(20, 10, 2)
-    assert rays_through(lens, image_points(lens, grid)).shape == grid.shape
-    assert rays_through(lens, np.empty((0, 2))).shape == (0, 2)
+    assert unproject_pixels(lens, project_rays(lens, grid)).shape == grid.shape
+    assert unproject_pixels(lens, np.empty((0, 2))).shape == (0, 2)
 
 
 def test_no_ray_leads_to_pixels_beyond_the_fold():
     """u = x - x^3 / 10 grows up to x = 1.83, where it is 1.22."""
     lens = Intrinsics(1, "SIMPLE_RADIAL", 64, 48, (50.0, 32.0, 24.0, -0.1))
     u = np.array([0.0, 0.5, 1.2, 1.23, 5.0, 1e6])
-    x, y = rays_through(lens, np.stack([32 + 50 * u, 24 + 0 * u], axis=-1)).T
+    x, y = unproject_pixels(lens, np.stack([32 + 50 * u, 24 + 0 * u], axis=-1)).T
     np.testing.assert_allclose(x[:3] - x[:3] ** 3 / 10, u[:3], atol=1e-9)
     assert (x[:3] < 1.83).all()
     np.testing.assert_allclose(y[:3], 0, atol=1e-9)

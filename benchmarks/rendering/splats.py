@@ -24,7 +24,8 @@ from splatseed.photos.view import View
 from splatseed.rendering.binning import RECORD, TILE, depth_order, list_tiles
 from splatseed.rendering.layout import gather
 from splatseed.runtime.jit import kernel, parallel_range
-from splatseed.splat.gaussians import PARAMETERS, SH_C0, Gaussians, neighbor_distances
+from splatseed.splat.from_seeds import neighbor_distances
+from splatseed.splat.gaussians import PARAMETERS, SH_C0, Gaussians
 from splatseed.synthetic.room import Room, build_room, orbit_cameras, render_views, visible
 
 __all__ = ["Workload", "make_workload", "useful_pairs"]

@@ -32,8 +32,10 @@ from benchmarks.rendering.stopwatch import RENDER_STAGES, Place, Stopwatch, time
 from splatseed import load_scene
 from splatseed.errors import SplatseedError
 from splatseed.photos.loading import load_split
-from splatseed.splat.gaussians import Gaussians, TrainingFrame, initial_gaussians, training_frame
+from splatseed.splat.from_seeds import initial_gaussians
+from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.rendering import render_view
+from splatseed.splat.training_frame import TrainingFrame, training_frame
 from splatseed.training.initialization import min_view_depths
 from splatseed.training.parameters import make_optimizers, make_parameters
 from splatseed.training.seeds import usable_seeds

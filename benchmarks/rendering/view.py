@@ -24,7 +24,7 @@ from PIL import Image
 
 from splatseed.camera import Camera
 from splatseed.photos.view import View
-from splatseed.splat.gaussians import training_frame
+from splatseed.splat.training_frame import training_frame
 from splatseed.viewer.flights import smooth_path
 from splatseed.viewer.models import ViewerItem
 from splatseed.viewer.pictures import Entry

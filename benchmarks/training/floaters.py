@@ -30,8 +30,10 @@ from splatseed.errors import SplatseedError
 from splatseed.photos.view import View, camera_views
 from splatseed.scene import Scene
 from splatseed.splat.evaluate import evaluate_views
-from splatseed.splat.gaussians import SH_C0, Gaussians, TrainingFrame, training_frame
-from splatseed.splat.rendering import ModelRenderer, as_bytes
+from splatseed.splat.gaussians import SH_C0, Gaussians
+from splatseed.splat.pictures import to_uint8
+from splatseed.splat.rendering import ModelRenderer
+from splatseed.splat.training_frame import TrainingFrame, training_frame
 from splatseed.synthetic import make_capture, write_capture
 from splatseed.training import TrainSettings, prepare_run
 from splatseed.training.depths import known_depths
@@ -139,7 +141,7 @@ def _draw(path: Path, view: View, models: Sequence[Gaussians]) -> None:
     pose = view.cam_from_world.copy()
     pose[0, 3] -= ASIDE
     beside = view.posed(pose)
-    pictures = [as_bytes(ModelRenderer(each, HERE).color(beside)) for each in models]
+    pictures = [to_uint8(ModelRenderer(each, HERE).color(beside)) for each in models]
     Image.fromarray(np.concatenate(pictures, axis=1)).save(path)
 
 

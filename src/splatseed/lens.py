@@ -24,11 +24,11 @@ TRIES, DIFFERENCE, ARRIVED = 30, 1e-6, 1e-9
 """Newton's method: its steps, the step of finite differences, and the tolerance."""
 
 
-def undistort_first(scene: Path | None) -> str:
+def undistort_advice(scene: Path | None) -> str:
     """Advice for the user whose scene must not have distortion; its folder, if that is known.
 
     Example:
-        >>> undistort_first(Path("my scene"))
+        >>> undistort_advice(Path("my scene"))
         "Undistort the scene first: splatseed undistort 'my scene' -o 'my scene_undistorted'."
     """
     if scene is None:
@@ -38,15 +38,15 @@ def undistort_first(scene: Path | None) -> str:
 
 def undistort_command(scene: Path) -> str:
     """The command that removes distortion from the scene in a folder."""
-    return f"splatseed undistort {quoted(scene)} -o {quoted(undistorted(scene))}"
+    return f"splatseed undistort {quoted(scene)} -o {quoted(undistorted_folder(scene))}"
 
 
-def undistorted(scene: Path) -> Path:
+def undistorted_folder(scene: Path) -> Path:
     """Where that command writes: beside the scene."""
     return scene.with_name(f"{scene.resolve().name}_undistorted")
 
 
-def image_points(lens: Intrinsics, xy: Float64[np.ndarray, "*B 2"]) -> Float64[np.ndarray, "*B 2"]:
+def project_rays(lens: Intrinsics, xy: Float64[np.ndarray, "*B 2"]) -> Float64[np.ndarray, "*B 2"]:
     """Pixel coordinates of rays (x, y, 1); the first pixel's centre is (0.5, 0.5)."""
     K = lens.K
     return np.asarray(distort(lens, xy) * K[[0, 1], [0, 1]] + K[:2, 2])
@@ -73,8 +73,10 @@ def distort(lens: Intrinsics, xy: Float64[np.ndarray, "*B 2"]) -> Float64[np.nda
     return np.stack(_moved(x, y, _terms(lens.model, k)), axis=-1)
 
 
-def rays_through(lens: Intrinsics, uv: Float64[np.ndarray, "*B 2"]) -> Float64[np.ndarray, "*B 2"]:
-    """The rays (x, y, 1) that a lens maps to pixels: ``image_points`` inverted by Newton's method.
+def unproject_pixels(
+    lens: Intrinsics, uv: Float64[np.ndarray, "*B 2"]
+) -> Float64[np.ndarray, "*B 2"]:
+    """The rays (x, y, 1) that a lens maps to pixels: ``project_rays`` inverted by Newton's method.
 
     Points on the plane at depth 1; NaN where no ray within the lens's fold leads there.
     """

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Self
 
-NOT_ASKED = "not asked for"
+NOT_REQUESTED = "not asked for"
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class EvalResult:
 
     per_image: tuple[ViewScore, ...]  # in the views' order; at least one
     lpips_net: str | None = None  # None if not measured
-    lpips_reason: str = NOT_ASKED  # why LPIPS was not measured; empty if it was
+    lpips_reason: str = NOT_REQUESTED  # why LPIPS was not measured; empty if it was
     num_gaussians: int | None = None  # that were rendered; None if the renderer is a black box
     model_bytes: int | None = None  # of their parameters as float32; None likewise
 

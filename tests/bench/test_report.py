@@ -24,7 +24,7 @@ from splatseed.bench.study import studies
 from splatseed.cli import main
 from splatseed.errors import OutputError, SceneFormatError, SceneNotFoundError
 from splatseed.io import load_scene
-from splatseed.splat.rendering import write_render
+from splatseed.splat.pictures import write_comparison
 from splatseed.synthetic import make_capture, write_capture
 
 from .browser import CHROMIUM, chromium
@@ -178,7 +178,9 @@ def with_capture(bench, path, digest, *gains, **changes):
         for name in ("view0.png", "view1.png"):
             noise = 40 * rng.standard_normal(truth.shape)
             render = np.clip(truth + noise, 0, 255).astype(np.float32) / 255
-            write_render(folder / name, truth, render, np.abs(render - truth / 255).mean(axis=2))
+            write_comparison(
+                folder / name, truth, render, np.abs(render - truth / 255).mean(axis=2)
+            )
     return write_bench(bench, finished)
 
 

@@ -28,7 +28,7 @@ from splatseed.io.ply import write_ply
 from splatseed.io.staging import MANIFEST, atomic_file, output_folder
 from splatseed.pointcloud import PointCloud
 from splatseed.splat.formats import write_gaussians
-from splatseed.splat.gaussians import initial_gaussians
+from splatseed.splat.from_seeds import initial_gaussians
 from splatseed.training.folder import RunFolder
 from splatseed.training.settings import TrainSettings
 from splatseed.training.state import load_checkpoint, make_strategy

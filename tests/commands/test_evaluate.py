@@ -12,7 +12,7 @@ pytest.importorskip("gsplat", reason="training needs gsplat's strategies")
 from splatseed.io import load_scene
 from splatseed.splat.evaluate import evaluate_views
 from splatseed.splat.formats import write_gaussians
-from splatseed.splat.gaussians import initial_gaussians
+from splatseed.splat.from_seeds import initial_gaussians
 from splatseed.training.prepare import prepare_run
 from splatseed.training.settings import TrainSettings
 

@@ -18,7 +18,7 @@ from splatseed.io import load_scene, write_scene
 from splatseed.io.colmap import write_images
 from splatseed.io.photograph import lens_warnings
 from splatseed.io.seeds import saw_all_photographs, was_upsampled
-from splatseed.lens import image_points, rays_through
+from splatseed.lens import project_rays, unproject_pixels
 from splatseed.photos.loading import load_views, refuse_distortion
 from splatseed.sfm import undistort
 from splatseed.synthetic import make_capture, write_capture
@@ -168,7 +168,7 @@ def test_what_is_undistorted_follows_the_lens_not_its_coefficients(distorted, tm
     # The middle, as its rays see it through the lens
     rows, columns = np.mgrid[20 : pinhole.height - 20, 20 : pinhole.width - 20]
     uv = np.stack([columns, rows], axis=-1) + 0.5
-    u, v = np.moveaxis(image_points(fisheye, rays_through(pinhole, uv)) - 0.5, -1, 0)
+    u, v = np.moveaxis(project_rays(fisheye, unproject_pixels(pinhole, uv)) - 0.5, -1, 0)
     before, written = (
         np.asarray(Image.open(folder / "images" / images[0].name).convert("L"), float)
         for folder in (distorted, out)

@@ -26,8 +26,8 @@ from splatseed.photos.loading import load_views
 from splatseed.photos.view import View
 from splatseed.rendering import rasterization
 from splatseed.similarity import Similarity
-from splatseed.splat.gaussians import initial_gaussians
-from splatseed.splat.rendering import photograph_of
+from splatseed.splat.from_seeds import initial_gaussians
+from splatseed.splat.photographs import photograph_tensor
 from splatseed.training.parameters import MIN_VIEW_DEPTH, as_parameters
 from splatseed.training.settings import TrainSettings
 from splatseed.training.state import make_strategy
@@ -170,7 +170,7 @@ def train(params, optimizers, strategy, views, world):
     state = strategy.initialize_state() if growth else {}
     for step in range(160):
         view = views[step * 7 % 16]
-        truth = photograph_of(view, torch.device("cpu"))[None]
+        truth = photograph_tensor(view, torch.device("cpu"))[None]
         camera = world.camera(view.cam_from_world), view.K
         pose, K = (torch.tensor(each[None], dtype=torch.float32) for each in camera)
         render, _, info = rasterization(

@@ -15,7 +15,7 @@ from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io import find_depths, load_scene
 from splatseed.io.depth_maps import Undistortion
 from splatseed.io.rgbd import load_rgbd, load_tum
-from splatseed.lens import image_points
+from splatseed.lens import project_rays
 from splatseed.scene import SceneSource
 
 START, PERIOD = 1305031102.175304, 1 / 30
@@ -135,7 +135,7 @@ def test_undistorted_map_has_the_value_that_the_lens_saw_along_each_ray():
     assert (whole.shape, whole.dtype) == ((440, 600), np.float32)
     for u, v in [(0, 0), (300, 225), (10, 400), (599, 439), (450, 100)]:
         ray = np.array([(u + 0.5 - 300) / 520, (v + 0.5 - 225) / 515])
-        x, y = np.floor(image_points(lens, ray))
+        x, y = np.floor(project_rays(lens, ray))
         expected = x + 1000 * y if 0 <= x < 640 and 0 <= y < 480 else np.nan
         np.testing.assert_equal(whole[v, u], np.float32(expected))
     assert half[225, 300] % 1000 // 2 == whole[225, 300] % 1000 // 2

@@ -13,7 +13,7 @@ from splatseed.camera import CAMERA_MODELS, Intrinsics
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.io import load_scene
 from splatseed.io.photograph_checks import ROUNDING, _off, fits
-from splatseed.lens import image_points
+from splatseed.lens import project_rays
 from splatseed.photos.cache import load_photograph
 from splatseed.photos.loading import load_split, load_views
 from splatseed.photos.sizes import at_file_size
@@ -116,8 +116,8 @@ def test_a_point_has_the_same_relative_place_in_every_copy(name, room, tmp_path)
     )
     xy = np.array([[0.3, -0.2], [-0.25, 0.1], [0.0, 0.0]])
     for image, size in zip(sized.images, COPIES, strict=True):
-        place = image_points(image.intrinsics, xy) / size
-        assert np.allclose(place, image_points(lens, xy) / RECORD, atol=1e-12)
+        place = project_rays(image.intrinsics, xy) / size
+        assert np.allclose(place, project_rays(lens, xy) / RECORD, atol=1e-12)
         assert np.allclose(image.observations.xy / size, [[0.5, 0.25]])
     for factor in (1, 3):
         one, other = (
@@ -225,8 +225,8 @@ def photograph(lens):
     """What the lens sees of the painting: rays of its pixels by fixed-point iteration."""
     goal, xy = np.stack([COLUMN, ROW], axis=-1), rays_of(lens.K, COLUMN, ROW)
     for _ in range(200):
-        xy = xy + 0.5 * (goal - image_points(lens, xy)) / lens.K[[0, 1], [0, 1]]
-    assert np.abs(image_points(lens, xy) - goal).max() < 1e-6
+        xy = xy + 0.5 * (goal - project_rays(lens, xy)) / lens.K[[0, 1], [0, 1]]
+    assert np.abs(project_rays(lens, xy) - goal).max() < 1e-6
     return np.rint(painting(xy)).astype(np.uint8)
 
 
@@ -237,7 +237,7 @@ def test_colours_are_interpolated_between_four_pixels(lens, rng):
     pixels, known = undistort(source, lens, lens.K)
     padded = np.pad(source.astype(float), ((1, 1), (1, 1), (0, 0)), mode="edge")
     for i, j in np.ndindex(HEIGHT, WIDTH):
-        u, v = image_points(lens, rays_of(lens.K, np.array(j + 0.5), np.array(i + 0.5)))
+        u, v = project_rays(lens, rays_of(lens.K, np.array(j + 0.5), np.array(i + 0.5)))
         if not (0 <= u <= WIDTH and 0 <= v <= HEIGHT):
             assert not known[i, j]
             assert not pixels[i, j].any()
@@ -255,7 +255,7 @@ def test_what_a_fold_would_show_again_is_unknown():
     white = np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
     pixels, known = undistort(white, lens, lens.K)
     rays = rays_of(lens.K, COLUMN, ROW)
-    uv = image_points(lens, rays)
+    uv = project_rays(lens, rays)
     assert np.all((uv > 0) & (uv < [WIDTH, HEIGHT]), axis=-1).all()  # all would show something
     distance = np.linalg.norm(rays, axis=-1)
     fold = np.sqrt(1 / 0.9)

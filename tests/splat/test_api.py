@@ -9,10 +9,11 @@ import pytest
 import torch
 
 import splatseed as ss
-from splatseed.photos.sight import shown_points
+from splatseed.photos.camera_check import reference_points
 from splatseed.photos.view import camera_views
-from splatseed.splat.gaussians import initial_gaussians, training_frame
+from splatseed.splat.from_seeds import initial_gaussians
 from splatseed.splat.rendering import render_view
+from splatseed.splat.training_frame import training_frame
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +34,7 @@ def test_a_render_at_a_scenes_image_is_that_of_the_trainer(scene, splat):
     height, width = image.camera.height, image.camera.width
     assert (picture.dtype, picture.shape) == (np.float32, (height, width, 3))
     assert 0 <= picture.min() < 0.2 < picture.max() <= 1
-    frame = training_frame(camera_views(scene.split()[0]), shown_points(scene))
+    frame = training_frame(camera_views(scene.split()[0]), reference_points(scene))
     arrays = frame.gaussians_from_world(splat).arrays()
     params = {name: torch.tensor(array) for name, array in arrays.items()}
     view = frame.view(camera_views([image])[0])

@@ -22,8 +22,9 @@ from splatseed.photos.view import View, camera_views
 from splatseed.scores import EvalResult, ViewScore
 from splatseed.splat.evaluate import evaluate_model, evaluate_views, load_model
 from splatseed.splat.formats import write_gaussians
-from splatseed.splat.gaussians import initial_gaussians, training_frame
+from splatseed.splat.from_seeds import initial_gaussians
 from splatseed.splat.rendering import ModelRenderer
+from splatseed.splat.training_frame import training_frame
 
 
 @pytest.fixture

@@ -213,13 +213,13 @@ def test_an_unpacked_sog_is_read(files, tmp_path):
 
 def test_a_box_and_an_opacity_keep_what_they_say():
     model = _gaussians()
-    kept = formats.keep_gaussians(model, formats.parse_crop("-1,-2,-3,1,2,3"), 0.25)
+    kept = formats.filter_gaussians(model, formats.parse_crop("-1,-2,-3,1,2,3"), 0.25)
     inside = (np.abs(model.means) <= [1, 2, 3]).all(axis=1)
     opaque = 1 / (1 + np.exp(-model.opacities)) >= 0.25
     np.testing.assert_array_equal(kept.means, model.means[inside & opaque])
-    assert formats.keep_gaussians(model) is model
+    assert formats.filter_gaussians(model) is model
     with pytest.raises(ParameterError, match="none of 700"):
-        formats.keep_gaussians(model, formats.parse_crop("90,90,90,91,91,91"))
+        formats.filter_gaussians(model, formats.parse_crop("90,90,90,91,91,91"))
     for text in ("0,0,0,1,1,0", "a,b,c,d,e,f", "0,0,0,1,1,nan"):
         with pytest.raises(ParameterError, match="`crop"):
             formats.parse_crop(text)

@@ -13,16 +13,15 @@ from splatseed.photos.loading import load_split
 from splatseed.photos.view import View
 from splatseed.pointcloud import PointCloud
 from splatseed.splat.formats import write_gaussians
-from splatseed.splat.gaussians import (
+from splatseed.splat.from_seeds import (
     EVEN,
     OWN,
-    SH_C0,
-    SH_C1,
     fit_harmonics,
     initial_gaussians,
     neighbor_distances,
-    training_frame,
 )
+from splatseed.splat.gaussians import SH_C0, SH_C1
+from splatseed.splat.training_frame import training_frame
 
 SIDE = 64
 

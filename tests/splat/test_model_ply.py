@@ -15,7 +15,8 @@ from splatseed.camera import Camera
 from splatseed.errors import SceneFormatError
 from splatseed.photos.view import view_of
 from splatseed.splat.formats import read_gaussians, write_gaussians
-from splatseed.splat.gaussians import Gaussians, TrainingFrame
+from splatseed.splat.gaussians import Gaussians
+from splatseed.splat.training_frame import TrainingFrame
 
 C0 = 0.28209479177387814  # 3DGS, utils/sh_utils.py
 KINDS = {"<f4": "float", "<f8": "double", "u1": "uchar", "<u2": "ushort", "<i4": "int"}

@@ -10,7 +10,7 @@ from PIL import Image as PillowImage
 
 from splatseed.io import load_scene
 from splatseed.splat.metrics import color_corrected, psnr
-from splatseed.splat.rendering import photograph_of
+from splatseed.splat.photographs import photograph_tensor
 from splatseed.training.exposure import Exposures
 from splatseed.training.prepare import prepare_run
 from splatseed.training.settings import TrainSettings
@@ -80,7 +80,7 @@ def test_unseen_views_gain_where_exposure_varies_and_lose_little_elsewhere(
         asked = TrainSettings(max_steps=200, data_factor=2, strategy="none", exposure=exposure)
         run = prepare_run(load_scene(scene), tmp_path / f"{scene.name}_{exposure}", asked)
         assert run.train()
-        pairs = [(run.trainer.render(v), photograph_of(v, CPU)) for v in run.trainer.test_views]
+        pairs = [(run.trainer.render(v), photograph_tensor(v, CPU)) for v in run.trainer.test_views]
         return np.mean([psnr(color_corrected(*pair), pair[1]) for pair in pairs])
 
     scenes = varied, larger_room_path

@@ -12,7 +12,7 @@ from splatseed.io import colmap, load_scene, write_scene
 from splatseed.io.origin import RECENTER, offset_beside, translated
 from splatseed.splat.evaluate import evaluate_model, evaluate_views, load_model
 from splatseed.splat.formats import read_gaussians, write_gaussians
-from splatseed.splat.world import shifted
+from splatseed.splat.model_frame import translate_gaussians
 from splatseed.training.prepare import prepare_run
 from splatseed.training.settings import TrainSettings
 from splatseed.training.start import read_start
@@ -67,7 +67,7 @@ def test_a_model_in_the_coordinates_of_the_files_is_moved_and_it_is_said(runs, t
     folder, psnr = runs["site"]
     file, notes = folder / "run" / "point_cloud.ply", []
     gaussians = read_gaussians(file)
-    write_gaussians(tmp_path / "world.ply", shifted(gaussians, offset_beside(file)))
+    write_gaussians(tmp_path / "world.ply", translate_gaussians(gaussians, offset_beside(file)))
     score = scored(tmp_path / "world.ply", folder / "scene")
     assert score == pytest.approx(psnr, abs=0.3)  # float32 has rounded it before
     started = read_start(tmp_path / "world.ply", load_scene(folder / "scene"), notes.append)

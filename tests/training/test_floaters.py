@@ -16,9 +16,11 @@ from splatseed.photos.view import View, camera_views
 from splatseed.pointcloud import PointCloud
 from splatseed.splat.evaluate import evaluate_model, load_model
 from splatseed.splat.formats import read_gaussians, write_gaussians
-from splatseed.splat.gaussians import SH_C0, Gaussians, training_frame
-from splatseed.splat.rendering import ModelRenderer, as_bytes
-from splatseed.splat.world import find_transform, moved
+from splatseed.splat.gaussians import SH_C0, Gaussians
+from splatseed.splat.model_frame import find_transform, transform_gaussians
+from splatseed.splat.pictures import to_uint8
+from splatseed.splat.rendering import ModelRenderer
+from splatseed.splat.training_frame import training_frame
 from splatseed.training import floaters
 from splatseed.training.floaters import find_floaters
 
@@ -50,7 +52,7 @@ def joined(*models):
 def pictured(model, view):
     """The view with the model's render as its photograph."""
     image = ModelRenderer(model, training_frame([view])).color(view)
-    return dataclasses.replace(view, photograph=as_bytes(image))
+    return dataclasses.replace(view, photograph=to_uint8(image))
 
 
 @pytest.fixture
@@ -142,7 +144,7 @@ def test_export_finds_floaters_in_a_room(sixteen_views, floating, splatseed, tmp
     fails = Mock(side_effect=MissingDependencyError("kernels", found="no nvcc", fix=""))
     monkeypatch.setattr(floaters, "pick_device", fails)
     world = find_transform("gsplat", sixteen_views[1])
-    write_gaussians(tmp_path / "theirs.ply", moved(read_gaussians(path), world))
+    write_gaussians(tmp_path / "theirs.ply", transform_gaussians(read_gaussians(path), world))
     words = ("-o", tmp_path / "again.ply", "--clean", root)
     assert splatseed("export", tmp_path / "theirs.ply", *words).code == 0
     again = read_gaussians(tmp_path / "again.ply")

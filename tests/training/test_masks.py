@@ -15,8 +15,8 @@ from splatseed.io import load_scene
 from splatseed.io.masks import with_masks
 from splatseed.photos.loading import load_views
 from splatseed.splat.evaluate import evaluate_views
-from splatseed.splat.metrics import ssim_of_all
-from splatseed.splat.rendering import fill_masked
+from splatseed.splat.metrics import mirrored_ssim
+from splatseed.splat.photographs import fill_masked
 from splatseed.training.strategies.grow import contributions
 from splatseed.training.trainer import photometric_loss
 
@@ -80,8 +80,8 @@ def test_masked_pixels_have_no_part_in_loss_growth_and_scores(occluded_path, beg
     assert results[0].psnr == results[1].psnr
     assert results[0].ssim == results[1].ssim < 0.5
     everywhere = torch.ones_like(mask)
-    assert ssim_of_all(render.detach(), photograph, everywhere) == pytest.approx(
-        ssim_of_all(render.detach(), photograph), abs=1e-5
+    assert mirrored_ssim(render.detach(), photograph, everywhere) == pytest.approx(
+        mirrored_ssim(render.detach(), photograph), abs=1e-5
     )
     run = begin(strategy="none")
     (seen,) = load_views(scene, scene.images[1:2])

@@ -20,7 +20,7 @@ from splatseed.io import load_scene
 from splatseed.pointcloud import PointCloud
 from splatseed.splat.evaluate import evaluate_views
 from splatseed.splat.formats import read_gaussians
-from splatseed.splat.rendering import opacities_of
+from splatseed.splat.rendering import opacity_from_logits
 from splatseed.training import device, prepare, run as run_module, trainer
 from splatseed.training.parameters import add_to_mean, gaussians_of, size_unit
 from splatseed.training.prepare import PrepareOptions, prepare_run
@@ -74,7 +74,7 @@ def single_threaded():
 def test_opacities_are_the_same_whatever_the_threads(single_threaded):
     def of_logits():
         logits = torch.linspace(-9, 9, 100_003, requires_grad=True)  # more than one thread takes
-        opacities = opacities_of(logits)
+        opacities = opacity_from_logits(logits)
         opacities.backward(torch.ones_like(logits))
         return opacities, logits.grad
 
@@ -285,7 +285,7 @@ def test_a_disk_that_is_full_among_the_results_costs_nothing(begin, monkeypatch)
         raise OutputError(f"{path}", found="No space left on device", fix="Free some.")
 
     with monkeypatch.context() as patch:
-        patch.setattr(run_module, "write_render", disk_full)
+        patch.setattr(run_module, "write_comparison", disk_full)
         with pytest.raises(OutputError, match=r"No space left.*as of step 30 is kept.*resume"):
             run.finish(evaluate_views)
     assert not run.folder.metrics.exists()

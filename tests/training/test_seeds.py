@@ -14,7 +14,7 @@ from splatseed.io.staging import MANIFEST
 from splatseed.photos.loading import load_split
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import silent
-from splatseed.splat.gaussians import initial_gaussians
+from splatseed.splat.from_seeds import initial_gaussians
 from splatseed.training.initialization import MARGIN, min_view_depths
 from splatseed.training.parameters import make_optimizers, make_parameters, optimize
 from splatseed.training.schedule import make_schedule

@@ -11,7 +11,7 @@ import pytest
 
 from splatseed.splat.evaluate import evaluate_views
 from splatseed.splat.formats import read_gaussians, write_gaussians
-from splatseed.splat.world import find_transform, moved
+from splatseed.splat.model_frame import find_transform, transform_gaussians
 from splatseed.training.prepare import prepare_run
 from splatseed.training.settings import TrainSettings
 
@@ -64,7 +64,7 @@ def test_a_hole_is_filled_where_the_strategy_adds(room, first, tmp_path):
 def test_a_model_in_its_trainers_world_is_brought_into_the_scenes(room, first, tmp_path):
     path, scores = first
     world = find_transform("gsplat", room)
-    write_gaussians(tmp_path / "theirs.ply", moved(read_gaussians(path), world))
+    write_gaussians(tmp_path / "theirs.ply", transform_gaussians(read_gaussians(path), world))
     notes = []
     run = prepare_run(room, tmp_path / "run", going_on(tmp_path / "theirs.ply"), note=notes.append)
     assert any("(gsplat)" in note for note in notes)

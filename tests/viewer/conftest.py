@@ -11,7 +11,7 @@ pytest.importorskip("torch", reason="rendering needs PyTorch")
 
 from splatseed.io import load_scene
 from splatseed.splat.formats import write_gaussians
-from splatseed.splat.gaussians import initial_gaussians
+from splatseed.splat.from_seeds import initial_gaussians
 from splatseed.training.settings import TrainSettings
 
 

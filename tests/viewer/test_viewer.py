@@ -24,7 +24,7 @@ from splatseed.errors import ParameterError, SceneFormatError
 from splatseed.io import load_scene
 from splatseed.pointcloud import PointCloud
 from splatseed.splat.evaluate import evaluate_views
-from splatseed.splat.gaussians import TrainingFrame
+from splatseed.splat.training_frame import TrainingFrame
 from splatseed.training.prepare import prepare_run
 from splatseed.training.settings import TrainSettings
 from splatseed.viewer import pictures, session as session_module

@@ -22,8 +22,8 @@ from splatseed.io.files import open_file, read_bytes
 from splatseed.io.load import search_depths
 from splatseed.io.photograph import photograph_bytes
 from splatseed.io.photograph_checks import check_sizes, with_photographs
+from splatseed.photos.camera_check import stray_camera_notes
 from splatseed.photos.loading import refuse_distortion
-from splatseed.photos.sight import stray_notes
 from splatseed.progress import Progress, in_threads, silent
 from splatseed.runtime.fingerprint import fingerprint, fingerprint_all
 from splatseed.scene import Scene
@@ -160,7 +160,7 @@ def survey(
     if with_depth and (planned.depth or search_depths(scene, depth) is not None):
         maps, scene = str(depth.resolve()), scene.replace(depths=find_depths(scene, depth))
     notes = [*scene.warnings, *([scene.listed.sentence] if scene.listed else [])]
-    notes += stray_notes(scene)
+    notes += stray_camera_notes(scene)
     return SceneFacts(
         str(path.resolve()), planned.label, planned.images, maps, scan,
         num_points=len(scene.points), num_images=len(scene.images), pixels=size[0] * size[1],

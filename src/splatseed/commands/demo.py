@@ -348,7 +348,8 @@ def _train_arm(
     """Train an arm and score it; also return a test view's photograph, render and error."""
     from splatseed.splat.evaluate import evaluate_views
     from splatseed.splat.metrics import flip_map
-    from splatseed.splat.rendering import as_bytes, error_picture, photograph_of
+    from splatseed.splat.photographs import photograph_tensor
+    from splatseed.splat.pictures import flip_heatmap, to_uint8
     from splatseed.training.prepare import PrepareOptions, prepare_run
     from splatseed.viewer.page import Tile
 
@@ -364,11 +365,11 @@ def _train_arm(
     shown = run.trainer.test_views[len(run.trainer.test_views) // 2]
     render = run.trainer.render(shown)
     score = f"{ARMS[name]}: {result.scores.psnr:.1f} dB over all test views"
-    errors = flip_map(render, photograph_of(shown, run.trainer.device))
+    errors = flip_map(render, photograph_tensor(shown, run.trainer.device))
     return result, (
         Tile("photograph, not trained on", shown.photograph),
-        Tile(score, as_bytes(render.cpu().numpy())),
-        Tile("FLIP: black 0, brightest 1", error_picture(errors)),
+        Tile(score, to_uint8(render.cpu().numpy())),
+        Tile("FLIP: black 0, brightest 1", flip_heatmap(errors)),
     )
 
 

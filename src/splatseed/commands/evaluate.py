@@ -122,7 +122,7 @@ def _score(
     options: Options, evaluation: Evaluation, model: TrainedModel, clock: StageClock
 ) -> EvalResult:
     """Score the test views and write the files that were asked for."""
-    from splatseed.splat.rendering import picture_names, write_render
+    from splatseed.splat.pictures import picture_names, write_comparison
 
     score = partial(evaluation.score, model, lpips_weights=options.lpips_weights, progress=clock)
     if options.renders is None:
@@ -132,7 +132,7 @@ def _score(
             names = picture_names(view.name for view in model.views)
 
             def draw(view: View, render: Any, errors: Any) -> None:
-                write_render(folder / names[view.name], view.photograph, render, errors)
+                write_comparison(folder / names[view.name], view.photograph, render, errors)
 
             result = score(on_view=draw)
     if options.output is not None:

@@ -16,13 +16,13 @@ from splatseed.io.origin import RECENTER, choose_origin, format_offset, offset_b
 from splatseed.requirements import require
 from splatseed.splat.formats import (
     FORMATS,
+    filter_gaussians,
     format_of_name,
-    keep_gaussians,
     parse_crop,
     read_gaussians,
     write_gaussians,
 )
-from splatseed.splat.world import shifted
+from splatseed.splat.model_frame import translate_gaussians
 from splatseed.text import quoted
 from splatseed.training.folder import RunFolder
 from splatseed.training.models import config_of, model_file
@@ -83,7 +83,7 @@ def run(arguments: list[str]) -> None:
         clock("read", 0.0)
         gaussians = read_gaussians(path, notes.append)
         # What leaves nothing is refused before photographs are compared.
-        kept = keep_gaussians(gaussians, crop, options.min_opacity)
+        kept = filter_gaussians(gaussians, crop, options.min_opacity)
         floaters = np.zeros(len(gaussians), bool)
         if cleans:
             from splatseed.training.floaters import floaters_of_model
@@ -94,9 +94,9 @@ def run(arguments: list[str]) -> None:
             floaters = floaters_of_model(
                 path, Path(str(scene)), masks=masks, progress=clock, **numbers
             )
-            kept = keep_gaussians(gaussians.select(~floaters), crop, options.min_opacity)
+            kept = filter_gaussians(gaussians.select(~floaters), crop, options.min_opacity)
         offset, far = offset_beside(path), choose_origin(kept.means)
-        kept = shifted(kept, -far) if far.any() else kept
+        kept = translate_gaussians(kept, -far) if far.any() else kept
         offset = far if offset is None else offset + far
         write_gaussians(target, kept, clock, notes.append)
         write_offset(target, offset)

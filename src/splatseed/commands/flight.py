@@ -156,7 +156,7 @@ def _size(options: Options, item: ViewerItem) -> tuple[int, int]:
 
 def _path(options: Options, item: ViewerItem, size: tuple[int, int]) -> tuple[list[View], float]:
     """A camera per frame, and the frame rate."""
-    from splatseed.splat.world import NO_TRANSFORM, find_transform
+    from splatseed.splat.model_frame import NO_TRANSFORM, find_transform
     from splatseed.viewer import flights
 
     cameras, frames = item.central_views, max(1, round(options.seconds * FPS))

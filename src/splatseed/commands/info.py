@@ -35,7 +35,7 @@ from splatseed.depthmap import DepthKind, DepthMaps
 from splatseed.errors import SplatseedError
 from splatseed.io import find_depths, load_scene
 from splatseed.io.seeds import was_upsampled
-from splatseed.photos.sight import stray_notes
+from splatseed.photos.camera_check import stray_camera_notes
 from splatseed.progress import Progress
 from splatseed.scene import Scene
 from splatseed.seeding import diagnostics
@@ -98,7 +98,7 @@ def run(arguments: list[str]) -> None:
         known = _known_depths(scene.depths, clock) if options.depth and scene.depths else 0
         poses, faint = _check_poses(scene, masks.share, clock)
     doubt = poses["problem"] if poses else ""
-    problems += [*stray_notes(scene), *([masks.problem] if masks.problem else [])]
+    problems += [*stray_camera_notes(scene), *([masks.problem] if masks.problem else [])]
     problems += [*_unfit_maps(scene, alignments or {}), *(each for each in (doubt, faint) if each)]
     if options.json:
         facts = {

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from splatseed.console import print_note, print_pairs
-from splatseed.lens import undistort_command, undistorted
+from splatseed.lens import undistort_command, undistorted_folder
 from splatseed.photos.sizes import at_file_size
 from splatseed.scene import Scene, SceneFormat
 from splatseed.seeding.advice import AS_IT_IS, SEEDED, Advice
@@ -70,7 +70,7 @@ def advice_commands(
     trains = not untrainable(scene)
     first: Commands = []
     if trains and is_distorted(scene):
-        first, path = [("undistort", undistort_command(path))], undistorted(path)
+        first, path = [("undistort", undistort_command(path))], undistorted_folder(path)
     source = quoted(path)
     training = f"--budget {planned.budget} --max-steps {planned.max_steps} -o RUN"
     if advice.method == SEEDED:

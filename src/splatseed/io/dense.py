@@ -29,7 +29,7 @@ from splatseed.io.files import StrPath
 from splatseed.io.image_folders import image_folders, link_folders
 from splatseed.io.photograph_checks import Size, check_sizes
 from splatseed.io.staging import MANIFEST, output_folder, write_json
-from splatseed.lens import rays_through
+from splatseed.lens import unproject_pixels
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, in_threads, silent
 from splatseed.scene import Image, Observations, Scene, Tracks
@@ -401,7 +401,7 @@ def _photograph_model(
         if seen is not None:
             uv = seen.xy
             if lens.has_distortion:  # features outside of the lens model stay
-                straight = rays_through(lens, uv) * lens.K[[0, 1], [0, 1]] + lens.K[:2, 2]
+                straight = unproject_pixels(lens, uv) * lens.K[[0, 1], [0, 1]] + lens.K[:2, 2]
                 uv = np.where(np.isnan(straight), uv, straight)
             scale = np.array([record.width / lens.width, record.height / lens.height])
             seen = Observations(uv * scale, seen.point_ids)

@@ -26,7 +26,7 @@ from splatseed.errors import OutputError, SceneFormatError, SceneNotFoundError
 from splatseed.io.depth_files import KINDS, SUFFIXES, check_stored, read_stored
 from splatseed.io.files import read_json, translate_errors
 from splatseed.io.staging import MANIFEST, output_folder, write_json
-from splatseed.lens import image_points
+from splatseed.lens import project_rays
 from splatseed.scene import Scene
 
 CAMERA_FILE = "cam_params.json"
@@ -58,7 +58,7 @@ class Undistortion:
         height, width = values.shape
         column, row = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
         fx, fy, cx, cy = camera.K[[0, 1, 0, 1], [0, 1, 2, 2]]
-        uv = image_points(self.lens, np.stack([(column - cx) / fx, (row - cy) / fy], axis=-1))
+        uv = project_rays(self.lens, np.stack([(column - cx) / fx, (row - cy) / fy], axis=-1))
         uv *= [width / self.lens.width, height / self.lens.height]
         inside = np.all((uv >= 0) & (uv < [width, height]), axis=-1)
         places = np.floor(np.where(inside[..., None], uv, 0)).astype(np.intp)

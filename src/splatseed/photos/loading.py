@@ -14,7 +14,7 @@ from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io.masks import read_mask
 from splatseed.io.photograph import photograph_folder
 from splatseed.io.photograph_checks import check_sizes
-from splatseed.lens import undistort_first
+from splatseed.lens import undistort_advice
 from splatseed.photos.cache import load_photograph
 from splatseed.photos.sizes import check_side
 from splatseed.photos.view import View
@@ -117,7 +117,7 @@ def refuse_distortion(
         raise SceneFormatError(
             f"cameras without lens distortion (PINHOLE), {reason}",
             found=f"{image.intrinsics.model} for {image.name}",
-            fix=undistort_first(scene),
+            fix=undistort_advice(scene),
         )
 
 

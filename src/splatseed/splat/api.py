@@ -13,8 +13,9 @@ from splatseed.camera import Camera
 from splatseed.photos.view import View, view_of
 from splatseed.runtime.torch_device import DeviceName, load_kernels, pick_torch_device
 from splatseed.scene import Image
-from splatseed.splat.gaussians import Gaussians, frame_of_model
+from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.rendering import ModelRenderer
+from splatseed.splat.training_frame import frame_of_model
 
 
 def render(

@@ -31,20 +31,28 @@ from splatseed.io import load_scene
 from splatseed.io.masks import with_masks
 from splatseed.io.photograph import photographs_digest
 from splatseed.io.photograph_checks import with_photographs
+from splatseed.photos.camera_check import reference_points
 from splatseed.photos.loading import load_views
-from splatseed.photos.sight import shown_points
 from splatseed.photos.sizes import at_file_size, default_factor
 from splatseed.photos.view import View, camera_views
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
-from splatseed.scores import NOT_ASKED, EvalResult, ViewScore
+from splatseed.scores import NOT_REQUESTED, EvalResult, ViewScore
 from splatseed.splat.formats import read_gaussians
-from splatseed.splat.gaussians import Gaussians, frame_of_model
+from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.lpips import LPIPS_NET, Lpips
-from splatseed.splat.metrics import color_corrected, flip_map, psnr, ssim_of_all
-from splatseed.splat.rendering import ModelRenderer, fill_masked, mask_of, photograph_of
+from splatseed.splat.metrics import color_corrected, flip_map, mirrored_ssim, psnr
+from splatseed.splat.model_frame import (
+    NO_TRANSFORM,
+    check_frame,
+    find_transform,
+    move_to_scene_origin,
+    view_in_model_frame,
+)
+from splatseed.splat.photographs import fill_masked, mask_tensor, photograph_tensor
+from splatseed.splat.rendering import ModelRenderer
 from splatseed.splat.ssim import WINDOW
-from splatseed.splat.world import NO_TRANSFORM, around_scene, check_world, find_transform, view_in
+from splatseed.splat.training_frame import frame_of_model
 from splatseed.text import agreeing, name_some
 
 Covisible: TypeAlias = Mapping[str, Bool[np.ndarray, "H W"]]
@@ -60,7 +68,7 @@ def evaluate_views(
     views: Sequence[View],
     *,
     lpips: Lpips | None = None,
-    lpips_reason: str = NOT_ASKED,
+    lpips_reason: str = NOT_REQUESTED,
     covisible: Covisible | None = None,
     on_view: OnView = lambda *_: None,
     progress: Progress = silent,
@@ -123,7 +131,7 @@ def _score(
             found="NaN or infinity" if list(image.shape) == shape else f"{list(image.shape)}",
             fix="Render views at their own width and height, of a model whose values are finite.",
         )
-    photograph, mask = photograph_of(view, image.device), mask_of(view, image.device)
+    photograph, mask = photograph_tensor(view, image.device), mask_tensor(view, image.device)
     shown = image.clamp(0.0, 1.0)
     image = fill_masked(shown, photograph, mask)
     errors = flip_map(image, photograph)
@@ -137,7 +145,7 @@ def _score(
     return ViewScore(
         view.name,
         psnr=psnr(image, photograph, mask),
-        ssim=ssim_of_all(image, photograph, mask),
+        ssim=mirrored_ssim(image, photograph, mask),
         lpips=None if lpips is None else lpips(image, photograph),
         seconds=seconds,
         covisible_psnr=within,
@@ -158,7 +166,7 @@ def _now() -> float:
 class TrainedModel:
     """Gaussians, the test views of their scene, and a function that renders a view of the scene.
 
-    ``doubt`` explains why the Gaussians may be in another frame; empty if they are surely not.
+    ``frame_warning`` says why the Gaussians may be in another frame; empty if they fit.
     ``notes`` are about what was left out or changed on reading.
     """
 
@@ -167,7 +175,7 @@ class TrainedModel:
     render: Render
     scene: Scene
     data_factor: int = 1
-    doubt: str = ""
+    frame_warning: str = ""
     notes: tuple[str, ...] = ()
 
 
@@ -240,14 +248,14 @@ def load_model(
         progress=progress,
     )
     if transform is None and path is not None:
-        gaussians = around_scene(path, scene, gaussians, notes.append)
+        gaussians = move_to_scene_origin(path, scene, gaussians, notes.append)
     world = None if transform is None else find_transform(transform, scene)
     proven = transform is None and trained_on == photographs_digest(scene)
     unasked = proven or transform == NO_TRANSFORM
-    doubt = "" if unasked else check_world(path, scene, gaussians, world)
-    points = shown_points(scene)
+    frame_warning = "" if unasked else check_frame(path, scene, gaussians, world)
+    points = reference_points(scene)
     frame = frame_of_model(
-        [view_in(world, view) for view in camera_views(train)],
+        [view_in_model_frame(world, view) for view in camera_views(train)],
         points if world is None else world.points(points),
         gaussians,
     )
@@ -255,8 +263,8 @@ def load_model(
         frame = dataclasses.replace(frame, near=near_plane * frame.scale)
     image = ModelRenderer(gaussians, frame, device).image
     return TrainedModel(
-        gaussians, views, lambda view: image(view_in(world, view)), scene, factor, doubt,
-        tuple(notes),
+        gaussians, views, lambda view: image(view_in_model_frame(world, view)), scene, factor,
+        frame_warning, tuple(notes),
     )  # fmt: skip
 
 

@@ -21,7 +21,7 @@ from splatseed.errors import ParameterError, SceneFormatError
 from splatseed.io.files import COPY_AGAIN, StrPath, read_bytes
 from splatseed.io.staging import atomic_file
 from splatseed.progress import Note, Progress, silent, silent_note
-from splatseed.splat import model_ply, packed, sog
+from splatseed.splat import compressed_ply, model_ply, sog, splat_file, spz
 from splatseed.splat.cleaning import drop_unusable
 from splatseed.splat.gaussians import Gaussians
 from splatseed.text import beginning, did_you_mean
@@ -48,18 +48,18 @@ class Format(NamedTuple):
 FORMATS = {
     "compressed-ply": Format(
         ".compressed.ply", "all but fine detail; PlayCanvas, SuperSplat",
-        packed.encode_compressed_ply, packed.decode_compressed_ply,
+        compressed_ply.encode, compressed_ply.decode,
     ),
     "ply": Format(
         ".ply", "everything, as 3DGS writes it; every tool reads it",
         model_ply.encode, model_ply.decode,
     ),
     "splat": Format(
-        ".splat", "no view-dependent colour; web viewers", packed.encode_splat, packed.decode_splat
+        ".splat", "no view-dependent colour; web viewers", splat_file.encode, splat_file.decode
     ),
     "spz": Format(
         ".spz", "all but fine detail; Niantic, three.js viewers, glTF tools",
-        packed.encode_spz, packed.decode_spz,
+        spz.encode, spz.decode,
     ),
     "sog": Format(".sog", "all but fine detail; PlayCanvas, SuperSplat", sog.encode, sog.decode),
 }  # fmt: skip
@@ -146,13 +146,13 @@ def detect_format(path: Path, data: bytes) -> str:
     begin = data
     with suppress(zlib.error):
         begin = zlib.decompressobj(wbits=31).decompress(data[:4096], 4)
-    if begin.startswith(packed.SPZ_MAGIC):
+    if begin.startswith(spz.MAGIC):
         return "spz"
     if data.startswith(b"PK\x03\x04") or (data[:1] == b"{" and suffix == ".json"):
         return "sog"
     found, fix = beginning(data), "Name a file of trained Gaussians."
     if suffix == ".splat":
-        size = packed.RECORD.itemsize
+        size = splat_file.RECORD.itemsize
         if data and len(data) % size == 0:
             return "splat"
         found = f"{len(data):,} bytes, not a multiple of the {size} of a .splat's Gaussian"
@@ -187,7 +187,7 @@ def parse_crop(text: str) -> Float64[np.ndarray, "2 3"]:
     return np.stack([low, high])
 
 
-def keep_gaussians(
+def filter_gaussians(
     gaussians: Gaussians, crop: Float64[np.ndarray, "2 3"] | None = None, min_opacity: float = 0.0
 ) -> Gaussians:
     """The Gaussians with centres in the box of ``parse_crop`` that are opaque enough, in order.

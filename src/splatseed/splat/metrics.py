@@ -79,7 +79,7 @@ def _unsaturated(values: Float[Tensor, "3 P"]) -> Bool[Tensor, "3 P"]:
 
 
 @torch.no_grad()
-def ssim_of_all(
+def mirrored_ssim(
     render: Float[Tensor, "H W 3"],
     photograph: Float[Tensor, "H W 3"],
     mask: Bool[Tensor, "H W"] | None = None,

@@ -24,7 +24,6 @@ from splatseed.io.files import ByteReader, translate_errors
 from splatseed.io.ply import EXPORT_PLY_AGAIN, Element, Header, parse_header
 from splatseed.progress import Note, silent_note
 from splatseed.splat.gaussians import SH_C0, Gaussians
-from splatseed.splat.packed import SH_COUNTS
 from splatseed.splat.ply_layout import (
     DC,
     ROTATION,
@@ -34,6 +33,7 @@ from splatseed.splat.ply_layout import (
     is_antialiased,
     rest_names,
 )
+from splatseed.splat.quantization import SH_COUNTS
 
 _COLORS = ("red", "green", "blue")
 _FILTER = "filter_3D"

@@ -16,14 +16,22 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt8
+from PIL import Image
 
 from splatseed.errors import SceneFormatError
 from splatseed.io.files import read_bytes, translate_errors
 from splatseed.progress import Note, Progress, silent, silent_note
-from splatseed.splat import packed
 from splatseed.splat.cleaning import MAX_LOG_SCALE
 from splatseed.splat.extent import COARSE, Fit, best_fit, left_out_note, morton_order, shells_of
 from splatseed.splat.gaussians import Gaussians
+from splatseed.splat.quantization import (
+    SH_COUNTS,
+    from_smallest_three,
+    opacity_bytes,
+    opacity_logits,
+    rounded_bytes,
+    smallest_three,
+)
 
 CONVERTER = "npx @playcanvas/splat-transform"
 """The converter by the authors of SOG and compressed PLY."""
@@ -50,22 +58,20 @@ def encode(
     gaussians: Gaussians, note: Note = silent_note, progress: Progress = silent
 ) -> list[bytes]:
     """The bytes of a file with the Gaussians, in Z-curve order."""
-    from PIL import Image  # noqa: PLC0415  (slow to import)
-
     gaussians = _within_steps(gaussians, note)
     order = morton_order(gaussians.means)
     curved = _curved(gaussians.means[order])
     low, high = curved.min(axis=0), curved.max(axis=0)
     positions = np.rint((curved - low) / np.where(high > low, high - low, 1) * 65535)
     positions = positions.astype(np.int64)
-    largest, three = packed.smallest_three(gaussians.quats[order])
+    largest, three = smallest_three(gaussians.quats[order])
     # The three smaller components in RGB, 252 + the index of the largest in A.
-    smaller = packed.rounded_bytes(three * np.sqrt(0.5) * 255 + 127.5)
+    smaller = rounded_bytes(three * np.sqrt(0.5) * 255 + 127.5)
     quats = np.column_stack([smaller, _QUAT_MARK + largest])
     logs = np.clip(gaussians.scales, -MAX_LOG_SCALE, MAX_LOG_SCALE)
     scales, sh0 = codebook(logs), codebook(gaussians.sh0)
     colors = codes(gaussians.sh0[order, 0], sh0)
-    opacity = packed.opacity_bytes(gaussians.opacities[order])
+    opacity = opacity_bytes(gaussians.opacities[order])
     pictures = {
         "means_l.webp": _grid(positions & 255),  # 16 bits: low bytes, then high ones
         "means_u.webp": _grid(positions >> 8),
@@ -98,7 +104,7 @@ def encode(
         pictures["shN_labels.webp"] = _grid(np.column_stack([labels & 255, labels >> 8, blank]))
         meta["shN"] = {
             "count": len(entries),
-            "bands": packed.SH_COUNTS.index(rest),
+            "bands": SH_COUNTS.index(rest),
             "codebook": book.tolist(),
             "files": ["shN_centroids.webp", "shN_labels.webp"],
         }
@@ -142,8 +148,6 @@ def _within_steps(gaussians: Gaussians, note: Note) -> Gaussians:
 
 def decode(path: Path, _: Note = silent_note) -> Gaussians:
     """The Gaussians in a file, or in the unpacked folder that a ``meta.json`` lies in."""
-    from PIL import Image  # noqa: PLC0415  (slow to import)
-
     with translate_errors(path, "a whole SOG"):
         content = _opened(path)
         meta = json.loads(content(_META))
@@ -176,15 +180,15 @@ def decode(path: Path, _: Note = silent_note) -> Gaussians:
         centers = {part: np.array(meta[part]["codebook"], np.float32) for part in ("scales", "sh0")}
         shN = np.zeros((count, 0, 3), np.float32)
         if "shN" in meta:
-            rest, entries = packed.SH_COUNTS[int(meta["shN"]["bands"])], int(meta["shN"]["count"])
+            rest, entries = SH_COUNTS[int(meta["shN"]["bands"])], int(meta["shN"]["count"])
             book = np.array(meta["shN"]["codebook"], np.float32)
             table = book[pixels("shN", 0, entries * rest)[:, :3].reshape(entries, rest, 3)]
             shN = table[pixels("shN", 1)[:, :2].astype(np.int64) @ np.array([1, 256])]
         return Gaussians(
             means=np.asarray(np.sign(curved) * np.expm1(np.abs(curved)), np.float32),
             scales=centers["scales"][pixels("scales")[:, :3]],
-            quats=packed.from_smallest_three(largest, three.astype(np.float32)),
-            opacities=packed.opacity_logits(sh0[:, 3]),
+            quats=from_smallest_three(largest, three.astype(np.float32)),
+            opacities=opacity_logits(sh0[:, 3]),
             sh0=centers["sh0"][sh0[:, None, :3]],
             shN=shN,
             antialiased=meta.get("model") == _ANTIALIASED,

@@ -40,8 +40,9 @@ require("torch", "gsplat", "flip_evaluator")  # before what imports them, for on
 from splatseed.camera import Camera
 from splatseed.splat.evaluate import evaluate_views
 from splatseed.splat.formats import read_gaussians
-from splatseed.splat.gaussians import Gaussians, TrainingFrame
+from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.rendering import ModelRenderer
+from splatseed.splat.training_frame import TrainingFrame
 from splatseed.training.device import pick_device
 from splatseed.training.evaluation import Evaluation
 from splatseed.training.prepare import PrepareOptions, prepare_run

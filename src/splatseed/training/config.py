@@ -16,7 +16,7 @@ from splatseed.io.masks import mask_choice, with_masks
 from splatseed.io.photograph import photographs_digest
 from splatseed.io.staging import write_json
 from splatseed.scene import Scene
-from splatseed.splat.gaussians import TrainingFrame
+from splatseed.splat.training_frame import TrainingFrame
 from splatseed.training.folder import RunFolder
 from splatseed.training.settings import TrainSettings
 

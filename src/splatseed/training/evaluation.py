@@ -98,7 +98,7 @@ class Evaluation:
 
     def doubts(self, loaded: TrainedModel) -> list[str]:
         """Describe what may make the scores wrong, one sentence each."""
-        doubts = [*loaded.notes, *filter(None, [loaded.doubt])]
+        doubts = [*loaded.notes, *filter(None, [loaded.frame_warning])]
         trained_every = self.config.get("test_every")
         if isinstance(trained_every, int):
             train = {image.name for image in loaded.scene.split(trained_every)[0]}

@@ -26,15 +26,17 @@ from splatseed.io import load_scene
 from splatseed.io.masks import with_masks
 from splatseed.io.photograph_checks import with_photographs
 from splatseed.photos.cache import user_cache_dir
+from splatseed.photos.camera_check import reference_points
 from splatseed.photos.loading import load_views
-from splatseed.photos.sight import shown_points
 from splatseed.photos.sizes import at_file_size, factor_for_size as factor_for
 from splatseed.photos.view import View
 from splatseed.progress import Progress, silent
 from splatseed.seeding.clouds.photo_consistency import find_evidence
 from splatseed.seeding.photo_methods import photographed
-from splatseed.splat.gaussians import Gaussians, frame_of_model
-from splatseed.splat.rendering import fill_masked, mask_of, photograph_of, render_view
+from splatseed.splat.gaussians import Gaussians
+from splatseed.splat.photographs import fill_masked, mask_tensor, photograph_tensor
+from splatseed.splat.rendering import render_view
+from splatseed.splat.training_frame import frame_of_model
 from splatseed.training.depths import DepthMaps, known_depths
 from splatseed.training.device import pick_device
 from splatseed.training.parameters import make_parameters
@@ -90,7 +92,7 @@ def floaters_of_model(
         settings = replace(settings, data_factor=factor_for(images, StereoSettings.max_size))
     factor, cache = settings.factor, user_cache_dir()
     views = load_views(scene, images, data_factor=factor, cache_dir=cache, progress=progress)
-    frame, device = frame_of_model(views, shown_points(scene), gaussians), _device(progress)
+    frame, device = frame_of_model(views, reference_points(scene), gaussians), _device(progress)
     depths, _ = known_depths(scene, frame.scale, settings, device.type, progress=progress)
     views = tuple(frame.view(view) for view in views)
     return find_floaters(frame.gaussians_from_world(gaussians), views, depths, device, progress)
@@ -168,9 +170,9 @@ def _needed(
     degree = round((1 + gaussians.shN.shape[1]) ** 0.5) - 1
     slope = torch.zeros_like(logits)
     for i, view in enumerate(views if suspects.any() else ()):
-        photograph = photograph_of(view, device)
+        photograph = photograph_tensor(view, device)
         render = render_view(params, view, degree)[0]
-        error = fill_masked(render, photograph, mask_of(view, device)) - photograph
+        error = fill_masked(render, photograph, mask_tensor(view, device)) - photograph
         slope += torch.autograd.grad(error.square().sum(), logits)[0]
         progress("look for floaters", (i + 1) / len(views))
     return np.asarray((slope < 0).cpu().numpy())

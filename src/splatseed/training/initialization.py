@@ -17,13 +17,9 @@ from jaxtyping import Bool, Float, Float32
 
 from splatseed.photos.view import NEAR_PLANE, View
 from splatseed.pointcloud import PointCloud
-from splatseed.splat.gaussians import (
-    Gaussians,
-    TrainingFrame,
-    fit_harmonics,
-    initial_gaussians,
-    training_frame,
-)
+from splatseed.splat.from_seeds import fit_harmonics, initial_gaussians
+from splatseed.splat.gaussians import Gaussians
+from splatseed.splat.training_frame import TrainingFrame, training_frame
 from splatseed.training.settings import TrainSettings
 
 MAX_PROJECTIONS, MIN_VIEWS = 20_000_000, 64

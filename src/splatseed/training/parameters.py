@@ -18,8 +18,9 @@ import torch
 from jaxtyping import Float, Float32
 from torch import Tensor
 
-from splatseed.splat.gaussians import PARAMETERS, SCENE_SCALE, Gaussians
-from splatseed.splat.rendering import opacities_of
+from splatseed.splat.gaussians import PARAMETERS, Gaussians
+from splatseed.splat.rendering import opacity_from_logits
+from splatseed.splat.training_frame import SCENE_SCALE
 from splatseed.training.schedule import Schedule
 
 Parameters = torch.nn.ParameterDict
@@ -125,7 +126,7 @@ def with_dropout(params: Parameters, fraction: float) -> Parameters | Mapping[st
     """
     if fraction <= 0:
         return params
-    opacities = opacities_of(params["opacities"])
+    opacities = opacity_from_logits(params["opacities"])
     kept = torch.rand_like(opacities) >= fraction
     raised = torch.logit((opacities / (1 - fraction)).clamp(max=MAX_RAISED))
     return {**params, "opacities": torch.where(kept, raised, DROPPED)}

@@ -21,16 +21,17 @@ from splatseed.io.files import StrPath
 from splatseed.io.photograph import photograph_folder, photographs_digest
 from splatseed.io.photograph_checks import check_sizes, with_photographs
 from splatseed.io.seeds import was_upsampled
+from splatseed.photos.camera_check import format_stray_note, reference_points
 from splatseed.photos.loading import load_split, refuse_distortion
-from splatseed.photos.sight import notes_on, shown_points
 from splatseed.photos.sizes import at_file_size
 from splatseed.photos.view import View, camera_views
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Note, Progress, silent, silent_note
 from splatseed.requirements import require
 from splatseed.scene import Scene
-from splatseed.splat.gaussians import Gaussians, TrainingFrame, frame_of_model
+from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.ssim import WINDOW
+from splatseed.splat.training_frame import TrainingFrame, frame_of_model
 from splatseed.training.config import (
     another_scene,
     check_same_input,
@@ -118,7 +119,7 @@ def prepare_run(
         scene, stereo = seeded(scene, settings, device.type, note, progress)
     initial = _initial(scene, settings, note)
     frame = initial.frame(scene, settings)
-    for stray in notes_on(frame.strays):
+    for stray in format_stray_note(frame.strays):
         note(stray)
     check_fits(initial.facts["count"], device)
     name = device_name(device)
@@ -194,7 +195,7 @@ class _Seeds:
         return seeds_facts(self.points)
 
     def frame(self, scene: Scene, settings: TrainSettings) -> TrainingFrame:
-        return frame_of_model(_train_poses(scene, settings), shown_points(scene), None)
+        return frame_of_model(_train_poses(scene, settings), reference_points(scene), None)
 
     def gaussians(
         self,
@@ -219,7 +220,7 @@ class _Start:
 
     def frame(self, scene: Scene, settings: TrainSettings) -> TrainingFrame:
         # Without points, the Gaussians show where the scene is.
-        return frame_of_model(_train_poses(scene, settings), shown_points(scene), self.model)
+        return frame_of_model(_train_poses(scene, settings), reference_points(scene), self.model)
 
     def gaussians(
         self,

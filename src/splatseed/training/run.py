@@ -22,8 +22,9 @@ from splatseed.photos.view import View
 from splatseed.progress import Progress, silent
 from splatseed.scores import CurvePoint, EvalResult, TrainingResult
 from splatseed.splat.formats import read_gaussians, write_gaussians
-from splatseed.splat.gaussians import TrainingFrame
-from splatseed.splat.rendering import ModelRenderer, picture_names, write_render
+from splatseed.splat.pictures import picture_names, write_comparison
+from splatseed.splat.rendering import ModelRenderer
+from splatseed.splat.training_frame import TrainingFrame
 from splatseed.training.device import device_name
 from splatseed.training.folder import Record, RunFolder, write_curve_csv, write_curve_png
 from splatseed.training.parameters import gaussians_of, take_mean
@@ -161,7 +162,7 @@ class TrainingRun:
         self, view: View, render: Float32[np.ndarray, "H W 3"], errors: Float32[np.ndarray, "H W"]
     ) -> None:
         path = self.folder.renders / self._pictures[view.name]
-        write_render(path, view.photograph, render, errors)
+        write_comparison(path, view.photograph, render, errors)
 
     def _on_record(self, record: Record) -> None:
         if self._board:

@@ -22,8 +22,9 @@ from splatseed.progress import Note
 from splatseed.runtime.fingerprint import fingerprint
 from splatseed.scene import Scene
 from splatseed.splat.formats import read_gaussians
-from splatseed.splat.gaussians import Gaussians, TrainingFrame
-from splatseed.splat.world import around_scene, in_scene_world
+from splatseed.splat.gaussians import Gaussians
+from splatseed.splat.model_frame import move_to_scene_frame, move_to_scene_origin
+from splatseed.splat.training_frame import TrainingFrame
 from splatseed.training.initialization import min_view_depths
 from splatseed.training.parameters import MAX_LOGIT, make_parameters
 from splatseed.training.settings import TrainSettings
@@ -40,9 +41,9 @@ def read_start(path: Path, scene: Scene, note: Note, *, same_poses: bool = False
         SceneNotFoundError: There is no such file.
         SceneFormatError: It holds no Gaussians, or they belong to another scene.
     """
-    gaussians, message = around_scene(path, scene, read_gaussians(path, note), note), ""
+    gaussians, message = move_to_scene_origin(path, scene, read_gaussians(path, note), note), ""
     if not same_poses:  # else mcmc's clones could look like another frame
-        gaussians, message = in_scene_world(path, scene, gaussians)
+        gaussians, message = move_to_scene_frame(path, scene, gaussians)
     if message:
         note(message)
     if gaussians.antialiased:

@@ -21,8 +21,9 @@ from torch import Tensor
 from splatseed.photos.view import View
 from splatseed.runtime.interruption import interruption
 from splatseed.runtime.workarounds import keep_freed_memory
-from splatseed.splat.metrics import psnr, ssim_of_all
-from splatseed.splat.rendering import Photographs, fill_masked, mask_of, photograph_of, render_view
+from splatseed.splat.metrics import mirrored_ssim, psnr
+from splatseed.splat.photographs import PhotographCache, fill_masked, mask_tensor, photograph_tensor
+from splatseed.splat.rendering import render_view
 from splatseed.splat.ssim import l1_and_ssim
 from splatseed.splat.ssim_conv import l1_and_ssim_by_convolution
 from splatseed.training.folder import Record
@@ -53,7 +54,7 @@ class Trainer:
         self.test_views = test_views
         self.on_record = on_record
         self.is_consistent = True  # the state is that between two steps, and may be saved
-        self._photographs = Photographs(train_views, self.device)
+        self._photographs = PhotographCache(train_views, self.device)
 
     def run(self, on_step: Callable[[int], None] = lambda _: None) -> bool:
         """Train to the last step, or until the user interrupts; return whether the last is done.
@@ -78,7 +79,7 @@ class Trainer:
         """Render and compare once, to compile kernels before the clock runs."""
         view = self.train_views[0]
         render, _ = render_view(self.state.params, view, self.settings.sh_degree)
-        photometric_loss(render, self._photographs.of(view)).backward()
+        photometric_loss(render, self._photographs.get(view)).backward()
         self.clear_gradients()
 
     def clear_gradients(self) -> None:
@@ -106,12 +107,12 @@ class Trainer:
         order = _epoch_order(self.settings.seed, epoch, len(self.train_views))
         index = int(order[position])
         view = self.train_views[index]
-        photograph = self._photographs.of(view)
+        photograph = self._photographs.get(view)
         # The recorded loss and PSNR are with dropout.
         sparse = len(self.train_views) <= MAX_DROPOUT_VIEWS
         shown = with_dropout(params, schedule.dropout_at(step)) if sparse else params
         plain, info = render_view(shown, view, schedule.sh_degree(step, self.settings.sh_degree))
-        render, mask = plain, mask_of(view, self.device)
+        render, mask = plain, mask_tensor(view, self.device)
         if state.exposures is not None:
             state.exposures.fit(index, plain, photograph, mask)
             render = state.exposures.apply(index, plain)
@@ -147,7 +148,7 @@ class Trainer:
         state.losses.clear()
         test_psnr, test_ssim = self.test_scores() if self._is_due(NUM_TESTS) else (None, None)
         seconds = round(state.watch.seconds, 3)
-        shown = round(psnr(render, photograph, mask_of(view, self.device)), 4)
+        shown = round(psnr(render, photograph, mask_tensor(view, self.device)), 4)
         count = len(state.params["means"])
         record = Record(state.step, seconds, loss, shown, test_psnr, count, test_ssim)
         state.records.append(record)
@@ -158,9 +159,9 @@ class Trainer:
         """Return the mean PSNR, dB, and mean SSIM of the test views."""
         scores = []
         for view in self.test_views:
-            photograph, mask = photograph_of(view, self.device), mask_of(view, self.device)
+            photograph, mask = photograph_tensor(view, self.device), mask_tensor(view, self.device)
             render = fill_masked(self.render(view), photograph, mask)
-            scores.append((psnr(render, photograph, mask), ssim_of_all(render, photograph, mask)))
+            scores.append((psnr(render, photograph, mask), mirrored_ssim(render, photograph, mask)))
         psnrs, ssims = zip(*scores, strict=True)
         return round(sum(psnrs) / len(psnrs), 4), round(sum(ssims) / len(ssims), 5)
 

@@ -29,7 +29,8 @@ from splatseed.progress import Progress, silent
 from splatseed.requirements import require
 from splatseed.similarity import Similarity
 from splatseed.splat.gaussians import Gaussians
-from splatseed.splat.rendering import ModelRenderer, as_bytes
+from splatseed.splat.pictures import to_uint8
+from splatseed.splat.rendering import ModelRenderer
 from splatseed.text import counted
 from splatseed.viewer.models import CORE, pinhole_view, split_picture
 from splatseed.viewer.page import depth_picture, nearness, value_range
@@ -269,7 +270,7 @@ def flight_frames(
         limits = value_range(nearness(np.stack([renderers[0].depth(view) for view in sample])))
     for i, view in enumerate(path):
         pictures = [
-            depth_picture(r.depth(view), limits) if depth else as_bytes(r.color(view))
+            depth_picture(r.depth(view), limits) if depth else to_uint8(r.color(view))
             for r in renderers
         ]
         yield pictures[0] if len(pictures) == 1 else split_picture(pictures[0], pictures[1], *names)

@@ -20,12 +20,13 @@ from splatseed.camera import Camera
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io import load_scene
 from splatseed.io.files import StrPath, read_bytes
-from splatseed.photos.sight import shown_points
+from splatseed.photos.camera_check import reference_points
 from splatseed.photos.view import View, camera_views, view_of
 from splatseed.scene import Scene
 from splatseed.splat.formats import detect_format, read_gaussians
-from splatseed.splat.gaussians import Gaussians, TrainingFrame, frame_of_model
-from splatseed.splat.world import around_scene
+from splatseed.splat.gaussians import Gaussians
+from splatseed.splat.model_frame import move_to_scene_origin
+from splatseed.splat.training_frame import TrainingFrame, frame_of_model
 from splatseed.text import quoted
 from splatseed.training.folder import RunFolder
 from splatseed.viewer.page import font, latin
@@ -95,7 +96,7 @@ def open_item(path: StrPath, scene_path: Path | None = None) -> ViewerItem:
         if path.is_file() and _is_model(path):
             gaussians, scene = read_gaussians(path, notes.append), scene_at(scene_path)
             if scene is not None:
-                gaussians = around_scene(path, scene, gaussians, notes.append)
+                gaussians = move_to_scene_origin(path, scene, gaussians, notes.append)
             return ViewerItem(path.name, scene, gaussians, notes=tuple(notes))
         scene = load_scene(path, require_points=False)
         if not scene.images and not len(scene.points):
@@ -119,7 +120,7 @@ def open_item(path: StrPath, scene_path: Path | None = None) -> ViewerItem:
     factor, every = (int(config.get(n) or d) for n, d in (("data_factor", 1), ("test_every", 8)))
     gaussians = read_gaussians(folder.gaussians, notes.append)
     if scene is not None:
-        gaussians = around_scene(folder.gaussians, scene, gaussians, notes.append)
+        gaussians = move_to_scene_origin(folder.gaussians, scene, gaussians, notes.append)
     return ViewerItem(folder.path.name, scene, gaussians, factor, every, tuple(notes))
 
 
@@ -168,7 +169,7 @@ def viewer_frame(item: ViewerItem) -> TrainingFrame:
     scene = item.scene
     if scene is not None and len(scene.images) > 1:
         poses = camera_views(scene.split(item.test_every)[0])
-        return frame_of_model(poses, shown_points(scene), item.gaussians)
+        return frame_of_model(poses, reference_points(scene), item.gaussians)
     if item.gaussians is not None:
         xyz = item.gaussians.means.astype(np.float64)
     else:

@@ -27,9 +27,11 @@ from splatseed.photos.view import View, camera_views
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene
 from splatseed.seeding.coverage import covered_cells
-from splatseed.splat.gaussians import Gaussians, TrainingFrame
+from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.metrics import flip_map
-from splatseed.splat.rendering import ModelRenderer, as_bytes, error_picture
+from splatseed.splat.pictures import flip_heatmap, to_uint8
+from splatseed.splat.rendering import ModelRenderer
+from splatseed.splat.training_frame import TrainingFrame
 from splatseed.viewer.clouds import cell_picture
 from splatseed.viewer.models import ViewerItem, pinhole_view
 from splatseed.viewer.page import BLANK, depth_picture, photograph_at
@@ -122,7 +124,7 @@ class Entry:
         self.item, self.name, self.frame, self._device = item, item.name, frame, device
         scene, painters = item.scene, dict[str, Callable[[View, Any], Picture | str]]()
         if self.has_model:
-            painters["Gaussians"] = lambda canvas, _: as_bytes(self.renderer.color(canvas))
+            painters["Gaussians"] = lambda canvas, _: to_uint8(self.renderer.color(canvas))
             painters["depth"] = lambda canvas, _: depth_picture(self.renderer.depth(canvas))
         if scene is not None and scene.has_photographs:
             painters["photograph"] = self._photograph
@@ -169,7 +171,7 @@ class Entry:
         with _DRAWING:
             try:
                 if fast and kind == "Gaussians":
-                    return as_bytes(self.fast_renderer.color(canvas)), ""
+                    return to_uint8(self.fast_renderer.color(canvas)), ""
                 drawn = self._painters[kind](canvas, at)
             except SplatseedError as error:
                 return None, str(error)
@@ -193,7 +195,7 @@ class Entry:
         if photograph is None:
             return f"The photograph {at.name} cannot be read."
         images = torch.from_numpy(self.renderer.color(view)), torch.from_numpy(photograph) / 255
-        return warp_to_canvas(canvas, error_picture(flip_map(*images)), at.camera)
+        return warp_to_canvas(canvas, flip_heatmap(flip_map(*images)), at.camera)
 
     def _depth_map(self, canvas: View, at: Image) -> Picture | str:
         maps = self._scene.depths

@@ -26,13 +26,13 @@ import torch
 
 from splatseed.errors import MissingDependencyError, PointCloudError
 from splatseed.splat.evaluate import evaluate_views
-from splatseed.splat.metrics import ssim_of_all
+from splatseed.splat.metrics import mirrored_ssim
 from splatseed.integrations.gsplat import GrowStrategy
 from splatseed.io import load_scene
 from splatseed.io.depth_maps import depth_folder
 from splatseed.runtime import torch_device
-from splatseed.splat import rendering
-from splatseed.splat.gaussians import initial_gaussians
+from splatseed.splat import photographs, rendering
+from splatseed.splat.from_seeds import initial_gaussians
 from splatseed.synthetic import make_capture, write_capture
 from splatseed.training import PrepareOptions, TrainSettings, prepare_run, state, trainer
 from splatseed.training.depths import DepthCache
@@ -100,8 +100,8 @@ def test_growth_in_another_trainers_loop_stays_on_the_gpu(room, tmp_path):
         first = initial_gaussians(room.points).arrays()
         params = as_parameters({n: torch.tensor(v, device=device) for n, v in first.items()})
         optimizers = {name: torch.optim.Adam([value]) for name, value in params.items()}
-        camera = rendering.camera_of(view, device)
-        truth = rendering.photograph_of(view, device)[None]
+        camera = rendering.camera_tensors(view, device)
+        truth = photographs.photograph_tensor(view, device)[None]
         strategy = GrowStrategy(2000, 12, 60, 12, depths=tmp_path / "maps", depth_scale=1.0)
         state = strategy.initialize_state()
         for step in range(13):
@@ -116,7 +116,7 @@ def test_growth_in_another_trainers_loop_stays_on_the_gpu(room, tmp_path):
 def test_a_step_does_not_wait_for_the_gpu(room, tmp_path, monkeypatch, strategy):
     """Once each view was shown, but for rounds, which look at how many Gaussians they change."""
     if strategy == "none":  # nor where photographs are sent anew
-        monkeypatch.setattr(rendering, "SHARE", 0.0)
+        monkeypatch.setattr(photographs, "MAX_MEMORY_SHARE", 0.0)
     waits = {}
 
     def count(step):
@@ -244,10 +244,10 @@ def test_the_loss_on_cuda_is_that_of_the_cpu_whatever_tf32_does():
     assert torch.backends.cudnn.allow_tf32  # PyTorch's default
     with pc.pretended_gpu():
         found, found_gradient = _loss(x.to("cuda"), y.to("cuda"))
-        scored = ssim_of_all(x.to("cuda"), y.to("cuda"))
+        scored = mirrored_ssim(x.to("cuda"), y.to("cuda"))
     assert torch.backends.cudnn.allow_tf32
     assert found == pytest.approx(value, rel=1e-5)
-    assert scored == pytest.approx(ssim_of_all(x, y), abs=1e-5)
+    assert scored == pytest.approx(mirrored_ssim(x, y), abs=1e-5)
     torch.testing.assert_close(found_gradient, gradient, rtol=1e-3, atol=1e-7)
 
 

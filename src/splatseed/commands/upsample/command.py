@@ -19,7 +19,7 @@ from splatseed.io.masks import with_masks
 from splatseed.io.origin import RECENTER, format_offset, middle_of_cameras, translated
 from splatseed.io.staging import check_output
 from splatseed.methods import Upsampler, configure, number_of_new, planned_size, traits_of
-from splatseed.photos.sight import stray_notes
+from splatseed.photos.camera_check import stray_camera_notes
 from splatseed.scene import Scene
 from splatseed.seeding import photo_methods
 from splatseed.seeding.advice import DEFAULT_METHOD, method_for
@@ -135,7 +135,7 @@ def _announce(
     options: Options, scene: Scene, methods: Mapping[str, Upsampler], number: str, memory_note: str
 ) -> None:
     """Print the plan, the scene's warnings, and the options that have no effect."""
-    for warning in (*scene.warnings, *stray_notes(scene)):
+    for warning in (*scene.warnings, *stray_camera_notes(scene)):
         print_note(warning)
     name, method = options.method, methods[options.method]
     if (listed := scene.listed) is not None and hasattr(method, "test_every"):

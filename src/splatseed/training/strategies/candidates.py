@@ -16,7 +16,7 @@ from torch import Tensor
 
 from splatseed.photos.view import View
 from splatseed.splat.gaussians import SH_C0
-from splatseed.splat.rendering import camera_of
+from splatseed.splat.rendering import camera_tensors
 from splatseed.training.parameters import MIN_VIEW_DEPTH, Optimizers, Parameters
 
 Candidates = Mapping[str, Tensor]
@@ -79,7 +79,7 @@ def _unproject(
     """Return the pixels' centres in the training frame: x = R^T (d K^-1 (u, v, 1) - t)."""
     u = (pixels % view.width + 0.5 - float(view.K[0, 2])) / float(view.K[0, 0])
     v = (pixels // view.width + 0.5 - float(view.K[1, 2])) / float(view.K[1, 1])
-    pose = camera_of(view, d.device).cam_from_world
+    pose = camera_tensors(view, d.device).cam_from_world
     in_camera = torch.stack([u * d, v * d, d], dim=1).double()
     return ((in_camera - pose[:3, 3]) @ pose[:3, :3]).float()
 

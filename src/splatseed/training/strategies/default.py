@@ -13,7 +13,7 @@ import torch
 from gsplat.strategy import DefaultStrategy
 from gsplat.strategy.ops import reset_opa
 
-from splatseed.splat.gaussians import SCENE_SCALE
+from splatseed.splat.training_frame import SCENE_SCALE
 from splatseed.training.device import Capacity, on_one_thread
 from splatseed.training.parameters import MIN_VIEW_DEPTH, Optimizers, Parameters, size_unit
 from splatseed.training.settings import TrainSettings

@@ -28,7 +28,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from splatseed.photos.view import View
-from splatseed.splat.rendering import fill_masked, mask_of, opacities_of, render_features
+from splatseed.splat.photographs import fill_masked, mask_tensor
+from splatseed.splat.rendering import opacity_from_logits, render_features
 from splatseed.training.device import Capacity, on_one_thread
 from splatseed.training.parameters import MAX_LOGIT, Optimizers, Parameters
 from splatseed.training.schedule import FULL_AT, Schedule
@@ -109,7 +110,7 @@ class ErrorDensification(Strategy):
         """Add each Gaussian's measurements in this view to the sums, and draw candidates."""
         if not self.should_accumulate(step):
             return
-        render = fill_masked(render.detach(), photograph, mask_of(view, photograph.device))
+        render = fill_masked(render.detach(), photograph, mask_tensor(view, photograph.device))
         error = (render - photograph).abs().mean(dim=-1)
         pixels, errors = contributions(params, view, error)
         sums = self._sums(params)
@@ -163,7 +164,7 @@ class ErrorDensification(Strategy):
         sums, count = self._sums(params), len(params["means"])
         measured = sums["views"] >= GROWTH.min_views
         # Nearly transparent, ...
-        pruned = opacities_of(params["opacities"].detach().flatten()) < GROWTH.min_opacity
+        pruned = opacity_from_logits(params["opacities"].detach().flatten()) < GROWTH.min_opacity
         # ... or less than half a pixel in every measured view, ...
         pruned |= measured & (sums["max_pixels"] < _min_pixels(sums["max_pixels"][measured]))
         more = self._num_recycled(count) - int(pruned.sum())
@@ -257,7 +258,7 @@ def contributions(
         frozen = {name: value.detach() for name, value in params.items()}
         frozen["opacities"] = frozen["opacities"].flatten()  # nerfstudio's are [N, 1]
         plain, weighted = render_features(frozen, view, colors).unbind(-1)
-        if (mask := mask_of(view, means.device)) is not None:
+        if (mask := mask_tensor(view, means.device)) is not None:
             plain, weighted = plain * mask, weighted * mask
         (plain.sum() + (weighted * error).sum()).backward()
     assert colors.grad is not None  # noqa: S101  (backward made it)

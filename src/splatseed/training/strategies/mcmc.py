@@ -10,8 +10,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatseed.rendering import MCMCStrategy
-from splatseed.splat.gaussians import SCENE_SCALE
-from splatseed.splat.rendering import opacities_of
+from splatseed.splat.rendering import opacity_from_logits
+from splatseed.splat.training_frame import SCENE_SCALE
 from splatseed.training.device import Capacity, on_one_thread
 from splatseed.training.parameters import MIN_VIEW_DEPTH, Optimizers, Parameters, size_unit
 from splatseed.training.schedule import LEARNING_RATES, Schedule
@@ -63,7 +63,7 @@ class Mcmc(Strategy):
 
     def regularization(self, params: Parameters) -> Float[Tensor, ""]:
         """Return the weighted sum of mean opacity and mean size."""
-        opacities, sizes = opacities_of(params["opacities"]), torch.exp(params["scales"])
+        opacities, sizes = opacity_from_logits(params["opacities"]), torch.exp(params["scales"])
         if MIN_VIEW_DEPTH in params:
             sizes = sizes / size_unit(params)[:, None]
         # 0.01 (mean opacity + mean size): unneeded Gaussians fade, and are relocated.

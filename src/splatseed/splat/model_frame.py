@@ -42,7 +42,7 @@ transform."""
 _FIX = "Name another file, or a word: gsplat, none."
 
 
-def view_in(world: Similarity | None, view: View) -> View:
+def view_in_model_frame(world: Similarity | None, view: View) -> View:
     """A view of the scene, posed in the model's world."""
     if world is None:
         return view
@@ -69,7 +69,7 @@ def find_transform(word: str, scene: Scene) -> Similarity | None:
     return _in_files(scene).then(world)
 
 
-def around_scene(
+def move_to_scene_origin(
     path: Path, scene: Scene, gaussians: Gaussians, note: Callable[[str], None] = lambda _: None
 ) -> Gaussians:
     """Gaussians, read from a path, moved to the origin that the scene is worked on around.
@@ -82,20 +82,20 @@ def around_scene(
         return gaussians
     if recorded is None:
         note(f"The Gaussians of {path} lie far from the scene's origin: {_moved_by(shift)}.")
-    return shifted(gaussians, shift)
+    return translate_gaussians(gaussians, shift)
 
 
 def _moved_by(shift: Float64[np.ndarray, " 3"]) -> str:
     return f"they were moved by {format_offset(shift)} to it"
 
 
-def shifted(gaussians: Gaussians, shift: Float64[np.ndarray, " 3"]) -> Gaussians:
+def translate_gaussians(gaussians: Gaussians, shift: Float64[np.ndarray, " 3"]) -> Gaussians:
     """The Gaussians moved by a shift."""
     means = gaussians.means.astype(np.float64) + shift
     return dataclasses.replace(gaussians, means=means.astype(np.float32))
 
 
-def check_world(
+def check_frame(
     path: Path | None, scene: Scene, gaussians: Gaussians, given: Similarity | None = None
 ) -> str:
     """Refuse a model, read from a path, that is not in the world of the scene's points.
@@ -129,7 +129,7 @@ def check_world(
     )
 
 
-def in_scene_world(path: Path, scene: Scene, gaussians: Gaussians) -> tuple[Gaussians, str]:
+def move_to_scene_frame(path: Path, scene: Scene, gaussians: Gaussians) -> tuple[Gaussians, str]:
     """Gaussians, read from a path, brought into the scene's world, and what there is to say.
 
     They are moved if a transform that their trainer may have applied puts them where the scene's
@@ -145,19 +145,19 @@ def in_scene_world(path: Path, scene: Scene, gaussians: Gaussians) -> tuple[Gaus
     word = min(ratios, key=ratios.__getitem__)
     if word == NO_TRANSFORM or ratios[word] > min(DOUBTFUL, ratios[NO_TRANSFORM] / CLOSER):
         try:
-            return gaussians, check_world(path, scene, gaussians)
+            return gaussians, check_frame(path, scene, gaussians)
         except SceneFormatError as error:
             fix = "Name the scene that they were trained on, or move them into its world."
             raise SceneFormatError(error.expected, found=error.found, fix=fix) from None
     world = find_transform(word, scene)
     assert world is not None  # noqa: S101  (only the word none has no transform)
-    return moved(gaussians, world.inverse), (
+    return transform_gaussians(gaussians, world.inverse), (
         f"The Gaussians of {path} are in their trainer's own world ({word}) and were moved into "
         "the scene's."
     )
 
 
-def moved(gaussians: Gaussians, similarity: Similarity) -> Gaussians:
+def transform_gaussians(gaussians: Gaussians, similarity: Similarity) -> Gaussians:
     """The Gaussians in the similarity's target; their harmonics turn with them."""
     turn = quat_from_rotation(similarity.rotation)
     w, x, y, z = gaussians.quats.astype(np.float64).T

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from splatseed.camera import Camera
-from splatseed.photos.sight import notes_on, sight_of, stray_views
+from splatseed.photos.camera_check import check_cameras, format_stray_note, stray_views
 from splatseed.photos.view import NO_PIXELS, View
 from splatseed.photos.viewpoint import look_at
-from splatseed.splat.gaussians import NEAR_SHARE, training_frame
+from splatseed.splat.training_frame import NEAR_SHARE, training_frame
 
 K = np.array([[140.0, 0, 80], [0, 140.0, 60], [0, 0, 1]])
 UP = np.array([0.0, 0.0, 1.0])
-NOWHERE = np.empty((0, 3))
+NO_POINTS = np.empty((0, 3))
 
 
 def _view(name, eye, target):
@@ -67,7 +67,7 @@ def test_a_few_points_far_away_change_nothing(place, rng):
     stray = _view("stray", np.array(place) * 0.9, place)
     more = np.concatenate([xyz, np.tile(place, (2, 1)) * [[1.0], [1.01]]])
     for seen in (views, [*views, stray]):
-        before, after = sight_of(seen, xyz), sight_of(seen, more)
+        before, after = check_cameras(seen, xyz), check_cameras(seen, more)
         assert after.strays.tolist() == before.strays.tolist()
         assert after.near == pytest.approx(before.near, rel=0.02)
 
@@ -141,7 +141,10 @@ def test_near_depth_and_strays_go_with_the_scene(rng):
             pose[:3, :3] = view.cam_from_world[:3, :3] @ turn.T
             pose[:3, 3] = scale * view.cam_from_world[:3, 3] - pose[:3, :3] @ shift
             moved.append(view.posed(pose))
-        before, after = sight_of(views, xyz), sight_of(moved, scale * xyz @ turn.T + shift)
+        before, after = (
+            check_cameras(views, xyz),
+            check_cameras(moved, scale * xyz @ turn.T + shift),
+        )
         assert after.strays.tolist() == before.strays.tolist()
         assert after.near == pytest.approx(scale * before.near, rel=1e-6)
 
@@ -150,16 +153,16 @@ def test_without_points_one_camera_in_ten_can_be_a_stray(rng):
     """A stereo pair and one wide view, say, or a close-up and a distant flight, have none."""
     views, _ = _station(rng)
     far = _far("close to each other", 3, rng)
-    assert stray_views(views, NOWHERE) == ()
+    assert stray_views(views, NO_POINTS) == ()
     for count in range(4):
-        assert stray_views([*views[:count], far[0]], NOWHERE) == ()
-    assert stray_views([*views[:10], far[0]], NOWHERE) == ("far 0",)
-    assert stray_views([*views, *far], NOWHERE) == ()
-    assert sight_of(views, NOWHERE).near is None
+        assert stray_views([*views[:count], far[0]], NO_POINTS) == ()
+    assert stray_views([*views[:10], far[0]], NO_POINTS) == ("far 0",)
+    assert stray_views([*views, *far], NO_POINTS) == ()
+    assert check_cameras(views, NO_POINTS).near is None
 
 
 def test_all_strays_are_in_one_note():
-    assert notes_on(()) == ()
-    assert "The camera of a is far" in notes_on("a")[0]
-    (note,) = notes_on("abcdefgh")
+    assert format_stray_note(()) == ()
+    assert "The camera of a is far" in format_stray_note("a")[0]
+    (note,) = format_stray_note("abcdefgh")
     assert note.endswith("leave them out (a, b, c, d, e and 3 more).")

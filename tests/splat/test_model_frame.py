@@ -17,8 +17,8 @@ from splatseed.io.origin import translated
 from splatseed.similarity import Similarity, fit_similarity
 from splatseed.splat.evaluate import evaluate_model, load_model
 from splatseed.splat.formats import write_gaussians
-from splatseed.splat.gaussians import initial_gaussians
-from splatseed.splat.world import check_world, find_transform, moved
+from splatseed.splat.from_seeds import initial_gaussians
+from splatseed.splat.model_frame import check_frame, find_transform, transform_gaussians
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +54,9 @@ def other(rng):
 
 def test_what_gsplats_examples_write_is_refused_and_scored_right(room, gaussians, psnr, tmp_path):
     path = tmp_path / "model.ply"
-    write_gaussians(path, moved(gaussians, find_transform("gsplat", load_scene(room))))
+    write_gaussians(
+        path, transform_gaussians(gaussians, find_transform("gsplat", load_scene(room)))
+    )
     with pytest.raises(SceneFormatError, match=r"transform=.gsplat"):
         load_model(path, room)
     right, wrong = (evaluate_model(load_model(path, room, transform=t)) for t in ("gsplat", "none"))
@@ -71,7 +73,7 @@ def test_what_gsplats_examples_write_is_refused_and_scored_right(room, gaussians
 def test_a_file_tells_the_transform(kind, room, gaussians, psnr, other, tmp_path):
     path = tmp_path / "point_cloud/iteration_7/point_cloud.ply"
     path.parent.mkdir(parents=True)
-    write_gaussians(path, moved(gaussians, other))
+    write_gaussians(path, transform_gaussians(gaussians, other))
     rows = other.matrix.tolist()
     unscaled = np.column_stack([other.rotation, other.translation / other.scale]).tolist()
     images = load_scene(room).images
@@ -141,18 +143,18 @@ def test_a_transform_that_would_be_refused_itself_is_not_named(room, gaussians, 
     small = replace(gaussians, means=gaussians.means * np.float32(1e-4))
     for given in (None, find_transform("gsplat", scene)):
         with pytest.raises(SceneFormatError, match="No known transform fits: probably"):
-            check_world(tmp_path / "model.ply", scene, small, given)
+            check_frame(tmp_path / "model.ply", scene, small, given)
 
 
 def test_a_model_that_lies_a_little_apart_is_scored_with_a_doubt(room, gaussians, tmp_path):
     """As another scene's does in a transform that happens to bring it near."""
     scene = load_scene(room)
-    assert not check_world(tmp_path / "model.ply", scene, gaussians)
+    assert not check_frame(tmp_path / "model.ply", scene, gaussians)
     gap = np.median(np.linalg.norm(np.diff(gaussians.means, axis=0), axis=1))
     beside = replace(gaussians, means=gaussians.means + np.float32([0, 0, 0.4 * gap]))
     write_gaussians(tmp_path / "model.ply", beside)
     model = load_model(tmp_path / "model.ply", room)
-    assert "times as far from the nearest Gaussian" in model.doubt
-    assert not load_model(tmp_path / "model.ply", room, transform="none").doubt
+    assert "times as far from the nearest Gaussian" in model.frame_warning
+    assert not load_model(tmp_path / "model.ply", room, transform="none").frame_warning
     few = gaussians.select(np.arange(0, len(gaussians), 8))  # large, they are a model still
-    assert not check_world(tmp_path / "few.ply", scene, few)
+    assert not check_frame(tmp_path / "few.ply", scene, few)

@@ -43,18 +43,18 @@ NAMED = 5  # strays named in a note
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
+class CameraCheck:
     """What views see of a scene."""
 
     strays: Bool[np.ndarray, " V"]
     near: float | None  # the near depth, in the unit of the poses; None without points in sight
 
 
-def sight_of(views: Sequence[View], xyz: Float[np.ndarray, "P 3"]) -> Sight:
+def check_cameras(views: Sequence[View], xyz: Float[np.ndarray, "P 3"]) -> CameraCheck:
     """What views see of finite points, both in one frame."""
     centers = camera_centers(views)
     if not views or not len(xyz):
-        return Sight(_far_from_most(centers), None)
+        return CameraCheck(_far_from_most(centers), None)
     most = max(LEAST_SAMPLE, MOST_PROJECTIONS // len(views))
     sample = np.asfortranarray(xyz[:: -(-len(xyz) // most)], np.float64)
     count, area, near, middle = np.array([_measured(view, sample) for view in views]).T
@@ -70,10 +70,10 @@ def sight_of(views: Sequence[View], xyz: Float[np.ndarray, "P 3"]) -> Sight:
         strays = _far_from_most(centers)
     known = ~strays & (count >= min(LEAST_POINTS, count[~strays].max()))
     depth = float(near[known].min())
-    return Sight(strays, depth if np.isfinite(depth) else None)
+    return CameraCheck(strays, depth if np.isfinite(depth) else None)
 
 
-def shown_points(scene: Scene) -> Float32[np.ndarray, "P 3"]:
+def reference_points(scene: Scene) -> Float32[np.ndarray, "P 3"]:
     """The finite points that show where a scene is: its own, or if it has none, those added."""
     points = scene.points.references
     return np.asarray(points.xyz[points.finite])
@@ -81,16 +81,16 @@ def shown_points(scene: Scene) -> Float32[np.ndarray, "P 3"]:
 
 def stray_views(views: Sequence[View], xyz: Float[np.ndarray, "P 3"]) -> tuple[str, ...]:
     """Names of the views whose cameras are strays, in a scene of these finite points, if any."""
-    strays = sight_of(views, xyz).strays
+    strays = check_cameras(views, xyz).strays
     return tuple(view.name for view, stray in zip(views, strays, strict=True) if stray)
 
 
-def stray_notes(scene: Scene) -> tuple[str, ...]:
+def stray_camera_notes(scene: Scene) -> tuple[str, ...]:
     """A note for the user that names a scene's stray cameras; none without them."""
-    return notes_on(stray_views(camera_views(scene.images), shown_points(scene)))
+    return format_stray_note(stray_views(camera_views(scene.images), reference_points(scene)))
 
 
-def notes_on(names: Sequence[str]) -> tuple[str, ...]:
+def format_stray_note(names: Sequence[str]) -> tuple[str, ...]:
     """A note for the user about stray cameras of these names; none without them."""
     if not names:
         return ()

@@ -1,0 +1,59 @@
+"""Images of renders and of their errors, written as PNG files."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32, UInt8
+from matplotlib import colormaps
+from PIL import Image
+
+from splatseed.io.files import StrPath
+from splatseed.io.staging import atomic_file
+
+GAP = 4  # white columns between the images of a row
+
+
+def flip_heatmap(errors: Float32[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W 3"]:
+    """FLIP of each pixel in the colours of its authors: black is 0, the brightest 1."""
+    return np.asarray(colormaps["magma"](errors, bytes=True)[..., :3], np.uint8)
+
+
+def to_uint8(image: Float32[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
+    """Colours in [0, 1] as 8-bit integers; others are clamped."""
+    return np.asarray(np.rint(np.clip(image, 0, 1) * 255), np.uint8)
+
+
+def write_comparison(
+    path: StrPath,
+    photograph: UInt8[np.ndarray, "H W 3"],
+    render: Float32[np.ndarray, "H W 3"],
+    errors: Float32[np.ndarray, "H W"],
+) -> None:
+    """Write a PNG of photograph, render and FLIP in a row."""
+    gap = np.full((len(photograph), GAP, 3), 255, np.uint8)
+    row = [photograph, gap, to_uint8(render), gap, flip_heatmap(errors)]
+    with atomic_file(Path(path)) as partial:
+        Image.fromarray(np.concatenate(row, axis=1)).save(partial)
+
+
+def picture_names(image_names: Iterable[str]) -> dict[str, str]:
+    """The file name of each image's picture; folders in an image's name become part of it.
+
+    Where a.jpg and a.jpeg would have the same, the later one becomes a-2.png.
+
+    Example:
+        >>> picture_names(["a/b.jpg", "a_b.jpg", "a/c.jpg"])
+        {'a/b.jpg': 'a_b.png', 'a_b.jpg': 'a_b-2.png', 'a/c.jpg': 'a_c.png'}
+    """
+    pictures: dict[str, str] = {}  # the image of each picture
+    for name in image_names:
+        stem = Path(name).with_suffix("").as_posix().replace("/", "_")
+        picture, number = f"{stem}.png", 1
+        while picture in pictures:
+            number += 1
+            picture = f"{stem}-{number}.png"
+        pictures[picture] = name
+    return {name: picture for picture, name in pictures.items()}

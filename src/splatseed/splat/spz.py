@@ -1,0 +1,206 @@
+"""Read and write Niantic's .spz: one attribute after another, in gzip or zstd (version 4).
+
+Axes are right, up, back; ours are right, down, front: y and z change sign. Source: nianticlabs/spz
+(load-spz.cc, splat-types.h).
+"""
+
+from __future__ import annotations
+
+import gzip
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from splatseed.errors import ParameterError
+from splatseed.io.files import COPY_AGAIN, read_bytes, translate_errors
+from splatseed.progress import Note, silent_note
+from splatseed.requirements import require
+from splatseed.runtime.memory import check_memory
+from splatseed.splat.extent import COARSE, Fit, best_fit, left_out_note, morton_order
+from splatseed.splat.gaussians import Gaussians
+from splatseed.splat.quantization import (
+    SH_COUNTS,
+    from_smallest_three,
+    opacity_bytes,
+    opacity_logits,
+    rounded_bytes,
+    smallest_three,
+)
+from splatseed.text import agreeing, counted
+
+MAGIC = b"NGSP"
+_HEADER = struct.Struct("<4sIIBBBB")
+_VERSION = 3  # the latest that every reader accepts
+_MAX_FIXED, _MAX_BITS = 2**23 - 1, 20
+"""Largest position in units of 2^-f, 24 bits with a sign; largest f."""
+_ANTIALIASED = 1
+"""The flag of models that are to be rendered with antialiasing."""
+_SH_COUNTS = (*SH_COUNTS, 24)
+"""Coefficients beyond the first by degree; those of degree 4 are not used."""
+_LOG_SCALES = (-10.0, 255 / 16 - 10)
+"""Log-scales that a byte holds."""
+_MAX_LOST_SHARE = 0.1
+"""Share of the picture that far Gaussians may take with them, where no bits would hold them."""
+_NINE_BITS = np.float32(511 * np.sqrt(2))
+_COLOR = 0.15 * 255
+"""Bytes per unit of the first coefficient: the format's scale."""
+_AXES = np.array([1, -1, -1], np.float32)
+_QUAT = np.array([1, 1, -1, -1], np.float32)
+_SH = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
+"""Signs of the spherical harmonics of degrees 1 to 3 when y and z are flipped."""
+_STEP = 4
+"""Further coefficients are rounded to this many 128ths, so that gzip saves more. Niantic's writer
+takes 8 for the first degree and 16 for the others: files are a quarter smaller, but coefficients of
+a short run vanish, and with them up to 2.8 dB (docs/formats.md)."""
+
+
+def encode(gaussians: Gaussians, note: Note = silent_note) -> list[bytes]:
+    """In Z-curve order, of degree 3 at most.
+
+    Raises:
+        ParameterError: Positions are beyond what the format can hold.
+    """
+    gaussians, bits = _fixed_point(gaussians, note)
+    order = morton_order(gaussians.means)
+    rest = gaussians.shN.shape[1]
+    # A position in units of 2^-f; a coefficient c beyond the first as 128 c + 128.
+    fixed = np.rint(gaussians.means[order] * _AXES * np.float64(2**bits)).astype("<i4")
+    sh = np.rint(gaussians.shN[order] * _SH[:rest, None] * 128 + 128)
+    # From the highest bits: the index of the largest of xyzw, then signs and sizes of the others.
+    quats = gaussians.quats[order] * _QUAT
+    largest, three = smallest_three(np.roll(quats, -1, axis=1))
+    turn = largest.astype(np.uint32)
+    for i in range(3):
+        part = np.minimum(np.rint(np.abs(three[:, i]) * _NINE_BITS), 511).astype(np.uint32)
+        turn = (turn << 10) | ((three[:, i] < 0).astype(np.uint32) << 9) | part
+    parts = [
+        fixed.view(np.uint8).reshape(-1, 4)[:, :3],  # 24 bits a component
+        opacity_bytes(gaussians.opacities[order]),
+        rounded_bytes(gaussians.sh0[order, 0] * _COLOR + 127.5),  # 255 (0.15 c + 1/2)
+        rounded_bytes((gaussians.scales[order] + 10) * 16),  # of log-scales
+        turn.astype("<u4"),
+        rounded_bytes(np.floor((sh + _STEP // 2) / _STEP) * _STEP),
+    ]
+    degree = SH_COUNTS.index(rest)
+    flags = _ANTIALIASED * gaussians.antialiased
+    header = _HEADER.pack(MAGIC, _VERSION, len(order), degree, bits, flags, 0)
+    body = b"".join(np.ascontiguousarray(part).tobytes() for part in parts)
+    return [gzip.compress(header + body, 6, mtime=0)]
+
+
+def _fixed_point(gaussians: Gaussians, note: Note) -> tuple[Gaussians, int]:
+    """The Gaussians that the format holds, and the fractional bits of their positions.
+
+    All have the same bits: the most that hold every position, unless a few far ones would cost the
+    others their place.
+    """
+    farthest = np.abs(gaussians.means.astype(np.float64)).max(axis=1)
+    fits = [Fit(farthest <= _MAX_FIXED / 2.0**bits, 2.0**-bits) for bits in range(_MAX_BITS + 1)]
+    whole = [bits for bits, fit in enumerate(fits) if fit.kept.all()]
+    first = max(whole, default=0)
+    chosen, lost, error = best_fit(gaussians, fits[first:])
+    bits = first + chosen
+    kept, most = fits[bits].kept, _MAX_FIXED / 2.0**bits
+    if not kept.any() or (not whole and lost > _MAX_LOST_SHARE):
+        raise ParameterError(
+            f"positions within {_MAX_FIXED:,} of the origin, which is all that .spz can hold",
+            found=f"one at {farthest.max():.3g}",
+            fix="Export another format, or crop the model.",
+        )
+    if not kept.all():
+        note(left_out_note(".spz", kept, f"more than {most:,.4g} units from the origin"))
+    if error > COARSE:
+        steps = f"up to {most:,.4g} units from the origin in steps of {2.0**-bits:.3g}"
+        note(
+            f"A .spz holds positions {steps}, too coarse for this model: export another format, or "
+            "move the model to the origin."
+        )
+    scales = np.sort(gaussians.scales[kept], axis=1)  # of a flat Gaussian the least does not count
+    beyond = (scales[:, 2] > _LOG_SCALES[1]) | (scales[:, 1] < _LOG_SCALES[0])
+    if number := int(np.count_nonzero(beyond)):
+        least, largest = np.exp(_LOG_SCALES)
+        note(
+            f"A .spz holds sizes from {least:.2g} to {largest:.0f} units: "
+            f"{counted(number, 'Gaussian')} {agreeing(number, 'has', 'have')} the nearest."
+        )
+    return gaussians if kept.all() else gaussians.select(kept), bits
+
+
+def decode(path: Path, note: Note = silent_note) -> Gaussians:
+    """Of any version; 4 needs zstandard."""
+    data = read_bytes(path)
+    with translate_errors(path, "a whole .spz"):
+        stream = zlib.decompressobj(wbits=31)
+        in_zstd = data.startswith(MAGIC)
+        header = data if in_zstd else stream.decompress(data, _HEADER.size)
+        _, version, count, degree, bits, flags, _ = _HEADER.unpack_from(header)
+        if not 1 <= version <= 4:
+            raise ValueError(f"version {version}; versions 1 to 4 are known")
+        if degree >= len(_SH_COUNTS) or count == 0 or bits > 24:
+            raise ValueError(f"{count} Gaussians of degree {degree}, {bits} fractional bits")
+        rest = _SH_COUNTS[degree]
+        # Position, opacity, colour, scale, rotation, harmonics: bytes per Gaussian.
+        sizes = [6 if version == 1 else 9, 1, 3, 3, 3 if version < 3 else 4, 3 * rest]
+        check_memory(count, sum(sizes), "Gaussians", fix=COPY_AGAIN)
+        wanted = count * sum(sizes)
+        if in_zstd:
+            body = _zstd_body(data, count, [size for size in sizes if size])
+        else:  # up to the size in the header: no zip bomb is unpacked
+            body = stream.decompress(stream.unconsumed_tail, wanted)
+        if not (in_zstd or stream.eof):  # to its checksum, and past what a newer version may add
+            stream.decompress(stream.unconsumed_tail, wanted)
+        if len(body) != wanted or not (in_zstd or stream.eof):
+            raise ValueError(f"a stream that ends after {len(body):,} of {wanted:,} bytes")
+        parts = np.split(np.frombuffer(body, np.uint8), count * np.cumsum(sizes)[:-1])
+        position, opacity, color, scale, turn, sh = (part.reshape(count, -1) for part in parts)
+        harmonics = (sh.reshape(count, rest, 3).astype(np.float32) - 128) / 128
+        if rest > len(_SH):
+            note(f"Of {rest} coefficients beyond the first, the {len(_SH)} of degree 3 are used.")
+            rest, harmonics = len(_SH), harmonics[:, : len(_SH)]
+        if version == 1:  # half floats
+            means = np.ascontiguousarray(position).view("<f2").astype(np.float32)
+        else:
+            digits = position.reshape(-1, 3, 3).astype(np.int32)
+            fixed = digits[..., 0] | digits[..., 1] << 8 | digits[..., 2] << 16
+            fixed = np.where(fixed > _MAX_FIXED, fixed - 2**24, fixed)
+            means = (fixed / 2.0**bits).astype(np.float32)
+        return Gaussians(
+            means=means * _AXES,
+            scales=(scale / 16 - 10).astype(np.float32),
+            quats=_quats(turn) * _QUAT,
+            opacities=opacity_logits(opacity[:, 0]),
+            sh0=((color - 127.5) / _COLOR).astype(np.float32)[:, None],
+            shN=np.asarray(harmonics * _SH[:rest, None], np.float32),
+            antialiased=bool(flags & _ANTIALIASED),
+        )
+
+
+def _zstd_body(data: bytes, count: int, sizes: list[int]) -> bytes:
+    """The attributes of version 4, whose header ends in the offset of a table of their streams."""
+    require("zstandard")
+    import zstandard  # noqa: PLC0415  (of the extra view)
+
+    (table,) = struct.unpack_from("<I", data, _HEADER.size)
+    at, body = table + 16 * len(sizes), b""
+    for i, size in enumerate(sizes):
+        length, _ = struct.unpack_from("<QQ", data, table + 16 * i)
+        body += zstandard.ZstdDecompressor().decompress(
+            data[at : at + length], max_output_size=count * size
+        )
+        at += length
+    return body
+
+
+def _quats(raw: UInt8[np.ndarray, "N B"]) -> Float32[np.ndarray, "N 4"]:
+    if raw.shape[1] == 3:  # a byte for each of x, y, z; w >= 0 follows
+        xyz = raw / np.float32(127.5) - 1
+        w = np.sqrt(np.maximum(1 - (xyz**2).sum(axis=1, keepdims=True), 0))
+        return np.hstack([w, xyz]).astype(np.float32)
+    packed = np.ascontiguousarray(raw).view("<u4")[:, 0]
+    fields = np.stack([(packed >> shift) & 1023 for shift in (20, 10, 0)], axis=1)
+    size = (fields & 511) / _NINE_BITS
+    three = np.where(fields >> 9, -size, size).astype(np.float32)
+    return np.roll(from_smallest_three((packed >> 30).astype(np.int64), three), 1, axis=1)
