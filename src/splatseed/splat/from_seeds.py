@@ -15,7 +15,6 @@ from scipy.spatial import cKDTree
 from splatseed.errors import PointCloudError
 from splatseed.photos.camera_check import camera_centers
 from splatseed.photos.view import View
-from splatseed.photos.zbuffer import visible_points
 from splatseed.pointcloud import PointCloud
 from splatseed.splat.gaussians import SH_C0, SH_C1, Gaussians
 
@@ -118,6 +117,9 @@ def fit_harmonics(seeds: PointCloud, views: Sequence[View]) -> Float32[np.ndarra
     sum_v |1/2 + y(d_v) h - p_v|^2 + OWN |1/2 + C0 h_0 - p|^2 + EVEN |C1 h_1..3|^2 in each colour
     channel. A seed that no view sees keeps its colour. Views are in the seeds' frame.
     """
+    # Loads Numba, for which `upsample --help` would wait.
+    from splatseed.photos.zbuffer import visible_points  # noqa: PLC0415
+
     xyz = np.ascontiguousarray(seeds.xyz, np.float32)
     # Normal equations; OWN and EVEN make them regular even for a seed that no view sees.
     normal = np.tile(np.diag([OWN * SH_C0**2, *[EVEN * SH_C1**2] * 3]), (len(xyz), 1, 1))
