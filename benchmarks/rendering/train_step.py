@@ -146,7 +146,7 @@ def _stages(trainer: Trainer) -> dict[str, Sequence[Place]]:
         "loss backward": [(_Loss, "backward")],
         "photograph": [(trainer._photographs, "of")],  # noqa: SLF001  (likewise)
         "Adam": [(each, name) for each in optimizers for name in ("step", "zero_grad")],
-        "strategy": [(strategy, "before"), (strategy, "after")],
+        "strategy": [(strategy, "before_backward"), (strategy, "after_step")],
     }
 
 

@@ -107,7 +107,7 @@ ARMS: Mapping[str, Arm] = {
     "- faster forgetting of gradients": Arm("default", _set(beta2=0.999)),
     "+ faster opacities": Arm("default", _times(opacities=4.0)),
     "+ all rates fall to 0.3": Arm("default", _falling(0.3)),
-    "- bound on first sizes": Arm("default", _set(largest=UNBOUNDED)),
+    "- bound on first sizes": Arm("default", _set(max_size=UNBOUNDED)),
     "densified from 1/6 to 3/5 of the run": Arm("default", _parts(1 / 6, 3 / 5)),
     "densified up to 3/4 of the run": Arm("default", _parts(1 / 60, 3 / 4)),
     "harmonics each fifth of the run": Arm("default", _late_harmonics),

@@ -92,7 +92,7 @@ def test_a_folder_that_is_not_the_peers_is_refused(bench, tmp_path):
         ({"arms": ("gsplat-default", "brush")}, "found brush"),
         ({"repeats": 0}, "--repeats of 1 or more"),
         ({"cap_default": True}, "--cap-max with --cap-default"),
-        ({"max_steps": 0}, "--max-steps"),
+        ({"max_steps": 0}, "max_steps"),
     ],
 )
 def test_options_that_make_no_sense_are_refused(bench, wrong, says):

@@ -408,7 +408,7 @@ def test_a_full_output(room, splatseed, monkeypatch):
 
 
 def _run_folder(path):
-    RunFolder(path).begin({"splatseed": "0"})
+    RunFolder(path).create({"splatseed": "0"})
     (path / "point_cloud.ply").touch()
 
 

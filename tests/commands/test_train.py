@@ -79,7 +79,7 @@ def refining(room, monkeypatch):
 
     def reconstruct(folder, output, settings, **how):
         assert how["refine_poses"]
-        assert how["held_out"] == {image.name for image in truth.split(8)[1]}
+        assert how["test_names"] == {image.name for image in truth.split(8)[1]}
         calls.append(folder)
         write_scene(truth, output)
         change = Refinement(False, 9.0, 0.5, 0.1, 0.2, 0.1, 0.2)

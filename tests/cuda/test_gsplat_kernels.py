@@ -84,4 +84,4 @@ def test_a_build_that_fails_is_one_sentence(machine, tmp_path):
     out, err = _start(machine).communicate()
     assert not err
     assert "nvcc fatal : no such thing" in out
-    assert "--backend cpu" in out
+    assert "`backend='cpu'`" in out

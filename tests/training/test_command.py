@@ -154,7 +154,7 @@ def test_large_photographs_are_smaller_by_default_and_stay_so(
 
     with monkeypatch.context() as patch:
         patch.setattr(Trainer, "_advance", step)
-        for module in ("training.settings", "photos.view"):
+        for module in ("training.settings", "photos.sizes"):
             patch.setattr(f"splatseed.{module}.TRAINED_SIDE", 48)
         assert _run(room_path, "--max-steps", "3", "--strategy", "none", "-o", run) == 130
     assert (

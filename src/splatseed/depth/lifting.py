@@ -121,7 +121,7 @@ def _images_with_maps(scene: Scene, settings: DepthSettings, notes: list[str]) -
         raise SceneNotFoundError(
             "a scene with depth maps of its images",
             found=f"{len(scene.images)} images, and maps of none of them",
-            fix="Pass the folder with the maps as `depth`, or maps to scene.with_depths.",
+            fix="Name the folder of the maps with `depth` (in Python: scene.with_depths).",
         )
     if lacking := sum(image.name not in depths for image in used):
         verbs = agreeing(lacking, "has no depth map and gives", "have no depth map and give")

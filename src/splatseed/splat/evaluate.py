@@ -92,6 +92,7 @@ def evaluate_views(
 
     Example:
         >>> import numpy as np, torch
+        >>> from splatseed.camera import Camera
         >>> grey = np.full((16, 16, 3), 128, np.uint8)
         >>> view = View("grey.png", grey, Camera(np.eye(3), 16, 16, np.eye(4)))
         >>> result = evaluate_views(lambda view: torch.zeros(16, 16, 3), [view])

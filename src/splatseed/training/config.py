@@ -89,7 +89,7 @@ def resumed_settings(
         if now[name] != value and (name in explicit or now[name] != default[name]):
             raise ParameterError(
                 f"`{name}={value!r}`, as when the run began",
-                found=f"{now[name]}",
+                found=f"`{name}={now[name]!r}`",
                 fix="Leave it out to resume, or start again with `overwrite=True`.",
             )
     refined = then.pop("refine_poses") is True

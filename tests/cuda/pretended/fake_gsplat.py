@@ -13,7 +13,7 @@ import torch
 from gsplat.cuda._torch_impl import _quat_scale_to_covar_preci, _spherical_harmonics
 from pretend_cuda import Pretend, check_input, elem, note
 
-from splatseed.rendering.autograd import Blend, Lens, Project
+from splatseed.rendering.autograd import Blend, ProjectionParams, Project
 from splatseed.rendering.mcmc import compute_relocation
 from splatseed.rendering.rasterize import intersect
 
@@ -38,7 +38,7 @@ def _vjp(function, inputs, gradients):
 
 def _lens(Ks, width, height, near, far, eps2d, radius_clip, antialiased):
     K = elem(Ks)[0].numpy()
-    return Lens(K, width, height, near, far, eps2d, radius_clip, antialiased)
+    return ProjectionParams(K, width, height, near, far, eps2d, radius_clip, antialiased)
 
 
 def _blend(means2d, conics, colors, opacities, backgrounds, width, height):
