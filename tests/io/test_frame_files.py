@@ -47,7 +47,7 @@ def files_of(scene):
 
 
 @pytest.mark.parametrize(
-    ("named", "there", "told"),
+    ("named", "there", "num_notes"),
     [
         ("images\\{}.png", "images/{}.png", False),
         (".\\images\\{}.png", "images/{}.png", False),
