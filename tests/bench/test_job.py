@@ -139,7 +139,9 @@ def test_points_of_photographs_are_made_once_for_all_budgets(
     plain, _ = make_seeds(scene, spec)
     first, seconds = make_seeds(scene, spec, bench=tmp_path)
     assert seeds_digest(first) == seeds_digest(plain)
-    monkeypatch.setattr("splatseed.seeding.upsampling.upsample", lambda *_, **__: pytest.fail("made again"))
+    monkeypatch.setattr(
+        "splatseed.seeding.upsampling.upsample", lambda *_, **__: pytest.fail("made again")
+    )
     again, later = make_seeds(scene, spec, bench=tmp_path)
     assert seeds_digest(again) == seeds_digest(plain)
     assert later > 0.3 * seconds
