@@ -13,7 +13,6 @@ from PIL import Image as PilImage
 pytest.importorskip("torch", reason="training needs PyTorch")
 pytest.importorskip("gsplat", reason="training needs gsplat's strategies")
 
-from splatseed.bench import job
 from splatseed.bench.job import (
     RunOptions,
     execute_runs,
