@@ -304,10 +304,10 @@ def _train(options: Options) -> bool:
     folder, steps = options.output, options.train_steps
     scenes = [f"scene_{name}" for name in (RANDOM, POSES)]
     add_files(folder, [*(f"run_{name}" for name in ARMS), *scenes, TRAINED_PICTURE])
-    most = read_manifest(folder / f"scene_{SHOWN}")["num_points"]
+    budget = read_manifest(folder / f"scene_{SHOWN}")["num_points"]
     # On the CPU also where there is a GPU, for which gsplat's kernels would be built first.
     settings = TrainSettings(
-        strategy="default", cap_max=most, max_steps=steps, seed=SEED, backend="cpu"
+        strategy="default", cap_max=budget, max_steps=steps, seed=SEED, backend="cpu"
     )
     with stage_display() as clock:
         seconds = _seed_poses_alone(folder, clock)

@@ -121,7 +121,7 @@ def run(arguments: list[str]) -> None:
 def _score(
     options: Options, evaluation: Evaluation, model: TrainedModel, clock: StageClock
 ) -> EvalResult:
-    """Score the test views and write the files that were asked for."""
+    """Score the test views and write the requested files."""
     from splatseed.splat.pictures import picture_names, write_comparison
 
     score = partial(evaluation.score, model, lpips_weights=options.lpips_weights, progress=clock)

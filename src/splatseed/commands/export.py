@@ -88,8 +88,8 @@ def run(arguments: list[str]) -> None:
         if cleans:
             from splatseed.training.floaters import floaters_of_model
 
-            asked = ("data_factor", "test_every")
-            numbers = {n: value for n in asked if isinstance(value := config.get(n), int)}
+            names = ("data_factor", "test_every")
+            numbers = {n: value for n in names if isinstance(value := config.get(n), int)}
             masks = config.get("masks")
             floaters = floaters_of_model(
                 path, Path(str(scene)), masks=masks, progress=clock, **numbers

@@ -59,8 +59,8 @@ class Planned(NamedTuple):
         if max_steps != FULL_RUN:
             flags = f"{flags}--max-steps {max_steps} "
         settings = TrainSettings(strategy="auto", max_steps=max_steps, cap_max=number)
-        most = settings.max_seeds(number)
-        return cls(number, max_steps, settings.densification, most, flags)
+        max_seeds = settings.max_seeds(number)
+        return cls(number, max_steps, settings.densification, max_seeds, flags)
 
 
 def advice_commands(

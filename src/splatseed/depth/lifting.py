@@ -2,7 +2,7 @@
 
 Notation: images give C *candidates* in all. A candidate is *sound* (``tier`` 0) if enough views
 confirm it, no view sees through it, and no depth discontinuity is near. Promise: ``lift`` returns
-exactly the number asked for, or raises one error with the number that is possible. Sound candidates
+exactly the requested number, or raises one error with the number that is possible. Sound candidates
 come first, then those that too few views confirm, then those near discontinuities; a note counts
 the latter two. Points that a view sees through are used only if the settings allow it. Within a
 tier, points are spread evenly in space, or images give equal numbers as far as they can. Results do

@@ -6,7 +6,7 @@ of the map and the photograph, with which other images' candidates are compared.
 w = 1 / depth is linear in the image on a plane at any slant, so w(-k) + w(+k) = 2 w(0) there, and a
 discontinuity shows as a residual.
 Promise: each file is read once. Pixels drawn have depth, lie away from discontinuities and where
-SfM has few points; none is drawn twice; there are at least as many as asked for, or all there are.
+SfM has few points; none is drawn twice; there are at least the requested number, or all there are.
 Candidates depend on the image, the seed and the settings only, not on threads or other images.
 """
 

@@ -129,8 +129,8 @@ def _read_seeds(folder: Path, points: PointCloud) -> tuple[dict[str, np.ndarray]
         known = {n: a if n == "source" else a.astype(np.float32) for n, a in arrays.items()}
         points.replace(**known)  # checks the values
     except (*ARCHIVE_FAILURES, PointCloudError) as error:
-        told = f"{SEEDS} was ignored: it is damaged, or not splatseed's"
-        return {}, (f"{told} ({type(error).__name__}).",)
+        warning = f"{SEEDS} was ignored: it is damaged, or not splatseed's"
+        return {}, (f"{warning} ({type(error).__name__}).",)
     return known, ()
 
 

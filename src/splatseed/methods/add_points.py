@@ -51,7 +51,7 @@ def add_points(
         chosen, name = configure(method, profile, **parameters), method
     elif extra := [*parameters, *(["profile"] if profile != "default" else [])]:
         raise ParameterError(
-            f"nothing beside {method!r}, which has its own parameters",
+            f"no parameters next to {method!r}, which has its own",
             found=", ".join(extra),
             fix="Give the method by name, or set its fields with dataclasses.replace.",
         )

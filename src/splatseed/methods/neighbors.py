@@ -108,10 +108,10 @@ class PreparedCloud:
 
         in_threads(query, len(self), QUERY_BLOCK, "neighbours", self.progress)
         farthest = float(np.abs(self.xyz).max())
-        return Neighbors(idx, distances_of(self.xyz, idx, least_distance(farthest)))
+        return Neighbors(idx, distances_of(self.xyz, idx, min_distance(farthest)))
 
 
-def least_distance(farthest: float) -> float:
+def min_distance(farthest: float) -> float:
     """Return the smallest distance of points whose largest centred coordinate is ``farthest``.
 
     It replaces 0 for points that centring in float64 has made equal.
@@ -214,11 +214,11 @@ def sound_bases(cloud: PreparedCloud, neighbors: Neighbors) -> Float64[np.ndarra
     # The lower quartile, which a few outliers among the neighbours do not move.
     nth = idx.shape[1] // 4
 
-    def judge(start: int, stop: int) -> None:
+    def check(start: int, stop: int) -> None:
         quartile = np.partition(spacing[idx[start:stop]], nth, axis=1)[:, nth]
         isolated[start:stop] = spacing[start:stop] > OUTLIER_FACTOR * quartile
 
-    in_threads(judge, len(idx), QUERY_BLOCK, "isolated points", silent)
+    in_threads(check, len(idx), QUERY_BLOCK, "isolated points", silent)
     return np.asarray(cloud.trusted & ~isolated, np.float64)
 
 
@@ -295,16 +295,16 @@ def sort_rows(
 
 
 def distances_of(
-    xyz: Float64[np.ndarray, "n 3"], idx: Int32[np.ndarray, "m k"], least: float
+    xyz: Float64[np.ndarray, "n 3"], idx: Int32[np.ndarray, "m k"], minimum: float
 ) -> Float64[np.ndarray, "m k"]:
-    """Compute the distances of the first m rows from their neighbours, at least ``least``."""
+    """Compute the distances of the first m rows from their neighbours, at least ``minimum``."""
     distance = np.empty(idx.shape)
 
     def fill(start: int, stop: int) -> None:
         apart = xyz[idx[start:stop]] - xyz[start:stop, None]
         apart *= apart
         squared = apart[..., 0] + apart[..., 1] + apart[..., 2]
-        distance[start:stop] = np.maximum(np.sqrt(squared), least)
+        distance[start:stop] = np.maximum(np.sqrt(squared), minimum)
 
     in_threads(fill, len(idx), QUERY_BLOCK, "distances", silent)
     return distance
