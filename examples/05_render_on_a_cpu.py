@@ -1,4 +1,4 @@
-"""Fit Gaussians to a picture with code written for gsplat, on a machine without a GPU.
+"""Fit Gaussians to an image with code written for gsplat, without a GPU.
 
 python examples/05_render_on_a_cpu.py [STEPS]
 """
@@ -21,9 +21,9 @@ NUM_GAUSSIANS = 600
 
 
 def main(steps: int) -> None:
-    """Fit, and write what came out beside the picture."""
-    picture = make_capture(seed=0, num_views=3, width=160, height=120).images[0]
-    truth = torch.tensor(picture) / 255.0
+    """Fit Gaussians, and write image and render side by side."""
+    image = make_capture(seed=0, num_views=3, width=160, height=120).images[0]
+    truth = torch.tensor(image) / 255.0
     height, width, _ = truth.shape
     K = torch.tensor([[80.0, 0, width / 2], [0, 80.0, height / 2], [0, 0, 1]])
     camera = {"viewmats": torch.eye(4)[None], "Ks": K[None], "width": width, "height": height}
@@ -38,9 +38,9 @@ def main(steps: int) -> None:
         "opacities": torch.zeros(NUM_GAUSSIANS),
         "colors": torch.zeros(NUM_GAUSSIANS, 3),
     }
-    optimizer = torch.optim.Adam([each.requires_grad_() for each in params.values()], lr=0.02)
+    optimizer = torch.optim.Adam([param.requires_grad_() for param in params.values()], lr=0.02)
     for step in range(steps + 1):
-        images, _, _ = rasterization(
+        renders, _, _ = rasterization(
             means=params["means"],
             quats=params["quats"],
             scales=torch.exp(params["scales"]),
@@ -48,15 +48,15 @@ def main(steps: int) -> None:
             colors=torch.sigmoid(params["colors"]),
             **camera,
         )
-        loss = (images[0] - truth).square().mean()
+        loss = (renders[0] - truth).square().mean()
         if step % (steps // 4) == 0:
             print(f"step {step:4d}: {-10 * float(loss.detach().log10()):.2f} dB")
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-    render = (images[0].detach().clamp(0, 1).numpy() * 255).round().astype(np.uint8)
-    Image.fromarray(np.hstack([picture, render])).save("fitted.png")
-    print("fitted.png: the picture, and what was fitted to it")
+    render = (renders[0].detach().clamp(0, 1).numpy() * 255).round().astype(np.uint8)
+    Image.fromarray(np.hstack([image, render])).save("fitted.png")
+    print("wrote fitted.png: the image and its fit")
 
 
 if __name__ == "__main__":

@@ -31,7 +31,7 @@ def _camera(quat, translation=(0.3, -0.2, 4.0)):
 
 
 @given(QUATS)
-def test_quaternions_come_back(quat):
+def test_quaternions_round_trip(quat):
     unit, rotation = quat / np.linalg.norm(quat), rotation_from_quat(quat)
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
     back = quat_from_rotation(rotation)
@@ -40,14 +40,14 @@ def test_quaternions_come_back(quat):
     assert abs(back @ unit) == pytest.approx(1, abs=1e-12)  # q and -q turn alike
 
 
-def test_a_matrix_that_is_not_quite_a_rotation_gives_the_nearest(rng):
+def test_an_inexact_rotation_gives_the_nearest_quaternion(rng):
     exact = rotation_from_quat(rng.normal(size=4))
     quat = quat_from_rotation(exact + 1e-6 * rng.normal(size=(3, 3)))
     np.testing.assert_allclose(rotation_from_quat(quat), exact, atol=1e-5)
 
 
 @given(QUATS)
-def test_unproject_undoes_project(quat):
+def test_unproject_inverts_project(quat):
     camera = _camera(quat)
     rng = np.random.default_rng(0)
     uv, depth = rng.uniform(0, [320, 240], (20, 2)), rng.uniform(0.5, 9, 20)
@@ -56,7 +56,7 @@ def test_unproject_undoes_project(quat):
     np.testing.assert_allclose(back_depth, depth, atol=1e-9)
 
 
-def test_what_is_not_in_front_has_no_pixel():
+def test_points_behind_the_camera_have_no_pixel():
     camera = _camera([1, 0, 0, 0], (0, 0, 0))
     uv, depth = camera.project(np.array([[0, 0, -1.0], [1, 1, 0], [0, 0, 1]]))
     assert np.isnan(uv[:2]).all()
@@ -65,7 +65,7 @@ def test_what_is_not_in_front_has_no_pixel():
 
 
 @pytest.mark.parametrize("name", CAMERA_MODELS)
-def test_models_are_colmaps(name):
+def test_models_match_colmap(name):
     model = CAMERA_MODELS[name]
     theirs = pycolmap.Camera.create_from_model_name(1, name, 500.0, 640, 480)
     numbers = len(theirs.params), len(theirs.focal_length_idxs())
@@ -87,7 +87,7 @@ def test_all_of_pycolmaps_models_are_known():
     assert {model.name: model.model_id for model in known} == ids
 
 
-def test_projection_is_colmaps(rng):
+def test_projection_matches_pycolmap(rng):
     ours = _camera([0.9, 0.1, -0.2, 0.3])
     pose = pycolmap.Rigid3d(ours.cam_from_world[:3])
     theirs = pycolmap.Camera(model="PINHOLE", width=320, height=240, params=[300, 310, 160, 120])
@@ -98,14 +98,14 @@ def test_projection_is_colmaps(rng):
 
 
 @pytest.mark.parametrize(
-    ("model", "params", "says"),
+    ("model", "params", "named"),
     [
         ("POLAROID", (1.0,) * 4, "'POLAROID'"),
-        ("EQUIRECTANGULAR", (9.0, 5.0), "panoramas"),
+        ("EQUIRECTANGULAR", (9.0, 5.0), "EQUIRECTANGULAR"),
         ("PINHOLE", (1.0,) * 3, "4 parameters; found 3"),
     ],
 )
-def test_records_that_are_none(model, params, says):
-    with pytest.raises(SceneFormatError, match=says) as error:
+def test_invalid_records_are_refused(model, params, named):
+    with pytest.raises(SceneFormatError, match=named) as error:
         Intrinsics(17, model, 10, 10, params)
     assert "camera 17" in str(error.value)

@@ -29,7 +29,7 @@ def rays(rng):
     return np.concatenate([np.zeros((1, 2)), rng.uniform(-0.8, 0.8, (200, 2))])
 
 
-def test_pixels_are_colmaps(lens, rays):
+def test_pixels_match_pycolmap(lens, rays):
     pycolmap = pytest.importorskip("pycolmap", reason="the reference for camera models")
     camera = pycolmap.Camera(
         model=lens.model, width=lens.width, height=lens.height, params=list(lens.params)
@@ -38,14 +38,14 @@ def test_pixels_are_colmaps(lens, rays):
     np.testing.assert_allclose(project_rays(lens, rays), expected, atol=1e-10)
 
 
-def test_the_way_back_leads_to_the_ray(lens, rays):
+def test_unproject_inverts_project_rays(lens, rays):
     np.testing.assert_allclose(unproject_pixels(lens, project_rays(lens, rays)), rays, atol=1e-7)
     grid = rays[:200].reshape(20, 10, 2)
     assert unproject_pixels(lens, project_rays(lens, grid)).shape == grid.shape
     assert unproject_pixels(lens, np.empty((0, 2))).shape == (0, 2)
 
 
-def test_no_ray_leads_to_pixels_beyond_the_fold():
+def test_pixels_beyond_the_fold_have_no_ray():
     """u = x - x^3 / 10 grows up to x = 1.83, where it is 1.22."""
     lens = Intrinsics(1, "SIMPLE_RADIAL", 64, 48, (50.0, 32.0, 24.0, -0.1))
     u = np.array([0.0, 0.5, 1.2, 1.23, 5.0, 1e6])
@@ -66,7 +66,7 @@ def test_without_coefficients_a_lens_is_a_pinhole(model, rng, rays):
     assert lens.has_distortion == (zeros > 0)
 
 
-def test_a_division_lens_shows_no_ray_beyond_its_largest():
+def test_a_division_model_has_a_largest_ray():
     """r = s / (1 + k s^2) is largest, 1 / (2 sqrt k), where s = 1 / sqrt k."""
     lens = Intrinsics(1, "SIMPLE_DIVISION", 64, 48, (50.0, 32.0, 24.0, 0.25))
     s = distort(lens, np.array([0.99, 0.0]))[0]
@@ -75,7 +75,7 @@ def test_a_division_lens_shows_no_ray_beyond_its_largest():
     assert fold_radius(lens, 3.0) == pytest.approx(1.0, abs=3 / 500)
 
 
-def test_a_lens_folds_where_its_radius_is_largest():
+def test_the_fold_is_at_the_largest_image_radius():
     """r (1 + k r^2) turns back at r = sqrt(-1 / 3k)."""
     lens = Intrinsics(1, "SIMPLE_RADIAL", 64, 48, (50.0, 32.0, 24.0, -0.3))
     assert fold_radius(lens, 2.0) == pytest.approx(np.sqrt(1 / 0.9), abs=2.0 / 500)

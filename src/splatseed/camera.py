@@ -1,9 +1,9 @@
-"""Camera: a posed pinhole camera, and the COLMAP camera records it comes from.
+"""Posed pinhole cameras, and COLMAP's camera records.
 
-Notation: ``cam_from_world`` [4, 4] maps homogeneous world points to OpenCV camera axes (x right,
-y down, z forward); ``K`` [3, 3] maps camera rays to pixels. The centre of the top-left pixel is at
-(0.5, 0.5), as in COLMAP. Quaternions are wxyz. Promise: everything here is float64 and exact up to
-rounding; lens distortion is kept in ``Intrinsics.params`` for writing but ignored by ``Camera``.
+``cam_from_world`` [4, 4] maps homogeneous world points to OpenCV camera axes (x right, y down, z
+forward); ``K`` [3, 3] maps camera rays to pixels. The centre of the top-left pixel is (0.5, 0.5).
+Quaternions are wxyz. All numbers are float64. ``Intrinsics.params`` hold distortion,
+which ``Camera`` ignores.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class CameraModel(NamedTuple):
     name: str
     num_params: int
     num_focal: int
-    """1 if fx = fy is stored once, 2 if apart; the principal point follows."""
+    """1 if fx = fy is stored once, 2 if they are separate; the principal point follows."""
 
 
 CAMERA_MODELS: dict[str, CameraModel] = {
@@ -50,9 +50,9 @@ CAMERA_MODELS: dict[str, CameraModel] = {
         CameraModel(16, "EUCM", 6, 2),
     )
 }
-"""COLMAP's camera models by name, but for panoramas; ids and parameter counts as in COLMAP 4.2."""
+"""COLMAP 4.2's camera models by name, without panoramas."""
 PANORAMA = CameraModel(17, "EQUIRECTANGULAR", 2, 0)
-"""COLMAP's model of a whole sphere, which has no focal length: no pinhole camera shows as much."""
+"""COLMAP's model of full panoramas, which no pinhole camera can show."""
 
 
 _TWO_FOCAL = {
@@ -64,19 +64,19 @@ _TWO_FOCAL = {
     "SIMPLE_DIVISION": "DIVISION",
     "SIMPLE_FISHEYE": "FISHEYE",
 }
-"""The model of two focal lengths that begins with the same coefficients and is equal to one of a
-single focal length where the further coefficients are 0."""
+"""For each model with one focal length, a model with two that starts with the same coefficients and
+is equal if its further coefficients are 0."""
 
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """A COLMAP camera record: everything but the pose.
+    """A COLMAP camera record: model, size and parameters, without a pose.
 
     Raises:
         SceneFormatError: The model is unknown, or the number of parameters is not the model's.
     """
 
-    camera_id: int  # that images refer to
+    camera_id: int
     model: str  # a key of ``CAMERA_MODELS``
     width: int  # pixels
     height: int
@@ -86,10 +86,10 @@ class Intrinsics:
         model = CAMERA_MODELS.get(self.model)
         if self.model == PANORAMA.name:
             raise SceneFormatError(
-                f"camera {self.camera_id} to be of perspective or fisheye photographs",
-                found=f"{self.model}, whole panoramas",
+                f"camera {self.camera_id} to be a perspective or fisheye camera",
+                found=f"{self.model}, a panorama",
                 fix="Cut each panorama into perspective views and find their poses, as COLMAP's "
-                "panorama_sfm.py does, then use the scene of these views.",
+                "panorama_sfm.py does, then use the scene with these views.",
             )
         if model is None:
             raise SceneFormatError(
@@ -107,17 +107,17 @@ class Intrinsics:
 
     @property
     def is_pinhole(self) -> bool:
-        """Whether the camera is free of distortion, as 3DGS trainers need it."""
+        """Whether the model has no distortion, as 3DGS trainers require."""
         return self.model in {"PINHOLE", "SIMPLE_PINHOLE"}
 
     @property
     def is_fisheye(self) -> bool:
-        """Whether distances in the image grow with the angle from the axis, not its tangent."""
+        """Whether the image radius grows with the angle from the axis, not with its tangent."""
         return self.model.endswith("FISHEYE")
 
     @property
     def has_distortion(self) -> bool:
-        """Whether straight lines look bent: not if all coefficients are 0, always by a fisheye."""
+        """Whether lines are curved: always for a fisheye, else if a coefficient is not 0."""
         terms = self.params[CAMERA_MODELS[self.model].num_focal + 2 :]
         if self.model == "EUCM":
             terms = terms[:1]  # without alpha, beta has no effect
@@ -125,24 +125,24 @@ class Intrinsics:
 
     @property
     def pinhole(self) -> Intrinsics:
-        """The same camera as PINHOLE; its distortion is left out."""
+        """The same camera as PINHOLE, without distortion."""
         (fx, _, cx), (_, fy, cy), _ = self.K.tolist()
         return replace(self, model="PINHOLE", params=(fx, fy, cx, cy))
 
     @property
     def K(self) -> Float64[np.ndarray, "3 3"]:  # noqa: N802  (the field's name)
-        """The pinhole matrix in pixels, [3, 3]; distortion is left out."""
+        """The pinhole matrix in pixels, without distortion."""
         num_focal = CAMERA_MODELS[self.model].num_focal
         fx, fy = self.params[0], self.params[num_focal - 1]
         cx, cy = self.params[num_focal : num_focal + 2]
         return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
     def resized(self, width: int, height: int) -> Intrinsics:
-        """The camera of a photograph that was resized to this size; itself at its own size.
+        """Return the camera of a photograph resized to this size.
 
-        Distortion acts on normalised coordinates, so only focal lengths and centre change. Where
-        the two axes are scaled differently, by rounding or stretching, a model with one focal
-        length gives way to its counterpart with two.
+        Distortion acts on normalised coordinates, so only focal lengths and centre change. If the
+        axes scale differently, by rounding or stretching, a model with two focal lengths replaces
+        one with a single focal length.
         """
         if (width, height) == (self.width, self.height):
             return self
@@ -193,15 +193,15 @@ class Camera:
 
     @property
     def center(self) -> Float64[np.ndarray, " 3"]:
-        """The camera's position in the world, [3]."""
+        """The camera's position in the world."""
         return self.world_from_cam[:3, 3]
 
     def project(
         self, xyz: Float[np.ndarray, "N 3"]
     ) -> tuple[Float64[np.ndarray, "N 2"], Float64[np.ndarray, " N"]]:
-        """Pixel coordinates [N, 2] and planar z-depths [N] of world points.
+        """Project world points; return pixel coordinates and planar z-depths.
 
-        Points at or behind the camera plane (depth <= 0) get NaN pixel coordinates.
+        Pixel coordinates are NaN for depths of 0 or less.
         """
         rotation, translation = self.cam_from_world[:3, :3], self.cam_from_world[:3, 3]
         cam = np.asarray(xyz, np.float64) @ rotation.T + translation
@@ -213,7 +213,7 @@ class Camera:
     def unproject(
         self, uv: Float[np.ndarray, "N 2"], depth: Float[np.ndarray, " N"]
     ) -> Float64[np.ndarray, "N 3"]:
-        """World points [N, 3] at pixel coordinates ``uv`` and planar z-depths ``depth``."""
+        """Return the world points at pixel coordinates ``uv`` and planar z-depths ``depth``."""
         rays = np.concatenate([uv, np.ones((len(uv), 1))], axis=1) @ np.linalg.inv(self.K).T
         cam = rays * np.asarray(depth, np.float64)[:, None]
         world_from_cam = self.world_from_cam
@@ -221,7 +221,7 @@ class Camera:
 
 
 def rotation_from_quat(quat: Float[np.ndarray, " 4"]) -> Float64[np.ndarray, "3 3"]:
-    """The rotation matrix [3, 3] of a wxyz quaternion, which need not have unit length."""
+    """Return the rotation matrix of a wxyz quaternion of any length."""
     w, x, y, z = np.asarray(quat, np.float64) / np.linalg.norm(quat)
     return np.array(
         [
@@ -233,10 +233,10 @@ def rotation_from_quat(quat: Float[np.ndarray, " 4"]) -> Float64[np.ndarray, "3 
 
 
 def quat_from_rotation(rotation: Float[np.ndarray, "3 3"]) -> Float64[np.ndarray, " 4"]:
-    """The unit wxyz quaternion, w >= 0, of a rotation matrix [3, 3]."""
+    """Return the unit wxyz quaternion, w >= 0, of a rotation matrix."""
     m = np.asarray(rotation, np.float64)
-    # The symmetric 4x4 form has the quaternion as its top eigenvector: no branch on the trace,
-    # and the nearest rotation when the matrix is not quite orthonormal.
+    # The quaternion is the top eigenvector of a symmetric 4x4 form: no branch on the trace, and
+    # the nearest rotation if the matrix is not quite orthonormal.
     form = np.array(
         [
             [m[0, 0] + m[1, 1] + m[2, 2], 0, 0, 0],

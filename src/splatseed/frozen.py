@@ -1,7 +1,7 @@
-"""Arrays that nobody can change, for the fields of frozen data types.
+"""Read-only arrays for the fields of frozen dataclasses.
 
-Promise: an array that someone can still write to is copied, so neither the caller's array nor its
-flags change; one that is read-only to everybody is shared.
+A writable array is copied, so that the caller's array and its flags do not change; a read-only one
+is shared.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 
 
 def read_only(values: Any, dtype: Any = None) -> np.ndarray:
-    """``values`` as a contiguous array that is read-only; a copy only if it must be one."""
+    """Return ``values`` as a contiguous read-only array, copied only if necessary."""
     array = np.asarray(values, dtype, order="C")
     is_own = array.base is None and array is not values  # conversion has copied it
     if not is_own and not _is_frozen(array):
@@ -23,7 +23,7 @@ def read_only(values: Any, dtype: Any = None) -> np.ndarray:
 
 
 def _is_frozen(array: np.ndarray) -> bool:
-    """Whether neither the array nor one whose memory it shares can be written to."""
+    """Whether neither the array nor any owner of its memory is writable."""
     owner: Any = array
     while isinstance(owner, np.ndarray):
         if owner.flags.writeable:

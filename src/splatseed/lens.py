@@ -1,14 +1,13 @@
-"""Lens distortion: where rays of the pinhole camera meet the image of a real lens.
+"""Lens distortion of COLMAP's camera models, in float64, on arrays of any shape.
 
-Notation: a ray (x, y, 1) in camera axes is named by its place (x, y) on the plane at depth 1; the
-lens moves it to another place (u, v) there, and pixels are (fx u + cx, fy v + cy). Parameters are
-those of COLMAP's camera models, by its definitions (src/colmap/sensor/models.h), the first of which
-are OpenCV's.
-Promise: float64; pure functions of arrays of any shape.
+Normalised coordinates (x, y) stand for the ray (x, y, 1) in camera axes. Distortion maps them to
+(u, v), and pixels are (fx u + cx, fy v + cy). Models and parameters are COLMAP's
+(src/colmap/sensor/models.h); the first of them are OpenCV's.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,14 +17,23 @@ from jaxtyping import Float64
 from splatseed.camera import CAMERA_MODELS, Intrinsics
 from splatseed.text import quoted
 
-DIRECTIONS, STEPS = 8, 1024
-"""Number of rays along which a fold is searched for, and of samples on each."""
-TRIES, DIFFERENCE, ARRIVED = 30, 1e-6, 1e-9
-"""Newton's method: its steps, the step of finite differences, and the tolerance."""
+
+@dataclass(frozen=True)
+class DistortionSettings:
+    """Constants of the inversion of distortion and of the search for folds."""
+
+    fold_directions: int = 8  # in which a fold is searched for
+    fold_samples: int = 1024  # in each direction
+    newton_steps: int = 30
+    difference: float = 1e-6  # step of finite differences, normalised coordinates
+    tolerance: float = 1e-9  # normalised coordinates
+
+
+SETTINGS = DistortionSettings()
 
 
 def undistort_advice(scene: Path | None) -> str:
-    """Advice for the user whose scene must not have distortion; its folder, if that is known.
+    """Return advice for the user to undistort a scene, with its folder if known.
 
     Example:
         >>> undistort_advice(Path("my scene"))
@@ -37,25 +45,26 @@ def undistort_advice(scene: Path | None) -> str:
 
 
 def undistort_command(scene: Path) -> str:
-    """The command that removes distortion from the scene in a folder."""
+    """Return the command that undistorts the scene in a folder."""
     return f"splatseed undistort {quoted(scene)} -o {quoted(undistorted_folder(scene))}"
 
 
 def undistorted_folder(scene: Path) -> Path:
-    """Where that command writes: beside the scene."""
+    """Return the output folder of ``undistort_command``, next to the scene."""
     return scene.with_name(f"{scene.resolve().name}_undistorted")
 
 
 def project_rays(lens: Intrinsics, xy: Float64[np.ndarray, "*B 2"]) -> Float64[np.ndarray, "*B 2"]:
-    """Pixel coordinates of rays (x, y, 1); the first pixel's centre is (0.5, 0.5)."""
+    """Project rays (x, y, 1) to pixels; the centre of the first pixel is (0.5, 0.5)."""
     K = lens.K
     return np.asarray(distort(lens, xy) * K[[0, 1], [0, 1]] + K[:2, 2])
 
 
 def distort(lens: Intrinsics, xy: Float64[np.ndarray, "*B 2"]) -> Float64[np.ndarray, "*B 2"]:
-    """Where the lens, but for its focal length and centre, moves points on the plane at depth 1.
+    """Apply lens distortion to normalised image coordinates.
 
-    Far out, where the polynomial has lost its meaning, the result is meaningless too.
+    The result is meaningless beyond the image, where the polynomial was not fitted; see
+    ``fold_radius``.
     """
     x, y = xy[..., 0], xy[..., 1]
     k = lens.params[CAMERA_MODELS[lens.model].num_focal + 2 :]
@@ -68,63 +77,62 @@ def distort(lens: Intrinsics, xy: Float64[np.ndarray, "*B 2"]) -> Float64[np.nda
     if lens.model == "FOV":
         return np.stack(_field_of_view(x, y, k[0]), axis=-1)
     if lens.model == "RAD_TAN_THIN_PRISM_FISHEYE":  # tangential terms apply to the radial result
-        x, y = _moved(x, y, _Terms(radial=k[:6]))
-        return np.stack(_moved(x, y, _Terms(tangential=k[7:5:-1], prism=k[8:])), axis=-1)
-    return np.stack(_moved(x, y, _terms(lens.model, k)), axis=-1)
+        x, y = _brown_conrady(x, y, _Terms(radial=k[:6]))
+        return np.stack(_brown_conrady(x, y, _Terms(tangential=k[7:5:-1], prism=k[8:])), axis=-1)
+    return np.stack(_brown_conrady(x, y, _terms(lens.model, k)), axis=-1)
 
 
 def unproject_pixels(
     lens: Intrinsics, uv: Float64[np.ndarray, "*B 2"]
 ) -> Float64[np.ndarray, "*B 2"]:
-    """The rays (x, y, 1) that a lens maps to pixels: ``project_rays`` inverted by Newton's method.
+    """Return the rays (x, y, 1) of pixels: ``project_rays`` inverted by Newton's method.
 
-    Points on the plane at depth 1; NaN where no ray within the lens's fold leads there.
+    NaN where no ray within the lens's fold projects to the pixel.
     """
     K = lens.K
     goal = (np.asarray(uv, np.float64) - K[:2, 2]) / K[[0, 1], [0, 1]]
-    xy, ahead = goal.copy(), DIFFERENCE * np.eye(2)
-    with np.errstate(all="ignore"):  # values far out need not be finite
-        for _ in range(TRIES):
-            columns = [distort(lens, xy + move) - distort(lens, xy - move) for move in ahead]
-            (a, c), (b, d) = (np.moveaxis(each / (2 * DIFFERENCE), -1, 0) for each in columns)
-            left = goal - distort(lens, xy)
-            u, v = left[..., 0], left[..., 1]
+    xy, moves = goal.copy(), SETTINGS.difference * np.eye(2)
+    with np.errstate(all="ignore"):  # distant coordinates need not stay finite
+        for _ in range(SETTINGS.newton_steps):
+            columns = [distort(lens, xy + move) - distort(lens, xy - move) for move in moves]
+            (a, c), (b, d) = (
+                np.moveaxis(each / (2 * SETTINGS.difference), -1, 0) for each in columns
+            )
+            residual = goal - distort(lens, xy)
+            u, v = residual[..., 0], residual[..., 1]
             xy = xy + np.stack([d * u - b * v, a * v - c * u], axis=-1) / (a * d - b * c)[..., None]
-        there = np.linalg.norm(goal - distort(lens, xy), axis=-1) < ARRIVED
-    radius = np.where(there, np.linalg.norm(xy, axis=-1), 0.0)
-    there &= radius <= fold_radius(lens, float(radius.max(initial=0.0)))
-    return np.where(there[..., None], xy, np.nan)
+        converged = np.linalg.norm(goal - distort(lens, xy), axis=-1) < SETTINGS.tolerance
+    radius = np.where(converged, np.linalg.norm(xy, axis=-1), 0.0)
+    converged &= radius <= fold_radius(lens, float(radius.max(initial=0.0)))
+    return np.where(converged[..., None], xy, np.nan)
 
 
-def fold_radius(lens: Intrinsics, most: float) -> float:
-    """The distance from (0, 0) at which the lens folds: rays farther out would land nearer again.
+def fold_radius(lens: Intrinsics, limit: float) -> float:
+    """Return the normalised radius beyond which the lens folds, or ``limit`` if it is smaller.
 
-    Polynomials are fitted within the image; beyond it they turn back sooner or later, and would
-    show the image a second time. ``most`` if there is no fold up to there.
+    Distortion polynomials are fitted within the image. Beyond it they may decrease, so that distant
+    rays would project into the image a second time.
     """
-    radius = np.linspace(0.0, most, STEPS + 1)
-    angle = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
+    radius = np.linspace(0.0, limit, SETTINGS.fold_samples + 1)
+    angle = np.arange(SETTINGS.fold_directions) * (2 * np.pi / SETTINGS.fold_directions)
     rays = np.stack([np.cos(angle), np.sin(angle)], axis=-1)[:, None] * radius[:, None]
-    with np.errstate(all="ignore"):  # a rational model may have poles out there
-        reached = np.linalg.norm(distort(lens, rays) - distort(lens, np.zeros(2)), axis=-1)
-        grows = np.all(np.diff(reached, axis=1) > 0, axis=0)
-    return float(most if grows.all() else radius[np.argmin(grows)])
+    with np.errstate(all="ignore"):  # rational models may have poles
+        distance = np.linalg.norm(distort(lens, rays) - distort(lens, np.zeros(2)), axis=-1)
+        increases = np.all(np.diff(distance, axis=1) > 0, axis=0)
+    return float(limit if increases.all() else radius[np.argmin(increases)])
 
 
 class _Terms(NamedTuple):
-    """A lens's coefficients: of r^2, r^4, ... in numerator and denominator, p1 and p2, a prism's.
+    """Coefficients of Brown and Conrady's model."""
 
-    The prism's multiply r^2 and r^4, first for u, then for v.
-    """
-
-    radial: tuple[float, ...] = ()
-    denominator: tuple[float, ...] = ()
-    tangential: tuple[float, ...] = (0.0, 0.0)
-    prism: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
+    radial: tuple[float, ...] = ()  # of r^2, r^4, ...
+    denominator: tuple[float, ...] = ()  # of r^2, r^4, ...
+    tangential: tuple[float, ...] = (0.0, 0.0)  # p1, p2
+    prism: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)  # of r^2 and r^4 for u, then for v
 
 
 def _terms(model: str, k: tuple[float, ...]) -> _Terms:
-    """A model's parameters, sorted into terms."""
+    """Sort a model's distortion parameters into terms."""
     match model:
         case "OPENCV":
             return _Terms(k[:2], tangential=k[2:])
@@ -137,11 +145,11 @@ def _terms(model: str, k: tuple[float, ...]) -> _Terms:
 
 
 Plane = tuple[np.ndarray, np.ndarray]
-"""First and second coordinates of points on the plane."""
+"""First and second normalised coordinates."""
 
 
-def _moved(x: np.ndarray, y: np.ndarray, terms: _Terms) -> Plane:
-    """Brown and Conrady's model, with a denominator and a thin prism."""
+def _brown_conrady(x: np.ndarray, y: np.ndarray, terms: _Terms) -> Plane:
+    """Apply Brown and Conrady's model, with a denominator and a thin prism."""
     p1, p2 = terms.tangential
     a1, a2, b1, b2 = terms.prism
     r2 = x * x + y * y
@@ -154,7 +162,7 @@ def _moved(x: np.ndarray, y: np.ndarray, terms: _Terms) -> Plane:
 
 
 def _polynomial(t: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
-    """1 + c1 t + c2 t^2 + ..., by Horner's rule."""
+    """Evaluate 1 + c1 t + c2 t^2 + ... by Horner's rule."""
     total = np.zeros_like(t)
     for coefficient in reversed(coefficients):
         total = t * (coefficient + total)
@@ -162,14 +170,14 @@ def _polynomial(t: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
 
 
 def _equidistant(x: np.ndarray, y: np.ndarray) -> Plane:
-    """A fisheye: the image radius is the angle from the axis, theta = atan r."""
+    """Apply the fisheye projection: the image radius is the angle from the axis, atan r."""
     r = np.hypot(x, y)
     scale = np.divide(np.arctan(r), r, out=np.ones_like(r), where=r > 0)
     return x * scale, y * scale
 
 
 def _field_of_view(x: np.ndarray, y: np.ndarray, omega: float) -> Plane:
-    """Devernay and Faugeras: the image radius is atan(2 r tan(omega / 2)) / omega."""
+    """Apply Devernay and Faugeras's model: image radius atan(2 r tan(omega / 2)) / omega."""
     if not omega:
         return x, y
     r = np.hypot(x, y)
@@ -180,17 +188,17 @@ def _field_of_view(x: np.ndarray, y: np.ndarray, omega: float) -> Plane:
 
 
 def _division(x: np.ndarray, y: np.ndarray, k: float) -> Plane:
-    """Fitzgibbon: a point (u, v) of the image is of the ray (u, v, 1 + k (u^2 + v^2)).
+    """Apply Fitzgibbon's model, in which (u, v) lies on the ray (u, v, 1 + k (u^2 + v^2)).
 
-    With k > 0 rays beyond 1 / (2 sqrt k) have no image: NaN.
+    NaN for k > 0 and radii beyond 1 / (2 sqrt k).
     """
-    # s = radius in the image / radius r on the plane solves k r^2 s^2 - s + 1 = 0.
+    # The ratio s of image radius to r solves k r^2 s^2 - s + 1 = 0.
     with np.errstate(invalid="ignore"):
         scale = 2 / (1 + np.sqrt(1 - 4 * k * (x * x + y * y)))
     return x * scale, y * scale
 
 
 def _unified(x: np.ndarray, y: np.ndarray, alpha: float, beta: float) -> Plane:
-    """Khomutenko, Garcia and Martinet's enhanced unified camera model, of a ray (x, y, 1)."""
+    """Apply Khomutenko, Garcia and Martinet's enhanced unified camera model."""
     denominator = alpha * np.sqrt(beta * (x * x + y * y) + 1) + 1 - alpha
     return x / denominator, y / denominator

@@ -1,8 +1,7 @@
-"""Scores: how well test views were rendered, during a run and at its end.
+"""Scores of test views, during a run and at its end.
 
-Notation: PSNR in dB, SSIM, FLIP and LPIPS without unit; seconds are wall time. Promise: results
-have these types from evaluation through training to a benchmark's ledger; means are means over
-images of per-image values; what was not measured is None, with the reason beside it.
+PSNR is in dB, SSIM, FLIP and LPIPS have no unit, seconds are wall time. Means are over images.
+Scores that were not measured are None.
 """
 
 from __future__ import annotations
@@ -24,25 +23,25 @@ class ViewScore:
     ssim: float  # 1 for equal images
     lpips: float | None  # 0 for equal images; None if not measured
     seconds: float  # time to render it
-    covisible_psnr: float | None = None  # over what two training views see; None if unknown
-    covisible_share: float | None = None  # of such pixels; likewise
+    covisible_psnr: float | None = None  # over pixels that two training views see; None if unknown
+    covisible_share: float | None = None  # of these pixels; likewise
     flip: float | None = None  # 0 for equal images; None in results of versions without it
     cc_psnr: float | None = None  # PSNR after correcting the render's colours, dB; likewise
 
 
 @dataclass(frozen=True)
 class EvalResult:
-    """Scores over test views."""
+    """Scores of test views, and their means."""
 
-    per_image: tuple[ViewScore, ...]  # in the views' order; at least one
+    per_image: tuple[ViewScore, ...]  # one or more, in the views' order
     lpips_net: str | None = None  # None if not measured
     lpips_reason: str = NOT_REQUESTED  # why LPIPS was not measured; empty if it was
-    num_gaussians: int | None = None  # that were rendered; None if the renderer is a black box
+    num_gaussians: int | None = None  # rendered; None if the renderer does not tell
     model_bytes: int | None = None  # of their parameters as float32; None likewise
 
     @property
     def psnr(self) -> float:
-        """Mean of the images' PSNR in dB, not the PSNR of the mean error."""
+        """Mean PSNR of the images in dB (not the PSNR of the mean error)."""
         return _mean(score.psnr for score in self.per_image)
 
     @property
@@ -52,27 +51,27 @@ class EvalResult:
 
     @property
     def cc_psnr(self) -> float | None:
-        """Mean colour-corrected PSNR in dB; None where it was not measured."""
+        """Mean colour-corrected PSNR in dB; None if not measured."""
         return _mean_known(score.cc_psnr for score in self.per_image)
 
     @property
     def flip(self) -> float | None:
-        """Mean FLIP; None where it was not measured."""
+        """Mean FLIP; None if not measured."""
         return _mean_known(score.flip for score in self.per_image)
 
     @property
     def lpips(self) -> float | None:
-        """Mean LPIPS; None where it was not measured."""
+        """Mean LPIPS; None if not measured."""
         return _mean_known(score.lpips for score in self.per_image)
 
     @property
     def covisible_psnr(self) -> float | None:
-        """Mean over the images with such pixels; None if there are none, or it was not measured."""
+        """Mean PSNR over co-visible pixels, of images that have any; None if not measured."""
         return _mean_known(score.covisible_psnr for score in self.per_image)
 
     @property
     def covisible_share(self) -> float | None:
-        """Mean share of the pixels that at least two training views see; None if not known."""
+        """Mean share of co-visible pixels; None if not measured."""
         return _mean_known(score.covisible_share for score in self.per_image)
 
     @property
@@ -81,7 +80,7 @@ class EvalResult:
         return _mean(score.seconds for score in self.per_image)
 
     def to_dict(self) -> dict[str, Any]:
-        """The result as plain values; infinity, which JSON lacks, becomes None."""
+        """Return plain values for JSON; infinity becomes None."""
         names = ("psnr", "cc_psnr", "ssim", "flip", "lpips", "covisible_psnr", "covisible_share")
         means = (*names, "render_seconds")
         return {
@@ -92,7 +91,7 @@ class EvalResult:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """The inverse of ``to_dict``; means are recomputed, and unknown keys ignored."""
+        """Invert ``to_dict``; means are recomputed, unknown keys ignored."""
         views = [
             ViewScore(**{**each, "psnr": math.inf if each["psnr"] is None else each["psnr"]})
             for each in values["per_image"]
@@ -119,12 +118,12 @@ class TrainingResult:
     scores: EvalResult  # of the test views at the end
     curve: tuple[CurvePoint, ...]  # of the test views during training, in order of steps
     steps: int
-    train_seconds: float  # of the steps, and of finding the depth that growth needs
-    num_seeds: int  # points that training began with
-    held_by_memory_at: int | None = None  # Gaussians at which memory ended growth
+    train_seconds: float  # of the steps, and of the depth maps for growth
+    num_seeds: int  # points at the start
+    held_by_memory_at: int | None = None  # Gaussians at which memory limited growth
 
     def to_dict(self) -> dict[str, Any]:
-        """The content of ``metrics.json``: the scores' values and the others side by side."""
+        """Return the content of ``metrics.json``."""
         others = {key: getattr(self, key) for key in ("steps", "train_seconds", "num_seeds")}
         tests = [_finite(asdict(point)) for point in self.curve]
         held = {"held_by_memory_at": self.held_by_memory_at}

@@ -50,7 +50,7 @@ def _far(kind, count, rng):
 @pytest.mark.parametrize(
     "kind", ["in one place", "close to each other", "everywhere", "facing the scene"]
 )
-def test_cameras_far_away_are_named_and_set_neither_scale_nor_near_plane(kind, count, rng):
+def test_strays_are_named_and_change_neither_scale_nor_near_plane(kind, count, rng):
     """Two of twelve once made all others' pictures black; eleven of 23 are fewer than half."""
     views, xyz = _station(rng)
     far = _far(kind, count, rng)
@@ -61,7 +61,7 @@ def test_cameras_far_away_are_named_and_set_neither_scale_nor_near_plane(kind, c
 
 
 @pytest.mark.parametrize("place", [(1e6, 0, 0), (0, 1e6, 0), (0, -1e6, 1e5)])
-def test_a_few_points_far_away_change_nothing(place, rng):
+def test_a_few_distant_points_change_nothing(place, rng):
     """Also where cameras, or a stray one, look at them."""
     views, xyz = _station(rng)
     stray = _view("stray", np.array(place) * 0.9, place)
@@ -69,10 +69,10 @@ def test_a_few_points_far_away_change_nothing(place, rng):
     for seen in (views, [*views, stray]):
         before, after = check_cameras(seen, xyz), check_cameras(seen, more)
         assert after.strays.tolist() == before.strays.tolist()
-        assert after.near == pytest.approx(before.near, rel=0.02)
+        assert after.near_depth == pytest.approx(before.near_depth, rel=0.02)
 
 
-def test_no_honest_camera_is_a_stray(rng):
+def test_valid_captures_have_no_strays(rng):
     room, other = _station(rng), _station(rng, (80, 0, 0), count=5, points=60)
     drone = [_view(f"d{i}", (20 * i, -300, 500), (20 * i, 0, 0)) for i in range(5)]
     ground = rng.uniform(-300, 300, (2000, 3)) * [1, 1, 0]
@@ -92,7 +92,7 @@ def test_no_honest_camera_is_a_stray(rng):
 
 
 @pytest.mark.parametrize("step", [1.0, 200.0, 800.0, 1e5])
-def test_the_near_plane_is_what_cameras_see_not_how_far_they_stand_apart(step, rng):
+def test_the_near_plane_follows_visible_depths_not_camera_distances(step, rng):
     views, xyz = _station(rng)
     moved = np.array([step, 0, 0])
     other = []
@@ -106,7 +106,7 @@ def test_the_near_plane_is_what_cameras_see_not_how_far_they_stand_apart(step, r
     assert frame.near / frame.scale > 0.8 * here.near / here.scale
 
 
-def test_the_nearest_surface_is_not_cut_and_the_lens_is_free(rng):
+def test_the_near_plane_lies_between_the_lens_and_the_nearest_surface(rng):
     """A macro path beside a far wall, and a drone over ground photographs."""
     small = [_station(rng, (0.05 * i, 0, 0), count=2, depth=1e-3) for i in range(20)]
     wall = _station(rng, depth=3.0)
@@ -128,7 +128,7 @@ def test_the_nearest_surface_is_not_cut_and_the_lens_is_free(rng):
     assert NEAR_SHARE * 300 < flat.near / flat.scale < NEAR_SHARE * 500
 
 
-def test_near_depth_and_strays_go_with_the_scene(rng):
+def test_near_depth_and_strays_follow_similarities(rng):
     views, xyz = _station(rng)
     views = [*views, *_far("everywhere", 3, rng)]
     turn, shift = np.linalg.qr(rng.normal(size=(3, 3)))[0], rng.normal(size=3)
@@ -146,7 +146,7 @@ def test_near_depth_and_strays_go_with_the_scene(rng):
             check_cameras(moved, scale * xyz @ turn.T + shift),
         )
         assert after.strays.tolist() == before.strays.tolist()
-        assert after.near == pytest.approx(scale * before.near, rel=1e-6)
+        assert after.near_depth == pytest.approx(scale * before.near_depth, rel=1e-6)
 
 
 def test_without_points_one_camera_in_ten_can_be_a_stray(rng):
@@ -158,10 +158,10 @@ def test_without_points_one_camera_in_ten_can_be_a_stray(rng):
         assert stray_views([*views[:count], far[0]], NO_POINTS) == ()
     assert stray_views([*views[:10], far[0]], NO_POINTS) == ("far 0",)
     assert stray_views([*views, *far], NO_POINTS) == ()
-    assert check_cameras(views, NO_POINTS).near is None
+    assert check_cameras(views, NO_POINTS).near_depth is None
 
 
-def test_all_strays_are_in_one_note():
+def test_one_note_names_all_strays():
     assert format_stray_note(()) == ()
     assert "The camera of a is far" in format_stray_note("a")[0]
     (note,) = format_stray_note("abcdefgh")

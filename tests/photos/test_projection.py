@@ -18,7 +18,7 @@ def camera(rng):
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_arrays_and_kernels_project_alike_bit_for_bit(rng, camera, dtype):
+def test_arrays_and_kernels_project_identically(rng, camera, dtype):
     xyz = rng.normal(size=(1000, 3)).astype(dtype)
     xyz[0] = camera.center  # about depth 0, where pixels need not be finite
     matrix, found = pixels_from_world(camera), np.empty((3, len(xyz)))
@@ -27,7 +27,7 @@ def test_arrays_and_kernels_project_alike_bit_for_bit(rng, camera, dtype):
         np.testing.assert_array_equal(found, ours)
 
 
-def test_pixels_and_depths_are_those_of_the_camera(rng, camera):
+def test_pixels_and_depths_equal_the_cameras(rng, camera):
     xyz = rng.normal(size=(1000, 3))
     column, row, depth = project(pixels_from_world(camera), xyz)
     uv, z = camera.project(xyz)

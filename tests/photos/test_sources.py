@@ -17,7 +17,7 @@ def worth(seen, xyz, centers, i: int, j: int) -> float:
     return total
 
 
-def test_views_that_see_the_same_are_paired_as_by_the_loop(rng):
+def test_pairs_equal_those_of_a_plain_loop(rng):
     """Eight cameras about 40 points, each of which sees some of them."""
     xyz, centers = rng.normal(size=(40, 3)), rng.normal(size=(8, 3)) - np.array([0, 0, 5])
     seen = [np.sort(rng.choice(40, rng.integers(5, 30), replace=False)) for _ in centers]
@@ -29,7 +29,7 @@ def test_views_that_see_the_same_are_paired_as_by_the_loop(rng):
         np.testing.assert_allclose(ours, np.sort(worths)[::-1][:4], atol=1e-9)
 
 
-def test_nobody_is_paired_without_a_common_point():
+def test_views_without_common_points_are_not_paired():
     xyz = np.array([[0.0, 0, 0], [1.0, 0, 0]])
     centers = np.array([[0.0, 0, -5], [1.0, 0, -5], [2.0, 0, -5]])
     seen = [np.array([0]), np.array([0, 1]), np.array([1])]
@@ -39,7 +39,7 @@ def test_nobody_is_paired_without_a_common_point():
         np.testing.assert_array_equal(chosen, np.full((num, 5), -1))
 
 
-def test_a_camera_far_away_takes_no_neighbour_from_others():
+def test_a_distant_camera_is_no_neighbour():
     """Sources without points: distances once counted relative to the largest of all."""
     poses = np.tile(np.eye(4), (13, 1, 1))
     poses[:12, 0, 3] = 0.1 * np.arange(12)

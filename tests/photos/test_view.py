@@ -43,7 +43,7 @@ def test_a_smaller_photograph_is_the_mean_over_blocks(picture, factor):
     assert np.abs(pixels - means).max() < 0.6  # Pillow rounds in fixed point
 
 
-def test_the_cache_is_used_and_knows_a_changed_photograph(picture, tmp_path):
+def test_the_cache_is_used_until_the_photograph_changes(picture, tmp_path):
     cache = tmp_path / "cache"
     first, _ = load_photograph(picture, 2, cache)
     (kept,) = cache.iterdir()
@@ -94,7 +94,7 @@ COPIES = [(48, 36), (192, 144), (37, 28), (95, 72), (96, 71), (97, 72), (120, 91
 
 
 @pytest.mark.parametrize("name", CAMERA_MODELS)
-def test_a_point_has_the_same_relative_place_in_every_copy(name, room, tmp_path):
+def test_a_point_keeps_its_relative_position_in_resized_copies(name, room, tmp_path):
     """At any size, also of slightly other shape, and whether views or the scene are resized."""
     model = CAMERA_MODELS[name]
     focal, terms = (80.0, 84.0)[: model.num_focal], model.num_params - model.num_focal - 2
@@ -166,7 +166,7 @@ def test_each_photograph_is_checked_against_its_own_record(size, orientation, sa
     assert at_file_size(copied) is copied
 
 
-def test_a_shape_that_no_rounding_explains_is_said_once():
+def test_a_stretched_shape_gives_one_warning():
     def warned(record, *sizes):
         lens = Intrinsics(1, "PINHOLE", *record, (900.0, 900.0, 500.0, 500.0))
         return [_off(lens, size) > ROUNDING for size in sizes if fits(lens, size)]
@@ -183,7 +183,7 @@ def bent(room, k):
     return dataclasses.replace(room.images[0], intrinsics=lens)
 
 
-def test_what_cannot_be_read_is_said(room, tmp_path):
+def test_unreadable_photographs_are_named(room, tmp_path):
     bad = tmp_path / "bad.png"
     bad.write_bytes(b"no image")
     for error, says, read, *words in (
@@ -250,7 +250,7 @@ def test_colours_are_interpolated_between_four_pixels(lens, rng):
     assert 0 < known.sum() < known.size
 
 
-def test_what_a_fold_would_show_again_is_unknown():
+def test_pixels_beyond_a_fold_are_masked():
     lens = Intrinsics(1, "SIMPLE_RADIAL", WIDTH, HEIGHT, (30.0, 48.0, 36.0, -0.3))
     white = np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
     pixels, known = undistort(white, lens, lens.K)
@@ -264,7 +264,7 @@ def test_what_a_fold_would_show_again_is_unknown():
     assert np.array_equal(pixels[..., 0] == 255, known)
 
 
-def test_views_are_undistorted_where_that_is_asked_for(copied):
+def test_views_are_undistorted_on_request(copied):
     """One photograph is of a lens, and a copy of half the size."""
     bent = LENSES[0]
     image, other = dataclasses.replace(copied.images[0], intrinsics=bent), copied.images[1]

@@ -27,7 +27,7 @@ def in_frame(camera, xyz):
     return ((uv >= 0) & (uv < [camera.width, camera.height])).all(axis=1)
 
 
-def test_the_image_with_the_fullest_frame_is_chosen(rng):
+def test_the_image_with_the_largest_fill_is_chosen(rng):
     crowd = Observations(rng.uniform(40, 50, (500, 2)), np.arange(500))
     spread = Observations(rng.uniform([0, 0], [160, 120], (300, 2)), np.arange(300))
     pointless = Observations(rng.uniform([0, 0], [160, 120], (900, 2)), np.full(900, -1))
@@ -44,7 +44,7 @@ def test_the_image_with_the_fullest_frame_is_chosen(rng):
         assert choose_image(scene_of(xyz, images)) is images[1]
 
 
-def test_a_bare_cloud_gets_a_camera_that_sees_it_from_above(rng):
+def test_a_bare_cloud_is_seen_from_above(rng):
     ground = np.column_stack([rng.uniform(-4, 4, (3000, 2)) * [1.0, 0.6], np.zeros(3000)])
     tree = np.column_stack([rng.normal(0, 0.1, (300, 2)), rng.uniform(0, 1.5, 300)])
     stray = rng.uniform(-300, 300, (60, 3))

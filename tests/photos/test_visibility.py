@@ -15,7 +15,7 @@ CAMERA = Camera(np.array([[60.0, 0, 30], [0, 60.0, 20], [0, 0, 1]]), 61, 41, np.
 
 
 @pytest.mark.parametrize(("near", "margin"), [(0.0, 0.0), (1.5, 0.0), (0.0, 0.1)])
-def test_points_in_the_image_are_those_of_the_loop(rng, near, margin):
+def test_points_in_the_image_equal_those_of_a_plain_loop(rng, near, margin):
     xyz = rng.uniform([-2, -2, -3], [2, 2, 3], (500, 3))
     xyz[7] = np.nan
     xyz[8] = 0.0  # in the camera's centre
@@ -41,7 +41,7 @@ def test_the_z_buffer_has_the_nearest_point_of_each_cell(rng):
     np.testing.assert_array_equal(points.nearest(CAMERA, (4, 6)), expected)
 
 
-def test_a_wall_hides_what_lies_behind_it(rng):
+def test_a_wall_occludes_points_behind_it(rng):
     wall = np.column_stack([rng.uniform(-2, 0, 4000), rng.uniform(-2, 2, 4000), np.full(4000, 2.0)])
     behind = np.column_stack([rng.uniform(-1, 1, (50, 2)), np.full(50, 3.0)])
     xyz = np.concatenate([wall, behind]).astype(np.float32)

@@ -28,7 +28,7 @@ def splat(scene, tmp_path_factory):
     return ss.read_gaussians(path)
 
 
-def test_a_render_at_a_scenes_image_is_that_of_the_trainer(scene, splat):
+def test_render_at_a_scene_image_equals_the_trainers(scene, splat):
     image = scene.images[0]
     picture = ss.render(splat, scene[image.name])
     height, width = image.camera.height, image.camera.width
@@ -54,7 +54,7 @@ def test_images_views_and_cameras_give_the_same_picture(scene, splat):
     assert np.abs(moved - picture).max() > 0.05
 
 
-def test_gaussians_are_frozen_short_to_show_and_written_as_read(splat, tmp_path):
+def test_gaussians_are_frozen_have_a_short_repr_and_round_trip(splat, tmp_path):
     assert repr(splat) == f"Gaussians({len(splat):,}, SH degree 3)"
     with pytest.raises(ValueError, match="read-only"):
         splat.means[0] = 0

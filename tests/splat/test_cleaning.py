@@ -52,7 +52,7 @@ def _read(path):
 
 
 @pytest.mark.parametrize(("name", "value"), BAD)
-def test_a_number_that_no_renderer_can_use_leaves_its_gaussian_out(model, name, value, tmp_path):
+def test_gaussians_with_unusable_numbers_are_dropped(model, name, value, tmp_path):
     write_gaussians(tmp_path / "m.ply", _with(model, name, [5], value))
     kept, notes = _read(tmp_path / "m.ply")
     assert np.array_equal(kept.means, np.delete(model.means, 5, axis=0))
@@ -67,7 +67,9 @@ def test_a_number_that_no_renderer_can_use_leaves_its_gaussian_out(model, name, 
         assert all(np.isfinite(array).all() for array in again.arrays().values())
 
 
-def test_several_kinds_are_counted_apart_and_a_model_of_nothing_else_is_refused(model, tmp_path):
+def test_unusable_gaussians_are_counted_by_kind_and_a_model_of_them_alone_is_refused(
+    model, tmp_path
+):
     bad = _with(_with(model, "means", [1, 2, 3], np.nan), "quats", [3, 4], np.inf)
     write_gaussians(tmp_path / "m.ply", bad)
     kept, (note,) = _read(tmp_path / "m.ply")
@@ -79,7 +81,7 @@ def test_several_kinds_are_counted_apart_and_a_model_of_nothing_else_is_refused(
         read_gaussians(tmp_path / "m.ply")
 
 
-def test_opacities_of_0_and_1_sizes_of_0_and_turns_of_a_ball_are_kept(model, tmp_path):
+def test_opacities_of_0_and_1_sizes_of_0_and_rotations_of_a_sphere_are_kept(model, tmp_path):
     odd = _with(_with(model, "opacities", [0], np.inf), "opacities", [1], -np.inf)
     odd = _with(odd, "scales", [2], -np.inf)
     scales = odd.scales.copy()
@@ -101,7 +103,7 @@ def test_opacities_of_0_and_1_sizes_of_0_and_turns_of_a_ball_are_kept(model, tmp
     np.testing.assert_allclose(kept.quats[5], unit, atol=1e-6)
 
 
-def test_numbers_of_a_packed_file_that_are_not_finite_are_left_out_too(model, tmp_path):
+def test_non_finite_gaussians_of_packed_files_are_dropped(model, tmp_path):
     """Other writers put a NaN into a record, a chunk's bounds, a half float or a codebook."""
     for suffix in SUFFIXES:
         write_gaussians(tmp_path / f"m{suffix}", model)

@@ -26,7 +26,7 @@ def _truth(depths, view, train):
     return (count >= 2).reshape(view.height, view.width)
 
 
-def test_agrees_with_the_true_depth_and_is_kept(sixteen_views, tmp_path):
+def test_covisible_pixels_match_the_true_depth_and_round_trip(sixteen_views, tmp_path):
     capture, scene = sixteen_views
     train, test = (camera_views(part) for part in scene.split(8))
     depths = {i.name: depth for i, depth in zip(scene.images, capture.depths, strict=True)}
@@ -39,7 +39,7 @@ def test_agrees_with_the_true_depth_and_is_kept(sixteen_views, tmp_path):
     assert read_covisible(tmp_path / "none.npz") is None
 
 
-def test_what_no_training_view_shows_is_left_out(sixteen_views):
+def test_pixels_without_training_views_are_excluded(sixteen_views):
     """With the training cameras turned away nothing is co-visible."""
     _, scene = sixteen_views
     train, test = scene.split(8)

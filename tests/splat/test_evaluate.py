@@ -37,7 +37,7 @@ def _view(image, name="a.png"):
     return View(name, image, Camera(np.eye(3), width, height, np.eye(4)))
 
 
-def test_scores_are_those_of_torchmetrics_on_clamped_renders(rng, truth):
+def test_scores_equal_torchmetrics_on_clamped_renders(rng, truth):
     functional = pytest.importorskip("torchmetrics.functional.image")
     photo = torch.from_numpy(truth / np.float32(255))
     noisy = photo + torch.from_numpy(rng.normal(0, 0.1, truth.shape).astype(np.float32))
@@ -49,7 +49,7 @@ def test_scores_are_those_of_torchmetrics_on_clamped_renders(rng, truth):
     assert result.ssim == pytest.approx(float(ssim), abs=1e-5)
 
 
-def test_the_mean_psnr_is_that_of_the_images_not_of_the_mean_error():
+def test_mean_psnr_averages_images_not_errors():
     image = np.zeros((16, 16, 3), np.uint8)
     errors = {"a.png": 0.1, "b.png": 0.01}
     views = [_view(image, name) for name in errors]
@@ -59,7 +59,7 @@ def test_the_mean_psnr_is_that_of_the_images_not_of_the_mean_error():
     assert [s.name for s in result.per_image] == ["a.png", "b.png"]
 
 
-def test_scores_over_a_mask_and_lpips_where_asked_for_and_what_is_drawn():
+def test_scores_use_masks_and_lpips_and_pass_renders_on():
     view = _view(np.full((16, 16, 3), 100, np.uint8))
     image = torch.full((16, 16, 3), 100 / 255)
     image[:8] += 0.1
@@ -83,7 +83,7 @@ def test_scores_over_a_mask_and_lpips_where_asked_for_and_what_is_drawn():
     assert (plain["covisible_psnr"], plain["covisible_share"]) == (None, None)
 
 
-def test_what_cannot_be_scored_is_refused(truth):
+def test_invalid_renders_are_refused(truth):
     for image in (torch.zeros(64, 48, 3), torch.full((48, 64, 3), math.nan)):
         with pytest.raises(ParameterError, match=r"a\.png"):
             evaluate_views(lambda _, image=image: image, [_view(truth)])
@@ -113,7 +113,9 @@ def model_path(larger_room_path, tmp_path_factory):
     return path
 
 
-def test_a_ply_of_the_world_is_scored_on_the_test_views(larger_room_path, model_path, tmp_path):
+def test_a_ply_in_world_coordinates_is_scored_on_the_test_views(
+    larger_room_path, model_path, tmp_path
+):
     model, scene = load_model(model_path, larger_room_path), load_scene(larger_room_path)
     result = evaluate_model(model)
     assert [s.name for s in result.per_image] == [i.name for i in scene.split()[1]]

@@ -19,7 +19,7 @@ from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundErro
 from splatseed.splat import formats
 from splatseed.splat.formats import FORMATS, read_gaussians, write_gaussians
 from splatseed.splat.gaussians import Gaussians
-from splatseed.splat.sog import _MOST_META
+from splatseed.splat.sog import _MAX_META
 
 SUFFIXES = [each.suffix for each in FORMATS.values()]
 # Of positions, log-scales, degrees of rotation, opacities, first and further coefficients.
@@ -73,7 +73,7 @@ def _assert_close(model, truth, limits):
 
 @pytest.mark.parametrize("rest", [0, 3, 8, 15])
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_a_model_comes_back_but_for_fine_detail(suffix, rest, tmp_path):
+def test_formats_round_trip_within_their_precision(suffix, rest, tmp_path):
     truth = _gaussians(rest=rest)
     write_gaussians(tmp_path / f"m{suffix}", truth)
     content = (tmp_path / f"m{suffix}").read_bytes()
@@ -104,7 +104,7 @@ def test_a_ply_has_the_layout_of_3dgs(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_one_gaussian_equal_ones_and_far_off_ones_are_models_too(suffix, tmp_path):
+def test_single_equal_and_distant_gaussians_round_trip(suffix, tmp_path):
     path, one, near = tmp_path / f"m{suffix}", _gaussians(1), _gaussians()
     write_gaussians(path, one)
     assert len(read_gaussians(path)) == 1
@@ -116,7 +116,7 @@ def test_one_gaussian_equal_ones_and_far_off_ones_are_models_too(suffix, tmp_pat
     np.testing.assert_allclose(found, np.sort(far.means, axis=0), atol=0.02)
 
 
-def test_what_a_format_cannot_hold_is_told_or_harms_nothing_else(tmp_path):
+def test_values_out_of_range_are_refused_or_leave_the_others_intact(tmp_path):
     near = _gaussians()
     with pytest.raises(ParameterError, match="of the origin"):
         write_gaussians(tmp_path / "m.spz", replace(near, means=near.means + np.float32(9e6)))
@@ -148,7 +148,7 @@ def files(tmp_path_factory):
 
 @given(st.sampled_from(SUFFIXES), st.data())
 @settings(max_examples=150, deadline=None)
-def test_damage_is_told_or_harmless(files, tmp_path_factory, suffix, data):
+def test_damaged_files_raise_one_error_or_are_read(files, tmp_path_factory, suffix, data):
     """Cut short or with bytes changed: our error or a model, nothing else."""
     content = bytearray(files[suffix])
     if data.draw(st.booleans()):
@@ -163,7 +163,7 @@ def test_damage_is_told_or_harmless(files, tmp_path_factory, suffix, data):
         assert len(read_gaussians(path)) > 0
 
 
-def test_what_is_no_model_is_named(files, tmp_path):
+def test_files_without_a_model_are_refused(files, tmp_path):
     bare = b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nend_header\n"
     many = bytearray(gzip.decompress(files[".spz"]))
     many[8:12] = b"\xff\xff\xff\x7f"
@@ -176,11 +176,11 @@ def test_what_is_no_model_is_named(files, tmp_path):
         ("a.splat", bytes(33), "33 bytes"),
         ("a.ksplat", bytes(40), "splat-transform IN.ksplat"),
         ("a.glb", b"glTF\x02\0\0\0", r"\.glb"),
-        ("metrics.json", b'{"psnr": 20.0}', "describes no Gaussians"),
+        ("metrics.json", b'{"psnr": 20.0}', "without Gaussians"),
         *((f"cut{suffix}", files[suffix][:-7], "cut") for suffix in SUFFIXES),
         ("m.ply", files[".compressed.ply"].replace(b" min_g", b" mim_g"), "min_g"),
         ("many.spz", gzip.compress(bytes(many)), "memory|ends"),
-        ("turned.spz", bytes(turned), "whole"),
+        ("turned.spz", bytes(turned), "turned.spz"),
         ("b.ply", files[".ply"].replace(b"f_dc_1", b"f_dc_9"), "f_dc_1"),
         ("c.ply", bare + bytes(4), "trained Gaussians"),
         ("nan.ply", (tmp_path / "nan.ply").read_bytes(), "9 Gaussians without a usable opacity"),
@@ -190,9 +190,9 @@ def test_what_is_no_model_is_named(files, tmp_path):
             read_gaussians(tmp_path / name)
 
 
-def test_notes_that_would_burst_are_refused_unread(tmp_path, monkeypatch):
+def test_an_oversized_meta_json_is_refused_unread(tmp_path, monkeypatch):
     with zipfile.ZipFile(tmp_path / "m.sog", "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("meta.json", b" " * (_MOST_META + 1))
+        archive.writestr("meta.json", b" " * (_MAX_META + 1))
     monkeypatch.setattr(zipfile.ZipFile, "read", None)  # must not be called
     with pytest.raises(SceneFormatError, match=r"meta\.json of 16,777,217 bytes"):
         read_gaussians(tmp_path / "m.sog")
@@ -211,7 +211,7 @@ def test_an_unpacked_sog_is_read(files, tmp_path):
 # Crop and clean ----------------------------------------------------------------------------------
 
 
-def test_a_box_and_an_opacity_keep_what_they_say():
+def test_crop_and_min_opacity_filter_gaussians():
     model = _gaussians()
     kept = formats.filter_gaussians(model, formats.parse_crop("-1,-2,-3,1,2,3"), 0.25)
     inside = (np.abs(model.means) <= [1, 2, 3]).all(axis=1)
@@ -244,7 +244,7 @@ def converter():
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_the_formats_own_tool_reads_ours(suffix, converter, tmp_path):
+def test_splat_transform_reads_our_files(suffix, converter, tmp_path):
     truth = _gaussians()
     write_gaussians(tmp_path / f"ours{suffix}", truth)
     converter(tmp_path / f"ours{suffix}", tmp_path / "theirs.ply")
@@ -254,7 +254,7 @@ def test_the_formats_own_tool_reads_ours(suffix, converter, tmp_path):
 
 
 @pytest.mark.parametrize("suffix", [".compressed.ply", ".spz", ".sog"])
-def test_we_read_what_the_formats_own_tool_writes(suffix, converter, tmp_path):
+def test_we_read_files_of_splat_transform(suffix, converter, tmp_path):
     truth = _gaussians()
     write_gaussians(tmp_path / "ours.ply", truth)
     converter("-g", "cpu", tmp_path / "ours.ply", tmp_path / f"theirs{suffix}")

@@ -14,8 +14,7 @@ from splatseed.photos.view import View
 from splatseed.pointcloud import PointCloud
 from splatseed.splat.formats import write_gaussians
 from splatseed.splat.from_seeds import (
-    EVEN,
-    OWN,
+    SETTINGS,
     fit_harmonics,
     initial_gaussians,
     neighbor_distances,
@@ -50,18 +49,18 @@ def test_initial_scale_is_the_distance_to_three_neighbours(rng):
     assert np.allclose(1 / (1 + np.exp(-gaussians.opacities)), 0.3)
 
 
-def test_first_gaussians_have_the_sizes_that_are_known_and_allowed(rng):
+def test_known_sizes_are_used_and_bounded(rng):
     xyz, sizes = rng.normal(size=(200, 3)), rng.uniform(1e-3, 10.0, 200)
     sizes[::3] = np.nan
     cloud, largest = _cloud(xyz), rng.uniform(0.01, 5.0, 200)
     free = initial_gaussians(cloud, scale_factor=0.5)
-    told = initial_gaussians(cloud.replace(sizes=sizes), scale_factor=0.5, largest=largest)
+    told = initial_gaussians(cloud.replace(sizes=sizes), scale_factor=0.5, max_sizes=largest)
     expected = np.where(np.isnan(sizes), np.exp(free.scales[:, 0]), 0.5 * sizes)
     expected = np.minimum(expected, largest)
     assert np.allclose(np.exp(told.scales), expected[:, None], rtol=1e-5)
 
 
-def test_first_gaussians_lie_flat_where_normals_are_known(rng):
+def test_seeds_with_normals_become_discs(rng):
     normals = rng.normal(size=(200, 3))
     normals[:6] = np.concatenate([np.eye(3), -np.eye(3)])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -110,7 +109,7 @@ def _view_from(x, value):
     return View(f"{x}.png", np.full((SIDE, SIDE, 3), value, np.uint8), Camera(K, SIDE, SIDE, pose))
 
 
-def test_the_fit_is_the_least_of_its_sum():
+def test_fitted_harmonics_minimise_the_sum_of_squares():
     """Against a general solver on the rows that the docstring's sum has."""
     seeds, values = _cloud([[0.1, 0.2, 0.0]]), (60, 120, 200)
     views = [_view_from(x, v) for x, v in zip((-1, 0, 1), values, strict=True)]
@@ -120,14 +119,17 @@ def test_the_fit_is_the_least_of_its_sum():
         d = d / np.linalg.norm(d)
         rows.append([SH_C0, -SH_C1 * d[1], SH_C1 * d[2], -SH_C1 * d[0]])
         right.append(value / 255 - 0.5)
-    rows += [np.sqrt(OWN) * np.array([SH_C0, 0, 0, 0]), *(np.sqrt(EVEN) * SH_C1 * np.eye(4)[1:])]
-    right += [np.sqrt(OWN) * (100 / 255 - 0.5), 0, 0, 0]
+    rows += [
+        np.sqrt(SETTINGS.color_weight) * np.array([SH_C0, 0, 0, 0]),
+        *(np.sqrt(SETTINGS.smoothness_weight) * SH_C1 * np.eye(4)[1:]),
+    ]
+    right += [np.sqrt(SETTINGS.color_weight) * (100 / 255 - 0.5), 0, 0, 0]
     expected = np.linalg.lstsq(np.array(rows), np.array(right), rcond=None)[0]
     for channel in fit_harmonics(seeds, views)[0].T:
         np.testing.assert_allclose(channel, expected, rtol=1e-4, atol=1e-5)
 
 
-def test_a_seed_that_no_view_shows_keeps_its_color():
+def test_an_invisible_seed_keeps_its_colour():
     """Behind the camera, beside its picture, or far behind a wall that fills the cells."""
     wall = [[x, y, 0.0] for x in np.linspace(-1, 1, 40) for y in np.linspace(-1, 1, 40)]
     seeds = _cloud([[0, 0, -9.0], [50.0, 0, 0], [0, 0, 3.0], *wall], (30, 60, 90))
@@ -138,7 +140,7 @@ def test_a_seed_that_no_view_shows_keeps_its_color():
     assert shown[3:].mean() > 0.5
 
 
-def test_harmonics_are_cut_or_filled_to_the_degree():
+def test_harmonics_are_truncated_or_padded_to_the_degree():
     harmonics = np.arange(24, dtype=np.float32).reshape(2, 4, 3)
     for degree, rest in ((0, 0), (1, 3), (3, 15)):
         seeds = _cloud([[0, 0, 0.0], [1, 0, 0.0]])
@@ -151,7 +153,7 @@ def test_harmonics_are_cut_or_filled_to_the_degree():
 # The frame ----------------------------------------------------------------------------------------
 
 
-def test_the_frame_depends_on_cameras_alone_and_undoes_itself(room, rng):
+def test_the_frame_depends_on_cameras_alone_and_round_trips(room, rng):
     train, _ = load_split(room)
     frame = training_frame(train)
     centers = np.array([np.linalg.inv(frame.view(v).cam_from_world)[:3, 3] for v in train])
@@ -167,7 +169,7 @@ def test_the_frame_depends_on_cameras_alone_and_undoes_itself(room, rng):
     assert training_frame(train[:1] * 2).scale == 1.0
 
 
-def test_sizes_shrink_with_the_frame(room):
+def test_sizes_scale_with_the_frame(room):
     frame, sizes = training_frame(load_split(room)[0]), np.full(len(room.points), 0.3)
     sizes[:2] = np.nan, 1e-38
     cloud = frame.cloud_from_world(room.points.replace(sizes=sizes))

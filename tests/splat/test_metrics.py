@@ -29,7 +29,7 @@ def _pair(rng, height, width):
 
 
 @pytest.mark.parametrize(("height", "width"), [(11, 11), (12, 40), (37, 23), (64, 50)])
-def test_ssim_is_torchmetrics_where_the_window_fits(rng, height, width):
+def test_ssim_equals_torchmetrics_where_the_window_fits(rng, height, width):
     x, y = _pair(rng, height, width)
     pair = torch.from_numpy(x), torch.from_numpy(y)
     expected = float(_torchmetrics_ssim(*pair))
@@ -60,7 +60,7 @@ def _by_convolution(render, photograph):
 
 
 @pytest.mark.parametrize("compute", [photometric_loss, _by_convolution])
-def test_gradient_is_autograds(rng, compute):
+def test_gradient_equals_autograd(rng, compute):
     x, y = (torch.from_numpy(image) for image in _pair(rng, 40, 29))
     ours, theirs = x.clone().requires_grad_(), x.double().requires_grad_()
     loss = compute(ours, y)
@@ -74,7 +74,7 @@ def test_gradient_is_autograds(rng, compute):
 # FLIP ---------------------------------------------------------------------------------------------
 
 
-def test_flip_is_that_of_its_authors_tool_on_files(rng, tmp_path):
+def test_flip_equals_its_authors_tool(rng, tmp_path):
     """The tool reads PNG by itself, so channels, range and orientation must agree."""
     theirs = pytest.importorskip("flip_evaluator", reason="FLIP needs its package")
     photograph, render = rng.integers(0, 256, (2, 24, 40, 3), np.uint8)
@@ -87,7 +87,7 @@ def test_flip_is_that_of_its_authors_tool_on_files(rng, tmp_path):
     assert ours.mean() == pytest.approx(mean, abs=1e-5)
 
 
-def test_flip_is_0_where_images_are_equal_and_clamps(rng):
+def test_flip_is_0_for_equal_images_and_clamps(rng):
     photograph = torch.from_numpy(rng.random((60, 90, 3), np.float32))
     render = photograph.clone()
     render[:, :30] = 5.0
@@ -115,7 +115,7 @@ def _corrected_slowly(render, photograph):
     return x.reshape(render.shape)
 
 
-def test_colors_are_corrected_as_by_multinerf_and_gsplat(rng):
+def test_colour_correction_equals_multinerf_and_gsplat(rng):
     photograph = rng.random((40, 30, 3)).astype(np.float32)
     mixed = photograph @ np.array([[0.8, 0.1, 0], [0, 0.6, 0], [0, 0.1, 1.4]], np.float32)
     render = np.clip(mixed**1.1 + 0.03 * rng.standard_normal(mixed.shape), 0, 1).astype(np.float32)
@@ -123,7 +123,7 @@ def test_colors_are_corrected_as_by_multinerf_and_gsplat(rng):
     np.testing.assert_allclose(corrected, _corrected_slowly(render, photograph), atol=1e-5)
 
 
-def test_a_change_of_exposure_costs_nothing_once_corrected_but_another_content_does(rng):
+def test_colour_correction_removes_exposure_but_no_errors_of_content(rng):
     photograph = torch.from_numpy(rng.random((40, 30, 3), np.float32))
     dark = 0.6 * photograph + 0.05
     assert psnr(dark, photograph) < 20
@@ -157,7 +157,7 @@ def network(tmp_path_factory):
     return folder, features
 
 
-def test_lpips_is_that_of_torchmetrics(network, rng, monkeypatch):
+def test_lpips_equals_torchmetrics(network, rng, monkeypatch):
     folder, features = network
     reference = pytest.importorskip("torchmetrics.functional.image.lpips")
     monkeypatch.setattr(reference, "_get_tv_model_features", lambda *_: features)
@@ -173,7 +173,7 @@ def test_lpips_is_that_of_torchmetrics(network, rng, monkeypatch):
     assert torch.equal(before, torch.random.get_rng_state())  # training after it is the same
 
 
-def test_lpips_with_the_published_weights_is_that_of_its_authors():
+def test_lpips_with_published_weights_equals_its_authors():
     """A number that the package ``lpips`` 0.1.4 gave for the same images."""
     try:
         metric = load_lpips()
@@ -187,7 +187,7 @@ def test_lpips_with_the_published_weights_is_that_of_its_authors():
 
 
 @pytest.mark.parametrize("content", [{}, [torch.zeros(1)], b"", b"text", b"PK\x03\x04 cut"])
-def test_a_file_of_something_else_is_refused(content, tmp_path):
+def test_a_file_without_the_weights_is_refused(content, tmp_path):
     path = tmp_path / "weights.pth"
     if isinstance(content, bytes):
         path.write_bytes(content)

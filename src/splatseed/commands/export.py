@@ -109,7 +109,7 @@ def run(arguments: list[str]) -> None:
     rows = [
         ("Gaussians", f"{len(kept):,} of {len(gaussians):,}"),
         *[("floaters", f"{np.count_nonzero(floaters):,} left out")] * cleans,
-        ("format", f"{name}: {FORMATS[name].about}"),
+        ("format", f"{name}: {FORMATS[name].description}"),
         ("size", f"{after / 1e6:.2f} MB, of {before / 1e6:.2f} MB read"),
         ("output", str(target)),
     ]

@@ -1,4 +1,4 @@
-"""``ss.render``: Gaussians from Python. Needs PyTorch (``pip install ".[train]"``)."""
+"""``ss.render``. Needs PyTorch (``pip install ".[train]"``)."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from jaxtyping import Float32
 
 from splatseed.requirements import require
 
-require("torch")  # before what imports it, for one clear error
+require("torch")  # before the imports below, for one clear error
 
 from splatseed.camera import Camera
 from splatseed.photos.view import View, view_of
@@ -21,24 +21,23 @@ from splatseed.splat.training_frame import frame_of_model
 def render(
     gaussians: Gaussians, camera: Image | Camera | View, *, backend: DeviceName = "auto"
 ) -> Float32[np.ndarray, "H W 3"]:
-    """Render Gaussians as a camera sees them.
+    """Render Gaussians from a camera.
 
     The near plane is a hundredth of the depth beyond which nine tenths of the Gaussians in the
-    image lie. For many pictures of a run, ``Run.render`` is faster: it keeps the Gaussians on the
+    image lie. ``Run.render`` is faster for many images of a run, as it keeps the Gaussians on the
     device.
 
     Args:
-        gaussians: The Gaussians, in the camera's world.
+        gaussians: The Gaussians, in the camera's world frame.
         camera: An image of a scene (``scene["DSC07956.JPG"]``), without its lens distortion; a
             ``Camera``; or a view.
-        backend: "cpu", "cuda", or "auto": a GPU if PyTorch sees one, else the CPU.
+        backend: "cpu", "cuda", or "auto" (a GPU if PyTorch finds one, else the CPU).
 
     Returns:
-        sRGB colours in [0, 1], float32 [H, W, 3], of the camera's height and width; black where
-        there are no Gaussians.
+        sRGB colours in [0, 1], float32, in the camera's size, on a black background.
 
     Raises:
-        ParameterError: ``backend`` is "cuda" and there is no GPU.
+        ParameterError: ``backend`` is "cuda" without a GPU.
         MissingDependencyError: PyTorch is absent, or gsplat's kernels cannot be built.
 
     Example:

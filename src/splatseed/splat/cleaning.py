@@ -1,9 +1,8 @@
-"""Leaving out what no renderer can draw of a model that was read, so that every format gets it.
+"""Drop Gaussians that no renderer can draw, for all formats alike.
 
-Kept are opacities of exactly 0 and 1, whose logits are infinite, sizes of 0 (a flat Gaussian), and
-a rotation of length 0 where all three sizes are equal, as it turns nothing. Left out are Gaussians
-with any other number that is not finite, with a size beyond e^20 or a position beyond 1e18 units,
-whose squares overflow in a renderer, and with a rotation of length 0.
+Dropped are Gaussians with a NaN or infinite number, a size beyond e^20 or a position beyond 1e18
+units (their squares overflow in a renderer), or a rotation of length 0. Kept are opacities of
+exactly 0 and 1 (infinite logits), sizes of 0, and a rotation of length 0 of a sphere.
 """
 
 from __future__ import annotations
@@ -19,20 +18,20 @@ from splatseed.splat.gaussians import Gaussians
 from splatseed.text import agreeing, counted
 
 MAX_LOG_SCALE = 20.0
-"""Larger sizes are left out; log-scales of compressed PLY end here, too."""
+"""Log-scale of the largest size; also the limit of compressed PLY and SOG."""
 MAX_POSITION = 1e18
 MIN_LOG_SCALE = float(np.log(np.finfo(np.float32).tiny))
-"""The log-scale of a size of 0, which would be -infinity."""
+"""Replaces the log-scale of a size of 0, -infinity."""
 _NORMS = (1e-6, 1e6)
-"""Quaternions of other lengths are normalised: their squares may leave single precision."""
-_ROUND = 1e-3  # largest difference of log-scales of a Gaussian that no rotation changes
+"""Quaternions of other lengths are normalised: their squares may overflow or underflow float32."""
+_MAX_SPHERE_SPREAD = 1e-3  # largest difference of log-scales of a sphere
 
 
 def drop_unusable(path: Path, gaussians: Gaussians) -> tuple[Gaussians, str]:
-    """The Gaussians that can be drawn, in order, and a note on those left out, empty if none are.
+    """Return the drawable Gaussians, in order, and a note on the others (empty without any).
 
     Raises:
-        SceneFormatError: None can be drawn.
+        SceneFormatError: No Gaussian can be drawn.
     """
     norms = np.linalg.norm(gaussians.quats.astype(np.float64), axis=1)
     kinds = _unusable(gaussians, norms)
@@ -59,9 +58,9 @@ def drop_unusable(path: Path, gaussians: Gaussians) -> tuple[Gaussians, str]:
 def _unusable(
     gaussians: Gaussians, norms: Float64[np.ndarray, " N"]
 ) -> dict[str, Bool[np.ndarray, " N"]]:
-    """Which Gaussians cannot be drawn, by the parameter at fault."""
+    """Return masks of the Gaussians that cannot be drawn, by the faulty parameter."""
 
-    def infinite(*arrays: np.ndarray) -> Bool[np.ndarray, " N"]:
+    def not_finite(*arrays: np.ndarray) -> Bool[np.ndarray, " N"]:
         flat = (each.reshape(len(each), -1) for each in arrays)
         return np.asarray(~np.stack([np.isfinite(each).all(axis=1) for each in flat]).all(axis=0))
 
@@ -70,14 +69,15 @@ def _unusable(
         return {
             "position": ~(np.abs(gaussians.means) <= MAX_POSITION).all(axis=1),  # also NaN
             "size": ~(gaussians.scales <= MAX_LOG_SCALE).all(axis=1),  # also NaN
-            "rotation": infinite(gaussians.quats) | ((norms == 0) & ~(spread < _ROUND)),
+            "rotation": not_finite(gaussians.quats)
+            | ((norms == 0) & ~(spread < _MAX_SPHERE_SPREAD)),
             "opacity": np.isnan(gaussians.opacities),
-            "colour": infinite(gaussians.sh0, gaussians.shN),
+            "colour": not_finite(gaussians.sh0, gaussians.shN),
         }
 
 
 def _representable(gaussians: Gaussians, norms: Float64[np.ndarray, " N"]) -> Gaussians:
-    """The same Gaussians, without sizes of 0 and quaternions of extreme length."""
+    """Replace sizes of 0 and quaternions of extreme length by equivalent ones."""
     if (extreme := (norms < _NORMS[0]) | (norms > _NORMS[1])).any():
         quats = gaussians.quats.copy()
         lengths = np.where(norms > 0, norms, 1)[extreme, None]
@@ -91,7 +91,7 @@ def _representable(gaussians: Gaussians, norms: Float64[np.ndarray, " N"]) -> Ga
 
 
 def _listed(counts: dict[str, int]) -> str:
-    """Such as "position (3), rotation (1)"; the count of a single kind goes without saying."""
+    """Format as "position (3), rotation (1)", or without a count if there is one kind."""
     if len(counts) == 1:
         return next(iter(counts))
     return ", ".join(f"{kind} ({count:,})" for kind, count in counts.items())

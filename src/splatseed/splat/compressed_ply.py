@@ -34,20 +34,21 @@ _BOUNDS = [
     for names in (("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b"))
     for end in ("min", "max")
 ]
-_GLARING = 2.5
-"""Colours farther from mid grey, 0.5, are apart: a byte is too coarse for them and all others."""
+_MAX_COLOR_OFFSET = 2.5
+"""Distance from mid grey, 0.5, beyond which colours get chunks of their own: bytes cannot resolve
+them together with usual colours."""
 _FILLER = np.array([0, 0x20080200, 0, 0], "<u4")
-"""The least of all that its chunk holds, not turned, opacity 0; left out on reading."""
+"""The minimum of each bound, no rotation, opacity 0; dropped on reading."""
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _Layout = tuple[tuple[int, int], ...]
-"""Shift and number of bits of each part of a packed number."""
+"""Shift and number of bits of each component of a packed number."""
 _VECTOR_BITS: _Layout = ((21, 11), (11, 10), (0, 11))
 _THREE_BITS: _Layout = ((20, 10), (10, 10), (0, 10))
 _COLOR_BITS: _Layout = ((24, 8), (16, 8), (8, 8))
 
 
 def encode(gaussians: Gaussians, _: Note = silent_note) -> list[bytes]:
-    """In Z-curve order, far Gaussians and colours beyond any display's in chunks of their own."""
+    """Encode Gaussians in Z-curve order; outliers in position or colour get separate chunks."""
     order, fillers = _in_chunks(gaussians)
     count, rest = len(order), 3 * gaussians.shN.shape[1]
     scales = np.clip(gaussians.scales[order], -MAX_LOG_SCALE, MAX_LOG_SCALE)
@@ -55,7 +56,7 @@ def encode(gaussians: Gaussians, _: Note = silent_note) -> list[bytes]:
     chunk, starts = np.arange(count) // _CHUNK, np.arange(0, count, _CHUNK)
     tables, units = [], []
     for values in (gaussians.means[order], scales, colors):
-        # The bounds of each chunk, and each value as a fraction between them.
+        # Bounds per chunk; values become fractions between them.
         low = np.minimum.reduceat(values, starts, axis=0)
         high = np.maximum.reduceat(values, starts, axis=0)
         extent = np.where(high > low, high - low, 1)
@@ -64,9 +65,9 @@ def encode(gaussians: Gaussians, _: Note = silent_note) -> list[bytes]:
     largest, three = smallest_three(gaussians.quats[order])
     packed = np.empty((count, 4), "<u4")
     packed[:, 0] = _pack(units[0], _VECTOR_BITS)
-    # 2 bits for the index of the largest component, 10 for each other one.
-    turn = _pack(three * np.float32(np.sqrt(0.5)) + np.float32(0.5), _THREE_BITS)
-    packed[:, 1] = (largest.astype(np.uint32) << 30) | turn
+    # 2 bits for the index of the largest component, 10 for each of the others.
+    rotation = _pack(three * np.float32(np.sqrt(0.5)) + np.float32(0.5), _THREE_BITS)
+    packed[:, 1] = (largest.astype(np.uint32) << 30) | rotation
     packed[:, 2] = _pack(units[1], _VECTOR_BITS)
     packed[:, 3] = _pack(units[2], _COLOR_BITS) | opacity_bytes(gaussians.opacities[order])
     packed[fillers] = _FILLER
@@ -84,15 +85,15 @@ def encode(gaussians: Gaussians, _: Note = silent_note) -> list[bytes]:
 
 
 def _in_chunks(gaussians: Gaussians) -> tuple[Int64[np.ndarray, " M"], Bool[np.ndarray, " M"]]:
-    """The Gaussians by chunk, and which places only fill one up.
+    """Return the index of each encoded Gaussian, chunk by chunk, and a mask of fillers.
 
-    Bounds of a chunk are its members'; so Gaussians of different shells, and those of colours far
-    beyond black or white, share none: each group but the last ends with fillers, invisible
-    Gaussians that repeat the place of one of it.
+    The members of a chunk set its bounds, so Gaussians of different shells or with extreme colours
+    must not share one. Each group but the last is padded to full chunks with fillers: invisible
+    copies of its last Gaussian.
     """
     colors = gaussians.sh0[:, 0] * np.float32(SH_C0) + np.float32(0.5)
-    glaring = (np.abs(colors - np.float32(0.5)) > _GLARING).any(axis=1)
-    groups = 2 * shells_of(gaussians.means) + glaring
+    extreme = (np.abs(colors - np.float32(0.5)) > _MAX_COLOR_OFFSET).any(axis=1)
+    groups = 2 * shells_of(gaussians.means) + extreme
     order = np.lexsort((morton_codes(gaussians.means), groups))
     ends = np.append(np.flatnonzero(np.diff(groups[order])) + 1, len(order))
     parts = [np.arange(0, ends[0]), *map(np.arange, ends[:-1], ends[1:])]
@@ -107,12 +108,12 @@ def _in_chunks(gaussians: Gaussians) -> tuple[Int64[np.ndarray, " M"], Bool[np.n
 
 
 def decode(path: Path, _: Note = silent_note) -> Gaussians:
-    """Chunks, vertices, and coefficients if there are some."""
+    """Decode a compressed PLY."""
     reader = ByteReader(path)
     header = parse_header(path, reader.data)
     reader.offset = header.size
     tables: dict[str, np.ndarray[Any, Any]] = {}
-    with translate_errors(path, "a whole compressed PLY"):
+    with translate_errors(path, "a complete compressed PLY"):
         for element in header.elements:
             reader.record = f"element {element.name}"
             tables[element.name] = reader.array(header.dtype(element), element.num_rows)
@@ -121,21 +122,21 @@ def decode(path: Path, _: Note = silent_note) -> Gaussians:
             raise ValueError(f"{len(chunks)} chunks for {len(vertices)} Gaussians")
         if any(vertices.dtype[name] != np.dtype("<u4") for name in _PACKED):
             raise ValueError("packed properties of another type than uint")
-        position, turn, scale, color = (vertices[name] for name in _PACKED)
+        position, rotation, scale, color = (vertices[name] for name in _PACKED)
         chunk = np.arange(len(vertices)) // _CHUNK
 
-        def within(units: Float32[np.ndarray, "N 3"], kind: int) -> Float32[np.ndarray, "N 3"]:
+        def in_bounds(units: Float32[np.ndarray, "N 3"], kind: int) -> Float32[np.ndarray, "N 3"]:
             ends = (chunks[names] for names in _BOUNDS[2 * kind : 2 * kind + 2])
             low, high = (structured_to_unstructured(end)[chunk] for end in ends)
             return np.asarray(low + units * (high - low), np.float32)
 
         colors = _unpack(color, _COLOR_BITS)
-        # Files from before 2024 have no colour bounds at all.
+        # Files from before 2024 have no colour bounds.
         if {*_BOUNDS[4], *_BOUNDS[5]} & set(chunks.dtype.names or ()):
-            colors = within(colors, 2)
+            colors = in_bounds(colors, 2)
         table, shN = tables.get("sh", vertices), np.zeros((len(vertices), 0, 3), np.float32)
         rest = [name for name in table.dtype.names or () if name.startswith("f_rest_")]
-        if rest:  # all of red, then green, then blue
+        if rest:  # red coefficients, then green, then blue
             if len(table) != len(vertices) or len(rest) not in {3 * k for k in SH_COUNTS}:
                 raise ValueError(f"{len(table)} rows of {len(rest)} f_rest")
             values = structured_to_unstructured(table[[f"f_rest_{i}" for i in range(len(rest))]])
@@ -143,13 +144,13 @@ def decode(path: Path, _: Note = silent_note) -> Gaussians:
             centers = np.where(values == 0, 0, np.where(values == 255, 1, centers))
             rows = (centers.astype(np.float32) - np.float32(0.5)) * np.float32(_SH_RANGE)
             shN = np.ascontiguousarray(rows.reshape(len(rows), 3, -1).transpose(0, 2, 1))
-        three = (_unpack(turn, _THREE_BITS) - np.float32(0.5)) * np.float32(np.sqrt(2))
-        packed = np.stack([position, turn, scale, color], axis=1)
+        three = (_unpack(rotation, _THREE_BITS) - np.float32(0.5)) * np.float32(np.sqrt(2))
+        packed = np.stack([position, rotation, scale, color], axis=1)
         kept = (packed != _FILLER).any(axis=1)
         gaussians = Gaussians(
-            means=within(_unpack(position, _VECTOR_BITS), 0),
-            scales=within(_unpack(scale, _VECTOR_BITS), 1),
-            quats=from_smallest_three((turn >> 30).astype(np.int64), three),
+            means=in_bounds(_unpack(position, _VECTOR_BITS), 0),
+            scales=in_bounds(_unpack(scale, _VECTOR_BITS), 1),
+            quats=from_smallest_three((rotation >> 30).astype(np.int64), three),
             opacities=opacity_logits((color & 255).astype(np.uint8)),
             sh0=((colors - np.float32(0.5)) / np.float32(SH_C0))[:, None],
             shN=shN,
@@ -159,11 +160,11 @@ def decode(path: Path, _: Note = silent_note) -> Gaussians:
 
 
 def _pack(units: Float32[np.ndarray, "N 3"], layout: _Layout) -> UInt32[np.ndarray, " N"]:
-    """Values in [0, 1] quantised to the given numbers of bits, shifted into one integer."""
+    """Quantise values in [0, 1] and pack them into one integer."""
     packed = np.zeros(len(units), np.uint32)
     for i, (shift, bits) in enumerate(layout):
-        most = 2**bits - 1
-        packed |= np.rint(np.clip(units[:, i], 0, 1) * most).astype(np.uint32) << np.uint32(shift)
+        levels = 2**bits - 1
+        packed |= np.rint(np.clip(units[:, i], 0, 1) * levels).astype(np.uint32) << np.uint32(shift)
     return packed
 
 

@@ -1,10 +1,10 @@
-"""Which pixels of the test views at least two training views see: where scores measure skill.
+"""Find the pixels of test views that at least two training views see.
 
-What fewer show can only be guessed. Images are divided into the cells of ``photos.zbuffer``. A
-cell's depth is that of the scene's own depth map, else ``cell_depths``, or the median of the
-nearest cells. A training view sees a point that projects into it and lies no more than ``SURFACE``
-behind the depth there. Promise: the answer depends on cameras, points and
-depth maps alone, never on a render, so it is the same for everything that is scored on a scene.
+Other pixels can only be guessed. Images are divided into the cells of ``photos.zbuffer``. A cell's
+depth is that of the scene's depth map, else of ``cell_depths``, else the median of the nearest
+cells. A training view sees a point that projects into it and lies at most ``SURFACE`` (relative)
+behind the depth there. The result does not depend on renders: it is the same for all models of a
+scene.
 """
 
 from __future__ import annotations
@@ -12,11 +12,14 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float32
+from scipy.ndimage import maximum_filter
+from scipy.spatial import cKDTree
 
 from splatseed.depthmap import DepthMaps
 from splatseed.io.files import ARCHIVE_FAILURES
@@ -29,13 +32,21 @@ from splatseed.photos.zbuffer import cell_depths
 from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
 
-_LEAST_VIEWS = 2  # training views that must see a pixel
-_CELLS, _LEAST_CELL = 100, 2.0
-"""Cells along the longer side (the SfM points of a capture fill most of so many), and the smallest
-side of a cell, in pixels."""
-_MAX_SIZE = 800  # longer side in pixels of the frames that are divided into cells
-_NEAREST = 4  # covered cells over which an empty cell takes the median of inverse depth
 _STAGE = "find co-visible pixels"
+
+
+@dataclass(frozen=True)
+class CovisibilitySettings:
+    """Constants of co-visibility."""
+
+    min_views: int = 2  # training views that must see a pixel
+    num_cells: int = 100  # along the longer side; the SfM points of a capture fill most of them
+    min_cell: float = 2.0  # px, side of a cell
+    max_side: int = 800  # px, longer side of the images that are divided into cells
+    num_nearest: int = 4  # covered cells whose median inverse depth fills an empty cell
+
+
+SETTINGS = CovisibilitySettings()
 
 Grids = Mapping[str, Bool[np.ndarray, "rows cols"]]
 
@@ -43,21 +54,19 @@ Grids = Mapping[str, Bool[np.ndarray, "rows cols"]]
 def find_covisible(
     scene: Scene, test_every: int = 8, progress: Progress = silent
 ) -> dict[str, Bool[np.ndarray, "rows cols"]]:
-    """The cells of each test view that at least two training views see, by the view's name.
+    """Return the cells of each test view that at least two training views see, by view name.
 
-    Every ``test_every``-th image is a test view; none if there are neither points nor depth maps.
+    Every ``test_every``-th image is a test view. Empty for a scene without points and depth maps.
 
     Raises:
         SceneFormatError: A depth map is damaged.
     """
-    from scipy.ndimage import maximum_filter  # noqa: PLC0415  (slow to import)
-
     points = scene.points.references
     xyz = np.ascontiguousarray(points.xyz[points.finite], np.float32)
     maps = scene.depths if scene.source and scene.source.format == "rgbd" else None
     if not scene.images or (maps is None and not len(xyz)):
         return {}
-    train, test = (_frames(part, maps) for part in scene.split(test_every))
+    train, test = (_small_views(part, maps) for part in scene.split(test_every))
     views = [*train, *test]
     by_view: dict[str, Bool[np.ndarray, "rows cols"]] = {}
     with ThreadPoolExecutor(os.cpu_count()) as pool:
@@ -65,7 +74,7 @@ def find_covisible(
         for grid in pool.map(lambda view: _depths(view, xyz, maps), views):
             depths.append(grid)
             progress(_STAGE, 0.5 * len(depths) / len(views))
-        # At an edge both surfaces count as seen: each cell's depth is its neighbours' largest.
+        # At depth edges both surfaces are visible: take the largest depth of each neighbourhood.
         farthest = (maximum_filter(grid, size=3, mode="nearest") for grid in depths)
         seen, own = list(zip(train, farthest, strict=False)), depths[len(train) :]
         grids = pool.map(lambda view, grid: _covisible(view, grid, seen), test, own)
@@ -76,33 +85,31 @@ def find_covisible(
 
 
 def pixel_masks(grids: Grids, views: Sequence[View]) -> dict[str, Bool[np.ndarray, "H W"]]:
-    """The cells that ``find_covisible`` found as masks of the pixels of views of any size."""
+    """Resize the cells of ``find_covisible`` to masks of the views' pixels."""
     return {v.name: _resized(grids[v.name], v.height, v.width) for v in views if v.name in grids}
 
 
 def _resized(values: np.ndarray[Any, Any], rows: int, cols: int) -> np.ndarray[Any, Any]:
-    """The nearest value at the centres of ``rows x cols`` cells of the same frame."""
+    """Resample to ``rows x cols`` cells of the same frame, by nearest neighbour."""
     i = (np.arange(rows) + 0.5) * values.shape[0] / rows
     j = (np.arange(cols) + 0.5) * values.shape[1] / cols
     return values[np.ix_(i.astype(np.int64), j.astype(np.int64))]
 
 
 def _cell(view: View) -> float:
-    return max(max(view.width, view.height) / _CELLS, _LEAST_CELL)
+    return max(max(view.width, view.height) / SETTINGS.num_cells, SETTINGS.min_cell)
 
 
-def _frames(images: Sequence[Image], maps: DepthMaps | None) -> Sequence[View]:
-    """The images' frames at the size that cells are stated for; with depth maps, those with one."""
+def _small_views(images: Sequence[Image], maps: DepthMaps | None) -> Sequence[View]:
+    """Return the images' views at most ``max_side`` large; with depth maps, of images with one."""
     known = [image for image in images if maps is None or image.name in maps]
-    return camera_views(known, factor_for_size(known, _MAX_SIZE)) if known else ()
+    return camera_views(known, factor_for_size(known, SETTINGS.max_side)) if known else ()
 
 
 def _depths(
     view: View, xyz: Float32[np.ndarray, "N 3"], maps: DepthMaps | None
 ) -> Float32[np.ndarray, "rows cols"]:
-    """Planar depth of each cell, gaps filled; infinite in all where nothing is known."""
-    from scipy.spatial import cKDTree  # noqa: PLC0415  (slow to import)
-
+    """Return the planar depth of each cell, gaps filled; all infinite without any depth."""
     if maps is None:
         depths = cell_depths(view.camera, xyz, _cell(view))
     else:  # RGB-D captures have planar depth
@@ -110,7 +117,7 @@ def _depths(
         depths = np.nan_to_num(values, nan=np.inf)
     known = np.isfinite(depths)
     if known.any() and not known.all():
-        k = min(_NEAREST, np.count_nonzero(known))
+        k = min(SETTINGS.num_nearest, np.count_nonzero(known))
         _, near = cKDTree(np.argwhere(known)).query(np.argwhere(~known), k=k)
         inverse = 1.0 / depths[known][near.reshape(-1, k)]
         depths = depths.copy()
@@ -134,11 +141,11 @@ def _covisible(
         points = points_in_image(other.camera, xyz)
         there = farthest[points.cells(other.camera, farthest.shape)]
         count[points.point_idx] += there >= (1.0 - SURFACE) * points.depth
-    return np.asarray((count.reshape(depths.shape) >= _LEAST_VIEWS) & known)
+    return np.asarray((count.reshape(depths.shape) >= SETTINGS.min_views) & known)
 
 
 def write_covisible(path: Path, grids: Grids) -> None:
-    """Store cells for the next run."""
+    """Cache the cells of ``find_covisible``."""
     names = np.array(list(grids), dtype=np.str_)
     arrays: dict[str, Any] = {f"cells_{i}": grid for i, grid in enumerate(grids.values())}
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -147,9 +154,9 @@ def write_covisible(path: Path, grids: Grids) -> None:
 
 
 def read_covisible(path: Path) -> dict[str, Bool[np.ndarray, "rows cols"]] | None:
-    """The cells that ``write_covisible`` stored; None if the file is missing or unreadable."""
+    """Read cached cells; None if the file is missing or unreadable."""
     try:
-        with np.load(path, allow_pickle=False) as kept:
-            return {str(name): kept[f"cells_{i}"] for i, name in enumerate(kept["names"])}
+        with np.load(path, allow_pickle=False) as file:
+            return {str(name): file[f"cells_{i}"] for i, name in enumerate(file["names"])}
     except ARCHIVE_FAILURES:
         return None

@@ -1,9 +1,9 @@
-"""Scores of Gaussians: how close renders are to photographs that were not used for training.
+"""Score Gaussians: compare renders with test photographs.
 
-Promise: values are sRGB 0..1, not linearised, renders clamped and not rounded to 8 bits; each view
-is scored at its own size; SSIM has an 11 x 11 Gaussian window (sigma 1.5) on images mirrored at
-their edges, as in torchmetrics and gsplat's trainer. A model is rendered in the frame of the
-scene's training cameras, as in training. Needs PyTorch (``pip install ".[train]"``).
+Values are sRGB in [0, 1]; renders are clamped, but not rounded to 8 bits. SSIM has an 11 x 11
+Gaussian window (sigma 1.5) on images mirrored at their edges, as in torchmetrics and gsplat's
+trainer. Models are rendered in the training frame of the scene's training cameras. Needs PyTorch
+(``pip install ".[train]"``).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float, Float32
 from splatseed.io.files import StrPath
 from splatseed.requirements import require
 
-require("torch", "flip_evaluator")  # before what loads it, for one clear error
+require("torch", "flip_evaluator")  # before the imports below, for one clear error
 
 import torch
 from torch import Tensor
@@ -59,7 +59,7 @@ Covisible: TypeAlias = Mapping[str, Bool[np.ndarray, "H W"]]
 """The pixels of each test view, by name, that at least two training views see."""
 Render: TypeAlias = Callable[[View], Float[Tensor, "H W 3"]]
 OnView: TypeAlias = Callable[[View, Float32[np.ndarray, "H W 3"], Float32[np.ndarray, "H W"]], None]
-"""Called with each view scored, its render clamped to [0, 1], and FLIP of each pixel."""
+"""Called with each view, its render clamped to [0, 1], and FLIP of each pixel."""
 
 
 @torch.no_grad()
@@ -73,22 +73,22 @@ def evaluate_views(
     on_view: OnView = lambda *_: None,
     progress: Progress = silent,
 ) -> EvalResult:
-    """Score renders of views against their photographs, where pixels are not masked.
+    """Score renders of views against their photographs.
 
-    Masked pixels have the photograph's colours for FLIP and LPIPS. The first view is rendered once
-    before, untimed, because a first call may compile.
+    Masked pixels have no part in scores; for FLIP and LPIPS the render takes the photograph's
+    colours there. The first view is rendered once more, untimed, because a first call may compile.
 
     Args:
         render: Renders a view as float [H, W, 3], values about 0..1, on any device.
-        views: The views; at least one.
-        lpips: The LPIPS metric; LPIPS is not measured when left out.
-        lpips_reason: Why it is left out, for the reader of the result.
-        covisible: The pixels over which PSNR is also computed, for the views it contains.
-        on_view: Called with each view, its render and its FLIP, to draw them.
+        views: One or more views.
+        lpips: The LPIPS metric; without it LPIPS is not measured.
+        lpips_reason: Why LPIPS is not measured, for the result.
+        covisible: Pixels over which PSNR is also computed, for some or all views.
+        on_view: Called with each view, its render and its FLIP.
         progress: Called with the name of a stage and its fraction done.
 
     Raises:
-        ParameterError: There are no views, or a render has another size or is not finite.
+        ParameterError: There are no views, or a render has the wrong shape or is not finite.
 
     Example:
         >>> import numpy as np, torch
@@ -100,9 +100,7 @@ def evaluate_views(
         5.99
     """
     if not views:
-        raise ParameterError(
-            "views to score", found="none", fix="Hold out some images for testing (test_every)."
-        )
+        raise ParameterError("views to score", found="none", fix="Choose test images (test_every).")
     render(views[0])
     scores = []
     for view in views:
@@ -130,11 +128,11 @@ def _score(
         raise ParameterError(
             f"a render of {view.name} of shape {shape} and finite values",
             found="NaN or infinity" if list(image.shape) == shape else f"{list(image.shape)}",
-            fix="Render views at their own width and height, of a model whose values are finite.",
+            fix="Render finite values at the width and height of the view.",
         )
     photograph, mask = photograph_tensor(view, image.device), mask_tensor(view, image.device)
-    shown = image.clamp(0.0, 1.0)
-    image = fill_masked(shown, photograph, mask)
+    clamped = image.clamp(0.0, 1.0)
+    image = fill_masked(clamped, photograph, mask)
     errors = flip_map(image, photograph)
     within, share, flips = None, None, errors if view.mask is None else errors[view.mask]
     if seen is not None:
@@ -142,7 +140,7 @@ def _score(
         seen = seen if view.mask is None else seen & view.mask
         if seen.any():
             within = psnr(image, photograph, torch.from_numpy(seen).to(image.device))
-    on_view(view, shown.cpu().numpy(), errors)
+    on_view(view, clamped.cpu().numpy(), errors)
     return ViewScore(
         view.name,
         psnr=psnr(image, photograph, mask),
@@ -157,7 +155,7 @@ def _score(
 
 
 def _now() -> float:
-    """Return the time once a GPU in use has finished its work."""
+    """Return the time after a GPU in use has finished its work."""
     if torch.cuda.is_initialized():  # type: ignore[no-untyped-call]  # PyTorch gives no types
         torch.cuda.synchronize()
     return time.perf_counter()
@@ -165,10 +163,10 @@ def _now() -> float:
 
 @dataclass(frozen=True, eq=False)
 class TrainedModel:
-    """Gaussians, the test views of their scene, and a function that renders a view of the scene.
+    """Gaussians, the test views of their scene, and a function that renders a view.
 
-    ``frame_warning`` says why the Gaussians may be in another frame; empty if they fit.
-    ``notes`` are about what was left out or changed on reading.
+    ``frame_warning`` says why the Gaussians may be in another frame; empty if they fit. ``notes``
+    list what was dropped or changed on reading.
     """
 
     gaussians: Gaussians
@@ -194,28 +192,26 @@ def load_model(
     cache_dir: Path | None = None,
     progress: Progress = silent,
 ) -> TrainedModel:
-    """Read Gaussians that any trainer wrote, and the test views of their scene.
+    """Load the Gaussians of any trainer, and the test views of their scene.
 
     Args:
         model: A file that ``read_gaussians`` reads, or Gaussians in the scene's frame.
         scene: The scene, or its path.
-        data_factor: The factor by which photographs are downsampled; when left out, as ``train``
-            chooses it.
+        data_factor: The factor by which photographs are downsampled; by default that of ``train``.
         test_every: Every n-th image, sorted by name, is a test view.
-        transform: From the scene's frame to the model's, as for ``find_transform``; when left out,
-            they must be the same.
-        masks: Which masks, as for ``io.masks.with_masks``.
-        trained_on: The ``photographs_digest`` of the run; where it is the scene's, the frames are
-            the same, whatever the clones that mcmc makes look like.
-        near_plane: The run's, in the model's units; when left out, it is found anew.
-        device: Where to render; the CPU when left out.
-        cache_dir: Where smaller photographs are cached; nowhere when left out.
+        transform: From the scene's to the model's frame, as for ``find_transform``; by default they
+            must be the same.
+        masks: The masks, as for ``io.masks.with_masks``.
+        trained_on: The ``photographs_digest`` of the run; if it equals the scene's, the frame is
+            known to be right and not checked.
+        near_plane: The run's, in the model's units; by default computed from the scene.
+        device: The device to render on, by default the CPU.
+        cache_dir: A folder in which to cache downsampled photographs; by default none.
         progress: Called with the name of a stage and its fraction done.
 
     Raises:
         SceneNotFoundError: The model, the scene or its images are missing.
-        SceneFormatError: One of them is damaged, or the Gaussians are not where the scene's points
-            are.
+        SceneFormatError: A file is damaged, or the Gaussians are in another frame.
         ParameterError: The transform cannot be computed.
     """
     notes: list[str] = []
@@ -234,8 +230,8 @@ def load_model(
     train, test = scene.split(test_every)
     if not train or not test:
         raise SceneNotFoundError(
-            f"{scene.source.root if scene.source else 'the scene'} to have images, some to train "
-            "on and some to test on",
+            f"{scene.source.root if scene.source else 'the scene'} to have images for training "
+            "and testing",
             found=f"{len(scene.images)}",
             fix="Name the scene with its cameras and photographs.",
         )
@@ -251,9 +247,9 @@ def load_model(
     if transform is None and path is not None:
         gaussians = move_to_scene_origin(path, scene, gaussians, notes.append)
     world = None if transform is None else find_transform(transform, scene)
-    proven = transform is None and trained_on == photographs_digest(scene)
-    unasked = proven or transform == NO_TRANSFORM
-    frame_warning = "" if unasked else check_frame(path, scene, gaussians, world)
+    same_scene = transform is None and trained_on == photographs_digest(scene)
+    skip_check = same_scene or transform == NO_TRANSFORM
+    frame_warning = "" if skip_check else check_frame(path, scene, gaussians, world)
     points = reference_points(scene)
     frame = frame_of_model(
         [view_in_model_frame(world, view) for view in camera_views(train)],
@@ -270,7 +266,7 @@ def load_model(
 
 
 def _with_test_photographs(scene: Scene, test_every: int) -> Scene:
-    """As ``with_photographs``, but accept a scene that has the test photographs only."""
+    """Like ``with_photographs``, but accept a scene with test photographs only."""
     try:
         return with_photographs(scene)
     except SceneNotFoundError:
@@ -282,7 +278,7 @@ def _with_test_photographs(scene: Scene, test_every: int) -> Scene:
 
 
 def evaluate_model(model: TrainedModel, **options: Any) -> EvalResult:
-    """Score a model on its test views and count its Gaussians; see ``evaluate_views``."""
+    """Score a model on its test views, with options of ``evaluate_views``; count its Gaussians."""
     result = evaluate_views(model.render, model.views, **options)
     return dataclasses.replace(
         result, num_gaussians=len(model.gaussians), model_bytes=model.gaussians.num_bytes

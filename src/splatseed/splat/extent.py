@@ -1,15 +1,16 @@
-"""Far Gaussians in packed formats: they must not take precision from all others.
+"""Preserve the precision of positions in packed formats despite distant Gaussians.
 
-Packed positions are steps between bounds, so one Gaussian at 1e6 units would leave the others a few
-steps. Notation: *distance* is from the median position, by the largest of the three axes, and
-*reach* its median, so that up to half of the Gaussians may be anywhere; *shell* 0 ends at 8 reaches
-and each further one is 64 times as large. Formats with chunks give each shell its own; formats
-with one step for all leave out far Gaussians where holding them would cost more of the picture.
+Packed positions are quantised between bounds: one Gaussian at 1e6 units would leave a few steps for
+all others. *Distance* is the maximum norm from the median position, and *reach* its median, which
+up to half of the Gaussians cannot move. *Shell* 0 ends at 8 reaches; each further shell is 64 times
+as large. Formats with chunks store each shell in its own chunks; formats with one step for all drop
+distant Gaussians if keeping them would cost more image quality.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -18,51 +19,55 @@ from jaxtyping import Bool, Float32, Float64, Int64
 from splatseed.splat.gaussians import Gaussians
 from splatseed.text import agreeing, counted
 
-NEAR, RATIO = 8.0, 64.0
-"""Where shell 0 ends, in reaches, and how much larger each further shell is."""
-NEGLIGIBLE = 1e-3
-"""Cost that nobody sees: as of rounding positions by 3% of a Gaussian's size."""
-COUNTED = 0.1
-"""Share of the cost of a lost Gaussian that does not depend on how large it appears."""
-MAX_BLUR = 0.5
-"""Cost of a Gaussian in the wrong place, of one that is lost."""
-COARSE = 0.1
-"""Median error of rounding, relative to a Gaussian's size, beyond which the user should know."""
-_MORTON_BITS = 21  # of each axis, 63 in all
+
+@dataclass(frozen=True)
+class PackingSettings:
+    """Constants of the choice of steps and shells."""
+
+    first_shell: float = 8.0  # end of shell 0, in reaches
+    shell_ratio: float = 64.0  # end of each further shell, in ends of the one before
+    negligible_cost: float = 1e-3  # invisible: rounding positions by 3% of a Gaussian's size
+    uniform_share: float = 0.1  # of the cost of a lost Gaussian; the rest follows its solid angle
+    max_blur: float = 0.5  # cost of a misplaced Gaussian, relative to a lost one
+    coarse_error: float = 0.1  # median rounding error, in sizes, that the user should know of
+    morton_bits: int = 21  # per axis; 63 in all
+
+
+SETTINGS = PackingSettings()
 
 
 def distances_of(means: Float32[np.ndarray, "N 3"]) -> tuple[Float64[np.ndarray, " N"], float]:
-    """The distance of each position, and the reach, which is positive."""
+    """Return the distance of each position, and the reach, which is positive."""
     xyz = means.astype(np.float64)
     distances = np.abs(xyz - np.median(xyz, axis=0)).max(axis=1)
     reach = float(np.median(distances))
-    if reach == 0:  # most are in one place
-        apart = distances[distances > 0]
-        reach = float(np.median(apart)) if len(apart) else 1.0
+    if reach == 0:  # at least half coincide
+        positive = distances[distances > 0]
+        reach = float(np.median(positive)) if len(positive) else 1.0
     return distances, reach
 
 
 def shells_of(means: Float32[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:
-    """The shell of each position."""
+    """Return the shell of each position."""
     distances, reach = distances_of(means)
-    beyond = np.maximum(distances / (NEAR * reach), 1.0)
-    shells = np.ceil(np.log(beyond) / np.log(RATIO))
+    beyond = np.maximum(distances / (SETTINGS.first_shell * reach), 1.0)
+    shells = np.ceil(np.log(beyond) / np.log(SETTINGS.shell_ratio))
     return np.asarray(shells, np.int64)
 
 
 def morton_codes(means: Float32[np.ndarray, "N 3"]) -> np.ndarray:
-    """Places on a Z curve whose cells grow with the distance, so that no far one makes them large.
+    """Return Z-curve codes of positions, in cells that grow with the distance.
 
-    Along each axis sign(x) log(1 + |x|), x in reaches from the median, is divided evenly.
+    Along each axis sign(x) log(1 + |x|), with x in reaches from the median, is divided evenly.
     """
     xyz = means.astype(np.float64)
     offsets = (xyz - np.median(xyz, axis=0)) / distances_of(means)[1]
     curved = np.sign(offsets) * np.log1p(np.abs(offsets))
     low, high = curved.min(axis=0), curved.max(axis=0)
     extent = np.where(high > low, high - low, 1)
-    cells = ((curved - low) / extent * (2**_MORTON_BITS - 1)).astype(np.uint64)
+    cells = ((curved - low) / extent * (2**SETTINGS.morton_bits - 1)).astype(np.uint64)
     code = np.zeros(len(xyz), np.uint64)
-    for bit in range(_MORTON_BITS):
+    for bit in range(SETTINGS.morton_bits):
         for axis in range(3):
             digit = (cells[:, axis] >> np.uint64(bit)) & np.uint64(1)
             code |= digit << np.uint64(3 * bit + axis)
@@ -70,40 +75,40 @@ def morton_codes(means: Float32[np.ndarray, "N 3"]) -> np.ndarray:
 
 
 def morton_order(means: Float32[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:
-    """The order of positions along the Z curve."""
+    """Return the order of positions along the Z curve."""
     return np.argsort(morton_codes(means), kind="stable")
 
 
 class Fit(NamedTuple):
-    """A way to hold positions: which it keeps, and the size of a step at each, or at all."""
+    """An encoding of positions: the Gaussians it keeps, and the step at each or at all of them."""
 
     kept: Bool[np.ndarray, " N"]
     step: Float64[np.ndarray, " N"] | float
 
 
 def best_fit(gaussians: Gaussians, fits: Sequence[Fit]) -> tuple[int, float, float]:
-    """The fit that costs the least: its index, the share lost, and the median error by rounding.
+    """Choose the fit of least cost; return its index, lost share and median rounding error.
 
-    Of fits whose cost is negligible the first is taken. A Gaussian counts by its opacity times the
-    solid angle in which it appears from the middle, and a little for its own sake. Left out, it is
-    lost; moved by rounding, it is blurred by the square of the error relative to its size, but by
-    less than if it were lost. The median error is relative to the size, too.
+    The first fit of negligible cost wins. A Gaussian's weight is its opacity times its solid angle
+    seen from the median position, plus a small uniform share. A dropped Gaussian costs its weight;
+    a rounded one costs its weight times the squared error relative to its size, up to ``max_blur``.
+    The median error is relative to the size, too.
     """
     distances, reach = distances_of(gaussians.means)
     sizes = np.exp(np.median(gaussians.scales, axis=1).astype(np.float64))
     with np.errstate(over="ignore"):
         opacity = 1 / (1 + np.exp(-gaussians.opacities.astype(np.float64)))
-    seen = opacity * np.minimum(sizes / np.maximum(distances, reach), 1) ** 2
-    even = np.full(len(seen), 1 / len(seen))
-    seen = seen / seen.sum() if seen.any() else even
-    weights = (1 - COUNTED) * seen + COUNTED * even
+    visible = opacity * np.minimum(sizes / np.maximum(distances, reach), 1) ** 2
+    even = np.full(len(visible), 1 / len(visible))
+    visible = visible / visible.sum() if visible.any() else even
+    weights = (1 - SETTINGS.uniform_share) * visible + SETTINGS.uniform_share * even
     costs = []
     for i, (kept, step) in enumerate(fits):
-        error = step / np.sqrt(12) / sizes  # of values that are rounded to steps
-        blurred = float((weights * np.minimum(error**2, MAX_BLUR))[kept].sum())
+        error = step / np.sqrt(12) / sizes  # RMS error of rounding to steps
+        blurred = float((weights * np.minimum(error**2, SETTINGS.max_blur))[kept].sum())
         lost = float(weights[~kept].sum())
         costs.append((lost + blurred, i, lost))
-        if lost + blurred <= NEGLIGIBLE:
+        if lost + blurred <= SETTINGS.negligible_cost:
             break
     _, best, lost = min(costs)
     kept, step = fits[best]
@@ -112,10 +117,12 @@ def best_fit(gaussians: Gaussians, fits: Sequence[Fit]) -> tuple[int, float, flo
 
 
 def left_out_note(suffix: str, kept: Bool[np.ndarray, " N"], where: str) -> str:
-    """The note on far Gaussians that a file of this suffix lacks."""
+    """Return a note on the distant Gaussians left out of a file with this suffix."""
     number = int(np.count_nonzero(~kept))
-    far = f"{counted(number, 'Gaussian')} of {len(kept):,} {agreeing(number, 'is', 'are')} {where}"
+    distant = (
+        f"{counted(number, 'Gaussian')} of {len(kept):,} {agreeing(number, 'is', 'are')} {where}"
+    )
     return (
-        f"{far} and {agreeing(number, 'was', 'were')} left out: in a {suffix} "
-        f"{agreeing(number, 'it', 'they')} would have made the positions of all others coarse."
+        f"{distant} and {agreeing(number, 'was', 'were')} left out: in a {suffix} "
+        f"{agreeing(number, 'it', 'they')} would reduce the precision of all other positions."
     )

@@ -1,9 +1,8 @@
-"""Files of trained Gaussians: 3DGS's .ply and the packed formats; and choosing which to keep.
+"""Read and write files of Gaussians, and filter them by position and opacity.
 
-Promise: a file's content decides its format when it is read, its name when it is
-written; a file appears whole or not at all; what is read can be drawn (``cleaning.py``). A .ply is
-read back bit for bit, its properties found by name; packed formats lose fine detail, and the
-Gaussians' order.
+The content decides the format on reading, the file name on writing. Writing is atomic. Gaussians
+that cannot be drawn are dropped on reading (``cleaning.py``). A .ply is lossless; packed formats
+lose fine detail and the order of Gaussians.
 """
 
 from __future__ import annotations
@@ -27,20 +26,20 @@ from splatseed.splat.gaussians import Gaussians
 from splatseed.text import beginning, did_you_mean
 
 _HEADER = 1 << 20
-_ELSEWHERE = {
+_UNSUPPORTED = {
     ".ksplat": "GaussianSplats3D's own tool (util/create-ksplat.js) makes one from a .ply",
     ".glb": f"{sog.CONVERTER} MODEL.ply OUT.glb makes one from a .ply",
     ".gltf": f"{sog.CONVERTER} MODEL.ply OUT.glb makes a .glb from a .ply",
     ".usdz": "NVIDIA's converter (PyPI: usd-convert-gsplat) makes one from a .ply",
 }
-"""Formats that are neither read nor written here, and the tools that write them."""
+"""Unsupported formats, and tools that write them."""
 
 
 class Format(NamedTuple):
-    """A format: its files' suffix, what it preserves and who reads it, and its two functions."""
+    """A file format; ``description`` lists what it preserves and its readers."""
 
     suffix: str
-    about: str
+    description: str
     encode: Callable[[Gaussians, Note], Iterable[bytes | memoryview]]
     decode: Callable[[Path, Note], Gaussians]
 
@@ -63,27 +62,26 @@ FORMATS = {
     ),
     "sog": Format(".sog", "all but fine detail; PlayCanvas, SuperSplat", sog.encode, sog.decode),
 }  # fmt: skip
-"""The formats by name; of two suffixes that a file name ends in, the longer comes first."""
+"""Formats by name; a suffix stands before those that it ends with."""
 SUFFIXES = {each.suffix: name for name, each in FORMATS.items()}
-"""The formats' names by file name suffix."""
+"""Names of formats by suffix."""
 
 
 def read_gaussians(path: StrPath, note: Note = silent_note) -> Gaussians:
-    """Read the Gaussians that any trainer wrote.
+    """Read the Gaussians of any trainer.
 
     Args:
-        path: A .ply, compressed .ply, .splat, .spz, or .sog (or its meta.json); its content decides
-            which.
-        note: Called with notes for the user, one sentence each, such as on Gaussians that cannot be
-            drawn (a number is NaN) and are left out.
+        path: A .ply, compressed .ply, .splat, .spz, or .sog (or its meta.json), recognised by its
+            content.
+        note: Called with notes for the user, such as on Gaussians with NaN, which are left out.
 
     Returns:
-        The Gaussians in the file's order (packed formats have an order of their own) and frame.
+        The Gaussians, in the order and frame of the file.
 
     Raises:
-        SceneNotFoundError: There is no such file.
-        SceneFormatError: It holds no Gaussians in a known format that can be drawn, or is damaged.
-        MissingDependencyError: It is an .spz of version 4, which needs zstandard.
+        SceneNotFoundError: The file does not exist.
+        SceneFormatError: The format is unknown, the file is damaged, or no Gaussian can be drawn.
+        MissingDependencyError: An .spz of version 4 needs zstandard.
     """
     path = Path(path)
     gaussians = FORMATS[detect_format(path, read_bytes(path))].decode(path, note)
@@ -96,13 +94,12 @@ def read_gaussians(path: StrPath, note: Note = silent_note) -> Gaussians:
 def write_gaussians(
     path: StrPath, gaussians: Gaussians, progress: Progress = silent, note: Note = silent_note
 ) -> None:
-    """Write at least one Gaussian, at finite positions, in the format that the file name asks for.
+    """Write one or more Gaussians, at finite positions, in the format of the file name's suffix.
 
-    ``note`` is called with each sentence that the user should read about what the format cannot
-    hold.
+    ``note`` is called with notes for the user on what the format cannot represent.
 
     Raises:
-        ParameterError: The suffix belongs to no format written here.
+        ParameterError: The suffix is not of a supported format.
         OutputError: The file cannot be written.
     """
     path = Path(path)
@@ -118,15 +115,15 @@ def write_gaussians(
 
 
 def format_of_name(path: Path) -> str:
-    """The format that a file name asks for.
+    """Return the name of the format of a file name's suffix.
 
     Raises:
-        ParameterError: The suffix belongs to no format written here.
+        ParameterError: The suffix is not of a supported format.
     """
     for suffix, name in SUFFIXES.items():
         if path.name.lower().endswith(suffix):
             return name
-    suffix, other = path.suffix or "none", _ELSEWHERE.get(path.suffix.lower())
+    suffix, other = path.suffix or "none", _UNSUPPORTED.get(path.suffix.lower())
     raise ParameterError(
         f"a file name that ends in one of {', '.join(SUFFIXES)}",
         found=suffix,
@@ -135,18 +132,18 @@ def format_of_name(path: Path) -> str:
 
 
 def detect_format(path: Path, data: bytes) -> str:
-    """The format of a file's content; of one without a signature, its name decides.
+    """Return the name of the format of a file's content (of a .splat, of its name).
 
     Raises:
-        SceneFormatError: The format cannot be read.
+        SceneFormatError: The format is not supported.
     """
     suffix = path.suffix.lower()
     if data.startswith(b"ply") and data[3:4] in (b"\n", b"\r", b" ", b"\t"):
         return "compressed-ply" if b"packed_position" in data[:_HEADER] else "ply"
-    begin = data
+    start = data
     with suppress(zlib.error):
-        begin = zlib.decompressobj(wbits=31).decompress(data[:4096], 4)
-    if begin.startswith(spz.MAGIC):
+        start = zlib.decompressobj(wbits=31).decompress(data[:4096], 4)
+    if start.startswith(spz.MAGIC):
         return "spz"
     if data.startswith(b"PK\x03\x04") or (data[:1] == b"{" and suffix == ".json"):
         return "sog"
@@ -157,7 +154,7 @@ def detect_format(path: Path, data: bytes) -> str:
             return "splat"
         found = f"{len(data):,} bytes, not a multiple of the {size} of a .splat's Gaussian"
         fix = COPY_AGAIN
-    elif suffix in _ELSEWHERE:
+    elif suffix in _UNSUPPORTED:
         found = f"a {suffix}"
         fix = f"Export a .ply where it came from, or try {sog.CONVERTER} IN{suffix} OUT.ply."
     expected = f"{path} to hold trained Gaussians ({', '.join(SUFFIXES)})"
@@ -165,17 +162,17 @@ def detect_format(path: Path, data: bytes) -> str:
 
 
 def parse_crop(text: str) -> Float64[np.ndarray, "2 3"]:
-    """The corners of the box given by six comma-separated numbers: minimum x, y, z, then maximum.
+    """Parse a box of six comma-separated numbers: minimum x, y, z, then maximum x, y, z.
 
     Raises:
-        ParameterError: There are not six, or they make no box.
+        ParameterError: The text is not six numbers, or a minimum is not below its maximum.
 
     Example:
         >>> parse_crop("-1,-1,-1,1,1,2").tolist()
         [[-1.0, -1.0, -1.0], [1.0, 1.0, 2.0]]
     """
     try:
-        low, high = np.array([float(word) for word in text.split(",")]).reshape(2, 3)
+        low, high = np.array([float(part) for part in text.split(",")]).reshape(2, 3)
     except ValueError:
         low = high = np.zeros(3)
     if not (low < high).all():
@@ -190,10 +187,10 @@ def parse_crop(text: str) -> Float64[np.ndarray, "2 3"]:
 def filter_gaussians(
     gaussians: Gaussians, crop: Float64[np.ndarray, "2 3"] | None = None, min_opacity: float = 0.0
 ) -> Gaussians:
-    """The Gaussians with centres in the box of ``parse_crop`` that are opaque enough, in order.
+    """Keep the Gaussians with centres in the box ``crop`` and at least ``min_opacity``, in order.
 
     Raises:
-        ParameterError: The opacity is out of range, or no Gaussian is left.
+        ParameterError: ``min_opacity`` is not in [0, 1), or no Gaussian is left.
     """
     if not 0 <= min_opacity < 1:
         raise ParameterError(

@@ -29,10 +29,10 @@ VISIBLE_LOGIT = -2.2  # opacity of about a tenth; fainter Gaussians do not show 
 
 @dataclass(frozen=True, eq=False)
 class Gaussians:
-    """N Gaussians, as 3DGS's .ply and gsplat's parameter dict hold them; float32, read-only.
+    """N Gaussians with the parameters of 3DGS's .ply and gsplat; float32, read-only arrays.
 
-    ``ss.read_gaussians`` reads them, ``ss.render`` renders them; ``dataclasses.replace`` and
-    ``select`` make others. Spherical harmonics have degree 0 to 3: K = 0, 3, 8 or 15.
+    ``ss.read_gaussians`` reads them and ``ss.render`` renders them. Spherical harmonics have degree
+    0 to 3: K = 0, 3, 8 or 15.
     """
 
     means: Float32[np.ndarray, "N 3"]  # positions
@@ -41,7 +41,7 @@ class Gaussians:
     opacities: Float32[np.ndarray, " N"]  # logits: 1 / (1 + exp(-x)) is the opacity
     sh0: Float32[np.ndarray, "N 1 3"]  # of harmonics: 0.5 + 0.2821 sh0 is the mean sRGB colour
     shN: Float32[np.ndarray, "N K 3"]  # noqa: N815  (gsplat's name)  # of higher degrees
-    antialiased: bool = False  # trained, and to be rendered, with ``rasterize_mode="antialiased"``
+    antialiased: bool = False  # needs ``rasterize_mode="antialiased"``
 
     def __post_init__(self) -> None:
         for name in PARAMETERS:
@@ -65,19 +65,19 @@ class Gaussians:
         return sum(array.nbytes for array in self.arrays().values())
 
     def arrays(self) -> dict[str, Float32[np.ndarray, "N ..."]]:
-        """The parameters by name, in the order above."""
+        """Return the parameters by name, in the order of ``PARAMETERS``."""
         return {name: getattr(self, name) for name in PARAMETERS}
 
     def select(self, index: Bool[np.ndarray, " N"] | Int64[np.ndarray, " M"]) -> Gaussians:
-        """Some of the Gaussians, by index or mask."""
+        """Return some of the Gaussians, by index or mask."""
         parts = {name: array[index] for name, array in self.arrays().items()}
         return dataclasses.replace(self, **parts)
 
     def write_ply(self, path: StrPath) -> None:
-        """Write them as 3DGS's .ply, which every viewer and trainer reads; replaces a file there.
+        """Write 3DGS's .ply, which every viewer and trainer reads; replaces an existing file.
 
         Raises:
-            OutputError: It cannot be written.
+            OutputError: The file cannot be written.
         """
         with atomic_file(Path(path)) as partial, partial.open("wb") as file:
             file.writelines(encode_layout(self.arrays(), self.antialiased))

@@ -1,10 +1,10 @@
-"""LPIPS, version 0.1: the distance of two images in the features of a network.
+"""LPIPS, version 0.1: the distance of two images in the feature space of a network.
 
-f_l is the output of the l-th of 5 stages, scaled to unit length over its channels; w_l >= 0 are
-learnt from human judgements, and d(x, y) = sum_l mean_places sum_c w_lc (f_lc(x) - f_lc(y))^2
-(Zhang et al. 2018, eq. 1). The weights of the network are torchvision's, the w_l torchmetrics'. The
-network is built here, because torchmetrics builds it by torchvision, which is tied to one version
-of PyTorch. Nothing is downloaded.
+d(x, y) = sum_l mean_pixels sum_c w_lc (f_lc(x) - f_lc(y))^2 (Zhang et al. 2018, eq. 1): f_l is
+the output of the l-th of 5 stages, scaled to unit length over its channels, and w_l >= 0 are learnt
+weights. The network's weights are torchvision's, the w_l torchmetrics'. The network is built here,
+because torchmetrics needs torchvision for it, which requires one version of PyTorch. Nothing is
+downloaded.
 """
 
 from __future__ import annotations
@@ -23,27 +23,27 @@ from splatseed.io.files import special_kind, translate_errors
 from splatseed.requirements import require
 
 LPIPS_NET, LPIPS_FILE = "vgg", "vgg16-397923af.pth"
-"""The network of LPIPS, which papers on 3DGS report, and PyTorch's name for the file of weights."""
+"""The network that papers on 3DGS use for LPIPS, and PyTorch's name of its weights file."""
 _URL = "https://download.pytorch.org/models/"
-_TAPS = (3, 8, 15, 22, 29)  # the layers whose output is compared
+_TAPS = (3, 8, 15, 22, 29)  # layers whose outputs are compared
 # Each channel of an image in [-1, 1] becomes (value - SHIFT) / SCALE, as in the metric's code.
 _SHIFT = (-0.030, -0.088, -0.188)
 _SCALE = (0.458, 0.448, 0.450)
 _EPSILON = 1e-8
-"""Added to the squared length, so that features that are all 0 can be scaled."""
+"""Added to squared lengths, so that zero features can be normalised."""
 
 
 @dataclass(frozen=True, eq=False)
 class Lpips:
-    """LPIPS with its weights, ready to compare images."""
+    """LPIPS with its weights."""
 
     features: nn.Sequential  # the network's convolutions, in torchvision's order
     heads: list[Tensor]  # w_l of each stage, [1, C_l, 1, 1]
 
     @torch.no_grad()
-    @torch.backends.cudnn.flags(enabled=True, allow_tf32=False)  # the score of any other device
+    @torch.backends.cudnn.flags(enabled=True, allow_tf32=False)  # the same score on all devices
     def __call__(self, render: Float[Tensor, "H W 3"], photograph: Float[Tensor, "H W 3"]) -> float:
-        """Return the distance of two images of values 0..1; 0 for equal images."""
+        """Return the distance of two images of values in [0, 1]; 0 for equal images."""
         pair = torch.stack([render, photograph]).permute(0, 3, 1, 2)
         shift, scale = (pair.new_tensor(values).view(1, 3, 1, 1) for values in (_SHIFT, _SCALE))
         x, total, heads = (2 * pair - 1 - shift) / scale, 0.0, iter(self.heads)
@@ -60,12 +60,12 @@ def load_lpips(weights: Path | None = None) -> Lpips:
     """Load LPIPS with VGG's weights: a file or its folder, by default PyTorch's cache.
 
     Raises:
-        MissingDependencyError: torchmetrics, which brings the w_l, is absent.
-        SceneNotFoundError: There are no weights; the message names the file to download.
-        SceneFormatError: The file does not hold this network's weights.
+        MissingDependencyError: torchmetrics, which has the w_l, is absent.
+        SceneNotFoundError: The weights are missing; the message names the file to download.
+        SceneFormatError: The file has no weights of this network.
     """
     path, layers, before = _weights_path(weights), list[nn.Module](), 3
-    with torch.device("meta"):  # no random weights first: they would change PyTorch's generator
+    with torch.device("meta"):  # random weights would change PyTorch's generator
         for channels, count in ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3)):
             for _ in range(count):
                 layers += [nn.Conv2d(before, channels, 3, padding=1), nn.ReLU(inplace=True)]
@@ -85,7 +85,7 @@ def load_lpips(weights: Path | None = None) -> Lpips:
 
 
 def has_lpips_weights() -> bool:
-    """Whether ``load_lpips`` can find its weights; no file is opened."""
+    """Whether the weights of ``load_lpips`` exist; no file is opened."""
     try:
         return _weights_path(None).is_file()
     except (MissingDependencyError, SceneNotFoundError):
@@ -110,5 +110,5 @@ def _weights_path(given: Path | None) -> Path:
 
 
 def _read(path: Path) -> dict[str, Tensor]:
-    with warnings.catch_warnings(action="ignore"):  # about what a foreign file might be
+    with warnings.catch_warnings(action="ignore"):  # about unknown files
         return dict(torch.load(path, map_location="cpu", weights_only=True))

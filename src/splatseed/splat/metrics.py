@@ -1,6 +1,6 @@
-"""Metrics of two images [H, W, 3], values about 0..1, in PyTorch: PSNR, SSIM and FLIP.
+"""PSNR, SSIM and FLIP of two images [H, W, 3] of values in about [0, 1], in PyTorch.
 
-Promise: on a GPU, only functions that return a Python number synchronise.
+On a GPU, only functions that return a Python number synchronise.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from splatseed.splat.ssim import WINDOW, l1_and_ssim
 from splatseed.splat.ssim_conv import l1_and_ssim_by_convolution, ssim_map
 
 _UNSATURATED = 0.5 / 255
-"""Minimum distance from 0 and from 1 of a value that the camera has not clipped."""
+"""Minimum distance from 0 and 1 of an unclipped value."""
 _CORRECTIONS = 5
-"""Fits of a render's colours to a photograph's: after each, other pixels are saturated."""
+"""Number of colour fits: after each fit, other pixels are saturated."""
 
 
 @torch.no_grad()
@@ -37,7 +37,7 @@ def psnr(
     error = error if mask is None else error[mask]
     if not error.numel():
         return math.nan
-    if error.device.type == "cpu":  # the last digits of PyTorch's depend on the number of threads
+    if error.device.type == "cpu":  # PyTorch's mean depends on the number of threads
         mean = float(np.mean(error.numpy(), dtype=np.float64))
     else:
         mean = float(error.mean(dtype=torch.float64))
@@ -50,13 +50,13 @@ def color_corrected(
     photograph: Float[Tensor, "H W 3"],
     mask: Bool[Tensor, "H W"] | None = None,
 ) -> Float[Tensor, "H W 3"]:
-    """Return a render with its colours fitted to the photograph's.
+    """Fit a render's colours to the photograph's.
 
-    Each channel becomes the quadratic polynomial of the render's three that fits best in least
-    squares, over the pixels of the mask whose channel is saturated in neither image; this is
-    repeated on the result. It is multinerf's ``color_correct`` (Barron et al. 2022), which
-    nerfstudio has too, and gsplat's ``color_correct_quadratic``, in double precision; of equally
-    good polynomials the one of least norm is taken, so that a render of one colour has one.
+    Each channel becomes a quadratic polynomial of the render's three channels, fitted by least
+    squares over the pixels of the mask that are saturated in neither image; the fit is repeated on
+    its result. This is multinerf's ``color_correct`` (Barron et al. 2022) and gsplat's
+    ``color_correct_quadratic``, in double precision. Of equally good polynomials the one of
+    smallest norm is chosen, so that a render of a single colour has a solution.
     """
     x, y = (image.reshape(-1, 3).T.double() for image in (render.clamp(0, 1), photograph))
     usable = _unsaturated(x) & _unsaturated(y)
@@ -86,7 +86,7 @@ def mirrored_ssim(
 ) -> float:
     """Return the mean SSIM over all pixels, or those of a mask, with mirrored edges.
 
-    Where masked, the render should have the photograph's pixels (``rendering.fill_masked``).
+    Masked pixels of the render should be the photograph's (``photographs.fill_masked``).
     """
     margin = [WINDOW // 2] * 4
     x, y = (
@@ -104,16 +104,16 @@ def mirrored_ssim(
 def flip_map(
     render: Float[Tensor, "H W 3"], photograph: Float[Tensor, "H W 3"]
 ) -> Float32[np.ndarray, "H W"]:
-    """Return FLIP of each pixel, 0 to 1: how different images look when one replaces the other.
+    """Return FLIP of each pixel, 0 to 1: the visible difference when images alternate.
 
-    It is LDR-FLIP for a screen with 67 pixels per degree of the eye's field, computed on the CPU
-    by its authors' package (Andersson et al. 2020). Images are sRGB, clamped to [0, 1].
+    LDR-FLIP at 67 pixels per degree of visual angle, computed on the CPU by its authors' package
+    (Andersson et al. 2020). Images are sRGB, clamped to [0, 1].
 
     Raises:
         MissingDependencyError: flip-evaluator is absent.
     """
     require("flip_evaluator")
-    from flip_evaluator import evaluate  # noqa: PLC0415  (only FLIP needs it)
+    from flip_evaluator import evaluate  # noqa: PLC0415  (optional: extra `train`)
 
     images = (each.clamp(0, 1).cpu().contiguous().numpy() for each in (photograph, render))
     errors, _, _ = evaluate(*images, "LDR", applyMagma=False, computeMeanError=False)

@@ -1,10 +1,8 @@
-"""Trained Gaussians in .ply files: 3DGS's layout, and what other trainers and tools make of it.
+"""Read and write Gaussians in .ply files: 3DGS's layout, and its variants by other trainers.
 
-The layout stands in ``ply_layout``. Properties are
-found by name, in any order and type; those that are not known are ignored. Notation: s_i are a
-Gaussian's three sizes, f is Mip-Splatting's ``filter_3D``. Promise: what is written in 3DGS's
-layout is read back bit for bit; what needs more than its own numbers to be drawn (networks, a time)
-is refused by name.
+``ply_layout`` has the layout. Properties are found by name, in any order and type; unknown ones are
+ignored. 3DGS's layout survives writing and reading bit for bit. Models that need a network or a
+time to be rendered are refused by name.
 """
 
 from __future__ import annotations
@@ -37,31 +35,31 @@ from splatseed.splat.quantization import SH_COUNTS
 
 _COLORS = ("red", "green", "blue")
 _FILTER = "filter_3D"
-_OTHER_KINDS = {
-    "f_anchor_feat": "anchors (as of Scaffold-GS), of which networks make the Gaussians",
-    "f_offset": "anchors (as of Scaffold-GS), of which networks make the Gaussians",
+_UNSUPPORTED = {
+    "f_anchor_feat": "anchors (as of Scaffold-GS), from which networks generate Gaussians",
+    "f_offset": "anchors (as of Scaffold-GS), from which networks generate Gaussians",
     "trbf_": "Gaussians that move and fade over time (as of Spacetime Gaussians)",
     "motion_": "Gaussians that move over time (as of Spacetime Gaussians)",
     "scaling_t": "Gaussians in space and time (4D Gaussian Splatting)",
     "scale_t": "Gaussians in space and time (4D Gaussian Splatting)",
     "sb_params": "Beta kernels (as of Deformable Beta Splatting), not Gaussians",
-    "f_asg": "colours that a network computes (as of Spec-Gaussian)",
+    "f_asg": "colours computed by a network (as of Spec-Gaussian)",
 }
-"""Beginnings of properties' names that tell models which their own program alone can draw."""
+"""Prefixes of properties of models that only their own program can render."""
 FLATNESS = 1e-3
 """Thickness of a flat Gaussian, relative to its smaller size: far below a pixel."""
 _UNUSED = (24, 35)  # coefficients beyond the first of degrees 4 and 5
-_BYTES = 2.0  # colours as floats beyond this are from 0 to 255, not from 0 to 1
+_MAX_UNIT_COLOR = 2.0  # float colours above it range to 255, not to 1
 _LIST = re.compile(rb"^property[ \t]+list[ \t]+\S+[ \t]+\S+[ \t]+(\S+)", re.MULTILINE)
 
 
 def encode(gaussians: Gaussians, _: Note = silent_note) -> list[bytes | memoryview]:
-    """All of the Gaussians, as 3DGS writes them."""
+    """Encode Gaussians as 3DGS does."""
     return encode_layout(gaussians.arrays(), gaussians.antialiased)
 
 
 def decode(path: Path, note: Note = silent_note) -> Gaussians:
-    """The Gaussians of a .ply by any program."""
+    """Decode the .ply of any trainer."""
     reader = ByteReader(path, EXPORT_PLY_AGAIN)
     header = parse_header(path, reader.data)
     names = {name for element in _up_to_vertices(header)[-1:] for name in element.types}
@@ -80,9 +78,9 @@ def decode(path: Path, note: Note = silent_note) -> Gaussians:
             arrays["scales"], arrays["opacities"], sizes
         )
         note(
-            f"{path} has filter_3D, of Mip-Splatting and its kin: sizes and opacities are as this "
-            "filter makes them. Their renderers also blur the picture less than 3DGS's, which "
-            "splatseed's is like, so that scores may differ."
+            f"{path} has filter_3D (Mip-Splatting and related methods), which was applied to sizes "
+            "and opacities. Their renderers also blur less than 3DGS's and splatseed's, so scores "
+            "may differ."
         )
     return Gaussians(**arrays, antialiased=is_antialiased(reader.data[: header.size]))
 
@@ -90,10 +88,10 @@ def decode(path: Path, note: Note = silent_note) -> Gaussians:
 def filtered(
     scales: Float32[np.ndarray, "N 3"], opacities: Float32[np.ndarray, " N"], size: np.ndarray
 ) -> tuple[Float32[np.ndarray, "N 3"], Float32[np.ndarray, " N"]]:
-    """Log-scales and opacity logits after Mip-Splatting's 3D smoothing filter (Yu et al., 2024).
+    """Apply Mip-Splatting's 3D smoothing filter (Yu et al., 2024) to log-scales and logits.
 
-    The Gaussian is convolved with another of size f and keeps its integral: s_i' = sqrt(s_i^2 +
-    f^2), and the opacity is multiplied by sqrt(det / det'), the product of s_i / s_i'.
+    Convolution with a Gaussian of size f that preserves the integral: sizes become s_i' =
+    sqrt(s_i^2 + f^2), and the opacity is multiplied by sqrt(det / det'), the product of s_i / s_i'.
     """
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         logs, others = scales.astype(np.float64), np.log(np.abs(size.astype(np.float64)))
@@ -110,7 +108,7 @@ def filtered(
 
 
 def _check(path: Path, header: Header, names: set[str], data: bytes) -> None:
-    """Refuse a file that holds no Gaussians, or none that can be drawn from their numbers alone."""
+    """Raise unless the file has Gaussians that need nothing else to be rendered."""
     rest = sum(name.startswith("f_rest_") for name in names)
     needed = [*XYZ, *(() if set(_COLORS) <= names else DC), *rest_names(rest), "opacity"]
     needed += ["scale_0", *(ROTATION if "scale_1" in names else ())]
@@ -118,7 +116,7 @@ def _check(path: Path, header: Header, names: set[str], data: bytes) -> None:
     kinds = (
         f"{kind}: {name}"
         for name in sorted(names)
-        for start, kind in _OTHER_KINDS.items()
+        for start, kind in _UNSUPPORTED.items()
         if name.startswith(start)
     )
     before = _up_to_vertices(header)
@@ -140,14 +138,14 @@ def _check(path: Path, header: Header, names: set[str], data: bytes) -> None:
 
 
 def _up_to_vertices(header: Header) -> list[Element]:
-    """The elements of a file before its vertices, and these."""
+    """Return the elements of a file up to and including its vertices."""
     names = [element.name for element in header.elements]
     last = names.index("vertex") if "vertex" in names else len(names)
     return list(header.elements[: last + 1])
 
 
 def _rows(reader: ByteReader, header: Header) -> np.ndarray:
-    """The vertices, as a structured array."""
+    """Read the vertices as a structured array."""
     reader.offset = header.size
     *others, vertex = _up_to_vertices(header)
     if not header.byte_order:
@@ -160,8 +158,8 @@ def _rows(reader: ByteReader, header: Header) -> np.ndarray:
 
 
 def _ascii_rows(reader: ByteReader, skipped: int, element: Element) -> np.ndarray:
-    """The vertices of an ascii file, after some lines of other elements."""
-    # What is not a byte is kept as float64, whatever is declared: a float32 as text is exact there.
+    """Read the vertices of an ascii file, after ``skipped`` lines of other elements."""
+    # Numbers but bytes become float64, whatever the declaration: exact for a float32 as text.
     dtype = np.dtype([(n, kind if kind == "u1" else "f8") for n, kind in element.types.items()])
     with translate_errors(reader.path, "rows of numbers after its header", fix=EXPORT_PLY_AGAIN):
         text = reader.data[reader.offset :].replace(b"nan(ind)", b"nan")  # as Windows writes it
@@ -181,35 +179,35 @@ def _ascii_rows(reader: ByteReader, skipped: int, element: Element) -> np.ndarra
 
 
 def _columns(rows: np.ndarray, names: Sequence[str]) -> Float32[np.ndarray, "N K"]:
-    """Properties as float32; what is beyond its range becomes infinite."""
+    """Return properties as float32; numbers beyond its range become infinite."""
     with np.errstate(over="ignore"):
         return np.array(structured_to_unstructured(rows[list(names)]), np.float32, order="C")
 
 
 def _first_colors(rows: np.ndarray, names: set[str]) -> Float32[np.ndarray, "N 3"]:
-    """f_dc_*; or red, green and blue, as integers or as floats from 0 to 1 or to 255."""
+    """Return f_dc_*, if necessary from red, green and blue (integers, or floats to 1 or 255)."""
     if set(DC) <= names:
         return _columns(rows, DC)
     kinds = [rows.dtype[name] for name in _COLORS]
     colors = _columns(rows, _COLORS).astype(np.float64)
-    top = 255.0
+    maximum = 255.0
     if all(kind.kind in "iu" for kind in kinds):
-        top = float(np.iinfo(kinds[0]).max)
-    elif (colors[np.isfinite(colors)] <= _BYTES).all():
-        top = 1.0
-    return ((colors / top - 0.5) / SH_C0).astype(np.float32)
+        maximum = float(np.iinfo(kinds[0]).max)
+    elif (colors[np.isfinite(colors)] <= _MAX_UNIT_COLOR).all():
+        maximum = 1.0
+    return ((colors / maximum - 0.5) / SH_C0).astype(np.float32)
 
 
 def _harmonics(rows: np.ndarray, names: set[str], note: Note) -> Float32[np.ndarray, "N K 3"]:
-    """Coefficients beyond the first, of degree 3 at most."""
+    """Return coefficients beyond the first, up to degree 3."""
     rest = sum(name.startswith("f_rest_") for name in names)
     if not rest:
         return np.zeros((len(rows), 0, 3), np.float32)
-    each, most = rest // 3, SH_COUNTS[-1]
-    if each > most:
-        note(f"Of {each} coefficients beyond the first, the {most} up to degree 3 are used.")
+    count, limit = rest // 3, SH_COUNTS[-1]
+    if count > limit:
+        note(f"Of {count} coefficients beyond the first, only the {limit} up to degree 3 are used.")
     every = rest_names(rest)
-    used = [name for color in range(3) for name in every[color * each :][: min(each, most)]]
+    used = [name for color in range(3) for name in every[color * count :][: min(count, limit)]]
     planes = _columns(rows, used).reshape(len(rows), 3, -1)
     return np.array(planes.transpose(0, 2, 1), np.float32, order="C")
 
@@ -217,16 +215,16 @@ def _harmonics(rows: np.ndarray, names: set[str], note: Note) -> Float32[np.ndar
 def _shape(
     rows: np.ndarray, names: set[str], note: Note
 ) -> tuple[Float32[np.ndarray, "N 3"], Float32[np.ndarray, "N 4"]]:
-    """Log-scales and rotations: of balls with one size, of discs with two, as of 2DGS."""
+    """Return log-scales and rotations: spheres for one size, discs for two (as of 2DGS)."""
     scales = _columns(rows, [name for name in SCALES if name in names])
     if scales.shape[1] == 1:
-        note("Each Gaussian has one size, scale_0: it is read as round.")
+        note("Gaussians have one size, scale_0: they are read as spheres.")
         quats = np.tile(np.array([1, 0, 0, 0], np.float32), (len(rows), 1))
         return np.repeat(scales, 3, axis=1), quats
     if scales.shape[1] == 2:
         note(
-            "Gaussians have two sizes, without scale_2, as of 2D Gaussian Splatting: they are read "
-            "as flat. Its renderer intersects rays with discs, so scores may differ."
+            "Gaussians have two sizes, as of 2D Gaussian Splatting: they are read as discs. Its "
+            "renderer intersects rays with discs, so scores may differ."
         )
         thin = scales.min(axis=1, keepdims=True) + np.float32(np.log(FLATNESS))
         scales = np.concatenate([scales, thin], axis=1)

@@ -16,39 +16,40 @@ MAX_MEMORY_SHARE = 0.25  # of a GPU's free memory, for photographs
 
 
 class PhotographCache:
-    """Photographs of views on a device, where the Gaussians are.
+    """Photographs of views on the device of the Gaussians.
 
-    As bytes all mostly fit on a GPU, and each is copied once; otherwise each step sends its own.
+    A GPU keeps all photographs as bytes if they fit into a share of its free memory; otherwise each
+    call copies one.
     """
 
     def __init__(self, views: Sequence[View], device: torch.device) -> None:
         self._device = device
-        self._held: dict[View, UInt8[Tensor, "H W 3"]] | None = None
+        self._cached: dict[View, UInt8[Tensor, "H W 3"]] | None = None
         if device.type == "cuda":
             free = free_bytes(device)
-            held = [each for view in views for each in (view.photograph, view.mask)]
-            total = sum(each.nbytes for each in held if each is not None)
+            arrays = [each for view in views for each in (view.photograph, view.mask)]
+            total = sum(each.nbytes for each in arrays if each is not None)
             if free is None or total <= MAX_MEMORY_SHARE * free:
-                self._held = {}
+                self._cached = {}
 
     def get(self, view: View) -> Float[Tensor, "H W 3"]:
-        """The view's photograph as float32 from 0 to 1."""
-        if self._held is None:
+        """Return the view's photograph as float32 from 0 to 1."""
+        if self._cached is None:
             return photograph_tensor(view, self._device)
-        if view not in self._held:
-            self._held[view] = _bytes_of(view, self._device)
-        return self._held[view].to(torch.float32).div_(255.0)
+        if view not in self._cached:
+            self._cached[view] = _bytes_of(view, self._device)
+        return self._cached[view].to(torch.float32).div_(255.0)
 
 
 def photograph_tensor(view: View, device: torch.device) -> Float[Tensor, "H W 3"]:
-    """The view's photograph as float32 from 0 to 1."""
+    """Return the view's photograph as float32 from 0 to 1."""
     return _bytes_of(view, device).to(torch.float32).div_(255.0)
 
 
 def _bytes_of(view: View, device: torch.device) -> UInt8[Tensor, "H W 3"]:
-    # A copy: PyTorch warns on stderr about read-only arrays, which a view's may be.
+    # torch.tensor copies: from_numpy warns about read-only arrays.
     pixels = torch.tensor(view.photograph)
-    if device.type == "cuda":  # from pinned memory a GPU fetches it while it works on earlier steps
+    if device.type == "cuda":  # makes the copy asynchronous
         pixels = pixels.pin_memory()
     return pixels.to(device, non_blocking=True)
 
@@ -57,13 +58,13 @@ _MASKS: WeakKeyDictionary[View, dict[torch.device, Bool[Tensor, "H W"]]] = WeakK
 
 
 def mask_tensor(view: View, device: torch.device) -> Bool[Tensor, "H W"] | None:
-    """The view's pixels that count, None: all; copied to the device once as long as it lives."""
+    """Return the mask of a view's valid pixels, None for all; cached while the view lives."""
     if view.mask is None:
         return None
-    kept = _MASKS.setdefault(view, {})
-    if device not in kept:
-        kept[device] = torch.tensor(view.mask).to(device)
-    return kept[device]
+    cached = _MASKS.setdefault(view, {})
+    if device not in cached:
+        cached[device] = torch.tensor(view.mask).to(device)
+    return cached[device]
 
 
 def fill_masked(
@@ -71,8 +72,5 @@ def fill_masked(
     photograph: Float[Tensor, "H W 3"],
     mask: Bool[Tensor, "H W"] | None,
 ) -> Float[Tensor, "H W 3"]:
-    """The render with the photograph's own pixels where these do not count: no error, no gradient.
-
-    Without a mask it is the render itself.
-    """
+    """Replace masked pixels of a render by the photograph's: they get no error and no gradient."""
     return render if mask is None else torch.where(mask[..., None], render, photograph)

@@ -17,12 +17,12 @@ GAP = 4  # white columns between the images of a row
 
 
 def flip_heatmap(errors: Float32[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W 3"]:
-    """FLIP of each pixel in the colours of its authors: black is 0, the brightest 1."""
+    """Map FLIP of each pixel to magma, its authors' colours: black for 0, the brightest for 1."""
     return np.asarray(colormaps["magma"](errors, bytes=True)[..., :3], np.uint8)
 
 
 def to_uint8(image: Float32[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
-    """Colours in [0, 1] as 8-bit integers; others are clamped."""
+    """Convert colours to 8 bits, clamped to [0, 1]."""
     return np.asarray(np.rint(np.clip(image, 0, 1) * 255), np.uint8)
 
 
@@ -32,7 +32,7 @@ def write_comparison(
     render: Float32[np.ndarray, "H W 3"],
     errors: Float32[np.ndarray, "H W"],
 ) -> None:
-    """Write a PNG of photograph, render and FLIP in a row."""
+    """Write photograph, render and FLIP side by side as a PNG."""
     gap = np.full((len(photograph), GAP, 3), 255, np.uint8)
     row = [photograph, gap, to_uint8(render), gap, flip_heatmap(errors)]
     with atomic_file(Path(path)) as partial:
@@ -40,9 +40,9 @@ def write_comparison(
 
 
 def picture_names(image_names: Iterable[str]) -> dict[str, str]:
-    """The file name of each image's picture; folders in an image's name become part of it.
+    """Return a unique PNG name per image; folders become part of it.
 
-    Where a.jpg and a.jpeg would have the same, the later one becomes a-2.png.
+    Of a.jpg and a.jpeg the second becomes a-2.png.
 
     Example:
         >>> picture_names(["a/b.jpg", "a_b.jpg", "a/c.jpg"])

@@ -1,7 +1,4 @@
-"""3DGS's .ply layout: its properties, and Gaussians written in it.
-
-A vertex is a Gaussian; of f_rest_* all of red comes first, then green, then blue.
-"""
+"""3DGS's .ply layout: a vertex per Gaussian; f_rest_* are red, then green, then blue."""
 
 from __future__ import annotations
 
@@ -21,17 +18,17 @@ _RENDER_MODE = re.compile(
 
 
 def rest_names(number: int) -> tuple[str, ...]:
-    """The properties of the coefficients of higher degrees."""
+    """Return the names of the coefficients of higher degrees."""
     return tuple(f"f_rest_{i}" for i in range(number))
 
 
 def antialiased_comment(antialiased: bool) -> list[str]:
-    """Brush's header line for Gaussians that are to be rendered with antialiasing."""
+    """Return Brush's header line for antialiased rendering, or none."""
     return ["comment SplatRenderMode: mip"] if antialiased else []
 
 
 def is_antialiased(header: bytes) -> bool:
-    """Whether the header's last comment on it, Brush's or Postshot's, asks for antialiasing."""
+    """Whether the header's last render mode, Brush's or Postshot's, is antialiased."""
     modes = _RENDER_MODE.findall(header)
     return bool(modes) and modes[-1].lower() in {b"mip", b"1"}
 
@@ -39,7 +36,7 @@ def is_antialiased(header: bytes) -> bool:
 def encode_layout(
     arrays: Mapping[str, Float32[np.ndarray, "N ..."]], antialiased: bool
 ) -> list[bytes | memoryview]:
-    """The file's bytes; ``arrays`` as of ``Gaussians.arrays``."""
+    """Encode ``Gaussians.arrays`` as a file's bytes."""
     count, rest = len(arrays["means"]), 3 * arrays["shN"].shape[1]
     harmonics = arrays["shN"].transpose(0, 2, 1).reshape(count, rest)
     columns = [

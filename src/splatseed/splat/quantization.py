@@ -18,7 +18,7 @@ _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 def smallest_three(
     quats: Float32[np.ndarray, "N 4"],
 ) -> tuple[Int64[np.ndarray, " N"], Float32[np.ndarray, "N 3"]]:
-    """The index of the largest component, and the other three in order; see the module."""
+    """Return the index of each quaternion's largest component, and the other three in order."""
     unit = unit_quats(quats)
     largest = np.argmax(np.abs(unit), axis=1)
     rows = np.arange(len(unit))
@@ -29,7 +29,7 @@ def smallest_three(
 def from_smallest_three(
     largest: Int64[np.ndarray, " N"], three: Float32[np.ndarray, "N 3"]
 ) -> Float32[np.ndarray, "N 4"]:
-    """The unit quaternions that ``smallest_three`` encoded."""
+    """Decode the unit quaternions of ``smallest_three``."""
     rows = np.arange(len(three))
     quats = np.empty((len(three), 4), np.float32)
     quats[rows[:, None], _OTHERS[largest]] = three
@@ -39,24 +39,24 @@ def from_smallest_three(
 
 
 def opacity_bytes(logits: Float32[np.ndarray, " N"]) -> UInt8[np.ndarray, " N"]:
-    """Opacities in [0, 1] in steps of 1/255."""
+    """Convert logits to opacities in steps of 1/255."""
     with np.errstate(over="ignore"):
         return np.rint(255 / (1 + np.exp(-logits.astype(np.float64)))).astype(np.uint8)
 
 
 def opacity_logits(values: UInt8[np.ndarray, " N"]) -> Float32[np.ndarray, " N"]:
-    """Logits of opacities in steps of 1/255; 0 and 1 move a quarter step inward to stay finite."""
+    """Convert opacities in steps of 1/255 to logits; 0 and 1 move inwards by a quarter step."""
     opacity = np.clip(values / 255, 0.25 / 255, 1 - 0.25 / 255)
     return np.log(opacity / (1 - opacity)).astype(np.float32)
 
 
 def rounded_bytes(values: np.ndarray) -> UInt8[np.ndarray, "..."]:
-    """Values from 0 to 255 as bytes; others are clipped."""
+    """Round values to bytes, clipped to 0 to 255."""
     return np.asarray(np.clip(np.rint(values), 0, 255), np.uint8)
 
 
 def unit_quats(quats: Float32[np.ndarray, "N 4"]) -> Float32[np.ndarray, "N 4"]:
-    """Quaternions of length 1; zeros become the identity."""
+    """Normalise quaternions; those of length 0 become the identity."""
     norms = np.linalg.norm(quats, axis=1, keepdims=True)
     known = np.isfinite(norms) & (norms > 0)
     unit = np.divide(quats, norms, out=np.zeros_like(quats), where=known)

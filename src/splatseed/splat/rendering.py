@@ -1,8 +1,7 @@
-"""Render Gaussians from a view.
+"""Render Gaussians from a view, on CPU or CUDA; training, scoring and viewing share this code.
 
-Notation: gsplat's parameter dict as tensors: ``means``, ``scales`` (logarithms), ``quats``,
-``opacities`` (logits), ``sh0``, ``shN``. Promise: one rasteriser serves training, scoring and
-viewing on CPU and CUDA alike; no step waits for what is copied to a GPU.
+Parameters are gsplat's dict of tensors: ``means``, ``scales`` (logarithms), ``quats``,
+``opacities`` (logits), ``sh0``, ``shN``. Copies to a GPU are asynchronous.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ MIN_ALPHA = 0.05  # a pixel of lower alpha has no depth
 
 
 class CameraTensors(NamedTuple):
-    """A view's camera on a device: as the rasteriser takes it, and its pose in float64."""
+    """A view's camera on a device: the rasteriser's arguments, and the pose in float64."""
 
     viewmats: Float[Tensor, "1 4 4"]
     Ks: Float[Tensor, "1 3 3"]
@@ -37,21 +36,21 @@ _CAMERAS: WeakKeyDictionary[View, dict[torch.device, CameraTensors]] = WeakKeyDi
 
 
 def camera_tensors(view: View, device: torch.device) -> CameraTensors:
-    """The view's camera on a device, copied there once as long as the view lives."""
-    kept = _CAMERAS.setdefault(view, {})
-    if device not in kept:
+    """Return the view's camera on a device; cached while the view lives."""
+    cached = _CAMERAS.setdefault(view, {})
+    if device not in cached:
         pose, K = (torch.from_numpy(np.array(each)) for each in (view.cam_from_world, view.K))
         viewmats, Ks = (each.to(torch.float32)[None].to(device) for each in (pose, K))
-        kept[device] = CameraTensors(viewmats, Ks, pose.to(device))
-    return kept[device]
+        cached[device] = CameraTensors(viewmats, Ks, pose.to(device))
+    return cached[device]
 
 
 def render_view(
     params: Mapping[str, Tensor] | torch.nn.ParameterDict, view: View, sh_degree: int
 ) -> tuple[Float[Tensor, "H W 3"], dict[str, Any]]:
-    """The render of a view, in the frame of its camera, and the rasteriser's ``info``.
+    """Render a view; return the image and the rasteriser's ``info``.
 
-    Coefficients of harmonics beyond ``sh_degree`` are ignored.
+    Harmonics beyond ``sh_degree`` are ignored. Gaussians and pose are in one frame.
     """
     images, _, info = _rasterize(params, view, sh_degree)
     return images, info
@@ -62,7 +61,7 @@ def render_features(
     view: View,
     features: Float[Tensor, "N D"],
 ) -> Float[Tensor, "H W D"]:
-    """The Gaussians rendered with arbitrary features in place of colours."""
+    """Render features of the Gaussians in place of their colours."""
     return _rasterize(params, view, features)[0]
 
 
@@ -80,9 +79,9 @@ class _Opacity(torch.autograd.Function):
 
 
 def opacity_from_logits(logits: Float[Tensor, "*N"]) -> Float[Tensor, "*N"]:
-    """1 / (1 + exp(-x)), differentiable, and the same whatever the number of threads.
+    """Return 1 / (1 + exp(-x)), differentiable and independent of the number of threads.
 
-    On the CPU ``torch.sigmoid`` is not: it rounds differently at the ends of each thread's part.
+    ``torch.sigmoid`` on the CPU rounds differently at the ends of each thread's part.
     """
     opacities: Tensor = _Opacity.apply(logits)  # type: ignore[no-untyped-call]
     return opacities
@@ -91,18 +90,18 @@ def opacity_from_logits(logits: Float[Tensor, "*N"]) -> Float[Tensor, "*N"]:
 def _rasterize(
     params: Mapping[str, Tensor] | torch.nn.ParameterDict,
     view: View,
-    shown: Tensor | int,
+    features: Tensor | int,
     mode: Literal["RGB", "ED"] = "RGB",
     *,
     antialiased: bool = False,
 ) -> tuple[Float[Tensor, "H W D"], Float[Tensor, "H W 1"], dict[str, Any]]:
-    """Render features, or harmonics up to a degree: image, alphas, ``info``."""
+    """Render features, or harmonics up to a degree; return image, alphas and ``info``."""
     colors: Tensor | tuple[Tensor, Tensor]
-    if isinstance(shown, Tensor):
-        colors, degree = shown, None
+    if isinstance(features, Tensor):
+        colors, degree = features, None
     else:  # unused coefficients would cost copies and optimiser steps for nothing
-        colors = (params["sh0"], params["shN"]) if shown else params["sh0"]
-        degree = shown
+        colors = (params["sh0"], params["shN"]) if features else params["sh0"]
+        degree = features
     camera = camera_tensors(view, params["means"].device)
     images, alphas, info = rasterization(
         params["means"], params["quats"], torch.exp(params["scales"]),
@@ -115,9 +114,10 @@ def _rasterize(
 
 
 class ModelRenderer:
-    """Renders Gaussians of the world, without gradients, on a device, by default the CPU.
+    """Renders Gaussians in world coordinates without gradients, by default on the CPU.
 
-    In ``frame`` near planes and single precision work. Antialiased Gaussians are rendered so.
+    ``frame`` provides the near plane, and coordinates that suit single precision. Antialiasing
+    follows ``Gaussians.antialiased``.
     """
 
     def __init__(
@@ -129,15 +129,15 @@ class ModelRenderer:
         self._params = {name: torch.tensor(array, device=device) for name, array in arrays.items()}
 
     def image(self, view: View) -> Float[Tensor, "H W 3"]:
-        """The render of a view of the world, about 0 to 1; the background is black."""
+        """Render a view: about 0 to 1, the background black."""
         return self._images(view, "RGB")[0]
 
     def color(self, view: View) -> Float32[np.ndarray, "H W 3"]:
-        """Likewise, clamped to [0, 1]."""
+        """Render a view as an array, clamped to [0, 1]."""
         return np.asarray(self.image(view).clamp_(0, 1).cpu().numpy())
 
     def depth(self, view: View) -> Float32[np.ndarray, "H W"]:
-        """Expected planar depth in world units; 0 where there is none."""
+        """Render expected planar depth in world units; 0 where alpha is too low."""
         image, alphas = self._images(view, "ED")
         depth = torch.where(alphas > MIN_ALPHA, image, 0)[..., 0] / self.frame.scale
         return np.asarray(depth.cpu().numpy())

@@ -1,8 +1,7 @@
-"""PlayCanvas's SOG, version 2: a .zip of lossless WebP pictures and ``meta.json``.
+"""Read and write PlayCanvas's SOG, version 2: a .zip of lossless WebP images and ``meta.json``.
 
-Each picture has one pixel per Gaussian; a *codebook* is 256 numbers that bytes stand for, a
-*palette* K vectors of coefficients that Gaussians share, and a *label* says which stands for each.
-Equal Gaussians give equal bytes. Source: the format's specification by PlayCanvas.
+Images have one pixel per Gaussian. A *codebook* maps bytes to 256 numbers, a *palette* maps labels
+to vectors of harmonics. Equal Gaussians give equal bytes. Source: PlayCanvas's specification.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from splatseed.errors import SceneFormatError
 from splatseed.io.files import read_bytes, translate_errors
 from splatseed.progress import Note, Progress, silent, silent_note
 from splatseed.splat.cleaning import MAX_LOG_SCALE
-from splatseed.splat.extent import COARSE, Fit, best_fit, left_out_note, morton_order, shells_of
+from splatseed.splat.extent import SETTINGS, Fit, best_fit, left_out_note, morton_order, shells_of
 from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.quantization import (
     SH_COUNTS,
@@ -39,25 +38,25 @@ CONVERTER = "npx @playcanvas/splat-transform"
 _VERSION = 2
 _META = "meta.json"
 _ANTIALIASED = "antialiased"
-"""What meta.json gives as the model of Gaussians that are to be rendered so."""
-_PER_ROW = 64  # palette entries per row of the centroid picture
-_MOST_LEVELS = 16  # the palette grows with the number of Gaussians, to 2^16 entries
-_MOST_BYTES, _MOST_META = 1 << 31, 1 << 24
-"""Larger pictures of an archive, and a larger meta.json, are refused unread."""
-_QUAT_MARK = 252
-"""Alpha of a rotation whose largest component is the first; SOG's marker."""
+"""Value of ``model`` in meta.json for antialiased rendering."""
+_PER_ROW = 64  # palette entries per row of the centroid image
+_MAX_LEVELS = 16  # the palette grows with the number of Gaussians, to 2^16 entries
+_MAX_BYTES, _MAX_META = 1 << 31, 1 << 24
+"""Size limits, in bytes, of an archive's image and meta.json; larger ones are refused unread."""
+_QUAT_ALPHA = 252
+"""Alpha of a rotation whose largest component is the first."""
 _CODES = 256
 _LLOYD_STEPS, _POWER_STEPS = 20, 3
-"""Alternations of assigning values to codes and moving codes to the means; steps of power
-iteration, as a rough principal direction is enough to halve a group."""
+"""Iterations of Lloyd's algorithm for codebooks, and of the power method for a group's principal
+direction, of which a rough one suffices."""
 _STAMP = (1980, 1, 1, 0, 0, 0)
-"""The timestamp of each picture in the zip, fixed so that equal Gaussians give equal bytes."""
+"""Fixed timestamp in the zip, so that equal Gaussians give equal bytes."""
 
 
 def encode(
     gaussians: Gaussians, note: Note = silent_note, progress: Progress = silent
 ) -> list[bytes]:
-    """The bytes of a file with the Gaussians, in Z-curve order."""
+    """Encode Gaussians in Z-curve order."""
     gaussians = _within_steps(gaussians, note)
     order = morton_order(gaussians.means)
     curved = _curved(gaussians.means[order])
@@ -67,12 +66,12 @@ def encode(
     largest, three = smallest_three(gaussians.quats[order])
     # The three smaller components in RGB, 252 + the index of the largest in A.
     smaller = rounded_bytes(three * np.sqrt(0.5) * 255 + 127.5)
-    quats = np.column_stack([smaller, _QUAT_MARK + largest])
+    quats = np.column_stack([smaller, _QUAT_ALPHA + largest])
     logs = np.clip(gaussians.scales, -MAX_LOG_SCALE, MAX_LOG_SCALE)
     scales, sh0 = codebook(logs), codebook(gaussians.sh0)
     colors = codes(gaussians.sh0[order, 0], sh0)
     opacity = opacity_bytes(gaussians.opacities[order])
-    pictures = {
+    images = {
         "means_l.webp": _grid(positions & 255),  # 16 bits: low bytes, then high ones
         "means_u.webp": _grid(positions >> 8),
         "quats.webp": _grid(quats),
@@ -93,15 +92,15 @@ def encode(
         meta["model"] = _ANTIALIASED
     count, rest, _ = gaussians.shN.shape
     if rest and count > 1:
-        levels = min(int(np.log2(count)), _MOST_LEVELS)
+        levels = min(int(np.log2(count)), _MAX_LEVELS)
         entries, labels = palette(gaussians.shN[order].reshape(count, -1), levels, progress)
         book = codebook(entries)
         # Entries are bytes of a third codebook, 64 entries per row.
         table = np.full((-(-len(entries) // _PER_ROW) * _PER_ROW, rest, 4), 255, np.uint8)
         table[: len(entries), :, :3] = codes(entries, book).reshape(-1, rest, 3)
-        pictures["shN_centroids.webp"] = table.reshape(-1, _PER_ROW * rest, 4)
+        images["shN_centroids.webp"] = table.reshape(-1, _PER_ROW * rest, 4)
         blank = np.zeros(count, np.int64)
-        pictures["shN_labels.webp"] = _grid(np.column_stack([labels & 255, labels >> 8, blank]))
+        images["shN_labels.webp"] = _grid(np.column_stack([labels & 255, labels >> 8, blank]))
         meta["shN"] = {
             "count": len(entries),
             "bands": SH_COUNTS.index(rest),
@@ -111,22 +110,22 @@ def encode(
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
         archive.writestr(zipfile.ZipInfo(_META, _STAMP), json.dumps(meta))
-        for name, pixels in pictures.items():
-            picture = io.BytesIO()
-            # exact keeps colours where alpha is 0, which opacities and quaternions need.
-            Image.fromarray(pixels).save(picture, "WEBP", lossless=True, exact=True, quality=75)
-            archive.writestr(zipfile.ZipInfo(name, _STAMP), picture.getvalue())
+        for name, pixels in images.items():
+            webp = io.BytesIO()
+            # `exact` keeps colours where alpha is 0, as opacities and quaternions require.
+            Image.fromarray(pixels).save(webp, "WEBP", lossless=True, exact=True, quality=75)
+            archive.writestr(zipfile.ZipInfo(name, _STAMP), webp.getvalue())
     return [file.getvalue()]
 
 
 def _curved(means: Float32[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
-    """sign(p) log(1 + |p|): finer steps near the middle of the scene."""
+    """Return sign(p) log(1 + |p|), which gives finer steps near the origin."""
     xyz = means.astype(np.float64)
     return np.asarray(np.sign(xyz) * np.log1p(np.abs(xyz)))
 
 
 def _within_steps(gaussians: Gaussians, note: Note) -> Gaussians:
-    """The Gaussians without far ones that would make the steps of all positions coarse."""
+    """Drop distant Gaussians that would make the steps of all positions coarse."""
     shells, curved = shells_of(gaussians.means), _curved(gaussians.means)
     fits = []
     for last in np.unique(shells)[::-1]:
@@ -138,21 +137,21 @@ def _within_steps(gaussians: Gaussians, note: Note) -> Gaussians:
     if not kept.all():
         nearest = np.abs(gaussians.means[~kept]).max(axis=1).min()
         note(left_out_note(".sog", kept, f"{nearest:,.4g} units or more from the origin"))
-    if error > COARSE:
+    if error > SETTINGS.coarse_error:
         note(
-            "A .sog rounds the positions of this model too much: export another format, or move "
+            "A .sog is too coarse for the positions of this model: export another format, or move "
             "the model to the origin."
         )
     return gaussians if kept.all() else gaussians.select(kept)
 
 
 def decode(path: Path, _: Note = silent_note) -> Gaussians:
-    """The Gaussians in a file, or in the unpacked folder that a ``meta.json`` lies in."""
-    with translate_errors(path, "a whole SOG"):
-        content = _opened(path)
+    """Decode a .sog file, or the unpacked folder of a ``meta.json``."""
+    with translate_errors(path, "a complete SOG"):
+        content = _part_reader(path)
         meta = json.loads(content(_META))
         if "means" not in meta:  # of every version; a run's metrics.json has none
-            raise ValueError("JSON that describes no Gaussians")
+            raise ValueError("JSON without Gaussians")
         if meta.get("version") != _VERSION:
             raise SceneFormatError(
                 f"{path} to be a SOG of version {_VERSION}",
@@ -163,19 +162,19 @@ def decode(path: Path, _: Note = silent_note) -> Gaussians:
         if count < 1:
             raise ValueError(f"{count} Gaussians")
 
-        def pixels(part: str, which: int = 0, least: int = count) -> UInt8[np.ndarray, "P 4"]:
-            name = meta[part]["files"][which]
+        def pixels(part: str, file_idx: int = 0, num: int = count) -> UInt8[np.ndarray, "P 4"]:
+            name = meta[part]["files"][file_idx]
             with Image.open(io.BytesIO(content(name))) as picture:
                 rows = np.asarray(picture.convert("RGBA")).reshape(-1, 4)
-            if len(rows) < least:
-                raise ValueError(f"{len(rows):,} pixels in {name}, of {least:,}")
-            return rows[:least]
+            if len(rows) < num:
+                raise ValueError(f"{len(rows):,} pixels in {name}, of {num:,}")
+            return rows[:num]
 
         low, high = (pixels("means", i)[:, :3].astype(np.uint16) for i in (0, 1))
-        least, most = (np.array(meta["means"][end], np.float64) for end in ("mins", "maxs"))
-        curved = least + (low | high << 8) / 65535 * (most - least)
+        lower, upper = (np.array(meta["means"][end], np.float64) for end in ("mins", "maxs"))
+        curved = lower + (low | high << 8) / 65535 * (upper - lower)
         quats, sh0 = pixels("quats"), pixels("sh0")
-        largest = np.clip(quats[:, 3].astype(np.int64) - _QUAT_MARK, 0, 3)
+        largest = np.clip(quats[:, 3].astype(np.int64) - _QUAT_ALPHA, 0, 3)
         three = (quats[:, :3] / 255 - 0.5) * np.sqrt(2)
         centers = {part: np.array(meta[part]["codebook"], np.float32) for part in ("scales", "sh0")}
         shN = np.zeros((count, 0, 3), np.float32)
@@ -196,7 +195,7 @@ def decode(path: Path, _: Note = silent_note) -> Gaussians:
 
 
 def _grid(values: np.ndarray) -> UInt8[np.ndarray, "H W 4"]:
-    """One pixel per row of 3 or 4 bytes, in a near-square picture; sides are multiples of 4."""
+    """Arrange rows of 3 or 4 bytes as pixels of a near-square image; sides are multiples of 4."""
     width = 4 * int(np.ceil(np.sqrt(len(values)) / 4))
     height = 4 * int(np.ceil(len(values) / width / 4))
     pixels = np.zeros((height * width, 4), np.uint8)
@@ -205,14 +204,14 @@ def _grid(values: np.ndarray) -> UInt8[np.ndarray, "H W 4"]:
     return pixels.reshape(height, width, 4)
 
 
-def _opened(path: Path) -> Callable[[str], bytes]:
-    """A function that returns the content of a named part."""
+def _part_reader(path: Path) -> Callable[[str], bytes]:
+    """Return a function that reads a named part."""
     if path.name.lower().endswith(".json"):
         return lambda name: read_bytes(path if name == _META else path.parent / Path(name).name)
     archive = zipfile.ZipFile(io.BytesIO(read_bytes(path)))
 
     def content(name: str) -> bytes:
-        if archive.getinfo(name).file_size > (_MOST_META if name == _META else _MOST_BYTES):
+        if archive.getinfo(name).file_size > (_MAX_META if name == _META else _MAX_BYTES):
             raise ValueError(f"{name} of {archive.getinfo(name).file_size:,} bytes")
         return archive.read(name)
 
@@ -220,10 +219,10 @@ def _opened(path: Path) -> Callable[[str], bytes]:
 
 
 def codebook(values: Float32[np.ndarray, "..."]) -> Float64[np.ndarray, " 256"]:
-    """The 256 numbers, ascending, that quantise values with small square error (1D Lloyd)."""
+    """Fit 256 ascending numbers that quantise values with small square error (1D Lloyd)."""
     ordered = np.sort(values.reshape(-1).astype(np.float64))
     sums = np.concatenate([[0.0], np.cumsum(ordered)])
-    # Half of the codes start evenly spaced, half at even ranks, for the tails and the middle.
+    # Half of the codes start evenly spaced, for the tails, and half at quantiles.
     ranks = np.quantile(ordered, (np.arange(_CODES // 2) + 0.5) / (_CODES // 2))
     centers = np.sort(np.concatenate([ranks, np.linspace(ordered[0], ordered[-1], _CODES // 2)]))
     for _ in range(_LLOYD_STEPS):
@@ -238,21 +237,24 @@ def codebook(values: Float32[np.ndarray, "..."]) -> Float64[np.ndarray, " 256"]:
 def codes(
     values: Float32[np.ndarray, "..."], centers: Float64[np.ndarray, " 256"]
 ) -> UInt8[np.ndarray, "..."]:
-    """The index of the codebook number nearest to each value."""
+    """Return the index of the nearest codebook number for each value."""
     return np.searchsorted((centers[1:] + centers[:-1]) / 2, values).astype(np.uint8)
 
 
 def palette(
     vectors: Float32[np.ndarray, "N D"], levels: int, progress: Progress = silent
 ) -> tuple[Float32[np.ndarray, "K D"], Int64[np.ndarray, " N"]]:
-    """2^levels vectors that stand for N >= 2^levels: groups are halved where they vary most."""
+    """Cluster N >= 2^levels vectors by recursive bisection; return the means and labels.
+
+    Groups are halved along their principal direction.
+    """
     count = 2**levels
     size = -(-len(vectors) // count)
-    # Groups keep one size, so that a level is a few array operations; the first fill them up.
+    # Groups have one size, padded with the first vectors: a level is a few array operations.
     order = np.resize(np.arange(len(vectors)), size * count)[None]
     for level in range(levels):
         progress("encode", level / levels)
-        along = _spread(vectors, order)
+        along = _along_principal_axis(vectors, order)
         order = np.take_along_axis(order, np.argsort(along, axis=1, kind="stable"), axis=1)
         order = order.reshape(2 * len(order), -1)
     labels = np.empty(len(vectors), np.int64)
@@ -263,10 +265,10 @@ def palette(
     return (sums / np.maximum(members, 1)[:, None]).astype(np.float32), labels
 
 
-def _spread(
+def _along_principal_axis(
     vectors: Float32[np.ndarray, "N D"], order: Int64[np.ndarray, "G M"]
 ) -> Float32[np.ndarray, "G M"]:
-    """Where each vector lies along the principal direction of its group."""
+    """Project each vector on the principal direction of its group."""
     along = np.empty(order.shape, np.float32)
     step = max(1, 2**20 // order.shape[1])
     for first in range(0, len(order), step):

@@ -19,11 +19,11 @@ RECORD = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), (
 
 
 def encode(gaussians: Gaussians, note: Note = silent_note) -> list[bytes]:
-    """By size times opacity, so that a viewer can draw the most important ones first."""
+    """Encode Gaussians, sorted by size times opacity so that viewers can draw the largest first."""
     if gaussians.antialiased:
         note(
-            "The model is to be rendered with antialiasing, which a .splat cannot say: small "
-            "Gaussians will be too opaque."
+            "The model needs antialiased rendering, which a .splat cannot record: small Gaussians "
+            "will be too opaque."
         )
     log_opacity = -np.logaddexp(0, -gaussians.opacities.astype(np.float64))
     size = gaussians.scales.astype(np.float64).sum(axis=1) + log_opacity
@@ -40,10 +40,10 @@ def encode(gaussians: Gaussians, note: Note = silent_note) -> list[bytes]:
 
 
 def decode(path: Path, _: Note = silent_note) -> Gaussians:
-    """A whole number of records; scales that are negative become NaN.
+    """Decode a .splat; negative scales become NaN.
 
-    As a .splat has no signature, one without usable scales and means in half of its Gaussians is
-    no .splat.
+    As a .splat has no signature, a file is refused if half of its Gaussians or more lack usable
+    means and scales.
     """
     reader = ByteReader(path)
     reader.record = "Gaussians"
@@ -52,7 +52,9 @@ def decode(path: Path, _: Note = silent_note) -> Gaussians:
     usable = (np.isfinite(rows["scale"]) & (rows["scale"] >= 0)).all(axis=1)
     bad = np.count_nonzero(~(usable & np.isfinite(rows["mean"]).all(axis=1)))
     if 2 * bad >= len(rows):
-        raise reader.error("finite positions and scales", f"others in {bad} Gaussians")
+        raise reader.error(
+            "finite positions and scales", f"NaN, infinity or negative scales in {bad} Gaussians"
+        )
     with np.errstate(divide="ignore", invalid="ignore"):
         scales = np.log(rows["scale"])
     return Gaussians(

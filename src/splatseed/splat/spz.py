@@ -19,7 +19,7 @@ from splatseed.io.files import COPY_AGAIN, read_bytes, translate_errors
 from splatseed.progress import Note, silent_note
 from splatseed.requirements import require
 from splatseed.runtime.memory import check_memory
-from splatseed.splat.extent import COARSE, Fit, best_fit, left_out_note, morton_order
+from splatseed.splat.extent import SETTINGS, Fit, best_fit, left_out_note, morton_order
 from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.quantization import (
     SH_COUNTS,
@@ -35,15 +35,15 @@ MAGIC = b"NGSP"
 _HEADER = struct.Struct("<4sIIBBBB")
 _VERSION = 3  # the latest that every reader accepts
 _MAX_FIXED, _MAX_BITS = 2**23 - 1, 20
-"""Largest position in units of 2^-f, 24 bits with a sign; largest f."""
+"""Largest position in units of 2^-f (24 bits with a sign), and the largest f."""
 _ANTIALIASED = 1
-"""The flag of models that are to be rendered with antialiasing."""
+"""Flag of models that need antialiased rendering."""
 _SH_COUNTS = (*SH_COUNTS, 24)
 """Coefficients beyond the first by degree; those of degree 4 are not used."""
 _LOG_SCALES = (-10.0, 255 / 16 - 10)
 """Log-scales that a byte holds."""
 _MAX_LOST_SHARE = 0.1
-"""Share of the picture that far Gaussians may take with them, where no bits would hold them."""
+"""Share of the image that may be lost with Gaussians beyond the largest position."""
 _NINE_BITS = np.float32(511 * np.sqrt(2))
 _COLOR = 0.15 * 255
 """Bytes per unit of the first coefficient: the format's scale."""
@@ -52,36 +52,36 @@ _QUAT = np.array([1, 1, -1, -1], np.float32)
 _SH = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
 """Signs of the spherical harmonics of degrees 1 to 3 when y and z are flipped."""
 _STEP = 4
-"""Further coefficients are rounded to this many 128ths, so that gzip saves more. Niantic's writer
-takes 8 for the first degree and 16 for the others: files are a quarter smaller, but coefficients of
-a short run vanish, and with them up to 2.8 dB (docs/formats.md)."""
+"""Harmonics are rounded to multiples of this many 128ths, which compress better. Niantic's writer
+uses 8 for degree 1 and 16 beyond it: files are a quarter smaller, but the small coefficients of a
+short run vanish, and PSNR falls by up to 2.8 dB."""
 
 
 def encode(gaussians: Gaussians, note: Note = silent_note) -> list[bytes]:
-    """In Z-curve order, of degree 3 at most.
+    """Encode Gaussians in Z-curve order.
 
     Raises:
-        ParameterError: Positions are beyond what the format can hold.
+        ParameterError: Positions exceed the format's range.
     """
     gaussians, bits = _fixed_point(gaussians, note)
     order = morton_order(gaussians.means)
     rest = gaussians.shN.shape[1]
-    # A position in units of 2^-f; a coefficient c beyond the first as 128 c + 128.
+    # Positions in units of 2^-f; a harmonic c as 128 c + 128.
     fixed = np.rint(gaussians.means[order] * _AXES * np.float64(2**bits)).astype("<i4")
     sh = np.rint(gaussians.shN[order] * _SH[:rest, None] * 128 + 128)
-    # From the highest bits: the index of the largest of xyzw, then signs and sizes of the others.
+    # From the highest bits: index of the largest of xyzw, then sign and size of each other one.
     quats = gaussians.quats[order] * _QUAT
     largest, three = smallest_three(np.roll(quats, -1, axis=1))
-    turn = largest.astype(np.uint32)
+    rotation = largest.astype(np.uint32)
     for i in range(3):
         part = np.minimum(np.rint(np.abs(three[:, i]) * _NINE_BITS), 511).astype(np.uint32)
-        turn = (turn << 10) | ((three[:, i] < 0).astype(np.uint32) << 9) | part
+        rotation = (rotation << 10) | ((three[:, i] < 0).astype(np.uint32) << 9) | part
     parts = [
-        fixed.view(np.uint8).reshape(-1, 4)[:, :3],  # 24 bits a component
+        fixed.view(np.uint8).reshape(-1, 4)[:, :3],  # 24 bits per component
         opacity_bytes(gaussians.opacities[order]),
         rounded_bytes(gaussians.sh0[order, 0] * _COLOR + 127.5),  # 255 (0.15 c + 1/2)
-        rounded_bytes((gaussians.scales[order] + 10) * 16),  # of log-scales
-        turn.astype("<u4"),
+        rounded_bytes((gaussians.scales[order] + 10) * 16),
+        rotation.astype("<u4"),
         rounded_bytes(np.floor((sh + _STEP // 2) / _STEP) * _STEP),
     ]
     degree = SH_COUNTS.index(rest)
@@ -92,47 +92,49 @@ def encode(gaussians: Gaussians, note: Note = silent_note) -> list[bytes]:
 
 
 def _fixed_point(gaussians: Gaussians, note: Note) -> tuple[Gaussians, int]:
-    """The Gaussians that the format holds, and the fractional bits of their positions.
+    """Return the Gaussians within the format's range, and the fractional bits of positions.
 
-    All have the same bits: the most that hold every position, unless a few far ones would cost the
-    others their place.
+    The bits are the most that can represent every position; distant Gaussians are dropped where
+    keeping them would cost the others more.
     """
     farthest = np.abs(gaussians.means.astype(np.float64)).max(axis=1)
     fits = [Fit(farthest <= _MAX_FIXED / 2.0**bits, 2.0**-bits) for bits in range(_MAX_BITS + 1)]
-    whole = [bits for bits, fit in enumerate(fits) if fit.kept.all()]
-    first = max(whole, default=0)
+    complete = [bits for bits, fit in enumerate(fits) if fit.kept.all()]
+    first = max(complete, default=0)
     chosen, lost, error = best_fit(gaussians, fits[first:])
     bits = first + chosen
-    kept, most = fits[bits].kept, _MAX_FIXED / 2.0**bits
-    if not kept.any() or (not whole and lost > _MAX_LOST_SHARE):
+    kept, limit = fits[bits].kept, _MAX_FIXED / 2.0**bits
+    if not kept.any() or (not complete and lost > _MAX_LOST_SHARE):
         raise ParameterError(
-            f"positions within {_MAX_FIXED:,} of the origin, which is all that .spz can hold",
+            f"positions within {_MAX_FIXED:,} units of the origin, the range of .spz",
             found=f"one at {farthest.max():.3g}",
             fix="Export another format, or crop the model.",
         )
     if not kept.all():
-        note(left_out_note(".spz", kept, f"more than {most:,.4g} units from the origin"))
-    if error > COARSE:
-        steps = f"up to {most:,.4g} units from the origin in steps of {2.0**-bits:.3g}"
+        note(left_out_note(".spz", kept, f"more than {limit:,.4g} units from the origin"))
+    if error > SETTINGS.coarse_error:
+        steps = f"up to {limit:,.4g} units from the origin in steps of {2.0**-bits:.3g}"
         note(
             f"A .spz holds positions {steps}, too coarse for this model: export another format, or "
             "move the model to the origin."
         )
-    scales = np.sort(gaussians.scales[kept], axis=1)  # of a flat Gaussian the least does not count
+    scales = np.sort(
+        gaussians.scales[kept], axis=1
+    )  # the thickness of a flat Gaussian does not matter
     beyond = (scales[:, 2] > _LOG_SCALES[1]) | (scales[:, 1] < _LOG_SCALES[0])
     if number := int(np.count_nonzero(beyond)):
-        least, largest = np.exp(_LOG_SCALES)
+        smallest, largest = np.exp(_LOG_SCALES)
         note(
-            f"A .spz holds sizes from {least:.2g} to {largest:.0f} units: "
-            f"{counted(number, 'Gaussian')} {agreeing(number, 'has', 'have')} the nearest."
+            f"A .spz holds sizes from {smallest:.2g} to {largest:.0f} units: "
+            f"{counted(number, 'Gaussian')} {agreeing(number, 'was', 'were')} clipped."
         )
     return gaussians if kept.all() else gaussians.select(kept), bits
 
 
 def decode(path: Path, note: Note = silent_note) -> Gaussians:
-    """Of any version; 4 needs zstandard."""
+    """Decode an .spz of version 1 to 4; version 4 needs zstandard."""
     data = read_bytes(path)
-    with translate_errors(path, "a whole .spz"):
+    with translate_errors(path, "a complete .spz"):
         stream = zlib.decompressobj(wbits=31)
         in_zstd = data.startswith(MAGIC)
         header = data if in_zstd else stream.decompress(data, _HEADER.size)
@@ -145,20 +147,20 @@ def decode(path: Path, note: Note = silent_note) -> Gaussians:
         # Position, opacity, colour, scale, rotation, harmonics: bytes per Gaussian.
         sizes = [6 if version == 1 else 9, 1, 3, 3, 3 if version < 3 else 4, 3 * rest]
         check_memory(count, sum(sizes), "Gaussians", fix=COPY_AGAIN)
-        wanted = count * sum(sizes)
+        num_bytes = count * sum(sizes)
         if in_zstd:
             body = _zstd_body(data, count, [size for size in sizes if size])
-        else:  # up to the size in the header: no zip bomb is unpacked
-            body = stream.decompress(stream.unconsumed_tail, wanted)
-        if not (in_zstd or stream.eof):  # to its checksum, and past what a newer version may add
-            stream.decompress(stream.unconsumed_tail, wanted)
-        if len(body) != wanted or not (in_zstd or stream.eof):
-            raise ValueError(f"a stream that ends after {len(body):,} of {wanted:,} bytes")
+        else:  # limited to the header's size: no zip bomb is unpacked
+            body = stream.decompress(stream.unconsumed_tail, num_bytes)
+        if not (in_zstd or stream.eof):  # read the checksum
+            stream.decompress(stream.unconsumed_tail, num_bytes)
+        if len(body) != num_bytes or not (in_zstd or stream.eof):
+            raise ValueError(f"a stream that ends after {len(body):,} of {num_bytes:,} bytes")
         parts = np.split(np.frombuffer(body, np.uint8), count * np.cumsum(sizes)[:-1])
-        position, opacity, color, scale, turn, sh = (part.reshape(count, -1) for part in parts)
+        position, opacity, color, scale, rotation, sh = (part.reshape(count, -1) for part in parts)
         harmonics = (sh.reshape(count, rest, 3).astype(np.float32) - 128) / 128
         if rest > len(_SH):
-            note(f"Of {rest} coefficients beyond the first, the {len(_SH)} of degree 3 are used.")
+            note(f"Of {rest} coefficients beyond the first, {len(_SH)} (degree 3) are used.")
             rest, harmonics = len(_SH), harmonics[:, : len(_SH)]
         if version == 1:  # half floats
             means = np.ascontiguousarray(position).view("<f2").astype(np.float32)
@@ -170,7 +172,7 @@ def decode(path: Path, note: Note = silent_note) -> Gaussians:
         return Gaussians(
             means=means * _AXES,
             scales=(scale / 16 - 10).astype(np.float32),
-            quats=_quats(turn) * _QUAT,
+            quats=_quats(rotation) * _QUAT,
             opacities=opacity_logits(opacity[:, 0]),
             sh0=((color - 127.5) / _COLOR).astype(np.float32)[:, None],
             shN=np.asarray(harmonics * _SH[:rest, None], np.float32),
@@ -179,9 +181,9 @@ def decode(path: Path, note: Note = silent_note) -> Gaussians:
 
 
 def _zstd_body(data: bytes, count: int, sizes: list[int]) -> bytes:
-    """The attributes of version 4, whose header ends in the offset of a table of their streams."""
+    """Decompress the attributes of version 4; its header ends with the offset of their table."""
     require("zstandard")
-    import zstandard  # noqa: PLC0415  (of the extra view)
+    import zstandard  # noqa: PLC0415  (optional: extra `view`)
 
     (table,) = struct.unpack_from("<I", data, _HEADER.size)
     at, body = table + 16 * len(sizes), b""

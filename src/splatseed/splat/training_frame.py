@@ -110,12 +110,12 @@ def training_frame(
 
     ``points`` locate the scene and are finite: ``PointCloud.references``, or means of Gaussians.
     """
-    centers, sight = camera_centers(views), check_cameras(views, points)
-    usual = centers[~sight.strays]
+    centers, check = camera_centers(views), check_cameras(views, points)
+    usual = centers[~check.strays]
     origin = usual.mean(axis=0)
     extent = float(np.linalg.norm(usual - origin, axis=1).max())
     rounding = 1e-9 * float(np.abs(usual).max())  # of coincident cameras
     scale = 1.0 / extent if extent > rounding else 1.0
-    near = NEAR_PLANE if sight.near is None else NEAR_SHARE * sight.near * scale
-    names = (view.name for view, stray in zip(views, sight.strays, strict=True) if stray)
+    near = NEAR_PLANE if check.near_depth is None else NEAR_SHARE * check.near_depth * scale
+    names = (view.name for view, stray in zip(views, check.strays, strict=True) if stray)
     return TrainingFrame(origin, scale, near, tuple(names))

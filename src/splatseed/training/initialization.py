@@ -44,7 +44,7 @@ def first_gaussians(
         sh_degree=settings.sh_degree,
         opacity=schedule.opacity,
         scale_factor=schedule.scale_factor,
-        largest=schedule.max_size * depths,
+        max_sizes=schedule.max_size * depths,
         flatness=schedule.flatness,
         harmonics=fit_harmonics(seeds, views) if settings.seed_colors else None,
     )
