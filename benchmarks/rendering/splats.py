@@ -21,8 +21,9 @@ from scipy.spatial.transform import Rotation
 
 from splatseed.camera import Camera
 from splatseed.photos.view import View
-from splatseed.rendering.binning import RECORD, TILE, depth_order, list_tiles
-from splatseed.rendering.layout import gather
+from splatseed.rendering._kernels.binning import RECORD, TILE
+from splatseed.rendering._kernels.layout import gather
+from splatseed.rendering.binning import depth_order, list_tiles
 from splatseed.runtime.jit import kernel, parallel_range
 from splatseed.splat.from_seeds import neighbor_distances
 from splatseed.splat.gaussians import PARAMETERS, SH_C0, Gaussians

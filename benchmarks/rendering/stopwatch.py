@@ -16,7 +16,8 @@ from typing import Any
 
 from benchmarks.common.clocks import Clock, start_clock
 
-from splatseed.rendering import autograd, blending, blending_vjp
+from splatseed.rendering import autograd
+from splatseed.rendering._kernels import blending, blending_vjp
 from splatseed.rendering.autograd import Blend, Harmonics, Project
 
 __all__ = ["RENDER_STAGES", "Stopwatch", "timed"]

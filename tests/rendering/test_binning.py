@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from splatseed.rendering import binning
-from splatseed.rendering.binning import TILE, depth_order, list_tiles
+from splatseed.rendering._kernels.binning import RECORD, TILE
+from splatseed.rendering.binning import depth_order, list_tiles
 
 View = tuple[np.ndarray, np.ndarray, np.ndarray, int, int]
 
 
 def lists_of(means2d, conics, reach, width, height):
     """The lists of Gaussians whose alpha reaches 1/255 where sigma is ``reach``."""
-    records = np.zeros((len(reach), binning.RECORD), np.float32)
+    records = np.zeros((len(reach), RECORD), np.float32)
     records[:, :2], records[:, 2:5] = means2d, conics * np.float32([-1 / 16, -1 / 8, -1 / 16])
     records[:, 5] = (reach - np.log(255.0)) / 8
     return list_tiles(records.ravel(), width, height)

@@ -113,8 +113,8 @@ def test_a_kernel_runs_where_no_cache_can_be_written(tiny, monkeypatch):
 
 
 def test_a_kernel_reaches_what_compiles_it_and_the_lanes_that_it_uses():
-    importlib.import_module("splatseed.rendering.harmonics")
-    reached = kernel_cache.reached_files("splatseed.rendering.harmonics").keys()
+    importlib.import_module("splatseed.rendering._kernels.harmonics")
+    reached = kernel_cache.reached_files("splatseed.rendering._kernels.harmonics").keys()
     assert "splatseed.cli" not in reached
     for name in ("jit", "workarounds", "compilation", "simd", "shuffles"):
         assert f"splatseed.runtime.{name}" in reached

@@ -14,6 +14,7 @@ from splatseed.camera import rotation_from_quat
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.io import load_scene, write_scene
 from splatseed.io.origin import translated
+from splatseed.rendering.harmonics import sh_basis
 from splatseed.similarity import Similarity, fit_similarity
 from splatseed.splat.evaluate import evaluate_model, load_model
 from splatseed.splat.formats import write_gaussians
@@ -108,6 +109,18 @@ def test_nerfstudios_transform_starts_from_colmaps_world(room, tmp_path):
     wanted = turned.points(load_scene(room).points.xyz)
     moved = find_transform(str(file), scene).points(scene.points.xyz)
     np.testing.assert_allclose(moved, wanted, atol=1e-5)
+
+
+def test_rotated_harmonics_have_the_same_colors_in_rotated_directions(rng, gaussians, other):
+    directions = rng.normal(size=(len(gaussians), 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+
+    def colors(model, at):
+        harmonics = np.concatenate([model.sh0, model.shN], axis=1)
+        return np.einsum("nk,nkc->nc", sh_basis(at, harmonics.shape[1]), harmonics)
+
+    rotated = colors(transform_gaussians(gaussians, other), directions @ other.rotation.T)
+    np.testing.assert_allclose(rotated, colors(gaussians, directions), atol=1e-5)
 
 
 def test_collinear_positions_give_no_similarity(rng, other):

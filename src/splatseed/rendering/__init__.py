@@ -1,4 +1,4 @@
-"""Rasterisation of 3D Gaussians: gsplat's ``rasterization`` on any machine.
+"""Rasterise 3D Gaussians with gsplat's ``rasterization`` on any machine.
 
 ``rasterization`` has the signature and the results of ``gsplat.rasterization`` (1.5.3). CUDA
 tensors go to gsplat itself; CPU tensors to this package's own rasteriser, so that code written for
@@ -25,7 +25,7 @@ __all__ = ["MCMCStrategy", "mcmc_on_cpu", "rasterization"]
 
 
 def __getattr__(name: str) -> Any:
-    """The names that need gsplat.
+    """Load the names that need gsplat.
 
     Raises:
         MissingDependencyError: gsplat is absent.

@@ -1,14 +1,13 @@
-"""``rasterization``: gsplat's signature, and its ``info`` dictionary, on the CPU.
+"""Rasterise on the CPU with gsplat's signature and its ``info`` dictionary.
 
 For code written against gsplat 1.5.3: arguments, results and the keys, shapes, types and numbers of
 ``info`` are gsplat's, so that its default densification runs unchanged, and MCMC through
 ``splatseed.rendering.MCMCStrategy``. What the CPU cannot do (fisheye, orthographic cameras,
-distributed rendering, rolling shutter) is refused, never ignored.
+distributed rendering, rolling shutter) raises an error.
 
 Notation: N Gaussians, C cameras, B batches, I = B C images, batch by batch; G = I N, or if packed
-the number of visible ones, image by image; P pairs of a Gaussian and a tile. The lists of pairs are
-made when ``info[...]`` first asks for one: a training step does not pay for them, as the rasteriser
-has its own.
+the number of visible Gaussians, image by image; P pairs of a Gaussian and a tile. ``info`` computes
+lists of pairs when first read: a training step does not need them, as the rasteriser has its own.
 """
 
 from __future__ import annotations
@@ -23,24 +22,24 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from splatseed.errors import ParameterError
+from splatseed.rendering._kernels.blending import CHANNELS
 from splatseed.rendering.autograd import Blend, Harmonics, Project, ProjectionParams, is_seen
-from splatseed.rendering.blending import CHANNELS
 from splatseed.rendering.harmonics import MAX_DEGREE
 from splatseed.requirements import require
 
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 RasterizeMode = Literal["classic", "antialiased"]
 GSPLAT_TILE = 16
-"""The size of the tiles that ``info`` lists, px."""
+"""Default side of the tiles in ``info``'s lists, px."""
 CUDA_ONLY: Mapping[str, object] = {
     "camera_model": "pinhole",
     **dict.fromkeys(("distributed", "segmented", "with_ut", "with_eval3d"), False),
     **dict.fromkeys(("radial_coeffs", "tangential_coeffs", "thin_prism_coeffs", "ftheta_coeffs")),
     **dict.fromkeys(("covars", "rolling_shutter", "viewmats_rs")),
 }
-"""gsplat's further arguments with their defaults."""
+"""Arguments that only gsplat supports, with their defaults."""
 LISTS = ("tiles_per_gauss", "isect_ids", "flatten_ids", "isect_offsets")
-"""The entries of ``info`` that are made when read."""
+"""Entries of ``info`` that are computed when first read."""
 
 
 def rasterization(
@@ -70,8 +69,8 @@ def rasterization(
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render N Gaussians into C pinhole cameras; differentiable.
 
-    "..." are batch dimensions, none or several, the same in all tensors: every batch has Gaussians
-    and cameras of its own.
+    "..." are any number of batch dimensions, the same in all tensors: every batch has its own
+    Gaussians and cameras.
 
     Args:
         means: Centres, world, float32 [..., N, 3].
@@ -80,7 +79,7 @@ def rasterization(
         opacities: 0 to 1, [..., N].
         colors: [..., N, D] or [..., C, N, D]; with ``sh_degree`` coefficients [..., N, K, 3] or
             [..., C, N, K, 3]. Beyond gsplat, the first coefficient [..., N, 1, 3] and the rest
-            [..., N, K - 1, 3] may come as a pair, as trainers keep them: joining them would take a
+            [..., N, K - 1, 3] may be a pair, as trainers store them: concatenation would take a
             quarter of a training step.
         viewmats: cam_from_world, OpenCV axes, [..., C, 4, 4].
         Ks: Pinhole matrices in px, [..., C, 3, 3].
@@ -88,7 +87,7 @@ def rasterization(
         height: Pixels.
         near_plane: Smallest z.
         far_plane: Largest z.
-        radius_clip: Gaussians no larger than this are left out, px.
+        radius_clip: Gaussians with both radii up to this are culled, px.
         eps2d: Blur added to the 2D covariance, px^2.
         sh_degree: Degree of spherical harmonics, 0 to 3; None uses colours directly.
         packed: Whether ``info`` lists visible Gaussians only; the image is the same.
@@ -184,21 +183,21 @@ def rasterization(
 
 
 def _unbatched(batch: tuple[int, ...], *tensors: Tensor) -> Iterable[tuple[Tensor, ...]]:
-    """One scene after the other: all tensors without their batch dimensions."""
+    """Iterate over scenes: all tensors without their batch dimensions."""
     if not batch:
         return [tensors]
     return zip(*(each.flatten(0, len(batch) - 1).unbind() for each in tensors), strict=True)
 
 
 def _project(
-    gaussians: Sequence[Tensor], viewmat: Tensor, lens: ProjectionParams, sparse: bool
+    gaussians: Sequence[Tensor], viewmat: Tensor, params: ProjectionParams, sparse: bool
 ) -> Projected:
-    """Means, quats, scales and opacities in one camera."""
+    """Project means, quats, scales and opacities into one camera."""
     opacities = gaussians[3]
-    radii, means2d, depths, conics, compensations = Project.apply(  # type: ignore[no-untyped-call]  # PyTorch's apply is untyped
-        *gaussians, viewmat, lens, sparse
+    radii, means2d, depths, conics, compensations = Project.apply(
+        *gaussians, viewmat, params, sparse
     )
-    if lens.antialiased:
+    if params.antialiased:
         opacities = opacities * compensations
     return Projected(radii, means2d, depths, conics, opacities)
 
@@ -211,7 +210,7 @@ def _colors(
     view: Projected,
     sh_degree: int | None,
 ) -> Tensor:
-    """Colours of N Gaussians in one camera, [N, D]; ``colors`` is one tensor or a pair."""
+    """Return the colours of N Gaussians in one camera, [N, D]; ``colors`` is a tensor or a pair."""
     base, rest = colors if len(colors) == 2 else (colors[0], None)
     if base.dim() == (3 if sh_degree is None else 4):
         base = base[camera]
@@ -219,12 +218,12 @@ def _colors(
         return base
     # The general inverse, as in gsplat: the rigid one has another gradient off the rotations.
     origin = torch.linalg.inv_ex(viewmats[camera]).inverse[:3, 3]
-    shades: Tensor = Harmonics.apply(means, origin, base, rest, view.radii, sh_degree)  # type: ignore[no-untyped-call]  # PyTorch's apply is untyped
+    shades: Tensor = Harmonics.apply(means, origin, base, rest, view.radii, sh_degree)
     return shades
 
 
 def _channels(colors: Tensor, depth: Tensor, render_mode: RenderMode) -> Tensor:
-    """The channels of a render mode, depth last."""
+    """Return the channels of a render mode, depth last."""
     if render_mode == "RGB":
         return colors
     return depth if render_mode in {"D", "ED"} else torch.cat([colors, depth], dim=-1)
@@ -237,7 +236,7 @@ def _blend(
     backgrounds: Tensor | None,
     absgrad: bool,
 ) -> tuple[Tensor, Tensor]:
-    """Images [..., C, H, W, D] and alphas [..., C, H, W, 1], by way of ``info["means2d"]``."""
+    """Return images [..., C, H, W, D] and alphas [..., C, H, W, 1], from ``info["means2d"]``."""
     means2d, ids = info["means2d"], info["gaussian_ids"]
     sums: Sequence[Tensor | None] = [None] * len(views)
     if absgrad:
@@ -251,7 +250,7 @@ def _blend(
         own: tuple[Tensor, ...] = (view.conics, shades[i], view.opacities, view.depths, view.radii)
         if seen is not None:  # a full slice would be copied by backward
             own = tuple(each[seen[i]] for each in own)
-        pixels, alpha = Blend.apply(  # type: ignore[no-untyped-call]  # PyTorch's apply is untyped
+        pixels, alpha = Blend.apply(
             centers, *own[:3], behind[i], *own[3:], info["width"], info["height"], sums[i]
         )
         images.append(pixels)
@@ -309,7 +308,7 @@ def _check_colors(
     own: tuple[int, ...],
     sh_degree: int | None,
 ) -> None:
-    """Shared by the cameras or one set per camera: the number of axes decides."""
+    """Check colours shared by the cameras or of one set per camera: the number of axes decides."""
     first, *others = shapes
     if sh_degree is None:
         fits = not others and first[:-1] in (shared, own) and first[-1] >= 1
@@ -350,7 +349,7 @@ class Projected(NamedTuple):
 
 
 class Info(dict[str, Any]):
-    """A dictionary whose ``LISTS`` are made when ``[]`` reads one of them."""
+    """A dictionary that computes its ``LISTS`` when ``[]`` reads one of them."""
 
     batch: tuple[int, ...]
     """The scenes' batch dimensions."""
@@ -372,14 +371,14 @@ class Info(dict[str, Any]):
         return self[name]
 
     def by_image(self, each: Tensor) -> Sequence[Tensor]:
-        """The images' own parts of an entry."""
+        """Split an entry by image."""
         if self["camera_ids"] is None:
             return each.flatten(0, -3).unbind()
         counts = torch.bincount(self.image_ids(), minlength=self["n_batches"] * self["n_cameras"])
         return torch.split(each, counts.tolist())
 
     def image_ids(self) -> Tensor:
-        """The image of each packed Gaussian, [G]."""
+        """Return the image index of each packed Gaussian, [G]."""
         ids: Tensor = self["batch_ids"] * self["n_cameras"] + self["camera_ids"]
         return ids
 
@@ -392,7 +391,7 @@ def _make_info(
     height: int,
     tile_size: int,
 ) -> Info:
-    """The ``info`` of I images; if packed it lists only visible Gaussians, image by image."""
+    """Make the ``info`` of I images; if packed, it lists only visible Gaussians, image by image."""
     batches = math.prod(batch)
     cameras = len(views) // batches
     info = Info(batch_ids=None, camera_ids=None, gaussian_ids=None)
@@ -433,13 +432,23 @@ def intersect(
 ) -> tuple[Int[Tensor, " G"], Int[Tensor, " P"], Int[Tensor, " P"], Int[Tensor, "I rows columns"]]:
     """Pair Gaussians with the tiles that their bounding boxes reach.
 
-    A pair's id is, from the highest bit down, its image, its tile (row by row, in as many bits as
-    the number of tiles needs) and the 32 bits of its depth, so that sorted ids are image by image,
-    tile by tile, front to back: gsplat's ``isect_tiles`` and ``isect_offset_encode``.
+    Equivalent to gsplat's ``isect_tiles`` and ``isect_offset_encode``. From the highest bit down, a
+    pair's id holds its image, its tile (in row-major order, in as many bits as the number of tiles
+    needs) and the 32 bits of its depth, so that sorted ids are ordered by image, tile and depth.
 
-    Takes centres and half-sizes of boxes in px (0: culled), depths, the image of each, I, and the
-    sizes of images and tiles in px; returns how many tiles each Gaussian touches, the pairs' ids,
-    sorted, int64, the Gaussian of each pair, and the first pair of each tile.
+    Args:
+        means2d: Centres, px.
+        radii: Half-sizes of the boxes, px; 0 where culled.
+        depths: z, at least 0.
+        images: The image of each Gaussian.
+        count: Number of images, I.
+        width: Pixels.
+        height: Pixels.
+        size: Side of a tile, px.
+
+    Returns:
+        The number of tiles that each Gaussian touches; the sorted ids, int64; the Gaussian of each
+        pair; the first pair of each tile.
     """
     columns, rows = -(-width // size), -(-height // size)
     tiles = columns * rows

@@ -1,8 +1,8 @@
-"""The specification of the rasteriser: slow, dense, readable, float64 if its inputs are.
+"""Specify the rasteriser: a slow, dense, readable renderer, float64 if its inputs are.
 
-Every Gaussian meets every pixel; PyTorch's autograd gives all gradients. Tests compare the fast
-stages with this file; where they disagree, this file is right. Conventions: OpenCV camera axes,
-pixel centres at +0.5, quaternions wxyz. Cut-offs are those of gsplat 1.5.3.
+It evaluates every Gaussian at every pixel; PyTorch's autograd gives all gradients. Tests compare
+the kernels with this file; where they disagree, this file is right. Conventions: OpenCV camera
+axes, pixel centres at +0.5, quaternions wxyz. Cut-offs are those of gsplat 1.5.3.
 """
 
 from __future__ import annotations
@@ -10,11 +10,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from splatseed.rendering.projection import EDGE, MAX_SIGMAS, MIN_ALPHA
+from splatseed.rendering._kernels.projection import EDGE, MAX_SIGMAS, MIN_ALPHA
 
 MAX_ALPHA = 0.999
-"""Largest alpha: see ``blending``."""
-STOP = 1e-4
+"""Largest alpha: see ``_kernels.blending``."""
+MIN_TRANSMITTANCE = 1e-4
 """Transmittance at which a pixel is finished."""
 
 
@@ -49,7 +49,7 @@ def rasterize_reference(
         height: Pixels.
         near_plane: Smallest z.
         far_plane: Largest z.
-        eps2d: px^2.
+        eps2d: Blur added to the 2D covariance, px^2.
         background: [D].
         antialiased: Whether opacities are compensated for the blur.
 
@@ -67,10 +67,10 @@ def rasterize_reference(
         # The blur widens a Gaussian; its opacity falls by the ratio of the areas.
         ratio = torch.linalg.det(raw) / torch.linalg.det(covariance)
         opacities = opacities * ratio.clamp(min=0.0).sqrt()
-    seen = in_range & _touches_image(means2d, covariance, opacities, width, height)
-    # Front to back, the seen ones first.
-    order = torch.argsort(torch.where(seen, points[:, 2], torch.inf), stable=True)[
-        : int(seen.sum())
+    visible = in_range & _touches_image(means2d, covariance, opacities, width, height)
+    # Front to back, visible Gaussians first.
+    order = torch.argsort(torch.where(visible, points[:, 2], torch.inf), stable=True)[
+        : int(visible.sum())
     ]
     image, transmittance = _blend(
         means2d[order], torch.linalg.inv(covariance[order]), opacities[order], colors[order],
@@ -86,7 +86,7 @@ def _focal(K: Tensor) -> Tensor:
 
 
 def _rotations(quats: Tensor) -> Tensor:
-    """[N, 3, 3] of wxyz quaternions of any length."""
+    """Return the rotations [N, 3, 3] of wxyz quaternions [N, 4] of any length."""
     w, x, y, z = torch.unbind(quats / quats.norm(dim=-1, keepdim=True), dim=-1)
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
@@ -106,7 +106,7 @@ def _covariance2d(
     height: int,
     eps2d: float,
 ) -> tuple[Tensor, Tensor]:
-    """2D covariances [N, 2, 2] with the blur, and without."""
+    """Return the 2D covariances [N, 2, 2] with the blur, and without."""
     factor = _rotations(quats) * scales[:, None, :]
     x, y, z = torch.unbind(points, dim=-1)
     focal, center = _focal(K), K[:2, 2]
@@ -128,7 +128,7 @@ def _covariance2d(
 def _touches_image(
     means2d: Tensor, covariance: Tensor, opacities: Tensor, width: int, height: int
 ) -> Tensor:
-    """Whether the box where alpha reaches 1/255, at most 3.33 sigmas, is in the image."""
+    """Test whether the box of alpha >= 1/255, at most 3.33 sigmas, overlaps the image, bool [N]."""
     # opacity exp(-sigmas^2 / 2) = 1/255
     sigmas = (
         (2 * torch.log(opacities.clamp(min=MIN_ALPHA) / MIN_ALPHA)).sqrt().clamp(max=MAX_SIGMAS)
@@ -142,22 +142,22 @@ def _touches_image(
 def _blend(
     means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, width: int, height: int
 ) -> tuple[Tensor, Tensor]:
-    """Gaussians in depth order into pixels: image [H, W, D] and the final transmittance [H, W]."""
+    """Blend Gaussians in depth order: return image [H, W, D] and final transmittance [H, W]."""
     y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     pixels = torch.stack([x, y], dim=-1).to(means2d) + 0.5
     transmittance = torch.ones(height, width).to(means2d)
-    going_on = torch.ones(height, width, dtype=torch.bool)
+    unfinished = torch.ones(height, width, dtype=torch.bool)
     image = torch.zeros(height, width, colors.shape[1]).to(means2d)
     for mean, conic, opacity, color in zip(means2d, conics, opacities, colors, strict=True):
         d = mean - pixels
         # sigma = d' conic d / 2; alpha = opacity exp(-sigma)
         sigma = 0.5 * (d[..., None, :] @ conic @ d[..., :, None])[..., 0, 0]
         alpha = (opacity * torch.exp(-sigma)).clamp(max=MAX_ALPHA)
-        counts = going_on & (sigma >= 0) & (alpha >= MIN_ALPHA)
+        counts = unfinished & (sigma >= 0) & (alpha >= MIN_ALPHA)
         after = torch.where(counts, transmittance * (1 - alpha), transmittance)
-        # The Gaussian that would bring T to the stop is not drawn itself.
-        going_on = going_on & ~(counts & (after <= STOP))
-        weight = torch.where(counts & going_on, alpha * transmittance, torch.zeros_like(alpha))
+        # The Gaussian that would finish a pixel is not drawn.
+        unfinished = unfinished & ~(counts & (after <= MIN_TRANSMITTANCE))
+        weight = torch.where(counts & unfinished, alpha * transmittance, torch.zeros_like(alpha))
         image = image + weight[..., None] * color
-        transmittance = torch.where(going_on, after, transmittance)
+        transmittance = torch.where(unfinished, after, transmittance)
     return image, transmittance

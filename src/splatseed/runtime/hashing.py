@@ -1,7 +1,7 @@
-"""Hash in kernels: SplitMix64's finaliser, and key tables with open addressing.
+"""Hash in kernels: SplitMix64's finaliser, and hash tables with open addressing.
 
-A table has 2^n slots of uint64; a free slot holds ``FREE``, which no key equals. In a table that is
-at most half full, a look-up takes a few steps.
+A table has 2^n slots of uint64; a free slot holds ``FREE``, which no key may equal. In a table at
+most half full, a look-up takes a few steps.
 """
 
 from __future__ import annotations

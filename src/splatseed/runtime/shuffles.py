@@ -1,9 +1,7 @@
-"""Lanes of ``simd``'s vectors: moved in fixed patterns, and extracted.
+"""Permute, extract and sum lanes of ``simd``'s vectors.
 
-Promise: as in ``simd``; only ``three_sums`` rounds, and its summation tree is fixed.
+Promise: as in ``simd``; only ``three_sums`` rounds, in a fixed summation tree.
 """
-
-# mypy: disable-error-code="no-untyped-def, no-untyped-call, misc"
 
 from __future__ import annotations
 
@@ -20,12 +18,11 @@ I32 = ir.IntType(32)
 
 
 def permutation(pattern: Sequence[int]):
-    """An intrinsic: lane j of its result is lane ``pattern[j]`` of its argument.
+    """Make an intrinsic whose result has lane ``pattern[j]`` of its argument in lane j.
 
-    Args:
-        pattern: ``LANES`` numbers below ``LANES``.
+    ``pattern`` is ``LANES`` numbers below ``LANES``.
     """
-    lanes = [int(each) for each in pattern]
+    lanes = [int(number) for number in pattern]
 
     @intrinsic
     def permute(typing_context, v):
@@ -38,7 +35,7 @@ def permutation(pattern: Sequence[int]):
 
 
 def lane(number: int):
-    """An intrinsic: one lane of its argument, as float32."""
+    """Make an intrinsic that returns a lane of its argument as float32."""
     index = ir.Constant(I32, number)
 
     @intrinsic
@@ -52,17 +49,17 @@ def lane(number: int):
 
 
 def _shuffle(builder, a, b, lanes):
-    """Lanes of two vectors; b's are numbered from ``LANES``."""
+    """Select lanes of two vectors; those of b are numbered from ``LANES``."""
     return builder.shuffle_vector(a, b, ir.Constant(INDEX, list(lanes)))
 
 
 @intrinsic
 def three_sums(typing_context, a, b, c):
-    """The sums of the lanes of a, b and c, in lanes 0, 4 and 8 of the result."""
+    """Return the sums of the lanes of a, b and c, in lanes 0, 4 and 8."""
 
     def generate(context, builder, signature, arguments):
         a, b, c = arguments
-        # Halves of a and c, then quarters of those and of b, side by side.
+        # Add halves of a and c, then quarters of these and of b, in parallel.
         low, high = [*range(8), *range(16, 24)], [*range(8, 16), *range(24, 32)]
         ac = builder.fadd(_shuffle(builder, a, c, low), _shuffle(builder, a, c, high))
         bb = builder.fadd(b, _shuffle(builder, b, b, [(j + 8) % LANES for j in range(LANES)]))
@@ -81,12 +78,12 @@ def three_sums(typing_context, a, b, c):
 
 @intrinsic
 def triple(typing_context, a, b, c):
-    """a, b and c in lanes 0, 1 and 2; the others hold anything."""
+    """Return a vector with a, b, c in lanes 0, 1, 2; the other lanes are undefined."""
 
     def generate(context, builder, signature, arguments):
         vector = UNDEFINED
-        for number, each in enumerate(arguments):
-            vector = builder.insert_element(vector, each, ir.Constant(I32, number))
+        for number, value in enumerate(arguments):
+            vector = builder.insert_element(vector, value, ir.Constant(I32, number))
         return vector
 
     return f32x16(types.float32, types.float32, types.float32), generate

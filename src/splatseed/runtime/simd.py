@@ -1,17 +1,13 @@
-"""Sixteen float32 lanes: a Numba type whose values live in vector registers.
+"""Vectors of sixteen float32 lanes for kernels: a Numba type held in vector registers.
 
-Auto-vectorisation fails on the rasteriser's loops (they branch, carry state over Gaussians and end
-early), and costs a factor of five to eight. This file gives kernels LLVM's ``<16 x float>``
-instead: one AVX-512 register, which LLVM splits in two on AVX2 and in four on NEON.
-Promise: every operation is exactly the float32 one in each lane, in the order written; sums over
-lanes run in one fixed tree. Nothing here is ``fastmath``, so results do not depend on how a kernel
-was compiled or cached.
-
-Notation: ``v`` is a vector; a *mask* is a vector of 1.0 and 0.0 only where a function says so,
-otherwise comparisons feed ``select`` directly.
+Auto-vectorisation fails on the rasteriser's loops, which branch, carry state over Gaussians and end
+early; scalar code is five to eight times slower. These vectors are LLVM's ``<16 x float>``: one
+AVX-512 register, which LLVM splits in two on AVX2 and in four on NEON.
+Promise: every operation is the exact float32 operation in each lane, in the order written; sums
+over lanes use a fixed tree. Nothing is ``fastmath``, so results do not depend on how a kernel was
+compiled or cached. Indices into arrays must not be negative: counting from the end, as NumPy does,
+takes several instructions even if it never happens.
 """
-
-# mypy: disable-error-code="no-untyped-def, no-untyped-call, misc"
 
 from __future__ import annotations
 
@@ -25,14 +21,14 @@ from splatseed.runtime.jit import inline
 
 LANES = 16
 QUARTER = LANES // 4
-"""Lanes that are loaded at a time by ``load_columns``."""
+"""Vectors per call of ``load_columns``."""
 VECTOR = ir.VectorType(ir.FloatType(), LANES)
 PIECE = ir.VectorType(ir.FloatType(), QUARTER)
 INDEX = ir.VectorType(ir.IntType(32), LANES)
 
 
 class _F32x16(types.Type):
-    """The Numba type of sixteen float32 lanes."""
+    """Numba type of sixteen float32 lanes."""
 
     def __init__(self):
         super().__init__(name="f32x16")
@@ -43,14 +39,14 @@ f32x16 = _F32x16()
 
 @register_model(_F32x16)
 class _F32x16Model(models.PrimitiveModel):
-    """Its values are LLVM vectors."""
+    """Represent values as LLVM vectors."""
 
     def __init__(self, manager, front_end_type):
         super().__init__(manager, front_end_type, VECTOR)
 
 
 def _binary(instruction):
-    """An intrinsic of two vectors that is one LLVM instruction."""
+    """Make an intrinsic of two vectors from an LLVM instruction."""
 
     @intrinsic
     def operation(typing_context, a, b):
@@ -67,7 +63,7 @@ divide = _binary("fdiv")
 
 
 def call_lanes(builder, name, arguments):
-    """Call one of LLVM's own functions, such as ``sqrt``, on vectors of sixteen float32."""
+    """Call an LLVM intrinsic, such as ``sqrt``, on vectors of sixteen float32."""
     kind = ir.FunctionType(VECTOR, [VECTOR] * len(arguments))
     function = cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v{LANES}f32")
     return builder.call(function, arguments)
@@ -75,7 +71,7 @@ def call_lanes(builder, name, arguments):
 
 @intrinsic
 def fma(typing_context, a, b, c):
-    """The product a b plus c, rounded once."""
+    """Return a b + c, rounded once."""
 
     def generate(context, builder, signature, arguments):
         return call_lanes(builder, "fma", arguments)
@@ -85,7 +81,7 @@ def fma(typing_context, a, b, c):
 
 @intrinsic
 def fnma(typing_context, a, b, c):
-    """Minus a b plus c, rounded once."""
+    """Return c - a b, rounded once."""
 
     def generate(context, builder, signature, arguments):
         a, b, c = arguments
@@ -96,7 +92,7 @@ def fnma(typing_context, a, b, c):
 
 @intrinsic
 def minimum(typing_context, a, b):
-    """The lesser in each lane; of a NaN and a number, the number."""
+    """Return the minimum per lane; of a NaN and a number, the number."""
 
     def generate(context, builder, signature, arguments):
         return call_lanes(builder, "minnum", arguments)
@@ -106,7 +102,7 @@ def minimum(typing_context, a, b):
 
 @intrinsic
 def select_greater(typing_context, a, b, yes, no):
-    """``yes`` where a > b, else ``no`` (also where either is NaN)."""
+    """Return ``yes`` where a > b, else ``no`` (also if a or b is NaN)."""
 
     def generate(context, builder, signature, arguments):
         left, right, if_true, if_false = arguments
@@ -117,7 +113,7 @@ def select_greater(typing_context, a, b, yes, no):
 
 @intrinsic
 def broadcast(typing_context, x):
-    """The same float32 in every lane."""
+    """Return a vector of the same float32 in every lane."""
 
     def generate(context, builder, signature, arguments):
         return in_all_lanes(builder, arguments[0])
@@ -126,7 +122,7 @@ def broadcast(typing_context, x):
 
 
 def in_all_lanes(builder, x, kind=VECTOR):
-    """A vector type's value whose lanes all hold the scalar ``x``."""
+    """Build a vector of a type with the scalar ``x`` in every lane."""
     undefined = ir.Constant(kind, ir.Undefined)
     first = builder.insert_element(undefined, x, ir.Constant(ir.IntType(32), 0))
     return builder.shuffle_vector(first, undefined, ir.Constant(INDEX, [0] * LANES))
@@ -134,10 +130,7 @@ def in_all_lanes(builder, x, kind=VECTOR):
 
 @intrinsic
 def broadcast_element(typing_context, array, index):
-    """Element ``index`` of a contiguous float32 array in every lane.
-
-    Like ``element``'s, the index must not be negative.
-    """
+    """Load element ``index`` of a contiguous float32 array into every lane."""
 
     def generate(context, builder, signature, arguments):
         return in_all_lanes(builder, _element(context, builder, signature.args[0], *arguments))
@@ -147,11 +140,7 @@ def broadcast_element(typing_context, array, index):
 
 @intrinsic
 def element(typing_context, array, index):
-    """Element ``index`` of a contiguous array.
-
-    The index must not be negative: counting from the end, as NumPy does, takes several instructions
-    even if it never happens.
-    """
+    """Load element ``index`` of a contiguous array."""
 
     def generate(context, builder, signature, arguments):
         return _element(context, builder, signature.args[0], *arguments)
@@ -165,14 +154,14 @@ def _element(context, builder, array_type, array, index):
 
 
 def _address(context, builder, array_type, array, index):
-    """Pointer to sixteen consecutive elements of a one-dimensional contiguous array."""
+    """Return a pointer to sixteen consecutive elements of a contiguous array."""
     data = context.make_array(array_type)(context, builder, array).data
     return builder.bitcast(builder.gep(data, [index]), VECTOR.as_pointer())
 
 
 @intrinsic
 def load(typing_context, array, index):
-    """Elements ``index`` to ``index + 15`` of a contiguous float32 array."""
+    """Load elements ``index`` to ``index + 15`` of a contiguous float32 array."""
 
     def generate(context, builder, signature, arguments):
         pointer = _address(context, builder, signature.args[0], *arguments)
@@ -183,7 +172,7 @@ def load(typing_context, array, index):
 
 @intrinsic
 def store(typing_context, array, index, v):
-    """Write ``v`` to elements ``index`` to ``index + 15`` of a contiguous float32 array."""
+    """Store ``v`` in elements ``index`` to ``index + 15`` of a contiguous float32 array."""
 
     def generate(context, builder, signature, arguments):
         pointer = _address(context, builder, signature.args[0], *arguments[:2])
@@ -195,7 +184,7 @@ def store(typing_context, array, index, v):
 
 @inline
 def aligned(size):
-    """A float32 array aligned to the size of a vector register."""
+    """Allocate a float32 array aligned to the size of a vector register."""
     array = np.empty(size + LANES, np.float32)
     first = -(array.ctypes.data // 4) % LANES
     return array[first : first + size]
@@ -203,9 +192,9 @@ def aligned(size):
 
 @intrinsic
 def load_columns(typing_context, array, index):
-    """Four vectors of sixteen rows of sixteen: lane i of vector j is element ``index + 16 i + j``.
+    """Load four columns of a 16 x 16 matrix: lane i of vector j is element ``index + 16 i + j``.
 
-    Four at a time fit the registers of AVX2, where all sixteen would go back to memory.
+    Four vectors fit the registers of AVX2; sixteen would spill to memory.
     """
 
     def generate(context, builder, signature, arguments):
@@ -221,7 +210,7 @@ def load_columns(typing_context, array, index):
 
 
 def _joined(builder, pieces):
-    """Vectors of one size behind each other, halves first."""
+    """Concatenate vectors of the same size, halves first."""
     if len(pieces) == 1:
         return pieces[0]
     half = len(pieces) // 2
@@ -233,7 +222,7 @@ def _joined(builder, pieces):
 
 @intrinsic
 def store_transposed(typing_context, array, index, vectors):
-    """Write lane i of vector j, of a tuple of sixteen, to element ``index + 16 i + j``."""
+    """Store lane i of vector j, of a tuple of sixteen, in element ``index + 16 i + j``."""
 
     def generate(context, builder, signature, arguments):
         pointer = _address(context, builder, signature.args[0], *arguments[:2])
@@ -250,7 +239,7 @@ def _row(builder, pointer, i):
 
 
 def _transposed(builder, rows):
-    """Lane i of row j becomes lane j of row i, one bit of both indices at a time."""
+    """Transpose: lane i of row j becomes lane j of row i, one bit of both indices at a time."""
     for width in (1, 2, 4, 8):
         rows = _exchange(builder, rows, width)
     return rows
@@ -271,7 +260,7 @@ def _exchange(builder, rows, width):
 
 @intrinsic
 def prefetch(typing_context, array, index):
-    """Ask for the cache line of element ``index`` of a contiguous array, without waiting for it."""
+    """Prefetch the cache line of element ``index`` of a contiguous array."""
 
     def generate(context, builder, signature, arguments):
         pointer = _address(context, builder, signature.args[0], *arguments)
@@ -299,7 +288,7 @@ def _fold(builder, vector, combine):
 
 @intrinsic
 def lane_sum(typing_context, v):
-    """The sum of the lanes, float32, in a fixed tree."""
+    """Sum the lanes, float32, in a fixed tree."""
 
     def generate(context, builder, signature, arguments):
         return _fold(builder, arguments[0], builder.fadd)
@@ -309,7 +298,7 @@ def lane_sum(typing_context, v):
 
 @intrinsic
 def any_greater(typing_context, a, b):
-    """Whether a > b in at least one lane."""
+    """Test whether a > b in at least one lane."""
 
     def generate(context, builder, signature, arguments):
         mask = builder.bitcast(builder.fcmp_ordered(">", *arguments), ir.IntType(LANES))
@@ -326,9 +315,9 @@ _EXP = [
 
 @intrinsic
 def exp_of_eighth(typing_context, x):
-    """exp(8 x) for x in [-0.7, 0], to 3e-6 relative; meaningless elsewhere.
+    """Approximate exp(8 x) for x in [-0.7, 0] to 3e-6 relative; undefined elsewhere.
 
-    -5.6 is low enough: an alpha below 1/255 = exp(-5.54) is under the cut-off.
+    The domain suffices: alphas below 1/255 = exp(-5.54) are cut off, and 8 x reaches -5.6.
     """
 
     def generate(context, builder, signature, arguments):
@@ -346,7 +335,7 @@ def exp_of_eighth(typing_context, x):
 
 @intrinsic
 def negative_magnitude(typing_context, v):
-    """-|v|: the sign bit set."""
+    """Return -|v|, by setting the sign bit."""
 
     def generate(context, builder, signature, arguments):
         bits = builder.bitcast(arguments[0], INDEX)

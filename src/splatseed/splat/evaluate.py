@@ -38,6 +38,7 @@ from splatseed.photos.view import View, camera_views
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 from splatseed.scores import NOT_REQUESTED, EvalResult, ViewScore
+from splatseed.splat._kernels import WINDOW
 from splatseed.splat.formats import read_gaussians
 from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.lpips import LPIPS_NET, Lpips
@@ -51,7 +52,6 @@ from splatseed.splat.model_frame import (
 )
 from splatseed.splat.photographs import fill_masked, mask_tensor, photograph_tensor
 from splatseed.splat.rendering import ModelRenderer
-from splatseed.splat.ssim import WINDOW
 from splatseed.splat.training_frame import frame_of_model
 from splatseed.text import agreeing, name_some
 

@@ -14,7 +14,8 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from splatseed.requirements import require
-from splatseed.splat.ssim import WINDOW, l1_and_ssim
+from splatseed.splat._kernels import WINDOW
+from splatseed.splat.ssim import l1_and_ssim
 from splatseed.splat.ssim_conv import l1_and_ssim_by_convolution, ssim_map
 
 _UNSATURATED = 0.5 / 255

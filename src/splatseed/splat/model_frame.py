@@ -206,15 +206,11 @@ def transform_gaussians(gaussians: Gaussians, similarity: Similarity) -> Gaussia
 def _sh_rotation(rotation: Float64[np.ndarray, "3 3"], terms: int) -> Float64[np.ndarray, "K K"]:
     """Return the matrix M that rotates coefficients: y(d) M h = y(R' d) h for all directions d."""
     # `export --help` loads this module, and must not wait for PyTorch.
-    import torch  # noqa: PLC0415
-    from gsplat.cuda._torch_impl import _eval_sh_bases_fast  # noqa: PLC0415
+    from splatseed.rendering.harmonics import sh_basis  # noqa: PLC0415
 
     directions = np.random.default_rng(0).normal(size=(8 * terms, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    bases, rotated_bases = (
-        _eval_sh_bases_fast(terms, torch.from_numpy(np.ascontiguousarray(each))).numpy()
-        for each in (directions, directions @ rotation)
-    )
+    bases, rotated_bases = sh_basis(directions, terms), sh_basis(directions @ rotation, terms)
     return np.asarray(np.linalg.lstsq(bases, rotated_bases, rcond=None)[0])
 
 

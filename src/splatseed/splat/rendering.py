@@ -83,7 +83,7 @@ def opacity_from_logits(logits: Float[Tensor, "*N"]) -> Float[Tensor, "*N"]:
 
     ``torch.sigmoid`` on the CPU rounds differently at the ends of each thread's part.
     """
-    opacities: Tensor = _Opacity.apply(logits)  # type: ignore[no-untyped-call]
+    opacities: Tensor = _Opacity.apply(logits)
     return opacities
 
 

@@ -1,6 +1,6 @@
 """SSIM and its gradient by PyTorch's convolutions, for any device.
 
-``splat.ssim`` has the equations, and a faster pass on the CPU.
+``_kernels`` has the equations and the notation, ``ssim`` a faster pass on the CPU.
 """
 
 from __future__ import annotations
@@ -12,7 +12,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import conv2d, conv_transpose2d
 
-from splatseed.splat.ssim import C1, C2, WINDOW, window_weights
+from splatseed.splat._kernels import C1, C2, WINDOW
+from splatseed.splat.ssim import window_weights
 
 
 @torch.no_grad()
@@ -22,7 +23,7 @@ def l1_and_ssim_by_convolution(
     l1_weight: float,
     ssim_weight: float,
 ) -> tuple[Float[Tensor, ""], Float[Tensor, ""], Float[Tensor, "H W 3"]]:
-    """Compute ``splat.ssim.l1_and_ssim`` by convolutions; its header has the equations."""
+    """Compute ``splat.ssim.l1_and_ssim`` by convolutions."""
     x, y = render.permute(2, 0, 1), photograph.permute(2, 0, 1)
     c1, c2 = float(C1), float(C2)
     # cuDNN's TF32 would round inputs to ten bits, and E[x^2] - E[x]^2 cancel.
@@ -52,7 +53,7 @@ def l1_and_ssim_by_convolution(
 
 
 def ssim_map(x: Float[Tensor, "H W 3"], y: Float[Tensor, "H W 3"]) -> Float[Tensor, "3 H-10 W-10"]:
-    """Return SSIM wherever the window fits; ``splat.ssim`` has the equation."""
+    """Return SSIM wherever the window fits."""
     x, y = x.permute(2, 0, 1), y.permute(2, 0, 1)
     with torch.backends.cudnn.flags(enabled=True, allow_tf32=False):
         mean_x, mean_y, e_xy, e_2 = _blur(torch.stack([x, y, x * y, x * x + y * y]))

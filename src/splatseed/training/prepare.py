@@ -29,8 +29,8 @@ from splatseed.pointcloud import PointCloud
 from splatseed.progress import Note, Progress, silent, silent_note
 from splatseed.requirements import require
 from splatseed.scene import Scene
+from splatseed.splat._kernels import WINDOW
 from splatseed.splat.gaussians import Gaussians
-from splatseed.splat.ssim import WINDOW
 from splatseed.splat.training_frame import TrainingFrame, frame_of_model
 from splatseed.training.config import (
     another_scene,

@@ -1,28 +1,26 @@
-"""Gradients of ``blending``, whose notation and arrays this file shares.
+"""Compute the gradients of ``blending``, with its notation and arrays.
 
-It walks front to back again: the colour behind a Gaussian is the final image minus what has been
-blended so far, so only the blocks that each Gaussian hits need be stored.
+The order is front to back again: the colour behind a Gaussian is the final image minus the colour
+blended so far, so the forward pass stores only hits.
 
-Notation: p = d loss / d sigma of one Gaussian at one pixel. Sums are kept per *span*, a Gaussian in
-a row of tiles, over the row's pixels; their table is below. With pixels at (x, y) from a block's
-centre and the mean at (mx, my), dx = mx - x, so all of them follow from the moments of p about the
+Notation: p = d loss / d sigma of one Gaussian at one pixel. Sums (table below) are kept per *span*,
+a Gaussian in a row of tiles, over the row's pixels. With pixels at (x, y) and the mean at (mx, my),
+both relative to a block's centre, dx = mx - x, so all sums follow from the moments of p about the
 centre.
 
-Stages: per tile and block the hits are queued, then blended with all state in registers. p and the
-weights alpha T of sixteen hits at a time are transposed, so that a vector holds one pixel of
-sixteen Gaussians: their sums over pixels are then plain additions, and pixels have the same few
-coordinates. One thread takes a row of tiles from left to right, so that a span's sums are added up
-in a fixed order without atomics, while they are still in the cache: the same bytes every time.
+Stages: per tile and block, hits are queued, then blended with all state in registers. p and the
+weights alpha T of sixteen hits are transposed, so that a vector holds one pixel of sixteen
+Gaussians: sums over pixels become additions of vectors, and pixels have the same few coordinates.
+One thread processes a row of tiles from left to right: the sums of a span are added in a fixed
+order without atomics, while they are in the cache.
 """
-
-# mypy: disable-error-code="no-untyped-def, no-untyped-call"
 
 from __future__ import annotations
 
 import numpy as np
 
-from splatseed.rendering.binning import LOWEST, RECORD, TILE
-from splatseed.rendering.blending import BLOCKS, CHANNELS, MAX_ALPHA, STOP
+from splatseed.rendering._kernels.binning import MIN_EXPONENT, RECORD, TILE
+from splatseed.rendering._kernels.blending import BLOCKS, CHANNELS, MAX_ALPHA, MIN_TRANSMITTANCE
 from splatseed.runtime.jit import always_inline, kernel, parallel_range
 from splatseed.runtime.simd import (
     LANES,
@@ -49,47 +47,46 @@ from splatseed.runtime.simd import (
 )
 
 SUMS = 16
-"""Numbers per span, each summed over its pixels:
+"""Numbers per span, summed over its pixels:
 
    0   1     2     3       4        5       6 .. 9       10          11          12 .. 15
    p   p dx  p dy  p dx^2  p dx dy  p dy^2  d channels   |d mean x|  |d mean y|  0
 """
 ABSOLUTE = 10
-"""Offset of the absolute gradients among them."""
+"""Offset of the absolute gradients in the sums."""
 CHUNK = 512
-"""Entries of a tile's list that are queued at a time."""
-AHEAD = 128
-"""How many list entries ahead records and sums are prefetched."""
+"""List entries that are queued at a time."""
+PREFETCH = 128
+"""Distance of prefetching of records and sums, list entries."""
 WEIGHTS, MEANS = LANES * LANES, 2 * LANES * LANES
-"""Offsets of the weights alpha T and the means in a batch of sixteen hits; p is at 0."""
+"""Offsets of the weights alpha T and of the means in a batch of sixteen hits; p is at 0."""
 BATCH = MEANS + 2 * LANES
 ZERO, ONE, HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
 OUTER = np.float32(1.5)
-"""A block's columns and rows are at -OUTER, -HALF, HALF and OUTER from its centre."""
+"""Columns and rows of a block are at -OUTER, -HALF, HALF and OUTER from its centre, px."""
 
 
 @kernel
 def backward(
     records, tile_start, listed_rank, listed_span, hits, row_order, lane_x, lane_y, fourth,
-    gradient,
-    behind, absolute, sums,
+    gradient, behind, absolute, sums,
 ):  # fmt: skip
-    """The sums of every span.
+    """Compute the sums of every span.
 
     Args:
         records: As in ``blending.forward``.
-        tile_start: As there.
-        listed_rank: As there.
+        tile_start: As in ``blending.forward``.
+        listed_rank: As in ``blending.forward``.
         listed_span: The span of each list entry, int32 [P].
-        hits: As ``blending.forward`` wrote them.
-        row_order: As there.
+        hits: Those of ``blending.forward``.
+        row_order: As in ``blending.forward``.
         lane_x: ``COLUMN``.
         lane_y: ``ROW``.
         fourth: Whether the last channel is used.
         gradient: d loss / d image, block image, float32 [t * 4 * CHANNELS * 16].
         behind: gradient . final colour - (d loss / d alpha) T_final, float32 [t * 4 * 16];
             overwritten.
-        absolute: Whether the absolute gradients of the means are wanted; else they are 0.
+        absolute: Whether to compute the absolute gradients of the means; else they are 0.
         sums: Written: float32 [16 S]; must hold 0.
     """
     columns = (len(tile_start) - 1) // len(row_order)
@@ -126,18 +123,17 @@ def backward(
 
 @always_inline
 def _queue_hits(hits, start, stop, records, listed_rank, sums, listed_span, queue):
-    """Queue the list entries that hit each block, and prefetch their data; returns the counts.
+    """Queue the list entries that hit each block, prefetch their data, and return the counts.
 
-    Waiting for memory is otherwise a third of the time.
+    Without prefetching, memory latency takes a third of the time.
     """
     n0 = n1 = n2 = n3 = 0
     for entry in range(start, stop):
         bits = np.int64(hits[entry])
-        # Both are scattered over memory: asked for now, they are there when their turn comes.
-        ahead = min(entry + AHEAD, len(hits) - 1)  # it may be the next tile's
+        ahead = min(entry + PREFETCH, len(hits) - 1)  # may belong to the next tile
         prefetch(records, RECORD * np.int64(listed_rank[ahead]))
         prefetch(sums, SUMS * np.int64(listed_span[ahead]))
-        # Written unconditionally, and overwritten by the next if the block is not hit.
+        # Branch-free: the next entry overwrites that of a block that is not hit.
         queue[n0] = queue[CHUNK + n1] = queue[2 * CHUNK + n2] = queue[3 * CHUNK + n3] = entry
         n0 += bits & 1
         n1 += bits >> 1 & 1
@@ -151,29 +147,29 @@ def _backward_block(
     records, listed_rank, listed_span, queue, first, count, lane_x, lane_y, x, y, fourth, gradient,
     gradient_at, behind, behind_at, transmittance, at, absolute, batch, sums,
 ):  # fmt: skip
-    """Blend the ``count`` hits from ``queue[first]`` of the block whose corner is (x, y).
+    """Blend ``count`` hits, from ``queue[first]`` on, of the block with its corner at (x, y), px.
 
-    ``gradient_at``, ``behind_at`` and ``at`` are the block's offsets in the preceding arrays.
+    ``gradient_at``, ``behind_at`` and ``at`` are the block's offsets in the arrays before them.
     """
-    zero, stop = broadcast(ZERO), broadcast(STOP)
+    zero, stop = broadcast(ZERO), broadcast(MIN_TRANSMITTANCE)
     px, py = add(load(lane_x, 0), broadcast(x + HALF)), add(load(lane_y, 0), broadcast(y + HALF))
-    # Carried from chunk to chunk: T in front of the next Gaussian, and what lies behind it.
+    # Carried from chunk to chunk: T in front of the next Gaussian, and ``far`` (below).
     t, far = load(transmittance, at), load(behind, behind_at)
     v0, v1 = load(gradient, gradient_at), load(gradient, gradient_at + LANES)
     v2, v3 = load(gradient, gradient_at + 2 * LANES), load(gradient, gradient_at + 3 * LANES)
-    for begin in range(first, first + count, LANES):
-        end = min(begin + LANES, first + count)
-        # Alphas first: they are independent, and overlap with the dependent chain below.
-        for k in range(end - begin):
-            r = RECORD * _looked_up(listed_rank, queue, begin + k)
+    for start in range(first, first + count, LANES):
+        end = min(start + LANES, first + count)
+        # Alphas first: they are independent of each other, unlike the chain below.
+        for k in range(end - start):
+            r = RECORD * _lookup(listed_rank, queue, start + k)
             batch[MEANS + k] = element(records, r)
             batch[MEANS + LANES + k] = element(records, r + 1)
             store(batch, LANES * k, _alpha(records, r, px, py))
-        for k in range(end - begin):
-            r = RECORD * _looked_up(listed_rank, queue, begin + k)
+        for k in range(end - start):
+            r = RECORD * _lookup(listed_rank, queue, start + k)
             alpha = load(batch, LANES * k)
             after = fnma(t, alpha, t)  # T' = T (1 - alpha)
-            # Where forward stopped, backward stops: alpha 0 gives p = 0 and weight 0.
+            # Where the pixel was finished, alpha = 0 gives p = 0 and weight 0.
             alpha = select_greater(after, stop, alpha, zero)
             weight = multiply(t, alpha)
             # shade = gradient . c, and far = gradient . (colour behind this Gaussian)
@@ -193,24 +189,24 @@ def _backward_block(
             store(batch, LANES * k, p)
             store(batch, WEIGHTS + LANES * k, weight)
         if absolute:
-            _add_absolute(records, listed_rank, listed_span, queue, begin, end, px, py, batch, sums)
+            _add_absolute(records, listed_rank, listed_span, queue, start, end, px, py, batch, sums)
         _reduce(batch, x + np.float32(2.0), y + np.float32(2.0), gradient, gradient_at, fourth)
-        for k in range(end - begin):
-            s = SUMS * _looked_up(listed_span, queue, begin + k)
+        for k in range(end - start):
+            s = SUMS * _lookup(listed_span, queue, start + k)
             store(sums, s, add(load(sums, s), load(batch, LANES * k)))
     store(transmittance, at, t)
     store(behind, behind_at, far)
 
 
 @always_inline
-def _looked_up(array, queue, place):
-    """The element of an int32 array at the list entry in a place of the queue, int64."""
+def _lookup(array, queue, place):
+    """Return the element of an int32 array at a queued list entry, int64."""
     return np.int64(element(array, np.int64(element(queue, place))))
 
 
 @always_inline
 def _alpha(records, r, px, py):
-    """min(0.999, exp(8 h)) where that is at least 1/255, else 0."""
+    """Compute alpha = min(0.999, exp(8 h)), or 0 below 1/255."""
     dx, dy = (
         subtract(broadcast_element(records, r), px),
         subtract(broadcast_element(records, r + 1), py),
@@ -222,13 +218,13 @@ def _alpha(records, r, px, py):
     )
     h = fma(multiply(c, dy), dy, broadcast_element(records, r + 5))
     h = fma(add(multiply(a, dx), multiply(b, dy)), dx, h)
-    alpha = select_greater(h, broadcast(LOWEST), exp_of_eighth(h), broadcast(ZERO))
+    alpha = select_greater(h, broadcast(MIN_EXPONENT), exp_of_eighth(h), broadcast(ZERO))
     return minimum(alpha, broadcast(MAX_ALPHA))
 
 
 @always_inline
 def _reduce(batch, center_x, center_y, gradient, gradient_at, fourth):
-    """From p, weights and means of sixteen hits to their sums over the block, one per row."""
+    """Reduce p, weights and means of sixteen hits to their sums over the block, a row per hit."""
     zero = broadcast(ZERO)
     # Moments of p over x within each row of the block, then over y: s = sum p, x = sum p x, ...
     s0, x0, xx0 = _moments(load_columns(batch, 0))
@@ -236,7 +232,7 @@ def _reduce(batch, center_x, center_y, gradient, gradient_at, fourth):
     s2, x2, xx2 = _moments(load_columns(batch, 8))
     s3, x3, xx3 = _moments(load_columns(batch, 12))
     s, y, yy = _moments((s0, s1, s2, s3))
-    # The rows' sums give s, y, yy; their first moments give x and xy, as sums over y.
+    # The first moments of the rows give x and xy.
     x, xy, _ = _moments((x0, x1, x2, x3))
     xx = add(add(xx0, xx3), add(xx1, xx2))
     mx, my = load(batch, MEANS), load(batch, MEANS + LANES)
@@ -263,7 +259,7 @@ def _reduce(batch, center_x, center_y, gradient, gradient_at, fourth):
 
 @always_inline
 def _moments(values):
-    """Sum, first and second moment of four values at -OUTER, -HALF, HALF and OUTER."""
+    """Return sum, first and second moment of four values at -OUTER, -HALF, HALF and OUTER."""
     a, b, c, d = values
     # At +-3/2 and +-1/2: even moments need only the sums of the pairs, odd ones the differences.
     outer, inner = add(a, d), add(b, c)
@@ -274,7 +270,7 @@ def _moments(values):
 
 @always_inline
 def _add_products(total, weights, values, first):
-    """``total`` plus weights[i] values[first + i] for four weights."""
+    """Return total + sum_i weights[i] values[first + i] over four weights."""
     total = fma(weights[0], broadcast_element(values, first), total)
     total = fma(weights[1], broadcast_element(values, first + 1), total)
     total = fma(weights[2], broadcast_element(values, first + 2), total)
@@ -282,10 +278,10 @@ def _add_products(total, weights, values, first):
 
 
 @always_inline
-def _add_absolute(records, listed_rank, listed_span, queue, begin, end, px, py, batch, sums):
-    """Add each pixel's |a p dx + b p dy| and |b p dx + c p dy| to the absolute sums, per hit."""
-    for k in range(end - begin):
-        entry = queue[begin + k]
+def _add_absolute(records, listed_rank, listed_span, queue, start, end, px, py, batch, sums):
+    """Add |a p dx + b p dy| and |b p dx + c p dy| of every pixel to the absolute sums."""
+    for k in range(end - start):
+        entry = queue[start + k]
         r, s = RECORD * np.int64(listed_rank[entry]), SUMS * np.int64(listed_span[entry])
         p = load(batch, LANES * k)
         along_x = multiply(p, subtract(broadcast_element(records, r), px))
@@ -298,14 +294,14 @@ def _add_absolute(records, listed_rank, listed_span, queue, begin, end, px, py, 
         c = broadcast(np.float32(-16.0) * records[r + 4])
         step_x = fma(a, along_x, multiply(b, along_y))
         step_y = fma(b, along_x, multiply(c, along_y))
-        # d mean x = a p dx + b p dy; minus minus its magnitude, as only the sign bit need be set
+        # |d mean x| = |a p dx + b p dy|, subtracted as -|.|: setting a sign bit is cheap
         sums[s + ABSOLUTE] -= lane_sum(negative_magnitude(step_x))
         sums[s + ABSOLUTE + 1] -= lane_sum(negative_magnitude(step_y))
 
 
 @kernel
 def sum_spans(span_start, sums, totals):
-    """Add up each Gaussian's spans in order: [16 S] to [G, 16] by depth rank."""
+    """Sum the spans of each Gaussian in order: [16 S] to [G, 16] by depth rank."""
     for g in parallel_range(len(totals)):
         total = broadcast(ZERO)
         for span in range(span_start[g], span_start[g + 1]):

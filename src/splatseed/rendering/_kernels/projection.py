@@ -1,4 +1,4 @@
-"""Projection of 3D Gaussians to the image plane (EWA splatting), and its gradient.
+"""Project 3D Gaussians to the image plane (EWA splatting), and compute the gradient.
 
 Specification (``reference.py`` is its readable form). With W, t the camera's rotation and
 translation, m_c = W m + t = (x, y, z), R = R(q / |q|), s the scales and J the Jacobian of the
@@ -6,13 +6,11 @@ pinhole projection at m_c (its x / z and y / z clamped to 15% of the image's siz
 the 2D covariance is P P' + eps2d I with P = U diag(s), U = T R and T = J W; its inverse is the
 conic (a, b, c). (M. Zwicker et al., EWA Splatting, 2002; conventions and cut-offs of gsplat 1.5.3.)
 
-Culled, with radius 0: z outside the near and far planes, opacity under 1/255, bounding box outside
-the image, and anything not finite. Arithmetic is float64 inside, float32 in and out. Gaussians are
-processed in blocks, one quantity per row, so that the compiler vectorises over them; the numbers of
-each are as if it stood alone.
+Culled (radius 0) are Gaussians with z outside the near and far planes, an opacity under 1/255, a
+bounding box outside the image, or any number that is not finite. Inputs and outputs are float32,
+arithmetic is float64. Gaussians are processed in blocks, a row per quantity, so that the compiler
+vectorises over them; results do not depend on the blocks.
 """
-
-# mypy: disable-error-code="no-untyped-def, no-untyped-call"
 
 from __future__ import annotations
 
@@ -23,21 +21,21 @@ import numpy as np
 from splatseed.runtime.jit import always_inline, kernel, parallel_range
 
 MIN_ALPHA = 1.0 / 255.0
-"""Smallest opacity that is drawn."""
+"""Smallest alpha that is drawn."""
 MAX_SIGMAS = 3.33
 """Largest half-size of the bounding box in sigmas: exp(-3.33^2 / 2) is 1/255."""
 EDGE = 0.15
-"""How far beyond the image's edges J is not clamped, as a fraction of the image's size."""
+"""Margin around the image within which J is not clamped, as a fraction of the image's size."""
 CHUNKS = 16
-"""Pieces whose camera gradients are summed separately, whatever the number of threads."""
+"""Parts whose camera gradients are summed separately; independent of the thread count."""
 BLOCK = 32
 """Gaussians per block."""
-X, Q, S, GIVEN = 0, 3, 7, 10
+X, Q, S, EXTRA = 0, 3, 7, 10
 """First rows of a block: the mean in the world, the quaternion, the scales, further inputs."""
 U, V, DEPTH, A, B, C, COMPENSATION, SIGMA_X, SIGMA_Y, INVERSE_DET, OPACITY = range(11)
-"""Rows of a projected block: mean, conic, standard deviations in px, 1 / det of the covariance."""
-DU, DV, DDEPTH, DCOMPENSATION, DCONIC = range(GIVEN, GIVEN + 5)
-"""Rows of the input gradients."""
+"""Rows of a projected block: mean, z, conic, standard deviations, 1 / det of the covariance."""
+DU, DV, DDEPTH, DCOMPENSATION, DCONIC = range(EXTRA, EXTRA + 5)
+"""Rows of a block that hold the gradients of the outputs."""
 
 
 @kernel
@@ -59,17 +57,17 @@ def project(
         near: Smallest z.
         far: Largest z.
         eps2d: Blur added to the covariance, px^2.
-        radius_clip: Gaussians whose radii are no larger are culled, px.
-        antialiased: Whether the opacity is compensated for the blur.
-        radii: Written, int32 [N, 2]; 0 = culled.
-        means2d: Written, float32 [N, 2], px; 0 where culled, as are the following.
+        radius_clip: Gaussians with both radii up to this are culled, px.
+        antialiased: Whether the cut-off uses opacities compensated for the blur.
+        radii: Written, px, int32 [N, 2]; 0 where culled.
+        means2d: Written, px, float32 [N, 2]; 0 where culled, likewise the following.
         depths: Written, float32 [N], z.
         conics: Written, float32 [N, 3].
         compensations: Written, float32 [N].
     """
     for chunk in parallel_range(CHUNKS):
-        # One allocation per chunk: one per Gaussian would take as long as all of the arithmetic.
-        block, projected = np.ones((GIVEN + 1, BLOCK), np.float32), np.empty((11, BLOCK))
+        # One allocation per chunk: one per Gaussian would take as long as the arithmetic.
+        block, projected = np.ones((EXTRA + 1, BLOCK), np.float32), np.empty((11, BLOCK))
         lanes = np.empty(BLOCK, np.intp)
         pose, lens = _pose(view), _lens(K, width, height)
         end = (chunk + 1) * len(means) // CHUNKS
@@ -77,15 +75,15 @@ def project(
             last = min(first + BLOCK, end)
             for i in range(first, last):
                 _gather(means, quats, scales, i, block, i - first)
-                block[GIVEN, i - first] = opacities[i]
+                block[EXTRA, i - first] = opacities[i]
             _project_block(block, pose, lens, eps2d, projected)
             _cull(block, near, far, width, height, antialiased, projected)
-            # Most Gaussians are culled: cleared in bulk, then written where seen.
+            # Most Gaussians are culled: clear all, then write the visible ones.
             radii[first:last] = 0
             means2d[first:last], depths[first:last] = np.float32(0.0), np.float32(0.0)
             conics[first:last], compensations[first:last] = np.float32(0.0), np.float32(0.0)
             count = 0
-            # A culled lane is overwritten by the next one, so no branch can be mispredicted.
+            # The next lane overwrites a culled one, so that no branch can be mispredicted.
             for lane in range(last - first):  # branch-free compaction
                 lanes[count] = lane
                 count += projected[OPACITY, lane] > 0.0
@@ -103,14 +101,14 @@ def project(
 
 @always_inline
 def _pose(view):
-    """The rows of the camera's rotation and its translation, float64."""
+    """Return the rows of the camera's rotation and its translation, float64."""
     rows = view.T
     return _column(rows, 0, 0), _column(rows, 0, 1), _column(rows, 0, 2), _column(view, 0, 3)
 
 
 @always_inline
 def _lens(K, width, height):
-    """fx, fy, cx, cy, and the bounds that x / z and y / z are clamped to in J."""
+    """Return fx, fy, cx, cy, and the bounds to which J clamps x / z and y / z."""
     fx, fy = np.float64(K[0, 0]), np.float64(K[1, 1])
     cx, cy = np.float64(K[0, 2]), np.float64(K[1, 2])
     beyond_x, beyond_y = EDGE * width / fx, EDGE * height / fy
@@ -136,19 +134,19 @@ def _dot(a, b):
 
 @always_inline
 def _times(a, b):
-    """The elementwise product."""
+    """Return the elementwise product."""
     return a[0] * b[0], a[1] * b[1], a[2] * b[2]
 
 
 @always_inline
 def _mix(wa, a, wb, b):
-    """The weighted sum of the vectors a and b."""
+    """Return the weighted sum wa a + wb b of two vectors."""
     return wa * a[0] + wb * b[0], wa * a[1] + wb * b[1], wa * a[2] + wb * b[2]
 
 
 @always_inline
-def _of_rows(weights, rows):
-    """A row vector times a matrix."""
+def _row_times(weights, rows):
+    """Return a row vector times a matrix."""
     a, b = _mix(weights[0], rows[0], weights[1], rows[1]), rows[2]
     return a[0] + weights[2] * b[0], a[1] + weights[2] * b[1], a[2] + weights[2] * b[2]
 
@@ -164,7 +162,7 @@ def _project_block(block, pose, lens, eps2d, projected):
         quat, _ = _quaternion(block, lane)
         R, s = _rotation(quat), _column(block, S, lane)
         # P = T R diag(s); covariance P P' + eps2d I, its inverse the conic (a, b, c)
-        P0, P1 = _times(_of_rows(T0, R), s), _times(_of_rows(T1, R), s)
+        P0, P1 = _times(_row_times(T0, R), s), _times(_row_times(T1, R), s)
         xx, xy, yy = _dot(P0, P0), _dot(P0, P1), _dot(P1, P1)
         # Its determinant before the blur, for the compensation below; then the blur.
         raw = xx * yy - xy * xy
@@ -183,7 +181,7 @@ def _project_block(block, pose, lens, eps2d, projected):
 
 @always_inline
 def _column(array, row, column):
-    """Three consecutive numbers of a column, float64."""
+    """Return three consecutive numbers of a column, float64."""
     a, b, c = array[row, column], array[row + 1, column], array[row + 2, column]
     return np.float64(a), np.float64(b), np.float64(c)
 
@@ -196,17 +194,17 @@ def _in_camera(block, lane, pose):
 
 @always_inline
 def _jacobian(x, y, z, lens):
-    """J00, J02, J11 and J12 of J = [fx/z, 0, -fx x/z^2; 0, fy/z, -fy y/z^2], clamped."""
+    """Return J00, J02, J11, J12 of J = [fx/z, 0, -fx x/z^2; 0, fy/z, -fy y/z^2], clamped."""
     fx, fy, _, _, low_x, high_x, low_y, high_y = lens
     over = 1.0 / z
-    # Clamped: the linear approximation J breaks down far outside the image.
+    # Clamped, because the linear approximation J fails far outside the image.
     x_z, y_z = min(max(x * over, low_x), high_x), min(max(y * over, low_y), high_y)
     return fx * over, -fx * over * x_z, fy * over, -fy * over * y_z
 
 
 @always_inline
 def _quaternion(block, lane):
-    """The normalised quaternion, and one over its length."""
+    """Return the normalised quaternion, and 1 / |q|."""
     w, (x, y, z) = np.float64(block[Q, lane]), _column(block, Q + 1, lane)
     over = 1.0 / math.sqrt(w * w + x * x + y * y + z * z)
     return (w * over, x * over, y * over, z * over), over
@@ -214,7 +212,7 @@ def _quaternion(block, lane):
 
 @always_inline
 def _rotation(quat):
-    """The rows of R(q) for a unit quaternion."""
+    """Return the rows of R(q) for a unit quaternion."""
     w, x, y, z = quat
     return (
         (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
@@ -225,18 +223,18 @@ def _rotation(quat):
 
 @always_inline
 def _cull(block, near, far, width, height, antialiased, projected):
-    """Fill the row OPACITY: 0 where the Gaussian is culled."""
+    """Write the row OPACITY, 0 where the Gaussian is culled."""
     for lane in range(BLOCK):
         u, v, z = projected[U, lane], projected[V, lane], projected[DEPTH, lane]
         over = projected[INVERSE_DET, lane]
-        # A box of 3.33 sigmas, and a pixel for the rounding up in _radii, which decides.
+        # A box of 3.33 sigmas, plus a pixel as _radii rounds up; _radii decides.
         rx = MAX_SIGMAS * projected[SIGMA_X, lane] + 1.0
         ry = MAX_SIGMAS * projected[SIGMA_Y, lane] + 1.0
-        opacity = np.float64(block[GIVEN, lane])
+        opacity = np.float64(block[EXTRA, lane])
         if antialiased:
             opacity *= projected[COMPENSATION, lane]
         seen = (near <= z) & (z <= far) & (opacity >= MIN_ALPHA) & (opacity < np.inf)
-        # A determinant that underflowed or is NaN leaves no ellipse; NaN fails every comparison.
+        # If the determinant underflowed or is NaN, there is no ellipse.
         seen &= (over > 0.0) & (over < np.inf)
         seen &= (u + rx > 0) & (u - rx < width) & (v + ry > 0) & (v - ry < height)
         projected[OPACITY, lane] = opacity if seen else 0.0
@@ -244,14 +242,14 @@ def _cull(block, near, far, width, height, antialiased, projected):
 
 @always_inline
 def _radii(projected, lane, width, height, radius_clip):
-    """Half-size of the bounding box within which alpha >= 1/255; 0 to cull the Gaussian."""
+    """Return the half-size, px, of the bounding box of alpha >= 1/255; 0 if culled."""
     u, v = projected[U, lane], projected[V, lane]
     # opacity exp(-sigmas^2 / 2) = 1/255
     sigmas = min(MAX_SIGMAS, math.sqrt(2.0 * math.log(projected[OPACITY, lane] / MIN_ALPHA)))
     rx, ry = np.ceil(sigmas * projected[SIGMA_X, lane]), np.ceil(sigmas * projected[SIGMA_Y, lane])
     inside = u + rx > 0 and u - rx < width and v + ry > 0 and v - ry < height
     if inside and (rx > radius_clip or ry > radius_clip):
-        # int32 holds the radii.
+        # Radii are stored as int32.
         return min(rx, 1e9), min(ry, 1e9)
     return 0.0, 0.0
 
@@ -261,10 +259,10 @@ def project_vjp(
     means, quats, scales, view, K, width, height, eps2d, radii,
     d_means2d, d_depths, d_conics, d_compensations, d_means, d_quats, d_scales, d_view,
 ):  # fmt: skip
-    """Gradients of ``project``.
+    """Compute the gradients of ``project``.
 
     Args:
-        means: As in ``project``, as are all up to ``radii``.
+        means: As in ``project``; likewise all up to ``radii``.
         quats: [N, 4].
         scales: [N, 3].
         view: [4, 4].
@@ -277,57 +275,57 @@ def project_vjp(
         d_depths: [N].
         d_conics: [N, 3].
         d_compensations: [N].
-        d_means: Written, float32 [N, 3]; 0 where culled, as are the following.
+        d_means: Written, float32 [N, 3]; 0 where culled, likewise the following.
         d_quats: Written, float32 [N, 4].
         d_scales: Written, float32 [N, 3].
         d_view: Written, float64 [CHUNKS, 3, 4].
     """
     for chunk in parallel_range(CHUNKS):
-        block, gradients = np.ones((GIVEN + 7, BLOCK), np.float32), np.empty((10, BLOCK))
+        block, gradients = np.ones((EXTRA + 7, BLOCK), np.float32), np.empty((10, BLOCK))
         sums, indices = np.zeros((3, 4, BLOCK)), np.empty(BLOCK, np.intp)
         pose, lens = _pose(view), _lens(K, width, height)
-        begin, end = chunk * len(means) // CHUNKS, (chunk + 1) * len(means) // CHUNKS
-        d_means[begin:end], d_quats[begin:end] = np.float32(0.0), np.float32(0.0)
-        d_scales[begin:end] = np.float32(0.0)
+        start, end = chunk * len(means) // CHUNKS, (chunk + 1) * len(means) // CHUNKS
+        d_means[start:end], d_quats[start:end] = np.float32(0.0), np.float32(0.0)
+        d_scales[start:end] = np.float32(0.0)
         count = 0
-        for i in range(begin, end):
+        for i in range(start, end):
             indices[count] = i
             count += radii[i, 0] > 0
             if count == BLOCK or (count > 0 and i == end - 1):
                 for lane in range(BLOCK):
-                    # An incomplete block repeats its last Gaussian, with gradients of 0.
-                    each, weight = indices[min(lane, count - 1)], np.float32(lane < count)
-                    _gather(means, quats, scales, each, block, lane)
-                    block[DU, lane] = weight * d_means2d[each, 0]
-                    block[DV, lane] = weight * d_means2d[each, 1]
-                    block[DDEPTH, lane] = weight * d_depths[each]
-                    block[DCOMPENSATION, lane] = weight * d_compensations[each]
+                    # The last Gaussian pads an incomplete block, with gradients of 0.
+                    index, weight = indices[min(lane, count - 1)], np.float32(lane < count)
+                    _gather(means, quats, scales, index, block, lane)
+                    block[DU, lane] = weight * d_means2d[index, 0]
+                    block[DV, lane] = weight * d_means2d[index, 1]
+                    block[DDEPTH, lane] = weight * d_depths[index]
+                    block[DCOMPENSATION, lane] = weight * d_compensations[index]
                     for k in range(3):
-                        block[DCONIC + k, lane] = weight * d_conics[each, k]
+                        block[DCONIC + k, lane] = weight * d_conics[index, k]
                 _block_vjp(block, pose, lens, eps2d, gradients, sums)
                 for lane in range(count):
-                    each = indices[lane]
+                    index = indices[lane]
                     for k in range(3):
-                        d_means[each, k] = gradients[X + k, lane]
-                        d_scales[each, k] = gradients[S + k, lane]
+                        d_means[index, k] = gradients[X + k, lane]
+                        d_scales[index, k] = gradients[S + k, lane]
                     for k in range(4):
-                        d_quats[each, k] = gradients[Q + k, lane]
+                        d_quats[index, k] = gradients[Q + k, lane]
                 count = 0
         for k in range(12):
-            # Lanes first, then (by the caller) chunks: a fixed order, so the bytes never vary.
+            # Over lanes; the caller sums over chunks: a fixed order for the same bytes.
             d_view[chunk, k // 4, k % 4] = sums[k // 4, k % 4].sum()
 
 
 @always_inline
 def _block_vjp(block, pose, lens, eps2d, gradients, sums):
-    """The gradients of a block's means, quaternions and scales; the pose's are accumulated."""
+    """Compute gradients of a block's means, quaternions and scales; accumulate the pose's."""
     for lane in range(BLOCK):
         x, y, z = _in_camera(block, lane, pose)
         J = _jacobian(x, y, z, lens)
         T0, T1 = _mix(J[0], pose[0], J[1], pose[2]), _mix(J[2], pose[1], J[3], pose[2])
         quat, over = _quaternion(block, lane)
         R, s = _rotation(quat), _column(block, S, lane)
-        U0, U1 = _of_rows(T0, R), _of_rows(T1, R)
+        U0, U1 = _row_times(T0, R), _row_times(T1, R)
         P0, P1 = _times(U0, s), _times(U1, s)
         d_xx, d_xy, d_yy = _covariance_vjp(block, lane, P0, P1, eps2d)
         # dP = 2 dS P for the symmetric d covariance dS
@@ -350,15 +348,15 @@ def _block_vjp(block, pose, lens, eps2d, gradients, sums):
         dT0 = _dot(R[0], dU0), _dot(R[1], dU0), _dot(R[2], dU0)
         dT1 = _dot(R[0], dU1), _dot(R[1], dU1), _dot(R[2], dU1)
         dJ = _dot(dT0, pose[0]), _dot(dT0, pose[2]), _dot(dT1, pose[1]), _dot(dT1, pose[2])
-        dt = _place_vjp(block, lane, x, y, z, lens, J, dJ)
+        dt = _mean_vjp(block, lane, x, y, z, lens, J, dJ)
         # m_c = W m + t: d m = W' d m_c
-        d_mean, mean = _of_rows(dt, pose), _column(block, X, lane)
+        d_mean, mean = _row_times(dt, pose), _column(block, X, lane)
         # dW = J' dT + d m_c m': T = J W and m_c = W m + t both depend on W
         dW0, dW1 = _mix(J[0], dT0, dt[0], mean), _mix(J[2], dT1, dt[1], mean)
         dW2 = _mix(J[1], dT0, J[3], dT1)
         for k in range(3):
             gradients[X + k, lane] = d_mean[k]
-            # The pose's sums stay apart by lane, so that the loop over lanes vectorises.
+            # A sum per lane, so that the loop over lanes vectorises.
             sums[0, k, lane] += dW0[k]
             sums[1, k, lane] += dW1[k]
             sums[2, k, lane] += dW2[k] + dt[2] * mean[k]
@@ -367,17 +365,17 @@ def _block_vjp(block, pose, lens, eps2d, gradients, sums):
 
 @always_inline
 def _covariance_vjp(block, lane, P0, P1, eps2d):
-    """The gradient of the covariance (xx, xy, yy), from d conic and d compensation."""
+    """Return the gradient of the covariance (xx, xy, yy), from d conic and d compensation."""
     raw_xx, xy, raw_yy = _dot(P0, P0), _dot(P0, P1), _dot(P1, P1)
     xx, yy = raw_xx + eps2d, raw_yy + eps2d
     over = 1.0 / (xx * yy - xy * xy)
-    # The conic again, which is cheaper to recompute than to load.
+    # Recomputing the conic is cheaper than loading it.
     a, b, c = yy * over, -xy * over, xx * over
     da, db, dc = _column(block, DCONIC, lane)
     # d covariance = -X G X for the inverse X and the symmetric gradient G
     ga, gb = da * a + 0.5 * db * b, da * b + 0.5 * db * c
     ha, hb = 0.5 * db * a + dc * b, 0.5 * db * b + dc * c
-    # compensation = sqrt(raw over): by d raw / (2 raw) and d over / (2 over)
+    # compensation c = sqrt(raw over), so d c = c / 2 (d raw / raw + d over / over)
     raw = raw_xx * raw_yy - xy * xy
     scaled = 0.5 * block[DCOMPENSATION, lane] * math.sqrt(max(raw * over, 0.0))
     by_raw = scaled / raw if raw > 0.0 else 0.0
@@ -391,10 +389,10 @@ def _covariance_vjp(block, lane, P0, P1, eps2d):
 
 @always_inline
 def _rotation_vjp(quat, dR):
-    """The gradient of the quaternion from d R, before its projection onto unit quaternions."""
+    """Return the gradient of the quaternion from dR, before projection to unit quaternions."""
     w, x, y, z = quat
     (d00, d01, d02), (d10, d11, d12), (d20, d21, d22) = dR
-    # R is quadratic in q: w meets the antisymmetric part of dR, and (x, y, z) meet both parts.
+    # R is quadratic in q; skew and (xy, xz, yz) are dR's antisymmetric and symmetric parts.
     skew_x, skew_y, skew_z = d21 - d12, d02 - d20, d10 - d01
     xy, xz, yz = d01 + d10, d02 + d20, d12 + d21
     return (
@@ -406,8 +404,8 @@ def _rotation_vjp(quat, dR):
 
 
 @always_inline
-def _place_vjp(block, lane, x, y, z, lens, J, dJ):
-    """The gradient of (x, y, z) in camera axes, from d J, d mean2d and d depth."""
+def _mean_vjp(block, lane, x, y, z, lens, J, dJ):
+    """Return the gradient of the mean (x, y, z) in camera axes, from dJ, d mean2d and d depth."""
     _, _, _, _, low_x, high_x, low_y, high_y = lens
     over = 1.0 / z
     x_z, y_z = x * over, y * over
