@@ -120,7 +120,7 @@ def test_opaque_walls_end_blending_and_hold_alpha(seed: int) -> None:
     scene["scales"] = scene["scales"].clamp(min=0.15)
     _, alpha = assert_agrees(scene)
     assert float(alpha.median()) > 0.999
-    assert float(alpha.max()) < 1.0 - reference.STOP
+    assert float(alpha.max()) < 1.0 - reference.MIN_TRANSMITTANCE
 
 
 def test_held_back_jacobian(rng) -> None:

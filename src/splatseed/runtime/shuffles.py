@@ -6,6 +6,7 @@ Promise: as in ``simd``; only ``three_sums`` rounds, in a fixed summation tree.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from llvmlite import ir
 from numba import types
@@ -17,7 +18,7 @@ UNDEFINED = ir.Constant(VECTOR, ir.Undefined)
 I32 = ir.IntType(32)
 
 
-def permutation(pattern: Sequence[int]):
+def permutation(pattern: Sequence[int]) -> Any:
     """Make an intrinsic whose result has lane ``pattern[j]`` of its argument in lane j.
 
     ``pattern`` is ``LANES`` numbers below ``LANES``.
@@ -34,7 +35,7 @@ def permutation(pattern: Sequence[int]):
     return permute
 
 
-def lane(number: int):
+def lane(number: int) -> Any:
     """Make an intrinsic that returns a lane of its argument as float32."""
     index = ir.Constant(I32, number)
 
