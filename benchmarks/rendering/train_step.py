@@ -144,7 +144,7 @@ def _stages(trainer: Trainer) -> dict[str, Sequence[Place]]:
         **RENDER_STAGES,
         "loss": [(_Loss, "forward")],
         "loss backward": [(_Loss, "backward")],
-        "photograph": [(trainer._photographs, "of")],  # noqa: SLF001  (likewise)
+        "photograph": [(trainer._photographs, "get")],  # noqa: SLF001  (likewise)
         "Adam": [(each, name) for each in optimizers for name in ("step", "zero_grad")],
         "strategy": [(strategy, "before_backward"), (strategy, "after_step")],
     }

@@ -156,7 +156,7 @@ def _score(
 
 def _now() -> float:
     """Return the time after a GPU in use has finished its work."""
-    if torch.cuda.is_initialized():  # type: ignore[no-untyped-call]  # PyTorch gives no types
+    if torch.cuda.is_initialized():
         torch.cuda.synchronize()
     return time.perf_counter()
 
