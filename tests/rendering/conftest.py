@@ -1,4 +1,4 @@
-"""Rendering needs PyTorch; without it these tests have nothing to say."""
+"""Rendering needs PyTorch; without it, these tests are skipped."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ pytest.importorskip("gsplat", reason="rendering is compared with gsplat's publis
 
 @pytest.fixture(autouse=True, scope="session")
 def one_thread_for_the_reference():
-    """The reference's tensors are tiny: more threads only wait for one another."""
+    """The reference's tensors are tiny: more threads only add overhead."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     yield

@@ -59,7 +59,7 @@ def alone(count, size=8, **change):
     return {**scene, **change}
 
 
-def test_radii_know_the_opacity():
+def test_radii_depend_on_the_opacity():
     """The box ends where alpha is 1/255: sigma = sqrt(2 log(255 opacity)) standard deviations."""
     opacities = [0.02, 0.3, 1.0]
     quats, scales = torch.tensor([[1.0, 0, 0, 0]] * 3), torch.tensor([[0.2, 0.1, 0.1]] * 3)
@@ -72,7 +72,7 @@ def test_radii_know_the_opacity():
 
 
 def wall(opacity, count=1):
-    """Equal Gaussians at one place, wide enough that exp(-sigma) is 1 over the image."""
+    """Equal Gaussians at the same position, wide enough that exp(-sigma) is 1 over the image."""
     sizes, opacities = torch.full((count, 3), 1000.0), torch.full((count,), opacity)
     return alone(count, scales=sizes, opacities=opacities)
 
@@ -80,14 +80,14 @@ def wall(opacity, count=1):
 @pytest.mark.parametrize(
     ("opacity", "alpha"), [(0.0, 0), (0.0039, 0), (0.00393, 0.00393), (0.5, 0.5), (1.0, 0.999)]
 )
-def test_alpha_is_cut_at_one_255th_and_held_at_0_999(opacity, alpha):
+def test_alpha_below_1_255th_is_zero_and_at_most_0_999(opacity, alpha):
     alphas = rasterization(**wall(opacity))[1]
     assert np.allclose(alphas.numpy(), alpha, rtol=2e-5, atol=0)
 
 
 @pytest.mark.parametrize(("opacity", "blended"), [(0.901, 3), (0.95, 3), (0.98, 2), (0.5, 13)])
-def test_blending_ends_before_a_ten_thousandth_passes(opacity, blended):
-    """The Gaussian that would bring T to 1e-4 or less is left out."""
+def test_blending_stops_before_the_minimum_transmittance(opacity, blended):
+    """The Gaussian that would bring T to 1e-4 or less is skipped."""
     assert (1 - opacity) ** blended > 1e-4 > (1 - opacity) ** (blended + 1)
     alphas = rasterization(**wall(opacity, count=20))[1]
     assert np.allclose(1 - alphas.numpy(), (1 - opacity) ** blended, rtol=2e-2)

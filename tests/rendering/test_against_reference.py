@@ -112,9 +112,8 @@ def test_a_pair_of_coefficients_is_their_concatenation(rng, degree: int) -> None
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_opaque_walls_end_blending_and_hold_alpha(seed: int) -> None:
-    """Both cut-offs of opaque scenes: alpha held at 0.999, and the end at a transmittance of
-    1e-4."""
+def test_cutoffs_of_opaque_scenes(seed: int) -> None:
+    """Alpha is at most 0.999, and blending stops at a transmittance of 1e-4."""
     scene = random_scene(np.random.default_rng(seed), 150)
     scene["opacities"] = 1.0 - 0.02 * (1.0 - scene["opacities"])
     scene["scales"] = scene["scales"].clamp(min=0.15)
@@ -123,8 +122,8 @@ def test_opaque_walls_end_blending_and_hold_alpha(seed: int) -> None:
     assert float(alpha.max()) < 1.0 - reference.MIN_TRANSMITTANCE
 
 
-def test_held_back_jacobian(rng) -> None:
-    """Gaussians beside the image, whose x / z is held at 15% beyond the edge."""
+def test_clamped_jacobian(rng) -> None:
+    """Gaussians outside the image, whose x / z is clamped at 15% beyond the edge."""
     scene = random_scene(rng, 40, size=(24, 24))
     scene["Ks"][:, :2, :2] *= 3.0
     scene["scales"] = scene["scales"].clamp(min=0.3)
@@ -142,7 +141,7 @@ def test_packed_makes_no_difference(rng) -> None:
     assert torch.equal(packed[1], dense[1])
 
 
-def test_info_lists_what_is_visible(rng) -> None:
+def test_info_lists_visible_gaussians(rng) -> None:
     scene = random_scene(rng, 80, cameras=3)
     scene["Ks"][:, :2, :2] *= 3.0
     (_, _, packed), (_, _, dense) = (rasterization(**scene, packed=p) for p in (True, False))
@@ -158,7 +157,7 @@ def test_info_lists_what_is_visible(rng) -> None:
 
 @pytest.mark.parametrize(("packed", "channels"), [(True, 3), (False, 3), (False, 4)])
 def test_gradient_of_2d_means(rng, packed: bool, channels: int) -> None:
-    """What densification reads: d loss / d means2d, and the sum of its absolute values over
+    """The inputs of densification: d loss / d means2d, and the sum of its absolute values over
     pixels."""
     scene = random_scene(rng, cameras=2, channels=channels)
     ours, ours_abs, seen = _gradients_of_2d_means(scene, packed=packed)
@@ -171,7 +170,7 @@ def test_gradient_of_2d_means(rng, packed: bool, channels: int) -> None:
 
 
 def _gradients_of_2d_means(scene: dict[str, Any], *, packed: bool) -> tuple[Tensor, Tensor, Tensor]:
-    """Both gradients [C, N, 2], and who is visible, [C, N]."""
+    """Both gradients [C, N, 2], and the visible Gaussians, bool, [C, N]."""
     means = scene["means"].clone().requires_grad_()
     image, alpha, info = rasterization(**{**scene, "means": means}, packed=packed, absgrad=True)
     info["means2d"].retain_grad()

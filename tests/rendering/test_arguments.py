@@ -1,4 +1,4 @@
-"""``rasterization``'s arguments: gsplat's names, and what is refused before rendering."""
+"""``rasterization``'s arguments: gsplat's names, and errors before rendering."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ N, C = 7, 2
 
 
 class Shutter(Enum):
-    """As gsplat's own, which lives beside its CUDA code."""
+    """Stands in for gsplat's function, which needs its CUDA code."""
 
     GLOBAL = 0
     ROLLING = 1
@@ -81,7 +81,7 @@ def refuse(scene, change):
 
 
 @pytest.mark.parametrize("change", REFUSED)
-def test_refused_in_one_line_that_names_the_argument(change):
+def test_an_error_names_the_argument_in_one_line(change):
     refuse(random_scene(np.random.default_rng(0), N, cameras=C), change)
 
 
@@ -98,7 +98,7 @@ BATCHED = [
 
 
 @pytest.mark.parametrize("change", BATCHED)
-def test_what_lacks_the_batch_is_refused(change):
+def test_tensors_without_the_batch_are_refused(change):
     scene = random_scene(np.random.default_rng(0), N, cameras=C)
     wide = {
         name: each.expand(1, 2, *each.shape) if isinstance(each, torch.Tensor) else each
@@ -114,7 +114,7 @@ def test_defaults_of_gsplats_further_arguments_pass():
 
 
 @pytest.mark.parametrize("count", [1, 2])
-def test_axes_of_equal_sizes_are_not_taken_for_one_another(count):
+def test_axes_of_equal_sizes_are_not_confused(count):
     scene = random_scene(np.random.default_rng(0), count, cameras=count, coefficients=count)
     shared = rasterization(**scene, sh_degree=0)[0]
     scene["colors"] = scene["colors"].expand(count, -1, -1, -1)
@@ -130,7 +130,7 @@ def test_names_and_defaults_are_gsplats():
 
 
 @pytest.mark.parametrize("package", ["torch", "gsplat"])
-def test_a_missing_package_is_named_with_what_to_install(package, monkeypatch):
+def test_a_missing_package_is_named_with_its_extra(package, monkeypatch):
     monkeypatch.setattr(splatseed, "render", None)
     for name in [name for name in sys.modules if name.startswith("splatseed.rendering")]:
         monkeypatch.delitem(sys.modules, name)

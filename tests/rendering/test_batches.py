@@ -1,4 +1,4 @@
-"""Batch dimensions: each batch is rendered as it is alone, and ``info`` lists them in order."""
+"""Batch dimensions: a batch is rendered as if it were alone, and ``info`` lists them in order."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MODELS = {
 
 
 def scenes_of(batch, sh, per_camera=False):
-    """Unlike scenes, some of whose Gaussians no camera sees."""
+    """Different scenes; some of their Gaussians are outside all cameras."""
     scenes = []
     for seed in range(int(np.prod(batch))):
         rng = np.random.default_rng(seed)
@@ -57,7 +57,7 @@ def rendered(scene, options):
 @pytest.mark.parametrize("batch", BATCHES)
 @pytest.mark.parametrize(("packed", "per_camera"), [(True, False), (False, True)])
 @pytest.mark.parametrize("model", MODELS)
-def test_batches_are_rendered_as_alone(batch, packed, per_camera, model):
+def test_a_batch_is_rendered_as_if_alone(batch, packed, per_camera, model):
     options = {"packed": packed, **MODELS[model]}
     scenes = scenes_of(batch, "sh_degree" in options, per_camera)
     image, alpha, *gradients = rendered(joined(scenes, batch), options)

@@ -49,7 +49,7 @@ def touched(view, slack):
 
 
 def listed(lists, view):
-    """The same, of the lists."""
+    """Which Gaussian is listed in which tile: bool [G, rows, columns]."""
     columns, rows = -(-view[3] // TILE), -(-view[4] // TILE)
     counts = np.zeros((len(view[2]), rows * columns), int)
     tiles = np.repeat(np.arange(rows * columns), np.diff(lists.tile_start))
@@ -59,7 +59,7 @@ def listed(lists, view):
 
 
 @pytest.mark.parametrize("size", [(40, 33), (8, 8), (3, 5), (1, 1), (200, 9)])
-def test_no_pair_is_missing_and_few_are_in_vain(rng, size):
+def test_no_pair_is_missing_and_few_are_unnecessary(rng, size):
     view = random_view(rng, 300, *size)
     lists = lists_of(*view)
     owner = np.repeat(np.arange(len(view[2])), np.diff(lists.span_start))
@@ -74,7 +74,7 @@ def test_no_pair_is_missing_and_few_are_in_vain(rng, size):
 @pytest.mark.parametrize("conic", [(1e-12, 0.0, 1e-12), (1e-38, 0.0, 1e-38), (0.0, 0.0, 0.0),
                                    (1e-40, 0.0, 1e-40), (1.0, 1.0, 1.0),
                                    (1.0, -1.0001, 1.0)])  # fmt: skip
-def test_giants_and_broken_needles_are_listed_everywhere(conic):
+def test_huge_or_degenerate_ellipses_are_listed_in_all_tiles(conic):
     lists = lists_of(
         np.array([[5.0, 7.0]], np.float32), np.array([conic], np.float32),
         np.array([3.0], np.float32), 40, 24,

@@ -1,4 +1,4 @@
-"""The same bytes, forward and backward, whatever the threads and wherever the kernels come from.
+"""The same bytes, forward and backward, for any number of threads, compiled or loaded from a cache.
 
 Run as a module: other processes, with other caches, must print the same.
 """

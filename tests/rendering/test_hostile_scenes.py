@@ -1,4 +1,4 @@
-"""Whatever the Gaussians are: finite pictures and gradients, and the broken ones harm nobody."""
+"""Extreme or non-finite Gaussians: results stay finite, and invalid Gaussians have no effect."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_extreme_numbers_stay_finite(changes, seed, options):
 
 @QUICK
 @given(replacements(broken=True), st.integers(0, 9), st.integers(0, 3))
-def test_broken_gaussians_are_as_if_absent(changes, seed, options):
+def test_invalid_gaussians_have_no_effect(changes, seed, options):
     scene, chosen = scene_of(seed, options)
     with_replacements(scene, changes)
     broken = sorted({gaussian for _, gaussian, _, _ in changes})
@@ -110,7 +110,7 @@ def test_none_visible(options):
 
 
 @pytest.mark.parametrize("scale", [1e2, 1e8, 1e15, 1e19])
-def test_a_giant_covers_everything_and_takes_little_memory(scale):
+def test_a_huge_gaussian_covers_the_image_with_little_memory(scale):
     scene = random_scene(np.random.default_rng(0), 1, size=(320, 200))
     scene.update(means=torch.tensor([[0.1, 0.2, 1.0]]), scales=torch.full((1, 3), scale))
     scene.update(opacities=torch.tensor([0.5]), viewmats=torch.eye(4)[None])
@@ -124,7 +124,7 @@ def test_a_giant_covers_everything_and_takes_little_memory(scale):
     assert grads["opacities"].isfinite().all()
 
 
-def test_inputs_are_left_alone(rng):
+def test_inputs_are_not_modified(rng):
     scene = random_scene(rng, 20, coefficients=4)
     before = {k: v.clone() for k, v in scene.items() if isinstance(v, Tensor)}
     gradients(scene, sh_degree=1)

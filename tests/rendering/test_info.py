@@ -75,7 +75,7 @@ def test_names_are_gsplats(packed):
     assert not packed or not info["batch_ids"].any()
 
 
-def test_a_step_of_training_makes_no_lists():
+def test_a_training_step_computes_no_lists():
     scene = scene_of(2)
     means = scene["means"].requires_grad_()
     params, strategy = {"means": means}, gsplat.DefaultStrategy()

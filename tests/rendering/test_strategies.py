@@ -125,7 +125,7 @@ def test_covariances_are_rotated_squares():
     assert torch.allclose(matrices[0], torch.diag(torch.tensor([4.0, 1.0, 9.0])), atol=1e-5)
 
 
-def test_gsplat_gets_its_own_functions_back_whatever_blocks_overlap():
+def test_overlapping_blocks_restore_gsplats_functions():
     def functions():
         return ops.compute_relocation, ops.quat_scale_to_covar_preci
 
@@ -165,7 +165,7 @@ def partly_seen(cameras, **more):
 @pytest.mark.parametrize(
     "options", [{}, {"rasterize_mode": "antialiased", "render_mode": "RGB+ED"}]
 )
-def test_sparse_gradients_are_the_dense_ones_of_the_seen(cameras, options):
+def test_sparse_gradients_equal_the_dense_gradients_of_visible_gaussians(cameras, options):
     scene = partly_seen(cameras)
     *picture, dense = gradients(scene, **options)
     *same, grads = gradients(scene, sparse_grad=True, **options)

@@ -1,15 +1,16 @@
-"""gsplat's MCMC strategy on either device: its relocation and covariances for CPU tensors.
+"""Run gsplat's MCMC strategy on either device: relocation and covariances for CPU tensors.
 
-Notation: o opacity, s scales, n the number of Gaussians at one place. With o' = 1 - (1 - o)^(1/n)
-(3DGS as MCMC, Kheradmand et al. 2024, eq. 9; the double sum folded by the hockey-stick identity):
+Notation: o opacity, s scales, n the number of Gaussians at the same position. With
+o' = 1 - (1 - o)^(1/n) (3DGS as MCMC, Kheradmand et al. 2024, eq. 9; the double sum simplified by
+the hockey-stick identity):
 
     s' = s o / sum_{k=0}^{n-1} (-1)^k C(n, k+1) o'^(k+1) / sqrt(k+1)
 
-gsplat 1.5.3 has both in CUDA only, and no hook for another implementation: its strategy reads them
-from the module ``gsplat.strategy.ops``. So ``mcmc_on_cpu`` replaces the module's functions for the
-duration of a block. ``tests/rendering/test_strategies.py`` fails once gsplat reads them elsewhere,
-or accepts CPU tensors, and this file can go. Promise: float64 inside, because the sum alternates;
-gsplat's files are unchanged, and CUDA tensors go to gsplat's own functions.
+gsplat 1.5.3 implements both in CUDA only and has no hook for another implementation: its strategy
+reads them from the module ``gsplat.strategy.ops``. So ``mcmc_on_cpu`` replaces the module's
+functions while a block runs. ``tests/rendering/test_strategies.py`` fails once gsplat reads them
+elsewhere or accepts CPU tensors; then this file can be removed. Promise: float64 inside, because
+the sum alternates; gsplat's files are unchanged; CUDA tensors go to gsplat's own functions.
 """
 
 from __future__ import annotations
@@ -35,9 +36,9 @@ def compute_relocation(
     ratios: Int[Tensor, " N"],
     binoms: Float[Tensor, "M M"],
 ) -> tuple[Tensor, Float[Tensor, "N 3"]]:
-    """Return the opacities (in their shape) and scales [N, 3] of ``ratios`` Gaussians for one.
+    """Compute opacities and scales [N, 3] for replacing each Gaussian by ``ratios`` equal copies.
 
-    Ratios are clamped to M, the size of gsplat's table of binomial coefficients.
+    The opacities keep their shape. Ratios are clamped to M, the size of gsplat's binomial table.
     """
     if opacities.is_cuda:
         from gsplat.relocation import compute_relocation as on_cuda  # noqa: PLC0415  (needs CUDA)
@@ -52,7 +53,7 @@ def compute_relocation(
     total = torch.zeros_like(old)
     for k in reversed(range(largest)):  # Horner's rule
         total = (total + table[shares, k]) * new
-    # A Gaussian that stays alone keeps its size to the bit.
+    # A Gaussian without copies keeps its exact size.
     factor = torch.where(shares == 1, 1.0, old / total)
     return new.to(opacities.dtype), scales * factor.to(scales.dtype).view(-1, 1)
 
@@ -86,14 +87,14 @@ def _coefficients(largest: int) -> Float[Tensor, "n k"]:
 
 _LOCK = Lock()
 _REPLACED: list[tuple[Any, Any]] = []
-"""The functions that each running block of any thread has replaced; gsplat's own first."""
+"""Functions replaced by the running blocks of all threads; gsplat's own first."""
 
 
 @contextmanager
 def mcmc_on_cpu() -> Iterator[None]:
     """Let gsplat's ``MCMCStrategy`` accept CPU tensors while the block runs.
 
-    For unchanged code that uses this class or a subclass: put its training loop into the block.
+    Code that uses this class or a subclass needs no change: run its training loop in the block.
     Blocks may be nested and run in several threads.
     """
     with _LOCK:

@@ -81,7 +81,7 @@ def sort_by_depth(depths, visible, keys, spare):
 def _ellipse(records, r):
     """Return A, B, C, R of A dx^2 + 2 B dx dy + C dy^2 <= R, with (dx, dy) = pixel - mean."""
     a, b, c = np.float64(records[r + 2]), np.float64(records[r + 3]), np.float64(records[r + 4])
-    # alpha = 1/255 where (log opacity - sigma) / 8 = MIN_EXPONENT; a record holds -A, -2 B, -C / 8,
+    # alpha = 1/255 at the exponent MIN_EXPONENT; a record holds -A, -2 B, -C.
     reach = max(np.float64(records[r + 5]) - np.float64(MIN_EXPONENT), 0.0)
     return -a, -0.5 * b, -c, reach
 
