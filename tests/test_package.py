@@ -27,7 +27,7 @@ SOURCE = Path(splatseed.__file__).parent
 MODULES = ["splatseed"] + [m.name for m in pkgutil.walk_packages(splatseed.__path__, "splatseed.")]
 
 ORDER = (
-    "errors", "settings", "text", "requirements", "progress", "frozen", "runtime", "camera",
+    "errors", "text", "settings", "requirements", "progress", "frozen", "runtime", "camera",
     "similarity", "lens", "pointcloud", "depthmap", "scene", "scores", "io", "photos", "depth",
     "methods", "seeding", "synthetic", "sfm", "rendering", "splat", "training", "integrations",
     "gsplat", "viewer", "bench", "console", "commands", "cli",

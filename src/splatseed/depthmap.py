@@ -16,8 +16,9 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from splatseed.camera import Camera
-from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
+from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError, UnknownNameError
 from splatseed.frozen import read_only
+from splatseed.text import did_you_mean
 
 DepthKind = Literal["z", "ray", "inverse"]
 """Meaning of a value: planar depth z along the camera's axis, distance along the pixel's ray, or an
@@ -105,31 +106,40 @@ class HeldDepths(dict[str, DepthMap]):
         return self[name]
 
 
-def maps_by_name(maps: Any, distorted: Collection[str] = ()) -> DepthMaps:
+def maps_by_name(maps: Any, names: Collection[str], distorted: Collection[str] = ()) -> DepthMaps:
     """Convert depth maps in memory to a scene's ``DepthMaps``.
 
     Args:
         maps: ``DepthMaps``; a mapping from image names to a ``DepthMap`` or an array of planar
             depth; or records with a ``name``, planar ``depth`` and ``camera``, as
             ``stereo_depths`` returns.
+        names: Names of the scene's images.
         distorted: Names of images whose cameras have lens distortion. Stereo's maps are of
             photographs without it, so they do not fit.
 
     Raises:
+        UnknownNameError: The scene has no image of a map's name.
         ParameterError: ``maps`` is none of these, or stereo's of such an image.
     """
     if isinstance(maps, DepthMaps):
         return maps
     try:
         if isinstance(maps, Mapping):
-            return HeldDepths({name: _as_map(each) for name, each in maps.items()})
-        held = HeldDepths({each.name: _as_map(each.depth, each.camera.K) for each in maps})
+            held, distorted = HeldDepths({name: _as_map(each) for name, each in maps.items()}), ()
+        else:
+            held = HeldDepths({each.name: _as_map(each.depth, each.camera.K) for each in maps})
     except (AttributeError, TypeError, ValueError):
         raise ParameterError(
             "depth maps by image name, such as find_depths gives, or what stereo_depths returns",
             found=type(maps).__name__,
             fix="Pass a dict of DepthMap by image name.",
         ) from None
+    if unknown := sorted(held.keys() - set(names)):
+        raise UnknownNameError(
+            "depth maps of the scene's images",
+            found=repr(unknown[0]),
+            fix=did_you_mean(unknown[0], names) or "scene.images lists them, each with its name.",
+        )
     if bent := [name for name in held if name in distorted]:
         raise ParameterError(
             "stereo's depth maps of images without lens distortion",

@@ -260,8 +260,9 @@ class Scene:
 
     def __post_init__(self) -> None:
         if self.depths is not None:
+            names = [image.name for image in self.images]
             distorted = {im.name for im in self.images if im.intrinsics.has_distortion}
-            object.__setattr__(self, "depths", maps_by_name(self.depths, distorted))
+            object.__setattr__(self, "depths", maps_by_name(self.depths, names, distorted))
         if self.points.original_idx is not None:  # from here on, rows count in this cloud
             object.__setattr__(self, "points", self.points.replace(original_idx=None))
         folder = self.source.image_dir if self.source else None

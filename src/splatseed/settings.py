@@ -18,12 +18,14 @@ import dataclasses
 import math
 import types
 import typing
+from collections.abc import Mapping
 from functools import cache
-from typing import Any, Literal, Union
+from typing import Any, Literal, TypeVar, Union
 
 import numpy as np
 
 from splatseed.errors import ParameterError
+from splatseed.text import did_you_mean
 
 Limit = float | str
 """A number, or the name of another field of the same settings."""
@@ -81,6 +83,27 @@ def check_settings(settings: Any, group: str = "") -> None:
         require(fits(value, hint), f"{label} as {describe_type(hint)}", value)
         if limits is not None and value is not None:
             require(limits.contains(value, settings), f"{label} {limits}", value)
+
+
+Settings = TypeVar("Settings")
+
+
+def change_settings(settings: Settings, name: str, values: Mapping[str, Any]) -> Settings:
+    """Return a copy of a dataclass of settings with some of its fields replaced.
+
+    Raises:
+        ParameterError: It has no such field; ``name`` says whose it would be.
+    """
+    known = [field.name for field in dataclasses.fields(settings)]  # type: ignore[arg-type]  # a dataclass
+    for given in values:
+        if given not in known:
+            raise ParameterError(
+                f"a parameter of {name} ({', '.join(known) or 'it has none'})",
+                found=repr(given),
+                fix=did_you_mean(given, known).strip() or "Choose one of these.",
+            )
+    changed: Settings = dataclasses.replace(settings, **values)  # type: ignore[type-var]  # likewise
+    return changed
 
 
 def require(condition: bool, expected: str, found: object) -> None:

@@ -61,7 +61,7 @@ WRONG_CALLS = [
     *(({"num_points": wrong}, "a whole number") for wrong in (200.5, "800")),
     ({"ratio": 2, "num_points": 320}, "found both"),
     *(({"seed": wrong}, "a seed") for wrong in (-1, "one")),
-    *(({"method": Copies(), **own}, "its own parameters") for own in ({"k": 9}, PAPER)),
+    *(({"method": Copies(), **own}, "no parameters next to") for own in ({"k": 9}, PAPER)),
 ]
 
 

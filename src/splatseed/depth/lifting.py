@@ -261,11 +261,14 @@ def _choose(
     """Choose ``num`` candidates, ascending indices, away from the originals if spread."""
     usable = int(np.count_nonzero(candidates.tier < SEEN_THROUGH))
     if usable < num:
-        larger = " or a larger `depth.region`" if settings.region < 1 else ""
+        more = [] if settings.see_through else ["`depth.see_through=True`"]
+        more += ["a larger `depth.region`"] if settings.region < 1 else []
+        seen = "" if settings.see_through else " that no other view sees through"
+        allow = f", or allow more with {' or '.join(more)}" if more else ""
         raise PointCloudError(
             f"depth maps that can give {num:,} points",
-            found=f"{usable:,} that no other view sees through" if usable else "none",
-            fix=f"Ask for fewer, or allow more with `depth.see_through=True`{larger}.",
+            found=f"{usable:,}{seen}" if usable else "none",
+            fix=f"Ask for fewer{allow}.",
         )
     taken = np.zeros(len(candidates.tier), bool)
     for tier in range(SEEN_THROUGH):

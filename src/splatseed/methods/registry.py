@@ -7,7 +7,6 @@ looked up. No package can replace a built-in method.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator, Mapping
 from functools import cached_property
 from importlib import import_module
@@ -18,6 +17,8 @@ from splatseed.errors import ParameterError, UnknownNameError
 from splatseed.methods.contract import Need, Upsampler, traits_of
 from splatseed.pointcloud import GENERATED, ORIGINAL, PointCloud
 from splatseed.scene import Scene
+from splatseed.settings import change_settings
+from splatseed.text import did_you_mean
 
 GROUP = "splatseed.methods"
 
@@ -50,11 +51,16 @@ class MethodRegistry(Mapping[str, type[Upsampler]]):
         if name in self._plugins:
             return cast("type[Upsampler]", self._plugins[name].load())
         raise UnknownNameError(
-            f"one of the methods {', '.join(self)}", found=repr(name), fix="Choose one of these."
+            f"one of the methods {', '.join(self)}",
+            found=repr(name),
+            fix=did_you_mean(str(name), self).strip() or "Choose one of these.",
         )
 
     def __contains__(self, name: object) -> bool:
         return name in BUILT_IN or name in self._plugins
+
+    def __repr__(self) -> str:
+        return f"METHODS({', '.join(self)})"
 
     def __iter__(self) -> Iterator[str]:
         yield from BUILT_IN
@@ -108,15 +114,7 @@ def configure(method: str, profile: Profile = "default", **parameters: Any) -> U
             "the profile 'default' or 'paper'", found=repr(profile), fix="Choose one of these."
         )
     chosen: Any = getattr(kind, "paper", kind)() if profile == "paper" else kind()
-    known = [f.name for f in dataclasses.fields(chosen)]
-    for name in parameters:
-        if name not in known:
-            raise ParameterError(
-                f"a parameter of {method} ({', '.join(known) or 'it has none'})",
-                found=repr(name),
-                fix="Check its spelling.",
-            )
-    configured: Upsampler = dataclasses.replace(chosen, **parameters)
+    configured: Upsampler = change_settings(chosen, method, parameters)
     return configured
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float64, UInt8
 
 from splatseed.camera import Camera
+from splatseed.errors import ParameterError
 from splatseed.photos.sizes import check_side
 from splatseed.scene import Image
 
@@ -64,6 +65,12 @@ def view_of(camera: Image | Camera | View) -> View:
         return camera
     if isinstance(camera, Image):
         return View(camera.name, NO_PIXELS, camera.camera)
+    if not isinstance(camera, Camera):
+        raise ParameterError(
+            "`camera` as an image of a scene, a Camera or a View",
+            found=type(camera).__name__,
+            fix='Pass scene["NAME"], for example.',
+        )
     return View("", NO_PIXELS, camera)
 
 

@@ -14,7 +14,7 @@ from contextlib import redirect_stdout
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
 
 from filelock import FileLock
 
@@ -38,10 +38,14 @@ def pick_torch_device(choice: DeviceName, argument: str) -> torch.device:
     """Return the device for a choice; ``auto`` takes a GPU if PyTorch sees one.
 
     Raises:
-        ParameterError: CUDA is requested and PyTorch sees no GPU; the message names ``argument``.
+        ParameterError: The choice is none of ``DeviceName``, or CUDA is requested and PyTorch sees
+            no GPU; the message names ``argument``.
     """
     import torch  # noqa: PLC0415  (see the file's docstring)
 
+    if choice not in get_args(DeviceName):
+        expected = f"`{argument}` of {', '.join(get_args(DeviceName))}"
+        raise ParameterError(expected, found=repr(choice), fix="Choose one of these.")
     seen = torch.cuda.is_available()
     if choice == "cuda" and not seen:
         raise ParameterError(

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from splatseed.errors import ParameterError
 from splatseed.methods import (
     NewPoints,
     Profile,
@@ -39,6 +40,7 @@ from splatseed.seeding.photo_methods import (
 )
 from splatseed.seeding.thinning import thin_to
 from splatseed.seeding.verify import verify as verify_points
+from splatseed.text import agreeing, counted
 
 if TYPE_CHECKING:
     from splatseed.depth.stereo.maps import StereoResult
@@ -72,7 +74,8 @@ def upsample(
 
     Args:
         scene: A scene or a cloud. New points start from originals (``source`` 0) and replace all
-            points that were added before.
+            points that were added before, which a note counts: add points of your own to the
+            result.
         method: A key of ``METHODS``, or a configured method. "auto" compares the photographs;
             without photographs "mls" replaces it, with a note.
         ratio: Points in all, as a multiple of the originals, for methods that interpolate; 4 if
@@ -99,7 +102,8 @@ def upsample(
         removes points of both kinds.
 
     Raises:
-        ParameterError: Unknown method, profile or parameter, or a value out of range.
+        ParameterError: Unknown method (an UnknownNameError, which is a KeyError, too), profile or
+            parameter, or a value out of range.
         PointCloudError: Too few distinct finite points for the method.
         SceneNotFoundError: The method needs photographs or depth maps that do not exist.
         SceneFormatError: A photograph or depth map is damaged or does not fit the scene.
@@ -112,8 +116,17 @@ def upsample(
         >>> len(seeds), seeds.num_original
         (800, 100)
     """
+    if not isinstance(scene, Scene | PointCloud):
+        raise ParameterError(
+            "`scene` as a Scene or a PointCloud",
+            found=type(scene).__name__,
+            fix="Load it first with load_scene.",
+        )
     scene = at_file_size(scene) if isinstance(scene, Scene) else Scene(scene)
     check_seed(seed)
+    if added := len(scene.points) - scene.points.num_original:
+        verb = agreeing(added, "is", "are")
+        note(f"{counted(added, 'point')} added before upsampling {verb} left out.")
     limit = None if budget is None else points_within(scene, budget)
     if extra_method is None and DEFAULT_METHOD in {method, getattr(method, "name", None)}:
         method = method_for(scene, method, note)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float32
 
+from splatseed.errors import ParameterError
 from splatseed.requirements import require
 
 require("torch")  # before the imports below, for one clear error
@@ -37,13 +38,19 @@ def render(
         sRGB colours in [0, 1], float32, in the camera's size, on a black background.
 
     Raises:
-        ParameterError: ``backend`` is "cuda" without a GPU.
+        ParameterError: An argument has another type, or ``backend`` is "cuda" without a GPU.
         MissingDependencyError: PyTorch is absent, or gsplat's kernels cannot be built.
 
     Example:
         splat = ss.read_gaussians("point_cloud.ply")
         picture = ss.render(splat, scene["DSC07956.JPG"])
     """
+    if not isinstance(gaussians, Gaussians):
+        raise ParameterError(
+            "`gaussians` as Gaussians",
+            found=type(gaussians).__name__,
+            fix="Pass what read_gaussians returns, or the `gaussians` of a run.",
+        )
     device = pick_torch_device(backend, "backend")
     if device.type == "cuda":
         load_kernels("backend")

@@ -67,12 +67,16 @@ SUFFIXES = {each.suffix: name for name, each in FORMATS.items()}
 """Names of formats by suffix."""
 
 
+RUN_FILE = "point_cloud.ply"
+"""The Gaussians in the folder of a run."""
+
+
 def read_gaussians(path: StrPath, note: Note = silent_note) -> Gaussians:
     """Read the Gaussians of any trainer.
 
     Args:
-        path: A .ply, compressed .ply, .splat, .spz, or .sog (or its meta.json), recognised by its
-            content.
+        path: The folder of a run, or a .ply, compressed .ply, .splat, .spz, or .sog (or its
+            meta.json), recognised by its content.
         note: Called with notes for the user, such as on Gaussians with NaN, which are left out.
 
     Returns:
@@ -84,6 +88,8 @@ def read_gaussians(path: StrPath, note: Note = silent_note) -> Gaussians:
         MissingDependencyError: An .spz of version 4 needs zstandard.
     """
     path = Path(path)
+    if path.is_dir():
+        path /= RUN_FILE
     gaussians = FORMATS[detect_format(path, read_bytes(path))].decode(path, note)
     gaussians, left_out = drop_unusable(path, gaussians)
     if left_out:

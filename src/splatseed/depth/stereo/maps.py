@@ -78,6 +78,10 @@ class StereoMap:
     agreeing: UInt8[np.ndarray, "H W"]
     rgb: UInt8[np.ndarray, "H W 3"]
 
+    def __repr__(self) -> str:
+        height, width = self.depth.shape
+        return f"StereoMap({self.name!r}, {width} x {height}, {self.known_fraction:.0%} known)"
+
     @property
     def known_fraction(self) -> float:
         """Fraction of the pixels that have a depth."""

@@ -7,7 +7,6 @@ map holds only depths that independently computed maps of other views confirm.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -26,6 +25,7 @@ from splatseed.photos.view import View
 from splatseed.photos.visibility import Visibility, find_visibility
 from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
+from splatseed.settings import change_settings
 
 MIN_SEEN = 300
 """A scene counts as having no points if half of its images see fewer. Coarse stereo takes two or
@@ -58,11 +58,11 @@ def stereo_depths(
         them to the method ``depth``.
 
     Raises:
-        ParameterError: A setting is out of range.
+        ParameterError: A setting is unknown or out of range.
         SceneNotFoundError: There are fewer than two photographs, or than half of the scene's.
         SceneFormatError: A photograph cannot be used.
     """
-    settings = replace(settings or StereoSettings(), **choices)
+    settings = change_settings(settings or StereoSettings(), "stereo_depths", choices)
     if len(scene.images) < 2:
         raise SceneNotFoundError(
             "at least two photographs with a pose",
