@@ -90,7 +90,7 @@ class _C:
         saved = [*map(elem, (means, quats, scales)), elem(viewmats)[0]]
         lens = _lens(Ks, width, height, 0.0, 0.0, eps2d, 0.0, False)
         state = SimpleNamespace(
-            saved_tensors=saved, lens=lens, radii=elem(radii)[0].numpy(), sparse=False
+            saved_tensors=saved, params=lens, radii=elem(radii)[0].numpy(), sparse=False
         )
         if gradients[3] is None:
             gradients[3] = torch.zeros_like(gradients[1])
