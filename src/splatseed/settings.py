@@ -92,7 +92,7 @@ def change_settings(settings: Settings, name: str, values: Mapping[str, Any]) ->
     """Return a copy of a dataclass of settings with some of its fields replaced.
 
     Raises:
-        ParameterError: It has no such field; ``name`` says whose it would be.
+        ParameterError: There is no such field; the message calls fields "parameters of ``name``".
     """
     known = [field.name for field in dataclasses.fields(settings)]  # type: ignore[arg-type]  # a dataclass
     for given in values:

@@ -382,7 +382,7 @@ def _summarise(options: Options, training: TrainingRun, result: TrainingResult) 
         ("test SSIM, FLIP", f"{scores.ssim:.4f}, {scores.flip or 0.0:.4f}"),
         ("Gaussians", f"{scores.num_gaussians:,} from {result.num_seeds:,} seeds"),
         ("training", f"{seconds:.1f} s for {result.steps:,} steps"),
-        ("Gaussians in", str(output / "point_cloud.ply")),
+        ("Gaussians in", str(training.folder.gaussians)),
         ("pictures", f"{output / 'renders'}, {output / 'curve.png'}"),
     ]
     print_pairs("splatseed train", rows)

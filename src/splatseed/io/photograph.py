@@ -45,9 +45,9 @@ def photograph_folder(scene: Scene) -> Path:
 
 
 def photographs_digest(scene: Scene) -> str:
-    """A fingerprint of lenses, poses and the sizes of the files, as they are when training begins.
+    """Fingerprint lenses, poses and the sizes of the photographs' files.
 
-    A run notes it: it tells later whether a scene is still what the run was trained on.
+    A run keeps it, so that a scene that has changed since is noticed.
     """
     parts = []
     folder = scene.source.image_dir if scene.source else None

@@ -22,6 +22,7 @@ from splatseed.io.files import read_text
 from splatseed.io.origin import add_offset
 from splatseed.io.staging import MANIFEST, atomic_file, write_json
 from splatseed.scene import Scene
+from splatseed.splat.formats import RUN_FILE
 
 KIND = "train"  # in a run folder's manifest
 
@@ -34,10 +35,10 @@ class RunFolder:
         self.config = path / "config.json"  # the scene and the settings
         self.checkpoint = path / "checkpoint.pt"  # from which an unfinished run is resumed
         self.metrics = path / "metrics.json"  # the scores, once the run has finished
-        self.gaussians = path / "point_cloud.ply"
+        self.gaussians = path / RUN_FILE
         self.curve_csv, self.curve_png = path / "curve.csv", path / "curve.png"
-        self.renders = path / "renders"  # test views beside their photographs
-        self.tensorboard = path / "tensorboard"  # its log, if asked for
+        self.renders = path / "renders"  # test views next to their photographs
+        self.tensorboard = path / "tensorboard"  # its log, if requested
         self.scene = path / "scene"  # at refined poses, if the run refined them
 
     @property
