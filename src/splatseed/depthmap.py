@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float32, Float64, UInt8
 
 from splatseed.camera import Camera
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError, UnknownNameError
@@ -39,9 +39,21 @@ class DepthMap:
     values: Float32[np.ndarray, "H W"]
     kind: DepthKind = "z"  # what a value is
     K: Float64[np.ndarray, "3 3"] | None = None  # in pixels of the map; None: the image's, scaled
+    confidence: UInt8[np.ndarray, "H W"] | None = None
+    """The sensor's confidence, 0 low, 1 medium, 2 high (ARKit's ARConfidenceLevel); None: unknown.
+    """
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "values", read_only(self.values))
+        if self.confidence is None:
+            return
+        if np.shape(self.confidence) != self.values.shape:
+            raise ParameterError(
+                f"a confidence per pixel of the depth map, {self.height} x {self.width}",
+                found=" x ".join(map(str, np.shape(self.confidence))),
+                fix="Resize both alike.",
+            )
+        object.__setattr__(self, "confidence", read_only(self.confidence, np.uint8))
 
     @property
     def width(self) -> int:

@@ -27,7 +27,7 @@ from splatseed.pointcloud import PointCloud
 NO_POINT = -1
 """Point id of a feature without a point."""
 
-SceneFormat = Literal["colmap", "transforms", "ply", "rgbd", "llff"]
+SceneFormat = Literal["colmap", "transforms", "ply", "rgbd", "llff", "phone"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,7 +179,7 @@ class SceneSource:
 
     format: SceneFormat
     root: Path  # the scene's folder; of a bare PLY, the one it lies in
-    points_path: Path  # of the points; of an RGB-D capture, which has none, the trajectory
+    points_path: Path  # of the points; of a capture without any, a file of the poses
     model_dir: Path | None = None  # COLMAP's, if there is one
     image_dir: Path | None = None  # that ``Image.name`` is relative to, if there is one
     transforms_path: Path | None = None  # if it was read

@@ -12,8 +12,9 @@ from PIL import Image as PilImage
 
 from splatseed.camera import Intrinsics
 from splatseed.io import colmap
+from splatseed.io.load import with_own_depths
 from splatseed.pointcloud import PointCloud
-from splatseed.scene import Image, Observations, Tracks
+from splatseed.scene import Image, Observations, Scene, Tracks
 
 
 class Model(NamedTuple):
@@ -21,6 +22,12 @@ class Model(NamedTuple):
     images: tuple[Image, ...]
     points: PointCloud
     tracks: Tracks
+
+
+@pytest.fixture(scope="session")
+def room_with_depth(room) -> Scene:
+    """The made room with its true depth."""
+    return with_own_depths(room)
 
 
 @pytest.fixture

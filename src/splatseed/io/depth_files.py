@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
 import numpy as np
+from jaxtyping import UInt8
 from PIL import Image as PilImage
 
 from splatseed.depthmap import DepthKind
@@ -32,6 +33,8 @@ _MAX_INFLATION = 100
 """Largest compression factor of a map in an archive: measured values hardly compress."""
 _SMALL = 1 << 26
 """Bytes up to which any compression factor is accepted: a map can be constant."""
+_MAX_LEVEL = 2
+"""The highest of ARKit's levels of confidence."""
 _NPZ_KEYS = ("depth", "arr_0")
 _PFM_HEADER = re.compile(rb"Pf\s+(\d{1,9})\s+(\d{1,9})\s+([-+.\deE]{1,32})[ \t]*\r?\n")
 _BIN_HEADER = re.compile(rb"(\d{1,9})&(\d{1,9})&1&")
@@ -70,6 +73,22 @@ def read_stored(path: StrPath) -> StoredDepth:
             values = values if short is None else values.squeeze(short)
         check_stored(values.shape, values.dtype)
         return StoredDepth(values, kind)
+
+
+def read_confidence(path: StrPath) -> UInt8[np.ndarray, "H W"]:
+    """Read the confidence of a depth map, 0 low, 1 medium, 2 high, from a PNG of 8 bits.
+
+    Stored are these levels, as in ARKit's ``ARConfidenceLevel``, or 0, 127 and 255 (Polycam).
+    """
+    path = Path(path)
+    data = read_bytes(path)
+    with translate_errors(path, "a confidence map"):
+        values = _read_picture(path, data)
+        check_stored(values.shape, values.dtype)
+        if values.dtype != np.uint8:
+            raise ValueError(f"values of {values.dtype}, not 8 bits")
+    levels = np.rint(values / 127.5) if values.max() > _MAX_LEVEL else values
+    return np.asarray(levels, np.uint8)
 
 
 def check_stored(shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:

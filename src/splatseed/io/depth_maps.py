@@ -2,9 +2,11 @@
 
 ``scale`` is stored units per scene unit; stored values are divided by it. For the image
 ``a/b.jpg``, the stems ``a/b.jpg``, ``a/b.jpg.geometric`` and ``.photometric`` (COLMAP's dense
-stereo), ``a/depthN`` for ``a/frameN.jpg`` (NICE-SLAM), ``a/X.depth`` for ``a/X.color.png``
-(7-Scenes), ``a/b`` and ``a/b_depth`` are tried in this order, each with ``SUFFIXES``. Promise: maps
-are float32 with NaN where unknown; reading is thread-safe.
+stereo), ``a/depthN`` for ``a/frameN.jpg`` (NICE-SLAM; 3D Scanner App's have ``_`` before the
+number), ``a/X.depth`` for ``a/X.color.png`` (7-Scenes), ``a/b`` and ``a/b_depth`` are tried in this
+order, each with ``SUFFIXES``. The confidence of ``depth_N.png`` is ``conf_N.png``, that of
+``depth/b.png`` is ``confidence/b.png`` beside the folder. Promise: maps are float32 with NaN where
+unknown; reading is thread-safe.
 """
 
 from __future__ import annotations
@@ -12,19 +14,19 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, UInt8
 
 from splatseed.camera import Intrinsics
 from splatseed.depthmap import DepthKind, DepthMap
 from splatseed.errors import OutputError, SceneFormatError, SceneNotFoundError
-from splatseed.io.depth_files import KINDS, SUFFIXES, check_stored, read_stored
-from splatseed.io.files import read_json, translate_errors
+from splatseed.io.depth_files import KINDS, SUFFIXES, check_stored, read_confidence, read_stored
+from splatseed.io.files import COPY_AGAIN, read_json, translate_errors
 from splatseed.io.staging import MANIFEST, output_folder, write_json
 from splatseed.lens import project_rays
 from splatseed.scene import Scene
@@ -41,8 +43,10 @@ _NO_HIT = 1e9
 _SATURATED = 65535
 _FOLDERS = ("", "stereo/depth_maps", "depth_maps", "results", "depths", "depth")
 """Subfolders searched for maps; the first with a match is used."""
-_FRAME = re.compile(r"frame(\d+)", re.IGNORECASE)
-_CAPTURED = re.compile(r"depth(\d+)", re.IGNORECASE)
+_FRAME = re.compile(r"frame_?(\d+)", re.IGNORECASE)
+_CAPTURED = re.compile(r"depth_?(\d+)", re.IGNORECASE)
+_CONFIDENCE_FOLDER = "confidence"
+"""The folder of confidence maps beside a folder of depth maps (Polycam, Stray Scanner)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,8 +56,11 @@ class Undistortion:
     lens: Intrinsics
     cameras: Mapping[str, Intrinsics]
 
-    def apply(self, name: str, values: Float32[np.ndarray, "H W"]) -> Float32[np.ndarray, "h w"]:
-        """Resample a map of the distorted camera, of any size, to the pixels of a photograph."""
+    def apply(self, name: str, values: np.ndarray, unknown: float = np.nan) -> np.ndarray:
+        """Resample a map [H, W] of the distorted camera to the pixels of a photograph [h, w].
+
+        Pixels outside of the map become ``unknown``.
+        """
         camera = self.cameras[name]
         height, width = values.shape
         column, row = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
@@ -62,7 +69,8 @@ class Undistortion:
         uv *= [width / self.lens.width, height / self.lens.height]
         inside = np.all((uv >= 0) & (uv < [width, height]), axis=-1)
         places = np.floor(np.where(inside[..., None], uv, 0)).astype(np.intp)
-        return np.where(inside, values[places[..., 1], places[..., 0]], np.float32(np.nan))
+        moved = values[places[..., 1], places[..., 0]]
+        return np.where(inside, moved, np.asarray(unknown, values.dtype))
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +88,8 @@ class DepthFiles:
     """Stored units per scene unit; None: 1000 for integers, 1 for floats."""
     lens: Undistortion | None = None
     """Resamples maps for undistorted photographs; None: not needed."""
+    confidences: Mapping[str, Path] = field(default_factory=dict)
+    """Files of the maps' confidence by image name; of an image without one it is unknown."""
 
     def __contains__(self, name: object) -> bool:
         return name in self.paths
@@ -117,7 +127,26 @@ class DepthFiles:
         elif stored.dtype == np.uint16:
             known &= stored != _SATURATED
         values[~known] = np.nan
-        return DepthMap(values if self.lens is None else self.lens.apply(name, values), kind)
+        confidence = self._confidence(name, values.shape)
+        if self.lens is not None:
+            values = self.lens.apply(name, values)
+            confidence = None if confidence is None else self.lens.apply(name, confidence, 0)
+        return DepthMap(values, kind, confidence=confidence)
+
+    def _confidence(self, name: str, shape: tuple[int, ...]) -> UInt8[np.ndarray, "H W"] | None:
+        path = self.confidences.get(name)
+        if path is None:
+            return None
+        confidence = read_confidence(path)
+        if confidence.shape != shape:
+            (height, width), size = shape, " x ".join(map(str, confidence.shape[::-1]))
+            raise SceneFormatError(
+                f"{path} to have the size of the depth map {self.paths[name].name}, "
+                f"{width} x {height}",
+                found=size,
+                fix=f"{COPY_AGAIN[:-1]}; without it, confidence is unknown.",
+            )
+        return confidence
 
 
 def match_by_name(scene: Scene, root: Path) -> DepthFiles | None:
@@ -127,12 +156,26 @@ def match_by_name(scene: Scene, root: Path) -> DepthFiles | None:
             continue
         if (folder / DESCRIPTION).is_file():
             return DepthFiles(paths, *read_description(folder / DESCRIPTION))
+        confidences = find_confidences(paths)
         example, scale = next(iter(paths.values())), None
         if _CAPTURED.fullmatch(example.stem) and example.suffix.lower() == ".png":
             camera = camera_file(folder, 2)
             scale = read_capture_scale(camera) if camera else None
-        return DepthFiles(paths, scale=scale)
+        return DepthFiles(paths, scale=scale, confidences=confidences)
     return None
+
+
+def find_confidences(paths: Mapping[str, Path]) -> dict[str, Path]:
+    """Find the confidence files of depth maps by image name; images without one are left out."""
+    found = dict[str, Path]()
+    for name, path in paths.items():
+        captured = _CAPTURED.fullmatch(path.stem)
+        beside = path.with_name(f"{path.stem.lower().replace('depth', 'conf')}.png")
+        folder = path.parent.parent / _CONFIDENCE_FOLDER
+        places = [*([beside] if captured else []), folder / f"{path.stem}.png"]
+        if file := next((place for place in places if place.is_file()), None):
+            found[name] = file
+    return found
 
 
 def _match(scene: Scene, folder: Path) -> dict[str, Path]:

@@ -25,6 +25,7 @@ from splatseed.io.nerfstudio import is_blender, read_blender, read_transforms_sc
 from splatseed.io.origin import recentered
 from splatseed.io.ply import read_ply_float64, refuse_gaussians
 from splatseed.io.rgbd import find_tum_depths, is_replica, is_tum, load_rgbd, load_tum
+from splatseed.io.scanner_app import is_scanner_app, read_scanner_app
 from splatseed.io.seeds import recall_seeds
 from splatseed.io.split import with_listed_split
 from splatseed.io.staging import ABSENT, MANIFEST, read_manifest
@@ -47,8 +48,9 @@ def load_scene(path: StrPath, *, require_points: bool = True) -> Scene:
     Args:
         path: A folder with a COLMAP model (in ``sparse/0``, ``sparse``, ``colmap/sparse/0``, the
             folder itself or its subfolder ``0``), ``transforms.json``, ``transforms_train.json``
-            and ``transforms_test.json``, LLFF's ``poses_bounds.npy``, or an RGB-D capture
-            (``traj.txt``, or ``rgb.txt`` and ``groundtruth.txt``); or a ``.json`` or ``.ply`` file.
+            and ``transforms_test.json``, LLFF's ``poses_bounds.npy``, an RGB-D capture
+            (``traj.txt``, or ``rgb.txt`` and ``groundtruth.txt``), or the export of a phone app
+            (3D Scanner App's ``frame_00000.json``); or a ``.json`` or ``.ply`` file.
             ``sparse`` takes precedence over ``transforms.json``, and that over ``colmap/sparse/0``.
         require_points: Raise for a scene without points; if False, its cloud is empty.
 
@@ -144,7 +146,12 @@ def _reader(folder: Path) -> Callable[[], Scene] | None:
         return partial(read_blender, folder)
     if (nested := nested_model(folder)) is not None:
         return partial(read_model, nested)
-    others = ((is_llff, read_llff), (is_replica, load_rgbd), (is_tum, load_tum))
+    others = (
+        (is_llff, read_llff),
+        (is_replica, load_rgbd),
+        (is_tum, load_tum),
+        (is_scanner_app, read_scanner_app),
+    )
     return next((partial(read, folder) for known, read in others if known(folder)), None)
 
 

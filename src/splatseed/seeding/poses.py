@@ -79,6 +79,8 @@ _OPENCV = "with OpenCV's camera axes (x right, y down, z forward)"
 CONVENTIONS = {
     "colmap": f"the model's images hold cam_from_world, {_OPENCV}",
     "llff": "poses_bounds.npy holds world_from_cam, with camera axes down, right, back",
+    "phone": "the app's poses are world_from_cam, with OpenGL's camera axes (x right, y up, z "
+    "back), as ARKit has them",
     "rgbd": f"its trajectory holds world_from_cam, {_OPENCV}",
     "transforms": "each transform_matrix is world_from_cam, with OpenGL's camera axes (x right, "
     "y up, z back)",

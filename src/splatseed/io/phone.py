@@ -1,0 +1,135 @@
+"""What the exports of phone apps share: ARKit's poses and cameras, one of each per photograph.
+
+ARKit's ``ARCamera.transform`` is ``world_from_cam`` in OpenGL axes (x right, y up, z back), metres,
+y up. Its ``intrinsics`` count pixels from the centre of the first one: its projection matrix adds
+half a pixel to the principal point. Photographs are stored as the sensor has them, unrotated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float64
+
+from splatseed.camera import Intrinsics
+from splatseed.errors import SceneFormatError
+from splatseed.io.camera_records import (
+    NotFiniteError,
+    check_enough,
+    format_error,
+    make_intrinsics,
+    rigid_pose,
+    unusable_warning,
+)
+from splatseed.io.nerfstudio import OPENCV_FROM_OPENGL
+from splatseed.io.origin import recentered
+from splatseed.io.photograph_checks import image_warnings
+from splatseed.pointcloud import PointCloud
+from splatseed.scene import Image, Scene, SceneSource
+
+HALF_PIXEL = 0.5
+"""From ARKit's principal point, counted from the first pixel's centre, to the image corner's."""
+_MAX_OFFSET = 0.25
+"""Largest plausible distance of the principal point from the middle, in image sizes."""
+
+
+class PhoneFrame(NamedTuple):
+    """A photograph's camera and pose as an app stores them."""
+
+    where: str  # file and record, for errors
+    size: tuple[int, int]  # width and height to which the pinhole belongs
+    pinhole: tuple[float, float, float, float]  # fx fy cx cy, from the image corner, px
+    world_from_cam: Float64[np.ndarray, "R 4"]  # OpenGL axes; 3 or 4 rows
+
+
+def read_phone_scene(
+    root: Path,
+    track: Path,
+    folder: Path,
+    names: Iterable[str],
+    read: Callable[[str], PhoneFrame],
+    notes: Iterable[str] = (),
+) -> Scene:
+    """Make a scene without points of a phone's photographs.
+
+    Args:
+        root: The export's folder.
+        track: A file of the poses.
+        folder: The folder of the photographs.
+        names: The photographs, relative to it, in order.
+        read: Returns the frame of a photograph; if it raises ``NotFiniteError``, the photograph is
+            left out.
+        notes: Further warnings.
+
+    Raises:
+        SceneFormatError: A camera or pose is malformed, or most are not finite.
+    """
+    cameras: dict[tuple[object, ...], Intrinsics] = {}
+    images, unusable = list[Image](), dict[str, NotFiniteError]()
+    for i, name in enumerate(names):
+        try:
+            frame = read(name)
+            key = (frame.size, frame.pinhole)
+            if key not in cameras:
+                cameras[key] = _camera(frame, len(cameras) + 1)
+            pose = rigid_pose(frame.where, frame.world_from_cam @ OPENCV_FROM_OPENGL)
+        except NotFiniteError as error:
+            unusable[name] = error
+            continue
+        images.append(Image(name, i + 1, cameras[key], *pose))
+    check_enough(unusable, len(images))
+    warnings = (
+        *notes,
+        *unusable_warning(unusable, len(images)),
+        *image_warnings(images, folder, root),
+    )
+    scene = Scene(
+        PointCloud.empty(),
+        tuple(images),
+        tuple(cameras.values()),
+        source=SceneSource("phone", root, track, image_dir=folder),
+        warnings=warnings,
+        absent=tuple(unusable),
+    )
+    return recentered(scene)
+
+
+def _camera(frame: PhoneFrame, camera_id: int) -> Intrinsics:
+    """Make a checked camera; one of another size has its principal point far from the middle."""
+    camera = make_intrinsics(frame.where, camera_id, "PINHOLE", *frame.size, frame.pinhole)
+    offset = np.abs(np.array(frame.pinhole[2:]) / frame.size - 0.5)
+    if offset.max() > _MAX_OFFSET:
+        width, height = frame.size
+        raise SceneFormatError(
+            f"a principal point near the middle of {width} x {height} pixels in {frame.where}",
+            found=f"({frame.pinhole[2]:g}, {frame.pinhole[3]:g})",
+            fix="Use the photographs as the app exported them: not resized, cropped or rotated.",
+        )
+    return camera
+
+
+def read_matrix(
+    where: str, record: Mapping[str, Any], key: str, rows: int, columns: int
+) -> Float64[np.ndarray, "R C"]:
+    """Return a row-major matrix of finite numbers that a record stores as one list.
+
+    Raises:
+        NotFiniteError: A number is NaN, infinite, or all are 0.
+        SceneFormatError: It is missing, or not such a list.
+    """
+    expected = f"{rows} x {columns} numbers {key}"
+    value = record.get(key)
+    try:
+        matrix: np.ndarray = np.array(value, np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise format_error(expected, where, repr(value)[:80]) from None
+    if value is None or matrix.size != rows * columns:
+        found = "none" if value is None else f"{matrix.size} numbers"
+        raise format_error(expected, where, found)
+    if not np.isfinite(matrix).all() or not matrix.any():
+        found = "NaN or infinity" if matrix.any() else "only zeros"
+        raise NotFiniteError(f"{expected} in {where}", found=found, fix="Export the scan again.")
+    return matrix.reshape(rows, columns)

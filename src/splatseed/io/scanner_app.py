@@ -1,0 +1,113 @@
+"""Exports of 3D Scanner App ("All Data"): photographs, ARKit's poses and LiDAR depth.
+
+A frame N (five digits) has ``frame_N.json`` with ``cameraPoseARFrame`` (row-major 4 x 4, ARKit's
+``world_from_cam``) and ``intrinsics`` (row-major K in pixels of the photograph), a photograph
+``frame_N.jpg`` if it is a key frame, ``depth_N.png`` (planar z, 16-bit millimetres) and
+``conf_N.png`` (ARKit's levels 0 to 2). Source: the app's exports; ``projectionMatrix`` in the same
+file tells the size that ``intrinsics`` belong to, and that half a pixel is to be added.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.io.camera_records import format_error
+from splatseed.io.depth_maps import match_by_name
+from splatseed.io.files import StrPath, read_json
+from splatseed.io.phone import HALF_PIXEL, PhoneFrame, read_matrix, read_phone_scene
+from splatseed.io.photograph_checks import Size, photograph_size
+from splatseed.scene import Scene
+from splatseed.text import agreeing, counted
+
+_RECORD = re.compile(r"frame_\d{5,}\.json")
+_PHOTOGRAPH = re.compile(r"frame_\d{5,}\.(?:jpe?g|heic|png)", re.IGNORECASE)
+_ROUNDING = 0.05
+"""Pixels by which a size from float32 matrices may differ from a whole number."""
+
+
+def is_scanner_app(folder: Path) -> bool:
+    """Whether a folder has a frame's record of 3D Scanner App."""
+    with suppress(OSError):  # one that may not be listed is no scene
+        return any(_RECORD.fullmatch(path.name) for path in folder.iterdir())
+    return False
+
+
+def read_scanner_app(root: StrPath) -> Scene:
+    """Read the frames that have a photograph, with their depth maps; the cloud is empty.
+
+    Raises:
+        SceneNotFoundError: No frame has a photograph.
+        SceneFormatError: A record is malformed.
+    """
+    root = Path(root)
+    names = sorted(path.name for path in root.iterdir())
+    records = {Path(name).stem: root / name for name in names if _RECORD.fullmatch(name)}
+    photographs = {Path(name).stem: name for name in names if _PHOTOGRAPH.fullmatch(name)}
+    used = [name for stem, name in photographs.items() if stem in records]
+    first = next(iter(records.values()))
+    if not used:
+        raise SceneNotFoundError(
+            f"photographs of 3D Scanner App's frames, such as {first.with_suffix('.jpg')}",
+            found=f"none for {counted(len(records), 'frame')}",
+            fix='In the app, share the scan as "All Data" and pass the folder in the archive.',
+        )
+    notes = []
+    if lacking := len(records) - len(used):
+        have = agreeing(lacking, "has no photograph and is", "have no photograph and are")
+        notes.append(f"{lacking} of {counted(len(records), 'frame')} {have} left out.")
+    if lost := [name for stem, name in photographs.items() if stem not in records]:
+        are = agreeing(len(lost), "is", "are")
+        subject = f"{counted(len(lost), 'photograph')} without a pose (a .json beside it)"
+        notes.append(f"{subject} {are} left out, such as {lost[0]}.")
+
+    def read(name: str) -> PhoneFrame:
+        return _read_frame(records[Path(name).stem], photograph_size(root / name))
+
+    scene = read_phone_scene(root, first, root, used, read, notes)
+    return scene.replace(depths=match_by_name(scene, root))
+
+
+def _read_frame(path: Path, size: Size) -> PhoneFrame:
+    record = read_json(path)
+    if not isinstance(record, dict):
+        expected = "a frame of 3D Scanner App, an object with cameraPoseARFrame and intrinsics"
+        raise format_error(expected, f"{path}", type(record).__name__)
+    pose = read_matrix(f"{path}", record, "cameraPoseARFrame", 4, 4)
+    K = read_matrix(f"{path}", record, "intrinsics", 3, 3)
+    if not np.allclose(K[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]], [0, 0, 0, 0, 1]):
+        raise SceneFormatError(
+            f"intrinsics fx 0 cx 0 fy cy 0 0 1, row by row, in {path}",
+            found=" ".join(f"{each:g}" for each in K.ravel()),
+            fix="Export the scan again.",
+        )
+    fx, fy, cx, cy = (float(each) for each in K[[0, 1, 0, 1], [0, 1, 2, 2]])
+    pinhole = (fx, fy, cx + HALF_PIXEL, cy + HALF_PIXEL)
+    return PhoneFrame(f"{path}", _captured_size(record, K, size), pinhole, pose)
+
+
+def _captured_size(record: Mapping[str, Any], K: Float64[np.ndarray, "3 3"], size: Size) -> Size:
+    """Return the size that K belongs to: the projection matrix has 2 fx / width, 2 fy / height.
+
+    The photograph may be a resized copy. Without such a matrix, its own size is returned.
+    """
+    try:
+        projection = read_matrix("", record, "projectionMatrix", 4, 4)
+    except SceneFormatError:
+        return size
+    scales = projection[[0, 1], [0, 1]]
+    if (scales > 0).all():
+        captured = 2 * K[[0, 1], [0, 1]] / scales
+        width, height = np.rint(captured).astype(int).tolist()
+        # For the screen instead of the sensor, the matrix has another shape or is turned.
+        turned = (size[0] > size[1]) != (width > height)
+        if np.abs(captured - (width, height)).max() <= _ROUNDING and not turned:
+            return width, height
+    return size
