@@ -16,7 +16,8 @@ from splatseed.errors import ReconstructionError
 from splatseed.io import load_scene
 from splatseed.progress import silent
 from splatseed.sfm import Settings, reconstruct
-from splatseed.sfm.colmap import Run, match_photographs, posed_model, require_pycolmap
+from splatseed.sfm.colmap import Run, posed_model, require_pycolmap
+from splatseed.sfm.matching import match_photographs
 from splatseed.sfm.refinement import (
     Poses,
     align,

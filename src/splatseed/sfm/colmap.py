@@ -1,9 +1,4 @@
-"""Stages of a pycolmap run: settings, features and matches, mapping, triangulation.
-
-Images and cameras are written to the database before features are detected, so that ids are ours:
-camera i has rig i, image i has frame i, counted from 1. Progress is read from the database through
-pycolmap: Python's sqlite3 is another copy of SQLite, and two copies in one process release each
-other's file locks, which corrupts the file.
+"""Stages of a pycolmap run: settings, mapping, triangulation; ``matching`` precedes them.
 
 Notation: a ``model`` is a ``pycolmap.Reconstruction``. Only ``require_pycolmap`` imports pycolmap.
 """
@@ -22,12 +17,11 @@ from typing import Any, Literal, TypeAlias, TypeVar, get_args
 import numpy as np
 
 from splatseed import errors
-from splatseed.io.masks import write_masks
 from splatseed.io.staging import remove
 from splatseed.progress import Progress
 from splatseed.requirements import install_command
 from splatseed.runtime.torch_device import DeviceName
-from splatseed.scene import Image, Masks
+from splatseed.scene import Image
 from splatseed.sfm.cameras import SharedCamera
 from splatseed.sfm.work_folder import DATABASE, MODELS, WorkFolder
 from splatseed.text import counted, name_some
@@ -37,7 +31,6 @@ T = TypeVar("T")
 
 _MIN_VERSION = 4  # the first that adds an image with its rig in one call
 _MAX_INT = 2**31 - 1  # pycolmap takes a 32-bit int
-_BLOCK_IMAGES = 16  # matches are committed per block of 16 x 16 pairs
 _POLL_SECONDS = 0.1
 _SIMPLE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL")
 _COMPLETE = "complete"  # file that marks a finished folder of models
@@ -192,77 +185,6 @@ def rigid(pycolmap: Any, image: Image) -> Any:
     """Convert ``cam_from_world`` of an image to ``pycolmap.Rigid3d``."""
     rotation = pycolmap.Rotation3d(np.roll(image.quat, -1))  # wxyz to xyzw
     return pycolmap.Rigid3d(rotation, image.translation)
-
-
-def match_photographs(run: Run, model: Any, masks: Masks | None = None) -> None:
-    """Fill the database with a model's images, features and verified matches."""
-    pycolmap, settings = run.pycolmap, run.settings
-    device = getattr(pycolmap.Device, settings.device)
-    names = {image_id: image.name for image_id, image in sorted(model.images.items())}
-    folder = run.work / "masks"
-    write_masks(masks, run.image_dir, names.values(), folder)
-    masked = {"mask_path": str(folder)} if folder.is_dir() else {}
-    with pycolmap.Database.open(run.database) as database:
-        _write_model(run, database, model)
-        extraction = pycolmap.FeatureExtractionOptions(
-            max_image_size=settings.max_image_size, num_threads=settings.threads
-        )
-        run.stage(
-            "features",
-            lambda: pycolmap.extract_features(
-                *(run.database, run.image_dir, list(names.values())),
-                reader_options=pycolmap.ImageReaderOptions(**masked),
-                extraction_options=extraction,
-                device=device,
-            ),
-            lambda: sum(map(database.exists_keypoints, names)),
-            len(names),
-        )
-        skipped = [name for i, name in names.items() if not database.exists_keypoints(i)]
-        if skipped:
-            raise errors.SceneFormatError(
-                f"pycolmap to read all images of {run.image_dir}",
-                found=f"{len(skipped)} that it skipped: {name_some(skipped)}",
-                fix="Export them again as 8-bit JPEG or PNG, or remove them.",
-            )
-        if settings.matcher == "exhaustive":
-            match, generator = pycolmap.match_exhaustive, pycolmap.ExhaustivePairGenerator
-            pairing = pycolmap.ExhaustivePairingOptions(block_size=_BLOCK_IMAGES)
-        else:
-            match, generator = pycolmap.match_sequential, pycolmap.SequentialPairGenerator
-            pairing = pycolmap.SequentialPairingOptions()
-        run.stage(
-            "matching",
-            lambda: match(
-                run.database,
-                matching_options=pycolmap.FeatureMatchingOptions(num_threads=settings.threads),
-                pairing_options=pairing,
-                verification_options=pycolmap.TwoViewGeometryOptions(
-                    ransac={"random_seed": settings.seed}
-                ),
-                device=device,
-            ),
-            database.num_matched_image_pairs,
-            len(set(generator(pairing, database).all_pairs())),
-        )
-
-
-def _write_model(run: Run, database: Any, model: Any) -> None:
-    """Write a model's cameras and images to the database, unless an earlier run did."""
-    if database.num_images() == len(model.images):
-        if run.kept is not None and run.kept.stale_matches:
-            database.clear_two_view_geometries()
-            database.clear_matches()
-            for camera in model.cameras.values():
-                database.update_camera(camera)
-        return
-    database.clear_all_tables()  # may be incomplete after a kill
-    for camera_id, camera in sorted(model.cameras.items()):
-        database.write_camera(camera, use_camera_id=True)
-        database.write_rig(model.rig(camera_id), use_rig_id=True)
-    for image_id in sorted(model.images):
-        database.write_frame(model.frame(image_id), use_frame_id=True)
-        database.write_image(model.image(image_id), use_image_id=True)
 
 
 def _options(run: Run) -> Any:

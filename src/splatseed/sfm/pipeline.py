@@ -40,6 +40,7 @@ from splatseed.sfm import colmap
 from splatseed.sfm.cameras import SharedCamera, describe_cameras, share_cameras
 from splatseed.sfm.colmap import Run, Settings
 from splatseed.sfm.export import export_scene
+from splatseed.sfm.matching import match_photographs
 from splatseed.sfm.photos import find_photos, match_poses
 from splatseed.sfm.refinement import Refinement, refine
 from splatseed.sfm.work_folder import WorkFolder, resumable_work, work_key
@@ -186,10 +187,10 @@ def _reconstruct(
     refinement = None
     if poses is None:
         model = colmap.guessed_model(run, cameras, camera_model)
-        colmap.match_photographs(run, model, masks)
+        match_photographs(run, model, masks)
         model_dir = colmap.map_images(run, names, camera_model, partial=partial)
     else:
-        colmap.match_photographs(run, colmap.posed_model(run.pycolmap, poses), masks)
+        match_photographs(run, colmap.posed_model(run.pycolmap, poses), masks)
         if refine_poses:
             poses, refinement = refine(run, poses)
         model_dir = colmap.triangulate_points(run, poses, test_names)

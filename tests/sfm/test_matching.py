@@ -1,0 +1,74 @@
+"""Pairs of photographs in the database: as pycolmap matches them, none twice, names kept."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+
+import pytest
+
+from splatseed.progress import silent
+from splatseed.sfm import Settings
+from splatseed.sfm.colmap import Run, posed_model, require_pycolmap
+from splatseed.sfm.matching import detect_features, match_pairs, match_photographs
+
+pycolmap = pytest.importorskip("pycolmap")
+
+
+@pytest.fixture
+def run(room, tmp_path):
+    """A run on four photographs of the room, whose names have spaces, and their model."""
+    folder = tmp_path / "photos"
+    images = [replace(image, name=f"a view {image.name}") for image in room.images[:4]]
+    for old, new in zip(room.images, images, strict=False):
+        (folder / new.name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(room.source.image_dir / old.name, folder / new.name)
+    work = tmp_path / "work"
+    work.mkdir()
+    settings = Settings("exhaustive", "cpu", threads=1)
+    run = Run(require_pycolmap(), settings, folder, work, silent)
+    return run, posed_model(pycolmap, images)
+
+
+def matches(database, pair):
+    found = database.read_two_view_geometry(*pair).inlier_matches
+    return database.read_matches(*pair).tolist(), found.tolist()
+
+
+def test_a_list_of_pairs_is_matched_as_by_pycolmap_and_none_twice(run):
+    run, model = run
+    progress = []
+    object.__setattr__(run, "on_progress", lambda *step: progress.append(step))
+    with pycolmap.Database.open(run.database) as database:
+        detect_features(run, database, model)
+        names = {image.image_id: image.name for image in database.read_all_images()}
+        match_pairs(run, database, [(1, 2), (2, 4)])
+        assert database.num_matched_image_pairs() == 2
+        first = matches(database, (1, 2)), matches(database, (2, 4))
+        assert len(first[0][1]) > 50
+        progress.clear()
+        match_pairs(run, database, [(1, 2), (1, 3)], "more")
+        assert {fraction for stage, fraction in progress if stage == "more"} >= {0.5, 1.0}
+        assert database.num_matched_image_pairs() == 3
+        assert {image.image_id: image.name for image in database.read_all_images()} == names
+        database.clear_matches()
+        database.clear_two_view_geometries()
+        pycolmap.match_exhaustive(
+            run.database,
+            verification_options=pycolmap.TwoViewGeometryOptions(ransac={"random_seed": 0}),
+            device=pycolmap.Device.cpu,
+        )
+        assert (matches(database, (1, 2)), matches(database, (2, 4))) == first
+
+
+def test_names_are_restored_after_a_kill(run):
+    run, model = run
+    with pycolmap.Database.open(run.database) as database:
+        detect_features(run, database, model)
+        image = database.read_image(1)
+        image.name = "1"
+        database.update_image(image)
+    match_photographs(run, model)
+    with pycolmap.Database.open(run.database) as database:
+        assert database.read_image(1).name == model.image(1).name
+        assert database.num_matched_image_pairs() == 6
