@@ -51,6 +51,56 @@ def write_scanner_app(scene, folder):
     return folder
 
 
+def write_polycam(scene, folder, prefix="corrected_"):
+    """Polycam's raw export; original photographs and cameras are wrong, if there are others."""
+    keyframes = folder / "keyframes"
+    for prefix_here in {prefix, ""}:
+        for kind in ("images", "cameras"):
+            (keyframes / f"{prefix_here}{kind}").mkdir(parents=True)
+    for kind in ("depth", "confidence"):
+        (keyframes / kind).mkdir()
+    for i, image in enumerate(scene.images):
+        name = f"{998_000_000 + 166_667 * i}"
+        lens, pose = image.camera, world_from_cam(image)
+        camera = {
+            **{f"t_{row}{column}": pose[row, column] for row in range(3) for column in range(4)},
+            "fx": lens.K[0, 0],
+            "fy": lens.K[1, 1],
+            "cx": lens.K[0, 2],
+            "cy": lens.K[1, 2],
+            "width": lens.width,
+            "height": lens.height,
+            "blur_score": 1.0 + i,
+        }
+        (keyframes / f"{prefix}cameras/{name}.json").write_text(json.dumps(camera))
+        photograph = PilImage.open(image.path).convert("RGB")
+        photograph.save(keyframes / f"{prefix}images/{name}.jpg")
+        if prefix:
+            wrong = {**camera, "t_03": 9.0}
+            (keyframes / f"cameras/{name}.json").write_text(json.dumps(wrong))
+            photograph.save(keyframes / f"images/{name}.jpg")
+        depth = millimetres(scene, image.name)[::2, ::2]
+        PilImage.fromarray(depth).save(keyframes / f"depth/{name}.png")
+        levels = np.array([0, 127, 255], np.uint8)[confidence_levels(depth.shape)]
+        PilImage.fromarray(levels).save(keyframes / f"confidence/{name}.png")
+    return folder
+
+
+def check_depths(scene, truth):
+    """Depth of every other pixel, to the millimetre, with its confidence."""
+    for image, known in zip(scene.images, truth.images, strict=True):
+        depth = scene.depths.read(image.name)
+        stored = millimetres(truth, known.name)[::2, ::2]
+        np.testing.assert_array_equal(np.nan_to_num(1000 * depth.values).round(), stored)
+        np.testing.assert_array_equal(depth.confidence, confidence_levels(stored.shape))
+
+
+def change(path, **fields):
+    """Change fields of a record; those that are None are removed."""
+    record = {**json.loads(path.read_text()), **fields}
+    path.write_text(json.dumps({k: v for k, v in record.items() if v is not None}))
+
+
 def check_cameras(scene, truth):
     """Poses to rounding, and intrinsics, in the order of ``truth``."""
     assert len(scene.images) == len(truth.images)

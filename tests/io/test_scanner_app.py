@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
 from PIL import Image as PilImage
@@ -12,7 +10,7 @@ from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io import find_depths, load_scene, write_scene
 from splatseed.io.load import with_own_depths
 
-from .phone_exports import check_cameras, confidence_levels, millimetres, write_scanner_app
+from .phone_exports import change, check_cameras, check_depths, write_scanner_app
 
 
 def load(path):
@@ -24,21 +22,12 @@ def export(room_with_depth, tmp_path):
     return write_scanner_app(room_with_depth, tmp_path / "export")
 
 
-def change(path, **fields):
-    record = json.loads(path.read_text())
-    path.write_text(json.dumps({**record, **fields}))
-
-
 def test_cameras_depth_and_confidence_come_back(export, room_with_depth):
     scene = load(export)
     assert scene.warnings == ()
     assert (scene.source.format, scene.source.image_dir, len(scene.points)) == ("phone", export, 0)
     check_cameras(scene, room_with_depth)
-    for image, known in zip(scene.images, room_with_depth.images, strict=True):
-        depth = scene.depths.read(image.name)
-        stored = millimetres(room_with_depth, known.name)[::2, ::2]
-        np.testing.assert_array_equal(np.nan_to_num(1000 * depth.values).round(), stored)
-        np.testing.assert_array_equal(depth.confidence, confidence_levels(stored.shape))
+    check_depths(scene, room_with_depth)
 
 
 def test_a_scene_written_elsewhere_finds_the_same_maps(export, tmp_path):

@@ -41,7 +41,7 @@ _INTEGER_SCALE = 1000.0
 _NO_HIT = 1e9
 """Values from here on mean that a renderer's ray hit nothing; Blender writes 1e10."""
 _SATURATED = 65535
-_FOLDERS = ("", "stereo/depth_maps", "depth_maps", "results", "depths", "depth")
+_FOLDERS = ("", "stereo/depth_maps", "depth_maps", "results", "depths", "depth", "keyframes/depth")
 """Subfolders searched for maps; the first with a match is used."""
 _FRAME = re.compile(r"frame_?(\d+)", re.IGNORECASE)
 _CAPTURED = re.compile(r"depth_?(\d+)", re.IGNORECASE)

@@ -24,6 +24,7 @@ from splatseed.io.masks import with_own_masks
 from splatseed.io.nerfstudio import is_blender, read_blender, read_transforms_scene
 from splatseed.io.origin import recentered
 from splatseed.io.ply import read_ply_float64, refuse_gaussians
+from splatseed.io.polycam import is_polycam, read_polycam
 from splatseed.io.rgbd import find_tum_depths, is_replica, is_tum, load_rgbd, load_tum
 from splatseed.io.scanner_app import is_scanner_app, read_scanner_app
 from splatseed.io.seeds import recall_seeds
@@ -50,7 +51,8 @@ def load_scene(path: StrPath, *, require_points: bool = True) -> Scene:
             folder itself or its subfolder ``0``), ``transforms.json``, ``transforms_train.json``
             and ``transforms_test.json``, LLFF's ``poses_bounds.npy``, an RGB-D capture
             (``traj.txt``, or ``rgb.txt`` and ``groundtruth.txt``), or the export of a phone app
-            (3D Scanner App's ``frame_00000.json``); or a ``.json`` or ``.ply`` file.
+            (3D Scanner App's ``frame_00000.json``, Polycam's ``keyframes``); or a ``.json`` or
+            ``.ply`` file.
             ``sparse`` takes precedence over ``transforms.json``, and that over ``colmap/sparse/0``.
         require_points: Raise for a scene without points; if False, its cloud is empty.
 
@@ -151,6 +153,7 @@ def _reader(folder: Path) -> Callable[[], Scene] | None:
         (is_replica, load_rgbd),
         (is_tum, load_tum),
         (is_scanner_app, read_scanner_app),
+        (is_polycam, read_polycam),
     )
     return next((partial(read, folder) for known, read in others if known(folder)), None)
 

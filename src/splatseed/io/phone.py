@@ -7,6 +7,7 @@ half a pixel to the principal point. Photographs are stored as the sensor has th
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,17 +20,18 @@ from splatseed.errors import SceneFormatError
 from splatseed.io.camera_records import (
     NotFiniteError,
     check_enough,
-    format_error,
     make_intrinsics,
     rigid_pose,
     unusable_warning,
 )
+from splatseed.io.files import read_json
 from splatseed.io.nerfstudio import OPENCV_FROM_OPENGL
 from splatseed.io.origin import recentered
 from splatseed.io.photograph_checks import image_warnings
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene, SceneSource
 
+EXPORT_AGAIN = "Export the scan again."
 HALF_PIXEL = 0.5
 """From ARKit's principal point, counted from the first pixel's centre, to the image corner's."""
 _MAX_OFFSET = 0.25
@@ -111,6 +113,37 @@ def _camera(frame: PhoneFrame, camera_id: int) -> Intrinsics:
     return camera
 
 
+def read_record(path: Path, what: str) -> dict[str, Any]:
+    """Read a JSON object; ``what`` it describes is named in errors."""
+    record = read_json(path)
+    if not isinstance(record, dict):
+        raise SceneFormatError(
+            f"{path} to be {what}, a JSON object", found=type(record).__name__, fix=EXPORT_AGAIN
+        )
+    return record
+
+
+def read_numbers(where: str, record: Mapping[str, Any], keys: Iterable[str]) -> list[float]:
+    """Return finite numbers of a record.
+
+    Raises:
+        NotFiniteError: One is NaN or infinite.
+        SceneFormatError: One is missing, or no number.
+    """
+    numbers = []
+    for key in keys:
+        value = record.get(key)
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            found = "none" if value is None else repr(value)[:80]
+            raise SceneFormatError(f"a number {key} in {where}", found=found, fix=EXPORT_AGAIN)
+        if not math.isfinite(value):
+            raise NotFiniteError(
+                f"a finite number {key} in {where}", found=f"{value}", fix=EXPORT_AGAIN
+            )
+        numbers.append(float(value))
+    return numbers
+
+
 def read_matrix(
     where: str, record: Mapping[str, Any], key: str, rows: int, columns: int
 ) -> Float64[np.ndarray, "R C"]:
@@ -125,11 +158,12 @@ def read_matrix(
     try:
         matrix: np.ndarray = np.array(value, np.float64)
     except (TypeError, ValueError, OverflowError):
-        raise format_error(expected, where, repr(value)[:80]) from None
+        found = repr(value)[:80]
+        raise SceneFormatError(f"{expected} in {where}", found=found, fix=EXPORT_AGAIN) from None
     if value is None or matrix.size != rows * columns:
         found = "none" if value is None else f"{matrix.size} numbers"
-        raise format_error(expected, where, found)
+        raise SceneFormatError(f"{expected} in {where}", found=found, fix=EXPORT_AGAIN)
     if not np.isfinite(matrix).all() or not matrix.any():
         found = "NaN or infinity" if matrix.any() else "only zeros"
-        raise NotFiniteError(f"{expected} in {where}", found=found, fix="Export the scan again.")
+        raise NotFiniteError(f"{expected} in {where}", found=found, fix=EXPORT_AGAIN)
     return matrix.reshape(rows, columns)

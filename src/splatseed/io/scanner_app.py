@@ -19,10 +19,16 @@ import numpy as np
 from jaxtyping import Float64
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
-from splatseed.io.camera_records import format_error
 from splatseed.io.depth_maps import match_by_name
-from splatseed.io.files import StrPath, read_json
-from splatseed.io.phone import HALF_PIXEL, PhoneFrame, read_matrix, read_phone_scene
+from splatseed.io.files import StrPath
+from splatseed.io.phone import (
+    EXPORT_AGAIN,
+    HALF_PIXEL,
+    PhoneFrame,
+    read_matrix,
+    read_phone_scene,
+    read_record,
+)
 from splatseed.io.photograph_checks import Size, photograph_size
 from splatseed.scene import Scene
 from splatseed.text import agreeing, counted
@@ -76,17 +82,14 @@ def read_scanner_app(root: StrPath) -> Scene:
 
 
 def _read_frame(path: Path, size: Size) -> PhoneFrame:
-    record = read_json(path)
-    if not isinstance(record, dict):
-        expected = "a frame of 3D Scanner App, an object with cameraPoseARFrame and intrinsics"
-        raise format_error(expected, f"{path}", type(record).__name__)
+    record = read_record(path, "a frame of 3D Scanner App")
     pose = read_matrix(f"{path}", record, "cameraPoseARFrame", 4, 4)
     K = read_matrix(f"{path}", record, "intrinsics", 3, 3)
     if not np.allclose(K[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]], [0, 0, 0, 0, 1]):
         raise SceneFormatError(
             f"intrinsics fx 0 cx 0 fy cy 0 0 1, row by row, in {path}",
             found=" ".join(f"{each:g}" for each in K.ravel()),
-            fix="Export the scan again.",
+            fix=EXPORT_AGAIN,
         )
     fx, fy, cx, cy = (float(each) for each in K[[0, 1, 0, 1], [0, 1, 2, 2]])
     pinhole = (fx, fy, cx + HALF_PIXEL, cy + HALF_PIXEL)

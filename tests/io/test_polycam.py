@@ -1,0 +1,89 @@
+"""Polycam's raw export: corrected key frames first, and what is missing is said."""
+
+from __future__ import annotations
+
+import shutil
+
+import pytest
+
+from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.io import find_depths, load_scene, write_scene
+
+from .phone_exports import change, check_cameras, check_depths, write_polycam
+
+
+def load(path):
+    return load_scene(path, require_points=False)
+
+
+@pytest.fixture
+def export(room_with_depth, tmp_path):
+    return write_polycam(room_with_depth, tmp_path / "export")
+
+
+def rename(paths, suffix):
+    for path in paths:
+        path.rename(path.with_suffix(suffix))
+
+
+@pytest.mark.parametrize("prefix", ["corrected_", ""])
+@pytest.mark.parametrize("given", ["", "keyframes"])
+def test_cameras_depth_and_confidence_come_back(room_with_depth, tmp_path, prefix, given):
+    export = write_polycam(room_with_depth, tmp_path / "export", prefix)
+    scene = load(export / given)
+    assert scene.warnings == ()
+    assert (scene.source.format, scene.source.root) == ("phone", export / given)
+    assert scene.source.image_dir == export / f"keyframes/{prefix}images"
+    check_cameras(scene, room_with_depth)
+    check_depths(scene, room_with_depth)
+    again = load(write_scene(scene, tmp_path / "out", require_points=False).path)
+    assert find_depths(again, export / given).paths == scene.depths.paths
+
+
+def test_original_key_frames_without_corrected_ones(export):
+    shutil.rmtree(export / "keyframes/corrected_cameras")
+    scene = load(export)
+    assert scene.source.image_dir == export / "keyframes/images"
+    assert scene.images[0].camera.world_from_cam[0, 3] == pytest.approx(9)
+
+
+def test_key_frames_without_a_photograph_or_a_camera_are_left_out(export):
+    cameras = sorted((export / "keyframes/corrected_cameras").iterdir())
+    cameras[0].unlink()
+    sorted((export / "keyframes/corrected_images").iterdir())[1].unlink()
+    scene = load(export)
+    assert [image.name for image in scene.images] == [f"{c.stem}.jpg" for c in cameras[2:]]
+    assert [w for w in scene.warnings if "left out" in w] == [
+        f"1 of 8 photographs has no camera and is left out, such as {cameras[0].stem}.jpg.",
+        "1 of 8 cameras has no photograph and is left out.",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"t_12": None}, r"a number t_12 in .*\.json; found none\. Export"),
+        ({"t_12": "0"}, r"a number t_12 in .*; found '0'"),
+        ({"fx": None}, "a number fx in "),
+        ({"t_00": 3.0}, "a rotation and a translation"),
+        ({"width": 48.5}, "width and height in pixels in .*; found 48.5 x 72"),
+        ({"cx": 1.0}, "a principal point near the middle of 96 x 72 pixels"),
+        ({"fy": float("nan")}, "a finite number fy in "),
+    ],
+)
+def test_malformed_cameras_are_named(export, fields, words):
+    for path in (export / "keyframes/corrected_cameras").iterdir():
+        change(path, **fields)
+    with pytest.raises(SceneFormatError, match=words):
+        load(export)
+
+
+def test_an_export_without_developer_mode(export):
+    for name in ("cameras", "corrected_cameras", "corrected_images"):
+        shutil.rmtree(export / "keyframes" / name)
+    words = (
+        r"found 9 photographs and 0 cameras\. In Polycam, switch Developer mode on.*sfm .*images"
+    )
+    for path in (export, export / "keyframes"):
+        with pytest.raises(SceneNotFoundError, match=words):
+            load(path)
