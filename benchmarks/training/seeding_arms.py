@@ -11,10 +11,12 @@ import dataclasses
 import tempfile
 import time
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 import splatseed as ss
 from splatseed.methods import configure
@@ -25,9 +27,49 @@ from splatseed.sfm import refined
 from splatseed.splat.evaluate import evaluate_views
 from splatseed.training import TrainSettings, prepare_run
 from splatseed.training.depths import stereo_size
+from splatseed.training.folder import Record
+from splatseed.training.schedule import Schedule
+from splatseed.training.trainer import Trainer
 
 __all__ = ["ARMS", "TEST_EVERY", "train", "triangulated", "validation_split"]
 
+
+@dataclass(frozen=True)
+class Start:
+    """How Gaussians begin, where it differs from ``train``."""
+
+    discs: bool = False
+    """Flat across stereo's normals, a tenth as thick as wide."""
+    opacities: tuple[float, float] | None = None
+    """From confidence 0 to 1; None: all 0.1."""
+    position_rate: float = 1.0
+    """Learning rate of the positions, as a multiple."""
+
+    def settings(self, **given: Any) -> TrainSettings:
+        """Settings whose schedule has this rate."""
+        rate = self.position_rate
+
+        class Slowed(TrainSettings):
+            @property
+            def schedule(self) -> Schedule:
+                own = super().schedule
+                rates = {**own.learning_rates, "means": rate * own.learning_rates["means"]}
+                return dataclasses.replace(own, learning_rates=rates)
+
+        kind = TrainSettings if rate == 1.0 else Slowed
+        return kind(seed_normals=self.discs, **given)
+
+    def set_opacities(self, logits: torch.Tensor, confidence: np.ndarray | None) -> None:
+        """Set first opacities by the seeds' confidence; SfM's points have none, and keep theirs."""
+        if self.opacities is None or confidence is None:
+            return
+        low, high = self.opacities
+        known = np.isfinite(confidence)
+        opacity = torch.from_numpy(low + (high - low) * confidence[known])
+        logits.data[torch.from_numpy(known)] = torch.logit(opacity).to(logits.dtype)
+
+
+DENSE = {"method": "auto", "spacing": 2.0, "grid": 2, "max_size": 800}
 ARMS: Mapping[str, Mapping[str, Any]] = {
     "sfm": {"method": "linear", "ratio": 1},
     "mls": {"method": "mls", "ratio": 4},
@@ -37,6 +79,11 @@ ARMS: Mapping[str, Mapping[str, Any]] = {
     "auto, no points": {"method": "auto", "points": False},
     "auto, refined": {"method": "auto", "points": False, "refined": True},
     "triangulated": {"method": "linear", "ratio": 1, "points": False, "refined": True},
+    "dense": DENSE,
+    "dense, discs": {**DENSE, "start": Start(discs=True)},
+    "dense, opacities": {**DENSE, "start": Start(opacities=(0.1, 0.8))},
+    "dense, slow": {**DENSE, "start": Start(position_rate=1 / 3)},
+    "dense, all three": {**DENSE, "start": Start(True, (0.1, 0.8), 1 / 3)},
     "random as gsplat": {"random": "gsplat"},
     "random as nerfstudio": {"random": "nerfstudio"},
 }
@@ -62,7 +109,8 @@ def train(
     validation = validation_split(whole, every, HELD_STEP * seed % TEST_EVERY)
     camera = validation.images[0].camera
     cap = round(rho * (camera.width // data_factor) * (camera.height // data_factor))
-    settings = TrainSettings(
+    begin = ARMS[arm].get("start", Start())
+    settings = begin.settings(
         strategy=strategy, max_steps=max_steps, data_factor=data_factor, seed=seed,
         cap_max=cap, test_every=TEST_EVERY, backend="cpu", seeding="scene",
     )  # fmt: skip
@@ -71,9 +119,11 @@ def train(
     seeding = time.perf_counter() - start
     with tempfile.TemporaryDirectory() as folder:
         run = prepare_run(validation.replace(points=points), Path(folder) / "run", settings)
+        begin.set_opacities(run.state.params["opacities"], points.confidence)
         before = time.process_time()
-        run.train()
-        processor, whole = time.process_time() - before, time.process_time() - begun
+        curve = Curve(run.trainer, begun)
+        run.train(curve.on_step)
+        processor, whole = curve.last - before, curve.last - begun
     scores = evaluate_views(run.trainer.render, run.trainer.test_views)
     return {
         "psnr": scores.psnr,
@@ -86,7 +136,39 @@ def train(
         "seconds": run.state.watch.seconds,
         "processor": processor,
         "whole_processor": whole,
+        "curve": curve.points,
     }
+
+
+class Curve:
+    """Scores of the held-out views in the course of a run, which takes no time to score them.
+
+    Args:
+        trainer: The trainer, whose records are watched.
+        begun: The processor's clock when the run began, seeds included.
+    """
+
+    def __init__(self, trainer: Trainer, begun: float) -> None:
+        self.points: list[tuple[int, float, float, float]] = []
+        """Step, seconds by the processor, PSNR, SSIM."""
+        self._begun, self._scoring, self._at = begun, 0.0, begun
+        self._pass_on, trainer.on_record = trainer.on_record, self._on_record
+
+    @property
+    def last(self) -> float:
+        """The clock at the last step, scoring left out."""
+        return self._at - self._scoring
+
+    def on_step(self, _: int) -> None:
+        """Note the time of a step."""
+        self._at = time.process_time()
+
+    def _on_record(self, record: Record) -> None:
+        if record.test_psnr is not None and record.test_ssim is not None:
+            seconds = round(self.last - self._begun, 2)
+            self.points.append((record.step, seconds, record.test_psnr, record.test_ssim))
+        self._pass_on(record)
+        self._scoring += time.process_time() - self._at
 
 
 def validation_split(whole: Scene, every: int, first: int) -> Scene:
@@ -105,7 +187,7 @@ def _seeds(scene: Scene, arm: str, settings: TrainSettings) -> PointCloud:
 
     Photographs are compared at the size at which ``splatseed train`` compares them.
     """
-    chosen = dict(ARMS[arm])
+    chosen = {name: value for name, value in ARMS[arm].items() if name != "start"}
     if "random" in chosen:
         return random_start(scene, np.random.default_rng(settings.seed), chosen["random"])
     if not chosen.pop("points", True):
@@ -115,9 +197,10 @@ def _seeds(scene: Scene, arm: str, settings: TrainSettings) -> PointCloud:
     name = chosen.pop("method")
     size = stereo_size(scene.split(TEST_EVERY)[0], settings, "cpu")
     known = {field.name for field in dataclasses.fields(ss.METHODS[name])}
-    given = {"test_every": TEST_EVERY, "max_size": size}
+    given = {"test_every": TEST_EVERY, "max_size": size, **chosen}
     method = configure(name, **{option: given[option] for option in known & given.keys()})
-    points = ss.upsample(scene, method, budget=settings.max_seeds(settings.cap or 0), **chosen)
+    how = {option: chosen[option] for option in chosen.keys() - known}
+    points = ss.upsample(scene, method, budget=settings.max_seeds(settings.cap or 0), **how)
     return points.select(points.distinct)
 
 
