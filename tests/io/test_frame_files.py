@@ -174,6 +174,54 @@ def test_depth_maps_have_the_unit_of_the_file(tmp_path, key, fields, stored, exp
         load(root)
 
 
+def test_a_depth_scale_per_frame_is_one_for_all(tmp_path):
+    root, scales = tmp_path / "scene", (0.001, 0.001)
+    shoot(root, "images/0.png", "images/1.png")
+    shoot(root, "images/0.depth.png", "images/1.depth.png", mode="I;16", value=1500)
+
+    def write_scales(scales):
+        named = [
+            {"file_path": f"images/{i}", "depth_path": f"images/{i}.depth.png"} for i in (0, 1)
+        ]
+        own = [{"integer_depth_scale": scale} if scale else {} for scale in scales]
+        frames = [{**frame, **fields} for frame, fields in zip(named, own, strict=True)]
+        write(root, frames, integer_depth_scale=1 / 65535)
+
+    write_scales(scales)
+    assert load(root).depths.read("1.png").values == pytest.approx(1.5)
+    write_scales((0.001, None))
+    with pytest.raises(SceneFormatError, match="one integer_depth_scale for all frames"):
+        load(root)
+
+
+def test_spectacular_ais_folder(tmp_path):
+    """Depth lies among the photographs, and a model without true tracks beside."""
+    root = tmp_path / "scene"
+    shoot(root, "images/frame_00001.jpg", "images/frame_00002.jpg")
+    shoot(root, "images/depth_00001.png", "images/depth_00002.png", mode="I;16", value=2500)
+    frames = [
+        {
+            "file_path": f"./images/frame_0000{i}.jpg",
+            "depth_file_path": f"./images/depth_0000{i}.png",
+        }
+        for i in (1, 2)
+    ]
+    write(root, frames, ply_file_path="./sparse_pc.ply", orientation_override="none")
+    names = [f"property float {axis}" for axis in "xyz"]
+    names += [f"property uint8 {color}" for color in ("red", "green", "blue")]
+    header = ["ply", "format ascii 1.0", "element vertex 1", *names, "end_header"]
+    (root / "sparse_pc.ply").write_text("\n".join([*header, "2.5 -2.75 -0.0625 103 91 71", ""]))
+    (root / "colmap/sparse/0").mkdir(parents=True)
+    for name in ("cameras", "images", "points3D"):
+        (root / f"colmap/sparse/0/{name}.txt").write_text("not read")
+    scene = load(root)
+    assert [image.name for image in scene.images] == ["frame_00001.jpg", "frame_00002.jpg"]
+    np.testing.assert_array_equal(scene.points.xyz, [[2.5, -2.75, -0.0625]])
+    np.testing.assert_array_equal(scene.points.rgb, [[103, 91, 71]])
+    assert list(scene.depths) == ["frame_00001.jpg", "frame_00002.jpg"]
+    assert scene.depths.read("frame_00002.jpg").values == pytest.approx(2.5)
+
+
 def test_masks_that_are_named_are_found_or_told(tmp_path):
     root = tmp_path / "scene"
     shoot(root, "images/0.png", "images/1.png")

@@ -9,6 +9,7 @@ from PIL import Image as PilImage
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io import find_depths, load_scene, write_scene
 from splatseed.io.load import with_own_depths
+from splatseed.sfm.photos import find_photos
 
 from .phone_exports import change, check_cameras, check_depths, write_scanner_app
 
@@ -28,6 +29,7 @@ def test_cameras_depth_and_confidence_come_back(export, room_with_depth):
     assert (scene.source.format, scene.source.image_dir, len(scene.points)) == ("phone", export, 0)
     check_cameras(scene, room_with_depth)
     check_depths(scene, room_with_depth)
+    assert list(find_photos(export)[0]) == [image.name for image in scene.images]
 
 
 def test_a_scene_written_elsewhere_finds_the_same_maps(export, tmp_path):

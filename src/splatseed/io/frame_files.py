@@ -19,7 +19,7 @@ from urllib.parse import unquote
 
 from splatseed.errors import SceneFormatError
 from splatseed.io.depth_files import SUFFIXES as DEPTH_SUFFIXES
-from splatseed.io.depth_maps import DepthFiles
+from splatseed.io.depth_maps import DepthFiles, find_confidences
 from splatseed.io.files import read_json
 from splatseed.text import counted
 
@@ -227,7 +227,8 @@ def named_depths(
     """Find the depth maps that frames name, with their unit; None without any.
 
     Integers in ``depth_path`` (instant-ngp, NeRFCapture) are multiplied by
-    ``integer_depth_scale``; those in ``depth_file_path`` (nerfstudio) are millimetres.
+    ``integer_depth_scale``, of the file or of all its frames; those in ``depth_file_path``
+    (nerfstudio, Spectacular AI) are millimetres.
     """
     paths, key_used = dict[str, Path](), ""
     for key in ("depth_file_path", "depth_path"):
@@ -239,13 +240,19 @@ def named_depths(
     if not paths:
         return None
     integers = all(path.suffix.lower() in _INTEGERS for path in paths.values())
+    units_in = [{**meta, **frames[name]} for name in paths]
     unit_key = "integer_depth_scale"
-    if key_used == "depth_file_path" and unit_key not in meta:
+    if key_used == "depth_file_path" and not any(unit_key in each for each in units_in):
         unit_key = "depth_unit_scale_factor"
-    unit = meta.get(unit_key)
+    units = {repr(each.get(unit_key)): each.get(unit_key) for each in units_in}
+    if len(units) > 1:
+        expected = f"one {unit_key} for all frames in {files.path}"
+        raise SceneFormatError(expected, found=", ".join(units)[:80], fix=FIX)
+    unit = next(iter(units.values()))
+    confidences = find_confidences(paths)
     if unit is None or (unit_key == "integer_depth_scale" and not integers):
-        return DepthFiles(paths)
+        return DepthFiles(paths, confidences=confidences)
     if isinstance(unit, bool) or not isinstance(unit, int | float) or not 0 < unit < math.inf:
         expected = f"{unit_key} above 0 in {files.path}"
         raise SceneFormatError(expected, found=repr(unit)[:80], fix=FIX)
-    return DepthFiles(paths, "z", 1 / unit)
+    return DepthFiles(paths, "z", 1 / unit, confidences=confidences)
