@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import re
 import shutil
 import sys
@@ -16,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image as PilImage
 
 torch = pytest.importorskip("torch", reason="some verbs import PyTorch")
 
@@ -77,6 +79,9 @@ COMMANDS = [
     (("info", "nowhere"), "nowhere"),
     (("info", "nowhere", "--bogus"), "--bogus"),
     (("info", "ROOM", "b", "c"), "b, c"),
+    (("info", "PHONE"), "cameraPoseARFrame in PHONE/frame_00000.json; found 12 numbers"),
+    (("upsample", "PHONE/bare", *OUT), "All Data"),
+    (("train", "POLYCAM", *OUT), "Developer mode"),
     (("info", "ROOM", "--picture", "a.png"), "--depth DIR"),
     (("info", "ROOM", "--depth-kind", "ray"), "--depth DIR"),
     (("info", "ROOM", "--depth-scale", "5"), "--depth DIR"),
@@ -209,6 +214,12 @@ def refused(room, tmp_path, monkeypatch, splatseed):
     (tmp_path / "TAKEN").mkdir()
     (tmp_path / "TAKEN" / "mine.txt").write_text("years")
     (tmp_path / "taken.spz").write_bytes(b"mine")
+    for folder in ("PHONE/bare", "POLYCAM/keyframes/images"):
+        (tmp_path / folder).mkdir(parents=True)
+    for name in ("PHONE/frame_00000.jpg", "POLYCAM/keyframes/images/1.jpg"):
+        PilImage.new("RGB", (8, 6)).save(tmp_path / name)
+    for name in ("PHONE/frame_00000.json", "PHONE/bare/frame_00000.json"):
+        (tmp_path / name).write_text(json.dumps({"cameraPoseARFrame": [1] * 12}))
     _run_folder(tmp_path / "RUN")
     (tmp_path / "RUN" / "point_cloud.ply").unlink()
     before = _contents(tmp_path)

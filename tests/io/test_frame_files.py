@@ -165,6 +165,7 @@ def test_depth_maps_have_the_unit_of_the_file(tmp_path, key, fields, stored, exp
     write(root, [{"file_path": "images/0", key: "sensor\\d_0.png"}, "images/1"], **fields)
     scene = load(root)
     assert list(scene.depths) == ["0.png"]
+    assert scene.warnings == ()
     depth = scene.depths.read("0.png")
     np.testing.assert_allclose(depth.values, expected, rtol=1e-4)
     again = load(write_scene(scene, tmp_path / "out", require_points=False).path)
@@ -192,6 +193,19 @@ def test_a_depth_scale_per_frame_is_one_for_all(tmp_path):
     write_scales((0.001, None))
     with pytest.raises(SceneFormatError, match="one integer_depth_scale for all frames"):
         load(root)
+
+
+def test_depth_maps_that_are_named_but_missing(tmp_path):
+    """NeRFCapture's offline mode names depth maps that it does not write."""
+    root = tmp_path / "scene"
+    shoot(root, "images/0.png", "images/1.png")
+    frames = [{"file_path": f"images/{i}", "depth_path": f"images/{i}.depth.png"} for i in (0, 1)]
+    write(root, frames, depth_integer_scale=1.0)
+    scene = load(root)
+    assert scene.depths is None
+    assert scene.warnings == (
+        "2 depth maps named in transforms.json cannot be found, such as images/0.depth.png.",
+    )
 
 
 def test_spectacular_ais_folder(tmp_path):

@@ -17,6 +17,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 from urllib.parse import unquote
 
+from splatseed.depthmap import DepthKind
 from splatseed.errors import SceneFormatError
 from splatseed.io.depth_files import SUFFIXES as DEPTH_SUFFIXES
 from splatseed.io.depth_maps import DepthFiles, find_confidences
@@ -223,36 +224,51 @@ def named_masks(
 
 def named_depths(
     files: FrameFiles, frames: Mapping[str, Mapping[str, Any]], meta: Mapping[str, Any]
-) -> DepthFiles | None:
-    """Find the depth maps that frames name, with their unit; None without any.
+) -> tuple[DepthFiles | None, list[str]]:
+    """Find the depth maps that frames name, with their unit, and warn of missing ones.
 
     Integers in ``depth_path`` (instant-ngp, NeRFCapture) are multiplied by
     ``integer_depth_scale``, of the file or of all its frames; those in ``depth_file_path``
     (nerfstudio, Spectacular AI) are millimetres.
     """
-    paths, key_used = dict[str, Path](), ""
+    paths, key_used, missing = dict[str, Path](), "", dict[str, str]()
     for key in ("depth_file_path", "depth_path"):
         for name, frame in frames.items():
             depth = frame.get(key)
-            found = files.depth_map(depth) if isinstance(depth, str) and depth else None
-            if found and found.path.suffix.lower() in DEPTH_SUFFIXES and name not in paths:
+            if not isinstance(depth, str) or not depth or name in paths:
+                continue
+            found = files.depth_map(depth)
+            if found is None:
+                missing[name] = depth
+            elif found.path.suffix.lower() in DEPTH_SUFFIXES:
                 paths[name], key_used = found.path, key_used or key
+    notes = []
+    if lost := [depth for name, depth in missing.items() if name not in paths]:
+        what = f"{counted(len(lost), 'depth map')} named in {files.path.name} cannot be found"
+        notes = [f"{what}, such as {lost[0]}."]
     if not paths:
-        return None
-    integers = all(path.suffix.lower() in _INTEGERS for path in paths.values())
-    units_in = [{**meta, **frames[name]} for name in paths]
-    unit_key = "integer_depth_scale"
-    if key_used == "depth_file_path" and not any(unit_key in each for each in units_in):
-        unit_key = "depth_unit_scale_factor"
-    units = {repr(each.get(unit_key)): each.get(unit_key) for each in units_in}
+        return None, notes
+    unit = _depth_unit(files, key_used, paths, [{**meta, **frames[name]} for name in paths])
+    scale = None if unit is None else 1 / unit
+    kind: DepthKind | None = None if unit is None else "z"
+    return DepthFiles(paths, kind, scale, confidences=find_confidences(paths)), notes
+
+
+def _depth_unit(
+    files: FrameFiles, key_used: str, paths: Mapping[str, Path], fields: Sequence[Mapping[str, Any]]
+) -> float | None:
+    """Return scene units per stored unit by the fields of each frame; None if not given."""
+    key = "integer_depth_scale"
+    if key_used == "depth_file_path" and not any(key in each for each in fields):
+        key = "depth_unit_scale_factor"
+    units = {repr(each.get(key)): each.get(key) for each in fields}
     if len(units) > 1:
-        expected = f"one {unit_key} for all frames in {files.path}"
+        expected = f"one {key} for all frames in {files.path}"
         raise SceneFormatError(expected, found=", ".join(units)[:80], fix=FIX)
     unit = next(iter(units.values()))
-    confidences = find_confidences(paths)
-    if unit is None or (unit_key == "integer_depth_scale" and not integers):
-        return DepthFiles(paths, confidences=confidences)
+    integers = all(path.suffix.lower() in _INTEGERS for path in paths.values())
+    if unit is None or (key == "integer_depth_scale" and not integers):
+        return None
     if isinstance(unit, bool) or not isinstance(unit, int | float) or not 0 < unit < math.inf:
-        expected = f"{unit_key} above 0 in {files.path}"
-        raise SceneFormatError(expected, found=repr(unit)[:80], fix=FIX)
-    return DepthFiles(paths, "z", 1 / unit, confidences=confidences)
+        raise SceneFormatError(f"{key} above 0 in {files.path}", found=repr(unit)[:80], fix=FIX)
+    return unit

@@ -118,11 +118,13 @@ def read_transforms_scene(path: StrPath) -> Scene:
     )
     frames = {i.name: f.fields for i, f in zip(images, transforms.frames, strict=True)}
     masks, gone = named_masks(FrameFiles(path), frames)
-    notes = [*transforms.warnings, *notes, *gone, *image_warnings(images, folder, path.parent)]
+    depths, lost = named_depths(FrameFiles(path), frames, transforms.json)
+    notes = [*transforms.warnings, *notes, *gone, *lost]
+    notes += image_warnings(images, folder, path.parent)
     scene = Scene(
         points, images, transforms.intrinsics, source=source,
         warnings=(*notes, *lens_warnings(images)),
-        depths=named_depths(FrameFiles(path), frames, transforms.json),
+        depths=depths,
         listed=transforms.listed,
         masks=Masks(masks) if masks else None, absent=transforms.absent,
     )  # fmt: skip
