@@ -53,7 +53,7 @@ class Settings:
     jobs: int = os.cpu_count() or 1
     """Runs at a time, on one thread each."""
     ledger: Path = Path("seeding.jsonl")
-    """Where results are kept, a line a run."""
+    """Where results are kept, a line a run; seeds in a folder of the same name beside it."""
 
 
 def run(key: Key, scenes: Path, ledger: Path) -> None:
@@ -63,7 +63,7 @@ def run(key: Key, scenes: Path, ledger: Path) -> None:
     result = call(
         "benchmarks.training.seeding_arms:train", threads=1, scene=str(scenes / scene), arm=arm,
         strategy=strategy, rho=rho, max_steps=max_steps, data_factor=data_factor, seed=seed,
-        every=every,
+        every=every, kept=str(ledger.resolve().with_suffix(".seeds")),
     )  # fmt: skip
     write_line(ledger, key, result)
     say(f"  {scene}, {arm}, {strategy}: {result['psnr']:.2f} dB")

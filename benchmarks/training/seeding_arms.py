@@ -19,8 +19,10 @@ import numpy as np
 import torch
 
 import splatseed as ss
+from splatseed.io.staging import atomic_file
 from splatseed.methods import configure
 from splatseed.pointcloud import PointCloud
+from splatseed.runtime.fingerprint import fingerprint
 from splatseed.scene import Scene, Split
 from splatseed.seeding.poses import random_start
 from splatseed.sfm import refined
@@ -98,12 +100,14 @@ HELD_STEP = 3
 
 def train(
     scene: str, arm: str, strategy: str, rho: float, max_steps: int, data_factor: int, seed: int,
-    every: int,
-) -> dict[str, float]:  # fmt: skip
+    every: int, kept: str | None = None,
+) -> dict[str, Any]:  # fmt: skip
     """One run, from every ``every``-th of the training photographs by name.
 
     Scores, Gaussians, seeds, and seconds: of seeding and of training by the clock, of training by
-    the processor, and ``whole_processor``, from the scene in memory to the last step.
+    the processor, and ``whole_processor``, from the scene in memory to the last step; the scores in
+    the course of the run are its ``curve``. The folder ``kept`` holds seeds of earlier runs, whose
+    seconds count all the same.
     """
     whole = ss.load_scene(Path(scene))
     validation = validation_split(whole, every, HELD_STEP * seed % TEST_EVERY)
@@ -114,16 +118,17 @@ def train(
         strategy=strategy, max_steps=max_steps, data_factor=data_factor, seed=seed,
         cap_max=cap, test_every=TEST_EVERY, backend="cpu", seeding="scene",
     )  # fmt: skip
-    start, begun = time.perf_counter(), time.process_time()
-    points = _seeds(validation, arm, settings)
-    seeding = time.perf_counter() - start
+    plan = settings.max_seeds(cap), max_steps, data_factor, seed, every
+    key = fingerprint(Path(scene).name, _how(arm), *plan)
+    file = Path(kept) / f"{key}.npz" if kept else None
+    points, seeding, seeding_processor = _known_seeds(validation, arm, settings, file)
+    begun = time.process_time() - seeding_processor
     with tempfile.TemporaryDirectory() as folder:
         run = prepare_run(validation.replace(points=points), Path(folder) / "run", settings)
         begin.set_opacities(run.state.params["opacities"], points.confidence)
         before = time.process_time()
         curve = Curve(run.trainer, begun)
         run.train(curve.on_step)
-        processor, whole = curve.last - before, curve.last - begun
     scores = evaluate_views(run.trainer.render, run.trainer.test_views)
     return {
         "psnr": scores.psnr,
@@ -134,8 +139,8 @@ def train(
         "points": int(validation.points.distinct.sum()),
         "seeding": seeding,
         "seconds": run.state.watch.seconds,
-        "processor": processor,
-        "whole_processor": whole,
+        "processor": curve.last - before,
+        "whole_processor": curve.last - begun,
         "curve": curve.points,
     }
 
@@ -182,12 +187,40 @@ def validation_split(whole: Scene, every: int, first: int) -> Scene:
     return validation.replace(images=(*shown, *held), listed=split)
 
 
+def _how(arm: str) -> dict[str, Any]:
+    """How an arm's seeds are made, without how training starts from them."""
+    return {name: value for name, value in ARMS[arm].items() if name != "start"}
+
+
+def _known_seeds(
+    scene: Scene, arm: str, settings: TrainSettings, file: Path | None
+) -> tuple[PointCloud, float, float]:
+    """The seeds of a run, from a file of an earlier one if there is one.
+
+    Also returns the seconds that making them took, by the clock and by the processor.
+    """
+    if file is not None and file.is_file():
+        with np.load(file) as arrays:
+            values = {name: arrays[name] for name in arrays.files}
+        seconds, processor = values.pop("seconds")
+        return PointCloud(**values), float(seconds), float(processor)
+    start, begun = time.perf_counter(), time.process_time()
+    points = _seeds(scene, arm, settings)
+    took = time.perf_counter() - start, time.process_time() - begun
+    if file is not None:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        arrays = {"xyz": points.xyz, "rgb": points.rgb, "source": points.source}
+        with atomic_file(file) as partial, partial.open("wb") as opened:
+            np.savez(opened, **arrays, **points.attributes, seconds=np.array(took))
+    return points, *took
+
+
 def _seeds(scene: Scene, arm: str, settings: TrainSettings) -> PointCloud:
     """The points that a run begins with, thinned where there are more than may be trained.
 
     Photographs are compared at the size at which ``splatseed train`` compares them.
     """
-    chosen = {name: value for name, value in ARMS[arm].items() if name != "start"}
+    chosen = _how(arm)
     if "random" in chosen:
         return random_start(scene, np.random.default_rng(settings.seed), chosen["random"])
     if not chosen.pop("points", True):
