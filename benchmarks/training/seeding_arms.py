@@ -156,24 +156,21 @@ class Curve:
     def __init__(self, trainer: Trainer, begun: float) -> None:
         self.points: list[tuple[int, float, float, float]] = []
         """Step, seconds by the processor, PSNR, SSIM."""
-        self._begun, self._scoring, self._at = begun, 0.0, begun
-        self._pass_on, trainer.on_record = trainer.on_record, self._on_record
-
-    @property
-    def last(self) -> float:
+        self.last = begun
         """The clock at the last step, scoring left out."""
-        return self._at - self._scoring
+        self._begun, self._scoring = begun, 0.0
+        self._pass_on, trainer.on_record = trainer.on_record, self._on_record
 
     def on_step(self, _: int) -> None:
         """Note the time of a step."""
-        self._at = time.process_time()
+        self.last = time.process_time() - self._scoring
 
     def _on_record(self, record: Record) -> None:
         if record.test_psnr is not None and record.test_ssim is not None:
             seconds = round(self.last - self._begun, 2)
             self.points.append((record.step, seconds, record.test_psnr, record.test_ssim))
         self._pass_on(record)
-        self._scoring += time.process_time() - self._at
+        self._scoring = time.process_time() - self.last
 
 
 def validation_split(whole: Scene, every: int, first: int) -> Scene:

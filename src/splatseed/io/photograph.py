@@ -98,6 +98,9 @@ def decode_photograph(path: Path, encoded: bytes, white: int = WHITE) -> PilImag
         if has_alpha(photograph):
             black = PilImage.new("RGBA", photograph.size, (0, 0, 0, 255))
             return PilImage.alpha_composite(black, photograph.convert("RGBA")).convert("RGB")
+        if photograph.mode == "RGB":  # converting would copy it, which takes as long as decoding
+            photograph.load()
+            return photograph
         return photograph.convert("RGB")
 
 
