@@ -42,6 +42,18 @@ def test_a_scene_written_elsewhere_finds_the_same_maps(export, tmp_path):
     assert len(maps.confidences) == len(scene.images)
 
 
+def test_depth_named_as_frames(export):
+    """Some versions of the app write EXR files named as the photographs are."""
+    for path in export.glob("depth_*.png"):
+        metres = np.asarray(PilImage.open(path)) / np.float32(1000)
+        np.save(path.with_name(f"frame_{path.stem[-5:]}.npy"), metres)
+        path.unlink()
+    depths = load(export).depths
+    assert {path.suffix for path in depths.paths.values()} == {".npy"}
+    assert len(depths.confidences) == 9
+    assert depths.read("frame_00006.jpg").confidence.max() == 2
+
+
 def test_frames_without_a_photograph_or_a_pose_are_left_out(export):
     (export / "frame_00003.jpg").unlink()
     (export / "frame_00006.jpg").unlink()

@@ -10,6 +10,7 @@ import pytest
 pytest.importorskip("torch", reason="scoring needs PyTorch")
 
 from splatseed.photos.view import camera_views
+from splatseed.pointcloud import PointCloud
 from splatseed.splat.covisible import find_covisible, pixel_masks, read_covisible, write_covisible
 
 
@@ -37,6 +38,19 @@ def test_covisible_pixels_match_the_true_depth_and_round_trip(sixteen_views, tmp
     (tmp_path / "a.npz").write_bytes(b"PK nonsense")
     assert read_covisible(tmp_path / "a.npz") is None
     assert read_covisible(tmp_path / "none.npz") is None
+
+
+@pytest.mark.parametrize("kind", ["rgbd", "phone"])
+def test_a_sensors_depth_needs_no_points(sixteen_views, kind):
+    capture, scene = sixteen_views
+    train, test = (camera_views(part) for part in scene.split(8))
+    depths = {i.name: depth for i, depth in zip(scene.images, capture.depths, strict=True)}
+    bare = scene.replace(points=PointCloud.empty())
+    assert find_covisible(bare.with_depths(depths), 8) == {}
+    sensed = bare.replace(source=replace(scene.source, format=kind)).with_depths(depths)
+    masks = pixel_masks(find_covisible(sensed, 8), test)
+    agree = [(masks[v.name] == _truth(depths, v, train)).mean() for v in test]
+    assert np.mean(agree) > 0.95
 
 
 def test_pixels_without_training_views_are_excluded(sixteen_views):

@@ -4,9 +4,9 @@
 ``a/b.jpg``, the stems ``a/b.jpg``, ``a/b.jpg.geometric`` and ``.photometric`` (COLMAP's dense
 stereo), ``a/depthN`` for ``a/frameN.jpg`` (NICE-SLAM; 3D Scanner App's have ``_`` before the
 number), ``a/X.depth`` for ``a/X.color.png`` (7-Scenes), ``a/b`` and ``a/b_depth`` are tried in this
-order, each with ``SUFFIXES``. The confidence of ``depth_N.png`` is ``conf_N.png``, that of
-``depth/b.png`` is ``confidence/b.png`` beside the folder. Promise: maps are float32 with NaN where
-unknown; reading is thread-safe.
+order, each with ``SUFFIXES``. The confidence of ``depth_N.png`` or ``frame_N.exr`` is
+``conf_N.png``, that of ``depth/b.png`` is ``confidence/b.png`` beside the folder. Promise: maps are
+float32 with NaN where unknown; reading is thread-safe.
 """
 
 from __future__ import annotations
@@ -169,10 +169,10 @@ def find_confidences(paths: Mapping[str, Path]) -> dict[str, Path]:
     """Find the confidence files of depth maps by image name; images without one are left out."""
     found = dict[str, Path]()
     for name, path in paths.items():
-        captured = _CAPTURED.fullmatch(path.stem)
-        beside = path.with_name(f"{path.stem.lower().replace('depth', 'conf')}.png")
-        folder = path.parent.parent / _CONFIDENCE_FOLDER
-        places = [*([beside] if captured else []), folder / f"{path.stem}.png"]
+        places = [path.parent.parent / _CONFIDENCE_FOLDER / f"{path.stem}.png"]
+        if number := _CAPTURED.fullmatch(path.stem) or _FRAME.fullmatch(path.stem):
+            separator = "_" if "_" in path.stem else ""
+            places.insert(0, path.with_name(f"conf{separator}{number[1]}.png"))
         if file := next((place for place in places if place.is_file()), None):
             found[name] = file
     return found

@@ -2,9 +2,10 @@
 
 A frame N (five digits) has ``frame_N.json`` with ``cameraPoseARFrame`` (row-major 4 x 4, ARKit's
 ``world_from_cam``) and ``intrinsics`` (row-major K in pixels of the photograph), a photograph
-``frame_N.jpg`` if it is a key frame, ``depth_N.png`` (planar z, 16-bit millimetres) and
-``conf_N.png`` (ARKit's levels 0 to 2). Source: the app's exports; ``projectionMatrix`` in the same
-file tells the size that ``intrinsics`` belong to, and that half a pixel is to be added.
+``frame_N.jpg`` if it is a key frame, ``depth_N.png`` (planar z, 16-bit millimetres; in some
+versions ``frame_N.exr``, metres) and ``conf_N.png`` (ARKit's levels 0 to 2). Source: the app's
+exports; ``projectionMatrix`` in the same file tells the size that ``intrinsics`` belong to, and
+that half a pixel is to be added.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from splatseed.scene import Scene
 from splatseed.text import agreeing, counted
 
 _RECORD = re.compile(r"frame_\d{5,}\.json")
-_PHOTOGRAPH = re.compile(r"frame_\d{5,}\.(?:jpe?g|heic|png)", re.IGNORECASE)
+_PHOTOGRAPH = re.compile(r"frame_\d{5,}\.(?:jpe?g|png)", re.IGNORECASE)
 _ROUNDING = 0.05
 """Pixels by which a size from float32 matrices may differ from a whole number."""
 

@@ -1,7 +1,7 @@
 """Find the pixels of test views that at least two training views see.
 
 Other pixels can only be guessed. Images are divided into the cells of ``photos.zbuffer``. A cell's
-depth is that of the scene's depth map, else of ``cell_depths``, else the median of the nearest
+depth is that of the sensor's depth map, else of ``cell_depths``, else the median of the nearest
 cells. A training view sees a point that projects into it and lies at most ``SURFACE`` (relative)
 behind the depth there. The result does not depend on renders: it is the same for all models of a
 scene.
@@ -63,7 +63,8 @@ def find_covisible(
     """
     points = scene.points.references
     xyz = np.ascontiguousarray(points.xyz[points.finite], np.float32)
-    maps = scene.depths if scene.source and scene.source.format == "rgbd" else None
+    sensed = scene.source is not None and scene.source.format in {"rgbd", "phone"}
+    maps = scene.depths if sensed else None
     if not scene.images or (maps is None and not len(xyz)):
         return {}
     train, test = (_small_views(part, maps) for part in scene.split(test_every))
@@ -112,7 +113,7 @@ def _depths(
     """Return the planar depth of each cell, gaps filled; all infinite without any depth."""
     if maps is None:
         depths = cell_depths(view.camera, xyz, _cell(view))
-    else:  # RGB-D captures have planar depth
+    else:  # a sensor's depth is planar, in the scene's unit
         values = _resized(maps.read(view.name).values, *grid_shape(view.camera, _cell(view)))
         depths = np.nan_to_num(values, nan=np.inf)
     known = np.isfinite(depths)
