@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -22,6 +23,7 @@ from splatseed.io.staging import check_output
 from splatseed.runtime.torch_device import DeviceName
 from splatseed.scene import Masks
 from splatseed.sfm import MatcherName, Settings, SfmReport, reconstruct
+from splatseed.sfm.first_look import FIRST_LOOK, STAGE
 from splatseed.sfm.photos import pick_frames
 from splatseed.text import counted, name_some, quoted, visible
 
@@ -40,9 +42,9 @@ class Options:
     refine_poses: bool = False
     """Refine the poses of --poses-from first, such as those of a phone or SLAM, which are off by a
     degree or two."""
-    matcher: MatcherName | None = None
-    """Match all pairs of images (the default for photographs), or each image with the next (the
-    default for a video)."""
+    matcher: MatcherName = "auto"
+    """Match all pairs of images (exhaustive), each image with the next ones by name (sequential),
+    or the pairs that a first look at few features finds to overlap (auto)."""
     frames: int = 150
     """Maximum frames from a video."""
     camera_model: str = "OPENCV"
@@ -105,8 +107,7 @@ def _from_video(options: Options, video: Path, clock: StageClock) -> SfmReport:
 
 def _from_photographs(options: Options, images: Path, clock: StageClock) -> SfmReport:
     video = images != options.images
-    matcher = options.matcher or ("sequential" if video else "exhaustive")
-    settings = Settings(matcher, options.device, seed=options.seed, threads=options.threads)
+    settings = Settings(options.matcher, options.device, seed=options.seed, threads=options.threads)
     masks: Masks | None = None
     if options.poses_from is None:
         stages = ["mapping"]
@@ -121,7 +122,6 @@ def _from_photographs(options: Options, images: Path, clock: StageClock) -> SfmR
         for note in (each for each in poses.warnings if RECENTER in each):
             print_note(note)
         how = {"poses_from": poses, "refine_poses": options.refine_poses}
-    clock.expect("features", "matching", *stages, "undistortion")
     named = options.poses_from is not None and poses.masks is not None and poses.masks.files
     if named:
         masks = poses.masks
@@ -137,7 +137,7 @@ def _from_photographs(options: Options, images: Path, clock: StageClock) -> SfmR
         overwrite=options.overwrite,
         on_progress=clock,
         on_note=print_note,
-        on_photos=partial(_tell_photographs, options, clock),
+        on_photos=partial(_tell_photographs, options, clock, stages),
         **how,
     )
 
@@ -145,15 +145,19 @@ def _from_photographs(options: Options, images: Path, clock: StageClock) -> SfmR
 def _tell_photographs(
     options: Options,
     clock: StageClock,
+    stages: Sequence[str],
     names: Sequence[str],
     left_out: Mapping[str, Sequence[str]],
     cameras: str,
 ) -> None:
     """Print the images that are read, since subfolders may hold images of other scenes."""
     images, number = options.images, len(names)
-    clock.count(number, "photographs", "features")
-    if options.matcher != "sequential" and not is_video(images):
-        clock.count(number * (number - 1) // 2, "pairs", "matching")
+    chosen = options.matcher == "auto" and number > FIRST_LOOK.max_exhaustive
+    look = [STAGE] if chosen and options.poses_from is None else []
+    clock.expect("features", *look, "matching", *stages, "undistortion")
+    clock.count(number, "photographs", "features", STAGE)
+    if options.matcher != "sequential" and not chosen:
+        clock.count(math.comb(number, 2), "pairs", "matching")
     if is_video(images):
         return
     folders = Counter(str(PurePosixPath(name).parent) for name in names)
@@ -168,6 +172,7 @@ def _tell_photographs(
 
 def _summarise(options: Options, report: SfmReport) -> None:
     rows = [
+        ("pairs matched", f"{report.num_pairs:,} of {math.comb(report.total, 2):,}"),
         ("images with a pose", f"{report.registered} of {report.total}"),
         ("points", f"{report.num_points:,}"),
         ("track length", f"mean {report.mean_track_length:.2f} images"),

@@ -8,7 +8,7 @@ from __future__ import annotations
 import importlib
 import math
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,7 +26,7 @@ from splatseed.sfm.cameras import SharedCamera
 from splatseed.sfm.work_folder import DATABASE, MODELS, WorkFolder
 from splatseed.text import counted, name_some
 
-MatcherName: TypeAlias = Literal["exhaustive", "sequential"]
+MatcherName: TypeAlias = Literal["auto", "exhaustive", "sequential"]
 T = TypeVar("T")
 
 _MIN_VERSION = 4  # the first that adds an image with its rig in one call
@@ -40,7 +40,9 @@ _COMPLETE = "complete"  # file that marks a finished folder of models
 class Settings:
     """Settings of feature detection, matching and reconstruction; validated."""
 
-    matcher: MatcherName = "exhaustive"  # sequential: with successors by name, for video
+    matcher: MatcherName = "auto"
+    """``auto`` matches pairs that agree at a first look, ``exhaustive`` all pairs, ``sequential``
+    each image with its successors by name."""
     device: DeviceName = "auto"  # of features and matching; the rest runs on the CPU
     max_image_size: int = 1600  # px; larger photographs are reduced for features
     seed: int = 0  # of RANSAC and bundle adjustment
@@ -111,6 +113,11 @@ class Run:
         """The feature database."""
         return (self.kept.folder if self.kept else self.work) / DATABASE
 
+    def num_pairs(self) -> int:
+        """Return the number of matched pairs, those without a match included."""
+        with self.pycolmap.Database.open(self.database) as database:
+            return len(database.read_two_view_geometry_num_inliers()[0])
+
     def stage(self, name: str, work: Callable[[], T], count: Callable[[], int], total: int) -> T:
         """Run ``work``, a blocking pycolmap call that releases the GIL, and report progress.
 
@@ -128,7 +135,7 @@ class Run:
             while not wait([future], _POLL_SECONDS).done:
                 self.on_progress(name, min(count() / max(total, 1), 1.0))
         self.on_progress(name, 1.0)
-        self.seconds[name] = time.perf_counter() - started
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - started
         try:
             return future.result()
         except Exception as error:  # pycolmap raises any C++ exception of its libraries
@@ -193,18 +200,28 @@ def _options(run: Run) -> Any:
     )
 
 
-def map_images(run: Run, names: Sequence[str], camera_model: str, *, partial: bool) -> Path:
+def map_images(
+    run: Run,
+    names: Sequence[str],
+    camera_model: str,
+    match_further: Callable[[Collection[str]], bool] | None,
+    *,
+    partial: bool,
+) -> Path:
     """Estimate poses, lenses and points; return the folder of the model with the most images.
+
+    ``match_further`` matches further pairs of photographs without a pose, by name, and returns
+    whether some match; then mapping goes on. None if all pairs of the matcher are matched.
 
     Raises:
         ReconstructionError: No model, or one of fewer than half of the photographs while
             ``partial`` is False.
     """
     models_dir = (run.kept.folder if run.kept else run.work) / MODELS
-    models = _mapped(run, models_dir, len(names))
+    models = _mapped(run, models_dir, names, match_further)
     more = ["take more overlapping photographs", "remove those of other places"]
-    if run.settings.matcher != "exhaustive":
-        more.append("use the exhaustive matcher")
+    if match_further is not None or run.settings.matcher == "sequential":
+        more.append("match all pairs with `matcher='exhaustive'`")
     if camera_model not in _SIMPLE:
         more.append("use a simpler camera model such as SIMPLE_RADIAL")
     advice = f"{', '.join(more[:-1])} or {more[-1]}"
@@ -216,8 +233,8 @@ def map_images(run: Run, names: Sequence[str], camera_model: str, *, partial: bo
             found="no two that match well enough to start one",
             fix=f"{advice[0].upper()}{advice[1:]}.",
         )
-    best = max(models, key=lambda i: (models[i].num_reg_images(), models[i].num_points3D()))
-    found = {image.name for image in models[best].images.values() if image.has_pose}
+    best = _largest(models)
+    found = _posed(models[best])
     if 2 * len(found) < len(names) and not partial:
         raise errors.ReconstructionError(
             f"at least half of the {len(names)} photographs to get a pose",
@@ -229,28 +246,58 @@ def map_images(run: Run, names: Sequence[str], camera_model: str, *, partial: bo
     return models_dir / str(best)
 
 
-def _mapped(run: Run, models_dir: Path, total: int) -> dict[int, Any]:
+def _mapped(
+    run: Run,
+    models_dir: Path,
+    names: Sequence[str],
+    match_further: Callable[[Collection[str]], bool] | None,
+) -> dict[int, Any]:
     """Map images, or load the finished models of an earlier run; return models by number."""
     if (models_dir / _COMPLETE).exists():
         folders = (path for path in models_dir.iterdir() if path.is_dir())
         return {int(path.name): run.pycolmap.Reconstruction(path) for path in folders}
     remove(models_dir)
     models_dir.mkdir()
+    models = _map(run, models_dir, len(names))
+    best = _largest(models)
+    lost = sorted({*names} - _posed(models[best])) if models else list(names)
+    if lost and match_further is not None and match_further(lost):
+        if models:  # goes on from the largest model, whose photographs keep their matches
+            folder = models_dir / "further"
+            folder.mkdir()
+            (models[best],) = _map(run, folder, len(lost), models_dir / str(best)).values()
+            remove(models_dir / str(best))
+            folder.rename(models_dir / str(best))
+        else:
+            models = _map(run, models_dir, len(names))
+    (models_dir / _COMPLETE).touch()
+    return models
+
+
+def _map(run: Run, folder: Path, total: int, given: Path | None = None) -> dict[int, Any]:
+    """Map images to models in numbered folders, or extend a given model in ``folder`` itself."""
     registered: list[None] = []  # except initial pairs
     models: dict[int, Any] = run.stage(
-        "mapping",
+        "mapping" if given is None else "further mapping",
         lambda: run.pycolmap.incremental_mapping(
-            run.database,
-            run.image_dir,
-            models_dir,
-            _options(run),
+            *(run.database, run.image_dir, folder, _options(run)),
+            **({} if given is None else {"input_path": given}),
             next_image_callback=lambda: registered.append(None),
         ),
         lambda: len(registered),
         total,
     )
-    (models_dir / _COMPLETE).touch()
     return models
+
+
+def _largest(models: Mapping[int, Any]) -> int:
+    """Return the number of the model with the most images, then points."""
+    sizes = {i: (model.num_reg_images(), model.num_points3D()) for i, model in models.items()}
+    return max(sizes, key=lambda i: sizes[i], default=0)
+
+
+def _posed(model: Any) -> set[str]:
+    return {image.name for image in model.images.values() if image.has_pose}
 
 
 def triangulate_points(run: Run, poses: Sequence[Image], without: Collection[str] = ()) -> Path:

@@ -11,27 +11,81 @@ pair is two image ids. Promise: the matches of a pair depend neither on other pa
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, TypeAlias
+from typing import Any
 
 from splatseed.errors import SceneFormatError
 from splatseed.io.masks import write_masks
 from splatseed.scene import Masks
 from splatseed.sfm.colmap import Run
+from splatseed.sfm.first_look import (
+    FIRST_LOOK,
+    STAGE,
+    Agreement,
+    Pair,
+    choose_pairs,
+    further_pairs,
+    largest_features,
+    measure_agreement,
+    poorly_connected,
+)
 from splatseed.text import name_some
-
-Pair: TypeAlias = tuple[int, int]
 
 _BLOCK_PAIRS = 128
 """Matches are committed per block of as many pairs; as many photographs' features are in memory."""
 
 
-def match_photographs(run: Run, model: Any, masks: Masks | None = None) -> None:
-    """Fill the database with a model's images, features and verified matches."""
+def match_photographs(run: Run, model: Any, masks: Masks | None = None) -> Agreement | None:
+    """Fill the database with a model's images, features and verified matches.
+
+    Returns the agreement of photographs at a first look, if that chose the pairs.
+    """
     with run.pycolmap.Database.open(run.database) as database:
         detect_features(run, database, model, masks)
-        match_pairs(run, database, _pairs(run, database))
+        if run.settings.matcher != "auto" or len(model.images) <= FIRST_LOOK.max_exhaustive:
+            match_pairs(run, database, _pairs(run, database))
+            return None
+        ids = sorted(model.images)
+        started = time.perf_counter()
+        features = largest_features(database, ids)
+        agreement = measure_agreement(features, run.on_progress)
+        run.seconds[STAGE] = time.perf_counter() - started
+        match_pairs(run, database, [(ids[i], ids[j]) for i, j in choose_pairs(agreement)])
+        weak = poorly_connected(len(ids), _verified(run, database, ids))
+        _match_further(run, database, agreement, weak)
+    return agreement
+
+
+def match_further(run: Run, agreement: Agreement, names: Collection[str]) -> bool:
+    """Match further pairs of photographs that got no pose; return whether any was verified."""
+    with run.pycolmap.Database.open(run.database) as database:
+        images = sorted(database.read_all_images(), key=lambda image: image.image_id)
+        lost = [i for i, image in enumerate(images) if image.name in names]
+        return _match_further(run, database, agreement, lost)
+
+
+def _match_further(
+    run: Run, database: Any, agreement: Agreement, photographs: Iterable[int]
+) -> bool:
+    ids = sorted(image.image_id for image in database.read_all_images())
+    before = _verified(run, database, ids)
+    if pairs := further_pairs(agreement, photographs, before):
+        match_pairs(run, database, [(ids[i], ids[j]) for i, j in pairs], "further matching")
+    after = _verified(run, database, ids)
+    return any(after[pair] > 0 for pair in after.keys() - before)
+
+
+def _verified(run: Run, database: Any, ids: Sequence[int]) -> dict[Pair, int]:
+    """Return the number of verified matches of the pairs that were matched, by index."""
+    index = {image_id: i for i, image_id in enumerate(ids)}
+    pairs, counts = database.read_two_view_geometry_num_inliers()
+    of_id = run.pycolmap.pair_id_to_image_pair
+    return {
+        (index[min(pair)], index[max(pair)]): count
+        for pair, count in zip(map(of_id, pairs), counts, strict=True)
+    }
 
 
 def _pairs(run: Run, database: Any) -> list[Pair]:

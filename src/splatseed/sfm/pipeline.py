@@ -40,13 +40,14 @@ from splatseed.sfm import colmap
 from splatseed.sfm.cameras import SharedCamera, describe_cameras, share_cameras
 from splatseed.sfm.colmap import Run, Settings
 from splatseed.sfm.export import export_scene
-from splatseed.sfm.matching import match_photographs
+from splatseed.sfm.matching import match_further, match_photographs
 from splatseed.sfm.photos import find_photos, match_poses
 from splatseed.sfm.refinement import Refinement, refine
 from splatseed.sfm.work_folder import WorkFolder, resumable_work, work_key
 
 OnPhotos: TypeAlias = Callable[[Sequence[str], Mapping[str, Sequence[str]], str], None]
 _DEFAULT = Settings()
+_CHILD = {"OPENBLAS_NUM_THREADS": "1"}  # our threads and NumPy's own would wait for each other
 _REASON = re.compile(r"what\(\):\s*(.*)|^[EF]\d{8}\s.*?\]\s*(.*)", re.MULTILINE)
 
 
@@ -64,6 +65,7 @@ class SfmReport:
     seconds: Mapping[str, float]  # wall time by stage, in order
     refinement: Refinement | None = None  # None without ``refine_poses``
     poses: tuple[Image, ...] = ()  # the known poses, refined with ``refine_poses``
+    num_pairs: int = 0  # matched pairs of photographs
 
 
 Job: TypeAlias = Callable[..., SfmReport]
@@ -187,15 +189,16 @@ def _reconstruct(
     refinement = None
     if poses is None:
         model = colmap.guessed_model(run, cameras, camera_model)
-        match_photographs(run, model, masks)
-        model_dir = colmap.map_images(run, names, camera_model, partial=partial)
+        agreement = match_photographs(run, model, masks)
+        further = None if agreement is None else lambda lost: match_further(run, agreement, lost)
+        model_dir = colmap.map_images(run, names, camera_model, further, partial=partial)
     else:
         match_photographs(run, colmap.posed_model(run.pycolmap, poses), masks)
         if refine_poses:
             poses, refinement = refine(run, poses)
         model_dir = colmap.triangulate_points(run, poses, test_names)
     _export(run, model_dir, staging, masks)
-    report = _report(run, staging, names)
+    report = replace(_report(run, staging, names), num_pairs=run.num_pairs())
     return replace(report, refinement=refinement, poses=tuple(poses or ()))
 
 
@@ -331,7 +334,7 @@ def _call(
     """Run a job in a child process."""
     log = staging / ".work" / "log.txt"
     call = (_work, images, staging, settings, kept, job, arguments)
-    with closing(Child(*call, reports=True, log=log.open("w+b"))) as child:
+    with closing(Child(*call, reports=True, environment=_CHILD, log=log.open("w+b"))) as child:
         try:
             report: SfmReport = child.result(progress)
         except errors.TaskLostError as error:
