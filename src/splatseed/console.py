@@ -106,6 +106,10 @@ class StageClock:
             self._bar.start_task(self._tasks[stage])
             self._bar.update(self._tasks[stage], completed=fraction)
 
+    def announce(self, sentence: str) -> None:
+        """Print a sentence above the bars, before long work."""
+        ERR.print(visible(with_options(sentence)), soft_wrap=True)
+
     def expect(self, *stages: str) -> None:
         """Show stages that are still to come."""
         for stage in stages:

@@ -57,7 +57,8 @@ def add_points(
         )
     else:
         chosen, kind = method, type(method)
-        name = next((each for each in METHODS if METHODS[each] is kind), kind.__name__)
+        known = (each for each in METHODS if METHODS[each] is kind)
+        name = next(known, getattr(chosen, "name", kind.__name__))
     num_new = number_of_new(chosen, name, len(originals), ratio, num_points)
     check_seed(seed)
     rng = np.random.default_rng(seed)

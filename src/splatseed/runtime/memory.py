@@ -109,6 +109,12 @@ def _of_container() -> int | None:
     return None
 
 
+def resident_bytes() -> int | None:
+    """Return the memory that this process holds now, in bytes; None if unknown (not on Linux)."""
+    kilobytes = _field("/proc/self/status", "VmRSS:")
+    return None if kilobytes is None else kilobytes * 1024
+
+
 def peak_bytes() -> int | None:
     """Return the peak memory of this process in bytes; None if unknown.
 

@@ -28,6 +28,7 @@ from splatseed.scene import Image, Scene
 from splatseed.settings import Range, check_settings
 
 if TYPE_CHECKING:
+    from splatseed.depth.stereo.fusion import StereoSeeds
     from splatseed.depth.stereo.maps import StereoMap, StereoResult
 
 MAX_SIZE = 800
@@ -61,6 +62,9 @@ class Stereo(PhotographMethod):
     """Pixels between seeds in the photographs; at least the grid."""
     grid: Annotated[int, Range(1, MAX_GRID)] = 4
     """Pixels between depths, along a row and a column."""
+    dense: bool = True
+    """Under a budget, make as many seeds as it allows where photographs confirm them; else thin
+    those that are `spacing` apart."""
 
     name: ClassVar[str] = "stereo"
 
@@ -81,9 +85,9 @@ class Stereo(PhotographMethod):
         self, scene: Scene, num_new: int, rng: np.random.Generator, progress: Progress
     ) -> NewPoints:
         """Make the points of a scene; ``num_new`` is ignored."""
-        return self._with_stereo(scene, rng, progress)[0]
+        return self.run(scene, rng, progress)[0]
 
-    def _with_stereo(
+    def run(
         self, scene: Scene, rng: np.random.Generator, progress: Progress
     ) -> tuple[NewPoints, StereoResult]:
         """Make the new points and return stereo's result besides.
@@ -106,12 +110,19 @@ class Stereo(PhotographMethod):
         stereo = compare(scene, images, views, self.grid, rng, progress)
         seeds = fuse(stereo, self.spacing, progress)
         found = _stereo_note(scene, stereo, time.perf_counter() - start)
-        source = np.full(len(seeds), source_code("stereo"), np.uint8)
-        new = NewPoints(
-            seeds.xyz, seeds.rgb, (*found, *warnings), seeds.normals, seeds.sizes,
-            seeds.confidence, source, stereo,
-        )  # fmt: skip
-        return new, stereo
+        new = stereo_points(seeds, (*found, *warnings), stereo)
+        return self.fill(scene, new, stereo.views, rng, progress), stereo
+
+    def fill(
+        self,
+        scene: Scene,
+        seeds: NewPoints,
+        views: Sequence[View],
+        rng: np.random.Generator,
+        progress: Progress,
+    ) -> NewPoints:
+        """Add seeds where stereo found none; this method adds none."""
+        return seeds
 
 
 @dataclass(frozen=True)
@@ -147,18 +158,30 @@ class Auto(Stereo):
 
     name: ClassVar[str] = "auto"
 
-    def _with_stereo(
-        self, scene: Scene, rng: np.random.Generator, progress: Progress
-    ) -> tuple[NewPoints, StereoResult]:
+    def fill(
+        self,
+        scene: Scene,
+        seeds: NewPoints,
+        views: Sequence[View],
+        rng: np.random.Generator,
+        progress: Progress,
+    ) -> NewPoints:
         """Add a seed in every cell that stereo leaves empty."""
-        seeds, stereo = super()._with_stereo(scene, rng, progress)
         known = PointCloud.concatenate(scene.points.originals, PointCloud(seeds.xyz, seeds.rgb))
-        gaps = _cover(stereo.views, known, self.cell, rng, progress)
+        gaps = _cover(views, known, self.cell, rng, progress)
         arrays: dict[str, Any] = {
             name: np.concatenate([getattr(seeds, name), getattr(gaps, name)])
             for name in ("xyz", "rgb", "normals", "sizes", "confidence", "source")
         }
-        return seeds._replace(**arrays), stereo
+        return seeds._replace(**arrays)
+
+
+def stereo_points(seeds: StereoSeeds, notes: tuple[str, ...], stereo: StereoResult) -> NewPoints:
+    """Return stereo's seeds as new points."""
+    source = np.full(len(seeds), source_code("stereo"), np.uint8)
+    return NewPoints(
+        seeds.xyz, seeds.rgb, notes, seeds.normals, seeds.sizes, seeds.confidence, source, stereo
+    )
 
 
 def has_points(scene: Scene) -> bool:

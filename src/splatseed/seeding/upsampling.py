@@ -30,9 +30,11 @@ from splatseed.scene import Scene
 from splatseed.seeding.advice import DEFAULT_METHOD, method_for
 from splatseed.seeding.budget import points_within
 from splatseed.seeding.coverage import covered_share
+from splatseed.seeding.dense import WithinBudget
 from splatseed.seeding.photo_methods import (
     CELL,
     MAX_SIZE,
+    Stereo,
     frames_of,
     photographed,
     read_views,
@@ -67,6 +69,7 @@ def upsample(
     profile: Profile = "default",
     progress: Progress = silent,
     note: Note = lambda _: None,
+    announce: Note | None = None,
     on_stereo: Callable[[StereoResult], None] | None = None,
     **parameters: Any,
 ) -> PointCloud:
@@ -83,7 +86,8 @@ def upsample(
             themselves and accept neither.
         num_points: Points in all, instead of ``ratio``.
         budget: Maximum number of points in all, or a string such as "0.25rho" for Gaussians per
-            pixel of one photograph. It may be below the number of originals.
+            pixel of one photograph. It may be below the number of originals. "auto" and "stereo"
+            make up to that many where photographs confirm them (``dense=False``: only thin).
         cover: Side in pixels of the photographs' cells that get a seed if they hold no point.
         verify: Slide interpolated points onto the surface that the photographs show, and drop those
             that no photograph confirms.
@@ -93,6 +97,8 @@ def upsample(
         profile: "default", or "paper" for the parameters and equations of the paper's text.
         progress: Called with the stage and the fraction done.
         note: Called with a sentence for each thing that was replaced or left out.
+        announce: Called with a sentence before work whose time and memory depend on the budget;
+            ``note`` if left out.
         on_stereo: Called with stereo's depth maps and views if the method compares photographs and
             the budget leaves room for new points.
         parameters: Fields of the method, such as ``k=12``.
@@ -116,13 +122,7 @@ def upsample(
         >>> len(seeds), seeds.num_original
         (800, 100)
     """
-    if not isinstance(scene, Scene | PointCloud):
-        raise ParameterError(
-            "`scene` as a Scene or a PointCloud",
-            found=type(scene).__name__,
-            fix="Load it first with load_scene.",
-        )
-    scene = at_file_size(scene) if isinstance(scene, Scene) else Scene(scene)
+    scene = _as_scene(scene)
     check_seed(seed)
     if added := len(scene.points) - scene.points.num_original:
         verb = agreeing(added, "is", "are")
@@ -139,9 +139,13 @@ def upsample(
     options: dict[str, Any] = {"seed": seed, "progress": progress, "note": note}
     # Measured points come first, so that the method fills the gaps between them.
     first = None if extra_method is None else add_points(scene, extra_method, **options)
+    base = scene if first is None else _with_measured(scene, first, method)
+    if limit is not None and isinstance(chosen, Stereo) and chosen.dense:
+        parameters = {} if isinstance(method, str) else parameters  # an object takes none
+        method, profile = WithinBudget(chosen, limit, announce or note), "default"
     cloud = add_points(
-        scene if first is None else _with_measured(scene, first, method), method, ratio=ratio,
-        num_points=num_points, profile=profile, on_stereo=on_stereo, **options, **parameters,
+        base, method, ratio=ratio, num_points=num_points, profile=profile, on_stereo=on_stereo,
+        **options, **parameters,
     )  # fmt: skip
     if first is not None:
         cloud = PointCloud.concatenate(first, cloud.select(cloud.source != ORIGINAL))
@@ -155,6 +159,19 @@ def upsample(
     if limit is not None:
         cloud = thin_to(scene, cloud, limit, chosen, seed, progress, cell=cover)
     return cloud
+
+
+def _as_scene(scene: Scene | PointCloud) -> Scene:
+    """Return a scene with cameras in pixels of the photographs' files; of a cloud without any."""
+    if isinstance(scene, PointCloud):
+        return Scene(scene)
+    if not isinstance(scene, Scene):
+        raise ParameterError(
+            "`scene` as a Scene or a PointCloud",
+            found=type(scene).__name__,
+            fix="Load it first with load_scene.",
+        )
+    return at_file_size(scene)
 
 
 def _thin_full_scene(

@@ -53,7 +53,7 @@ def seeded(
     stereo: list[StereoResult] = []
     cloud = upsample(
         scene,
-        Auto(test_every=settings.test_every, max_size=size),
+        Auto(test_every=settings.test_every, max_size=size, dense=False),
         budget=None if settings.cap is None else settings.max_seeds(settings.cap),
         progress=progress,
         note=note,

@@ -84,7 +84,7 @@ def _upsample(options: Options, methods: dict[str, Any]) -> None:
         seeds = upsample(
             scene, method, num_points=total, budget=options.budget, cover=options.cover_cell,
             verify=options.verify, extra_method=extra_method, seed=options.seed, progress=clock,
-            note=notes.append,
+            note=notes.append, announce=clock.announce,
         )  # fmt: skip
         seeded = scene.with_points(seeds)
         clock("check", 0.0)

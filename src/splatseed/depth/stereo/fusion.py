@@ -1,10 +1,16 @@
 """Fuse the maps of all views to one seed per piece of surface.
 
+Each view is divided into square cells. A pixel becomes a seed unless its cell, in its own view or
+in one that confirms it, already has a seed at that depth. Pixels come view by view, the most
+confident first. Cells may have several sizes, the *levels* (see ``detail``): each pixel then has
+the level of its surroundings.
+
 Promise: seeds lie on confirmed depths only; the same maps give the same bytes.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -13,6 +19,7 @@ from jaxtyping import Float32, Float64, Int32, Int64, UInt8
 from splatseed.depth.stereo._kernels.agreement import occupy_cells
 from splatseed.depth.stereo.maps import StereoResult, block_means
 from splatseed.depth.stereo.quads import other_from_view
+from splatseed.photos.view import View
 from splatseed.progress import Progress, silent
 
 SAME_DEPTH = 0.03
@@ -43,63 +50,92 @@ class StereoSeeds:
         return len(self.xyz)
 
 
+@dataclass(frozen=True, eq=False)
+class CellGrids:
+    """The cells of all views at all levels, and the seeds in them."""
+
+    cells: Float64[np.ndarray, " L"]  # side of a cell at each level, in pixels
+    offsets: Int64[np.ndarray, "V L"]  # start of each view's cells at each level
+    columns: Int64[np.ndarray, "V L"]  # cells in a row
+    occupied: Float32[np.ndarray, " C"]  # inverse depth of the seed in each cell, 0 without
+
+    @classmethod
+    def of(cls, views: Sequence[View], cells: Sequence[float]) -> CellGrids:
+        """Cells without seeds."""
+        sides = np.array(cells, np.float64)
+        columns, rows = (
+            (np.array([getattr(view, side) for view in views])[:, None] / sides).astype(int) + 1
+            for side in ("width", "height")
+        )
+        starts = np.cumsum([0, *(rows * columns).ravel()])
+        occupied = np.zeros(starts[-1], np.float32)
+        return cls(sides, starts[:-1].reshape(rows.shape), columns, occupied)
+
+    def mark(self, i: int, uv: Float64[np.ndarray, "M 2"], z: Float64[np.ndarray, " M"]) -> None:
+        """Occupy the cells of view i, at all levels, at these pixels and depths."""
+        for level, side in enumerate(self.cells):
+            column, row = (uv / side).astype(np.int64).T
+            self.occupied[self.offsets[i, level] + row * self.columns[i, level] + column] = 1.0 / z
+
+    def choose(
+        self,
+        stereo: StereoResult,
+        i: int,
+        order: Int32[np.ndarray, " P"],
+        levels: UInt8[np.ndarray, "h w"],
+    ) -> Int32[np.ndarray, " M"]:
+        """Choose the pixels of view i that become seeds; occupies their cells in all views."""
+        others = stereo.sources[i]
+        matrices: Float64[np.ndarray, "K 3 4"] = np.zeros((len(others), 3, 4))
+        for k, j in enumerate(others.tolist()):
+            if j >= 0:
+                matrices[k] = other_from_view(stereo.views[i], stereo.views[j])
+        chosen = np.zeros(len(order), np.bool_)
+        occupy_cells(
+            order, levels, stereo.planes[i], stereo.agreeing[i], i, others, matrices,
+            stereo.settings.grid, self.cells, SAME_DEPTH, self.occupied, self.offsets,
+            self.columns, chosen,
+        )  # fmt: skip
+        return np.asarray(order[chosen])
+
+
 def fuse(stereo: StereoResult, cell: float, progress: Progress = silent) -> StereoSeeds:
     """Choose seeds from confirmed pixels, about ``cell`` pixels apart in the photographs.
-
-    A pixel becomes a seed unless its cell in its own view, or in one that confirms it, already has
-    a seed at that depth. Seeds come view by view, the most confident first.
 
     Args:
         stereo: The result of stereo.
         cell: Side of a cell in pixels of the views; not below the grid of the maps.
         progress: Called with the stage and the fraction done.
     """
-    cell = max(float(cell), float(stereo.settings.grid))
-    shapes = np.array(
-        [(int(view.height / cell) + 1, int(view.width / cell) + 1) for view in stereo.views]
-    )
-    offsets = np.cumsum([0, *shapes.prod(axis=1)])
-    occupied = np.zeros(offsets[-1], np.float32)
+    grids = CellGrids.of(stereo.views, [max(float(cell), float(stereo.settings.grid))])
     parts = []
     for i in range(len(stereo.views)):
-        chosen = _choose_pixels(stereo, i, cell, occupied, offsets, shapes)
-        parts.append(_make_seeds(stereo, i, chosen, cell))
+        levels = np.zeros(stereo.costs[i].shape, np.uint8)
+        chosen = grids.choose(stereo, i, by_confidence(stereo, i), levels)
+        parts.append(make_seeds(stereo, i, chosen, grids.cells[levels.ravel()[chosen]]))
         progress("fuse depths", (i + 1) / len(stereo.views))
-    arrays = {
-        f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(StereoSeeds)
-    }
-    return StereoSeeds(**arrays)
+    return concatenate(parts)
 
 
-def _choose_pixels(
-    stereo: StereoResult,
-    i: int,
-    cell: float,
-    occupied: Float32[np.ndarray, " C"],
-    offsets: Int64[np.ndarray, " V+1"],
-    shapes: Int64[np.ndarray, "V 2"],
-) -> Int64[np.ndarray, " M"]:
-    """Choose the pixels of view i that become seeds; occupies their cells in all views."""
+def concatenate(parts: Sequence[StereoSeeds]) -> StereoSeeds:
+    """Join the seeds of all views."""
+    return StereoSeeds(
+        **{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(StereoSeeds)}
+    )
+
+
+def by_confidence(stereo: StereoResult, i: int) -> Int32[np.ndarray, " P"]:
+    """Confirmed pixels of view i, row * w + column, the most confident first."""
     confidence = stereo.confidence(i).ravel()
-    # The most confident pixel takes its cell first; pixels at 0 are not confirmed.
+    # Pixels at 0 are not confirmed.
     order = np.argsort(-confidence, kind="stable")[: np.count_nonzero(confidence)]
-    others = stereo.sources[i]
-    matrices: Float64[np.ndarray, "K 3 4"] = np.zeros((len(others), 3, 4))
-    for k, j in enumerate(others.tolist()):
-        if j >= 0:
-            matrices[k] = other_from_view(stereo.views[i], stereo.views[j])
-    chosen = np.zeros(len(order), np.bool_)
-    occupy_cells(
-        order, stereo.planes[i], stereo.agreeing[i], i, others, matrices, stereo.settings.grid,
-        cell, SAME_DEPTH, occupied, offsets, shapes, chosen,
-    )  # fmt: skip
-    return np.asarray(order[chosen])
+    return order.astype(np.int32)
 
 
-def _make_seeds(
-    stereo: StereoResult, i: int, chosen: Int64[np.ndarray, " M"], cell: float
+def make_seeds(
+    stereo: StereoResult, i: int, chosen: Int32[np.ndarray, " M"], cells: Float64[np.ndarray, " M"]
 ) -> StereoSeeds:
-    """Seeds at the chosen pixels of view i."""
+    """Seeds at the chosen pixels of view i, whose cells have these sides in pixels."""
     view, grid = stereo.views[i], stereo.settings.grid
     width = stereo.costs[i].shape[1]
     row, column = chosen // width, chosen % width
@@ -111,7 +147,7 @@ def _make_seeds(
         view.camera.unproject(uv, z).astype(np.float32),
         block_means(view.photograph, grid)[row, column],
         normals.astype(np.float32),
-        (cell * z / view.K[0, 0]).astype(np.float32),
+        (cells * z / view.K[0, 0]).astype(np.float32),
         stereo.confidence(i)[row, column],
         np.full(len(chosen), i, np.int32),
     )

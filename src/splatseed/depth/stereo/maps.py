@@ -105,6 +105,7 @@ class StereoResult:
         costs: Of each view, float32 [h, w].
         agreeing: Bit k is set where source k of a view confirms its depth, uint8 [h, w] of each.
         sources: The views that each was compared with, best first, int64 [V, K]; -1 = none.
+        bounds: Smallest and largest inverse depth of each view's search, float32 [V, 2].
         settings: The settings.
     """
 
@@ -113,6 +114,7 @@ class StereoResult:
     costs: list[Float32[np.ndarray, "h w"]]
     agreeing: list[UInt8[np.ndarray, "h w"]]
     sources: Int64[np.ndarray, "V K"]
+    bounds: Float32[np.ndarray, "V 2"]
     settings: StereoSettings
 
     def confirmed(self, i: int) -> Bool[np.ndarray, "h w"]:

@@ -47,6 +47,7 @@ class _InitialPlanes:
     num_fitted: int = 8  # nearest points that a plane is fitted to
     num_random: int = 16  # candidates where a view sees fewer points than that
     margin: float = 1.3  # depth ranges extend beyond the points by this factor
+    first_sweep: int = 2  # known planes are perturbed as little as in that sweep of others
     ridge: float = 1e-3  # shrinks slopes, relative to the points' spread: they may be collinear
 
 
@@ -60,6 +61,8 @@ class DepthPrior:
     uv: Float64[np.ndarray, "M 2"]  # pixels of the points that it sees
     w: Float64[np.ndarray, " M"]  # their inverse depths
     bounds: Float32[np.ndarray, " 2"]  # smallest and largest inverse depth of the search
+    planes: Float32[np.ndarray, "3 h w"] | None = None  # of an earlier comparison, in view pixels
+    step: float = 0.0  # pixels between these planes
 
     @classmethod
     def from_points(
@@ -81,6 +84,8 @@ def initial_planes(
 ) -> Float32[np.ndarray, "K 3 h w"]:
     """Candidate planes for each grid point, random where the view sees too few points."""
     rows, columns = shape
+    if prior.planes is not None:
+        return _nearest_planes(prior.planes, prior.step, shape, grid)
     w = prior.w
     if len(w) < INITIAL.num_fitted:
         low, high = prior.bounds
@@ -112,6 +117,30 @@ def _fit_planes(
     outside = (fitted[0] < low / INITIAL.margin) | (fitted[0] > high * INITIAL.margin)
     fitted[:, outside] = [w[outside].mean(axis=1), np.zeros(outside.sum()), np.zeros(outside.sum())]
     return np.asarray(fitted)
+
+
+def _nearest_planes(
+    planes: Float32[np.ndarray, "3 h w"], step: float, shape: tuple[int, int], grid: int
+) -> Float32[np.ndarray, "4 3 rows columns"]:
+    """Extrapolate the four nearest planes of a coarser grid to each point of a finer one."""
+    # Pixel (q + 0.5) grid lies at (q + 0.5) grid / step - 0.5 in units of the coarser grid.
+    places = [(np.arange(n) + 0.5) * grid for n in shape]
+    cells = [np.floor(place / step - 0.5).astype(np.int64) for place in places]
+    out = np.empty((4, 3, *shape), np.float32)
+    for k in range(4):
+        ends = planes.shape[1:]
+        row, column = (
+            np.clip(cell + (k >> axis & 1), 0, end - 1)
+            for axis, (cell, end) in enumerate(zip(cells, ends, strict=True))
+        )
+        down, across = (
+            (place - (at + 0.5) * step).astype(np.float32)
+            for place, at in zip(places, (row, column), strict=True)
+        )
+        w, gx, gy = planes[:, row[:, None], column]
+        # w(u, v) = w0 + gx (u - u0) + gy (v - v0)
+        out[k] = w + gx * across + gy * down[:, None], gx, gy
+    return out
 
 
 def check_stereo_memory(views: Sequence[View], settings: StereoSettings) -> None:
@@ -170,7 +199,9 @@ def match_views(
     in_threads(work, len(views), 1, "compare photographs", progress)
     planes, costs = [pair[0] for pair in matched], [pair[1] for pair in matched]
     agreeing = _confirm_all(views, planes, costs, sources, settings, progress)
-    return StereoResult(tuple(views), planes, costs, agreeing, sources, settings)
+    unknown = np.full(2, np.nan, np.float32)
+    bounds = np.stack([unknown if prior is None else prior.bounds for prior in priors])
+    return StereoResult(tuple(views), planes, costs, agreeing, sources, bounds, settings)
 
 
 def _match_view(
@@ -192,7 +223,8 @@ def _match_view(
         view, greys[i], [views[j] for j in others], [greys[j] for j in others], grid, prior.bounds
     )
     initialise(quad_images, initial_planes(prior, shape, grid, rng), planes, costs)
-    for number in range(settings.sweeps):
+    first = 0 if prior.planes is None else INITIAL.first_sweep
+    for number in range(first, first + settings.sweeps):
         for color in range(2):
             key = rng.integers(1 << 63, dtype=np.uint64)
             red_black_sweep(quad_images, color, number, key, planes, costs)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from splatseed.runtime.jit import inline
+from splatseed.runtime.jit import always_inline, inline
 
 
 @inline
@@ -67,50 +67,67 @@ def _agrees(x, y, depth, grid, planes, costs, max_cost, tolerance):
 
 @inline
 def occupy_cells(
-    order, planes, agreeing, own, others, matrices, grid, cell, same, occupied, offsets, shapes, out
-):
+    order, levels, planes, agreeing, own, others, matrices, grid, cells, same, occupied, offsets,
+    columns, out,
+):  # fmt: skip
     """Choose pixels of a view greedily: one per cell of every view that sees it at that depth.
 
+    Each view is divided into cells of several sizes, the *levels*. A pixel needs a free cell at its
+    own level, and occupies its cells at all levels.
+
     Args:
-        order: Pixels of the view, row * w + column, by priority, int64 [P].
+        order: Pixels of the view, row * w + column, by priority, [P].
+        levels: Of each pixel of the view, uint8 [h, w].
         planes: Of the view, float32 [3, h, w].
         agreeing: Bit k is set where view ``others[k]`` confirms the depth, uint8 [h, w].
         own: Number of the view.
         others: Numbers of the views it was compared with, int64 [K].
         matrices: ``j_from_i`` of these views, float64 [K, 3, 4].
         grid: Pixels between grid points.
-        cell: Side of a cell in pixels.
+        cells: Side of a cell at each level in pixels, float64 [L].
         same: Relative difference of depth up to which a cell counts as occupied.
         occupied: Inverse depth of the seed in each cell of all views, 0 where there is none,
             float32 [C], updated in place.
-        offsets: Start of each view's cells, int64 [V + 1].
-        shapes: Rows and columns of each view's cells, int64 [V, 2].
+        offsets: Start of each view's cells at each level, int64 [V, L].
+        columns: Cells in a row, likewise, int64 [V, L].
         out: Whether each pixel of ``order`` is chosen, bool [P].
     """
     width = agreeing.shape[1]
     num = len(others)
-    cells, inverses = np.zeros(num + 1, np.int64), np.zeros(num + 1, np.float32)
+    views, inverses = np.zeros(num + 1, np.int64), np.zeros(num + 1, np.float32)
+    x, y = np.zeros(num + 1), np.zeros(num + 1)
     for n in range(len(order)):
         row, column = order[n] // width, order[n] % width
         w = planes[0, row, column]
         u, v = (column + 0.5) * grid, (row + 0.5) * grid
-        cells[0], inverses[0] = offsets[own] + int(v / cell) * shapes[own, 1] + int(u / cell), w
+        views[0], x[0], y[0], inverses[0] = own, u, v, w
         count = 1
         for k in range(num):
             # Its cell in each view that confirms it: a surface must not get a seed per view.
             if agreeing[row, column] >> np.uint8(k) & 1:
-                m, j, z = matrices[k], others[k], 1.0 / w
+                m, z = matrices[k], 1.0 / w
                 depth = (m[2, 0] * u + m[2, 1] * v + m[2, 2]) * z + m[2, 3]
-                x = ((m[0, 0] * u + m[0, 1] * v + m[0, 2]) * z + m[0, 3]) / depth
-                y = ((m[1, 0] * u + m[1, 1] * v + m[1, 2]) * z + m[1, 3]) / depth
-                cells[count] = offsets[j] + int(y / cell) * shapes[j, 1] + int(x / cell)
+                views[count] = others[k]
+                x[count] = ((m[0, 0] * u + m[0, 1] * v + m[0, 2]) * z + m[0, 3]) / depth
+                y[count] = ((m[1, 0] * u + m[1, 1] * v + m[1, 2]) * z + m[1, 3]) / depth
                 inverses[count] = 1.0 / depth
                 count += 1
+        level = levels[row, column]
         free = True
         for k in range(count):
+            cell = _cell(views[k], level, x[k], y[k], cells, offsets, columns)
             # 0 marks a free cell, as 0 / w is far from 1.
-            free = free and not abs(occupied[cells[k]] / inverses[k] - 1.0) <= same
+            free = free and not abs(occupied[cell] / inverses[k] - 1.0) <= same
         if free:
             out[n] = True
             for k in range(count):
-                occupied[cells[k]] = inverses[k]
+                for each in range(len(cells)):
+                    cell = _cell(views[k], each, x[k], y[k], cells, offsets, columns)
+                    occupied[cell] = inverses[k]
+
+
+@always_inline
+def _cell(view, level, x, y, cells, offsets, columns):
+    """Index of the cell of a view that holds a pixel, at one level."""
+    side = cells[level]
+    return offsets[view, level] + int(y / side) * columns[view, level] + int(x / side)

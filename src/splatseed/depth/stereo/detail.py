@@ -1,0 +1,230 @@
+"""Seeds in proportion to detail: as many as asked for, closest together where contrast is high.
+
+Notation: the *contrast* of a pixel is the mean length of the grey gradient around it, relative to
+the median over all confirmed pixels. At a *spacing* of s pixels, a pixel of contrast c has cells of
+side s c^-e/2, within limits: e = 1 puts seeds in proportion to contrast, as
+Structure-from-Motion's points are, e = 0 evenly. Sides are rounded to *levels*, s times powers of
+sqrt(2) and the limits; level 0 has the largest cells.
+
+Promise: seeds lie on confirmed depths only; the same maps give the same bytes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int32, UInt8
+from scipy.ndimage import uniform_filter
+
+from splatseed.depth.stereo.fusion import (
+    CellGrids,
+    StereoSeeds,
+    by_confidence,
+    concatenate,
+    make_seeds,
+)
+from splatseed.depth.stereo.maps import StereoResult
+from splatseed.depth.stereo.quads import grey_image
+from splatseed.progress import Progress, silent
+
+Placed = tuple[Float64[np.ndarray, "M 2"], Float64[np.ndarray, " M"]]
+"""Pixels of points in a view, and their depths."""
+
+
+@dataclass(frozen=True)
+class _DetailSettings:
+    """How seeds follow detail, and the search for the spacing."""
+
+    exponent: float = 1.0  # e: seeds per area ~ contrast^e
+    floor: float = 0.5  # grey levels per pixel, added to every gradient: noise is no detail
+    every: int = 7  # of the confirmed pixels, one in so many is used for the median contrast
+    tolerance: float = 0.02  # share of the seeds asked for that may be missing
+    num_bisections: int = 30  # of the expected spacing
+    share_finest: float = 0.1  # of the seeds, whose cells determine the grid
+    max_steps: int = 12  # spacings tried
+    finest: float = 1.0 / 64  # smallest spacing tried, relative to the largest cell
+
+
+DETAIL = _DetailSettings()
+
+
+@dataclass(frozen=True, eq=False)
+class Levels:
+    """Sides of cells from the largest down to the grid; those between are a factor apart."""
+
+    sides: Float64[np.ndarray, " L"]
+    spacing: float
+    highest: int  # the second side is spacing * 2^(highest / 2)
+
+    @classmethod
+    def of(cls, spacing: float, largest: float, smallest: float) -> Levels:
+        """Levels at a spacing, within limits; all in pixels."""
+        low, high = (2 * math.log2(limit / spacing) for limit in (smallest, largest))
+        steps = np.arange(math.ceil(high) - 1, math.floor(low), -1)
+        sides = np.array([largest, *(spacing * 2.0 ** (steps / 2)), smallest])
+        return cls(sides, spacing, math.ceil(high) - 1)
+
+    def of_contrast(self, contrast: Float32[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
+        """Level of each pixel."""
+        step = np.rint(-DETAIL.exponent * np.log2(contrast))  # 2 log2(side / spacing)
+        return np.asarray(np.clip(self.highest + 1 - step, 0, len(self.sides) - 1), np.uint8)
+
+
+def find_contrast(stereo: StereoResult, radius: float) -> list[Float32[np.ndarray, "h w"]]:
+    """Contrast of each grid point of all views, over a square of ``2 radius`` pixels."""
+    grid = stereo.settings.grid
+    size = max(1, round(2 * radius / grid))
+    found = []
+    for view in stereo.views:
+        gradients = _gradient_length(grey_image(view.photograph))
+        rows, columns = (side // grid for side in gradients.shape)
+        blocks = gradients[: rows * grid, : columns * grid].reshape(rows, grid, columns, grid)
+        means = uniform_filter(blocks.mean(axis=(1, 3)), size, mode="nearest")
+        found.append(means + np.float32(DETAIL.floor))
+    pixels = np.concatenate([c[stereo.confirmed(i)][:: DETAIL.every] for i, c in enumerate(found)])
+    median = np.float32(np.median(pixels)) if len(pixels) else np.float32(1)
+    return [c / median for c in found]
+
+
+def side_of(contrast: Float32[np.ndarray, "..."], spacing: float) -> Float32[np.ndarray, "..."]:
+    """Side of the cells of pixels of some contrast, without limits."""
+    return np.asarray(spacing * contrast ** np.float32(-DETAIL.exponent / 2), np.float32)
+
+
+def expected_spacing(stereo: StereoResult, num: int, largest: float) -> tuple[float, float]:
+    """Estimate the spacing at which ``num`` seeds are chosen, in pixels of the views.
+
+    Every seed at the grid's spacing stands for a square of surface, which holds one over the square
+    of its cells' side times as many; the grid limits nothing.
+
+    Args:
+        stereo: The result of stereo.
+        num: Number of seeds.
+        largest: Side of the largest cells in pixels.
+
+    Returns:
+        The spacing, and the side of cells that a tenth of the seeds fall below; 0 without seeds.
+    """
+    grid = float(stereo.settings.grid)
+    contrasts = find_contrast(stereo, largest / 2)
+    grids, found = CellGrids.of(stereo.views, [grid]), []
+    for i, contrast in enumerate(contrasts):
+        levels = np.zeros(contrast.shape, np.uint8)
+        found.append(contrast.ravel()[grids.choose(stereo, i, by_confidence(stereo, i), levels)])
+    contrast = np.concatenate(found)
+    if not len(contrast):
+        return 0.0, 0.0
+    low, high = DETAIL.finest * grid, largest / DETAIL.finest
+    for _ in range(DETAIL.num_bisections):
+        spacing = math.sqrt(low * high)
+        sides = np.minimum(side_of(contrast, spacing), largest)
+        low, high = (low, spacing) if (grid**2 / sides**2).sum() < num else (spacing, high)
+    seeds = 1 / sides**2
+    order = np.argsort(sides)
+    finest = order[np.searchsorted(np.cumsum(seeds[order]), DETAIL.share_finest * seeds.sum())]
+    return spacing, float(sides[finest])
+
+
+def fuse_at_most(
+    stereo: StereoResult,
+    num: int,
+    largest: float,
+    known: Sequence[Placed],
+    spacing: float,
+    progress: Progress = silent,
+) -> StereoSeeds:
+    """Choose at most ``num`` seeds from confirmed pixels, in proportion to detail.
+
+    Args:
+        stereo: The result of stereo.
+        num: Most seeds; about as many are chosen if so many pixels are confirmed. There are more
+            only if there are more of the largest cells.
+        largest: Side of the largest cells in pixels of the views.
+        known: Points that each view sees already: their cells get no seed.
+        spacing: A guess of the spacing, from which the search starts.
+        progress: Called with the stage and the fraction done.
+    """
+    chosen = _Search(stereo, largest, known, progress).run(num, spacing)
+    each = enumerate(zip(chosen.pixels, chosen.sides, strict=True))
+    return concatenate([make_seeds(stereo, i, pixels, sides) for i, (pixels, sides) in each])
+
+
+@dataclass(frozen=True, eq=False)
+class _Choice:
+    """The pixels of each view that become seeds at a spacing, and the sides of their cells."""
+
+    pixels: list[Int32[np.ndarray, " M"]]
+    sides: list[Float64[np.ndarray, " M"]]
+    all_largest: bool  # no larger spacing gives fewer
+    all_smallest: bool  # no smaller spacing gives more
+
+    def __len__(self) -> int:
+        return sum(map(len, self.pixels))
+
+
+class _Search:
+    """The spacing at which about a number of seeds is chosen."""
+
+    def __init__(
+        self, stereo: StereoResult, largest: float, known: Sequence[Placed], progress: Progress
+    ) -> None:
+        self.stereo, self.known, self.progress = stereo, known, progress
+        self.largest = max(largest, float(stereo.settings.grid))
+        self.contrast = find_contrast(stereo, largest / 2)
+        self.orders = [by_confidence(stereo, i) for i in range(len(stereo.views))]
+        self.num_done = 0
+
+    def choose(self, spacing: float) -> _Choice:
+        """Choose the pixels that become seeds at a spacing."""
+        levels = Levels.of(spacing, self.largest, float(self.stereo.settings.grid))
+        grids = CellGrids.of(self.stereo.views, levels.sides.tolist())
+        for i, (uv, z) in enumerate(self.known):
+            grids.mark(i, uv, z)
+        pixels, sides, limits = [], [], []
+        for i, order in enumerate(self.orders):
+            level = levels.of_contrast(self.contrast[i])
+            pixels.append(grids.choose(self.stereo, i, order, level))
+            sides.append(levels.sides[level.ravel()[pixels[-1]]])
+            limits += [level.min(), level.max()] if level.size else []
+            # The number of spacings is not known before: each fills half of what is left.
+            share = 1 - 0.5**self.num_done * (1 - 0.5 * (i + 1) / len(self.orders))
+            self.progress("fuse depths", share)
+        self.num_done += 1
+        last = len(levels.sides) - 1
+        return _Choice(pixels, sides, max(limits) == 0, min(limits) == last)
+
+    def run(self, num: int, spacing: float) -> _Choice:
+        """Find the smallest spacing that gives at most ``num`` seeds, to ``tolerance``."""
+        low, high = DETAIL.finest * self.largest, self.largest / DETAIL.finest
+        spacing = min(max(spacing, low), high)
+        best: _Choice | None = None
+        for _ in range(DETAIL.max_steps):
+            chosen = self.choose(spacing)
+            if len(chosen) > num:
+                low = spacing
+                if chosen.all_largest:
+                    best = chosen
+                    break
+            else:
+                best, high = chosen, spacing
+                if len(chosen) >= (1 - DETAIL.tolerance) * num or chosen.all_smallest:
+                    break
+            # number ~ 1 / spacing^2 on surfaces; fewer where cells are at a limit already
+            target = (1 - DETAIL.tolerance / 2) * num
+            guess = spacing * math.sqrt(max(len(chosen), 1) / target)
+            spacing = guess if low < guess < high else math.sqrt(low * high)
+        best = self.choose(high) if best is None else best
+        self.progress("fuse depths", 1.0)
+        return best
+
+
+def _gradient_length(grey: UInt8[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"]:
+    """Length of the gradient by central differences, grey levels per pixel; 0 at the border."""
+    image = grey.astype(np.float32)
+    across, down = np.zeros_like(image), np.zeros_like(image)
+    across[:, 1:-1] = (image[:, 2:] - image[:, :-2]) / 2
+    down[1:-1] = (image[2:] - image[:-2]) / 2
+    return np.hypot(across, down)
