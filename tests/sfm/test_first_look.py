@@ -13,6 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from splatseed.progress import silent, thread_limit
 from splatseed.sfm import Settings, first_look, matching
 from splatseed.sfm.colmap import Run, map_images, posed_model, require_pycolmap
+from splatseed.sfm.database import run_database
 from splatseed.sfm.first_look import (
     FIRST_LOOK,
     choose_pairs,
@@ -126,7 +127,7 @@ def run(room, tmp_path):
 
 def test_the_largest_features_are_read(run):
     run, model = run
-    with run.pycolmap.Database.open(run.database) as database:
+    with run_database(run, model) as database:
         matching.detect_features(run, database, model)
         (features,) = largest_features(database, [3])
         keypoints, all_features = database.read_keypoints(3), database.read_descriptors(3).data

@@ -10,7 +10,8 @@ import pytest
 from splatseed.progress import silent
 from splatseed.sfm import Settings
 from splatseed.sfm.colmap import Run, posed_model, require_pycolmap
-from splatseed.sfm.matching import detect_features, match_pairs, match_photographs
+from splatseed.sfm.database import run_database
+from splatseed.sfm.matching import detect_features, match_pairs
 
 pycolmap = pytest.importorskip("pycolmap")
 
@@ -39,7 +40,7 @@ def test_a_list_of_pairs_is_matched_as_by_pycolmap_and_none_twice(run):
     run, model = run
     progress = []
     object.__setattr__(run, "on_progress", lambda *step: progress.append(step))
-    with pycolmap.Database.open(run.database) as database:
+    with run_database(run, model) as database:
         detect_features(run, database, model)
         names = {image.image_id: image.name for image in database.read_all_images()}
         match_pairs(run, database, [(1, 2), (2, 4)])
@@ -59,16 +60,3 @@ def test_a_list_of_pairs_is_matched_as_by_pycolmap_and_none_twice(run):
             device=pycolmap.Device.cpu,
         )
         assert (matches(database, (1, 2)), matches(database, (2, 4))) == first
-
-
-def test_names_are_restored_after_a_kill(run):
-    run, model = run
-    with pycolmap.Database.open(run.database) as database:
-        detect_features(run, database, model)
-        image = database.read_image(1)
-        image.name = "1"
-        database.update_image(image)
-    match_photographs(run, model)
-    with pycolmap.Database.open(run.database) as database:
-        assert database.read_image(1).name == model.image(1).name
-        assert database.num_matched_image_pairs() == 6

@@ -60,6 +60,9 @@ class Options:
     """Worker threads; -1 = all cores."""
     partial: bool = False
     """Write the scene even if fewer than half of the photographs get a pose."""
+    resume: bool = False
+    """Keep features and matches in OUTPUT_sfm after success, too, and use them in later runs with
+    further photographs or other options; after a failure, the same command resumes without it."""
     overwrite: bool = False
     """Replace an output folder that splatseed wrote before."""
 
@@ -140,6 +143,7 @@ def _from_photographs(options: Options, images: Path, clock: StageClock) -> SfmR
         options.output,
         settings,
         masks=masks,
+        resume=options.resume,
         overwrite=options.overwrite,
         on_progress=clock,
         on_note=print_note,

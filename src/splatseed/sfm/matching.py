@@ -1,10 +1,5 @@
 """Features of photographs, and their verified matches, in the database of a run.
 
-Images and cameras are written before features are detected, so that ids are ours: camera i has rig
-i, image i has frame i, counted from 1. Progress is read from the database through pycolmap:
-Python's sqlite3 is another copy of SQLite, and two copies in one process release each other's file
-locks, which corrupts the file.
-
 Notation: a ``model`` is a ``pycolmap.Reconstruction``, a ``database`` a ``pycolmap.Database``. A
 pair is two image ids. Promise: the matches of a pair depend neither on other pairs nor on threads.
 """
@@ -12,14 +7,14 @@ pair is two image ids. Promise: the matches of a pair depend neither on other pa
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Collection, Iterable, Sequence
 from typing import Any
 
 from splatseed.errors import SceneFormatError
 from splatseed.io.masks import write_masks
 from splatseed.scene import Masks
 from splatseed.sfm.colmap import Run
+from splatseed.sfm.database import numbered, run_database
 from splatseed.sfm.first_look import (
     FIRST_LOOK,
     STAGE,
@@ -42,7 +37,7 @@ def match_photographs(run: Run, model: Any, masks: Masks | None = None) -> Agree
 
     Returns the agreement of photographs at a first look, if that chose the pairs.
     """
-    with run.pycolmap.Database.open(run.database) as database:
+    with run_database(run, model) as database:
         detect_features(run, database, model, masks)
         if run.settings.matcher != "auto" or len(model.images) <= FIRST_LOOK.max_exhaustive:
             match_pairs(run, database, _pairs(run, database))
@@ -101,13 +96,12 @@ def _pairs(run: Run, database: Any) -> list[Pair]:
 
 
 def detect_features(run: Run, database: Any, model: Any, masks: Masks | None = None) -> None:
-    """Write a model's images and their features to the database, as far as they are missing."""
+    """Write the features of a model's images to the database, as far as they are missing."""
     pycolmap, settings = run.pycolmap, run.settings
     names = {image_id: image.name for image_id, image in sorted(model.images.items())}
     folder = run.work / "masks"
     write_masks(masks, run.image_dir, names.values(), folder)
     masked = {"mask_path": str(folder)} if folder.is_dir() else {}
-    _write_model(run, database, model)
     extraction = pycolmap.FeatureExtractionOptions(
         max_image_size=settings.max_image_size, num_threads=settings.threads
     )
@@ -131,25 +125,6 @@ def detect_features(run: Run, database: Any, model: Any, masks: Masks | None = N
         )
 
 
-def _write_model(run: Run, database: Any, model: Any) -> None:
-    """Write a model's cameras and images to the database, unless an earlier run did."""
-    if database.num_images() == len(model.images):
-        _rename(database, {i: image.name for i, image in model.images.items()})
-        if run.kept is not None and run.kept.stale_matches:
-            database.clear_two_view_geometries()
-            database.clear_matches()
-            for camera in model.cameras.values():
-                database.update_camera(camera)
-        return
-    database.clear_all_tables()  # may be incomplete after a kill
-    for camera_id, camera in sorted(model.cameras.items()):
-        database.write_camera(camera, use_camera_id=True)
-        database.write_rig(model.rig(camera_id), use_rig_id=True)
-    for image_id in sorted(model.images):
-        database.write_frame(model.frame(image_id), use_frame_id=True)
-        database.write_image(model.image(image_id), use_image_id=True)
-
-
 def match_pairs(run: Run, database: Any, pairs: Sequence[Pair], stage: str = "matching") -> None:
     """Match and verify distinct pairs of images whose features are in the database.
 
@@ -161,7 +136,7 @@ def match_pairs(run: Run, database: Any, pairs: Sequence[Pair], stage: str = "ma
     listed.write_text("".join(f"{a} {b}\n" for a, b in pairs), "ascii")
     matched = sum(database.exists_matches(*pair) for pair in pairs)
     others = database.num_matched_image_pairs() - matched
-    with _numbered(database):
+    with numbered(database):
         run.stage(
             stage,
             lambda: pycolmap.match_image_pairs(
@@ -178,25 +153,3 @@ def match_pairs(run: Run, database: Any, pairs: Sequence[Pair], stage: str = "ma
             lambda: database.num_matched_image_pairs() - others,
             len(pairs),
         )
-
-
-@contextmanager
-def _numbered(database: Any) -> Iterator[None]:
-    """Give the database's images their ids as names: in lists of pairs a name ends at a space.
-
-    After a kill, ``_write_model`` restores the names.
-    """
-    names = {image.image_id: image.name for image in database.read_all_images()}
-    _rename(database, {image_id: str(image_id) for image_id in names})
-    try:
-        yield
-    finally:
-        _rename(database, names)
-
-
-def _rename(database: Any, names: dict[int, str]) -> None:
-    for image_id, name in names.items():
-        image = database.read_image(image_id)
-        if image.name != name:
-            image.name = name
-            database.update_image(image)

@@ -85,6 +85,7 @@ def reconstruct(
     masks: Masks | None = None,
     partial: bool = False,
     keep: bool = True,
+    resume: bool = False,
     overwrite: bool = False,
     on_progress: Progress = silent,
     on_photos: OnPhotos | None = None,
@@ -115,6 +116,7 @@ def reconstruct(
         partial: Accept a model of fewer than half of the photographs.
         keep: On failure, keep features, matches and models in ``OUTPUT_sfm``, and resume from
             those of an earlier call (``sfm.work_folder``).
+        resume: Keep them on success as well, for calls with further photographs or other options.
         overwrite: Replace ``output`` if it exists.
         on_progress: Called with the stage and the fraction done.
         on_photos: Called before work starts with the photographs' names, the names of skipped
@@ -142,10 +144,14 @@ def reconstruct(
         if on_photos is not None:
             on_photos(list(photos), left_out, described)
         lenses = _lenses(cameras, camera_model, poses)
-        matching = (settings.matcher, settings.seed)
-        key = work_key(photos, lenses, masks, settings.max_image_size, matching)
+        key = work_key(
+            *(photos, lenses, masks, settings.seed),
+            features=[settings.max_image_size],
+            pairs=[settings.matcher, refine_poses],
+        )
         options = camera_model, poses, refine_poses, test_names, masks, partial
-        with resumable_work(Path(output), key, on_note) if keep else nullcontext() as kept:
+        work = resumable_work(Path(output), key, on_note, resume=resume)
+        with work if keep or resume else nullcontext() as kept:
             how = (images, staging, settings, on_progress, kept, _reconstruct)
             report = _call(*how, list(photos), cameras, *options)
         if poses_from is not None:

@@ -1,7 +1,12 @@
-"""Resumable work of a failed run: features, matches and models in ``OUTPUT_sfm``.
+"""Resumable work of a run: features, matches and models in ``OUTPUT_sfm``.
 
-The same command resumes it. With other settings of matching or lenses, features are reused; with
-other photographs, masks or camera groups, nothing is. A successful run removes the folder.
+The folder stays if a run fails or is killed, and the same command resumes from it. A successful run
+removes it, unless ``resume`` asks to keep it for further runs. Whatever still applies is used:
+features of each photograph whose file, mask and size are unchanged, matches of two such
+photographs, verified matches with the same cameras and seed, models with the same matcher.
+
+The *key* of a run fingerprints what these depend on. The manifest holds the key of what the folder
+contains, and names its images in the order of their ids.
 """
 
 from __future__ import annotations
@@ -21,38 +26,63 @@ from splatseed.text import quoted
 
 KIND = "sfm work"
 DATABASE, MODELS = "database.db", "models"
+_KEEP, _IMAGES = "keep", "images"  # further entries of the manifest
+
+
+class WorkKey(NamedTuple):
+    """Fingerprints of what the contents of a folder depend on."""
+
+    features: Mapping[str, str]  # by photograph
+    verified: str  # verified matches, given the features
+    models: str  # models, given all others
 
 
 class WorkFolder(NamedTuple):
-    """The folder, and whether its matches were made with other settings."""
+    """The folder, the key of the run, and what an earlier run left."""
 
     folder: Path
-    stale_matches: bool = False
+    key: WorkKey
+    unchanged: bool = False  # the database is of the same photographs and cameras
+    reusable: frozenset[str] = frozenset()  # photographs whose features and matches apply
+
+    @property
+    def image_names(self) -> list[str]:
+        """The names of the database's images by id, if a run has written them."""
+        names = read_manifest(self.folder).get(_IMAGES)
+        return names if isinstance(names, list) else []
+
+    def set_contents(self, image_names: Sequence[str]) -> None:
+        """Record that the database is of the run's photographs; names are in order of ids."""
+        _write(self.folder, self.key, {_IMAGES: list(image_names)})
 
 
 def work_key(
     photos: Photos,
     cameras: Iterable[tuple[Sequence[str], Intrinsics | str]],
     masks: Masks | None,
-    max_image_size: int,
-    matching: Sequence[object],
-) -> dict[str, str]:
-    """Fingerprint the inputs of features, and the further inputs of matches.
+    seed: int,
+    *,
+    features: Sequence[object] = (),
+    pairs: Sequence[object] = (),
+) -> WorkKey:
+    """Fingerprint the inputs of features, verified matches and models.
 
     Args:
         photos: The photographs.
         cameras: For each camera, the names of its photographs, and its intrinsics or model.
         masks: Their masks.
-        max_image_size: The size at which features are detected.
-        matching: Settings of pairs and their verification.
+        seed: The seed of verification and mapping.
+        features: Settings of features.
+        pairs: Settings of the choice of pairs.
     """
-    features: list[object] = [version("pycolmap"), max_image_size]
-    lenses = []
+    by_name, lenses = dict[str, str](), list[object]()
     for names, lens in cameras:
-        features += [(name, photos[name].digest, _mask_facts(masks, name)) for name in names]
-        features.append("another camera")
-        lenses.append(lens if isinstance(lens, str) else (lens.model, lens.params))
-    return {"features": _digest(features), "matches": _digest([*lenses, *matching])}
+        for name in names:
+            facts = (photos[name].digest, *_mask_facts(masks, name))
+            by_name[name] = _digest([version("pycolmap"), *features, *facts])
+        lenses += [*names, lens if isinstance(lens, str) else (lens.model, lens.params)]
+    verified = _digest([*lenses, seed])
+    return WorkKey(by_name, verified, _digest([*sorted(by_name.items()), verified, *pairs]))
 
 
 def _mask_facts(masks: Masks | None, name: str) -> tuple[object, ...]:
@@ -69,51 +99,74 @@ def _digest(facts: Sequence[object]) -> str:
 
 @contextmanager
 def resumable_work(
-    output: Path, key: Mapping[str, str], on_note: Callable[[str], None]
+    output: Path, key: WorkKey, on_note: Callable[[str], None], *, resume: bool = False
 ) -> Iterator[WorkFolder | None]:
     """Yield the work folder of an output; it is kept if the block fails after work started.
 
-    Yields None if the path is taken or another run has locked the folder.
+    ``resume`` keeps it after success as well, in this and later runs. Yields None if the path is
+    taken or another run has locked the folder.
     """
     target = output.resolve()
     folder = target.with_name(f"{target.name}_sfm")
-    if folder.exists() and read_manifest(folder).get("command") != KIND:
-        yield None
-        return
     with ExitStack() as stack:
-        folder.mkdir(exist_ok=True)
         try:
+            if folder.exists() and read_manifest(folder).get("command") != KIND:
+                raise FileExistsError
+            folder.mkdir(exist_ok=True)
             stack.enter_context(locked(folder))
         except OSError:
+            on_note(f"{quoted(folder)} is not free, so that nothing of this run can be kept.")
             yield None
             return
-        stale = _prepare(folder, key, lambda text: on_note(text.format(quoted(folder))))
+        resume = resume or bool(read_manifest(folder).get(_KEEP))
+        kept = _prepare(folder, key, on_note, keep=resume)
         try:
-            yield WorkFolder(folder, stale)
+            yield kept
         except BaseException as error:
             if not (folder / DATABASE).exists():
                 remove(folder)
             elif isinstance(error, KeyboardInterrupt):
                 on_note(f"The same command resumes from {quoted(folder)}.")
             raise
-        remove(folder)
+        if resume:
+            size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+            on_note(
+                f"Features and matches are kept in {quoted(folder)}, {size / 2**20:,.0f} MB, for "
+                "runs with further photographs or other options; it may be deleted."
+            )
+        else:
+            remove(folder)
 
 
-def _prepare(folder: Path, key: Mapping[str, str], on_note: Callable[[str], None]) -> bool:
-    """Remove content that does not match the key; return whether matches are stale."""
+def _prepare(
+    folder: Path, key: WorkKey, on_note: Callable[[str], None], *, keep: bool
+) -> WorkFolder:
+    """Find out what an earlier run left that applies, and remove models that do not."""
     before: Mapping[str, Any] = read_manifest(folder)
-    found = (folder / DATABASE).is_file()
-    stale = found and before.get("matches") != key["matches"]
-    if not found or before.get("features") != key["features"]:
-        stale = False
-        for name in (DATABASE, f"{DATABASE}-wal", f"{DATABASE}-shm", MODELS):
-            remove(folder / name)
-        if found:
-            on_note("The work in {} is of other photographs, masks or cameras: started again.")
-    elif stale:
+    old = before.get("features") if (folder / DATABASE).is_file() else {}
+    old = old if isinstance(old, dict) else {}
+    reusable = {name: each for name, each in key.features.items() if old.get(name) == each}
+    same = bool(old) and old == key.features
+    unchanged = same and before.get("verified") == key.verified
+    where, number, total = quoted(folder), len(reusable), len(key.features)
+    if not unchanged or before.get("models") != key.models:
         remove(folder / MODELS)
-        on_note("The features in {} are used; the settings of matches differ.")
-    else:
-        on_note("Resumes from the features, matches and models in {}.")
-    write_json(folder / MANIFEST, {"command": KIND, **key})
-    return stale
+    if unchanged and (folder / MODELS).is_dir():
+        on_note(f"Resumes from the features, matches and models in {where}.")
+    elif unchanged:
+        on_note(f"Resumes from the features and matches in {where}.")
+    elif reusable:
+        those = "The" if same else f"{number:,} of {total:,} photographs are as before: their"
+        on_note(f"{those} features and matches in {where} are used.")
+    elif old:
+        on_note(f"The work in {where} is of other photographs or masks: started again.")
+    # Until the database is of this run, the manifest vouches only for what both have in common.
+    now = key if unchanged else WorkKey(reusable, "", "")
+    images = {_IMAGES: before[_IMAGES]} if _IMAGES in before and (old or unchanged) else {}
+    _write(folder, now, {**images, **({_KEEP: True} if keep else {})})
+    return WorkFolder(folder, key, unchanged, frozenset(reusable))
+
+
+def _write(folder: Path, key: WorkKey, further: Mapping[str, object]) -> None:
+    kept = {_KEEP: True} if read_manifest(folder).get(_KEEP) else {}
+    write_json(folder / MANIFEST, {"command": KIND, **key._asdict(), **kept, **further})
