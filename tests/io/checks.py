@@ -11,10 +11,12 @@ from splatseed.camera import Intrinsics
 from splatseed.errors import SplatseedError
 from splatseed.io import colmap
 from splatseed.io.clouds import open_cloud
-from splatseed.io.depth_files import read_stored
+from splatseed.io.depth_files import read_confidence, read_stored
 from splatseed.io.depth_maps import read_capture_scale, read_description
 from splatseed.io.ply import read_ply
+from splatseed.io.polycam import _read_camera
 from splatseed.io.rgbd import _read_intrinsics, _read_list, _read_track
+from splatseed.io.scanner_app import _read_frame
 
 CAMERAS = (Intrinsics(1, "PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0)),)
 
@@ -27,12 +29,19 @@ def read_capture_camera(path):
     return read_capture_scale(path), _read_intrinsics(path)
 
 
+def read_scanner_frame(path):
+    return _read_frame(path, (96, 72))
+
+
 READERS = {
     **dict.fromkeys(("cameras.bin", "cameras.txt"), colmap.read_cameras),
     **dict.fromkeys(("images.bin", "images.txt"), read_images),
     **dict.fromkeys(("points3D.bin", "points3D.txt"), colmap.read_points3d),
     **dict.fromkeys(("little.ply", "big.ply", "ascii.ply"), read_ply),
     **dict.fromkeys(("a.bin", "a.npy", "a.npz", "a.pfm", "a.png", "a.tiff"), read_stored),
+    "conf_0.png": read_confidence,
+    "frame_00000.json": read_scanner_frame,
+    "camera.json": _read_camera,
     "depths.json": read_description,
     "cam_params.json": read_capture_camera,
     "rgb.txt": _read_list,

@@ -6,6 +6,7 @@ more than memory holds, and laspy looks for as many records as a header promises
 
 from __future__ import annotations
 
+import json
 import struct
 from contextlib import suppress
 from unittest.mock import Mock
@@ -84,6 +85,15 @@ def valid(tmp_path_factory) -> dict[str, bytes]:
     np.savez(folder / "a.npz", depth=array, kind="ray")
     PilImage.fromarray(array.astype(np.uint16)).save(folder / "a.png")
     PilImage.fromarray(array).save(folder / "a.tiff", compression="tiff_lzw")
+    PilImage.fromarray(np.array([[0, 1, 2], [2, 2, 0]], np.uint8)).save(folder / "conf_0.png")
+    K = [80, 0, 47.5, 0, 80, 35.5, 0, 0, 1]
+    projection = [2 * 80 / 96, 0, 0, 0, 0, 2 * 80 / 72, *[0] * 9, 1]
+    frame = {"cameraPoseARFrame": np.eye(4).ravel().tolist(), "intrinsics": K}
+    frame = json.dumps({**frame, "projectionMatrix": projection})
+    (folder / "frame_00000.json").write_text(frame)
+    rows = {f"t_{i}{j}": float(i == j) for i in range(3) for j in range(4)}
+    lens = {"fx": 80, "fy": 80, "cx": 48, "cy": 36, "width": 96, "height": 72}
+    (folder / "camera.json").write_text(json.dumps({**rows, **lens}))
     (folder / "depths.json").write_text('{"kind": "z", "scale": 2.5}')
     camera = '"w": 4, "h": 3, "fx": 5.5, "fy": 5, "cx": 2, "cy": 1.5, "scale": 2.5'
     (folder / "cam_params.json").write_text(f'{{"camera": {{{camera}}}}}')

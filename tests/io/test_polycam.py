@@ -69,6 +69,7 @@ def test_key_frames_without_a_photograph_or_a_camera_are_left_out(export):
         ({"width": 48.5}, "width and height in pixels in .*; found 48.5 x 72"),
         ({"cx": 1.0}, "a principal point near the middle of 96 x 72 pixels"),
         ({"fy": float("nan")}, "a finite number fy in "),
+        ({"fx": 10**400}, "a finite number fx in .*found inf"),
     ],
 )
 def test_malformed_cameras_are_named(export, fields, words):

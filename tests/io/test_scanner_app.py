@@ -101,6 +101,7 @@ def test_cameras_of_resized_photographs_belong_to_the_captured_size(export, room
         ({"cameraPoseARFrame": ["a"] * 16}, "4 x 4 numbers cameraPoseARFrame"),
         ({"cameraPoseARFrame": [2.0, *[0.0] * 15]}, "a rotation and a translation"),
         ({"intrinsics": [80, 0, 0, 0, 80, 0, 48, 36, 1]}, "fx 0 cx 0 fy cy 0 0 1, row by row"),
+        ({"intrinsics": [1e300, 0, 48, 0, 1e300, 36, 0, 0, 1]}, "a camera size in pixels"),
         ({"intrinsics": [80, 0, 48, 0, -80, 36, 0, 0, 1]}, "focal length"),
     ],
 )

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -136,11 +137,14 @@ def read_numbers(where: str, record: Mapping[str, Any], keys: Iterable[str]) -> 
         if isinstance(value, bool) or not isinstance(value, int | float):
             found = "none" if value is None else repr(value)[:80]
             raise SceneFormatError(f"a number {key} in {where}", found=found, fix=EXPORT_AGAIN)
-        if not math.isfinite(value):
+        number = math.inf
+        with suppress(OverflowError):  # an integer of hundreds of digits
+            number = float(value)
+        if not math.isfinite(number):
             raise NotFiniteError(
-                f"a finite number {key} in {where}", found=f"{value}", fix=EXPORT_AGAIN
+                f"a finite number {key} in {where}", found=f"{number}", fix=EXPORT_AGAIN
             )
-        numbers.append(float(value))
+        numbers.append(number)
     return numbers
 
 

@@ -36,6 +36,8 @@ from splatseed.text import agreeing, counted
 
 _RECORD = re.compile(r"frame_\d{5,}\.json")
 _PHOTOGRAPH = re.compile(r"frame_\d{5,}\.(?:jpe?g|png)", re.IGNORECASE)
+_MIN_SCALE = 1e-3
+"""Smallest plausible 2 fx / width: a telescope's."""
 _ROUNDING = 0.05
 """Pixels by which a size from float32 matrices may differ from a whole number."""
 
@@ -107,11 +109,11 @@ def _captured_size(record: Mapping[str, Any], K: Float64[np.ndarray, "3 3"], siz
     except SceneFormatError:
         return size
     scales = projection[[0, 1], [0, 1]]
-    if (scales > 0).all():
-        captured = 2 * K[[0, 1], [0, 1]] / scales
-        width, height = np.rint(captured).astype(int).tolist()
-        # For the screen instead of the sensor, the matrix has another shape or is turned.
-        turned = (size[0] > size[1]) != (width > height)
-        if np.abs(captured - (width, height)).max() <= _ROUNDING and not turned:
-            return width, height
-    return size
+    if not (scales > _MIN_SCALE).all():
+        return size
+    captured = 2 * K[[0, 1], [0, 1]] / scales
+    width, height = map(round, captured.tolist())
+    # For the screen instead of the sensor, the matrix has another shape or is turned.
+    turned = (size[0] > size[1]) != (width > height)
+    whole = np.abs(captured - np.rint(captured)).max() <= _ROUNDING
+    return (width, height) if whole and not turned else size
