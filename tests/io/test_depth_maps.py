@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +13,10 @@ from hypothesis.extra import numpy as hnp
 from PIL import Image as PilImage
 
 from splatseed.camera import Intrinsics
-from splatseed.errors import OutputError, SceneFormatError, SceneNotFoundError
+from splatseed.depthmap import DepthMap
+from splatseed.errors import OutputError, ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.io import find_depths
-from splatseed.io.depth_maps import DESCRIPTION, depth_folder
+from splatseed.io.depth_maps import DESCRIPTION, Undistortion, depth_folder
 from splatseed.io.staging import MANIFEST
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene, SceneSource
@@ -100,6 +102,30 @@ def test_images_without_a_map_are_named(tmp_path):
     for name, told in (("a.jpg", r"a\.npy"), ("c.jpg", r"a depth map of c\.jpg")):
         with pytest.raises(SceneNotFoundError, match=told):
             depths.read(name)
+
+
+def test_confidence_is_undistorted_with_its_map(tmp_path):
+    """Depth is 1 m more than the level, so that both must stay together."""
+    levels = np.random.default_rng(0).integers(0, 3, (30, 40), np.uint8)
+    PilImage.fromarray((1000 * (levels + 1.0)).astype(np.uint16)).save(tmp_path / "depth_7.png")
+    PilImage.fromarray(levels).save(tmp_path / "conf_7.png")
+    bent = Intrinsics(1, "OPENCV", 40, 30, (35.0, 36.0, 20.0, 15.0, -0.4, 0.0, 0.0, 0.0))
+    maps = find_depths(scene_of("frame_00007.jpg"), tmp_path)
+    plain = maps.read("frame_00007.jpg")
+    np.testing.assert_array_equal(plain.confidence, levels)
+    wide = replace(LENS, params=(20.0, 20.0, 20.0, 15.0))  # its corners lie outside of the map
+    moved = replace(maps, lens=Undistortion(bent, {"frame_00007.jpg": wide}))
+    depth = moved.read("frame_00007.jpg")
+    known = np.isfinite(depth.values)
+    assert 0.2 < known.mean() < 1
+    np.testing.assert_array_equal(depth.values[known], depth.confidence[known] + 1)
+    assert not depth.confidence[~known].any()
+    assert not np.array_equal(depth.confidence, levels)
+
+
+def test_a_confidence_per_pixel():
+    with pytest.raises(ParameterError, match="per pixel of the depth map, 3 x 4; found 4 x 3"):
+        DepthMap(np.ones((3, 4), np.float32), confidence=np.ones((4, 3), np.uint8))
 
 
 @pytest.mark.parametrize("name", ["results", "."])
