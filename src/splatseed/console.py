@@ -11,7 +11,7 @@ import ast
 import re
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext
 from typing import Any
 
 from rich import progress as rich_progress
@@ -20,6 +20,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from splatseed.progress import Progress, extraction_progress
 from splatseed.runtime.compilation import watched
 from splatseed.text import quoted, visible
 
@@ -178,8 +179,51 @@ def stage_display(
     drawn = rich_progress.Progress(*columns, console=ERR, transient=True)
     bar = drawn if ERR.is_terminal else None
     clock._lines = _Lines(clock._items) if lines and bar is None else None  # noqa: SLF001  (ours)
-    with clock._shown(bar), bar or nullcontext(), watched(clock.compilation):  # noqa: SLF001  (ours)
+    shows = bar is not None or clock._lines is not None  # noqa: SLF001  (ours)
+    with (
+        clock._shown(bar), bar or nullcontext(), watched(clock.compilation),  # noqa: SLF001  (ours)
+        _extraction_told(clock) if shows else nullcontext(),  # else a second display would open
+    ):  # fmt: skip
         yield clock
+
+
+@contextmanager
+def _extraction_told(progress: Progress) -> Iterator[None]:
+    token = extraction_progress.set(progress)
+    try:
+        yield
+    finally:
+        extraction_progress.reset(token)
+
+
+class _Shown:
+    """A ``Progress`` that opens a display at the first call and closes it once a stage is done."""
+
+    def __init__(self) -> None:
+        self._display = ExitStack()
+        self._clock: StageClock | None = None
+
+    def __call__(self, stage: str, fraction: float) -> None:
+        if self._clock is None:
+            self._clock = self._display.enter_context(stage_display(remaining=True, lines=True))
+        self._clock(stage, fraction)
+        if fraction >= 1:
+            self.close()
+
+    def close(self) -> None:
+        self._display.close()
+        self._clock = None
+
+
+@contextmanager
+def extraction_shown() -> Iterator[None]:
+    """Show the extraction of photographs from videos and archives, whichever call causes it."""
+    shown = _Shown()
+    try:
+        with _extraction_told(shown):
+            yield
+    finally:
+        shown.close()
 
 
 def with_options(message: str) -> str:

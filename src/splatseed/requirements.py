@@ -26,6 +26,7 @@ EXTRAS = {
     "sfm": ("pycolmap>=4.0", "imageio-ffmpeg>=0.6"),
     "cluster": ("ray>=2.40",),
     "exr": ("OpenEXR>=3.3",),
+    "r3d": ("lzfse>=0.4.2",),
     "tensorboard": ("tensorboard>=2.14",),
 }
 """Requirements by extra, as in pyproject.toml; messages list them, since an extra can only be

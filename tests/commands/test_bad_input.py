@@ -79,6 +79,10 @@ COMMANDS = [
     (("info", "nowhere"), "nowhere"),
     (("info", "nowhere", "--bogus"), "--bogus"),
     (("info", "ROOM", "b", "c"), "b, c"),
+    (("info", "film.mp4"), "splatseed sfm film.mp4"),
+    (("info", "junk.r3d"), "junk.r3d"),
+    (("info", "RECORD3D"), "RECORD3D/metadata.json"),
+    (("info", "STRAY"), "STRAY/rgb.mp4"),
     (("info", "PHONE"), "cameraPoseARFrame in PHONE/frame_00000.json; found 12 numbers"),
     (("upsample", "PHONE/bare", *OUT), "All Data"),
     (("train", "POLYCAM", *OUT), "Developer mode"),
@@ -210,6 +214,12 @@ def refused(room, tmp_path, monkeypatch, splatseed):
     (tmp_path / "junk.ply").write_bytes(b"ply\n")
     write_gaussians(tmp_path / "model.ply", initial_gaussians(load_scene(room).points))
     (tmp_path / "film.mp4").write_bytes(b"\0" * 999)
+    (tmp_path / "junk.r3d").write_bytes(b"PK\3\4")
+    (tmp_path / "RECORD3D" / "rgb").mkdir(parents=True)
+    (tmp_path / "RECORD3D" / "metadata.json").write_text('{"poses": 9}')
+    (tmp_path / "STRAY").mkdir()
+    for name in ("odometry.csv", "camera_matrix.csv"):
+        (tmp_path / "STRAY" / name).touch()
     np.savez(tmp_path / "scan.npz", xyz=np.random.default_rng(0).random((99, 3)))
     (tmp_path / "TAKEN").mkdir()
     (tmp_path / "TAKEN" / "mine.txt").write_text("years")

@@ -55,14 +55,6 @@ def test_the_photographs_are_counted_by_folder(called, tmp_path, splatseed, caps
     assert "1 image of grey, run/d.png" in told.out
 
 
-def test_poses_in_the_folder_are_not_dropped_silently(called, tmp_path, splatseed):
-    (tmp_path / "frame_00000.json").write_text("{}")  # a phone's export
-    run = splatseed("sfm", tmp_path, "-o", tmp_path / "out")
-    assert f"add --poses-from {tmp_path}." in " ".join(run.out.split())
-    assert "poses_from" not in called
-    assert "--poses-from" not in splatseed("sfm", tmp_path / "a", "-o", tmp_path / "out").out
-
-
 def test_known_poses_are_triangulated_and_refined_when_asked(called, room, tmp_path, splatseed):
     words = ("sfm", room / "images", "--poses-from", room, "-o", tmp_path / "out")
     assert splatseed(*words).code == 0

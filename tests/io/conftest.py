@@ -31,6 +31,14 @@ def room_with_depth(room) -> Scene:
 
 
 @pytest.fixture
+def captures(tmp_path, monkeypatch) -> Path:
+    """An empty cache of extracted photographs."""
+    folder = tmp_path / "captures"
+    monkeypatch.setattr("splatseed.io.extraction._base", lambda: folder)
+    return folder
+
+
+@pytest.fixture
 def model(rng) -> Model:
     """Four images that all see each of ten points; ids with gaps; ids and indices agree."""
     intrinsics = (

@@ -17,7 +17,6 @@ from splatseed.commands.options import parse_options, refuse
 from splatseed.console import ERR, StageClock, print_note, print_pairs, stage_display
 from splatseed.io import load_scene
 from splatseed.io.files import is_video
-from splatseed.io.load import is_scene
 from splatseed.io.masks import masks_near
 from splatseed.io.origin import RECENTER
 from splatseed.io.staging import check_output
@@ -114,11 +113,6 @@ def _from_photographs(options: Options, images: Path, clock: StageClock) -> SfmR
     settings = Settings(options.matcher, options.device, seed=options.seed, threads=options.threads)
     masks: Masks | None = None
     if options.poses_from is None:
-        if not video and is_scene(images):
-            print_note(
-                f"{visible(images)} has poses, which are not used; to keep them, add --poses-from "
-                f"{quoted(images)}."
-            )
         stages = ["mapping"]
         how: dict[str, Any] = {
             "camera_model": options.camera_model,

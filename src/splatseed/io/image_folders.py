@@ -12,6 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path, PurePath
 
+from splatseed.io.extraction import is_extracted
 from splatseed.io.files import open_file
 from splatseed.scene import Scene
 
@@ -50,7 +51,10 @@ def sibling_folders(root: Path) -> dict[str, Path]:
 
 
 def link_folders(folders: Mapping[str, Path], output: Path, *, copy: bool) -> list[str]:
-    """Link or copy image folders into ``output``; missing ones are left out."""
+    """Link or copy image folders into ``output``; missing ones are left out.
+
+    Photographs extracted into the user's cache are always copied.
+    """
     present = {name: source for name, source in folders.items() if source.exists()}
     around = output.resolve().parent
     for name, source in present.items():
@@ -60,7 +64,7 @@ def link_folders(folders: Mapping[str, Path], output: Path, *, copy: bool) -> li
         # Relative if output and source are siblings, to move together.
         if around in goal.parents and around != Path(around.anchor):
             goal = Path(os.path.relpath(goal, target.parent.resolve()))
-        if not copy:
+        if not copy and not is_extracted(source):  # a link would break when the cache is emptied
             with suppress(OSError, NotImplementedError):  # a file system or system without links
                 target.symlink_to(goal, target_is_directory=source.is_dir())
         if not target.is_symlink():

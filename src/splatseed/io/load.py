@@ -25,11 +25,20 @@ from splatseed.io.nerfstudio import is_blender, read_blender, read_transforms_sc
 from splatseed.io.origin import recentered
 from splatseed.io.ply import read_ply_float64, refuse_gaussians
 from splatseed.io.polycam import is_polycam, read_polycam
+from splatseed.io.record3d import (
+    ARCHIVE,
+    find_recorded_depths,
+    is_record3d,
+    is_rgbd_video,
+    read_r3d,
+    read_record3d,
+)
 from splatseed.io.rgbd import find_tum_depths, is_replica, is_tum, load_rgbd, load_tum
 from splatseed.io.scanner_app import is_scanner_app, read_scanner_app
 from splatseed.io.seeds import recall_seeds
 from splatseed.io.split import with_listed_split
 from splatseed.io.staging import ABSENT, MANIFEST, read_manifest
+from splatseed.io.stray import is_stray, read_stray
 from splatseed.scene import Scene, SceneSource
 from splatseed.text import name_some, quoted
 
@@ -51,8 +60,9 @@ def load_scene(path: StrPath, *, require_points: bool = True) -> Scene:
             folder itself or its subfolder ``0``), ``transforms.json``, ``transforms_train.json``
             and ``transforms_test.json``, LLFF's ``poses_bounds.npy``, an RGB-D capture
             (``traj.txt``, or ``rgb.txt`` and ``groundtruth.txt``), or the export of a phone app
-            (3D Scanner App's ``frame_00000.json``, Polycam's ``keyframes``); or a ``.json`` or
-            ``.ply`` file.
+            (3D Scanner App's ``frame_00000.json``, Polycam's ``keyframes``, Record3D's
+            ``EXR_RGBD``, Stray Scanner's ``rgb.mp4`` and ``odometry.csv``); or a ``.json``,
+            ``.ply`` or ``.r3d`` file (Record3D's).
             ``sparse`` takes precedence over ``transforms.json``, and that over ``colmap/sparse/0``.
         require_points: Raise for a scene without points; if False, its cloud is empty.
 
@@ -154,6 +164,8 @@ def _reader(folder: Path) -> Callable[[], Scene] | None:
         (is_tum, load_tum),
         (is_scanner_app, read_scanner_app),
         (is_polycam, read_polycam),
+        (is_record3d, read_record3d),
+        (is_stray, read_stray),
     )
     return next((partial(read, folder) for known, read in others if known(folder)), None)
 
@@ -176,19 +188,36 @@ def _read_file(path: Path) -> Scene:
         return recentered(Scene(points, source=source), exact)
     if suffix == ".json":
         return read_transforms_scene(path)
-    if is_video(path):
-        found, fix = "a video", f"Reconstruct a scene first: splatseed sfm {quoted(path)} -o SCENE."
-    elif find_model(path.parent) is not None:
-        found = "one file of a COLMAP model"
-        fix = f"Pass the scene's folder: {scene_root(path.parent)}"
-    elif suffix in _SCAN_SUFFIXES:
-        found = f"a {suffix} file, a scan"
-        fix = f"Use it as seeds: splatseed upsample SCENE --cloud {quoted(path)} -o OUT."
-    else:
-        found, folder = f"a {path.suffix or 'nameless'} file", _scene_above(path)
-        fix = f"Pass the scene's folder{f': {folder}' if folder else '.'}"
-    expected = f"{path} to be a scene folder, a .ply or a .json file"
+    if _is_archive(path):
+        return read_r3d(path)
+    expected = f"{path} to be a scene folder, a .ply, .json or {ARCHIVE} file"
+    found, fix = _video_advice(path) if is_video(path) else _file_advice(path)
     raise SceneFormatError(expected, found=found, fix=fix)
+
+
+def _video_advice(path: Path) -> tuple[str, str]:
+    """Return what a video is that is no scene, and what to do."""
+    if is_rgbd_video(path):
+        fix = 'In the app, export the recording as "EXR + RGB" or as .r3d, which have them.'
+        return 'Record3D\'s export "RGBD video", which has no poses', fix
+    if is_stray(path.parent):
+        return "the video of Stray Scanner", f"Pass the scene's folder: {path.parent}"
+    return "a video", f"Reconstruct a scene first: splatseed sfm {quoted(path)} -o SCENE."
+
+
+def _file_advice(path: Path) -> tuple[str, str]:
+    """Return what a file is that is neither a scene nor a video, and what to do."""
+    suffix = path.suffix.lower()
+    if find_model(path.parent) is not None:
+        return "one file of a COLMAP model", f"Pass the scene's folder: {scene_root(path.parent)}"
+    if suffix in _SCAN_SUFFIXES:
+        fix = f"Use it as seeds: splatseed upsample SCENE --cloud {quoted(path)} -o OUT."
+        return f"a {suffix} file, a scan", fix
+    if suffix == ".zip":
+        return "an archive", "Unpack it, and pass the scene's folder."
+    folder = _scene_above(path)
+    fix = f"Pass the scene's folder{f': {folder}' if folder else '.'}"
+    return f"a {path.suffix or 'nameless'} file", fix
 
 
 def _scene_above(path: Path) -> Path | None:
@@ -236,7 +265,8 @@ def find_depths(
     Args:
         scene: The scene.
         path: A folder of maps named like the images, subfolders included; a COLMAP dense workspace;
-            an RGB-D capture in NICE-SLAM's or TUM's layout; or the output of ``splatseed depth``.
+            an RGB-D capture in NICE-SLAM's or TUM's layout; a recording of Record3D; or the output
+            of ``splatseed depth``.
         kind: Meaning of the values; None: as the folder or file declares, else planar z.
         scale: Stored units per scene unit; None: as the folder declares, else 1000 for integers
             and 1 for floats.
@@ -253,7 +283,7 @@ def find_depths(
         fix = "Pass the stored units per scene unit."
         raise ParameterError("`scale` above 0", found=f"{scale}", fix=fix)
     root = Path(path)
-    if not root.is_dir():
+    if not root.is_dir() and not _is_archive(root):
         found, fix = (
             "a file" if root.exists() else "nothing",
             "Pass the folder that contains the maps.",
@@ -271,6 +301,10 @@ def find_depths(
     return replace(maps, kind=kind or maps.kind, scale=scale or maps.scale)
 
 
+def _is_archive(path: Path) -> bool:
+    return path.suffix.lower() == ARCHIVE and path.is_file()
+
+
 def with_own_depths(scene: Scene) -> Scene:
     """Attach the depth maps found in the scene's own folder, unless it has maps already."""
     if scene.depths is not None or scene.source is None:
@@ -280,6 +314,8 @@ def with_own_depths(scene: Scene) -> Scene:
 
 def search_depths(scene: Scene, root: Path) -> DepthFiles | None:
     """Find depth maps as ``find_depths`` does; None if no image has one."""
+    if _is_archive(root) or is_record3d(root):
+        return find_recorded_depths(scene, root)
     if is_tum(root) and (maps := find_tum_depths(scene, root)) is not None:
         return maps
     if (maps := match_by_name(scene, root)) is not None:

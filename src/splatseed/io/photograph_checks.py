@@ -17,6 +17,7 @@ from PIL import Image as PilImage
 
 from splatseed.camera import Intrinsics
 from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.io.extraction import is_extracted
 from splatseed.io.files import open_file, similar_name, special_kind, translate_errors
 from splatseed.io.photograph import COPY_AGAIN, photograph_bytes, photograph_folder
 from splatseed.scene import Image, Scene
@@ -149,7 +150,7 @@ def image_warnings(images: Sequence[Image], image_dir: Path | None, root: Path) 
     around = os.path.abspath(root)  # noqa: PTH100
     paths = {im.name: os.path.abspath(image_dir / im.name) for im in images}  # noqa: PTH100
     outside = [n for n, path in paths.items() if os.path.commonpath([path, around]) != around]
-    if outside:
+    if outside and not is_extracted(image_dir):
         lie = agreeing(len(outside), "lies", "lie")
         warnings.append(
             f"{len(outside)} of {len(images)} images {lie} outside of {root}, such as {outside[0]}."

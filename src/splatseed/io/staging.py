@@ -301,11 +301,11 @@ def _remove_leftovers(target: Path) -> None:
 
 
 @contextmanager
-def locked(path: Path) -> Iterator[None]:
-    """Lock a file or folder; raise ``OSError`` if another process holds the lock."""
+def locked(path: Path, *, wait: bool = False) -> Iterator[None]:
+    """Lock a file or folder; if another process holds the lock, wait or raise ``OSError``."""
     with ExitStack() as stack:
         if fcntl is not None:
             descriptor = os.open(path, os.O_RDONLY)
             stack.callback(os.close, descriptor)
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
         yield

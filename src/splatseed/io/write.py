@@ -19,6 +19,7 @@ from typing import Literal
 from splatseed.errors import OutputError, PointCloudError
 from splatseed.io.cleaning import clean_scene
 from splatseed.io.colmap_layout import write_colmap_layout
+from splatseed.io.extraction import is_extracted
 from splatseed.io.files import StrPath
 from splatseed.io.image_folders import link_folders
 from splatseed.io.mask_files import FOLDER as MASKS
@@ -115,7 +116,8 @@ def write_scene(
                 versions[package] = version(package)
         read = None
         if source is not None:
-            bare = source.points_path if source.format == "ply" else source.root
+            is_file = source.format == "ply" or is_extracted(source.root)
+            bare = source.points_path if is_file else source.root
             read = str(source.transforms_path or bare)
         num_new = counts["num_points"] - counts["num_original"]
         if scene.absent:  # so that the others train or test as before

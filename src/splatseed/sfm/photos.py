@@ -5,33 +5,29 @@ half) and skips unreadable files. Video frames are chosen sharp and spaced by im
 a standing camera gives one frame.
 
 Notation: the *motion* at a frame is the cumulative image motion in image widths: the sum of the
-median shifts of blocks between frames, by phase correlation (Kuglin and Hines 1975). *Sharpness* is
-the variance of the Laplacian.
+median shifts of blocks between frames, by phase correlation (Kuglin and Hines 1975).
 """
 
 from __future__ import annotations
 
-import logging
 import re
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int64, UInt8
-from PIL import Image as PilImage
-from scipy.ndimage import laplace
+from jaxtyping import Float32
 
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.io.files import VIDEO_SUFFIXES, StrPath, files_below
+from splatseed.io.film import choose_frames
 from splatseed.io.mask_files import masks_among
 from splatseed.io.photograph import check_photograph, open_photograph, photograph_bytes
 from splatseed.io.photograph_checks import check_sizes, resized_to
 from splatseed.io.staging import read_manifest
+from splatseed.io.video import ANALYSIS_WIDTH, sharpness, small_frames, write_frames
 from splatseed.progress import Progress, silent
-from splatseed.requirements import require
 from splatseed.runtime.fingerprint import fingerprint
 from splatseed.scene import Image, Scene
 from splatseed.sfm.cameras import Photo, Photos, read_exif
@@ -51,10 +47,8 @@ _GREY_MODES = ("L", "1", "LA")
 _MAPS = re.compile(r"(^|[/_.-])(conf|confidence|depth|disparity|masks?)([/_.\d-]|$)", re.IGNORECASE)
 """Names of maps that scanning apps write beside photographs."""
 
-_ANALYSIS_WIDTH, _BLOCK = 256, 64
-"""Width at which frames are analysed, and side of the blocks of phase correlation, px."""
-_MIN_STEP = 0.02
-"""Smallest image motion between chosen frames, in widths."""
+_BLOCK = 64
+"""Side of the blocks of phase correlation, px."""
 _MIN_FRAMES = 3
 """Fewest frames of a scene."""
 
@@ -179,16 +173,14 @@ def pick_frames(
         raise ParameterError(expected, found=f"{frames}", fix="Try 150.")
     if not video.is_file():
         raise SceneNotFoundError(f"a video {video}", found="none", fix="Check the path.")
-    sharpness, steps = [], []
+    sharp, steps = [], []
     before: Float32[np.ndarray, "H W"] | None = None
-    for frame, part in _frames(video, ["-vf", f"scale={_ANALYSIS_WIDTH}:-2"], "gray"):
-        grey = frame[..., 0].astype(np.float32)
-        sharpness.append(float(laplace(grey).var()))
-        steps.append(0.0 if before is None else shift(before, grey) / _ANALYSIS_WIDTH)
+    for grey in small_frames(video, progress):
+        sharp.append(sharpness(grey))
+        steps.append(0.0 if before is None else shift(before, grey) / ANALYSIS_WIDTH)
         before = grey
-        progress("analyse video", part)
     motion = np.cumsum(steps)
-    numbers = choose_frames(np.array(sharpness), motion, frames).tolist()
+    numbers = choose_frames(np.array(sharp), motion, frames).tolist()
     if len(numbers) < _MIN_FRAMES:
         raise SceneFormatError(
             f"{video} to show the scene from several places",
@@ -196,24 +188,9 @@ def pick_frames(
             f"{motion[-1] if len(motion) else 0:.1%} of the width",
             fix="Film while you walk around the scene.",
         )
-    for number, (pixels, part) in enumerate(_frames(video, [], "rgb24")):
-        if number in numbers:
-            path = folder / f"{video.stem}_{number:06}.jpg"
-            PilImage.fromarray(pixels).save(path, quality=95, subsampling=0)
-        progress("write frames", part)
+    paths = {number: folder / f"{video.stem}_{number:06}.jpg" for number in numbers}
+    write_frames(video, paths, progress)
     return PickedFrames(tuple(numbers), len(motion), float(motion[-1]))
-
-
-def choose_frames(
-    sharpness: Float64[np.ndarray, " F"], motion: Float64[np.ndarray, " F"], limit: int
-) -> Int64[np.ndarray, " P"]:
-    """Choose the sharpest frame in each of at most ``limit`` equal intervals of motion."""
-    if not len(motion):
-        return np.empty(0, np.int64)
-    step = max(motion[-1] / limit, _MIN_STEP)
-    interval = np.minimum((motion / step).astype(np.int64), max(int(motion[-1] / step) - 1, 0))
-    order = np.lexsort((-sharpness, interval))
-    return np.sort(order[np.unique(interval[order], return_index=True)[1]])
 
 
 def shift(before: Float32[np.ndarray, "H W"], now: Float32[np.ndarray, "H W"]) -> float:
@@ -233,33 +210,3 @@ def shift(before: Float32[np.ndarray, "H W"], now: Float32[np.ndarray, "H W"]) -
     # Shifts of more than half a block are negative.
     dy, dx = ((each + _BLOCK // 2) % _BLOCK - _BLOCK // 2 for each in np.divmod(at, _BLOCK))
     return float(np.median(np.hypot(dx, dy)))
-
-
-def _frames(
-    video: Path, parameters: list[str], pixels: Literal["gray", "rgb24"]
-) -> Iterator[tuple[UInt8[np.ndarray, "H W C"], float]]:
-    """Yield frames of a video, and the fraction read so far."""
-    require("imageio_ffmpeg")
-    import imageio_ffmpeg  # noqa: PLC0415  (an optional package)
-
-    channels = 1 if pixels == "gray" else 3
-    # Silence its warning about reading at another size.
-    logging.getLogger("imageio_ffmpeg").setLevel(logging.ERROR)
-    try:
-        reader = imageio_ffmpeg.read_frames(
-            str(video), pix_fmt=pixels, bits_per_pixel=8 * channels,
-            output_params=["-fps_mode", "passthrough", *parameters],
-        )  # fmt: skip
-        facts = dict(next(reader))
-        total = max(1.0, float(facts.get("duration") or 0) * float(facts.get("fps") or 0))
-        width, height = facts["size"]
-        for i, raw in enumerate(reader):
-            frame = np.frombuffer(raw, np.uint8).reshape(height, width, channels)
-            yield frame, min(1.0, (i + 1) / total)
-    except (OSError, RuntimeError, StopIteration, IndexError, ValueError) as error:
-        text = " ".join(str(error).split())
-        raise SceneFormatError(
-            f"{video} to be a video that ffmpeg can read",
-            found=(text if len(text) <= 120 else f"...{text[-117:]}") or type(error).__name__,
-            fix="Convert it to .mp4 (H.264), or pass a folder of photographs.",
-        ) from None
