@@ -78,6 +78,9 @@ ARMS: Mapping[str, Mapping[str, Any]] = {
     "cover": {"method": "cover"},
     "stereo": {"method": "stereo"},
     "auto": {"method": "auto"},
+    "auto, photographs alone": {"method": "auto", "dense": False, "depth_maps": False},
+    "auto, depth maps too": {"method": "auto", "dense": False},
+    "depth": {"method": "depth"},
     "auto, no points": {"method": "auto", "points": False},
     "auto, refined": {"method": "auto", "points": False, "refined": True},
     "triangulated": {"method": "linear", "ratio": 1, "points": False, "refined": True},
@@ -89,8 +92,9 @@ ARMS: Mapping[str, Mapping[str, Any]] = {
     "random as gsplat": {"random": "gsplat"},
     "random as nerfstudio": {"random": "nerfstudio"},
 }
-"""How seeds are made, by what the table calls them; at ratio 1 nothing is added to SfM's points,
-and without points these are taken away first; *refined* is with ``--refine-poses``, which
+"""How seeds are made, by what the table calls them; *photographs alone* leaves out the depth maps
+that come with a capture (both as in ``splatseed train``); at ratio 1 nothing is added to SfM's
+points, and without points these are taken away first; *refined* is with ``--refine-poses``, which
 triangulates some again. SfM's points were made from all photographs, those held out too;
 *triangulated* are only those of the features of the training photographs."""
 TEST_EVERY = 8
@@ -109,7 +113,7 @@ def train(
     the course of the run are its ``curve``. The folder ``kept`` holds seeds of earlier runs, whose
     seconds count all the same.
     """
-    whole = ss.load_scene(Path(scene))
+    whole = ss.load_scene(Path(scene), require_points=False)
     validation = validation_split(whole, every, HELD_STEP * seed % TEST_EVERY)
     camera = validation.images[0].camera
     cap = round(rho * (camera.width // data_factor) * (camera.height // data_factor))

@@ -9,7 +9,7 @@ map on demand, so a scene's maps need not fit in memory.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
@@ -24,6 +24,8 @@ DepthKind = Literal["z", "ray", "inverse"]
 """Meaning of a value: planar depth z along the camera's axis, distance along the pixel's ray, or an
 inverse depth of the form a / z + b (what most monocular networks predict)."""
 
+MIN_CONFIDENCE = 2
+"""Default confidence from which on depth is used."""
 ASPECT_SLACK = 0.02
 """Largest relative difference of a map's aspect ratio from its image's, by rounding of sizes."""
 
@@ -54,6 +56,13 @@ class DepthMap:
                 fix="Resize both alike.",
             )
         object.__setattr__(self, "confidence", read_only(self.confidence, np.uint8))
+
+    def reliable(self, min_confidence: int) -> DepthMap:
+        """Return the map with depth of a lower confidence unknown; itself without a confidence."""
+        if self.confidence is None or min_confidence <= 0:
+            return self
+        sure = self.confidence >= min_confidence
+        return replace(self, values=np.where(sure, self.values, np.float32(np.nan)))
 
     @property
     def width(self) -> int:
@@ -86,7 +95,11 @@ class DepthMap:
 
 @runtime_checkable
 class DepthMaps(Protocol):
-    """The depth maps of a scene, by image name."""
+    """The depth maps of a scene, by image name.
+
+    An optional member, ``in_scene_units``, is True where depth comes with the capture and needs no
+    alignment, as a LiDAR's in metres beside poses in metres.
+    """
 
     def __contains__(self, name: object) -> bool:
         """Whether the image of that name has a map."""
@@ -116,6 +129,11 @@ class HeldDepths(dict[str, DepthMap]):
                 f"a depth map of {name}", found=f"maps of {len(self):,} others", fix="Add one."
             )
         return self[name]
+
+
+def in_scene_units(maps: DepthMaps | None) -> bool:
+    """Whether there are maps, and their depth needs no alignment."""
+    return maps is not None and len(maps) > 0 and bool(getattr(maps, "in_scene_units", False))
 
 
 def maps_by_name(maps: Any, names: Collection[str], distorted: Collection[str] = ()) -> DepthMaps:

@@ -14,6 +14,8 @@ import splatseed as ss
 from splatseed.camera import Intrinsics
 from splatseed.depth import lifting
 from splatseed.depth.alignment import PlanarDepth, lift_pixels
+from splatseed.depth.settings import PER_POINT
+from splatseed.depthmap import HeldDepths
 from splatseed.errors import ParameterError, PointCloudError, SceneFormatError, SceneNotFoundError
 from splatseed.scene import Split
 
@@ -143,8 +145,61 @@ def test_metric_depth_needs_no_points(exact, capture):
     assert capture.surfaces.distance(seeds.xyz.astype(np.float64)).max() < FLOAT32
     with pytest.raises(ParameterError, match="num_points"):
         ss.upsample(empty, "depth", ratio=4, align=False)
-    with pytest.raises(PointCloudError, match="original"):
-        ss.upsample(empty, "depth", num_points=1500)
+    for num in (None, 1500):
+        with pytest.raises(PointCloudError, match=r"found none.*`depth\.align=False`"):
+            ss.upsample(empty, "depth", num_points=num)
+
+
+@pytest.fixture
+def metric(make_maps):
+    """Makes maps that come with a capture, in its unit."""
+
+    class MetricMaps(HeldDepths):
+        in_scene_units = True
+
+    return lambda *arguments: MetricMaps(make_maps(*arguments))
+
+
+def test_a_capture_with_metric_depth_needs_no_option(exact, capture, metric):
+    empty = exact.replace(points=exact.points.select(slice(0)), tracks=None, depths=metric())
+    seeds = ss.upsample(empty, "depth")
+    assert len(seeds) == round(0.25 * 160 * 120)
+    assert capture.surfaces.distance(seeds.xyz.astype(np.float64)).max() < FLOAT32
+    first = empty.replace(images=empty.images[:1])
+    known = int((first.depths.read(first.images[0].name).values > 0).sum())
+    assert len(ss.upsample(first, "depth", see_through=True)) == known // PER_POINT
+
+
+def test_images_with_few_points_keep_metric_depth(exact, capture, metric):
+    """Of an image before a bare wall; without a unit, it is left out."""
+    few = exact.with_points(exact.points.select(slice(60)))
+    notes = []
+    new = lifted(few.replace(depths=metric()), 4000, note=notes.append, min_points=30)
+    assert not notes
+    assert np.median(capture.surfaces.distance(new.xyz.astype(np.float64))) < 0.002
+    # Where points show that the unit is another one, it is no help.
+    other = metric("z", lambda z, _: 3 * z)
+    lifted(few.replace(depths=other), 1000, note=notes.append, min_points=30)
+    lifted(few, 1000, note=notes.append, min_points=30)
+    left_out = [note for note in notes if "10 of 12 depth maps are left out" in note]
+    assert len(left_out) == 2
+    assert "SfM points on known depth; 30 are needed" in left_out[1]
+
+
+def test_depth_of_low_confidence_is_not_lifted(exact, capture, make_maps):
+    sure = np.full((120, 160), 2, np.uint8)
+    sure[:, 120:] = 1
+
+    def change(z, _):
+        z[:, 120:] *= 1.3
+        return z
+
+    wrong = make_maps("z", change)
+    maps = {name: dataclasses.replace(each, confidence=sure) for name, each in wrong.items()}
+    scene, off = exact.replace(depths=maps), capture.surfaces.distance
+    options = {"align": False, "min_agreeing": 0, "see_through": True}
+    assert off(lifted(scene, 2000, **options).xyz.astype(np.float64)).max() < FLOAT32
+    assert off(lifted(scene, 2000, min_confidence=1, **options).xyz.astype(np.float64)).max() > 0.1
 
 
 def test_infinities_zeros_and_negatives_are_never_lifted(exact, make_maps):

@@ -18,6 +18,7 @@ from splatseed.methods.neighbors import NEIGHBOR_BYTES
 from splatseed.photos.loading import load_views
 from splatseed.pointcloud import PointCloud
 from splatseed.runtime import memory
+from splatseed.scene import Scene
 from splatseed.synthetic import make_capture, write_capture
 from splatseed.training.settings import BYTES_PER_GAUSSIAN
 
@@ -45,7 +46,7 @@ def test_upsample_says_how_many_points_and_neighbors_fit(free, rng):
     with pytest.raises(ParameterError, match=r"at most 200 neighbours of each of 1,000 .* 999"):
         upsample(cloud, "mls", ratio=2, k=100_000)
     free(None)  # an unknown amount refuses nothing
-    assert number_of_new(None, "mls", 10, None, 10**9) == 10**9 - 10
+    assert number_of_new(None, "mls", Scene(cloud), None, 10**9) == 10**9 - 1000
 
 
 def test_photographs_of_a_scene_and_what_stereo_holds_beside_them(free, scene):

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from splatseed.console import print_note, print_pairs
+from splatseed.depth.settings import PER_POINT
 from splatseed.lens import undistort_command, undistorted_folder
 from splatseed.photos.sizes import at_file_size
 from splatseed.scene import Scene, SceneFormat
@@ -18,9 +19,6 @@ from splatseed.training.schedule import FULL_RUN
 from splatseed.training.settings import BUDGET, TrainSettings
 
 RATIO = 16
-PER_POINT = 8
-"""Pixels of known depth per new point. With fewer, lifting runs out of free pixels away from depth
-discontinuities: on stereo's maps of a kitchen with 14% known, one in 8.2 was."""
 COLMAP_ONLY = frozenset({"gsplat", "graphdeco", "LichtFeld"})
 """Trainers that read COLMAP's layout better than transforms.json."""
 PINHOLE_ONLY = frozenset({"splatseed", "graphdeco", "OpenSplat", "LichtFeld"})

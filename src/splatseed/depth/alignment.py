@@ -358,6 +358,27 @@ def _residual(depth: DepthMap, value: Values, z: Values, scale: float, shift: fl
     return float(np.median(np.where(np.isfinite(error), error, np.inf)))
 
 
+def reject_other_units(alignments: dict[str, Alignment], min_points: int) -> dict[str, Alignment]:
+    """Reject maps taken as they are for lack of points, if those that have points need a scale."""
+    few = max(min_points, 1)
+    scales = [
+        each.scale
+        for each in alignments.values()
+        if each.rejected is None and each.num_points >= few
+    ]
+    factor = float(np.median(scales)) if scales else 1.0
+    if 1.0 / LIMITS.unit_factor < factor < LIMITS.unit_factor:
+        return alignments
+    return {
+        name: replace(
+            each, rejected=f"{each.num_points} SfM points on known depth; {few} are needed"
+        )
+        if each.rejected is None and each.num_points < few
+        else each
+        for name, each in alignments.items()
+    }
+
+
 def reject_outliers(
     alignments: dict[str, Alignment], max_ratio: float | None
 ) -> dict[str, Alignment]:

@@ -19,14 +19,16 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
-from splatseed.depth.alignment import lift_pixels, reject_outliers
+from splatseed.depth.alignment import lift_pixels, reject_other_units, reject_outliers
 from splatseed.depth.comparison import choose_neighbors, find_support, synchronize_scales
-from splatseed.depth.settings import DepthSettings
+from splatseed.depth.settings import PER_POINT, DepthSettings
 from splatseed.depth.thinning import spread_evenly
 from splatseed.depth.views import DepthView, read_view
+from splatseed.depthmap import in_scene_units
 from splatseed.errors import PointCloudError, SceneFormatError, SceneNotFoundError
 from splatseed.io.photograph import photograph_folder
 from splatseed.io.photograph_checks import with_photographs
+from splatseed.photos.sizes import at_file_size, default_factor
 from splatseed.photos.visibility import Visibility, find_visibility
 from splatseed.progress import Progress, in_threads, silent
 from splatseed.scene import Image, Scene
@@ -34,6 +36,8 @@ from splatseed.text import agreeing
 
 SOUND, UNCONFIRMED, NEAR_EDGE, SEEN_THROUGH = range(4)
 """Tiers, in the order in which they are used; the last is never used."""
+POINTS_PER_PIXEL = 0.25
+"""Points for a scene without any, per pixel of a photograph at the size that is trained."""
 VIEWS_PER_TASK = 4
 MAX_NAMED = 3
 """Images that a note names."""
@@ -71,6 +75,7 @@ def lift(
         SceneFormatError: A file is damaged or does not fit, or no map can be aligned.
         PointCloudError: The maps cannot give that many points.
     """
+    settings = _settings_without_points(scene, settings)
     scene, center = _centered(scene)
     visibility, notes = find_visibility(scene), list[str]()
     images = _images_with_maps(scene, settings, notes)
@@ -78,7 +83,7 @@ def lift(
     if settings.compares_views or settings.spread:
         factor = OVERSAMPLING.compared
     views = _read_views(scene, images, visibility, factor * num, settings, rng, progress)
-    images, views = _leave_out(images, views, settings.max_residual_ratio, notes)
+    images, views = _leave_out(images, views, settings, notes)
     candidates = _gather(views, settings, progress)
     while (
         (sound := int(np.count_nonzero(candidates.tier == SOUND))) < num
@@ -105,6 +110,45 @@ def lift(
     xyz = candidates.xyz[chosen]
     np.add(xyz, center, out=xyz, casting="same_kind")  # in float64, then rounded
     return xyz, candidates.rgb[chosen], tuple(notes)
+
+
+def suggested_number(scene: Scene, settings: DepthSettings) -> int:
+    """Return a number of points for a scene without any: a quarter per pixel of a photograph.
+
+    It is limited to what the maps can give. Raises as ``lift``.
+    """
+    settings = _settings_without_points(scene, settings)
+    images = at_file_size(
+        scene.replace(images=tuple(_images_with_maps(scene, settings, [])))
+    ).images
+    factor, depths = default_factor(images), scene.depths
+    assert depths is not None  # noqa: S101  (these images have maps)
+    sizes = [(im.camera.width // factor) * (im.camera.height // factor) for im in images]
+    number, known = round(POINTS_PER_PIXEL * float(np.median(sizes))), 0
+    for image in images:
+        values = depths.read(image.name).reliable(settings.min_confidence).values
+        known += int(np.count_nonzero(np.isfinite(values)))
+        if known >= PER_POINT * number:
+            return number
+    return max(1, known // PER_POINT)
+
+
+def _settings_without_points(scene: Scene, settings: DepthSettings) -> DepthSettings:
+    """Return the settings, without alignment if there are no points to align to.
+
+    Raises:
+        PointCloudError: There are none, and the maps' unit is not the scene's.
+    """
+    if not settings.align or scene.points.originals.finite.any():
+        return settings
+    if scene.depths is not None and not in_scene_units(scene.depths):
+        raise PointCloudError(
+            "points from Structure-from-Motion, to whose scale the depth maps are fitted",
+            found="none that are original and finite",
+            fix="Triangulate some (splatseed sfm --poses-from), or pass `depth.align=False` if the "
+            "maps are in the unit of the poses.",
+        )
+    return replace(settings, align=False)
 
 
 def _images_with_maps(scene: Scene, settings: DepthSettings, notes: list[str]) -> list[Image]:
@@ -175,12 +219,13 @@ def _centered(scene: Scene) -> tuple[Scene, Float64[np.ndarray, " 3"]]:
 
 
 def _leave_out(
-    images: list[Image], views: list[DepthView], max_ratio: float | None, notes: list[str]
+    images: list[Image], views: list[DepthView], settings: DepthSettings, notes: list[str]
 ) -> tuple[list[Image], list[DepthView]]:
     """Keep the images and views whose maps are aligned; adds a note on the others."""
-    alignments = reject_outliers(
-        {image.name: view.alignment for image, view in zip(images, views, strict=True)}, max_ratio
-    )
+    alignments = {image.name: view.alignment for image, view in zip(images, views, strict=True)}
+    if settings.align:
+        alignments = reject_other_units(alignments, settings.min_points)
+    alignments = reject_outliers(alignments, settings.max_residual_ratio)
     reasons = {name: a.rejected for name, a in alignments.items() if a.rejected is not None}
     if len(reasons) == len(alignments):
         name, reason = next(iter(reasons.items()))

@@ -30,7 +30,7 @@ from splatseed.depth.alignment import (
     map_camera,
 )
 from splatseed.depth.settings import DepthSettings
-from splatseed.depthmap import DepthMap, DepthMaps
+from splatseed.depthmap import DepthMap, DepthMaps, in_scene_units
 from splatseed.io.bit_depth import WHITE
 from splatseed.io.masks import read_mask
 from splatseed.io.photograph import decode_photograph, photograph_bytes
@@ -111,7 +111,7 @@ def read_view(
         SceneFormatError: A file is damaged, does not fit, or the camera has lens distortion.
     """
     refuse_distortion(image, reason="along whose rays pixels are lifted")
-    depth = depths.read(image.name)
+    depth = depths.read(image.name).reliable(settings.min_confidence)
     if (mask := read_mask(masks, image.name, folder / image.name)) is not None:
         values = np.where(pixels_within(mask, depth), depth.values, np.float32(np.nan))
         depth = replace(depth, values=values)
@@ -120,6 +120,9 @@ def read_view(
     ray = {"unit_ray": settings.unit_ray}
     if settings.align:
         alignment = align_map(depth, camera, points, settings.fit, settings.min_points, **ray)
+        few = alignment.num_points < max(settings.min_points, 1)
+        if few and in_scene_units(depths):  # their unit is the scene's, up to a small error
+            alignment = check_units(depth, camera, points, **ray)
     else:
         alignment = check_units(depth, camera, points, **ray)
     if alignment.rejected is not None:

@@ -90,6 +90,8 @@ class DepthFiles:
     """Resamples maps for undistorted photographs; None: not needed."""
     confidences: Mapping[str, Path] = field(default_factory=dict)
     """Files of the maps' confidence by image name; of an image without one it is unknown."""
+    in_scene_units: bool = False
+    """Whether the maps come with a capture and share the unit of its poses."""
 
     def __contains__(self, name: object) -> bool:
         return name in self.paths

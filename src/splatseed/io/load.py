@@ -85,6 +85,8 @@ def load_scene(path: StrPath, *, require_points: bool = True) -> Scene:
         scene = reader()
         if scene.source is not None:
             scene = scene.replace(source=replace(scene.source, named=path.absolute()))
+        if isinstance(scene.depths, DepthFiles):  # their format states the unit
+            scene = scene.replace(depths=replace(scene.depths, in_scene_units=True))
     except SplatseedError:
         raise
     except OSError as error:  # from listing folders; reading files raises SplatseedError
@@ -298,7 +300,11 @@ def find_depths(
             found="none" if name else "a scene without images",
             fix="Give maps the names of their images, subfolders included, with another suffix.",
         )
-    return replace(maps, kind=kind or maps.kind, scale=scale or maps.scale)
+    maps = replace(maps, kind=kind or maps.kind, scale=scale or maps.scale)
+    own = scene.depths
+    if isinstance(own, DepthFiles) and replace(own, in_scene_units=False) == maps:
+        return own  # the capture's, named again
+    return maps
 
 
 def _is_archive(path: Path) -> bool:

@@ -59,8 +59,8 @@ def add_points(
         chosen, kind = method, type(method)
         known = (each for each in METHODS if METHODS[each] is kind)
         name = next(known, getattr(chosen, "name", kind.__name__))
-    num_new = number_of_new(chosen, name, len(originals), ratio, num_points)
     check_seed(seed)
+    num_new = number_of_new(chosen, name, whole, ratio, num_points)
     rng = np.random.default_rng(seed)
     if num_new == 0 and len(originals) > 0:
         return originals
@@ -76,14 +76,18 @@ def add_points(
 
 
 def number_of_new(
-    method: Upsampler, name: str, num_original: int, ratio: float | None, num_points: int | None
+    method: Upsampler, name: str, scene: Scene, ratio: float | None, num_points: int | None
 ) -> int | None:
-    """Return the number of points to make; None if the method chooses it itself.
+    """Return the number of points to add to a scene's originals; None if the method chooses it.
 
     Raises:
         ParameterError: A number is given for such a method, out of range or too large for memory.
     """
+    num_original = len(scene.points.originals)
     if not chooses_number(method):
+        suggest = getattr(method, "suggested_number", None)
+        if suggest is not None and not num_original and ratio is None and num_points is None:
+            num_points = suggest(scene)
         total = planned_size(num_original, ratio, num_points)
         if total == 0 and "points" not in traits_of(method).needs:
             raise ParameterError(

@@ -53,9 +53,11 @@ class Traits:
 class Upsampler(Protocol):
     """An upsampling method. Third parties register classes under ``splatseed.methods``.
 
-    Two members are optional. ``traits`` (``Traits``) is for a method that needs more than points,
+    Three members are optional. ``traits`` (``Traits``) is for a method that needs more than points,
     or chooses the number of new points itself. ``paper()``, a class method, gives the parameters
     that follow a paper to the letter; without it both profiles are the same.
+    ``suggested_number(scene)`` gives the number of new points for a scene without originals, of
+    which no ratio is a multiple.
     """
 
     def __call__(

@@ -29,10 +29,13 @@ class Depth(DepthSettings):
     def __post_init__(self) -> None:
         check_settings(self, self.name)
 
-    @property
-    def traits(self) -> Traits:
-        """Need originals only to align maps that are not in scene units."""
-        return Traits(frozenset({"points", "depth"} if self.align else {"depth"}))
+    traits: ClassVar[Traits] = Traits(frozenset({"depth"}))
+
+    def suggested_number(self, scene: Scene) -> int:
+        """Return the number of points to make for a scene without any."""
+        from splatseed.depth.lifting import suggested_number
+
+        return suggested_number(scene, self)
 
     @classmethod
     def paper(cls) -> Self:

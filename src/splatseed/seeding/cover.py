@@ -111,6 +111,10 @@ class CoverSeeds:
     def __len__(self) -> int:
         return len(self.xyz)
 
+    def select(self, which: Bool[np.ndarray, " M"]) -> CoverSeeds:
+        """Return some of the seeds."""
+        return CoverSeeds(*(getattr(self, field.name)[which] for field in fields(CoverSeeds)))
+
     @staticmethod
     def concatenate(parts: Sequence[CoverSeeds]) -> CoverSeeds:
         """Join parts, one after another."""
@@ -146,7 +150,7 @@ def cover(
     masks = _check_pixels(views, masks)
     reference = reference_depths(views, xyz, max(cell, MIN_CHECK_CELL), progress)
     typical = _typical_depth(reference, len(xyz))
-    cloud = _GrowableArray(xyz)
+    cloud = GrowableArray(xyz)
     parts = []
     for v in rng.permutation(len(views)):
         # Drawn for every view, empty cells or not: one view's gaps do not change the next's draw.
@@ -158,7 +162,7 @@ def cover(
             guess = guess_depths(depths, empty, lift, reference, checked)
         else:
             guess = np.full(len(empty), typical), np.full(len(empty), np.inf, np.float32)
-        seeds = _make_seeds(views[v], int(v), cell, empty, guess, masks[v])
+        seeds = make_seeds(views[v], int(v), cell, empty, guess, masks[v])
         cloud.append(seeds.xyz)
         parts.append(seeds)
         progress("cover", len(parts) / len(views))
@@ -208,7 +212,7 @@ def _typical_depth(reference: ReferenceDepths, num: int) -> np.float32:
     return np.float32(np.median(depths))
 
 
-class _GrowableArray:
+class GrowableArray:
     """An array of points with amortised appending."""
 
     def __init__(self, values: Float32[np.ndarray, "N 3"]) -> None:
@@ -217,9 +221,11 @@ class _GrowableArray:
 
     @property
     def values(self) -> Float32[np.ndarray, "N 3"]:
+        """The points so far, without a copy."""
         return self._buffer[: self._num]
 
     def append(self, more: Float32[np.ndarray, "M 3"]) -> None:
+        """Add points at the end."""
         num = self._num + len(more)
         if num > len(self._buffer):
             # Doubled, so that all copies together are linear in the number of points.
@@ -230,7 +236,7 @@ class _GrowableArray:
         self._num = num
 
 
-def _make_seeds(
+def make_seeds(
     view: View,
     idx: int,
     cell: float,
@@ -238,7 +244,10 @@ def _make_seeds(
     guess: tuple[Float32[np.ndarray, " M"], Float32[np.ndarray, " M"]],
     mask: Mask | None,
 ) -> CoverSeeds:
-    """Place seeds in empty cells at the guessed depths, except where too few pixels count."""
+    """Place seeds in empty cells at given depths, except where too few pixels count.
+
+    ``guess`` are the depths and the distances to the nearest covered cells, in cells.
+    """
     depths, distances = guess
     shape = grid_shape(view.camera, cell)
     used = np.ones((1, 1), np.bool_) if mask is None else np.asarray(mask, np.bool_)

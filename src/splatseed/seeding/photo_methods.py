@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 import numpy as np
 
 from splatseed.depth.stereo.maps import MAX_GRID, MIN_POINTS, StereoSettings
+from splatseed.depthmap import MIN_CONFIDENCE, in_scene_units
 from splatseed.errors import PointCloudError, SceneNotFoundError
 from splatseed.methods import as_cloud, source_code
 from splatseed.methods.contract import NewPoints, Traits
@@ -26,10 +27,12 @@ from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress
 from splatseed.scene import Image, Scene
 from splatseed.settings import Range, check_settings
+from splatseed.text import counted
 
 if TYPE_CHECKING:
     from splatseed.depth.stereo.fusion import StereoSeeds
     from splatseed.depth.stereo.maps import StereoMap, StereoResult
+    from splatseed.seeding.cover import CoverSeeds
 
 MAX_SIZE = 800
 """Longer side, in pixels, of the photographs that methods compare."""
@@ -65,6 +68,8 @@ class Stereo(PhotographMethod):
     dense: bool = True
     """Under a budget, make as many seeds as it allows where photographs confirm them; else thin
     those that are `spacing` apart."""
+    depth_maps: bool = True
+    """Without points, begin at the depth of the scene's maps, if there are any."""
 
     name: ClassVar[str] = "stereo"
 
@@ -78,8 +83,21 @@ class Stereo(PhotographMethod):
         images = photographed(scene, self.test_every)
         views = read_views(scene, images, self.max_size, progress)
         rng = np.random.default_rng(seed)
-        stereo = compare(scene, images, views, self.grid, rng, progress, only)
+        stereo = self._compare(scene, images, views, rng, progress, only)
         return tuple(stereo.map(i) for i in only)
+
+    def _compare(
+        self,
+        scene: Scene,
+        images: Sequence[Image],
+        views: Sequence[View],
+        rng: np.random.Generator,
+        progress: Progress,
+        only: Sequence[int] | None = None,
+    ) -> StereoResult:
+        """Run ``compare`` with these settings."""
+        scene = scene if self.depth_maps else scene.replace(depths=None)
+        return compare(scene, images, views, self.grid, rng, progress, only)
 
     def __call__(
         self, scene: Scene, num_new: int, rng: np.random.Generator, progress: Progress
@@ -107,7 +125,7 @@ class Stereo(PhotographMethod):
             warnings = tuple(each for each in (error.warning if error else "", faint) if each)
         views = read_views(scene, images, self.max_size, progress)
         start = time.perf_counter()
-        stereo = compare(scene, images, views, self.grid, rng, progress)
+        stereo = self._compare(scene, images, views, rng, progress)
         seeds = fuse(stereo, self.spacing, progress)
         found = _stereo_note(scene, stereo, time.perf_counter() - start)
         new = stereo_points(seeds, (*found, *warnings), stereo)
@@ -155,6 +173,12 @@ class Auto(Stereo):
 
     cell: Annotated[int, Range(1, 256)] = CELL
     """Side in pixels of a cell that gets a seed if it holds no point."""
+    depth_maps: bool = True
+    """Use the depth maps that come with a capture (a LiDAR's, a Kinect's): without points begin at
+    their depth, and take theirs where photographs confirm none."""
+    min_confidence: Annotated[int, Range(0, 2)] = MIN_CONFIDENCE
+    """Where photographs confirm none, use depth from this confidence on, if maps have one: 0 low,
+    1 medium, 2 high."""
 
     name: ClassVar[str] = "auto"
 
@@ -166,14 +190,40 @@ class Auto(Stereo):
         rng: np.random.Generator,
         progress: Progress,
     ) -> NewPoints:
-        """Add a seed in every cell that stereo leaves empty."""
+        """Add a seed in each cell that stereo leaves empty, at a measured depth if there is one."""
         known = PointCloud.concatenate(scene.points.originals, PointCloud(seeds.xyz, seeds.rgb))
-        gaps = _cover(views, known, self.cell, rng, progress)
+        parts = [seeds]
+        if self.depth_maps and in_scene_units(scene.depths):
+            parts.append(self._from_maps(scene, seeds.stereo, known, progress))
+            known = PointCloud.concatenate(known, PointCloud(parts[1].xyz, parts[1].rgb))
+        parts.append(_cover(views, known, self.cell, rng, progress))
         arrays: dict[str, Any] = {
-            name: np.concatenate([getattr(seeds, name), getattr(gaps, name)])
+            name: np.concatenate([getattr(part, name) for part in parts])
             for name in ("xyz", "rgb", "normals", "sizes", "confidence", "source")
         }
-        return seeds._replace(**arrays)
+        notes = tuple(note for part in parts for note in part.notes)
+        return seeds._replace(notes=notes, **arrays)
+
+    def _from_maps(
+        self, scene: Scene, stereo: StereoResult | None, known: PointCloud, progress: Progress
+    ) -> NewPoints:
+        """Make the seeds that the scene's depth maps give where stereo found none."""
+        from splatseed.seeding.map_seeds import cell_maps, seeds_from_maps, unit_problem
+
+        assert scene.depths is not None  # noqa: S101  (they are in scene units)
+        assert stereo is not None  # noqa: S101  (its seeds are to be completed)
+        images = photographed(scene, self.test_every)
+        maps = cell_maps(
+            stereo.views, images, scene.depths, self.cell, self.min_confidence, progress
+        )
+        note = unit_problem(stereo, maps)
+        if note:
+            maps = [np.full_like(each, np.nan) for each in maps]
+        xyz = known.xyz[known.finite]
+        seeds = seeds_from_maps(stereo.views, xyz, maps, stereo.sources, self.cell, progress)
+        num = counted(sum(image.name in scene.depths for image in images), "depth map")
+        note = note or f"Where photographs confirm no depth, it is that of the scene's {num}."
+        return _unoriented(seeds, "depth", (note,))
 
 
 def stereo_points(seeds: StereoSeeds, notes: tuple[str, ...], stereo: StereoResult) -> NewPoints:
@@ -283,9 +333,14 @@ def _cover(
 
     xyz, masks = cloud.xyz[cloud.finite], [view.mask for view in views]
     seeds = cover(views, xyz, cell=cell, rng=rng, masks=masks, progress=progress)
-    normals = np.full((len(seeds.xyz), 3), np.nan, np.float32)
-    source = np.full(len(seeds.xyz), source_code("cover"), np.uint8)
-    return NewPoints(seeds.xyz, seeds.rgb, (), normals, seeds.size, seeds.confidence, source)
+    return _unoriented(seeds, "cover")
+
+
+def _unoriented(seeds: CoverSeeds, method: str, notes: tuple[str, ...] = ()) -> NewPoints:
+    """Make new points of seeds without normals."""
+    normals = np.full((len(seeds), 3), np.nan, np.float32)
+    source = np.full(len(seeds), source_code(method), np.uint8)
+    return NewPoints(seeds.xyz, seeds.rgb, notes, normals, seeds.size, seeds.confidence, source)
 
 
 def _stereo_note(scene: Scene, stereo: StereoResult, seconds: float) -> tuple[str, ...]:

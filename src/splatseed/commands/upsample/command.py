@@ -74,7 +74,7 @@ def _upsample(options: Options, methods: dict[str, Any]) -> None:
             if options.method != CLOUD:
                 extra_method = replace(cloud.method, alone=False)
         method, count = methods[options.method], len(scene.points)
-        new = number_of_new(method, options.method, count, options.ratio, options.num_points)
+        new = number_of_new(method, options.method, scene, options.ratio, options.num_points)
         total = None if new is None else count + new
         limit = None if options.budget is None else points_within(scene, options.budget)
     changes = {"--verify": options.verify, "--cover": options.cover_cell is not None}

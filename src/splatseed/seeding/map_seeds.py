@@ -1,0 +1,224 @@
+"""Seeds from a sensor's depth maps where a cloud leaves cells of the photographs empty.
+
+Notation: cells are those of ``photos.zbuffer``. The *cell map* of a view is its map's planar depth
+at the centre of each cell, NaN where the map has none, where its confidence is too low, and near
+discontinuities. Views are processed in order, each with the seeds of the views before; an empty
+cell with a depth gets one seed. Another view *sees through* a seed that lies in front of all its
+known depths around the seed's cell, by more than ``MAPS.tolerance``; then there is no seed.
+Promise: seeds lie at measured depths, never at guesses; nothing is random, and bytes do not depend
+on the number of threads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int64
+
+from splatseed.depth._kernels import find_edges
+from splatseed.depth.alignment import LIMITS, map_camera
+from splatseed.depth.settings import DepthSettings
+from splatseed.depth.stereo.maps import StereoResult
+from splatseed.depthmap import DepthMap, DepthMaps
+from splatseed.lens import project_rays
+from splatseed.photos.projection import cells_from_world, grid_shape, project
+from splatseed.photos.view import View
+from splatseed.photos.zbuffer import cell_depths
+from splatseed.progress import Progress, in_threads, silent
+from splatseed.scene import Image
+from splatseed.seeding.cover import CoverSeeds, GrowableArray, make_seeds
+
+CellMap = Float32[np.ndarray, "rows cols"]
+
+
+@dataclass(frozen=True)
+class _MapSettings:
+    """Settings of seeds from maps."""
+
+    confidence: float = 0.5  # of a seed: above cover's guesses, below what photographs confirm
+    tolerance: float = 0.05  # relative depth by which a view must see past a seed
+
+
+MAPS = _MapSettings()
+
+
+def seeds_from_maps(
+    views: Sequence[View],
+    xyz: Float32[np.ndarray, "N 3"],
+    maps: Sequence[CellMap],
+    sources: Int64[np.ndarray, "V K"],
+    cell: float,
+    progress: Progress = silent,
+) -> CoverSeeds:
+    """Put a seed into every empty cell whose depth is known.
+
+    Args:
+        views: Photographs with their pixels.
+        xyz: The points so far, finite.
+        maps: The views' cell maps, as ``cell_maps`` returns.
+        sources: The other views to compare each with, int64 [V, K]; -1 = none.
+        cell: Side of a cell, in pixels.
+        progress: Called with the stage and the fraction done.
+    """
+    cloud = GrowableArray(np.ascontiguousarray(xyz, np.float32))
+    parts = []
+    for i, view in enumerate(views):
+        covered = np.isfinite(cell_depths(view.camera, cloud.values, cell))
+        empty = np.flatnonzero(~covered & np.isfinite(maps[i]))
+        found = maps[i].ravel()[empty], np.ones(len(empty), np.float32)
+        seeds = make_seeds(view, i, cell, empty, found, view.mask)
+        others = [j for j in sources[i].tolist() if j >= 0]
+        seeds = seeds.select(~_seen_through(seeds.xyz, views, maps, others, cell))
+        cloud.append(seeds.xyz)
+        parts.append(replace(seeds, confidence=np.full(len(seeds), MAPS.confidence, np.float32)))
+        progress("depth maps", (i + 1) / len(views))
+    return CoverSeeds.concatenate(parts)
+
+
+def unit_problem(stereo: StereoResult, maps: Sequence[CellMap]) -> str:
+    """Explain how maps contradict the depths that photographs confirm in their unit; else empty.
+
+    ``maps`` are cell maps of the stereo's views.
+    """
+    ratios = [_ratios(stereo, i, known) for i, known in enumerate(maps)]
+    ratio = np.concatenate(ratios)
+    if len(ratio) < LIMITS.unit_points:
+        return ""
+    middle = float(np.median(ratio))
+    if 1.0 / LIMITS.unit_factor < middle < LIMITS.unit_factor:
+        return ""
+    return (
+        f"The scene's depth maps are left out: their depth is {middle:.3g} times that of the "
+        "photographs, so they have another unit."
+    )
+
+
+def _ratios(stereo: StereoResult, i: int, known: CellMap) -> Float64[np.ndarray, " M"]:
+    """Return a cell map's depth over stereo's, at the cells' centres where both are known."""
+    confirmed, shape = stereo.confirmed(i), np.array(known.shape)
+    row, column = np.indices(known.shape)
+    row = (row * confirmed.shape[0] + confirmed.shape[0] // 2) // shape[0]
+    column = (column * confirmed.shape[1] + confirmed.shape[1] // 2) // shape[1]
+    both = confirmed[row, column] & np.isfinite(known)
+    # Planes hold inverse depth.
+    return np.asarray((known * stereo.planes[i][0][row, column])[both], np.float64)
+
+
+def _seen_through(
+    points: Float32[np.ndarray, "M 3"],
+    views: Sequence[View],
+    maps: Sequence[CellMap],
+    others: Sequence[int],
+    cell: float,
+) -> Bool[np.ndarray, " M"]:
+    """Mark points in front of everything that one of some other views shows around them."""
+    seen = np.zeros(len(points), np.bool_)
+    for j in others:
+        column, row, depth = project(cells_from_world(views[j].camera, cell), points)
+        rows, cols = maps[j].shape
+        inside = (depth > 0) & (column >= 0) & (column < cols) & (row >= 0) & (row < rows)
+        at = np.flatnonzero(inside)
+        nearest = _nearest_around(maps[j])[row[at].astype(np.int64), column[at].astype(np.int64)]
+        # False where nothing is known.
+        seen[at] |= depth[at] < nearest * (1.0 - MAPS.tolerance)
+    return seen
+
+
+def _nearest_around(known: CellMap) -> CellMap:
+    """Return the smallest depth among each cell and its eight neighbours; NaN if one is unknown."""
+    padded = np.pad(known, 1, constant_values=np.inf)
+    shifted = [
+        padded[i : i + known.shape[0], j : j + known.shape[1]] for i in range(3) for j in range(3)
+    ]
+    return np.asarray(np.minimum.reduce(shifted))  # NaN propagates
+
+
+def cell_maps(
+    views: Sequence[View],
+    images: Sequence[Image],
+    depths: DepthMaps,
+    cell: float,
+    min_confidence: int,
+    progress: Progress = silent,
+) -> list[CellMap]:
+    """Read the maps of some views' images, at the centres of their cells.
+
+    Args:
+        views: The views, without lens distortion.
+        images: Their images, as photographed.
+        depths: Maps in scene units.
+        cell: Side of a cell, in pixels of the views.
+        min_confidence: Depth of a lower confidence is unknown.
+        progress: Called with the stage and the fraction done.
+
+    Raises:
+        SceneNotFoundError: A map's file is gone.
+        SceneFormatError: A map cannot be read, or differs from its image in aspect ratio.
+    """
+    found = [np.full(grid_shape(view.camera, cell), np.nan, np.float32) for view in views]
+
+    def work(start: int, stop: int) -> None:
+        for i in range(start, stop):
+            if images[i].name in depths:
+                depth = depths.read(images[i].name).reliable(min_confidence)
+                found[i] = depth_at_cells(views[i], images[i], depth, cell)
+
+    in_threads(work, len(views), 1, "read depth maps", progress)
+    return found
+
+
+def depth_at_cells(view: View, image: Image, depth: DepthMap, cell: float) -> CellMap:
+    """Return planar depth at the centres of a view's cells, NaN where unknown or near an edge."""
+    rows, cols = grid_shape(view.camera, cell)
+    if depth.kind == "inverse":  # up to an unknown scale and shift
+        return np.full((rows, cols), np.nan, np.float32)
+    row, column = np.indices((rows, cols)) + 0.5
+    pixels = np.stack([column * (view.width / cols), row * (view.height / rows)], axis=-1)
+    rays = (pixels - view.K[:2, 2]) / view.K[[0, 1], [0, 1]]
+    with np.errstate(all="ignore"):  # far outside, a lens model need not be finite
+        places = _pixels_of_rays(image, depth, rays)
+    inside = ((places >= 0) & (places < [depth.width, depth.height])).all(axis=-1)
+    places = places[inside]
+    z = _interpolated(depth.values, places)
+    if depth.kind == "ray":
+        z /= np.sqrt((rays[inside] ** 2).sum(axis=-1) + 1.0).astype(np.float32)
+    settings, known = DepthSettings(), np.isfinite(z)
+    number = places.astype(np.int64)[known] @ [1, depth.width]
+    near = np.empty(len(number), np.bool_)
+    find_edges(depth.values, number, settings.edge_radius, settings.edge_tolerance, near)
+    z[np.flatnonzero(known)[near]] = np.nan
+    cells = np.full((rows, cols), np.nan, np.float32)
+    cells[inside] = z
+    return cells
+
+
+def _interpolated(
+    values: Float32[np.ndarray, "H W"], places: Float64[np.ndarray, "M 2"]
+) -> Float32[np.ndarray, " M"]:
+    """Interpolate 1 / z, linear on planes, between four pixels; NaN where one is unknown."""
+    size = np.array(values.shape[::-1])
+    corner = np.clip(np.floor(places - 0.5), 0, np.maximum(size - 2, 0)).astype(np.int64)
+    right, down = np.clip(places - 0.5 - corner, 0.0, 1.0).T
+    (column, row), (next_column, next_row) = corner.T, np.minimum(corner + 1, size - 1).T
+    weighted = (
+        ((1 - right) * (1 - down), values[row, column]),
+        (right * (1 - down), values[row, next_column]),
+        ((1 - right) * down, values[next_row, column]),
+        (right * down, values[next_row, next_column]),
+    )
+    with np.errstate(divide="ignore"):
+        z = 1.0 / sum(weight / z for weight, z in weighted)
+    return np.where((z > 0) & (z < np.inf), z, np.nan).astype(np.float32)
+
+
+def _pixels_of_rays(
+    image: Image, depth: DepthMap, rays: Float64[np.ndarray, "R C 2"]
+) -> Float64[np.ndarray, "R C 2"]:
+    """Project rays (x, y, 1) to the pixels of an image's map, with the image's lens."""
+    K = map_camera(depth, image).K
+    if depth.K is not None:
+        return np.asarray(rays * K[[0, 1], [0, 1]] + K[:2, 2])
+    lens = image.intrinsics
+    return project_rays(lens, rays) * [depth.width / lens.width, depth.height / lens.height]

@@ -1,0 +1,110 @@
+"""Seeds from depth maps that come with a capture, where photographs confirm nothing."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import splatseed as ss
+from splatseed.camera import Intrinsics
+from splatseed.depthmap import DepthMap, HeldDepths
+from splatseed.methods import SOURCE_CODES
+from splatseed.photos.view import view_of
+from splatseed.seeding.map_seeds import depth_at_cells
+
+DEPTH, COVER = SOURCE_CODES["depth"], SOURCE_CODES["cover"]
+
+
+class MetricMaps(HeldDepths):
+    """Maps that come with a capture, in its unit."""
+
+    in_scene_units = True
+
+
+@pytest.fixture(scope="module")
+def make_maps(room, room_capture):
+    """Makes true maps, after ``change(z, i)`` of the i-th image's, with a confidence."""
+
+    def make(change=lambda z, _: z, confidence=None, kind=MetricMaps):
+        maps = kind()
+        for i, (image, z) in enumerate(zip(room.images, room_capture.depths, strict=True)):
+            values = change(np.where(z > 0, z, np.nan).astype(np.float32), i)
+            maps[image.name] = DepthMap(values, confidence=confidence)
+        return maps
+
+    return make
+
+
+def off_surface(seeds, capture, code):
+    return capture.surfaces.distance(seeds.xyz[seeds.source == code].astype(np.float64))
+
+
+def test_measured_depth_replaces_guesses(room, room_capture, make_maps):
+    notes = []
+    guessed = ss.upsample(room)
+    scene = room.replace(depths=make_maps())
+    seeds = ss.upsample(scene, note=notes.append)
+    off = off_surface(seeds, room_capture, DEPTH)
+    assert len(off) > 300
+    assert off.max() < 2e-3  # metres; the room measures 5
+    assert np.count_nonzero(seeds.source == COVER) < 0.7 * np.count_nonzero(guessed.source == COVER)
+    assert any("it is that of the scene's 16 depth maps" in note for note in notes)
+    confidence = seeds.confidence[seeds.source == DEPTH]
+    assert seeds.confidence[seeds.source == COVER].max() < confidence.min()
+    without = ss.upsample(scene, depth_maps=False)
+    np.testing.assert_array_equal(without.xyz, guessed.xyz)
+
+
+def test_maps_of_another_unit_or_origin_are_not_used(room, make_maps):
+    """Those of a network, in a folder that the user named, have no unit."""
+    found = ss.upsample(room.replace(depths=make_maps(kind=HeldDepths)))
+    assert DEPTH not in found.source
+    notes = []
+    twice = room.replace(depths=make_maps(lambda z, _: 1.5 * z))
+    assert DEPTH not in ss.upsample(twice, note=notes.append).source
+    assert "times that of the photographs" in notes[-1]
+
+
+def test_uncertain_and_contradicted_depth_gives_no_seed(room, room_capture, make_maps):
+    half = np.full((120, 160), 2, np.uint8)
+    half[:, 80:] = 0
+
+    def change(z, i):
+        z[:, 80:] *= 0.6
+        if i == 7:
+            z[40:80, 20:60] *= 0.5  # a blob in the air that all others see through
+        return z
+
+    maps = make_maps(change, half)
+    seeds = ss.upsample(room.replace(depths=maps))
+    assert off_surface(seeds, room_capture, DEPTH).max() < 2e-3
+    seeds = ss.upsample(room.replace(depths=maps), min_confidence=0)
+    assert off_surface(seeds, room_capture, DEPTH).max() > 0.1
+
+
+def test_depth_at_cells_equals_a_loop(room, rng):
+    """Of a map of another size, with distances along rays, of a photograph with distortion."""
+    image = room.images[0]
+    lens = Intrinsics(1, "SIMPLE_RADIAL", 160, 120, (150.0, 82.0, 57.0, 0.1))
+    image = dataclasses.replace(image, intrinsics=lens)
+    view = view_of(room.images[0])
+    plane = 3.0 + 0.001 * np.arange(80) + 0.002 * np.arange(60)[:, None]
+    values = plane.astype(np.float32)
+    values[20:30, 30:40] = np.nan
+    found = depth_at_cells(view, image, DepthMap(values, "ray"), 8)
+    assert found.shape == (15, 20)
+    checked = 0
+    for row, column in zip(*np.nonzero(np.isfinite(found)), strict=True):
+        x = (8 * column + 4 - view.K[0, 2]) / view.K[0, 0]
+        y = (8 * row + 4 - view.K[1, 2]) / view.K[1, 1]
+        bend = 1 + 0.1 * (x * x + y * y)
+        u, v = (150 * bend * x + 82) / 2, (150 * bend * y + 57) / 2
+        if not (0.5 <= u <= 79.5 and 0.5 <= v <= 59.5):  # outside of the pixels' centres
+            continue
+        distance = 3.0 + 0.001 * (u - 0.5) + 0.002 * (v - 0.5)
+        assert found[row, column] == pytest.approx(distance / np.sqrt(x * x + y * y + 1), rel=1e-4)
+        checked += 1
+    assert 100 < checked < 300
+    assert np.isnan(depth_at_cells(view, image, DepthMap(values, "inverse"), 8)).all()
