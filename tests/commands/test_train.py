@@ -15,7 +15,7 @@ from splatseed.commands.train import bar_columns, parse
 from splatseed.console import LiteralConsole
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io import load_scene, write_scene
-from splatseed.sfm import Refinement, SfmReport
+from splatseed.sfm import Refinement, pipeline
 
 pytest.importorskip("torch", reason="training needs PyTorch")
 pytest.importorskip("gsplat", reason="training needs gsplat's strategies")
@@ -77,15 +77,14 @@ def refining(room, monkeypatch):
     """Stands in for pycolmap: poses and points are the room's. Its list tells the calls."""
     truth, calls = load_scene(room), []
 
-    def reconstruct(folder, output, settings, **how):
-        assert how["refine_poses"]
-        assert how["test_names"] == {image.name for image in truth.split(8)[1]}
+    def call(folder, staging, settings, progress, kept, job, poses, test_names, masks):
+        assert job is pipeline._refine
+        assert test_names == {image.name for image in truth.split(8)[1]}
         calls.append(folder)
-        write_scene(truth, output)
         change = Refinement(False, 9.0, 0.5, 0.1, 0.2, 0.1, 0.2)
-        return SfmReport(output, 12, 12, (), len(truth.points), 3.0, 0.5, {}, change, truth.images)
+        return pipeline._Refined(truth.images, truth.points, change)
 
-    monkeypatch.setattr("splatseed.sfm.pipeline.reconstruct", reconstruct)
+    monkeypatch.setattr(pipeline, "_call", call)
     return calls
 
 

@@ -15,7 +15,7 @@ from splatseed.camera import quat_from_rotation
 from splatseed.errors import ReconstructionError
 from splatseed.io import load_scene
 from splatseed.progress import silent
-from splatseed.sfm import Settings, reconstruct
+from splatseed.sfm import Settings, first_look, matching, reconstruct
 from splatseed.sfm.colmap import Run, posed_model, require_pycolmap
 from splatseed.sfm.matching import match_photographs
 from splatseed.sfm.refinement import (
@@ -74,6 +74,24 @@ def test_noise_is_taken_out_the_same_each_time(room, refined):
     assert refinement.largest_turn == pytest.approx(turns(found, poses_of(given)).max())
     assert refinement.median_shift == pytest.approx(np.median(shifts(found, poses_of(given))))
     np.testing.assert_equal(poses_of(refined(given)[0]), found)
+
+
+def test_pairs_by_poses_that_are_off_suffice(room, tmp_path, monkeypatch):
+    few = replace(first_look.FIRST_LOOK, max_exhaustive=4, partners=3, bridges=1, further=2)
+    for module in (first_look, matching):
+        monkeypatch.setattr(module, "FIRST_LOOK", few)
+    given = with_noise(room.images, 2.0, 3.0)
+    run = Run(require_pycolmap(), Settings(device="cpu"), room.source.image_dir, tmp_path, silent)
+    model = posed_model(pycolmap, given)
+    agreement = match_photographs(run, model, None, given)
+    assert run.num_pairs() < 45  # of 66
+    with pycolmap.Database.open(run.database) as database:
+        shared = database.read_two_view_geometry(1, 2).inlier_matches
+    assert agreement[0, 1] > agreement[0, 6]
+    assert len(shared) > 50
+    true, (images, _) = poses_of(room.images), refine(run, given)
+    before, found = median_errors(poses_of(given), true), poses_of(images)
+    assert (median_errors(align(found, true), true) < before / 15).all()
 
 
 def test_true_poses_stay_exactly(room, refined):

@@ -10,9 +10,11 @@ import time
 from collections.abc import Collection, Iterable, Sequence
 from typing import Any
 
+import numpy as np
+
 from splatseed.errors import SceneFormatError
 from splatseed.io.masks import write_masks
-from splatseed.scene import Masks
+from splatseed.scene import Image, Masks
 from splatseed.sfm.colmap import Run
 from splatseed.sfm.database import numbered, run_database
 from splatseed.sfm.first_look import (
@@ -32,8 +34,12 @@ _BLOCK_PAIRS = 128
 """Matches are committed per block of as many pairs; as many photographs' features are in memory."""
 
 
-def match_photographs(run: Run, model: Any, masks: Masks | None = None) -> Agreement | None:
+def match_photographs(
+    run: Run, model: Any, masks: Masks | None = None, poses: Sequence[Image] = ()
+) -> Agreement | None:
     """Fill the database with a model's images, features and verified matches.
+
+    ``poses``, if they are known, are the model's images in the order of their ids, from 1.
 
     Returns the agreement of photographs at a first look, if that chose the pairs.
     """
@@ -43,14 +49,44 @@ def match_photographs(run: Run, model: Any, masks: Masks | None = None) -> Agree
             match_pairs(run, database, _pairs(run, database))
             return None
         ids = sorted(model.images)
-        started = time.perf_counter()
-        features = largest_features(database, ids)
-        agreement = measure_agreement(features, run.on_progress)
-        run.seconds[STAGE] = time.perf_counter() - started
+        if poses:
+            agreement = _agreement_by_poses(run, database, model, poses)
+        else:
+            started = time.perf_counter()
+            features = largest_features(database, ids)
+            agreement = measure_agreement(features, run.on_progress)
+            run.seconds[STAGE] = time.perf_counter() - started
         match_pairs(run, database, [(ids[i], ids[j]) for i, j in choose_pairs(agreement)])
         weak = poorly_connected(len(ids), _verified(run, database, ids))
         _match_further(run, database, agreement, weak)
     return agreement
+
+
+def _agreement_by_poses(run: Run, database: Any, model: Any, poses: Sequence[Image]) -> Agreement:
+    """Infer the agreement from poses, and from depths by the matches of neighbours."""
+    from splatseed.sfm import overlap  # noqa: PLC0415  (imports Numba, for which --help would wait)
+
+    cameras = [image.camera for image in poses]
+    pairs = overlap.first_pairs(cameras)
+    match_pairs(run, database, [(i + 1, j + 1) for i, j in pairs], STAGE)
+    ids = range(1, len(poses) + 1)
+    lenses = [model.image(i).camera for i in ids]
+    xy = [database.read_keypoints(i)[:, :2].astype(np.float64) for i in ids]
+    rays = [lens.cam_from_img(points) for lens, points in zip(lenses, xy, strict=True)]
+    seen = [[np.empty((0, 3))] for _ in poses]
+    for i, j in pairs:
+        found = database.read_two_view_geometry(i + 1, j + 1)
+        if not run.pycolmap.estimate_two_view_geometry_pose(
+            *(lenses[i], xy[i], lenses[j], xy[j], found)
+        ):
+            continue  # unrelated
+        matched = rays[i][found.inlier_matches[:, 0]], rays[j][found.inlier_matches[:, 1]]
+        relative = found.cam2_from_cam1.matrix()
+        points = overlap.points_of_matches(matched, relative, (cameras[i], cameras[j]))
+        for view, of_view in zip((i, j), points, strict=True):
+            seen[view].append(of_view)
+    shares = overlap.overlaps(cameras, [np.concatenate(points) for points in seen])
+    return overlap.expected_agreement(shares)
 
 
 def match_further(run: Run, agreement: Agreement, names: Collection[str]) -> bool:

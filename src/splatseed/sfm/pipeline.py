@@ -15,11 +15,13 @@ from importlib.metadata import version
 from pathlib import Path, PurePosixPath
 from shutil import rmtree
 from tempfile import TemporaryDirectory
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
 
 from splatseed import errors
 from splatseed.camera import CAMERA_MODELS, Intrinsics
-from splatseed.io import load_scene, write_scene
+from splatseed.io import write_scene
 from splatseed.io.colmap_layout import write_split
 from splatseed.io.colmap_model import read_model_cameras
 from splatseed.io.files import StrPath
@@ -39,7 +41,7 @@ from splatseed.scene import Image, Masks, Scene
 from splatseed.sfm import colmap
 from splatseed.sfm.cameras import SharedCamera, describe_cameras, share_cameras
 from splatseed.sfm.colmap import Run, Settings
-from splatseed.sfm.export import export_scene
+from splatseed.sfm.export import drop_repeats, export_scene
 from splatseed.sfm.matching import match_further, match_photographs
 from splatseed.sfm.photos import find_photos, match_poses
 from splatseed.sfm.refinement import Refinement, refine
@@ -48,6 +50,7 @@ from splatseed.sfm.work_folder import WorkFolder, resumable_work, work_key
 OnPhotos: TypeAlias = Callable[[Sequence[str], Mapping[str, Sequence[str]], str], None]
 _DEFAULT = Settings()
 _CHILD = {"OPENBLAS_NUM_THREADS": "1"}  # our threads and NumPy's own would wait for each other
+_WORK = ".work"  # folder of temporary files in the staging folder
 _REASON = re.compile(r"what\(\):\s*(.*)|^[EF]\d{8}\s.*?\]\s*(.*)", re.MULTILINE)
 
 
@@ -68,8 +71,8 @@ class SfmReport:
     num_pairs: int = 0  # matched pairs of photographs
 
 
-Job: TypeAlias = Callable[..., SfmReport]
-"""A job of the child process: (run, staging folder, *arguments) to report."""
+Job: TypeAlias = Callable[..., Any]
+"""A job of the child process: (run, staging folder, *arguments) to its result."""
 
 
 def reconstruct(
@@ -153,7 +156,7 @@ def reconstruct(
         work = resumable_work(Path(output), key, on_note, resume=resume)
         with work if keep or resume else nullcontext() as kept:
             how = (images, staging, settings, on_progress, kept, _reconstruct)
-            report = _call(*how, list(photos), cameras, *options)
+            report: SfmReport = _call(*how, list(photos), cameras, *options)
         if poses_from is not None:
             write_split(poses_from, staging)
             write_offset(staging, poses_from.offset)
@@ -199,7 +202,7 @@ def _reconstruct(
         further = None if agreement is None else lambda lost: match_further(run, agreement, lost)
         model_dir = colmap.map_images(run, names, camera_model, further, partial=partial)
     else:
-        match_photographs(run, colmap.posed_model(run.pycolmap, poses), masks)
+        match_photographs(run, colmap.posed_model(run.pycolmap, poses), masks, poses)
         if refine_poses:
             poses, refinement = refine(run, poses)
         model_dir = colmap.triangulate_points(run, poses, test_names)
@@ -245,11 +248,13 @@ def undistort(
     check_sizes(scene.images, images)
     scene = at_file_size(scene).replace(intrinsics=())  # pycolmap needs cameras of the files' size
     with _staged(images, Path(output), "undistort", overwrite=overwrite) as staging:
-        work = staging / ".work" / "distorted"
+        work = staging / _WORK / "distorted"
         distorted = write_scene(scene, work, format="colmap", require_points=False).path
         names, how = sorted(image.name for image in scene.images), (images, staging, _DEFAULT)
         model_dir = distorted / "sparse" / "0"
-        report = _call(*how, on_progress, None, _undistort, model_dir, names, scene.masks)
+        report: SfmReport = _call(
+            *how, on_progress, None, _undistort, model_dir, names, scene.masks
+        )
         carry_seeds(scene, distorted, staging)
         write_split(scene, staging)
         write_offset(staging, scene.offset)
@@ -277,21 +282,16 @@ def refined(
         ReconstructionError: The poses drifted, or no point could be triangulated.
         MissingDependencyError: pycolmap is absent.
     """
-    folder = photograph_folder(scene)
+    require("pycolmap")
+    folder = photograph_folder(scene).absolute()
     test = scene.split(test_every)[1] if test_every or scene.listed else ()
+    poses = match_poses(find_photos(folder)[0], scene, folder)
     with TemporaryDirectory(prefix="splatseed-refine-") as name:
-        report = reconstruct(
-            *(folder, Path(name) / "scene", Settings(seed=seed)),
-            poses_from=scene,
-            refine_poses=True,
-            test_names=frozenset(image.name for image in test),
-            masks=scene.masks,
-            keep=False,
-            on_progress=progress,
-        )
-        found = load_scene(report.path).replace(images=report.poses)
-    change, points = report.refinement, f"{report.num_points:,} points were triangulated"
-    assert change is not None  # noqa: S101  (refine_poses is set)
+        (Path(name) / _WORK).mkdir()
+        names = {image.name for image in test}
+        child = (folder, Path(name), Settings(seed=seed), progress, None, _refine)
+        found: _Refined = _call(*child, poses, names, scene.masks)
+    change, points = found.refinement, f"{len(found.points):,} points were triangulated"
     if change.kept:
         how = f"Poses are as given: refined, they would gain less than 0.1 px. {points}."
     else:
@@ -300,7 +300,28 @@ def refined(
             f"{change.error_after:.2f} px: cameras turned by {change.median_turn:.2f} degrees "
             f"and moved by {change.median_shift:.3g} units, both the median; {points}."
         )
-    return with_refined(scene, found), how
+    return with_refined(scene, scene.replace(images=found.poses, points=found.points)), how
+
+
+class _Refined(NamedTuple):
+    """Result of ``_refine``."""
+
+    poses: tuple[Image, ...]
+    points: PointCloud
+    refinement: Refinement
+
+
+def _refine(
+    run: Run, _: Path, poses: Sequence[Image], test_names: Collection[str], masks: Masks | None
+) -> _Refined:
+    match_photographs(run, colmap.posed_model(run.pycolmap, poses), masks, poses)
+    poses, refinement = refine(run, poses)
+    model = run.pycolmap.Reconstruction(colmap.triangulate_points(run, poses, test_names))
+    drop_repeats(model)
+    points = [point for _, point in sorted(model.points3D.items())]
+    xyz = np.array([point.xyz for point in points], np.float32)
+    cloud = PointCloud(xyz, np.array([point.color for point in points], np.uint8))
+    return _Refined(tuple(poses), cloud.select(cloud.distinct), refinement)
 
 
 def with_refined(scene: Scene, found: Scene) -> Scene:
@@ -323,9 +344,9 @@ def with_refined(scene: Scene, found: Scene) -> Scene:
 def _staged(images: Path, output: Path, kind: str, *, overwrite: bool) -> Iterator[Path]:
     """Yield the staging folder of the scene, with ``.work`` for temporary files on its disk."""
     with output_folder(output, kind=kind, overwrite=overwrite, protect=(images,)) as staging:
-        (staging / ".work").mkdir()
+        (staging / _WORK).mkdir()
         yield staging.absolute()
-        rmtree(staging / ".work")
+        rmtree(staging / _WORK)
 
 
 def _call(
@@ -336,13 +357,13 @@ def _call(
     kept: WorkFolder | None,
     job: Job,
     *arguments: Any,
-) -> SfmReport:
-    """Run a job in a child process."""
-    log = staging / ".work" / "log.txt"
+) -> Any:
+    """Run a job in a child process; return its result."""
+    log = staging / _WORK / "log.txt"
     call = (_work, images, staging, settings, kept, job, arguments)
     with closing(Child(*call, reports=True, environment=_CHILD, log=log.open("w+b"))) as child:
         try:
-            report: SfmReport = child.result(progress)
+            return child.result(progress)
         except errors.TaskLostError as error:
             reasons, found = _REASON.findall(log.read_text("utf-8", "replace")), error.found
             if reasons:
@@ -351,7 +372,6 @@ def _call(
             if kept is not None:
                 fix = f"{fix[:-1]}, and run it again: finished work is in {kept.folder}."
             raise errors.ReconstructionError("pycolmap to finish", found=found, fix=fix) from error
-    return report
 
 
 def _work(
@@ -362,11 +382,11 @@ def _work(
     job: Job,
     arguments: Sequence[Any],
     progress: Progress,
-) -> SfmReport:
+) -> Any:
     pycolmap = colmap.require_pycolmap(settings.device)
     pycolmap.logging.logtostderr = True  # not to files in the temporary folder
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.ERROR)
-    run = Run(pycolmap, settings, images, staging / ".work", progress, kept)
+    run = Run(pycolmap, settings, images, staging / _WORK, progress, kept)
     return job(run, staging, *arguments)
 
 

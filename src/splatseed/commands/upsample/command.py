@@ -55,7 +55,7 @@ def _upsample(options: Options, methods: dict[str, Any]) -> None:
         if options.refine_poses:
             from splatseed.sfm import refined
 
-            clock.expect("features", "matching", "refinement", "triangulation", "undistortion")
+            clock.expect("features", "matching", "refinement", "triangulation")
             test_every = getattr(methods[options.method], "test_every", 0)
             scene, note = refined(scene, options.seed, clock, test_every=test_every)
             notes.append(note)
