@@ -13,7 +13,7 @@ pytest.importorskip("pycolmap", reason="needs pycolmap")
 from splatseed.io.staging import locked
 from splatseed.progress import silent
 from splatseed.scene import Masks
-from splatseed.sfm import Settings
+from splatseed.sfm import Settings, colmap
 from splatseed.sfm.cameras import Photo
 from splatseed.sfm.colmap import Run, posed_model, require_pycolmap
 from splatseed.sfm.database import run_database
@@ -41,6 +41,7 @@ def fail(output, key, **how):
         (kept.folder / "database.db").touch()
         kept.set_contents(list(key.features))
         (kept.folder / "models" / "0").mkdir(parents=True, exist_ok=True)
+        (kept.folder / "models" / "complete").touch()
         raise KeyboardInterrupt
     assert f"{output.name}_sfm" in notes.pop()
     return notes, found
@@ -159,3 +160,36 @@ def test_features_and_matches_move_to_the_database_of_other_photographs(room, tm
             found = [each.read_two_view_geometry(*pair).inlier_matches for each in (resumed, anew)]
             assert len(found[0]) > 30
             np.testing.assert_array_equal(*found)
+
+
+def test_mapping_goes_on_from_the_last_sure_snapshot(room, tmp_path, monkeypatch):
+    folder, work = tmp_path / "out_sfm", tmp_path / "work"
+    for each in (folder, work):
+        each.mkdir()
+    monkeypatch.setattr(colmap, "_SNAPSHOT_FRAMES", 2)
+    settings = Settings("sequential", "cpu")
+    kept = WorkFolder(folder, WorkKey({}, "", ""))
+    run = Run(require_pycolmap(), settings, room.source.image_dir, work, silent, kept)
+    images = room.images[:8]
+    match_photographs(run, posed_model(run.pycolmap, images))
+    names = [image.name for image in images]
+
+    def interrupt(stage, _):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        colmap.map_images(
+            replace(run, on_progress=interrupt), names, "PINHOLE", None, partial=False
+        )
+    given = []
+    real_extend = colmap._extend
+
+    def extend(run, stage, snapshot, *rest):
+        given.append(run.pycolmap.Reconstruction(snapshot).num_reg_images())
+        return real_extend(run, stage, snapshot, *rest)
+
+    monkeypatch.setattr(colmap, "_extend", extend)
+    model = colmap.map_images(run, names, "PINHOLE", None, partial=False)
+    assert 2 < given[0] < 8
+    assert run.pycolmap.Reconstruction(model).num_reg_images() == 8
+    assert {path.name for path in (folder / "models").iterdir()} == {"0", "complete"}

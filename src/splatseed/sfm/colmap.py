@@ -23,7 +23,7 @@ from splatseed.requirements import install_command
 from splatseed.runtime.torch_device import DeviceName
 from splatseed.scene import Image
 from splatseed.sfm.cameras import SharedCamera
-from splatseed.sfm.work_folder import DATABASE, MODELS, WorkFolder
+from splatseed.sfm.work_folder import COMPLETE, DATABASE, MODELS, WorkFolder
 from splatseed.text import counted, name_some
 
 MatcherName: TypeAlias = Literal["auto", "exhaustive", "sequential"]
@@ -32,8 +32,9 @@ T = TypeVar("T")
 _MIN_VERSION = 4  # the first that adds an image with its rig in one call
 _MAX_INT = 2**31 - 1  # pycolmap takes a 32-bit int
 _POLL_SECONDS = 0.1
+_SNAPSHOTS = "snapshots"  # folder of models amid mapping
+_SNAPSHOT_FRAMES = 50  # photographs mapped between two of them
 _SIMPLE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL")
-_COMPLETE = "complete"  # file that marks a finished folder of models
 
 
 @dataclass(frozen=True)
@@ -253,34 +254,45 @@ def _mapped(
     match_further: Callable[[Collection[str]], bool] | None,
 ) -> dict[int, Any]:
     """Map images, or load the finished models of an earlier run; return models by number."""
-    if (models_dir / _COMPLETE).exists():
+    if (models_dir / COMPLETE).exists():
         folders = (path for path in models_dir.iterdir() if path.is_dir())
         return {int(path.name): run.pycolmap.Reconstruction(path) for path in folders}
-    remove(models_dir)
-    models_dir.mkdir()
-    models = _map(run, models_dir, len(names))
+    snapshot = _snapshot(models_dir / _SNAPSHOTS)
+    for path in models_dir.iterdir() if models_dir.is_dir() else ():
+        if path.name != _SNAPSHOTS:
+            remove(path)
+    models_dir.mkdir(exist_ok=True)
+    if snapshot is None:
+        models = _map(run, "mapping", models_dir, len(names))
+    else:
+        models = {0: _extend(run, "mapping", snapshot, models_dir / "0", len(names))}
     best = _largest(models)
     lost = sorted({*names} - _posed(models[best])) if models else list(names)
     if lost and match_further is not None and match_further(lost):
         if models:  # goes on from the largest model, whose photographs keep their matches
-            folder = models_dir / "further"
-            folder.mkdir()
-            (models[best],) = _map(run, folder, len(lost), models_dir / str(best)).values()
-            remove(models_dir / str(best))
-            folder.rename(models_dir / str(best))
+            folder = models_dir / str(best)
+            models[best] = _extend(run, "further mapping", folder, folder, len(lost))
         else:
-            models = _map(run, models_dir, len(names))
-    (models_dir / _COMPLETE).touch()
+            models = _map(run, "further mapping", models_dir, len(names))
+    remove(models_dir / _SNAPSHOTS)
+    (models_dir / COMPLETE).touch()
     return models
 
 
-def _map(run: Run, folder: Path, total: int, given: Path | None = None) -> dict[int, Any]:
+def _map(
+    run: Run, stage: str, folder: Path, total: int, given: Path | None = None
+) -> dict[int, Any]:
     """Map images to models in numbered folders, or extend a given model in ``folder`` itself."""
     registered: list[None] = []  # except initial pairs
+    options = _options(run)
+    if run.kept is not None:
+        options.snapshot_path = run.kept.folder / MODELS / _SNAPSHOTS
+        options.snapshot_path.mkdir(exist_ok=True)
+        options.snapshot_frames_freq = _SNAPSHOT_FRAMES
     models: dict[int, Any] = run.stage(
-        "mapping" if given is None else "further mapping",
+        stage,
         lambda: run.pycolmap.incremental_mapping(
-            *(run.database, run.image_dir, folder, _options(run)),
+            *(run.database, run.image_dir, folder, options),
             **({} if given is None else {"input_path": given}),
             next_image_callback=lambda: registered.append(None),
         ),
@@ -288,6 +300,23 @@ def _map(run: Run, folder: Path, total: int, given: Path | None = None) -> dict[
         total,
     )
     return models
+
+
+def _extend(run: Run, stage: str, given: Path, folder: Path, total: int) -> Any:
+    """Go on mapping from a given model, and write the result to ``folder``."""
+    extended = folder.with_name("extended")
+    extended.mkdir()
+    (model,) = _map(run, stage, extended, total, given).values()
+    remove(folder)
+    extended.rename(folder)
+    return model
+
+
+def _snapshot(folder: Path) -> Path | None:
+    """Return the last model but one that a killed run wrote amid mapping: the last may be cut."""
+    files = folder.iterdir() if folder.is_dir() else ()
+    written = sorted(files, key=lambda path: path.stat().st_mtime_ns)
+    return written[-2] if len(written) > 1 else None
 
 
 def _largest(models: Mapping[int, Any]) -> int:

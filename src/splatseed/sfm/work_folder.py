@@ -26,6 +26,7 @@ from splatseed.text import quoted
 
 KIND = "sfm work"
 DATABASE, MODELS = "database.db", "models"
+COMPLETE = "complete"  # file in the folder of models that marks them as finished
 _KEEP, _IMAGES = "keep", "images"  # further entries of the manifest
 
 
@@ -151,7 +152,7 @@ def _prepare(
     where, number, total = quoted(folder), len(reusable), len(key.features)
     if not unchanged or before.get("models") != key.models:
         remove(folder / MODELS)
-    if unchanged and (folder / MODELS).is_dir():
+    if unchanged and (folder / MODELS / COMPLETE).is_file():
         on_note(f"Resumes from the features, matches and models in {where}.")
     elif unchanged:
         on_note(f"Resumes from the features and matches in {where}.")
