@@ -22,6 +22,8 @@ _UNSATURATED = 0.5 / 255
 """Minimum distance from 0 and 1 of an unclipped value."""
 _CORRECTIONS = 5
 """Number of colour fits: after each fit, other pixels are saturated."""
+_BLOCK = 1 << 15
+"""Pixels that are fitted at a time on the CPU: their terms stay in its cache."""
 
 
 @torch.no_grad()
@@ -59,20 +61,31 @@ def color_corrected(
     ``color_correct_quadratic``, in double precision. Of equally good polynomials the one of
     smallest norm is chosen, so that a render of a single colour has a solution.
     """
-    x, y = (image.reshape(-1, 3).T.double() for image in (render.clamp(0, 1), photograph))
+    pair = (render.clamp(0, 1), photograph)
+    x, y = (image.reshape(-1, 3).T.double().contiguous() for image in pair)
     usable = _unsaturated(x) & _unsaturated(y)
     if mask is not None:
         usable &= mask.reshape(-1)
+    size = _BLOCK if x.device.type == "cpu" else len(usable[0])
     for _ in range(_CORRECTIONS):
-        r, g, b = x
-        terms = torch.stack([r * r, r * g, r * b, g * g, g * b, b * b, r, g, b, torch.ones_like(r)])
-        fits = []
-        for target, valid in zip(y, usable & _unsaturated(x), strict=True):
-            known = terms * valid
-            inverse = torch.linalg.pinv(known @ terms.T, rtol=1e-12, hermitian=True)
-            fits.append(inverse @ (known @ target))
-        x = (torch.stack(fits) @ terms).clamp(0, 1)
+        normal, right = x.new_zeros((3, 10, 10)), x.new_zeros((3, 10, 1))
+        for source, target, valid in zip(
+            *(each.split(size, 1) for each in (x, y, usable)), strict=True
+        ):
+            terms = _quadratic_terms(source)
+            known = terms * (valid & _unsaturated(source))[:, None]
+            normal += known @ terms.T
+            right += known @ target[:, :, None]
+        fits = torch.linalg.pinv(normal, rtol=1e-12, hermitian=True) @ right
+        fitted = [fits[..., 0] @ _quadratic_terms(source) for source in x.split(size, 1)]
+        x = torch.cat(fitted, dim=1).clamp(0, 1)
     return x.T.reshape(render.shape).to(render.dtype)
+
+
+def _quadratic_terms(x: Float[Tensor, "3 P"]) -> Float[Tensor, "10 P"]:
+    """Return the monomials of degree 2 or less of each pixel's colour."""
+    r, g, b = x
+    return torch.stack([r * r, r * g, r * b, g * g, g * b, b * b, r, g, b, torch.ones_like(r)])
 
 
 def _unsaturated(values: Float[Tensor, "3 P"]) -> Bool[Tensor, "3 P"]:
