@@ -71,18 +71,18 @@ class Start:
         logits.data[torch.from_numpy(known)] = torch.logit(opacity).to(logits.dtype)
 
 
-DENSE = {"method": "auto", "spacing": 2.0, "grid": 2, "max_size": 800}
+DENSE = {"method": "auto"}
 ARMS: Mapping[str, Mapping[str, Any]] = {
     "sfm": {"method": "linear", "ratio": 1},
     "mls": {"method": "mls", "ratio": 4},
     "cover": {"method": "cover"},
-    "stereo": {"method": "stereo"},
-    "auto": {"method": "auto"},
+    "stereo": {"method": "stereo", "dense": False},
+    "auto": {"method": "auto", "dense": False},
     "auto, photographs alone": {"method": "auto", "dense": False, "depth_maps": False},
     "auto, depth maps too": {"method": "auto", "dense": False},
     "depth": {"method": "depth"},
-    "auto, no points": {"method": "auto", "points": False},
-    "auto, refined": {"method": "auto", "points": False, "refined": True},
+    "auto, no points": {"method": "auto", "dense": False, "points": False},
+    "auto, refined": {"method": "auto", "dense": False, "points": False, "refined": True},
     "triangulated": {"method": "linear", "ratio": 1, "points": False, "refined": True},
     "dense": DENSE,
     "dense, discs": {**DENSE, "start": Start(discs=True)},
@@ -93,10 +93,11 @@ ARMS: Mapping[str, Mapping[str, Any]] = {
     "random as nerfstudio": {"random": "nerfstudio"},
 }
 """How seeds are made, by what the table calls them; *photographs alone* leaves out the depth maps
-that come with a capture (both as in ``splatseed train``); at ratio 1 nothing is added to SfM's
-points, and without points these are taken away first; *refined* is with ``--refine-poses``, which
-triangulates some again. SfM's points were made from all photographs, those held out too;
-*triangulated* are only those of the features of the training photographs."""
+that come with a capture; at ratio 1 nothing is added to SfM's points, and without points these are
+taken away first; *refined* is with ``--refine-poses``, which triangulates some again; *dense* are
+as many as the budget allows, all others of auto as ``splatseed train`` makes them. SfM's points were
+made from all photographs, those held out too; *triangulated* are only those of the features of the
+training photographs."""
 TEST_EVERY = 8
 HELD_STEP = 3
 """Runs of seed s hold out every eighth view from the one of number 3 s (mod 8) on."""
