@@ -95,7 +95,7 @@ ARMS: Mapping[str, Mapping[str, Any]] = {
 """How seeds are made, by what the table calls them; *photographs alone* leaves out the depth maps
 that come with a capture; at ratio 1 nothing is added to SfM's points, and without points these are
 taken away first; *refined* is with ``--refine-poses``, which triangulates some again; *dense* are
-as many as the budget allows, all others of auto as ``splatseed train`` makes them. SfM's points were
+as many as the budget allows, and auto's others are those of ``splatseed train``. SfM's points were
 made from all photographs, those held out too; *triangulated* are only those of the features of the
 training photographs."""
 TEST_EVERY = 8
