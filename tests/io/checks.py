@@ -15,8 +15,10 @@ from splatseed.io.depth_files import read_confidence, read_stored
 from splatseed.io.depth_maps import read_capture_scale, read_description
 from splatseed.io.ply import read_ply
 from splatseed.io.polycam import _read_camera
+from splatseed.io.record3d import _read_metadata
 from splatseed.io.rgbd import _read_intrinsics, _read_list, _read_track
 from splatseed.io.scanner_app import _read_frame
+from splatseed.io.stray import _read_camera as _read_stray_camera, _read_track as _read_odometry
 
 CAMERAS = (Intrinsics(1, "PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0)),)
 
@@ -33,6 +35,16 @@ def read_scanner_frame(path):
     return _read_frame(path, (96, 72))
 
 
+def read_record3d(path):
+    metadata = _read_metadata(path, path.read_bytes())
+    return [metadata.frame(f"{number}.jpg") for number in range(len(metadata.poses))]
+
+
+def read_odometry(path):
+    track = _read_odometry(path.parent)
+    return [track.frame(index, (96, 72)) for index in range(len(track.poses))]
+
+
 READERS = {
     **dict.fromkeys(("cameras.bin", "cameras.txt"), colmap.read_cameras),
     **dict.fromkeys(("images.bin", "images.txt"), read_images),
@@ -42,6 +54,9 @@ READERS = {
     "conf_0.png": read_confidence,
     "frame_00000.json": read_scanner_frame,
     "camera.json": _read_camera,
+    "metadata.json": read_record3d,
+    "odometry.csv": read_odometry,
+    "camera_matrix.csv": _read_stray_camera,
     "depths.json": read_description,
     "cam_params.json": read_capture_camera,
     "rgb.txt": _read_list,

@@ -23,7 +23,7 @@ from splatseed.io.ply import write_ply
 from .checks import READERS, assert_only_our_errors, damages, drain
 from .conftest import CLOUDS, Model, written
 
-TEXT = (".txt", "ascii.ply")
+TEXT = (".txt", ".csv", "ascii.ply")
 WORDS = st.sampled_from(
     [*"0123456789", "-1", "255", "1e999", "nan", "-inf", "1_0", "0x1", "99999999999999999999", "#"]
     + ["\n"] * 6
@@ -94,6 +94,17 @@ def valid(tmp_path_factory) -> dict[str, bytes]:
     rows = {f"t_{i}{j}": float(i == j) for i in range(3) for j in range(4)}
     lens = {"fx": 80, "fy": 80, "cx": 48, "cy": 36, "width": 96, "height": 72}
     (folder / "camera.json").write_text(json.dumps({**rows, **lens}))
+    metadata = {"w": 96, "h": 72, "dw": 48, "dh": 36, "K": [80, 0, 0, 0, 80, 0, 48, 36, 1]}
+    metadata |= {
+        "poses": [[0, 0, 0.6, 0.8, 1, 2, 3]],
+        "perFrameIntrinsicCoeffs": [[80, 80, 48, 36]],
+    }
+    (folder / "metadata.json").write_text(json.dumps(metadata))
+    header = "timestamp, frame, x, y, z, qx, qy, qz, qw, fx, fy, cx, cy\n"
+    (folder / "odometry.csv").write_text(
+        f"{header}0.5, 000000, 1, 2, 3, 0, 0, 0.6, 0.8, 8, 8, 4, 3\n"
+    )
+    (folder / "camera_matrix.csv").write_text("80.0, 0.0, 48\n0.0, 80.0, 36\n0.0, 0.0, 1.0")
     (folder / "depths.json").write_text('{"kind": "z", "scale": 2.5}')
     camera = '"w": 4, "h": 3, "fx": 5.5, "fy": 5, "cx": 2, "cy": 1.5, "scale": 2.5'
     (folder / "cam_params.json").write_text(f'{{"camera": {{{camera}}}}}')

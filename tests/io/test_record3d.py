@@ -90,7 +90,8 @@ def test_a_photograph_has_the_pose_of_its_number(room_with_depth, tmp_path):
     truth = room_with_depth.replace(images=room_with_depth.images[:8])
     check_cameras(scene, truth)
     (note,) = scene.warnings
-    assert note.endswith("9 photographs and 18 poses: the 8 of the same number are used.")
+    assert note.startswith("There are 9 photographs and 18 poses in")
+    assert note.endswith(f"in {export / 'EXR_RGBD'}: the 8 of the same number are used.")
 
 
 def test_one_camera_where_frames_have_none_of_their_own(export, room_with_depth):
@@ -139,9 +140,7 @@ def test_an_archive_is_extracted_once(room_with_depth, tmp_path, captures, lzfse
     check_depths(scene, room_with_depth)
     (folder,) = captures.iterdir()
     assert (scene.source.root, scene.source.again) == (folder, path)
-    assert scene.warnings[0].endswith(
-        "9 photographs and 18 poses: the 9 of the same number are used."
-    )
+    assert scene.warnings[0].endswith(f"18 poses in {path}: the 9 of the same number are used.")
     before = {file: file.stat().st_mtime_ns for file in folder.rglob("*")}
     again = load(path.rename(tmp_path / "moved.r3d"))
     assert {file: file.stat().st_mtime_ns for file in folder.rglob("*")} == before
@@ -268,6 +267,10 @@ def test_incomplete_exports_are_told_apart(export, tmp_path):
     video.write_bytes(b"\0" * 99 + b'{"intrinsicMatrix":[1],"rangeOfEncodedDepth":[0,3]}')
     with pytest.raises(SceneFormatError, match=r'"RGBD video", which has no poses\. .*as \.r3d'):
         load(video)
+    with zipfile.ZipFile(tmp_path / "other.r3d", "w") as archive:
+        archive.writestr("readme", b"")
+    with pytest.raises(SceneFormatError, match="an archive of Record3D; found no 'metadata'"):
+        load(tmp_path / "other.r3d")
     (tmp_path / "cut.r3d").write_bytes(b"PK\3\4" + b"\0" * 99)
     with pytest.raises(SceneFormatError, match=r"cut\.r3d to be an archive of Record3D"):
         load(tmp_path / "cut.r3d")

@@ -115,7 +115,7 @@ def read_record3d(folder: StrPath) -> Scene:
     data = read_bytes(path)
     metadata = _read_metadata(path, data)
     sizes = {file.name: file.stat().st_size for file in photographs.iterdir() if file.is_file()}
-    names, notes = _choose(metadata, sizes, photographs)
+    names, notes = _choose(metadata, sizes, root)
     depths = root / layout.depths, layout.depth_suffix
     if layout is _R3D:
         maps = [f"{_number(name)}{suffix}" for name in names for suffix in (".depth", ".conf")]
@@ -136,7 +136,7 @@ def read_r3d(path: StrPath) -> Scene:
     """
     path = Path(path)
     with _opened(path) as archive, translate_errors(path, "an archive of Record3D"):
-        data = archive.read(_R3D.metadata)
+        data = _read_within(archive, _R3D.metadata)
         members = {info.filename: (info.file_size, info.CRC) for info in archive.infolist()}
     metadata = _read_metadata(path, data)
     inside = f"{_R3D.photographs}/"
@@ -276,22 +276,21 @@ def _choose(
     Args:
         metadata: The recording's.
         sizes: Bytes of the files beside the photographs, and of these, by name.
-        where: Their folder or archive.
+        where: The recording.
     """
     found = {_number(name): name for name in sorted(sizes) if _PHOTOGRAPH.fullmatch(name)}
     posed = [number for number in sorted(found) if number < len(metadata.poses)]
     if not posed:
         raise SceneNotFoundError(
-            f"photographs 0.jpg, 1.jpg, ... in {where}",
+            f"photographs 0.jpg, 1.jpg, ... of Record3D in {where}",
             found=f"none with one of the {len(metadata.poses):,} poses" if found else "none",
             fix=_FIX,
         )
     notes = []
-    without_pose, num_poses = len(found) - len(posed), len(metadata.poses)
-    if without_pose or len(posed) < num_poses:
-        subject = f"{counted(len(found), 'photograph')} and {counted(num_poses, 'pose')}"
+    if len(posed) < max(len(found), len(metadata.poses)):
+        numbers = f"{counted(len(found), 'photograph')} and {counted(len(metadata.poses), 'pose')}"
         used = f"the {len(posed):,} of the same number {agreeing(len(posed), 'is', 'are')} used"
-        notes.append(f"{metadata.path} and {where.name} have {subject}: {used}.")
+        notes.append(f"There are {numbers} in {where}: {used}.")
     quats, centers = metadata.poses[posed, :4], metadata.poses[posed, 4:]
     usable = np.isfinite(metadata.poses[posed]).all(axis=1) & quats.any(axis=1)
     known = [number for number, ok in zip(posed, usable.tolist(), strict=True) if ok]
@@ -328,12 +327,14 @@ def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
 def _read_packed(path: Path, archive: zipfile.ZipFile, name: str) -> bytes | None:
     member = f"{_R3D.photographs}/{name}"
     with translate_errors(path, f"an archive of Record3D, with {member} undamaged"):
-        if member not in archive.NameToInfo:
-            return None
-        info = archive.getinfo(member)
-        if info.file_size > _MAX_MEMBER:
-            raise ValueError(f"{info.file_size:,} bytes")
-        return archive.read(info)
+        return _read_within(archive, member) if member in archive.NameToInfo else None
+
+
+def _read_within(archive: zipfile.ZipFile, member: str) -> bytes:
+    info = archive.NameToInfo[member]
+    if info.file_size > _MAX_MEMBER:
+        raise ValueError(f"{info.file_size:,} bytes of {member}")
+    return archive.read(info)
 
 
 def _read_member(root: Path, name: str) -> bytes | None:
