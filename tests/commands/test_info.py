@@ -182,7 +182,8 @@ def test_a_scenes_own_maps_are_counted_and_can_be_lifted(rgbd, tmp_path, splatse
     assert _pairs(splatseed("info", rgbd).out)["depth maps"] == "12"
     run = splatseed("info", rgbd, "--depth", rgbd)
     assert run.code == 0
-    assert "left out" not in run.out
+    for text in ("left out", "to align the depth maps with", "no-align", "confidence"):
+        assert text not in run.out
     lifted, triangulated = run.out.splitlines()[-2:]
     assert "splatseed sfm" in triangulated
     words = shlex.split(lifted.split("splatseed ")[1])
@@ -190,6 +191,20 @@ def test_a_scenes_own_maps_are_counted_and_can_be_lifted(rgbd, tmp_path, splatse
     assert made.code == 0, made.err
     wanted = int(words[words.index("--num-points") + 1])
     assert len(load_scene(tmp_path / "out").points) == wanted > 100
+
+
+def test_maps_of_low_confidence_do_not_count(rgbd, splatseed):
+    """The number suggested follows from the pixels that lifting uses."""
+    numbers = []
+    for sure in (1.0, 0.5):
+        for path in (rgbd / "results").glob("depth*.png"):
+            levels = np.zeros(np.asarray(PilImage.open(path)).shape, np.uint8)
+            levels[: round(sure * len(levels))] = 2
+            PilImage.fromarray(levels).save(path.with_name(path.name.replace("depth", "conf")))
+        out = splatseed("info", rgbd, "--depth", rgbd).out
+        assert f"of high confidence at {sure:.0%} of its pixels" in out
+        numbers.append(int(re.search(r"--num-points (\d+)", out)[1]))
+    assert numbers[1] < 0.6 * numbers[0]
 
 
 # What splatseed wrote -----------------------------------------------------------------------------

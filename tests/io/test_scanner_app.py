@@ -40,6 +40,15 @@ def test_a_scene_written_elsewhere_finds_the_same_maps(export, tmp_path):
     maps = find_depths(again, export)
     assert (maps.paths, maps.confidences) == (scene.depths.paths, scene.depths.confidences)
     assert len(maps.confidences) == len(scene.images)
+    assert not maps.in_scene_units  # the other scene may have another unit
+
+
+def test_maps_of_the_capture_named_again_keep_its_unit(export, monkeypatch):
+    scene = load(export)
+    assert scene.depths.in_scene_units
+    monkeypatch.chdir(export.parent)
+    assert find_depths(scene, export.name).in_scene_units
+    assert not find_depths(scene, export.name, scale=100).in_scene_units
 
 
 def test_depth_named_as_frames(export):

@@ -31,7 +31,8 @@ from splatseed.console import (
     stage_display,
     with_options,
 )
-from splatseed.depthmap import DepthKind, DepthMaps
+from splatseed.depth.settings import DepthSettings
+from splatseed.depthmap import DepthKind, DepthMaps, in_scene_units
 from splatseed.errors import SplatseedError
 from splatseed.io import find_depths, load_scene
 from splatseed.io.seeds import was_upsampled
@@ -168,14 +169,15 @@ def _known_depths(depths: DepthMaps, clock: StageClock) -> int:
     """Count the pixels with a depth, over all maps."""
     known = 0
     for i, name in enumerate(depths):
-        known += int(np.count_nonzero(np.isfinite(depths.read(name).values)))
+        reliable = depths.read(name).reliable(DepthSettings.min_confidence)
+        known += int(np.count_nonzero(np.isfinite(reliable.values)))
         clock("count depths", (i + 1) / len(depths))
     return known
 
 
 def _unfit_maps(scene: Scene, alignments: Mapping[str, Alignment]) -> list[str]:
     """Describe maps that cannot be aligned, as a list of at most one problem."""
-    if alignments and not len(scene.points):
+    if alignments and not len(scene.points) and not in_scene_units(scene.depths):
         unit = "only maps in the scene's unit can be used, with --depth.no-align"
         return [f"there are no points to align the depth maps with: {unit}"]
     unfit = sum(each.rejected is not None for each in alignments.values())
@@ -219,7 +221,7 @@ def _next(
     if options.depth is not None and scene.depths and not is_distorted(scene):
         how = "" if options.depth_kind is None else f"--depth-kind {options.depth_kind} "
         how += "" if options.depth_scale is None else f"--depth-scale {options.depth_scale:g} "
-        how += "" if any_points else "--depth.no-align "
+        how += "" if any_points or in_scene_units(scene.depths) else "--depth.no-align "
         how += next_steps.number_option(len(scene.points), known, planned.max_seeds)
         lifted = next_steps.lifting_command(options.scene, options.depth, how)
     if any_points and lifted:
@@ -351,6 +353,9 @@ def _print_depth(title: str, scene: Scene, alignments: Mapping[str, Alignment]) 
     if known and scene.depths is not None:
         first = scene.depths.read(known[0])
         maps = f"{maps}, the first {first.width} x {first.height}, kind {first.kind}"
+        if first.confidence is not None:
+            high = np.mean(first.confidence >= DepthSettings.min_confidence)
+            maps += f", of high confidence at {high:.0%} of its pixels"
         if first.kind == "inverse":
             columns = {"scale": ".4g", "shift": ".4g", "residual": ".2%"}
     if not len(scene.points):  # nothing to compare with

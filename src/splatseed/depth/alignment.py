@@ -22,7 +22,7 @@ from jaxtyping import Float32, Float64, Int, Int64
 from splatseed.camera import Camera
 from splatseed.depth._kernels import SIGMA_OF_MEDIAN
 from splatseed.depth.settings import DepthSettings, Fit
-from splatseed.depthmap import DepthMap
+from splatseed.depthmap import DepthMap, in_scene_units
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.photos.visibility import PointsInImage, find_visibility, points_in_image
 from splatseed.progress import Progress, in_threads, silent
@@ -233,6 +233,7 @@ def align(
 ) -> dict[str, Alignment]:
     """Align each depth map of a scene to its SfM points, by image name; rejected maps included.
 
+    Maps in the scene's unit keep it where there are too few points.
     ``max_residual_ratio`` is as in ``DepthSettings``.
 
     Raises:
@@ -249,10 +250,13 @@ def align(
 
     def work(start: int, stop: int) -> None:
         for image in images[start:stop]:
-            depth = depths.read(image.name)
+            depth = depths.read(image.name).reliable(DepthSettings.min_confidence)
             camera = map_camera(depth, image)
             points = points_in_image(camera, visibility.of(image))
-            found[image.name] = align_map(depth, camera, points)
+            alignment = align_map(depth, camera, points)
+            if alignment.num_points < DepthSettings.min_points and in_scene_units(depths):
+                alignment = check_units(depth, camera, points)
+            found[image.name] = alignment
 
     in_threads(work, len(images), 1, "align depth", progress)
     return reject_outliers({image.name: found[image.name] for image in images}, max_residual_ratio)

@@ -302,9 +302,16 @@ def find_depths(
         )
     maps = replace(maps, kind=kind or maps.kind, scale=scale or maps.scale)
     own = scene.depths
-    if isinstance(own, DepthFiles) and replace(own, in_scene_units=False) == maps:
-        return own  # the capture's, named again
+    if isinstance(own, DepthFiles) and _same_maps(own, maps):
+        return replace(maps, in_scene_units=own.in_scene_units)  # the capture's, named again
     return maps
+
+
+def _same_maps(maps: DepthFiles, others: DepthFiles) -> bool:
+    """Whether two sets of maps are the same files, in the same unit."""
+    if maps.scale != others.scale or maps.paths.keys() != others.paths.keys():
+        return False
+    return all(path.samefile(others.paths[name]) for name, path in maps.paths.items())
 
 
 def _is_archive(path: Path) -> bool:

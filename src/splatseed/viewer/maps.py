@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float, Float64, UInt8
 
 from splatseed.depth.alignment import Alignment, PlanarDepth, map_camera
+from splatseed.depth.settings import DepthSettings
 from splatseed.depth.stereo import StereoMap
 from splatseed.io.files import StrPath
 from splatseed.photos.visibility import find_visibility, points_in_image
@@ -106,7 +107,7 @@ def _checked(
     size = page.fitted(image.intrinsics.width, image.intrinsics.height, CHECK_SIDE)
     photograph = page.photograph_or_blank(scene, image, size)
     assert scene.depths is not None  # noqa: S101  (there are alignments of them)
-    depth = scene.depths.read(image.name)
+    depth = scene.depths.read(image.name).reliable(DepthSettings.min_confidence)
     camera = map_camera(depth, image)
     aligned, points = np.isfinite(alignment.scale), PointCloud.empty()
     if depth.kind == "inverse" and not aligned:
