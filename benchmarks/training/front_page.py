@@ -3,9 +3,10 @@
 Each capture's points are taken away. The *random start* is what gsplat begins with then, under
 3DGS's densification: for ``max_steps``, and again for as many steps as fit into the seconds that
 *ours* takes, seeding included. Ours is seeded by ``auto`` from the training photographs alone, and
-trained with ``default`` and with ``grow``; once more from points that pycolmap triangulates at the
-given poses, as ``upsample --refine-poses`` does. SfM's own points, under ``default``, show what
-could be had. All have the same number of Gaussians at most, ``rho`` per pixel. Seconds are the
+trained with ``default`` and with ``grow``; once more with ``--refine-poses``, whose triangulated
+points guide it. SfM's own points, under ``default``, show what could be had. Captures without, such
+as a phone's, are trained at refined poses from a random start and from the triangulated points
+alone, too. All have the same number of Gaussians at most, ``rho`` per pixel. Seconds are the
 processor's, on one thread, and of triangulation by the clock.
 
 Promise: nothing is chosen by hand. The *gain* of a view or a capture is the PSNR of ours with
@@ -36,7 +37,7 @@ from benchmarks.common.clouds import find_scenes
 from benchmarks.common.machine import describe
 from benchmarks.common.markdown import table
 from benchmarks.training.baseline import say
-from benchmarks.training.seeding_arms import triangulated
+from benchmarks.training.seeding_arms import at_refined_poses
 from jaxtyping import UInt8
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
@@ -58,8 +59,6 @@ __all__ = ["train_all"]
 Window = tuple[slice, slice]
 
 CAPTURES = ("fern", "fox", "treehill", "bonsai", "stone_horse", "face", "dorm", "desk")
-MOST_MATCHED = 150
-"""Photographs up to which points are triangulated too: each is matched with every other."""
 WIDE = 9.0
 """Inches; a hundred pixels each."""
 PART = 3
@@ -71,6 +70,8 @@ ARMS = {
     "auto": "auto",
     "grow": "auto + grow",
     "refined": "--refine-poses, auto + grow",
+    "random, refined": "--refine-poses, random start",
+    "triangulated": "--refine-poses, its points + grow",
     "sfm": "SfM's points",
 }
 OURS: dict[str, StrategyName] = {"grow": "grow", "auto": "default"}
@@ -181,7 +182,7 @@ def train_all(
     scene: str, pictures: str, rho: float, max_steps: int, long_side: int
 ) -> dict[str, dict[str, float]]:
     """All runs of one capture; the renders of its median view go into ``pictures``, an .npz."""
-    whole = ss.load_scene(Path(scene))
+    whole = ss.load_scene(Path(scene), require_points=False)
     bare = whole.replace(points=PointCloud.empty(), tracks=None)
     dice = bare.replace(points=random_start(bare, np.random.default_rng(0)))
     camera = whole.images[0].camera
@@ -200,17 +201,21 @@ def train_all(
     for strategy in OURS.values():
         train(bare, strategy, 4, "auto")  # loads kernels: it takes seconds
     runs = {name: train(bare, of, seeding="auto") for name, of in OURS.items()}
-    if len(bare.images) <= MOST_MATCHED:
-        begun = time.perf_counter()  # it works in a process of its own
-        posed = triangulated(bare, 0)
-        triangulating = time.perf_counter() - begun
-        refined = train(posed, "grow", seeding="auto")
-        runs["refined"] = refined._replace(seconds=refined.seconds + triangulating)
+    begun = time.perf_counter()  # it works in a process of its own
+    posed = at_refined_poses(bare, 0)
+    refining = time.perf_counter() - begun
+    at_refined = {"refined": train(posed, "grow", seeding="auto")}
+    if not len(whole.points):  # a device's poses
+        start = posed.replace(points=random_start(posed, np.random.default_rng(0)))
+        at_refined["random, refined"] = train(start, "default")
+        at_refined["triangulated"] = train(posed, "grow")
+    runs |= {name: run._replace(seconds=run.seconds + refining) for name, run in at_refined.items()}
     # A run's cost per step grows with its Gaussians, so the trial is as long as the other.
     runs["random"] = train(dice, "default")
     steps = round(max_steps * runs["grow"].seconds / runs["random"].seconds)
     runs["random, equal"] = train(dice, "default", max(steps, max_steps))
-    runs["sfm"] = train(whole, "default")
+    if len(whole.points):
+        runs["sfm"] = train(whole, "default")
     _keep_median(runs["random, equal"], runs["grow"], Path(pictures))
     return {name: each.told() for name, each in runs.items()}
 

@@ -8,6 +8,7 @@ no method looks at them.
 from __future__ import annotations
 
 import dataclasses
+import os
 import tempfile
 import time
 from collections.abc import Mapping
@@ -33,7 +34,7 @@ from splatseed.training.folder import Record
 from splatseed.training.schedule import Schedule
 from splatseed.training.trainer import Trainer
 
-__all__ = ["ARMS", "TEST_EVERY", "train", "triangulated", "validation_split"]
+__all__ = ["ARMS", "TEST_EVERY", "at_refined_poses", "train", "validation_split"]
 
 
 @dataclass(frozen=True)
@@ -82,8 +83,15 @@ ARMS: Mapping[str, Mapping[str, Any]] = {
     "auto, depth maps too": {"method": "auto", "dense": False},
     "depth": {"method": "depth"},
     "auto, no points": {"method": "auto", "dense": False, "points": False},
-    "auto, refined": {"method": "auto", "dense": False, "points": False, "refined": True},
-    "triangulated": {"method": "linear", "ratio": 1, "points": False, "refined": True},
+    "auto, refined": {"method": "auto", "dense": False, "refined": True},
+    "auto, refined, no points": {
+        "method": "auto",
+        "dense": False,
+        "points": False,
+        "refined": True,
+    },
+    "depth, refined": {"method": "depth", "points": False, "refined": True},
+    "triangulated": {"method": "linear", "ratio": 1, "refined": True},
     "dense": DENSE,
     "dense, discs": {**DENSE, "start": Start(discs=True)},
     "dense, opacities": {**DENSE, "start": Start(opacities=(0.1, 0.8))},
@@ -91,13 +99,14 @@ ARMS: Mapping[str, Mapping[str, Any]] = {
     "dense, all three": {**DENSE, "start": Start(True, (0.1, 0.8), 1 / 3)},
     "random as gsplat": {"random": "gsplat"},
     "random as nerfstudio": {"random": "nerfstudio"},
+    "random, refined": {"random": "gsplat", "refined": True},
 }
 """How seeds are made, by what the table calls them; *photographs alone* leaves out the depth maps
 that come with a capture; at ratio 1 nothing is added to SfM's points, and without points these are
-taken away first; *refined* is with ``--refine-poses``, which triangulates some again; *dense* are
-as many as the budget allows, and auto's others are those of ``splatseed train``. SfM's points were
-made from all photographs, those held out too; *triangulated* are only those of the features of the
-training photographs."""
+taken away first; *refined* is with ``--refine-poses``, which triangulates others in their place,
+also where poses are exact and stay; *dense* are as many as the budget allows, and auto's others are
+those of ``splatseed train``. SfM's points were made from all photographs, those held out too;
+*triangulated* are only those of the features of the training photographs."""
 TEST_EVERY = 8
 HELD_STEP = 3
 """Runs of seed s hold out every eighth view from the one of number 3 s (mod 8) on."""
@@ -126,7 +135,13 @@ def train(
     plan = settings.max_seeds(cap), max_steps, data_factor, seed, every
     key = fingerprint(Path(scene).name, _how(arm), *plan)
     file = Path(kept) / f"{key}.npz" if kept else None
-    points, seeding, seeding_processor = _known_seeds(validation, arm, settings, file)
+    seeding = seeding_processor = 0.0
+    if ARMS[arm].get("refined", False):
+        key = fingerprint(Path(scene).name, "refined", seed, every)
+        poses = Path(kept) / f"{key}.npz" if kept else None
+        validation, seeding, seeding_processor = _known_poses(validation, seed, poses)
+    points, *took = _known_seeds(validation, arm, settings, file)
+    seeding, seeding_processor = seeding + took[0], seeding_processor + took[1]
     begun = time.process_time() - seeding_processor
     with tempfile.TemporaryDirectory() as folder:
         run = prepare_run(validation.replace(points=points), Path(folder) / "run", settings)
@@ -227,8 +242,7 @@ def _seeds(scene: Scene, arm: str, settings: TrainSettings) -> PointCloud:
         return random_start(scene, np.random.default_rng(settings.seed), chosen["random"])
     if not chosen.pop("points", True):
         scene = scene.replace(points=PointCloud.empty(), tracks=None)
-    if chosen.pop("refined", False):
-        scene = triangulated(scene, settings.seed)
+    chosen.pop("refined", None)
     name = chosen.pop("method")
     size = stereo_size(scene.split(TEST_EVERY)[0], settings, "cpu")
     known = {field.name for field in dataclasses.fields(ss.METHODS[name])}
@@ -239,12 +253,44 @@ def _seeds(scene: Scene, arm: str, settings: TrainSettings) -> PointCloud:
     return points.select(points.distinct)
 
 
-def triangulated(scene: Scene, seed: int) -> Scene:
-    """The scene with points from the features of its training photographs, at its own poses.
+def _known_poses(scene: Scene, seed: int, file: Path | None) -> tuple[Scene, float, float]:
+    """The scene at refined poses, from a file of an earlier run if there is one.
+
+    Also returns the seconds that it took, by the clock and by the processors of the child process.
+    """
+    if file is not None and file.is_file():
+        with np.load(file) as arrays:
+            kept = {name: arrays[name] for name in arrays.files}
+        images = tuple(
+            dataclasses.replace(image, quat=quat, translation=translation, observations=None)
+            for image, quat, translation in zip(
+                scene.images, kept["quats"], kept["translations"], strict=True
+            )
+        )
+        points = PointCloud(kept["xyz"], kept["rgb"])
+        return scene.replace(images=images, points=points, tracks=None), *kept["seconds"].tolist()
+    start, before = time.perf_counter(), os.times()
+    found = at_refined_poses(scene, seed)
+    after = os.times()
+    processor = after.children_user - before.children_user
+    took = time.perf_counter() - start, processor + after.children_system - before.children_system
+    if file is not None:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_file(file) as partial, partial.open("wb") as opened:
+            np.savez(
+                opened,
+                quats=np.stack([image.quat for image in found.images]),
+                translations=np.stack([image.translation for image in found.images]),
+                xyz=found.points.xyz, rgb=found.points.rgb, seconds=np.array(took),
+            )  # fmt: skip
+    return found, *took
+
+
+def at_refined_poses(scene: Scene, seed: int) -> Scene:
+    """The scene at refined poses, with points from features of its training photographs.
 
     Args:
         scene: A scene with photographs.
         seed: Seed of every random choice.
     """
-    shown = scene.replace(images=scene.split(TEST_EVERY)[0])
-    return scene.replace(points=refined(shown, seed)[0].points, tracks=None)
+    return refined(scene, seed, test_every=TEST_EVERY)[0]

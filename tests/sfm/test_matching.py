@@ -5,10 +5,11 @@ from __future__ import annotations
 import shutil
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from splatseed.progress import silent
-from splatseed.sfm import Settings
+from splatseed.sfm import Settings, pipeline
 from splatseed.sfm.colmap import Run, posed_model, require_pycolmap
 from splatseed.sfm.database import run_database
 from splatseed.sfm.matching import detect_features, match_pairs
@@ -60,3 +61,28 @@ def test_a_list_of_pairs_is_matched_as_by_pycolmap_and_none_twice(run):
             device=pycolmap.Device.cpu,
         )
         assert (matches(database, (1, 2)), matches(database, (2, 4))) == first
+
+
+def test_features_without_doubling_are_fewer_and_coarser(run):
+    run, model = run
+    counts, sizes = [], []
+    for doubled in (True, False):
+        work = run.work / str(doubled)
+        work.mkdir()
+        settings = replace(run.settings, doubled=doubled)
+        with run_database(replace(run, work=work, settings=settings), model) as database:
+            detect_features(replace(run, work=work, settings=settings), database, model)
+            keypoints = database.read_keypoints(1)
+        counts.append(len(keypoints))
+        sizes.append(np.hypot(keypoints[:, 2], keypoints[:, 4]).min())
+    assert counts[1] < 0.7 * counts[0]
+    assert sizes[1] == pytest.approx(2 * sizes[0], rel=0.1)
+
+
+def test_only_large_photographs_are_refined_by_features_that_are_not_doubled(room):
+    assert pipeline._refining(3, room.images) == Settings(seed=3)
+    large = [
+        replace(image, intrinsics=replace(image.intrinsics, width=1440, height=1920))
+        for image in room.images
+    ]
+    assert pipeline._refining(3, large) == Settings(seed=3, max_image_size=2000, doubled=False)

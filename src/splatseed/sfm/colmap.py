@@ -46,6 +46,7 @@ class Settings:
     each image with its successors by name."""
     device: DeviceName = "auto"  # of features and matching; the rest runs on the CPU
     max_image_size: int = 1600  # px; larger photographs are reduced for features
+    doubled: bool = True  # photographs, after that, for features: more and finer ones
     seed: int = 0  # of RANSAC and bundle adjustment
     threads: int = -1  # -1 = all cores
 

