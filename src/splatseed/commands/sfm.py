@@ -157,7 +157,7 @@ def _tell_photographs(
     """Print the images that are read, since subfolders may hold images of other scenes."""
     images, number = options.images, len(names)
     chosen = options.matcher == "auto" and number > FIRST_LOOK.max_exhaustive
-    look = [STAGE] if chosen and options.poses_from is None else []
+    look = [STAGE] if chosen else []
     clock.expect("features", *look, "matching", *stages, "undistortion")
     clock.count(number, "photographs", "features", STAGE)
     if options.matcher != "sequential" and not chosen:

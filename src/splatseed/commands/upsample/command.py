@@ -53,11 +53,7 @@ def _upsample(options: Options, methods: dict[str, Any]) -> None:
         if options.gaussians is not None:  # photographs bound their sizes
             photo_methods.photographed(scene, without="leave out --gaussians")
         if options.refine_poses:
-            from splatseed.sfm import refined
-
-            clock.expect("features", "matching", "refinement", "triangulation")
-            test_every = getattr(methods[options.method], "test_every", 0)
-            scene, note = refined(scene, options.seed, clock, test_every=test_every)
+            scene, note = _refined(options, scene, methods[options.method], clock)
             notes.append(note)
         if options.recenter:
             scene = translated(scene, middle_of_cameras(scene))
@@ -104,6 +100,19 @@ def _upsample(options: Options, methods: dict[str, Any]) -> None:
     report.summarise(options, scene, len(scene.points), origins, written, seconds, findings)
     for note in notes:
         print_note(note)
+
+
+def _refined(
+    options: Options, scene: Scene, method: Upsampler, clock: StageClock
+) -> tuple[Scene, str]:
+    """Return the scene at refined poses, and what changed; no points of the method's test views."""
+    from splatseed.sfm import refined
+    from splatseed.sfm.first_look import FIRST_LOOK, STAGE
+
+    look = [STAGE] if len(scene.images) > FIRST_LOOK.max_exhaustive else []
+    clock.expect("features", *look, "matching", "refinement", "triangulation")
+    test_every = getattr(method, "test_every", 0)
+    return refined(scene, options.seed, clock, test_every=test_every)
 
 
 def _write_extras(
