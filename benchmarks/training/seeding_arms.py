@@ -93,6 +93,7 @@ ARMS: Mapping[str, Mapping[str, Any]] = {
     "depth, refined": {"method": "depth", "points": False, "refined": True},
     "triangulated": {"method": "linear", "ratio": 1, "refined": True},
     "dense": DENSE,
+    "dense, no points": {**DENSE, "points": False},
     "dense, discs": {**DENSE, "start": Start(discs=True)},
     "dense, opacities": {**DENSE, "start": Start(opacities=(0.1, 0.8))},
     "dense, slow": {**DENSE, "start": Start(position_rate=1 / 3)},
