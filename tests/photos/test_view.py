@@ -47,10 +47,17 @@ def test_the_cache_is_used_until_the_photograph_changes(picture, tmp_path):
     cache = tmp_path / "cache"
     first, _ = load_photograph(picture, 2, cache)
     (kept,) = cache.iterdir()
-    PilImage.fromarray(255 - first).save(kept)
-    assert np.array_equal(load_photograph(picture, 2, cache)[0], 255 - first)
-    kept.write_bytes(b"damaged")
-    assert np.array_equal(load_photograph(picture, 2, cache)[0], first)
+    whole = kept.read_bytes()
+    np.savez(kept, photograph=255 - first, size=np.array([37, 23]))
+    inverse, size = load_photograph(picture, 2, cache)
+    assert np.array_equal(inverse, 255 - first)
+    assert size == (37, 23)
+    flipped = bytearray(whole)
+    flipped[whole.index(first.tobytes()) + 5] ^= 1
+    for damaged in (b"damaged", whole[:200], bytes(flipped)):
+        kept.write_bytes(damaged)
+        assert np.array_equal(load_photograph(picture, 2, cache)[0], first)
+        assert kept.read_bytes() == whole
     PilImage.new("RGB", (37, 23), (9, 9, 9)).save(picture)
     assert (load_photograph(picture, 2, cache)[0] == 9).all()
 

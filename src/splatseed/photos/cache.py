@@ -14,10 +14,10 @@ import numpy as np
 from jaxtyping import UInt8
 from platformdirs import user_cache_path
 
-from splatseed.errors import OutputError, ParameterError, SceneFormatError
+from splatseed.errors import OutputError, ParameterError
 from splatseed.io.bit_depth import WHITE
-from splatseed.io.files import StrPath
-from splatseed.io.photograph import decode_photograph, open_photograph, photograph_bytes
+from splatseed.io.files import ARCHIVE_FAILURES, StrPath
+from splatseed.io.photograph import decode_photograph, photograph_bytes
 from splatseed.io.staging import atomic_file
 from splatseed.photos.sizes import check_side
 
@@ -40,24 +40,36 @@ def load_photograph(
     encoded = photograph_bytes(path)
     digest = hashlib.blake2b(encoded, digest_size=16, person=FILTER.encode()).hexdigest()
     kept = (
-        None if cache_dir is None or factor == 1 else cache_dir / f"{digest}_{factor}_{white}.png"
+        None if cache_dir is None or factor == 1 else cache_dir / f"{digest}_{factor}_{white}.npz"
     )
-    if kept is not None and kept.is_file():
-        with suppress(SceneFormatError):  # a damaged copy is made again
-            photograph = decode_photograph(kept, photograph_bytes(kept))
-            return np.array(photograph), open_photograph(path, encoded).size
+    if kept is not None and (known := _read(kept)):
+        return known
     original = decode_photograph(path, encoded, white)
     width, height = original.width // factor, original.height // factor
     check_side(path, 1, factor, (width, height))
     photograph = original
     if factor > 1:
         photograph = original.reduce(factor, (0, 0, width * factor, height * factor))
+    pixels, size = np.array(photograph), original.size
     if kept is not None:
         with suppress(OutputError, OSError):  # a cache that cannot be written is done without
             kept.parent.mkdir(parents=True, exist_ok=True)
-            with atomic_file(kept) as partial:
-                photograph.save(partial, compress_level=1)
-    return np.array(photograph), original.size
+            with atomic_file(kept) as partial, partial.open("wb") as file:
+                np.savez(file, photograph=pixels, size=np.array(size))
+    return pixels, size
+
+
+def _read(path: Path) -> tuple[UInt8[np.ndarray, "H W 3"], tuple[int, int]] | None:
+    """Read a cached copy, and the size of the file that it was made from; None if unusable.
+
+    It is not compressed: reading a PNG takes longer than decoding a JPEG of twice its size.
+    """
+    if not path.is_file():
+        return None
+    with suppress(*ARCHIVE_FAILURES), np.load(path) as arrays:  # a damaged copy is made again
+        width, height = arrays["size"].tolist()
+        return arrays["photograph"], (width, height)
+    return None
 
 
 def user_cache_dir() -> Path:
