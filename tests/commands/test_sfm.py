@@ -26,21 +26,29 @@ def called(monkeypatch, tmp_path):
     def reconstruct(*args, **kwargs):
         calls.update(args=args, **kwargs)
         change = changes.pop() if kwargs.get("refine_poses") else None
-        return SfmReport(tmp_path / "out", 13, 20, LOST, *FACTS, change)
+        return SfmReport(tmp_path / "out", 13, 20, LOST, *FACTS, change, num_pairs=77)
 
     monkeypatch.setattr(sfm, "reconstruct", reconstruct)
     return calls
 
 
 def test_words_reach_the_reconstruction_and_its_report_the_user(called, tmp_path, splatseed):
-    words = ["--matcher", "sequential", "--threads", 2, "--overwrite", "--seed", 3]
+    words = ["--matcher", "sequential", "--threads", 2, "--overwrite", "--seed", 3, "--resume"]
     run = splatseed("sfm", tmp_path, "-o", tmp_path / "out", "--no-shared-camera", *words)
     assert (run.code, run.err) == (0, "")
     settings = Settings("sequential", seed=3, threads=2)
     assert called["args"] == (tmp_path, tmp_path / "out", settings)
     assert not called["shared_camera"]
     assert called["overwrite"]
-    for text in ("13 of 20", "1,234", "mean 5.50 images", "mean 0.610 px", "and 2 more"):
+    assert called["resume"]
+    for text in (
+        "77 of 190",
+        "13 of 20",
+        "1,234",
+        "mean 5.50 images",
+        "mean 0.610 px",
+        "and 2 more",
+    ):
         assert text in run.out
     assert f"splatseed upsample {tmp_path / 'out'} " in run.out
 

@@ -81,13 +81,15 @@ def parts(number, pairs):
 
 
 def test_pairs_are_few_and_close_loops():
-    pairs = choose_pairs(walk(120))
+    pairs = choose_pairs(walk(200))
     assert pairs == sorted({*pairs})
-    assert len(pairs) < 120 * 20 / 2
-    partners = np.bincount(np.ravel(pairs), minlength=120)
+    assert len(pairs) < 200 * 20 / 2
+    partners = np.bincount(np.ravel(pairs), minlength=200)
     assert partners.min() >= FIRST_LOOK.partners
+    of_few = np.bincount(np.ravel(choose_pairs(walk(60))))
+    assert of_few.min() >= FIRST_LOOK.max_partners
     between_rounds = [pair for pair in pairs if pair[1] - pair[0] > 30]
-    assert {i for i, _ in between_rounds} >= set(range(5, 55))
+    assert {i for i, _ in between_rounds} >= set(range(5, 95))
 
 
 def test_photographs_that_agree_with_none_are_matched_with_their_successors():
@@ -143,7 +145,13 @@ def test_a_graph_in_parts_is_completed_before_and_after_mapping(run, monkeypatch
     run, model = run
     names = [model.image(i).name for i in range(1, 9)]
     few = replace(
-        FIRST_LOOK, partners=2, bridges=0, successors=0, max_exhaustive=4, min_connections=0
+        FIRST_LOOK,
+        partners=2,
+        max_partners=2,
+        bridges=0,
+        successors=0,
+        max_exhaustive=4,
+        min_connections=0,
     )
     for module in (first_look, matching):
         monkeypatch.setattr(module, "FIRST_LOOK", few)

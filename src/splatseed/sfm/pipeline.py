@@ -376,7 +376,9 @@ def _call(
     """Run a job in a child process; return its result."""
     log = staging / _WORK / "log.txt"
     call = (_work, images, staging, settings, kept, job, arguments)
-    with closing(Child(*call, reports=True, environment=_CHILD, log=log.open("w+b"))) as child:
+    limit = {"NUMBA_NUM_THREADS": str(settings.threads)} if settings.threads > 0 else {}
+    environment = {**_CHILD, **limit}
+    with closing(Child(*call, reports=True, environment=environment, log=log.open("w+b"))) as child:
         try:
             return child.result(progress)
         except errors.TaskLostError as error:
