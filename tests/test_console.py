@@ -13,7 +13,15 @@ from rich.console import Console
 
 import splatseed
 from splatseed import console
-from splatseed.console import StageClock, print_note, print_pairs, print_table, stage_display
+from splatseed.console import (
+    StageClock,
+    extraction_shown,
+    print_note,
+    print_pairs,
+    print_table,
+    stage_display,
+)
+from splatseed.progress import extraction_progress, silent
 from splatseed.runtime import compilation
 from splatseed.text import quoted, visible
 
@@ -59,6 +67,29 @@ def test_a_log_has_a_line_per_stage_with_its_count(capsys, monkeypatch):
         "features: 2,000 photographs, 62 s",
         "mapping: done, 2.5 s",
     ]
+
+
+def test_extraction_is_shown_whichever_call_causes_it(capsys, monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(console.time, "perf_counter", lambda: now[0])
+
+    def extract(stage):
+        for seconds, fraction in ((1, 0.0), (32, 0.5), (2, 1.0), (1, 1.0)):  # counted too few
+            now[0] += seconds
+            extraction_progress.get(silent)(stage, fraction)
+
+    with extraction_shown():
+        extract("write frames")
+        with stage_display(lines=True) as clock:
+            extract("analyse video")
+        with stage_display():  # shows nothing, so the one around it does
+            extract("write frames")
+    extract("nobody looks")
+    assert list(clock.seconds()) == ["analyse video"]
+    assert capsys.readouterr().err.splitlines() == [
+        *(f"{stage}: {done}" for stage in ("write frames", "analyse video", "write frames")
+          for done in ("50%, 32 s", "done, 34 s")),
+    ]  # fmt: skip
 
 
 def test_a_log_is_told_once_of_compilation_that_takes_long(capsys, monkeypatch):

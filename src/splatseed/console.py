@@ -171,6 +171,15 @@ def stage_display(
         lines: Print a line per stage if stderr is not a terminal.
     """
     clock = StageClock() if clock is None else clock
+    # Extraction must not open a second display.
+    told = _extraction_told(clock) if ERR.is_terminal or lines else nullcontext()
+    with _display(clock, remaining=remaining, lines=lines), told:
+        yield clock
+
+
+@contextmanager
+def _display(clock: StageClock, *, remaining: bool, lines: bool) -> Iterator[StageClock]:
+    """Show progress as ``stage_display``, but not that of extraction."""
     named, left = (
         rich_progress.TextColumn(text, markup=False) for text in ("{task.description}", "left")
     )
@@ -179,11 +188,7 @@ def stage_display(
     drawn = rich_progress.Progress(*columns, console=ERR, transient=True)
     bar = drawn if ERR.is_terminal else None
     clock._lines = _Lines(clock._items) if lines and bar is None else None  # noqa: SLF001  (ours)
-    shows = bar is not None or clock._lines is not None  # noqa: SLF001  (ours)
-    with (
-        clock._shown(bar), bar or nullcontext(), watched(clock.compilation),  # noqa: SLF001  (ours)
-        _extraction_told(clock) if shows else nullcontext(),  # else a second display would open
-    ):  # fmt: skip
+    with clock._shown(bar), bar or nullcontext(), watched(clock.compilation):  # noqa: SLF001  (ours)
         yield clock
 
 
@@ -204,8 +209,12 @@ class _Shown:
         self._clock: StageClock | None = None
 
     def __call__(self, stage: str, fraction: float) -> None:
+        if self._clock is None and fraction >= 1:
+            return
         if self._clock is None:
-            self._clock = self._display.enter_context(stage_display(remaining=True, lines=True))
+            self._clock = self._display.enter_context(
+                _display(StageClock(), remaining=True, lines=True)
+            )
         self._clock(stage, fraction)
         if fraction >= 1:
             self.close()
