@@ -122,7 +122,7 @@ def test_maps_that_do_not_fit_are_not_advised(room, splatseed):
     assert "12 of 12 depth maps" in run.out
     assert "--method depth" not in run.out
     assert "by method depth" not in run.out
-    assert _pairs(run.out)["depth maps"] == "12"
+    assert _pairs(run.out)["depth maps"] == "12 of 120 x 90 pixels"
 
 
 def test_true_depth_fits(room, splatseed):
@@ -179,14 +179,15 @@ def test_the_number_of_points_suggested(points, known, most, said):
     assert number_option(points, known, most) == said
 
 
-def test_a_scenes_own_maps_are_counted_and_can_be_lifted(rgbd, tmp_path, splatseed):
-    assert _pairs(splatseed("info", rgbd).out)["depth maps"] == "12"
-    run = splatseed("info", rgbd, "--depth", rgbd)
+def test_a_scenes_own_maps_are_described_and_can_be_lifted(rgbd, tmp_path, splatseed):
+    run = splatseed("info", rgbd)
     assert run.code == 0
+    assert _pairs(run.out)["depth maps"] == "12 of 120 x 90 pixels; method auto uses them"
     for text in ("left out", "to align the depth maps with", "no-align", "confidence"):
         assert text not in run.out
     lifted, triangulated = run.out.splitlines()[-2:]
     assert "splatseed sfm" in triangulated
+    assert "--depth" not in lifted
     words = shlex.split(lifted.split("splatseed ")[1])
     made = splatseed(*[tmp_path / "out" if word == "OUT" else word for word in words])
     assert made.code == 0, made.err

@@ -25,6 +25,7 @@ FERN = Measured(6_009, 120_000, empty=0.4)
         (FERN, 30_000, "mcmc", "auto", []),
         (replace(FERN, num_points=0), 30_000, "grow", "auto", ["no points"]),
         (replace(FERN, depth_maps=True), 21_000, "default", "depth", []),
+        (replace(FERN, depth_maps=True, metric_maps=True), 21_000, "default", "auto", ["", "maps"]),
         (replace(FERN, photographs=False), 21_000, "default", "mls", []),
     ],
 )

@@ -97,6 +97,7 @@ def run(arguments: list[str]) -> None:
         problems = [*diagnostics.find_problems(scene, cloud, empty)]
         alignments = None if options.depth is None else _alignments(options, scene, clock)
         known = _known_depths(scene.depths, clock) if options.depth and scene.depths else 0
+        maps = diagnostics.depth_map_statistics(scene, clock)
         poses, faint = _check_poses(scene, masks.share, clock)
     doubt = poses["problem"] if poses else ""
     problems += [*stray_camera_notes(scene), *([masks.problem] if masks.problem else [])]
@@ -104,7 +105,7 @@ def run(arguments: list[str]) -> None:
     if options.json:
         facts = {
             "points": cloud, "tracks": tracks, "empty": regions, "poses": poses, "masks": masks,
-            "depth": alignments, "problems": problems,
+            "depth_map_facts": maps, "depth": alignments, "problems": problems,
         }  # fmt: skip
         facts = _plain({**_facts_of(scene), **facts})
         print(json.dumps(facts, indent=2, allow_nan=False), file=OUT.file)
@@ -115,7 +116,8 @@ def run(arguments: list[str]) -> None:
     planned = Planned.of(usable, options.budget, options.max_steps)
     share = None if regions is None else regions.mean
     advice = advice_for(usable, planned.max_seeds, strategy=planned.strategy, empty=share)
-    rows = [*_source_rows(scene), *_cloud_rows(cloud), *_track_rows(tracks)]
+    rows = [*_source_rows(scene), *_depth_map_rows(maps)]
+    rows += [*_cloud_rows(cloud), *_track_rows(tracks)]
     rows += _photograph_rows(regions, poses, masks)
     rows += _advice_rows(advice, planned) if len(scene.points) else []
     print_pairs(str(options.scene), rows)
@@ -218,10 +220,13 @@ def _next(
     """Return the next commands, or the choices if there are several."""
     any_points, refine = len(scene.points) > 0, "--refine-poses" in problem
     lifted = ""
-    if options.depth is not None and scene.depths and not is_distorted(scene):
+    metric = in_scene_units(scene.depths) and not any_points
+    if metric and not is_distorted(scene) and scene.has_photographs:
+        lifted = f"splatseed upsample {quoted(options.scene)} --method depth -o OUT"
+    elif options.depth is not None and scene.depths and not is_distorted(scene):
         how = "" if options.depth_kind is None else f"--depth-kind {options.depth_kind} "
         how += "" if options.depth_scale is None else f"--depth-scale {options.depth_scale:g} "
-        how += "" if any_points or in_scene_units(scene.depths) else "--depth.no-align "
+        how += "" if any_points else "--depth.no-align "
         how += next_steps.number_option(len(scene.points), known, planned.max_seeds)
         lifted = next_steps.lifting_command(options.scene, options.depth, how)
     if any_points and lifted:
@@ -233,7 +238,7 @@ def _next(
         return advised
     points = next_steps.triangulate_command(options.scene, scene, "OUT")
     points = f"{points} --refine-poses" if refine else points
-    maps = [("or from the maps", lifted)] if lifted and known else []
+    maps = [("or from the maps", lifted)] if lifted and (known or metric) else []
     return [*advised, *maps, ("or points" if advised or maps else "points", points)]
 
 
@@ -277,13 +282,23 @@ def _source_rows(scene: Scene) -> list[tuple[str, str]]:
     train, test = scene.split()
     by = f", by its {scene.listed.origin}" if scene.listed else ""
     images = f"{len(scene.images):,} ({len(train):,} to train, {len(test):,} to test{by})"
-    maps = [] if scene.depths is None else [("depth maps", f"{len(scene.depths):,}")]
     return [
         ("format", scene.source.format if scene.source else "memory"),
         ("cameras", ", ".join(cameras) or "none"),
         ("images", images if scene.images else "none"),
-        *maps,
     ]
+
+
+def _depth_map_rows(maps: diagnostics.DepthMapStatistics | None) -> list[tuple[str, str]]:
+    if maps is None:
+        return []
+    size = f"{maps.num_maps:,} of {maps.width} x {maps.height} pixels"
+    if maps.confidence is not None:
+        low, medium, high = maps.confidence
+        size += f", of high confidence at {high:.0%}, medium {medium:.0%}, low {low:.0%}"
+    elif maps.known < 1:
+        size += f", with a depth at {maps.known:.0%}"
+    return [("depth maps", f"{size}; method auto uses them" if maps.in_scene_units else size)]
 
 
 def _cloud_rows(cloud: diagnostics.CloudStatistics) -> list[tuple[str, str]]:

@@ -18,6 +18,7 @@ from typing import Literal
 
 import numpy as np
 
+from splatseed.depthmap import in_scene_units
 from splatseed.io.seeds import was_upsampled
 from splatseed.methods import Upsampler
 from splatseed.pointcloud import PointCloud
@@ -47,6 +48,7 @@ class Measured:
     layout: str | None = None  # of the cameras; None for fewer than three
     photographs: bool = True  # whether any exist
     depth_maps: bool = False  # whether any exist
+    metric_maps: bool = False  # whether they are in scene units, so that method auto uses them
 
 
 @dataclass(frozen=True)
@@ -104,8 +106,11 @@ def advise(
         maps = "Its depth maps can give some, too: `method='depth'`, `depth.align=False`, "
         maps += "`num_points=N`."
         how = ": depth comes from comparing the photographs" if measured.photographs else ""
+        if measured.metric_maps and measured.photographs:
+            how += ", and from its depth maps where they confirm none"
         none = f"There are no points to start with{how}."
-        return Advice(DEFAULT_METHOD, (none, *([maps] if measured.depth_maps else [])), measured)
+        unaligned = measured.depth_maps and not measured.metric_maps
+        return Advice(DEFAULT_METHOD, (none, *([maps] if unaligned else [])), measured)
     if not measured.photographs:
         return Advice(
             FALLBACK, ("Without photographs and their poses, points are interpolated.",), measured
@@ -129,7 +134,9 @@ def advise(
         )
         return Advice(AS_IT_IS, (f"It has {per_pixel}.", places_itself), measured)
     reasons = [f"It has {per_pixel}, and room for {has:.1f} times as many seeds."]
-    if measured.depth_maps:
+    if measured.metric_maps:
+        reasons.append("Where photographs confirm no depth, it is that of the depth maps.")
+    elif measured.depth_maps:
         return Advice("depth", (*reasons, "Its depth maps show the surfaces."), measured)
     if measured.empty is not None:
         cells = f"{measured.empty:.0%} of the cells of a coarse grid over the pictures"
@@ -148,6 +155,7 @@ def measure(scene: Scene, empty: float | None = None) -> Measured:
         layout=camera_layout(scene),
         photographs=scene.has_photographs,
         depth_maps=scene.depths is not None and bool(len(scene.depths)),
+        metric_maps=in_scene_units(scene.depths),
     )
 
 

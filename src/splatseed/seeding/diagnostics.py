@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64
 
+from splatseed.depthmap import in_scene_units
 from splatseed.errors import SplatseedError
 from splatseed.io.masks import read_mask
 from splatseed.methods.neighbors import prepare, sound_bases
@@ -23,6 +24,7 @@ from splatseed.scene import NO_POINT, Image, Scene
 EMPTY_CELLS = 32  # cells of the grid of empty regions along an image's longer side
 MIN_UNMASKED = 0.5  # minimum fraction of a cell's pixels that count for the cell to count
 MAX_MASKS_READ = 32
+MAX_MAPS_READ = 16
 MAX_ISOLATED, MAX_EMPTY = 0.02, 0.5
 """Fractions of isolated points, and of the images' area without points, above which to warn."""
 
@@ -62,6 +64,20 @@ class EmptyRegions:
     worst_name: str
 
 
+@dataclass(frozen=True)
+class DepthMapStatistics:
+    """Statistics of a scene's depth maps, by a sample of them."""
+
+    num_maps: int
+    width: int  # pixels of the first
+    height: int
+    known: float  # fraction of the pixels with a depth
+    confidence: (
+        tuple[float, float, float] | None
+    )  # fractions of low, medium and high; None: unknown
+    in_scene_units: bool  # whether method auto uses them
+
+
 def cloud_statistics(scene: Scene, progress: Progress = silent) -> CloudStatistics:
     """Compute statistics of the points of a scene."""
     xyz, left = scene.points.xyz, scene.left_out
@@ -98,6 +114,35 @@ def track_statistics(scene: Scene) -> TrackStatistics | None:
     return TrackStatistics(
         float(lengths.mean()), _percentiles(lengths), float(known.mean()), _percentiles(known)
     )
+
+
+def depth_map_statistics(scene: Scene, progress: Progress = silent) -> DepthMapStatistics | None:
+    """Read some of a scene's depth maps; None without any.
+
+    Raises:
+        SceneNotFoundError: A map's file is gone.
+        SceneFormatError: A map cannot be read.
+    """
+    depths = scene.depths
+    if depths is None or not len(depths):
+        return None
+    names = list(depths)
+    sample = [names[i * len(names) // MAX_MAPS_READ] for i in range(MAX_MAPS_READ)]
+    known, levels, first = list[float](), list[Float64[np.ndarray, " 3"]](), None
+    for i, name in enumerate(dict.fromkeys(sample)):
+        depth = depths.read(name)
+        first = first or depth
+        known.append(float(np.isfinite(depth.values).mean()))
+        if depth.confidence is not None:
+            counts = np.bincount(depth.confidence.ravel(), minlength=3)[:3]
+            levels.append(counts / depth.confidence.size)
+        progress("depth maps", (i + 1) / len(sample))
+    assert first is not None  # noqa: S101  (there is a map)
+    low, medium, high = np.mean(levels, axis=0).tolist() if levels else (np.nan,) * 3
+    return DepthMapStatistics(
+        len(names), first.width, first.height, float(np.mean(known)),
+        (low, medium, high) if levels else None, in_scene_units(depths),
+    )  # fmt: skip
 
 
 def empty_regions(

@@ -161,7 +161,8 @@ def _announce(
     how = ""
     if isinstance(method, photo_methods.Stereo) and not photo_methods.has_depth_hints(scene):
         points = "too few" if photo_methods.has_points(scene) else "no"
-        where = "" if scene.depths is None else ", around its depth maps"
+        maps = scene.depths if method.depth_maps else None
+        where = "" if maps is None else ", around its depth maps"
         how = f": {points} points, so depth is found by comparing photographs{where}"
     kind = scene.source.format if scene.source else "memory"
     size = f"{counted(len(scene.images), 'image')}, {counted(len(scene.points), 'point')}"
