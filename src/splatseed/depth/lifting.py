@@ -141,10 +141,10 @@ def _settings_without_points(scene: Scene, settings: DepthSettings) -> DepthSett
     """
     if not settings.align or scene.points.originals.finite.any():
         return settings
-    if scene.depths is not None and not in_scene_units(scene.depths):
+    if not in_scene_units(scene.depths):
         raise PointCloudError(
-            "points from Structure-from-Motion, to whose scale the depth maps are fitted",
-            found="none that are original and finite",
+            "at least one original point with finite coordinates, to whose scale maps are fitted",
+            found=f"none of {len(scene.points):,}" if len(scene.points) else "none",
             fix="Triangulate some (splatseed sfm --poses-from), or pass `depth.align=False` if the "
             "maps are in the unit of the poses.",
         )

@@ -86,8 +86,9 @@ def number_of_new(
     num_original = len(scene.points.originals)
     if not chooses_number(method):
         suggest = getattr(method, "suggested_number", None)
-        if suggest is not None and not num_original and ratio is None and num_points is None:
-            num_points = suggest(scene)
+        if suggest is not None and not num_original:
+            suggested = suggest(scene)  # raises where the method cannot do without originals
+            num_points = suggested if num_points is None and ratio is None else num_points
         total = planned_size(num_original, ratio, num_points)
         if total == 0 and "points" not in traits_of(method).needs:
             raise ParameterError(
