@@ -24,8 +24,11 @@ DepthKind = Literal["z", "ray", "inverse"]
 """Meaning of a value: planar depth z along the camera's axis, distance along the pixel's ray, or an
 inverse depth of the form a / z + b (what most monocular networks predict)."""
 
-MIN_CONFIDENCE = 2
-"""Default confidence from which on depth is used."""
+MIN_CONFIDENCE = 1
+"""Default confidence from which on depth is used. On a phone's capture (corridor) depth of
+confidence 0, 1 and 2 is within 5% of other views' at 75%, 85% and 98% of the pixels. Where
+photographs confirm none, 79% of the seeds of confidence 1 are within 5% of a surface, and 70% of
+the guesses that they replace; of confidence 0, 47% are, and 52%."""
 ASPECT_SLACK = 0.02
 """Largest relative difference of a map's aspect ratio from its image's, by rounding of sizes."""
 

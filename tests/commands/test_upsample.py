@@ -259,7 +259,10 @@ def test_the_maps_are_named_and_noted_or_the_scenes_own(room, surfaces, tmp_path
 
 def test_a_capture_has_its_own_maps_and_needs_no_points(rgbd, surfaces, tmp_path, splatseed):
     out, lift = tmp_path / "out", ("--method", "depth", "--depth.no-align", "--num-points")
-    run = splatseed("upsample", rgbd, *lift, 700, "-o", out)
+    run = splatseed("upsample", rgbd, *lift[:2], "-o", tmp_path / "plain")
+    assert (run.code, run.err) == (0, "")
+    assert f"{round(0.25 * 120 * 90):,} points" in run.out
+    run = splatseed("upsample", rgbd, *lift[:2], "--num-points", 700, "-o", out)
     assert (run.code, run.err) == (0, "")
     assert "far from any original" not in run.out
     scene = load_scene(out)
@@ -273,8 +276,7 @@ def test_a_capture_has_its_own_maps_and_needs_no_points(rgbd, surfaces, tmp_path
     assert len(load_scene(tmp_path / "again").points) == 9
     mls, none = ("upsample", out, "--method", "mls"), "700"
     for words, says in (
-        (("upsample", rgbd, *lift[:3]), "--num-points"),
-        (("upsample", rgbd, *lift[:2], "--num-points", 9), "--poses-from"),
+        (("upsample", out, *lift[:2], *maps), "--depth.no-align"),
         (mls, none),
         (("bench", "--scenes", out), none),
     ):
