@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from splatseed.camera import Intrinsics
+from splatseed.depthmap import DepthMap
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Masks, Scene, Tracks
 from splatseed.seeding import diagnostics as module
@@ -135,3 +136,15 @@ def test_problems_list_those_of_the_reader_first(rng):
     (repeats,) = module.find_problems(_scene(rng.random((5, 3))), _statistics(1000, 100, 200), None)
     assert repeats.startswith("100 points (12.5%)")  # of those that are left
     assert "no points" in module.find_problems(_scene([]), _statistics(0, 0), None)[0]
+
+
+def test_depth_maps_are_described_by_a_sample(room):
+    assert module.depth_map_statistics(room) is None
+    values = np.ones((12, 16), np.float32)
+    values[:3] = np.nan
+    levels = np.repeat(np.array([0, 1, 2, 2], np.uint8), 3)[:, None] * np.ones(16, np.uint8)
+    maps = {image.name: DepthMap(values, confidence=levels) for image in room.images}
+    found = module.depth_map_statistics(room.with_depths(maps))
+    assert found == module.DepthMapStatistics(
+        len(room.images), 16, 12, 0.75, (0.25, 0.25, 0.5), in_scene_units=False
+    )
