@@ -194,17 +194,16 @@ def test_a_scenes_own_maps_are_described_and_can_be_lifted(rgbd, tmp_path, splat
     assert len(load_scene(tmp_path / "out").points) == round(0.25 * 120 * 90)
 
 
-def test_maps_of_low_confidence_do_not_count(rgbd, splatseed):
-    """The number suggested follows from the pixels that lifting uses."""
-    pixels = 0
+def test_maps_of_low_confidence_do_not_count(rgbd, tmp_path, splatseed):
+    """Of a tenth of their pixels depth is used, and an eighth of these give a point."""
     for path in (rgbd / "results").glob("depth*.png"):
-        levels = np.zeros(np.asarray(PilImage.open(path)).shape, np.uint8)
-        levels[: len(levels) // 2] = 2
+        levels = np.zeros((90, 120), np.uint8)
+        levels[:9] = 2
         PilImage.fromarray(levels).save(path.with_name(path.name.replace("depth", "conf")))
-        pixels += levels.size
-    out = splatseed("info", rgbd, "--depth", rgbd).out
-    assert "of high confidence at 50% of its pixels" in out
-    assert f"--num-points {pixels // 2 // PER_POINT} " in out
+    out = splatseed("info", rgbd).out
+    assert "of high confidence at 10%, medium 0%, low 90%" in _pairs(out)["depth maps"]
+    out = splatseed("upsample", rgbd, "--method", "depth", "-o", tmp_path / "out").out
+    assert f"{12 * 9 * 120 // PER_POINT:,} points" in out
 
 
 # What splatseed wrote -----------------------------------------------------------------------------

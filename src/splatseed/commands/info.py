@@ -368,9 +368,6 @@ def _print_depth(title: str, scene: Scene, alignments: Mapping[str, Alignment]) 
     if known and scene.depths is not None:
         first = scene.depths.read(known[0])
         maps = f"{maps}, the first {first.width} x {first.height}, kind {first.kind}"
-        if first.confidence is not None:
-            high = np.mean(first.confidence >= DepthSettings.min_confidence)
-            maps += f", of high confidence at {high:.0%} of its pixels"
         if first.kind == "inverse":
             columns = {"scale": ".4g", "shift": ".4g", "residual": ".2%"}
     if not len(scene.points):  # nothing to compare with
