@@ -11,6 +11,7 @@ The kernel's own high-water mark is reset before the run and read after it (Linu
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -25,7 +26,7 @@ import numpy as np
 
 import splatseed as ss
 
-__all__ = ["FamilyWatch", "peak_bytes_per_output", "reset_peak", "status_bytes"]
+__all__ = ["FamilyWatch", "family_seconds", "peak_bytes_per_output", "reset_peak", "status_bytes"]
 
 PROCESSES = Path("/proc")
 STATUS = PROCESSES / "self/status"
@@ -122,6 +123,17 @@ def _family(pid: int) -> Iterator[int]:
         with suppress(OSError):  # it has just ended
             for child in task.read_text("ascii").split():
                 yield from _family(int(child))
+
+
+def family_seconds(pid: int) -> float:
+    """CPU seconds of a process and its descendants so far, those that have ended included."""
+    ticks = 0
+    for each in _family(pid):
+        with suppress(OSError, IndexError):  # it has just ended, and is its parent's
+            # After the name, which may hold spaces: own and ended children's, user and system.
+            fields = (PROCESSES / str(each) / "stat").read_text("utf-8", "replace")
+            ticks += sum(map(int, fields.rpartition(")")[2].split()[11:15]))
+    return ticks / os.sysconf("SC_CLK_TCK")
 
 
 def _resident(pid: int) -> int:

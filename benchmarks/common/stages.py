@@ -2,17 +2,19 @@
 
 Notation: a *stage* is one that the command reports as its progress, from its first report to the
 first report of another; ``START`` is what comes before, imports above all. Promise: the stages add
-up to the command. For a process of its own (``children.call``), where one command runs.
+up to the command. For a process of its own (``children.call``), where one command runs;
+processes that it starts count.
 """
 
 from __future__ import annotations
 
+import os
 import time
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from benchmarks.common.memory import reset_peak, status_bytes
+from benchmarks.common.memory import FamilyWatch, family_seconds, reset_peak, status_bytes
 
 from splatseed import cli, console
 
@@ -28,18 +30,20 @@ class Stage:
     name: str
     seconds: float = 0.0
     processor: float = 0.0
-    """Seconds of all threads."""
+    """CPU seconds of all threads and processes."""
     peak: int = 0
-    """Most bytes resident; -1 off Linux."""
+    """Most bytes resident, of all processes; -1 off Linux."""
 
 
 class StageWatch:
-    """Measures stages; ``mark`` ends the running one."""
+    """Measures stages of this process and its descendants; ``mark`` ends the running one."""
 
     def __init__(self) -> None:
         self._stages = {START: Stage(START)}
         self._running = START
-        self._since = time.perf_counter(), time.process_time()
+        self._family = FamilyWatch(os.getpid())
+        self._family.__enter__()
+        self._since = _now()
         reset_peak()
 
     def mark(self, name: str) -> None:
@@ -50,18 +54,26 @@ class StageWatch:
         self._running = name
 
     def stages(self) -> list[Stage]:
-        """End the running stage; return all in order of first appearance."""
+        """End the running stage, and with it all; return them in order of first appearance."""
         self._end()
+        self._family.__exit__(None, None, None)
         return list(self._stages.values())
 
     def _end(self) -> None:
-        now, peak = (time.perf_counter(), time.process_time()), status_bytes("VmHWM")
+        now = _now()
+        # The kernel knows this process' peak; what it has together with others is sampled.
+        peak = max(status_bytes("VmHWM"), self._family.peak)
         stage = self._stages.setdefault(self._running, Stage(self._running))
         stage.seconds += now[0] - self._since[0]
         stage.processor += now[1] - self._since[1]
         stage.peak = max(stage.peak, peak)
-        self._since = now
+        self._since, self._family.peak = now, 0
         reset_peak()
+
+
+def _now() -> tuple[float, float]:
+    """The wall's clock, and the CPU seconds of all processes."""
+    return time.perf_counter(), family_seconds(os.getpid())
 
 
 def run_command(arguments: list[str]) -> list[dict[str, Any]]:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from types import SimpleNamespace
 
 import pytest
@@ -35,13 +37,26 @@ def test_the_stages_of_a_command_are_those_it_reports(bench, captures, monkeypat
 
 def test_a_stage_that_comes_again_is_added_to_itself(bench, monkeypatch):
     times = iter([0.0, 1.0, 3.0, 6.0, 10.0])
-    clock = SimpleNamespace(perf_counter=lambda: next(times), process_time=lambda: 0.0)
-    monkeypatch.setattr(bench.stages, "time", clock)
+    monkeypatch.setattr(bench.stages, "time", SimpleNamespace(perf_counter=lambda: next(times)))
     watch = bench.stages.StageWatch()
     for name in ("read", "read", "match", "read"):
         watch.mark(name)
     found = {each.name: each.seconds for each in watch.stages()}
     assert found == {"start": 1.0, "read": 2.0 + 4.0, "match": 3.0}
+
+
+def test_processes_that_a_stage_starts_count(bench):
+    watch = bench.stages.StageWatch()
+    watch.mark("child")
+    # Half a second on a core, and 200 MB; it ends within the stage.
+    work = "import time; b = bytearray(2 * 10**8)\nwhile time.process_time() < 0.5: pass"
+    subprocess.run([sys.executable, "-c", work], check=True)
+    watch.mark("own")
+    start, child, own = watch.stages()
+    assert [each.name for each in (start, child, own)] == ["start", "child", "own"]
+    assert child.processor > 0.45
+    assert own.processor < 0.2
+    assert child.peak > own.peak + 150_000_000
 
 
 def test_a_part_of_a_capture_has_its_first_photographs(bench, captures, monkeypatch, tmp_path):
