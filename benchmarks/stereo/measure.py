@@ -37,7 +37,7 @@ WHOLE_TARGET = "30 s, 2 GB"
 THREADS = 2
 PEER_ROWS = 40
 POINTS_OF = ("treehill", "fern", "fox", "bonsai")
-PARTS = ("speed", "whole", "truth", "pairs", "points", "few", "bare", "foliage")
+PARTS = ("speed", "whole", "truth", "pairs", "points", "few", "bare", "foliage", "dense")
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Settings:
     parts: tuple[str, ...] = PARTS
     """speed: a hypothesis; whole: 100 views; truth: against true depth; pairs: OpenCV's semi-global
     matching, likewise; points: against SfM's points; few: begun from a few of these; bare: without
-    points; foliage: treehill."""
+    points; foliage: treehill; dense: seeds within budgets."""
     scenes: tuple[str, ...] = TRUE_SCENES
     """Where depth is known."""
     arms: tuple[str, ...] = tuple(ARMS)
@@ -203,6 +203,24 @@ def print_bare(settings: Settings) -> None:
         print(f"{table([f'{name}: {header[0]}', *header[1:]], rows)}\n", flush=True)
 
 
+def print_dense(settings: Settings) -> None:
+    """Seeds of a budget against true depth, beside sparse ones."""
+    names = [name for name in at_hand(settings.scenes) if name != "made, no texture"]
+    prepare(names, settings.cache)
+    header = ["photographs, depths", "seeds", "within 1%", "within 5%", "CPU s"]
+    for name in names:
+        rows = call(
+            "benchmarks.stereo.dense:score_dense", threads=THREADS, name=name,
+            cache=str(settings.cache), limit=settings.limit,
+        )  # fmt: skip
+        cells = [
+            [row["label"], row["size"], f"{row['seeds']:,}",
+             *(f"{share:.1%}" for share in row["shares"]), f"{row['seconds']:.1f}"]
+            for row in rows
+        ]  # fmt: skip
+        print(f"{table([name, *header], cells)}\n", flush=True)
+
+
 def _print_arms(
     function: str,
     score: Callable[..., Any],
@@ -230,6 +248,7 @@ PRINTERS: dict[str, Callable[[Settings], None]] = {
     "few": print_few,
     "bare": print_bare,
     "foliage": print_foliage,
+    "dense": print_dense,
 }
 
 

@@ -37,6 +37,7 @@ __all__ = [
     "Score",
     "first",
     "load",
+    "nearest_error",
     "prepare",
     "reached",
     "relative_error",
@@ -171,11 +172,18 @@ def _map_shares(stereo: StereoResult, scene: Scene) -> tuple[float, float, float
 
 def relative_error(depth: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """Of a map against depth pixels of any size, [h, w]; NaN where either is unknown."""
-    rows, columns = (
-        np.clip(np.rint((np.arange(n) + 0.5) * m / n).astype(int), 1, m - 1)
-        for n, m in zip(depth.shape, truth.shape, strict=True)
+    row, column = ((np.arange(n) + 0.5) / n for n in depth.shape)
+    places = np.stack(np.broadcast_arrays(column, row[:, None]), axis=-1)
+    return nearest_error(places, depth, truth)
+
+
+def nearest_error(places: np.ndarray, depth: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Of depths at places [..., 2], in widths and heights, against the four pixels around each."""
+    column, row = (
+        np.clip(np.rint(places[..., axis] * m).astype(int), 1, m - 1)
+        for axis, m in enumerate(reversed(truth.shape))
     )
-    around = np.stack([truth[rows - a][:, columns - b] for a in (0, 1) for b in (0, 1)])
+    around = np.stack([truth[row - a, column - b] for a in (0, 1) for b in (0, 1)])
     around = np.where(around > 0, around, np.nan)
     one = around.max(axis=0) < ONE_SURFACE * around.min(axis=0)
     around = np.where(one, around.mean(axis=0), around)

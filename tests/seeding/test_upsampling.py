@@ -12,7 +12,7 @@ from splatseed.photos import loading
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import silent
 from splatseed.scene import Split
-from splatseed.seeding.budget import parse_budget
+from splatseed.seeding.budget import parse_budget, pixels_meant
 from splatseed.seeding.thinning import thin_to
 from splatseed.seeding.upsampling import share_covered
 
@@ -179,3 +179,9 @@ def test_a_budget_is_a_number_or_a_density(budget):
     else:
         with pytest.raises(ParameterError, match=says):
             parse_budget(budget, 2000)
+
+
+def test_a_density_names_the_size_of_the_photographs(room):
+    assert pixels_meant(room, "0.5rho") == ": 0.5rho of 160 x 120 pixels"
+    assert not pixels_meant(room, None)
+    assert not pixels_meant(room, "500k")

@@ -20,9 +20,30 @@ MAX_BUDGET = 10**12
 
 def points_within(scene: Scene, budget: int | str) -> int:
     """Parse a budget; rho counts pixels of the scene's photographs at the default training size."""
-    images = at_file_size(scene).images
-    photographs = camera_views(images, factor_for_size(images, TRAINED_SIDE)) if images else ()
+    photographs = _at_trained_size(scene)
     return parse_budget(budget, median_pixels(photographs) if photographs else 0)
+
+
+def pixels_meant(scene: Scene, budget: int | str | None) -> str:
+    """Describe the photograph whose pixels a budget in rho counts; empty for other budgets.
+
+    Example:
+        >>> from splatseed.pointcloud import PointCloud
+        >>> pixels_meant(Scene(PointCloud.empty()), "50k")
+        ''
+    """
+    photographs = _at_trained_size(scene)
+    if not photographs or not str(budget).strip().lower().endswith(RHO):
+        return ""
+    by_pixels = sorted(photographs, key=lambda view: view.width * view.height)
+    middle = by_pixels[len(by_pixels) // 2]
+    return f": {str(budget).strip()} of {middle.width} x {middle.height} pixels"
+
+
+def _at_trained_size(scene: Scene) -> tuple[View, ...]:
+    """The views of a scene, without pixels, at the default training size."""
+    images = at_file_size(scene).images
+    return camera_views(images, factor_for_size(images, TRAINED_SIDE)) if images else ()
 
 
 def median_pixels(views: Sequence[View]) -> float:

@@ -51,13 +51,13 @@ class _DenseSettings:
     """Sizes of the second comparison, and what it costs relative to the first."""
 
     max_size: int = 1600  # longer side of photographs, pixels
-    small: int = 800  # photographs up to this size may be compared at every pixel
-    min_grid: int = 2  # pixels between depths, of larger photographs
-    max_grid: int = 4  # larger photographs give more accurate depths than finer grids of small ones
+    grids: tuple[int, ...] = (2, 4)  # pixels between depths
+    split: int = 2  # a pixel of a map has seeds up to this many times as close as its grid
     matching: float = 0.25  # time per depth: one sweep instead of four, on larger photographs
-    fusions: float = 1.5  # time per depth: several spacings, but each confidence only once
+    fusions: float = 1.5  # time per place: several spacings, but each confidence only once
     depth_bytes: int = 17  # a plane, its cost and agreement
-    fusion_bytes: int = 4 + 8 + 4  # per depth: order, cells of all levels, contrast
+    order_bytes: int = 4 + 1 + 4  # per depth: order, level, one contrast of all views at a time
+    cell_bytes: int = 8  # per place: cells of all levels
     guess_bytes: int = 4 * 3 * 4  # per depth of a view that is being matched
     seed_bytes: int = 240  # per seed while it is made and written
     usable: float = 0.85  # share of the free memory
@@ -73,6 +73,7 @@ class Plan:
 
     factor: int  # photographs are reduced by this
     grid: int  # pixels of the reduced photographs between depths
+    split: int  # places for seeds along a row and a column of a depth's pixel
     num_depths: int  # of all views
     memory: int  # of the process, bytes; an upper bound
     within: bool  # whether free memory holds that
@@ -130,7 +131,9 @@ class WithinBudget:
         scale = first / plan.factor
         known = _originals_in_views(scene, images, dense.views)
         largest = self.method.spacing * scale
-        seeds = fuse_at_most(dense, num, largest, known, spacing * scale, progress)
+        seeds = fuse_at_most(
+            dense, num, largest, known, spacing * scale, progress, plan.split
+        )  # fmt: skip
         points = self.method.fill(
             scene, stereo_points(seeds, new.notes, stereo), stereo.views, rng, progress
         )
@@ -164,17 +167,22 @@ def plan_comparisons(
         num: Points to make.
     """
     least = min(first, factor_for_size(images, DENSE.max_size))
-    factor = min(max(int(finest / DENSE.max_grid), least), first)
-    longest = max(max(image.camera.width, image.camera.height) for image in images)
-    min_grid = 1 if longest / factor <= DENSE.small else DENSE.min_grid
-    start = min(max(int(finest / factor), min_grid), DENSE.max_grid)
-    choices = [(factor, each) for each in range(start, DENSE.max_grid + 1)]
-    choices += [(each, DENSE.max_grid) for each in range(factor + 1, first + 1)]
-    choices = [pair for pair in choices if pair[0] * pair[1] < first * grid]
-    return [_plan(images, *pair, num) for pair in (*choices, (first, grid))]
+    factor = min(max(int(finest / max(DENSE.grids)), least), first)
+    pairs = [(factor, each) for each in DENSE.grids]
+    pairs += [(each, max(DENSE.grids)) for each in range(factor + 1, first + 1)]
+    pairs = [(each, step) for each, step in pairs if each * step < first * grid]
+    pairs.append((first, grid))
+    # The coarsest grid that resolves the smallest cells, then all that need less memory.
+    fine = [i for i, (each, step) in enumerate(pairs) if each * step / DENSE.split <= finest]
+    start = max((i for i in fine if pairs[i][0] == factor), default=0)
+    plans = []
+    for each, step in pairs[start:]:
+        split = DENSE.split if each * step > finest and step % DENSE.split == 0 else 1
+        plans.append(_plan(images, each, step, split, num))
+    return plans
 
 
-def _plan(images: Sequence[Image], factor: int, grid: int, num: int) -> Plan:
+def _plan(images: Sequence[Image], factor: int, grid: int, split: int, num: int) -> Plan:
     """Estimate the memory of a comparison."""
     sizes = [(im.camera.width // factor, im.camera.height // factor) for im in images]
     pixels = [width * height for width, height in sizes]
@@ -184,12 +192,14 @@ def _plan(images: Sequence[Image], factor: int, grid: int, num: int) -> Plan:
     # Colours and grey; each thread's photographs with 4 bytes per pixel and candidate planes.
     matching = 4 * sum(pixels) + DENSE.depth_bytes * sum(depths)
     matching += threads * (4 * sources * max(pixels) + DENSE.guess_bytes * max(depths))
-    fusion = 3 * sum(pixels) + (DENSE.depth_bytes + DENSE.fusion_bytes) * sum(depths)
-    # Two other views confirm a seed, so that there are three depths per seed at least.
-    more = max(matching, fusion + DENSE.seed_bytes * min(num, sum(depths) // 3))
+    places = split**2 * sum(depths)
+    fusion = 3 * sum(pixels) + (DENSE.depth_bytes + DENSE.order_bytes) * sum(depths)
+    # Two other views confirm a seed, so that there are three places per seed at least.
+    fusion += DENSE.cell_bytes * places + DENSE.seed_bytes * min(num, places // 3)
+    more = max(matching, fusion)
     free = free_memory()
     within = free is None or more <= DENSE.usable * free
-    return Plan(factor, grid, sum(depths), (resident_bytes() or PROCESS) + more, within)
+    return Plan(factor, grid, split, sum(depths), (resident_bytes() or PROCESS) + more, within)
 
 
 def _announcement(
@@ -205,7 +215,7 @@ def _announcement(
     expected = ratio * (
         DENSE.matching * spent["compare photographs"]
         + spent["compare depths"]
-        + DENSE.fusions * spent["fuse depths"]
+        + DENSE.fusions * plan.split**2 * spent["fuse depths"]
     )
     expected += spent["read images"] + spent["cover"]
     sides = max((im.camera.width // plan.factor, im.camera.height // plan.factor) for im in images)

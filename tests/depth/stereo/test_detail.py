@@ -113,3 +113,27 @@ def test_larger_photographs_refine_the_planes_of_smaller_ones(tmp_path):
         assert (error < 0.01).mean() > 0.97
     again = compare_closer(coarse, views, 2, 0, silent)
     assert again.planes[3].tobytes() == fine.planes[3].tobytes()
+
+
+def test_places_within_a_pixel_lie_on_its_plane(plane):
+    whole, half = (
+        fuse_at_most(plane.stereo, 10**9, LARGEST, NONE, 0.2, split=split) for split in (1, 2)
+    )
+    assert len(half) > 2 * len(whole)
+    off = [plane.surfaces.distance(seeds.xyz.astype(float)) for seeds in (whole, half)]
+    assert np.quantile(off[1], 0.9) < 1.1 * np.quantile(off[0], 0.9)
+    assert np.median(half.sizes) == pytest.approx(0.5 * np.median(whole.sizes), rel=0.05)
+    # Colours are those of the places.
+    view = plane.stereo.views[0]
+    uv = view.camera.project(half.xyz[half.view_idx == 0].astype(float))[0]
+    column, row = np.floor(uv + 1e-3).astype(int).T
+    same = (view.photograph[row, column] == half.rgb[half.view_idx == 0]).all(axis=1)
+    assert same.mean() > 0.99
+
+
+def test_two_views_suffice_for_the_largest_cells_only(wall):
+    strong = fuse_at_most(wall, 10**9, LARGEST, NONE, 1.0)
+    bits = [each & np.uint8(3) for each in wall.agreeing]
+    weak = fuse_at_most(dataclasses.replace(wall, agreeing=bits), 10**9, LARGEST, NONE, 1.0)
+    assert 0 < len(weak) < 0.1 * len(strong)
+    assert weak.sizes.min() > 0.9 * LARGEST * 2.8 / 100

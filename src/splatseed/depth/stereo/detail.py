@@ -1,5 +1,8 @@
 """Seeds in proportion to detail: as many as asked for, closest together where contrast is high.
 
+A third view must confirm pixels whose cells are smaller than the largest: two may agree by chance,
+and wrong depths, which share a cell with no other, are chosen first.
+
 Notation: the *contrast* of a pixel is the mean length of the grey gradient around it, relative to
 the median over all confirmed pixels. At a *spacing* of s pixels, a pixel of contrast c has cells of
 side s c^-e/2, within limits: e = 1 puts seeds in proportion to contrast, as
@@ -16,11 +19,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int32, UInt8
+from jaxtyping import Bool, Float32, Float64, Int8, UInt8
 from scipy.ndimage import uniform_filter
 
 from splatseed.depth.stereo.fusion import (
     CellGrids,
+    Places,
     StereoSeeds,
     by_confidence,
     concatenate,
@@ -30,6 +34,9 @@ from splatseed.depth.stereo.maps import StereoResult
 from splatseed.depth.stereo.quads import grey_image
 from splatseed.progress import Progress, silent
 
+Steps = Int8[np.ndarray, "h w"]
+WEAK = 127
+"""Step of pixels that have the largest cells at any spacing."""
 Placed = tuple[Float64[np.ndarray, "M 2"], Float64[np.ndarray, " M"]]
 """Pixels of points in a view, and their depths."""
 
@@ -39,6 +46,8 @@ class _DetailSettings:
     """How seeds follow detail, and the search for the spacing."""
 
     exponent: float = 1.0  # e: seeds per area ~ contrast^e
+    closest: float = 2.0  # limit of spacing / side: edges in depth have contrast, too
+    min_agreeing: int = 3  # views that confirm pixels with smaller cells than the largest
     floor: float = 0.5  # grey levels per pixel, added to every gradient: noise is no detail
     every: int = 7  # of the confirmed pixels, one in so many is used for the median contrast
     tolerance: float = 0.02  # share of the seeds asked for that may be missing
@@ -67,10 +76,24 @@ class Levels:
         sides = np.array([largest, *(spacing * 2.0 ** (steps / 2)), smallest])
         return cls(sides, spacing, math.ceil(high) - 1)
 
-    def of_contrast(self, contrast: Float32[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
-        """Level of each pixel."""
-        step = np.rint(-DETAIL.exponent * np.log2(contrast))  # 2 log2(side / spacing)
-        return np.asarray(np.clip(self.highest + 1 - step, 0, len(self.sides) - 1), np.uint8)
+    def of_steps(self, steps: Steps) -> UInt8[np.ndarray, "h w"]:
+        """Level of each pixel, by its ``steps_of`` contrast."""
+        level = self.highest + 1 - steps.astype(np.int64)
+        return np.asarray(np.clip(level, 0, len(self.sides) - 1), np.uint8)
+
+
+def steps_of(stereo: StereoResult, i: int, contrast: Float32[np.ndarray, "h w"]) -> Steps:
+    """2 log2 of side / spacing for each pixel of view i, rounded; ``WEAK`` without a third view."""
+    steps = np.asarray(np.rint(-DETAIL.exponent * np.log2(contrast)), np.int8)
+    steps[~_is_strong(stereo, i)] = WEAK
+    return steps
+
+
+def _is_strong(stereo: StereoResult, i: int) -> Bool[np.ndarray, "h w"]:
+    """Whether as many views confirm each pixel as cells below the largest need."""
+    num_sources = int((stereo.sources[i] >= 0).sum())
+    needed = max(1, min(DETAIL.min_agreeing, num_sources))
+    return np.asarray(np.bitwise_count(stereo.agreeing[i]) >= needed)
 
 
 def find_contrast(stereo: StereoResult, radius: float) -> list[Float32[np.ndarray, "h w"]]:
@@ -109,18 +132,22 @@ def expected_spacing(stereo: StereoResult, num: int, largest: float) -> tuple[fl
         The spacing, and the side of cells that a tenth of the seeds fall below; 0 without seeds.
     """
     grid = float(stereo.settings.grid)
-    contrasts = find_contrast(stereo, largest / 2)
-    grids, found = CellGrids.of(stereo.views, [grid]), []
-    for i, contrast in enumerate(contrasts):
-        levels = np.zeros(contrast.shape, np.uint8)
-        found.append(contrast.ravel()[grids.choose(stereo, i, by_confidence(stereo, i), levels)])
+    grids, found, weak = CellGrids.of(stereo.views, [grid]), [], 0
+    for i, contrast in enumerate(find_contrast(stereo, largest / 2)):
+        levels, strong = np.zeros(contrast.shape, np.uint8), _is_strong(stereo, i).ravel()
+        pixels = grids.choose(stereo, i, by_confidence(stereo, i), levels).pixels
+        found.append(contrast.ravel()[pixels[strong[pixels]]])
+        weak += len(pixels) - len(found[-1])
     contrast = np.concatenate(found)
     if not len(contrast):
         return 0.0, 0.0
+    num = max(num - round(weak * (grid / largest) ** 2), 1)
     low, high = DETAIL.finest * grid, largest / DETAIL.finest
     for _ in range(DETAIL.num_bisections):
         spacing = math.sqrt(low * high)
-        sides = np.minimum(side_of(contrast, spacing), largest)
+        sides = np.minimum(
+            np.maximum(side_of(contrast, spacing), spacing / DETAIL.closest), largest
+        )
         low, high = (low, spacing) if (grid**2 / sides**2).sum() < num else (spacing, high)
     seeds = 1 / sides**2
     order = np.argsort(sides)
@@ -135,6 +162,7 @@ def fuse_at_most(
     known: Sequence[Placed],
     spacing: float,
     progress: Progress = silent,
+    split: int = 1,
 ) -> StereoSeeds:
     """Choose at most ``num`` seeds from confirmed pixels, in proportion to detail.
 
@@ -146,55 +174,64 @@ def fuse_at_most(
         known: Points that each view sees already: their cells get no seed.
         spacing: A guess of the spacing, from which the search starts.
         progress: Called with the stage and the fraction done.
+        split: Places for seeds along a row and a column of a pixel of the maps.
     """
-    chosen = _Search(stereo, largest, known, progress).run(num, spacing)
-    each = enumerate(zip(chosen.pixels, chosen.sides, strict=True))
-    return concatenate([make_seeds(stereo, i, pixels, sides) for i, (pixels, sides) in each])
+    chosen = _Search(stereo, largest, split, known, progress).run(num, spacing)
+    return concatenate([make_seeds(stereo, i, each) for i, each in enumerate(chosen.places)])
 
 
 @dataclass(frozen=True, eq=False)
 class _Choice:
-    """The pixels of each view that become seeds at a spacing, and the sides of their cells."""
+    """The places in each view that become seeds at a spacing."""
 
-    pixels: list[Int32[np.ndarray, " M"]]
-    sides: list[Float64[np.ndarray, " M"]]
+    places: list[Places]
     all_largest: bool  # no larger spacing gives fewer
     all_smallest: bool  # no smaller spacing gives more
 
     def __len__(self) -> int:
-        return sum(map(len, self.pixels))
+        return sum(map(len, self.places))
 
 
 class _Search:
     """The spacing at which about a number of seeds is chosen."""
 
     def __init__(
-        self, stereo: StereoResult, largest: float, known: Sequence[Placed], progress: Progress
+        self,
+        stereo: StereoResult,
+        largest: float,
+        split: int,
+        known: Sequence[Placed],
+        progress: Progress,
     ) -> None:
         self.stereo, self.known, self.progress = stereo, known, progress
-        self.largest = max(largest, float(stereo.settings.grid))
-        self.contrast = find_contrast(stereo, largest / 2)
+        self.smallest, self.split = stereo.settings.grid / split, split
+        self.largest = max(largest, self.smallest)
+        # What follows from the contrast alone, in a byte per pixel.
+        contrasts = find_contrast(stereo, largest / 2)
+        self.steps = [steps_of(stereo, i, contrast) for i, contrast in enumerate(contrasts)]
         self.orders = [by_confidence(stereo, i) for i in range(len(stereo.views))]
         self.num_done = 0
 
     def choose(self, spacing: float) -> _Choice:
         """Choose the pixels that become seeds at a spacing."""
-        levels = Levels.of(spacing, self.largest, float(self.stereo.settings.grid))
+        smallest = max(self.smallest, spacing / DETAIL.closest)
+        levels = Levels.of(spacing, self.largest, min(smallest, self.largest))
         grids = CellGrids.of(self.stereo.views, levels.sides.tolist())
         for i, (uv, z) in enumerate(self.known):
             grids.mark(i, uv, z)
-        pixels, sides, limits = [], [], []
+        places, limits = [], []
         for i, order in enumerate(self.orders):
-            level = levels.of_contrast(self.contrast[i])
-            pixels.append(grids.choose(self.stereo, i, order, level))
-            sides.append(levels.sides[level.ravel()[pixels[-1]]])
-            limits += [level.min(), level.max()] if level.size else []
+            level = levels.of_steps(self.steps[i])
+            places.append(grids.choose(self.stereo, i, order, level, self.split))
+            strong = level[self.steps[i] != WEAK]
+            limits += [strong.min(), strong.max()] if strong.size else []
             # The number of spacings is not known before: each fills half of what is left.
             share = 1 - 0.5**self.num_done * (1 - 0.5 * (i + 1) / len(self.orders))
             self.progress("fuse depths", share)
         self.num_done += 1
         last = len(levels.sides) - 1
-        return _Choice(pixels, sides, max(limits) == 0, min(limits) == last)
+        finest = min(limits, default=last) == last and smallest == self.smallest
+        return _Choice(places, max(limits, default=0) == 0, finest)
 
     def run(self, num: int, spacing: float) -> _Choice:
         """Find the smallest spacing that gives at most ``num`` seeds, to ``tolerance``."""

@@ -67,13 +67,14 @@ def _agrees(x, y, depth, grid, planes, costs, max_cost, tolerance):
 
 @inline
 def occupy_cells(
-    order, levels, planes, agreeing, own, others, matrices, grid, cells, same, occupied, offsets,
-    columns, out,
+    order, levels, planes, agreeing, own, others, matrices, grid, split, limits, cells, same,
+    occupied, offsets, columns, out,
 ):  # fmt: skip
-    """Choose pixels of a view greedily: one per cell of every view that sees it at that depth.
+    """Choose places in a view greedily: one per cell of every view that sees it at that depth.
 
-    Each view is divided into cells of several sizes, the *levels*. A pixel needs a free cell at its
-    own level, and occupies its cells at all levels.
+    Each pixel of a map has split x split places, on its plane. Each view is divided into cells of
+    several sizes, the *levels*. A place needs a free cell at its pixel's level, and occupies its
+    cells at all levels.
 
     Args:
         order: Pixels of the view, row * w + column, by priority, [P].
@@ -84,46 +85,56 @@ def occupy_cells(
         others: Numbers of the views it was compared with, int64 [K].
         matrices: ``j_from_i`` of these views, float64 [K, 3, 4].
         grid: Pixels between grid points.
+        split: Places along a row and a column of a pixel of the map.
+        limits: Width and height of each view, [V, 2].
         cells: Side of a cell at each level in pixels, float64 [L].
         same: Relative difference of depth up to which a cell counts as occupied.
         occupied: Inverse depth of the seed in each cell of all views, 0 where there is none,
             float32 [C], updated in place.
         offsets: Start of each view's cells at each level, int64 [V, L].
         columns: Cells in a row, likewise, int64 [V, L].
-        out: Whether each pixel of ``order`` is chosen, bool [P].
+        out: Whether each place of each pixel of ``order`` is chosen, bool [P, split * split].
     """
     width = agreeing.shape[1]
     num = len(others)
     views, inverses = np.zeros(num + 1, np.int64), np.zeros(num + 1, np.float32)
     x, y = np.zeros(num + 1), np.zeros(num + 1)
+    views[0] = own
     for n in range(len(order)):
         row, column = order[n] // width, order[n] % width
-        w = planes[0, row, column]
-        u, v = (column + 0.5) * grid, (row + 0.5) * grid
-        views[0], x[0], y[0], inverses[0] = own, u, v, w
-        count = 1
-        for k in range(num):
-            # Its cell in each view that confirms it: a surface must not get a seed per view.
-            if agreeing[row, column] >> np.uint8(k) & 1:
-                m, z = matrices[k], 1.0 / w
-                depth = (m[2, 0] * u + m[2, 1] * v + m[2, 2]) * z + m[2, 3]
-                views[count] = others[k]
-                x[count] = ((m[0, 0] * u + m[0, 1] * v + m[0, 2]) * z + m[0, 3]) / depth
-                y[count] = ((m[1, 0] * u + m[1, 1] * v + m[1, 2]) * z + m[1, 3]) / depth
-                inverses[count] = 1.0 / depth
-                count += 1
         level = levels[row, column]
-        free = True
-        for k in range(count):
-            cell = _cell(views[k], level, x[k], y[k], cells, offsets, columns)
-            # 0 marks a free cell, as 0 / w is far from 1.
-            free = free and not abs(occupied[cell] / inverses[k] - 1.0) <= same
-        if free:
-            out[n] = True
+        for place in range(split * split):
+            # w(u, v) = w0 + gx (u - u0) + gy (v - v0)
+            across = ((place % split + 0.5) / split - 0.5) * grid
+            down = ((place // split + 0.5) / split - 0.5) * grid
+            w = planes[0, row, column] + planes[1, row, column] * across
+            w += planes[2, row, column] * down
+            u, v = (column + 0.5) * grid + across, (row + 0.5) * grid + down
+            x[0], y[0], inverses[0] = u, v, w
+            count = 1
+            for k in range(num):
+                # Its cell in each view that confirms it: a surface must not get a seed per view.
+                if agreeing[row, column] >> np.uint8(k) & 1:
+                    m, j, z = matrices[k], others[k], 1.0 / w
+                    depth = (m[2, 0] * u + m[2, 1] * v + m[2, 2]) * z + m[2, 3]
+                    px = ((m[0, 0] * u + m[0, 1] * v + m[0, 2]) * z + m[0, 3]) / depth
+                    py = ((m[1, 0] * u + m[1, 1] * v + m[1, 2]) * z + m[1, 3]) / depth
+                    # The pixel's centre lies in that view; other places may lie outside.
+                    if 0.0 <= px < limits[j, 0] and 0.0 <= py < limits[j, 1]:
+                        views[count], x[count], y[count] = j, px, py
+                        inverses[count] = 1.0 / depth
+                        count += 1
+            free = w > 0.0
             for k in range(count):
-                for each in range(len(cells)):
-                    cell = _cell(views[k], each, x[k], y[k], cells, offsets, columns)
-                    occupied[cell] = inverses[k]
+                cell = _cell(views[k], level, x[k], y[k], cells, offsets, columns)
+                # 0 marks a free cell, as 0 / w is far from 1.
+                free = free and not abs(occupied[cell] / inverses[k] - 1.0) <= same
+            if free:
+                out[n, place] = True
+                for k in range(count):
+                    for each in range(len(cells)):
+                        cell = _cell(views[k], each, x[k], y[k], cells, offsets, columns)
+                        occupied[cell] = inverses[k]
 
 
 @always_inline
