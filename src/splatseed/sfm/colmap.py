@@ -277,6 +277,9 @@ def _mapped(
             models[best] = _extend(run, "further mapping", folder, folder, len(lost))
         else:
             models = _map(run, "further mapping", models_dir, len(names))
+    registered = models[_largest(models)].num_reg_images() if models else 0
+    if 2 * registered < len(names):
+        models |= _map_globally(run, models_dir, max(models, default=-1) + 1, registered, names)
     remove(models_dir / _SNAPSHOTS)
     (models_dir / COMPLETE).touch()
     return models
@@ -315,6 +318,38 @@ def _extend(run: Run, stage: str, given: Path, folder: Path, total: int) -> Any:
     remove(folder)
     extended.rename(folder)
     return model
+
+
+def _map_globally(
+    run: Run, models_dir: Path, number: int, registered: int, names: Sequence[str]
+) -> dict[int, Any]:
+    """Map all images at once; return the model by its number if it has more than ``registered``.
+
+    That needs no initial pair, on which incremental mapping fails where a wrong focal length fits
+    two photographs as well. The result is held to incremental mapping's criteria.
+    """
+    pycolmap, settings, folder = run.pycolmap, run.settings, models_dir / "global"
+    options = pycolmap.GlobalPipelineOptions(
+        num_threads=settings.threads, random_seed=settings.seed
+    )
+    folder.mkdir()
+    try:
+        models = run.stage(
+            "global mapping",
+            lambda: pycolmap.global_mapping(run.database, run.image_dir, folder, options),
+            lambda: 0,
+            1,
+        )
+        best = _largest(models)
+        if not models or models[best].num_reg_images() <= registered:
+            return {}
+        into = models_dir / str(number)
+        model = _extend(run, "further mapping", folder / str(best), into, len(names))
+        return {number: model} if model.num_reg_images() > registered else {}
+    except errors.ReconstructionError:
+        return {}  # the models of incremental mapping are reported
+    finally:
+        remove(folder)
 
 
 def _snapshot(folder: Path) -> Path | None:
