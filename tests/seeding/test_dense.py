@@ -66,7 +66,9 @@ def test_what_photographs_do_not_confirm_is_not_made_up(few, sparse):
     notes = []
     seeds = ss.upsample(few, "stereo", budget="10M", note=notes.append)
     assert len(sparse) < len(seeds) < 60_000
-    assert f"Photographs confirm {len(seeds):,} of the 10,000,000 points" in notes[-1]
+    assert notes[-1] == (
+        f"Photographs confirm {len(seeds):,} of the 10,000,000 points of the budget."
+    )
 
 
 def test_a_budget_that_sparse_seeds_fill_only_thins_them(few, sparse, monkeypatch):
@@ -103,7 +105,8 @@ def test_memory_is_predicted_and_kept_within_what_is_free(few, monkeypatch):
     monkeypatch.setattr(dense, "free_memory", lambda: free)
     ss.upsample(few, budget="10M", note=notes.append, announce=before.append)
     assert not before  # as coarse as the first comparison
-    assert f"{memory.format_bytes(plans[0].memory)} hold all" in notes[-1]
+    assert f"takes {memory.format_bytes(plans[0].memory)} of memory, which is not" in notes[-1]
+    assert " more fill gaps. " in notes[-1]
 
 
 @pytest.mark.parametrize(

@@ -144,14 +144,18 @@ class WithinBudget:
         self, scene: Scene, points: NewPoints, plans: Sequence[Plan], plan: Plan
     ) -> tuple[str, ...]:
         """Say why there are fewer points than the budget allows, if so."""
-        count = len(scene.points.originals) + len(points.xyz)
-        if count >= DENSE.nearly * self.limit:
+        num_known = len(scene.points.originals)
+        if num_known + len(points.xyz) >= DENSE.nearly * self.limit:
             return ()
-        confirmed = f"Photographs confirm {count:,} of the {self.limit:,} points that the budget"
-        if plan is plans[0]:
-            return (f"{confirmed} allows.",)
-        need = format_bytes(plans[0].memory)
-        return (f"{confirmed} allows, at the size that free memory holds; {need} hold all.",)
+        from_stereo = np.asarray(points.source) == source_code("stereo")
+        confirmed = num_known + int(np.count_nonzero(from_stereo))
+        others = len(points.xyz) - int(np.count_nonzero(from_stereo))
+        note = f"Photographs confirm {confirmed:,} of the {self.limit:,} points of the budget"
+        note += f"; {others:,} more fill gaps." if others else "."
+        if plan is not plans[0]:
+            need = format_bytes(plans[0].memory)
+            note += f" Comparing more of their pixels takes {need} of memory, which is not free."
+        return (note,)
 
 
 def plan_comparisons(
