@@ -23,7 +23,7 @@ from splatseed.io.staging import check_output
 from splatseed.runtime.torch_device import DeviceName
 from splatseed.scene import Masks
 from splatseed.sfm import MatcherName, Settings, SfmReport, reconstruct
-from splatseed.sfm.first_look import FIRST_LOOK, STAGE
+from splatseed.sfm.first_look import FIRST_LOOK, NEIGHBOURS, STAGE
 from splatseed.sfm.photos import pick_frames
 from splatseed.text import counted, name_some, quoted, visible
 
@@ -157,7 +157,7 @@ def _tell_photographs(
     """Print the images that are read, since subfolders may hold images of other scenes."""
     images, number = options.images, len(names)
     chosen = options.matcher == "auto" and number > FIRST_LOOK.max_exhaustive
-    look = [STAGE] if chosen else []
+    look = [STAGE, *([NEIGHBOURS] if options.poses_from else [])] if chosen else []
     clock.expect("features", *look, "matching", *stages, "undistortion")
     clock.count(number, "photographs", "features", STAGE)
     if options.matcher != "sequential" and not chosen:

@@ -62,6 +62,7 @@ class FirstLook:
 
 FIRST_LOOK = FirstLook()
 STAGE = "first look"
+NEIGHBOURS = "neighbour matching"  # a stage that follows if poses are known
 _NORM = 512.0  # of SIFT's descriptors as 8-bit integers, in COLMAP and elsewhere
 
 

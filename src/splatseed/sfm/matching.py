@@ -19,6 +19,7 @@ from splatseed.sfm.colmap import Run
 from splatseed.sfm.database import numbered, run_database
 from splatseed.sfm.first_look import (
     FIRST_LOOK,
+    NEIGHBOURS,
     STAGE,
     Agreement,
     Pair,
@@ -41,7 +42,8 @@ def match_photographs(
 
     ``poses``, if they are known, are the model's images in the order of their ids, from 1.
 
-    Returns the agreement of photographs at a first look, if that chose the pairs.
+    Returns the agreement of photographs at a first look, if that chose the pairs; for known poses
+    with the agreement to be expected from their overlap added, and 0 without overlap.
     """
     with run_database(run, model) as database:
         detect_features(run, database, model, masks)
@@ -49,26 +51,30 @@ def match_photographs(
             match_pairs(run, database, _pairs(run, database))
             return None
         ids = sorted(model.images)
+        started = time.perf_counter()
+        features = largest_features(database, ids)
+        agreement = measure_agreement(features, run.on_progress)
+        run.seconds[STAGE] = time.perf_counter() - started
         if poses:
-            agreement = _agreement_by_poses(run, database, model, poses)
-        else:
-            started = time.perf_counter()
-            features = largest_features(database, ids)
-            agreement = measure_agreement(features, run.on_progress)
-            run.seconds[STAGE] = time.perf_counter() - started
+            expected = _expected_agreement(run, database, model, poses)
+            # Features of places that look alike agree, too.
+            agreement = (agreement + expected) * (expected > 0)
         match_pairs(run, database, [(ids[i], ids[j]) for i, j in choose_pairs(agreement)])
         weak = poorly_connected(len(ids), _verified(run, database, ids))
         _match_further(run, database, agreement, weak)
     return agreement
 
 
-def _agreement_by_poses(run: Run, database: Any, model: Any, poses: Sequence[Image]) -> Agreement:
-    """Infer the agreement from poses, and from depths by the matches of neighbours."""
+def _expected_agreement(run: Run, database: Any, model: Any, poses: Sequence[Image]) -> Agreement:
+    """Infer the agreement from poses, and from depths by the matches of neighbours.
+
+    It suffers from errors of the poses, but not from bare surfaces.
+    """
     from splatseed.sfm import overlap  # noqa: PLC0415  (imports Numba, for which --help would wait)
 
     cameras = [image.camera for image in poses]
     pairs = overlap.first_pairs(cameras)
-    match_pairs(run, database, [(i + 1, j + 1) for i, j in pairs], STAGE)
+    match_pairs(run, database, [(i + 1, j + 1) for i, j in pairs], NEIGHBOURS)
     ids = range(1, len(poses) + 1)
     lenses = [model.image(i).camera for i in ids]
     xy = [database.read_keypoints(i)[:, :2].astype(np.float64) for i in ids]

@@ -107,9 +107,9 @@ def _refined(
 ) -> tuple[Scene, str]:
     """Return the scene at refined poses, and what changed; no points of the method's test views."""
     from splatseed.sfm import refined
-    from splatseed.sfm.first_look import FIRST_LOOK, STAGE
+    from splatseed.sfm.first_look import FIRST_LOOK, NEIGHBOURS, STAGE
 
-    look = [STAGE] if len(scene.images) > FIRST_LOOK.max_exhaustive else []
+    look = [STAGE, NEIGHBOURS] if len(scene.images) > FIRST_LOOK.max_exhaustive else []
     clock.expect("features", *look, "matching", "refinement", "triangulation")
     test_every = getattr(method, "test_every", 0)
     return refined(scene, options.seed, clock, test_every=test_every)
