@@ -12,7 +12,8 @@ from splatseed.camera import Intrinsics
 from splatseed.depthmap import DepthMap, HeldDepths
 from splatseed.methods import SOURCE_CODES
 from splatseed.photos.view import view_of
-from splatseed.seeding.map_seeds import depth_at_cells
+from splatseed.pointcloud import PointCloud
+from splatseed.seeding.map_seeds import depth_at_cells, guides_badly
 
 DEPTH, COVER = SOURCE_CODES["depth"], SOURCE_CODES["cover"]
 
@@ -65,6 +66,17 @@ def test_maps_of_another_unit_or_origin_are_not_used(room, make_maps):
     twice = room.replace(depths=make_maps(lambda z, _: 1.5 * z))
     assert DEPTH not in ss.upsample(twice, note=notes.append).source
     assert "times that of the photographs" in notes[-1]
+
+
+def test_maps_of_another_unit_do_not_guide_stereo(room, make_maps):
+    """Begun at wrong depths, stereo would find nothing to contradict them."""
+    bare, notes = room.with_points(PointCloud.empty()), []
+    scene = bare.replace(depths=make_maps(lambda z, _: 1000 * z))
+    seeds = ss.upsample(scene, note=notes.append)
+    assert any("do not guide stereo" in note for note in notes)
+    assert any("have another unit" in note for note in notes)
+    assert DEPTH not in seeds.source
+    assert not guides_badly(bare.replace(depths=make_maps()), room.images)
 
 
 def test_uncertain_and_contradicted_depth_gives_no_seed(room, room_capture, make_maps):

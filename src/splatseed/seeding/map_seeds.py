@@ -21,14 +21,15 @@ from splatseed.depth._kernels import find_edges
 from splatseed.depth.alignment import LIMITS, map_camera
 from splatseed.depth.settings import DepthSettings
 from splatseed.depth.stereo.maps import StereoResult
-from splatseed.depthmap import DepthMap, DepthMaps
+from splatseed.depthmap import MIN_CONFIDENCE, DepthMap, DepthMaps
 from splatseed.lens import project_rays
 from splatseed.photos.projection import cells_from_world, grid_shape, project
 from splatseed.photos.view import View
 from splatseed.photos.zbuffer import cell_depths
 from splatseed.progress import Progress, in_threads, silent
-from splatseed.scene import Image
+from splatseed.scene import Image, Scene
 from splatseed.seeding.cover import CoverSeeds, GrowableArray, make_seeds
+from splatseed.seeding.poses import compare_samples
 
 CellMap = Float32[np.ndarray, "rows cols"]
 
@@ -82,17 +83,42 @@ def unit_problem(stereo: StereoResult, maps: Sequence[CellMap]) -> str:
 
     ``maps`` are cell maps of the stereo's views.
     """
-    ratios = [_ratios(stereo, i, known) for i, known in enumerate(maps)]
-    ratio = np.concatenate(ratios)
-    if len(ratio) < LIMITS.unit_points:
-        return ""
-    middle = float(np.median(ratio))
-    if 1.0 / LIMITS.unit_factor < middle < LIMITS.unit_factor:
+    ratios = np.concatenate([_ratios(stereo, i, known) for i, known in enumerate(maps)])
+    if _same_unit(ratios):
         return ""
     return (
-        f"The scene's depth maps are left out: their depth is {middle:.3g} times that of the "
-        "photographs, so they have another unit."
+        f"The scene's depth maps are left out: their depth is {np.median(ratios):.3g} times that "
+        "of the photographs, so they have another unit."
     )
+
+
+def guides_badly(scene: Scene, images: Sequence[Image]) -> str:
+    """Explain why a scene's maps cannot tell stereo where to begin; empty if they can.
+
+    A few photographs are compared without them: begun at wrong depths, stereo finds too little to
+    contradict them.
+    """
+    ratios = np.empty(0)
+    for stereo, chosen in compare_samples(scene, images):
+        assert scene.depths is not None  # noqa: S101  (they are asked about)
+        maps = cell_maps(stereo.views, chosen, scene.depths, stereo.settings.grid, MIN_CONFIDENCE)
+        found = [_ratios(stereo, i, known) for i, known in enumerate(maps)]
+        ratios = np.concatenate([ratios, *found])
+        if len(ratios) >= LIMITS.unit_points:
+            break
+    if _same_unit(ratios):
+        return ""
+    return (
+        f"The scene's depth maps do not guide stereo: their depth is {np.median(ratios):.3g} times "
+        "that of the photographs."
+    )
+
+
+def _same_unit(ratios: Float64[np.ndarray, " M"]) -> bool:
+    """Whether ratios of depth, if there are enough, are about 1 at the median."""
+    if len(ratios) < LIMITS.unit_points:
+        return True
+    return bool(1.0 / LIMITS.unit_factor < np.median(ratios) < LIMITS.unit_factor)
 
 
 def _ratios(stereo: StereoResult, i: int, known: CellMap) -> Float64[np.ndarray, " M"]:

@@ -83,21 +83,21 @@ class Stereo(PhotographMethod):
         images = photographed(scene, self.test_every)
         views = read_views(scene, images, self.max_size, progress)
         rng = np.random.default_rng(seed)
-        stereo = self._compare(scene, images, views, rng, progress, only)
+        guided, _ = self._guided(scene, images)
+        stereo = compare(guided, images, views, self.grid, rng, progress, only)
         return tuple(stereo.map(i) for i in only)
 
-    def _compare(
-        self,
-        scene: Scene,
-        images: Sequence[Image],
-        views: Sequence[View],
-        rng: np.random.Generator,
-        progress: Progress,
-        only: Sequence[int] | None = None,
-    ) -> StereoResult:
-        """Run ``compare`` with these settings."""
-        scene = scene if self.depth_maps else scene.replace(depths=None)
-        return compare(scene, images, views, self.grid, rng, progress, only)
+    def _guided(self, scene: Scene, images: Sequence[Image]) -> tuple[Scene, tuple[str, ...]]:
+        """Return the scene, without maps that stereo must not begin at, and a note on them."""
+        if scene.depths is None or has_depth_hints(scene):
+            return scene, ()
+        problem = ""
+        if self.depth_maps:
+            from splatseed.seeding.map_seeds import guides_badly
+
+            problem = guides_badly(scene, images)
+        used = self.depth_maps and not problem
+        return scene if used else scene.replace(depths=None), (problem,) if problem else ()
 
     def __call__(
         self, scene: Scene, num_new: int, rng: np.random.Generator, progress: Progress
@@ -123,9 +123,11 @@ class Stereo(PhotographMethod):
             faint = agreement_warning(check_poses(scene, images, progress))
             error = estimate_pose_error(scene, images, progress)
             warnings = tuple(each for each in (error.warning if error else "", faint) if each)
+        guided, notes = self._guided(scene, images)
+        warnings = (*warnings, *notes)
         views = read_views(scene, images, self.max_size, progress)
         start = time.perf_counter()
-        stereo = self._compare(scene, images, views, rng, progress)
+        stereo = compare(guided, images, views, self.grid, rng, progress)
         seeds = fuse(stereo, self.spacing, progress)
         found = _stereo_note(scene, stereo, time.perf_counter() - start)
         new = stereo_points(seeds, (*found, *warnings), stereo)

@@ -8,7 +8,7 @@ mistake of convention (``CORRECTIONS``) is undone.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Literal
@@ -18,7 +18,7 @@ from jaxtyping import Float64
 
 from splatseed.camera import Camera
 from splatseed.depth.stereo.coarse import prior_from_baseline
-from splatseed.depth.stereo.maps import StereoSettings
+from splatseed.depth.stereo.maps import StereoResult, StereoSettings
 from splatseed.depth.stereo.matching import match_views, valid_blocks
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.photos.loading import load_views
@@ -195,6 +195,30 @@ def _check_centers(poses: Poses) -> None:
 
 def _agreement(scene: Scene, images: Sequence[Image], poses: Poses, sample: int) -> float:
     """Return the mean agreement of a sampled photograph and its partners at these poses."""
+    stereo = compare_sample(scene, images, poses, sample)[0]
+    shares = []
+    for i, view in enumerate(stereo.views):
+        confirmed = stereo.confirmed(i)
+        if view.mask is not None:
+            confirmed = confirmed[valid_blocks(view.mask, _SETTINGS.stereo.grid)]
+        if confirmed.size:
+            shares.append(confirmed.mean())
+    return float(np.mean(shares)) if shares else 0.0
+
+
+def compare_samples(
+    scene: Scene, images: Sequence[Image]
+) -> Iterator[tuple[StereoResult, list[Image]]]:
+    """Compare a few photographs with their partners over all depths, one after the other."""
+    poses = np.stack([image.camera.cam_from_world for image in images])
+    for sample in range(_SETTINGS.samples):
+        yield compare_sample(scene, images, poses, sample)
+
+
+def compare_sample(
+    scene: Scene, images: Sequence[Image], poses: Poses, sample: int
+) -> tuple[StereoResult, list[Image]]:
+    """Compare a sampled photograph and its partners at these poses; also return their images."""
     first = (2 * sample + 1) * len(images) // (2 * _SETTINGS.samples)
     partners = choose_by_pose(poses, _SETTINGS.partners)[first]
     idx = [first, *partners[partners >= 0].tolist()]
@@ -204,15 +228,7 @@ def _agreement(scene: Scene, images: Sequence[Image], poses: Poses, sample: int)
     views = [view.posed(poses[i]) for view, i in zip(loaded, idx, strict=True)]
     sources = choose_by_pose(poses[idx], _SETTINGS.partners)
     priors = [prior_from_baseline(views, i, others) for i, others in enumerate(sources)]
-    stereo = match_views(views, priors, sources, _SETTINGS.stereo, 0, silent)
-    shares = []
-    for i, view in enumerate(views):
-        confirmed = stereo.confirmed(i)
-        if view.mask is not None:
-            confirmed = confirmed[valid_blocks(view.mask, _SETTINGS.stereo.grid)]
-        if confirmed.size:
-            shares.append(confirmed.mean())
-    return float(np.mean(shares)) if shares else 0.0
+    return match_views(views, priors, sources, _SETTINGS.stereo, 0, silent), chosen
 
 
 def _any_overlap(cameras: Sequence[Camera]) -> bool:
