@@ -11,6 +11,7 @@ import pytest
 
 import splatseed as ss
 from splatseed.methods import SOURCE_CODES
+from splatseed.photos import loading
 from splatseed.runtime import memory
 from splatseed.seeding import dense
 from splatseed.seeding.dense import plan_comparisons
@@ -87,6 +88,17 @@ def test_the_same_seed_gives_the_same_bytes_on_any_number_of_threads(made, few, 
     second = ss.upsample(few, budget=BUDGET)
     for name in ("xyz", "rgb", "source", "normals", "sizes", "confidence"):
         assert getattr(made[0], name).tobytes() == getattr(second, name).tobytes()
+
+
+def test_held_out_photographs_are_not_compared_again(few, monkeypatch):
+    read, load = [], loading.load_photograph
+    monkeypatch.setattr(
+        loading, "load_photograph", lambda path, *a: (read.append(path.name), load(path, *a))[1]
+    )
+    seeds = ss.upsample(few, budget=BUDGET, test_every=3)
+    assert 0.9 * BUDGET < len(seeds) <= BUDGET
+    names = sorted(image.name for image in few.images)
+    assert sorted(read) == sorted(2 * [name for i, name in enumerate(names) if i % 3])
 
 
 def test_memory_is_predicted_and_kept_within_what_is_free(few, monkeypatch):

@@ -43,7 +43,8 @@ class Options:
     num_points: int | None = None
     """Total points, not a ratio."""
     budget: Annotated[str | None, tyro.conf.arg(metavar="N|Xrho")] = None
-    """Maximum points: a number, or 0.25rho for a quarter of a full-size photograph's pixels."""
+    """Maximum points: a number, or 0.25rho for a quarter of the pixels of a photograph of at most
+    1600 a side. Methods auto and stereo make up to that many where photographs confirm them."""
     cover_cell: Annotated[int | None, tyro.conf.arg(name="cover")] = None
     """Add a seed to every photograph cell without a point; the value is the cell's side in pixels.
     Methods auto and cover have --auto.cell and --cover.cell instead."""
