@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import splatseed as ss
+from splatseed.depth.stereo import detail
 from splatseed.methods import SOURCE_CODES
 from splatseed.photos import loading
 from splatseed.runtime import memory
@@ -70,6 +71,17 @@ def test_what_photographs_do_not_confirm_is_not_made_up(few, sparse):
     assert notes[-1] == (
         f"Photographs confirm {len(seeds):,} of the 10,000,000 points of the budget."
     )
+
+
+def test_where_no_third_view_confirms_a_depth_sparse_seeds_remain(few, sparse, monkeypatch):
+    monkeypatch.setattr(
+        detail, "_is_strong", lambda stereo, i: np.zeros_like(stereo.costs[i], bool)
+    )
+    notes = []
+    seeds = ss.upsample(few, budget=BUDGET, note=notes.append)
+    assert seeds.xyz.tobytes() == sparse.xyz.tobytes()
+    confirmed = len(few.points) + (sparse.source == STEREO).sum()
+    assert notes[-1].startswith(f"Photographs confirm {confirmed:,} of the 6,000 points")
 
 
 def test_a_budget_that_sparse_seeds_fill_only_thins_them(few, sparse, monkeypatch):

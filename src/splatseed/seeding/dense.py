@@ -114,13 +114,15 @@ class WithinBudget:
         from_stereo = np.asarray(new.source) == source_code("stereo")
         # Cover's guesses stay as sparse as they are: more of them would confirm nothing.
         num = room - int(np.count_nonzero(~from_stereo))
-        if len(new.xyz) >= room or not from_stereo.any():
+        if len(new.xyz) >= room:
             return new
+        spacing, finest = expected_spacing(stereo, num, self.method.spacing)
+        if not finest:  # nothing is confirmed that could be sampled more closely
+            return new._replace(notes=(*new.notes, *self._shortage(scene, new)))
         images = at_file_size(
             scene.replace(images=photographed(scene, self.method.test_every))
         ).images
         first = factor_for_size(images, self.method.max_size)
-        spacing, finest = expected_spacing(stereo, num, self.method.spacing)
         plans = plan_comparisons(images, first, self.method.grid, first * finest, self.limit)
         plan = next((each for each in plans if each.within), plans[-1])
         dense = stereo
@@ -138,12 +140,14 @@ class WithinBudget:
             scene, stereo_points(seeds, new.notes, stereo), stereo.views, rng, progress
         )
         points = _drop_guesses(points, room)
-        return points._replace(notes=(*new.notes, *self._shortage(scene, points, plans, plan)))
+        need = 0 if plan is plans[0] else plans[0].memory
+        return points._replace(notes=(*new.notes, *self._shortage(scene, points, need)))
 
-    def _shortage(
-        self, scene: Scene, points: NewPoints, plans: Sequence[Plan], plan: Plan
-    ) -> tuple[str, ...]:
-        """Say why there are fewer points than the budget allows, if so."""
+    def _shortage(self, scene: Scene, points: NewPoints, need: int = 0) -> tuple[str, ...]:
+        """Say why there are fewer points than the budget allows, if so.
+
+        ``need`` is the memory that comparing more pixels would take; 0 if that is not the reason.
+        """
         num_known = len(scene.points.originals)
         if num_known + len(points.xyz) >= DENSE.nearly * self.limit:
             return ()
@@ -152,9 +156,9 @@ class WithinBudget:
         others = len(points.xyz) - int(np.count_nonzero(from_stereo))
         note = f"Photographs confirm {confirmed:,} of the {self.limit:,} points of the budget"
         note += f"; {others:,} more fill gaps." if others else "."
-        if plan is not plans[0]:
-            need = format_bytes(plans[0].memory)
-            note += f" Comparing more of their pixels takes {need} of memory, which is not free."
+        if need:
+            amount = format_bytes(need)
+            note += f" Comparing more of their pixels takes {amount} of memory, which is not free."
         return (note,)
 
 
