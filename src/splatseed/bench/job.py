@@ -1,8 +1,8 @@
 """Carry out a run: make seeds, train, score, and write the run's folder.
 
-A run's folder is written in one step. Seeds equal the output of ``splatseed upsample``; their time
-excludes the compilation of kernels. Runs share the files in ``BENCH/seeds``, ``depths`` and
-``covisible``.
+A run's folder is written in one step. Seeds equal the output of ``splatseed upsample``, with
+``--auto.no-dense`` under a budget, as arms of several budgets share them; their time excludes the
+compilation of kernels. Runs share the files in ``BENCH/seeds``, ``depths`` and ``covisible``.
 """
 
 from __future__ import annotations
@@ -47,6 +47,7 @@ from splatseed.scene import Scene
 from splatseed.scores import EvalResult
 from splatseed.seeding.advice import DEFAULT_METHOD
 from splatseed.seeding.clouds.method import Cloud
+from splatseed.seeding.photo_methods import Stereo
 from splatseed.training.settings import TrainSettings
 
 if TYPE_CHECKING:  # PyTorch, which takes a while
@@ -322,6 +323,8 @@ def _method_and_size(scene: Scene, spec: RunSpec) -> tuple[Upsampler, dict[str, 
         return Cloud(**spec.parameters).of(spec.scene.cloud), {}
     own = {name: v for name, v in spec.parameters.items() if not name.startswith(prefix)}
     method = configure(seeding_method(arm.method), arm.profile, **own)
+    if isinstance(method, Stereo):  # seeds are thinned to each budget, with and without a cache
+        method = replace(method, dense=False)
     if arm.method in WITH_CLOUD:
         cloud = {n.removeprefix(prefix): v for n, v in spec.parameters.items() if n not in own}
         return method, {"extra_method": Cloud(**cloud).of(spec.scene.cloud)}
