@@ -56,17 +56,17 @@ class Settings:
     """Where to write the runs as CSV, and their curves beside it as NAME_curves.csv."""
 
 
-Runs = Mapping[tuple[Plan, Arm], Mapping[tuple[str, int], Mapping[str, Any]]]
-"""By plan and arm, then by capture and seed."""
+Runs = Mapping[tuple[Plan, Arm], Mapping[tuple[str, int, int], Mapping[str, Any]]]
+"""By plan and arm, then by capture, data factor and seed."""
 
 
 def read_runs(path: Path) -> Runs:
     """Read the runs of a ledger that kept their curves."""
-    runs: dict[tuple[Plan, Arm], dict[tuple[str, int], Mapping[str, Any]]] = {}
-    for (capture, seeds, strategy, rho, steps, _, seed, _), run in read_ledger(path).items():
+    runs: dict[tuple[Plan, Arm], dict[tuple[str, int, int], Mapping[str, Any]]] = {}
+    for (capture, seeds, strategy, rho, steps, factor, seed, _), run in read_ledger(path).items():
         if "curve" in run:
             key = Plan(rho, steps), Arm(seeds, strategy)
-            runs.setdefault(key, {})[capture, seed] = run
+            runs.setdefault(key, {})[capture, factor, seed] = run
     return runs
 
 
@@ -97,7 +97,7 @@ class Comparison:
 
 
 def compare(ours: Runs, arm: Arm, baseline: Arm, plan: Plan) -> dict[str, Comparison]:
-    """Compare an arm with the baseline on each capture that both have run on."""
+    """Compare an arm with the baseline on each capture that both have run on, at equal sizes."""
     runs, theirs = ours.get((plan, arm), {}), ours.get((plan, baseline), {})
     found: dict[str, list[Comparison]] = {}
     for key in sorted(runs.keys() & theirs.keys()):
@@ -112,7 +112,7 @@ def compare(ours: Runs, arm: Arm, baseline: Arm, plan: Plan) -> dict[str, Compar
 
 
 def _mean(seeds: list[Comparison]) -> Comparison:
-    """Average over seeds; a quality counts as reached if all runs reach it."""
+    """Average over runs; a quality counts as reached if all runs reach it."""
     reached: dict[str, float | None] = {}
     for name in seeds[0].reached:
         times = [each.reached[name] for each in seeds]
@@ -135,7 +135,8 @@ def rows(runs: Runs, baseline: Arm) -> Iterable[list[str]]:
 
 def _cells(found: Mapping[str, Comparison]) -> list[str]:
     gains = {capture: each.psnr for capture, each in found.items()}
-    error = statistics.stdev(gains.values()) / len(gains) ** 0.5 if len(gains) > 1 else 0.0
+    spread = statistics.stdev(gains.values()) / len(gains) ** 0.5 if len(gains) > 1 else 0.0
+    error = f" ± {spread:.2f}" if len(gains) > 1 else ""
     worst = min(gains, key=lambda capture: gains[capture])
     ssim = statistics.mean(each.ssim for each in found.values())
     seconds = statistics.mean(each.seconds for each in found.values())
@@ -145,7 +146,7 @@ def _cells(found: Mapping[str, Comparison]) -> list[str]:
         mean = f"{statistics.mean(known):.2f} " if known else ""  # type: ignore[type-var]
         times.append(f"{mean}({len(known)} of {len(found)})")
     return [
-        f"{statistics.mean(gains.values()):+.2f} ± {error:.2f}",
+        f"{statistics.mean(gains.values()):+.2f}{error}",
         f"{1000 * ssim:+.0f}",
         f"{worst} {gains[worst]:+.2f}",
         f"{seconds:.2f}",
@@ -158,7 +159,7 @@ def left_out(runs: Runs, baseline: Arm, plan: Plan) -> dict[str, tuple[Arm, floa
 
     Only arms that have run on all captures of the plan's baseline; the baseline is one of them.
     """
-    captures = {capture for capture, _ in runs.get((plan, baseline), {})}
+    captures = {capture for capture, *_ in runs.get((plan, baseline), {})}
     gains = {
         arm: {capture: each.psnr for capture, each in compare(runs, arm, baseline, plan).items()}
         for of, arm in runs
@@ -189,7 +190,7 @@ def left_out_rows(runs: Runs, baseline: Arm) -> Iterable[list[str]]:
 def write_csv(path: Path, runs: Runs) -> None:
     """Write a line for each run, and a line for each point of its curve."""
     curves = path.with_name(f"{path.stem}_curves.csv")
-    names = ["capture", "method", "strategy", "rho", "steps", "seed"]
+    names = ["capture", "method", "strategy", "rho", "steps", "factor", "seed"]
     with (
         path.open("w", encoding="utf-8", newline="") as file,
         curves.open("w", encoding="utf-8", newline="") as curve,
@@ -198,8 +199,8 @@ def write_csv(path: Path, runs: Runs) -> None:
         lines.writerow([*names, *FACTS])
         points.writerow([*names, *(name if name != "step" else "at" for name in CURVE)])
         for (plan, arm), by_capture in sorted(runs.items()):
-            for (capture, seed), run in sorted(by_capture.items()):
-                key = [capture, *arm, *plan, seed]
+            for (capture, factor, seed), run in sorted(by_capture.items()):
+                key = [capture, *arm, *plan, factor, seed]
                 lines.writerow([*key, *(round(run[name], 4) for name in FACTS)])
                 points.writerows([*key, *point] for point in run["curve"])
 

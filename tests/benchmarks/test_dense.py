@@ -147,7 +147,7 @@ def test_runs_and_curves_are_written_as_csv(bench, ledger, tmp_path, capsys):
     points = list(csv.DictReader((tmp_path / "out_curves.csv").open()))
     assert (len(runs), len(points)) == (6, 12)
     assert {**points[0], **runs[0]} == {
-        "capture": "a", "seeds": "9", "strategy": "none", "rho": "1.0", "steps": "500", "seed": "0",
-        "psnr": "23.0", "ssim": "0.7", "gaussians": "9", "cap": "9", "points": "5",
-        "whole_processor": "4.0", "at": "1", "seconds": "2.0", "method": "dense",
+        "capture": "a", "seeds": "9", "strategy": "none", "rho": "1.0", "steps": "500",
+        "factor": "2", "seed": "0", "psnr": "23.0", "ssim": "0.7", "gaussians": "9", "cap": "9",
+        "points": "5", "whole_processor": "4.0", "at": "1", "seconds": "2.0", "method": "dense",
     }  # fmt: skip
