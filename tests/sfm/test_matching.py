@@ -80,9 +80,13 @@ def test_features_without_doubling_are_fewer_and_coarser(run):
 
 
 def test_only_large_photographs_are_refined_by_features_that_are_not_doubled(room):
-    assert pipeline._refining(3, room.images) == Settings(seed=3)
+    settings = Settings(seed=3)
+    assert pipeline._refining(settings, room.images) == settings
     large = [
         replace(image, intrinsics=replace(image.intrinsics, width=1440, height=1920))
         for image in room.images
     ]
-    assert pipeline._refining(3, large) == Settings(seed=3, max_image_size=2000, doubled=False)
+    undoubled = replace(settings, max_image_size=2000, doubled=False)
+    assert pipeline._refining(settings, large) == undoubled
+    chosen = replace(settings, max_image_size=1200)
+    assert pipeline._refining(chosen, large) == chosen
