@@ -40,7 +40,7 @@ __all__: list[str] = []
 
 SCENES = ("corridor", "plush")
 SIDES = {"train_800": 800, "train_1600": 1600}
-"""Stages that time a training step: the most pixels on a photograph's longer side."""
+"""Stages that time a training step: maximum pixels on a photograph's longer side."""
 STAGES = ("info", "sfm", "refine", "auto", "dense", "depth", "write", *SIDES)
 BUDGET = 1_000_000
 STEP_VIEWS, STEPS = 8, 20
@@ -188,10 +188,10 @@ def _describe_output(stage: str, output: Path) -> str:
 def write(scene: str, output: str) -> list[dict[str, Any]]:
     """Read a scene, and write it in both layouts with its photographs; in a process of its own."""
     watch = StageWatch()
-    watch.mark("read")
+    watch.begin("read")
     read = load_scene(Path(scene))
     for layout in ("colmap", "transforms"):
-        watch.mark(layout)
+        watch.begin(layout)
         write_scene(read, Path(output) / layout, format=layout, copy_images=True, overwrite=True)
     return [asdict(stage) for stage in watch.stages()]
 
@@ -279,7 +279,7 @@ def run_stages(name: str, settings: Settings, results: dict[str, Any], kept: Pat
 
 
 def main(settings: Settings) -> None:
-    """Measure what is asked for, and print the tables of all results so far."""
+    """Measure the chosen stages, and print the tables of all results so far."""
     warn_if_busy()
     settings.work.mkdir(parents=True, exist_ok=True)
     kept = settings.work / "results.json"

@@ -15,10 +15,10 @@ import splatseed
 from splatseed import console
 from splatseed.console import (
     StageClock,
-    extraction_shown,
     print_note,
     print_pairs,
     print_table,
+    show_extraction,
     stage_display,
 )
 from splatseed.progress import extraction_progress, silent
@@ -78,7 +78,7 @@ def test_extraction_is_shown_whichever_call_causes_it(capsys, monkeypatch):
             now[0] += seconds
             extraction_progress.get(silent)(stage, fraction)
 
-    with extraction_shown():
+    with show_extraction():
         extract("write frames")
         with stage_display(lines=True) as clock:
             extract("analyse video")

@@ -32,11 +32,11 @@ class Stage:
     processor: float = 0.0
     """CPU seconds of all threads and processes."""
     peak: int = 0
-    """Most bytes resident, of all processes; -1 off Linux."""
+    """Peak resident bytes of all processes; -1 off Linux."""
 
 
 class StageWatch:
-    """Measures stages of this process and its descendants; ``mark`` ends the running one."""
+    """Measures stages of this process and its descendants; ``begin`` ends the running one."""
 
     def __init__(self) -> None:
         self._stages = {START: Stage(START)}
@@ -46,7 +46,7 @@ class StageWatch:
         self._since = _now()
         reset_peak()
 
-    def mark(self, name: str) -> None:
+    def begin(self, name: str) -> None:
         """Note what the running stage took, and begin another unless it is the same."""
         if name == self._running:
             return
@@ -85,16 +85,16 @@ def run_command(arguments: list[str]) -> list[dict[str, Any]]:
     watch = StageWatch()
 
     class Watched(console.StageClock):
-        """Marks the stages that the command reports, and compilation."""
+        """Begins the stages that the command reports, and compilation."""
 
         def __call__(self, stage: str, fraction: float) -> None:
-            watch.mark(stage)
+            watch.begin(stage)
             super().__call__(stage, fraction)
 
         def compilation(self, begins: bool) -> None:
             super().compilation(begins)
             with suppress(IndexError):  # no stage yet
-                watch.mark(self._started[-1][0])
+                watch.begin(self._started[-1][0])
 
     console.StageClock = Watched  # type: ignore[misc]  # what ``stage_display`` makes
     cli.main(arguments)

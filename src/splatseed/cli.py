@@ -14,7 +14,7 @@ from typing import NoReturn
 
 from rich.table import Table
 
-from splatseed.console import ERR, OUT, extraction_shown, with_options
+from splatseed.console import ERR, OUT, show_extraction, with_options
 from splatseed.errors import SplatseedError
 from splatseed.runtime.environment import set_thread_defaults
 from splatseed.runtime.interruption import Termination, exit_code
@@ -45,7 +45,7 @@ def main(arguments: list[str] | None = None) -> None:
     words = sys.argv[1:] if arguments is None else arguments
     set_thread_defaults()
     try:
-        with _termination_raised(), extraction_shown():
+        with _termination_raised(), show_extraction():
             _run_verb(words)
             sys.stdout.flush()
     except SplatseedError as error:

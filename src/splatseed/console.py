@@ -172,8 +172,8 @@ def stage_display(
     """
     clock = StageClock() if clock is None else clock
     # Extraction must not open a second display.
-    told = _extraction_told(clock) if ERR.is_terminal or lines else nullcontext()
-    with _display(clock, remaining=remaining, lines=lines), told:
+    extraction = _report_extraction(clock) if ERR.is_terminal or lines else nullcontext()
+    with _display(clock, remaining=remaining, lines=lines), extraction:
         yield clock
 
 
@@ -193,7 +193,7 @@ def _display(clock: StageClock, *, remaining: bool, lines: bool) -> Iterator[Sta
 
 
 @contextmanager
-def _extraction_told(progress: Progress) -> Iterator[None]:
+def _report_extraction(progress: Progress) -> Iterator[None]:
     token = extraction_progress.set(progress)
     try:
         yield
@@ -201,7 +201,7 @@ def _extraction_told(progress: Progress) -> Iterator[None]:
         extraction_progress.reset(token)
 
 
-class _Shown:
+class _ExtractionDisplay:
     """A ``Progress`` that opens a display at the first call and closes it once a stage is done."""
 
     def __init__(self) -> None:
@@ -225,11 +225,11 @@ class _Shown:
 
 
 @contextmanager
-def extraction_shown() -> Iterator[None]:
+def show_extraction() -> Iterator[None]:
     """Show the extraction of photographs from videos and archives, whichever call causes it."""
-    shown = _Shown()
+    shown = _ExtractionDisplay()
     try:
-        with _extraction_told(shown):
+        with _report_extraction(shown):
             yield
     finally:
         shown.close()

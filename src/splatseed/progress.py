@@ -17,7 +17,7 @@ Progress: TypeAlias = Callable[[str, float], None]
 Note: TypeAlias = Callable[[str], None]
 
 extraction_progress: ContextVar[Progress] = ContextVar("extraction_progress")
-"""Told how much of a video or archive is extracted (``io.extraction``); unset: nobody is."""
+"""Called while a video or archive is extracted (``io.extraction``); unset: shown nowhere."""
 thread_limit: ContextVar[int | None] = ContextVar("thread_limit", default=None)
 """Maximum threads of ``in_threads``; None for one per CPU."""
 

@@ -40,18 +40,18 @@ def test_a_stage_that_comes_again_is_added_to_itself(bench, monkeypatch):
     monkeypatch.setattr(bench.stages, "time", SimpleNamespace(perf_counter=lambda: next(times)))
     watch = bench.stages.StageWatch()
     for name in ("read", "read", "match", "read"):
-        watch.mark(name)
+        watch.begin(name)
     found = {each.name: each.seconds for each in watch.stages()}
     assert found == {"start": 1.0, "read": 2.0 + 4.0, "match": 3.0}
 
 
 def test_processes_that_a_stage_starts_count(bench):
     watch = bench.stages.StageWatch()
-    watch.mark("child")
+    watch.begin("child")
     # Half a second on a core, and 200 MB; it ends within the stage.
     work = "import time; b = bytearray(2 * 10**8)\nwhile time.process_time() < 0.5: pass"
     subprocess.run([sys.executable, "-c", work], check=True)
-    watch.mark("own")
+    watch.begin("own")
     start, child, own = watch.stages()
     assert [each.name for each in (start, child, own)] == ["start", "child", "own"]
     assert child.processor > 0.45

@@ -12,7 +12,7 @@ from splatseed.photos import loading
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import silent
 from splatseed.scene import Split
-from splatseed.seeding.budget import parse_budget, pixels_meant
+from splatseed.seeding.budget import describe_rho, parse_budget
 from splatseed.seeding.thinning import thin_to
 from splatseed.seeding.upsampling import share_covered
 
@@ -182,6 +182,6 @@ def test_a_budget_is_a_number_or_a_density(budget):
 
 
 def test_a_density_names_the_size_of_the_photographs(room):
-    assert pixels_meant(room, "0.5rho") == ": 0.5rho of 160 x 120 pixels"
-    assert not pixels_meant(room, None)
-    assert not pixels_meant(room, "500k")
+    assert describe_rho(room, "0.5rho") == ": 0.5rho of 160 x 120 pixels"
+    assert not describe_rho(room, None)
+    assert not describe_rho(room, "500k")

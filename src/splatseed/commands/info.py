@@ -105,7 +105,7 @@ def run(arguments: list[str]) -> None:
     if options.json:
         facts = {
             "points": cloud, "tracks": tracks, "empty": regions, "poses": poses, "masks": masks,
-            "depth_map_facts": maps, "depth": alignments, "problems": problems,
+            "depth_map_statistics": maps, "depth": alignments, "problems": problems,
         }  # fmt: skip
         facts = _plain({**_facts_of(scene), **facts})
         print(json.dumps(facts, indent=2, allow_nan=False), file=OUT.file)

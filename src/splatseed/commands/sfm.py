@@ -141,12 +141,12 @@ def _from_photographs(options: Options, images: Path, clock: StageClock) -> SfmR
         overwrite=options.overwrite,
         on_progress=clock,
         on_note=print_note,
-        on_photos=partial(_tell_photographs, options, clock, stages),
+        on_photos=partial(_report_photographs, options, clock, stages),
         **how,
     )
 
 
-def _tell_photographs(
+def _report_photographs(
     options: Options,
     clock: StageClock,
     stages: Sequence[str],

@@ -69,7 +69,7 @@ def read_phone_scene(
         notes: Further warnings.
 
     Raises:
-        SceneFormatError: A camera or pose is malformed, or most are not finite.
+        SceneFormatError: A camera or pose is malformed, or more than half are not finite.
     """
     cameras: dict[tuple[object, ...], Intrinsics] = {}
     images, unusable = list[Image](), dict[str, NotFiniteError]()

@@ -4,7 +4,7 @@ A frame N (five digits) has ``frame_N.json`` with ``cameraPoseARFrame`` (row-maj
 ``world_from_cam``) and ``intrinsics`` (row-major K in pixels of the photograph), a photograph
 ``frame_N.jpg`` if it is a key frame, ``depth_N.png`` (planar z, 16-bit millimetres; in some
 versions ``frame_N.exr``, metres) and ``conf_N.png`` (ARKit's levels 0 to 2). Source: the app's
-exports; ``projectionMatrix`` in the same file tells the size that ``intrinsics`` belong to, and
+exports; ``projectionMatrix`` in the same file gives the size that ``intrinsics`` belong to, and
 that half a pixel is to be added.
 """
 

@@ -178,7 +178,7 @@ def _extract(video: Path, track: _Track) -> Path:
         usable = np.flatnonzero(track.usable)
         usable = usable[(usable >= first) & (usable < first + len(sharp))]
         rotations = np.array([rotation_from_quat(q) for q in track.poses[usable][:, [6, 3, 4, 5]]])
-        # The principal point is near the middle, and nothing else tells the width yet.
+        # The principal point is near the middle; the width is not known yet.
         focal = float(np.nanmedian(track.pinholes[:, 0] / (2 * track.pinholes[:, 2])))
         motion = pose_motion(rotations.reshape(-1, 3, 3), track.poses[usable, :3], focal)
         chosen = usable[choose_frames(sharp[usable - first], motion, FILM.max_frames)] - first

@@ -1,4 +1,4 @@
-"""Frames of a video, decoded by ffmpeg: small grey ones to judge, some of full size as JPEGs.
+"""Frames of a video, decoded by ffmpeg: small grey ones for analysis, some of full size as JPEGs.
 
 Notation: frames are numbered from 0 as ffmpeg delivers them, each once (no frame rate is enforced).
 *Sharpness* is the variance of the Laplacian at a width of ``ANALYSIS_WIDTH``.
@@ -33,7 +33,7 @@ def small_frames(
 
     Args:
         video: The file.
-        progress: Told the fraction of the video that is read.
+        progress: Called with the fraction of the video that is read.
         hidden: Also yield frames that the file's edit list hides from players.
 
     Raises:

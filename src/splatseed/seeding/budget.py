@@ -24,12 +24,12 @@ def points_within(scene: Scene, budget: int | str) -> int:
     return parse_budget(budget, median_pixels(photographs) if photographs else 0)
 
 
-def pixels_meant(scene: Scene, budget: int | str | None) -> str:
+def describe_rho(scene: Scene, budget: int | str | None) -> str:
     """Describe the photograph whose pixels a budget in rho counts; empty for other budgets.
 
     Example:
         >>> from splatseed.pointcloud import PointCloud
-        >>> pixels_meant(Scene(PointCloud.empty()), "50k")
+        >>> describe_rho(Scene(PointCloud.empty()), "50k")
         ''
     """
     photographs = _at_trained_size(scene)

@@ -93,14 +93,14 @@ def unit_problem(stereo: StereoResult, maps: Sequence[CellMap]) -> str:
 
 
 def guides_badly(scene: Scene, images: Sequence[Image]) -> str:
-    """Explain why a scene's maps cannot tell stereo where to begin; empty if they can.
+    """Explain why a scene's maps cannot guide stereo; empty if they can.
 
     A few photographs are compared without them: begun at wrong depths, stereo finds too little to
     contradict them.
     """
     ratios = np.empty(0)
     for stereo, chosen in compare_samples(scene, images):
-        assert scene.depths is not None  # noqa: S101  (they are asked about)
+        assert scene.depths is not None  # noqa: S101  (callers check)
         maps = cell_maps(stereo.views, chosen, scene.depths, stereo.settings.grid, MIN_CONFIDENCE)
         found = [_ratios(stereo, i, known) for i, known in enumerate(maps)]
         ratios = np.concatenate([ratios, *found])

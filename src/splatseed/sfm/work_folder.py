@@ -1,7 +1,7 @@
 """Resumable work of a run: features, matches and models in ``OUTPUT_sfm``.
 
 The folder stays if a run fails or is killed, and the same command resumes from it. A successful run
-removes it, unless ``resume`` asks to keep it for further runs. Whatever still applies is used:
+removes it, unless ``resume`` keeps it for further runs. Whatever still applies is used:
 features of each photograph whose file, mask and size are unchanged, matches of two such
 photographs, verified matches with the same cameras and seed, models with the same matcher.
 

@@ -23,7 +23,7 @@ from splatseed.photos.camera_check import stray_camera_notes
 from splatseed.scene import Scene
 from splatseed.seeding import photo_methods
 from splatseed.seeding.advice import DEFAULT_METHOD, method_for
-from splatseed.seeding.budget import pixels_meant, points_within
+from splatseed.seeding.budget import describe_rho, points_within
 from splatseed.text import counted, visible
 
 
@@ -169,7 +169,7 @@ def _announce(
     OUT.print(
         f"{visible(options.scene)} ({kind}, {size})\n"
         f"  -> {report.method_description(name, method, options.profile)}{how}\n  "
-        f"-> {visible(options.output)} ({number}{pixels_meant(scene, options.budget)}, "
+        f"-> {visible(options.output)} ({number}{describe_rho(scene, options.budget)}, "
         f"seed {options.seed}){memory_note}",
         soft_wrap=True,
     )

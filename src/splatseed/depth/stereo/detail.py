@@ -1,4 +1,4 @@
-"""Seeds in proportion to detail: as many as asked for, closest together where contrast is high.
+"""Seeds in proportion to detail: up to a given number, closest together where contrast is high.
 
 A third view must confirm pixels whose cells are smaller than the largest: two may agree by chance,
 and wrong depths, which share a cell with no other, are chosen first.
@@ -50,7 +50,7 @@ class _DetailSettings:
     min_agreeing: int = 3  # views that confirm pixels with smaller cells than the largest
     floor: float = 0.5  # grey levels per pixel, added to every gradient: noise is no detail
     every: int = 7  # of the confirmed pixels, one in so many is used for the median contrast
-    tolerance: float = 0.02  # share of the seeds asked for that may be missing
+    tolerance: float = 0.02  # share of the requested seeds that may be missing
     num_bisections: int = 30  # of the expected spacing
     share_finest: float = 0.1  # of the seeds, whose cells determine the grid
     max_steps: int = 12  # spacings tried
@@ -168,7 +168,7 @@ def fuse_at_most(
 
     Args:
         stereo: The result of stereo.
-        num: Most seeds; about as many are chosen if so many pixels are confirmed. There are more
+        num: Maximum number of seeds, nearly reached if enough pixels are confirmed. It is exceeded
             only if there are more of the largest cells.
         largest: Side of the largest cells in pixels of the views.
         known: Points that each view sees already: their cells get no seed.
@@ -218,7 +218,7 @@ class _Search:
         levels = Levels.of(spacing, self.largest, min(smallest, self.largest))
         grids = CellGrids.of(self.stereo.views, levels.sides.tolist())
         for i, (uv, z) in enumerate(self.known):
-            grids.mark(i, uv, z)
+            grids.occupy(i, uv, z)
         places, limits = [], []
         for i, order in enumerate(self.orders):
             level = levels.of_steps(self.steps[i])

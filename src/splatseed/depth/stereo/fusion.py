@@ -87,7 +87,7 @@ class CellGrids:
         limits = np.array([(view.width, view.height) for view in views])
         return cls(sides, starts[:-1].reshape(rows.shape), columns, limits, occupied)
 
-    def mark(self, i: int, uv: Float64[np.ndarray, "M 2"], z: Float64[np.ndarray, " M"]) -> None:
+    def occupy(self, i: int, uv: Float64[np.ndarray, "M 2"], z: Float64[np.ndarray, " M"]) -> None:
         """Occupy the cells of view i, at all levels, at these pixels and depths."""
         for level, side in enumerate(self.cells):
             column, row = (uv / side).astype(np.int64).T
