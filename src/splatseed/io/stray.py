@@ -146,6 +146,9 @@ def _read_track(root: Path) -> _Track:
         except (ValueError, IndexError):
             expected = f"{len(header)} numbers, separated by commas, in {where}"
             raise SceneFormatError(expected, found=line.strip()[:120], fix=COPY_AGAIN) from None
+    if not lens and not (root / CAMERA).is_file():
+        expected = f"columns {', '.join(_PINHOLE)} in {path}, or a file {root / CAMERA}"
+        raise SceneNotFoundError(expected, found="neither", fix=_FIX)
     table = np.array(rows, np.float64)
     numbers = table[:, 0]
     if not (np.isfinite(numbers).all() and (np.diff(numbers) > 0).all() and numbers[0] >= 0):
