@@ -14,7 +14,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -115,14 +115,14 @@ HELD_STEP = 3
 
 def train(
     scene: str, arm: str, strategy: str, rho: float, max_steps: int, data_factor: int, seed: int,
-    every: int, kept: str | None = None,
+    every: int, kept: str | None = None, backend: Literal["cpu", "cuda"] = "cpu",
 ) -> dict[str, Any]:  # fmt: skip
     """One run, from every ``every``-th of the training photographs by name.
 
     Scores, Gaussians, seeds, and seconds: of seeding and of training by the clock, of training by
     the processor, and ``whole_processor``, from the scene in memory to the last step; the scores in
     the course of the run are its ``curve``. The folder ``kept`` holds seeds of earlier runs, whose
-    seconds count all the same.
+    seconds count all the same. On a GPU only ``seconds`` is what training takes.
     """
     whole = ss.load_scene(Path(scene), require_points=False)
     validation = validation_split(whole, every, HELD_STEP * seed % TEST_EVERY)
@@ -131,7 +131,7 @@ def train(
     begin = ARMS[arm].get("start", Start())
     settings = begin.settings(
         strategy=strategy, max_steps=max_steps, data_factor=data_factor, seed=seed,
-        cap_max=cap, test_every=TEST_EVERY, backend="cpu", seeding="scene",
+        cap_max=cap, test_every=TEST_EVERY, backend=backend, seeding="scene",
     )  # fmt: skip
     plan = settings.max_seeds(cap), max_steps, data_factor, seed, every
     key = fingerprint(Path(scene).name, _how(arm), *plan)
