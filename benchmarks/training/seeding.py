@@ -11,8 +11,9 @@ import os
 import statistics
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import tyro
 from benchmarks.common.children import call
@@ -52,18 +53,20 @@ class Settings:
     """Train on every n-th of the training photographs, by name."""
     jobs: int = os.cpu_count() or 1
     """Runs at a time, on one thread each."""
+    backend: Literal["cpu", "cuda"] = "cpu"
+    """Where to train; runs on a GPU want a ledger of their own."""
     ledger: Path = Path("seeding.jsonl")
     """Where results are kept, a line a run; seeds in a folder of the same name beside it."""
 
 
-def run(key: Key, scenes: Path, ledger: Path) -> None:
+def run(key: Key, scenes: Path, ledger: Path, backend: str = "cpu") -> None:
     """One run, and its line in the ledger."""
     scene, arm, strategy, rho, max_steps, data_factor, seed, every = key
     say(f"{scene}, {arm}, {strategy}, rho {rho:g}, seed {seed} ...")
     result = call(
         "benchmarks.training.seeding_arms:train", threads=1, scene=str(scenes / scene), arm=arm,
         strategy=strategy, rho=rho, max_steps=max_steps, data_factor=data_factor, seed=seed,
-        every=every, kept=str(ledger.resolve().with_suffix(".seeds")),
+        every=every, kept=str(ledger.resolve().with_suffix(".seeds")), backend=backend,
     )  # fmt: skip
     write_line(ledger, key, result)
     say(f"  {scene}, {arm}, {strategy}: {result['psnr']:.2f} dB")
@@ -122,7 +125,8 @@ def _scores(means: list[float]) -> str:
 
 def main(settings: Settings) -> None:
     """Run what is not there yet, and print the table."""
-    run_missing(wanted(settings), run, settings.ledger, settings.jobs)
+    train = partial(run, backend=settings.backend)
+    run_missing(wanted(settings), train, settings.ledger, settings.jobs)
     header = ["strategy", "rho", "seeds", *settings.scenes, "mean"]
     print(f"{describe()}\n\n### {settings.max_steps:,} steps, {settings.seeds} run(s) of each\n")
     print(table(header, rows(read_ledger(settings.ledger), settings)))
