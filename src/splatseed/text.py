@@ -49,6 +49,16 @@ def quoted(path: Path | str) -> str:
     return shlex.quote(f"./{text}" if text.startswith("-") else text)
 
 
+def numeric_order(name: str) -> list[str | int]:
+    """Return a sort key that orders the numbers in names by value.
+
+    Example:
+        >>> sorted(["10.jpg", "9.jpg", "010b.jpg"], key=numeric_order)
+        ['9.jpg', '10.jpg', '010b.jpg']
+    """
+    return [int(part) if i % 2 else part for i, part in enumerate(re.split(r"(\d+)", name))]
+
+
 def describe_error(error: Exception) -> str:
     """Describe another library's exception about a file, for the user.
 

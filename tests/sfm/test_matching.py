@@ -10,9 +10,10 @@ import pytest
 
 from splatseed.progress import silent
 from splatseed.sfm import Settings, pipeline
-from splatseed.sfm.colmap import Run, posed_model, require_pycolmap
+from splatseed.sfm.cameras import SharedCamera
+from splatseed.sfm.colmap import Run, guessed_model, posed_model, require_pycolmap
 from splatseed.sfm.database import run_database
-from splatseed.sfm.matching import detect_features, match_pairs
+from splatseed.sfm.matching import _pairs, detect_features, match_pairs
 
 pycolmap = pytest.importorskip("pycolmap")
 
@@ -30,6 +31,22 @@ def run(room, tmp_path):
     settings = Settings("exhaustive", "cpu", threads=1)
     run = Run(require_pycolmap(), settings, folder, work, silent)
     return run, posed_model(pycolmap, images)
+
+
+def test_successors_follow_the_numbers_in_names(run):
+    run, _ = run
+    photograph = next(run.image_dir.glob("*.png"))
+    names = [f"{number}.png" for number in range(14)]
+    for name in names:
+        shutil.copy(photograph, run.image_dir / name)
+    model = guessed_model(run, [SharedCamera(tuple(names), names[0], "")], "SIMPLE_RADIAL")
+    assert [model.image(i).name for i in sorted(model.images)] == names
+    run = replace(run, settings=replace(run.settings, matcher="sequential"))
+    with run_database(run, model) as database:
+        pairs = _pairs(run, database)
+    partners = [names[b - 1] for a, b in pairs if names[a - 1] == "1.png"]
+    assert partners == [f"{number}.png" for number in range(2, 12)]
+    assert len(pairs) == len(set(pairs))
 
 
 def matches(database, pair):

@@ -77,7 +77,8 @@ def advice_commands(
         train = f"splatseed train {source} --seeds scene {training}"
     else:
         how = f"--method {advice.method} --ratio 4"
-        how = f"--budget {planned.max_seeds}" if advice.method == "auto" else how
+        if advice.method == "auto":  # as train seeds: more gain nothing in a whole run
+            how = f"--budget {planned.max_seeds} --auto.no-dense"
         how = f"{how} --refine-poses" if refine else how
         first.append(("seeds", f"splatseed upsample {source} {how} -o OUT"))
         train = f"splatseed train OUT {training}"

@@ -24,7 +24,7 @@ from splatseed.runtime.torch_device import DeviceName
 from splatseed.scene import Image
 from splatseed.sfm.cameras import SharedCamera
 from splatseed.sfm.work_folder import COMPLETE, DATABASE, MODELS, WorkFolder
-from splatseed.text import counted, name_some
+from splatseed.text import counted, name_some, numeric_order
 
 MatcherName: TypeAlias = Literal["auto", "exhaustive", "sequential"]
 T = TypeVar("T")
@@ -160,7 +160,7 @@ def guessed_model(run: Run, cameras: Sequence[SharedCamera], camera_model: str) 
         camera.camera_id = camera_id
         model.add_camera_with_trivial_rig(camera)
         ids |= dict.fromkeys(shared.names, camera_id)
-    for number, name in enumerate(sorted(ids), 1):
+    for number, name in enumerate(sorted(ids, key=numeric_order), 1):  # successors are neighbours
         image = pycolmap.Image(name=name, image_id=number, camera_id=ids[name])
         model.add_image_with_trivial_frame(image)
     return model

@@ -29,8 +29,10 @@ from splatseed.sfm.first_look import (
     measure_agreement,
     poorly_connected,
 )
-from splatseed.text import name_some
+from splatseed.text import name_some, numeric_order
 
+_STEPS = sorted({*range(1, 11), *(2**n for n in range(10))})
+"""How far on in the sequence partners are: COLMAP's overlap of 10, and powers of two."""
 _BLOCK_PAIRS = 128
 """Matches are committed per block of as many pairs; as many photographs' features are in memory."""
 
@@ -127,14 +129,12 @@ def _verified(run: Run, database: Any, ids: Sequence[int]) -> dict[Pair, int]:
 
 def _pairs(run: Run, database: Any) -> list[Pair]:
     """Return the pairs of the run's matcher."""
-    pycolmap = run.pycolmap
     if run.settings.matcher == "sequential":
-        options = pycolmap.SequentialPairingOptions()
-        pairs = pycolmap.SequentialPairGenerator(options, database).all_pairs()
-    else:
-        options = pycolmap.ExhaustivePairingOptions()
-        pairs = pycolmap.ExhaustivePairGenerator(options, database).all_pairs()
-    return list(dict.fromkeys(pairs))
+        images = sorted(database.read_all_images(), key=lambda image: numeric_order(image.name))
+        ids = [image.image_id for image in images]
+        return [(a, ids[i + n]) for i, a in enumerate(ids) for n in _STEPS if i + n < len(ids)]
+    options = run.pycolmap.ExhaustivePairingOptions()
+    return list(dict.fromkeys(run.pycolmap.ExhaustivePairGenerator(options, database).all_pairs()))
 
 
 def detect_features(run: Run, database: Any, model: Any, masks: Masks | None = None) -> None:
