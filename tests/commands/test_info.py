@@ -13,6 +13,7 @@ import pytest
 from PIL import Image as PilImage
 
 from splatseed import upsample
+from splatseed.commands import next_steps
 from splatseed.commands.next_steps import number_option
 from splatseed.depth.alignment import align
 from splatseed.depth.settings import PER_POINT
@@ -30,7 +31,8 @@ def _pairs(out):
     return {line[0]: line[1].strip() for line in lines if len(line) == 2}
 
 
-def test_a_colmap_scene(room, splatseed):
+def test_a_colmap_scene(room, splatseed, monkeypatch):
+    monkeypatch.setattr(next_steps, "which", lambda _: None)  # as without a GPU
     run = splatseed("info", room)
     assert (run.code, run.err) == (0, "")
     scene, rows = load_scene(room), _pairs(run.out)
@@ -43,7 +45,8 @@ def test_a_colmap_scene(room, splatseed):
     low = [float(x) for x in rows["bounding box"].split()[:3]]
     np.testing.assert_allclose(low, scene.points.xyz.min(axis=0), rtol=1e-3)
     advised = run.out.partition("\nnext\n")[2]
-    assert re.findall(r"splatseed (\w+)", advised) == ["train"]
+    assert re.findall(r"splatseed (\w+)", advised) == ["train", "train", "info"]
+    assert rows["photographs agree"].endswith("of the pixels looked at: enough")
 
 
 def test_the_advice_depends_on_the_plan(room, splatseed):
@@ -56,12 +59,11 @@ def test_the_advice_depends_on_the_plan(room, splatseed):
     assert "--seeds scene --budget 5400 --max-steps 20000" in sparse
 
 
-def test_info_does_not_wait_for_numba(room):
+def test_info_on_points_alone_does_not_wait_for_numba(room):
     code = "import sys; from splatseed.cli import main; main(sys.argv[1:]); print(*sys.modules)"
-    words = [sys.executable, "-c", code, "info", str(room)]
+    words = [sys.executable, "-c", code, "info", str(room / "sparse" / "0" / "points3D.ply")]
     run = subprocess.run(words, capture_output=True, check=False, text=True, timeout=60)
     assert (run.returncode, run.stderr) == (0, "")
-    assert "image area without points" in run.stdout
     assert not {"numba", "torch"} & set(run.stdout.splitlines()[-1].split())
 
 
@@ -224,7 +226,7 @@ def test_a_seeded_scene_is_advised_for_training(room, tmp_path, splatseed):
     assert "are isolated" not in run.out
     assert _pairs(run.out)["isolated"] == _pairs(plain)["isolated"]
     assert re.search(r"1,392 .* 464", run.out)
-    assert run.out.rstrip().endswith(f"splatseed train '{path}' -o RUN")
+    assert f"splatseed train '{path}' -o RUN\n" in run.out
     assert "upsampl" not in run.out.replace("splatseed upsample made", "")
 
 
@@ -260,6 +262,7 @@ def test_poses_of_a_device_are_advised_to_be_refined(as_by_a_device, tmp_path, s
     assert not poses["error"]["exact"]
     assert 0.1 < poses["error"]["degrees"] < 1
     told = splatseed("info", path).out
+    assert re.search(r"px .* at 240 px a side: above 0.5 px", told)
     advised = told.partition("next")[2]
-    assert f"splatseed upsample {path} --budget" in advised
-    assert advised.count("--refine-poses") == 2
+    assert f"splatseed train {path} --refine-poses --budget" in advised
+    assert f"sfm {path / 'images'} --poses-from {path} -o OUT --refine-poses" in advised

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from splatseed.camera import Intrinsics
+from splatseed.commands import next_steps
 from splatseed.commands.next_steps import print_training
 from splatseed.io import load_scene, write_scene
 from splatseed.pointcloud import PointCloud
@@ -56,11 +57,37 @@ def test_what_info_advises_works(points, bent, tmp_path, monkeypatch, splatseed)
     kept = whole if points else whole.replace(points=PointCloud.empty(), tracks=None)
     write_scene(kept, scene, copy_images=True, require_points=False)
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(next_steps, "which", lambda _: None)  # as without a GPU
     run = splatseed("info", scene)
     assert run.code == 0, run.err
-    wanted = ["train"] if points else ["upsample", "train", "sfm"]
+    wanted = ["train", "train", *(["info"] if points else ["upsample", "sfm"])]
     assert follow(run.out, splatseed) == ["undistort", *wanted]
-    assert points or len(load_scene("OUT").points) > 500
+    for folder in ("RUN", "SMALL"):
+        assert (Path(folder) / "metrics.json").is_file()
+
+
+@pytest.mark.parametrize("points", [True, False])
+@pytest.mark.parametrize("trainer", ["gsplat", "nerfstudio"])
+def test_the_advice_is_for_the_trainer_that_is_named(
+    points, trainer, room, tmp_path, monkeypatch, splatseed
+):
+    whole = load_scene(room)
+    kept = whole if points else whole.replace(points=PointCloud.empty(), tracks=None)
+    path = write_scene(kept, tmp_path / "it", format="transforms", require_points=False).path
+    monkeypatch.chdir(tmp_path)
+    out = splatseed("info", path, "--for", trainer).out
+    assert "strategy default" in out or not points
+    seeds = out.rpartition("\nnext\n")[2].partition("splatseed ")[2].splitlines()[0]
+    assert "upsample" in seeds  # 3DGS's densification gains by seeds, grow does not
+    assert ("--format colmap" in seeds) == (trainer == "gsplat")
+    assert splatseed(*shlex.split(seeds)).code == 0
+    assert load_scene("OUT").source.format == ("colmap" if trainer == "gsplat" else "transforms")
+    command = {
+        "gsplat": "simple_trainer.py default --data_dir",
+        "nerfstudio": "ns-train splatfacto",
+    }
+    assert f"{command[trainer]} " in out
+    assert f"{tmp_path / 'OUT'}" in out
 
 
 @pytest.mark.parametrize("kept", ["some", "no folder"])

@@ -19,7 +19,7 @@ import numpy as np
 import tyro
 
 from splatseed.commands import next_steps
-from splatseed.commands.next_steps import Commands, Planned
+from splatseed.commands.next_steps import Commands, Planned, TrainerName
 from splatseed.commands.options import parse_options, refuse
 from splatseed.commands.outputs import check_free
 from splatseed.console import (
@@ -77,6 +77,8 @@ class Options:
     splatseed train's. The advice depends on it."""
     max_steps: int = FULL_RUN
     """Steps that you plan to train, for the commands that are printed."""
+    trainer: Annotated[TrainerName, tyro.conf.arg(name="for")] = "splatseed"
+    """The trainer that you plan to use: the advice and the commands are for it."""
     json: bool = False
     """Print one JSON object instead, for scripts."""
 
@@ -113,7 +115,7 @@ def run(arguments: list[str]) -> None:
     usable = scene
     if alignments and len(scene.points) and all(each.rejected for each in alignments.values()):
         usable = scene.replace(depths=None)  # nothing follows from maps that cannot be used
-    planned = Planned.of(usable, options.budget, options.max_steps)
+    planned = Planned.of(usable, options.budget, options.max_steps, options.trainer)
     share = None if regions is None else regions.mean
     advice = advice_for(usable, planned.max_seeds, strategy=planned.strategy, empty=share)
     rows = [*_source_rows(scene), *_depth_map_rows(maps)]
@@ -190,14 +192,14 @@ def _unfit_maps(scene: Scene, alignments: Mapping[str, Alignment]) -> list[str]:
 def _check_poses(
     scene: Scene, masked: float, progress: Progress
 ) -> tuple[dict[str, Any] | None, str]:
-    """Compare a few photographs of a scene without points.
+    """Compare a few photographs of a scene.
 
-    ``masked`` is the share of pixels that masks exclude. Returns None for a scene with points or
-    without photographs; else the share of checked pixels whose depth other photographs confirm
-    (``agreement``), the pose error (``error``) and the resulting ``problem``. The second value is a
-    warning if photographs agree at few pixels, else empty.
+    ``masked`` is the share of pixels that masks exclude. Returns None without photographs; else the
+    share of checked pixels whose depth other photographs confirm (``agreement``), the pose error
+    (``error``) and the resulting ``problem``. The second value is a warning if photographs agree at
+    few pixels, else empty. A scene with points has neither: it can be trained from them.
     """
-    if has_points(scene) or not scene.has_photographs:
+    if not scene.has_photographs:
         return None, ""
     from splatseed.seeding.pose_accuracy import estimate_pose_error
     from splatseed.seeding.poses import agreement_warning, check_poses
@@ -206,9 +208,13 @@ def _check_poses(
         images = photographed(scene)
         agreement = check_poses(scene, images, progress)
     except SplatseedError as refused:
+        if has_points(scene):
+            return None, ""
         problem = with_options(f"The photographs cannot be compared: {refused}")
         return {"agreement": 0.0, "error": None, "problem": problem}, ""
     error = estimate_pose_error(scene, images, progress)
+    if has_points(scene):
+        return {"agreement": agreement, "error": error, "problem": ""}, ""
     problem = with_options(error.warning) if error else ""
     facts = {"agreement": agreement, "error": error, "problem": problem}
     return facts, agreement_warning(agreement, masked)
@@ -345,8 +351,17 @@ def _photograph_rows(
         grid = f"(of cells, {diagnostics.EMPTY_CELLS} along the longer side)"
         rows.append(("image area without points", f"{regions.mean:.0%} on average, {worst} {grid}"))
     if poses and (poses["error"] is not None or not poses["problem"]):
-        agreed = f"at {poses['agreement']:.0%} of the pixels looked at"
-        miss = "unknown" if poses["error"] is None else f"{poses['error']}"
+        from splatseed.seeding.pose_accuracy import MAX_EXACT
+        from splatseed.seeding.poses import agreement_warning
+
+        few = agreement_warning(poses["agreement"]) != ""
+        agreed = (
+            f"at {poses['agreement']:.0%} of the pixels looked at: {'few' if few else 'enough'}"
+        )
+        miss = "unknown: too few corners are found again"
+        if (error := poses["error"]) is not None:
+            limit = f"exact, at most {MAX_EXACT:g} px" if error.exact else f"above {MAX_EXACT:g} px"
+            miss = f"{error}: {limit}"
         rows += [("photographs agree", agreed), ("pose error", miss)]
     return rows
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import NamedTuple
+from shutil import which
+from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -16,8 +17,11 @@ from splatseed.seeding.advice import AS_IT_IS, SEEDED, Advice
 from splatseed.seeding.trainability import is_distorted, untrainable
 from splatseed.text import quoted
 from splatseed.training.schedule import FULL_RUN
-from splatseed.training.settings import BUDGET, TrainSettings
+from splatseed.training.settings import BUDGET, StrategyName, TrainSettings
 
+TrainerName: TypeAlias = Literal[
+    "splatseed", "gsplat", "graphdeco", "nerfstudio", "brush", "opensplat", "lichtfeld"
+]
 RATIO = 16
 COLMAP_ONLY = frozenset({"gsplat", "graphdeco", "LichtFeld"})
 """Trainers that read COLMAP's layout better than transforms.json."""
@@ -39,10 +43,20 @@ class Planned(NamedTuple):
     strategy: str
     max_seeds: int
     flags: str
+    trainer: TrainerName
 
     @classmethod
-    def of(cls, scene: Scene, budget: str | None = None, max_steps: int = FULL_RUN) -> Planned:
-        """Plan the training of a scene by the options of ``info``."""
+    def of(
+        cls,
+        scene: Scene,
+        budget: str | None = None,
+        max_steps: int = FULL_RUN,
+        trainer: TrainerName = "splatseed",
+    ) -> Planned:
+        """Plan the training of a scene by the options of ``info``.
+
+        The other trainers densify as 3DGS does, unless they are told otherwise.
+        """
         images = at_file_size(scene).images
         factor = TrainSettings().with_data_factor(images).factor
         lenses = [image.intrinsics for image in images]
@@ -56,35 +70,81 @@ class Planned(NamedTuple):
             flags = f"--budget {number} "
         if max_steps != FULL_RUN:
             flags = f"{flags}--max-steps {max_steps} "
-        settings = TrainSettings(strategy="auto", max_steps=max_steps, cap_max=number)
+        strategy: StrategyName = "auto" if trainer == "splatseed" else "default"
+        settings = TrainSettings(strategy=strategy, max_steps=max_steps, cap_max=number)
         max_seeds = settings.max_seeds(number)
-        return cls(number, max_steps, settings.densification, max_seeds, flags)
+        return cls(number, max_steps, settings.densification, max_seeds, flags, trainer)
 
 
 def advice_commands(
     path: Path, scene: Scene, advice: Advice, planned: Planned, *, refine: bool
 ) -> Commands:
-    """Return the commands that follow the advice; with ``refine``, poses are refined first."""
-    trains = not untrainable(scene)
+    """Return the commands that follow the advice; with ``refine``, poses are refined first.
+
+    Of a scene without points, splatseed trains from seeds of the training photographs alone, so
+    that the score of the others is honest; seeds of all are for other trainers.
+    """
+    if untrainable(scene):
+        if advice.method in {AS_IT_IS, SEEDED}:
+            return [("look", f"splatseed view {quoted(path)}")]
+        return [("seeds", _seeding(path, advice, planned, refine=refine))]
     first: Commands = []
-    if trains and is_distorted(scene):
+    own = planned.trainer == "splatseed"
+    if is_distorted(scene) and (own or planned.trainer in map(str.lower, PINHOLE_ONLY)):
         first, path = [("undistort", undistort_command(path))], undistorted_folder(path)
     source = quoted(path)
-    training = f"--budget {planned.budget} --max-steps {planned.max_steps} -o RUN"
+    plan = f"--budget {planned.budget} --max-steps {planned.max_steps}"
+    refining = "--refine-poses " if refine else ""
+    if not own:
+        return [*first, *_for_trainer(path, scene, advice, planned, refine=refine)]
     if advice.method == SEEDED:
-        train = f"splatseed train {source} {planned.flags}-o RUN"
+        how = planned.flags
     elif advice.method == AS_IT_IS:
-        train = f"splatseed train {source} --seeds scene {training}"
+        how = f"--seeds scene {plan} "
+    elif advice.method == "auto":
+        how = f"{refining}{plan} "
     else:
-        how = f"--method {advice.method} --ratio 4"
-        if advice.method == "auto":  # as train seeds: more gain nothing in a whole run
-            how = f"--budget {planned.max_seeds} --auto.no-dense"
-        how = f"{how} --refine-poses" if refine else how
-        first.append(("seeds", f"splatseed upsample {source} {how} -o OUT"))
-        train = f"splatseed train OUT {training}"
-    if not trains:
-        return first or [("look", f"splatseed view {source}")]
-    return [*first, ("train", train)]
+        seeds = ("seeds", _seeding(path, advice, planned, refine=refine))
+        return [*first, seeds, ("train", f"splatseed train OUT {plan} -o RUN")]
+    commands = [*first, ("train", f"splatseed train {source} {how}-o RUN")]
+    if not (which("nvidia-smi") or which("rocminfo")):
+        commands.append(("or in minutes", f"splatseed train {source} {refining}{SMALL} -o SMALL"))
+    if advice.method == "auto":
+        others = _seeding(path, advice, planned, refine=refine)
+        return [*commands, ("seeds for another trainer", others)]
+    return [*commands, ("another trainer", f"splatseed info {source} --for gsplat")]
+
+
+SMALL = "--long-side 480 --max-steps 1500"
+"""A run of minutes on a CPU: 146 photographs take 132 seconds on one core (README)."""
+
+
+def _seeding(path: Path, advice: Advice, planned: Planned, *, refine: bool) -> str:
+    """Return the command that adds points by the method advised."""
+    how = f"--method {advice.method} --ratio 4"
+    if advice.method == "auto":  # as train seeds: more gain nothing in a whole run
+        how = f"--budget {planned.max_seeds} --auto.no-dense"
+    elif advice.method in {AS_IT_IS, SEEDED}:
+        how = "--method linear --ratio 1"
+    how = f"{how} --refine-poses" if refine else how
+    return f"splatseed upsample {quoted(path)} {how} -o OUT"
+
+
+def _for_trainer(
+    path: Path, scene: Scene, advice: Advice, planned: Planned, *, refine: bool
+) -> Commands:
+    """Return the commands that lead to another trainer."""
+    kept = scene.source is not None and scene.source.format == "transforms"
+    layout: SceneFormat = "transforms" if kept else "colmap"
+    other = kept and planned.trainer in map(str.lower, COLMAP_ONLY)
+    commands: Commands = []
+    if other or advice.method not in {AS_IT_IS, SEEDED}:
+        seeds = _seeding(path, advice, planned, refine=refine)
+        if other:
+            layout, seeds = "colmap", f"{seeds} --format colmap"
+        commands, path = [("seeds", seeds)], Path("OUT")
+    named = {name.lower(): command for name, command in training_commands(path, layout)}
+    return [*commands, ("train", named[planned.trainer])]
 
 
 def after_depth(path: Path, scene: Scene, maps: Path, known: int, *, aligned: bool) -> Commands:
