@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 
+import numpy as np
 import pytest
 from rich.progress import Progress
 
@@ -77,8 +79,9 @@ def refining(room, monkeypatch):
     """Stands in for pycolmap: poses and points are the room's. Its list tells the calls."""
     truth, calls = load_scene(room), []
 
-    def call(folder, staging, settings, progress, kept, job, poses, test_names, masks):
+    def call(folder, staging, settings, progress, kept, job, poses, test_names, masks, has_points):
         assert job is pipeline._refine
+        assert not has_points
         assert test_names == {image.name for image in truth.split(8)[1]}
         calls.append(folder)
         change = Refinement(False, 9.0, 0.5, 0.1, 0.2, 0.1, 0.2)
@@ -165,6 +168,63 @@ def test_a_resumed_run_keeps_its_poses_and_photographs(
     _unfinish(run)
     shutil.rmtree(run / "scene")
     refused(str(run / "scene"), bare, "--resume", "-o", run)
+
+
+@pytest.fixture
+def refinement_of_room(room, monkeypatch):
+    """Stands in for pycolmap: returns the room's poses, and 100 points if they are not kept."""
+
+    def stand_in(*, kept):
+        truth, change = load_scene(room), Refinement(kept, 0.6, 0.6 if kept else 0.3)
+
+        def call(*arguments):
+            assert arguments[-1]  # the scene has points
+            points = (
+                truth.points.select(slice(0, 0)) if kept else truth.points.select(slice(0, 100))
+            )
+            images = truth.images
+            if not kept:
+                images = [replace(i, translation=i.translation + 0.01) for i in images]
+            return pipeline._Refined(tuple(images), points, change)
+
+        monkeypatch.setattr(pipeline, "_call", call)
+
+    return stand_in
+
+
+def test_points_stay_where_refinement_gains_nothing(room, refinement_of_room, splatseed, tmp_path):
+    refinement_of_room(kept=True)
+    own, scene = load_scene(room), load_scene(room)
+    same, note = pipeline.refined(own, 0)
+    assert same is own
+    words = ("--method", "linear", "--ratio", "2", "-o")
+    out = splatseed("upsample", room, "--refine-poses", *words, tmp_path / "seeds").out
+    assert "Poses and points stay as given" in note
+    assert note in out
+    seeds = load_scene(tmp_path / "seeds")
+    np.testing.assert_array_equal(seeds.points.xyz[: len(scene.points)], scene.points.xyz)
+    assert len(seeds.tracks) == len(scene.tracks)
+    run, plain = tmp_path / "run", tmp_path / "plain"
+    assert note in splatseed("train", room, *SHORT, "--refine-poses", "-o", run).out
+    finished = _gaussians(run)
+    _unfinish(run)
+    assert splatseed("train", room, "--resume", "-o", run).code == 0
+    assert splatseed("train", room, *SHORT, "-o", plain).code == 0
+    assert _gaussians(run) == finished == _gaussians(plain)
+
+
+def test_points_that_refinement_replaces_are_announced_first(
+    room, refinement_of_room, splatseed, tmp_path
+):
+    refinement_of_room(kept=False)
+    number = len(load_scene(room).points)
+    out = splatseed("upsample", room, "--refine-poses", "--method", "linear", "--ratio", "2",
+                    "-o", tmp_path / "seeds").out  # fmt: skip
+    assert f"100 points, triangulated in place of the scene's {number:,}" in out.split("->")[0]
+    assert len(load_scene(tmp_path / "seeds").points) == 200
+    out = splatseed("train", room, *SHORT, "--refine-poses", "-o", tmp_path / "run").out
+    told = f"The scene's {number:,} points are replaced by 100 triangulated"
+    assert told in out.split("->")[0]
 
 
 def test_refine_poses_is_refused_on_a_resumed_run_and_on_seeds(

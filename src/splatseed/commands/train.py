@@ -89,7 +89,8 @@ class Options:
     """A folder of masks, where pixels of 0 do not count, or none; inverted: only they count. By
     default the folder masks beside the photographs, and transparency."""
     refine_poses: bool = False
-    """First refine a phone's or SLAM's poses and triangulate points; both replace the scene's."""
+    """First refine a phone's or SLAM's poses; points triangulated there replace the scene's, unless
+    refinement gains nothing."""
     resume: bool = False
     """Resume the run in the output folder, with its own settings; start one if there is none."""
     tensorboard: bool = False

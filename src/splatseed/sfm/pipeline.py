@@ -273,11 +273,12 @@ def _undistort(
 def refined(
     scene: Scene, seed: int, progress: Progress = silent, *, test_every: int = 0
 ) -> tuple[Scene, str]:
-    """The scene at refined poses, with the points that its photographs' features give.
+    """Return the scene at refined poses, and what was done, in a sentence.
 
-    Its photographs, lenses and depth maps stay; its own points are replaced. The test views, every
-    ``test_every``-th (0: none) or those of the scene's list, are refined with the others, but no
-    point is of them. Also what was done, in a sentence.
+    Where refinement gains nothing, the scene keeps its poses, and its points if it has any. Else
+    points are triangulated from its photographs' features, in place of its own. Photographs, lenses
+    and depth maps stay. The test views, every ``test_every``-th (0: none) or those of the scene's
+    list, are refined with the others, but contribute no triangulated point.
 
     Raises:
         SceneNotFoundError: It has no photographs.
@@ -285,7 +286,7 @@ def refined(
         MissingDependencyError: pycolmap is absent.
     """
     require("pycolmap")
-    folder = photograph_folder(scene).absolute()
+    folder, own = photograph_folder(scene).absolute(), len(scene.points)
     test = scene.split(test_every)[1] if test_every or scene.listed else ()
     poses = match_poses(find_photos(folder)[0], scene, folder)
     with TemporaryDirectory(prefix="splatseed-refine-") as name:
@@ -293,15 +294,18 @@ def refined(
         names = {image.name for image in test}
         settings = _refining(Settings(seed=seed), poses)
         child = (folder, Path(name), settings, progress, None, _refine)
-        found: _Refined = _call(*child, poses, names, scene.masks)
-    change, points = found.refinement, f"{len(found.points):,} points were triangulated"
+        found: _Refined = _call(*child, poses, names, scene.masks, own > 0)
+    change, count = found.refinement, f"{len(found.points):,}"
     if change.kept:
-        how = f"Poses are as given: refined, they would gain less than 0.1 px. {points}."
+        what = "Poses and points stay" if own else f"{count} points were triangulated; poses stay"
+        how = f"{what} as given: refined poses gain less than 0.1 px of reprojection error."
     else:
+        what = f"The scene's {own:,} points are replaced by {count}" if own else f"{count} points"
         how = (
-            f"Refined poses lower the mean reprojection error from {change.error_before:.2f} to "
-            f"{change.error_after:.2f} px: cameras turned by {change.median_turn:.2f} degrees "
-            f"and moved by {change.median_shift:.3g} units, both the median; {points}."
+            f"{what} triangulated at refined poses, which lower the mean reprojection error from "
+            f"{change.error_before:.2f} to {change.error_after:.2f} px: cameras turned by "
+            f"{change.median_turn:.2f} degrees and moved by {change.median_shift:.3g} units, both "
+            "the median."
         )
     return with_refined(scene, scene.replace(images=found.poses, points=found.points)), how
 
@@ -331,10 +335,17 @@ class _Refined(NamedTuple):
 
 
 def _refine(
-    run: Run, _: Path, poses: Sequence[Image], test_names: Collection[str], masks: Masks | None
+    run: Run,
+    _: Path,
+    poses: Sequence[Image],
+    test_names: Collection[str],
+    masks: Masks | None,
+    has_points: bool,
 ) -> _Refined:
     match_photographs(run, colmap.posed_model(run.pycolmap, poses), masks, poses)
     poses, refinement = refine(run, poses)
+    if refinement.kept and has_points:  # which stay
+        return _Refined(tuple(poses), PointCloud.empty(), refinement)
     model = run.pycolmap.Reconstruction(colmap.triangulate_points(run, poses, test_names))
     drop_repeats(model)
     points = [point for _, point in sorted(model.points3D.items())]
@@ -346,10 +357,13 @@ def _refine(
 def with_refined(scene: Scene, found: Scene) -> Scene:
     """Replace poses and points by those of another scene of the same photographs.
 
-    Images missing there keep their poses; its points become originals without tracks.
+    Images missing there keep their poses; its points become originals without tracks. A scene with
+    points stays as it is if all poses are equal.
     """
     posed = {image.name: image for image in found.images}
     pairs = [(image, posed.get(image.name, image)) for image in scene.images]
+    if len(scene.points) and all(_same_pose(image, pose) for image, pose in pairs):
+        return scene
     images = tuple(
         # Drop observations of the replaced points.
         replace(i, quat=pose.quat, translation=pose.translation, observations=None)
@@ -357,6 +371,10 @@ def with_refined(scene: Scene, found: Scene) -> Scene:
     )
     points = PointCloud(found.points.xyz, found.points.rgb)
     return scene.replace(images=images, points=points, tracks=None)
+
+
+def _same_pose(a: Image, b: Image) -> bool:
+    return np.array_equal(a.quat, b.quat) and np.array_equal(a.translation, b.translation)
 
 
 @contextmanager

@@ -140,7 +140,8 @@ def train(
         long_side: Instead of ``data_factor``: downsample photographs by the smallest whole factor
             that leaves at most this many pixels on their longer side.
         masks: A folder of masks, "none", or "inverted"; by default the scene's own masks.
-        refine_poses: First refine the poses of a phone or SLAM and triangulate points.
+        refine_poses: First refine the poses of a phone or SLAM; points triangulated there replace
+            the scene's, unless refinement gains nothing.
         resume: Resume the run in ``output``, with its own settings; start one if there is none.
         overwrite: Replace an earlier run in ``output``.
         tensorboard: Also write a log for TensorBoard.

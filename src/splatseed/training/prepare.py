@@ -60,7 +60,8 @@ class PrepareOptions:
     overwrite: bool = False
     """Replace an earlier run in the folder."""
     refine_poses: bool = False
-    """First refine the poses of a phone or SLAM and triangulate points, in place of the scene's."""
+    """First refine the poses of a phone or SLAM; points triangulated there replace the scene's,
+    unless refinement gains nothing."""
     tensorboard: bool = False
     """Also write TensorBoard's log."""
     explicit: Collection[str] = ()

@@ -50,10 +50,12 @@ def _upsample(options: Options, methods: dict[str, Any]) -> None:
     with stage_display() as clock:
         clock("read", 0.0)
         scene = _read(options, methods[options.method])
+        own, replaced = scene.points, 0
         if options.gaussians is not None:  # photographs bound their sizes
             photo_methods.photographed(scene, without="leave out --gaussians")
         if options.refine_poses:
             scene, note = _refined(options, scene, methods[options.method], clock)
+            replaced = 0 if scene.points is own else len(own)
             notes.append(note)
         if options.recenter:
             scene = translated(scene, middle_of_cameras(scene))
@@ -75,7 +77,7 @@ def _upsample(options: Options, methods: dict[str, Any]) -> None:
         limit = None if options.budget is None else points_within(scene, options.budget)
     changes = {"--verify": options.verify, "--cover": options.cover_cell is not None}
     number = report.number_summary(total, limit, [name for name in changes if changes[name]])
-    _announce(options, scene, methods, number, "" if cloud is None else cloud.memory_note)
+    _announce(options, scene, replaced, methods, number, "" if cloud is None else cloud.memory_note)
     with stage_display(clock):
         seeds = upsample(
             scene, method, num_points=total, budget=options.budget, cover=options.cover_cell,
@@ -97,7 +99,7 @@ def _upsample(options: Options, methods: dict[str, Any]) -> None:
     if options.gaussians is not None:
         notes.append(f"The initial Gaussians are in {visible(options.gaussians)}.")
     origins = report.origin_counts(seeds, written.num_points)
-    report.summarise(options, scene, len(scene.points), origins, written, seconds, findings)
+    report.summarise(options, scene, replaced, origins, written, seconds, findings)
     for note in notes:
         print_note(note)
 
@@ -141,7 +143,12 @@ def _read(options: Options, method: Upsampler) -> Scene:
 
 
 def _announce(
-    options: Options, scene: Scene, methods: Mapping[str, Upsampler], number: str, memory_note: str
+    options: Options,
+    scene: Scene,
+    replaced: int,
+    methods: Mapping[str, Upsampler],
+    number: str,
+    memory_note: str,
 ) -> None:
     """Print the plan, the scene's warnings, and the options that have no effect."""
     for warning in (*scene.warnings, *stray_camera_notes(scene)):
@@ -165,7 +172,8 @@ def _announce(
         where = "" if maps is None else ", around its depth maps"
         how = f": {points} points, so depth is found by comparing photographs{where}"
     kind = scene.source.format if scene.source else "memory"
-    size = f"{counted(len(scene.images), 'image')}, {counted(len(scene.points), 'point')}"
+    points = f"{counted(len(scene.points), 'point')}{report.in_place_of(replaced)}"
+    size = f"{counted(len(scene.images), 'image')}, {points}"
     OUT.print(
         f"{visible(options.scene)} ({kind}, {size})\n"
         f"  -> {report.method_description(name, method, options.profile)}{how}\n  "

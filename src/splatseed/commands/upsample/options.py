@@ -67,8 +67,8 @@ class Options:
     """A folder of masks, where pixels of 0 do not count, or none; inverted: only they count. By
     default the folder masks beside the photographs, and transparency."""
     refine_poses: bool = False
-    """First refine the poses, such as a phone's or SLAM's, and triangulate points; both replace the
-    scene's."""
+    """First refine the poses, such as a phone's or SLAM's; points triangulated there replace the
+    scene's, unless refinement gains nothing."""
     cloud_files: Annotated[
         tyro.conf.UseAppendAction[tuple[Path, ...]],
         tyro.conf.arg(name="cloud", metavar="FILE", help_behavior_hint="(repeatable)"),

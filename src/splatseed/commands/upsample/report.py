@@ -72,6 +72,16 @@ def method_description(name: str, method: Upsampler, profile: Profile) -> str:
     return f"{name} ({', '.join(changes)})" if changes else name
 
 
+def in_place_of(replaced: int) -> str:
+    """Say whether refinement replaced the scene's points by triangulated ones; empty if not.
+
+    Example:
+        >>> in_place_of(5740)
+        ", triangulated in place of the scene's 5,740"
+    """
+    return f", triangulated in place of the scene's {replaced:,}" if replaced else ""
+
+
 def number_summary(total: int | None, limit: int | None, changed_by: Sequence[str] = ()) -> str:
     """Say how many points to expect; the options ``changed_by`` may add or drop some.
 
@@ -114,7 +124,7 @@ def origin_counts(seeds: PointCloud, written: int) -> dict[str, int]:
 def summarise(
     options: Options,
     scene: Scene,
-    num_read: int,
+    replaced: int,
     origins: Mapping[str, int],
     written: WriteReport,
     seconds: Mapping[str, float],
@@ -125,11 +135,11 @@ def summarise(
     if written.dropped_nonfinite + written.dropped_duplicates:
         left_out += [f"{written.dropped_nonfinite:,} not finite"]
         left_out += [f"{written.dropped_duplicates:,} duplicate"]
-    if thinned := num_read - written.num_original:
+    if thinned := len(scene.points) - written.num_original:
         left_out += [f"{thinned:,} originals, for the budget"]
     made = ", ".join(f"{count:,} {name}" for name, count in origins.items())
     rows = [
-        ("points in", f"{num_read:,}"),
+        ("points in", f"{len(scene.points):,}{in_place_of(replaced)}"),
         ("points out", f"{written.num_points:,} ({made})"),
         *([("left out", ", ".join(left_out))] if left_out else []),
         *found,
