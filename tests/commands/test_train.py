@@ -118,8 +118,10 @@ def test_refined_poses_are_what_is_trained_scored_and_shown(
     run = splatseed("train", bare, *SHORT, "--refine-poses", "-o", tmp_path / "run")
     assert (run.code, run.err) == (0, "")
     assert re.search(r"9\.00 .* 0\.50 px", run.out)
+    assert "points of the scene and" in run.out  # triangulated points and auto's
     config = json.loads((tmp_path / "run/config.json").read_text())
     assert (config["scene"], config["refine_poses"]) == (str(bare), True)
+    assert config["seeds"]["count"] > 1.2 * len(load_scene(room).points)
     moved = (tmp_path / "run").rename(tmp_path / "moved")
     shown = open_item(moved).scene
     assert _poses(shown) == _poses(load_scene(room))

@@ -113,11 +113,15 @@ def prepare_run(
         scene = with_masks_of(scene, earlier)
     settings = settings.with_data_factor(scene.images, note)
     device = pick_device(settings.backend, progress)
+    given = scene.points.xyz
     if refine_poses:
         scene = _at_refined_poses(scene, folder, earlier, settings, note, progress)
     posed, stereo = scene, None
     if settings.start is None:
-        scene, stereo = seeded(scene, settings, device.type, note, progress)
+        triangulated = not np.array_equal(scene.points.xyz, given)
+        scene, stereo = seeded(
+            scene, settings, device.type, note, progress, triangulated=triangulated
+        )
     initial = _initial(scene, settings, note)
     frame = initial.frame(scene, settings)
     for stray in format_stray_note(frame.strays):
