@@ -23,6 +23,8 @@ TrainerName: TypeAlias = Literal[
     "splatseed", "gsplat", "graphdeco", "nerfstudio", "brush", "opensplat", "lichtfeld"
 ]
 RATIO = 16
+SMALL = "--long-side 480 --max-steps 1500"
+"""A run of minutes on a CPU: 146 photographs take 132 seconds on one core (README)."""
 COLMAP_ONLY = frozenset({"gsplat", "graphdeco", "LichtFeld"})
 """Trainers that read COLMAP's layout better than transforms.json."""
 PINHOLE_ONLY = frozenset({"splatseed", "graphdeco", "OpenSplat", "LichtFeld"})
@@ -115,10 +117,6 @@ def advice_commands(
     return [*commands, ("another trainer", f"splatseed info {source} --for gsplat")]
 
 
-SMALL = "--long-side 480 --max-steps 1500"
-"""A run of minutes on a CPU: 146 photographs take 132 seconds on one core (README)."""
-
-
 def _seeding(path: Path, advice: Advice, planned: Planned, *, refine: bool) -> str:
     """Return the command that adds points by the method advised."""
     how = f"--method {advice.method} --ratio 4"
@@ -134,9 +132,11 @@ def _for_trainer(
     path: Path, scene: Scene, advice: Advice, planned: Planned, *, refine: bool
 ) -> Commands:
     """Return the commands that lead to another trainer."""
-    kept = scene.source is not None and scene.source.format == "transforms"
-    layout: SceneFormat = "transforms" if kept else "colmap"
-    other = kept and planned.trainer in map(str.lower, COLMAP_ONLY)
+    source = scene.source.format if scene.source else "colmap"
+    layout: SceneFormat = "transforms" if source == "transforms" else "colmap"
+    other = source not in {"colmap", "transforms"} or (
+        layout == "transforms" and planned.trainer in map(str.lower, COLMAP_ONLY)
+    )
     commands: Commands = []
     if other or advice.method not in {AS_IT_IS, SEEDED}:
         seeds = _seeding(path, advice, planned, refine=refine)
