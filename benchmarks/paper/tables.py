@@ -25,7 +25,7 @@ from benchmarks.paper.printed import printed_costs, printed_gains, printed_psnr
 
 from splatseed.bench.plan import SFM
 from splatseed.bench.statistics import Difference, adjusted, over_scenes
-from splatseed.bench.study_tables import NOISE
+from splatseed.bench.study_tables import verdict_mark
 from splatseed.bench.tables import Cell, Number, Row, Table, to_markdown
 from splatseed.errors import SceneFormatError, SplatseedError
 from splatseed.io.staging import atomic_file
@@ -45,7 +45,8 @@ DIGITS = {**dict(zip(COSTS, (2, 0, 0, 1), strict=True)), **dict.fromkeys(PRINTED
 """Of table 3."""
 GAIN_NOTE = (
     "dB ± standard error: of a scene over repeats (none of one), of a mean over its column's "
-    "scenes. ~: within noise (Holm over all cells of scenes, and over a strategy's means in a row)."
+    "scenes. ~: within noise (Holm over all cells of scenes, and over a strategy's means in a "
+    "row); ?: too few repeats or scenes to tell."
 )
 SCORE_NOTE = (
     "PSNR in dB / SSIM / LPIPS where its weights are there, then what PSNR gains; means over "
@@ -192,8 +193,7 @@ def _marked(cells: Sequence[Number], gained: Sequence[Difference | None] = ()) -
 def _gain_cell(gain: Difference | None) -> Cell:
     if gain is None:
         return ""
-    mark = NOISE if gain.verdict == "within noise" else ""
-    return Number(gain.mean, se=gain.se, signed=True, mark=mark)
+    return Number(gain.mean, se=gain.se, signed=True, mark=verdict_mark(gain))
 
 
 def _mean_gains(results: Results, way: Way, scenes: Sequence[str], kinds: Kinds) -> list[Cell]:

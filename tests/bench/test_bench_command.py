@@ -200,6 +200,29 @@ def test_bad_words_are_refused_and_nothing_is_written(
     assert sorted(tmp_path.rglob("*")) == before
 
 
+@pytest.mark.parametrize(
+    ("words", "ratios", "budgets", "note"),
+    [
+        (("--ratios", 4, 8), (4, 8), ("0.25rho or 12x",), "--budgets none lifts it"),
+        (("--ratio", 16, "--profile", "default"), (16,), ("0.25rho or 23x",), "none lifts it"),
+        (("--ratios", 8, "--profiles", "paper"), (8,), (), ""),
+        (("--ratios", 8, "--budgets", "none"), (8,), (), ""),
+        (("--budgets", "5k"), (), ("5000",), "Methods fill the budget: --ratios 8"),
+        (("--budget", "5k", "--ratios", 8), (8,), ("5000",), "at most 5,000 Gaussians on room"),
+    ],
+)  # fmt: skip
+def test_arms_have_equal_numbers_unless_told_otherwise(
+    bench, room_path, tmp_path, words, ratios, budgets, note
+):
+    code, out, err = bench("--scenes", room_path, "--methods", "sfm", "mls", *words, "--dry-run")
+    assert (code, err) == (0, "")
+    (tmp_path / "plan.toml").write_text(out)
+    plan = read_plan(tmp_path / "plan.toml")
+    assert (plan.ratios, plan.budgets) == (ratios, budgets)
+    assert note in out
+    assert ("Gaussians on room" in out) == bool(budgets)
+
+
 def test_a_plan_that_makes_no_difference_is_told(plan_path, bench, tmp_path):
     for budget, full in (("50", True), ("100k", False)):
         plan = plan_path(methods=("sfm", "mls"), ratios=(), budgets=(budget,))

@@ -11,7 +11,16 @@ from pathlib import Path
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from splatseed.bench.plan import SFM, Arm, Plan, RunResult, RunSpec, plan_runs
+from splatseed.bench.plan import (
+    SFM,
+    Arm,
+    Plan,
+    RunResult,
+    RunSpec,
+    describe_budget,
+    fair_budget,
+    plan_runs,
+)
 from splatseed.bench.plan_file import plan_text, read_plan
 from splatseed.bench.scenes import DEMO, PlannedScene, SceneFacts
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
@@ -226,6 +235,21 @@ def test_a_budget_is_the_same_number_for_every_arm_of_a_scene():
     assert {run.training.data_factor for run in runs} == {2}  # 533 rows become 266
     seeds = {(r.arm.strategy, r.max_seeds) for r in runs if r.scene.name == "fern"}
     assert seeds == {("default", 21_000), ("default", 14_000), ("grow", 30_000), ("grow", 20_000)}
+
+
+def test_a_fair_budget_thins_no_seeds_that_a_ratio_asks_for():
+    budget = fair_budget((4, 8))
+    assert (budget, describe_budget(budget)) == (
+        "0.25rho or 12x", "0.25 per pixel of a photograph or 12 per point of the scene (the larger)"
+    )  # fmt: skip
+    plan = Plan(ratios=(4, 8), budgets=(budget,), repeats=1, long_side=800)
+    runs = plan_runs(plan, [FERN, BONSAI], "cpu", "1")
+    caps = {run.scene.name: run.training.cap_max for run in runs}
+    assert caps == {"fern": 120_000, "bonsai": 1_320_000}  # by pixels, and by points
+    assert all(run.max_seeds >= run.arm.ratio * run.scene.num_points for run in runs)
+    assert Plan(budgets=(" 12.0X or 50k",)).budgets == ("12x or 50000",)
+    with pytest.raises(ParameterError, match="found 'xx'"):
+        Plan(budgets=("0.25rho or xx",))
 
 
 ARM = Arm("mls", "default", 8, "none")

@@ -72,8 +72,8 @@ ONE = {"scenes": ("fox",), "gains": {(SFM, 1): 0.0, ("mls", 8): 0.5}, "repeats":
 @pytest.mark.parametrize(
     ("planted", "said"),
     [
-        (runs(**ONE), "over repeats and 95% interval for this scene trained"),
-        (runs(**{**ONE, "repeats": 1}), "which a single run cannot confirm"),
+        (runs(**ONE), "mean over repeats, for this scene trained again"),
+        (runs(**{**ONE, "repeats": 1}), "than sfm + none (1 repeat: too few to tell)"),
         (runs(**{**ONE, "gains": {("mls", 8): 0.1}}), "There is no comparison yet"),
         ([], "0 runs"),
         ([*runs(**ONE), *runs(**ONE, max_steps=2000)], "Set 2: 2,000 steps"),

@@ -11,6 +11,7 @@ from scipy import stats
 from splatseed.bench.statistics import (
     Difference,
     adjusted,
+    difference,
     holm,
     over_scenes,
     paired_differences,
@@ -62,8 +63,9 @@ def test_missing_runs_are_left_out(rng):
 
 def test_one_repeat_claims_nothing(rng):
     differences = adjusted(paired_differences(plant(rng, scenes=1, arms=3, repeats=1)[0]))
-    assert all(each.verdict == "unknown" and math.isnan(each.se) for each in differences)
-    assert all(math.isnan(bound) for bound in differences[0].interval())
+    assert all(each.verdict == "too few to tell" for each in differences)
+    assert all(math.isnan(bound) for bound in (differences[0].se, *differences[0].interval()))
+    assert differences[0].caveat == " (1 repeat: too few to tell)"
 
 
 def test_runs_without_any_noise():
@@ -92,11 +94,30 @@ def test_holm_step_by_step(rng):
 
 
 def test_verdicts():
-    for mean, p, expected in (
-        (1.0, 0.01, "better"), (-1.0, 0.01, "worse"), (1.0, 0.2, "within noise")
+    for mean, p, df, expected in (
+        (1.0, 0.01, 3, "better"), (-1.0, 0.01, 1, "worse"), (1.0, 0.2, 3, "within noise"),
+        (1.0, 0.2, 2, "too few to tell"),
     ):  # fmt: skip
-        assert adjusted([Difference(mean, 0.1, 3, 4, p)])[0].verdict == expected
+        assert adjusted([Difference(mean, 0.1, df, 4, p)])[0].verdict == expected
     assert adjusted([None]) == (None,)
+
+
+def test_an_interval_excludes_0_exactly_if_the_difference_is_a_claim(rng):
+    """-2.264 ± 0.135 from 2 of 3 pairs is p = 0.038, of a family of two 0.076: no claim."""
+    two = adjusted([difference(-2.264, 0.135, 1, 2), difference(0.1, 0.135, 1, 2)])
+    assert [each.verdict for each in two] == ["too few to tell"] * 2
+    assert all(math.isnan(bound) for bound in two[0].interval())
+    seen = set()
+    for _ in range(50):
+        df = int(rng.integers(1, 9))
+        family = [difference(m, 1.0, df, df + 1) for m in 4 * rng.standard_normal(5)]
+        for each in adjusted(family):
+            low, high = each.interval()
+            claim = each.verdict in {"better", "worse"}
+            assert claim == (low > 0 or high < 0)
+            assert claim == (each.caveat == "")
+            seen.add(each.verdict)
+    assert len(seen) == 4
 
 
 def claims(values):

@@ -21,7 +21,7 @@ from splatseed.bench.runs import Run
 from splatseed.bench.study import studies
 from splatseed.bench.tables import Number, Table, write_table
 
-from .planted import GAINS, result, runs
+from .planted import GAINS, SCENES, result, runs
 
 MLS8 = "mls 8x"
 FOX = ("fox",)
@@ -182,7 +182,7 @@ def test_time_counts_seeding_and_steps_do_not():
     # The target is 9.5 of 10 dB up.
     assert math.exp(slower.gains["steps"].mean) == pytest.approx(0.95)
     assert math.exp(slower.gains["seconds"].mean) == pytest.approx((0.95 * 20 + 4) / 21)
-    assert (slower.reached, base.gain.verdict) == (slower.runs, "unknown")  # none to itself
+    assert slower.reached == slower.runs
     never = by_label["random 8x + default"]
     assert (never.gains["steps"], never.gains["seconds"], never.reached) == (None, None, 0)
 
@@ -192,13 +192,61 @@ def test_time_counts_seeding_and_steps_do_not():
     [
         (-0.5, {"noise": 0.0}, "no arm beats sfm + none: mls 8x + none is closest, 0.50 dB"),
         (0.5, {"noise": 0.0}, "mls 8x + none is best: 0.50 dB"),
-        # The test with the noise of all variants is stronger.
         (0.5, {"noise": 0.3, "scenes": FOX, "repeats": 2},
-         "the 2 repeats of these two arms alone do not confirm"),
+         "than sfm + none (2 repeats: too few to tell)"),
+        (0.5, {"noise": 0.45, "scenes": FOX, "repeats": 4},
+         "than sfm + none (within the noise between repeats)"),
     ],
 )  # fmt: skip
 def test_only_a_gain_is_called_best_and_a_few_repeats_are_not_called_chance(gain, changes, text):
     assert text in conclude(one(runs(gains={(SFM, 1): 0.0, ("mls", 8): gain}, **changes)))[0]
+
+
+@pytest.mark.parametrize("scenes", [FOX, SCENES])
+def test_a_comparison_has_one_verdict_in_all_tables_and_sentences(scenes):
+    """Of one scene, all arms estimate the noise; two repeats of a pair alone would not find it."""
+    study = one(runs(scenes=scenes, strategies=("default", "none"), repeats=2, noise=0.05, seed=4))
+    gained = gains(study, "default")
+    expected = gained.on_these if scenes == FOX else gained.on_like
+    own = {each.arm.seeds: each.gain for each in compared_arms(study) if each.arm.seeds != SFM
+           and each.arm.strategy == "default"}  # fmt: skip
+    for label, gain in expected.items():
+        for name in ("mean", "se", "df", "n", "p", "adjusted", "unit"):
+            assert getattr(own[label], name) == pytest.approx(getattr(gain, name)), name
+    assert own[MLS8].verdict == "better"
+    marks = column(study_tables.gain_table(study, "default"), "mls 8x")
+    assert marks["mean, these scenes"].mark == ""
+
+
+def test_too_few_repeats_are_no_noise():
+    planted = {"scenes": FOX, "gains": {(SFM, 1): 0.0, ("mls", 8): 0.02}, "noise": 0.1}
+    for repeats, mark in ((1, "?"), (2, "?"), (9, "~")):
+        study = one(runs(repeats=repeats, seed=1, **planted))
+        table = study_tables.gain_table(study, "none")
+        assert {row[1].mark for row in table.rows} == {mark}
+        assert study_tables.psnr_table(study, "none").rows[0][2].mark == mark
+        assert [row[3].mark for row in study_tables.arm_table(study).rows if row[0] != SFM] == [
+            mark
+        ]
+
+
+def test_a_larger_number_is_stated_and_equal_numbers_are_compared():
+    planted = {(SFM, 1): 0.0, ("linear", 8): 0.2, ("mls", 8): 0.5}
+    ends = {SFM: 5000, "linear": 5020, "mls": 9000}
+    for more in (20, 3000):
+        ends["linear"] = 5000 + more
+        finished = [
+            Run(run.spec, result(run.result.psnr, num_gaussians=ends[run.spec.arm.method]))
+            for run in runs(scenes=FOX, gains=planted, noise=0.0)
+        ]
+        first, number, equal, *_ = conclude(one(finished))
+        assert "mls 8x + none is best: 0.50 dB" in first
+        assert "ends with 9,000 Gaussians, sfm + none with 5,000" in number
+        if more == 20:
+            assert "linear 8x + none is best: 0.20 dB" in equal
+        else:
+            assert "splatseed bench --budgets 5000 does" in equal
+    assert not any("ends with" in said for said in conclude(budgeted(noise=0.0)))
 
 
 def test_the_answer_names_the_worst_scene_and_the_seconds():
@@ -249,7 +297,7 @@ def test_no_change_is_claimed_at_most_at_the_stated_rate():
 def test_single_runs_and_changed_files_claim_nothing():
     fox, other = runs(scenes=FOX, repeats=1), runs(scenes=FOX, repeats=1, seed=1, digest="z")
     comparison = compare(fox, other)
-    assert {each.verdict for each in comparison.changes.values()} == {"unknown"}
+    assert {each.verdict for each in comparison.changes.values()} == {"too few to tell"}
     assert any("fox differs" in note for note in comparison.notes)
     assert compare(fox, []) is None
     same = [*runs(max_steps=2000), *fox]  # of two sets the one whose settings are the same

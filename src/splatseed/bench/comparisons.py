@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Hashable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import product
 from typing import NamedTuple, TypeVar
@@ -92,9 +92,10 @@ def clear_best(study: Study, strategy: StrategyName, scene: str) -> bool:
     if len(complete) < max(2, len(scores.dropna(how="all"))):
         return False
     second, first = complete.mean(axis=1).sort_values().iloc[-2:]
-    lead = difference(first - second, noise * math.sqrt(2 / complete.shape[1]), df, 1)
+    repeats = complete.shape[1]
+    lead = difference(first - second, noise * math.sqrt(2 / repeats), df, repeats)
     # The first step of Holm: the second arm was chosen among all others.
-    return lead.p * (len(complete) - 1) <= statistics.LEVEL
+    return replace(lead, adjusted=lead.p * (len(complete) - 1)).verdict == "better"
 
 
 def reach(result: RunResult, target: float) -> tuple[float, float]:
@@ -177,7 +178,8 @@ def baseline_of(study: Study) -> ArmKey | None:
 def compared_arms(study: Study) -> tuple[ComparedArm, ...]:
     """Compare every arm with the baseline; returns them in order of mean gain.
 
-    The p values of each score are adjusted over the arms.
+    The p values of each score are adjusted over the arms of a strategy, as those of ``gains``: the
+    same comparison has the same verdict in both.
     """
     base = baseline_of(study)
     if base is None:
@@ -193,9 +195,11 @@ def compared_arms(study: Study) -> tuple[ComparedArm, ...]:
     by_arm = {ArmKey(strategy, label): part for (strategy, label), part in groups}
     gained = {}
     for name in (*SCORES, *_TIMED):
-        known = {arm: _over_scenes(part, f"{name}_gain") for arm, part in by_arm.items()}
-        unadjusted = known.pop(base)  # with itself: not in the family
-        gained[name] = {base: unadjusted, **_adjusted(known)}
+        known = {arm: _mean_gain(study, pairs, arm, name) for arm in by_arm}
+        gained[name] = {base: known.pop(base)}  # with itself: not in a family
+        for strategy in study.strategies:
+            family = {arm: gain for arm, gain in known.items() if arm.strategy == strategy}
+            gained[name] |= _adjusted(family)
     columns = [*SCORES, "gaussians", "seeding", "training"]
     compared = []
     for arm, part in by_arm.items():
@@ -226,12 +230,28 @@ def _timed(base: RunResult, own: RunResult, spec: RunSpec) -> tuple[float, float
     return lead, math.log(steps / max_steps), math.log(seconds / base.seconds)
 
 
-def _over_scenes(frame: pd.DataFrame, column: str) -> Difference | None:
-    """Average over scenes, or over the repeats of a single scene; None if a value is unknown."""
-    if frame[column].isna().any():
+def _mean_gain(study: Study, pairs: pd.DataFrame, arm: ArmKey, name: str) -> Difference | None:
+    """Average a gain over scenes, or over the repeats of a single scene; None if one is unknown.
+
+    The noise of a single scene is pooled over all arms of the two strategies, as in ``gains``. That
+    of relative times is the arm's own, as the baseline has none.
+    """
+    base, column = baseline_of(study), f"{name}_gain"
+    part = pairs[(pairs["strategy"] == arm.strategy) & (pairs["seeds"] == arm.seeds)]
+    if part[column].isna().any():
         return None
-    means = frame.groupby("scene")[column].mean()
-    return statistics.over_scenes(frame[column] if len(means) == 1 else means)
+    means = part.groupby("scene")[column].mean()
+    if len(means) > 1:
+        return statistics.over_scenes(means)
+    if name in {"steps", "seconds"} or arm == base:
+        return statistics.over_scenes(part[column], "repeat")
+    runs, value = (study.runs, name) if name in SCORES else (pairs, column)
+    strategies = {key.strategy for key in (arm, base) if key}
+    near = runs["strategy"].isin(strategies) & (runs["scene"] == means.index[0])
+    scores = runs[near].pivot_table(index=["strategy", "seeds"], columns="repeat", values=value)
+    labels = [base, *(each for each in scores.index if each != base)]
+    differences = statistics.paired_differences(scores.loc[labels].to_numpy())
+    return differences[labels.index(arm) - 1]
 
 
 Place = tuple[StrategyName, str, str]

@@ -34,6 +34,10 @@ _MARKERS = {2.0: "v", 4.0: "s", 8.0: "o", 16.0: "^", 32.0: "D"}  # others: a cro
 _DASHES = {"default": "-", "mcmc": "--", "grow": "-.", "none": ":"}
 _AS_3DGS = (0, (1, 3))
 _HIGHEST = " Of each method, the highest ratio."
+_INTERVAL = (
+    "95% interval, adjusted for the number of comparisons as the tables are: it excludes 0 exactly "
+    "if the gain is beyond noise. Without an interval there are too few repeats or scenes to tell"
+)
 _MAX_CURVES = 8  # in one panel
 _LATE = 0.2  # the y axis fits the part of the curves after this share of the run
 
@@ -173,7 +177,7 @@ def _curve(study: Study, scene: str, arm: ArmKey, by: str) -> tuple[np.ndarray, 
 
 
 def scene_figure(study: Study, strategy: StrategyName) -> Plot | None:
-    """The gain on each scene with its 95% interval; None where nothing can be compared."""
+    """The gain on each scene with its interval; None where nothing can be compared."""
     gained = gains(study, strategy)
     if not gained.on_scene:
         return None
@@ -192,8 +196,8 @@ def scene_figure(study: Study, strategy: StrategyName) -> Plot | None:
     _finish_rows(axes, names, SFM)
     some = _HIGHEST * (len(seeds) < len(gained.seeds))
     caption = (
-        f"Gain over sfm on each scene, strategy {strategy}: mean over repeats and 95% interval (of "
-        f"each comparison alone, not adjusted for their number).{some}"
+        f"Gain over sfm on each scene, strategy {strategy}: mean over repeats and {_INTERVAL}."
+        f"{some}"
     )
     return _plot(f"gain_by_scene_{strategy}", caption, figure, styles)
 
@@ -212,7 +216,7 @@ def _finish_rows(axes: Axes, names: Sequence[str], base: str) -> None:
 
 
 def arm_figure(study: Study) -> Plot | None:
-    """Each arm's mean gain over the baseline with its 95% interval; None where there is one arm."""
+    """Each arm's mean gain over the baseline with its interval; None where there is one arm."""
     base, compared = baseline_of(study), compared_arms(study)
     others = [each for each in compared if each.arm != base]
     if base is None or not others:
@@ -223,11 +227,6 @@ def arm_figure(study: Study) -> Plot | None:
         axes.errorbar(each.gain.mean, row, xerr=_interval(each.gain), marker="o", **style)
     _finish_rows(axes, [each.arm.label for each in others], base.label)
     alone = all(len(each.scenes) == 1 for each in others)
-    of = "repeats and 95% interval for this scene trained again" if alone else (
-        "scenes and 95% interval for scenes like these"
-    )  # fmt: skip
-    caption = (
-        f"Gain over {base.label} of every arm: mean over {of} (of each comparison alone, not "
-        "adjusted for their number)."
-    )
+    of = "repeats, for this scene trained again" if alone else "scenes, for scenes like these"
+    caption = f"Gain over {base.label} of every arm: mean over {of}, and {_INTERVAL}."
     return _plot("gain_arms", caption, figure, {})

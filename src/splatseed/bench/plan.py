@@ -22,7 +22,7 @@ from splatseed.scores import CurvePoint, EvalResult
 from splatseed.seeding.budget import RHO, parse_budget
 from splatseed.text import did_you_mean
 from splatseed.training.duration import GROWTH, step_seconds
-from splatseed.training.settings import Backend, StrategyName, TrainSettings
+from splatseed.training.settings import SEED_SHARE, Backend, StrategyName, TrainSettings
 
 SFM = "sfm"
 """The baseline: the unchanged points of Structure-from-Motion, at ratio 1."""
@@ -43,6 +43,11 @@ _SCENE_KEY = ("name", "digest", "depth_digest", "cloud_digest")
 """Fields of ``SceneFacts`` that enter a run's key; paths and sizes do not."""
 _LISTS = ("methods", "strategies", "profiles", "ratios", "budgets")
 _DEFAULT = TrainSettings()
+PER_POINT, _OR = "x", " or "
+"""The unit of a budget per original point; what stands between two budgets, of which the larger
+counts."""
+_FAIR_RHO = 0.25
+"""Gaussians per pixel that ``fair_budget`` allows at least."""
 _MAX_IMAGE_PIXELS = 1e9
 """A budget per pixel is invalid if it allows no Gaussian in an image of this size."""
 _MIN_SIDE = 11
@@ -245,9 +250,10 @@ class Plan:
     ratios: tuple[float, ...] = (8.0,)
     """Total points per original; empty if budgets determine the number."""
     budgets: tuple[str, ...] = ()
-    """Maximum final Gaussians, equal for all arms: a number, or "0.25rho" for 0.25 per pixel of a
-    photograph at training size. Seeds are thinned to the budget, or for strategies that add
-    Gaussians to the share of it at which they start."""
+    """Maximum final Gaussians, equal for all arms: a number, "0.25rho" for 0.25 per pixel of a
+    photograph at training size, "12x" for 12 per original point, or the larger of both, "0.25rho or
+    12x". Seeds are thinned to the budget, or for strategies that add Gaussians to the share of it
+    at which they start."""
     strategies: tuple[StrategyName, ...] = ("default",)
     """Densification strategies."""
     uncapped: tuple[StrategyName, ...] = ()
@@ -380,15 +386,49 @@ def _training(plan: Plan, scene: SceneFacts, arm: Arm, backend: Backend) -> Trai
     settings = replace(plan.training, backend=backend, data_factor=factor)
     if not arm.budget:
         return settings
-    return replace(settings, cap_max=max(2, parse_budget(arm.budget, scene.pixels_at(factor))))
+    pixels, limits = scene.pixels_at(factor), list[int]()
+    for part in arm.budget.split(_OR):
+        per_point = part.endswith(PER_POINT)
+        text = part.removesuffix(PER_POINT) + RHO if per_point else part
+        limits.append(parse_budget(text, scene.num_points if per_point else pixels))
+    return replace(settings, cap_max=max(2, *limits))
 
 
 def _budget(given: object) -> str:
     """Normalise a budget, so that 20000, "20k" and "20000.0" are equal."""
-    text = str(given).strip().lower()
-    number = parse_budget(text, pixels=_MAX_IMAGE_PIXELS)
-    if text.endswith(RHO):
-        return f"{float(text.removesuffix(RHO)):g}{RHO}"
-    if number < 2:
-        raise ParameterError("budgets of at least 2 Gaussians", found=f"{given}", fix=HELP)
-    return f"{number}"
+    parts = list[str]()
+    for part in str(given).strip().lower().split(_OR):
+        text = part.strip()
+        unit = next((unit for unit in (RHO, PER_POINT) if text.endswith(unit)), "")
+        try:
+            float(text.removesuffix(unit))
+        except ValueError:  # the error shows the text as given
+            unit = ""
+        text = text.removesuffix(unit)
+        number = parse_budget(text + RHO * bool(unit), pixels=_MAX_IMAGE_PIXELS)
+        if number < 2:
+            raise ParameterError("budgets of at least 2 Gaussians", found=f"{given}", fix=HELP)
+        parts.append(f"{float(text):g}{unit}" if unit else f"{number}")
+    return _OR.join(parts)
+
+
+def fair_budget(ratios: Sequence[float]) -> str:
+    """The budget that is equal for all arms, and thins none of the seeds that ratios ask for.
+
+    It also allows ``_FAIR_RHO``, as few points would else make a coarse model.
+    """
+    seeds = max(ratios, default=1.0) / min(SEED_SHARE.values())
+    return f"{_FAIR_RHO:g}{RHO}{_OR}{math.ceil(seeds)}{PER_POINT}"
+
+
+def describe_budget(budget: str) -> str:
+    """Describe a normalised budget: "0.25 per pixel of a photograph"."""
+    parts = list[str]()
+    for part in budget.split(_OR):
+        if part.endswith(RHO):
+            parts.append(f"{part.removesuffix(RHO)} per pixel of a photograph")
+        elif part.endswith(PER_POINT):
+            parts.append(f"{part.removesuffix(PER_POINT)} per point of the scene")
+        else:
+            parts.append(f"{int(part):,}")
+    return " or ".join(parts) + " (the larger)" * (len(parts) > 1)

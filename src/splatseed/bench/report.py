@@ -44,11 +44,6 @@ _EQUAL = 0.01
 """Maximum relative difference of numbers of Gaussians that count as equal."""
 _MAX_LISTED = 200
 """Maximum runs in a table of missing or failed runs."""
-_CAVEATS = {
-    "within noise": ", which may be chance",
-    "unknown": ", which a single run cannot confirm",
-}
-"""Added to a difference by its verdict."""
 Part: TypeAlias = Mapping[str, Any] | Table | figures.Plot | str | None
 
 
@@ -172,19 +167,21 @@ def conclude(study: Study) -> tuple[str, ...]:
     others = rivals(study)
     if base is None or not others:
         return (f"There is no comparison yet: it needs runs of {SFM} and of another arm.",)
-    best = others[0]
+    best, compared = others[0], {arm.arm: arm for arm in compared_arms(study)}
     at = " under one budget of Gaussians" if study.settings["budget"] else ""
     at = at if unequal_numbers(study) else " with equal numbers of Gaussians"
-    first = f"{best.arm.label} is best: "
+    place = "is best" if best.gain.verdict == "better" else "has the highest mean"
+    first = f"{best.arm.label} {place}: "
     if best.gain.mean < _MIN_GAIN:
         first = f"no arm beats {base.label}: {best.arm.label} is closest, "
     conclusions = [f"On {counted(len(best.scenes), 'scene')}{at}, {first}{_against(best, base)}."]
-    means = {arm.arm: arm.means for arm in compared_arms(study) if arm.scenes == best.scenes}
-    if base in means:
-        own, other = (means[arm]["seeding"] + means[arm]["training"] for arm in (best.arm, base))
+    if compared[base].scenes == best.scenes:
+        own, other = (each.means["seeding"] + each.means["training"] for each in
+                      (best, compared[base]))  # fmt: skip
         conclusions[0] += (
             f" A run takes {own:.0f} s, seeding included, against {other:.0f} s of {base.label}."
         )
+        conclusions += _at_equal_numbers(others, compared[base])
     from_sfm = best.arm.seeds == SFM
     rest = [arm for arm in others if (arm.arm.seeds == SFM) != from_sfm]
     if rest:
@@ -196,14 +193,14 @@ def conclude(study: Study) -> tuple[str, ...]:
         position = position if abs(lead.mean) >= _MIN_GAIN else "level with it"
         conclusions.append(
             f"When {base.label} ends, seeding included, {best.arm.label} is {position}"
-            f"{_CAVEATS.get(lead.verdict, '')}."
+            f"{lead.caveat}."
         )
     if time_ratio is not None:
         share = math.exp(time_ratio.mean)
         time = f"{share:.0%} of" if share < 1 else f"{share:.2f} times"
         conclusions.append(
             f"It reaches the final PSNR of {base.label} in {time} the time of {base.label}, "
-            f"seeding included{_CAVEATS.get(time_ratio.verdict, '')}."
+            f"seeding included{time_ratio.caveat}."
         )
     elif best.reached < best.runs:
         conclusions.append(
@@ -211,13 +208,38 @@ def conclude(study: Study) -> tuple[str, ...]:
         )
     for strategy in study.strategies:
         verdicts = [gain.verdict for gain in gains(study, strategy).on_these.values()]
-        if verdicts and set(verdicts) != {"unknown"}:
+        few = verdicts.count("too few to tell")
+        if few < len(verdicts):
             conclusions.append(
-                f"Beyond the noise of repeated training, {verdicts.count('better')} of "
-                f"{counted(len(verdicts), 'variant')} under {strategy} are better than {SFM}, and "
-                f"{verdicts.count('worse')} worse."
+                f"Beyond the noise between repeats{' on these scenes' * (len(study.scenes) > 1)}, "
+                f"{verdicts.count('better')} of {counted(len(verdicts), 'variant')} under "
+                f"{strategy} are better than {SFM}, and {verdicts.count('worse')} worse"
+                f"{f'; there are too few repeats to tell of {few}' * bool(few)}."
             )
     return tuple(conclusions)
+
+
+def _at_equal_numbers(others: Sequence[ComparedArm], base: ComparedArm) -> Iterator[str]:
+    """State the numbers of Gaussians where the best arm has more, and the best without more."""
+    label, limit = base.arm.label, base.means["gaussians"] * (1 + _EQUAL)
+    best, number = others[0], others[0].means["gaussians"]
+    if number <= limit:
+        return
+    yield (
+        f"{best.arm.label} ends with {number:,.0f} Gaussians, {label} with "
+        f"{base.means['gaussians']:,.0f}: the larger number alone can raise PSNR."
+    )
+    equal = next((arm for arm in others if arm.means["gaussians"] <= limit), None)
+    if equal is None:
+        yield (
+            f"No other arm ends with as few Gaussians as {label}, so these runs do not tell what "
+            f"equal numbers give; splatseed bench --budgets {base.means['gaussians']:.0f} does."
+        )
+    else:
+        yield (
+            f"Of arms with no more Gaussians than {label}, {equal.arm.label} is best: "
+            f"{_against(equal, base.arm)}."
+        )
 
 
 def _against(arm: ComparedArm, base: ArmKey) -> str:
@@ -227,13 +249,8 @@ def _against(arm: ComparedArm, base: ArmKey) -> str:
         worst = f"; on {scene}, its worst scene, {_difference(minimum)}"
     if abs(gain.mean) < _MIN_GAIN:
         return f"level with {base.label}{worst}"
-    over = "scenes" if len(arm.scenes) > 1 else "repeats"
-    spread = "" if math.isnan(gain.se) else f" (± {gain.se:.2f} over {over})"
-    caveat = _CAVEATS.get(gain.verdict, "")
-    if gain.verdict == "within noise" and len(arm.scenes) == 1:
-        # The last sentences use the noise of all variants together, a stronger test.
-        caveat = f", which the {arm.runs} repeats of these two arms alone do not confirm"
-    return f"{_difference(gain.mean, spread)} than {base.label}{caveat}{worst}"
+    spread = "" if math.isnan(gain.se) else f" (± {gain.se:.2f} over {gain.unit}s)"
+    return f"{_difference(gain.mean, spread)} than {base.label}{gain.caveat}{worst}"
 
 
 def _difference(gain: float, spread: str = "") -> str:

@@ -7,6 +7,8 @@ like these (``over_scenes``).
 
 p values are two-sided, and adjusted over a family of comparisons after Holm (1979), which bounds
 the chance of any false claim in the family. An unknown p is NaN, and makes no claim.
+``Difference.verdict`` is the one rule of significance: marks in tables, intervals in figures and
+sentences of the report follow from it.
 """
 
 from __future__ import annotations
@@ -20,12 +22,19 @@ import numpy as np
 from jaxtyping import Float, Float64
 from scipy.stats import t
 
+from splatseed.text import counted
+
 LEVEL = 0.05
 """A difference is a claim when its adjusted p is at most this."""
 EXACT = 1e-9
 """Standard errors below this are rounding errors of equal runs."""
+MIN_DF = 3
+"""Degrees of freedom from which a difference that is no claim is called noise. Of 2, the standard
+deviation is known to within a factor of 12 (95% interval: 0.5 to 6.3 times the estimate), of 3 to
+within 7: fewer can support a claim, but not tell a small difference from none."""
 
-Verdict = Literal["better", "worse", "within noise", "unknown"]
+Verdict = Literal["better", "worse", "within noise", "too few to tell"]
+Unit = Literal["repeat", "scene"]
 
 
 @dataclass(frozen=True)
@@ -36,9 +45,10 @@ class Difference:
         mean: In the unit of the scores.
         se: Standard error of the mean; NaN for one sample.
         df: Degrees of freedom of the standard error.
-        n: Samples that the mean is over: pairs of runs, or scenes.
+        n: Repeats or scenes that the mean is over.
         p: Two-sided p value of a mean of 0; NaN if unknown.
         adjusted: The p value after Holm's adjustment over its family.
+        unit: What ``n`` counts, and what the standard error is between.
     """
 
     mean: float
@@ -47,42 +57,60 @@ class Difference:
     n: int
     p: float
     adjusted: float = math.nan
+    unit: Unit = "repeat"
 
     @property
     def verdict(self) -> Verdict:
-        """The claim at ``LEVEL`` of the adjusted p."""
-        if math.isnan(self.adjusted):
-            return "unknown"
-        if self.adjusted > LEVEL:
-            return "within noise"
-        return "better" if self.mean > 0 else "worse"
+        """The rule of significance: a claim if the adjusted p is at most ``LEVEL``.
 
-    def interval(self, level: float = 1 - LEVEL) -> tuple[float, float]:
-        """The confidence interval of the mean, not adjusted; NaN if unknown.
-
-        Args:
-            level: The share of such intervals that hold the true mean.
+        Otherwise the difference is within noise, or, with fewer than ``MIN_DF`` degrees of freedom,
+        based on too few repeats or scenes to tell.
         """
+        if self.adjusted <= LEVEL:  # not if NaN
+            return "better" if self.mean > 0 else "worse"
+        known = self.df >= MIN_DF and not math.isnan(self.adjusted)
+        return "within noise" if known else "too few to tell"
+
+    @property
+    def caveat(self) -> str:
+        """The verdict in parentheses, to follow the mean in a sentence; empty for a claim."""
+        return {
+            "within noise": f" (within the noise between {self.unit}s)",
+            "too few to tell": f" ({counted(self.n, self.unit)}: too few to tell)",
+        }.get(self.verdict, "")
+
+    def interval(self) -> tuple[float, float]:
+        """The interval of the mean that excludes 0 exactly if the difference is a claim.
+
+        This is the confidence interval at 1 - ``LEVEL``, widened by the ratio of the adjusted p to
+        p; NaN if there are too few samples to tell.
+        """
+        level = LEVEL
+        if not math.isnan(self.adjusted):
+            level *= self.p / self.adjusted if self.adjusted > 0 else 1.0
+            if self.verdict == "too few to tell":
+                return math.nan, math.nan
         if math.isnan(self.se):
             return math.nan, math.nan
-        half = float(t.ppf((1 + level) / 2, self.df)) * self.se if self.se > EXACT else 0.0
+        half = float(t.isf(level / 2, self.df)) * self.se if self.se > EXACT else 0.0
         return self.mean - half, self.mean + half
 
 
-def difference(mean: float, se: float, df: float, n: int) -> Difference:
+def difference(mean: float, se: float, df: float, n: int, unit: Unit = "repeat") -> Difference:
     """Make a difference with the p value of its t statistic.
 
     Args:
         mean: The mean.
         se: Its standard error; NaN if unknown.
         df: Degrees of freedom of the standard error.
-        n: Samples behind the mean.
+        n: Repeats or scenes behind the mean.
+        unit: What ``n`` counts.
     """
     if math.isnan(se) or df <= 0:
-        return Difference(mean, math.nan, 0.0, n, math.nan)
+        return Difference(mean, math.nan, 0.0, n, math.nan, unit=unit)
     if se <= EXACT:  # no noise
-        return Difference(mean, 0.0, df, n, 1.0 if abs(mean) <= EXACT else 0.0)
-    return Difference(mean, se, df, n, float(2 * t.sf(abs(mean) / se, df)))
+        return Difference(mean, 0.0, df, n, 1.0 if abs(mean) <= EXACT else 0.0, unit=unit)
+    return Difference(mean, se, df, n, float(2 * t.sf(abs(mean) / se, df)), unit=unit)
 
 
 def paired_differences(values: Float[np.ndarray, "A R"]) -> tuple[Difference | None, ...]:
@@ -146,7 +174,7 @@ def these_scenes(scenes: Sequence[Difference]) -> Difference:
     mean = float(np.mean([scene.mean for scene in scenes]))
     variance = np.array([scene.se**2 for scene in scenes])
     total = variance.sum()
-    n = sum(scene.n for scene in scenes)
+    n = max(scene.n for scene in scenes)
     if math.isnan(total):
         return difference(mean, math.nan, 0, n)
     freedom = np.array([scene.df for scene in scenes])
@@ -155,18 +183,22 @@ def these_scenes(scenes: Sequence[Difference]) -> Difference:
     return difference(mean, math.sqrt(total) / len(scenes), df, n)
 
 
-def over_scenes(means: Sequence[float] | Float64[np.ndarray, " S"]) -> Difference:
+def over_scenes(
+    means: Sequence[float] | Float64[np.ndarray, " S"], unit: Unit = "scene"
+) -> Difference:
     """Average differences over scenes, with the error for scenes like these: a one-sample t-test.
 
     The samples are scenes, not runs, as the repeats of a scene are not independent.
 
     Args:
-        means: The mean difference of each scene over its repeats, [S], at least one.
+        means: The mean difference of each scene over its repeats, [S], at least one; or the
+            differences of each repeat of a single scene.
+        unit: Which of both.
     """
     values = np.asarray(means, np.float64)
     n = len(values)
     se = float(values.std(ddof=1)) / math.sqrt(n) if n > 1 else math.nan
-    return difference(float(values.mean()), se, n - 1, n)
+    return difference(float(values.mean()), se, n - 1, n, unit)
 
 
 def holm(p: Sequence[float]) -> tuple[float, ...]:

@@ -16,7 +16,7 @@ from typing import get_args
 
 import pandas as pd
 
-from splatseed.bench.plan import SFM, SHARED, Arm, RunResult, RunSpec
+from splatseed.bench.plan import SFM, SHARED, Arm, RunResult, RunSpec, describe_budget
 from splatseed.bench.runs import Run
 from splatseed.methods import METHODS
 from splatseed.training.settings import StrategyName, TrainSettings
@@ -99,9 +99,7 @@ class Study:
         sized: dict[str, list[str]] = defaultdict(list)
         for name, factor in factors.items():
             sized[f"1/{factor} of their" if factor != 1 else "full"].append(name)
-        budget, is_share = str(settings["budget"]), str(settings["budget"]).endswith("rho")
-        share = f"{budget.removesuffix('rho')} per pixel of a photograph"
-        limit = share if is_share else f"{int(budget or 0):,}"
+        budget = str(settings["budget"])
         counts = self.runs.groupby(["strategy", "scene", "seeds"]).size()
         low, high = counts.min(), counts.max()
         repeats = f"{high}" if low == high else f"{low} to {high}"
@@ -110,7 +108,7 @@ class Study:
             *(f"{', '.join(names)} at {size} size" for size, names in sized.items()),
             f"test_every {settings['test_every']}",
             f"Gaussians: at most {settings['cap_max']:,}" if settings["cap_max"] else "",
-            f"Gaussians: at most {limit}" if budget else "",
+            f"Gaussians: at most {describe_budget(budget)}" if budget else "",
             f"spherical harmonics of degree {settings['sh_degree']}"
             if settings["sh_degree"] != 3
             else "",

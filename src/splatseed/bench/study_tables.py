@@ -6,7 +6,7 @@ Means are over the runs of a scene first, then over scenes. Only a significant g
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from statistics import fmean
 
 from scipy.stats import sem
@@ -14,12 +14,13 @@ from scipy.stats import sem
 from splatseed.bench import comparisons
 from splatseed.bench.comparisons import ArmKey, compared_arms, gains
 from splatseed.bench.plan import SFM
-from splatseed.bench.statistics import Difference
+from splatseed.bench.statistics import Difference, Verdict
 from splatseed.bench.study import Study
 from splatseed.bench.tables import Cell, Number, Row, Table, make_table
 from splatseed.training.settings import StrategyName
 
-NOISE, CLEAR, ONE_RUN = "~", "†", "(1 run)"
+CLEAR = "†"
+_MARKS: Mapping[Verdict, str] = {"within noise": "~", "too few to tell": "?"}
 _COSTS = {
     "num_seeds": ("seeds", 0), "seeding": ("upsampling, s", 2), "training": ("training, s", 1),
     "memory": ("peak memory, MB", 0), "gpu_memory": ("peak GPU memory, MB", 0),
@@ -38,19 +39,22 @@ _ARM_COLUMNS = {
 Rows = list[Row]
 
 
-def _gain_cell(gain: Difference | None, digits: int = 3, single: str = "") -> Cell:
-    """Format a gain with its standard error, or with ``single`` if it has one sample."""
+def verdict_mark(gain: Difference) -> str:
+    """The mark of a difference that is no claim, which notes of tables explain; else empty."""
+    return _MARKS.get(gain.verdict, "")
+
+
+def _gain_cell(gain: Difference | None, digits: int = 3) -> Cell:
+    """Format a gain with its standard error."""
     if gain is None:
         return ""
-    mark = NOISE if gain.verdict == "within noise" else ""
-    text = single if math.isnan(gain.se) and gain.n == 1 else ""
-    return Number(gain.mean, digits, gain.se, signed=True, mark=mark, text=text)
+    return Number(gain.mean, digits, gain.se, signed=True, mark=verdict_mark(gain))
 
 
 def _ratio_cell(log: Difference | None) -> Cell:
     if log is None:
         return ""
-    return Number(math.exp(log.mean), mark=NOISE if log.verdict == "within noise" else "")
+    return Number(math.exp(log.mean), mark=verdict_mark(log))
 
 
 def psnr_table(study: Study, strategy: StrategyName) -> Table:
@@ -63,21 +67,21 @@ def psnr_table(study: Study, strategy: StrategyName) -> Table:
 
 def _psnr_row(study: Study, strategy: StrategyName, scene: str, labels: Sequence[str]) -> Row:
     gained = gains(study, strategy)
-    verdicts = {v: each.verdict for v in labels if (each := gained.on_scene.get((scene, v)))}
+    found = {v: each for v in labels if (each := gained.on_scene.get((scene, v)))}
     best, clear = gained.top(scene), comparisons.clear_best(study, strategy, scene)
 
     def cell(label: str) -> Cell:
         values = [run.psnr for run in study.results(strategy, scene, label).values()]
         if not values:
             return ""
-        verdict, text = verdicts.get(label), ONE_RUN if len(values) == 1 else ""
+        gain, mark = found.get(label), ""
         if label == SFM:
-            bold, mark = bool(verdicts) and set(verdicts.values()) == {"worse"}, ""
+            bold = bool(found) and {each.verdict for each in found.values()} == {"worse"}
         else:
-            bold = label == best and verdict == "better"
-            mark = NOISE if verdict == "within noise" else CLEAR * (bold and clear)
-        se = math.nan if text else float(sem(values))
-        return Number(fmean(values), se=se, text=text, mark=mark, bold=bold)
+            bold = gain is not None and label == best and gain.verdict == "better"
+            mark = (verdict_mark(gain) if gain else "") or CLEAR * (bold and clear)
+        se = float(sem(values)) if len(values) > 1 else math.nan
+        return Number(fmean(values), se=se, mark=mark, bold=bold)
 
     return scene, *map(cell, labels)
 
@@ -108,19 +112,12 @@ def gain_table(study: Study, strategy: StrategyName) -> Table:
     """Tabulate the gains of each variant by scene, and their two means."""
     gained = gains(study, strategy)
     rows: Rows = [
-        (
-            scene,
-            *(
-                _gain_cell(gained.on_scene.get((scene, label)), single=ONE_RUN)
-                for label in gained.seeds
-            ),
-        )
+        (scene, *(_gain_cell(gained.on_scene.get((scene, label))) for label in gained.seeds))
         for scene in gained.scenes
     ]
     rows.append(("mean, these scenes", *map(_gain_cell, gained.on_these.values())))
     if len(gained.scenes) > 1:
-        like = (_gain_cell(each, single="(1 scene)") for each in gained.on_like.values())
-        rows.append(("mean, scenes like these", *like))
+        rows.append(("mean, scenes like these", *map(_gain_cell, gained.on_like.values())))
     return make_table("gains", ("scene", *gained.seeds), rows, strategy=strategy,
                       description=study.description)  # fmt: skip
 
@@ -204,7 +201,7 @@ def comparison_tables(comparison: comparisons.Comparison) -> tuple[Table, Table,
     """Tabulate different settings, changes, and arms of only one benchmark."""
     scenes = sorted({scene for _, _, scene in comparison.changes})
     changes = [
-        (*arm, *(_change_cell(comparison.changes.get((*arm, scene)), ONE_RUN) for scene in scenes),
+        (*arm, *(_change_cell(comparison.changes.get((*arm, scene))) for scene in scenes),
          _change_cell(mean))
         for arm, mean in comparison.means.items()
     ]  # fmt: skip
@@ -214,9 +211,8 @@ def comparison_tables(comparison: comparisons.Comparison) -> tuple[Table, Table,
     return settings, changed, only
 
 
-def _change_cell(change: Difference | None, single: str = "") -> Cell:
+def _change_cell(change: Difference | None) -> Cell:
     if change is None:
         return ""
-    mark = {"within noise": NOISE, "unknown": ""}.get(change.verdict, "*")
-    text = single if change.verdict == "unknown" else ""
-    return Number(change.mean, 3, change.se, signed=True, mark=mark, text=text, bold=mark == "*")
+    mark = verdict_mark(change) or "*"
+    return Number(change.mean, 3, change.se, signed=True, mark=mark, bold=mark == "*")

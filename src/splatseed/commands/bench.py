@@ -16,7 +16,7 @@ import tyro
 from rich.progress import BarColumn, Progress as Bar, TaskID, TextColumn, TimeRemainingColumn
 
 from splatseed.bench.job import RunOptions, execute_runs
-from splatseed.bench.plan import DEPTH, SFM, Plan, RunSpec, needs_cloud, plan_runs
+from splatseed.bench.plan import DEPTH, SFM, Plan, RunSpec, fair_budget, needs_cloud, plan_runs
 from splatseed.bench.plan_file import PLAN, PresetName, plan_text, preset_plan, read_plan
 from splatseed.bench.runs import (
     Run,
@@ -40,7 +40,7 @@ from splatseed.runtime.environment import available_cpus, worker_env
 from splatseed.runtime.interruption import exit_code
 from splatseed.runtime.memory import check_memory
 from splatseed.runtime.tasks import ProcessWorkers, Workers
-from splatseed.text import counted, did_you_mean, quoted, visible
+from splatseed.text import counted, did_you_mean, name_some, quoted, visible
 from splatseed.training.settings import BYTES_PER_GAUSSIAN, Backend, StrategyName
 
 if TYPE_CHECKING:
@@ -51,9 +51,13 @@ _FAILURES_SHOWN = 5
 _DEFAULT = Plan()
 
 
-def _default(values: Sequence[object]) -> Any:
-    """An empty tuple for an option that is not given; the help shows the actual default."""
-    return tyro.conf.arg(help_behavior_hint=f"(default: {' '.join(map(str, values))})")
+def _list(alias: str, values: Sequence[object]) -> Any:
+    """A list, under the name that other verbs have for one value, too.
+
+    It is empty if the option is not given; the help shows the actual default.
+    """
+    hint = f"(default: {' '.join(map(str, values))})"
+    return tyro.conf.arg(aliases=[alias], help_behavior_hint=hint)
 
 
 @dataclass(frozen=True)
@@ -69,16 +73,17 @@ class Options:
     """The benchmark's folder: a new one, or one to resume."""
     scenes: tuple[str, ...] = ()
     """Scene folders with photographs; demo: is a synthetic room. With --data: names of scenes."""
-    methods: Annotated[tuple[str, ...], _default(_DEFAULT.methods)] = ()
+    methods: Annotated[tuple[str, ...], _list("--method", _DEFAULT.methods)] = ()
     """Seeding methods; sfm, the original points, is the baseline."""
-    ratios: Annotated[tuple[float, ...], _default([f"{r:g}" for r in _DEFAULT.ratios])] = ()
+    ratios: Annotated[tuple[float, ...], _list("--ratio", [f"{r:g}" for r in _DEFAULT.ratios])] = ()
     """Total points per original point."""
-    budgets: tuple[str, ...] = ()
-    """Maximum final Gaussians, equal for all arms: 50k, or 0.25rho for 0.25 per photograph pixel at
-    training size. Methods fill the budget, unless --ratios are given."""
-    strategies: Annotated[tuple[StrategyName, ...], _default(_DEFAULT.strategies)] = ()
+    budgets: Annotated[tuple[str, ...], _list("--budget", [fair_budget(_DEFAULT.ratios)])] = ()
+    """Maximum final Gaussians, equal for all arms: 50k, 0.25rho for 0.25 per photograph pixel at
+    training size, 12x for 12 per point, or none. Methods fill a budget that is given, unless
+    --ratios are given. The default is none for profile paper, and grows with the ratios."""
+    strategies: Annotated[tuple[StrategyName, ...], _list("--strategy", _DEFAULT.strategies)] = ()
     """Densification strategies; -3dgs keeps the rates and schedules of 3DGS."""
-    profiles: Annotated[tuple[Profile, ...], _default(_DEFAULT.profiles)] = ()
+    profiles: Annotated[tuple[Profile, ...], _list("--profile", _DEFAULT.profiles)] = ()
     """Parameter sets of the methods: improved (default), or as in the paper."""
     repeats: int | None = None
     """Number of repeats (3), with different random seeds; error bars need at least 2."""
@@ -189,8 +194,13 @@ def _changed(plan: Plan, options: Options) -> Plan:
 
     training = replace(plan.training, **given("max_steps", "data_factor"))
     changes = given("methods", "budgets", "strategies", "profiles", "repeats", "long_side")
-    if options.ratios or (options.budgets and not plan.budgets):
+    no_budget = [text.lower() for text in options.budgets] == ["none"]
+    if no_budget:
+        changes["budgets"] = ()
+    if options.ratios or (options.budgets and not plan.budgets and not no_budget):
         changes["ratios"] = options.ratios
+    if plan is _DEFAULT and not options.budgets and "paper" not in options.profiles:
+        changes["budgets"] = (fair_budget(changes.get("ratios", plan.ratios)),)
     scenes = _scenes(plan, options)
     labels = Counter(scene.label for scene in scenes)
     for i, scene in enumerate(scenes):  # prefix equal folder names with their parents'
@@ -303,7 +313,7 @@ def _prepare(
     plan = replace(plan, scenes=tuple(scene for scene, _ in present))
     scenes = [facts for _, facts in present]
     specs = plan_runs(plan, scenes, machine.backend, package_version("splatseed"))
-    notes += _notes(plan, scenes, specs)
+    notes += [*_budget_notes(options, plan), *_notes(plan, scenes, specs)]
     fix = "Name other methods, or what these need."
     refuse((not specs, "a plan with runs", "; ".join(notes) or "none", fix))
     if (
@@ -315,6 +325,17 @@ def _prepare(
             num_seeds, BYTES_PER_GAUSSIAN * jobs, f"seeds per run with {jobs} at a time", fix=fix
         )
     return plan, scenes, specs, notes
+
+
+def _budget_notes(options: Options, plan: Plan) -> Iterator[str]:
+    """Say what the options for budgets and ratios mean where one of both is left out."""
+    if options.budgets and plan.budgets and not plan.ratios:
+        yield "Methods fill the budget: --ratios 8 makes 8 times the points instead."
+    if plan.budgets == (fair_budget(plan.ratios),) and not options.budgets:
+        yield (
+            "All arms have the same limit of Gaussians, since more of them alone raise PSNR: "
+            "--budgets none lifts it, and --profiles paper has none."
+        )
 
 
 def _notes(plan: Plan, scenes: Sequence[SceneFacts], specs: Sequence[RunSpec]) -> Iterator[str]:
@@ -388,6 +409,10 @@ def _bench(options: Options, plan: Plan, machine: Machine, arguments: Sequence[s
 def _announcement(plan: Plan, runs: Sequence[Run], machine: Machine) -> Iterator[str]:
     """Describe the runs, and estimate time and disk of the pending ones."""
     yield f"{count_runs(runs)}; {machine.description}"
+    specs = (run.spec for run in runs if run.spec.arm.budget)
+    limits = dict.fromkeys((spec.scene.name, spec.training.cap_max) for spec in specs)
+    if limits:
+        yield f"at most {name_some([f'{cap:,} Gaussians on {name}' for name, cap in limits])}"
     pending = [run.spec for run in runs if run.result is None]
     if pending:
         measured = len(runs) - len(pending)
