@@ -44,6 +44,7 @@ def test_a_run_is_exported_cropped_cleaned_and_can_be_scored(model, splatseed, t
         assert (
             f"{out} --scene '/data/my scene' --data-factor 2 --test-every 5 --masks /my/m" in said
         )
+        assert f"splatseed view {out}" in said
     kept = read_gaussians(out)
     assert 70 < len(kept) < 130
     assert kept.means[:, 2].min() > -0.01

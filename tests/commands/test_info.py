@@ -22,6 +22,8 @@ from splatseed.io.colmap import write_points3d
 from splatseed.io.depth_maps import depth_folder
 from splatseed.io.ply import write_ply
 from splatseed.pointcloud import PointCloud
+from splatseed.splat.formats import write_gaussians
+from splatseed.splat.gaussians import Gaussians
 from splatseed.synthetic import make_capture, write_capture
 
 
@@ -47,6 +49,34 @@ def test_a_colmap_scene(room, splatseed, monkeypatch):
     advised = run.out.partition("\nnext\n")[2]
     assert re.findall(r"splatseed (\w+)", advised) == ["train", "train", "info"]
     assert rows["photographs agree"].endswith("of the pixels looked at: enough")
+
+
+@pytest.mark.parametrize("name", ["model.ply", "model.spz", "model.splat", "model.sog"])
+def test_trained_gaussians(name, rng, splatseed, tmp_path):
+    count, path = 500, tmp_path / name
+    opacities = np.where(np.arange(count) % 5 == 0, -4.0, 3.0)
+    arrays = {
+        "means": rng.uniform([-1, -2, 3], [1, 2, 9], (count, 3)),
+        "scales": np.log(np.tile([0.02, 0.5, 0.25], (count, 1))),
+        "quats": rng.normal(size=(count, 4)),
+        "opacities": opacities,
+        "sh0": rng.normal(size=(count, 1, 3)),
+        "shN": 0.1 * rng.normal(size=(count, 8, 3)),
+    }
+    write_gaussians(path, Gaussians(**{k: a.astype(np.float32) for k, a in arrays.items()}))
+    run = splatseed("info", path)
+    assert (run.code, run.err) == (0, "")
+    rows, facts = _pairs(run.out), json.loads(splatseed("info", path, "--json").out)
+    assert (rows["Gaussians"], facts["gaussians"]) == ("500", 500)
+    assert facts["sh_degree"] == (0 if name.endswith(".splat") else 2)
+    assert rows["fainter than 0.1"] == "20%"
+    assert facts["flat"] == 1.0
+    np.testing.assert_allclose(facts["opacity"], [0.018, 0.953, 0.953, 0.953, 0.953], atol=0.02)
+    np.testing.assert_allclose(facts["size"], 5 * [0.5], rtol=0.06)
+    expected = [arrays["means"].min(axis=0), arrays["means"].max(axis=0)]
+    np.testing.assert_allclose(facts["bounding_box"], expected, atol=0.02)
+    assert f"splatseed view {path}" in run.out
+    assert splatseed("info", path, "--budget", 9).code == 2
 
 
 def test_the_advice_depends_on_the_plan(room, splatseed):

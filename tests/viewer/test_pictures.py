@@ -16,7 +16,15 @@ from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene, SceneSource
 from splatseed.viewer import clouds as pages
 from splatseed.viewer.maps import map_tiles, normal_picture
-from splatseed.viewer.page import UNKNOWN, Tile, color_bar, depth_picture, write_grid
+from splatseed.viewer.page import (
+    GROUND,
+    UNKNOWN,
+    Tile,
+    color_bar,
+    depth_picture,
+    legend,
+    write_grid,
+)
 from splatseed.viewer.points import COLORS, origin_colors, points_over, render_points
 
 K = np.array([[50.0, 0, 20], [0, 50.0, 15], [0, 0, 1]])
@@ -45,7 +53,7 @@ def _read(path):
 def test_a_point_in_the_middle_of_a_pixel_colours_that_pixel_alone():
     for size in (1, 0.01):  # however small its disc
         picture = render_points(_cloud(_at(7, 22, 3.0), [255, 0, 0]), CAMERA, point_size=size)
-        assert np.argwhere((picture < 255).any(axis=2)).tolist() == [[22, 7]]
+        assert np.argwhere((picture != GROUND).any(axis=2)).tolist() == [[22, 7]]
 
 
 def test_drawing_matches_a_loop_over_points(rng):
@@ -56,7 +64,7 @@ def test_drawing_matches_a_loop_over_points(rng):
     uv, depth = CAMERA.project(seen.astype(np.float32))
     shown = (np.abs(uv / [40, 30] - 0.5) < 0.5 + 2 * size / np.array([40, 30])).all(axis=1)
     radius = size * np.clip(np.median(depth[shown]) / depth, 0.75, 2.0)
-    expected = np.full((60, 80, 3), 255.0)
+    expected = np.full((60, 80, 3), GROUND, float)
     v, u = np.mgrid[:60, :80] + 0.5
     for i in np.argsort(-depth):
         expected[np.hypot(u - 2 * uv[i, 0], v - 2 * uv[i, 1]) <= radius[i]] = rgb[i]
@@ -107,6 +115,31 @@ def test_a_pair_shows_both_clouds(scene, tmp_path):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(OutputError):
         pages.preview_pair(scene, dense, tmp_path / "file" / "pair.png")
+
+
+def test_white_walls_show_and_guessed_seeds_are_marked(scene, tmp_path):
+    """On a ground that is neither; without guesses there is no third picture."""
+    source = np.where(np.arange(150) % 3, SOURCE_CODES["stereo"], SOURCE_CODES["cover"])
+    white = scene.points.replace(rgb=np.full((150, 3), 255, np.uint8))
+    seeds = white.replace(source=source.astype(np.uint8))
+    path = pages.preview_pair(scene.replace(points=white), seeds, tmp_path / "pair.png")
+    left, right, marked = np.array_split(_read(path)[60:], 3, axis=1)
+    orange = np.array(COLORS[SOURCE_CODES["cover"]])
+    for picture in (left, right, marked):
+        assert (picture == GROUND).all(axis=2).mean() > 0.5
+    drawn = [(np.abs(p - orange) < 9).all(axis=2).sum() for p in (left, right, marked)]
+    assert drawn[:2] == [0, 0]
+    assert drawn[2] >= 50  # of 50 guesses
+    pair = _read(pages.preview_pair(scene, white, tmp_path / "again.png"))
+    assert pair.shape[1] < 2 * 830
+
+
+def test_a_legend_has_all_colours_in_as_many_rows_as_it_needs():
+    entries = {f"origin {i} 123,456": (i, 200, 9) for i in range(6)}
+    for width, rows in ((2000, 1), (600, 2), (150, 6)):
+        strip = legend(entries, width)
+        assert (strip.shape[1], len(strip) // len(legend({}, width))) == (width, rows)
+        assert all((strip == color).all(axis=2).any() for color in entries.values())
 
 
 def test_the_grid_starts_with_the_photograph(scene, tmp_path):

@@ -32,7 +32,7 @@ from splatseed.io.photograph import decode_photograph, photograph_bytes
 from splatseed.progress import Progress, silent
 from splatseed.runtime.fingerprint import fingerprint
 from splatseed.scene import Scene
-from splatseed.splat.pictures import GAP
+from splatseed.splat.pictures import split_comparison
 from splatseed.viewer.clouds import preview_methods
 
 FIGURES = "figures"
@@ -143,9 +143,7 @@ def _pictures(paths: Mapping[str, Path]) -> tuple[dict[str, bytes], dict[str, by
 
 def _split(path: Path) -> UInt8[np.ndarray, "3 H W 3"]:
     """Split a picture into the photograph, render and error map that it has side by side."""
-    pixels = np.asarray(decode_photograph(path, photograph_bytes(path)))
-    width = (pixels.shape[1] - 2 * GAP) // 3
-    return np.stack([pixels[:, i * (width + GAP) :][:, :width] for i in range(3)])
+    return split_comparison(np.asarray(decode_photograph(path, photograph_bytes(path))))
 
 
 def _jpeg(pixels: UInt8[np.ndarray, "H W 3"], side: int) -> bytes:

@@ -349,7 +349,7 @@ def _train_arm(
     from splatseed.splat.evaluate import evaluate_views
     from splatseed.splat.metrics import flip_map
     from splatseed.splat.photographs import photograph_tensor
-    from splatseed.splat.pictures import flip_heatmap, to_uint8
+    from splatseed.splat.pictures import FLIP_LABEL, flip_heatmap, to_uint8
     from splatseed.training.prepare import PrepareOptions, prepare_run
     from splatseed.viewer.page import Tile
 
@@ -369,7 +369,7 @@ def _train_arm(
     return result, (
         Tile("photograph, not trained on", shown.photograph),
         Tile(score, to_uint8(render.cpu().numpy())),
-        Tile("FLIP: black 0, brightest 1", flip_heatmap(errors)),
+        Tile(FLIP_LABEL, flip_heatmap(errors)),
     )
 
 

@@ -118,7 +118,8 @@ def run(arguments: list[str]) -> None:
         print_note(note)
     if name == "splat" and gaussians.shN.size:
         print_note("A .splat has no view-dependent colour: the model's is left out.")
-    print_pairs("next", [("score it", _scoring_command(options))])
+    looking = ("look at it", f"splatseed view {quoted(options.output)}")
+    print_pairs("next", [looking, ("score it", _scoring_command(options))])
 
 
 def _scoring_command(options: Options) -> str:

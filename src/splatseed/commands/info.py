@@ -44,6 +44,7 @@ from splatseed.seeding.advice import Advice, advice_for
 from splatseed.seeding.photo_methods import has_points, photographed
 from splatseed.seeding.trainability import is_distorted, untrainable
 from splatseed.text import counted, quoted, visible
+from splatseed.training.folder import RunFolder
 from splatseed.training.schedule import FULL_RUN
 
 if TYPE_CHECKING:  # Numba, which takes a while to load, comes with it
@@ -57,10 +58,11 @@ IMAGES_SHOWN = 12
 
 @dataclass(frozen=True)
 class Options:
-    """Show what is in a scene: cameras, images, points, tracks, depth maps, and problems."""
+    """Show what is in a scene (cameras, images, points, maps) and its problems, or in a model."""
 
     scene: Annotated[Path, tyro.conf.Positional]
-    """A COLMAP scene folder, a folder with transforms.json, an RGB-D capture, or a .ply."""
+    """A COLMAP scene folder, a folder with transforms.json, an RGB-D capture, a .ply; or a run or a
+    file of trained Gaussians."""
     depth: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Also compare a folder of depth maps, in any layout of docs/formats.md, with the SfM
     points."""
@@ -86,6 +88,8 @@ class Options:
 def run(arguments: list[str]) -> None:
     """Run the verb with these arguments."""
     options = parse_options(Options, "info", arguments)
+    if _shows_model(options):
+        return
     with stage_display() as clock:
         clock("read", 0.0)
         scene = _read(options)
@@ -132,6 +136,23 @@ def run(arguments: list[str]) -> None:
         if missing := untrainable(scene):
             print_note(missing)
         print_pairs("next", _next(options, usable, advice, planned, known, doubt))
+
+
+def _shows_model(options: Options) -> bool:
+    """Print what is in trained Gaussians; returns False for a scene."""
+    if not options.scene.is_file() and not RunFolder(options.scene).is_run:
+        return False
+    from splatseed.commands.model_info import is_model, show_model
+
+    if not is_model(options.scene):
+        return False
+    given = options.depth, options.depth_kind, options.depth_scale, options.picture, options.budget
+    found = f"trained Gaussians at {visible(options.scene)}"
+    expected = "a scene, for options about depth and budgets"
+    fix = "Drop these options, or name the scene."
+    refuse((any(each is not None for each in given), expected, found, fix))
+    show_model(options.scene, as_json=options.json)
+    return True
 
 
 def _read(options: Options) -> Scene:

@@ -26,6 +26,7 @@ from splatseed.splat.gaussians import Gaussians
 from splatseed.text import beginning, did_you_mean
 
 _HEADER = 1 << 20
+_MODEL_SUFFIXES = (".spz", ".splat", ".sog", ".ksplat", ".glb")
 _UNSUPPORTED = {
     ".ksplat": "GaussianSplats3D's own tool (util/create-ksplat.js) makes one from a .ply",
     ".glb": f"{sog.CONVERTER} MODEL.ply OUT.glb makes one from a .ply",
@@ -165,6 +166,20 @@ def detect_format(path: Path, data: bytes) -> str:
         fix = f"Export a .ply where it came from, or try {sog.CONVERTER} IN{suffix} OUT.ply."
     expected = f"{path} to hold trained Gaussians ({', '.join(SUFFIXES)})"
     raise SceneFormatError(expected, found=found, fix=fix)
+
+
+def holds_gaussians(path: Path) -> bool:
+    """Whether a file holds Gaussians, or claims to by its suffix; a .ply of points does not."""
+    if path.suffix.lower() in _MODEL_SUFFIXES:
+        return True
+    data = read_bytes(path)
+    if path.suffix.lower() == ".json" and b'"means"' not in data[:_HEADER]:
+        return False
+    try:
+        kind = detect_format(path, data)
+    except SceneFormatError:
+        return False
+    return kind != "ply" or b" scale_0\n" in data[:_HEADER].replace(b"\r", b"")
 
 
 def parse_crop(text: str) -> Float64[np.ndarray, "2 3"]:

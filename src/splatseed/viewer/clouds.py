@@ -14,21 +14,22 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float64, UInt8
-from PIL import Image as PillowImage, ImageDraw
 
 from splatseed.camera import Camera
 from splatseed.io.files import StrPath
-from splatseed.methods import source_name
+from splatseed.methods import SOURCE_CODES, source_name
 from splatseed.photos.viewpoint import choose_camera, choose_image
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
 from splatseed.viewer import page
-from splatseed.viewer.points import origin_colors, points_over, render_points
+from splatseed.viewer.points import COLORS, origin_colors, points_over, render_points
 
 PAIR_SIDE = 800  # longer side of two or three pictures in a row, pixels
-GREY = 150
+GREY = 215  # of a cloud without colours, paler than the ground
 NEAR, FAR = np.array([0, 114, 178]), np.array([213, 94, 0])
 """Colours of points on an aligned cloud and off it."""
+GUESSED = SOURCE_CODES["cover"]
+"""The origin of seeds at depths that no photograph confirms."""
 EMPTY, BLEND = np.array([214.0, 20.0, 190.0]), 0.6
 """Colour of cells without a seed (magenta is rare in photographs) and its opacity."""
 DIM = 0.75  # brightness of the photograph under cells
@@ -47,10 +48,20 @@ class CoveredView(NamedTuple):
 def preview_pair(
     scene: Scene, upsampled: PointCloud, path: StrPath, *, title: str = "upsampled"
 ) -> Path:
-    """Write a picture of the scene's points and one of the upsampled points, with a title."""
-    path = Path(path)
-    clouds = {"original": scene.points, title: upsampled}
-    return page.write_grid(_cloud_tiles(clouds, choose_camera(scene), PAIR_SIDE), path, columns=2)
+    """Write a picture of the scene's points and one of the upsampled points, with a title.
+
+    If some are guesses, a third one shows them in their origin's colour, and the others in grey.
+    """
+    path, camera = Path(path), choose_camera(scene)
+    tiles = _cloud_tiles({"original": scene.points, title: upsampled}, camera, PAIR_SIDE)
+    guessed = upsampled.source == GUESSED
+    if guessed.any():
+        grey = upsampled.rgb.mean(axis=1, keepdims=True).astype(np.uint8)
+        rgb = np.where(guessed[:, None], np.array(COLORS[GUESSED], np.uint8), grey)
+        label = f"orange: {guessed.sum():,} guessed from neighbours   grey: all others"
+        marked = {label: upsampled.replace(rgb=rgb)}
+        tiles += _cloud_tiles(marked, camera, PAIR_SIDE, counted=False)
+    return page.write_grid(tiles, path, columns=len(tiles))
 
 
 def preview_methods(scene: Scene, clouds: Mapping[str, PointCloud], path: StrPath) -> Path:
@@ -95,16 +106,12 @@ def preview_origins(scene: Scene, points: PointCloud, path: StrPath) -> Path:
         page.Tile(f"{len(points):,} seeds", render_points(points, camera, scale=scale)),
         page.Tile("by origin", points_over(colored, camera, photograph, scale=scale)),
     ]
-    # Legend: a dot in each origin's colour and its name.
-    strip = PillowImage.new("RGB", (2 * size[0], page.STRIP_HEIGHT), page.PAPER)
-    draw, letters, x = ImageDraw.Draw(strip), page.font(18), 8.0
     codes, counts = np.unique(points.source, return_counts=True)
-    for code, count, color in zip(codes, counts, origin_colors(codes).tolist(), strict=True):
-        text = f"{source_name(int(code))} {count:,}"
-        draw.ellipse((x, 14, x + 16, 30), fill=tuple(color))
-        draw.text((x + 24, 22), text, fill=page.INK, font=letters, anchor="lm")
-        x += 24 + letters.getlength(text) + 28
-    return page.write_grid(tiles, path, columns=2, footer=np.asarray(strip))
+    entries = {
+        f"{source_name(int(code))}{' (guessed)' * int(code == GUESSED)} {count:,}": tuple(color)
+        for code, count, color in zip(codes, counts, origin_colors(codes).tolist(), strict=True)
+    }
+    return page.write_grid(tiles, path, columns=2, footer=page.legend(entries, 2 * size[0]))
 
 
 def preview_alignment(
@@ -146,7 +153,10 @@ def preview_cells(views: Sequence[CoveredView], path: StrPath) -> Path:
         ):
             picture = cell_picture(view.photograph, covered, view.cell)
             tiles.append(page.Tile(label, page.resized(picture, size)))
-    return page.write_grid(tiles, path, columns=2 if len(views) == 1 else 4)
+    side = f"{views[0].cell} px" if views else ""
+    tint = tuple(int(each) for each in BLEND * EMPTY + (1 - BLEND) * DIM * 128)
+    legend = page.legend({f"cells of {side} without a point": tint}, page.GRID_SIDE)
+    return page.write_grid(tiles, path, columns=2 if len(views) == 1 else 4, footer=legend)
 
 
 def cell_picture(

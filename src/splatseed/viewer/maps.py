@@ -43,7 +43,7 @@ def preview_maps(scene: Scene, maps: Sequence[StereoMap], path: StrPath, *, limi
         size = page.fitted(maps[i].camera.width, maps[i].camera.height, SIDE)
         photograph = page.photograph_or_blank(scene, by_name.get(maps[i].name), size)
         tiles += map_tiles(maps[i], photograph)
-    bar = page.color_bar("far, 0", "near, 1; unknown is grey", "viridis")
+    bar = page.color_bar("far; confidence 0", "near; confidence 1; grey: unknown", "viridis")
     return page.write_grid(tiles, path, columns=4, footer=bar)
 
 
@@ -96,7 +96,7 @@ def preview_depth(scene: Scene, alignments: Mapping[str, Alignment], path: StrPa
     for name in sorted(ranks, key=used.index) + left_out[:1]:
         image, label = by_name[name], f"{name}, {ranks.get(name, 'left out')}"
         tiles += _checked(scene, image, alignments[name], visibility.of(image), label)
-    bar = page.color_bar("0", f"off by {LIMIT:.0%} or more")
+    bar = page.color_bar("points: depth agrees", f"off by {LIMIT:.0%} or more")
     return page.write_grid(tiles, path, columns=3, footer=bar)
 
 
@@ -118,7 +118,8 @@ def _checked(
         z = PlanarDepth.from_map(depth, camera, scale, shift, unit_ray=False).full()
         low, high = page.value_range(z)
         picture = page.depth_picture(z)
-        caption = f"depth {low:.3g} to {high:.3g}" + ("" if aligned else ", not aligned")
+        caption = f"depth {low:.3g} (yellow) to {high:.3g} (violet)"
+        caption += "" if aligned else ", not aligned"
         seen = points_in_image(camera, xyz)
         column, row = seen.uv.astype(np.int64).T
         error = np.abs(z[row, column] / seen.depth - 1.0)

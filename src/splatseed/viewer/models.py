@@ -19,11 +19,11 @@ from PIL import Image as PillowImage, ImageDraw
 from splatseed.camera import Camera
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io import load_scene
-from splatseed.io.files import StrPath, read_bytes
+from splatseed.io.files import StrPath
 from splatseed.photos.camera_check import reference_points
 from splatseed.photos.view import View, camera_views, view_of
 from splatseed.scene import Scene
-from splatseed.splat.formats import detect_format, read_gaussians
+from splatseed.splat.formats import holds_gaussians, read_gaussians
 from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.model_frame import move_to_scene_origin
 from splatseed.splat.training_frame import TrainingFrame, frame_of_model
@@ -31,8 +31,6 @@ from splatseed.text import quoted
 from splatseed.training.folder import RunFolder
 from splatseed.viewer.page import font, latin
 
-MODEL_SUFFIXES = (".spz", ".splat", ".sog", ".ksplat", ".glb")
-_HEADER = 1 << 16
 CORE = 0.6
 """Fraction of the points, nearest to their median, that the frame is fitted to without cameras."""
 LINE = 2  # pixels of the border between two pictures
@@ -93,7 +91,7 @@ def open_item(path: StrPath, scene_path: Path | None = None) -> ViewerItem:
 
     folder, notes = RunFolder(path), list[str]()
     if not path.is_dir() or not folder.is_run:
-        if path.is_file() and _is_model(path):
+        if path.is_file() and holds_gaussians(path):
             gaussians, scene = read_gaussians(path, notes.append), scene_at(scene_path)
             if scene is not None:
                 gaussians = move_to_scene_origin(path, scene, gaussians, notes.append)
@@ -133,20 +131,6 @@ def unique_names(paths: Sequence[Path]) -> list[str]:
         unique = (s for s in suffixes if sum(other[-len(s) :] == s for other in absolute) == 1)
         names.append("/".join(next(unique, parts[-1:])))
     return names
-
-
-def _is_model(path: Path) -> bool:
-    """Whether a file holds Gaussians; a .ply of points is a scene."""
-    if path.suffix.lower() in MODEL_SUFFIXES:
-        return True
-    data = read_bytes(path)
-    if path.suffix.lower() == ".json" and b'"means"' not in data[:_HEADER]:
-        return False
-    try:
-        kind = detect_format(path, data)
-    except SceneFormatError:
-        return False
-    return kind != "ply" or b" scale_0\n" in data[:_HEADER].replace(b"\r", b"")
 
 
 def same_world(first: ViewerItem, second: ViewerItem) -> bool:

@@ -7,7 +7,7 @@ unknown values are grey; an unreadable photograph is no error, as pages have oth
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,6 +26,8 @@ GRID_SIDE = 600
 LABEL_SIZES = (20, 11)  # font size by default, and the smallest for long labels
 GAP, LABEL_HEIGHT, STRIP_HEIGHT = 12, 34, 44
 PAPER, INK, UNKNOWN = (255, 255, 255), (20, 20, 20), (150, 150, 150)
+GROUND = (110, 110, 110)
+"""Behind points in their own colours, here and in the viewer: white and black walls show on it."""
 BLANK = (230, 230, 230)  # in place of a photograph
 RANGE = (2, 98)
 """Percentiles of a map's values at the ends of its colours."""
@@ -152,6 +154,23 @@ def color_bar(low: str, high: str, colormap: str = "plasma") -> UInt8[np.ndarray
     draw.text((12, 22), low, fill=INK, font=letters, anchor="lm")
     draw.text((GRID_SIDE - right + 12, 22), high, fill=INK, font=letters, anchor="lm")
     return np.asarray(bar)
+
+
+def legend(entries: Mapping[str, tuple[int, ...]], width: int) -> UInt8[np.ndarray, "H W 3"]:
+    """Strip with a dot in each colour, and its name; as many rows as fit ``width``."""
+    letters, places, x, row = font(18), list[tuple[float, int]](), 8.0, 0
+    for text in entries:
+        needed = 24 + letters.getlength(text) + 28
+        if x + needed > width and x > 8.0:
+            x, row = 8.0, row + 1
+        places.append((x, row * STRIP_HEIGHT))
+        x += needed
+    strip = PillowImage.new("RGB", (width, (row + 1) * STRIP_HEIGHT), PAPER)
+    draw = ImageDraw.Draw(strip)
+    for (text, color), (left, top) in zip(entries.items(), places, strict=True):
+        draw.ellipse((left, top + 14, left + 16, top + 30), fill=tuple(color))
+        draw.text((left + 24, top + 22), text, fill=INK, font=letters, anchor="lm")
+    return np.asarray(strip)
 
 
 # Photographs --------------------------------------------------------------------------------------

@@ -35,7 +35,7 @@ from splatseed.splat.training_frame import TrainingFrame
 from splatseed.viewer.clouds import cell_picture
 from splatseed.viewer.models import ViewerItem, pinhole_view
 from splatseed.viewer.page import BLANK, depth_picture, photograph_at
-from splatseed.viewer.points import origin_colors, render_points
+from splatseed.viewer.points import origin_colors, points_over, render_points
 
 Picture = UInt8[np.ndarray, "H W 3"]
 Drawn = tuple[Picture | None, str]
@@ -136,7 +136,7 @@ class Entry:
             points = scene.points
             colored = points.replace(rgb=origin_colors(points.source))
             painters["points"] = lambda canvas, _: render_points(points, canvas.camera)
-            painters["origins"] = lambda canvas, _: render_points(colored, canvas.camera)
+            painters["origins"] = lambda canvas, _: points_over(colored, canvas.camera)
             if scene.images:
                 painters["uncovered cells"] = self._uncovered
         self._painters = painters

@@ -17,7 +17,7 @@ from splatseed.camera import Camera
 from splatseed.methods import SOURCE_CODES
 from splatseed.pointcloud import GENERATED, ORIGINAL, PointCloud
 from splatseed.viewer._kernels import draw_discs
-from splatseed.viewer.page import PAPER, fitted, resized
+from splatseed.viewer.page import GROUND, PAPER, fitted, resized
 
 DISCS_PER_SIDE = 340
 """A disc at the median depth is the picture's longer side divided by this: 2.4 px at 800."""
@@ -48,7 +48,7 @@ def render_points(
     camera: Camera,
     *,
     point_size: float | None = None,
-    background: tuple[int, int, int] | UInt8[np.ndarray, "H W 3"] = PAPER,
+    background: tuple[int, int, int] | UInt8[np.ndarray, "H W 3"] = GROUND,
     scale: float = 1.0,
 ) -> UInt8[np.ndarray, "H W 3"]:
     """Draw a cloud: each pixel shows the nearest point whose disc covers it.
@@ -61,7 +61,8 @@ def render_points(
         camera: The camera to look from; its lens distortion is ignored.
         point_size: Diameter of a disc at the median depth, in pixels of the picture; by
             default a 340th of the picture's longer side.
-        background: Colour where there are no points, 0..255, or a picture of the same size.
+        background: Colour where there are no points, 0..255, by default mid-grey, or a picture of
+            the same size.
         scale: Size of the picture relative to the camera's.
 
     Returns:
@@ -73,7 +74,7 @@ def render_points(
         >>> cloud = PointCloud(np.array([[0.0, 0, 2]]), np.array([[255, 0, 0]], np.uint8))
         >>> picture = render_points(cloud, Camera(K, 32, 24, np.eye(4)), point_size=3)
         >>> picture[12, 16].tolist(), picture[0, 0].tolist()
-        ([255, 0, 0], [255, 255, 255])
+        ([255, 0, 0], [110, 110, 110])
     """
     width, height = (max(round(side * scale), 1) for side in (camera.width, camera.height))
     size = max(width, height) / DISCS_PER_SIDE if point_size is None else point_size

@@ -24,7 +24,7 @@ from splatseed.scene import Image, Scene
 from splatseed.text import visible
 from splatseed.viewer import pictures
 from splatseed.viewer.models import split_picture
-from splatseed.viewer.page import fitted, photograph_at
+from splatseed.viewer.page import GROUND, fitted, photograph_at
 from splatseed.viewer.pictures import Entry
 
 NO_PICTURE, NO_SECOND = "points only", "nothing"
@@ -379,7 +379,9 @@ class Session:
         if second is not None:
             picture = self._join([(None, ""), *drawn][-2:], canvas, named=scale == 1)
         self._picture, quality = picture, FRAMES.jpeg_still if scale == 1 else FRAMES.jpeg_moving
-        self._client.scene.set_background_image(picture, format="jpeg", jpeg_quality=quality)
+        ground = np.full((canvas.height, canvas.width, 3), GROUND, np.uint8)
+        shown = ground if picture is None else picture  # behind points that the browser draws
+        self._client.scene.set_background_image(shown, format="jpeg", jpeg_quality=quality)
         self._client.flush()
         return canvas.width * canvas.height if drawn else 0
 
@@ -393,8 +395,8 @@ class Session:
         )
 
     def _join(self, drawn: list[pictures.Drawn], canvas: View, *, named: bool) -> np.ndarray:
-        white = np.full((canvas.height, canvas.width, 3), 255, np.uint8)
-        left, right = (white if picture is None else picture for picture, _ in drawn)
+        ground = np.full((canvas.height, canvas.width, 3), GROUND, np.uint8)
+        left, right = (ground if picture is None else picture for picture, _ in drawn)
         names = (self._kind.value, self._second.value)
         if len(self._entries) > 1:
             names = (f"{self._entry.name}: {names[0]}", names[1])
@@ -414,7 +416,7 @@ class Session:
         over = PillowImage.fromarray(
             self._client.get_render(size[1], size[0], transport_format="png", timeout=20.0)
         ).convert("RGBA")
-        under = PillowImage.new("RGBA", over.size, "white")
+        under = PillowImage.new("RGBA", over.size, GROUND)
         if self._picture is not None:
             under.paste(PillowImage.fromarray(self._picture).resize(over.size))
         file = io.BytesIO()
