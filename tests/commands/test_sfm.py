@@ -5,10 +5,17 @@ What the reconstruction does is tested in tests/sfm.
 
 from __future__ import annotations
 
+import shutil
+
 import pytest
 
 from splatseed.commands import sfm
+from splatseed.io import load_scene
+from splatseed.io.load import with_own_depths
 from splatseed.sfm import Refinement, Settings, SfmReport
+from splatseed.sfm.photos import find_photos
+
+from ..io.phone_exports import write_polycam, write_scanner_app
 
 LOST = tuple(f"lost{i}.jpg" for i in range(10))
 FACTS = (1234, 5.5, 0.61, {"features": 1.0})
@@ -60,7 +67,36 @@ def test_the_photographs_are_counted_by_folder(called, tmp_path, splatseed, caps
     )
     told = capsys.readouterr()
     assert told.err == f"3 photographs in {tmp_path}: 2 in scene, 1 in run\n1 camera\n"
-    assert "1 image of grey, run/d.png" in told.out
+    assert "note: Left out: 1 image of grey (run/d.png).\n" == told.out
+
+
+def test_an_apps_export_gives_its_photographs_and_its_poses_are_pointed_out(
+    called, room, tmp_path, splatseed, capsys
+):
+    scene = with_own_depths(load_scene(room))
+    scanner = write_scanner_app(scene, tmp_path / "scanner")
+    for name in ("textured_output.jpg", "thumb_00000.jpg"):
+        shutil.copy(scanner / "frame_00000.jpg", scanner / name)
+    polycam = write_polycam(scene, tmp_path / "polycam")
+    shutil.copytree(room / "images", polycam / "keyframes/images", dirs_exist_ok=True)
+    for export, photographs in (
+        (scanner, scanner),
+        (polycam, polycam / "keyframes/corrected_images"),
+    ):
+        assert splatseed("sfm", export, "-o", tmp_path / "out").code == 0
+        assert called["args"][0] == photographs
+        photos, left_out = find_photos(photographs)
+        assert len(photos) == 12
+        called["on_photos"](list(photos), left_out, "")
+        told = capsys.readouterr()
+        assert told.out.count("Left out") == (export == scanner)
+        assert f"{export} has poses of 12 photographs: splatseed upsample {export} " in told.out
+        assert f"12 photographs in {photographs}\n" in told.err
+    left_out = find_photos(scanner)[1]
+    assert [len(names) for names in left_out.values()] == [12, 12, 2]
+    splatseed("sfm", room / "images", "-o", tmp_path / "out")
+    called["on_photos"](["view_000.png"], {}, "")
+    assert "upsample" not in capsys.readouterr().out
 
 
 def test_known_poses_are_triangulated_and_refined_when_asked(called, room, tmp_path, splatseed):

@@ -15,17 +15,21 @@ import tyro
 
 from splatseed.commands.options import parse_options, refuse
 from splatseed.console import ERR, StageClock, print_note, print_pairs, stage_display
+from splatseed.errors import SplatseedError
 from splatseed.io import load_scene
 from splatseed.io.files import is_video
 from splatseed.io.masks import masks_near
 from splatseed.io.origin import RECENTER
 from splatseed.io.staging import check_output
 from splatseed.runtime.torch_device import DeviceName
-from splatseed.scene import Masks
+from splatseed.scene import Masks, Scene
 from splatseed.sfm import MatcherName, Settings, SfmReport, reconstruct
 from splatseed.sfm.first_look import FIRST_LOOK, NEIGHBOURS, STAGE
 from splatseed.sfm.photos import pick_frames
 from splatseed.text import counted, name_some, quoted, visible
+
+SHOWN = 3
+"""Images of each kind that are named where they are left out."""
 
 
 @dataclass(frozen=True)
@@ -33,8 +37,9 @@ class Options:
     """Make a scene from photographs: poses and points, undistorted, ready to upsample."""
 
     images: Annotated[Path, tyro.conf.Positional]
-    """A folder of photographs, or a video, of which sharp frames at even distances are used. No
-    features are detected where masks (in a folder masks beside the photographs) are 0."""
+    """A folder of photographs, a phone app's export, or a video, of which sharp frames at even
+    distances are used. No features are detected where masks (in a folder masks beside the
+    photographs) are 0."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """The scene folder to write."""
     poses_from: Path | None = None
@@ -112,6 +117,9 @@ def _from_photographs(options: Options, images: Path, clock: StageClock) -> SfmR
     video = images != options.images
     settings = Settings(options.matcher, options.device, seed=options.seed, threads=options.threads)
     masks: Masks | None = None
+    capture = None if video else _posed(options.images)
+    if capture is not None and capture.source is not None and capture.source.format == "phone":
+        images = capture.source.image_dir or images  # an app's folder has other pictures, too
     if options.poses_from is None:
         stages = ["mapping"]
         how: dict[str, Any] = {
@@ -141,28 +149,42 @@ def _from_photographs(options: Options, images: Path, clock: StageClock) -> SfmR
         overwrite=options.overwrite,
         on_progress=clock,
         on_note=print_note,
-        on_photos=partial(_report_photographs, options, clock, stages),
+        on_photos=partial(_report_photographs, options, images, capture, clock, stages),
         **how,
     )
 
 
+def _posed(path: Path) -> Scene | None:
+    """Return the scene of photographs with poses that is at a path already, if there is one."""
+    try:
+        scene = load_scene(path, require_points=False)
+    except SplatseedError:
+        return None  # its photographs may do
+    return scene if scene.images else None
+
+
 def _report_photographs(
     options: Options,
+    images: Path,
+    capture: Scene | None,
     clock: StageClock,
     stages: Sequence[str],
     names: Sequence[str],
     left_out: Mapping[str, Sequence[str]],
     cameras: str,
 ) -> None:
-    """Print the images that are read, since subfolders may hold images of other scenes."""
-    images, number = options.images, len(names)
+    """Print the images that are read, since subfolders may hold images of other scenes.
+
+    ``capture`` is the scene at ``options.images``, whose poses are not used unless asked for.
+    """
+    number = len(names)
     chosen = options.matcher == "auto" and number > FIRST_LOOK.max_exhaustive
     look = [STAGE, *([NEIGHBOURS] if options.poses_from else [])] if chosen else []
     clock.expect("features", *look, "matching", *stages, "undistortion")
     clock.count(number, "photographs", "features", STAGE)
     if options.matcher != "sequential" and not chosen:
         clock.count(math.comb(number, 2), "pairs", "matching")
-    if is_video(images):
+    if is_video(options.images):
         return
     folders = Counter(str(PurePosixPath(name).parent) for name in names)
     shown = name_some([f"{count:,} in {folder}" for folder, count in folders.most_common()])
@@ -170,8 +192,19 @@ def _report_photographs(
     ERR.print(visible(f"{counted(len(names), 'photograph')} in {images}{where}"), soft_wrap=True)
     if cameras:
         ERR.print(cameras, soft_wrap=True)
-    for what, them in left_out.items():
-        print_note(f"Left out: {counted(len(them), 'image')} {what}, {name_some(them)}.")
+    skipped = [
+        f"{counted(len(them), 'image')} {what} ({name_some(them, SHOWN)})"
+        for what, them in left_out.items()
+    ]
+    if skipped:
+        print_note(f"Left out: {'; '.join(skipped)}.")
+    if capture is not None and options.poses_from is None:
+        scene = quoted(options.images)
+        print_note(
+            f"{visible(options.images)} has poses of {counted(len(capture.images), 'photograph')}: "
+            f"splatseed upsample {scene} -o OUT uses them without SfM, splatseed info {scene} "
+            "measures their error."
+        )
 
 
 def _summarise(options: Options, report: SfmReport) -> None:

@@ -49,6 +49,11 @@ def is_scanner_app(folder: Path) -> bool:
     return False
 
 
+def is_photograph(name: str) -> bool:
+    """Whether a file of an export has the name of a frame's photograph."""
+    return _PHOTOGRAPH.fullmatch(name) is not None
+
+
 def read_scanner_app(root: StrPath) -> Scene:
     """Read the frames that have a photograph, with their depth maps; the cloud is empty.
 
@@ -59,7 +64,7 @@ def read_scanner_app(root: StrPath) -> Scene:
     root = Path(root)
     names = sorted(path.name for path in root.iterdir())
     records = {Path(name).stem: root / name for name in names if _RECORD.fullmatch(name)}
-    photographs = {Path(name).stem: name for name in names if _PHOTOGRAPH.fullmatch(name)}
+    photographs = {Path(name).stem: name for name in names if is_photograph(name)}
     used = [name for stem, name in photographs.items() if stem in records]
     first = next(iter(records.values()))
     if not used:

@@ -224,7 +224,8 @@ def map_images(
     models_dir = (run.kept.folder if run.kept else run.work) / MODELS
     models = _mapped(run, models_dir, names, match_further)
     more = ["take more overlapping photographs", "remove those of other places"]
-    if match_further is not None or run.settings.matcher == "sequential":
+    chosen = match_further is not None or run.settings.matcher == "sequential"
+    if chosen and run.num_pairs() < math.comb(len(names), 2):
         more.append("match all pairs with `matcher='exhaustive'`")
     if camera_model not in _SIMPLE:
         more.append("use a simpler camera model such as SIMPLE_RADIAL")

@@ -25,6 +25,7 @@ from splatseed.io.film import choose_frames
 from splatseed.io.mask_files import masks_among
 from splatseed.io.photograph import check_photograph, open_photograph, photograph_bytes
 from splatseed.io.photograph_checks import check_sizes, resized_to
+from splatseed.io.scanner_app import is_photograph, is_scanner_app
 from splatseed.io.staging import read_manifest
 from splatseed.io.video import ANALYSIS_WIDTH, sharpness, small_frames, write_frames
 from splatseed.progress import Progress, silent
@@ -42,6 +43,7 @@ _GREY = "of 16-bit or floating-point grey, as depth maps are"
 _FOREIGN = "of an unsupported format"
 _MASK = "named as masks of others are"
 _MAP = "of grey, named as maps of depth or confidence are"
+_BESIDE = "that 3D Scanner App writes beside its photographs"
 _DEPTH_MODES = ("I", "F")  # Pillow's names for 16- and 32-bit grey
 _GREY_MODES = ("L", "1", "LA")
 _MAPS = re.compile(r"(^|[/_.-])(conf|confidence|depth|disparity|masks?)([/_.\d-]|$)", re.IGNORECASE)
@@ -57,8 +59,8 @@ def find_photos(image_dir: StrPath) -> tuple[dict[str, Photo], dict[str, list[st
     """Find the photographs of a folder and its subfolders, at least two.
 
     Skipped are hidden files, masks, depth maps (16-bit or float grey; next to colour photographs
-    also 8-bit grey with the name of a depth or confidence map), and unsupported formats such as
-    HEIC or raw.
+    also 8-bit grey with the name of a depth or confidence map), textures and thumbnails in an
+    export of 3D Scanner App, and unsupported formats such as HEIC or raw.
 
     Returns:
         The photographs by name (relative path), sorted; and the names of skipped images by reason.
@@ -88,6 +90,10 @@ def find_photos(image_dir: StrPath) -> tuple[dict[str, Photo], dict[str, list[st
     )
     masks = masks_among(names)
     names = [name for name in names if name not in masks]
+    beside = []
+    if is_scanner_app(image_dir):
+        beside = [name for name in names if not (is_photograph(name) or _MAPS.search(name))]
+        names = [name for name in names if name not in beside]
     with ThreadPoolExecutor() as pool:  # Pillow decodes outside the GIL
         read = dict(zip(names, pool.map(lambda n: _read(image_dir / n), names), strict=True))
     grey = [name for name, (photo, _) in read.items() if photo is None]
@@ -98,6 +104,7 @@ def find_photos(image_dir: StrPath) -> tuple[dict[str, Photo], dict[str, list[st
     kinds = (
         (_GREY, grey),
         (_MAP, [n for n in maps if n not in grey]),
+        (_BESIDE, beside),
         (_FOREIGN, foreign),
         (_MASK, sorted(masks)),
     )
