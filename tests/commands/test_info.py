@@ -87,6 +87,7 @@ def test_the_advice_depends_on_the_plan(room, splatseed):
     assert "leave the points as they are" in sparse
     assert "Strategy grow puts new Gaussians" in " ".join(sparse.split())
     assert "--seeds scene --budget 5400 --max-steps 20000" in sparse
+    assert "5,400 Gaussians at most (0.5rho of 120 x 90 pixels), 20,000 steps" in sparse
 
 
 def test_info_on_points_alone_does_not_wait_for_numba(room):

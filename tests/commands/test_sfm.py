@@ -67,7 +67,7 @@ def test_the_photographs_are_counted_by_folder(called, tmp_path, splatseed, caps
     )
     told = capsys.readouterr()
     assert told.err == f"3 photographs in {tmp_path}: 2 in scene, 1 in run\n1 camera\n"
-    assert "note: Left out: 1 image of grey (run/d.png).\n" == told.out
+    assert told.out == "note: Left out: 1 image of grey (run/d.png).\n"
 
 
 def test_an_apps_export_gives_its_photographs_and_its_poses_are_pointed_out(

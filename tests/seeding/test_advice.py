@@ -33,6 +33,8 @@ def test_what_is_there_decides_the_method(measured, most, strategy, method, says
     said = advise(measured, most, strategy=strategy)
     assert said.method == method
     assert all(word in reason for word, reason in zip(says, said.reasons, strict=False))
+    per_pixel = "per pixel of a photograph's" in said.reasons[0]
+    assert per_pixel == (measured.num_points > 0 and measured.photographs)
     assert ("leave" in said.sentence) == (method == AS_IT_IS)
 
 

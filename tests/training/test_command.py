@@ -38,8 +38,9 @@ def test_trains_by_the_best_strategy_and_says_what_and_where(room_path, tmp_path
     words = (room_path, "--max-steps", "3", "--long-side", "48", "-o", run)
     assert _run(*words) == 0
     said = capsys.readouterr()
-    for words_said in ("-> strategy grow (auto),", f"At most {48 * 36:,} Gaussians", "test PSNR",
-                       f"splatseed view {run}"):  # fmt: skip
+    size = "rho of 48 x 36 pixels"
+    for words_said in ("-> strategy grow (auto),", f"At most {48 * 36:,} Gaussians: 1{size}",
+                       "test PSNR", f"splatseed view {run}"):  # fmt: skip
         assert words_said in said.out
     assert not said.err
     config, metrics = _json(run / "config.json"), _json(run / "metrics.json")
@@ -57,6 +58,7 @@ def test_trains_by_the_best_strategy_and_says_what_and_where(room_path, tmp_path
         assert _run(*words, "--strategy", strategy, *budget, "--overwrite") == 0
         config = _json(run / "config.json")
         assert (config["strategy"], config["cap_max"]) == (strategy, cap)
+        assert (f"{cap} Gaussians: 0.25{size}" in capsys.readouterr().out) == bool(budget)
     # Where nothing is named, a run goes on as it began.
     asked = TrainSettings()
     again = replace(asked, max_steps=3, data_factor=2)

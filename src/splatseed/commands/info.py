@@ -389,7 +389,8 @@ def _photograph_rows(
 
 def _advice_rows(advice: Advice, planned: Planned) -> list[tuple[str, str]]:
     """Return the advice, its reasons, and the training it is for."""
-    plan = f"{planned.budget:,} Gaussians at most, {planned.max_steps:,} steps, strategy"
+    size = f" ({planned.rho})" if planned.rho else ""
+    plan = f"{planned.budget:,} Gaussians at most{size}, {planned.max_steps:,} steps, strategy"
     rows = [("planned", f"{plan} {planned.strategy}"), ("advice", advice.sentence)]
     if advice.measured.layout:
         rows.insert(0, ("cameras stand", advice.measured.layout))

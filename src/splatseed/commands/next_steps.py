@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from shutil import which
 from typing import Literal, NamedTuple, TypeAlias
@@ -41,6 +42,7 @@ class Planned(NamedTuple):
     """How a scene will be trained, and the options of train for it."""
 
     budget: int
+    rho: str  # the budget per pixel, and the photograph's size; empty without photographs
     max_steps: int
     strategy: str
     max_seeds: int
@@ -62,8 +64,8 @@ class Planned(NamedTuple):
         images = at_file_size(scene).images
         factor = TrainSettings().with_data_factor(images).factor
         lenses = [image.intrinsics for image in images]
-        sizes = [(lens.width // factor) * (lens.height // factor) for lens in lenses]
-        pixels = round(float(np.median(sizes))) if sizes else BUDGET
+        sizes = [(lens.width // factor, lens.height // factor) for lens in lenses]
+        pixels = round(float(np.median([w * h for w, h in sizes]))) if sizes else BUDGET
         number, flags = max(2, min(BUDGET, pixels)), ""
         if budget is not None:
             from splatseed.seeding.budget import points_within
@@ -75,7 +77,11 @@ class Planned(NamedTuple):
         strategy: StrategyName = "auto" if trainer == "splatseed" else "default"
         settings = TrainSettings(strategy=strategy, max_steps=max_steps, cap_max=number)
         max_seeds = settings.max_seeds(number)
-        return cls(number, max_steps, settings.densification, max_seeds, flags, trainer)
+        rho = ""
+        if sizes:
+            width, height = sorted(sizes, key=math.prod)[len(sizes) // 2]
+            rho = f"{number / pixels:.2g}rho of {width} x {height} pixels"
+        return cls(number, rho, max_steps, settings.densification, max_seeds, flags, trainer)
 
 
 def advice_commands(

@@ -28,7 +28,7 @@ from splatseed.io.files import read_text
 from splatseed.requirements import require
 from splatseed.runtime.interruption import exit_code
 from splatseed.scores import TrainingResult
-from splatseed.seeding.budget import RHO
+from splatseed.seeding.budget import in_rho
 from splatseed.settings import fits
 from splatseed.text import did_you_mean, quoted, visible
 from splatseed.training.duration import (
@@ -279,7 +279,7 @@ def _watched(options: Options, training: TrainingRun) -> Iterator[TrainingViewer
 
 def _per_pixel(options: Options) -> bool:
     """Whether the budget depends on the size of the photographs."""
-    return options.budget is None or options.budget.strip().lower().endswith(RHO)
+    return options.budget is None or in_rho(options.budget)
 
 
 class _TimeLeft:

@@ -118,7 +118,8 @@ def advise(
     has = max_seeds / measured.num_points
     share = measured.num_points / measured.pixels if measured.pixels else 0.0
     shown = f"{share:.2f}" if share >= 0.01 or not share else f"{share:.1g}"
-    per_pixel = f"{measured.num_points:,} points, {shown} per pixel"
+    size = f" of a photograph's {measured.pixels:,.0f}" if measured.pixels else ""
+    per_pixel = f"{measured.num_points:,} points, {shown} per pixel{size}"
     if has < room:
         full = (
             f"Training starts with at most {max_seeds:,}, so there is no room for more: where that "

@@ -33,17 +33,27 @@ def describe_rho(scene: Scene, budget: int | str | None) -> str:
         ''
     """
     photographs = _at_trained_size(scene)
-    if not photographs or not str(budget).strip().lower().endswith(RHO):
+    if not photographs or not in_rho(budget):
         return ""
-    by_pixels = sorted(photographs, key=lambda view: view.width * view.height)
-    middle = by_pixels[len(by_pixels) // 2]
-    return f": {str(budget).strip()} of {middle.width} x {middle.height} pixels"
+    return f": {str(budget).strip()} of {median_size(photographs)} pixels"
+
+
+def in_rho(budget: int | str | None) -> bool:
+    """Whether a budget is per pixel of a photograph."""
+    return str(budget).strip().lower().endswith(RHO)
 
 
 def _at_trained_size(scene: Scene) -> tuple[View, ...]:
     """The views of a scene, without pixels, at the default training size."""
     images = at_file_size(scene).images
     return camera_views(images, factor_for_size(images, TRAINED_SIDE)) if images else ()
+
+
+def median_size(views: Sequence[View]) -> str:
+    """Return the width and height of the view of median size, for messages: "1600 x 1200"."""
+    by_pixels = sorted(views, key=lambda view: view.width * view.height)
+    middle = by_pixels[len(by_pixels) // 2]
+    return f"{middle.width} x {middle.height}"
 
 
 def median_pixels(views: Sequence[View]) -> float:

@@ -29,7 +29,7 @@ from splatseed.progress import Note, Progress, silent, silent_note
 from splatseed.requirements import require
 from splatseed.scene import Image, Scene
 from splatseed.scores import EvalResult
-from splatseed.seeding.budget import median_pixels, parse_budget
+from splatseed.seeding.budget import in_rho, median_pixels, median_size, parse_budget
 from splatseed.text import did_you_mean
 from splatseed.training.folder import RunFolder
 from splatseed.training.models import config_of, model_file, near_plane_of
@@ -327,16 +327,19 @@ def _within_budget(
         return settings
     views = camera_views(scene.images, settings.factor)
     pixels = median_pixels(views) if views else 0
+    size = f"{median_size(views)} pixels, a photograph's size in training" if views else ""
     if budget is not None:
         cap = parse_budget(budget, pixels)
         if cap < MIN_GAUSSIANS:
             expected = f"`budget` of {MIN_GAUSSIANS} Gaussians or more"
             raise ParameterError(expected, found=str(budget), fix="Try 0.25rho.")
+        if in_rho(budget):
+            note(f"At most {cap:,} Gaussians: {budget} of {size}.")
         return dataclasses.replace(settings, cap_max=cap)
     cap = max(2, min(BUDGET, round(pixels)))
-    reason = "one for each pixel of a photograph; `budget` sets another"
+    reason = f"{'1rho' if pixels <= BUDGET else 'fewer than 1rho'} of {size}"
     if settings.start:  # a merge of two may be larger, and must not be thinned unless asked for
-        cap = max(cap, len(read_gaussians(Path(settings.start))))
-        reason = "one for each pixel of a photograph, or as many as it starts with"
-    note(f"At most {cap:,} Gaussians, {reason}.")
+        number = len(read_gaussians(Path(settings.start)))
+        cap, reason = (number, "as many as it starts with") if number > cap else (cap, reason)
+    note(f"At most {cap:,} Gaussians: {reason}; `budget` sets another number.")
     return dataclasses.replace(settings, cap_max=cap)
