@@ -25,8 +25,10 @@ from splatseed.io.nerfstudio import read_cloud_transform
 from splatseed.io.origin import translated
 from splatseed.io.ply import read_ply, write_ply
 from splatseed.io.staging import unlisted_files
-from splatseed.methods import METHODS, SOURCE_CODES, chooses_number, configure
+from splatseed.methods import METHODS, SOURCE_CODES, chooses_number, configure, source_code
 from splatseed.pointcloud import PointCloud
+from splatseed.seeding.coverage import covered_share
+from splatseed.seeding.photo_methods import frames_of
 from splatseed.sfm.refinement import poses_of, turns
 from splatseed.similarity import Similarity
 from splatseed.splat.formats import read_gaussians
@@ -83,12 +85,25 @@ def seeded(room, tmp_path_factory):
     return out, said.getvalue()
 
 
-def test_the_default_method_uses_the_photographs(seeded):
+def test_the_default_method_uses_the_photographs(seeded, room):
     out, said = seeded
     assert "at most 2,000 points" in said
     assert re.search(r"[\d,]+ original, [\d,]+ stereo, [\d,]+ cover", said)
-    assert re.search(r"covered +[\d.]+% of the 8 x 8 pixel cells", said)
     written = _manifest(out)
+    shares, points = written["covered"], load_scene(out).points
+    assert shares["cell"] == 8
+    measured = points.xyz[points.source != source_code("cover")]
+    frames, room_points = frames_of(load_scene(room)), load_scene(room).points.xyz
+    for share, xyz in (("before", room_points), ("measured", measured), ("total", points.xyz)):
+        assert shares[share] == pytest.approx(covered_share(frames, xyz), abs=1e-6)
+    assert 0.1 < shares["before"] < shares["measured"] < shares["total"] <= 1
+    assert re.search(
+        rf"covered +{shares['measured']:.1%} of the 8 x 8 pixel cells .* hold points of the scene "
+        rf"or points on surfaces that photographs confirm; {shares['before']:.1%} before\n"
+        rf" +guessed +{shares['total'] - shares['measured']:.1%} hold only points guessed from "
+        rf"neighbours by cover \({len(points) - len(measured):,} of {len(points):,} points\)",
+        said,
+    )
     assert (written["method"], written["budget"]) == ("auto", "2000")
     assert len(load_scene(out).points) <= 2000
     assert pycolmap.Reconstruction(out / "sparse/0").num_images() == 12

@@ -139,3 +139,4 @@ def test_changing_light_gives_a_warning_and_exposure_none(room, tmp_path):
     agreement = check_poses(lit, lit.images)
     assert f"{agreement:.0%} of the pixels" in agreement_warning(agreement)
     assert "20%" in agreement_warning(0.08, 0.8)
+    assert f"{agreement:.0%}" not in agreement_warning(agreement, stated=True)

@@ -84,10 +84,13 @@ def source_code(name: str) -> int:
     return SOURCE_CODES.get(name, GENERATED)
 
 
-def source_name(code: int) -> str:
-    """Return the method's name, "original" or "other" for a ``PointCloud.source`` code."""
+def source_name(code: int, other: str = "other") -> str:
+    """Return the method's name, or "original", for a ``PointCloud.source`` code.
+
+    All third-party methods have one code, and the name ``other``.
+    """
     names = {ORIGINAL: "original", **{code: name for name, code in SOURCE_CODES.items()}}
-    return names.get(code, "other")
+    return names.get(code, other)
 
 
 Profile = Literal["default", "paper"]

@@ -120,9 +120,9 @@ class Stereo(PhotographMethod):
             from splatseed.seeding.pose_accuracy import estimate_pose_error
             from splatseed.seeding.poses import agreement_warning, check_poses
 
-            faint = agreement_warning(check_poses(scene, images, progress))
+            faint = agreement_warning(check_poses(scene, images, progress), stated=True)
             error = estimate_pose_error(scene, images, progress)
-            warnings = tuple(each for each in (error.warning if error else "", faint) if each)
+            warnings = tuple(each for each in (faint, error.warning if error else "") if each)
         guided, notes = self._guided(scene, images)
         warnings = (*warnings, *notes)
         views = read_views(scene, images, self.max_size, progress)

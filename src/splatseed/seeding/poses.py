@@ -159,19 +159,28 @@ def _disagreement(
     )
 
 
-def agreement_warning(agreement: float, masked: float = 0.0) -> str:
+def agreement_warning(agreement: float, masked: float = 0.0, *, stated: bool = False) -> str:
     """Explain a low result of ``check_poses`` in a sentence; empty if it is not low.
 
-    ``masked`` is the fraction of the pixels that masks leave out.
+    Args:
+        agreement: The result.
+        masked: Fraction of the pixels that masks leave out.
+        stated: Whether the share of pixels with a confirmed depth has been stated, by all
+            photographs instead of a few: two different numbers for it would confuse.
     """
     if agreement >= _SETTINGS.low:
         return ""
     few = f" masks that leave {1 - masked:.0%} of the pixels," if masked >= 0.5 else ""
+    what = "Likely reasons for so little are"
+    if not stated:
+        what = (
+            f"The photographs agree on the depth of only {agreement:.0%} of the pixels that count, "
+            "so method auto will find few points. Likely reasons are"
+        )
     return (
-        f"The photographs agree on the depth of only {agreement:.0%} of the pixels that count, so "
-        f"method auto will find few points. Likely reasons are{few} light that changes between "
-        "photographs, bare or shiny surfaces, or photographs far apart. Take more from closer "
-        "together in constant light, or triangulate points (splatseed sfm --poses-from)."
+        f"{what}{few} light that changes between photographs, bare or shiny surfaces, or "
+        "photographs far apart. Take more from closer together in constant light, or triangulate "
+        "points (splatseed sfm --poses-from)."
     )
 
 

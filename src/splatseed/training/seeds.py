@@ -14,6 +14,7 @@ import numpy as np
 
 from splatseed.depth.stereo.maps import StereoResult
 from splatseed.io.seeds import saw_all_photographs, was_upsampled
+from splatseed.methods import source_code
 from splatseed.photos.view import View
 from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.progress import Note, Progress
@@ -71,6 +72,8 @@ def seeded(
     if len(scene.points):
         made = f"{kept:,} points of the scene and {len(cloud) - kept:,} new ones"
         alternative = " `seeding='scene'` starts from the scene's points alone."
+    guessed = np.count_nonzero(cloud.source == source_code("cover"))
+    made = f"{made}, {guessed:,} of them guessed from neighbours"
     note(f"Seeds by method auto: {made}, in {time.perf_counter() - start:.0f} s.{alternative}")
     return scene.replace(points=cloud), stereo[0] if stereo else None
 

@@ -86,11 +86,13 @@ def _upsample(options: Options, methods: dict[str, Any]) -> None:
         )  # fmt: skip
         seeded = scene.with_points(seeds)
         clock("check", 0.0)
-        findings = report.findings(scene, seeds, method)
+        coverage = report.measure_coverage(scene, seeds)
+        findings = report.findings(options, scene, seeds, method, coverage)
         clock("write", 0.0)
         written = write_scene(
             seeded, options.output, format=options.format, overwrite=options.overwrite,
-            copy_images=options.copy_images, provenance=report.provenance(options, scene, method),
+            copy_images=options.copy_images,
+            provenance=report.provenance(options, scene, method, coverage),
         )  # fmt: skip
         if cloud is not None:
             cloud.write(options.output)
@@ -98,7 +100,7 @@ def _upsample(options: Options, methods: dict[str, Any]) -> None:
         seconds = clock.seconds()
     if options.gaussians is not None:
         notes.append(f"The initial Gaussians are in {visible(options.gaussians)}.")
-    origins = report.origin_counts(seeds, written.num_points)
+    origins = report.origin_counts(seeds, options.method, written.num_points)
     report.summarise(options, scene, replaced, origins, written, seconds, findings)
     for note in notes:
         print_note(note)

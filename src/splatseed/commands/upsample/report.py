@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,13 +15,28 @@ from splatseed.commands.upsample.options import Options
 from splatseed.commands.upsample.previews import PICTURES
 from splatseed.console import print_note, print_pairs
 from splatseed.io import WriteReport
-from splatseed.methods import Profile, Upsampler, chooses_number, configure, source_name
+from splatseed.methods import (
+    Profile,
+    Upsampler,
+    chooses_number,
+    configure,
+    source_code,
+    source_name,
+)
 from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.scene import Scene
 from splatseed.seeding.geometry_score import far_share
+from splatseed.seeding.photo_methods import CELL
 
 CLOUD_PARAMETERS = {"files", "transform", "memory", "alone"}
 """Parameters of the method cloud that other lines show."""
+MEASURED = {
+    "stereo": "points on surfaces that photographs confirm",
+    "depth": "points at the depth of depth maps",
+    "cloud": "points of the scan",
+}
+"""Origins of new points at a measured depth, and what they are."""
+GUESSED = "guessed from neighbours"
 
 
 def parameters_of(method: Upsampler) -> dict[str, object]:
@@ -29,7 +45,9 @@ def parameters_of(method: Upsampler) -> dict[str, object]:
     return {name: value for name, value in given.items() if name not in CLOUD_PARAMETERS}
 
 
-def provenance(options: Options, scene: Scene, method: Upsampler) -> dict[str, object]:
+def provenance(
+    options: Options, scene: Scene, method: Upsampler, coverage: Coverage | None
+) -> dict[str, object]:
     """Return how the output was made, for ``splatseed.json``."""
 
     def full(path: Path | None) -> str | None:
@@ -55,6 +73,7 @@ def provenance(options: Options, scene: Scene, method: Upsampler) -> dict[str, o
         "budget": options.budget,
         "cover": options.cover_cell,
         "verify": options.verify,
+        "covered": None if coverage is None else {"cell": CELL, **coverage._asdict()},
         "seed": options.seed,
     }
 
@@ -97,28 +116,68 @@ def number_summary(total: int | None, limit: int | None, changed_by: Sequence[st
     return f"{total:,} points{before}"
 
 
-def findings(scene: Scene, seeds: PointCloud, method: Upsampler) -> list[tuple[str, str]]:
+class Coverage(NamedTuple):
+    """Shares, 0 to 1, of the photographs' cells, ``CELL`` pixels a side, that hold a point."""
+
+    before: float  # of the scene
+    measured: float  # of the scene, or at a depth that was measured
+    total: float  # of any kind, guesses included
+
+
+def measure_coverage(scene: Scene, seeds: PointCloud) -> Coverage | None:
+    """Return the coverage of the photographs; None without images."""
+    if not scene.images:
+        return None
+    from splatseed.seeding.upsampling import share_covered
+
+    measured = seeds.select(np.isin(seeds.source, [ORIGINAL, *map(source_code, MEASURED)]))
+    return Coverage(*(share_covered(scene, each) for each in (scene.points, measured, seeds)))
+
+
+def findings(
+    options: Options, scene: Scene, seeds: PointCloud, method: Upsampler, coverage: Coverage | None
+) -> list[tuple[str, str]]:
     """Return rows on new points far from the originals, and on photograph cells covered."""
     rows = []
     if len(scene.points) and not chooses_number(method):
         new = seeds.xyz[seeds.source != ORIGINAL]
         far = far_share(scene.points.xyz, new)
         rows.append(("far from any original", f"{far:.2%} of the new points, over 3 spacings"))
-    if scene.images:
-        from splatseed.seeding.upsampling import share_covered
-
-        before, after = share_covered(scene, scene.points), share_covered(scene, seeds)
-        share = f"{after:.1%} of the 8 x 8 pixel cells of the photographs have a point"
-        rows.append(("covered", f"{share}; {before:.1%} before"))
+    if coverage is not None:
+        rows += _coverage_rows(coverage, origin_counts(seeds, options.method))
     return rows
 
 
-def origin_counts(seeds: PointCloud, written: int) -> dict[str, int]:
-    """Count the points by origin; fewer than ``seeds`` are ``written`` if positions repeat."""
-    if len(seeds) > written:
+def _coverage_rows(coverage: Coverage, counts: Mapping[str, int]) -> list[tuple[str, str]]:
+    """Describe cells with measured points, and those that only hold points of other kinds."""
+    kinds = [words for name, words in MEASURED.items() if name in counts]
+    if coverage.before or not kinds:
+        kinds.insert(0, "points of the scene")
+    cells = f"of the {CELL} x {CELL} pixel cells of the photographs hold {' or '.join(kinds)}"
+    before = f"; {coverage.before:.1%} before" if coverage.before else ""
+    rows = [("covered", f"{coverage.measured:.1%} {cells}{before}")]
+    others = {n: counts[n] for n in counts if n not in {*MEASURED, source_name(ORIGINAL)}}
+    if others:
+        from splatseed.seeding.upsampling import INTERPOLATING
+
+        how = {**dict.fromkeys(INTERPOLATING, "interpolated between points"), "cover": GUESSED}
+        made = " or ".join(f"{how.get(name, 'made')} by {name}" for name in others)
+        of = f"{sum(others.values()):,} of {sum(counts.values()):,} points"
+        share = max(0.0, coverage.total - coverage.measured)
+        rows.append(("guessed", f"{share:.1%} hold only points {made} ({of})"))
+    return rows
+
+
+def origin_counts(seeds: PointCloud, method: str, written: int | None = None) -> dict[str, int]:
+    """Count the points by origin, ``method`` if no other is known.
+
+    Fewer than ``seeds`` are ``written`` if positions repeat.
+    """
+    if written is not None and len(seeds) > written:
         seeds = seeds.select(seeds.distinct)
     codes, counts = np.unique(seeds.source, return_counts=True)
-    return dict(zip(map(source_name, codes.tolist()), counts.tolist(), strict=True))
+    names = [source_name(code, method) for code in codes.tolist()]
+    return dict(zip(names, counts.tolist(), strict=True))
 
 
 def summarise(
