@@ -69,6 +69,11 @@ def install_command(*packages: str, upgrade: bool = False) -> str:
     options = ["--upgrade"] if upgrade else []
     options += ["-c", quoted(_TESTED)] if _TESTED.is_file() else []
     words = ["install", *options, *map(quote, wanted)]
+    return pip_command(*words)
+
+
+def pip_command(*words: str) -> str:
+    """Return a command of this Python's own pip, such as "python -m pip uninstall NAME"."""
     return f"{quoted(sys.executable or 'python')} -m pip {' '.join(words)}"
 
 

@@ -96,7 +96,7 @@ COMMANDS = [
     ((*UP, "--budget", "1e-9rho"), "1e-9rho"),
     ((*UP, "--cover", "8"), "--auto.cell"),
     ((*UP, "--auto.grid", "0"), "grid"),
-    ((*UP, "--method", "magic"), "magic"),
+    ((*UP, "--method", "magic"), "pip install"),
     ((*UP, "--format", "nerf"), "nerf"),
     ((*UP, "--ratoi", "4"), "--ratio"),
     ((*MLS, "--mls.k", "2"), "mls.k"),

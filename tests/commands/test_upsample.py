@@ -8,6 +8,7 @@ import re
 import shlex
 import shutil
 from contextlib import redirect_stdout
+from importlib.metadata import EntryPoint
 from io import StringIO
 from pathlib import Path
 from types import SimpleNamespace
@@ -24,15 +25,19 @@ from splatseed.io import load_scene, write_scene
 from splatseed.io.nerfstudio import read_cloud_transform
 from splatseed.io.origin import translated
 from splatseed.io.ply import read_ply, write_ply
+from splatseed.io.seeds import method_of_points
 from splatseed.io.staging import unlisted_files
 from splatseed.methods import METHODS, SOURCE_CODES, chooses_number, configure, source_code
+from splatseed.methods.registry import GROUP
 from splatseed.pointcloud import PointCloud
 from splatseed.seeding.coverage import covered_share
 from splatseed.seeding.photo_methods import frames_of
 from splatseed.sfm.refinement import poses_of, turns
 from splatseed.similarity import Similarity
 from splatseed.splat.formats import read_gaussians
+from splatseed.splat.training_frame import TrainingFrame
 from splatseed.synthetic import make_capture
+from splatseed.viewer.pictures import clouds_by_origin
 
 from ..command_line import exit_code
 
@@ -244,6 +249,35 @@ def test_poses_are_refined_and_points_triangulated(sharp_room, sharp_bare, tmp_p
     bare, truth = load_scene(sharp_bare, require_points=False), poses_of(sharp_room.images)
     before, after = (np.median(turns(poses_of(each.images), truth)) for each in (bare, out))
     assert after < 0.3 * before
+
+
+@pytest.fixture
+def own_method(tmp_path, monkeypatch):
+    """Installs the package that docs/methods.md shows."""
+    page = (Path(__file__).parents[2] / "docs/methods.md").read_text("utf-8")
+    own = page.partition("## Your own method")[2]
+    (code,) = re.findall(r"```python\n(.*?)```", own, re.DOTALL)
+    (name, value) = re.search(r"\[project.entry-points.*\n(\w+) = \"(.*)\"", own).groups()
+    (tmp_path / "package").mkdir()
+    (tmp_path / "package" / f"{value.partition(':')[0]}.py").write_text(code)
+    monkeypatch.syspath_prepend(tmp_path / "package")
+    monkeypatch.setitem(METHODS._plugins, name, EntryPoint(name, value, GROUP))
+    (command,) = re.findall(r"^splatseed upsample SCENE (.*) -o OUT$", own, re.MULTILINE)
+    return name, command.split()
+
+
+def test_a_method_of_ones_own_is_named_as_the_origin(own_method, room, tmp_path, splatseed):
+    name, words = own_method
+    run = splatseed("upsample", room, *words, "-o", tmp_path / "out")
+    assert (run.code, run.err) == (0, "")
+    new = 3 * len(load_scene(room).points)
+    assert f" original, {new:,} {name})" in run.out
+    assert f"hold only points made by {name} ({new:,} of " in run.out
+    scene = load_scene(tmp_path / "out")
+    assert method_of_points(scene) == name
+    clouds = clouds_by_origin(scene.points, TrainingFrame(np.zeros(3), 1.0), 100, name)
+    assert [cloud.name for cloud in clouds] == ["original", name]
+    assert method_of_points(load_scene(room)) == "other"
 
 
 # Depth maps ---------------------------------------------------------------------------------------

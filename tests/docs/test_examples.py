@@ -71,6 +71,11 @@ def test_compare_methods(run):
 
 
 def test_your_own_method(run):
+    page = (FOLDER.parent / "docs/methods.md").read_text("utf-8")
+    (block,) = re.findall(
+        r"```python\n(.*?)```", page.partition("## Your own method")[2], re.DOTALL
+    )
+    assert block in (FOLDER / "04_your_own_method.py").read_text("utf-8")
     assert run("04_your_own_method.py") == "500 points -> 2000, 500 of them the originals\n"
 
 

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+from importlib.metadata import EntryPoint
+
 import numpy as np
 import pytest
 
 import splatseed as ss
 from splatseed import METHODS
-from splatseed.errors import ParameterError, PointCloudError
+from splatseed.errors import (
+    MissingDependencyError,
+    ParameterError,
+    PointCloudError,
+    UnknownNameError,
+)
 from splatseed.methods import configure
 
 from .contract import METHOD_NAMES, PHOTOGRAPH_METHODS, Copies
@@ -99,6 +106,16 @@ def test_a_third_party_adds_methods_and_takes_none_over(wavy):
     assert list(METHODS) == names
     assert len(METHODS) == len(names)
     assert set(ss.upsample(wavy, "copies").source) == {0, 255}
+
+
+def test_a_method_that_is_not_installed_or_broken_is_explained(monkeypatch):
+    with pytest.raises(UnknownNameError, match=r"'copies'.*registers.*pip inst"):
+        METHODS["copies"]
+    entry = EntryPoint("copies", "no_such_module:Copies", "splatseed.methods")
+    monkeypatch.setitem(METHODS._plugins, "copies", entry)
+    expected = r"'copies', no_such_module:Copies .*ModuleNotFoundError.*pip uninstall"
+    with pytest.raises(MissingDependencyError, match=expected):
+        ss.upsample(ss.PointCloud(np.zeros((1, 3)), np.zeros((1, 3), np.uint8)), "copies")
 
 
 class Changing(Copies):

@@ -85,6 +85,12 @@ def was_upsampled(scene: Scene) -> bool:
     return _upsampling(scene) is not None or scene.points.num_original < len(scene.points)
 
 
+def method_of_points(scene: Scene) -> str:
+    """Return the name of the method that made the scene's new points; "other" if unknown."""
+    method = (_upsampling(scene) or {}).get("method")
+    return method if isinstance(method, str) else "other"
+
+
 def saw_all_photographs(scene: Scene) -> bool:
     """Whether ``splatseed upsample`` made new points from photographs and held none out."""
     facts = _upsampling(scene) or {}

@@ -13,9 +13,10 @@ from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Literal, cast
 
-from splatseed.errors import ParameterError, UnknownNameError
+from splatseed.errors import MissingDependencyError, ParameterError, UnknownNameError
 from splatseed.methods.contract import Need, Upsampler, traits_of
 from splatseed.pointcloud import GENERATED, ORIGINAL, PointCloud
+from splatseed.requirements import pip_command
 from splatseed.scene import Scene
 from splatseed.settings import change_settings
 from splatseed.text import did_you_mean
@@ -49,12 +50,29 @@ class MethodRegistry(Mapping[str, type[Upsampler]]):
             module, _, attribute = BUILT_IN[name].partition(":")
             return cast("type[Upsampler]", getattr(import_module(module), attribute))
         if name in self._plugins:
-            return cast("type[Upsampler]", self._plugins[name].load())
+            return self._load(name)
+        choose = did_you_mean(str(name), self).strip() or "Choose one of these."
         raise UnknownNameError(
             f"one of the methods {', '.join(self)}",
             found=repr(name),
-            fix=did_you_mean(str(name), self).strip() or "Choose one of these.",
+            fix=f"{choose} A method of your own is known by name once a package that registers it "
+            f"as an entry point in group {GROUP} is installed (docs/methods.md, "
+            f'"Your own method"): {pip_command("install", "-e", "FOLDER")}.',
         )
+
+    def _load(self, name: str) -> type[Upsampler]:
+        """Import the class that an installed package registers."""
+        entry = self._plugins[name]
+        try:
+            return cast("type[Upsampler]", entry.load())
+        except Exception as error:  # another's code may raise anything
+            package = entry.dist.name if entry.dist else entry.value
+            raise MissingDependencyError(
+                f"method {name!r}, {entry.value} of the package {package}, to be imported",
+                found=f"{type(error).__name__}: {error}",
+                fix="Correct the package and install it again, or do without: "
+                f"{pip_command('uninstall', package)}.",
+            ) from error
 
     def __contains__(self, name: object) -> bool:
         return name in BUILT_IN or name in self._plugins

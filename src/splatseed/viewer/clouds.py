@@ -94,8 +94,11 @@ def preview_errors(
     return page.write_grid(tiles, path, footer=bar)
 
 
-def preview_origins(scene: Scene, points: PointCloud, path: StrPath) -> Path:
-    """Write a page of the seeds in their own colours, and by origin over the photograph."""
+def preview_origins(scene: Scene, points: PointCloud, path: StrPath, other: str = "other") -> Path:
+    """Write a page of the seeds in their own colours, and by origin over the photograph.
+
+    ``other`` is the name of a third party's method.
+    """
     path = Path(path)
     camera = choose_camera(scene)
     scale = PAIR_SIDE / max(camera.width, camera.height)
@@ -108,7 +111,9 @@ def preview_origins(scene: Scene, points: PointCloud, path: StrPath) -> Path:
     ]
     codes, counts = np.unique(points.source, return_counts=True)
     entries = {
-        f"{source_name(int(code))}{' (guessed)' * int(code == GUESSED)} {count:,}": tuple(color)
+        f"{source_name(int(code), other)}{' (guessed)' * int(code == GUESSED)} {count:,}": tuple(
+            color
+        )
         for code, count, color in zip(codes, counts, origin_colors(codes).tolist(), strict=True)
     }
     return page.write_grid(tiles, path, columns=2, footer=page.legend(entries, 2 * size[0]))

@@ -253,8 +253,13 @@ class ViewerCloud:
     count: int
 
 
-def clouds_by_origin(points: PointCloud, frame: TrainingFrame, limit: int) -> list[ViewerCloud]:
-    """Split the finite points by origin, thinned evenly to ``limit``, in the viewer frame."""
+def clouds_by_origin(
+    points: PointCloud, frame: TrainingFrame, limit: int, other: str = "other"
+) -> list[ViewerCloud]:
+    """Split the finite points by origin, thinned evenly to ``limit``, in the viewer frame.
+
+    ``other`` is the name of a third party's method.
+    """
     every = max(1, -(-len(points) // limit))
     finite = points.select(points.finite)
     codes, counts = np.unique(finite.source, return_counts=True)
@@ -263,7 +268,7 @@ def clouds_by_origin(points: PointCloud, frame: TrainingFrame, limit: int) -> li
         part = finite.select(np.flatnonzero(finite.source == code)[::every])
         color = tuple(origin_colors(np.array([code], np.uint8))[0].tolist())
         xyz = frame.points_from_world(part.xyz)
-        clouds.append(ViewerCloud(source_name(code), xyz, part.rgb, color, count))
+        clouds.append(ViewerCloud(source_name(code, other), xyz, part.rgb, color, count))
     return clouds
 
 

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from PIL import Image as PillowImage
 
+from splatseed.io.seeds import method_of_points
 from splatseed.photos.view import View
 from splatseed.scene import Image, Scene
 from splatseed.text import visible
@@ -236,7 +237,8 @@ class Session:
 
     def _send_points(self, scene: Scene, limit: int) -> None:
         """Replace the browser's points by at most ``limit`` points of the scene."""
-        clouds = pictures.clouds_by_origin(scene.points, self._entry.frame, limit)
+        other = method_of_points(scene)
+        clouds = pictures.clouds_by_origin(scene.points, self._entry.frame, limit, other)
         if clouds:
             self._clouds = {cloud.name: cloud for cloud in clouds}
             self._base_size = pictures.point_size(clouds, scene.images, self._entry.frame)

@@ -106,13 +106,15 @@ class Options:
 class _Choice:
     """The options that determine which methods have options here, and the defaults of those."""
 
-    method: Literal[tuple(METHODS)] | None = None  # type: ignore[valid-type]  # known at run time
+    method: str | None = None  # perhaps unknown
     profile: Profile = "default"
 
 
 def parse(arguments: list[str]) -> tuple[Options, dict[str, Upsampler]]:
     """Parse the options of the verb and of every method."""
     chosen = parse_some(_Choice, arguments)
+    if chosen.method is not None:
+        METHODS[chosen.method]  # raises for an unknown one, with advice
     names: Collection[str] = METHODS
     if {"-h", "--help"} & set(arguments):  # the options of all methods are too many to read
         names = [] if chosen.method is None else [chosen.method]

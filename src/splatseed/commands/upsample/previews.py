@@ -53,7 +53,7 @@ def write_previews(
     clouds.preview_pair(scene, seeds, folder / PAIR, title=options.method)
     if scene.has_photographs:
         clock("preview", 0.4)
-        clouds.preview_origins(scene, seeds, folder / ORIGINS)
+        clouds.preview_origins(scene, seeds, folder / ORIGINS, options.method)
         clock("preview", 0.6)
         images = photographed(scene)
         views = read_views(scene, [images[i] for i in _some_of(images)], MAX_SIZE, silent)
