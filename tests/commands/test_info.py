@@ -42,6 +42,7 @@ def test_a_colmap_scene(room, splatseed, monkeypatch):
     assert rows["cameras"] == "1 PINHOLE 120x90"
     assert rows["images"] == "12 (10 to train, 2 to test)"
     assert rows["points"] == f"{len(scene.points):,}"
+    assert rows["depth maps"].startswith("12 beside the photographs; method depth aligns")
     assert rows["track length, images"].startswith(f"mean {scene.tracks.lengths.mean():.3g},")
     assert rows["reprojection error, px"].startswith(f"mean {scene.tracks.errors.mean():.3f},")
     low = [float(x) for x in rows["bounding box"].split()[:3]]

@@ -90,7 +90,10 @@ def test_an_apps_export_gives_its_photographs_and_its_poses_are_pointed_out(
         called["on_photos"](list(photos), left_out, "")
         told = capsys.readouterr()
         assert told.out.count("Left out") == (export == scanner)
-        assert f"{export} has poses of 12 photographs: splatseed upsample {export} " in told.out
+        assert (
+            f"{export} has poses of 12 photographs, and depth maps: splatseed upsample {export} "
+            in told.out
+        )
         assert f"12 photographs in {photographs}\n" in told.err
     left_out = find_photos(scanner)[1]
     assert [len(names) for names in left_out.values()] == [12, 12, 2]

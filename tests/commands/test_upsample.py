@@ -299,8 +299,12 @@ def test_the_maps_are_named_and_noted_or_the_scenes_own(room, surfaces, tmp_path
     assert told["parameters"]["min_agreeing"] == 2
     points = load_scene(own).points
     assert np.median(surfaces.distance(points.xyz[points.source != 0].astype(float))) < 0.01
+    maps = "Its 12 depth maps are not used by linear: method depth aligns them"
+    words = ("--method", "linear", "-o")
+    assert maps in splatseed("upsample", room, *words, tmp_path / "lines").out
     bare = write_scene(load_scene(room), tmp_path / "bare").path
     (bare / "depths").unlink()
+    assert "depth maps" not in splatseed("upsample", bare, *words, tmp_path / "bare_lines").out
     run = splatseed("upsample", bare, "--method", "depth", "-o", tmp_path / "none")
     assert (run.code, run.err.count("\n")) == (2, 1)
     assert "--depth" in run.err

@@ -35,6 +35,7 @@ from splatseed.depth.settings import DepthSettings
 from splatseed.depthmap import DepthKind, DepthMaps, in_scene_units
 from splatseed.errors import SplatseedError
 from splatseed.io import find_depths, load_scene
+from splatseed.io.load import depths_beside
 from splatseed.io.seeds import was_upsampled
 from splatseed.photos.camera_check import stray_camera_notes
 from splatseed.progress import Progress
@@ -104,6 +105,7 @@ def run(arguments: list[str]) -> None:
         alignments = None if options.depth is None else _alignments(options, scene, clock)
         known = _known_depths(scene.depths, clock) if options.depth and scene.depths else 0
         maps = diagnostics.depth_map_statistics(scene, clock)
+        beside = len(depths_beside(scene) or ())
         poses, faint = _check_poses(scene, masks.share, clock)
     doubt = poses["problem"] if poses else ""
     problems += [*stray_camera_notes(scene), *([masks.problem] if masks.problem else [])]
@@ -122,7 +124,7 @@ def run(arguments: list[str]) -> None:
     planned = Planned.of(usable, options.budget, options.max_steps, options.trainer)
     share = None if regions is None else regions.mean
     advice = advice_for(usable, planned.max_seeds, strategy=planned.strategy, empty=share)
-    rows = [*_source_rows(scene), *_depth_map_rows(maps)]
+    rows = [*_source_rows(scene), *_depth_map_rows(maps, beside)]
     rows += [*_cloud_rows(cloud), *_track_rows(tracks)]
     rows += _photograph_rows(regions, poses, masks)
     rows += _advice_rows(advice, planned) if len(scene.points) else []
@@ -284,6 +286,7 @@ def _facts_of(scene: Scene) -> dict[str, Any]:
             for c in scene.intrinsics
         ],
         "depth_maps": 0 if scene.depths is None else len(scene.depths),
+        "depth_maps_beside": len(depths_beside(scene) or ()),
     }
 
 
@@ -316,9 +319,12 @@ def _source_rows(scene: Scene) -> list[tuple[str, str]]:
     ]
 
 
-def _depth_map_rows(maps: diagnostics.DepthMapStatistics | None) -> list[tuple[str, str]]:
+def _depth_map_rows(
+    maps: diagnostics.DepthMapStatistics | None, beside: int
+) -> list[tuple[str, str]]:
     if maps is None:
-        return []
+        there = f"{beside:,} beside the photographs; method depth aligns them with the points"
+        return [("depth maps", there)] * (beside > 0)
     size = f"{maps.num_maps:,} of {maps.width} x {maps.height} pixels"
     if maps.confidence is not None:
         low, medium, high = maps.confidence

@@ -201,9 +201,9 @@ def _report_photographs(
     if capture is not None and options.poses_from is None:
         scene = quoted(options.images)
         print_note(
-            f"{visible(options.images)} has poses of {counted(len(capture.images), 'photograph')}: "
-            f"splatseed upsample {scene} -o OUT uses them without SfM, splatseed info {scene} "
-            "measures their error."
+            f"{visible(options.images)} has poses of {counted(len(capture.images), 'photograph')}"
+            f"{', and depth maps' if capture.depths else ''}: splatseed upsample {scene} -o OUT "
+            f"uses them without SfM, splatseed info {scene} measures the error of the poses."
         )
 
 

@@ -325,6 +325,23 @@ def with_own_depths(scene: Scene) -> Scene:
     return scene.replace(depths=search_depths(scene, scene.source.root))
 
 
+def depths_beside(scene: Scene) -> DepthFiles | None:
+    """Find files named as depth maps in the folder of a scene without maps; None without any.
+
+    In contrast to ``with_own_depths``, nobody asked for them: other files count less readily.
+    """
+    if scene.depths is not None or scene.source is None:
+        return None
+    try:
+        maps = search_depths(scene, scene.source.root)
+    except SplatseedError:
+        return None  # method depth, which needs them, raises it
+    shown = (
+        [] if maps is None else [f"{path.parent.name}/{path.name}" for path in maps.paths.values()]
+    )
+    return maps if shown and all("depth" in each.lower() for each in shown) else None
+
+
 def search_depths(scene: Scene, root: Path) -> DepthFiles | None:
     """Find depth maps as ``find_depths`` does; None if no image has one."""
     if _is_archive(root) or is_record3d(root):

@@ -156,6 +156,8 @@ def _announce(
     for warning in (*scene.warnings, *stray_camera_notes(scene)):
         print_note(warning)
     name, method = options.method, methods[options.method]
+    if unused := report.unused_maps_note(options, scene, method):
+        print_note(unused)
     if (listed := scene.listed) is not None and hasattr(method, "test_every"):
         tests = counted(len(listed.test), "test image")
         print_note(f"{tests} of the scene's {listed.origin} take no part in the seeds.")

@@ -14,7 +14,9 @@ from splatseed.commands.upsample.cloud import ALIGNMENT
 from splatseed.commands.upsample.options import Options
 from splatseed.commands.upsample.previews import PICTURES
 from splatseed.console import print_note, print_pairs
+from splatseed.depthmap import in_scene_units
 from splatseed.io import WriteReport
+from splatseed.io.load import depths_beside
 from splatseed.methods import (
     Profile,
     Upsampler,
@@ -27,6 +29,7 @@ from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.scene import Scene
 from splatseed.seeding.geometry_score import far_share
 from splatseed.seeding.photo_methods import CELL
+from splatseed.text import agreeing, counted
 
 CLOUD_PARAMETERS = {"files", "transform", "memory", "alone"}
 """Parameters of the method cloud that other lines show."""
@@ -114,6 +117,20 @@ def number_summary(total: int | None, limit: int | None, changed_by: Sequence[st
         return "as many points as the photographs need"
     before = f" before {' and '.join(changed_by)}" if changed_by else ""
     return f"{total:,} points{before}"
+
+
+def unused_maps_note(options: Options, scene: Scene, method: Upsampler) -> str:
+    """Point out the scene's depth maps if the method does not use them; else empty."""
+    attached, beside = scene.depths, depths_beside(scene)
+    maps = attached or beside
+    used = in_scene_units(attached) and getattr(method, "depth_maps", False)
+    if not maps or used or options.method == "depth" or options.depth_maps is not None:
+        return ""
+    others = "method depth aligns them with the points"
+    if in_scene_units(attached):
+        others = "methods auto and depth use them"
+    are = agreeing(len(maps), "is", "are")
+    return f"Its {counted(len(maps), 'depth map')} {are} not used by {options.method}: {others}."
 
 
 class Coverage(NamedTuple):
