@@ -422,11 +422,11 @@ def fair_budget(ratios: Sequence[float]) -> str:
 
 
 def describe_budget(budget: str) -> str:
-    """Describe a normalised budget: "0.25 per pixel of a photograph"."""
+    """Describe a normalised budget: "0.25 per pixel of a photograph in training"."""
     parts = list[str]()
     for part in budget.split(_OR):
         if part.endswith(RHO):
-            parts.append(f"{part.removesuffix(RHO)} per pixel of a photograph")
+            parts.append(f"{part.removesuffix(RHO)} per pixel of a photograph in training")
         elif part.endswith(PER_POINT):
             parts.append(f"{part.removesuffix(PER_POINT)} per point of the scene")
         else:
