@@ -7,20 +7,20 @@ import json
 import shutil
 import socket
 from dataclasses import replace
+from functools import partial
+from importlib import import_module
 
 import numpy as np
 import pytest
 from PIL import Image as PilImage
 
 pytest.importorskip("torch", reason="networks of transformers need PyTorch")
-pytest.importorskip("transformers", reason="needs splatseed[depth]")
+if importlib.util.find_spec("transformers") is None:
+    pytest.skip("needs splatseed[depth]", allow_module_level=True)
 
 import torch
-import transformers
 from safetensors.torch import load_file, save_file
-from transformers.modeling_outputs import DepthEstimatorOutput
 
-from splatseed.depth.monocular import DepthNetwork, Meaning, estimate_depths, load_network
 from splatseed.errors import (
     MissingDependencyError,
     OutputError,
@@ -87,7 +87,19 @@ SAVED = {
 """Networks by name: the kind and configuration of each, and of its image processor."""
 
 
-def save_network(name, folder):
+@pytest.fixture(scope="module")
+def transformers():
+    """The package, whose import would take a third of the time to collect all tests."""
+    return import_module("transformers")
+
+
+@pytest.fixture(scope="module")
+def monocular():
+    """What is tested, which imports the package as well."""
+    return import_module("splatseed.depth.monocular")
+
+
+def save_network(transformers, name, folder):
     """Save a network with random weights, large enough to make a map that is not flat."""
     kind, options, sizes = SAVED[name]
     processor = "DPT" if kind == "DepthAnything" else kind
@@ -114,10 +126,35 @@ CPU = torch.device("cpu")
 
 
 @pytest.fixture(scope="module")
-def saved(tmp_path_factory):
+def saved(transformers, tmp_path_factory):
     """The folder of a network by its name. Not to be written to."""
     folder = tmp_path_factory.mktemp("networks")
-    return {name: save_network(name, folder / name) for name in SAVED}
+    return {name: save_network(transformers, name, folder / name) for name in SAVED}
+
+
+@pytest.fixture(scope="module")
+def processor_of(transformers):
+    """Loads the image processor of a network's folder."""
+    return partial(transformers.AutoImageProcessor.from_pretrained, backend="pil")
+
+
+@pytest.fixture(scope="module")
+def identity(transformers, processor_of):
+    """A network that predicts the first channel of its input: a map shows where its pixels lie."""
+
+    class Identity(transformers.PreTrainedModel):
+        def __init__(self, path):
+            super().__init__(transformers.AutoConfig.from_pretrained(path))
+            self.weight, processor = torch.nn.Parameter(torch.zeros(1)), processor_of(path)
+            normalises = processor.do_normalize
+            self.mean = processor.image_mean[0] if normalises else 0.0
+            self.std = processor.image_std[0] if normalises else 1.0
+
+        def forward(self, pixel_values):
+            depth = (pixel_values[:, 0] * self.std + self.mean) * 255
+            return transformers.modeling_outputs.DepthEstimatorOutput(predicted_depth=depth)
+
+    return Identity
 
 
 @pytest.fixture
@@ -133,34 +170,33 @@ def ramp():
     return np.repeat((u + v)[..., None], 3, axis=2).astype(np.uint8)
 
 
-def processor_of(path):
-    return transformers.AutoImageProcessor.from_pretrained(path, backend="pil")
-
-
-def test_the_kind_of_a_network_comes_from_its_config_or_an_argument(saved, tmp_path):
+def test_the_kind_of_a_network_comes_from_its_config_or_an_argument(monocular, saved, tmp_path):
     for name in KINDS:
-        assert load_network(str(saved[name]), device="cpu").meaning.kind == KINDS[name]
-    assert load_network(str(saved["dpt"]), depth_kind="ray", device="cpu").meaning.kind == "ray"
+        assert monocular.load_network(str(saved[name]), device="cpu").meaning.kind == KINDS[name]
+    assert (
+        monocular.load_network(str(saved["dpt"]), depth_kind="ray", device="cpu").meaning.kind
+        == "ray"
+    )
     folder = shutil.copytree(saved["depth_anything"], tmp_path / "copy")
     config = json.loads((folder / "config.json").read_text())
     metric = {**config, "depth_estimation_type": "metric", "max_depth": 20}
     (folder / "config.json").write_text(json.dumps(metric))
-    assert load_network(str(folder), device="cpu").meaning.kind == "z"
+    assert monocular.load_network(str(folder), device="cpu").meaning.kind == "z"
     unknown = {**config, "model_type": "prompt_depth_anything"}
     (folder / "config.json").write_text(json.dumps(unknown))
     with pytest.raises(ParameterError, match="`depth_kind`"):
-        load_network(str(folder), device="cpu")
+        monocular.load_network(str(folder), device="cpu")
 
 
 @pytest.mark.parametrize("name", ["depth_anything", "dpt", "glpn"])
 def test_predictions_are_those_of_transformers_and_nothing_is_printed(
-    name, saved, photographs, capfd
+    monocular, name, saved, transformers, processor_of, photographs, capfd
 ):
     network = transformers.AutoModelForDepthEstimation.from_pretrained(saved[name])
     with torch.no_grad():
         outputs = network(**processor_of(saved[name])(photographs, return_tensors="pt"))
     capfd.readouterr()
-    ours = load_network(str(saved[name]), device="cpu")
+    ours = monocular.load_network(str(saved[name]), device="cpu")
     for photograph, expected in zip(photographs, outputs.predicted_depth, strict=True):
         depth = ours(photograph)
         wanted = torch.nn.functional.interpolate(expected[None, None], (60, 90), mode="bicubic")
@@ -170,31 +206,16 @@ def test_predictions_are_those_of_transformers_and_nothing_is_printed(
     assert capfd.readouterr() == ("", "")
 
 
-class _Identity(transformers.PreTrainedModel):
-    """Predicts the first channel of its input, so that a map shows where its pixels lie."""
-
-    def __init__(self, path):
-        super().__init__(transformers.AutoConfig.from_pretrained(path))
-        self.weight, processor = torch.nn.Parameter(torch.zeros(1)), processor_of(path)
-        normalises = processor.do_normalize
-        self.mean = processor.image_mean[0] if normalises else 0.0
-        self.std = processor.image_std[0] if normalises else 1.0
-
-    def forward(self, pixel_values):
-        depth = (pixel_values[:, 0] * self.std + self.mean) * 255
-        return DepthEstimatorOutput(predicted_depth=depth)
-
-
 @pytest.mark.parametrize("name", SAVED)
-def test_a_map_lies_on_its_photograph(name, saved, ramp):
+def test_a_map_lies_on_its_photograph(monocular, name, saved, processor_of, identity, ramp):
     """Padding is removed and centres stay in place, to a fifth of a pixel along either axis.
 
     ZoeDepth's processor resizes corners onto corners, which moves its own input by half a pixel.
     """
     if name == "zoedepth":
         pytest.importorskip("torchvision")
-    processor, network = processor_of(saved[name]), _Identity(saved[name])
-    depth = DepthNetwork(processor, network, Meaning("z", "made"), CPU)(ramp)
+    processor, network = processor_of(saved[name]), identity(saved[name])
+    depth = monocular.DepthNetwork(processor, network, monocular.Meaning("z", "made"), CPU)(ramp)
     assert depth.shape == ramp.shape[:2]
     off = np.abs(depth - ramp[..., 0])[8:-8, 8:-8].mean()
     assert off < (1.2 if name == "zoedepth" else 0.4)
@@ -213,19 +234,21 @@ def test_a_map_lies_on_its_photograph(name, saved, ramp):
         ("preprocessor_config.json", b"[1"),
     ],
 )
-def test_a_damaged_folder_raises_one_error(file, content, saved, tmp_path):
+def test_a_damaged_folder_raises_one_error(monocular, file, content, saved, tmp_path):
     folder = shutil.copytree(saved["depth_anything"], tmp_path / "copy")
     with pytest.raises(SceneFormatError, match="a file"):
-        load_network(str(folder / file))
+        monocular.load_network(str(folder / file))
     (folder / file).unlink()
     if content is not None:
         (folder / file).write_bytes(content)
     with pytest.raises(SceneFormatError, match=str(folder)) as caught:
-        load_network(str(folder), device="cpu")
+        monocular.load_network(str(folder), device="cpu")
     assert "\n" not in str(caught.value)
 
 
-def test_missing_weights_are_refused_except_those_that_dpt_never_uses(saved, tmp_path, photographs):
+def test_missing_weights_are_refused_except_those_that_dpt_never_uses(
+    monocular, saved, tmp_path, photographs
+):
     """Which the files that Intel published omit."""
     unused = "neck.fusion_stage.layers.0.residual_layer1."
     for name, omitted in (("depth_anything", "head."), ("dpt", unused)):
@@ -235,13 +258,15 @@ def test_missing_weights_are_refused_except_those_that_dpt_never_uses(saved, tmp
         assert len(kept) < len(weights)
         save_file(kept, folder / "model.safetensors")
     with pytest.raises(SceneFormatError, match=r"head\.conv1\.bias"):
-        load_network(str(tmp_path / "depth_anything"), device="cpu")
-    ours, whole = (load_network(str(f), device="cpu") for f in (tmp_path / "dpt", saved["dpt"]))
+        monocular.load_network(str(tmp_path / "depth_anything"), device="cpu")
+    ours, whole = (
+        monocular.load_network(str(f), device="cpu") for f in (tmp_path / "dpt", saved["dpt"])
+    )
     np.testing.assert_allclose(ours(photographs[0]), whole(photographs[0]), atol=1e-5)
 
 
 @pytest.mark.parametrize("model", ["nobody/Depth-Nothing-hf", "nothing", "a/b/c", "../x"])
-def test_a_network_that_is_not_local_is_not_downloaded(model, monkeypatch, tmp_path):
+def test_a_network_that_is_not_local_is_not_downloaded(monocular, model, monkeypatch, tmp_path):
     def refuse(*_, **__):
         raise AssertionError("a connection was tried")
 
@@ -250,32 +275,32 @@ def test_a_network_that_is_not_local_is_not_downloaded(model, monkeypatch, tmp_p
     monkeypatch.setattr(socket, "getaddrinfo", refuse)
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SceneNotFoundError) as caught:
-        load_network(model)
+        monocular.load_network(model)
     name = model if model.startswith("nobody") else "depth-anything/Depth-Anything-V2-Small-hf"
     assert f"hf download {name} --local-dir {name.partition('/')[2]} " in str(caught.value)
 
 
-def test_an_id_is_found_in_the_cache(saved, tmp_path, monkeypatch):
+def test_an_id_is_found_in_the_cache(monocular, saved, tmp_path, monkeypatch):
     entry = tmp_path / "models--me--tiny"
     shutil.copytree(saved["dpt"], entry / "snapshots" / ("0" * 40))
     (entry / "refs").mkdir()
     (entry / "refs" / "main").write_text("0" * 40)
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
-    assert load_network("me/tiny", device="cpu").meaning.kind == "inverse"
+    assert monocular.load_network("me/tiny", device="cpu").meaning.kind == "inverse"
 
 
 @pytest.mark.skipif(
     importlib.util.find_spec("torchvision") is not None, reason="torchvision is here"
 )
-def test_a_processor_that_needs_torchvision_is_refused_without(saved, tmp_path):
+def test_a_processor_that_needs_torchvision_is_refused_without(monocular, saved, tmp_path):
     with pytest.raises(MissingDependencyError, match="torchvision"):
-        load_network(str(saved["zoedepth"]), device="cpu")
+        monocular.load_network(str(saved["zoedepth"]), device="cpu")
     folder = shutil.copytree(saved["depth_anything"], tmp_path / "copy")
     (folder / "config.json").write_text('{"model_type": "depth_pro"}')
     processor = {"image_processor_type": "DepthProImageProcessor"}
     (folder / "preprocessor_config.json").write_text(json.dumps(processor))
     with pytest.raises(MissingDependencyError, match="torchvision"):
-        load_network(str(folder), device="cpu")
+        monocular.load_network(str(folder), device="cpu")
 
 
 @pytest.mark.parametrize(
@@ -286,14 +311,18 @@ def test_a_processor_that_needs_torchvision_is_refused_without(saved, tmp_path):
         (RuntimeError("sizes of tensors must match"), SceneFormatError),
     ],
 )
-def test_a_network_that_fails_raises_one_error(error, raised, saved, ramp, monkeypatch):
+def test_a_network_that_fails_raises_one_error(
+    monocular, error, raised, saved, processor_of, identity, ramp, monkeypatch
+):
     def fail(*_, **__):
         raise error
 
-    monkeypatch.setattr(_Identity, "forward", fail)
-    network = _Identity(saved["dpt"])
+    monkeypatch.setattr(identity, "forward", fail)
+    network = identity(saved["dpt"])
     with pytest.raises(raised):
-        DepthNetwork(processor_of(saved["dpt"]), network, Meaning("z", "made"), CPU)(ramp)
+        monocular.DepthNetwork(
+            processor_of(saved["dpt"]), network, monocular.Meaning("z", "made"), CPU
+        )(ramp)
 
 
 # A scene's photographs through a network ----------------------------------------------------------
@@ -302,10 +331,8 @@ def test_a_network_that_fails_raises_one_error(error, raised, saved, ramp, monke
 class Brightness:
     """A network that takes bright for near, remembers what it was asked, and fails twice."""
 
-    meaning = Meaning("inverse", "made")
-
-    def __init__(self):
-        self.asked = []
+    def __init__(self, meaning):
+        self.meaning, self.asked = meaning, []
 
     def __call__(self, image):
         self.asked.append(image.shape[:2])
@@ -315,13 +342,18 @@ class Brightness:
 
 
 @pytest.fixture
+def network(monocular):
+    return Brightness(monocular.Meaning("inverse", "made"))
+
+
+@pytest.fixture
 def own(exact, tmp_path):
     """A copy of the room that a test may spoil."""
     return load_scene(shutil.copytree(exact.source.image_dir.parent, tmp_path / "own"))
 
 
-def test_every_image_gets_a_map_that_the_reader_finds(own, tmp_path):
-    network, stages = Brightness(), []
+def test_every_image_gets_a_map_that_the_reader_finds(monocular, own, network, tmp_path):
+    stages = []
     first, second, *rest = own.images
     folder = own.source.image_dir
     for image, name in ((first, "left/a.png"), (second, "right/a.png")):
@@ -332,7 +364,7 @@ def test_every_image_gets_a_map_that_the_reader_finds(own, tmp_path):
     smaller.save(folder / rest[0].name)
     renamed = (replace(first, name="left/a.png"), replace(second, name="right/a.png"), *rest[:3])
     scene = own.replace(images=renamed)
-    report = estimate_depths(
+    report = monocular.estimate_depths(
         scene, network, tmp_path / "maps", max_size=80, progress=lambda *each: stages.append(each)
     )
     sizes = {image.name: (80, 60) for image in renamed} | {rest[0].name: (40, 30)}
@@ -354,8 +386,9 @@ def test_every_image_gets_a_map_that_the_reader_finds(own, tmp_path):
 
 
 @pytest.mark.parametrize("damage", ["cut short", "of another shape", "text"])
-def test_a_bad_photograph_stops_before_the_network_is_run(damage, own, tmp_path):
-    network = Brightness()
+def test_a_bad_photograph_stops_before_the_network_is_run(
+    monocular, damage, own, network, tmp_path
+):
     path = own.source.image_dir / max(image.name for image in own.images)
     whole = path.read_bytes()
     path.unlink()
@@ -364,14 +397,14 @@ def test_a_bad_photograph_stops_before_the_network_is_run(damage, own, tmp_path)
     else:
         path.write_bytes(whole[:-100] if damage == "cut short" else b"not an image")
     with pytest.raises((SceneFormatError, SceneNotFoundError), match=path.name):
-        estimate_depths(own, network, tmp_path / "maps")
+        monocular.estimate_depths(own, network, tmp_path / "maps")
     assert not network.asked
     assert not (tmp_path / "maps").exists()
 
 
-def test_maps_are_never_written_into_the_scene(exact):
-    folder, network = exact.source.image_dir.parent, Brightness()
+def test_maps_are_never_written_into_the_scene(monocular, exact, network):
+    folder = exact.source.image_dir.parent
     for output in (folder, folder / "images" / "maps"):
         with pytest.raises(OutputError):
-            estimate_depths(exact, network, output)
+            monocular.estimate_depths(exact, network, output)
     assert not network.asked
