@@ -5,19 +5,23 @@ from __future__ import annotations
 import gc
 import math
 import os
+import pickle
 
 from splatseed.runtime.environment import set_thread_defaults
 
 set_thread_defaults()  # before PyTorch and Numba load, as the command line does
 
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numba
 import numpy as np
 import pytest
 
 from splatseed.io import load_scene
+from splatseed.io.staging import locked
 from splatseed.scene import Scene
 from splatseed.synthetic import Capture, make_capture, write_capture
 
@@ -92,11 +96,42 @@ def scenes() -> Path:
     return SCENES
 
 
+class Room(NamedTuple):
+    """The demo's room, seen in some views."""
+
+    capture: Capture  # as it was made, with its true depth
+    path: Path  # on disk, a COLMAP scene with depth maps; not to be written to
+
+
 @pytest.fixture(scope="session")
-def room_path(tmp_path_factory) -> Path:
+def room_of(tmp_path_factory) -> Callable[[int, int, int], Room]:
+    """Makes the room, ``room_of(num_views, width, height)``.
+
+    It takes seconds, so that all processes of the suite share what one of them has made.
+    """
+    common = tmp_path_factory.getbasetemp()
+    common = common.parent if "PYTEST_XDIST_WORKER" in os.environ else common
+
+    @cache
+    def make(num_views: int, width: int, height: int) -> Room:
+        folder = common / "rooms" / f"{num_views}_{width}_{height}"
+        folder.mkdir(parents=True, exist_ok=True)
+        made, path = folder / "made", folder / "room"
+        with locked(folder, wait=True):
+            if made.is_file():
+                return Room(pickle.loads(made.read_bytes()), path)  # noqa: S301  (our own)
+            capture = make_capture(0, num_views, width, height)
+            write_capture(capture, path)
+            made.write_bytes(pickle.dumps(capture))
+        return Room(capture, path)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def room_path(room_of) -> Path:
     """A COLMAP scene of the demo's room: 9 views of 96 x 72. Not to be written to."""
-    capture = make_capture(0, num_views=9, width=96, height=72)
-    return write_capture(capture, tmp_path_factory.mktemp("room") / "room")
+    return room_of(9, 96, 72).path
 
 
 @pytest.fixture(scope="session")
@@ -106,17 +141,16 @@ def room(room_path) -> Scene:
 
 
 @pytest.fixture(scope="session")
-def larger_room_path(tmp_path_factory) -> Path:
+def larger_room_path(room_of) -> Path:
     """The room in 12 views of 120 x 90, with about 460 points. Not to be written to."""
-    capture = make_capture(0, num_views=12, width=120, height=90)
-    return write_capture(capture, tmp_path_factory.mktemp("room") / "room")
+    return room_of(12, 120, 90).path
 
 
 @pytest.fixture(scope="session")
-def sixteen_views(tmp_path_factory) -> tuple[Capture, Scene]:
+def sixteen_views(room_of) -> tuple[Capture, Scene]:
     """The room in 16 views of 160 x 120: as it was made, with its true depth, and as it is read."""
-    capture = make_capture(0, num_views=16, width=160, height=120)
-    return capture, load_scene(write_capture(capture, tmp_path_factory.mktemp("room") / "room"))
+    room = room_of(16, 160, 120)
+    return room.capture, load_scene(room.path)
 
 
 @pytest.fixture

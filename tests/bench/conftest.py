@@ -8,7 +8,6 @@ import pytest
 
 from splatseed.bench.plan import Plan
 from splatseed.bench.scenes import PlannedScene
-from splatseed.synthetic import make_capture, write_capture
 from splatseed.training.settings import TrainSettings
 
 
@@ -33,10 +32,9 @@ def in_process():
 
 
 @pytest.fixture(scope="session")
-def room_path(tmp_path_factory):
+def room_path(room_of):
     """A COLMAP scene of 9 views of 64 x 48 with depth maps, not to be written to."""
-    path = tmp_path_factory.mktemp("room") / "room"
-    return write_capture(make_capture(0, num_views=9, width=64, height=48), path)
+    return room_of(9, 64, 48).path
 
 
 @pytest.fixture

@@ -28,7 +28,6 @@ from splatseed.errors import ParameterError, SceneNotFoundError
 from splatseed.io import load_scene
 from splatseed.io.ply import write_ply
 from splatseed.splat.covisible import read_covisible
-from splatseed.synthetic import make_capture
 from splatseed.training.seeds import seeds_digest
 
 from .planted import surveyed
@@ -86,7 +85,7 @@ COMMANDS = {
 
 
 @pytest.mark.parametrize("method", COMMANDS)
-def test_seeds_are_those_that_the_command_writes(small_plan, own_room, tmp_path, method):
+def test_seeds_are_those_that_the_command_writes(small_plan, own_room, room_of, tmp_path, method):
     """Also where the cloud has points that are not finite, or twice at one place."""
     points, model = load_scene(own_room).points, own_room / "sparse" / "0"
     xyz = points.xyz.copy()
@@ -94,7 +93,7 @@ def test_seeds_are_those_that_the_command_writes(small_plan, own_room, tmp_path,
     for path in model.glob("points3D.*"):
         path.unlink()
     write_ply(model / "points3D.ply", points.replace(xyz=xyz))
-    scan, surfaces = tmp_path / "scan.npz", make_capture(0, 3, 32, 32).surfaces
+    scan, surfaces = tmp_path / "scan.npz", room_of(9, 64, 48).capture.surfaces
     np.savez(scan, xyz=surfaces.sample(20_000, np.random.default_rng(2)))
     facts = surveyed(own_room, cloud=scan, with_depth=True)
     plan = dataclasses.replace(small_plan, methods=(method,), repeats=1)

@@ -16,7 +16,6 @@ from splatseed.camera import quat_from_rotation
 from splatseed.io import load_scene, write_scene
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
-from splatseed.synthetic import make_capture, write_capture
 
 
 @pytest.fixture(scope="session")
@@ -71,10 +70,10 @@ def as_by_a_device() -> Callable[[Scene], Scene]:
 
 
 @pytest.fixture(scope="session")
-def sharp_room(tmp_path_factory) -> Scene:
+def sharp_room(room_of) -> Scene:
     """The room in pictures large enough for features: 10 views of 320 x 240."""
-    capture = make_capture(0, num_views=10, width=320, height=240)
-    return load_scene(write_capture(capture, tmp_path_factory.mktemp("sharp") / "room"))
+    room = load_scene(room_of(12, 320, 240).path)  # which the tests of sfm have as well
+    return room.replace(images=room.images[:10])
 
 
 @pytest.fixture(scope="session")

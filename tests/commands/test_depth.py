@@ -13,13 +13,16 @@ import pytest
 
 import splatseed.depth.stereo
 from splatseed.io import find_depths, load_scene
-from splatseed.synthetic import make_capture, write_capture
+from splatseed.synthetic import write_capture
 
 from ..bent import bend
 from ..stereo_maps import true_maps
 
-CAPTURE = make_capture(0, num_views=12, width=120, height=90)
-"""The room of these commands."""
+
+@pytest.fixture(scope="module")
+def capture(room_of):
+    """The room of these commands as it was made."""
+    return room_of(12, 120, 90).capture
 
 
 @pytest.fixture
@@ -61,9 +64,9 @@ def test_a_network(room, network, tmp_path, splatseed):
 
 
 @pytest.fixture
-def stereo(monkeypatch):
+def stereo(capture, monkeypatch):
     """Stereo that returns true ``maps``; ``calls`` are its arguments."""
-    known = SimpleNamespace(calls=[], maps=true_maps(CAPTURE, 2))
+    known = SimpleNamespace(calls=[], maps=true_maps(capture, 2))
 
     def stereo_depths(scene, *, max_size=800, progress=None):
         known.calls.append((len(scene.images), max_size))
@@ -95,13 +98,13 @@ def test_a_plain_folder(room, tmp_path, splatseed, stereo):
 
 
 @pytest.fixture(scope="module")
-def bent(tmp_path_factory):
+def bent(room_of, tmp_path_factory):
     """The room through a lens with distortion, its maps a quarter of it."""
-    capture = make_capture(0, num_views=12, width=160, height=120)
+    capture = room_of(12, 160, 120).capture
     return write_capture(bend(capture), tmp_path_factory.mktemp("bent") / "room")
 
 
-def test_a_distorted_capture_becomes_a_cloud_on_its_surfaces(bent, tmp_path, splatseed):
+def test_a_distorted_capture_becomes_a_cloud_on_its_surfaces(bent, capture, tmp_path, splatseed):
     """From its own stereo to COLMAP's fusion."""
     out = tmp_path / "dense"
     run = splatseed("depth", bent, "--colmap", "-o", out)
@@ -114,7 +117,7 @@ def test_a_distorted_capture_becomes_a_cloud_on_its_surfaces(bent, tmp_path, spl
     subprocess.run(line.split()[1:], check=True, capture_output=True)
     xyz = load_scene(out / "fused.ply").points.xyz
     assert len(xyz) > 300
-    assert np.median(CAPTURE.surfaces.distance(xyz.astype(float))) < 0.01  # metres
+    assert np.median(capture.surfaces.distance(xyz.astype(float))) < 0.01  # metres
 
 
 @pytest.mark.usefixtures("stereo")

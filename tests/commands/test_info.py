@@ -24,7 +24,6 @@ from splatseed.io.ply import write_ply
 from splatseed.pointcloud import PointCloud
 from splatseed.splat.formats import write_gaussians
 from splatseed.splat.gaussians import Gaussians
-from splatseed.synthetic import make_capture, write_capture
 
 
 def _pairs(out):
@@ -145,10 +144,9 @@ def _rows(out):
 
 
 @pytest.fixture(scope="session")
-def tour(tmp_path_factory):
+def tour(room_of):
     """A room of 15 views: more than are listed. Not to be written to."""
-    path = tmp_path_factory.mktemp("tour") / "tour"
-    return write_capture(make_capture(0, num_views=15, width=96, height=72), path)
+    return room_of(15, 64, 48).path
 
 
 def test_maps_that_do_not_fit_are_not_advised(room, splatseed):
@@ -285,16 +283,14 @@ def test_exact_poses_without_points_are_advised_to_get_points(
     assert sum("agree on the depth of only 8%" in each for each in problems) == 1
 
 
-def test_poses_of_a_device_are_advised_to_be_refined(as_by_a_device, tmp_path, splatseed):
-    capture = make_capture(0, num_views=16, width=240, height=180)
-    scene = as_by_a_device(load_scene(write_capture(capture, tmp_path / "room")))
-    path = write_scene(scene, tmp_path / "bare", require_points=False).path
-    poses = json.loads(splatseed("info", path, "--json").out)["poses"]
+def test_poses_of_a_device_are_advised_to_be_refined(sharp_bare, splatseed):
+    poses = json.loads(splatseed("info", sharp_bare, "--json").out)["poses"]
     assert poses["agreement"] > 0.3
     assert not poses["error"]["exact"]
     assert 0.1 < poses["error"]["degrees"] < 1
-    told = splatseed("info", path).out
-    assert re.search(r"px .* at 240 px a side: above 0.5 px", told)
+    told = splatseed("info", sharp_bare).out
+    assert re.search(r"px .* at 320 px a side: above 0.5 px", told)
     advised = told.partition("next")[2]
-    assert f"splatseed train {path} --refine-poses --budget" in advised
-    assert f"sfm {path / 'images'} --poses-from {path} -o OUT --refine-poses" in advised
+    assert f"splatseed train {sharp_bare} --refine-poses --budget" in advised
+    images = sharp_bare / "images"
+    assert f"sfm {images} --poses-from {sharp_bare} -o OUT --refine-poses" in advised

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
+from pathlib import Path
+
 import pycolmap
 import pytest
 
@@ -37,18 +40,35 @@ def test_colmap_scenes_are_described_and_upsampled(name, method, scenes, tmp_pat
     assert ("repeat the position" in run.out) == ("left out" in run.out)
 
 
-@pytest.mark.parametrize("name", ["replica/room0", "7scenes_redkitchen"])
-def test_depth_captures_need_no_points_for_the_default(name, scenes, tmp_path, splatseed):
-    run = splatseed("info", scenes / name)
+@pytest.fixture
+def capture(request, scenes, tmp_path_factory) -> Path:
+    """A capture with depth maps, of its first photographs where there are many."""
+    path = scenes / request.param
+    poses = (path / "traj.txt").read_text().splitlines(keepends=True)
+    if len(poses) < 30:
+        return path
+    few = tmp_path_factory.mktemp("captures") / path.name
+    (few / "results").mkdir(parents=True)
+    (few / "traj.txt").write_text("".join(poses[:16]))
+    shutil.copy(path / "cam_params.json", few)
+    for number in range(16):
+        for name in (f"frame{number:06d}.jpg", f"depth{number:06d}.png"):
+            (few / "results" / name).symlink_to(path / "results" / name)
+    return few
+
+
+@pytest.mark.parametrize("capture", ["replica/room0", "7scenes_redkitchen"], indirect=True)
+def test_depth_captures_need_no_points_for_the_default(capture, tmp_path, splatseed):
+    run = splatseed("info", capture)
     assert run.code == 0
     assert "--poses-from" in run.out
     assert "nan" not in run.out
-    run = splatseed("upsample", scenes / name, "--method", "mls", "-o", tmp_path / "out")
+    run = splatseed("upsample", capture, "--method", "mls", "-o", tmp_path / "out")
     assert run.code == 2
     assert "--poses-from" in run.err
     assert not list(tmp_path.iterdir())
-    if name == "replica/room0":  # the other has 143 photographs
+    if capture.name == "room0":
         few = ["--auto.test-every", 0, "--auto.max-size", 320]
-        run = splatseed("upsample", scenes / name, *few, "-o", tmp_path / "out")
+        run = splatseed("upsample", capture, *few, "-o", tmp_path / "out")
         assert run.code == 0
         assert len(load_scene(tmp_path / "out").points) > 3000

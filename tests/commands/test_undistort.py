@@ -21,15 +21,15 @@ from splatseed.io.seeds import saw_all_photographs, was_upsampled
 from splatseed.lens import project_rays, unproject_pixels
 from splatseed.photos.loading import load_views, refuse_distortion
 from splatseed.sfm import undistort
-from splatseed.synthetic import make_capture, write_capture
+from splatseed.synthetic import write_capture
 
 from ..bent import bend
 
 
 @pytest.fixture(scope="module")
-def distorted(tmp_path_factory):
+def distorted(room_of, tmp_path_factory):
     """The room through a lens with distortion."""
-    capture = bend(make_capture(0, num_views=12, width=120, height=90))
+    capture = bend(room_of(12, 120, 90).capture)
     path = write_capture(capture, tmp_path_factory.mktemp("bent") / "scene")
     names = [image.name for image in capture.scene.images]
     (path / "test_list.txt").write_text("\n".join(names[:2]))

@@ -36,7 +36,6 @@ from splatseed.sfm.refinement import poses_of, turns
 from splatseed.similarity import Similarity
 from splatseed.splat.formats import read_gaussians
 from splatseed.splat.training_frame import TrainingFrame
-from splatseed.synthetic import make_capture
 from splatseed.viewer.pictures import clouds_by_origin
 
 from ..command_line import exit_code
@@ -45,9 +44,9 @@ WITH_RATIO = [name for name in METHODS if not chooses_number(name)]
 
 
 @pytest.fixture(scope="module")
-def surfaces():
+def surfaces(room_of):
     """The room's true surfaces."""
-    return make_capture(0, 3, 32, 32).surfaces
+    return room_of(12, 120, 90).capture.surfaces
 
 
 def _manifest(folder):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import shutil
 import subprocess
@@ -18,25 +19,32 @@ HERE = Path(__file__).parent / "pretended"
 ROOT = Path(__file__).parents[2]
 
 
+SOURCES = HERE / "guard.cpp", HERE / "hooks.cpp"
+
+
 @pytest.fixture(scope="module")
-def guard(tmp_path_factory):
-    """The device guard, built against this PyTorch."""
+def guard(request):
+    """The device guard, built against this PyTorch: once, as that takes the compiler 15 seconds."""
     if shutil.which("g++") is None:
         pytest.skip("needs g++ to build a device guard for PyTorch")
     if torch.version.cuda is not None:
         pytest.skip("this PyTorch is a CUDA build: benchmarks/gpu tries the real thing")
     if not sys.platform.startswith("linux"):
         pytest.skip("PyTorch's libraries have other names here")
-    built = tmp_path_factory.mktemp("guard") / "libguard.so"
     home = Path(torch.__file__).parent
+    content = b"".join(path.read_bytes() for path in SOURCES)
+    folder = request.config.cache.mkdir("device_guard")
+    built = folder / f"{torch.__version__}-{hashlib.sha256(content).hexdigest()[:16]}.so"
+    if built.exists():
+        return built
+    partial = folder / f"{os.getpid()}.so"
     command = [
         "g++", "-std=c++20", "-O1", "-fPIC", "-shared",
         f"-I{home / 'include'}", f"-I{home / 'include/torch/csrc/api/include'}",
-        str(HERE / "guard.cpp"), str(HERE / "hooks.cpp"),
-        f"-L{home / 'lib'}", "-lc10", "-ltorch_cpu", "-o", str(built),
+        *map(str, SOURCES), f"-L{home / 'lib'}", "-lc10", "-ltorch_cpu", "-o", str(partial),
     ]  # fmt: skip
     subprocess.run(command, check=True)
-    return built
+    return partial.rename(built)
 
 
 @pytest.mark.slow

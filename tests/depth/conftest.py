@@ -8,7 +8,6 @@ import pytest
 from splatseed.depth.alignment import ray_length
 from splatseed.depthmap import DepthMap
 from splatseed.io import load_scene
-from splatseed.synthetic import make_capture, write_capture
 
 
 class MemoryMaps(dict):
@@ -19,9 +18,9 @@ class MemoryMaps(dict):
 
 
 @pytest.fixture(scope="session")
-def capture():
+def capture(room_of):
     """The demo's room, small: 12 views of 160 x 120."""
-    return make_capture(0, num_views=12, width=160, height=120)
+    return room_of(12, 160, 120).capture
 
 
 @pytest.fixture(scope="session")
@@ -42,7 +41,6 @@ def make_maps(capture):
 
 
 @pytest.fixture(scope="session")
-def exact(capture, make_maps, tmp_path_factory):
+def exact(room_of, make_maps):
     """Its scene, read from disk, with the exact planar depth of every image in memory."""
-    folder = write_capture(capture, tmp_path_factory.mktemp("depth") / "room")
-    return load_scene(folder).replace(depths=make_maps())
+    return load_scene(room_of(12, 160, 120).path).replace(depths=make_maps())

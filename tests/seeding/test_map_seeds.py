@@ -70,13 +70,14 @@ def test_maps_of_another_unit_or_origin_are_not_used(room, make_maps):
 
 def test_maps_of_another_unit_do_not_guide_stereo(room, make_maps):
     """Begun at wrong depths, stereo would find nothing to contradict them."""
-    bare, notes = room.with_points(PointCloud.empty()), []
+    few = room.replace(images=room.images[:8])  # which is quicker
+    bare, notes = few.with_points(PointCloud.empty()), []
     scene = bare.replace(depths=make_maps(lambda z, _: 1000 * z))
     seeds = ss.upsample(scene, note=notes.append)
     assert any("do not guide stereo" in note for note in notes)
     assert any("have another unit" in note for note in notes)
     assert DEPTH not in seeds.source
-    assert not guides_badly(bare.replace(depths=make_maps()), room.images)
+    assert not guides_badly(bare.replace(depths=make_maps()), bare.images)
 
 
 def test_uncertain_and_contradicted_depth_gives_no_seed(room, room_capture, make_maps):

@@ -5,16 +5,15 @@ from __future__ import annotations
 import pytest
 
 from splatseed.io import load_scene
-from splatseed.synthetic import make_capture, write_capture
 
 
 @pytest.fixture(scope="session")
-def capture():
+def capture(room_of):
     """The room in 12 views of 320 x 240."""
-    return make_capture(0, num_views=12, width=320, height=240)
+    return room_of(12, 320, 240).capture
 
 
 @pytest.fixture(scope="session")
-def room(capture, tmp_path_factory):
+def room(room_of):
     """The same on disk, with its true poses. Not to be written to."""
-    return load_scene(write_capture(capture, tmp_path_factory.mktemp("sfm") / "room"))
+    return load_scene(room_of(12, 320, 240).path)

@@ -12,8 +12,8 @@ from splatseed.synthetic.room import visible
 
 
 @pytest.fixture(scope="module")
-def capture():
-    return make_capture(seed=0, num_views=14, width=200, height=150)
+def capture(room_of):
+    return room_of(16, 160, 120).capture
 
 
 def test_depth_unprojects_onto_the_surfaces(capture):

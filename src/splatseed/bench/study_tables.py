@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from statistics import fmean
-
-from scipy.stats import sem
+from statistics import fmean, stdev
 
 from splatseed.bench import comparisons
 from splatseed.bench.comparisons import ArmKey, compared_arms, gains
@@ -80,7 +78,7 @@ def _psnr_row(study: Study, strategy: StrategyName, scene: str, labels: Sequence
         else:
             bold = gain is not None and label == best and gain.verdict == "better"
             mark = (verdict_mark(gain) if gain else "") or CLEAR * (bold and clear)
-        se = float(sem(values)) if len(values) > 1 else math.nan
+        se = stdev(values) / math.sqrt(len(values)) if len(values) > 1 else math.nan
         return Number(fmean(values), se=se, mark=mark, bold=bold)
 
     return scene, *map(cell, labels)
