@@ -240,7 +240,8 @@ def test_a_budget_is_the_same_number_for_every_arm_of_a_scene():
 def test_a_fair_budget_thins_no_seeds_that_a_ratio_asks_for():
     budget = fair_budget((4, 8))
     assert (budget, describe_budget(budget)) == (
-        "0.25rho or 12x", "0.25 per pixel of a photograph or 12 per point of the scene (the larger)"
+        "0.25rho or 12x",
+        "0.25 per pixel of a photograph in training or 12 per point of the scene (the larger)",
     )  # fmt: skip
     plan = Plan(ratios=(4, 8), budgets=(budget,), repeats=1, long_side=800)
     runs = plan_runs(plan, [FERN, BONSAI], "cpu", "1")
