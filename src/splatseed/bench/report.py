@@ -186,7 +186,9 @@ def conclude(study: Study) -> tuple[str, ...]:
     rest = [arm for arm in others if (arm.arm.seeds == SFM) != from_sfm]
     if rest:
         kind = "Of arms with other seeds" if from_sfm else "Of arms without new points"
-        conclusions.append(f"{kind}, {rest[0].arm.label} is best: {_against(rest[0], base)}.")
+        answer = f"{rest[0].arm.label} is best: {_against(rest[0], base)}."
+        if not conclusions[-1].endswith(answer):  # as the best at equal numbers
+            conclusions.append(f"{kind}, {answer}")
     lead, time_ratio = best.gains["in_time"], best.gains["seconds"]
     if lead is not None:
         position = f"{abs(lead.mean):.2f} dB {'ahead' if lead.mean > 0 else 'behind'}"
@@ -206,17 +208,22 @@ def conclude(study: Study) -> tuple[str, ...]:
         conclusions.append(
             f"{best.reached} of its {best.runs} runs reach the final PSNR of {base.label}."
         )
+    return *conclusions, *_beyond_noise(study)
+
+
+def _beyond_noise(study: Study) -> Iterator[str]:
+    """State how many variants gain on these scenes, by strategy."""
+    on = " on these scenes" if len(study.scenes) > 1 else ""
     for strategy in study.strategies:
         verdicts = [gain.verdict for gain in gains(study, strategy).on_these.values()]
         few = verdicts.count("too few to tell")
         if few < len(verdicts):
-            conclusions.append(
-                f"Beyond the noise between repeats{' on these scenes' * (len(study.scenes) > 1)}, "
-                f"{verdicts.count('better')} of {counted(len(verdicts), 'variant')} under "
-                f"{strategy} are better than {SFM}, and {verdicts.count('worse')} worse"
-                f"{f'; there are too few repeats to tell of {few}' * bool(few)}."
+            yield (
+                f"Beyond the noise between repeats{on}, {verdicts.count('better')} of "
+                f"{counted(len(verdicts), 'variant')} under {strategy} are better than {SFM}, and "
+                f"{verdicts.count('worse')} worse"
+                f"{f'; there are too few repeats to tell of {few}' if few else ''}."
             )
-    return tuple(conclusions)
 
 
 def _at_equal_numbers(others: Sequence[ComparedArm], base: ComparedArm) -> Iterator[str]:
@@ -231,9 +238,10 @@ def _at_equal_numbers(others: Sequence[ComparedArm], base: ComparedArm) -> Itera
     )
     equal = next((arm for arm in others if arm.means["gaussians"] <= limit), None)
     if equal is None:
+        how = f"; splatseed bench --budgets {base.means['gaussians']:.0f} does"
         yield (
             f"No other arm ends with as few Gaussians as {label}, so these runs do not tell what "
-            f"equal numbers give; splatseed bench --budgets {base.means['gaussians']:.0f} does."
+            f"equal numbers give{'' if base.arm.strategy.startswith('none') else how}."
         )
     else:
         yield (
