@@ -249,7 +249,7 @@ def test_each_picture_is_drawn_and_a_moving_one_keeps_the_most_visible(entry, mo
     for kind in kinds:
         drawn[kind], why = entry.draw(kind, canvas, image)
         assert (why, drawn[kind].shape) == ("", (120, 160, 3))
-        assert drawn[kind].std() > 3
+        assert drawn[kind].std() > 1  # few points, on a ground almost as grey
     # What is drawn is what was photographed, as far as Gaussians nobody trained can be.
     photograph, full = drawn["photograph"].astype(int), drawn["Gaussians"].astype(int)
     assert np.abs(photograph - full).mean() < np.abs(photograph[:, ::-1] - full).mean()
