@@ -28,6 +28,7 @@ from splatseed.errors import ParameterError, SceneNotFoundError
 from splatseed.io import load_scene
 from splatseed.io.ply import write_ply
 from splatseed.splat.covisible import read_covisible
+from splatseed.splat.pictures import BAND
 from splatseed.training.seeds import seeds_digest
 
 from .planted import surveyed
@@ -61,7 +62,7 @@ def test_a_result_says_what_was_measured_and_a_little_is_kept(specs, tmp_path):
     assert result.peak_bytes > 50e6
     assert read_run(tmp_path, spec).result == result
     pictures = sorted((kept / "renders").iterdir())
-    assert [PilImage.open(path).size for path in pictures] == [(3 * 64 + 8, 48)] * 3
+    assert [PilImage.open(path).size for path in pictures] == [(3 * 64 + 8, 48 + BAND)] * 3
     seen = read_covisible(next((tmp_path / "covisible").iterdir()))
     assert set(seen) == {view.name for view in result.scores.per_image}
     assert 0.3 < result.scores.covisible_share <= 1

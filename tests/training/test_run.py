@@ -20,6 +20,7 @@ from splatseed.io import load_scene
 from splatseed.pointcloud import PointCloud
 from splatseed.splat.evaluate import evaluate_views
 from splatseed.splat.formats import read_gaussians
+from splatseed.splat.pictures import BAND
 from splatseed.splat.rendering import opacity_from_logits
 from splatseed.training import device, prepare, run as run_module, trainer
 from splatseed.training.parameters import add_to_mean, gaussians_of, size_unit
@@ -228,7 +229,7 @@ def test_results_are_whole_and_in_the_scenes_world(begin, room):
     assert PilImage.open(folder.curve_png).size[0] > 100
     pictures = sorted(folder.renders.iterdir())
     assert len(pictures) == 2
-    assert PilImage.open(pictures[0]).size == (3 * 48 + 8, 36)
+    assert PilImage.open(pictures[0]).size == (3 * 48 + 8, 36 + BAND)
     assert not folder.checkpoint.exists()
     assert not list(folder.path.glob(".*partial*"))
 
