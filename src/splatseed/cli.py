@@ -29,7 +29,7 @@ VERBS = {
     "flight": "Make a video of a flight through a trained model.",
     "bench": "Compare methods by training: many runs, resumable, then a report.",
     "depth": "Make depth maps of the photographs, by a network or by stereo.",
-    "info": "Show what is in a scene and what is wrong with it, or what is in a model.",
+    "info": "Show what is in a scene or a model, and what is wrong with it.",
     "sfm": "Make a scene from photographs (pycolmap).",
     "undistort": "Take lens distortion out of a scene (pycolmap).",
     "demo": "Make a small scene, upsample it by every method, measure, train.",

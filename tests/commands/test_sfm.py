@@ -12,8 +12,10 @@ import pytest
 from splatseed.commands import sfm
 from splatseed.io import load_scene
 from splatseed.io.load import with_own_depths
+from splatseed.seeding.pose_accuracy import PoseErrorEstimate
 from splatseed.sfm import Refinement, Settings, SfmReport
 from splatseed.sfm.photos import find_photos
+from splatseed.synthetic import make_capture, write_capture
 
 from ..io.phone_exports import write_polycam, write_scanner_app
 
@@ -36,6 +38,7 @@ def called(monkeypatch, tmp_path):
         return SfmReport(tmp_path / "out", 13, 20, LOST, *FACTS, change, num_pairs=77)
 
     monkeypatch.setattr(sfm, "reconstruct", reconstruct)
+    monkeypatch.setattr(sfm, "_pose_error", lambda *_: calls.get("error"))
     return calls
 
 
@@ -58,6 +61,24 @@ def test_words_reach_the_reconstruction_and_its_report_the_user(called, tmp_path
     ):
         assert text in run.out
     assert f"splatseed upsample {tmp_path / 'out'} " in run.out
+
+
+@pytest.mark.parametrize("exact", [True, False])
+def test_poses_that_photographs_do_not_fit_are_pointed_out(exact, called, tmp_path, splatseed):
+    called["error"] = PoseErrorEstimate(0.2 if exact else 2.2, 0.17, exact, 757)
+    out = splatseed("sfm", tmp_path, "-o", tmp_path / "out").out
+    verdict = "0.2 px (0.17 degrees) at 757 px a side: exact, at most 0.5 px"
+    assert (verdict if exact else "2.2 px (0.17 degrees) at 757 px a side: above 0.5 px") in out
+    assert ("do not fit these poses" in out) != exact
+
+
+def test_poses_are_measured_by_the_photographs(tmp_path):
+    capture = make_capture(0, num_views=16, width=240, height=180)
+    path = write_capture(capture, tmp_path / "room")
+    report = SfmReport(path, 16, 16, (), *FACTS)
+    error = sfm._pose_error(report, lambda *_: None)
+    assert error.exact
+    assert error.px < 0.2
 
 
 def test_the_photographs_are_counted_by_folder(called, tmp_path, splatseed, capsys):

@@ -378,17 +378,14 @@ def _photograph_rows(
         grid = f"(of cells, {diagnostics.EMPTY_CELLS} along the longer side)"
         rows.append(("image area without points", f"{regions.mean:.0%} on average, {worst} {grid}"))
     if poses and (poses["error"] is not None or not poses["problem"]):
-        from splatseed.seeding.pose_accuracy import MAX_EXACT
         from splatseed.seeding.poses import agreement_warning
 
         few = agreement_warning(poses["agreement"]) != ""
         agreed = (
             f"at {poses['agreement']:.0%} of the pixels looked at: {'few' if few else 'enough'}"
         )
-        miss = "unknown: too few corners are found again"
-        if (error := poses["error"]) is not None:
-            limit = f"exact, at most {MAX_EXACT:g} px" if error.exact else f"above {MAX_EXACT:g} px"
-            miss = f"{error}: {limit}"
+        error = poses["error"]
+        miss = "unknown: too few corners are found again" if error is None else error.verdict
         rows += [("photographs agree", agreed), ("pose error", miss)]
     return rows
 

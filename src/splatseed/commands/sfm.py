@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
@@ -27,6 +27,9 @@ from splatseed.sfm import MatcherName, Settings, SfmReport, reconstruct
 from splatseed.sfm.first_look import FIRST_LOOK, NEIGHBOURS, STAGE
 from splatseed.sfm.photos import pick_frames
 from splatseed.text import counted, name_some, quoted, visible
+
+if TYPE_CHECKING:  # Numba, for which --help would wait, comes with it
+    from splatseed.seeding.pose_accuracy import PoseErrorEstimate
 
 SHOWN = 3
 """Images of each kind that are named where they are left out."""
@@ -97,7 +100,8 @@ def run(arguments: list[str]) -> None:
         clock("prepare", 0.0)
         make = _from_video if video else _from_photographs
         report = make(options, options.images, clock)
-    _summarise(options, report)
+        error = _pose_error(report, clock)
+    _summarise(options, report, error)
 
 
 def _from_video(options: Options, video: Path, clock: StageClock) -> SfmReport:
@@ -207,13 +211,23 @@ def _report_photographs(
         )
 
 
-def _summarise(options: Options, report: SfmReport) -> None:
+def _pose_error(report: SfmReport, clock: StageClock) -> PoseErrorEstimate | None:
+    """Measure the poses by corners that SfM did not use: wrong ones can fit its own points."""
+    from splatseed.seeding.photo_methods import photographed
+    from splatseed.seeding.pose_accuracy import estimate_pose_error
+
+    scene = load_scene(report.path, require_points=False)
+    return estimate_pose_error(scene, photographed(scene), clock)
+
+
+def _summarise(options: Options, report: SfmReport, error: PoseErrorEstimate | None) -> None:
     rows = [
         ("pairs matched", f"{report.num_pairs:,} of {math.comb(report.total, 2):,}"),
         ("images with a pose", f"{report.registered} of {report.total}"),
         ("points", f"{report.num_points:,}"),
         ("track length", f"mean {report.mean_track_length:.2f} images"),
         ("reprojection error", f"mean {report.mean_reprojection_error:.3f} px"),
+        ("pose error", "unknown" if error is None else error.verdict),
     ]
     if (change := report.refinement) is not None:
         before, after = f"{change.error_before:.3f} px", f"{change.error_after:.3f} px"
@@ -232,6 +246,11 @@ def _summarise(options: Options, report: SfmReport) -> None:
     print_pairs("splatseed sfm", rows)
     if 2 * report.registered < report.total:
         print_note("This is a part of the scene: fewer than half of the photographs have a pose.")
+    if error is not None and not error.exact:
+        print_note(
+            "The photographs do not fit these poses well: look at them (splatseed view), and take "
+            "more photographs, closer together, of where they are wrong."
+        )
     if report.unregistered:
         print_note(f"without a pose: {name_some(report.unregistered)}")
     print_pairs("next", [("", f"splatseed upsample {quoted(options.output)} -o OUT --preview")])

@@ -79,6 +79,11 @@ class PoseErrorEstimate:
         return f"{self.px:.2g} px ({self.degrees:.2g} degrees) at {self.side:,} px a side"
 
     @property
+    def verdict(self) -> str:
+        """The error, and whether the poses are exact."""
+        return f"{self}: {'exact, at most' if self.exact else 'above'} {MAX_EXACT:g} px"
+
+    @property
     def warning(self) -> str:
         """A sentence with advice; empty if the poses are exact."""
         if self.exact:
