@@ -119,10 +119,11 @@ def run(arguments: list[str]) -> int:
     parser.add_argument("--scenes", type=Path, default=Path("../shared/scenes"))
     asked = parser.parse_args(arguments)
     known = json.loads(asked.file.read_text("utf-8")) if asked.file.exists() else {}
+    chosen = [case for case in cases(asked.scenes) if case[0].startswith(tuple(asked.only))]
+    if not chosen:
+        parser.error(f"no name begins with {' or '.join(asked.only)}")
     different = 0
-    for name, make in cases(asked.scenes):
-        if not name.startswith(tuple(asked.only)):
-            continue
+    for name, make in chosen:
         found = make()
         if asked.action == "record":
             known[name] = found
