@@ -48,7 +48,7 @@ def test_a_colmap_scene(room, splatseed, monkeypatch):
     np.testing.assert_allclose(low, scene.points.xyz.min(axis=0), rtol=1e-3)
     advised = run.out.partition("\nnext\n")[2]
     assert re.findall(r"splatseed (\w+)", advised) == ["train", "train", "info"]
-    assert rows["photographs agree"].endswith("of the pixels looked at: enough")
+    assert rows["photographs agree"].endswith("of the pixels compared: enough")
 
 
 @pytest.mark.parametrize("name", ["model.ply", "model.spz", "model.splat", "model.sog"])

@@ -64,6 +64,7 @@ def test_what_info_advises_works(points, bent, tmp_path, monkeypatch, splatseed)
     assert follow(run.out, splatseed) == ["undistort", *wanted]
     for folder in ("RUN", "SMALL"):
         assert (Path(folder) / "metrics.json").is_file()
+    assert points or len(load_scene("OUT").points) > 500
 
 
 @pytest.mark.parametrize("points", [True, False])

@@ -39,7 +39,7 @@ HEADERS = st.sampled_from(
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning:PIL")
 
 fuzz = settings(
-    max_examples=25,
+    max_examples=40,
     deadline=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )

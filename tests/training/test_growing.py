@@ -137,7 +137,7 @@ def test_a_budget_that_growth_filled_is_not_spent_again(view):
     torch.testing.assert_close(*means)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(deadline=None)
 @given(count=st.integers(2, 12), budget=st.integers(2, 40))
 def test_the_budget_is_never_exceeded(count, budget):
     matrix = np.array([[SIDE, 0, SIDE / 2], [0, SIDE, SIDE / 2], [0, 0, 1.0]])
@@ -183,7 +183,7 @@ def test_nothing_is_placed_where_the_depth_is_unknown(view):
     assert params["means"].detach()[:, 2].max() < 2.5
 
 
-@settings(max_examples=50, deadline=None)
+@settings(deadline=None)
 @given(
     height=st.integers(1, 9), width=st.integers(1, 9), count=st.integers(1, 50),
     seed=st.integers(0, 9),

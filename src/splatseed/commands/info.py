@@ -381,9 +381,7 @@ def _photograph_rows(
         from splatseed.seeding.poses import agreement_warning
 
         few = agreement_warning(poses["agreement"]) != ""
-        agreed = (
-            f"at {poses['agreement']:.0%} of the pixels looked at: {'few' if few else 'enough'}"
-        )
+        agreed = f"at {poses['agreement']:.0%} of the pixels compared: {'few' if few else 'enough'}"
         error = poses["error"]
         miss = "unknown: too few corners are found again" if error is None else error.verdict
         rows += [("photographs agree", agreed), ("pose error", miss)]
