@@ -1,4 +1,4 @@
-"""What we write passes what each trainer's loader demands, done as strictly (docs/formats.md)."""
+"""What we write passes what each trainer's loader demands, done as strictly (docs/trainers.md)."""
 
 from __future__ import annotations
 

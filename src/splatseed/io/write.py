@@ -3,7 +3,7 @@
 A *layout* is the set of files that a trainer looks for: COLMAP's (``colmap_layout``) or
 nerfstudio's (``transforms_layout``). Promise: the folder appears completely or not at all; its
 points are finite and distinct, in the scene's order in all files; originals keep their float64
-positions and tracks; point ids are 1..N. docs/formats.md lists which trainer needs which file.
+positions and tracks; point ids are 1..N. docs/trainers.md lists what each trainer needs.
 """
 
 from __future__ import annotations
