@@ -101,15 +101,11 @@ def page_tables(results: Results) -> dict[str, list[Table]]:
     first = finished[:1]
     points, deep = (results.scenes(with_depth=each) for each in (False, True))
     kinds = (("mipnerf360", points), ("replica", deep))
+    by_photographs = [_by_ratio(results, way, *kinds[0], full=True) for way in first]
+    by_depth = [_by_ratio(results, way, *kinds[1], full=way in first) for way in finished]
     return {
-        **{
-            f"table{number}": [
-                table
-                for way in finished
-                if (table := _by_ratio(results, way, key, scenes, full=way in first)).rows
-            ]
-            for number, (key, scenes) in enumerate(kinds, start=1)
-        },
+        "table1": _with_rows([*by_photographs, _all_means(results, finished[1:], points)]),
+        "table2": _with_rows(by_depth),
         "table3": [
             _costs(results, way, key, scenes) for way in first for key, scenes in kinds if scenes
         ],
@@ -162,6 +158,21 @@ def _by_ratio(
     notes = (SCORE_NOTE, GAIN_NOTE) if full else (GAIN_NOTE,)
     title = f"{'Scores and gains' if full else 'Gains'} over sfm, {way.label}"
     return Table("gains", title, header, rows, notes)
+
+
+def _with_rows(tables: Iterable[Table]) -> list[Table]:
+    return [table for table in tables if table.rows]
+
+
+def _all_means(results: Results, ways: Sequence[Way], scenes: Sequence[str]) -> Table:
+    """The mean gains of several ways over the same scenes, by ratio."""
+    methods, rows = _columns(results, scenes), list[Row]()
+    for way in ways:
+        for ratio in results.ratios(scenes):
+            means = _mean_gains(results, way, scenes, [(method, ratio) for method in methods])
+            if any(map(str, means)):
+                rows.append((way.label, f"{ratio:g}x", *means))
+    return Table("means", "Mean gains over sfm", ("runs", "ratio", *methods), rows, (GAIN_NOTE,))
 
 
 def _with_sfm(kinds: Kinds) -> Kinds:

@@ -78,6 +78,15 @@ def test_a_benchmark_that_was_killed_fills_the_page_and_blanks_the_rest(paper, t
     assert (tmp_path / "paper.md").read_bytes() == again
 
 
+def test_further_ways_have_means_alone(paper, tmp_path):
+    own = runs(SCENES[:3], GAINS, ("default", "mcmc"), noise=0.01)
+    results = paper("gained").read_results([write_bench(tmp_path / "B", own)])
+    full, means = map(to_markdown, paper("tables").page_tables(results)["table1"])
+    assert "/ .800 (+0.6" in row(full, "fern", "4x")[-2]
+    assert row(means, "mcmc, profile default", "4x")[-2].startswith("+0.6")
+    assert "fern" not in means
+
+
 def test_guidelines_are_decided_by_what_was_planted(paper, tmp_path):
     guidelines = paper("guidelines")
     results = paper("gained").read_results([write_bench(tmp_path / "B", planned())])
