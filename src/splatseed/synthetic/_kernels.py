@@ -1,4 +1,4 @@
-"""Numba kernels of textures (value noise) and of leaves (nearest disc, first disc along a ray)."""
+"""Numba kernels: textures (value noise), leaves (nearest disc, first disc along a ray), waves."""
 
 import numpy as np
 
@@ -102,3 +102,43 @@ def first_disc(
             if t > 0.0 and t < nearest[i] and x * x + y * y + z * z <= limit:
                 nearest[i] = t
     return nearest
+
+
+@inline
+def first_wave_crossing(
+    start: np.ndarray,  # float64 [3]: u, v, w of the rays' origin
+    directions: np.ndarray,  # float64 [N, 3], along u, v and w
+    near: np.ndarray,  # float64 [N]
+    far: np.ndarray,  # float64 [N]
+    amplitude: float,
+    wavelength: float,
+    steps_per_wave: int,
+    bisections: int,
+) -> np.ndarray:  # float64 [N]
+    """Return the first t from near to far where each ray crosses w = A sin(2 pi u / wavelength).
+
+    Each ray marches in fractions of a wave until it is on the other side, then bisects; inf for a
+    miss.
+    """
+    crossing = np.full(len(directions), np.inf)
+    k = 2.0 * np.pi / wavelength
+    for i in range(len(directions)):
+        u, du = start[0], directions[i, 0]
+        w, dw = start[2], directions[i, 2]
+        step = wavelength / steps_per_wave / max(abs(du), 1e-12)
+        low, high = near[i], near[i]
+        above = w + low * dw > amplitude * np.sin(k * (u + low * du))
+        crossed = False
+        while high < far[i] and not crossed:
+            low, high = high, min(high + step, far[i])
+            crossed = (w + high * dw > amplitude * np.sin(k * (u + high * du))) != above
+        if not crossed:
+            continue
+        for _ in range(bisections):
+            middle = (low + high) / 2
+            if (w + middle * dw > amplitude * np.sin(k * (u + middle * du))) == above:
+                low = middle
+            else:
+                high = middle
+        crossing[i] = high
+    return crossing

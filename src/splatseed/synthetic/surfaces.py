@@ -15,7 +15,7 @@ from typing import Any, Protocol
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int64
 
-from splatseed.synthetic._kernels import first_disc, nearest_disc
+from splatseed.synthetic._kernels import first_disc, first_wave_crossing, nearest_disc
 
 Vector = Float64[np.ndarray, " 3"]
 Frame = Float64[np.ndarray, "3 3"]
@@ -329,37 +329,17 @@ class SineSheet(Surface):
         near = np.maximum(near, 0.0)
         inside = np.flatnonzero(near < far)
         t = np.full(len(directions), np.inf)
-        t[inside] = self._first_crossing(start, local[inside], near[inside], far[inside])
+        t[inside] = first_wave_crossing(
+            start,
+            local[inside],
+            near[inside],
+            far[inside],
+            self.amplitude,
+            self.wavelength,
+            _STEPS_PER_WAVE,
+            _BISECTIONS,
+        )
         return t
-
-    def _first_crossing(
-        self, start: np.ndarray, directions: np.ndarray, near: np.ndarray, far: np.ndarray
-    ) -> np.ndarray:
-        """March from near to far in fractions of a wave, then bisect the first crossing."""
-        at_start = self._above(start, directions, near)
-        along_wave = np.maximum(np.abs(directions[:, 0]), 1e-12)
-        step = self.wavelength / _STEPS_PER_WAVE / along_wave
-        low, high = near.copy(), np.full(len(near), np.inf)
-        active = np.arange(len(near))
-        while len(active):
-            t = np.minimum(low[active] + step[active], far[active])
-            crossed = self._above(start, directions[active], t) != at_start[active]
-            high[active[crossed]] = t[crossed]
-            going = ~crossed & (t < far[active])
-            low[active[going]] = t[going]
-            active = active[going]
-        hit = np.flatnonzero(np.isfinite(high))
-        side = self._above(start, directions[hit], low[hit])
-        for _ in range(_BISECTIONS):
-            middle = (low[hit] + high[hit]) / 2
-            before = self._above(start, directions[hit], middle) == side
-            low[hit[before]], high[hit[~before]] = middle[before], middle[~before]
-        return high
-
-    def _above(self, start: np.ndarray, directions: np.ndarray, t: np.ndarray) -> np.ndarray:
-        """Whether rays are above the wave (along w) at t."""
-        u, w = (start[i] + t * directions[:, i] for i in (0, 2))
-        return np.asarray(w > self._height(u))
 
     def normals(self, xyz: Points) -> Points:
         slope = self._slope((xyz - self.corner) @ self.frame[0])
