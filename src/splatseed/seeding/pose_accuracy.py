@@ -14,8 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float64
-from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter, sobel, uniform_filter
-from scipy.signal import correlate
+from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter, sobel
 
 from splatseed.depth.stereo.maps import StereoSettings
 from splatseed.photos.loading import load_views
@@ -24,6 +23,7 @@ from splatseed.photos.sources import choose_by_pose
 from splatseed.photos.view import View
 from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
+from splatseed.seeding._kernels.correlation import correlate_patch
 
 Gray = Float64[np.ndarray, "H W"]
 Pixel = Float64[np.ndarray, " 2"]
@@ -198,7 +198,7 @@ def _miss(
         return None
     # Slightly backwards, too: with wrong poses a far point may seem to be behind infinity.
     length = -_HALF - _REACH, _HALF + int(max_motion)
-    scores = _correlation(patch, _sample(rotated, p + margin, along, length, _HALF + _REACH))
+    scores = correlate_patch(patch, _sample(rotated, p + margin, along, length, _HALF + _REACH))
     at = np.unravel_index(np.argmax(scores), scores.shape)
     best, (column, row) = scores[at], at
     rest = scores.copy()
@@ -220,19 +220,3 @@ def _sample(image: Gray, p: Pixel, along: Pixel, length: tuple[int, int], width:
     b = np.arange(-width, width + 1)[None]
     x = p[0] - 0.5 + a * along[0] - b * along[1]
     return _bilinear(image, x, p[1] - 0.5 + a * along[1] + b * along[0])
-
-
-def _correlation(patch: Gray, band: Gray) -> Gray:
-    """Correlate a patch with each place of a band, normalised; -1 where the band is unknown."""
-    known = np.isfinite(band)
-    filled = np.where(known, band, 0.0)
-    centred = patch - patch.mean()
-    # sum (b - mean b) a = sum b a, as the sum of a is 0.
-    product = correlate(filled, centred, mode="valid", method="fft")
-    inner = (slice(_HALF, -_HALF), slice(_HALF, -_HALF))
-    mean, square, share = (
-        uniform_filter(values, 2 * _HALF + 1)[inner]
-        for values in (filled, filled * filled, known.astype(np.float64))
-    )
-    spread = np.sqrt(np.maximum(square - mean * mean, 1e-6) * patch.size)
-    return np.where(share > 1 - 1e-9, product / (spread * np.linalg.norm(centred)), -1.0)
