@@ -52,6 +52,8 @@ SCORE_NOTE = (
     "PSNR in dB / SSIM / LPIPS where its weights are there, then what PSNR gains; means over "
     "repeats. Bold: the highest PSNR of a row, be it by chance."
 )
+SHOWN = 16.0
+"""The ratio of which table 1 shows every scene; of the others it has the means."""
 Kinds: TypeAlias = Sequence[tuple[str, float]]
 """Methods with ratios."""
 
@@ -101,7 +103,7 @@ def page_tables(results: Results) -> dict[str, list[Table]]:
     first = finished[:1]
     points, deep = (results.scenes(with_depth=each) for each in (False, True))
     kinds = (("mipnerf360", points), ("replica", deep))
-    by_photographs = [_by_ratio(results, way, *kinds[0], full=True) for way in first]
+    by_photographs = [_by_ratio(results, way, *kinds[0], full=True, only=SHOWN) for way in first]
     by_depth = [_by_ratio(results, way, *kinds[1], full=way in first) for way in finished]
     return {
         "table1": _with_rows([*by_photographs, _all_means(results, finished[1:], points)]),
@@ -123,16 +125,27 @@ def _columns(results: Results, scenes: Iterable[str]) -> tuple[str, ...]:
 
 
 def _by_ratio(
-    results: Results, way: Way, key: str, scenes: Sequence[str], *, full: bool = False
+    results: Results,
+    way: Way,
+    key: str,
+    scenes: Sequence[str],
+    *,
+    full: bool = False,
+    only: float | None = None,
 ) -> Table:
-    """Gains by ratio and scene, and in full the scores too; with their means, and the paper's."""
+    """Gains by ratio and scene, and in full the scores too; with their means, and the paper's.
+
+    With ``only`` a ratio of which there are runs, the other ratios have their means alone.
+    """
     methods, rows = _columns(results, scenes), list[Row]()
     theirs, printed = printed_psnr(key), printed_gains(key)
-    for ratio in results.ratios(scenes):
+    ratios = results.ratios(scenes)
+    for ratio in ratios:
         shown, kinds = f"{ratio:g}x", [(method, ratio) for method in methods]
         run = {each: [results.gain(way, each, *kind) for kind in kinds] for each in scenes}
         run = {scene: gained for scene, gained in run.items() if any(gained)}
-        for scene, gained in run.items():
+        each_scene = only in (None, ratio) or only not in ratios
+        for scene, gained in run.items() if each_scene else ():
             if not full:
                 rows.append((scene, shown, *map(_gain_cell, gained)))
                 continue

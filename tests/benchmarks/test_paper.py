@@ -82,7 +82,9 @@ def test_further_ways_have_means_alone(paper, tmp_path):
     own = runs(SCENES[:3], GAINS, ("default", "mcmc"), noise=0.01)
     results = paper("gained").read_results([write_bench(tmp_path / "B", own)])
     full, means = map(to_markdown, paper("tables").page_tables(results)["table1"])
-    assert "/ .800 (+0.6" in row(full, "fern", "4x")[-2]
+    assert "/ .800 (+0.6" in row(full, "fern", "16x")[-2]
+    assert row(full, "mean", "4x")[-2].startswith("+0.6")
+    assert "| fern | 4x |" not in full
     assert row(means, "mcmc, profile default", "4x")[-2].startswith("+0.6")
     assert "fern" not in means
 
