@@ -11,8 +11,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from splatseed.progress import silent, thread_limit
-from splatseed.sfm import Settings, colmap, first_look, matching
-from splatseed.sfm.colmap import Run, map_images, posed_model, require_pycolmap
+from splatseed.sfm import Settings, first_look, matching
+from splatseed.sfm.colmap import Run, posed_model, require_pycolmap
 from splatseed.sfm.database import run_database
 from splatseed.sfm.first_look import (
     FIRST_LOOK,
@@ -22,7 +22,7 @@ from splatseed.sfm.first_look import (
     measure_agreement,
     poorly_connected,
 )
-from splatseed.similarity import fit_similarity
+from splatseed.sfm.mapping import map_images
 
 
 def descriptors(rng, number):
@@ -182,22 +182,3 @@ def test_a_graph_in_parts_is_completed_before_and_after_mapping(run, monkeypatch
     assert asked == [names[:4]] or asked == [names[4:]]
     assert run.pycolmap.Reconstruction(folder).num_reg_images() == 8
     assert list(run.seconds)[-4:] == ["matching", "further matching", "mapping", "further mapping"]
-
-
-def test_where_incremental_mapping_fails_all_photographs_are_mapped_at_once(run, monkeypatch):
-    run, model = run
-    matching.match_photographs(run, model)
-    incremental = colmap._map
-
-    def fail_to_start(run, stage, *rest):
-        return {} if stage == "mapping" else incremental(run, stage, *rest)
-
-    monkeypatch.setattr(colmap, "_map", fail_to_start)
-    names = [model.image(i).name for i in range(1, 9)]
-    found = run.pycolmap.Reconstruction(map_images(run, names, "PINHOLE", None, partial=False))
-    assert found.num_reg_images() == 8
-    assert found.compute_mean_reprojection_error() < 1
-    true = np.array([model.image(i).projection_center() for i in range(1, 9)])
-    centers = [found.find_image_with_name(name).projection_center() for name in names]
-    moved = fit_similarity(np.array(centers), true).points(np.array(centers))
-    assert np.linalg.norm(moved - true, axis=1).max() < 0.05

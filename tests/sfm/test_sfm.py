@@ -25,7 +25,7 @@ from splatseed.io import load_scene
 from splatseed.pointcloud import PointCloud
 from splatseed.runtime import child
 from splatseed.scene import Scene, Split
-from splatseed.sfm import Settings, colmap, reconstruct
+from splatseed.sfm import Settings, mapping, reconstruct
 from splatseed.sfm.export import clear_orientation, drop_repeats
 from splatseed.similarity import fit_similarity
 
@@ -164,12 +164,12 @@ def test_too_few_registered_is_an_error_that_names_them(num, photos, tmp_path, m
 
 @pytest.mark.parametrize(("pairs", "advised"), [(3, False), (2, True)])
 def test_all_pairs_are_advised_only_if_some_are_left(pairs, advised, tmp_path, monkeypatch):
-    monkeypatch.setattr(colmap, "_mapped", lambda *_: {})
+    monkeypatch.setattr(mapping, "_mapped", lambda *_: {})
     run = SimpleNamespace(
         kept=None, work=tmp_path, settings=Settings("auto"), num_pairs=lambda: pairs
     )
     with pytest.raises(ReconstructionError) as caught:
-        colmap.map_images(run, ["a.png", "b.png", "c.png"], "OPENCV", bool, partial=False)
+        mapping.map_images(run, ["a.png", "b.png", "c.png"], "OPENCV", bool, partial=False)
     assert ("matcher='exhaustive'" in caught.value.fix) == advised
 
 

@@ -13,7 +13,7 @@ pytest.importorskip("pycolmap", reason="needs pycolmap")
 from splatseed.io.staging import locked
 from splatseed.progress import silent
 from splatseed.scene import Masks
-from splatseed.sfm import Settings, colmap
+from splatseed.sfm import Settings, mapping
 from splatseed.sfm.cameras import Photo
 from splatseed.sfm.colmap import Run, posed_model, require_pycolmap
 from splatseed.sfm.database import run_database
@@ -166,7 +166,7 @@ def test_mapping_goes_on_from_the_last_sure_snapshot(room, tmp_path, monkeypatch
     folder, work = tmp_path / "out_sfm", tmp_path / "work"
     for each in (folder, work):
         each.mkdir()
-    monkeypatch.setattr(colmap, "_SNAPSHOT_FRAMES", 2)
+    monkeypatch.setattr(mapping, "_SNAPSHOT_FRAMES", 2)
     settings = Settings("sequential", "cpu")
     kept = WorkFolder(folder, WorkKey({}, "", ""))
     run = Run(require_pycolmap(), settings, room.source.image_dir, work, silent, kept)
@@ -178,18 +178,18 @@ def test_mapping_goes_on_from_the_last_sure_snapshot(room, tmp_path, monkeypatch
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        colmap.map_images(
+        mapping.map_images(
             replace(run, on_progress=interrupt), names, "PINHOLE", None, partial=False
         )
     given = []
-    real_extend = colmap._extend
+    real_extend = mapping._extend
 
     def extend(run, stage, snapshot, *rest):
         given.append(run.pycolmap.Reconstruction(snapshot).num_reg_images())
         return real_extend(run, stage, snapshot, *rest)
 
-    monkeypatch.setattr(colmap, "_extend", extend)
-    model = colmap.map_images(run, names, "PINHOLE", None, partial=False)
+    monkeypatch.setattr(mapping, "_extend", extend)
+    model = mapping.map_images(run, names, "PINHOLE", None, partial=False)
     assert 2 < given[0] < 8
     assert run.pycolmap.Reconstruction(model).num_reg_images() == 8
     assert {path.name for path in (folder / "models").iterdir()} == {"0", "complete"}

@@ -1,4 +1,4 @@
-"""Stages of a pycolmap run: settings, mapping, triangulation; ``matching`` precedes them.
+"""What the stages of a pycolmap run share, and triangulation at known poses.
 
 Notation: a ``model`` is a ``pycolmap.Reconstruction``. Only ``require_pycolmap`` imports pycolmap.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 import importlib
 import math
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,14 +17,13 @@ from typing import Any, Literal, TypeAlias, TypeVar, get_args
 import numpy as np
 
 from splatseed import errors
-from splatseed.io.staging import remove
 from splatseed.progress import Progress
 from splatseed.requirements import install_command
 from splatseed.runtime.torch_device import DeviceName
 from splatseed.scene import Image
 from splatseed.sfm.cameras import SharedCamera
-from splatseed.sfm.work_folder import COMPLETE, DATABASE, MODELS, WorkFolder
-from splatseed.text import counted, name_some, numeric_order
+from splatseed.sfm.work_folder import DATABASE, WorkFolder
+from splatseed.text import numeric_order
 
 MatcherName: TypeAlias = Literal["auto", "exhaustive", "sequential"]
 T = TypeVar("T")
@@ -32,11 +31,6 @@ T = TypeVar("T")
 _MIN_VERSION = 4  # the first that adds an image with its rig in one call
 _MAX_INT = 2**31 - 1  # pycolmap takes a 32-bit int
 _POLL_SECONDS = 0.1
-_SNAPSHOTS = "snapshots"  # folder of models amid mapping
-_SNAPSHOT_FRAMES = 50  # photographs mapped between two of them
-_GROWTH = 1.25  # of the model between global adjustments; COLMAP's 1.1 takes 1.4 times as long
-_TOLERANCE = 1e-6  # relative change of cost that ends an adjustment; 0 takes 1.3 times as long
-_SIMPLE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL")
 
 
 @dataclass(frozen=True)
@@ -198,176 +192,11 @@ def rigid(pycolmap: Any, image: Image) -> Any:
     return pycolmap.Rigid3d(rotation, image.translation)
 
 
-def _options(run: Run) -> Any:
+def mapping_options(run: Run) -> Any:
+    """Return COLMAP's options of mapping and triangulation, for this run."""
     return run.pycolmap.IncrementalPipelineOptions(
         num_threads=run.settings.threads, random_seed=run.settings.seed
     )
-
-
-def map_images(
-    run: Run,
-    names: Sequence[str],
-    camera_model: str,
-    match_further: Callable[[Collection[str]], bool] | None,
-    *,
-    partial: bool,
-) -> Path:
-    """Estimate poses, lenses and points; return the folder of the model with the most images.
-
-    ``match_further`` matches further pairs of photographs without a pose, by name, and returns
-    whether some match; then mapping goes on. None if all pairs of the matcher are matched.
-
-    Raises:
-        ReconstructionError: No model, or one of fewer than half of the photographs while
-            ``partial`` is False.
-    """
-    models_dir = (run.kept.folder if run.kept else run.work) / MODELS
-    models = _mapped(run, models_dir, names, match_further)
-    more = ["take more overlapping photographs", "remove those of other places"]
-    chosen = match_further is not None or run.settings.matcher == "sequential"
-    if chosen and run.num_pairs() < math.comb(len(names), 2):
-        more.append("match all pairs with `matcher='exhaustive'`")
-    if camera_model not in _SIMPLE:
-        more.append("use a simpler camera model such as SIMPLE_RADIAL")
-    advice = f"{', '.join(more[:-1])} or {more[-1]}"
-    if run.kept:
-        advice = f"{advice}; features and matches are kept in {run.kept.folder}"
-    if not models:
-        raise errors.ReconstructionError(
-            f"a model of the {len(names)} photographs",
-            found="no two that match well enough to start one",
-            fix=f"{advice[0].upper()}{advice[1:]}.",
-        )
-    best = _largest(models)
-    found = _posed(models[best])
-    if 2 * len(found) < len(names) and not partial:
-        raise errors.ReconstructionError(
-            f"at least half of the {len(names)} photographs to get a pose",
-            found=f"{len(found)} in the largest of {counted(len(models), 'model')}; "
-            f"without a pose: {name_some([name for name in names if name not in found])}",
-            fix=f"Pass `partial=True` to write the scene of these {len(found)}. For more, "
-            f"{advice}.",
-        )
-    return models_dir / str(best)
-
-
-def _mapped(
-    run: Run,
-    models_dir: Path,
-    names: Sequence[str],
-    match_further: Callable[[Collection[str]], bool] | None,
-) -> dict[int, Any]:
-    """Map images, or load the finished models of an earlier run; return models by number."""
-    if (models_dir / COMPLETE).exists():
-        folders = (path for path in models_dir.iterdir() if path.is_dir())
-        return {int(path.name): run.pycolmap.Reconstruction(path) for path in folders}
-    snapshot = _snapshot(models_dir / _SNAPSHOTS)
-    for path in models_dir.iterdir() if models_dir.is_dir() else ():
-        if path.name != _SNAPSHOTS:
-            remove(path)
-    models_dir.mkdir(exist_ok=True)
-    if snapshot is None:
-        models = _map(run, "mapping", models_dir, len(names))
-    else:
-        models = {0: _extend(run, "mapping", snapshot, models_dir / "0", len(names))}
-    best = _largest(models)
-    lost = sorted({*names} - _posed(models[best])) if models else list(names)
-    if lost and match_further is not None and match_further(lost):
-        if models:  # goes on from the largest model, whose photographs keep their matches
-            folder = models_dir / str(best)
-            models[best] = _extend(run, "further mapping", folder, folder, len(lost))
-        else:
-            models = _map(run, "further mapping", models_dir, len(names))
-    registered = models[_largest(models)].num_reg_images() if models else 0
-    if 2 * registered < len(names):
-        models |= _map_globally(run, models_dir, max(models, default=-1) + 1, registered, names)
-    remove(models_dir / _SNAPSHOTS)
-    (models_dir / COMPLETE).touch()
-    return models
-
-
-def _map(
-    run: Run, stage: str, folder: Path, total: int, given: Path | None = None
-) -> dict[int, Any]:
-    """Map images to models in numbered folders, or extend a given model in ``folder`` itself."""
-    registered: list[None] = []  # except initial pairs
-    options = _options(run)
-    options.ba_global_frames_ratio = options.ba_global_points_ratio = _GROWTH
-    options.ba_global_function_tolerance = options.ba_local_function_tolerance = _TOLERANCE
-    if run.kept is not None:
-        options.snapshot_path = run.kept.folder / MODELS / _SNAPSHOTS
-        options.snapshot_path.mkdir(exist_ok=True)
-        options.snapshot_frames_freq = _SNAPSHOT_FRAMES
-    models: dict[int, Any] = run.stage(
-        stage,
-        lambda: run.pycolmap.incremental_mapping(
-            *(run.database, run.image_dir, folder, options),
-            **({} if given is None else {"input_path": given}),
-            next_image_callback=lambda: registered.append(None),
-        ),
-        lambda: len(registered),
-        total,
-    )
-    return models
-
-
-def _extend(run: Run, stage: str, given: Path, folder: Path, total: int) -> Any:
-    """Go on mapping from a given model, and write the result to ``folder``."""
-    extended = folder.with_name("extended")
-    extended.mkdir()
-    (model,) = _map(run, stage, extended, total, given).values()
-    remove(folder)
-    extended.rename(folder)
-    return model
-
-
-def _map_globally(
-    run: Run, models_dir: Path, number: int, registered: int, names: Sequence[str]
-) -> dict[int, Any]:
-    """Map all images at once; return the model by its number if it has more than ``registered``.
-
-    That needs no initial pair, on which incremental mapping fails where a wrong focal length fits
-    two photographs as well. The result is held to incremental mapping's criteria.
-    """
-    pycolmap, settings, folder = run.pycolmap, run.settings, models_dir / "global"
-    options = pycolmap.GlobalPipelineOptions(
-        num_threads=settings.threads, random_seed=settings.seed
-    )
-    folder.mkdir()
-    try:
-        models = run.stage(
-            "global mapping",
-            lambda: pycolmap.global_mapping(run.database, run.image_dir, folder, options),
-            lambda: 0,
-            1,
-        )
-        best = _largest(models)
-        if not models or models[best].num_reg_images() <= registered:
-            return {}
-        into = models_dir / str(number)
-        model = _extend(run, "further mapping", folder / str(best), into, len(names))
-        return {number: model} if model.num_reg_images() > registered else {}
-    except errors.ReconstructionError:
-        return {}  # the models of incremental mapping are reported
-    finally:
-        remove(folder)
-
-
-def _snapshot(folder: Path) -> Path | None:
-    """Return the last model but one that a killed run wrote amid mapping: the last may be cut."""
-    files = folder.iterdir() if folder.is_dir() else ()
-    written = sorted(files, key=lambda path: path.stat().st_mtime_ns)
-    return written[-2] if len(written) > 1 else None
-
-
-def _largest(models: Mapping[int, Any]) -> int:
-    """Return the number of the model with the most images, then points."""
-    sizes = {i: (model.num_reg_images(), model.num_points3D()) for i, model in models.items()}
-    return max(sizes, key=lambda i: sizes[i], default=0)
-
-
-def _posed(model: Any) -> set[str]:
-    return {image.name for image in model.images.values() if image.has_pose}
 
 
 def triangulate_points(run: Run, poses: Sequence[Image], without: Collection[str] = ()) -> Path:
@@ -377,7 +206,7 @@ def triangulate_points(run: Run, poses: Sequence[Image], without: Collection[str
     """
     model_dir = run.work / "model"
     model_dir.mkdir()
-    options = _options(run)
+    options = mapping_options(run)
     options.max_extra_param = math.inf  # known lenses are trusted: Kinects have a k3 above 1
     posed = posed_model(run.pycolmap, poses, without)
     model = run.stage(

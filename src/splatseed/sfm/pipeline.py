@@ -42,6 +42,7 @@ from splatseed.sfm import colmap
 from splatseed.sfm.cameras import SharedCamera, describe_cameras, share_cameras
 from splatseed.sfm.colmap import Run, Settings
 from splatseed.sfm.export import drop_repeats, export_scene
+from splatseed.sfm.mapping import map_images
 from splatseed.sfm.matching import match_further, match_photographs
 from splatseed.sfm.photos import find_photos, match_poses
 from splatseed.sfm.refinement import Refinement, refine
@@ -202,7 +203,7 @@ def _reconstruct(
         model = colmap.guessed_model(run, cameras, camera_model)
         agreement = match_photographs(run, model, masks)
         further = None if agreement is None else lambda lost: match_further(run, agreement, lost)
-        model_dir = colmap.map_images(run, names, camera_model, further, partial=partial)
+        model_dir = map_images(run, names, camera_model, further, partial=partial)
     else:
         match_photographs(run, colmap.posed_model(run.pycolmap, poses), masks, poses)
         if refine_poses:
