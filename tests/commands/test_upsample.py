@@ -160,14 +160,25 @@ def test_a_bare_ply_where_new_points_coincide(tmp_path, splatseed):
 def test_transforms_in_transforms_out(room, tmp_path, splatseed):
     first, second = tmp_path / "first", tmp_path / "second"
     write_scene(load_scene(room), first, format="transforms")
-    assert splatseed("upsample", first, "-o", second, "--method", "mls").code == 0
-    assert _manifest(second)["format"] == "transforms"
+    (first / "depths").unlink()
+    run = splatseed("upsample", first, "-o", second, "--method", "mls")
+    assert run.code == 0, run.err
+    assert _manifest(second)["format"] == "both"
+    assert run.out.count(f" {second}") >= 7  # a command for every trainer
+    assert f"ns-train splatfacto --data {second}\n" in run.out  # reads transforms.json
+    assert pycolmap.Reconstruction(second / "sparse/0").num_images() == 12
     before, after = load_scene(first), load_scene(second)
     np.testing.assert_array_equal(after.points.xyz[: len(before.points)], before.points.xyz)
     assert (second / "images").is_dir()
-    words = ("--format", "colmap", "--method", "mls", "-o", tmp_path / "third")
-    assert splatseed("upsample", first, *words).code == 0
-    assert pycolmap.Reconstruction(tmp_path / "third/sparse/0").num_images() == 12
+    # Depth maps that Brush would take for photographs: the layouts are written one by one.
+    (first / "depths").symlink_to(room / "depths")
+    run = splatseed("upsample", first, "-o", tmp_path / "third", "--method", "mls")
+    assert run.code == 0, run.err
+    assert not (tmp_path / "third/sparse").exists()
+    command = run.out.partition("written by: ")[2].splitlines()[0]
+    run = splatseed(*shlex.split(command)[1:])
+    assert run.code == 0, run.err
+    assert pycolmap.Reconstruction(tmp_path / "third-colmap/sparse/0").num_images() == 12
 
 
 @pytest.mark.parametrize(

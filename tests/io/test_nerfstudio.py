@@ -83,7 +83,7 @@ def test_content_that_was_read_is_kept(content, scene_dir, tmp_path):
     scene = load_scene(path)
     write_scene(scene, tmp_path / "out")
     out = json.loads((tmp_path / "out/transforms.json").read_text())
-    assert out == {**content, "ply_file_path": "sparse_pc.ply"}
+    assert out == {**content, "camera_model": "OPENCV", "ply_file_path": "sparse_pc.ply"}
     assert (tmp_path / "out/images_2").is_dir()
     again = load_scene(tmp_path / "out")
     assert_same_cloud(again.points, scene.points)

@@ -11,9 +11,11 @@ import numpy as np
 
 from splatseed.console import print_note, print_pairs
 from splatseed.depth.settings import PER_POINT
+from splatseed.io.staging import read_manifest
+from splatseed.io.transforms_layout import Layout
 from splatseed.lens import undistort_command, undistorted_folder
 from splatseed.photos.sizes import at_file_size
-from splatseed.scene import Scene, SceneFormat
+from splatseed.scene import Scene
 from splatseed.seeding.advice import AS_IT_IS, SEEDED, Advice
 from splatseed.seeding.trainability import is_distorted, untrainable
 from splatseed.text import quoted
@@ -139,7 +141,9 @@ def _for_trainer(
 ) -> Commands:
     """Return the commands that lead to another trainer."""
     source = scene.source.format if scene.source else "colmap"
-    layout: SceneFormat = "transforms" if source == "transforms" else "colmap"
+    layout: Layout = "transforms" if source == "transforms" else "colmap"
+    if scene.source and read_manifest(scene.source.root).get("format") == "both":
+        layout = "both"
     other = source not in {"colmap", "transforms"} or (
         layout == "transforms" and planned.trainer in map(str.lower, COLMAP_ONLY)
     )
@@ -199,7 +203,7 @@ def triangulate_command(path: Path, scene: Scene, output: str) -> str:
     return f"splatseed sfm {images} --poses-from {quoted(path)} -o {output}"
 
 
-def print_training(read_from: Path, scene: Scene, output: Path, layout: SceneFormat) -> None:
+def print_training(read_from: Path, scene: Scene, output: Path, layout: Layout) -> None:
     """Print the commands that train a written scene, and what some of them need first."""
     if not scene.images:  # writing it said so
         return
@@ -230,7 +234,7 @@ def off_centre(scene: Scene) -> float:
     return float(np.linalg.norm(points - sizes / 2, axis=1).max(initial=0.0))
 
 
-def training_commands(path: Path, layout: SceneFormat, *, distorted: bool = False) -> Commands:
+def training_commands(path: Path, layout: Layout, *, distorted: bool = False) -> Commands:
     """Return (trainer, command) for every trainer that reads the scene at ``path`` unchanged.
 
     Example:
@@ -242,8 +246,8 @@ def training_commands(path: Path, layout: SceneFormat, *, distorted: bool = Fals
     scene = quoted(full)
     result = [quoted(f"{full}-{name}") for name in ("gsplat", "graphdeco", "lichtfeld")]
     gsplat = f"--data_dir {scene} --data_factor 1 --result_dir {result[0]}"
-    colmap = layout != "transforms"
-    folder = " colmap --colmap-path sparse/0 --downscale-factor 1" if colmap else ""
+    alone = layout == "colmap"  # nerfstudio looks for transforms.json unless it is told otherwise
+    folder = " colmap --colmap-path sparse/0 --downscale-factor 1" if alone else ""
     commands = {
         "splatseed": f"splatseed train {quoted(path)} -o {quoted(f'{path}-run')}",
         "gsplat": f"python examples/simple_trainer.py default {gsplat}",
@@ -253,5 +257,6 @@ def training_commands(path: Path, layout: SceneFormat, *, distorted: bool = Fals
         "OpenSplat": f"./opensplat {scene} -n 30000",
         "LichtFeld": f"./build/LichtFeld-Studio -d {scene} -o {result[2]}",
     }
-    unable = (frozenset() if colmap else COLMAP_ONLY) | (PINHOLE_ONLY if distorted else frozenset())
+    unable = COLMAP_ONLY if layout == "transforms" else frozenset()
+    unable |= PINHOLE_ONLY if distorted else frozenset()
     return [(name, command) for name, command in commands.items() if name not in unable]

@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from jaxtyping import Float64
 
-from splatseed.camera import CAMERA_MODELS, Intrinsics, quat_from_rotation
+from splatseed.camera import CAMERA_MODELS, Intrinsics, quat_from_rotation, rotation_from_quat
 from splatseed.errors import SceneFormatError
 from splatseed.io.files import COPY_AGAIN
 from splatseed.text import agreeing, name_some
@@ -21,6 +21,7 @@ MAX_ID = 2**32 - 1
 """The largest camera id, image id or feature index: 32 bits in COLMAP's binary form."""
 _MAX_SIZE = 2**31 - 1
 _RIGID_TOLERANCE = 1e-3  # of rotation @ rotation.T against the identity
+_EXACT = 1e-12  # of the same, of a rotation in double precision
 _NORM_RANGE = (1e-100, 1e100)  # inside it the square of a quaternion's norm is a normal float
 
 
@@ -76,7 +77,10 @@ def rigid_pose(
         expected = f"a rotation and a translation as world_from_cam in {where}"
         fix = "Remove the scale from the poses (and from the points)."
         raise SceneFormatError(expected, found="a scaled, sheared or mirrored one", fix=fix)
-    return quat_from_rotation(rotation), -rotation @ world_from_cam[:3, 3]
+    quat = quat_from_rotation(rotation)
+    if off > _EXACT:  # else the centre would move: by a metre, for six digits at a million
+        rotation = rotation_from_quat(quat)
+    return quat, -rotation @ world_from_cam[:3, 3]
 
 
 def check_enough(unusable: Mapping[str, NotFiniteError], used: int) -> None:

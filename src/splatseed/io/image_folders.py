@@ -50,13 +50,34 @@ def sibling_folders(root: Path) -> dict[str, Path]:
     return {name: root / name for name in _SIBLINGS if (root / name).is_dir()}
 
 
+def photographs_hidden(folders: Mapping[str, Path], scene: Scene) -> str:
+    """Say which linked files Brush would take for photographs; empty if none.
+
+    Of the files whose path ends in the name of an image of a COLMAP model, Brush takes the first
+    by path, in whichever folder (its ``find_image_by_name``).
+    """
+    image_dir = scene.source.image_dir if scene.source else None
+    wanted = {image.name.lower(): image.name for image in scene.images}
+    for name, source in sorted(folders.items()):
+        if image_dir is None or name >= "images" or not source.is_dir():
+            continue
+        for top, _, files in os.walk(source):
+            inside = PurePath(top).relative_to(source).parts
+            for parts in ((*inside, file) for file in files):
+                ends = ("/".join(parts[start:]).lower() for start in range(len(parts)))
+                own = (image_dir / wanted[end] for end in ends if end in wanted)
+                if any(path.parent.resolve() != Path(top).resolve() for path in own):
+                    return f"Brush would take files in {name} for photographs of their names"
+    return ""
+
+
 def link_folders(folders: Mapping[str, Path], output: Path, *, copy: bool) -> list[str]:
     """Link or copy image folders into ``output``; missing ones are left out.
 
     Photographs extracted into the user's cache are always copied.
     """
     present = {name: source for name, source in folders.items() if source.exists()}
-    around = output.resolve().parent
+    around, copied = output.resolve().parent, dict[Path, Path]()
     for name, source in present.items():
         target = output / name
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -67,8 +88,12 @@ def link_folders(folders: Mapping[str, Path], output: Path, *, copy: bool) -> li
         if not copy and not is_extracted(source):  # a link would break when the cache is emptied
             with suppress(OSError, NotImplementedError):  # a file system or system without links
                 target.symlink_to(goal, target_is_directory=source.is_dir())
+        elif (twin := copied.get(source.resolve())) is not None:  # under another name
+            with suppress(OSError, NotImplementedError):
+                target.symlink_to(os.path.relpath(twin, target.parent), twin.is_dir())
         if not target.is_symlink():
             _copy(source.resolve(), target)
+            copied[source.resolve()] = target
     return sorted(present)
 
 

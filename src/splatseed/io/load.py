@@ -63,7 +63,8 @@ def load_scene(path: StrPath, *, require_points: bool = True) -> Scene:
             (3D Scanner App's ``frame_00000.json``, Polycam's ``keyframes``, Record3D's
             ``EXR_RGBD``, Stray Scanner's ``rgb.mp4`` and ``odometry.csv``); or a ``.json``,
             ``.ply`` or ``.r3d`` file (Record3D's).
-            ``sparse`` takes precedence over ``transforms.json``, and that over ``colmap/sparse/0``.
+            ``sparse`` takes precedence over ``transforms.json`` (except in an output of splatseed
+            that has both), and that over ``colmap/sparse/0``.
         require_points: Raise for a scene without points; if False, its cloud is empty.
 
     Returns:
@@ -152,6 +153,8 @@ def is_scene(folder: StrPath) -> bool:
 
 def _reader(folder: Path) -> Callable[[], Scene] | None:
     """Choose the reader of a folder by the names of its files."""
+    if read_manifest(folder).get("format") == "both" and (folder / _TRANSFORMS).is_file():
+        return partial(read_transforms_scene, folder / _TRANSFORMS)  # it says more: masks, depth
     if (model := scene_model(folder)) is not None:
         return partial(read_model, model)
     if (folder / _TRANSFORMS).is_file():

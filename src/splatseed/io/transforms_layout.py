@@ -1,12 +1,12 @@
-"""Nerfstudio's layout of an output: ``transforms.json`` and its PLY."""
+"""Nerfstudio's layout of an output, ``transforms.json`` and its PLY, alone or beside COLMAP's."""
 
 from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Collection, Sequence
-from pathlib import Path
-from typing import Any, Literal
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path, PurePath
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
@@ -14,9 +14,15 @@ from jaxtyping import Float64
 from splatseed.camera import CAMERA_MODELS, Intrinsics
 from splatseed.errors import OutputError
 from splatseed.io import nerfstudio
-from splatseed.io.colmap_layout import Written, without_zero_distortion
+from splatseed.io.colmap_layout import Written, without_zero_distortion, write_colmap_layout
 from splatseed.io.frame_files import FrameFiles
-from splatseed.io.image_folders import copy_files, first_folders, image_folders, sibling_folders
+from splatseed.io.image_folders import (
+    copy_files,
+    first_folders,
+    image_folders,
+    photographs_hidden,
+    sibling_folders,
+)
 from splatseed.io.mask_files import FOLDER as MASKS, find_masks
 from splatseed.io.ply import write_ply
 from splatseed.io.seeds import write_seeds
@@ -24,10 +30,11 @@ from splatseed.io.split import ROOT_LISTS
 from splatseed.io.staging import write_json
 from splatseed.scene import Scene, SceneSource
 
-Layout = Literal["colmap", "transforms"]
+Layout = Literal["colmap", "transforms", "both"]
 _NERFSTUDIO_FROM_COLMAP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]])
 """The ``applied_transform`` that nerfstudio gives a COLMAP model: (x, y, z) -> (x, z, -y)."""
 _PATH_KEYS = ("file_path", "mask_path", "depth_file_path", "depth_path")
+_FIELDS = ("w", "h", "fl_x", "fl_y", "cx", "cy")
 _LIST_KEYS = ("train_filenames", "val_filenames", "test_filenames")
 _TERMS = {"OPENCV": ("k1", "k2", "p1", "p2"), "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4")}
 """Nerfstudio's distortion terms, in the order of COLMAP's parameters."""
@@ -36,37 +43,84 @@ _FISHEYE = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 _MODELS = dict.fromkeys(_PERSPECTIVE, "OPENCV") | dict.fromkeys(_FISHEYE, "OPENCV_FISHEYE")
 
 
+class _Plan(NamedTuple):
+    """What a ``transforms.json`` will hold, before masks are named, and the folders it names."""
+
+    content: dict[str, Any]
+    folders: dict[str, Path]
+    transform: Float64[np.ndarray, "3 4"] | None = None  # of a new file's world
+
+
 def write_transforms_layout(scene: Scene, folder: Path) -> Written:
     """Write ``transforms.json`` and its PLY into an output."""
-    source, points, offset = scene.source, scene.points, scene.offset
-    if source is not None and source.transforms_path is not None:
+    return _write(scene, folder, _plan(scene), "transforms")
+
+
+def write_both_layouts(scene: Scene, folder: Path) -> tuple[Written, Layout]:
+    """Write a scene from a ``transforms.json`` in both layouts, in one world.
+
+    Readers of COLMAP models find ``sparse/0`` and ``images``, the others ``transforms.json``. If
+    both cannot be in one folder, ``transforms.json`` is written alone, with a note.
+    """
+    plan, folders = _plan(scene), image_folders(scene)
+    if obstacle := _obstacle(scene, plan.folders, folders):
+        notes, linked, offset = _write(scene, folder, plan, "transforms")
+        return (
+            [*notes, f"COLMAP's layout was left out: {obstacle}."],
+            linked,
+            offset,
+        ), "transforms"
+    notes, linked, offset = _write(scene, folder, plan, "both")
+    more, folders, _ = write_colmap_layout(scene, folder)
+    return ([*notes, *more], {**linked, **folders}, offset), "both"
+
+
+def _obstacle(scene: Scene, named: Mapping[str, Path], folders: Mapping[str, Path]) -> str:
+    """Say why the folders of both layouts cannot be in one folder; empty if they can."""
+    for name, path in folders.items():
+        top = PurePath(name).parts[0]
+        taken = named.get(name) or named.get(top)
+        if taken is not None and (top != name or taken.resolve() != path.resolve()):
+            return f"its folder {top} would hold other files than the {top} of transforms.json"
+    return photographs_hidden({**named, **folders}, scene)
+
+
+def _plan(scene: Scene) -> _Plan:
+    source = scene.source
+    if source is None or source.transforms_path is None:
+        A = None if source and source.format == "transforms" else _NERFSTUDIO_FROM_COLMAP
+        return _Plan(_new_json(scene, A), image_folders(scene), A)
+    names = {image.name for image in scene.images}
+    content = _kept_json(nerfstudio.read_transforms(source.transforms_path), names)
+    if scene.origin.any():
+        content = _moved_json(content, scene.origin)
+    frames = (*content["frames"], *content.get("test_frames", ()))
+    found = (frame.get(key) for frame in frames for key in _PATH_KEYS)
+    paths = [each for each in found if isinstance(each, str) and not Path(each).is_absolute()]
+    if source.image_dir is not None and source.image_dir.resolve() == source.root.resolve():
+        paths += names  # a frame's own path may lack the extension
+    # The first folders of relative paths, so that these resolve.
+    firsts = {first: source.root / first for first in first_folders(paths)}
+    return _Plan(content, {**sibling_folders(source.root), **firsts})
+
+
+def _write(scene: Scene, folder: Path, plan: _Plan, layout: Layout) -> Written:
+    source, points, offset, (content, folders, A) = scene.source, scene.points, scene.offset, plan
+    if source is None or source.transforms_path is None:
+        _name_masks(scene, content["frames"], [image.name for image in scene.images], layout)
+    elif (scene.masks is not None and scene.masks.choice is not None) or rewrites_masks(
+        scene, layout
+    ):
         names = {image.name for image in scene.images}
         transforms = nerfstudio.read_transforms(source.transforms_path)
-        content = _kept_json(transforms, names)
-        if scene.origin.any():
-            content = _moved_json(content, scene.origin)
-        chosen = scene.masks is not None and scene.masks.choice is not None
-        if chosen or rewrites_masks(scene, "transforms"):
-            pairs = list(zip(transforms.images, transforms.frames, strict=True))
-            for key, tests in (("frames", False), ("test_frames", True)):
-                kept = [i.name for i, f in pairs if i.name in names and f.is_test == tests]
-                _name_masks(scene, content.get(key, ()), kept)
-        frames = (*content["frames"], *content.get("test_frames", ()))
-        found = (frame.get(key) for frame in frames for key in _PATH_KEYS)
-        paths = [each for each in found if isinstance(each, str) and not Path(each).is_absolute()]
-        if source.image_dir is not None and source.image_dir.resolve() == source.root.resolve():
-            paths += names  # a frame's own path may lack the extension
-        # The first folders of relative paths, so that these resolve.
-        firsts = {first: source.root / first for first in first_folders(paths)}
-        folders = {**sibling_folders(source.root), **firsts}
-    else:
-        A = None if source and source.format == "transforms" else _NERFSTUDIO_FROM_COLMAP
-        content, folders = _new_json(scene, A), image_folders(scene)
-        _name_masks(scene, content["frames"], [image.name for image in scene.images])
-        if A is not None:
-            xyz = nerfstudio.apply_transform(A, points.xyz).astype(np.float32)
-            normals = None if points.normals is None else points.normals @ A[:, :3].T
-            points, offset = points.replace(xyz=xyz, normals=normals), A[:, :3] @ offset
+        pairs = list(zip(transforms.images, transforms.frames, strict=True))
+        for key, tests in (("frames", False), ("test_frames", True)):
+            kept = [i.name for i, f in pairs if i.name in names and f.is_test == tests]
+            _name_masks(scene, content.get(key, ()), kept, layout)
+    if A is not None:
+        xyz = nerfstudio.apply_transform(A, points.xyz).astype(np.float32)
+        normals = None if points.normals is None else points.normals @ A[:, :3].T
+        points, offset = points.replace(xyz=xyz, normals=normals), A[:, :3] @ offset
     write_json(folder / "transforms.json", {**content, "ply_file_path": "sparse_pc.ply"})
     write_ply(folder / "sparse_pc.ply", points)
     shutil.copyfile(folder / "sparse_pc.ply", folder / "pointcloud.ply")  # LichtFeld's name for it
@@ -120,7 +174,7 @@ def _camera_fields(camera: Intrinsics) -> dict[str, Any]:
     terms = camera.params[CAMERA_MODELS[camera.model].num_focal + 2 :]
     matrix = camera.K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
     fields = {"camera_model": model, "w": camera.width, "h": camera.height}
-    fields |= zip(("fl_x", "fl_y", "cx", "cy"), matrix, strict=True)
+    fields |= zip(_FIELDS[2:], matrix, strict=True)
     return fields | dict(zip(_TERMS[model], (*terms, 0.0, 0.0, 0.0, 0.0), strict=False))
 
 
@@ -137,7 +191,7 @@ def _kept_json(transforms: nerfstudio.Transforms, names: Collection[str]) -> dic
         if not isinstance(path, str):
             return path
         found, plain = finders[key](path), Path(os.path.abspath(root / path))  # noqa: PTH100
-        if found and found.path not in (plain, plain.with_name(plain.name + found.path.suffix)):
+        if found and found.path != plain:  # without its suffix, say, which nerfstudio needs
             path = Path(os.path.relpath(found.path, root)).as_posix()
         if os.path.normpath(path).startswith(".."):
             return os.path.abspath(root / path)  # noqa: PTH100  (resolve would follow links)
@@ -149,7 +203,8 @@ def _kept_json(transforms: nerfstudio.Transforms, names: Collection[str]) -> dic
         if image.name in names:
             fields = frame.fields
             moved = {key: portable(fields[key], key) for key in _PATH_KEYS if key in fields}
-            frames[frame.is_test].append({**fields, **moved})
+            missing = _missing_fields({**content, **fields}, image.intrinsics)
+            frames[frame.is_test].append({**fields, **moved, **missing})
             used.add(os.path.normpath(str(fields["file_path"])))
     all_of = (*content["frames"], *(f.fields for f in transforms.frames if f.is_test))
     gone = {os.path.normpath(str(frame.get("file_path"))) for frame in all_of} - used
@@ -160,7 +215,20 @@ def _kept_json(transforms: nerfstudio.Transforms, names: Collection[str]) -> dic
         lists[key] = [portable(name) for name in listed if os.path.normpath(name) not in gone]
     kept = {key: value for key, value in content.items() if key != "test_frames"}
     tests = {"test_frames": frames[True]} if frames[True] else {}
+    if "camera_model" not in kept:
+        kept["camera_model"] = "OPENCV_FISHEYE" if content.get("is_fisheye") is True else "OPENCV"
     return {**kept, **lists, "frames": frames[False], **tests}
+
+
+def _missing_fields(fields: Mapping[str, Any], camera: Intrinsics) -> dict[str, float]:
+    """Return the size, focal lengths and principal point that a frame and its file lack.
+
+    nerfstudio and OpenSplat need them, and ``camera_model``, where others take ``camera_angle_x``
+    and the middle of the photograph.
+    """
+    values = camera.width, camera.height, *camera.K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+    known = dict(zip(_FIELDS, values, strict=True))
+    return {name: value for name, value in known.items() if fields.get(name) is None}
 
 
 def _moved_json(content: dict[str, Any], offset: Float64[np.ndarray, " 3"]) -> dict[str, Any]:
@@ -190,7 +258,7 @@ def rewrites_masks(scene: Scene, layout: Layout) -> bool:
     named = layout == "transforms" and masks.choice is None and _names_masks(source)
     folder = (source.root / MASKS).absolute()
     inside = all(folder in path.absolute().parents for path in masks.files.values())
-    if inside and layout == "colmap":  # where masks are known by their names alone
+    if inside and layout != "transforms":  # where masks are known by their names alone
         inside = find_masks([image.name for image in scene.images], folder)[0].keys() == (
             masks.files.keys()
         )
@@ -205,12 +273,14 @@ def _names_masks(source: SceneSource) -> bool:
     return any(isinstance(frame.fields.get("mask_path"), str) for frame in frames)
 
 
-def _name_masks(scene: Scene, frames: Sequence[dict[str, Any]], names: Sequence[str]) -> None:
+def _name_masks(
+    scene: Scene, frames: Sequence[dict[str, Any]], names: Sequence[str], layout: Layout
+) -> None:
     """Set ``mask_path`` if all frames have a mask: nerfstudio takes masks of all or none."""
     if scene.masks is None or scene.source is None:
         return
     files, root = scene.masks.files, scene.source.root
-    rewrites = rewrites_masks(scene, "transforms")
+    rewrites = rewrites_masks(scene, layout)
     for frame, name in zip(frames, names, strict=True):
         frame.pop("mask_path", None)
         if rewrites:

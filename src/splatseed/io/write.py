@@ -1,9 +1,10 @@
 """Writing a scene that every 3D Gaussian Splatting trainer loads unchanged.
 
-A *layout* is the set of files that a trainer looks for: COLMAP's (``colmap_layout``) or
-nerfstudio's (``transforms_layout``). Promise: the folder appears completely or not at all; its
-points are finite and distinct, in the scene's order in all files; originals keep their float64
-positions and tracks; point ids are 1..N. docs/trainers.md lists what each trainer needs.
+A *layout* is the set of files that a trainer looks for: COLMAP's (``colmap_layout``),
+nerfstudio's (``transforms_layout``), or both in one folder and one world. Promise: the folder
+appears completely or not at all; its points are finite and distinct, in the scene's order in all
+files; originals keep their float64 positions and tracks; point ids are 1..N. docs/trainers.md lists
+what each trainer needs.
 """
 
 from __future__ import annotations
@@ -21,12 +22,17 @@ from splatseed.io.cleaning import clean_scene
 from splatseed.io.colmap_layout import write_colmap_layout
 from splatseed.io.extraction import is_extracted
 from splatseed.io.files import StrPath
-from splatseed.io.image_folders import link_folders
+from splatseed.io.image_folders import link_folders, photographs_hidden
 from splatseed.io.mask_files import FOLDER as MASKS
 from splatseed.io.masks import write_masks
 from splatseed.io.origin import write_offset
 from splatseed.io.staging import ABSENT, MANIFEST, output_folder, write_json
-from splatseed.io.transforms_layout import Layout, rewrites_masks, write_transforms_layout
+from splatseed.io.transforms_layout import (
+    Layout,
+    rewrites_masks,
+    write_both_layouts,
+    write_transforms_layout,
+)
 from splatseed.scene import Scene
 
 _KIND = "write_scene"
@@ -67,8 +73,8 @@ def write_scene(
     Args:
         scene: The scene, originals first in its cloud.
         path: The folder to create.
-        format: The layout. ``auto`` is the layout that was read, and COLMAP's for a PLY file, an
-            RGB-D capture or a scene made in memory.
+        format: The layout. ``auto`` is COLMAP's, and both for a scene from a ``transforms.json``
+            unless they disturb each other.
         overwrite: Whether an earlier output of splatseed may be replaced.
         copy_images: Copy the image folders instead of linking them.
         provenance: Entries for ``splatseed.json`` on how the points were made.
@@ -91,8 +97,13 @@ def write_scene(
     inputs = source.inputs if source else ()
     kind = str(made.get("command", _KIND))
     with output_folder(path, kind=kind, overwrite=overwrite, protect=inputs) as folder:
-        write_layout = write_colmap_layout if layout == "colmap" else write_transforms_layout
-        notes, image_sources, offset = write_layout(clean, folder)
+        if layout == "both":
+            (notes, image_sources, offset), layout = write_both_layouts(clean, folder)
+        else:
+            write = write_colmap_layout if layout == "colmap" else write_transforms_layout
+            notes, image_sources, offset = write(clean, folder)
+            if layout == "colmap" and (hidden := photographs_hidden(image_sources, clean)):
+                notes.append(f"{hidden}: remove the folder's link before you train with it.")
         write_offset(folder, offset)
         masks, photographs = clean.masks, source.image_dir if source else None
         if masks and photographs and rewrites_masks(clean, layout):
@@ -131,7 +142,8 @@ def write_scene(
 
 def _choose_layout(scene: Scene, wanted: str) -> Layout:
     if wanted == "auto":
-        return "transforms" if scene.source and scene.source.format == "transforms" else "colmap"
+        read = scene.source is not None and scene.source.format == "transforms"
+        return "both" if read and scene.images else "colmap"
     if wanted == "colmap":
         return "colmap"
     if wanted == "transforms" and scene.images:

@@ -40,10 +40,10 @@ def run(arguments: list[str]) -> None:
         check_free(options.gaussians, overwrite=options.overwrite, protect=protect)
     for file in options.cloud_files:
         open_cloud(file)  # reads the header, so that a bad file fails before work starts
-    _upsample(options, methods)
+    _upsample(options, methods, arguments)
 
 
-def _upsample(options: Options, methods: dict[str, Any]) -> None:
+def _upsample(options: Options, methods: dict[str, Any], arguments: list[str]) -> None:
     from splatseed.seeding.upsampling import upsample
 
     notes: list[str] = []
@@ -101,7 +101,7 @@ def _upsample(options: Options, methods: dict[str, Any]) -> None:
     if options.gaussians is not None:
         notes.append(f"The initial Gaussians are in {visible(options.gaussians)}.")
     origins = report.origin_counts(seeds, options.method, written.num_points)
-    report.summarise(options, scene, replaced, origins, written, seconds, findings)
+    report.summarise(options, scene, replaced, origins, written, seconds, findings, arguments)
     for note in notes:
         print_note(note)
 

@@ -91,7 +91,7 @@ class Options:
     gaussians: Path | None = None
     """Also write the initial Gaussians as a 3DGS .ply, for trainers that start from one."""
     format: Literal["auto", "colmap", "transforms"] = "auto"
-    """Layout to write: auto is the input's."""
+    """Layout to write: auto is COLMAP's, and for a scene from a transforms.json both."""
     copy_images: bool = False
     """Copy images instead of linking them."""
     overwrite: bool = False

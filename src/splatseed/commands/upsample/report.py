@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -29,7 +30,7 @@ from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.scene import Scene
 from splatseed.seeding.geometry_score import far_share
 from splatseed.seeding.photo_methods import CELL
-from splatseed.text import agreeing, counted
+from splatseed.text import agreeing, counted, quoted
 
 CLOUD_PARAMETERS = {"files", "transform", "memory", "alone"}
 """Parameters of the method cloud that other lines show."""
@@ -197,6 +198,22 @@ def origin_counts(seeds: PointCloud, method: str, written: int | None = None) ->
     return dict(zip(names, counts.tolist(), strict=True))
 
 
+def colmap_command(arguments: Sequence[str], output: Path) -> str:
+    """Return the command that writes the same scene in COLMAP's layout, beside the output.
+
+    Example:
+        >>> colmap_command(["my scene", "-o", "OUT", "--ratio=8"], Path("OUT"))
+        "splatseed upsample 'my scene' --ratio=8 --format colmap -o OUT-colmap"
+    """
+    replaced, words, rest = ("-o", "--output", "--format"), list[str](), iter(arguments)
+    for word in rest:
+        if word in replaced:
+            next(rest, None)  # its value
+        elif word.partition("=")[0] not in replaced:
+            words.append(shlex.quote(word))
+    return f"splatseed upsample {' '.join(words)} --format colmap -o {quoted(f'{output}-colmap')}"
+
+
 def summarise(
     options: Options,
     scene: Scene,
@@ -205,8 +222,9 @@ def summarise(
     written: WriteReport,
     seconds: Mapping[str, float],
     found: Sequence[tuple[str, str]],
+    arguments: Sequence[str],
 ) -> None:
-    """Print the final table and the commands to run next."""
+    """Print the final table and the commands to run next; ``arguments`` are those of the verb."""
     output, left_out = options.output, []
     if written.dropped_nonfinite + written.dropped_duplicates:
         left_out += [f"{written.dropped_nonfinite:,} not finite"]
@@ -222,7 +240,9 @@ def summarise(
         ("seconds", ", ".join(f"{stage} {time:.2f}" for stage, time in seconds.items())),
         ("output", str(output)),
     ]
+    here = output.resolve()
     links = [Path(name) for name in written.files if (output / name).is_symlink()]
+    links = [link for link in links if here not in (output / link).resolve().parents]
     photographs = [link for link in links if link.parts[0] == "images"] or links
     there = [(output / link).resolve() for link in photographs]
     if linked := sorted({str(path if path.is_dir() else path.parent) for path in there}):
@@ -236,7 +256,7 @@ def summarise(
         print_note(note)
     if written.layout == "transforms":
         print_note(
-            "The commands for gsplat's examples, graphdeco's code and LichtFeld need COLMAP's "
-            "layout: --format colmap."
+            "gsplat's examples, graphdeco's code and LichtFeld need COLMAP's layout, written by: "
+            f"{colmap_command(arguments, output)}"
         )
     print_training(options.scene, scene, output, written.layout)
