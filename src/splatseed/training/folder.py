@@ -158,9 +158,11 @@ def write_curve_png(path: Path, records: Sequence[Record]) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415  (slow to import)
     from matplotlib.figure import Figure  # noqa: PLC0415  (loads with its use)
 
-    figure = Figure(figsize=(7.0, 7.0), layout="constrained")
+    figure = Figure(figsize=(7.0, 7.0))
     FigureCanvasAgg(figure)
-    losses, psnrs, counts = figure.subplots(3, 1, sharex=True)
+    # Margins for labels of up to 100,000,000: a layout that is found draws all three times.
+    margins = {"left": 0.16, "right": 0.98, "bottom": 0.075, "top": 0.985, "hspace": 0.06}
+    losses, psnrs, counts = figure.subplots(3, 1, sharex=True, gridspec_kw=margins)
     steps = [r.step for r in records]
     losses.semilogy(steps, [r.loss for r in records], color="C3")
     losses.set_ylabel("loss")
