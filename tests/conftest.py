@@ -6,6 +6,7 @@ import gc
 import math
 import os
 import pickle
+import sys
 
 from splatseed.runtime.environment import set_thread_defaults
 
@@ -21,7 +22,7 @@ import numpy as np
 import pytest
 
 from splatseed.io import load_scene
-from splatseed.io.staging import locked
+from splatseed.io.staging import atomic_file, locked
 from splatseed.scene import Scene
 from splatseed.synthetic import Capture, make_capture, write_capture
 
@@ -34,6 +35,47 @@ SCENES = Path(os.environ.get("SPLATSEED_SCENES", Path(__file__).parents[2] / "sh
 def _untold_compilation(monkeypatch):
     """What commands say on stderr must not depend on what is compiled already."""
     monkeypatch.setattr("splatseed.console.MIN_LOGGED_COMPILATION", math.inf)
+
+
+@pytest.fixture
+def compare_once(request, monkeypatch):
+    """Compares the same photographs once for all tests that use this, but for ``compare_anew``."""
+    from .compared_once import USERS, match_views
+
+    if "compare_anew" not in request.fixturenames:
+        for module in USERS:
+            monkeypatch.setattr(module, "match_views", match_views)
+
+
+@pytest.fixture
+def compare_anew():
+    """For tests of what comes of comparing photographs twice."""
+
+
+_drawn: list[bytes] = []
+
+
+@pytest.fixture
+def draw_curves():
+    """For tests of the picture of a run's curves: each run draws its own."""
+
+
+@pytest.fixture(autouse=True)
+def _curves_are_drawn_once(request, monkeypatch):
+    """Drawing curves takes half a second, at the end of hundreds of runs; others copy the first."""
+    run = sys.modules.get("splatseed.training.run")
+    if run is None or "draw_curves" in request.fixturenames:
+        return
+    draw = run.write_curve_png
+
+    def copy(path, records):
+        if not _drawn:
+            draw(path, records)
+            _drawn.append(path.read_bytes())
+        with atomic_file(path) as partial:
+            partial.write_bytes(_drawn[0])
+
+    monkeypatch.setattr(run, "write_curve_png", copy)
 
 
 @pytest.hookimpl(wrapper=True)

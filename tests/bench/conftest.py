@@ -25,6 +25,11 @@ class InProcess:
     kill = stop
 
 
+@pytest.fixture(autouse=True)
+def _compare_once(compare_once):
+    """Photographs are not the subject of benchmarks."""
+
+
 @pytest.fixture
 def in_process():
     """``InProcess`` workers."""

@@ -48,6 +48,11 @@ def _poses_are_checked_once(monkeypatch):
         monkeypatch.setattr(module, name, _once(getattr(module, name)))
 
 
+@pytest.fixture(autouse=True)
+def _compare_once(compare_once):
+    """Photographs are not the subject of commands."""
+
+
 @pytest.fixture(scope="session")
 def room(larger_room_path) -> Path:
     """The path of the larger room, which the commands are given."""
@@ -101,8 +106,8 @@ def as_by_a_device() -> Callable[[Scene], Scene]:
 
 @pytest.fixture(scope="session")
 def sharp_room(room_of) -> Scene:
-    """The room in pictures large enough for features: 10 views of 320 x 240."""
-    room = load_scene(room_of(12, 320, 240).path)  # which the tests of sfm have as well
+    """The room in pictures large enough for features: 10 views of 256 x 192."""
+    room = load_scene(room_of(12, 256, 192).path)  # which the tests of sfm have as well
     return room.replace(images=room.images[:10])
 
 

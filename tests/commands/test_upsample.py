@@ -113,7 +113,9 @@ def test_the_default_method_uses_the_photographs(seeded, room):
     assert pycolmap.Reconstruction(out / "sparse/0").num_images() == 12
 
 
-def test_the_same_seed_gives_the_same_bytes_and_another_does_not(seeded, room, tmp_path, splatseed):
+def test_the_same_seed_gives_the_same_bytes_and_another_does_not(
+    seeded, room, tmp_path, splatseed, compare_anew
+):
     for seed in (0, 6):
         words = ("--budget", 2000, "--seed", seed, "-o", tmp_path / str(seed))
         run = splatseed("upsample", room, *words)

@@ -11,6 +11,11 @@ from splatseed.training.prepare import PrepareOptions, prepare_run
 from splatseed.training.settings import TrainSettings
 
 
+@pytest.fixture(autouse=True)
+def _compare_once(compare_once):
+    """Photographs are not the subject of training."""
+
+
 @pytest.fixture
 def begin(room, tmp_path):
     """Prepares a run of the room; ``begin(name, {"resume": True}, strategy=...)``."""

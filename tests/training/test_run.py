@@ -96,7 +96,7 @@ def test_opacities_are_the_same_whatever_the_threads(single_threaded):
     ],
 )
 def test_a_run_goes_on_to_the_byte_whatever_the_threads(
-    begin, strategy, stop, exposure, single_threaded
+    begin, strategy, stop, exposure, single_threaded, compare_anew
 ):
     settings = {"strategy": strategy, "cap_max": CAP, "exposure": exposure}
     straight = begin("straight", **settings)
@@ -211,7 +211,7 @@ def test_opacities_are_reset_on_request(begin):
     assert torch.sigmoid(run.state.params["opacities"]).max() < 0.05
 
 
-def test_results_are_whole_and_in_the_scenes_world(begin, room):
+def test_results_are_whole_and_in_the_scenes_world(begin, room, draw_curves):
     run = begin(max_steps=20)
     seeds_in_world = run.frame.points_to_world(gaussians_of(run.state.params).means)
     assert np.allclose(seeds_in_world, room.points.xyz, atol=1e-4)
@@ -226,7 +226,9 @@ def test_results_are_whole_and_in_the_scenes_world(begin, room):
     assert json.loads(folder.config.read_text())["data_factor"] == 2
     rows = list(csv.DictReader(folder.curve_csv.open()))
     assert int(rows[-1]["step"]) == 20
-    assert PilImage.open(folder.curve_png).size[0] > 100
+    curves = np.asarray(PilImage.open(folder.curve_png))
+    assert curves.shape[1] > 100
+    assert len(np.unique(curves.reshape(-1, curves.shape[2]), axis=0)) > 20  # lines on white
     pictures = sorted(folder.renders.iterdir())
     assert len(pictures) == 2
     assert PilImage.open(pictures[0]).size == (3 * 48 + 8, 36 + BAND)
