@@ -10,6 +10,7 @@ import re
 import subprocess
 import sys
 import tomllib
+from functools import cache
 from graphlib import TopologicalSorter
 from importlib.metadata import version
 from importlib.util import resolve_name
@@ -41,9 +42,21 @@ DELEGATING = {
 """What methods of data types hand over to when they are called: io, which imports these types."""
 
 
+@cache
+def _tree(path):
+    """A file's syntax, which several tests look through."""
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+@cache
+def _import_statements(path):
+    """A file's imports, also those within functions."""
+    return [n for n in ast.walk(_tree(path)) if isinstance(n, ast.Import | ast.ImportFrom)]
+
+
 def _imports(path):
     """What a file imports anywhere, also within functions."""
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in _import_statements(path):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -184,7 +197,7 @@ def test_files_import_each_other_in_no_circle():
 def _imported_files(path, name, modules):
     """The modules of ours that a file imports anywhere, but itself."""
     found = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in _import_statements(path):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -205,7 +218,7 @@ COMMAND = re.compile(r"\b(splatseed [a-z]+|hf|ray|colmap) ")
 def test_messages_of_the_library_name_arguments_not_options(part):
     """But for whole commands: see splatseed.errors."""
     for path in _files(part):
-        for line, text in _texts(ast.parse(path.read_text(encoding="utf-8"))):
+        for line, text in _texts(_tree(path)):
             assert COMMAND.search(text) or not OPTION.search(text), f"{path.name}:{line}: {text}"
 
 
@@ -250,7 +263,7 @@ def _packages_above(name):
 
 def _imported_on_loading(path, modules):
     """Which of our modules a file imports when it is loaded itself, not when a function runs."""
-    for node in _run_on_loading(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in _run_on_loading(_tree(path)):
         if isinstance(node, ast.Import):
             yield from {alias.name for alias in node.names} & modules.keys()
         elif isinstance(node, ast.ImportFrom) and node.module in modules:
