@@ -15,7 +15,6 @@ from splatseed.io.load import with_own_depths
 from splatseed.seeding.pose_accuracy import PoseErrorEstimate
 from splatseed.sfm import Refinement, Settings, SfmReport
 from splatseed.sfm.photos import find_photos
-from splatseed.synthetic import make_capture, write_capture
 
 from ..io.phone_exports import write_polycam, write_scanner_app
 
@@ -72,10 +71,8 @@ def test_poses_that_photographs_do_not_fit_are_pointed_out(exact, called, tmp_pa
     assert ("do not fit these poses" in out) != exact
 
 
-def test_poses_are_measured_by_the_photographs(tmp_path):
-    capture = make_capture(0, num_views=16, width=240, height=180)
-    path = write_capture(capture, tmp_path / "room")
-    report = SfmReport(path, 16, 16, (), *FACTS)
+def test_poses_are_measured_by_the_photographs(room_of):
+    report = SfmReport(room_of(16, 240, 180).path, 16, 16, (), *FACTS)
     error = sfm._pose_error(report, lambda *_: None)
     assert error.exact
     assert error.px < 0.2

@@ -9,11 +9,11 @@ from splatseed.io import load_scene
 
 @pytest.fixture(scope="session")
 def capture(room_of):
-    """The room in 12 views of 320 x 240."""
-    return room_of(12, 320, 240).capture
+    """The room in 12 views of 256 x 192."""
+    return room_of(12, 256, 192).capture
 
 
 @pytest.fixture(scope="session")
 def room(room_of):
     """The same on disk, with its true poses. Not to be written to."""
-    return load_scene(room_of(12, 320, 240).path)
+    return load_scene(room_of(12, 256, 192).path)

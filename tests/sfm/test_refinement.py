@@ -122,7 +122,7 @@ def test_poses_that_drift_or_are_of_others_are_refused(room, refined):
 def test_a_scene_has_the_refined_poses_and_one_without_matches_its_own(room, tmp_path):
     photos = tmp_path / "photos"
     shutil.copytree(room.source.image_dir, photos)
-    noise = np.random.default_rng(0).integers(0, 256, (240, 320, 3), np.uint8)
+    noise = np.random.default_rng(0).integers(0, 256, (192, 256, 3), np.uint8)
     PilImage.fromarray(noise).save(photos / "view_000.png")
     given = room.replace(images=tuple(with_noise(room.images, 2.0, 3.0)))
     how = {"poses_from": given, "refine_poses": True, "test_names": {"view_003.png"}}

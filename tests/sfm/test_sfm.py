@@ -112,10 +112,10 @@ def test_known_poses_are_kept_and_surfaces_found(capture, posed, photos, tmp_pat
 def test_a_known_lens_is_believed_and_triangulation_repeats_itself(posed, photos, tmp_path):
     """Coefficients above 1, as a Kinect's, which COLMAP takes for a calibration gone wrong."""
     cancel = (0.0, 0.0, 0.0, 0.0, 1.2, 0.0, 0.0, 1.2)  # the rational model's k3 = k6
-    lens = Intrinsics(7, "FULL_OPENCV", 320, 240, (*posed.intrinsics[0].params, *cancel))
+    lens = Intrinsics(7, "FULL_OPENCV", 256, 192, (*posed.intrinsics[0].params, *cancel))
     images = tuple(replace(image, intrinsics=lens) for image in posed.images[:4])
     scene = Scene(PointCloud.empty(), images, (lens,))
-    settings = Settings(seed=3, max_image_size=240)
+    settings = Settings(seed=3, max_image_size=192)
     first, second = (
         reconstruct(photos, tmp_path / name, settings, poses_from=scene)
         for name in ("first", "second")
@@ -176,7 +176,7 @@ def test_all_pairs_are_advised_only_if_some_are_left(pairs, advised, tmp_path, m
 def test_photographs_are_told_first_and_an_interrupt_leaves_nothing(photos, tmp_path):
     folder, told = tmp_path / "photos", []
     shutil.copytree(photos, folder / "below")
-    PilImage.new("I;16", (320, 240)).save(folder / "depth.png")
+    PilImage.new("I;16", (256, 192)).save(folder / "depth.png")
     PilImage.new("L", (64, 48)).save(folder / "conf_00000.png")
     (folder / "phone.heic").touch()
 
@@ -218,7 +218,7 @@ def test_bad_folders_are_refused(photos, tmp_path):
     (folder / "a.heic").touch()
     (folder / "notes.txt").touch()
     shutil.copy(photos / "view_000.png", folder / "a.png")
-    PilImage.new("I;16", (320, 240)).save(folder / "depth.png")
+    PilImage.new("I;16", (256, 192)).save(folder / "depth.png")
     refused("depth.png", "a.heic", "1 other")
     (folder / "b.png").write_bytes(b"not an image")
     refused("b.png", error=SceneFormatError)
