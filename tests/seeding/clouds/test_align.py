@@ -17,7 +17,7 @@ from splatseed.seeding.clouds.icp import Stage
 from splatseed.similarity import Similarity
 
 MOVE = Similarity(0.37, spread_rotations(500)[321], np.array([5.6e5, 5.9e6, -80.0]))
-FEWER_SCALES = AlignSettings(search=SearchSettings(scales=SearchSettings.scales[1:4]))
+FEWER = AlignSettings(search=SearchSettings(rotations=600, scales=SearchSettings.scales[1:4]))
 QUICK = AlignSettings(
     search=SearchSettings(rotations=150, refined=2),
     stages=(
@@ -73,7 +73,7 @@ def aligned(folder, tie_xyz, xyz, settings, **arrays):
 @pytest.mark.slow
 def test_a_cloud_that_is_shifted_scaled_and_turned(made, tmp_path):
     tie_xyz, dense = made
-    found = aligned(tmp_path, tie_xyz, MOVE.points(dense), FEWER_SCALES, rgb=shades(dense))
+    found = aligned(tmp_path, tie_xyz, MOVE.points(dense), FEWER, rgb=shades(dense))
     back = found.scene_from_cloud.points(MOVE.points(dense))
     assert np.linalg.norm(back - dense, axis=1).max() < 0.005  # metres
     rotation = found.scene_from_cloud.rotation @ MOVE.rotation
