@@ -253,7 +253,8 @@ def test_photographs_without_points_are_seeded_and_drawn(bare, tmp_path, splatse
 
 
 def test_poses_are_refined_and_points_triangulated(sharp_room, sharp_bare, tmp_path, splatseed):
-    run = splatseed("upsample", sharp_bare, "-o", tmp_path / "out", "--refine-poses")
+    words = ("--refine-poses", "--method", "linear", "--ratio", 2)
+    run = splatseed("upsample", sharp_bare, "-o", tmp_path / "out", *words)
     assert run.code == 0, run.err
     out = load_scene(tmp_path / "out")
     assert out.points.num_original > 100  # those that were triangulated
