@@ -1,4 +1,4 @@
-"""``splatseed export``: write trained Gaussians in the formats of viewers and engines."""
+"""``splatseed export``: write trained Gaussians for viewers and engines, or as a web page."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from splatseed.commands.options import parse_options, refuse
 from splatseed.commands.outputs import check_free
 from splatseed.console import print_note, print_pairs, stage_display
 from splatseed.io.origin import RECENTER, choose_origin, format_offset, offset_beside, write_offset
+from splatseed.progress import Note, Progress
 from splatseed.requirements import require
 from splatseed.splat.formats import (
     FORMATS,
@@ -22,26 +23,29 @@ from splatseed.splat.formats import (
     read_gaussians,
     write_gaussians,
 )
+from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.model_frame import translate_gaussians
-from splatseed.text import quoted
+from splatseed.text import quoted, visible
 from splatseed.training.folder import RunFolder
 from splatseed.training.models import config_of, model_file
 from splatseed.training.settings import TrainSettings
 
+PAGE = ".html"
+PAGE_DESCRIPTION = "html: one colour per Gaussian, their mean over the training cameras; browsers"
 OWN = "own"
 """The value of --clean for the scene of the run."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """Write a trained model in another format, optionally cropped and cleaned."""
+    """Write a trained model in another format or as a web page, optionally cropped and cleaned."""
 
     model: Annotated[Path, tyro.conf.Positional]
     """A run folder of splatseed train, or a file of Gaussians: .ply, .compressed.ply, .splat, .spz,
     .sog."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """The file to write; its suffix chooses the format: .ply, .compressed.ply, .splat, .spz,
-    .sog."""
+    """The file to write; its suffix chooses the format: .ply, .compressed.ply, .splat, .spz, .sog,
+    or .html, a page with viewer and model that browsers open from disk."""
     crop: Annotated[str | None, tyro.conf.arg(metavar="x0,y0,z0,x1,y1,z1")] = None
     """Keep the Gaussians whose centres lie in this box, in world coordinates; write --crop=-1,...
     if the first number is negative."""
@@ -57,7 +61,8 @@ class Options:
 def run(arguments: list[str]) -> None:
     """Run the verb with these arguments."""
     options = parse_options(Options, "export", arguments)
-    name = format_of_name(options.output)
+    page = options.output.name.lower().endswith(PAGE)
+    name = PAGE if page else format_of_name(options.output, (PAGE,))
     crop = None if options.crop is None else parse_crop(options.crop)
     path, target = model_file(options.model), options.output
     cleans = options.clean is not None
@@ -76,8 +81,8 @@ def run(arguments: list[str]) -> None:
         (RunFolder(target.resolve().parent).is_run, f"a file outside training runs, not {target}",
          "the folder of a run", "Choose a place beside the run."),
     )  # fmt: skip
-    if cleans:
-        require("torch")
+    if cleans or page:
+        require("torch", *["viser"] * page)
     notes: list[str] = []
     with stage_display() as clock:
         clock("read", 0.0)
@@ -95,21 +100,15 @@ def run(arguments: list[str]) -> None:
                 path, Path(str(scene)), masks=masks, progress=clock, **numbers
             )
             kept = filter_gaussians(gaussians.select(~floaters), crop, options.min_opacity)
-        offset, far = offset_beside(path), choose_origin(kept.means)
-        kept = translate_gaussians(kept, -far) if far.any() else kept
-        offset = far if offset is None else offset + far
-        write_gaussians(target, kept, clock, notes.append)
-        write_offset(target, offset)
-    if offset.any():
-        notes.append(
-            f"The file is around {format_offset(offset)}, as {target.name}.{RECENTER} beside it "
-            "records: coordinates before = after + offset."
-        )
+        if page:
+            _write_page(options.model, path, kept, target, clock, notes.append)
+        else:
+            _write_file(path, kept, target, clock, notes.append)
     before, after = path.stat().st_size, target.stat().st_size
     rows = [
         ("Gaussians", f"{len(kept):,} of {len(gaussians):,}"),
         *[("floaters", f"{np.count_nonzero(floaters):,} left out")] * cleans,
-        ("format", f"{name}: {FORMATS[name].description}"),
+        ("format", PAGE_DESCRIPTION if page else f"{name}: {FORMATS[name].description}"),
         ("size", f"{after / 1e6:.2f} MB, of {before / 1e6:.2f} MB read"),
         ("output", str(target)),
     ]
@@ -118,8 +117,39 @@ def run(arguments: list[str]) -> None:
         print_note(note)
     if name == "splat" and gaussians.shN.size:
         print_note("A .splat has no view-dependent colour: the model's is left out.")
-    looking = ("look at it", f"splatseed view {quoted(options.output)}")
-    print_pairs("next", [looking, ("score it", _scoring_command(options))])
+    if page:
+        link = visible(target.resolve().as_uri())
+        print_pairs("next", [("open it in a browser, here or wherever you send it", link)])
+    else:
+        looking = ("look at it", f"splatseed view {quoted(options.output)}")
+        print_pairs("next", [looking, ("score it", _scoring_command(options))])
+
+
+def _write_file(path: Path, kept: Gaussians, target: Path, progress: Progress, note: Note) -> None:
+    """Write the Gaussians, read from ``path``, and their offset."""
+    offset, far = offset_beside(path), choose_origin(kept.means)
+    kept = translate_gaussians(kept, -far) if far.any() else kept
+    offset = far if offset is None else offset + far
+    write_gaussians(target, kept, progress, note)
+    write_offset(target, offset)
+    if offset.any():
+        note(
+            f"The file is around {format_offset(offset)}, as {target.name}.{RECENTER} beside it "
+            "records: coordinates before = after + offset."
+        )
+
+
+def _write_page(
+    model: Path, path: Path, kept: Gaussians, target: Path, progress: Progress, note: Note
+) -> None:
+    """Write the Gaussians as a web page, named after the run or the file."""
+    from splatseed.viewer.models import item_of_model
+    from splatseed.viewer.web_page import check_page_size, write_page
+
+    check_page_size(len(kept))
+    name = model.resolve().name if model.is_dir() else model.stem
+    item = item_of_model(name, path, kept, note)
+    write_page(target, item, progress, note)
 
 
 def _scoring_command(options: Options) -> str:

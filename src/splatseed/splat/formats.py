@@ -8,7 +8,7 @@ lose fine detail and the order of Gaussians.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
@@ -121,8 +121,10 @@ def write_gaussians(
         file.writelines(parts)
 
 
-def format_of_name(path: Path) -> str:
+def format_of_name(path: Path, more: Collection[str] = ()) -> str:
     """Return the name of the format of a file name's suffix.
+
+    ``more`` are suffixes that the caller handles, for the message.
 
     Raises:
         ParameterError: The suffix is not of a supported format.
@@ -131,10 +133,11 @@ def format_of_name(path: Path) -> str:
         if path.name.lower().endswith(suffix):
             return name
     suffix, other = path.suffix or "none", _UNSUPPORTED.get(path.suffix.lower())
+    known = (*SUFFIXES, *more)
     raise ParameterError(
-        f"a file name that ends in one of {', '.join(SUFFIXES)}",
+        f"a file name that ends in one of {', '.join(known)}",
         found=suffix,
-        fix=f"Export a .ply: {other}." if other else f"{did_you_mean(suffix, SUFFIXES)}Choose one.",
+        fix=f"Export a .ply: {other}." if other else f"{did_you_mean(suffix, known)}Choose one.",
     )
 
 

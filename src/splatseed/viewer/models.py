@@ -22,6 +22,7 @@ from splatseed.io import load_scene
 from splatseed.io.files import StrPath
 from splatseed.photos.camera_check import reference_points
 from splatseed.photos.view import View, camera_views, view_of
+from splatseed.progress import Note, silent_note
 from splatseed.scene import Scene
 from splatseed.splat.formats import holds_gaussians, read_gaussians
 from splatseed.splat.gaussians import Gaussians
@@ -110,16 +111,44 @@ def open_item(path: StrPath, scene_path: Path | None = None) -> ViewerItem:
             found="a run that has not finished",
             fix=f"Continue it: splatseed train SCENE -o {quoted(folder.path)} --resume.",
         )
-    config, scene = folder.read_config(), scene_at(scene_path)
-    own = folder.scene_of(config)
-    if scene is None and own is not None:
-        with suppress(SceneNotFoundError, SceneFormatError):  # it was moved or deleted
-            scene = scene_at(Path(own))
-    factor, every = (int(config.get(n) or d) for n, d in (("data_factor", 1), ("test_every", 8)))
+    scene = scene_at(scene_path) or scene_of_run(folder)
+    factor, every = _split_of_run(folder)
     gaussians = read_gaussians(folder.gaussians, notes.append)
     if scene is not None:
         gaussians = move_to_scene_origin(folder.gaussians, scene, gaussians, notes.append)
     return ViewerItem(folder.path.name, scene, gaussians, factor, every, tuple(notes))
+
+
+def scene_of_run(folder: RunFolder) -> Scene | None:
+    """Read the scene that a run's config names; None if it cannot be read."""
+    own = folder.scene_of(folder.read_config())
+    if own is not None:
+        with suppress(SceneNotFoundError, SceneFormatError):  # it was moved or deleted
+            return load_scene(Path(own), require_points=False)
+    return None
+
+
+def item_of_model(
+    name: str, model: Path, gaussians: Gaussians, note: Note = silent_note
+) -> ViewerItem:
+    """Return Gaussians read from a model file, with the scene of the run that the file is of.
+
+    ``gaussians`` may be a part of the file's; they are moved to the scene's world.
+    """
+    folder = RunFolder(model.parent)
+    if model != folder.gaussians or not folder.is_run:
+        return ViewerItem(name, None, gaussians)
+    scene = scene_of_run(folder)
+    if scene is not None:
+        gaussians = move_to_scene_origin(model, scene, gaussians, note)
+    return ViewerItem(name, scene, gaussians, *_split_of_run(folder))
+
+
+def _split_of_run(folder: RunFolder) -> tuple[int, int]:
+    """Return the data factor and ``test_every`` of a run."""
+    config = folder.read_config()
+    factor, every = (int(config.get(n) or d) for n, d in (("data_factor", 1), ("test_every", 8)))
+    return factor, every
 
 
 def unique_names(paths: Sequence[Path]) -> list[str]:

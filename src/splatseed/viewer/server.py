@@ -22,13 +22,15 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Float64
 
+from splatseed.camera import Camera
 from splatseed.errors import ParameterError
 from splatseed.photos.view import View
 from splatseed.photos.viewpoint import choose_camera, choose_image
 from splatseed.requirements import require
 from splatseed.scene import Image, Scene
+from splatseed.splat.training_frame import TrainingFrame
 from splatseed.viewer.flights import orbit, upward
 from splatseed.viewer.models import ViewerItem
 from splatseed.viewer.pictures import Drawn, Entry, fitted_fov, viewer_pose
@@ -134,17 +136,27 @@ class Viewer:
             camera = choose_camera(scene) if image is None else image.camera
             cameras = [image.camera for image in scene.images] or [camera]
             up = -np.mean([c.cam_from_world[1, :3] for c in cameras], axis=0)
-            fov, (_, position) = fitted_fov(camera, 1.5), viewer_pose(camera, frame)
-            step = 0.0 if entry.has_model else STEP_BACK  # to see the cameras
-            position = position - step * camera.world_from_cam[:3, 2]
+            # Behind the first camera of a scene, to see the cameras.
+            place_camera(self.server, camera, up, frame, 0.0 if entry.has_model else STEP_BACK)
         else:
-            camera = orbit([], entry.item.model, 1, (600, 400))[0].camera
-            up, fov, (_, position) = np.zeros(3), 0.9, viewer_pose(camera, frame)
-        ahead = camera.world_from_cam[:3, 2]
-        self.server.scene.set_up_direction(tuple(upward(up)))
-        start = self.server.initial_camera
-        start.position, start.look_at = tuple(position), tuple(position + ahead)
-        start.fov, start.near = fov, min(start.near, frame.near)
+            outside = orbit([], entry.item.model, 1, (600, 400))[0].camera
+            place_camera(self.server, outside, np.zeros(3), frame)
+
+
+def place_camera(
+    server: Any,
+    camera: Camera,
+    up: Float64[np.ndarray, " 3"],
+    frame: TrainingFrame,
+    step_back: float = 0.0,
+) -> None:
+    """Start browsers of a viser server at a camera, or some way behind it in the viewer frame."""
+    ahead, (_, position) = camera.world_from_cam[:3, 2], viewer_pose(camera, frame)
+    position = position - step_back * ahead
+    server.scene.set_up_direction(tuple(upward(up)))
+    start = server.initial_camera
+    start.position, start.look_at = tuple(position), tuple(position + ahead)
+    start.fov, start.near = fitted_fov(camera, 1.5), min(start.near, frame.near)
 
 
 class _LiveEntry(Entry):
