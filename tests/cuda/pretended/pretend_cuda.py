@@ -23,7 +23,7 @@ ctypes.CDLL(os.environ["PRETENDED_GUARD"], ctypes.RTLD_GLOBAL)
 
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_flatten, tree_map, tree_unflatten
+from torch.utils._pytree import tree_map
 
 GPU = torch.device("cuda", 0)
 aten = torch.ops.aten
@@ -82,6 +82,7 @@ def elem(t):
 
 
 CROSS = {aten.copy_.default, aten._copy_from.default}
+PINNING = {aten.is_pinned.default, aten._pin_memory.default}
 TAKES_CPU_SCALARS = {
     *(aten.where.self, aten.where.ScalarSelf, aten.fill_.Tensor, aten.fill.Tensor),
     *(aten.masked_fill_.Tensor, aten.masked_fill.Tensor),
@@ -117,12 +118,32 @@ def _tf32(x):
     return ((bits + 0x1000) & ~0x1FFF).view(torch.float32)
 
 
+def map_leaves(function, x):
+    """As PyTorch's tree_map, which takes most of the time: operators have lists and tuples only."""
+    if isinstance(x, (list, tuple)):
+        mapped = [map_leaves(function, each) for each in x]
+        return mapped if isinstance(x, list) else tuple(mapped)
+    if isinstance(x, dict):
+        return {name: map_leaves(function, each) for name, each in x.items()}
+    return function(x)
+
+
+def _plain(x):
+    """What the CPU's operator is given."""
+    if isinstance(x, Pretend):
+        return x.elem
+    return "cpu" if isinstance(x, torch.device) and x.type == "cuda" else x
+
+
 def dispatch(func, args, kwargs):
     """Compute an operator on the CPU; its results are on the GPU if its inputs or target are."""
-    flat, spec = tree_flatten((args, kwargs))
+    flat = []
+    map_leaves(flat.append, (args, kwargs))
     gpu = [t for t in flat if isinstance(t, Pretend)]
-    cpu = [t for t in flat if isinstance(t, torch.Tensor) and not isinstance(t, Pretend)]
     target = kwargs.get("device") and torch.device(kwargs["device"]).type
+    if not gpu and target != "cuda" and func not in PINNING and not kwargs.get("pin_memory"):
+        return func(*args, **kwargs)  # the CPU's own
+    cpu = [t for t in flat if isinstance(t, torch.Tensor) and not isinstance(t, Pretend)]
     if gpu:
         COUNTS["launch"] += 1
         _check(func, args, cpu)
@@ -139,10 +160,7 @@ def dispatch(func, args, kwargs):
         return args[0]
     if func == aten.is_pinned.default:
         return elem(args[0]).data_ptr() in PINNED
-    plain = [t.elem if isinstance(t, Pretend) else t for t in flat]
-    a, k = tree_unflatten(
-        ["cpu" if isinstance(t, torch.device) and t.type == "cuda" else t for t in plain], spec
-    )
+    a, k = map_leaves(_plain, (args, kwargs))
     if target:
         k["device"] = "cpu"
     pinned = k.pop("pin_memory", None) or func is aten._pin_memory.default
@@ -167,7 +185,7 @@ def dispatch(func, args, kwargs):
             raise NotImplementedError(f"{func} changes the shape in place")
         return Pretend(o) if again is None else again
 
-    return tree_map(wrap, out)
+    return map_leaves(wrap, out)
 
 
 def _check(func, args, cpu):
@@ -214,7 +232,9 @@ def _patch_torch():
     def pretended_load(*args, map_location=None, **kwargs):
         gpu = map_location is not None and torch.device(map_location).type == "cuda"
         content = load(*args, map_location="cpu" if gpu else map_location, **kwargs)
-        return tree_map(lambda x: Pretend(x) if gpu and isinstance(x, torch.Tensor) else x, content)
+        return map_leaves(
+            lambda x: Pretend(x) if gpu and isinstance(x, torch.Tensor) else x, content
+        )
 
     torch.load = pretended_load
     torch.save = lambda content, *args: save(tree_map(elem, content), *args)
