@@ -32,6 +32,12 @@ def _posed(scene, poses):
     return scene.replace(points=PointCloud.empty(), tracks=None, images=images)
 
 
+@pytest.fixture(scope="module")
+def room(room_path):
+    """The room in 9 views of 96 x 72: what is told of poses is as clear as in larger ones."""
+    return load_scene(room_path)
+
+
 @pytest.fixture
 def poses(room):
     return np.array([image.camera.cam_from_world for image in room.images])
@@ -70,8 +76,8 @@ def _in_place(poses, place):
         (np.linalg.inv, SceneFormatError, f"once {INVERTED}"),
         (lambda poses: np.linalg.inv(poses) @ YZ, SceneFormatError, f"once {INVERTED_YZ}"),
         (np.random.default_rng(0).permutation, SceneFormatError, "confirm at"),
-        (lambda poses: _in_place(poses, (0.0, 0, 0)), SceneFormatError, "all 16 cameras"),
-        (lambda poses: _in_place(poses, (100.0, -20, 3)), SceneFormatError, "all 16 cameras"),
+        (lambda poses: _in_place(poses, (0.0, 0, 0)), SceneFormatError, "all 9 cameras"),
+        (lambda poses: _in_place(poses, (100.0, -20, 3)), SceneFormatError, "all 9 cameras"),
         (lambda _: _back_to_back(), SceneFormatError, "no two of 4"),
         (lambda poses: poses[:1], SceneNotFoundError, "found 1"),
     ],
@@ -82,8 +88,9 @@ def test_poses_at_which_nothing_can_be_compared_are_refused(spoil, error, found,
         check_poses(scene, scene.images)
 
 
-def test_only_poses_of_scenes_without_points_are_checked(room, poses, monkeypatch):
-    notes = []
+def test_only_poses_of_scenes_without_points_are_checked(sixteen_views, monkeypatch):
+    _, room = sixteen_views
+    poses, notes = np.array([image.camera.cam_from_world for image in room.images]), []
     seeds = upsample(_posed(room, poses), note=notes.append)
     assert len(seeds) > 300
     assert len(notes) == 1
@@ -120,15 +127,16 @@ def _changed(scene, folder, change, mask=None):
 
 
 def test_masked_pixels_need_not_agree(room, tmp_path):
-    mask = np.zeros((120, 160), np.uint8)
-    mask[40:100, 50:130] = 255  # a quarter
+    mask = np.zeros((72, 96), np.uint8)
+    mask[24:60, 30:78] = 255  # a quarter
     scene = _changed(room, tmp_path / "statue", lambda pixels, _: pixels, mask)
     share = check_poses(scene, scene.images)
     assert share > 0.3
     assert agreement_warning(share, 0.75) == ""
 
 
-def test_changing_light_gives_a_warning_and_exposure_none(room, tmp_path):
+def test_changing_light_gives_a_warning_and_exposure_none(sixteen_views, tmp_path):
+    _, room = sixteen_views
     exposed = _changed(room, tmp_path / "exposed", lambda p, rng: p * rng.uniform(0.4, 1.2))
     assert agreement_warning(check_poses(exposed, exposed.images)) == ""
 
