@@ -27,6 +27,8 @@ if not (root / "gsplat_cuda.so").exists():
     (root / "gsplat_cuda.so").touch()
 _C = object() if shutil.which("ninja") else None
 """
+NO_HOME = "CUDA_HOME = None"
+"""What builds extensions in PyTorch, as it is where there is no CUDA toolkit."""
 LOAD = """
 import sys
 from splatseed.errors import MissingDependencyError
@@ -57,7 +59,16 @@ def machine(tmp_path):
     }
 
 
-def _stand_in(folder, *, fails=False):
+def _stand_in(folder, *, fails=False, torch=False):
+    """Of gsplat, and where asked of PyTorch, which takes each process four seconds to import."""
+    if torch:
+        (folder / "peer/torch/utils").mkdir(parents=True)
+        for name, text in {
+            "__init__": "",
+            "utils/__init__": "",
+            "utils/cpp_extension": NO_HOME,
+        }.items():
+            (folder / f"peer/torch/{name}.py").write_text(text)
     (folder / "peer/gsplat/cuda").mkdir(parents=True)
     (folder / "peer/gsplat/__init__.py").touch()
     (folder / "peer/gsplat/cuda/_backend.py").write_text(BACKEND.format(fails=fails))
@@ -71,7 +82,7 @@ def _start(environment):
 
 
 def test_processes_that_come_at_once_build_once(machine, tmp_path):
-    _stand_in(tmp_path)
+    _stand_in(tmp_path, torch=True)
     ended = [each.communicate() for each in [_start(machine) for _ in range(2)]]
     assert not any(err for _, err in ended), ended
     assert len(list((tmp_path / "built/gsplat_cuda").glob("built-by-*"))) == 1
