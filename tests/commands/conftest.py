@@ -84,16 +84,16 @@ def rgbd(room, tmp_path) -> Path:
 
 
 @pytest.fixture(scope="session")
-def as_by_a_device() -> Callable[[Scene], Scene]:
+def as_by_a_device() -> Callable[..., Scene]:
     """Takes a scene's points away, and turns each of its cameras by half a degree or so."""
 
-    def turned(scene: Scene) -> Scene:
+    def turned(scene: Scene, degrees: float = 0.5) -> Scene:
         rng = np.random.default_rng(0)
         images = tuple(
             dataclasses.replace(
                 image,
                 quat=quat_from_rotation(
-                    Rotation.from_rotvec(np.radians(rng.normal(0, 0.5, 3))).as_matrix()
+                    Rotation.from_rotvec(np.radians(rng.normal(0, degrees, 3))).as_matrix()
                     @ image.camera.cam_from_world[:3, :3]
                 ),
             )

@@ -284,14 +284,14 @@ def test_exact_poses_without_points_are_advised_to_get_points(
 
 
 def test_poses_of_a_device_are_advised_to_be_refined(room_of, as_by_a_device, tmp_path, splatseed):
-    scene = as_by_a_device(load_scene(room_of(16, 240, 180).path))
+    scene = as_by_a_device(load_scene(room_of(16, 160, 120).path), degrees=1.0)
     path = write_scene(scene, tmp_path / "bare", require_points=False).path
     poses = json.loads(splatseed("info", path, "--json").out)["poses"]
     assert poses["agreement"] > 0.3
     assert not poses["error"]["exact"]
     assert 0.1 < poses["error"]["degrees"] < 1
     told = splatseed("info", path).out
-    assert re.search(r"px .* at 240 px a side: above 0.5 px", told)
+    assert re.search(r"px .* at 160 px a side: above 0.5 px", told)
     advised = told.partition("next")[2]
     assert f"splatseed train {path} --refine-poses --budget" in advised
     assert f"sfm {path / 'images'} --poses-from {path} -o OUT --refine-poses" in advised

@@ -72,7 +72,7 @@ def test_poses_that_photographs_do_not_fit_are_pointed_out(exact, called, tmp_pa
 
 
 def test_poses_are_measured_by_the_photographs(room_of):
-    report = SfmReport(room_of(16, 240, 180).path, 16, 16, (), *FACTS)
+    report = SfmReport(room_of(16, 160, 120).path, 16, 16, (), *FACTS)
     error = sfm._pose_error(report, lambda *_: None)
     assert error.exact
     assert error.px < 0.2
