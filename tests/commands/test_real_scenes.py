@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from pathlib import Path
 
@@ -38,6 +39,7 @@ def test_colmap_scenes_are_described_and_upsampled(name, method, scenes, tmp_pat
     # Duplicates of the input are left out, and told of.
     assert 1.9 * len(before.points) < len(after.points) <= 2 * len(before.points)
     assert ("repeat the position" in run.out) == ("left out" in run.out)
+    assert re.search(rf"points in +{total:,}\n", run.out)
 
 
 @pytest.fixture

@@ -15,9 +15,11 @@ from splatseed.camera import quat_from_rotation
 from splatseed.errors import ReconstructionError
 from splatseed.io import load_scene
 from splatseed.progress import silent
+from splatseed.scene import LeftOut
 from splatseed.sfm import Settings, first_look, matching, reconstruct
 from splatseed.sfm.colmap import Run, posed_model, require_pycolmap
 from splatseed.sfm.matching import match_photographs
+from splatseed.sfm.pipeline import with_refined
 from splatseed.sfm.refinement import (
     Poses,
     align,
@@ -154,3 +156,10 @@ def test_rotations_count_and_a_wrong_camera_hardly(wrong):
     aligned, rest = align(moved, given), np.arange(9) != 4
     assert turns(aligned, given).max() < (1e-2 if wrong else 1e-4)
     assert shifts(aligned, given)[rest].max() < (1e-3 if wrong else 1e-5)
+
+
+def test_points_of_the_files_that_were_left_out_go_with_the_others(room):
+    scene = room.replace(left_out=LeftOut(0, 5))
+    moved = tuple(replace(im, translation=im.translation + 0.1) for im in room.images)
+    assert with_refined(scene, scene).left_out == LeftOut(0, 5)  # poses and points stay
+    assert with_refined(scene, scene.replace(images=moved)).left_out == LeftOut()

@@ -37,7 +37,7 @@ from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.requirements import require
 from splatseed.runtime.child import Child
-from splatseed.scene import Image, Masks, Scene
+from splatseed.scene import Image, LeftOut, Masks, Scene
 from splatseed.sfm import colmap
 from splatseed.sfm.cameras import SharedCamera, describe_cameras, share_cameras
 from splatseed.sfm.colmap import Run, Settings
@@ -371,7 +371,7 @@ def with_refined(scene: Scene, found: Scene) -> Scene:
         for i, pose in pairs
     )
     points = PointCloud(found.points.xyz, found.points.rgb)
-    return scene.replace(images=images, points=points, tracks=None)
+    return scene.replace(images=images, points=points, tracks=None, left_out=LeftOut())
 
 
 def _same_pose(a: Image, b: Image) -> bool:

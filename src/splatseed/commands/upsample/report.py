@@ -233,7 +233,7 @@ def summarise(
         left_out += [f"{thinned:,} originals, for the budget"]
     made = ", ".join(f"{count:,} {name}" for name, count in origins.items())
     rows = [
-        ("points in", f"{len(scene.points):,}{in_place_of(replaced)}"),
+        ("points in", f"{len(scene.points) + sum(scene.left_out):,}{in_place_of(replaced)}"),
         ("points out", f"{written.num_points:,} ({made})"),
         *([("left out", ", ".join(left_out))] if left_out else []),
         *found,
