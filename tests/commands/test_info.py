@@ -22,6 +22,7 @@ from splatseed.io.colmap import write_points3d
 from splatseed.io.depth_maps import depth_folder
 from splatseed.io.ply import write_ply
 from splatseed.pointcloud import PointCloud
+from splatseed.seeding.pose_accuracy import PoseErrorEstimate
 from splatseed.splat.formats import write_gaussians
 from splatseed.splat.gaussians import Gaussians
 
@@ -281,6 +282,24 @@ def test_exact_poses_without_points_are_advised_to_get_points(
     monkeypatch.setattr("splatseed.seeding.poses.check_poses", lambda *_: 0.08)
     problems = json.loads(splatseed("info", tmp_path / "nerf", "--json").out)["problems"]
     assert sum("agree on the depth of only 8%" in each for each in problems) == 1
+
+
+def test_poses_are_measured_by_training_views_unless_these_give_no_estimate(
+    room_of, as_by_a_device, tmp_path, splatseed, monkeypatch
+):
+    scene = as_by_a_device(load_scene(room_of(16, 160, 120).path), degrees=1.0)
+    path = write_scene(scene, tmp_path / "bare", require_points=False).path
+    measured, train = [], scene.split()[0]
+
+    def estimate(_, images, *__):
+        measured.append([image.name for image in images])
+        return None if len(measured) == 1 else PoseErrorEstimate(0.7, 0.1, False, 160)
+
+    monkeypatch.setattr("splatseed.seeding.pose_accuracy.estimate_pose_error", estimate)
+    error = json.loads(splatseed("info", path, "--json").out)["poses"]["error"]
+    assert error["px"] == 0.7
+    assert len(train) == 14
+    assert measured == [[i.name for i in train], [i.name for i in scene.images]]
 
 
 def test_poses_of_a_device_are_advised_to_be_refined(room_of, as_by_a_device, tmp_path, splatseed):

@@ -59,7 +59,7 @@ def test_words_reach_the_reconstruction_and_its_report_the_user(called, tmp_path
         "and 2 more",
     ):
         assert text in run.out
-    assert f"splatseed upsample {tmp_path / 'out'} " in run.out
+    assert f"splatseed info {tmp_path / 'out'}" in run.out
 
 
 @pytest.mark.parametrize("exact", [True, False])

@@ -7,13 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from PIL import Image as PilImage
 
 from splatseed.progress import silent
 from splatseed.sfm import Settings, pipeline
 from splatseed.sfm.cameras import SharedCamera
 from splatseed.sfm.colmap import Run, guessed_model, posed_model, require_pycolmap
 from splatseed.sfm.database import run_database
-from splatseed.sfm.matching import _pairs, detect_features, match_pairs
+from splatseed.sfm.matching import _pairs, detect_features, match_pairs, match_photographs
 
 pycolmap = pytest.importorskip("pycolmap")
 
@@ -79,6 +80,18 @@ def test_a_list_of_pairs_is_matched_as_by_pycolmap_and_none_twice(run):
             device=pycolmap.Device.cpu,
         )
         assert (matches(database, (1, 2)), matches(database, (2, 4))) == first
+
+
+def test_a_pair_without_a_match_was_matched(run, rng):
+    run, model = run
+    photograph = run.image_dir / model.image(4).name
+    size = PilImage.open(photograph).size
+    noise = rng.integers(0, 255, (size[1], size[0], 3), np.uint8)
+    PilImage.fromarray(noise).save(photograph)
+    match_photographs(run, model)
+    with pycolmap.Database.open(run.database) as database:
+        assert len(database.read_two_view_geometry_num_inliers()[0]) == 3
+    assert run.num_pairs() == 6
 
 
 def test_features_without_doubling_are_fewer_and_coarser(run):

@@ -253,4 +253,4 @@ def _summarise(options: Options, report: SfmReport, error: PoseErrorEstimate | N
         )
     if report.unregistered:
         print_note(f"without a pose: {name_some(report.unregistered)}")
-    print_pairs("next", [("", f"splatseed upsample {quoted(options.output)} -o OUT --preview")])
+    print_pairs("next", [("what suits it", f"splatseed info {quoted(options.output)}")])

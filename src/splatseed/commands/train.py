@@ -399,5 +399,7 @@ def _next_commands(output: Path) -> list[tuple[str, str]]:
     """Return the commands for a finished run; LPIPS only where its weights are."""
     from splatseed.splat.lpips import has_lpips_weights
 
+    view = ("look at it", f"splatseed view {quoted(output)}")
+    share = ("share it", f"splatseed export {quoted(output)} -o {quoted(f'{output}.html')}")
     score = ("score again, with LPIPS", f"splatseed evaluate {quoted(output)}")
-    return [("look at it", f"splatseed view {quoted(output)}"), *[score] * has_lpips_weights()]
+    return [view, share, *[score] * has_lpips_weights()]

@@ -114,7 +114,7 @@ class Run:
     def num_pairs(self) -> int:
         """Return the number of matched pairs, those without a match included."""
         with self.pycolmap.Database.open(self.database) as database:
-            return len(database.read_two_view_geometry_num_inliers()[0])
+            return int(database.num_matched_image_pairs())
 
     def stage(self, name: str, work: Callable[[], T], count: Callable[[], int], total: int) -> T:
         """Run ``work``, a blocking pycolmap call that releases the GIL, and report progress.

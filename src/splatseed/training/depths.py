@@ -34,10 +34,9 @@ class StereoCost:
     """How much of a run stereo may take on a device."""
 
     pixels: float
-    """Pixels compared per pixel rendered in training. On the CPU, stereo then takes at most a tenth
-    of training's seconds (bonsai and treehill at 1,500 steps: 7%). Comparing always runs on the
-    CPU, some 0.7 million pixels a second and core. The number for a GPU is an estimate: 150 million
-    pixels rendered a second, beside 8 cores; benchmarks/gpu measures both."""
+    """Pixels compared per pixel rendered in training. Comparing always runs on the CPU, some 0.7
+    million pixels a second and core. The number for a GPU is an estimate: 150 million pixels
+    rendered a second, beside 8 cores; benchmarks/gpu measures both."""
     min_size: int
     """Minimum side, px. On the CPU it is at least the size that is trained, too; on a GPU that is
     the photographs' own."""
@@ -48,6 +47,9 @@ COSTS: Mapping[str, StereoCost] = MappingProxyType(
 )
 MIN_VIEWS = 48
 """Minimum views to compare, if there are as many, however short the run: fewer may not overlap."""
+_VIEWS = 0.5
+"""Fraction of the affordable views that are compared: growth gains as much as from all of them
+(benchmarks/training/README.md), in a tenth to a fifth less time with a hundred views."""
 SWEEPS = 2
 """PatchMatch iterations. Two more take 1.6 times as long, find the depth of 1% more of the pixels
 (bonsai, treehill, fox), and gain nothing beyond noise."""
@@ -94,7 +96,7 @@ def compared_images(
     scales = [size / max(image.camera.width, image.camera.height) for image in images]
     scale = min(1.0, float(np.median(scales))) if scales else 1.0
     affordable = COSTS[device].pixels * settings.max_steps / (scale * settings.factor) ** 2
-    count = min(len(images), max(MIN_VIEWS, int(affordable)))
+    count = min(len(images), max(MIN_VIEWS, int(_VIEWS * affordable)))
     places = np.linspace(0, len(images) - 1, count).round().astype(int)
     return [images[i] for i in places]
 
