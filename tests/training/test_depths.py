@@ -11,7 +11,7 @@ from hypothesis import given, strategies as st
 from splatseed.camera import Intrinsics
 from splatseed.depth.stereo.pipeline import find_stereo
 from splatseed.scene import Image
-from splatseed.training.depths import COSTS, MIN_VIEWS, compared_images, known_depths, stereo_size
+from splatseed.training.depths import COSTS, MIN_VIEWS, known_depths, placing_views, stereo_size
 from splatseed.training.prepare import prepare_run
 from splatseed.training.settings import TrainSettings
 
@@ -86,11 +86,13 @@ def test_comparing_takes_a_part_of_training_unless_few_views_are_compared_at_its
     longer = dataclasses.replace(asked, max_steps=steps + 1)
     size = stereo_size([image] * count, asked, device)
     assert 64 <= size <= stereo_size([image] * count, longer, device) <= 800
-    chosen = compared_images([image] * count, asked, device)
+    chosen, placing = placing_views([image] * count, asked, device)
+    assert placing <= size
+    size = placing
     compared = len(chosen) * min(size, width) ** 2 * 3 / 4
     rendered = steps * (width / factor) ** 2 * 3 / 4
     least = max(64, width // factor) if device == "cpu" else 200
-    fits = compared <= 1.05 * COSTS[device].pixels * rendered
+    fits = compared <= 0.525 * COSTS[device].pixels * rendered
     assert fits or (size <= least and len(chosen) == min(count, MIN_VIEWS))
     # Rounding may cost one view where stereo affords exactly all.
     assert len(chosen) >= count - 1 or size <= least

@@ -126,7 +126,7 @@ def run_job(
 ) -> RunResult:
     """Carry out a run, and write its folder."""
     from splatseed.splat.lpips import load_lpips  # noqa: PLC0415  (PyTorch)
-    from splatseed.training.depths import DepthCache, compared_images, stereo_size  # noqa: PLC0415  (Numba)
+    from splatseed.training.depths import DepthCache, placing_views  # noqa: PLC0415  (Numba)
     from splatseed.training.prepare import PrepareOptions, prepare_run  # noqa: PLC0415  (PyTorch)
 
     start = time.perf_counter()
@@ -137,8 +137,7 @@ def run_job(
         seeds, seeding = make_seeds(scene, spec, progress, bench)
         every = spec.training.test_every
         images, backend = scene.split(every)[0], spec.settings.backend
-        size = stereo_size(images, spec.settings, backend)
-        count = len(compared_images(images, spec.settings, backend))
+        views, size = placing_views(images, spec.settings, backend)
         # Runs of a repeat share the depths of stereo that growth needs, and each counts their time,
         # unless the seeds of auto have, as in splatseed train.
         run = prepare_run(
@@ -150,7 +149,7 @@ def run_job(
                 depth_cache=DepthCache(
                     bench
                     / "depths"
-                    / f"{spec.scene.digest}_{every}_{size}_{count}_{spec.repeat}.npz",
+                    / f"{spec.scene.digest}_{every}_{size}_{len(views)}_{spec.repeat}.npz",
                     seeding_method(spec.arm.method) == DEFAULT_METHOD and not _is_full(scene, spec),
                 ),
             ),

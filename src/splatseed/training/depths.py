@@ -47,9 +47,9 @@ COSTS: Mapping[str, StereoCost] = MappingProxyType(
 )
 MIN_VIEWS = 48
 """Minimum views to compare, if there are as many, however short the run: fewer may not overlap."""
-_VIEWS = 0.5
-"""Fraction of the affordable views that are compared: growth gains as much as from all of them
-(benchmarks/training/README.md), in a tenth to a fifth less time with a hundred views."""
+_PLACING = 0.5
+"""Fraction of this cost that growth needs where it alone compares photographs: it gains as much as
+from all of it (benchmarks/training/README.md), in up to a fifth less time."""
 SWEEPS = 2
 """PatchMatch iterations. Two more take 1.6 times as long, find the depth of 1% more of the pixels
 (bonsai, treehill, fox), and gain nothing beyond noise."""
@@ -63,11 +63,13 @@ class DepthCache:
     seconds_counted: bool = False  # whether the time of the seeds includes that of the maps
 
 
-def stereo_size(images: Sequence[Image], settings: TrainSettings, device: str) -> int:
+def stereo_size(
+    images: Sequence[Image], settings: TrainSettings, device: str, fraction: float = 1.0
+) -> int:
     """Return the largest side, px, at which to compare photographs for a run of this length.
 
     Where training on ``device`` (cpu or cuda) takes much longer than comparing, it is the limit of
-    ``StereoSettings``.
+    ``StereoSettings``. ``fraction``: of what stereo may take.
     """
     full = StereoSettings().max_size
     if not images:
@@ -79,26 +81,28 @@ def stereo_size(images: Sequence[Image], settings: TrainSettings, device: str) -
     compared = pixels * (limit / longest) ** 2
     rendered = settings.max_steps * pixels / len(images) / settings.factor**2
     # The number of pixels is proportional to the square of the size.
-    affordable = int(limit * math.sqrt(cost.pixels * rendered / compared))
+    affordable = int(limit * math.sqrt(fraction * cost.pixels * rendered / compared))
     trained = longest // settings.factor if device == "cpu" else 0
     return min(full, max(cost.min_size, trained, affordable))
 
 
-def compared_images(
+def placing_views(
     images: Sequence[Image], settings: TrainSettings, device: str
-) -> Sequence[Image]:
-    """Select the training photographs to compare: as many as a run of this length affords.
+) -> tuple[Sequence[Image], int]:
+    """Select the training photographs to compare for growth, and the largest side, px, to do it at.
 
-    ``images`` are sorted by name; the selected ones are evenly spaced.
+    As many as a run of this length affords: ``images`` are sorted by name, and the selected ones
+    are evenly spaced.
     """
-    size = stereo_size(images, settings, device)
+    size = stereo_size(images, settings, device, _PLACING)
     # In pixels of the photographs, at the compared size and at the trained size.
     scales = [size / max(image.camera.width, image.camera.height) for image in images]
     scale = min(1.0, float(np.median(scales))) if scales else 1.0
-    affordable = COSTS[device].pixels * settings.max_steps / (scale * settings.factor) ** 2
-    count = min(len(images), max(MIN_VIEWS, int(_VIEWS * affordable)))
+    pixels = _PLACING * COSTS[device].pixels
+    affordable = pixels * settings.max_steps / (scale * settings.factor) ** 2
+    count = min(len(images), max(MIN_VIEWS, int(affordable)))
     places = np.linspace(0, len(images) - 1, count).round().astype(int)
-    return [images[i] for i in places]
+    return [images[i] for i in places], size
 
 
 def known_depths(
@@ -115,7 +119,7 @@ def known_depths(
     """Find the depth maps on which ``grow`` places Gaussians; none if the settings use none.
 
     Args:
-        scene: The scene, whose ``compared_images`` get a map.
+        scene: The scene, whose ``placing_views`` get a map.
         scale: Training units per unit of the scene.
         settings: How to train.
         device: Where to train, cpu or cuda.
@@ -138,8 +142,8 @@ def known_depths(
         if stereo:
             maps = tuple(stereo.map(i) for i in range(len(stereo.views)))
         else:
-            compared = scene.replace(images=compared_images(images, settings, device))
-            size = stereo_size(images, settings, device)
+            views, size = placing_views(images, settings, device)
+            compared = scene.replace(images=views)
             maps = stereo_depths(
                 compared, seed=settings.seed, progress=progress, max_size=size, sweeps=SWEEPS
             )
