@@ -48,8 +48,8 @@ COSTS: Mapping[str, StereoCost] = MappingProxyType(
 MIN_VIEWS = 48
 """Minimum views to compare, if there are as many, however short the run: fewer may not overlap."""
 _PLACING = 0.5
-"""Fraction of this cost that growth needs where it alone compares photographs: it gains as much as
-from all of it (benchmarks/training/README.md), in up to a fifth less time."""
+"""Fraction of this cost that growth needs where it alone compares more than ``MIN_VIEWS``: it gains
+as much as from all of it (benchmarks/training/README.md), in up to a fifth less time."""
 SWEEPS = 2
 """PatchMatch iterations. Two more take 1.6 times as long, find the depth of 1% more of the pixels
 (bonsai, treehill, fox), and gain nothing beyond noise."""
@@ -94,11 +94,12 @@ def placing_views(
     As many as a run of this length affords: ``images`` are sorted by name, and the selected ones
     are evenly spaced.
     """
-    size = stereo_size(images, settings, device, _PLACING)
+    fraction = _PLACING if len(images) > MIN_VIEWS else 1.0
+    size = stereo_size(images, settings, device, fraction)
     # In pixels of the photographs, at the compared size and at the trained size.
     scales = [size / max(image.camera.width, image.camera.height) for image in images]
     scale = min(1.0, float(np.median(scales))) if scales else 1.0
-    pixels = _PLACING * COSTS[device].pixels
+    pixels = fraction * COSTS[device].pixels
     affordable = pixels * settings.max_steps / (scale * settings.factor) ** 2
     count = min(len(images), max(MIN_VIEWS, int(affordable)))
     places = np.linspace(0, len(images) - 1, count).round().astype(int)
