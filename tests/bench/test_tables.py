@@ -245,7 +245,7 @@ def test_a_larger_number_is_stated_and_equal_numbers_are_compared():
         if more == 20:
             assert "linear 8x + default is best: 0.20 dB" in equal
         else:
-            assert "the same command with --budgets 5000 does" in equal
+            assert "splatseed bench --budgets 5000, its other options as here, does" in equal
     assert not any("ends with" in said for said in conclude(budgeted(noise=0.0)))
 
 

@@ -238,7 +238,8 @@ def _at_equal_numbers(others: Sequence[ComparedArm], base: ComparedArm) -> Itera
     )
     equal = next((arm for arm in others if arm.means["gaussians"] <= limit), None)
     if equal is None:
-        how = f"; the same command with --budgets {base.means['gaussians']:.0f} does"
+        budget = f"{base.means['gaussians']:.0f}"
+        how = f"; splatseed bench --budgets {budget}, its other options as here, does"
         yield (
             f"No other arm ends with as few Gaussians as {label}, so these runs do not tell what "
             f"equal numbers give{'' if base.arm.strategy.startswith('none') else how}."
