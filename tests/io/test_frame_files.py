@@ -127,7 +127,16 @@ def test_test_frames_are_the_split_and_bad_ones_are_left_out(tmp_path):
     again = load(write_scene(scene, tmp_path / "out", require_points=False).path)
     assert again.split() != again.replace(listed=None).split()
     assert [len(part) for part in again.split()] == [2, 2]
-    assert again.masks.files.keys() == {"1.JPG"}
+    # COLMAP's layout, which is written, too, knows masks by their names: by others than here.
+    assert not (tmp_path / "out/masks").exists()  # the mask masks nothing
+    assert "mask_path" not in (tmp_path / "out/transforms.json").read_text()
+    with PilImage.open(tmp_path / "dslr/resized_anon_masks/1.png") as mask:
+        mask.paste(0, (0, 0, 3, 6))
+        mask.save(tmp_path / "dslr/resized_anon_masks/1.png")
+    again = load(write_scene(scene, tmp_path / "masked", require_points=False).path)
+    counts = {name: file for name, file in again.masks.files.items() if name == "1.JPG"}
+    assert counts == {"1.JPG": tmp_path / "masked/masks/1.JPG.png"}
+    assert np.array(PilImage.open(counts["1.JPG"])).any(axis=0).tolist() == [False] * 3 + [True] * 5
     for i in (3, 4):  # as where photographs are kept back
         (tmp_path / f"dslr/resized_images/{i}.JPG").unlink()
     scene = load(root)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 from collections.abc import Collection, Mapping, Sequence
@@ -263,6 +264,15 @@ def rewrites_masks(scene: Scene, layout: Layout) -> bool:
             masks.files.keys()
         )
     return masks.inverted or not (inside or named)
+
+
+def forget_masks(folder: Path) -> None:
+    """Name no masks in an output's ``transforms.json``, as it has none."""
+    path = folder / "transforms.json"
+    content = json.loads(path.read_text("utf-8"))
+    for frame in (*content["frames"], *content.get("test_frames", ())):
+        frame.pop("mask_path", None)
+    write_json(path, content)
 
 
 def _names_masks(source: SceneSource) -> bool:

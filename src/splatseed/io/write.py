@@ -29,6 +29,7 @@ from splatseed.io.origin import write_offset
 from splatseed.io.staging import ABSENT, MANIFEST, output_folder, write_json
 from splatseed.io.transforms_layout import (
     Layout,
+    forget_masks,
     rewrites_masks,
     write_both_layouts,
     write_transforms_layout,
@@ -111,6 +112,8 @@ def write_scene(
             alone = replace(masks, alpha=False)  # photographs keep their transparency
             names = [im.name for im in clean.images if (photographs / im.name).is_file()]
             write_masks(alone, photographs, names, folder / MASKS)
+            if layout != "colmap" and not (folder / MASKS).is_dir():
+                forget_masks(folder)  # no photograph has a masked pixel
         linked = link_folders(image_sources, folder, copy=copy_images)
         tops = {PurePath(each).parts[0] for each in linked}
         own = [each for each in folder.rglob("*") if each.relative_to(folder).parts[0] not in tops]
