@@ -34,7 +34,7 @@ def _posed(scene, poses):
 
 @pytest.fixture(scope="module")
 def room(room_path):
-    """The room in 9 views of 96 x 72: what is told of poses is as clear as in larger ones."""
+    """The room in 9 views of 96 x 72: the agreement of poses is as clear as in larger ones."""
     return load_scene(room_path)
 
 

@@ -39,7 +39,7 @@ from splatseed.io.load import depths_beside
 from splatseed.io.seeds import was_upsampled
 from splatseed.photos.camera_check import stray_camera_notes
 from splatseed.progress import Progress
-from splatseed.scene import Image, Scene
+from splatseed.scene import Scene
 from splatseed.seeding import diagnostics
 from splatseed.seeding.advice import Advice, advice_for
 from splatseed.seeding.photo_methods import has_points, photographed
@@ -224,7 +224,7 @@ def _check_poses(
     """
     if not scene.has_photographs:
         return None, ""
-    from splatseed.seeding.pose_accuracy import estimate_pose_error
+    from splatseed.seeding.pose_accuracy import estimate_pose_error, given_pose_error
     from splatseed.seeding.poses import agreement_warning, check_poses
 
     try:
@@ -238,24 +238,10 @@ def _check_poses(
     if has_points(scene):
         error = estimate_pose_error(scene, images, progress)
         return {"agreement": agreement, "error": error, "problem": ""}, ""
-    # Poses that are far off may leave too few corners between neighbours that are further apart.
-    error = estimate_pose_error(scene, _trained(scene, images), progress) or estimate_pose_error(
-        scene, images, progress
-    )
+    error = given_pose_error(scene, images, progress)
     problem = with_options(error.warning) if error else ""
     facts = {"agreement": agreement, "error": error, "problem": problem}
     return facts, agreement_warning(agreement, masked)
-
-
-def _trained(scene: Scene, images: Sequence[Image]) -> Sequence[Image]:
-    """Return the images without test views, whose poses ``train`` measures; all if one is left.
-
-    Drift shows between neighbours that are further apart: of a phone's walk (``corridor``), whose
-    refined poses gain 2.3 dB, all views have 0.50 px, which is exact, and those to train 0.74.
-    """
-    names = {image.name for image in scene.split()[0]}
-    kept = [image for image in images if image.name in names]
-    return kept if len(kept) > 1 else images
 
 
 def _next(

@@ -117,11 +117,11 @@ class Stereo(PhotographMethod):
         images = photographed(scene, self.test_every)
         warnings: tuple[str, ...] = ()
         if not has_points(scene):
-            from splatseed.seeding.pose_accuracy import estimate_pose_error
+            from splatseed.seeding.pose_accuracy import given_pose_error
             from splatseed.seeding.poses import agreement_warning, check_poses
 
             faint = agreement_warning(check_poses(scene, images, progress), stated=True)
-            error = estimate_pose_error(scene, images, progress)
+            error = given_pose_error(scene, images, progress)
             warnings = tuple(each for each in (faint, error.warning if error else "") if each)
         guided, notes = self._guided(scene, images)
         warnings = (*warnings, *notes)

@@ -132,6 +132,24 @@ def estimate_pose_error(
     return PoseErrorEstimate(px, degrees, round(px, 2) <= MAX_EXACT, side // stereo_factor)
 
 
+def given_pose_error(
+    scene: Scene, images: Sequence[Image], progress: Progress = silent
+) -> PoseErrorEstimate | None:
+    """Estimate the error of poses of which no points are known, by the training views.
+
+    Drift shows between neighbours that are further apart: of a phone's walk (``corridor``), whose
+    refined poses gain 2.3 dB, all views have 0.50 px, which is exact, and those to train 0.74.
+    Without an estimate, as poses that are far off leave too few corners there, all are measured.
+
+    Raises:
+        SceneFormatError: A photograph cannot be used.
+    """
+    names = {image.name for image in scene.split()[0]}
+    train = [image for image in images if image.name in names]
+    error = estimate_pose_error(scene, train, progress) if len(train) > 1 else None
+    return error or estimate_pose_error(scene, images, progress)
+
+
 def _misses(view: View, other: View) -> Float64[np.ndarray, " M"]:
     """Return the signed distances from their epipolar lines at which corners are found."""
     j_from_i = other.cam_from_world @ np.linalg.inv(view.cam_from_world)

@@ -109,8 +109,9 @@ def _mapped(
         else:
             models = _map(run, "further mapping", models_dir, len(names))
     best = _largest(models)
-    if not models or explained(run, models[best]) < _EXPLAINED:
-        models |= _map_globally(run, models_dir, best, models.get(best), names)
+    share = explained(run, models[best]) if models else 0.0
+    if share < _EXPLAINED:
+        models |= _map_globally(run, models_dir, best, share, names)
     remove(models_dir / _SNAPSHOTS)
     (models_dir / COMPLETE).touch()
     return models
@@ -152,19 +153,19 @@ def _extend(run: Run, stage: str, given: Path, folder: Path, total: int) -> Any:
 
 
 def _map_globally(
-    run: Run, models_dir: Path, number: int, given: Any | None, names: Sequence[str]
+    run: Run, models_dir: Path, number: int, share: float, names: Sequence[str]
 ) -> dict[int, Any]:
-    """Map all images at once; return the model by its number if it explains more than ``given``.
+    """Map all images at once; return the model by its number if it explains more than ``share``.
 
     That needs no initial pair, on which incremental mapping fails where a wrong focal length fits
     two photographs as well, and averages rotations over all pairs, so that wrong ones are outvoted.
-    The result is held to incremental mapping's criteria, and takes the place of ``given``.
+    The result is held to incremental mapping's criteria, and takes the place of that model.
     """
     folder = models_dir / "global"
     folder.mkdir()
     try:
         found = _map_at_once(run, folder, len(names))
-        if found is None or (given and explained(run, found[1]) <= explained(run, given)):
+        if found is None or explained(run, found[1]) <= share:
             return {}
         remove(models_dir / str(number))
         found[0].rename(models_dir / str(number))

@@ -136,7 +136,7 @@ def _write_extras(
 
 def _read(options: Options, method: Upsampler) -> Scene:
     """Read the scene's original points, and its depth maps if the method or an option uses them."""
-    needed = "points" in traits_of(method).needs and not options.refine_poses  # makes points
+    needed = "points" in traits_of(method).needs and not options.refine_poses  # it makes points
     scene = with_masks(load_originals(options.scene, require_points=needed), options.masks)
     if options.depth_maps is not None:
         kind, scale = options.depth_kind, options.depth_scale
