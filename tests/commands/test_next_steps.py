@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import shlex
 import shutil
 from pathlib import Path
@@ -62,6 +63,7 @@ def test_what_info_advises_works(points, bent, tmp_path, monkeypatch, splatseed)
     assert run.code == 0, run.err
     wanted = ["train", "train", *(["info"] if points else ["upsample", "sfm"])]
     assert follow(run.out, splatseed) == ["undistort", *wanted]
+    assert re.search(r"\n  train, about \d+ (minute|hour)s? +splatseed train", run.out), run.out
     for folder in ("RUN", "SMALL"):
         assert (Path(folder) / "metrics.json").is_file()
     assert points or len(load_scene("OUT").points) > 500
@@ -80,6 +82,9 @@ def test_the_advice_is_for_the_trainer_that_is_named(
     assert "strategy default" in out or not points
     seeds = out.rpartition("\nnext\n")[2].partition("splatseed ")[2].splitlines()[0]
     assert "upsample" in seeds  # 3DGS's densification gains by seeds, grow does not
+    assert "--budget" not in seeds  # all that auto makes may be trained
+    tight = splatseed("info", path, "--for", trainer, "--budget", "900").out
+    assert "--budget 630 --auto.no-dense" in tight
     assert ("--format colmap" in seeds) == (trainer == "gsplat")
     assert splatseed(*shlex.split(seeds)).code == 0
     assert load_scene("OUT").source.format == ("colmap" if trainer == "gsplat" else "transforms")

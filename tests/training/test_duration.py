@@ -17,6 +17,7 @@ from splatseed.training.duration import (
     format_duration,
     mean_gaussians,
     options_for_an_hour,
+    planned_seconds,
     seconds_left,
     step_seconds,
 )
@@ -50,6 +51,16 @@ def test_later_steps_are_slower_and_the_machine_is_the_runs_own():
     assert seconds_left(GROW, EARLY._replace(step=10_000)) == 0
     steady = replace(GROW, strategy="none")
     assert seconds_left(steady, EARLY) == pytest.approx(9_900 * 0.5)
+
+
+def test_a_run_that_has_not_begun_is_estimated_from_its_seeds():
+    settings, pixels = replace(GROW, strategy="none"), 400_000
+    planned = planned_seconds(settings, 50_000, pixels, device="cpu", threads=2)
+    assert planned == pytest.approx(10_000 * step_seconds("cpu", 50_000, pixels))
+    one = planned_seconds(settings, 50_000, pixels, device="cpu", threads=1)
+    assert one == pytest.approx(2 * planned)
+    grown = planned_seconds(GROW, 50_000, pixels, device="cpu", threads=2)
+    assert planned < grown < 10_000 * step_seconds("cpu", 400_000, pixels)
 
 
 @pytest.mark.parametrize("per_pixel", [True, False])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from shutil import which
 from typing import Literal, NamedTuple, TypeAlias
@@ -14,11 +15,14 @@ from splatseed.depth.settings import PER_POINT
 from splatseed.io.staging import read_manifest
 from splatseed.io.transforms_layout import Layout
 from splatseed.lens import undistort_command, undistorted_folder
-from splatseed.photos.sizes import at_file_size
-from splatseed.scene import Scene
+from splatseed.photos.sizes import TRAINED_SIDE, at_file_size, factor_for_size
+from splatseed.runtime.environment import available_cpus
+from splatseed.scene import Image, Scene
 from splatseed.seeding.advice import AS_IT_IS, SEEDED, Advice
+from splatseed.seeding.photo_methods import Auto
 from splatseed.seeding.trainability import is_distorted, untrainable
 from splatseed.text import quoted
+from splatseed.training.duration import format_duration, planned_seconds
 from splatseed.training.schedule import FULL_RUN
 from splatseed.training.settings import BUDGET, StrategyName, TrainSettings
 
@@ -26,8 +30,10 @@ TrainerName: TypeAlias = Literal[
     "splatseed", "gsplat", "graphdeco", "nerfstudio", "brush", "opensplat", "lichtfeld"
 ]
 RATIO = 16
-SMALL = "--long-side 480 --max-steps 1500"
+SMALL_SIDE, SMALL_STEPS = 480, 1500
 """A run of minutes on a CPU: 146 photographs take 132 seconds on one core (README)."""
+COMPARE_SECONDS = 0.5
+"""CPU seconds in which stereo compares a photograph (benchmarks/README.md, real size)."""
 COLMAP_ONLY = frozenset({"gsplat", "graphdeco", "LichtFeld"})
 """Trainers that read COLMAP's layout better than transforms.json."""
 PINHOLE_ONLY = frozenset({"splatseed", "graphdeco", "OpenSplat", "LichtFeld"})
@@ -50,6 +56,8 @@ class Planned(NamedTuple):
     max_seeds: int
     flags: str
     trainer: TrainerName
+    seconds: float  # roughly, of splatseed's own training on this machine's CPU
+    most_seeds: int  # that auto makes without a budget
 
     @classmethod
     def of(
@@ -58,13 +66,14 @@ class Planned(NamedTuple):
         budget: str | None = None,
         max_steps: int = FULL_RUN,
         trainer: TrainerName = "splatseed",
+        long_side: int = TRAINED_SIDE,
     ) -> Planned:
         """Plan the training of a scene by the options of ``info``.
 
         The other trainers densify as 3DGS does, unless they are told otherwise.
         """
         images = at_file_size(scene).images
-        factor = TrainSettings().with_data_factor(images).factor
+        factor = factor_for_size(images, long_side) if images else 1
         lenses = [image.intrinsics for image in images]
         sizes = [(lens.width // factor, lens.height // factor) for lens in lenses]
         pixels = round(float(np.median([w * h for w, h in sizes]))) if sizes else BUDGET
@@ -83,7 +92,13 @@ class Planned(NamedTuple):
         if sizes:
             width, height = sorted(sizes, key=math.prod)[len(sizes) // 2]
             rho = f"{number / pixels:.2g}rho of {width} x {height} pixels"
-        return cls(number, rho, max_steps, settings.densification, max_seeds, flags, trainer)
+        seeds = min(len(scene.points), max_seeds) or max_seeds
+        threads = available_cpus()
+        seconds = planned_seconds(settings, seeds, pixels, device="cpu", threads=threads)
+        seconds += COMPARE_SECONDS * len(images) / threads
+        growth = settings.densification
+        most = len(scene.points) + _most_seeds(images)
+        return cls(number, rho, max_steps, growth, max_seeds, flags, trainer, seconds, most)
 
 
 def advice_commands(
@@ -116,9 +131,15 @@ def advice_commands(
     else:
         seeds = ("seeds", _seeding(path, advice, planned, refine=refine))
         return [*first, seeds, ("train", f"splatseed train OUT {plan} -o RUN")]
-    commands = [*first, ("train", f"splatseed train {source} {how}-o RUN")]
+    train, label = f"splatseed train {source} {how}-o RUN", "train"
+    shorter: Commands = []
     if not (which("nvidia-smi") or which("rocminfo")):
-        commands.append(("or in minutes", f"splatseed train {source} {refining}{SMALL} -o SMALL"))
+        label = f"train, about {format_duration(planned.seconds)}"
+        small = Planned.of(scene, None, SMALL_STEPS, long_side=SMALL_SIDE)
+        how = f"{refining}--long-side {SMALL_SIDE} --max-steps {SMALL_STEPS} -o SMALL"
+        command = f"splatseed train {source} {how}"
+        shorter = [(f"or about {format_duration(small.seconds)}", command)]
+    commands = [*first, (label, train), *shorter]
     if advice.method == "auto":
         others = _seeding(path, advice, planned, refine=refine)
         return [*commands, ("seeds for another trainer", others)]
@@ -129,11 +150,23 @@ def _seeding(path: Path, advice: Advice, planned: Planned, *, refine: bool) -> s
     """Return the command that adds points by the method advised."""
     how = f"--method {advice.method} --ratio 4"
     if advice.method == "auto":  # as train seeds: more gain nothing in a whole run
-        how = f"--budget {planned.max_seeds} --auto.no-dense"
+        fits = planned.most_seeds <= planned.max_seeds
+        how = "" if fits else f"--budget {planned.max_seeds} --auto.no-dense"
     elif advice.method in {AS_IT_IS, SEEDED}:
         how = "--method linear --ratio 1"
-    how = f"{how} --refine-poses" if refine else how
-    return f"splatseed upsample {quoted(path)} {how} -o OUT"
+    options = [how, "--refine-poses" if refine else "", "-o OUT"]
+    return " ".join([f"splatseed upsample {quoted(path)}", *filter(None, options)])
+
+
+def _most_seeds(images: Sequence[Image]) -> int:
+    """Return how many seeds ``auto`` makes at most: one per ``spacing`` of each photograph."""
+    settings = Auto()
+    if not images:
+        return 0
+    factor = factor_for_size(images, settings.max_size)
+    step = factor * settings.spacing
+    sizes = [(image.intrinsics.width, image.intrinsics.height) for image in images]
+    return sum(math.ceil(width / step) * math.ceil(height / step) for width, height in sizes)
 
 
 def _for_trainer(

@@ -16,6 +16,8 @@ from splatseed.training.settings import TrainSettings
 COSTS = {"cpu": (6e-3, 0.18e-6, 0.09e-6), "cuda": (8e-3, 5e-9, 2e-9)}
 """a, b and c: measured on 2 cores with AVX-512 on three scenes, and on one GPU with 3 million
 Gaussians. Another machine may be several times off, its proportions less."""
+MEASURED_THREADS = 2
+"""Threads with which the CPU's were measured; a step is split among all."""
 GROWTH = 3.0
 """Gaussians at the end of a run per seed, with densification and without a cap: a guess."""
 HOUR, TOO_LONG = 3600.0, 5400.0
@@ -67,6 +69,23 @@ def seconds_left(settings: TrainSettings, now: RunSpeed) -> float:
         return 0.0
     slower = now.seconds / step_seconds(now.device, now.gaussians, now.pixels)
     return left * slower * step_seconds(now.device, mean_gaussians(settings, now), now.pixels)
+
+
+def planned_seconds(
+    settings: TrainSettings, seeds: int, pixels: int, *, device: str, threads: int
+) -> float:
+    """Return roughly the seconds of the steps of a run that has not begun.
+
+    Args:
+        settings: The run's.
+        seeds: Number of points that it starts from.
+        pixels: Of a photograph as it is trained.
+        device: ``cpu`` or ``cuda``.
+        threads: Cores that train on the CPU.
+    """
+    step = step_seconds(device, seeds, pixels)
+    step *= MEASURED_THREADS / threads if device == "cpu" else 1.0
+    return seconds_left(settings, RunSpeed(0, step, seeds, pixels, device))
 
 
 def options_for_an_hour(
