@@ -117,6 +117,18 @@ def test_a_pair_shows_both_clouds(scene, tmp_path):
         pages.preview_pair(scene, dense, tmp_path / "file" / "pair.png")
 
 
+def test_a_scene_without_points_is_shown_by_its_photograph(scene, tmp_path):
+    bare = scene.replace(points=PointCloud.empty(), tracks=None)
+    shown, with_points = (
+        _read(pages.preview_pair(each, scene.points, tmp_path / name))
+        for each, name in ((bare, "bare.png"), (scene, "both.png"))
+    )
+    left, right = np.array_split(shown[60:], 2, axis=1)
+    assert (np.abs(left - PHOTOGRAPH) < 9).all(axis=2).mean() > 0.9
+    same = np.array_split(with_points[60:], 2, axis=1)[1]
+    np.testing.assert_array_equal(right, same)
+
+
 def test_white_walls_show_and_guessed_seeds_are_marked(scene, tmp_path):
     """On a ground that is neither; without guesses there is no third picture."""
     source = np.where(np.arange(150) % 3, SOURCE_CODES["stereo"], SOURCE_CODES["cover"])

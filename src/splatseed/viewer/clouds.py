@@ -50,10 +50,12 @@ def preview_pair(
 ) -> Path:
     """Write a picture of the scene's points and one of the upsampled points, with a title.
 
-    If some are guesses, a third one shows them in their origin's colour, and the others in grey.
+    A scene without points is shown by its photograph. If some are guesses, a third one shows them in their origin's colour, and the others in grey.
     """
     path, camera = Path(path), choose_camera(scene)
-    tiles = _cloud_tiles({"original": scene.points, title: upsampled}, camera, PAIR_SIDE)
+    original = {"original": scene.points} if len(scene.points) else {}
+    tiles = [] if original else _photograph(scene, PAIR_SIDE, "photograph")
+    tiles += _cloud_tiles({**original, title: upsampled}, camera, PAIR_SIDE)
     guessed = upsampled.source == GUESSED
     if guessed.any():
         grey = upsampled.rgb.mean(axis=1, keepdims=True).astype(np.uint8)
