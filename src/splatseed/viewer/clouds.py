@@ -50,7 +50,8 @@ def preview_pair(
 ) -> Path:
     """Write a picture of the scene's points and one of the upsampled points, with a title.
 
-    A scene without points is shown by its photograph. If some are guesses, a third one shows them in their origin's colour, and the others in grey.
+    A scene without points is shown by its photograph. If some are guesses, a third one shows them
+    in their origin's colour, and the others in grey.
     """
     path, camera = Path(path), choose_camera(scene)
     original = {"original": scene.points} if len(scene.points) else {}
