@@ -178,7 +178,7 @@ def test_a_graph_in_parts_is_completed_before_and_after_mapping(run, monkeypatch
         asked.append(lost)
         return matching.match_further(run, agreement, lost)
 
-    folder = map_images(run, names, "PINHOLE", further, partial=False)
+    folder, _ = map_images(run, names, "PINHOLE", further, partial=False)
     assert asked == [names[:4]] or asked == [names[4:]]
     assert run.pycolmap.Reconstruction(folder).num_reg_images() == 8
     assert list(run.seconds)[-4:] == ["matching", "further matching", "mapping", "further mapping"]

@@ -8,9 +8,10 @@ import pytest
 pytest.importorskip("pycolmap", reason="needs pycolmap")
 
 from splatseed.progress import silent
-from splatseed.sfm import Settings, mapping
+from splatseed.sfm import Settings, agreement, mapping
+from splatseed.sfm.agreement import compare_with_matches
 from splatseed.sfm.colmap import Run, posed_model, require_pycolmap
-from splatseed.sfm.mapping import explained, map_images
+from splatseed.sfm.mapping import map_images
 from splatseed.sfm.matching import match_photographs
 from splatseed.similarity import fit_similarity
 
@@ -55,9 +56,14 @@ def misplaced(model, found):
     return np.linalg.norm(fit_similarity(centers, true).points(centers) - true, axis=1).max()
 
 
+def explained(run, model):
+    return compare_with_matches(run, model).explained
+
+
 def test_true_poses_explain_the_matches_and_a_turned_camera_does_not_explain_its_own(matched):
     run, model = matched
-    assert explained(run, model) > 0.99
+    found = compare_with_matches(run, model)
+    assert min(found.explained, found.link) > 0.99
     with run.pycolmap.Database.open(run.database) as database:
         pairs, counts = database.read_two_view_geometry_num_inliers()
     pairs = [run.pycolmap.pair_id_to_image_pair(pair) for pair in pairs]
@@ -68,6 +74,25 @@ def test_true_poses_explain_the_matches_and_a_turned_camera_does_not_explain_its
     without = run.pycolmap.Reconstruction(model)
     without.deregister_frame(without.image(3).frame_id)
     assert explained(run, without) == pytest.approx(rest, abs=0.01)
+
+
+def test_two_parts_that_are_displaced_are_found_at_their_weakest_link(matched, monkeypatch):
+    run, model = matched
+    displaced = run.pycolmap.Reconstruction(model)
+    for number in (2, 5, 7):
+        frame = displaced.image(number).frame
+        shift = np.array([1.0, 0, 0]) @ frame.rig_from_world.rotation.matrix().T
+        frame.rig_from_world = run.pycolmap.Rigid3d(
+            frame.rig_from_world.rotation, frame.rig_from_world.translation + shift
+        )
+    found = compare_with_matches(run, displaced)
+    assert found.part == tuple(model.image(i).name for i in (2, 5, 7))
+    assert found.link < 0.2
+    assert found.explained > 0.3
+    monkeypatch.setattr(agreement, "_PART", 0.5)  # no part of three of the eight any more
+    even = compare_with_matches(run, displaced)
+    assert len(even.part) == 4
+    assert even.link > found.link
 
 
 @pytest.mark.parametrize("incremental", ["no model", "wrong poses"])
@@ -89,7 +114,8 @@ def test_where_incremental_mapping_fails_all_photographs_are_mapped_at_once(
 
     monkeypatch.setattr(mapping, "_map", fail)
     names = [model.image(i).name for i in range(1, 9)]
-    folder = map_images(run, names, "PINHOLE", None, partial=False)
+    folder, doubt = map_images(run, names, "PINHOLE", None, partial=False)
+    assert doubt == ""
     found = run.pycolmap.Reconstruction(folder)
     assert found.num_reg_images() == 8
     assert found.compute_mean_reprojection_error() < 1
@@ -101,8 +127,8 @@ def test_poses_that_explain_the_matches_are_not_mapped_again(run, monkeypatch):
     run, model = run
     monkeypatch.setattr(mapping, "_map_globally", None)
     names = [model.image(i).name for i in range(1, 9)]
-    found = run.pycolmap.Reconstruction(map_images(run, names, "PINHOLE", None, partial=False))
-    assert misplaced(model, found) < 0.05
+    folder, _ = map_images(run, names, "PINHOLE", None, partial=False)
+    assert misplaced(model, run.pycolmap.Reconstruction(folder)) < 0.05
 
 
 def test_a_worse_model_of_all_photographs_at_once_is_not_kept(run, monkeypatch):
@@ -116,6 +142,23 @@ def test_a_worse_model_of_all_photographs_at_once_is_not_kept(run, monkeypatch):
 
     monkeypatch.setattr(mapping, "_map", extend)
     names = [model.image(i).name for i in range(1, 9)]
-    folder = map_images(run, names, "PINHOLE", None, partial=False)
+    folder, doubt = map_images(run, names, "PINHOLE", None, partial=False)
+    assert doubt == ""
     assert misplaced(model, run.pycolmap.Reconstruction(folder)) < 0.05
     assert {path.name for path in folder.parent.iterdir()} == {"0", "complete"}
+
+
+def test_a_part_that_stays_misplaced_is_named(run, monkeypatch):
+    run, model = run
+    wrong = with_turned(run, model, [1, 2, 3, 4], 40)
+
+    def map_wrongly(run, stage, folder, *rest):
+        (folder / "0").mkdir()
+        wrong.write(folder / "0")
+        return {0: wrong}
+
+    monkeypatch.setattr(mapping, "_map", map_wrongly)
+    monkeypatch.setattr(mapping, "_map_globally", lambda *_: {})
+    names = [model.image(i).name for i in range(1, 9)]
+    _, doubt = map_images(run, names, "PINHOLE", None, partial=False)
+    assert "% of the matches between 4 of the photographs (view_00" in doubt

@@ -189,7 +189,7 @@ def test_mapping_goes_on_from_the_last_sure_snapshot(room, tmp_path, monkeypatch
         return real_extend(run, stage, snapshot, *rest)
 
     monkeypatch.setattr(mapping, "_extend", extend)
-    model = mapping.map_images(run, names, "PINHOLE", None, partial=False)
+    model, _ = mapping.map_images(run, names, "PINHOLE", None, partial=False)
     assert 2 < given[0] < 8
     assert run.pycolmap.Reconstruction(model).num_reg_images() == 8
     assert {path.name for path in (folder / "models").iterdir()} == {"0", "complete"}

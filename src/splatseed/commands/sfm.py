@@ -246,7 +246,9 @@ def _summarise(options: Options, report: SfmReport, error: PoseErrorEstimate | N
     print_pairs("splatseed sfm", rows)
     if 2 * report.registered < report.total:
         print_note("This is a part of the scene: fewer than half of the photographs have a pose.")
-    if error is not None and not error.exact:
+    if report.doubt:
+        print_note(report.doubt)
+    elif error is not None and not error.exact:
         print_note(
             "The photographs do not fit these poses well: look at them (splatseed view), and take "
             "more photographs, closer together, of where they are wrong."

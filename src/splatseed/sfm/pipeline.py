@@ -70,6 +70,7 @@ class SfmReport:
     refinement: Refinement | None = None  # None without ``refine_poses``
     poses: tuple[Image, ...] = ()  # the known poses, refined with ``refine_poses``
     num_pairs: int = 0  # matched pairs of photographs
+    doubt: str = ""  # why the poses may be wrong; empty if the matches agree with them
 
 
 Job: TypeAlias = Callable[..., Any]
@@ -198,19 +199,19 @@ def _reconstruct(
     masks: Masks | None,
     partial: bool,
 ) -> SfmReport:
-    refinement = None
+    refinement, doubt = None, ""
     if poses is None:
         model = colmap.guessed_model(run, cameras, camera_model)
         agreement = match_photographs(run, model, masks)
         further = None if agreement is None else lambda lost: match_further(run, agreement, lost)
-        model_dir = map_images(run, names, camera_model, further, partial=partial)
+        model_dir, doubt = map_images(run, names, camera_model, further, partial=partial)
     else:
         match_photographs(run, colmap.posed_model(run.pycolmap, poses), masks, poses)
         if refine_poses:
             poses, refinement = refine(run, poses)
         model_dir = colmap.triangulate_points(run, poses, test_names)
     _export(run, model_dir, staging, masks)
-    report = replace(_report(run, staging, names), num_pairs=run.num_pairs())
+    report = replace(_report(run, staging, names), num_pairs=run.num_pairs(), doubt=doubt)
     return replace(report, refinement=refinement, poses=tuple(poses or ()))
 
 
