@@ -48,12 +48,12 @@ def with_turned(run, model, numbers, degrees):
 
 
 def with_displaced(run, model, numbers):
-    """A copy of the model in which some cameras are a metre farther along the x axis."""
+    """A copy of the model in which some cameras are displaced by a metre along the x axis."""
     displaced = run.pycolmap.Reconstruction(model)
     for number in numbers:
         frame = displaced.image(number).frame
         rotation = frame.rig_from_world.rotation
-        shift = rotation.matrix() @ np.array([-1.0, 0, 0])
+        shift = rotation.matrix() @ np.array([1.0, 0, 0])
         frame.rig_from_world = run.pycolmap.Rigid3d(
             rotation, frame.rig_from_world.translation + shift
         )
