@@ -182,7 +182,8 @@ def _coverage_rows(coverage: Coverage, counts: Mapping[str, int]) -> list[tuple[
         made = " or ".join(f"{how.get(name, 'made')} by {name}" for name in others)
         of = f"{sum(others.values()):,} of {sum(counts.values()):,} points"
         share = max(0.0, coverage.total - coverage.measured)
-        rows.append(("guessed", f"{share:.1%} hold only points {made} ({of})"))
+        label = "guessed" if {*others} == {"cover"} else "not confirmed"
+        rows.append((label, f"{share:.1%} hold only points {made} ({of})"))
     return rows
 
 
