@@ -85,6 +85,9 @@ def test_further_ways_have_means_alone(paper, tmp_path):
     assert "/ .800 (+0.6" in row(full, "fern", "16x")[-2]
     assert row(full, "mean", "4x")[-2].startswith("+0.6")
     assert "| fern | 4x |" not in full
+    (costs,) = map(to_markdown, paper("tables").page_tables(results)["table3"])
+    assert row(costs, "mls", "16x")
+    assert "| mls | 4x |" not in costs
     assert row(means, "mcmc, profile default", "4x")[-2].startswith("+0.6")
     assert "fern" not in means
 
