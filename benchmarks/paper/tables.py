@@ -1,7 +1,8 @@
 """The paper's tables in its own layout, from the folders of benchmarks, complete or not.
 
 Notation: a *way* is as in ``gained``; each table of a page stands between its own two marks, and
-nothing else of the page is touched. A cell without a finished run is blank.
+nothing else of the page is touched. Before table 1 it says what cells mean; one without a finished
+run is blank.
 
     python -m benchmarks.paper.tables BENCH BENCH_DEPTH
 
@@ -43,15 +44,6 @@ COSTS = (*SECONDS, "gaussians", "model")
 PRINTED = {"train_time_s": "paper: training, s", "model_size_mb": "paper: model, MB"}
 DIGITS = {**dict(zip(COSTS, (2, 0, 0, 1), strict=True)), **dict.fromkeys(PRINTED, 0)}
 """Of table 3."""
-GAIN_NOTE = (
-    "dB ± standard error: of a scene over repeats (none of one), of a mean over its column's "
-    "scenes. ~: within noise (Holm over all cells of scenes, and over a strategy's means in a "
-    "row); ?: too few repeats or scenes to tell."
-)
-SCORE_NOTE = (
-    "PSNR in dB / SSIM / LPIPS where its weights are there, then what PSNR gains; means over "
-    "repeats. Bold: the highest PSNR of a row, be it by chance."
-)
 SHOWN = 16.0
 """The ratio of which tables 1 and 2 show every scene, and table 3 the costs; of the others tables 1
 and 2 have the means."""
@@ -171,9 +163,8 @@ def _by_ratio(
             name = f"mean of the paper's {len(printed)} scenes"
             rows.append((name, shown, *blank, *(Number(each, signed=True) for each in means)))
     header = ("scene", "ratio", *([SFM] if full else []), *methods)
-    notes = (SCORE_NOTE, GAIN_NOTE) if full else (GAIN_NOTE,)
     title = f"{'Scores and gains' if full else 'Gains'} over sfm, {way.label}"
-    return Table("gains", title, header, rows, notes)
+    return Table("gains", title, header, rows)
 
 
 def _with_rows(tables: Iterable[Table]) -> list[Table]:
@@ -188,7 +179,7 @@ def _all_means(results: Results, ways: Sequence[Way], scenes: Sequence[str]) -> 
             means = _mean_gains(results, way, scenes, [(method, ratio) for method in methods])
             if any(map(str, means)):
                 rows.append((way.label, f"{ratio:g}x", *means))
-    return Table("means", "Mean gains over sfm", ("runs", "ratio", *methods), rows, (GAIN_NOTE,))
+    return Table("means", "Mean gains over sfm", ("runs", "ratio", *methods), rows)
 
 
 def _with_sfm(kinds: Kinds) -> Kinds:
@@ -262,11 +253,7 @@ def _costs(results: Results, way: Way, key: str, scenes: Sequence[str]) -> Table
         for scene in scenes
         if not any(results.repeats(way, scene, label, "model").empty for label in labels)
     ]
-    note = (
-        f"Means over the scenes that have all of these runs: {', '.join(done) or 'none yet'}. "
-        "Seconds are of the clock, of a scene's repeats the least, and upsampling is not part of "
-        "training. MB are of a million bytes. The paper's are of its own machine, at 30,000 steps."
-    )
+    note = f"Means over the scenes that have all of these runs: {', '.join(done) or 'none yet'}."
     header = ("method", "ratio", *(MEASURES[name] for name in COSTS), *PRINTED.values())
     return Table("costs", f"Time and size, {way.label}", header, rows, (note,))
 
@@ -284,7 +271,7 @@ def _ablation(results: Results, ways: Sequence[Way], scenes: Sequence[str]) -> I
     rows.append(("mean", *(cell for each in means for cell in each)))
     header = ("scene", *(f"{r:g}x, {w.strategy}" for w in by_strategy for _, r in kinds))
     if kinds and rows[:-1]:
-        yield Table("random", "Random points: gain over sfm", header, rows, (GAIN_NOTE,))
+        yield Table("random", "Random points: gain over sfm", header, rows)
 
 
 def _conditions(results: Results, ways: Sequence[Way]) -> Table:
