@@ -285,7 +285,9 @@ def test_a_method_of_ones_own_is_named_as_the_origin(own_method, room, tmp_path,
     assert (run.code, run.err) == (0, "")
     new = 3 * len(load_scene(room).points)
     assert f" original, {new:,} {name})" in run.out
-    assert re.search(rf"  not confirmed +\S+% hold only points made by {name} \({new:,} of ", run.out)
+    assert re.search(
+        rf"  not confirmed +\S+% hold only points made by {name} \({new:,} of ", run.out
+    )
     scene = load_scene(tmp_path / "out")
     assert method_of_points(scene) == name
     clouds = clouds_by_origin(scene.points, TrainingFrame(np.zeros(3), 1.0), 100, name)
