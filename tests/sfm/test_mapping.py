@@ -47,16 +47,14 @@ def with_turned(run, model, numbers, degrees):
     return turned
 
 
-def with_displaced(run, model, numbers):
-    """A copy of the model in which some cameras are displaced by a metre along the x axis."""
+def with_displaced(run, model, numbers, shift=(1.0, 0.0, 0.0)):
+    """A copy of the model in which some cameras are displaced."""
     displaced = run.pycolmap.Reconstruction(model)
     for number in numbers:
         frame = displaced.image(number).frame
         rotation = frame.rig_from_world.rotation
-        shift = rotation.matrix() @ np.array([1.0, 0, 0])
-        frame.rig_from_world = run.pycolmap.Rigid3d(
-            rotation, frame.rig_from_world.translation + shift
-        )
+        moved = frame.rig_from_world.translation + rotation.matrix() @ np.array(shift)
+        frame.rig_from_world = run.pycolmap.Rigid3d(rotation, moved)
     return displaced
 
 
@@ -153,6 +151,26 @@ def test_a_worse_model_of_all_photographs_at_once_is_not_kept(run, monkeypatch):
     assert doubt == ""
     assert misplaced(model, run.pycolmap.Reconstruction(folder)) < 0.05
     assert {path.name for path in folder.parent.iterdir()} == {"0", "complete"}
+
+
+def test_a_displaced_part_is_mapped_again_without_what_displaced_it(run, monkeypatch):
+    run, model = run
+    names = [model.image(i).name for i in range(1, 9)]
+    folder, _ = map_images(run, names, "PINHOLE", None, partial=False)
+    right = run.pycolmap.Reconstruction(folder)
+    wrong = with_displaced(
+        run, right, [right.find_image_with_name(names[i]).image_id for i in (1, 4)], (2.0, 3.0, 1.0)
+    )
+    wrong.write(folder)
+    found = compare_with_matches(run, wrong)
+    assert found.part == (names[1], names[4])
+    before = run.pycolmap.Database.open(run.database).num_verified_image_pairs()
+    monkeypatch.setattr(mapping, "_map_globally", None)
+    mended, after = mapping._relinked(run, folder.parent, int(folder.name), found)
+    assert after.link > 0.9 > found.link
+    assert misplaced(model, mended) < 0.05
+    assert {path.name for path in folder.parent.iterdir()} == {folder.name, "complete"}
+    assert run.pycolmap.Database.open(run.database).num_verified_image_pairs() == before
 
 
 def test_a_part_that_stays_misplaced_is_named(run, monkeypatch):

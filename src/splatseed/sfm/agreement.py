@@ -26,7 +26,8 @@ class Agreement(NamedTuple):
 
     explained: float  # share of all matches
     link: float  # share of the matches between ``part`` and the rest; 1 if no two parts have any
-    part: tuple[str, ...]  # the smaller part at the weakest link, sorted
+    part: tuple[str, ...]  # names of the smaller part at the weakest link, sorted
+    agreeing: tuple[tuple[str, str], ...]  # pairs that link the two, of mostly explained matches
 
 
 class _Pairs(NamedTuple):
@@ -86,8 +87,8 @@ def _read_pairs(run: Run, model: Any) -> tuple[_Pairs, int]:
     return _Pairs(names, columns[0], columns[1], *columns[2:].astype(float)), unposed
 
 
-def _weakest_link(pairs: _Pairs) -> tuple[float, tuple[str, ...]]:
-    """Return the smallest share of explained matches between two parts, and the smaller part.
+def _weakest_link(pairs: _Pairs) -> tuple[float, tuple[str, ...], tuple[tuple[str, str], ...]]:
+    """Return the smallest share of explained matches between two parts, the smaller and the links.
 
     Of all divisions of the photographs, the one that minimises sum a / sum t over the pairs that it
     separates is approximated as in spectral clustering: the smallest generalised eigenvector of the
@@ -97,7 +98,7 @@ def _weakest_link(pairs: _Pairs) -> tuple[float, tuple[str, ...]]:
     count = len(pairs.names)
     least = max(1, round(_PART * count))
     if count < 2 * least or not len(pairs.first):
-        return 1.0, ()
+        return 1.0, (), ()
     explained, matches = (
         _laplacian(pairs, weights) for weights in (pairs.explained, pairs.matches)
     )
@@ -116,7 +117,10 @@ def _weakest_link(pairs: _Pairs) -> tuple[float, tuple[str, ...]]:
             shares[size] = pairs.explained[apart].sum() / pairs.matches[apart].sum()
     size = int(np.argmin(shares))
     part = order[:size] if 2 * size <= count else order[size:]
-    return float(shares[size]), tuple(sorted(pairs.names[i] for i in part))
+    apart = (ends[0] < size) & (ends[1] >= size)
+    fitting = np.flatnonzero(apart & (2 * pairs.explained >= pairs.matches))
+    links = ((pairs.names[pairs.first[i]], pairs.names[pairs.second[i]]) for i in fitting)
+    return float(shares[size]), tuple(sorted(pairs.names[i] for i in part)), tuple(links)
 
 
 def _laplacian(pairs: _Pairs, weights: Float64[np.ndarray, " P"]) -> Float64[np.ndarray, "N N"]:

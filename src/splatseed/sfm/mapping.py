@@ -1,9 +1,9 @@
 """Estimate poses, lenses and points of the photographs whose matches are in a run's database.
 
-Incremental mapping comes first. Where its poses contradict the matches, in all or between two parts
-of the photographs, as happens if photographs are placed beside others that merely look alike, all
-are mapped at once, too (COLMAP's global mapper), and the poses that explain more of the matches are
-kept.
+Incremental mapping comes first. It may place photographs beside others that merely look alike, and
+its poses then contradict matches. If they contradict those between two parts of the photographs,
+the smaller part is mapped again; if they still contradict many, all are mapped at once, too
+(COLMAP's global mapper), and the poses that explain more of the matches are kept.
 
 Notation: a ``model`` is a ``pycolmap.Reconstruction``; models are in numbered folders.
 """
@@ -12,7 +12,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
+from sqlite3 import connect
 from typing import Any
 
 from splatseed import errors
@@ -33,6 +36,7 @@ repeated patterns; of bonsai's every third photograph wrong poses explain 0.69 t
 _LINK = 0.5
 """The same of the matches between any two parts: of all 292 photographs of bonsai, 0.95 of the
 matches agree with poses that displace 107 photographs, but 0.13 of those that link them."""
+_RELINKED = 3  # parts that are mapped again at most
 _SIMPLE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL")
 
 
@@ -125,7 +129,12 @@ def _mapped(
         else:
             models = _map(run, "further mapping", models_dir, len(names))
     best = _largest(models)
-    found = compare_with_matches(run, models[best]) if models else Agreement(0.0, 0.0, ())
+    found = compare_with_matches(run, models[best]) if models else Agreement(0.0, 0.0, (), ())
+    for _ in range(_RELINKED):
+        relinked = _relinked(run, models_dir, best, found) if found.link < _LINK else None
+        if relinked is None:
+            break
+        models[best], found = relinked
     if found.explained < _EXPLAINED or found.link < _LINK:
         models |= _map_globally(run, models_dir, best, found.explained, names)
     remove(models_dir / _SNAPSHOTS)
@@ -166,6 +175,43 @@ def _extend(run: Run, stage: str, given: Path, folder: Path, total: int) -> Any:
     remove(folder)
     extended.rename(folder)
     return model
+
+
+def _relinked(
+    run: Run, models_dir: Path, number: int, found: Agreement
+) -> tuple[Any, Agreement] | None:
+    """Map the part again that is linked to the others by few matches that agree with its place.
+
+    Without these matches its photographs are placed by all the others. Returns the model and its
+    agreement if it explains more, and then replaces model ``number``; else None.
+    """
+    given = models_dir / str(number)
+    if not found.agreeing or not given.is_dir():
+        return None
+    folder = models_dir / "relinked"
+    folder.mkdir()
+    try:
+        alone = replace(run, kept=None, work=folder)
+        with closing(connect(run.database)) as source, closing(connect(alone.database)) as copy:
+            source.backup(copy)
+        model = run.pycolmap.Reconstruction(given)
+        for name in found.part:
+            model.deregister_frame(model.find_image_with_name(name).frame_id)
+        (rest := folder / "rest").mkdir()
+        model.write(rest)
+        with run.pycolmap.Database.open(alone.database) as database:
+            ids = {image.name: image.image_id for image in database.read_all_images()}
+            for a, b in found.agreeing:
+                database.delete_two_view_geometry(ids[a], ids[b])
+        model = _extend(alone, "further mapping", rest, rest, len(found.part))
+        agreement = compare_with_matches(run, model)
+        if agreement.explained <= found.explained:
+            return None
+        remove(given)
+        rest.rename(given)
+        return model, agreement
+    finally:
+        remove(folder)
 
 
 def _map_globally(
