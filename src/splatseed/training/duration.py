@@ -13,9 +13,10 @@ from typing import NamedTuple
 from splatseed.training.schedule import FULL_AT
 from splatseed.training.settings import TrainSettings
 
-COSTS = {"cpu": (6e-3, 0.18e-6, 0.09e-6), "cuda": (8e-3, 5e-9, 2e-9)}
-"""a, b and c: measured on 2 cores with AVX-512 on three scenes, and on one GPU with 3 million
-Gaussians. Another machine may be several times off, its proportions less."""
+COSTS = {"cpu": (5e-3, 0.35e-6, 0.15e-6), "cuda": (8e-3, 5e-9, 2e-9)}
+"""a, b and c: on 2 cores, between a quiet machine with AVX-512 and a busy one with AVX2, on eight
+captures; and on one GPU with 3 million Gaussians. Another machine may be twice as fast or half as
+fast, its proportions differ less."""
 MEASURED_THREADS = 2
 """Threads with which the CPU's were measured; a step is split among all."""
 GROWTH = 3.0
