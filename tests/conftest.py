@@ -195,6 +195,28 @@ def sixteen_views(room_of) -> tuple[Capture, Scene]:
     return room.capture, load_scene(room.path)
 
 
+class CalledHere:
+    """A ``Child`` that runs in this process."""
+
+    def __init__(self, function, *arguments, reports, environment, log):
+        self._call, self._log = pickle.dumps((function, arguments)), log
+        assert reports
+        assert environment
+
+    def result(self, progress):
+        function, arguments = pickle.loads(self._call)  # noqa: S301  (our own)
+        return function(*arguments, progress=progress)
+
+    def close(self):
+        self._log.close()
+
+
+@pytest.fixture
+def pycolmap_here(monkeypatch):
+    """Reconstructs in this process, where its child is not the subject: it takes two seconds."""
+    monkeypatch.setattr("splatseed.sfm.pipeline.Child", CalledHere)
+
+
 @pytest.fixture
 def splatseed(capsys) -> Callable[..., Run]:
     """Runs ``splatseed WORDS...`` here; only SystemExit may come out of it."""

@@ -51,6 +51,7 @@ def follow(out: str, splatseed) -> list[str]:
 
 
 @pytest.mark.parametrize("points", [True, False])
+@pytest.mark.usefixtures("pycolmap_here")
 def test_what_info_advises_works(points, bent, tmp_path, monkeypatch, splatseed):
     pytest.importorskip("torch", reason="trains")
     pytest.importorskip("pycolmap", reason="undistorts")

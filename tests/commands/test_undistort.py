@@ -25,6 +25,8 @@ from splatseed.synthetic import write_capture
 
 from ..bent import bend
 
+pytestmark = pytest.mark.usefixtures("pycolmap_here")
+
 
 @pytest.fixture(scope="module")
 def distorted(room_of, tmp_path_factory):

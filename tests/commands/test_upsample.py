@@ -252,6 +252,7 @@ def test_photographs_without_points_are_seeded_and_drawn(bare, tmp_path, splatse
         assert (out / f"preview{name}.png").stat().st_size > 5000
 
 
+@pytest.mark.usefixtures("pycolmap_here")
 def test_poses_are_refined_and_points_triangulated(sharp_room, sharp_bare, tmp_path, splatseed):
     words = ("--refine-poses", "--method", "linear", "--ratio", 2)
     run = splatseed("upsample", sharp_bare, "-o", tmp_path / "out", *words)

@@ -121,6 +121,7 @@ def test_poses_that_drift_or_are_of_others_are_refused(room, refined):
             refined(with_poses(room.images, others))
 
 
+@pytest.mark.usefixtures("pycolmap_here")
 def test_a_scene_has_the_refined_poses_and_one_without_matches_its_own(room, tmp_path):
     photos = tmp_path / "photos"
     shutil.copytree(room.source.image_dir, photos)

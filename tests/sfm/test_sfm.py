@@ -86,6 +86,7 @@ def test_reconstruct_finds_the_cameras(posed, photos, tmp_path):
     assert manifest["report"]["registered"] == 6
 
 
+@pytest.mark.usefixtures("pycolmap_here")
 def test_known_poses_are_kept_and_surfaces_found(capture, posed, photos, tmp_path):
     known = posed.replace(images=posed.images[1:])  # the first photograph has no pose
     test = frozenset(["view_002.png"])
@@ -109,6 +110,7 @@ def test_known_poses_are_kept_and_surfaces_found(capture, posed, photos, tmp_pat
     assert np.median(capture.surfaces.distance(xyz)) < 0.01
 
 
+@pytest.mark.usefixtures("pycolmap_here")
 def test_a_known_lens_is_believed_and_triangulation_repeats_itself(posed, photos, tmp_path):
     """Coefficients above 1, as a Kinect's, which COLMAP takes for a calibration gone wrong."""
     cancel = (0.0, 0.0, 0.0, 0.0, 1.2, 0.0, 0.0, 1.2)  # the rational model's k3 = k6
@@ -129,6 +131,7 @@ def test_a_known_lens_is_believed_and_triangulation_repeats_itself(posed, photos
 
 
 @pytest.mark.parametrize("num", [8, 3])
+@pytest.mark.usefixtures("pycolmap_here")
 def test_too_few_registered_is_an_error_that_names_them(num, photos, tmp_path, monkeypatch):
     """Fewer than half, or none; the work is kept for the next call, COLMAP's own log is not."""
     mixed = tmp_path / "mixed"
@@ -255,6 +258,7 @@ def test_exif_orientation_is_cleared_and_pixels_are_kept(tmp_path, endian):
             assert name == "plain.jpg" or tags[0x0110] == "a camera"
 
 
+@pytest.mark.usefixtures("pycolmap_here")
 def test_what_cannot_be_done_is_refused_and_nothing_written(posed, photos, tmp_path):
     wrong = {"matcher": "psychic", "device": "tpu", "max_image_size": 0, "seed": -1, "threads": 0}
     for name, value in wrong.items():
@@ -283,6 +287,7 @@ def test_what_cannot_be_done_is_refused_and_nothing_written(posed, photos, tmp_p
     assert len(files_below(photos)) == 6
 
 
+@pytest.mark.usefixtures("pycolmap_here")
 def test_pycolmap_is_asked_for(photos, tmp_path, monkeypatch):
     if not pycolmap.has_cuda:
         with pytest.raises(MissingDependencyError, match="built for the CPU"):
