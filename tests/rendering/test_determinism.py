@@ -1,7 +1,4 @@
-"""The same bytes, forward and backward, for any number of threads, compiled or loaded from a cache.
-
-Run as a module: other processes, with other caches, must print the same.
-"""
+"""The same bytes, forward and backward, for any number of threads, compiled or from a cache."""
 
 from __future__ import annotations
 
@@ -14,10 +11,8 @@ from pathlib import Path
 import numba
 import numpy as np
 import pytest
-import torch
 
-from splatseed.rendering.autograd import Harmonics
-
+from .cached_colors import digest_of_colors
 from .scenes import gradients, random_scene
 
 MODES = ({}, {"rasterize_mode": "antialiased", "packed": False},
@@ -52,19 +47,9 @@ def test_any_number_of_threads():
     assert len(digests) == 1
 
 
-def colors():
-    """Colours by harmonics and their gradients: vector code of four files, compiled in seconds."""
-    rng, shapes = np.random.default_rng(0), ((3000, 3), (3,), (3000, 16, 3))
-    arrays = [rng.normal(size=shape).astype(np.float32) for shape in shapes]
-    inputs = [torch.tensor(each, requires_grad=True) for each in arrays]
-    shades = Harmonics.apply(*inputs, None, torch.ones(3000, 2, dtype=torch.int32), 3)
-    shades.square().sum().backward()
-    return [shades, *(each.grad for each in inputs)]
-
-
 def test_freshly_compiled_and_loaded_from_the_cache(tmp_path):
     """A new process with an empty cache compiles; a second one loads what the first has left."""
-    expected = digest(colors())
+    expected = digest_of_colors()
     assert _in_new_process(tmp_path) == expected
     compiled = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.nbc")}
     assert compiled
@@ -74,13 +59,8 @@ def test_freshly_compiled_and_loaded_from_the_cache(tmp_path):
 
 def _in_new_process(cache):
     run = subprocess.run(
-        [sys.executable, "-m", "tests.rendering.test_determinism"], cwd=Path(__file__).parents[2],
+        [sys.executable, "-m", "tests.rendering.cached_colors"], cwd=Path(__file__).parents[2],
         env={**os.environ, "NUMBA_CACHE_DIR": str(cache)}, capture_output=True, text=True,
         check=True,
     )  # fmt: skip
     return run.stdout.strip()
-
-
-if __name__ == "__main__":
-    torch.set_num_threads(1)
-    print(digest(colors()))  # noqa: T201  (its one result)
