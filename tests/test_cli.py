@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import pty
 import re
-import signal
 import subprocess
 import sys
 from importlib.metadata import entry_points, version
@@ -79,7 +78,7 @@ def _read_all(master):
 
 
 SLOW_WRITER = """
-import signal, sys, time
+import sys, time
 from pathlib import Path
 from splatseed.cli import main
 from splatseed.io import colmap
@@ -90,14 +89,12 @@ def write(path, points, tracks=None):
     time.sleep(60)
 
 colmap.write_points3d = write
-# A suite that runs in the background of a shell has Ctrl-C ignored, and its children inherit it.
-signal.signal(signal.SIGINT, signal.default_int_handler)
 main()
 """
 
 
-@pytest.mark.parametrize(("stop", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_stopping_while_writing_leaves_nothing(ply, tmp_path, stop, code):
+def test_stopping_while_writing_leaves_nothing(ply, tmp_path):
+    """By SIGTERM; that SIGINT ends each verb likewise is tested in tests/runtime."""
     words = [sys.executable, "-c", SLOW_WRITER, "upsample", str(ply), "-o", str(tmp_path / "a/out")]
     with subprocess.Popen(
         words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -105,9 +102,9 @@ def test_stopping_while_writing_leaves_nothing(ply, tmp_path, stop, code):
         for line in process.stdout:
             if line == "writing\n":
                 break
-        process.send_signal(stop)
+        process.terminate()
         _, err = process.communicate(timeout=60)
-    assert process.returncode == code
+    assert process.returncode == 143
     assert "interrupted" in err
     assert "Traceback" not in err
     assert [path.name for path in tmp_path.iterdir()] == [ply.name]

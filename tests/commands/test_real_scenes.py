@@ -17,8 +17,7 @@ from splatseed.io import load_scene
     [
         ("fox", "mls"),
         ("fern", "voronoi"),
-        ("treehill", "triangle"),
-        ("mipnerf360_sfm/bicycle", "linear"),
+        ("mipnerf360_sfm/bicycle", "triangle"),
         ("mipnerf360_sfm/stump", "spline"),
     ],
 )
