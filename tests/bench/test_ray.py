@@ -7,14 +7,14 @@ import shutil
 import tempfile
 import threading
 import time
+from importlib.util import find_spec
 
 import pytest
 
 pytest.importorskip("torch", reason="training needs PyTorch")
 pytest.importorskip("gsplat", reason="training needs gsplat's strategies")
-pytest.importorskip("ray", reason="Ray is an extra: pip install -e '.[cluster]'")
-
-from ray.cluster_utils import Cluster
+if find_spec("ray") is None:  # not imported here: half a second in each process of the suite
+    pytest.skip("Ray is an extra: pip install -e '.[cluster]'", allow_module_level=True)
 
 from splatseed.bench.plan_file import plan_text
 from splatseed.bench.runs import read_runs
@@ -25,6 +25,8 @@ NODE = {"num_cpus": 1, "object_store_memory": 80 * 2**20}  # bytes; the least th
 @pytest.fixture
 def nodes(tmp_path, monkeypatch):
     """The cluster, and two nodes beside a head that runs nothing, by their temporary folders."""
+    from ray.cluster_utils import Cluster
+
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
     monkeypatch.setenv("RAY_worker_niceness", "0")  # or workers wait for every other process
     short = tempfile.mkdtemp(dir=tempfile.gettempdir())  # names of sockets must not be long

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
+import shutil
 from html import unescape
 from io import BytesIO
 
@@ -209,9 +210,17 @@ def with_capture(bench, path, digest, *gains, **changes):
 GOOD = (("linear", 2), 0.2), (("mls", 3), 0.5)
 
 
-def test_seeds_and_views_are_shown_and_not_made_again(tmp_path, capture, monkeypatch):
-    bench = with_capture(tmp_path / "b", *capture, *GOOD)
-    report, first = write_report(bench), (bench / REPORT).read_bytes()
+@pytest.fixture(scope="module")
+def reported(tmp_path_factory, capture):
+    """A benchmark with pictures, not to be written to, and what was said of its report."""
+    bench = with_capture(tmp_path_factory.mktemp("bench") / "b", *capture, *GOOD)
+    return bench, write_report(bench)
+
+
+def test_seeds_and_views_are_shown_and_not_made_again(tmp_path, reported, monkeypatch):
+    made, report = reported
+    bench = shutil.copytree(made, tmp_path / "b")
+    first = (bench / REPORT).read_bytes()
     assert not report.notes
     assert len(list((bench / "figures").glob("clouds_.._a_room_*.png"))) == 1
     # The middle one of the views, with its error maps.
@@ -238,14 +247,12 @@ def test_a_changed_scene_costs_its_pictures_alone_and_losers_are_not_called_the_
 
 
 @pytest.fixture(scope="module")
-def opened(tmp_path_factory, capture):
+def opened(tmp_path_factory, reported):
     """A report in a browser."""
     if CHROMIUM is None:
         pytest.skip("chromium is not installed (Debian: apt-get install chromium)")
-    bench = with_capture(tmp_path_factory.mktemp("bench") / "b", *capture, *GOOD)
-    write_report(bench)
     with chromium(tmp_path_factory.mktemp("profile")) as page:
-        yield page, bench / REPORT
+        yield page, reported[0] / REPORT
 
 
 @pytest.mark.parametrize("width", [1200, 320])

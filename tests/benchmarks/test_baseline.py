@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import shutil
+
 import pytest
 
 pytest.importorskip("torch", reason="training needs PyTorch")
 
 from splatseed.io import load_scene
-from splatseed.synthetic import make_capture, write_capture
 from splatseed.training import TrainSettings
 from splatseed.training.schedule import make_schedule
 
@@ -15,10 +16,10 @@ MODULES = ("training.baseline", "training.baseline_arms")
 
 
 @pytest.fixture(scope="module")
-def captures(tmp_path_factory):
+def captures(room_of, tmp_path_factory):
     """A folder with a capture that goes by the name of a real one."""
     folder = tmp_path_factory.mktemp("captures")
-    write_capture(make_capture(0, num_views=18, width=64, height=48), folder / "fern")
+    shutil.copytree(room_of(18, 64, 48).path, folder / "fern")
     return folder
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,7 +14,6 @@ import pytest
 torch = pytest.importorskip("torch", reason="training needs PyTorch")
 
 from splatseed.io import load_scene
-from splatseed.synthetic import make_capture, write_capture
 from splatseed.training.folder import Record
 
 MODULES = ("training.dense", "training.seeding", "training.seeding_arms")
@@ -20,10 +21,9 @@ PLAN = {"strategy": "none", "rho": 0.2, "max_steps": 20, "data_factor": 1, "seed
 
 
 @pytest.fixture(scope="module")
-def capture(tmp_path_factory):
+def capture(room_of, tmp_path_factory):
     folder = tmp_path_factory.mktemp("captures") / "fern"
-    write_capture(make_capture(0, num_views=18, width=64, height=48), folder)
-    return folder
+    return Path(shutil.copytree(room_of(18, 64, 48).path, folder))
 
 
 def test_opacities_follow_the_confidence_of_seeds_that_have_one(bench):

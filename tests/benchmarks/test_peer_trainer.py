@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shutil
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,6 @@ import torch
 from splatseed.errors import MissingDependencyError, ParameterError, SceneNotFoundError
 from splatseed.photos.loading import load_split
 from splatseed.splat.ssim_conv import l1_and_ssim_by_convolution
-from splatseed.synthetic import make_capture, write_capture
 
 MODULES = (
     "common.children",
@@ -22,9 +22,9 @@ MODULES = (
 
 
 @pytest.fixture(scope="module")
-def room(tmp_path_factory):
+def room(room_of, tmp_path_factory):
     path = tmp_path_factory.mktemp("room") / "room"
-    return write_capture(make_capture(0, num_views=12, width=96, height=72), path)
+    return Path(shutil.copytree(room_of(12, 96, 72).path, path))
 
 
 def test_validation_views_are_of_the_training_views(bench, room):

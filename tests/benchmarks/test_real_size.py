@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -11,16 +12,15 @@ import pytest
 
 from splatseed import console
 from splatseed.io import load_scene
-from splatseed.synthetic import make_capture, write_capture
 
 MODULES = ("real_size", "common.stages")
 
 
 @pytest.fixture(scope="module")
-def captures(tmp_path_factory):
+def captures(room_of, tmp_path_factory):
     """A folder with a capture that goes by the name of a real one."""
     folder = tmp_path_factory.mktemp("captures")
-    write_capture(make_capture(0, num_views=6, width=64, height=48), folder / "plush")
+    shutil.copytree(room_of(9, 64, 48).path, folder / "plush")
     return folder
 
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import re
+import shutil
 from pathlib import Path
 
 import pytest
 
 pytest.importorskip("torch", reason="training and scoring need PyTorch")
-
-from splatseed.synthetic import make_capture, write_capture
 
 ROOT = Path(__file__).parents[2]
 NAMES = ("SEEDED", "SCENE", "garden")
@@ -18,12 +17,11 @@ PAGES = {"README.md": 1, "docs/api.md": 5, "docs/training.md": 1}
 
 
 @pytest.fixture
-def folder(tmp_path, monkeypatch):
+def folder(room_of, tmp_path, monkeypatch):
     """The working directory, with a small scene under every name that the pages use."""
     monkeypatch.chdir(tmp_path)
-    capture = make_capture(0, num_views=9, width=64, height=48)
     for name in NAMES:
-        write_capture(capture, tmp_path / name)
+        shutil.copytree(room_of(9, 64, 48).path, tmp_path / name)
     return tmp_path
 
 

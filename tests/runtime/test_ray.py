@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import socket
 import tempfile
 
 import pytest
 
-pytest.importorskip("ray", reason="Ray is an extra: pip install -e '.[cluster]'")
+if importlib.util.find_spec("ray") is None:  # not imported here: half a second in each process
+    pytest.skip("Ray is an extra: pip install -e '.[cluster]'", allow_module_level=True)
 
 from splatseed.errors import ParameterError
 from splatseed.runtime.ray_tasks import RayWorkers, ray_cluster

@@ -137,7 +137,7 @@ def test_a_budget_that_growth_filled_is_not_spent_again(view):
     torch.testing.assert_close(*means)
 
 
-@settings(deadline=None)
+@settings(deadline=None, max_examples=30)
 @given(count=st.integers(2, 12), budget=st.integers(2, 40))
 def test_the_budget_is_never_exceeded(count, budget):
     matrix = np.array([[SIDE, 0, SIDE / 2], [0, SIDE, SIDE / 2], [0, 0, 1.0]])
