@@ -17,7 +17,7 @@ from splatseed.seeding.clouds.icp import Stage
 from splatseed.similarity import Similarity
 
 MOVE = Similarity(0.37, spread_rotations(500)[321], np.array([5.6e5, 5.9e6, -80.0]))
-FEWER = AlignSettings(search=SearchSettings(rotations=600, scales=SearchSettings.scales[1:4]))
+FEWER = AlignSettings(search=SearchSettings(rotations=300, scales=SearchSettings.scales[1:4]))
 QUICK = AlignSettings(
     search=SearchSettings(rotations=150, refined=2),
     stages=(
