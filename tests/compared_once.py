@@ -1,4 +1,4 @@
-"""Stereo of the same photographs, found once for all tests of a process.
+"""Stereo of the same photographs, found once for all tests and processes of the suite.
 
 Most tests of commands, runs and benchmarks look at one room, which takes seconds to compare.
 """
@@ -9,10 +9,12 @@ import hashlib
 import pickle
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 from splatseed.depth.stereo import closer, coarse, matching, pipeline
 from splatseed.depth.stereo.maps import StereoResult
+from splatseed.io.staging import atomic_file
 from splatseed.photos.view import View
 from splatseed.progress import Progress
 from splatseed.seeding import poses
@@ -24,15 +26,30 @@ _found: dict[bytes, StereoResult] = {}
 
 
 def match_views(
-    views: Sequence[View], priors: Any, sources: Any, settings: Any, seed: int, progress: Progress
+    folder: Path,
+    views: Sequence[View],
+    priors: Any,
+    sources: Any,
+    settings: Any,
+    seed: int,
+    progress: Progress,
 ) -> StereoResult:
-    """As ``matching.match_views``, whose result follows from all arguments but the progress."""
+    """As ``matching.match_views``, whose result follows from all arguments but the progress.
+
+    Results are kept in ``folder`` for the other processes.
+    """
     matching.check_stereo_memory(views, settings)
     key = _digest(views, priors, sources, settings, seed)
+    kept = folder / key.hex()
+    if key not in _found and kept.is_file():
+        _found[key] = pickle.loads(kept.read_bytes())  # noqa: S301  (our own)
     if key in _found:
         progress("compare photographs", 1.0)
     else:
-        _found[key] = matching.match_views(views, priors, sources, settings, seed, progress)
+        found = matching.match_views(views, priors, sources, settings, seed, progress)
+        _found[key] = replace(found, views=())
+        with atomic_file(kept) as partial:
+            partial.write_bytes(pickle.dumps(_found[key]))
     found, lists = _found[key], ("planes", "costs", "agreeing")
     copies = {name: [each.copy() for each in getattr(found, name)] for name in lists}
     return replace(found, views=tuple(views), **copies)

@@ -13,7 +13,7 @@ from splatseed.runtime.environment import set_thread_defaults
 set_thread_defaults()  # before PyTorch and Numba load, as the command line does
 
 from collections.abc import Callable, Iterator
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -37,14 +37,23 @@ def _untold_compilation(monkeypatch):
     monkeypatch.setattr("splatseed.console.MIN_LOGGED_COMPILATION", math.inf)
 
 
+@pytest.fixture(scope="session")
+def common(tmp_path_factory) -> Path:
+    """A folder that all processes of the suite share."""
+    folder = tmp_path_factory.getbasetemp()
+    return folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder
+
+
 @pytest.fixture
-def compare_once(request, monkeypatch):
+def compare_once(request, monkeypatch, common):
     """Compares the same photographs once for all tests that use this, but for ``compare_anew``."""
     from .compared_once import USERS, match_views
 
+    folder = common / "compared"
+    folder.mkdir(exist_ok=True)
     if "compare_anew" not in request.fixturenames:
         for module in USERS:
-            monkeypatch.setattr(module, "match_views", match_views)
+            monkeypatch.setattr(module, "match_views", partial(match_views, folder))
 
 
 @pytest.fixture
@@ -146,13 +155,11 @@ class Room(NamedTuple):
 
 
 @pytest.fixture(scope="session")
-def room_of(tmp_path_factory) -> Callable[[int, int, int], Room]:
+def room_of(common) -> Callable[[int, int, int], Room]:
     """Makes the room, ``room_of(num_views, width, height)``.
 
     It takes seconds, so that all processes of the suite share what one of them has made.
     """
-    common = tmp_path_factory.getbasetemp()
-    common = common.parent if "PYTEST_XDIST_WORKER" in os.environ else common
 
     @cache
     def make(num_views: int, width: int, height: int) -> Room:

@@ -15,6 +15,7 @@ from splatseed.photos.view import view_of
 from splatseed.pointcloud import PointCloud
 from splatseed.seeding.map_seeds import depth_at_cells, guides_badly
 
+pytestmark = pytest.mark.usefixtures("compare_once")
 DEPTH, COVER = SOURCE_CODES["depth"], SOURCE_CODES["cover"]
 
 

@@ -16,6 +16,7 @@ from splatseed.seeding.budget import describe_rho, parse_budget
 from splatseed.seeding.thinning import thin_to
 from splatseed.seeding.upsampling import share_covered
 
+pytestmark = pytest.mark.usefixtures("compare_once")
 by_photographs = pytest.mark.parametrize("method", ["stereo", "cover", "auto"])
 STEREO, COVER, CLOUD = (SOURCE_CODES[name] for name in ("stereo", "cover", "cloud"))
 
@@ -58,7 +59,7 @@ def test_the_maps_are_those_that_seeds_are_made_of(room, seeds):
     ],
 )
 def test_the_same_seed_gives_the_same_bytes_on_any_number_of_threads(
-    method, options, room, set_threads
+    method, options, room, set_threads, compare_anew
 ):
     first = ss.upsample(room, method, seed=3, **options)
     set_threads(1)
