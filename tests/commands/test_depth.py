@@ -104,6 +104,7 @@ def bent(room_of, tmp_path_factory):
     return write_capture(bend(capture), tmp_path_factory.mktemp("bent") / "room")
 
 
+@pytest.mark.usefixtures("pycolmap_here")
 def test_a_distorted_capture_becomes_a_cloud_on_its_surfaces(bent, capture, tmp_path, splatseed):
     """From its own stereo to COLMAP's fusion."""
     out = tmp_path / "dense"

@@ -147,6 +147,7 @@ def test_depth_is_lifted_where_pixels_count(scene_path):
     assert counts[uv[:, 1], uv[:, 0]].all()
 
 
+@pytest.mark.usefixtures("pycolmap_here")
 def test_undistortion_carries_masks_along(sixteen_views, tmp_path):
     """By our own and by pycolmap's, the box covers the same part of the photographs."""
     pytest.importorskip("pycolmap", reason="pycolmap undistorts")
