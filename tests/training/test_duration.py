@@ -55,11 +55,11 @@ def test_later_steps_are_slower_and_the_machine_is_the_runs_own():
 
 def test_a_run_that_has_not_begun_is_estimated_from_its_seeds():
     settings, pixels = replace(GROW, strategy="none"), 400_000
-    planned = planned_seconds(settings, 50_000, pixels, device="cpu", threads=2)
+    planned = planned_seconds(settings, 50_000, pixels, 2)
     assert planned == pytest.approx(10_000 * step_seconds("cpu", 50_000, pixels))
-    one = planned_seconds(settings, 50_000, pixels, device="cpu", threads=1)
+    one = planned_seconds(settings, 50_000, pixels, 1)
     assert one == pytest.approx(2 * planned)
-    grown = planned_seconds(GROW, 50_000, pixels, device="cpu", threads=2)
+    grown = planned_seconds(GROW, 50_000, pixels, 2)
     assert planned < grown < 10_000 * step_seconds("cpu", 400_000, pixels)
 
 

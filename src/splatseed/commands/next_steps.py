@@ -70,7 +70,7 @@ class Planned(NamedTuple):
     ) -> Planned:
         """Plan the training of a scene by the options of ``info``.
 
-        The other trainers densify as 3DGS does, unless they are told otherwise.
+        The other trainers densify as 3DGS does by default.
         """
         images = at_file_size(scene).images
         factor = factor_for_size(images, long_side) if images else 1
@@ -94,7 +94,7 @@ class Planned(NamedTuple):
             rho = f"{number / pixels:.2g}rho of {width} x {height} pixels"
         seeds = min(len(scene.points), max_seeds) or max_seeds
         threads = available_cpus()
-        seconds = planned_seconds(settings, seeds, pixels, device="cpu", threads=threads)
+        seconds = planned_seconds(settings, seeds, pixels, threads)
         seconds += COMPARE_SECONDS * len(images) / threads
         growth = settings.densification
         most = len(scene.points) + _most_seeds(images)

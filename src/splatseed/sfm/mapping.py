@@ -98,7 +98,7 @@ def _doubt(found: Agreement) -> str:
     return (
         f"The poses contradict {1 - found.link:.0%} of the matches between {len(found.part):,} of "
         f"the photographs ({named}) and the others: one of these two parts is probably misplaced. "
-        "Look at the scene; photographs of what lies between the two may help."
+        "Check their cameras (splatseed view), and take photographs of what lies between the two."
     )
 
 
@@ -187,7 +187,7 @@ def _relinked(
     agreement if it explains more, and then replaces model ``number``; else None.
     """
     given = models_dir / str(number)
-    if not found.agreeing or not given.is_dir():
+    if not found.agreeing:
         return None
     folder = models_dir / "relinked"
     folder.mkdir()

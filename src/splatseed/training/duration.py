@@ -14,7 +14,7 @@ from splatseed.training.schedule import FULL_AT
 from splatseed.training.settings import TrainSettings
 
 COSTS = {"cpu": (5e-3, 0.35e-6, 0.15e-6), "cuda": (8e-3, 5e-9, 2e-9)}
-"""a, b and c: on 2 cores, between a quiet machine with AVX-512 and a busy one with AVX2, on eight
+"""a, b and c: on 2 cores, between a quiet machine with AVX-512 and a busy one with AVX2, on nine
 captures; and on one GPU with 3 million Gaussians. Another machine may be twice as fast or half as
 fast, its proportions differ less."""
 MEASURED_THREADS = 2
@@ -72,21 +72,17 @@ def seconds_left(settings: TrainSettings, now: RunSpeed) -> float:
     return left * slower * step_seconds(now.device, mean_gaussians(settings, now), now.pixels)
 
 
-def planned_seconds(
-    settings: TrainSettings, seeds: int, pixels: int, *, device: str, threads: int
-) -> float:
-    """Return roughly the seconds of the steps of a run that has not begun.
+def planned_seconds(settings: TrainSettings, seeds: int, pixels: int, threads: int) -> float:
+    """Return roughly the seconds of the steps of a run on the CPU that has not begun.
 
     Args:
         settings: The run's.
         seeds: Number of points that it starts from.
         pixels: Of a photograph as it is trained.
-        device: ``cpu`` or ``cuda``.
-        threads: Cores that train on the CPU.
+        threads: Cores that it uses.
     """
-    step = step_seconds(device, seeds, pixels)
-    step *= MEASURED_THREADS / threads if device == "cpu" else 1.0
-    return seconds_left(settings, RunSpeed(0, step, seeds, pixels, device))
+    step = MEASURED_THREADS / threads * step_seconds("cpu", seeds, pixels)
+    return seconds_left(settings, RunSpeed(0, step, seeds, pixels))
 
 
 def options_for_an_hour(
