@@ -15,6 +15,7 @@ import math
 import os
 import stat
 import struct
+import threading
 import tokenize
 import zipfile
 import zlib
@@ -53,6 +54,8 @@ _OPEN_FLAGS = (
     getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
 )
 _COUNT = struct.Struct("<Q")
+_PARSER = threading.Lock()
+"""NumPy parses headers as Python, which two threads at once fail at (python/cpython#106905)."""
 
 
 def files_below(folder: Path) -> list[Path]:
@@ -181,9 +184,10 @@ def read_npy_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[An
     magic = file.read(npy_format.MAGIC_LEN)
     if not magic.startswith(npy_format.MAGIC_PREFIX):
         raise ValueError(f"no NumPy array, but {beginning(magic)}")
-    if magic.endswith(b"\x01\x00"):
-        return npy_format.read_array_header_1_0(file)
-    return npy_format.read_array_header_2_0(file)
+    with _PARSER:
+        if magic.endswith(b"\x01\x00"):
+            return npy_format.read_array_header_1_0(file)
+        return npy_format.read_array_header_2_0(file)
 
 
 def read_npy(file: IO[bytes], max_bytes: float = np.inf) -> np.ndarray:

@@ -7,6 +7,7 @@ content of the original; a failure to write the cache is ignored.
 from __future__ import annotations
 
 import hashlib
+import zipfile
 from contextlib import suppress
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from platformdirs import user_cache_path
 
 from splatseed.errors import OutputError, ParameterError
 from splatseed.io.bit_depth import WHITE
-from splatseed.io.files import ARCHIVE_FAILURES, StrPath
+from splatseed.io.files import ARCHIVE_FAILURES, StrPath, read_npy
 from splatseed.io.photograph import decode_photograph, photograph_bytes
 from splatseed.io.staging import atomic_file
 from splatseed.photos.sizes import check_side
@@ -66,9 +67,11 @@ def _read(path: Path) -> tuple[UInt8[np.ndarray, "H W 3"], tuple[int, int]] | No
     """
     if not path.is_file():
         return None
-    with suppress(*ARCHIVE_FAILURES), np.load(path) as arrays:  # a damaged copy is made again
-        width, height = arrays["size"].tolist()
-        return arrays["photograph"], (width, height)
+    with suppress(*ARCHIVE_FAILURES), zipfile.ZipFile(path) as archive:  # damaged: made again
+        with archive.open("size.npy") as file:
+            width, height = read_npy(file).tolist()
+        with archive.open("photograph.npy") as file:  # not by np.load: views are read in threads
+            return read_npy(file), (width, height)
     return None
 
 
