@@ -207,31 +207,38 @@ COMMANDS = [
 NEEDED = {"sfm": "pycolmap", "depth": "transformers", "view": "viser", "flight": "imageio_ffmpeg"}
 
 
-@pytest.fixture
-def refused(room, tmp_path, monkeypatch, splatseed):
-    """Checks that words are refused, where ROOM is a scene and SCAN a cloud."""
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "junk.ply").write_bytes(b"ply\n")
-    write_gaussians(tmp_path / "model.ply", initial_gaussians(load_scene(room).points))
-    (tmp_path / "film.mp4").write_bytes(b"\0" * 999)
-    (tmp_path / "junk.r3d").write_bytes(b"PK\3\4")
-    (tmp_path / "RECORD3D" / "rgb").mkdir(parents=True)
-    (tmp_path / "RECORD3D" / "metadata.json").write_text('{"poses": 9}')
-    (tmp_path / "STRAY").mkdir()
+@pytest.fixture(scope="module")
+def things(room, tmp_path_factory) -> Path:
+    """A folder of what the words name. Not to be written to."""
+    folder = tmp_path_factory.mktemp("things")
+    (folder / "junk.ply").write_bytes(b"ply\n")
+    write_gaussians(folder / "model.ply", initial_gaussians(load_scene(room).points))
+    (folder / "film.mp4").write_bytes(b"\0" * 999)
+    (folder / "junk.r3d").write_bytes(b"PK\3\4")
+    (folder / "RECORD3D" / "rgb").mkdir(parents=True)
+    (folder / "RECORD3D" / "metadata.json").write_text('{"poses": 9}')
+    (folder / "STRAY").mkdir()
     for name in ("odometry.csv", "camera_matrix.csv"):
-        (tmp_path / "STRAY" / name).touch()
-    np.savez(tmp_path / "scan.npz", xyz=np.random.default_rng(0).random((99, 3)))
-    (tmp_path / "TAKEN").mkdir()
-    (tmp_path / "TAKEN" / "mine.txt").write_text("years")
-    (tmp_path / "taken.spz").write_bytes(b"mine")
-    for folder in ("PHONE/bare", "POLYCAM/keyframes/images"):
-        (tmp_path / folder).mkdir(parents=True)
+        (folder / "STRAY" / name).touch()
+    np.savez(folder / "scan.npz", xyz=np.random.default_rng(0).random((99, 3)))
+    (folder / "TAKEN").mkdir()
+    (folder / "TAKEN" / "mine.txt").write_text("years")
+    (folder / "taken.spz").write_bytes(b"mine")
+    for inner in ("PHONE/bare", "POLYCAM/keyframes/images"):
+        (folder / inner).mkdir(parents=True)
     for name in ("PHONE/frame_00000.jpg", "POLYCAM/keyframes/images/1.jpg"):
-        PilImage.new("RGB", (8, 6)).save(tmp_path / name)
+        PilImage.new("RGB", (8, 6)).save(folder / name)
     for name in ("PHONE/frame_00000.json", "PHONE/bare/frame_00000.json"):
-        (tmp_path / name).write_text(json.dumps({"cameraPoseARFrame": [1] * 12}))
-    _run_folder(tmp_path / "RUN")
-    (tmp_path / "RUN" / "point_cloud.ply").unlink()
+        (folder / name).write_text(json.dumps({"cameraPoseARFrame": [1] * 12}))
+    _run_folder(folder / "RUN")
+    (folder / "RUN" / "point_cloud.ply").unlink()
+    return folder
+
+
+@pytest.fixture
+def refused(room, things, tmp_path, monkeypatch, splatseed):
+    """Checks that words are refused, where ROOM is a scene and SCAN a cloud."""
+    monkeypatch.chdir(shutil.copytree(things, tmp_path, dirs_exist_ok=True))
     before = _contents(tmp_path)
 
     def check(*words):
