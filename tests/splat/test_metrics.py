@@ -12,7 +12,10 @@ torch = pytest.importorskip("torch", reason="scoring needs PyTorch")
 from PIL import Image as PillowImage
 from torch import nn
 
+from splatseed.camera import Camera
 from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.photos.view import View
+from splatseed.splat.evaluate import evaluate_views
 from splatseed.splat.lpips import LPIPS_FILE, load_lpips
 from splatseed.splat.metrics import color_corrected, flip_map, psnr
 from splatseed.splat.ssim import l1_and_ssim
@@ -69,6 +72,20 @@ def test_gradient_equals_autograd(rng, compute):
     (3 * expected).backward()
     assert loss.item() == pytest.approx(expected.item(), rel=1e-5)
     torch.testing.assert_close(ours.grad.double(), theirs.grad, rtol=1e-3, atol=1e-8)
+
+
+def test_scores_are_of_clamped_renders(rng):
+    theirs = pytest.importorskip("torchmetrics.functional.image")
+    truth = rng.integers(0, 256, (48, 64, 3), dtype=np.uint8)
+    photo = torch.from_numpy(truth / np.float32(255))
+    noisy = photo + torch.from_numpy(rng.normal(0, 0.1, truth.shape).astype(np.float32))
+    view = View("a.png", truth, Camera(np.eye(3), 64, 48, np.eye(4)))
+    result = evaluate_views(lambda _: noisy, [view])
+    x, y = (image.clamp(0, 1).permute(2, 0, 1)[None] for image in (noisy, photo))
+    expected = theirs.peak_signal_noise_ratio(x, y, data_range=1.0)
+    assert result.psnr == pytest.approx(float(expected), abs=1e-3)
+    expected = theirs.structural_similarity_index_measure(x, y, sigma=1.5, data_range=1.0)
+    assert result.ssim == pytest.approx(float(expected), abs=1e-5)
 
 
 # FLIP ---------------------------------------------------------------------------------------------
