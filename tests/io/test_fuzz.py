@@ -39,7 +39,7 @@ HEADERS = st.sampled_from(
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning:PIL")
 
 fuzz = settings(
-    max_examples=40,
+    max_examples=25,
     deadline=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
@@ -133,7 +133,7 @@ def test_damaged_files_and_random_bytes(name, target, head, drawn, edits, valid)
 
 
 @pytest.mark.parametrize("name", [name for name in READERS if name.endswith(TEXT)])
-@settings(fuzz, max_examples=20)
+@settings(fuzz, max_examples=12)
 @given(words=st.lists(WORDS | st.text(max_size=5), max_size=60))
 def test_random_words(name, target, words, valid):
     whole, drawn = valid[name], " ".join(words).encode("utf-8", errors="replace")

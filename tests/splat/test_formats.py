@@ -147,7 +147,7 @@ def files(tmp_path_factory):
 
 
 @given(st.sampled_from(SUFFIXES), st.data())
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=80, deadline=None)
 def test_damaged_files_raise_one_error_or_are_read(files, tmp_path_factory, suffix, data):
     """Cut short or with bytes changed: our error or a model, nothing else."""
     content = bytearray(files[suffix])
