@@ -36,7 +36,7 @@ repeated patterns; of bonsai's every third photograph wrong poses explain 0.69 t
 _LINK = 0.5
 """The same of the matches between any two parts: of all 292 photographs of bonsai, 0.95 of the
 matches agree with poses that displace 107 photographs, but 0.13 of those that link them to the
-others. Of right poses (desk, dorm, fern, bonsai) the weakest link has 0.78 to 0.997."""
+others. The weakest link of right poses has 0.78 (bonsai) to 0.997, on eight captures."""
 _RELINKED = 3  # parts that are mapped again at most
 _SIMPLE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL")
 
