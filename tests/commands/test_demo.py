@@ -11,6 +11,9 @@ import pycolmap
 import pytest
 from PIL import Image as PilImage
 
+pytest.importorskip("gsplat", reason="training needs PyTorch and gsplat's strategies")
+
+import splatseed.training.run  # noqa: F401  (loaded, its curves are drawn once for all tests)
 from splatseed import synthetic
 from splatseed.commands import demo
 from splatseed.errors import MissingDependencyError
@@ -23,13 +26,12 @@ from splatseed.synthetic import write_capture
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
     monkeypatch.setattr(demo, "RATIO", 2.0)
-    small = partial(synthetic.make_capture, width=160, height=120)
+    small = partial(synthetic.make_capture, width=120, height=90)
     monkeypatch.setattr(synthetic, "make_capture", small)
 
 
 @pytest.mark.slow
 def test_the_demo_leaves_a_scene_scores_pictures_and_runs(tmp_path, splatseed):
-    pytest.importorskip("gsplat", reason="training needs PyTorch and gsplat's strategies")
     out = tmp_path / "demo"
     run = splatseed("demo", "--views", 6, "--train-steps", 12, "-o", out)
     assert run.code == 0, run
@@ -103,7 +105,6 @@ def test_the_compiling_process_starts_with_the_first_compilation_and_ends(monkey
 
 def test_the_compiling_process_runs_a_small_demo(tmp_path):
     """A failure there would go unseen: the demo would compile by itself, and be slow."""
-    pytest.importorskip("gsplat", reason="training needs PyTorch and gsplat's strategies")
     write_capture(synthetic.make_capture(demo.SEED, **demo.SMALL), tmp_path / "scene")
     for part in demo.AHEAD:
         demo._compile(part, demo._load(tmp_path), tmp_path)

@@ -63,10 +63,16 @@ def test_a_network(room, network, tmp_path, splatseed):
     assert "view_000.png" in run.out  # named, as its map is flat
 
 
+@pytest.fixture(scope="module")
+def maps(capture):
+    """True maps of half the size."""
+    return true_maps(capture, 2)
+
+
 @pytest.fixture
-def stereo(capture, monkeypatch):
+def stereo(maps, monkeypatch):
     """Stereo that returns true ``maps``; ``calls`` are its arguments."""
-    known = SimpleNamespace(calls=[], maps=true_maps(capture, 2))
+    known = SimpleNamespace(calls=[], maps=maps)
 
     def stereo_depths(scene, *, max_size=800, progress=None):
         known.calls.append((len(scene.images), max_size))
