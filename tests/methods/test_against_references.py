@@ -36,7 +36,7 @@ CASES = {
     "voronoi": (voronoi, {}),
 }
 
-NUM_NEW = 200
+NUM_NEW = 100
 SEED = 5
 
 

@@ -71,7 +71,7 @@ def test_maps_of_another_unit_or_origin_are_not_used(room, make_maps):
 
 def test_maps_of_another_unit_do_not_guide_stereo(room, make_maps):
     """Begun at wrong depths, stereo would find nothing to contradict them."""
-    few = room.replace(images=room.images[:8])  # which is quicker
+    few = room.replace(images=room.images[:5])  # which is quicker
     bare, notes = few.with_points(PointCloud.empty()), []
     scene = bare.replace(depths=make_maps(lambda z, _: 1000 * z))
     seeds = ss.upsample(scene, note=notes.append)

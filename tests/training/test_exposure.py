@@ -79,7 +79,7 @@ def test_unseen_views_gain_where_exposure_varies_and_lose_little_elsewhere(
         PillowImage.fromarray(np.rint(changed).astype(np.uint8)).save(path)
 
     def corrected(scene, exposure):
-        asked = TrainSettings(max_steps=200, data_factor=2, strategy="none", exposure=exposure)
+        asked = TrainSettings(max_steps=150, data_factor=2, strategy="none", exposure=exposure)
         run = prepare_run(load_scene(scene), tmp_path / f"{scene.name}_{exposure}", asked)
         assert run.train()
         pairs = [(run.trainer.render(v), photograph_tensor(v, CPU)) for v in run.trainer.test_views]
