@@ -30,7 +30,7 @@ confidence 0, 1 and 2 is within 5% of other views' at 75%, 85% and 98% of the pi
 photographs confirm none, 79% of the seeds of confidence 1 are within 5% of a surface, and 70% of
 the guesses that they replace; of confidence 0, 47% are, and 52%."""
 ASPECT_SLACK = 0.02
-"""Largest relative difference of a map's aspect ratio from its image's, by rounding of sizes."""
+"""Largest relative difference of a map's aspect ratio from its image's, beyond a pixel."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +86,9 @@ class DepthMap:
         if self.K is not None:
             return Camera(self.K, self.width, self.height, camera.cam_from_world)
         scale = np.array([self.width / camera.width, self.height / camera.height])
-        if abs(scale[0] / scale[1] - 1) > ASPECT_SLACK:
+        off = abs(self.width * camera.height - self.height * camera.width)
+        rounded = off <= max(camera.width, camera.height)  # by a pixel of the map
+        if not rounded and abs(scale[0] / scale[1] - 1) > ASPECT_SLACK:
             raise SceneFormatError(
                 f"a depth map with the aspect ratio of its image, {camera.width} x {camera.height}",
                 found=f"{self.width} x {self.height}",

@@ -66,6 +66,17 @@ def test_the_first_of_several_candidates_is_taken(tmp_path):
 LEFT_RIGHT, DENSE = ["left/1.npy", "right/1.npy"], ["stereo/depth_maps/a.jpg.geometric.bin"]
 
 
+@pytest.mark.parametrize("size", [(10, 7), (10, 8), (40, 30), (80, 59)])
+def test_a_map_of_another_size_fits_its_image_within_a_pixel(size):
+    (image,) = scene_of("a.png").images
+    width, height = size
+    camera = DepthMap(np.ones((height, width), np.float32)).camera(image.camera)
+    assert camera.K[0] * 40 / width == pytest.approx(image.camera.K[0])
+    assert camera.K[1] * 30 / height == pytest.approx(image.camera.K[1])
+    with pytest.raises(SceneFormatError, match=f"aspect ratio.*found {width} x {height - 2}"):
+        DepthMap(np.ones((height - 2, width), np.float32)).camera(image.camera)
+
+
 @pytest.mark.parametrize(
     ("files", "names", "found"),
     [
