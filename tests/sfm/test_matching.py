@@ -11,7 +11,7 @@ from PIL import Image as PilImage
 
 from splatseed.progress import silent
 from splatseed.sfm import Settings, pipeline
-from splatseed.sfm.cameras import SharedCamera
+from splatseed.sfm.cameras import Photo, SharedCamera
 from splatseed.sfm.colmap import Run, guessed_model, posed_model, require_pycolmap
 from splatseed.sfm.database import run_database
 from splatseed.sfm.matching import _pairs, detect_features, match_pairs, match_photographs
@@ -110,14 +110,11 @@ def test_features_without_doubling_are_fewer_and_coarser(run):
     assert sizes[1] == pytest.approx(2 * sizes[0], rel=0.1)
 
 
-def test_only_large_photographs_are_refined_by_features_that_are_not_doubled(room):
+def test_poses_of_large_photographs_need_no_doubling():
     settings = Settings(seed=3)
-    assert pipeline._refining(settings, room.images) == settings
-    large = [
-        replace(image, intrinsics=replace(image.intrinsics, width=1440, height=1920))
-        for image in room.images
-    ]
+    small, large = ({"a.jpg": Photo(size)} for size in ((1440, 1080), (1200, 1600)))
+    assert pipeline._for_poses(settings, small) == settings
     undoubled = replace(settings, max_image_size=2000, doubled=False)
-    assert pipeline._refining(settings, large) == undoubled
+    assert pipeline._for_poses(settings, large) == undoubled
     chosen = replace(settings, max_image_size=1200)
-    assert pipeline._refining(chosen, large) == chosen
+    assert pipeline._for_poses(chosen, large) == chosen

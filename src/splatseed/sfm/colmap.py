@@ -35,7 +35,11 @@ _POLL_SECONDS = 0.1
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings of feature detection, matching and reconstruction; validated."""
+    """Settings of feature detection, matching and reconstruction; validated.
+
+    By default, photographs of 1,600 px and more are used at up to 2,000 px without doubling where
+    poses are estimated or refined; any other ``max_image_size`` counts as it is.
+    """
 
     matcher: MatcherName = "auto"
     """``auto`` matches pairs that agree at a first look, ``exhaustive`` all pairs, ``sequential``
