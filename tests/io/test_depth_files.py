@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import time
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings, strategies as st
 from hypothesis.extra import numpy as hnp
+from numpy.lib import format as npy_format
 from PIL import Image as PilImage
 
 from splatseed import requirements
@@ -119,3 +123,21 @@ def test_exr(tmp_path, rng, dtype):
         path.write_bytes(path.read_bytes()[:kept])
         with pytest.raises(SceneFormatError, match=r"a\.exr to be a depth map"):
             read_stored(path)
+
+
+def test_array_headers_are_parsed_in_one_thread_at_a_time(tmp_path, monkeypatch):
+    """Two at once fail in CPython before 3.11.8, if rarely (python/cpython#106905)."""
+    np.save(tmp_path / "a.npy", np.ones((3, 4), np.float32))
+    parse, inside, most = npy_format.read_array_header_1_0, [], []
+
+    def parse_slowly(file):
+        inside.append(file)
+        time.sleep(0.005)
+        most.append(len(inside))
+        inside.remove(file)
+        return parse(file)
+
+    monkeypatch.setattr(npy_format, "read_array_header_1_0", parse_slowly)
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(read_stored, [tmp_path / "a.npy"] * 16))
+    assert most == [1] * 16

@@ -119,34 +119,3 @@ print(kept(), keep_freed_memory(), kept())
 """
     run = _run(tmp_path / "keep.py", program)
     assert run.stdout.split() == ["False", "True", "True"], run.stderr
-
-
-PARSED_AT_ONCE = """
-import gc, io, sys, time
-from concurrent.futures import ThreadPoolExecutor
-import numpy as np
-from splatseed.io.files import read_npy
-
-def read(number):
-    return reader(io.BytesIO(data.getvalue()))
-
-data = io.BytesIO()
-np.save(data, np.arange(3))
-reader = {"numpy": np.load, "splatseed": read_npy}[sys.argv[1]]
-gc.callbacks.append(lambda phase, info: time.sleep(0.001))  # another thread runs meanwhile
-gc.set_threshold(11)
-with ThreadPoolExecutor(8) as pool:
-    assert all((array == np.arange(3)).all() for array in pool.map(read, range(200)))
-"""
-
-
-MENDED = pytest.mark.skipif(sys.version_info >= (3, 11, 8), reason="mended in CPython 3.11.8")
-
-
-@pytest.mark.parametrize(
-    ("reader", "fails"), [pytest.param("numpy", True, marks=MENDED), ("splatseed", False)]
-)
-def test_array_headers_are_parsed_in_one_thread_at_a_time(reader, fails):
-    command = [sys.executable, "-c", PARSED_AT_ONCE, reader]
-    run = subprocess.run(command, check=False, capture_output=True, text=True, timeout=60)
-    assert ("recursion depth" in run.stderr, run.returncode) == (fails, int(fails)), run.stderr
