@@ -319,8 +319,8 @@ _LARGE = 1600  # px; longer sides of photographs whose features suffice without 
 def _for_poses(settings: Settings, photos: Photos) -> Settings:
     """Return settings for estimating or refining poses; sizes that the caller chose stay.
 
-    Large photographs are not doubled but used at up to 2,000 px: the poses of 40 of a phone's of
-    1,920 px, refined, and of 97 of 1,800 px are as exact, in a third of the time, by 0.44 of the
+    Large photographs are not doubled but used at up to 2,000 px: the pose error of 40 of a phone's
+    of 1,920 px, refined, and of 97 of 1,800 px is the same, in a third of the time, by 0.44 of the
     features or points.
     """
     chosen = (settings.max_image_size, settings.doubled)
