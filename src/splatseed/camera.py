@@ -220,6 +220,11 @@ class Camera:
         return np.asarray(cam @ world_from_cam[:3, :3].T + world_from_cam[:3, 3])
 
 
+def same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Whether two sizes have one aspect ratio, within a pixel."""
+    return abs(size[0] * other[1] - size[1] * other[0]) <= max(*size, *other)
+
+
 def rotation_from_quat(quat: Float[np.ndarray, " 4"]) -> Float64[np.ndarray, "3 3"]:
     """Return the rotation matrix of a wxyz quaternion of any length."""
     w, x, y, z = np.asarray(quat, np.float64) / np.linalg.norm(quat)

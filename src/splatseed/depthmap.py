@@ -15,7 +15,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
-from splatseed.camera import Camera
+from splatseed.camera import Camera, same_shape
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError, UnknownNameError
 from splatseed.frozen import read_only
 from splatseed.text import did_you_mean
@@ -86,9 +86,8 @@ class DepthMap:
         if self.K is not None:
             return Camera(self.K, self.width, self.height, camera.cam_from_world)
         scale = np.array([self.width / camera.width, self.height / camera.height])
-        off = abs(self.width * camera.height - self.height * camera.width)
-        rounded = off <= max(camera.width, camera.height)  # by a pixel of the map
-        if not rounded and abs(scale[0] / scale[1] - 1) > ASPECT_SLACK:
+        alike = same_shape((self.width, self.height), (camera.width, camera.height))
+        if not alike and abs(scale[0] / scale[1] - 1) > ASPECT_SLACK:
             raise SceneFormatError(
                 f"a depth map with the aspect ratio of its image, {camera.width} x {camera.height}",
                 found=f"{self.width} x {self.height}",

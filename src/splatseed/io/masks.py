@@ -18,7 +18,7 @@ from jaxtyping import Bool
 from numpy.lib.stride_tricks import sliding_window_view
 from PIL import Image as PilImage
 
-from splatseed.camera import Intrinsics
+from splatseed.camera import Intrinsics, same_shape
 from splatseed.errors import SceneFormatError, SceneNotFoundError, SplatseedError
 from splatseed.io.bit_depth import is_16_bit, opaque_value, read_16_bit
 from splatseed.io.depth_maps import Undistortion
@@ -127,7 +127,7 @@ def read_mask(
             picture = open_photograph(path, read_bytes(path))
             marked = _read_counts(picture) != masks.inverted
         size = open_photograph(photograph, photograph_bytes(photograph)).size
-        if not _same_shape(picture.size, size):
+        if not same_shape(picture.size, size):
             raise SceneFormatError(
                 f"the mask {path} to have the size of {name}, {size[0]} x {size[1]}",
                 found=f"{picture.size[0]} x {picture.size[1]}",
@@ -162,11 +162,6 @@ def _read_counts(picture: PilImage.Image) -> Bool[np.ndarray, "H W"]:
     if has_alpha(picture):
         counts &= np.asarray(picture.convert("RGBA").getchannel("A")) > 0
     return np.asarray(counts)
-
-
-def _same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
-    """Whether two sizes have one aspect ratio, within a pixel."""
-    return abs(size[0] * other[1] - size[1] * other[0]) <= max(*size, *other)
 
 
 def _fitted(counts: Bool[np.ndarray, "H W"], size: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
