@@ -99,6 +99,7 @@ COMMANDS = [
     ((*UP, "--method", "magic"), "pip install"),
     ((*UP, "--format", "nerf"), "nerf"),
     ((*UP, "--ratoi", "4"), "--ratio"),
+    ((*UP, "--k", "9"), "--mls.k"),
     ((*MLS, "--mls.k", "2"), "mls.k"),
     ((*MLS, "--mls.frame", "up"), "--mls.frame"),
     ((*MLS, "--linear.k", "2"), "--linear.k"),

@@ -21,12 +21,23 @@ MaskChoice = Annotated[str | None, tyro.conf.arg(metavar="DIR|none|inverted[:DIR
 
 
 def parse_options(
-    kind: type[Options], verb: str, arguments: Sequence[str], default: Options | None = None
+    kind: type[Options],
+    verb: str,
+    arguments: Sequence[str],
+    default: Options | None = None,
+    *,
+    quiet: bool = False,
 ) -> Options:
-    """Parse ``arguments``, which follow the verb; ``default`` holds the values of other options."""
+    """Parse ``arguments``, which follow the verb; ``default`` holds the values of other options.
+
+    Raises:
+        SystemExit: They are wrong, which is printed unless ``quiet``, or ask for help.
+    """
     given: dict[str, Any] = {} if default is None else {"default": default}
-    prog = f"splatseed {verb}"
-    options: Options = tyro.cli(kind, prog=prog, args=list(arguments), config=CONFIG, **given)
+    options: Options = tyro.cli(
+        kind, prog=f"splatseed {verb}", args=list(arguments), config=CONFIG,
+        console_outputs=not quiet, **given,
+    )  # fmt: skip
     return options
 
 

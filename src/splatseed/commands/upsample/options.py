@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from inspect import getdoc
 from pathlib import Path
@@ -116,14 +116,29 @@ def parse(arguments: list[str]) -> tuple[Options, dict[str, Upsampler]]:
     chosen = parse_some(_Choice, arguments)
     if chosen.method is not None:
         METHODS[chosen.method]  # raises for an unknown one, with advice
-    names: Collection[str] = METHODS
+
+    def parsed(names: Iterable[str], *, quiet: bool = False) -> Any:
+        kind = _with_methods({name: configure(name, chosen.profile) for name in names})
+        return parse_options(kind, "upsample", arguments, quiet=quiet)
+
     if {"-h", "--help"} & set(arguments):  # the options of all methods are too many to read
-        names = [] if chosen.method is None else [chosen.method]
-    methods = {name: configure(name, chosen.profile) for name in names}
-    options: Any = parse_options(_with_methods(methods), "upsample", arguments)
+        parsed([] if chosen.method is None else [chosen.method])
+    try:  # the options of all methods would take four times as long
+        options = parsed((name for name in METHODS if _has_options(name, arguments)), quiet=True)
+    except SystemExit as stop:
+        if not stop.code:  # what was asked for is printed
+            raise
+        options = parsed(METHODS)  # what is wrong is told with all methods in view
     if options.cloud_files and chosen.method is None:
         options = replace(options, method=CLOUD)
-    return options, {name: getattr(options, name) for name in METHODS}
+    return options, {
+        name: getattr(options, name, None) or configure(name, chosen.profile) for name in METHODS
+    }
+
+
+def _has_options(method: str, arguments: list[str]) -> bool:
+    start = f"--{method}.".replace("_", "-")  # tyro takes either
+    return any(word.replace("_", "-").startswith((start, "--tyro-")) for word in arguments)
 
 
 def full_options() -> type[Options]:
