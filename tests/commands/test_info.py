@@ -227,6 +227,16 @@ def test_a_scenes_own_maps_are_described_and_can_be_lifted(rgbd, tmp_path, splat
     assert len(load_scene(tmp_path / "out").points) == round(0.25 * 120 * 90)
 
 
+def test_maps_in_another_unit_are_a_problem(rgbd, splatseed):
+    camera = rgbd / "cam_params.json"
+    camera.write_text(camera.read_text().replace('"scale": 5000', '"scale": 1000'))
+    run = splatseed("info", rgbd)
+    assert run.code == 0
+    assert _pairs(run.out)["depth maps"] == "12 of 120 x 90 pixels"
+    assert "the depth maps are in another unit than the poses: their depth is" in run.out
+    assert "--method depth" not in run.out
+
+
 def test_maps_of_low_confidence_do_not_count(rgbd, tmp_path, splatseed):
     """Of a tenth of their pixels depth is used, and an eighth of these give a point."""
     for path in (rgbd / "results").glob("depth*.png"):

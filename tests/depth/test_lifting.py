@@ -170,6 +170,29 @@ def test_a_capture_with_metric_depth_needs_no_option(exact, capture, metric):
     assert len(ss.upsample(first, "depth", see_through=True)) == known // PER_POINT
 
 
+@pytest.mark.parametrize("wrong", ["feet", "millimetres", "kilometres", "axes"])
+def test_metric_maps_that_contradict_each_other_are_refused(exact, metric, wrong):
+    """Without points nothing else would show that their unit or the poses are wrong."""
+    scale = {"feet": 3.28, "millimetres": 1000, "kilometres": 0.001, "axes": 1}[wrong]
+    bare = exact.replace(points=exact.points.select(slice(0)), tracks=None)
+    bare = bare.replace(depths=metric("z", lambda z, _: scale * z))
+    if wrong == "axes":
+        posed = [  # half a turn about x: OpenGL's camera axes
+            dataclasses.replace(
+                image,
+                quat=image.quat[[1, 0, 3, 2]] * [-1, 1, -1, 1],
+                translation=image.translation * [1, -1, -1],
+            )
+            for image in bare.images
+        ]
+        bare = bare.replace(images=tuple(posed))
+    with pytest.raises(SceneFormatError, match=r"agree with each other.*`depth\.min_agreeing=0`"):
+        ss.upsample(bare, "depth", num_points=1500)
+    assert (
+        len(ss.upsample(bare, "depth", num_points=1500, min_agreeing=0, see_through=True)) == 1500
+    )
+
+
 def test_images_with_few_points_keep_metric_depth(exact, capture, metric):
     """Of an image before a bare wall; without a unit, it is left out."""
     few = exact.with_points(exact.points.select(slice(60)))

@@ -13,7 +13,7 @@ from splatseed.depthmap import DepthMap, HeldDepths
 from splatseed.methods import SOURCE_CODES
 from splatseed.photos.view import view_of
 from splatseed.pointcloud import PointCloud
-from splatseed.seeding.map_seeds import depth_at_cells, guides_badly
+from splatseed.seeding.map_seeds import depth_at_cells, unit_mismatch
 
 pytestmark = pytest.mark.usefixtures("compare_once")
 DEPTH, COVER = SOURCE_CODES["depth"], SOURCE_CODES["cover"]
@@ -69,6 +69,19 @@ def test_maps_of_another_unit_or_origin_are_not_used(room, make_maps):
     assert "times that of the photographs" in notes[-1]
 
 
+def test_single_maps_of_another_unit_are_left_out(room, room_capture, make_maps):
+    """As if a part of the capture came from another device; the median map is right."""
+    notes = []
+    maps = make_maps(lambda z, i: (5 if i in {3, 9, 12} else 1) * z)
+    seeds = ss.upsample(room.replace(depths=maps), note=notes.append)
+    off = off_surface(seeds, room_capture, DEPTH)
+    assert len(off) > 200
+    assert off.max() < 2e-3
+    left_out = next(note for note in notes if "left out" in note)
+    assert left_out.startswith("3 of 16 depth maps are left out (view_003.png, view_009.png, ")
+    assert any("it is that of the scene's 13 depth maps" in note for note in notes)
+
+
 def test_maps_of_another_unit_do_not_guide_stereo(room, make_maps):
     """Begun at wrong depths, stereo would find nothing to contradict them."""
     few = room.replace(images=room.images[:5])  # which is quicker
@@ -78,7 +91,7 @@ def test_maps_of_another_unit_do_not_guide_stereo(room, make_maps):
     assert any("do not guide stereo" in note for note in notes)
     assert any("have another unit" in note for note in notes)
     assert DEPTH not in seeds.source
-    assert not guides_badly(bare.replace(depths=make_maps()), bare.images)
+    assert not unit_mismatch(bare.replace(depths=make_maps()), bare.images)
 
 
 def test_uncertain_and_contradicted_depth_gives_no_seed(room, room_capture, make_maps):

@@ -107,9 +107,13 @@ def run(arguments: list[str]) -> None:
         maps = diagnostics.depth_map_statistics(scene, clock)
         beside = len(depths_beside(scene) or ())
         poses, faint = _check_poses(scene, masks.share, clock)
+        mismatch = _unit_mismatch(scene, poses)
+    if maps is not None and mismatch:
+        maps = dataclasses.replace(maps, in_scene_units=False)
     doubt = poses["problem"] if poses else ""
     problems += [*stray_camera_notes(scene), *([masks.problem] if masks.problem else [])]
-    problems += [*_unfit_maps(scene, alignments or {}), *(each for each in (doubt, faint) if each)]
+    problems += _unfit_maps(scene, alignments or {})
+    problems += [each for each in (doubt, faint, mismatch) if each]
     if options.json:
         facts = {
             "points": cloud, "tracks": tracks, "empty": regions, "poses": poses, "masks": masks,
@@ -119,7 +123,8 @@ def run(arguments: list[str]) -> None:
         print(json.dumps(facts, indent=2, allow_nan=False), file=OUT.file)
         return
     usable = scene
-    if alignments and len(scene.points) and all(each.rejected for each in alignments.values()):
+    unfit = bool(alignments) and all(each.rejected for each in (alignments or {}).values())
+    if mismatch or (unfit and len(scene.points)):
         usable = scene.replace(depths=None)  # nothing follows from maps that cannot be used
     planned = Planned.of(usable, options.budget, options.max_steps, options.trainer)
     share = None if regions is None else regions.mean
@@ -242,6 +247,16 @@ def _check_poses(
     problem = with_options(error.warning) if error else ""
     facts = {"agreement": agreement, "error": error, "problem": problem}
     return facts, agreement_warning(agreement, masked)
+
+
+def _unit_mismatch(scene: Scene, poses: Mapping[str, Any] | None) -> str:
+    """Describe depth maps of another unit than the poses, unless the poses cannot be checked."""
+    if not in_scene_units(scene.depths) or poses is None or not poses["agreement"]:
+        return ""
+    from splatseed.seeding.map_seeds import unit_mismatch
+
+    mismatch = unit_mismatch(scene, photographed(scene))
+    return f"the depth maps are in another unit than the poses: {mismatch}" if mismatch else ""
 
 
 def _next(

@@ -41,6 +41,10 @@ POINTS_PER_PIXEL = 0.25
 VIEWS_PER_TASK = 4
 MAX_NAMED = 3
 """Images that a note names."""
+MIN_AGREEMENT = 0.5
+"""Smallest share that is confirmed of the candidates that others confirm or see through, where maps
+are not aligned to points: 0.99 and more on three captures, 0.36 and less with maps in another unit
+or poses with other camera axes."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +76,8 @@ def lift(
 
     Raises:
         SceneNotFoundError: There are no maps or no photographs, or a file is gone.
-        SceneFormatError: A file is damaged or does not fit, or no map can be aligned.
+        SceneFormatError: A file is damaged or does not fit, no map can be aligned, or maps that are
+            not aligned contradict each other.
         PointCloudError: The maps cannot give that many points.
     """
     settings = _settings_without_points(scene, settings)
@@ -85,6 +90,8 @@ def lift(
     views = _read_views(scene, images, visibility, factor * num, settings, rng, progress)
     images, views = _leave_out(images, views, settings, notes)
     candidates = _gather(views, settings, progress)
+    if not settings.align and settings.min_agreeing:  # nothing else checks unit and poses
+        _check_agreement(candidates, len(views))
     while (
         (sound := int(np.count_nonzero(candidates.tier == SOUND))) < num
         and factor < OVERSAMPLING.limit
@@ -250,6 +257,7 @@ class _Candidates(NamedTuple):
     rgb: UInt8[np.ndarray, "C 3"]
     footprint: Float32[np.ndarray, " C"]  # size of a pixel at their depth, scene units
     tier: UInt8[np.ndarray, " C"]
+    confirmed: Bool[np.ndarray, " C"]  # by one other view at least
     view_idx: Int64[np.ndarray, " C"]
 
 
@@ -270,13 +278,14 @@ def _gather(views: Sequence[DepthView], settings: DepthSettings, progress: Progr
         np.concatenate([view.rgb for view in views]),
         np.empty(stop_of[-1], np.float32),
         np.empty(stop_of[-1], np.uint8),
+        np.zeros(stop_of[-1], np.bool_),
         np.repeat(np.arange(len(views)), counts),
     )
 
     def work(first: int, last: int) -> None:
         for i in range(first, last):
             view, own, factor = views[i], copies[i], float(factors[i])
-            xyz, _, footprint, tier, _ = (
+            xyz, _, footprint, tier, confirmed, _ = (
                 column[stop_of[i] - counts[i] : stop_of[i]] for column in candidates
             )
             xyz[:] = lift_pixels(view.pixel, view.z, view.camera, factor)
@@ -288,12 +297,30 @@ def _gather(views: Sequence[DepthView], settings: DepthSettings, progress: Progr
                 others = [copy for j in neighbors[i] if j >= 0 and (copy := copies[j]) is not None]
                 confirming, seen_through = find_support(xyz, own, others, settings)
                 tier[confirming < settings.min_agreeing] = UNCONFIRMED
+                confirmed[:] = confirming > 0
             tier[view.edge] = NEAR_EDGE  # the worst tier counts
             if seen_through is not None and not settings.see_through:
                 tier[seen_through] = SEEN_THROUGH
 
     in_threads(work, len(views), VIEWS_PER_TASK, "compare views", progress)
     return candidates
+
+
+def _check_agreement(candidates: _Candidates, num_views: int) -> None:
+    """Raise ``SceneFormatError`` if the maps of three views or more contradict one another."""
+    confirmed = int(np.count_nonzero(candidates.confirmed))
+    contradicted = np.count_nonzero((candidates.tier == SEEN_THROUGH) & ~candidates.confirmed)
+    shown = confirmed + int(contradicted)
+    if confirmed >= MIN_AGREEMENT * max(shown, 1) or num_views < 3:
+        return
+    which = f"{confirmed / shown:.0%} of the pixels that others show" if shown else "no pixel"
+    raise SceneFormatError(
+        "depth maps that agree with each other at the scene's poses, as they are not aligned to "
+        "points",
+        found=f"maps that confirm the depth of {which}",
+        fix="Check the poses, and whether the maps are in their unit (splatseed info SCENE compares"
+        " the photographs), or pass `depth.min_agreeing=0` to use the maps as they are.",
+    )
 
 
 def _choose(

@@ -30,6 +30,7 @@ from splatseed.progress import Progress, in_threads, silent
 from splatseed.scene import Image, Scene
 from splatseed.seeding.cover import CoverSeeds, GrowableArray, make_seeds
 from splatseed.seeding.poses import compare_samples
+from splatseed.text import agreeing, counted, name_some
 
 CellMap = Float32[np.ndarray, "rows cols"]
 
@@ -78,22 +79,37 @@ def seeds_from_maps(
     return CoverSeeds.concatenate(parts)
 
 
-def unit_problem(stereo: StereoResult, maps: Sequence[CellMap]) -> str:
-    """Explain how maps contradict the depths that photographs confirm in their unit; else empty.
+def in_scene_unit(
+    stereo: StereoResult, names: Sequence[str], maps: Sequence[CellMap]
+) -> tuple[list[CellMap], str]:
+    """Return the maps without those whose depth contradicts the photographs', and a note on these.
 
-    ``maps`` are cell maps of the stereo's views.
+    A map with too few cells that photographs confirm is judged by those of all maps.
+
+    Args:
+        stereo: Stereo of the photographs.
+        names: Names of its views' images.
+        maps: Cell maps of the views. A map that is left out becomes NaN.
     """
-    ratios = np.concatenate([_ratios(stereo, i, known) for i, known in enumerate(maps)])
-    if _same_unit(ratios):
-        return ""
-    return (
-        f"The scene's depth maps are left out: their depth is {np.median(ratios):.3g} times that "
-        "of the photographs, so they have another unit."
-    )
+    ratios = [_ratios(stereo, i, known) for i, known in enumerate(maps)]
+    pooled = np.concatenate(ratios)
+    known = [i for i, each in enumerate(maps) if np.isfinite(each).any()]
+    enough = {i: len(ratios[i]) >= LIMITS.unit_points for i in known}
+    wrong = [i for i in known if not _same_unit(ratios[i] if enough[i] else pooled)]
+    if not wrong:
+        return list(maps), ""
+    kept = [np.full_like(each, np.nan) if i in wrong else each for i, each in enumerate(maps)]
+    factor = f"{np.median(np.concatenate([ratios[i] for i in wrong])):.4g}"
+    if wrong == known:
+        what = "The scene's depth maps are left out: their depth is"
+        return kept, f"{what} {factor} times that of the photographs, so they have another unit."
+    are, which = agreeing(len(wrong), "is", "are"), name_some([names[i] for i in wrong], 3)
+    what = f"{len(wrong)} of {counted(len(known), 'depth map')} {are} left out ({which}): depth is"
+    return kept, f"{what} {factor} times that of the photographs."
 
 
-def guides_badly(scene: Scene, images: Sequence[Image]) -> str:
-    """Explain why a scene's maps cannot guide stereo; empty if they can.
+def unit_mismatch(scene: Scene, images: Sequence[Image]) -> str:
+    """Say how the depth of a scene's maps differs from that of its photographs; empty if it agrees.
 
     A few photographs are compared without them: begun at wrong depths, stereo finds too little to
     contradict them.
@@ -108,10 +124,7 @@ def guides_badly(scene: Scene, images: Sequence[Image]) -> str:
             break
     if _same_unit(ratios):
         return ""
-    return (
-        f"The scene's depth maps do not guide stereo: their depth is {np.median(ratios):.3g} times "
-        "that of the photographs."
-    )
+    return f"their depth is {np.median(ratios):.4g} times that of the photographs"
 
 
 def _same_unit(ratios: Float64[np.ndarray, " M"]) -> bool:

@@ -93,9 +93,10 @@ class Stereo(PhotographMethod):
             return scene, ()
         problem = ""
         if self.depth_maps:
-            from splatseed.seeding.map_seeds import guides_badly
+            from splatseed.seeding.map_seeds import unit_mismatch
 
-            problem = guides_badly(scene, images)
+            if mismatch := unit_mismatch(scene, images):
+                problem = f"The scene's depth maps do not guide stereo: {mismatch}."
         used = self.depth_maps and not problem
         return scene if used else scene.replace(depths=None), (problem,) if problem else ()
 
@@ -210,7 +211,7 @@ class Auto(Stereo):
         self, scene: Scene, stereo: StereoResult | None, known: PointCloud, progress: Progress
     ) -> NewPoints:
         """Make the seeds that the scene's depth maps give where stereo found none."""
-        from splatseed.seeding.map_seeds import cell_maps, seeds_from_maps, unit_problem
+        from splatseed.seeding.map_seeds import cell_maps, in_scene_unit, seeds_from_maps
 
         assert scene.depths is not None  # noqa: S101  (they are in scene units)
         assert stereo is not None  # noqa: S101  (its seeds are to be completed)
@@ -218,14 +219,14 @@ class Auto(Stereo):
         maps = cell_maps(
             stereo.views, images, scene.depths, self.cell, self.min_confidence, progress
         )
-        note = unit_problem(stereo, maps)
-        if note:
-            maps = [np.full_like(each, np.nan) for each in maps]
+        maps, left_out = in_scene_unit(stereo, [image.name for image in images], maps)
         xyz = known.xyz[known.finite]
         seeds = seeds_from_maps(stereo.views, xyz, maps, stereo.sources, self.cell, progress)
-        num = counted(sum(image.name in scene.depths for image in images), "depth map")
-        note = note or f"Where photographs confirm no depth, it is that of the scene's {num}."
-        return _unoriented(seeds, "depth", (note,))
+        notes = [left_out] if left_out else []
+        if num := sum(bool(np.isfinite(each).any()) for each in maps):
+            of = counted(num, "depth map")
+            notes.append(f"Where photographs confirm no depth, it is that of the scene's {of}.")
+        return _unoriented(seeds, "depth", tuple(notes))
 
 
 def stereo_points(seeds: StereoSeeds, notes: tuple[str, ...], stereo: StereoResult) -> NewPoints:
