@@ -87,6 +87,24 @@ def test_a_folder_none_and_inverted_can_be_chosen(scene_path, tmp_path):
             with_masks(scene, choice)
 
 
+def test_masks_that_leave_out_most_pixels_may_be_inverted(scene_path, tmp_path):
+    """Many tools mark by 255 what is to be left out."""
+    note = (
+        "Masks leave out 91% of the pixels of their photographs: if 0 marks the pixels that count"
+    )
+    for i in range(9):
+        paint(tmp_path / f"own/view_{i:03}.png")
+        counted = paint(scene_path / f"masks/view_{i:03}.png", inside=255)
+    assert 1 - counted.mean() == pytest.approx(0.91, abs=0.005)
+    scene = load_scene(scene_path)
+    assert (
+        sum(note in warning for warning in (*scene.warnings, *masks_near(scene_path / "images")[1]))
+        == 2
+    )
+    for choice in ("inverted", "none", str(tmp_path / "own")):
+        assert not any(note in warning for warning in with_masks(scene, choice).warnings)
+
+
 def test_what_cannot_be_a_mask_is_named(scene_path):
     path = scene_path / "masks/view_000.png"
     paint(path, size=(48, 40), box=np.s_[:5, :5])
@@ -175,6 +193,7 @@ def test_undistortion_carries_masks_along(sixteen_views, tmp_path):
     [
         *("masks/{}.PNG", "masks/{}.jpg", "Masks/{}.png", "mask/{}.png.png", "images/masks/{}.png"),
         *("mask/{}.mask.png", "masks/{}_mask.png", "masks/{}.png.mask.png", "masks/VIEW_003.png"),
+        *("masks/{}.tif", "masks/{}.webp"),
         *("images/{}.mask.png", "images/{}_mask.png", "images/{}.png.mask.png"),
     ],
 )
@@ -183,7 +202,7 @@ def test_masks_of_other_tools_are_found_and_written_as_colmaps(scene_path, tmp_p
     scene = load_scene(scene_path)
     assert scene.masks.files.keys() == {"view_003.png"}
     (mask,) = [each for each in masks_of(scene) if each is not None]
-    if not name.endswith(".jpg"):  # which blurs edges
+    if not name.endswith((".jpg", ".webp")):  # which blur edges
         assert np.array_equal(mask, counts)
     assert np.count_nonzero(mask != counts) < 40
     out = write_scene(scene, tmp_path / "out", format="colmap").path

@@ -2,9 +2,9 @@
 
 In a folder of masks, the mask of ``a/b.jpg`` is the first of ``a/b.jpg.png`` (COLMAP), ``a/b.png``
 (nerfstudio), ``a/b.jpg.mask.png`` (RealityScan), ``a/b.mask.png`` (OpenMVS) and ``a/b_mask.png``
-(3DGRUT), each also as JPEG and in any case; else such a file without the subfolder, if the name is
-unique. The last three may also lie beside the photograph. A photograph of the scene is never a
-mask.
+(3DGRUT), each also as JPEG, TIFF, WebP or BMP, and in any case; else such a file without the
+subfolder, if the name is unique. The last three may also lie beside the photograph. A photograph of
+the scene is never a mask.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from splatseed.io.files import files_below
 from splatseed.text import agreeing, counted
 
 FOLDER = "masks"
-SUFFIXES = (".png", ".jpg", ".jpeg")
+SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
 _FOLDERS = ("masks", "mask")
 _MASK_LIKE = ("mask", "segment")
 """Parts of folder names that suggest masks of unknown polarity."""

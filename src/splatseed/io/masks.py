@@ -32,6 +32,12 @@ from splatseed.text import counted
 NONE, INVERTED = "none", "inverted"
 """Values of ``masks`` besides a folder; ``inverted:DIR`` inverts the masks of a folder."""
 _LISTED = "masks of the scene's images, named a.jpg.png or a.png for a.jpg,"
+_LOSSY = ("JPEG", "MPO", "WEBP")
+"""Formats that may store 0 as slightly more."""
+_SAMPLE = 5
+"""Masks that are read with a scene."""
+_MOST = 0.5
+"""Share of masked pixels from which on masks may be inverted ones."""
 
 
 def with_masks(scene: Scene, choice: str | None) -> Scene:
@@ -40,11 +46,15 @@ def with_masks(scene: Scene, choice: str | None) -> Scene:
     Raises:
         SceneNotFoundError: No image has a mask there.
     """
-    if choice is None or choice == NONE:
-        return scene if choice is None else scene.replace(masks=None)
+    if choice is None:
+        return scene
+    own, notes = scene.masks or Masks({}), list[str]()
+    answered = _mostly_masked(own)
+    kept = [warning for warning in scene.warnings if warning not in answered]
+    if choice == NONE:
+        return scene.replace(masks=None, warnings=tuple(kept))
     inverted = choice == INVERTED or choice.startswith(f"{INVERTED}:")
     location = choice.removeprefix(INVERTED).removeprefix(":") if inverted else choice
-    own, notes = scene.masks or Masks({}), list[str]()
     files: Mapping[str, Path] = own.files
     folder = Path(location).absolute() if location else None
     if folder is not None:
@@ -58,7 +68,7 @@ def with_masks(scene: Scene, choice: str | None) -> Scene:
         fix = "Pass a folder of masks, or omit `masks`."
         raise SceneNotFoundError(f"{_LISTED} {where}", found=found, fix=fix)
     masks = replace(own, files=files, inverted=inverted, choice=choice)
-    return scene.replace(masks=masks, warnings=(*scene.warnings, *notes))
+    return scene.replace(masks=masks, warnings=(*kept, *notes, *_mostly_masked(masks)))
 
 
 def mask_choice(scene: Scene) -> str | None:
@@ -67,14 +77,17 @@ def mask_choice(scene: Scene) -> str | None:
 
 
 def with_own_masks(scene: Scene) -> Scene:
-    """Attach the masks found near the photographs of a scene that was just read."""
+    """Attach the masks found near the photographs of a scene that was just read, if it has none."""
     folder = scene.source.image_dir if scene.source else None
-    if scene.source is None or folder is None or scene.masks is not None:
+    masks, notes = scene.masks, list[str]()
+    if scene.source is None or folder is None:
         return scene
-    names = [image.name for image in scene.images]
-    files, notes = find_own_masks(names, folder, scene.source.root)
-    notes += _resized(files, folder)
-    return scene.replace(masks=Masks(files), warnings=(*scene.warnings, *notes))
+    if masks is None:
+        names = [image.name for image in scene.images]
+        files, notes = find_own_masks(names, folder, scene.source.root)
+        notes += _resized(files, folder)
+        masks = Masks(files)
+    return scene.replace(masks=masks, warnings=(*scene.warnings, *notes, *_mostly_masked(masks)))
 
 
 def masks_near(photographs: Path) -> tuple[Masks, list[str]]:
@@ -89,7 +102,22 @@ def masks_near(photographs: Path) -> tuple[Masks, list[str]]:
     if files:
         where = next(iter(files.values())).parent
         notes = [f"{counted(len(files), 'photograph')} with a mask in {where}.", *notes]
-    return Masks(files), notes
+    return Masks(files), [*notes, *_mostly_masked(Masks(files))]
+
+
+def _mostly_masked(masks: Masks) -> list[str]:
+    """Note masks that leave out most pixels, by a sample: many tools mark by 255 what to leave out.
+
+    Masks that the user has called inverted are taken as they are.
+    """
+    files, shares = [*masks.files.values()], list[float]()
+    for path in files[:: -(-len(files) // _SAMPLE) or 1] if not masks.inverted else ():
+        with suppress(SplatseedError), translate_errors(path, "a mask"):  # reported when used
+            shares.append(1.0 - float(_read_counts(open_photograph(path, read_bytes(path))).mean()))
+    if not shares or (share := float(np.mean(shares))) < _MOST:
+        return []
+    what = f"Masks leave out {share:.0%} of the pixels of their photographs"
+    return [f"{what}: if 0 marks the pixels that count, use `masks={INVERTED!r}`."]
 
 
 def _resized(files: Mapping[str, Path], folder: Path) -> list[str]:
@@ -157,7 +185,7 @@ def _read_counts(picture: PilImage.Image) -> Bool[np.ndarray, "H W"]:
     """Return the pixels of a mask that are neither 0 nor transparent."""
     if picture.mode.startswith(("I", "F")):  # Pillow's conversion would clip
         return np.asarray(np.asarray(picture) > 0)
-    threshold = 128 if picture.format == "JPEG" else 1  # JPEG may store 0 as slightly more
+    threshold = 128 if picture.format in _LOSSY else 1
     counts = np.asarray(picture.convert("L")) >= threshold
     if has_alpha(picture):
         counts &= np.asarray(picture.convert("RGBA").getchannel("A")) > 0
