@@ -16,7 +16,7 @@ from PIL import Image as PilImage
 from splatseed.camera import Camera, Intrinsics, rotation_from_quat
 from splatseed.errors import OutputError, SceneFormatError, SplatseedError
 from splatseed.io import load_scene, write_scene
-from splatseed.io.nerfstudio import _same_cameras, read_transforms
+from splatseed.io.nerfstudio import pair_centers, read_transforms
 from splatseed.io.ply import read_ply, write_ply
 from splatseed.pointcloud import PointCloud
 from splatseed.similarity import Similarity
@@ -147,7 +147,9 @@ def test_instant_ngps_recentred_poses_are_fitted(content, scene_dir, model, rng)
 def test_cameras_are_the_same_by_their_paths_or_by_names_that_are_unique(model):
     first, second = (replace(i, name=f"cam{n}/0.jpg") for n, i in enumerate(model.images[:2]))
     for others, same in (([second, first], 2), ([replace(second, name="other/0.jpg")], 0)):
-        pairs = _same_cameras([first, second], others)
+        pairs = pair_centers(
+            *([(im.name, im.camera.center) for im in each] for each in ([first, second], others))
+        )
         assert len(pairs) == same
         assert all(np.array_equal(*pair) for pair in pairs)
 

@@ -98,6 +98,22 @@ def test_the_transform_is_read_from_a_file(kind, room, gaussians, psnr, other, t
     assert result.psnr == pytest.approx(psnr, abs=0.05)
 
 
+def test_cameras_json_of_a_rig_pairs_cameras_by_folder(room, other, tmp_path):
+    """Photographs of several cameras have equal names."""
+    scene = load_scene(room)
+    half = len(scene.images) // 2
+    names = [f"cam{i // half}/{i % half:03}.png" for i in range(2 * half)]
+    images = [
+        replace(image, name=name)
+        for image, name in zip(scene.images[: 2 * half], names, strict=True)
+    ]
+    places = other.points(np.array([image.camera.center for image in images])).tolist()
+    cameras = [{"img_name": n, "position": at} for n, at in zip(names, places, strict=True)]
+    (tmp_path / "cameras.json").write_text(json.dumps(cameras))
+    found = find_transform(str(tmp_path / "cameras.json"), scene.replace(images=tuple(images)))
+    np.testing.assert_allclose(found.matrix, other.matrix, atol=1e-6)
+
+
 def test_nerfstudios_transform_starts_from_colmaps_world(room, tmp_path):
     """Which is not that of a scene that was read from transforms.json."""
     write_scene(load_scene(room), tmp_path / "nerf", format="transforms")

@@ -78,6 +78,9 @@ _LEGACY_TRANSFORM = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]])
 """The transform of nerfstudio versions that do not write ``applied_transform``."""
 _MIN_FITTED = 4
 """Fewest cameras to fit a similarity: it fits any three centres nearly exactly."""
+Center = Float64[np.ndarray, " 3"]
+Named = Sequence[tuple[str, Center]]
+"""Names of images, and the centres of their cameras."""
 _POSE_TOLERANCE = 1e-2  # of the cameras' extent, between transforms.json and its COLMAP model
 
 
@@ -386,7 +389,12 @@ def _transform_of_model(
         candidates = [transforms.applied_transform]
     elif model_dir.parts[-3:-2] != ("colmap",):  # not a folder that nerfstudio made
         candidates.reverse()
-    pairs = _same_cameras(transforms.images, model_images)
+    pairs = pair_centers(
+        *(
+            [(im.name, im.camera.center) for im in each]
+            for each in (transforms.images, model_images)
+        )
+    )
     if not pairs:
         doubt = f"no image of {model_dir} is in {transforms.path.name}: points may be misaligned."
         return candidates[0], [doubt]
@@ -409,20 +417,23 @@ def _transform_of_model(
     )
 
 
-def _same_cameras(
-    images: Sequence[Image], others: Sequence[Image]
-) -> list[tuple[Float64[np.ndarray, " 3"], Float64[np.ndarray, " 3"]]]:
-    """Pair camera centres by image path, else by unique file name."""
-    for path in (lambda n: n.removeprefix("images/"), lambda n: PurePath(n).name):
-        centers: list[dict[str, Any]] = []
-        for each in (images, others):
-            names = Counter(path(image.name) for image in each)
-            found = {path(i.name): i.camera.center for i in each if names[path(i.name)] == 1}
-            centers.append(found)
-        pairs = [(center, centers[1][n]) for n, center in centers[0].items() if n in centers[1]]
-        if pairs:
+def pair_centers(named: Named, others: Named) -> list[tuple[Center, Center]]:
+    """Pair camera centres by image path, else by file name, else by that without suffix.
+
+    Names that are not unique have no pair.
+    """
+    for short in (lambda n: n.removeprefix("images/"), lambda n: PurePath(n).name, _stem):
+        unique: list[dict[str, Center]] = []
+        for each in (named, others):
+            count = Counter(short(name) for name, _ in each)
+            unique.append({short(name): at for name, at in each if count[short(name)] == 1})
+        if pairs := [(at, unique[1][name]) for name, at in unique[0].items() if name in unique[1]]:
             return pairs
     return []
+
+
+def _stem(name: str) -> str:
+    return PurePath(name).stem
 
 
 def read_cloud_transform(path: StrPath, scene: Scene) -> Similarity:

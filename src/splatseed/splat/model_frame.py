@@ -13,7 +13,7 @@ import dataclasses
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,7 +23,7 @@ from scipy.spatial import KDTree
 from splatseed.camera import quat_from_rotation
 from splatseed.errors import ParameterError, SceneFormatError
 from splatseed.io.files import read_json
-from splatseed.io.nerfstudio import NERFSTUDIO, similarity_in
+from splatseed.io.nerfstudio import NERFSTUDIO, pair_centers, similarity_in
 from splatseed.io.origin import find_shift, format_offset, offset_beside
 from splatseed.photos.view import View
 from splatseed.scene import Scene
@@ -245,11 +245,14 @@ def _candidates(path: Path | None, scene: Scene) -> dict[str, Similarity | None]
 
 
 def _from_cameras_json(path: Path, cameras: list[Any], scene: Scene) -> Similarity:
-    """Fit the similarity from the scene's cameras to those of graphdeco's ``cameras.json``."""
-    known = {PurePosixPath(image.name).stem: image.camera.center for image in scene.images}
+    """Fit the similarity from the scene's cameras to those of graphdeco's ``cameras.json``.
+
+    Its names are those of the images, in older versions without folder and suffix.
+    """
+    known = [(image.name, image.camera.center) for image in scene.images]
     try:
-        placed = [(PurePosixPath(str(c["img_name"])).stem, c["position"]) for c in cameras]
-        pairs = [(known[name], np.array(at, np.float64)) for name, at in placed if name in known]
+        placed = [(str(c["img_name"]), np.array(c["position"], np.float64)) for c in cameras]
+        pairs = pair_centers(known, placed)
         source, target = (np.reshape(each, (-1, 3)) for each in zip(*pairs, strict=True))
     except (KeyError, TypeError, ValueError):
         source = target = np.empty((0, 3))
