@@ -245,6 +245,27 @@ def test_spectacular_ais_folder(tmp_path):
     assert scene.depths.read("frame_00002.jpg").values == pytest.approx(2.5)
 
 
+def test_relocated_masks_and_maps_are_of_one_frame(tmp_path):
+    """Of a rig's cameras, files of one name were once in several folders."""
+    root, kinds = tmp_path / "scene", (("mask_path", "masks"), ("depth_file_path", "depth"))
+    names = []
+    for camera in ("left", "right"):
+        fields = {key: f"D:\\rig\\{camera}\\{folder}\\0.png" for key, folder in kinds}
+        names.append({"file_path": f"{camera}/0.png", **fields})
+        shoot(root, names[-1]["file_path"])
+    shoot(root, "masks/0.png", "depth/0.png", mode="L")
+    scene = load(write(root, names))
+    assert not scene.masks.files
+    assert scene.depths is None
+    for what in ("2 masks", "2 depth maps"):
+        assert f"{what} named in transforms.json cannot be found" in " ".join(scene.warnings)
+    out = write_scene(scene, tmp_path / "out", format="transforms", require_points=False).path
+    named = json.loads((out / "transforms.json").read_text())["frames"]
+    assert [each["mask_path"] for each in named] == [each["mask_path"] for each in names]
+    shared = [{**each, "mask_path": "D:\\rig\\masks\\0.png"} for each in names]
+    assert len(load(write(root, shared)).masks.files) == 2  # one mask for all, such as a bonnet's
+
+
 def test_masks_that_are_named_are_found_or_told(tmp_path):
     root = tmp_path / "scene"
     shoot(root, "images/0.png", "images/1.png")

@@ -11,7 +11,7 @@ import math
 import os
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
@@ -49,19 +49,19 @@ class FrameFiles:
     path: Path
     _names: dict[Path, dict[str, list[str]]] = field(default_factory=dict)
 
-    def photograph(self, name: str) -> Found | None:
-        """Find the photograph of a frame; None if missing."""
+    def photographs(self, names: Iterable[str]) -> dict[str, Found]:
+        """Find the photographs that frames name, without those that are missing."""
         undistorted = "undistorted" in self.path.name
         folders = _SCANNETPP[::-1] if undistorted else _SCANNETPP
-        return self._find(name, (*_PHOTOGRAPHS, *folders), SUFFIXES)
+        return self._find_all(names, (*_PHOTOGRAPHS, *folders), SUFFIXES)
 
-    def mask(self, name: str) -> Found | None:
-        """Find the mask of a frame; None if missing."""
-        return self._find(name, _MASKS, (".png",))
+    def masks(self, names: Iterable[str]) -> dict[str, Found]:
+        """Find the masks that frames name, without those that are missing."""
+        return self._find_all(names, _MASKS, (".png",))
 
-    def depth_map(self, name: str) -> Found | None:
-        """Find the depth map of a frame; None if missing."""
-        return self._find(name, ("depth", "depths"), ())
+    def depth_maps(self, names: Iterable[str]) -> dict[str, Found]:
+        """Find the depth maps that frames name, without those that are missing."""
+        return self._find_all(names, ("depth", "depths"), ())
 
     def expected(self, name: str, folder: Path | None) -> Path:
         """Return where a missing photograph should be; ``folder`` contains the others."""
@@ -69,6 +69,15 @@ class FrameFiles:
         if folder is not None and _DRIVE.match(plain):
             return folder / PurePosixPath(plain).name
         return _absolute(self.path.parent / plain)
+
+    def _find_all(
+        self, names: Iterable[str], folders: Sequence[str], suffixes: Sequence[str]
+    ) -> dict[str, Found]:
+        """Find files; a relocated one must not be that of another name."""
+        each = {name: self._find(name, folders, suffixes) for name in dict.fromkeys(names)}
+        found = {name: file for name, file in each.items() if file is not None}
+        count = Counter(file.path for file in found.values())
+        return {n: file for n, file in found.items() if not file.relocated or count[file.path] == 1}
 
     def _find(self, name: str, folders: Sequence[str], suffixes: Sequence[str]) -> Found | None:
         root = self.path.parent
@@ -187,15 +196,9 @@ def _listed(path: Path, meta: Any) -> list[_Listed]:
         name = fields.get("file_path")
         if not isinstance(name, str) or not name or "\0" in name:
             raise SceneFormatError(f"a file_path in {path}, {where}", found=repr(name), fix=FIX)
-        listed.append(_Listed(where, name, fields, is_test, files.photograph(name)))
-    # A relocated file must not be the photograph of another frame.
-    names = Counter(each.found.path for each in {e.name: e for e in listed}.values() if each.found)
-    return [
-        each._replace(found=None)
-        if each.found and each.found.relocated and names[each.found.path] > 1
-        else each
-        for each in listed
-    ]
+        listed.append(_Listed(where, name, fields, is_test, None))
+    photographs = files.photographs(each.name for each in listed)
+    return [each._replace(found=photographs.get(each.name)) for each in listed]
 
 
 def _moved(path: Path, listed: Sequence[_Listed]) -> list[str]:
@@ -212,10 +215,11 @@ def named_masks(
     files: FrameFiles, frames: Mapping[str, Mapping[str, Any]]
 ) -> tuple[dict[str, Path], list[str]]:
     """Find the masks that frames name, by image, and warn of missing ones."""
-    named = {name: frame.get("mask_path") for name, frame in frames.items()}
-    found = {name: files.mask(mask) for name, mask in named.items() if isinstance(mask, str)}
-    missing = [str(named[name]) for name, each in found.items() if each is None]
-    masks = {name: each.path for name, each in found.items() if each}
+    given = {name: frame.get("mask_path") for name, frame in frames.items()}
+    named = {name: mask for name, mask in given.items() if isinstance(mask, str)}
+    found = files.masks(named.values())
+    missing = [mask for mask in named.values() if mask not in found]
+    masks = {name: found[mask].path for name, mask in named.items() if mask in found}
     if not missing:
         return masks, []
     what = f"{counted(len(missing), 'mask')} named in {files.path.name} cannot be found"
@@ -233,15 +237,13 @@ def named_depths(
     """
     paths, key_used, missing = dict[str, Path](), "", dict[str, str]()
     for key in ("depth_file_path", "depth_path"):
-        for name, frame in frames.items():
-            depth = frame.get(key)
-            if not isinstance(depth, str) or not depth or name in paths:
-                continue
-            found = files.depth_map(depth)
-            if found is None:
-                missing[name] = depth
-            elif found.path.suffix.lower() in DEPTH_SUFFIXES:
-                paths[name], key_used = found.path, key_used or key
+        given = {name: frame.get(key) for name, frame in frames.items() if name not in paths}
+        named = {name: depth for name, depth in given.items() if isinstance(depth, str) and depth}
+        found = files.depth_maps(named.values())
+        missing |= {name: depth for name, depth in named.items() if depth not in found}
+        for name, depth in named.items():
+            if depth in found and found[depth].path.suffix.lower() in DEPTH_SUFFIXES:
+                paths[name], key_used = found[depth].path, key_used or key
     notes = []
     if lost := [depth for name, depth in missing.items() if name not in paths]:
         what = f"{counted(len(lost), 'depth map')} named in {files.path.name} cannot be found"

@@ -16,7 +16,7 @@ from splatseed.camera import CAMERA_MODELS, Intrinsics
 from splatseed.errors import OutputError
 from splatseed.io import nerfstudio
 from splatseed.io.colmap_layout import Written, without_zero_distortion, write_colmap_layout
-from splatseed.io.frame_files import FrameFiles
+from splatseed.io.frame_files import Found, FrameFiles
 from splatseed.io.image_folders import (
     copy_files,
     first_folders,
@@ -183,17 +183,18 @@ def _kept_json(transforms: nerfstudio.Transforms, names: Collection[str]) -> dic
     """Return a file's content for another folder, with the named images only."""
     root, content = transforms.path.parent, transforms.json
     files = FrameFiles(transforms.path)
-    finders = dict(
-        zip(_PATH_KEYS, (files.photograph, files.mask, *[files.depth_map] * 2), strict=True)
-    )
+    finders = (files.photographs, files.masks, files.depth_maps, files.depth_maps)
+    found = {
+        key: find(_named(transforms, key)) for key, find in zip(_PATH_KEYS, finders, strict=True)
+    }
 
-    def portable(path: Any, key: str = "file_path") -> Any:
+    def portable(path: Any, there: Mapping[str, Found]) -> Any:
         """Return a path to the same file from another folder of this computer."""
         if not isinstance(path, str):
             return path
-        found, plain = finders[key](path), Path(os.path.abspath(root / path))  # noqa: PTH100
-        if found and found.path != plain:  # without its suffix, say, which nerfstudio needs
-            path = Path(os.path.relpath(found.path, root)).as_posix()
+        file, plain = there.get(path), Path(os.path.abspath(root / path))  # noqa: PTH100
+        if file and file.path != plain:  # without its suffix, say, which nerfstudio needs
+            path = Path(os.path.relpath(file.path, root)).as_posix()
         if os.path.normpath(path).startswith(".."):
             return os.path.abspath(root / path)  # noqa: PTH100  (resolve would follow links)
         return path
@@ -203,7 +204,7 @@ def _kept_json(transforms: nerfstudio.Transforms, names: Collection[str]) -> dic
     for frame, image in zip(transforms.frames, transforms.images, strict=True):
         if image.name in names:
             fields = frame.fields
-            moved = {key: portable(fields[key], key) for key in _PATH_KEYS if key in fields}
+            moved = {key: portable(fields[key], found[key]) for key in _PATH_KEYS if key in fields}
             missing = _missing_fields({**content, **fields}, image.intrinsics)
             frames[frame.is_test].append({**fields, **moved, **missing})
             used.add(os.path.normpath(str(fields["file_path"])))
@@ -213,12 +214,19 @@ def _kept_json(transforms: nerfstudio.Transforms, names: Collection[str]) -> dic
     for key in (key for key in _LIST_KEYS if isinstance(content.get(key), list)):
         listed = [name for name in content[key] if isinstance(name, str)]
         # Nerfstudio fails over names that no frame has.
-        lists[key] = [portable(name) for name in listed if os.path.normpath(name) not in gone]
+        kept_names = [name for name in listed if os.path.normpath(name) not in gone]
+        lists[key] = [portable(name, files.photographs([name])) for name in kept_names]
     kept = {key: value for key, value in content.items() if key != "test_frames"}
     tests = {"test_frames": frames[True]} if frames[True] else {}
     if "camera_model" not in kept:
         kept["camera_model"] = "OPENCV_FISHEYE" if content.get("is_fisheye") is True else "OPENCV"
     return {**kept, **lists, "frames": frames[False], **tests}
+
+
+def _named(transforms: nerfstudio.Transforms, key: str) -> list[str]:
+    """List the files that the frames name under a key."""
+    names = (frame.fields.get(key) for frame in transforms.frames)
+    return [name for name in names if isinstance(name, str)]
 
 
 def _missing_fields(fields: Mapping[str, Any], camera: Intrinsics) -> dict[str, float]:
