@@ -193,9 +193,10 @@ def compared_arms(study: Study) -> tuple[ComparedArm, ...]:
         pairs[f"{name}_gain"] = pairs[name] - pairs[f"{name}_base"]
     groups = pairs.groupby(["strategy", "seeds"], sort=False)
     by_arm = {ArmKey(strategy, label): part for (strategy, label), part in groups}
+    mean_gain = _MeanGains(study, pairs, base)
     gained = {}
     for name in (*SCORES, *_TIMED):
-        known = {arm: _mean_gain(study, pairs, arm, name) for arm in by_arm}
+        known = {arm: mean_gain(arm, part, name) for arm, part in by_arm.items()}
         gained[name] = {base: known.pop(base)}  # with itself: not in a family
         for strategy in study.strategies:
             family = {arm: gain for arm, gain in known.items() if arm.strategy == strategy}
@@ -230,28 +231,43 @@ def _timed(base: RunResult, own: RunResult, spec: RunSpec) -> tuple[float, float
     return lead, math.log(steps / max_steps), math.log(seconds / base.seconds)
 
 
-def _mean_gain(study: Study, pairs: pd.DataFrame, arm: ArmKey, name: str) -> Difference | None:
-    """Average a gain over scenes, or over the repeats of a single scene; None if one is unknown.
+class _MeanGains:
+    """Average gains over scenes, or over the repeats of a single scene.
 
     The noise of a single scene is pooled over all arms of the two strategies, as in ``gains``. That
     of relative times is the arm's own, as the baseline has none.
     """
-    base, column = baseline_of(study), f"{name}_gain"
-    part = pairs[(pairs["strategy"] == arm.strategy) & (pairs["seeds"] == arm.seeds)]
-    if part[column].isna().any():
-        return None
-    means = part.groupby("scene")[column].mean()
-    if len(means) > 1:
-        return statistics.over_scenes(means)
-    if name in {"steps", "seconds"} or arm == base:
-        return statistics.over_scenes(part[column], "repeat")
-    runs, value = (study.runs, name) if name in SCORES else (pairs, column)
-    strategies = {key.strategy for key in (arm, base) if key}
-    near = runs["strategy"].isin(strategies) & (runs["scene"] == means.index[0])
-    scores = runs[near].pivot_table(index=["strategy", "seeds"], columns="repeat", values=value)
-    labels = [base, *(each for each in scores.index if each != base)]
-    differences = statistics.paired_differences(scores.loc[labels].to_numpy())
-    return differences[labels.index(arm) - 1]
+
+    def __init__(self, study: Study, pairs: pd.DataFrame, base: ArmKey) -> None:
+        self._study, self._pairs, self._base = study, pairs, base
+        self._on_scene: dict[tuple[str, str, str], dict[ArmKey, Difference | None]] = {}
+
+    def __call__(self, arm: ArmKey, part: pd.DataFrame, name: str) -> Difference | None:
+        """Average one over the pairs of an arm; None if one of them is unknown."""
+        column = part[f"{name}_gain"]
+        if column.isna().any():
+            return None
+        means = column.groupby(part["scene"]).mean()
+        if len(means) > 1:
+            return statistics.over_scenes(means)
+        if name in {"steps", "seconds"} or arm == self._base:
+            return statistics.over_scenes(column, "repeat")
+        place = arm.strategy, str(means.index[0]), name
+        if place not in self._on_scene:
+            self._on_scene[place] = self._differences(*place)
+        return self._on_scene[place][arm]
+
+    def _differences(
+        self, strategy: StrategyName, scene: str, name: str
+    ) -> dict[ArmKey, Difference | None]:
+        """Compare the arms of a strategy with the baseline on one scene."""
+        scored = name in SCORES
+        runs, value = (self._study.runs, name) if scored else (self._pairs, f"{name}_gain")
+        near = runs["strategy"].isin({strategy, self._base.strategy}) & (runs["scene"] == scene)
+        scores = runs[near].pivot_table(index=["strategy", "seeds"], columns="repeat", values=value)
+        others = [ArmKey(*each) for each in scores.index if each != self._base]
+        differences = statistics.paired_differences(scores.loc[[self._base, *others]].to_numpy())
+        return dict(zip(others, differences, strict=True))
 
 
 Place = tuple[StrategyName, str, str]

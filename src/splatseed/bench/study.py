@@ -63,9 +63,13 @@ class Study:
         arm = self.variants[label]
         return replace(arm, ratio=0.0).label + label.removeprefix(arm.label)
 
+    @cached_property
+    def _by_strategy(self) -> dict[str, pd.DataFrame]:
+        return dict(tuple(self.runs.groupby("strategy")))
+
     def under(self, strategy: StrategyName) -> pd.DataFrame:
         """Select the runs of a strategy."""
-        return self.runs[self.runs["strategy"] == strategy]
+        return self._by_strategy.get(strategy, self.runs[:0])
 
     def seeded_under(self, strategy: StrategyName) -> tuple[str, ...]:
         """The labels of a strategy's variants, without the baseline."""
@@ -85,9 +89,8 @@ class Study:
     def scores(self, strategy: StrategyName, scene: str) -> pd.DataFrame:
         """PSNR of a scene, a row per variant, the baseline first, and a column per repeat."""
         part = self.under(strategy)
-        scores = part[part["scene"] == scene].pivot_table(
-            index="seeds", columns="repeat", values="psnr"
-        )
+        part = part[part["scene"] == scene]  # without duplicates, which pivot_table would average
+        scores = part.pivot(index="seeds", columns="repeat", values="psnr")  # noqa: PD010
         return scores.reindex([SFM, *self.seeded_under(strategy)])
 
     @property
