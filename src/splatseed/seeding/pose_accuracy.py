@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float64
-from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter, sobel
+from scipy.ndimage import gaussian_filter, maximum_filter, sobel
 
 from splatseed.depth.stereo.maps import StereoSettings
 from splatseed.photos.loading import load_views
@@ -23,7 +23,7 @@ from splatseed.photos.sources import choose_by_pose
 from splatseed.photos.view import View
 from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
-from splatseed.seeding._kernels.correlation import correlate_patch
+from splatseed.seeding._kernels.correlation import correlate_patch, interpolate
 
 Gray = Float64[np.ndarray, "H W"]
 Pixel = Float64[np.ndarray, " 2"]
@@ -182,12 +182,8 @@ def _rotated(image: Gray, homography: Float64[np.ndarray, "3 3"], view: View, ma
     rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ homography.T
     with np.errstate(divide="ignore", invalid="ignore"):
         x, y = rays[..., 0] / rays[..., 2], rays[..., 1] / rays[..., 2]
-    return _bilinear(image, *np.where(rays[..., 2] <= 0, -1.0, [x - 0.5, y - 0.5]))
-
-
-def _bilinear(image: Gray, x: np.ndarray, y: np.ndarray) -> Gray:
-    """Interpolate, with the centre of the first pixel at 0; NaN outside."""
-    return np.asarray(map_coordinates(image, [y, x], order=1, cval=np.nan))
+    turned: Gray = interpolate(image, *np.where(rays[..., 2] <= 0, -1.0, [x - 0.5, y - 0.5]))
+    return turned
 
 
 def _corners(image: Gray, mask: Bool[np.ndarray, "H W"] | None) -> Float64[np.ndarray, "N 2"]:
@@ -237,4 +233,5 @@ def _sample(image: Gray, p: Pixel, along: Pixel, length: tuple[int, int], width:
     a = np.arange(length[0], length[1] + 1)[:, None]
     b = np.arange(-width, width + 1)[None]
     x = p[0] - 0.5 + a * along[0] - b * along[1]
-    return _bilinear(image, x, p[1] - 0.5 + a * along[1] + b * along[0])
+    band: Gray = interpolate(image, x, p[1] - 0.5 + a * along[1] + b * along[0])
+    return band

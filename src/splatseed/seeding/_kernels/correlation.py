@@ -1,8 +1,29 @@
-"""Numba kernel of a patch's normalised correlation with each place of a band."""
+"""Numba kernels: bands of a photograph, and a patch's normalised correlation with their places."""
 
 import numpy as np
 
 from splatseed.runtime.jit import inline
+
+
+@inline
+def interpolate(
+    image: np.ndarray,  # float64 [H, W]
+    x: np.ndarray,  # float64 [A, B], columns, with the centre of the first pixel at 0
+    y: np.ndarray,  # float64 [A, B], rows
+) -> np.ndarray:  # float64 [A, B]
+    """Interpolate an image bilinearly; NaN outside of the centres of its outermost pixels."""
+    result = np.full(x.shape, np.nan)
+    height, width = image.shape
+    for i in range(x.shape[0]):
+        for j in range(x.shape[1]):
+            u, v = x[i, j], y[i, j]
+            if 0.0 <= u <= width - 1 and 0.0 <= v <= height - 1:
+                column, row = min(int(u), width - 2), min(int(v), height - 2)
+                s, t = u - column, v - row
+                upper = (1.0 - s) * image[row, column] + s * image[row, column + 1]
+                lower = (1.0 - s) * image[row + 1, column] + s * image[row + 1, column + 1]
+                result[i, j] = (1.0 - t) * upper + t * lower
+    return result
 
 
 @inline
