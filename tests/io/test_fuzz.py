@@ -20,7 +20,7 @@ from splatseed.errors import SceneFormatError, SplatseedError
 from splatseed.io.depth_files import read_stored
 from splatseed.io.ply import write_ply
 
-from .checks import EDITS, READERS, apply_edits, assert_only_our_errors, drain, rewrite
+from .checks import CHARACTERS, EDITS, READERS, apply_edits, assert_only_our_errors, drain, rewrite
 from .conftest import CLOUDS, Model, written
 
 TEXT = (".txt", ".csv", "ascii.ply")
@@ -134,7 +134,7 @@ def test_damaged_files_and_random_bytes(name, target, head, drawn, edits, valid)
 
 @pytest.mark.parametrize("name", [name for name in READERS if name.endswith(TEXT)])
 @settings(fuzz, max_examples=12)
-@given(words=st.lists(WORDS | st.text(max_size=5), max_size=60))
+@given(words=st.lists(WORDS | st.text(CHARACTERS, max_size=5), max_size=60))
 def test_random_words(name, target, words, valid):
     whole, drawn = valid[name], " ".join(words).encode("utf-8", errors="replace")
     start = whole.find(b"end_header\n") + 11

@@ -67,9 +67,9 @@ def test_notes_beside_a_scene_are_not_read_without_end(kind, odd, scene_dir):
 
 
 def test_a_file_larger_than_the_memory_is_not_read(tmp_path, monkeypatch):
-    (tmp_path / "file").write_bytes(b"12345")
-    assert read_file(tmp_path / "file") == b"12345"
-    monkeypatch.setattr(files, "free_memory", lambda: 4)
+    (tmp_path / "file").write_bytes(bytes(2 << 20))
+    assert read_file(tmp_path / "file") == bytes(2 << 20)
+    monkeypatch.setattr(files, "free_memory", lambda: (2 << 20) - 1)
     with pytest.raises(SceneFormatError, match=r"more than the .* of free memory"):
         photograph_bytes(tmp_path / "file")
 

@@ -166,16 +166,16 @@ def test_depth_is_lifted_where_pixels_count(scene_path):
 
 
 @pytest.mark.usefixtures("pycolmap_here")
-def test_undistortion_carries_masks_along(sixteen_views, tmp_path):
+def test_undistortion_carries_masks_along(room_of, tmp_path):
     """By our own and by pycolmap's, the box covers the same part of the photographs."""
     pytest.importorskip("pycolmap", reason="pycolmap undistorts")
     from splatseed.sfm import undistort
 
-    path = write_capture(bend(sixteen_views[0]), tmp_path / "bent")
+    path = write_capture(bend(room_of(9, 96, 72).capture), tmp_path / "bent")
     photograph = np.asarray(PilImage.open(path / "images/view_000.png")).copy()
     photograph[BOX] = (255, 0, 255)
     PilImage.fromarray(photograph).save(path / "images/view_000.png")
-    paint(path / "masks/view_000.png", size=(160, 120))
+    paint(path / "masks/view_000.png")
     scene = load_scene(path)
     undistort(scene, tmp_path / "flat")
     flat = load_scene(tmp_path / "flat")

@@ -21,6 +21,8 @@ from splatseed.io.ply import read_ply, write_ply
 from splatseed.pointcloud import PointCloud
 from splatseed.similarity import Similarity
 
+from .checks import CHARACTERS
+
 FIELDS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 APPLIED = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]])
@@ -210,8 +212,10 @@ def test_lens_models(content, tmp_path, lens, name, terms):
 
 
 ANY_JSON = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
-    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=3), inner),
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(CHARACTERS, max_size=5),
+    lambda inner: (
+        st.lists(inner, max_size=4) | st.dictionaries(st.text(CHARACTERS, max_size=3), inner)
+    ),
     max_leaves=6,
 )
 

@@ -54,6 +54,8 @@ _OPEN_FLAGS = (
     getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
 )
 _COUNT = struct.Struct("<Q")
+_SMALL_FILE = 1 << 20
+"""Bytes that always fit: to look up the free memory takes longer than to read them."""
 _PARSER = threading.Lock()
 """NumPy parses headers as Python, which two threads at once fail at (python/cpython#106905)."""
 
@@ -115,7 +117,7 @@ def read_file(path: Path) -> bytes:
 
 def check_fits_memory(path: Path, size: int) -> None:
     """Raise ``OSError`` if a file of ``size`` bytes does not fit in free memory."""
-    free = free_memory()
+    free = None if size <= _SMALL_FILE else free_memory()
     if free is not None and size > free:
         reason = f"{size / 1e9:,.1f} GB, more than the {free / 1e9:,.1f} GB of free memory"
         raise OSError(errno.EFBIG, reason, str(path))
