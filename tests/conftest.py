@@ -191,8 +191,8 @@ def room(room_path) -> Scene:
 
 @pytest.fixture(scope="session")
 def larger_room_path(room_of) -> Path:
-    """The room in 12 views of 120 x 90, with about 460 points. Not to be written to."""
-    return room_of(12, 120, 90).path
+    """The room in 12 views of 96 x 72, with more points. Not to be written to."""
+    return room_of(12, 96, 72).path
 
 
 @pytest.fixture(scope="session")

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from scipy import stats
+import scipy
 
 from splatseed.bench.statistics import (
     Difference,
@@ -33,9 +33,9 @@ def plant(rng, *, scenes, arms, repeats, gain=0.0, noise=0.06, spread=0.0):
 def test_two_arms_are_scipys_paired_t_test(rng):
     values = plant(rng, scenes=1, arms=2, repeats=5)[0]
     ours = paired_differences(values)[0]
-    expected = stats.ttest_rel(values[1], values[0])
+    expected = scipy.stats.ttest_rel(values[1], values[0])
     assert ours.p == pytest.approx(expected.pvalue, rel=1e-9)
-    assert ours.se == pytest.approx(stats.sem(values[1] - values[0]))
+    assert ours.se == pytest.approx(scipy.stats.sem(values[1] - values[0]))
     assert ours.df == 4
     assert ours.interval() == pytest.approx(tuple(expected.confidence_interval(0.95)))
 
@@ -76,7 +76,7 @@ def test_runs_without_any_noise():
 
 def test_over_scenes_is_scipys_one_sample_t_test(rng):
     means = rng.standard_normal(7)
-    ours, expected = over_scenes(means), stats.ttest_1samp(means, 0.0)
+    ours, expected = over_scenes(means), scipy.stats.ttest_1samp(means, 0.0)
     assert ours.p == pytest.approx(expected.pvalue)
     assert ours.df == 6
     assert math.isnan(over_scenes([0.3]).p)
@@ -151,7 +151,7 @@ def test_gains_that_only_vary_by_scene_are_not_claimed_for_scenes_like_these(rng
     planted = {"scenes": 5, "arms": 2, "repeats": 4, "noise": 0.05, "spread": 0.3}
     assert rates(rng, any, **planted)[2] < 0.09
     runs = [
-        stats.ttest_1samp(np.diff(plant(rng, **planted), axis=1).ravel(), 0).pvalue < 0.05
+        scipy.stats.ttest_1samp(np.diff(plant(rng, **planted), axis=1).ravel(), 0).pvalue < 0.05
         for _ in range(SIMULATIONS)
     ]
     assert np.mean(runs) > 0.25

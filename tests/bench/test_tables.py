@@ -9,7 +9,7 @@ import re
 
 import numpy as np
 import pytest
-from scipy import stats
+import scipy
 
 pytest.importorskip("pandas", reason="tables need pandas")
 
@@ -278,7 +278,7 @@ def test_one_arm_is_welchs_test():
     a = runs(scenes=FOX, gains={(SFM, 1): 0.0}, repeats=4)
     b = runs(scenes=FOX, gains={(SFM, 1): 0.1}, repeats=6, seed=1, noise=0.2)
     scores = [[run.result.psnr for run in each] for each in (a, b)]
-    expected = stats.ttest_ind(scores[1], scores[0], equal_var=False)
+    expected = scipy.stats.ttest_ind(scores[1], scores[0], equal_var=False)
     difference = compare(a, b).changes["none", "sfm", "fox"]
     assert difference.p == pytest.approx(expected.pvalue)
     assert difference.df == pytest.approx(expected.df)

@@ -26,7 +26,7 @@ from splatseed.synthetic import write_capture
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
     monkeypatch.setattr(demo, "RATIO", 2.0)
-    small = partial(synthetic.make_capture, width=120, height=90)
+    small = partial(synthetic.make_capture, width=96, height=72)
     monkeypatch.setattr(synthetic, "make_capture", small)
 
 

@@ -22,7 +22,7 @@ from ..stereo_maps import true_maps
 @pytest.fixture(scope="module")
 def capture(room_of):
     """The room of these commands as it was made."""
-    return room_of(12, 120, 90).capture
+    return room_of(12, 96, 72).capture
 
 
 @pytest.fixture
@@ -46,10 +46,10 @@ def network(monkeypatch):
 
 def test_a_network(room, network, tmp_path, splatseed):
     words = ("depth", room, "--model", "tiny", "-o", tmp_path / "d")
-    run = splatseed(*words, "--max-size", 100)
+    run = splatseed(*words, "--max-size", 80)
     assert (run.code, run.err) == (0, "")
     assert network.calls == [("tiny", {"depth_kind": None})]
-    for text in ("inverse", "12 of 100 x 75", f"splatseed info {room} --depth {tmp_path / 'd'}"):
+    for text in ("inverse", "12 of 80 x 60", f"splatseed info {room} --depth {tmp_path / 'd'}"):
         assert text in run.out
     depths = find_depths(load_scene(room), tmp_path / "d")
     assert {depths.read(name).kind for name in depths} == {"inverse"}
@@ -93,7 +93,7 @@ def test_a_plain_folder(room, tmp_path, splatseed, stereo):
     out, words = tmp_path / "maps", ("depth", room, "-o", tmp_path / "maps")
     run = splatseed(*words)
     assert (run.code, run.err) == (0, "")
-    assert "60 x 45" in run.out
+    assert "48 x 36" in run.out
     assert f"--method depth --depth {out}" in run.out
     depths, known = find_depths(load_scene(room), out), stereo.maps[3]
     assert depths.kind == "z"
@@ -106,7 +106,7 @@ def test_a_plain_folder(room, tmp_path, splatseed, stereo):
 @pytest.fixture(scope="module")
 def bent(room_of, tmp_path_factory):
     """The room through a lens with distortion, its maps a quarter of it."""
-    capture = room_of(12, 160, 120).capture
+    capture = room_of(12, 96, 72).capture
     return write_capture(bend(capture), tmp_path_factory.mktemp("bent") / "room")
 
 

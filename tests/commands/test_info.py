@@ -39,7 +39,7 @@ def test_a_colmap_scene(room, splatseed, monkeypatch):
     assert (run.code, run.err) == (0, "")
     scene, rows = load_scene(room), _pairs(run.out)
     assert rows["format"] == "colmap"
-    assert rows["cameras"] == "1 PINHOLE 120x90"
+    assert rows["cameras"] == "1 PINHOLE 96x72"
     assert rows["images"] == "12 (10 to train, 2 to test)"
     assert rows["points"] == f"{len(scene.points):,}"
     assert rows["depth maps"].startswith("12 beside the photographs; method depth aligns")
@@ -84,11 +84,11 @@ def test_the_advice_depends_on_the_plan(room, splatseed):
     full = splatseed("info", room, "--budget", 60, "--max-steps", 500).out
     assert "there is no room for more" in full
     assert "--seeds scene --budget 60 --max-steps 500" in full.partition("\nnext\n")[2]
-    sparse = splatseed("info", room, "--budget", 5400, "--max-steps", 20000).out
+    sparse = splatseed("info", room, "--budget", 3456, "--max-steps", 20000).out
     assert "leave the points as they are" in sparse
     assert "Strategy grow puts new Gaussians" in " ".join(sparse.split())
-    assert "--seeds scene --budget 5400 --max-steps 20000" in sparse
-    assert "5,400 Gaussians at most (0.5rho of 120 x 90 pixels), 20,000 steps" in sparse
+    assert "--seeds scene --budget 3456 --max-steps 20000" in sparse
+    assert "3,456 Gaussians at most (0.5rho of 96 x 72 pixels), 20,000 steps" in sparse
 
 
 def test_info_on_points_alone_does_not_wait_for_numba(room):
@@ -155,14 +155,14 @@ def test_maps_that_do_not_fit_are_not_advised(room, splatseed):
     assert "12 of 12 depth maps" in run.out
     assert "--method depth" not in run.out
     assert "by method depth" not in run.out
-    assert _pairs(run.out)["depth maps"] == "12 of 120 x 90 pixels"
+    assert _pairs(run.out)["depth maps"] == "12 of 96 x 72 pixels"
 
 
 def test_true_depth_fits(room, splatseed):
     run = splatseed("info", room, "--depth", room / "depths")
     assert (run.code, run.err) == (0, "")
     pairs, rows = _pairs(run.out), _rows(run.out)
-    assert pairs["maps"] == "12 of 12 images, the first 120 x 90, kind z"
+    assert pairs["maps"] == "12 of 12 images, the first 96 x 72, kind z"
     assert pairs["left out"] == "0"
     scene = load_scene(room)
     expected = align(scene.replace(depths=find_depths(scene, room / "depths")))
@@ -215,7 +215,7 @@ def test_the_number_of_points_suggested(points, known, most, said):
 def test_a_scenes_own_maps_are_described_and_can_be_lifted(rgbd, tmp_path, splatseed):
     run = splatseed("info", rgbd)
     assert run.code == 0
-    assert _pairs(run.out)["depth maps"] == "12 of 120 x 90 pixels; method auto uses them"
+    assert _pairs(run.out)["depth maps"] == "12 of 96 x 72 pixels; method auto uses them"
     for text in ("left out", "to align the depth maps with", "no-align", "confidence"):
         assert text not in run.out
     lifted, triangulated = run.out.splitlines()[-2:]
@@ -224,7 +224,7 @@ def test_a_scenes_own_maps_are_described_and_can_be_lifted(rgbd, tmp_path, splat
     words = shlex.split(lifted.split("splatseed ")[1])
     made = splatseed(*[tmp_path / "out" if word == "OUT" else word for word in words])
     assert made.code == 0, made.err
-    assert len(load_scene(tmp_path / "out").points) == round(0.25 * 120 * 90)
+    assert len(load_scene(tmp_path / "out").points) == round(0.25 * 96 * 72)
 
 
 def test_maps_in_another_unit_are_a_problem(rgbd, splatseed):
@@ -240,13 +240,13 @@ def test_maps_in_another_unit_are_a_problem(rgbd, splatseed):
 def test_maps_of_low_confidence_do_not_count(rgbd, tmp_path, splatseed):
     """Of a tenth of their pixels depth is used, and an eighth of these give a point."""
     for path in (rgbd / "results").glob("depth*.png"):
-        levels = np.zeros((90, 120), np.uint8)
-        levels[:9] = 2
+        levels = np.zeros((72, 96), np.uint8)
+        levels[:18, :40] = 2
         PilImage.fromarray(levels).save(path.with_name(path.name.replace("depth", "conf")))
     out = splatseed("info", rgbd).out
     assert "of high confidence at 10%, medium 0%, low 90%" in _pairs(out)["depth maps"]
     out = splatseed("upsample", rgbd, "--method", "depth", "-o", tmp_path / "out").out
-    assert f"{12 * 9 * 120 // PER_POINT:,} points" in out
+    assert f"{12 * 18 * 40 // PER_POINT:,} points" in out
 
 
 # What splatseed wrote -----------------------------------------------------------------------------
@@ -266,7 +266,7 @@ def test_a_seeded_scene_is_advised_for_training(room, tmp_path, splatseed):
     assert (run.code, run.err) == (0, "")
     assert "are isolated" not in run.out
     assert _pairs(run.out)["isolated"] == _pairs(plain)["isolated"]
-    assert re.search(r"1,392 .* 464", run.out)
+    assert re.search(rf"{len(seeds) - len(far):,} .* {len(far)}", run.out)
     assert f"splatseed train '{path}' -o RUN\n" in run.out
     assert "upsampl" not in run.out.replace("splatseed upsample made", "")
 

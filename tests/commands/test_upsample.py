@@ -46,7 +46,7 @@ WITH_RATIO = [name for name in METHODS if not chooses_number(name)]
 @pytest.fixture(scope="module")
 def surfaces(room_of):
     """The room's true surfaces."""
-    return room_of(12, 120, 90).capture.surfaces
+    return room_of(12, 96, 72).capture.surfaces
 
 
 def _manifest(folder):
@@ -85,13 +85,13 @@ def seeded(room, tmp_path_factory):
     """The room with the points of the default, and what was said."""
     out = tmp_path_factory.mktemp("seeded") / "my scene"
     with redirect_stdout(StringIO()) as said:
-        assert exit_code("upsample", room, "--budget", 2000, "-o", out) == 0
+        assert exit_code("upsample", room, "--budget", 1200, "-o", out) == 0
     return out, said.getvalue()
 
 
 def test_the_default_method_uses_the_photographs(seeded, room):
     out, said = seeded
-    assert "at most 2,000 points" in said
+    assert "at most 1,200 points" in said
     assert re.search(r"[\d,]+ original, [\d,]+ stereo, [\d,]+ cover", said)
     written = _manifest(out)
     shares, points = written["covered"], load_scene(out).points
@@ -108,8 +108,8 @@ def test_the_default_method_uses_the_photographs(seeded, room):
         rf"neighbours by cover \({len(points) - len(measured):,} of {len(points):,} points\)",
         said,
     )
-    assert (written["method"], written["budget"]) == ("auto", "2000")
-    assert len(load_scene(out).points) <= 2000
+    assert (written["method"], written["budget"]) == ("auto", "1200")
+    assert len(load_scene(out).points) <= 1200
     assert pycolmap.Reconstruction(out / "sparse/0").num_images() == 12
 
 
@@ -117,7 +117,7 @@ def test_the_same_seed_gives_the_same_bytes_and_another_does_not(
     seeded, room, tmp_path, splatseed, compare_anew
 ):
     for seed in (0, 6):
-        words = ("--budget", 2000, "--seed", seed, "-o", tmp_path / str(seed))
+        words = ("--budget", 1200, "--seed", seed, "-o", tmp_path / str(seed))
         run = splatseed("upsample", room, *words)
         assert (run.code, run.err) == (0, "")
     assert _bytes(tmp_path / "0") == _bytes(seeded[0])
@@ -330,7 +330,7 @@ def test_a_capture_has_its_own_maps_and_needs_no_points(rgbd, surfaces, tmp_path
     out, lift = tmp_path / "out", ("--method", "depth", "--depth.no-align", "--num-points")
     run = splatseed("upsample", rgbd, *lift[:2], "-o", tmp_path / "plain")
     assert (run.code, run.err) == (0, "")
-    assert f"{round(0.25 * 120 * 90):,} points" in run.out
+    assert f"{round(0.25 * 96 * 72):,} points" in run.out
     run = splatseed("upsample", rgbd, *lift[:2], "--num-points", 700, "-o", out)
     assert (run.code, run.err) == (0, "")
     assert "far from any original" not in run.out

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy import stats
+import scipy
 
 import splatseed as ss
 from splatseed.methods.neighbors import draw_bases, prepare
@@ -18,7 +18,7 @@ NUM = 20_000
 
 
 def assert_uniform(values):
-    assert stats.kstest(values, "uniform").pvalue > 1e-3
+    assert scipy.stats.kstest(values, "uniform").pvalue > 1e-3
 
 
 def new_points(xyz, method, **options):
@@ -59,7 +59,7 @@ def test_triangle_is_uniform_in_the_triangle():
     # P(x + y < t) = t^2, and y / (x + y) is uniform and independent of it.
     assert_uniform((x + y) ** 2)
     assert_uniform(y / (x + y))
-    assert stats.spearmanr(x + y, y / (x + y)).pvalue > 1e-3
+    assert scipy.stats.spearmanr(x + y, y / (x + y)).pvalue > 1e-3
     assert np.abs(rgb[:, 0] - 255 * (1 - x - y)).max() <= 0.501
 
 
@@ -99,4 +99,4 @@ def test_random_is_uniform_in_the_bounding_box_with_the_originals_colors(rng):
     low, high = cloud.min(axis=0), cloud.max(axis=0)
     for axis in ((xyz - low) / (high - low)).T:
         assert_uniform(axis)
-    assert stats.binomtest(int((rgb[:, 0] == 255).sum()), NUM, 1 / 50).pvalue > 1e-3
+    assert scipy.stats.binomtest(int((rgb[:, 0] == 255).sum()), NUM, 1 / 50).pvalue > 1e-3

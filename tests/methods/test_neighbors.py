@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy import stats
+import scipy
 
 from splatseed import PointCloud, Scene
 from splatseed.methods import configure
@@ -56,7 +56,7 @@ def test_bases_are_drawn_by_weight(prepared, rng):
     assert bases.total == bases.count.sum() == 100_000
     assert bases.count[0] == 0
     expected = weight[1:] / weight.sum() * 100_000
-    assert stats.chisquare(bases.count[1:], expected).pvalue > 1e-3
+    assert scipy.stats.chisquare(bases.count[1:], expected).pvalue > 1e-3
 
 
 def scene_with(lengths, errors):

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import scipy
 from PIL import Image as PilImage
-from scipy import stats
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -34,7 +34,7 @@ def new_points(whole, method, num_new=NUM_NEW):
 
 
 def assert_uniform(values):
-    assert stats.kstest(values, "uniform").pvalue > 1e-3
+    assert scipy.stats.kstest(values, "uniform").pvalue > 1e-3
 
 
 def assert_equally_likely(draws, num):
@@ -42,7 +42,7 @@ def assert_equally_likely(draws, num):
     group = int(np.ceil(16 * num / len(draws)))
     sizes = np.bincount(np.arange(num) // group)
     counts = np.bincount(draws // group, minlength=len(sizes))
-    assert stats.chisquare(counts, sizes / num * len(draws)).pvalue > 1e-3
+    assert scipy.stats.chisquare(counts, sizes / num * len(draws)).pvalue > 1e-3
 
 
 @pytest.mark.parametrize(("method", "k"), [("linear", 1), ("triangle", 2)])
@@ -76,7 +76,7 @@ def test_equations_1_and_2(method, k, wavy, wavy_exact):
         assert_uniform(chosen[:, 1] / (chosen[:, 1] + chosen[:, 2]))
     expected = np.array([len(members) for members in simplices.values()]) / len(xyz) * NUM_NEW
     observed = np.bincount(found, minlength=len(bases))
-    assert stats.chisquare(observed, expected).pvalue > 1e-3
+    assert scipy.stats.chisquare(observed, expected).pvalue > 1e-3
 
 
 @pytest.mark.filterwarnings("ignore:(?s).*storage space exceeds:UserWarning")  # s is inert
@@ -130,8 +130,8 @@ def test_equation_6(wavy, wavy_exact, rng):
     order = np.argsort(table.sum(axis=0))[::-1]
     group = np.minimum(np.cumsum(table.sum(axis=0)[order]) // 120, 150)
     table = np.array([np.bincount(group, row[order]) for row in table])
-    assert stats.chi2_contingency(table[:, table.sum(axis=0) > 0]).pvalue > 1e-3
-    assert stats.ks_2samp(gaps, expected_gaps).pvalue > 1e-3
+    assert scipy.stats.chi2_contingency(table[:, table.sum(axis=0) > 0]).pvalue > 1e-3
+    assert scipy.stats.ks_2samp(gaps, expected_gaps).pvalue > 1e-3
 
 
 WIDTH, HEIGHT, FOCAL, TRUE_SCALE = 48, 36, 24.0, 2.0
@@ -184,7 +184,7 @@ def test_equations_7_to_9(slanted):
         for places, size in ((column, WIDTH), (row, HEIGHT)):
             assert size / 4 <= places.min() <= places.max() < 3 * size / 4
         blocks = np.bincount((column - 12) // 6 + 4 * ((row - 9) // 6), minlength=12)
-        assert stats.chisquare(blocks).pvalue > 1e-3
+        assert scipy.stats.chisquare(blocks).pvalue > 1e-3
 
 
 def test_random_points(wavy, wavy_exact):

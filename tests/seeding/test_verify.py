@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from functools import cache
 
 import numpy as np
 import pytest
@@ -42,8 +43,12 @@ def on_plane(places):
 
 KNOWN = on_plane(np.stack(np.meshgrid(*[STEP * np.arange(-5, 6)] * 2), axis=-1).reshape(-1, 2))
 ROOM = Room(("plane",), tilted_plane(30.0), (STONE,))
-VIEWS = [View(f"{k}", render_view(ROOM, c)[0], c) for k, c in enumerate(arc())]
-"""Five views of the plane, 96 x 80."""
+
+
+@cache
+def five_views():
+    """Views of the plane, 96 x 80."""
+    return [View(f"{k}", render_view(ROOM, c)[0], c) for k, c in enumerate(arc())]
 
 
 @pytest.fixture
@@ -100,7 +105,7 @@ def numbers(points):
 def test_points_near_a_plane_slide_back_onto_it(places, rng):
     off = rng.uniform(0.3, 1.2, len(places)) * rng.choice([-1, 1], len(places))
     new = shifted(places, off)
-    kept = run_verify(VIEWS, KNOWN, new)
+    kept = run_verify(five_views(), KNOWN, new)
     assert len(kept.xyz) > 0.95 * len(new)
     before = np.abs(new[numbers(kept)] @ NORMAL) / spacings(KNOWN, new[numbers(kept)])
     after = np.abs(kept.xyz @ NORMAL) / spacings(KNOWN, new[numbers(kept)])
@@ -112,7 +117,7 @@ def test_points_near_a_plane_slide_back_onto_it(places, rng):
 
 
 def test_without_texture_flat_places_stay_and_others_are_dropped(places, rng):
-    grey = [constant(view) for view in VIEWS]
+    grey = [constant(view) for view in five_views()]
     flat = run_verify(grey, KNOWN, places)
     np.testing.assert_array_equal(flat.xyz, places.astype(np.float32))
     assert (flat.confidence == np.float32(SETTINGS.textureless_confidence)).all()
@@ -124,15 +129,15 @@ def test_points_that_no_pair_of_photographs_sees_stay_unchecked(places):
     beside = shifted(places, np.full(len(places), 0.8))
     half = len(KNOWN) // 2
     apart = [range(half), range(half, len(KNOWN))]
-    dark = [dataclasses.replace(v, mask=np.zeros((v.height, v.width), bool)) for v in VIEWS]
+    dark = [dataclasses.replace(v, mask=np.zeros((v.height, v.width), bool)) for v in five_views()]
     for kept in (
-        run_verify(VIEWS[:1], KNOWN, beside),
-        run_verify(VIEWS[:2], KNOWN, beside, apart),
-        run_verify([VIEWS[0]] * 2, KNOWN, beside),
+        run_verify(five_views()[:1], KNOWN, beside),
+        run_verify(five_views()[:2], KNOWN, beside, apart),
+        run_verify([five_views()[0]] * 2, KNOWN, beside),
         run_verify(dark, KNOWN, beside),
         run_verify([], KNOWN, beside),
-        run_verify(VIEWS, KNOWN[:1], beside),
-        run_verify(VIEWS, KNOWN[:0], beside),
+        run_verify(five_views(), KNOWN[:1], beside),
+        run_verify(five_views(), KNOWN[:0], beside),
     ):
         np.testing.assert_array_equal(kept.xyz, beside.astype(np.float32))
         assert np.isnan(kept.confidence).all()
@@ -142,12 +147,12 @@ def test_points_that_no_pair_of_photographs_sees_stay_unchecked(places):
 def test_mothers_pixels_drop_no_point(places):
     """Half of every photograph is mothers: points there stay, unchecked."""
     cut = []
-    for view in VIEWS:
+    for view in five_views():
         mask = np.arange(view.width) < np.full((view.height, 1), view.width // 2)
         shown = view.photograph * mask[..., None]
         cut.append(dataclasses.replace(view, mask=mask, photograph=shown))
     far = np.concatenate([shifted(places, np.full(len(places), off)) for off in (-5.0, 5.0)])
-    columns = np.array([v.camera.project(far)[0][:, 0] for v in VIEWS])
+    columns = np.array([v.camera.project(far)[0][:, 0] for v in five_views()])
     black, lit = (columns > WIDTH // 2).all(axis=0), (columns < WIDTH // 2 - 5).all(axis=0)
     assert min(black.sum(), lit.sum()) > 20
     kept = run_verify(cut, KNOWN, far)
@@ -171,7 +176,7 @@ SHAPES = {"apart": [1, 1, 1], "at one place": 0, "on a line": [1, 0, 0], "on a p
 def test_degenerate_input_gives_only_confirmed_points(seed, num_views, num_known, shape, look):
     rng = np.random.default_rng(seed)
     known = rng.normal(scale=0.2, size=(num_known, 3)) * SHAPES[shape]
-    views = VIEWS[:num_views]
+    views = five_views()[:num_views]
     if look != "noise":
         views = [constant(v) if k or look == "constant" else v for k, v in enumerate(views)]
     new = rng.normal(scale=0.3, size=(rng.integers(0, 12), 3)).astype(np.float32)

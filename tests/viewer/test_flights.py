@@ -157,7 +157,7 @@ def test_a_flight_is_a_video_of_the_scene(run_folder, tmp_path, splatseed):
     said = splatseed("flight", run_folder, "-o", out, "--seconds", 0.2)
     assert (said.code, said.err) == (0, "")
     frames, fps = _frames(out)
-    assert (frames.shape, fps) == ((6, 90, 120, 3), 30)
+    assert (frames.shape, fps) == ((6, 72, 96, 3), 30)
     assert frames.mean() > 20
     assert np.abs(np.diff(frames.astype(int), axis=0)).mean() > 0.5  # it moves
 

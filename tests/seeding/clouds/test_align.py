@@ -17,9 +17,8 @@ from splatseed.seeding.clouds.icp import Stage
 from splatseed.similarity import Similarity
 
 MOVE = Similarity(0.37, spread_rotations(500)[321], np.array([5.6e5, 5.9e6, -80.0]))
-FEWER = AlignSettings(search=SearchSettings(rotations=300, scales=SearchSettings.scales[1:4]))
 QUICK = AlignSettings(
-    search=SearchSettings(rotations=150, refined=2),
+    search=SearchSettings(rotations=300, refined=4, scales=SearchSettings.scales[1:4]),
     stages=(
         Stage(60, 150, 10, 0.25, 0.04, 0.75, 0.04),
         Stage(6, 600, 15, 0.1, 0.02, 0.75, 0.02),
@@ -73,7 +72,7 @@ def aligned(folder, tie_xyz, xyz, settings, **arrays):
 @pytest.mark.slow
 def test_a_cloud_that_is_shifted_scaled_and_turned(made, tmp_path):
     tie_xyz, dense = made
-    found = aligned(tmp_path, tie_xyz, MOVE.points(dense), FEWER, rgb=shades(dense))
+    found = aligned(tmp_path, tie_xyz, MOVE.points(dense), QUICK, rgb=shades(dense))
     back = found.scene_from_cloud.points(MOVE.points(dense))
     assert np.linalg.norm(back - dense, axis=1).max() < 0.005  # metres
     rotation = found.scene_from_cloud.rotation @ MOVE.rotation
