@@ -92,12 +92,13 @@ def render_points(
     # The nearest point whose disc covers each pixel; -1 where there is none.
     front = np.full((SMOOTHING * height, SMOOTHING * width), -1)
     draw_discs(uv, depth, radii, np.full(front.shape, np.inf), front)
-    colors = np.concatenate([rgb, [PAPER]]).astype(np.float64)[front]
-    blocks = (height, SMOOTHING, width, SMOOTHING)
-    behind = np.broadcast_to(np.asarray(background, np.float64), (height, width, 3))
-    covered = (front >= 0).reshape(blocks)[..., None]
-    picture = np.where(covered, colors.reshape(*blocks, 3), behind[:, None, :, None])
-    return np.asarray(np.round(picture.mean(axis=(1, 3))), np.uint8)
+    colors = np.concatenate([rgb, [PAPER]]).astype(np.uint16)
+    behind = np.broadcast_to(np.asarray(background, np.uint16), (height, width, 3))
+    total = np.zeros((height, width, 3), np.uint16)
+    for row, column in np.ndindex(SMOOTHING, SMOOTHING):
+        shown = front[row::SMOOTHING, column::SMOOTHING]
+        total += np.where((shown >= 0)[..., None], colors[shown], behind)
+    return np.asarray(np.round(total / SMOOTHING**2), np.uint8)
 
 
 def origin_colors(source: UInt8[np.ndarray, " N"]) -> UInt8[np.ndarray, "N 3"]:
