@@ -144,6 +144,41 @@ def test_normals_are_not_taken_for_colours(tmp_path, points):
     assert open_cloud(path).colors == "none"
 
 
+def test_intensity_and_normals_may_precede_colours(tmp_path, points):
+    xyz, rgb = points
+    intensity, upward = np.arange(NUM), np.abs(xyz) / np.linalg.norm(xyz, axis=1, keepdims=True)
+    tables = ([xyz, intensity, rgb], [xyz, upward, rgb / 255])
+    for table in tables:
+        np.savetxt(tmp_path / "a.xyz", np.column_stack(table), "%.6f")
+        check(tmp_path / "a.xyz", xyz, rgb)
+
+
+@pytest.mark.parametrize(
+    ("kind", "white", "odd"),
+    [
+        ("f4", 1, 1.3),  # a filter's overshoot
+        ("f4", 255, 280),
+        ("f8", 1, np.inf),
+        *(("u2", white, None) for white in (255, 1023, 4095, 65535)),
+    ],
+)
+def test_white_of_colours_in_other_types(tmp_path, points, kind, white, odd):
+    xyz, rgb = points
+    rgb[:2] = 255
+    colors = rgb * (white / 255)
+    colors[0] = white if odd is None else odd
+    names = [*("x", "y", "z"), *("red", "green", "blue")]
+    rows = np.empty(NUM, [(name, f"<{'f8' if i < 3 else kind}") for i, name in enumerate(names)])
+    for name, column in zip(names, np.column_stack([xyz, colors]).T, strict=True):
+        rows[name] = np.rint(column) if kind == "u2" and name in names[3:] else column
+    types = {"f4": "float", "f8": "double", "u2": "ushort"}
+    header = [f"property {types['f8' if i < 3 else kind]} {name}" for i, name in enumerate(names)]
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {NUM}", *header]
+    path = tmp_path / "a.ply"
+    path.write_bytes("\n".join([*lines, "end_header\n"]).encode() + rows.tobytes())
+    check(path, xyz, rgb)
+
+
 def test_point_maps_of_networks(tmp_path, rng):
     """VGGT's fields: images have channels before rows; DUSt3R's and MASt3R's have them last."""
     xyz = rng.normal(size=(2, 5, 7, 3)).astype(np.float32)

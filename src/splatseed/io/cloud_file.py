@@ -1,8 +1,9 @@
 """Point files read in chunks: the reader interface, and tables of binary rows and text lines.
 
 A *block* is consecutive rows (points) as columns by name. Colours are scaled by their white level:
-1, 255 or 65535. It is detected from values, not types, since many writers store 8-bit values in 16
-bits; a sample of the file is read first, so that results do not depend on the chunk size.
+1 for floats, or that of 8, 10, 12 or 16 bits. It is detected from values, not types, since many
+writers store 8-bit values in 16 bits; a sample of the file is read first, so that results do not
+depend on the chunk size.
 """
 
 from __future__ import annotations
@@ -42,6 +43,10 @@ _INTENSITY_NAMES = (
     *("reflectance", "scalar_Reflectance"),
 )
 _GREY = 128
+_WHITES = (255.0, 1023.0, 4095.0, 65535.0)
+"""White of 8, 10, 12 and 16 bits."""
+_FLOAT_QUANTILE, _OVERSHOOT = 0.999, 2.0
+"""Quantile of colours in floats, and how far it may be above their white."""
 _BLACK_PERCENTILE, _WHITE_PERCENTILE = 1.0, 99.0
 """Percentiles of intensity mapped to black and white; few specular points can dominate a scan."""
 _TEXT_BYTES = 1 << 22
@@ -163,13 +168,18 @@ def _columns(block: Block, names: Sequence[str]) -> np.ndarray:
 
 
 def white_level(sample: Shaped[np.ndarray, "..."]) -> float:
-    """Detect the value that means 255 from a sample of colours."""
-    if sample.dtype == np.uint8 or not sample.size:
+    """Detect the value that means 255 from a sample of colours.
+
+    Floats may exceed it: filters and interpolation overshoot, and a few values may be damaged.
+    """
+    known = np.asarray(sample, np.float64).ravel()
+    known = known[np.isfinite(known)]
+    if sample.dtype == np.uint8 or not known.size:
         return 255.0
-    largest = float(np.nanmax(np.asarray(sample, np.float64), initial=0.0))
-    if largest > 255.0:
-        return 65535.0
-    return 1.0 if sample.dtype.kind == "f" and largest <= 1.0 else 255.0
+    is_float = sample.dtype.kind == "f"
+    largest = np.quantile(known, _FLOAT_QUANTILE) / _OVERSHOOT if is_float else known.max()
+    whites = [*([1.0] if is_float else []), *_WHITES]
+    return next((white for white in whites if largest <= white), _WHITES[-1])
 
 
 def to_uint8(values: Shaped[np.ndarray, "..."], full: float) -> UInt8[np.ndarray, "..."]:

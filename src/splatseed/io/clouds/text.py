@@ -2,9 +2,9 @@
 
 Delimiter, decimal comma and header line are detected from the first lines. Without a header,
 columns 1 to 3 are the position. The colour is the first run of three columns with integers from 0
-to 65535, or with numbers from 0 to 1 that are not unit normals; a fourth and last column is
-intensity. ``warnings`` report the guess. PTS files start with the point count and have intensity
-before colours.
+to 65535, or with numbers from 0 to 1 that are not unit normals; if the first of them exceeds 255
+and three bytes follow it, it is intensity. A fourth and last column is intensity. ``warnings``
+report the guess. PTS files start with the point count and have intensity before colours.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ _NAMES = (
 _COMMENT = re.compile(r"^(//|#|%|;)+\s*")
 _UNIT = 1e-2
 """Largest difference from 1 in the length of a normal."""
+_BYTE = 255
 
 
 def open_text(path: Path) -> CloudFile:
@@ -109,19 +110,41 @@ def _guessed(sample: Float64[np.ndarray, "N C"], is_pts: bool) -> list[str]:
     """Guess column names from values."""
     count = sample.shape[1]
     names = [*XYZ, *(f"column {i + 1}" for i in range(3, count))]
-    starts = range(4, 5) if is_pts and count == 7 else range(3, count - 2)
-    start = next((i for i in starts if _are_colors(sample[:, i : i + 3])), None)
-    if start is not None:
+    start = 4 if is_pts and count == 7 else _first_colors(sample)
+    if start is not None and _are_colors(sample[:, start : start + 3]):
         names[start : start + 3] = RGB
     elif count == 4:
         names[3] = "intensity"
     return names
 
 
+def _first_colors(sample: Float64[np.ndarray, "N C"]) -> int | None:
+    """Return the first of three columns that look like colours; None without any."""
+    start, last = len(XYZ), sample.shape[1] - len(RGB)
+    while start <= last:
+        columns = sample[:, start : start + 3]
+        if _are_normals(columns):
+            start += 3
+        elif not _are_colors(columns):
+            start += 1
+        else:
+            # An intensity of more than 8 bits before bytes: together they would be nearly black.
+            bytes_follow = start < last and _are_colors(sample[:, start + 1 : start + 4])
+            bytes_follow = bytes_follow and sample[:, start + 1 : start + 4].max() <= _BYTE
+            return start + 1 if bytes_follow and columns[:, 0].max() > _BYTE else start
+    return None
+
+
 def _are_colors(values: Float64[np.ndarray, "N 3"]) -> bool:
     known = values[np.isfinite(values).all(axis=1)]
     if not len(known) or known.min() < 0:
         return False
-    if known.max() <= 1.0 and (known != np.rint(known)).any():
-        return bool((np.abs(np.linalg.norm(known, axis=1) - 1.0) > _UNIT).mean() > 0.5)
-    return bool(known.max() <= 65535 and (known == np.rint(known)).all())
+    in_unit = known.max() <= 1.0 and not _are_normals(values)
+    return bool(in_unit or (known.max() <= 65535 and (known == np.rint(known)).all()))
+
+
+def _are_normals(values: Float64[np.ndarray, "N 3"]) -> bool:
+    """Whether most rows are of length 1, and not all of them whole numbers."""
+    known = values[np.isfinite(values).all(axis=1)]
+    is_unit = np.abs(np.linalg.norm(known, axis=1) - 1.0) <= _UNIT
+    return bool((known != np.rint(known)).any() and is_unit.mean() >= 0.5)
