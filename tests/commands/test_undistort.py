@@ -24,6 +24,7 @@ from splatseed.sfm import undistort
 from splatseed.synthetic import write_capture
 
 from ..bent import bend
+from ..wide_png import png16
 
 pytestmark = pytest.mark.usefixtures("pycolmap_here")
 
@@ -190,3 +191,28 @@ def test_a_model_without_distortion_is_written_as_pinhole(layout, distorted, tmp
     assert written.images[0].intrinsics.model == "PINHOLE"
     assert written.images[0].intrinsics.params == old.pinhole.params
     assert not lens_warnings(scene.images)
+
+
+@pytest.mark.parametrize("kind", ["10 bits", "transparent"])
+def test_photographs_that_pycolmap_misreads_stay_as_they_are_read(kind, distorted, tmp_path):
+    """It has four grey levels for 10 bits in 16, and shows colours of transparent pixels."""
+    path = shutil.copytree(distorted, tmp_path / "scene", symlinks=False)
+    for image in load_scene(path).images:
+        file = path / "images" / image.name
+        pixels = np.asarray(Image.open(file).convert("RGBA")).copy()
+        if kind == "10 bits":
+            file.write_bytes(png16(np.rint(pixels[..., :3] * (1023 / 255))))
+        else:
+            pixels[:, :60, 3] = 0
+            Image.fromarray(pixels).save(file)
+    scene = load_scene(path)
+    before = undistort(load_scene(distorted), tmp_path / "plain").path
+    after = load_scene(undistort(scene, tmp_path / "straight").path)
+    for image in after.images:
+        expected = np.asarray(Image.open(before / "images" / image.name), int)
+        left = expected.shape[1] // 3  # columns well within the transparent ones
+        if kind == "transparent":
+            assert not image.read()[:, :left].any()
+        visible = np.s_[:] if kind == "10 bits" else np.s_[:, 2 * left :]
+        assert np.abs(image.read()[visible] - expected[visible]).max() <= 2
+    assert (after.source.root / "masks").is_dir() == (kind == "transparent")

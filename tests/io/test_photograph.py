@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-import zlib
 
 import numpy as np
 import pytest
@@ -16,6 +15,8 @@ from splatseed.io.masks import read_mask
 from splatseed.io.photograph import check_photograph, decode_photograph, photograph_bytes
 from splatseed.photos.loading import load_views
 from splatseed.scene import Masks
+
+from ..wide_png import png16
 
 
 def decoded(path):
@@ -48,20 +49,6 @@ def test_a_file_cut_short_is_told_from_a_whole_one(suffix, rng, tmp_path):
             check_photograph(path)
     with pytest.raises(SceneNotFoundError, match=r"gone\.jpg"):
         check_photograph(tmp_path / "gone.jpg")
-
-
-def png16(channels, transparent=None):
-    """A PNG of 16 bits of [H, W, C], as Pillow does not write them; C = 1, 2 (grey), 3 or 4."""
-    height, width, count = channels.shape
-    color = {1: 0, 2: 4, 3: 2, 4: 6}[count]
-    header = struct.pack(">IIBBBBB", width, height, 16, color, 0, 0, 0)
-    rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in channels)
-    extra = [] if transparent is None else [(b"tRNS", struct.pack(">H", transparent))]
-    chunks = [(b"IHDR", header), *extra, (b"IDAT", zlib.compress(rows)), (b"IEND", b"")]
-    return b"\x89PNG\r\n\x1a\n" + b"".join(
-        struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
-        for name, data in chunks
-    )
 
 
 ALL16 = np.arange(65536, dtype=np.uint16).reshape(256, 256)

@@ -22,6 +22,7 @@ from splatseed.requirements import install_command
 from splatseed.runtime.torch_device import DeviceName
 from splatseed.scene import Image
 from splatseed.sfm.cameras import SharedCamera
+from splatseed.sfm.readable import COPIES
 from splatseed.sfm.work_folder import DATABASE, WorkFolder
 from splatseed.text import numeric_order
 
@@ -114,6 +115,11 @@ class Run:
     def database(self) -> Path:
         """The feature database."""
         return (self.kept.folder if self.kept else self.work) / DATABASE
+
+    @property
+    def readable(self) -> Path:
+        """The photographs as features are found in them: copies where pycolmap needs some."""
+        return copies if (copies := self.work / COPIES).is_dir() else self.image_dir
 
     def num_pairs(self) -> int:
         """Return the number of matched pairs, those without a match included."""
@@ -216,7 +222,7 @@ def triangulate_points(run: Run, poses: Sequence[Image], without: Collection[str
     model = run.stage(
         "triangulation",
         lambda: run.pycolmap.triangulate_points(
-            posed, run.database, run.image_dir, model_dir, options=options
+            posed, run.database, run.readable, model_dir, options=options
         ),
         posed.num_points3D,
         0,

@@ -13,6 +13,7 @@ from splatseed.camera import Intrinsics
 from splatseed.errors import OutputError
 from splatseed.pointcloud import first_of_equals
 from splatseed.sfm.colmap import Run
+from splatseed.sfm.readable import copy_misread
 
 _ORIENTATION, _SHORT, _UPRIGHT = 0x0112, 3, 1  # the tag, its type, its value for upright
 _HEAD_BYTES = 1 << 17  # EXIF (at most 64 KiB) is the first or second segment
@@ -22,7 +23,8 @@ _NEGLIGIBLE = 2e-7  # a coefficient that counts as distortion but moves no pixel
 def export_scene(run: Run, model_dir: Path, staging: Path, *, distinct: bool = True) -> None:
     """Write a model's undistorted photographs and points to ``staging``.
 
-    Photographs of PINHOLE cameras are copied, with the EXIF orientation cleared. Reprojection
+    Photographs of PINHOLE cameras are copied, with the EXIF orientation cleared; of the others,
+    transparent pixels are black. Reprojection
     errors are in pixels of the undistorted photographs. ``distinct`` drops points at the position
     of another.
 
@@ -37,13 +39,21 @@ def export_scene(run: Run, model_dir: Path, staging: Path, *, distinct: bool = T
     straight.mkdir()
     given.write(straight)
 
+    posed = [image for image in given.images.values() if image.has_pose]
+    plain = {image.name for image in posed if given.cameras[image.camera_id].is_undistorted()}
+    photographs = copy_misread(
+        *(run.image_dir, [image.name for image in posed], run.work / "opaque"),
+        over_black=True,
+        linked=plain,
+    )
+
     def num_written() -> int:
         return sum(path.is_file() for path in (dense / "images").rglob("*"))
 
     run.stage(
         "undistortion",
         lambda: pycolmap.undistort_images(
-            dense, straight, run.image_dir, num_threads=run.settings.threads
+            dense, straight, photographs, num_threads=run.settings.threads
         ),
         num_written,
         num_images,

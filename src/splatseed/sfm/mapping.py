@@ -158,7 +158,7 @@ def _map(
     models: dict[int, Any] = run.stage(
         stage,
         lambda: run.pycolmap.incremental_mapping(
-            *(run.database, run.image_dir, folder, options),
+            *(run.database, run.readable, folder, options),
             **({} if given is None else {"input_path": given}),
             next_image_callback=lambda: registered.append(None),
         ),
@@ -246,7 +246,7 @@ def _map_at_once(run: Run, folder: Path, total: int) -> tuple[Path, Any] | None:
     try:
         models = run.stage(
             "global mapping",
-            lambda: pycolmap.global_mapping(run.database, run.image_dir, folder, options),
+            lambda: pycolmap.global_mapping(run.database, run.readable, folder, options),
             lambda: 0,
             1,
         )

@@ -29,6 +29,7 @@ from splatseed.sfm.first_look import (
     measure_agreement,
     poorly_connected,
 )
+from splatseed.sfm.readable import COPIES, copy_misread
 from splatseed.text import name_some, numeric_order
 
 _STEPS = sorted({*range(1, 11), *(2**n for n in range(10))})
@@ -143,6 +144,7 @@ def detect_features(run: Run, database: Any, model: Any, masks: Masks | None = N
     names = {image_id: image.name for image_id, image in sorted(model.images.items())}
     folder = run.work / "masks"
     write_masks(masks, run.image_dir, names.values(), folder)
+    copy_misread(run.image_dir, names.values(), run.work / COPIES)
     masked = {"mask_path": str(folder)} if folder.is_dir() else {}
     extraction = pycolmap.FeatureExtractionOptions(
         max_image_size=settings.max_image_size,
@@ -152,7 +154,7 @@ def detect_features(run: Run, database: Any, model: Any, masks: Masks | None = N
     run.stage(
         "features",
         lambda: pycolmap.extract_features(
-            *(run.database, run.image_dir, list(names.values())),
+            *(run.database, run.readable, list(names.values())),
             reader_options=pycolmap.ImageReaderOptions(**masked),
             extraction_options=extraction,
             device=getattr(pycolmap.Device, settings.device),
