@@ -61,28 +61,29 @@ def compare_anew():
     """For tests of what comes of comparing photographs twice."""
 
 
-_drawn: list[bytes] = []
-
-
 @pytest.fixture
 def draw_curves():
     """For tests of the picture of a run's curves: each run draws its own."""
 
 
 @pytest.fixture(autouse=True)
-def _curves_are_drawn_once(request, monkeypatch):
-    """Drawing curves takes half a second, at the end of hundreds of runs; others copy the first."""
+def _curves_are_drawn_once(request, monkeypatch, common):
+    """Drawing curves takes half a second, at the end of hundreds of runs; others copy the first.
+
+    All processes of the suite do, most of which need not even import what draws.
+    """
     run = sys.modules.get("splatseed.training.run")
     if run is None or "draw_curves" in request.fixturenames:
         return
-    draw = run.write_curve_png
+    draw, drawn = run.write_curve_png, common / "curves.png"
 
     def copy(path, records):
-        if not _drawn:
+        if not drawn.is_file():
             draw(path, records)
-            _drawn.append(path.read_bytes())
+            with atomic_file(drawn) as partial:
+                partial.write_bytes(path.read_bytes())
         with atomic_file(path) as partial:
-            partial.write_bytes(_drawn[0])
+            partial.write_bytes(drawn.read_bytes())
 
     monkeypatch.setattr(run, "write_curve_png", copy)
 

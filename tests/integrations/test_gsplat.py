@@ -168,7 +168,7 @@ def train(params, optimizers, strategy, views, world):
     """The losses of a run as trainers that use gsplat have it."""
     growth, losses = isinstance(strategy, GrowStrategy), []
     state = strategy.initialize_state() if growth else {}
-    for step in range(160):
+    for step in range(110):
         view = views[step * 7 % 16]
         truth = photograph_tensor(view, torch.device("cpu"))[None]
         camera = world.camera(view.cam_from_world), view.K

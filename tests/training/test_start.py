@@ -15,7 +15,7 @@ from splatseed.splat.model_frame import find_transform, transform_gaussians
 from splatseed.training.prepare import prepare_run
 from splatseed.training.settings import TrainSettings
 
-FIRST = TrainSettings(strategy="grow", max_steps=200, cap_max=1200, backend="cpu")
+FIRST = TrainSettings(strategy="grow", max_steps=120, cap_max=1200, backend="cpu")
 
 
 def trained(scene, folder, settings, **options):
@@ -40,7 +40,7 @@ def going_on(path, steps=60, **settings):
 def test_a_run_that_goes_on_keeps_what_was_learnt(room, first, tmp_path):
     path, scores = first
     before = path.read_bytes()
-    further, run = trained(room, tmp_path / "run", going_on(path, 150, strategy="none"))
+    further, run = trained(room, tmp_path / "run", going_on(path, 80, strategy="none"))
     assert further.psnr > scores.psnr - 0.1
     assert run.count() == len(read_gaussians(path))
     assert path.read_bytes() == before
@@ -74,14 +74,16 @@ def test_a_model_in_its_trainers_world_is_brought_into_the_scenes(room, first, t
 
 def test_a_smaller_budget_keeps_those_that_contribute_most(room, first, tmp_path):
     path, _ = first
-    notes = []
-    settings = going_on(path, cap_max=600)
+    whole, notes = read_gaussians(path), []
+    half = len(whole) // 2
+    settings = going_on(path, cap_max=half)
     run = prepare_run(room, tmp_path / "run", settings, note=notes.append)
-    assert run.count() == 600
-    assert any("600 of 1,200 Gaussians" in note for note in notes)
-    whole = read_gaussians(path)
+    assert run.count() == half
+    assert any(f"{half} of {len(whole):,} Gaussians" in note for note in notes)
     rng = np.random.default_rng(0)
-    write_gaussians(tmp_path / "some.ply", whole.select(np.sort(rng.permutation(len(whole))[:600])))
+    write_gaussians(
+        tmp_path / "some.ply", whole.select(np.sort(rng.permutation(len(whole))[:half]))
+    )
     other = prepare_run(room, tmp_path / "other", going_on(tmp_path / "some.ply"))
     best, any_ = (evaluate_views(r.trainer.render, r.trainer.test_views) for r in (run, other))
     assert best.psnr > any_.psnr + 1
