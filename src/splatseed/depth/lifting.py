@@ -45,6 +45,9 @@ MIN_AGREEMENT = 0.5
 """Smallest share that is confirmed of the candidates that others confirm or see through, where maps
 are not aligned to points: 0.99 and more on three captures, 0.36 and less with maps in another unit
 or poses with other camera axes."""
+MIN_SHOWN = 0.02
+"""Smallest share of candidates that others confirm or see through for that to mean something: views
+that hardly overlap have a few at their edges."""
 
 
 @dataclass(frozen=True)
@@ -311,7 +314,8 @@ def _check_agreement(candidates: _Candidates, num_views: int) -> None:
     confirmed = int(np.count_nonzero(candidates.confirmed))
     contradicted = np.count_nonzero((candidates.tier == SEEN_THROUGH) & ~candidates.confirmed)
     shown = confirmed + int(contradicted)
-    if confirmed >= MIN_AGREEMENT * max(shown, 1) or num_views < 3:
+    overlap = shown >= MIN_SHOWN * len(candidates.tier) or not confirmed
+    if num_views < 3 or not overlap or confirmed >= MIN_AGREEMENT * max(shown, 1):
         return
     which = f"{confirmed / shown:.0%} of the pixels that others show" if shown else "no pixel"
     raise SceneFormatError(
