@@ -189,6 +189,10 @@ def test_instant_ngp_without_extension_size_or_focal_length(folder, tmp_path, mo
     np.testing.assert_allclose(rotation_from_quat(image.quat), np.diag([1, -1, -1]), atol=1e-12)
     write_scene(scene, tmp_path / "a")
     assert (tmp_path / f"a/{folder}0001.png").is_file()
+    write_json(path, {"camera_angle_x": 45, "frames": [frame]})
+    with pytest.raises(SceneFormatError, match="in radians"):
+        load_scene(path)
+    write_json(path, {"camera_angle_x": 1.2, "frames": [frame]})
     (root / folder / "0001.png").unlink()
     with pytest.raises(SceneFormatError, match="w and h"):
         load_scene(path)

@@ -129,3 +129,15 @@ def test_frames_of_nan_are_left_out(change, scene_dir):
     assert sum("1 of 4 images is left out" in text for text in scene.warnings) == 1
     write_scene(scene, scene_dir.with_name("again"))
     assert parts(load_scene(scene_dir.with_name("again"))) == parts(scene)
+
+
+@pytest.mark.parametrize("scale", [0.5, 1.0, 2.0, 1 / 640])
+def test_intrinsics_of_another_size_are_noted(scale, model, scene_dir):
+    """A transforms.json may state no size, and its photographs may be resized; 1 / 640: shares."""
+    lens = model.images[0].intrinsics
+    scaled = replace(lens, params=tuple(scale * each for each in lens.params))
+    path = scene_dir / "sparse/0/cameras.bin"
+    colmap.write_cameras(path, [scaled, model.images[1].intrinsics])
+    noted = [w for w in load_scene(scene_dir).warnings if "not in pixels of this size" in w]
+    assert len(noted) == (scale != 1)
+    assert all("2 of 4 images" in note and model.images[0].name in note for note in noted)

@@ -284,8 +284,11 @@ def _focal_length(
 ) -> float:
     angle = values.get(f"camera_angle_{axis}")
     if values.get(f"fl_{axis}") is None and angle is not None:
-        half = math.tan(_number(where, values, f"camera_angle_{axis}") / 2)
-        focal_length = 0.5 * size / half if half else math.inf
+        radians = _number(where, values, f"camera_angle_{axis}")
+        if not 0 < radians < math.pi:
+            expected = f"a camera_angle_{axis} between 0 and pi, in radians, in {where}"
+            raise NotFiniteError(expected, found=f"{radians:g}", fix=_FIX)
+        focal_length = 0.5 * size / math.tan(radians / 2)
     else:
         focal_length = _number(where, values, f"fl_{axis}", default)
     if not 0 < focal_length < math.inf:

@@ -30,6 +30,11 @@ ASPECT_SLACK = 0.02
 """Largest relative difference in aspect ratio between a resized copy and its camera."""
 ROUNDING = 2.0
 """Pixels by which a side may be off after resizing; rounding gives 1 at most."""
+MAX_OFF_CENTER = 0.2
+"""Distance of a principal point from the image centre along both axes, as shares of the size, that
+suggests another size: half the pixels put it at a quarter, twice at the corner."""
+MIN_FOCAL = 0.05
+"""Smallest plausible focal length of a perspective camera, in image sizes: 169 degrees."""
 _SIDEWAYS = frozenset({5, 6, 7, 8})
 """EXIF orientations that swap width and height."""
 _NAMED = 3  # photographs listed in a message
@@ -135,15 +140,16 @@ def _sideways(path: Path) -> int:
 
 
 def image_warnings(images: Sequence[Image], image_dir: Path | None, root: Path) -> list[str]:
-    """Warn of missing photographs and of sizes that do not fit their cameras."""
+    """Warn of missing photographs, and of cameras that do not fit their sizes."""
     if not images:
         return []
+    odd = _odd_camera_warnings(images)
     if image_dir is None:
         dead = root / "images" if (root / "images").is_symlink() else None
         missing = (
             f"{dead} links to {dead.readlink()}, which does not exist" if dead else "is missing"
         )
-        return [f"The images folder {missing}; points can be made, but not trained."]
+        return [f"The images folder {missing}; points can be made, but not trained.", *odd]
     absent = {im.name: None for im in images if not (image_dir / im.name).is_file()}
     warnings = [_missing_warning([*absent], len(images), image_dir)] if absent else []
     # Links are not followed: users make them on purpose.
@@ -155,7 +161,31 @@ def image_warnings(images: Sequence[Image], image_dir: Path | None, root: Path) 
         warnings.append(
             f"{len(outside)} of {len(images)} images {lie} outside of {root}, such as {outside[0]}."
         )
+    warnings += odd
     return [*warnings, *_size_warnings([im for im in images if im.name not in absent], image_dir)]
+
+
+def _odd_camera_warnings(images: Sequence[Image]) -> list[str]:
+    """Warn of focal lengths and principal points that are probably of another image size."""
+    odd = [image for image in images if _is_of_another_size(image.intrinsics)]
+    if not odd:
+        return []
+    lens = odd[0].intrinsics
+    fx, fy, cx, cy = lens.K[[0, 1, 0, 1], [0, 1, 2, 2]]
+    of = f"{len(odd)} of {counted(len(images), 'image')}"
+    what = f"The focal lengths and principal point of {of} are probably not in pixels of this size"
+    such = f"({fx:.4g}, {fy:.4g}) and ({cx:.4g}, {cy:.4g}) in {lens.width} x {lens.height}"
+    advice = "State the width and height that they belong to."
+    return [f"{what}: {such} for {odd[0].name}. {advice}"]
+
+
+def _is_of_another_size(lens: Intrinsics) -> bool:
+    """Whether intrinsics do not fit the image size, as after resizing, or if they are fractions."""
+    size = np.array([lens.width, lens.height])
+    right, below = lens.K[:2, 2] / size - 0.5
+    off = min(abs(right), abs(below)) if right * below > 0 else 0.0
+    too_wide = not lens.is_fisheye and min(lens.K[[0, 1], [0, 1]] / size) < MIN_FOCAL
+    return bool(off > MAX_OFF_CENTER or too_wide)
 
 
 def _missing_warning(missing: Sequence[str], count: int, image_dir: Path) -> str:
