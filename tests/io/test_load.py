@@ -41,12 +41,15 @@ def test_model_is_found_in_its_usual_places(scene_dir, model, place):
         np.testing.assert_array_equal(scene.tracks.xyz, model.tracks.xyz)
 
 
-def test_photographs_are_where_most_of_them_are(scene_dir):
-    shutil.copytree(scene_dir / "images", scene_dir / "images_2")
-    for missing in ("images/left/image000.jpg", "images_2/left/image001.jpg"):
-        (scene_dir / missing).unlink()
-    (scene_dir / "images_2/left/image002.jpg").unlink()
+def test_photographs_are_where_at_least_half_of_them_are(scene_dir):
+    """A folder that lacks a few is not replaced: the next may hold reduced or distorted copies."""
+    shutil.copytree(scene_dir / "images", scene_dir / "input")
+    (scene_dir / "images/left/image000.jpg").unlink()
     assert load_scene(scene_dir).source.image_dir == scene_dir / "images"
+    for number in (1, 2):
+        (scene_dir / f"images/left/image00{number}.jpg").rename(scene_dir / f"{number}.jpg")
+    assert load_scene(scene_dir).source.image_dir == scene_dir / "input"
+    shutil.rmtree(scene_dir / "input")
     named = scene_dir.rename(scene_dir.with_name("colmap"))  # as nerfstudio's folder of a model
     assert load_scene(named).source.image_dir == named / "images"
 

@@ -175,13 +175,17 @@ def read_colmap_scene(model_dir: StrPath) -> Scene:
 
 
 def _image_dir(root: Path, images: Sequence[Image]) -> Path | None:
-    """Return the first known folder with all images, else that with most, else the first one."""
+    """Return the first known folder with half of the images, else that with most, or the first.
+
+    Not the first with all: where one lacks a photograph, the next may hold reduced copies or, as
+    graphdeco's ``input``, photographs with distortion that the model's cameras do not have.
+    """
     folders = [root / name for name in IMAGE_DIRS if (root / name).is_dir()]
     counts_by_folder = dict[Path, int]()
     for folder in (*folders, root):
         counts_by_folder[folder] = sum((folder / image.name).is_file() for image in images)
-        if counts_by_folder[folder] == len(images) > 0:
-            break
+        if 2 * counts_by_folder[folder] >= len(images) > 0:
+            return folder
     best = max(counts_by_folder, key=lambda folder: counts_by_folder[folder])
     return best if counts_by_folder[best] else next(iter(folders), None)
 
