@@ -96,11 +96,9 @@ def test_masks_that_leave_out_most_pixels_may_be_inverted(scene_path, tmp_path):
         paint(tmp_path / f"own/view_{i:03}.png")
         counted = paint(scene_path / f"masks/view_{i:03}.png", inside=255)
     assert 1 - counted.mean() == pytest.approx(0.91, abs=0.005)
-    scene = load_scene(scene_path)
-    assert (
-        sum(note in warning for warning in (*scene.warnings, *masks_near(scene_path / "images")[1]))
-        == 2
-    )
+    scene, of_sfm = load_scene(scene_path), masks_near(scene_path / "images")[1]
+    assert [each for each in scene.warnings if note in each] == [f"{note}, use `masks='inverted'`."]
+    assert f"{note}, invert them." in of_sfm  # sfm has no such option
     for choice in ("inverted", "none", str(tmp_path / "own")):
         assert not any(note in warning for warning in with_masks(scene, choice).warnings)
 

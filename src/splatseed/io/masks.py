@@ -102,10 +102,10 @@ def masks_near(photographs: Path) -> tuple[Masks, list[str]]:
     if files:
         where = next(iter(files.values())).parent
         notes = [f"{counted(len(files), 'photograph')} with a mask in {where}.", *notes]
-    return Masks(files), [*notes, *_mostly_masked(Masks(files))]
+    return Masks(files), [*notes, *_mostly_masked(Masks(files), "invert them")]
 
 
-def _mostly_masked(masks: Masks) -> list[str]:
+def _mostly_masked(masks: Masks, fix: str = f"use `masks={INVERTED!r}`") -> list[str]:
     """Note masks that leave out most pixels, by a sample: many tools mark by 255 what to leave out.
 
     Masks that the user has called inverted are taken as they are.
@@ -117,7 +117,7 @@ def _mostly_masked(masks: Masks) -> list[str]:
     if not shares or (share := float(np.mean(shares))) < _MOST:
         return []
     what = f"Masks leave out {share:.0%} of the pixels of their photographs"
-    return [f"{what}: if 0 marks the pixels that count, use `masks={INVERTED!r}`."]
+    return [f"{what}: if 0 marks the pixels that count, {fix}."]
 
 
 def _resized(files: Mapping[str, Path], folder: Path) -> list[str]:
