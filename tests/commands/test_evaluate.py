@@ -13,6 +13,7 @@ from splatseed.io import load_scene
 from splatseed.splat.evaluate import evaluate_views
 from splatseed.splat.formats import write_gaussians
 from splatseed.splat.from_seeds import initial_gaussians
+from splatseed.training.models import split_doubt
 from splatseed.training.prepare import prepare_run
 from splatseed.training.settings import TrainSettings
 
@@ -62,6 +63,16 @@ def test_a_ply_of_another_trainer_is_scored(model, room, splatseed, tmp_path, mo
     weights = ("LPIPS was not computed", "https://", str(tmp_path / "hub"), "--lpips-weights")
     assert all(said in run.out for said in ("mean", *weights)), run.out
     assert run.err == ""
+    assert "does not record on which photographs it was trained" in run.out
+
+
+@pytest.mark.parametrize("evaluated", [True, False])
+def test_graphdecos_trainer_records_whether_it_held_out_photographs(evaluated, tmp_path):
+    model = tmp_path / "point_cloud/iteration_7/point_cloud.ply"
+    model.parent.mkdir(parents=True)
+    (tmp_path / "cfg_args").write_text(f"Namespace(data_device='cuda', eval={evaluated})")
+    assert ("eval=False" in split_doubt(model, 3)) != evaluated
+    assert bool(split_doubt(model, 3)) != evaluated
 
 
 def _refused(run, *texts):

@@ -48,6 +48,8 @@ def test_a_run_is_exported_cropped_cleaned_and_can_be_scored(model, splatseed, t
     kept = read_gaussians(out)
     assert 70 < len(kept) < 130
     assert kept.means[:, 2].min() > -0.01
+    assert "upside down" in splatseed("export", out, "-o", tmp_path / "again.ply").out
+    assert "upside down" not in splatseed("export", out, "-o", tmp_path / "again.spz").out
 
 
 def test_gaussians_left_out_are_noted_once(model, splatseed, tmp_path):

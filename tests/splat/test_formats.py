@@ -6,6 +6,7 @@ import gzip
 import json
 import os
 import shutil
+import struct
 import subprocess
 import zipfile
 from contextlib import suppress
@@ -15,10 +16,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
+from splatseed.camera import rotation_from_quat
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError, SplatseedError
+from splatseed.similarity import Similarity
 from splatseed.splat import formats
 from splatseed.splat.formats import FORMATS, read_gaussians, write_gaussians
 from splatseed.splat.gaussians import Gaussians
+from splatseed.splat.model_frame import transform_gaussians
 from splatseed.splat.sog import _MAX_META
 
 SUFFIXES = [each.suffix for each in FORMATS.values()]
@@ -211,6 +215,53 @@ def test_an_unpacked_sog_is_read(files, tmp_path):
 # Crop and clean ----------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("version", [3, 4])
+def test_axes_named_in_an_spz_are_converted(version, tmp_path):
+    """SPZ_ADOBE_coordinate_system, after another extension."""
+    pytest.importorskip("torch", reason="rotating harmonics needs PyTorch")
+    from splatseed.rendering.harmonics import sh_basis
+
+    truth = _gaussians()
+    write_gaussians(tmp_path / "m.spz", truth)
+    content = bytearray(gzip.decompress((tmp_path / "m.spz").read_bytes()))
+    upright, content[14] = read_gaussians(tmp_path / "m.spz"), 2  # the flag of extensions
+
+    def read_as(axes):
+        records = struct.pack("<IIB", 0xADBE0002, 1, 5) + struct.pack("<III", 0xADBE0003, 4, axes)
+        file = gzip.compress(bytes(content) + records)
+        if version == 4:
+            zstandard = pytest.importorskip("zstandard", reason="version 4 needs zstandard")
+            sizes, at, table, streams = (9, 1, 3, 3, 4, 45), 16, b"", b""
+            for size in (size * len(truth) for size in sizes):
+                stream = zstandard.compress(bytes(content[at : at + size]))
+                table += struct.pack("<QQ", len(stream), size)
+                streams, at = streams + stream, at + size
+            header = bytes(content[:4]) + struct.pack("<I", 4) + bytes(content[8:16])
+            file = header + struct.pack("<I12x", 32 + len(records)) + records + table + streams
+        (tmp_path / "m.spz").write_bytes(file)
+        return read_gaussians(tmp_path / "m.spz")
+
+    def covariances(model):
+        rotations = np.stack([rotation_from_quat(quat) for quat in _unit(model.quats)])
+        return np.einsum("nij,nj,nkj->nik", rotations, np.exp(2 * model.scales), rotations)
+
+    directions = np.random.default_rng(0).normal(size=(20, 3))
+    # Unspecified; the default; right, down, front; left, up, front.
+    for axes, signs in {0: (1, 1, 1), 4: (1, 1, 1), 6: (1, -1, -1), 7: (-1, 1, -1)}.items():
+        model = read_as(axes)
+        assert np.array_equal(model.means, upright.means * np.float32(signs))
+        flipped = covariances(upright) * np.outer(signs, signs)
+        np.testing.assert_allclose(covariances(model), flipped, rtol=1e-3, atol=1e-6)
+        bases = [sh_basis(each, 16)[:, 1:] for each in (directions, directions * signs)]
+        colors = [
+            np.einsum("dk,nkc->ndc", basis, each.shN)
+            for basis, each in zip(bases, (model, upright), strict=True)
+        ]
+        np.testing.assert_allclose(*colors, atol=1e-4)
+    with pytest.raises(SceneFormatError, match="SPZ_ADOBE_coordinate_system"):
+        read_as(12)
+
+
 def test_crop_and_min_opacity_filter_gaussians():
     model = _gaussians()
     kept = formats.filter_gaussians(model, formats.parse_crop("-1,-2,-3,1,2,3"), 0.25)
@@ -243,6 +294,14 @@ def converter():
     return convert
 
 
+def _upright(model, suffix, truth):
+    """The model as the truth is turned: newer versions do not convert the axes of an .spz."""
+    low, high = truth.means.min(axis=0), model.means.min(axis=0)
+    if suffix != ".spz" or np.abs(low - high).max() < 0.1:
+        return model
+    return transform_gaussians(model, Similarity(1.0, np.diag([1.0, -1.0, -1.0]), np.zeros(3)))
+
+
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_splat_transform_reads_our_files(suffix, converter, tmp_path):
     truth = _gaussians()
@@ -250,7 +309,8 @@ def test_splat_transform_reads_our_files(suffix, converter, tmp_path):
     converter(tmp_path / f"ours{suffix}", tmp_path / "theirs.ply")
     limits = [None if limit is None else limit + 1e-6 for limit in LIMITS[suffix]]
     limits[2] = 2 * limits[2] + 0.01  # it takes 127.5 for the middle of a byte, not 128
-    _assert_close(read_gaussians(tmp_path / "theirs.ply"), truth, limits)
+    theirs = _upright(read_gaussians(tmp_path / "theirs.ply"), suffix, truth)
+    _assert_close(theirs, truth, limits)
 
 
 @pytest.mark.parametrize("suffix", [".compressed.ply", ".spz", ".sog"])
@@ -262,6 +322,6 @@ def test_we_read_files_of_splat_transform(suffix, converter, tmp_path):
         pytest.importorskip("zstandard", reason="version 4 needs zstandard")
     converter(tmp_path / f"theirs{suffix}", tmp_path / "as_they_read_it.ply")
     same = (1e-5, 1e-5, 0.1, 0.002, 1e-5, 1e-5)
-    theirs = read_gaussians(tmp_path / f"theirs{suffix}")
+    theirs = _upright(read_gaussians(tmp_path / f"theirs{suffix}"), suffix, truth)
     _assert_close(theirs, read_gaussians(tmp_path / "as_they_read_it.ply"), same)
     assert np.abs(np.sort(theirs.means, axis=0) - np.sort(truth.means, axis=0)).max() < 0.02

@@ -19,7 +19,12 @@ from splatseed.similarity import Similarity, fit_similarity
 from splatseed.splat.evaluate import evaluate_model, load_model
 from splatseed.splat.formats import write_gaussians
 from splatseed.splat.from_seeds import initial_gaussians
-from splatseed.splat.model_frame import check_frame, find_transform, transform_gaussians
+from splatseed.splat.model_frame import (
+    check_frame,
+    find_transform,
+    move_to_scene_frame,
+    transform_gaussians,
+)
 
 
 @pytest.fixture(scope="module")
@@ -173,6 +178,24 @@ def test_a_transform_that_would_be_refused_is_not_suggested(room, gaussians, tmp
     for given in (None, find_transform("gsplat", scene)):
         with pytest.raises(SceneFormatError, match="No known transform fits"):
             check_frame(tmp_path / "model.ply", scene, small, given)
+
+
+def test_a_flipped_model_is_named_and_a_cropped_one_is_accepted(room, gaussians, psnr, tmp_path):
+    """As of a .spz without converted axes, and of a model that its user cropped to a subject."""
+    path, scene = tmp_path / "model.ply", load_scene(room)
+    write_gaussians(path, transform_gaussians(gaussians, find_transform("flipped", scene)))
+    with pytest.raises(SceneFormatError, match=r"transform=.flipped"):
+        load_model(path, room)
+    scored = evaluate_model(load_model(path, room, transform="flipped"))
+    assert scored.psnr == pytest.approx(psnr, abs=0.05)
+    distance = np.linalg.norm(gaussians.means - gaussians.means[0], axis=1)
+    part = gaussians.select(np.argsort(distance)[: len(gaussians) // 4])
+    assert not check_frame(path, scene, part)
+    turned = transform_gaussians(part, find_transform("flipped", scene))
+    assert "flipped" in move_to_scene_frame(path, scene, turned)[1]
+    moved = replace(part, means=part.means + np.float32([0, 0, 30]))
+    with pytest.raises(SceneFormatError, match="No known transform fits"):
+        check_frame(path, scene, moved)
 
 
 def test_a_slightly_misplaced_model_is_scored_with_a_warning(room, gaussians, tmp_path):

@@ -19,8 +19,9 @@ from splatseed.io import load_scene, write_scene
 from splatseed.photos.view import NO_PIXELS, View, camera_views
 from splatseed.photos.viewpoint import look_at
 from splatseed.similarity import Similarity
-from splatseed.splat.formats import read_gaussians
+from splatseed.splat.formats import read_gaussians, write_gaussians
 from splatseed.splat.gaussians import Gaussians
+from splatseed.splat.model_frame import find_transform, transform_gaussians
 from splatseed.splat.rendering import ModelRenderer
 from splatseed.viewer import flights
 from splatseed.viewer.flights import orbit, read_path, smooth_path
@@ -138,6 +139,22 @@ def test_pictures_are_split_at_the_border():
 
 def test_a_ply_of_points_is_shown_as_points(room):
     assert open_item(room / "sparse/0/points3D.ply").gaussians is None
+
+
+def test_a_model_in_its_trainers_frame_is_shown_by_the_cameras_of_its_scene(
+    room, run_folder, tmp_path
+):
+    gaussians, scene = read_gaussians(run_folder / "point_cloud.ply"), load_scene(room)
+    transform = find_transform("gsplat", scene)
+    write_gaussians(tmp_path / "model.ply", transform_gaussians(gaussians, transform))
+    item = open_item(tmp_path / "model.ply", room)
+    assert np.abs(item.model.means - gaussians.means).max() < 1e-4
+    assert "trainer's frame (gsplat)" in item.notes[0]
+    elsewhere = dataclasses.replace(gaussians, means=gaussians.means + np.float32(100))
+    write_gaussians(tmp_path / "model.ply", elsewhere)
+    item = open_item(tmp_path / "model.ply", room)
+    assert np.array_equal(item.model.means, elsewhere.means)
+    assert "another scene" in item.notes[0]
 
 
 # The command --------------------------------------------------------------------------------------

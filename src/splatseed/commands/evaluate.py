@@ -40,13 +40,15 @@ class Options:
     scene: Path | None = None
     """The scene the model belongs to, in the same world; a run knows its own."""
     data_factor: int | None = None
-    """Factor by which photographs are downsampled; by default a run's own, else 1."""
+    """Factor by which photographs are downsampled; by default a run's own, else the smallest that
+    leaves at most 1600 pixels on the longer side."""
     test_every: int | None = None
     """Score every n-th image, sorted by name; by default as the run was trained, else 8."""
-    transform: Annotated[str | None, tyro.conf.arg(metavar="FILE|gsplat|none")] = None
+    transform: Annotated[str | None, tyro.conf.arg(metavar="FILE|gsplat|flipped|none")] = None
     """From the scene's world to the model's, if its trainer normalised the scene: a JSON file with
-    a matrix, nerfstudio's dataparser_transforms.json, graphdeco's cameras.json, or gsplat for its
-    examples' normalisation; none: score the model where it is, unchanged."""
+    a matrix, nerfstudio's dataparser_transforms.json, graphdeco's cameras.json, gsplat for its
+    examples' normalisation, or flipped for y and z negated; none: score the model where it is,
+    unchanged."""
     masks: MaskChoice = None
     """A folder of masks, where pixels of 0 do not count, or none; inverted: only they count. By
     default the run's, else the folder masks beside the photographs, and transparency."""

@@ -115,6 +115,11 @@ def run(arguments: list[str]) -> None:
     print_pairs("splatseed export", rows)
     for note in notes:
         print_note(note)
+    if path.suffix.lower() == ".spz" != target.suffix.lower():
+        print_note(
+            "The axes of the .spz were read as right, up, back, as specified. If the result is "
+            "upside down, they had not been converted (docs/models.md)."
+        )
     if name == "splat" and gaussians.shN.size:
         print_note("A .splat has no view-dependent colour: the model's is left out.")
     if page:

@@ -50,7 +50,7 @@ class Options:
     path: Annotated[Path | None, tyro.conf.arg(metavar="FILE|orbit")] = None
     """A camera path to fly instead: nerfstudio's JSON, in the model's world or that of --transform;
     or orbit, to circle the cameras' focus."""
-    transform: Annotated[str | None, tyro.conf.arg(metavar="FILE|gsplat|none")] = None
+    transform: Annotated[str | None, tyro.conf.arg(metavar="FILE|gsplat|flipped|none")] = None
     """Transform from the model's world to the path's, by default none: the
     dataparser_transforms.json of nerfstudio's run, or other values of evaluate --transform."""
     compare: Path | None = None

@@ -81,3 +81,11 @@ class Gaussians:
         """
         with atomic_file(Path(path)) as partial, partial.open("wb") as file:
             file.writelines(encode_layout(self.arrays(), self.antialiased))
+
+
+def antialiasing_note(file: str) -> str:
+    """Return a note for the user on an antialiased model in a file that cannot record it."""
+    return (
+        f"The model needs antialiased rendering, which {file} cannot record: small Gaussians will "
+        "be too opaque."
+    )

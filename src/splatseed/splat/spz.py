@@ -1,7 +1,10 @@
 """Read and write Niantic's .spz: one attribute after another, in gzip or zstd (version 4).
 
-Axes are right, up, back; ours are right, down, front: y and z change sign. Source: nianticlabs/spz
-(load-spz.cc, splat-types.h).
+Axes are right, up, back, unless an extension names others; ours are right, down, front: y and z
+change sign. Programs that do not convert axes (Niantic's ply_to_spz, PlayCanvas's splat-transform)
+store ours without a record of it: their models are read turned by 180 degrees about x, which
+``model_frame`` finds out where a scene is known. Source: nianticlabs/spz (load-spz.cc,
+splat-types.h, extensions).
 """
 
 from __future__ import annotations
@@ -10,11 +13,12 @@ import gzip
 import struct
 import zlib
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from splatseed.errors import ParameterError
+from splatseed.errors import ParameterError, SceneFormatError
 from splatseed.io.files import COPY_AGAIN, read_bytes, translate_errors
 from splatseed.progress import Note, silent_note
 from splatseed.requirements import require
@@ -36,8 +40,13 @@ _HEADER = struct.Struct("<4sIIBBBB")
 _VERSION = 3  # the latest that every reader accepts
 _MAX_FIXED, _MAX_BITS = 2**23 - 1, 20
 """Largest position in units of 2^-f (24 bits with a sign), and the largest f."""
-_ANTIALIASED = 1
-"""Flag of models that need antialiased rendering."""
+_ANTIALIASED, _EXTENDED = 1, 2
+"""Flags of models that need antialiased rendering, and of files with extensions."""
+_AXES_EXTENSION, _RIGHT_UP_BACK = 0xADBE0003, 4
+"""Type of the extension with the axes (SPZ_ADOBE_coordinate_system), and the default axes. Axes
+from 1 to 8 are 1 + 1 (x is right, not left) + 2 (y is up, not down) + 4 (z is front, not back)."""
+_MAX_EXTENSIONS = 1 << 20
+"""Maximum bytes of extensions; more is a damaged file."""
 _SH_COUNTS = (*SH_COUNTS, 24)
 """Coefficients beyond the first by degree; those of degree 4 are not used."""
 _LOG_SCALES = (-10.0, 255 / 16 - 10)
@@ -47,10 +56,26 @@ _MAX_LOST_SHARE = 0.1
 _NINE_BITS = np.float32(511 * np.sqrt(2))
 _COLOR = 0.15 * 255
 """Bytes per unit of the first coefficient: the format's scale."""
-_AXES = np.array([1, -1, -1], np.float32)
-_QUAT = np.array([1, 1, -1, -1], np.float32)
-_SH = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
-"""Signs of the spherical harmonics of degrees 1 to 3 when y and z are flipped."""
+
+
+class _Signs(NamedTuple):
+    """Signs that turn a model's axes into ours: of positions, of wxyz, and of harmonics."""
+
+    position: Float32[np.ndarray, " 3"]
+    quat: Float32[np.ndarray, " 4"]
+    sh: Float32[np.ndarray, " 15"]  # of degrees 1 to 3
+
+
+def _signs(axes: int) -> _Signs:
+    """Return the signs for axes 1 to 8."""
+    right, up, front = (bool((axes - 1) >> bit & 1) for bit in range(3))
+    x, y, z = 1 if right else -1, -1 if up else 1, 1 if front else -1
+    sh = [y, z, x, x * y, y * z, 1, x * z, 1, y, x * y * z, y, z, x, z, x]
+    rows = [x, y, z], [1, y * z, x * z, x * y], sh
+    return _Signs(*(np.array(row, np.float32) for row in rows))
+
+
+_OWN = _signs(_RIGHT_UP_BACK)
 _STEP = 4
 """Harmonics are rounded to multiples of this many 128ths, which compress better. Niantic's writer
 uses 8 for degree 1 and 16 beyond it: files are a quarter smaller, but the small coefficients of a
@@ -67,10 +92,10 @@ def encode(gaussians: Gaussians, note: Note = silent_note) -> list[bytes]:
     order = morton_order(gaussians.means)
     rest = gaussians.shN.shape[1]
     # Positions in units of 2^-f; a harmonic c as 128 c + 128.
-    fixed = np.rint(gaussians.means[order] * _AXES * np.float64(2**bits)).astype("<i4")
-    sh = np.rint(gaussians.shN[order] * _SH[:rest, None] * 128 + 128)
+    fixed = np.rint(gaussians.means[order] * _OWN.position * np.float64(2**bits)).astype("<i4")
+    sh = np.rint(gaussians.shN[order] * _OWN.sh[:rest, None] * 128 + 128)
     # From the highest bits: index of the largest of xyzw, then sign and size of each other one.
-    quats = gaussians.quats[order] * _QUAT
+    quats = gaussians.quats[order] * _OWN.quat
     largest, three = smallest_three(np.roll(quats, -1, axis=1))
     rotation = largest.astype(np.uint32)
     for i in range(3):
@@ -149,19 +174,20 @@ def decode(path: Path, note: Note = silent_note) -> Gaussians:
         check_memory(count, sum(sizes), "Gaussians", fix=COPY_AGAIN)
         num_bytes = count * sum(sizes)
         if in_zstd:
-            body = _zstd_body(data, count, [size for size in sizes if size])
+            body, extensions = _zstd_parts(data, count, [size for size in sizes if size])
         else:  # limited to the header's size: no zip bomb is unpacked
-            body = stream.decompress(stream.unconsumed_tail, num_bytes)
-        if not (in_zstd or stream.eof):  # read the checksum
-            stream.decompress(stream.unconsumed_tail, num_bytes)
+            body, extensions = stream.decompress(stream.unconsumed_tail, num_bytes), b""
+        if not (in_zstd or stream.eof):  # also reads the checksum
+            extensions = stream.decompress(stream.unconsumed_tail, _MAX_EXTENSIONS)
         if len(body) != num_bytes or not (in_zstd or stream.eof):
             raise ValueError(f"a stream that ends after {len(body):,} of {num_bytes:,} bytes")
+        signs = _signs(_axes_in(path, extensions) if flags & _EXTENDED else _RIGHT_UP_BACK)
         parts = np.split(np.frombuffer(body, np.uint8), count * np.cumsum(sizes)[:-1])
         position, opacity, color, scale, rotation, sh = (part.reshape(count, -1) for part in parts)
         harmonics = (sh.reshape(count, rest, 3).astype(np.float32) - 128) / 128
-        if rest > len(_SH):
-            note(f"Of {rest} coefficients beyond the first, {len(_SH)} (degree 3) are used.")
-            rest, harmonics = len(_SH), harmonics[:, : len(_SH)]
+        if rest > (limit := SH_COUNTS[-1]):
+            note(f"Of {rest} coefficients beyond the first, {limit} (degree 3) are used.")
+            rest, harmonics = limit, harmonics[:, :limit]
         if version == 1:  # half floats
             means = np.ascontiguousarray(position).view("<f2").astype(np.float32)
         else:
@@ -170,18 +196,42 @@ def decode(path: Path, note: Note = silent_note) -> Gaussians:
             fixed = np.where(fixed > _MAX_FIXED, fixed - 2**24, fixed)
             means = (fixed / 2.0**bits).astype(np.float32)
         return Gaussians(
-            means=means * _AXES,
+            means=means * signs.position,
             scales=(scale / 16 - 10).astype(np.float32),
-            quats=_quats(rotation) * _QUAT,
+            quats=_quats(rotation) * signs.quat,
             opacities=opacity_logits(opacity[:, 0]),
             sh0=((color - 127.5) / _COLOR).astype(np.float32)[:, None],
-            shN=np.asarray(harmonics * _SH[:rest, None], np.float32),
+            shN=np.asarray(harmonics * signs.sh[:rest, None], np.float32),
             antialiased=bool(flags & _ANTIALIASED),
         )
 
 
-def _zstd_body(data: bytes, count: int, sizes: list[int]) -> bytes:
-    """Decompress the attributes of version 4; its header ends with the offset of their table."""
+def _axes_in(path: Path, extensions: bytes) -> int:
+    """Return the axes that extensions name; each is its type, the length of its content, and that.
+
+    Raises:
+        SceneFormatError: z is not the front or back.
+    """
+    at, axes = 0, _RIGHT_UP_BACK
+    while at + 8 <= len(extensions):
+        kind, length = struct.unpack_from("<II", extensions, at)
+        if kind == _AXES_EXTENSION:
+            (axes,) = struct.unpack_from("<I", extensions, at + 8)
+        at += 8 + length
+    if axes > 8:
+        raise SceneFormatError(
+            f"{path} with y up or down, and z front or back",
+            found=f"other axes, of number {axes}, in SPZ_ADOBE_coordinate_system",
+            fix="Export it with the axes right, up, back.",
+        )
+    return axes or _RIGHT_UP_BACK  # 0: unspecified
+
+
+def _zstd_parts(data: bytes, count: int, sizes: list[int]) -> tuple[bytes, bytes]:
+    """Decompress the attributes of version 4; also return its extensions.
+
+    Its header of 32 bytes, with the offset of the attributes' table, precedes the extensions.
+    """
     require("zstandard")
     import zstandard  # noqa: PLC0415  (optional: extra `view`)
 
@@ -193,7 +243,7 @@ def _zstd_body(data: bytes, count: int, sizes: list[int]) -> bytes:
             data[at : at + length], max_output_size=count * size
         )
         at += length
-    return body
+    return body, data[2 * _HEADER.size : table]
 
 
 def _quats(raw: UInt8[np.ndarray, "N B"]) -> Float32[np.ndarray, "N 4"]:

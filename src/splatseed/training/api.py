@@ -253,7 +253,8 @@ def evaluate(
         test_every: Every n-th image, sorted by name, is a test view; by default as the run was
             trained, else 8.
         transform: From the scene's frame to the model's, if its trainer normalised the scene: a
-            file, "gsplat", or "none" to skip the check that they agree.
+            file, "gsplat", "flipped" (y and z negated), or "none" to skip the check that they
+            agree.
         masks: A folder of masks, "none", or "inverted"; by default the run's, else the scene's.
         lpips_weights: VGG's weights for LPIPS; by default from PyTorch's cache. Without weights
             LPIPS is None.

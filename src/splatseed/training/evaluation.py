@@ -22,7 +22,7 @@ from splatseed.splat.evaluate import OnView, TrainedModel, evaluate_model, load_
 from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.lpips import load_lpips
 from splatseed.training.device import pick_device
-from splatseed.training.models import config_of, model_file, near_plane_of
+from splatseed.training.models import config_of, model_file, near_plane_of, split_doubt
 from splatseed.training.settings import Backend, TrainSettings
 
 MINIMUM = {"data_factor": 1, "test_every": 2}
@@ -98,7 +98,7 @@ class Evaluation:
 
     def doubts(self, loaded: TrainedModel) -> list[str]:
         """Describe what may make the scores wrong, one sentence each."""
-        doubts = [*loaded.notes, *filter(None, [loaded.frame_warning])]
+        doubts = [*loaded.notes, loaded.frame_warning]
         trained_every = self.config.get("test_every")
         if isinstance(trained_every, int):
             train = {image.name for image in loaded.scene.split(trained_every)[0]}
@@ -108,7 +108,9 @@ class Evaluation:
                     f"The run was trained on {seen} of these {len(loaded.views)} views: its "
                     f"test_every was {trained_every}."
                 )
-        return doubts
+        elif isinstance(self.model, Path):
+            doubts.append(split_doubt(self.model, len(loaded.views)))
+        return [doubt for doubt in doubts if doubt]
 
     def score(
         self,

@@ -26,7 +26,7 @@ from splatseed.progress import Note, silent_note
 from splatseed.scene import Scene
 from splatseed.splat.formats import holds_gaussians, read_gaussians
 from splatseed.splat.gaussians import Gaussians
-from splatseed.splat.model_frame import move_to_scene_origin
+from splatseed.splat.model_frame import move_to_scene_frame, move_to_scene_origin
 from splatseed.splat.training_frame import TrainingFrame, frame_of_model
 from splatseed.text import quoted
 from splatseed.training.folder import RunFolder
@@ -95,7 +95,7 @@ def open_item(path: StrPath, scene_path: Path | None = None) -> ViewerItem:
         if path.is_file() and holds_gaussians(path):
             gaussians, scene = read_gaussians(path, notes.append), scene_at(scene_path)
             if scene is not None:
-                gaussians = move_to_scene_origin(path, scene, gaussians, notes.append)
+                gaussians = _in_scene(path, scene, gaussians, notes.append)
             return ViewerItem(path.name, scene, gaussians, notes=tuple(notes))
         scene = load_scene(path, require_points=False)
         if not scene.images and not len(scene.points):
@@ -111,12 +111,30 @@ def open_item(path: StrPath, scene_path: Path | None = None) -> ViewerItem:
             found="a run that has not finished",
             fix=f"Continue it: splatseed train SCENE -o {quoted(folder.path)} --resume.",
         )
-    scene = scene_at(scene_path) or scene_of_run(folder)
+    scene, own = scene_at(scene_path), scene_path is None
+    scene = scene or scene_of_run(folder)
     factor, every = _split_of_run(folder)
     gaussians = read_gaussians(folder.gaussians, notes.append)
     if scene is not None:
-        gaussians = move_to_scene_origin(folder.gaussians, scene, gaussians, notes.append)
+        move = move_to_scene_origin if own else _in_scene
+        gaussians = move(folder.gaussians, scene, gaussians, notes.append)
     return ViewerItem(folder.path.name, scene, gaussians, factor, every, tuple(notes))
+
+
+def _in_scene(path: Path, scene: Scene, gaussians: Gaussians, note: Note) -> Gaussians:
+    """Move Gaussians to the frame of the scene that the user names; note it if none is known."""
+    gaussians = move_to_scene_origin(path, scene, gaussians, note)
+    try:
+        gaussians, moved = move_to_scene_frame(path, scene, gaussians)
+    except SceneFormatError as error:
+        note(
+            f"The cameras probably do not show the Gaussians of {path} as photographed. "
+            f"Expected {error.expected}; found {error.found}."
+        )
+        return gaussians
+    if moved:
+        note(moved)
+    return gaussians
 
 
 def scene_of_run(folder: RunFolder) -> Scene | None:

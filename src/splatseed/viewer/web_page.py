@@ -23,7 +23,7 @@ from splatseed.photos.view import View
 from splatseed.progress import Note, Progress, silent, silent_note
 from splatseed.rendering.harmonics import sh_basis
 from splatseed.requirements import require
-from splatseed.splat.gaussians import SH_C0, Gaussians
+from splatseed.splat.gaussians import SH_C0, Gaussians, antialiasing_note
 from splatseed.splat.quantization import opacity_bytes, unit_quats
 from splatseed.text import counted
 from splatseed.viewer.flights import orbit
@@ -94,6 +94,8 @@ def write_page(
     model = item.model
     check_page_size(len(model))
     progress("encode", 0.0)
+    if model.antialiased:
+        note(antialiasing_note("a web page"))
     frame = viewer_frame(item)
     covariances, unit, clipped = page_covariances(model, frame.scale)
     if clipped:
