@@ -13,12 +13,14 @@ pytest.importorskip("pycolmap", reason="needs pycolmap")
 from splatseed.io.staging import locked
 from splatseed.progress import silent
 from splatseed.scene import Masks
-from splatseed.sfm import Settings, mapping
+from splatseed.sfm import Settings, mapping, pipeline
 from splatseed.sfm.cameras import Photo
 from splatseed.sfm.colmap import Run, posed_model, require_pycolmap
 from splatseed.sfm.database import run_database
 from splatseed.sfm.matching import match_photographs
 from splatseed.sfm.work_folder import WorkFolder, WorkKey, resumable_work, work_key
+
+from ..wide_png import png16
 
 PHOTOS = {name: Photo((40, 30), digest=name) for name in ("a.jpg", "b.jpg", "c.jpg")}
 
@@ -78,6 +80,24 @@ def test_another_run_uses_what_applies(other, unchanged, reusable, note, tmp_pat
     assert found == (unchanged, reusable, False)
     assert note in notes[0]
     assert fail(tmp_path / "out", key(**other))[1] == (True, len(other.get("photos", PHOTOS)), True)
+
+
+def test_brighter_photographs_of_few_bits_make_features_anew(tmp_path, monkeypatch):
+    """Features are found at the white of the whole capture."""
+    whites = []
+
+    def stop(*_, features, **__):
+        whites.append(features[-1])
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(pipeline, "work_key", stop)
+    (photos := tmp_path / "photos").mkdir()
+    for name, largest in (("a.png", 900), ("b.png", 800), ("c.png", 4000)):
+        (photos / name).write_bytes(png16(np.full((30, 40, 3), largest)))
+        if name != "a.png":
+            with pytest.raises(KeyboardInterrupt):
+                pipeline.reconstruct(photos, tmp_path / "out")
+    assert whites == [1023, 4095]
 
 
 def test_a_kill_before_the_database_is_rewritten_loses_only_what_differs(tmp_path):

@@ -22,6 +22,7 @@ import numpy as np
 from splatseed import errors
 from splatseed.camera import CAMERA_MODELS, Intrinsics
 from splatseed.io import write_scene
+from splatseed.io.bit_depth import find_white
 from splatseed.io.colmap_layout import write_split
 from splatseed.io.colmap_model import read_model_cameras
 from splatseed.io.files import StrPath
@@ -151,9 +152,11 @@ def reconstruct(
         if refine_poses or poses is None:
             settings = _for_poses(settings, photos)
         lenses = _lenses(cameras, camera_model, poses)
+        white, _ = find_white([images / name for name in photos])
         key = work_key(
             *(photos, lenses, masks, settings.seed),
-            features=[settings.max_image_size, settings.doubled],
+            # Features are found in copies of photographs that use fewer than 16 bits.
+            features=[settings.max_image_size, settings.doubled, white],
             pairs=[settings.matcher, refine_poses],
         )
         options = camera_model, poses, refine_poses, test_names, masks, partial
