@@ -232,7 +232,7 @@ def test_maps_in_another_unit_are_a_problem(rgbd, splatseed):
     camera.write_text(camera.read_text().replace('"scale": 5000', '"scale": 1000'))
     run = splatseed("info", rgbd)
     assert run.code == 0
-    assert _pairs(run.out)["depth maps"] == "12 of 120 x 90 pixels"
+    assert _pairs(run.out)["depth maps"] == "12 of 96 x 72 pixels"
     assert "the depth maps are in another unit than the poses: their depth is" in run.out
     assert "--method depth" not in run.out
 
