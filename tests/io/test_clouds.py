@@ -179,6 +179,21 @@ def test_white_of_colours_in_other_types(tmp_path, points, kind, white, odd):
     check(path, xyz, rgb)
 
 
+def test_packed_colours_of_a_text_pcd_may_be_printed_as_integers(tmp_path, points):
+    xyz, rgb = points
+    bits = rgb @ np.array([1 << 16, 1 << 8, 1], np.uint32)
+    printed = {"bits": bits, "opaque": bits | 0xFF << 24, "floats": bits.view(np.float32)}
+    for name, values in printed.items():
+        rows = [f"{x} {y} {z} {c}" for (x, y, z), c in zip(xyz, values.tolist(), strict=True)]
+        head = f"FIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F F\nPOINTS {NUM}\nDATA ascii\n"
+        (tmp_path / f"{name}.pcd").write_text(head + "\n".join(rows) + "\n")
+        check(tmp_path / f"{name}.pcd", xyz, rgb)
+    lines = (tmp_path / "floats.pcd").read_text().split("\n")
+    path = tmp_path / "lost.pcd"
+    path.write_text("\n".join([*lines[:5], f"{lines[5].rpartition(' ')[0]} nan", *lines[6:]]))
+    check(path, xyz, np.concatenate([np.full((1, 3), 128), rgb[1:]]))
+
+
 def test_point_maps_of_networks(tmp_path, rng):
     """VGGT's fields: images have channels before rows; DUSt3R's and MASt3R's have them last."""
     xyz = rng.normal(size=(2, 5, 7, 3)).astype(np.float32)

@@ -16,6 +16,7 @@ from PIL import Image as PilImage
 from splatseed.camera import Camera, Intrinsics, rotation_from_quat
 from splatseed.errors import OutputError, SceneFormatError, SplatseedError
 from splatseed.io import load_scene, write_scene
+from splatseed.io.masks import read_mask
 from splatseed.io.nerfstudio import pair_centers, read_transforms
 from splatseed.io.ply import read_ply, write_ply
 from splatseed.pointcloud import PointCloud
@@ -261,6 +262,25 @@ def test_malformed_files_and_frames_are_named(content, tmp_path, change, frame):
     path.write_bytes(change if frame is None else json.dumps(content | change).encode())
     with pytest.raises(SceneFormatError, match=r"t\.json, frame 2" if frame else r"t\.json"):
         read_transforms(path)
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_masks_of_blenders_files(named, tmp_path):
+    """Named by the frames, or in a folder; transparent pixels stay empty space."""
+    root, pixels = tmp_path / "lego", np.full((30, 40), 255, np.uint8)
+    pixels[:, :10] = 0
+    for part in ("train", "test"):
+        for folder in (part, f"masks/{part}"):
+            (root / folder).mkdir(parents=True)
+        PilImage.new("RGBA", (40, 30)).save(root / part / "r_0.png")
+        mask = f"{part}_0.png" if named else f"masks/{part}/r_0.png"
+        PilImage.fromarray(pixels).save(root / mask)
+        frame = {"file_path": f"./{part}/r_0", "transform_matrix": np.eye(4).tolist()}
+        frames = [{**frame, **({"mask_path": mask} if named else {})}]
+        write_json(root / f"transforms_{part}.json", {"camera_angle_x": 0.7, "frames": frames})
+    scene = load_scene(root, require_points=False)
+    for image in scene.images:
+        np.testing.assert_array_equal(read_mask(scene.masks, image.name, image.path), pixels > 0)
 
 
 @pytest.mark.parametrize("layout", ["auto", "colmap"])

@@ -79,14 +79,14 @@ def mask_choice(scene: Scene) -> str | None:
 def with_own_masks(scene: Scene) -> Scene:
     """Attach the masks found near the photographs of a scene that was just read, if it has none."""
     folder = scene.source.image_dir if scene.source else None
-    masks, notes = scene.masks, list[str]()
+    masks, notes = scene.masks or Masks({}), list[str]()
     if scene.source is None or folder is None:
         return scene
-    if masks is None:
+    if not masks.files:
         names = [image.name for image in scene.images]
         files, notes = find_own_masks(names, folder, scene.source.root)
         notes += _resized(files, folder)
-        masks = Masks(files)
+        masks = replace(masks, files=files)
     return scene.replace(masks=masks, warnings=(*scene.warnings, *notes, *_mostly_masked(masks)))
 
 

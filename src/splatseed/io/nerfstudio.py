@@ -154,14 +154,20 @@ def read_blender(folder: StrPath) -> Scene:
         notes = [f"{path}: {lacking}, so some training images become test views."]
     cameras: dict[tuple[object, ...], Intrinsics] = {}
     images: list[Image] = []
+    masks: dict[str, Path] = {}
     for part in parts:
-        for image in part.images:
+        fields: dict[str, Mapping[str, Any]] = {}
+        for image, frame in zip(part.images, part.frames, strict=True):
             lens = image.intrinsics
             key = (lens.model, lens.width, lens.height, lens.params)
             shared = cameras.setdefault(key, replace(lens, camera_id=len(cameras) + 1))
             name = os.path.relpath(part.image_dir / image.name, folder.absolute())
             name = PurePath(name).as_posix()
+            fields[name] = frame.fields
             images.append(replace(image, name=name, image_id=len(images) + 1, intrinsics=shared))
+        found_masks, gone = named_masks(FrameFiles(part.path), fields)
+        masks |= found_masks
+        notes += gone
     points, exact, points_path, found = _find_points(parts[0])
     notes = list(dict.fromkeys((*notes, *(each for p in parts for each in p.warnings), *found)))
     names, num_train = [image.name for image in images], len(parts[0].images)
@@ -173,7 +179,7 @@ def read_blender(folder: StrPath) -> Scene:
         source=SceneSource("transforms", folder, points_path, image_dir=folder),
         warnings=(*notes, *image_warnings(images, folder, folder), *lens_warnings(images)),
         listed=Split(train, test, f"pair of {_BLENDER[0]} and {_BLENDER[1]}") if split else None,
-        masks=Masks({}, alpha=False),  # transparent pixels are empty space, trained as black
+        masks=Masks(masks, alpha=False),  # transparent pixels are empty space, trained as black
     )
     return recentered(scene, exact)
 

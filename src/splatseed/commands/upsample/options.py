@@ -32,8 +32,8 @@ class Options:
     """Upsample the points of a scene, ready for any 3DGS trainer."""
 
     scene: Annotated[Path, tyro.conf.Positional]
-    """A COLMAP folder, one with transforms.json, an RGB-D capture, or a cloud (.ply, .las, .laz,
-    .e57, .xyz ...)."""
+    """A COLMAP folder, one with transforms.json, an RGB-D capture, or a .ply of points; other
+    clouds are seeds of a scene (--cloud)."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """The scene folder to write."""
     method: str = DEFAULT_METHOD

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from splatseed.io.files import open_file, translate_errors
 from splatseed.runtime.memory import check_memory
 
 _HEADER_BYTES = 1 << 16
+_MAX_PACKED, _PACKED_GREY = 2**32 - 1, 0x808080
 _KINDS = {"F": "f", "I": "i", "U": "u"}
 
 
@@ -35,7 +36,26 @@ def open_pcd(path: Path) -> CloudFile:
     fields = [(name, int(np.prod(dtype[name].shape, dtype=int))) for name in dtype.names or ()]
     names = [name if i == 0 else f"{name} {i}" for name, count in fields for i in range(count)]
     types = {PACKED_RGB: dtype[PACKED_RGB]} if PACKED_RGB in names else {}
+    if types and dtype[PACKED_RGB].kind == "f":
+        return _FloatColorLines(path, names, offset, rows)
     return LineCloud(path, names, offset, rows, types=types)
+
+
+class _FloatColorLines(LineCloud):
+    """Lines whose packed colours are floats, or the integers of the same bits.
+
+    The bits of an opaque colour are a NaN as a float, so some writers print the integer; of a NaN
+    the colour is lost, and grey.
+    """
+
+    def _block(self, lines: Sequence[str], num_before: int) -> Block:
+        block = dict(super()._block(lines, num_before))
+        packed = np.asarray(block[PACKED_RGB])
+        whole = packed >= 1  # as a float a colour without its unused byte is below 1e-37
+        bits = packed.astype(np.float32).view(np.uint32)
+        bits[whole] = np.minimum(packed[whole], _MAX_PACKED).astype(np.uint32)
+        bits[np.isnan(packed)] = _PACKED_GREY
+        return {**block, PACKED_RGB: bits}
 
 
 class _ColumnCloud(CloudFile):
