@@ -264,6 +264,24 @@ def test_each_picture_is_drawn_and_a_moving_one_keeps_the_most_visible(entry, mo
     assert np.abs(full - fast).mean() < 0.6 * full.std()
 
 
+def test_photographs_are_shown_as_models_are_rendered_without_distortion(room):
+    scene = load_scene(room)
+    lens = scene.images[0].intrinsics
+    bent = replace(lens, model="OPENCV", params=(*lens.params, -0.4, 0.0, 0.0, 0.0))
+    image = replace(scene.images[0], intrinsics=bent)
+    entry = _entry(ViewerItem("room", scene.replace(images=(image, *scene.images[1:]))))
+    canvas = _canvas_at(entry, image, (lens.width, lens.height))
+    shown = entry.draw("photograph", canvas, image)[0].astype(int)
+    with Image.open(room / "images" / image.name) as file:
+        stored = np.asarray(file.convert("RGB")).astype(int)
+    fx, fy, cx, cy = lens.params
+    row, column = np.indices(stored.shape[:2])
+    x, y = (column + 0.5 - cx) / fx, (row + 0.5 - cy) / fy
+    factor = 1 - 0.4 * (x**2 + y**2)  # the lens pulls pixels inwards
+    wanted = stored[(fy * factor * y + cy).astype(int), (fx * factor * x + cx).astype(int)]
+    assert np.abs(shown - wanted).mean() < 0.5 * np.abs(stored - wanted).mean()
+
+
 def test_a_picture_that_cannot_be_drawn_has_a_reason(room, run_folder, tmp_path):
     own = shutil.copytree(room, tmp_path / "own")
     entry = _entry(open_item(run_folder, own))

@@ -23,6 +23,7 @@ from PIL import Image as PillowImage
 from splatseed.camera import Camera, quat_from_rotation, rotation_from_quat
 from splatseed.errors import SplatseedError
 from splatseed.methods import source_name
+from splatseed.photos.undistortion import undistort
 from splatseed.photos.view import View, camera_views
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene
@@ -235,8 +236,12 @@ def _view_within(image: Image, side: int) -> View:
 
 @lru_cache(maxsize=8)
 def _photograph_of(scene: Scene, image: Image, side: int) -> UInt8[np.ndarray, "h w 3"] | None:
+    """Read a photograph without its lens distortion, as models are rendered."""
     view = _view_within(image, side)
-    return photograph_at(scene, image, (view.width, view.height))
+    photograph = photograph_at(scene, image, (view.width, view.height))
+    if photograph is None or not image.intrinsics.has_distortion:
+        return photograph
+    return undistort(photograph, image.intrinsics, view.K)[0]
 
 
 # What the browser draws ---------------------------------------------------------------------------
