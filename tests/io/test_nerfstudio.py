@@ -312,4 +312,5 @@ def test_blenders_files_are_one_scene_and_so_is_its_output(layout, tmp_path, rng
         seen = [im.camera.project(each.points.xyz.astype(np.float64))[0] for im in ordered]
         pixels.append(np.nan_to_num(np.stack(seen)))
     np.testing.assert_allclose(*pixels, rtol=1e-3, atol=1e-2)
+    assert [each.masks.alpha for each in (scene, again)] == [False, False]  # black, not masked
     assert not [each for each in scene.warnings if "missing" in each or "outside" in each]

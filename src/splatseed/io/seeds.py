@@ -21,7 +21,7 @@ from jaxtyping import Float32
 
 from splatseed.errors import PointCloudError
 from splatseed.io.files import ARCHIVE_FAILURES, read_npy
-from splatseed.io.staging import ABSENT, MANIFEST, read_manifest, write_json
+from splatseed.io.staging import ABSENT, BLACK, MANIFEST, TRANSPARENT, read_manifest, write_json
 from splatseed.pointcloud import ATTRIBUTES, ORIGINAL, PointCloud
 from splatseed.runtime.fingerprint import fingerprint
 from splatseed.scene import Scene
@@ -111,8 +111,10 @@ def carry_seeds(scene: Scene, written: Path, folder: Path) -> None:
     """
     if (written / SEEDS).is_file():
         shutil.copyfile(written / SEEDS, folder / SEEDS)
-    absent = {ABSENT: list(scene.absent)} if scene.absent else {}
-    write_json(folder / MANIFEST, {**absent, UPSAMPLED: _upsampling(scene)})
+    facts: dict[str, Any] = {ABSENT: list(scene.absent)} if scene.absent else {}
+    if scene.masks and not scene.masks.alpha:
+        facts[TRANSPARENT] = BLACK
+    write_json(folder / MANIFEST, {**facts, UPSAMPLED: _upsampling(scene)})
 
 
 def _read_seeds(folder: Path, points: PointCloud) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:

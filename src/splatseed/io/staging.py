@@ -36,6 +36,8 @@ MANIFEST = "splatseed.json"
 """The file that marks a folder as written by splatseed."""
 ABSENT = "absent"
 """The manifest's key for ``Scene.absent``."""
+TRANSPARENT, BLACK = "transparent", "black"
+"""The manifest's entry for masks without ``Masks.alpha``."""
 
 _MIN_LEFTOVER_AGE = 5.0
 """Age in seconds from which an unlocked partial is a leftover; new ones are locked at once."""
