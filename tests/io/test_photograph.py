@@ -104,6 +104,14 @@ def test_grey_of_8_bits_palettes_and_floats_are_as_they_are(rng, tmp_path):
     assert np.array_equal(saved(tmp_path, floats)[..., 1], np.rint(floats * 255))
 
 
+def test_one_too_large_for_pillow_is_to_be_made_smaller(tmp_path, monkeypatch):
+    """A phone's 200 megapixels are over its limit."""
+    monkeypatch.setattr(PilImage, "MAX_IMAGE_PIXELS", 10)
+    PilImage.new("L", (8, 6)).save(path := tmp_path / "large.jpg")
+    with pytest.raises(SceneFormatError, match=r"48 pixels.*Make a smaller copy"):
+        decoded(path)
+
+
 def test_transparent_pixels_are_black(tmp_path):
     for channels in (4, 2):
         values = np.full((4, 6, channels), 200, np.uint8)
