@@ -79,7 +79,7 @@ def test_unseen_views_gain_where_exposure_varies_and_lose_little_elsewhere(
         PillowImage.fromarray(np.rint(changed).astype(np.uint8)).save(path)
 
     def corrected(scene, exposure):
-        asked = TrainSettings(max_steps=150, data_factor=2, strategy="none", exposure=exposure)
+        asked = TrainSettings(max_steps=200, data_factor=2, strategy="none", exposure=exposure)
         run = prepare_run(load_scene(scene), tmp_path / f"{scene.name}_{exposure}", asked)
         assert run.train()
         pairs = [(run.trainer.render(v), photograph_tensor(v, CPU)) for v in run.trainer.test_views]
@@ -87,5 +87,5 @@ def test_unseen_views_gain_where_exposure_varies_and_lose_little_elsewhere(
 
     scenes = varied, larger_room_path
     gain, elsewhere = (corrected(each, "affine") - corrected(each, "none") for each in scenes)
-    assert gain > 0.5  # 0.9 when this was written, and 0.2 elsewhere
+    assert gain > 0.5  # 0.6 when this was written, and 0.1 elsewhere
     assert elsewhere > -0.3
