@@ -48,6 +48,7 @@ def specs(small_plan, room_path):
     return {run.arm.method: run for run in runs}
 
 
+@pytest.mark.usefixtures("score_often")
 def test_a_result_says_what_was_measured_and_a_little_is_kept(specs, tmp_path):
     spec = specs["linear"]
     result = run_job(spec, RunOptions(), tmp_path)

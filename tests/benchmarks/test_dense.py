@@ -44,6 +44,7 @@ def test_a_slow_start_changes_the_rate_of_positions_alone(bench):
     assert bench.seeding_arms.Start(discs=True).settings(**given).seed_normals
 
 
+@pytest.mark.usefixtures("score_often")
 def test_a_run_keeps_its_curve_and_its_seeds(bench, capture, monkeypatch, tmp_path):
     first = bench.seeding_arms.train(str(capture), "sfm", kept=str(tmp_path), **PLAN)
     steps, seconds, psnr, _ = zip(*first["curve"], strict=True)

@@ -207,7 +207,7 @@ def test_opacities_are_reset_on_request(begin):
     assert torch.sigmoid(run.state.params["opacities"]).max() < 0.05
 
 
-def test_results_are_whole_and_in_the_scenes_world(begin, room, draw_curves):
+def test_results_are_whole_and_in_the_scenes_world(begin, room, draw_curves, score_often):
     run = begin(max_steps=20)
     seeds_in_world = run.frame.points_to_world(gaussians_of(run.state.params).means)
     assert np.allclose(seeds_in_world, room.points.xyz, atol=1e-4)
