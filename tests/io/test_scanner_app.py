@@ -8,7 +8,7 @@ from PIL import Image as PilImage
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io import find_depths, load_scene, write_scene
-from splatseed.io.load import with_own_depths
+from splatseed.io.load import with_depths_in, with_own_depths
 from splatseed.sfm.photos import find_photos
 
 from .phone_exports import change, check_cameras, check_depths, write_scanner_app
@@ -78,6 +78,22 @@ def test_frames_without_a_photograph_or_a_pose_are_left_out(export):
     ]
     assert scene.depths.read("frame_00012.jpg").confidence is None
     assert "frame_00015.jpg" not in scene.depths
+
+
+def test_a_map_without_its_confidence_is_named(export, tmp_path):
+    assert with_depths_in(load(export), export).warnings == ()
+    (export / "conf_00006.png").unlink()
+    (export / "conf_00012.png").unlink()
+    scene = load(export)
+    which = "frame_00006.jpg, frame_00012.jpg"
+    note = f"2 of 9 depth maps have no confidence and are used whole: {which}."
+    assert scene.warnings == with_depths_in(scene, export).warnings == (note,)
+    again = load(write_scene(scene, tmp_path / "out", require_points=False).path)
+    assert again.warnings == ()
+    assert with_depths_in(again, export).warnings == (note,)
+    for path in export.glob("conf_*.png"):
+        path.unlink()  # then confidence is unknown to the whole capture
+    assert load(export).warnings == with_depths_in(scene, export).warnings == ()
 
 
 def test_lost_tracking_leaves_an_image_out(export):

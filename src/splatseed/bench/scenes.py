@@ -15,11 +15,11 @@ import numpy as np
 
 from splatseed.depthmap import DepthMaps
 from splatseed.errors import SceneNotFoundError
-from splatseed.io import find_depths, load_originals
+from splatseed.io import load_originals
 from splatseed.io.clouds import open_cloud
 from splatseed.io.colmap_model import scene_root
 from splatseed.io.files import open_file, read_bytes
-from splatseed.io.load import search_depths
+from splatseed.io.load import search_depths, with_depths_in
 from splatseed.io.photograph import photograph_bytes
 from splatseed.io.photograph_checks import check_sizes, with_photographs
 from splatseed.photos.camera_check import stray_camera_notes
@@ -109,7 +109,7 @@ def open_scene(scene: PlannedScene) -> Scene:
         opened = opened.replace(source=source)
     if opened.images and opened.source is not None and opened.source.image_dir is not None:
         opened = with_photographs(opened)
-    return opened.replace(depths=find_depths(opened, Path(scene.depth))) if scene.depth else opened
+    return with_depths_in(opened, Path(scene.depth)) if scene.depth else opened
 
 
 def survey(
@@ -158,7 +158,7 @@ def survey(
         open_cloud(Path(planned.cloud))  # reports an invalid header now
     depth = Path(planned.depth) if planned.depth else scene.source.root
     if with_depth and (planned.depth or search_depths(scene, depth) is not None):
-        maps, scene = str(depth.resolve()), scene.replace(depths=find_depths(scene, depth))
+        maps, scene = str(depth.resolve()), with_depths_in(scene, depth)
     notes = [*scene.warnings, *([scene.listed.sentence] if scene.listed else [])]
     notes += stray_camera_notes(scene)
     return SceneFacts(

@@ -34,8 +34,8 @@ from splatseed.console import (
 from splatseed.depth.settings import DepthSettings
 from splatseed.depthmap import DepthKind, DepthMaps, in_scene_units
 from splatseed.errors import SplatseedError
-from splatseed.io import find_depths, load_scene
-from splatseed.io.load import depths_beside
+from splatseed.io import load_scene
+from splatseed.io.load import depths_beside, with_depths_in
 from splatseed.io.seeds import was_upsampled
 from splatseed.photos.camera_check import stray_camera_notes
 from splatseed.progress import Progress
@@ -180,8 +180,8 @@ def _read(options: Options) -> Scene:
     scene = load_scene(options.scene, require_points=False)
     if options.depth is None:
         return scene
-    maps = find_depths(scene, options.depth, kind=options.depth_kind, scale=options.depth_scale)
-    return scene.replace(depths=maps)
+    kind, scale = options.depth_kind, options.depth_scale
+    return with_depths_in(scene, options.depth, kind=kind, scale=scale)
 
 
 def _alignments(options: Options, scene: Scene, clock: StageClock) -> dict[str, Alignment]:

@@ -30,6 +30,7 @@ from splatseed.io.files import COPY_AGAIN, read_json, translate_errors
 from splatseed.io.staging import MANIFEST, output_folder, write_json
 from splatseed.lens import project_rays
 from splatseed.scene import Scene
+from splatseed.text import agreeing, counted, name_some
 
 CAMERA_FILE = "cam_params.json"
 """Camera and depth scale of an RGB-D capture, in its folder or the parent."""
@@ -178,6 +179,18 @@ def find_confidences(paths: Mapping[str, Path]) -> dict[str, Path]:
         if file := next((place for place in places if place.is_file()), None):
             found[name] = file
     return found
+
+
+def confidence_warnings(maps: object) -> list[str]:
+    """Warn of maps without a confidence among others that have one; at most one sentence."""
+    if not isinstance(maps, DepthFiles) or not maps.confidences:
+        return []
+    lacking = [name for name in maps if name not in maps.confidences]
+    if not lacking:
+        return []
+    have = agreeing(len(lacking), "has no confidence and is", "have no confidence and are")
+    which = name_some(lacking, 3)
+    return [f"{len(lacking):,} of {counted(len(maps), 'depth map')} {have} used whole: {which}."]
 
 
 def _match(scene: Scene, folder: Path) -> dict[str, Path]:

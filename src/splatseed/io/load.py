@@ -17,7 +17,7 @@ from splatseed.io.bit_depth import WHITE, find_white
 from splatseed.io.cleaning import clean_scene, cloud_warnings
 from splatseed.io.colmap_model import find_model, nested_model, read_model, scene_model, scene_root
 from splatseed.io.depth_files import KINDS, SUFFIXES
-from splatseed.io.depth_maps import DepthFiles, match_by_name
+from splatseed.io.depth_maps import DepthFiles, confidence_warnings, match_by_name
 from splatseed.io.files import StrPath, is_video, special_kind
 from splatseed.io.llff import is_llff, read_llff
 from splatseed.io.masks import with_own_masks
@@ -105,6 +105,7 @@ def load_scene(path: StrPath, *, require_points: bool = True) -> Scene:
     folder, white, notes = scene.source.image_dir if scene.source else None, WHITE, list[str]()
     if folder is not None:
         white, notes = find_white([folder / image.name for image in scene.images])
+    notes += confidence_warnings(scene.depths)
     warnings = (*scene.warnings, *notes, *cloud_warnings(scene.points))
     return scene.replace(warnings=warnings, white=white)
 
@@ -319,6 +320,23 @@ def find_depths(
     return maps
 
 
+def with_depths_in(
+    scene: Scene, path: StrPath, *, kind: DepthKind | None = None, scale: float | None = None
+) -> Scene:
+    """Attach the depth maps of a folder instead of the scene's own; arguments of ``find_depths``.
+
+    Raises as ``find_depths``.
+    """
+    return _with_maps(scene, find_depths(scene, path, kind=kind, scale=scale))
+
+
+def _with_maps(scene: Scene, maps: DepthFiles | None) -> Scene:
+    """Attach maps, with warnings about them in place of those about the scene's own."""
+    replaced = confidence_warnings(scene.depths)
+    warnings = [each for each in scene.warnings if each not in replaced]
+    return scene.replace(depths=maps, warnings=(*warnings, *confidence_warnings(maps)))
+
+
 def _same_maps(maps: DepthFiles, others: DepthFiles) -> bool:
     """Whether two sets of maps are the same files, in the same unit."""
     if maps.scale != others.scale or maps.paths.keys() != others.paths.keys():
@@ -334,7 +352,7 @@ def with_own_depths(scene: Scene) -> Scene:
     """Attach the depth maps found in the scene's own folder, unless it has maps already."""
     if scene.depths is not None or scene.source is None:
         return scene
-    return scene.replace(depths=search_depths(scene, scene.source.root))
+    return _with_maps(scene, search_depths(scene, scene.source.root))
 
 
 def depths_beside(scene: Scene) -> DepthFiles | None:

@@ -11,10 +11,10 @@ from splatseed.commands.upsample import previews, report
 from splatseed.commands.upsample.cloud import load_cloud
 from splatseed.commands.upsample.options import CLOUD, Options, check, parse
 from splatseed.console import OUT, StageClock, print_note, stage_display
-from splatseed.io import find_depths, load_originals, write_scene
+from splatseed.io import load_originals, write_scene
 from splatseed.io.clouds import open_cloud
 from splatseed.io.colmap_model import scene_root
-from splatseed.io.load import with_own_depths
+from splatseed.io.load import with_depths_in, with_own_depths
 from splatseed.io.masks import with_masks
 from splatseed.io.origin import RECENTER, format_offset, middle_of_cameras, translated
 from splatseed.io.staging import check_output
@@ -140,7 +140,7 @@ def _read(options: Options, method: Upsampler) -> Scene:
     scene = with_masks(load_originals(options.scene, require_points=needed), options.masks)
     if options.depth_maps is not None:
         kind, scale = options.depth_kind, options.depth_scale
-        return scene.replace(depths=find_depths(scene, options.depth_maps, kind=kind, scale=scale))
+        return with_depths_in(scene, options.depth_maps, kind=kind, scale=scale)
     return with_own_depths(scene) if options.method == "depth" else scene
 
 
