@@ -28,7 +28,7 @@ def called(monkeypatch, tmp_path):
     calls = {}
     changes = [
         Refinement(True, 0.162, 0.162),
-        Refinement(False, 9.44, 0.16, 0.04, 0.113, 1.24, 3.66),
+        Refinement(False, 9.44, 0.16, 0.04, 0.113, 1.24, 3.66, ("a.jpg",)),
     ]
 
     def reconstruct(*args, **kwargs):
@@ -120,12 +120,18 @@ def test_an_apps_export_gives_its_photographs_and_its_poses_are_pointed_out(
     assert "upsample" not in capsys.readouterr().out
 
 
-def test_known_poses_are_triangulated_and_refined_when_asked(called, room, tmp_path, splatseed):
+def test_known_poses_are_triangulated_and_refined_when_asked(
+    called, room, tmp_path, splatseed, capsys
+):
     words = ("sfm", room / "images", "--poses-from", room, "-o", tmp_path / "out")
     assert splatseed(*words).code == 0
     assert len(called["poses_from"].images) == 12
     assert "camera_model" not in called
+    names = [image.name for image in called["poses_from"].images]
+    called["on_photos"](names[2:], {"of an unsupported format": [names[1]]}, "")
+    assert f"; 1 pose without a photograph ({names[0]})." in capsys.readouterr().out
     moved = splatseed(*words, "--refine-poses").out
     for text in ("9.440 px", "0.160 px", "0.04 units", "0.113", "1.24 degrees", "3.66"):
         assert text in moved
+    assert "stay as given: fewer than 10 points are seen in a.jpg." in moved
     assert "kept as given" in splatseed(*words, "--refine-poses").out

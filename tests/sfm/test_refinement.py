@@ -19,9 +19,10 @@ from splatseed.scene import LeftOut
 from splatseed.sfm import Settings, first_look, matching, reconstruct
 from splatseed.sfm.colmap import Run, posed_model, require_pycolmap
 from splatseed.sfm.matching import match_photographs
-from splatseed.sfm.pipeline import with_refined
+from splatseed.sfm.pipeline import _Refined, refined as refined_scene, with_refined
 from splatseed.sfm.refinement import (
     Poses,
+    Refinement,
     align,
     poses_of,
     refine,
@@ -134,6 +135,7 @@ def test_a_scene_has_the_refined_poses_and_one_without_matches_its_own(room, tmp
     assert {image.name for image in report.poses} - shown == {"view_003.png"}
     found = sorted(report.poses, key=lambda image: image.name)
     np.testing.assert_allclose(found[0].camera.center, given.images[0].camera.center)
+    assert report.refinement.excluded == ("view_000.png",)
     moved = shifts(poses_of(found), poses_of(given.images))
     assert report.refinement.median_shift == pytest.approx(np.median(moved))
     true = poses_of(room.images[1:])
@@ -157,6 +159,27 @@ def test_rotations_count_and_a_wrong_camera_hardly(wrong):
     aligned, rest = align(moved, given), np.arange(9) != 4
     assert turns(aligned, given).max() < (1e-2 if wrong else 1e-4)
     assert shifts(aligned, given)[rest].max() < (1e-3 if wrong else 1e-5)
+
+
+def test_poses_that_stay_among_refined_ones_are_named(room, tmp_path, monkeypatch):
+    photos = shutil.copytree(room.source.image_dir, tmp_path / "photos")
+    (photos / "view_001.png").rename(photos / "view_001.webp")
+    names = ["view_000.png", "view_001.webp", *(image.name for image in room.images[2:])]
+    images = [replace(im, name=name) for im, name in zip(room.images, names, strict=True)]
+    source = replace(room.source, image_dir=photos)
+    scene = room.replace(images=tuple(images), source=source)
+    (photos / "view_005.png").unlink()  # which the scene's own warning names
+
+    def call(*arguments):
+        change = Refinement(False, 9.0, 0.1, excluded=("view_000.png",))
+        return _Refined(arguments[6], room.points, change)
+
+    monkeypatch.setattr("splatseed.sfm.pipeline._call", call)
+    _, note = refined_scene(scene, 0)
+    assert note.endswith(
+        "The poses of 2 of 12 images stay as given: SfM does not read view_001.webp; fewer than 10 "
+        "points are seen in view_000.png."
+    )
 
 
 def test_points_of_the_files_that_were_left_out_go_with_the_others(room):

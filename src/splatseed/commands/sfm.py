@@ -26,6 +26,7 @@ from splatseed.scene import Masks, Scene
 from splatseed.sfm import MatcherName, Settings, SfmReport, reconstruct
 from splatseed.sfm.first_look import FIRST_LOOK, NEIGHBOURS, STAGE
 from splatseed.sfm.photos import pick_frames
+from splatseed.sfm.refinement import unrefined_note
 from splatseed.text import counted, name_some, quoted, visible
 
 if TYPE_CHECKING:  # Numba, for which --help would wait, comes with it
@@ -121,6 +122,7 @@ def _from_photographs(options: Options, images: Path, clock: StageClock) -> SfmR
     video = images != options.images
     settings = Settings(options.matcher, options.device, seed=options.seed, threads=options.threads)
     masks: Masks | None = None
+    poses: Scene | None = None
     capture = None if video else _posed(options.images)
     if capture is not None and capture.source is not None and capture.source.format == "phone":
         images = capture.source.image_dir or images  # an app's folder has other pictures, too
@@ -137,8 +139,7 @@ def _from_photographs(options: Options, images: Path, clock: StageClock) -> SfmR
         for note in (each for each in poses.warnings if RECENTER in each):
             print_note(note)
         how = {"poses_from": poses, "refine_poses": options.refine_poses}
-    named = options.poses_from is not None and poses.masks is not None and poses.masks.files
-    if named:
+    if poses is not None and poses.masks is not None and poses.masks.files:
         masks = poses.masks
     elif not video:
         masks, notes = masks_near(images)
@@ -153,7 +154,7 @@ def _from_photographs(options: Options, images: Path, clock: StageClock) -> SfmR
         overwrite=options.overwrite,
         on_progress=clock,
         on_note=print_note,
-        on_photos=partial(_report_photographs, options, images, capture, clock, stages),
+        on_photos=partial(_report_photographs, options, images, capture, clock, stages, poses),
         **how,
     )
 
@@ -173,13 +174,15 @@ def _report_photographs(
     capture: Scene | None,
     clock: StageClock,
     stages: Sequence[str],
+    poses: Scene | None,
     names: Sequence[str],
     left_out: Mapping[str, Sequence[str]],
     cameras: str,
 ) -> None:
     """Print the images that are read, since subfolders may hold images of other scenes.
 
-    ``capture`` is the scene at ``options.images``, whose poses are not used unless asked for.
+    ``capture`` is the scene at ``options.images``, whose poses are not used unless asked for;
+    ``poses`` has those that are.
     """
     number = len(names)
     chosen = options.matcher == "auto" and number > FIRST_LOOK.max_exhaustive
@@ -200,6 +203,11 @@ def _report_photographs(
         f"{counted(len(them), 'image')} {what} ({name_some(them, SHOWN)})"
         for what, them in left_out.items()
     ]
+    known = {*names, *(name for them in left_out.values() for name in them)}
+    if poses is not None and (lost := [im.name for im in poses.images if im.name not in known]):
+        skipped.append(
+            f"{counted(len(lost), 'pose')} without a photograph ({name_some(lost, SHOWN)})"
+        )
     if skipped:
         print_note(f"Left out: {'; '.join(skipped)}.")
     if capture is not None and options.poses_from is None:
@@ -253,6 +261,8 @@ def _summarise(options: Options, report: SfmReport, error: PoseErrorEstimate | N
             "The photographs do not fit these poses well: look at them (splatseed view), and take "
             "more photographs, closer together, of where they are wrong."
         )
+    if change is not None and (note := unrefined_note(len(report.poses), change.excluded)):
+        print_note(note)
     if report.unregistered:
         print_note(f"without a pose: {name_some(report.unregistered)}")
     print_pairs("next", [("what suits it", f"splatseed info {quoted(options.output)}")])

@@ -46,7 +46,7 @@ from splatseed.sfm.export import drop_repeats, export_scene
 from splatseed.sfm.mapping import map_images
 from splatseed.sfm.matching import match_further, match_photographs
 from splatseed.sfm.photos import find_photos, match_poses
-from splatseed.sfm.refinement import Refinement, refine
+from splatseed.sfm.refinement import Refinement, refine, unrefined_note
 from splatseed.sfm.work_folder import WorkFolder, resumable_work, work_key
 
 OnPhotos: TypeAlias = Callable[[Sequence[str], Mapping[str, Sequence[str]], str], None]
@@ -278,7 +278,7 @@ def _undistort(
 def refined(
     scene: Scene, seed: int, progress: Progress = silent, *, test_every: int = 0
 ) -> tuple[Scene, str]:
-    """Return the scene at refined poses, and what was done, in a sentence.
+    """Return the scene at refined poses, and what was done, in sentences.
 
     Where refinement gains nothing, the scene keeps its poses, and its points if it has any. Else
     points are triangulated from its photographs' features, in place of its own. Photographs, lenses
@@ -313,6 +313,10 @@ def refined(
             f"{change.median_turn:.2f} degrees and moved by {change.median_shift:.3g} units, both "
             "the median."
         )
+        others = {image.name for image in scene.images} - {image.name for image in poses}
+        unread = [name for name in sorted(others) if (folder / name).is_file()]
+        if note := unrefined_note(len(scene.images), change.excluded, unread):
+            how = f"{how} {note}"
     return with_refined(scene, scene.replace(images=found.poses, points=found.points)), how
 
 

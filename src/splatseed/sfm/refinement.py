@@ -27,7 +27,7 @@ from splatseed.camera import quat_from_rotation
 from splatseed.errors import ReconstructionError
 from splatseed.scene import Image
 from splatseed.sfm.colmap import Run, posed_model, rigid
-from splatseed.text import name_some
+from splatseed.text import counted, name_some
 
 
 @dataclass(frozen=True)
@@ -80,6 +80,7 @@ class Refinement:
     largest_shift: float = 0.0
     median_turn: float = 0.0  # over cameras, degrees
     largest_turn: float = 0.0
+    excluded: tuple[str, ...] = ()  # images that see too few points, whose poses are unchanged
 
 
 class Poses(NamedTuple):
@@ -201,8 +202,22 @@ def refine(run: Run, given: Sequence[Image]) -> tuple[list[Image], Refinement]:
             f"{turn[worst]:.1f} degrees and {shift[worst]:.3g} units in {names[worst]}, and "
             f"{len(drifted)} of {len(names)} such images: {name_some(names[drifted].tolist())}",
         )
-    moves = [float(each) for of in (shift, turn) for each in (np.median(of), of.max())]
-    return with_poses(given, poses), Refinement(False, before.error, after.error, *moves)
+    shifted, turned = ((float(np.median(of)), float(of.max())) for of in (shift, turn))
+    excluded = tuple(names[~after.seeing].tolist())
+    change = Refinement(False, before.error, after.error, *shifted, *turned, excluded)
+    return with_poses(given, poses), change
+
+
+def unrefined_note(total: int, excluded: Sequence[str], unread: Sequence[str] = ()) -> str:
+    """Name the images, of ``total``, whose poses stay as given beside refined ones; may be empty.
+
+    ``unread`` have photographs that SfM does not read.
+    """
+    too_few = f"fewer than {LIMITS.min_points} points are seen in"
+    kinds = (("SfM does not read", unread), (too_few, excluded))
+    reasons = "; ".join(f"{why} {name_some(names, 3)}" for why, names in kinds if names)
+    unrefined = f"The poses of {len(unread) + len(excluded):,} of {counted(total, 'image')}"
+    return f"{unrefined} stay as given: {reasons}." if reasons else ""
 
 
 def _refused(expected: str, found: str) -> ReconstructionError:
