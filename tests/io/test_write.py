@@ -123,6 +123,31 @@ def test_references_that_nobody_confirms_are_taken_out(scene_dir, tmp_path, mode
     assert "references" in " ".join(report.notes)
 
 
+@pytest.mark.parametrize("lost", ["image", "camera", "unused camera"])
+def test_rigs_and_frames_go_with_a_record_that_is_left_out(scene_dir, tmp_path, lost):
+    """Or else pycolmap could not use, or not even read, what is written."""
+    folder = scene_dir / "sparse/0"
+    model = pycolmap.Reconstruction(str(folder))
+    nan = float("nan")
+    if "camera" in lost:  # of a rig without images
+        focal = nan if lost == "camera" else 50
+        spare = pycolmap.Camera(model="PINHOLE", width=64, height=48, params=[focal, 50, 32, 24])
+        spare.camera_id = 1 + max(model.cameras)
+        model.add_camera_with_trivial_rig(spare)
+    if lost == "image":
+        frame = model.frames[min(model.frames)]
+        frame.rig_from_world = pycolmap.Rigid3d(frame.rig_from_world.rotation, [nan] * 3)
+    model.write_binary(str(folder))
+    scene = load_scene(scene_dir)
+    if lost == "unused camera":
+        scene = scene.replace(intrinsics=())
+    report = write_scene(scene, tmp_path / "out")
+    assert "Rigs" in " ".join(report.notes)
+    written = pycolmap.Reconstruction(str(tmp_path / "out/sparse/0"))
+    assert len(written.images) == len(scene.images) == len(model.images) - (lost == "image")
+    assert f"num_images = {len(scene.images)}" in written.summary()
+
+
 def test_rigs_and_frames_are_copied_byte_for_byte(scene_dir, tmp_path, rng):
     folder = scene_dir / "sparse/0"
     pycolmap.Reconstruction(str(folder)).write(str(folder))

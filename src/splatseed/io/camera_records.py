@@ -83,6 +83,11 @@ def rigid_pose(
     return quat, -rotation @ world_from_cam[:3, 3]
 
 
+def unusable_images(unusable: Unusable) -> dict[str, NotFiniteError]:
+    """Return the images among the records that were left out."""
+    return {name: error for name, error in unusable.items() if isinstance(name, str)}
+
+
 def check_enough(unusable: Mapping[str, NotFiniteError], used: int) -> None:
     """Raise the first image's error if fewer than half of the images are usable."""
     if len(unusable) > used:

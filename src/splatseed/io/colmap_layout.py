@@ -5,6 +5,7 @@ The root holds no PLY, because Brush loads any that it finds there.
 
 from __future__ import annotations
 
+from collections.abc import Container
 from pathlib import Path
 
 import numpy as np
@@ -47,7 +48,7 @@ def write_colmap_layout(scene: Scene, folder: Path) -> Written:
     notes: list[str] = []
     source = scene.source
     if source is not None and source.model_dir is not None:
-        rigs, notes = _rigs(scene, source.model_dir)
+        rigs, notes = _rigs(scene, cameras, source.model_dir)
         copy_files(source.root, _ROOT_EXTRAS, folder)
         copy_files(source.model_dir, (*_MODEL_EXTRAS, *rigs), model_dir)
     if num_broken:
@@ -79,23 +80,32 @@ def write_split(scene: Scene, folder: Path) -> None:
         (folder / part).write_text(text, "utf-8")
 
 
-def _rigs(scene: Scene, model_dir: Path) -> tuple[list[str], list[str]]:
-    """Return the files of rigs and frames that fit the output, or a note why none does."""
+def _rigs(scene: Scene, cameras: Container[int], model_dir: Path) -> tuple[list[str], list[str]]:
+    """Return the files of rigs and frames that fit the output, or a note why none does.
+
+    ``cameras`` are the ids of the output's records.
+    """
     there = [name for name in ("rigs.bin", "frames.bin") if (model_dir / name).is_file()]
     why = "as text they would not be read beside the binary model"
-    if there:  # they repeat the poses of the images
+    if there:  # they name cameras and images, and repeat the poses
+        lenses, posed, unusable = read_model_cameras(model_dir)
         now, before = (
             {
                 (im.image_id, im.name, im.intrinsics.camera_id): im.camera.cam_from_world
                 for im in images
             }
-            for images in (scene.images, read_model_cameras(model_dir)[1])
+            for images in (scene.images, posed)
         )
-        if now.keys() == before.keys() and all(
-            np.allclose(now[key], before[key], rtol=_SAME_POSE, atol=_SAME_POSE) for key in now
+        complete = not unusable and all(lens.camera_id in cameras for lens in lenses)
+        if (
+            complete
+            and now.keys() == before.keys()
+            and all(
+                np.allclose(now[key], before[key], rtol=_SAME_POSE, atol=_SAME_POSE) for key in now
+            )
         ):
             return there, []
-        why = "the scene no longer has the same images and poses"
+        why = "the scene no longer has the same cameras, images and poses"
     elif not any((model_dir / name).is_file() for name in ("rigs.txt", "frames.txt")):
         return [], []
     return [], [f"Rigs and frames were left out: {why}."]

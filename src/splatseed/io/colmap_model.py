@@ -7,7 +7,7 @@ on, which are not ordered by size: the one with the most images is read.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from jaxtyping import Float64
 
 from splatseed.camera import Intrinsics
 from splatseed.errors import SceneNotFoundError, SplatseedError
-from splatseed.io.camera_records import NotFiniteError, Unusable, check_enough, unusable_warning
+from splatseed.io.camera_records import Unusable, check_enough, unusable_images, unusable_warning
 from splatseed.io.colmap import MIN_IMAGE_BYTES, read_cameras, read_images, read_points3d
 from splatseed.io.files import StrPath, numbered_lines, open_file
 from splatseed.io.origin import recentered
@@ -152,7 +152,8 @@ def read_colmap_scene(model_dir: StrPath) -> Scene:
     """Read a model as a scene, with warnings for the user."""
     model_dir = Path(model_dir)
     root = scene_root(model_dir)
-    intrinsics, images, unusable = _read_model(model_dir)
+    intrinsics, images, left_out = read_model_cameras(model_dir)
+    unusable = unusable_images(left_out)
     points, exact, tracks, points_path = read_model_points(model_dir)
     image_dir = _image_dir(root, images)
     warnings = [*image_warnings(images, image_dir, root), *lens_warnings(images)]
@@ -190,15 +191,10 @@ def _image_dir(root: Path, images: Sequence[Image]) -> Path | None:
     return best if counts_by_folder[best] else next(iter(folders), None)
 
 
-def read_model_cameras(model_dir: Path) -> tuple[tuple[Intrinsics, ...], tuple[Image, ...]]:
-    """Read the usable camera and image records of a model."""
-    return _read_model(model_dir)[:2]
-
-
-def _read_model(
+def read_model_cameras(
     model_dir: Path,
-) -> tuple[tuple[Intrinsics, ...], tuple[Image, ...], Mapping[str, NotFiniteError]]:
-    """Read the usable cameras and images, and the errors of the other images by name.
+) -> tuple[tuple[Intrinsics, ...], tuple[Image, ...], Unusable]:
+    """Read the usable camera and image records of a model, and the errors of the others.
 
     Raises:
         NotFiniteError: Fewer than half of the images are usable.
@@ -207,11 +203,10 @@ def _read_model(
     if cameras_path is None and images_path is not None:
         expected = f"cameras.bin or cameras.txt beside {images_path}"
         raise SceneNotFoundError(expected, found="neither", fix="Copy the complete model.")
-    bad: Unusable = {}
-    intrinsics = read_cameras(cameras_path, bad) if cameras_path else ()
-    images = read_images(images_path, intrinsics, bad) if images_path else ()
-    unusable = {name: error for name, error in bad.items() if isinstance(name, str)}
-    check_enough(unusable, len(images))
+    unusable: Unusable = {}
+    intrinsics = read_cameras(cameras_path, unusable) if cameras_path else ()
+    images = read_images(images_path, intrinsics, unusable) if images_path else ()
+    check_enough(unusable_images(unusable), len(images))
     return intrinsics, images, unusable
 
 

@@ -382,7 +382,7 @@ def _points_of_model(
 ) -> tuple[PointCloud, Float64[np.ndarray, "N 3"], Path, list[str]]:
     """Read the points of a COLMAP model and map them into the transforms' space."""
     points, exact, _, points_path = read_model_points(model_dir)
-    _, model_images = read_model_cameras(model_dir)
+    model_images = read_model_cameras(model_dir)[1]
     transform, doubts = _transform_of_model(transforms, model_dir, model_images)
     xyz = apply_transform(transform, exact)
     with np.errstate(over="ignore"):  # beyond float32's range: infinite, dropped later
