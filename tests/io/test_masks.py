@@ -191,7 +191,7 @@ def test_undistortion_carries_masks_along(room_of, tmp_path):
     [
         *("masks/{}.PNG", "masks/{}.jpg", "Masks/{}.png", "mask/{}.png.png", "images/masks/{}.png"),
         *("mask/{}.mask.png", "masks/{}_mask.png", "masks/{}.png.mask.png", "masks/VIEW_003.png"),
-        *("masks/{}.tif", "masks/{}.webp"),
+        *("masks/{}.tif", "masks/{}.webp", "masks/{}.gif"),
         *("images/{}.mask.png", "images/{}_mask.png", "images/{}.png.mask.png"),
     ],
 )
@@ -205,6 +205,19 @@ def test_masks_of_other_tools_are_found_and_written_as_colmaps(scene_path, tmp_p
     assert np.count_nonzero(mask != counts) < 40
     out = write_scene(scene, tmp_path / "out", format="colmap").path
     assert np.array_equal(masks_of(load_scene(out))[3], mask)
+
+
+def test_masks_of_a_format_that_is_not_read_are_noted(scene_path):
+    paint(scene_path / "masks/view_003.png")
+    for name in ("view_003.npy", "view_004.png.npy", "view_005.npy", "notes.txt"):
+        (scene_path / "masks" / name).write_bytes(b"")
+    reason = "are of a format that is not read: save masks as PNG."
+    note = f"2 masks, such as view_004.png.npy, {reason}"
+    scene = load_scene(scene_path)
+    assert [warning for warning in scene.warnings if "not read" in warning] == [note]
+    assert note in with_masks(scene, str(scene_path / "masks")).warnings
+    (scene_path / "masks/view_003.png").unlink()
+    assert f"3 masks, such as view_003.npy, {reason}" in load_scene(scene_path).warnings
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,7 @@
 
 In a folder of masks, the mask of ``a/b.jpg`` is the first of ``a/b.jpg.png`` (COLMAP), ``a/b.png``
 (nerfstudio), ``a/b.jpg.mask.png`` (RealityScan), ``a/b.mask.png`` (OpenMVS) and ``a/b_mask.png``
-(3DGRUT), each also as JPEG, TIFF, WebP or BMP, and in any case; else such a file without the
+(3DGRUT), each also as JPEG, TIFF, WebP, BMP or GIF, and in any case; else such a file without the
 subfolder, if the name is unique. The last three may also lie beside the photograph. A photograph of
 the scene is never a mask.
 """
@@ -17,7 +17,7 @@ from splatseed.io.files import files_below
 from splatseed.text import agreeing, counted
 
 FOLDER = "masks"
-SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
+SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp", ".gif")
 _FOLDERS = ("masks", "mask")
 _MASK_LIKE = ("mask", "segment")
 """Parts of folder names that suggest masks of unknown polarity."""
@@ -67,9 +67,8 @@ def find_masks(
     """
     is_own = image_dir is not None and folder.resolve() == image_dir.resolve()
     taken = set(names) if is_own else set()
-    paths = (path for path in files_below(folder) if path.suffix.lower() in SUFFIXES)
-    every = {path.relative_to(folder).as_posix(): path for path in paths}
-    there = {name: path for name, path in every.items() if name not in taken}
+    every = {path.relative_to(folder).as_posix(): path for path in files_below(folder)}
+    there = {n: path for n, path in every.items() if _is_mask_file(n) and n not in taken}
     folded = {name.casefold(): path for name, path in reversed(there.items())}
     same = Counter(PurePosixPath(name).stem.casefold() for name in names)
     files, used = dict[str, Path](), set[Path]()
@@ -86,7 +85,22 @@ def find_masks(
             files[name] = path
             used.add(path)
     left = [] if is_own else [path for path in there.values() if path not in used]
-    return files, _notes(names, files, left, folder)
+    notes = _notes(names, files, left, folder)
+    if not is_own:
+        notes += _unread([name for name in names if name not in files], every.keys() - there.keys())
+    return files, notes
+
+
+def _unread(unmasked: Collection[str], others: Collection[str]) -> list[str]:
+    """Note files of other formats that are named as the masks of images without one."""
+    stems = {stem.casefold() for name in unmasked for stem in _mask_stems(name)}
+    found = sorted(other for other in others if _stem(other) in stems)
+    if not found:
+        return []
+    which = (
+        f"{counted(len(found), 'mask')}, such as {found[0]}, {agreeing(len(found), 'is', 'are')}"
+    )
+    return [f"{which} of a format that is not read: save masks as PNG."]
 
 
 def _notes(
