@@ -63,7 +63,7 @@ def test_grey_of_16_bits_becomes_the_nearest_of_8(tmp_path, monkeypatch):
         assert all(np.array_equal(pixels[..., channel], NEAREST) for channel in range(3))
     real = PilImage.open
 
-    def as_32_bits(file):
+    def as_32_bits(file, **_):
         """As before Pillow 11, whose reader its own conversion from I;16 stands in for."""
         picture = real(file).convert("I")
         picture.format = "PNG"

@@ -242,9 +242,10 @@ def test_exif_orientation_is_cleared_and_pixels_are_kept(tmp_path, endian):
     exif.endian = endian
     exif[0x0110], exif[0x0112] = "a camera", 6
     (tmp_path / "sub").mkdir()
-    for name in ("turned.jpg", "sub/turned.JPG", "plain.jpg"):
+    for name in ("turned.jpg", "sub/turned.JPG", "plain.jpg", "turned.tif"):
         extra = {} if name == "plain.jpg" else {"exif": exif}
-        PilImage.fromarray(pixels).save(tmp_path / name, format="JPEG", **extra)
+        kind = "TIFF" if name == "turned.tif" else "JPEG"
+        PilImage.fromarray(pixels).save(tmp_path / name, format=kind, **extra)
     (tmp_path / "turned.jpg").chmod(0o444)
     before = {name: (tmp_path / name).read_bytes() for name in files_below(tmp_path)}
     clear_orientation(tmp_path)

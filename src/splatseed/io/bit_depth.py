@@ -20,6 +20,7 @@ from PIL import Image as PilImage
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io.files import open_file, read_bytes, translate_errors
+from splatseed.io.picture import open_picture
 from splatseed.text import counted
 
 WHITE = 65535
@@ -58,12 +59,12 @@ def _layout(photograph: PilImage.Image) -> str:
 
 def read_16_bit(encoded: bytes) -> UInt16[np.ndarray, "H W C"]:
     """Decode a 16-bit image; C is 1 (grey), 2 (grey, alpha), 3 or 4."""
-    picture = PilImage.open(BytesIO(encoded))
+    picture = open_picture(BytesIO(encoded))
     layout = _layout(picture)
     if layout not in _LOW_BYTES:
         return np.asarray(picture).astype(np.uint16)[..., None]
     high = np.asarray(picture)
-    picture = PilImage.open(BytesIO(encoded))
+    picture = open_picture(BytesIO(encoded))
     picture.tile = [_as_layout(tile, _LOW_BYTES[layout]) for tile in picture.tile]
     low = np.asarray(picture).astype(np.uint16)
     if layout.startswith("LA"):

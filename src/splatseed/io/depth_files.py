@@ -18,10 +18,10 @@ from typing import Any, NamedTuple, get_args
 
 import numpy as np
 from jaxtyping import UInt8
-from PIL import Image as PilImage
 
 from splatseed.depthmap import DepthKind
 from splatseed.io.files import StrPath, read_bytes, read_npy, translate_errors
+from splatseed.io.picture import open_picture
 from splatseed.requirements import require
 from splatseed.text import beginning
 
@@ -145,7 +145,7 @@ def _body(data: bytes, header: re.Match[bytes], dtype: str) -> np.ndarray:
 
 
 def _read_picture(_: Path, data: bytes) -> np.ndarray:
-    with PilImage.open(io.BytesIO(data), formats=("PNG", "TIFF")) as picture:
+    with open_picture(io.BytesIO(data), ("PNG", "TIFF")) as picture:
         if picture.mode not in _GREY:
             raise ValueError(f"a picture of mode {picture.mode}, not one channel")
         values = np.asarray(picture)

@@ -19,7 +19,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
-from PIL import Image as PilImage
 
 from splatseed.camera import Intrinsics
 from splatseed.errors import SceneFormatError
@@ -56,6 +55,7 @@ from splatseed.io.frame_files import (
 from splatseed.io.origin import recentered
 from splatseed.io.photograph import lens_warnings
 from splatseed.io.photograph_checks import image_warnings
+from splatseed.io.picture import open_picture
 from splatseed.io.ply import read_ply_float64
 from splatseed.io.point_files import differing_points_notes
 from splatseed.pointcloud import PointCloud
@@ -277,7 +277,7 @@ def _camera(
     else:
         expected = f"a readable image, or w and h to be, in {where}"
         with translate_errors(file, expected, fix=_FIX), open_file(file) as opened:
-            width, height = PilImage.open(opened).size
+            width, height = open_picture(opened).size
     fl_x = _focal_length(where, values, "x", width, None)
     fl_y = _focal_length(where, values, "y", height, fl_x)
     center = _number(where, values, "cx", width / 2), _number(where, values, "cy", height / 2)

@@ -18,6 +18,7 @@ from PIL import Image as PilImage
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io.bit_depth import WHITE, is_16_bit, opaque_value, read_16_bit
 from splatseed.io.files import read_bytes, similar_name, translate_errors
+from splatseed.io.picture import open_picture
 from splatseed.runtime.fingerprint import fingerprint
 from splatseed.scene import Image, Scene
 
@@ -74,7 +75,7 @@ def photograph_bytes(path: Path) -> bytes:
 def open_photograph(path: Path, encoded: bytes) -> PilImage.Image:
     """Open encoded bytes as a photograph; only the header is decoded."""
     with translate_errors(path, "an image", fix=COPY_AGAIN):
-        return PilImage.open(BytesIO(encoded))
+        return open_picture(BytesIO(encoded))
 
 
 def decode_photograph(path: Path, encoded: bytes, white: int = WHITE) -> PilImage.Image:

@@ -20,6 +20,7 @@ from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io.extraction import is_extracted
 from splatseed.io.files import open_file, similar_name, special_kind, translate_errors
 from splatseed.io.photograph import COPY_AGAIN, photograph_bytes, photograph_folder
+from splatseed.io.picture import ORIENTATION, open_picture
 from splatseed.scene import Image, Scene
 from splatseed.text import agreeing, counted, name_some
 
@@ -71,7 +72,7 @@ def photograph_size(path: Path) -> Size:
     if not path.is_file():
         photograph_bytes(path)  # raises with advice for a missing file
     with translate_errors(path, "an image", fix=COPY_AGAIN), open_file(path) as file:
-        return PilImage.open(file).size
+        return open_picture(file).size
 
 
 def fits(lens: Intrinsics, size: Size) -> bool:
@@ -133,7 +134,7 @@ def _sideways(path: Path) -> int:
     """Return EXIF's orientation if it swaps width and height, else 0."""
     try:
         with open_file(path) as file, PilImage.open(file) as picture:
-            orientation = int(picture.getexif().get(0x0112, 0))
+            orientation = int(picture.getexif().get(ORIENTATION, 0))
     except Exception:  # noqa: BLE001  (damaged EXIF makes Pillow raise anything)
         return 0
     return orientation if orientation in _SIDEWAYS else 0

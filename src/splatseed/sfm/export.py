@@ -11,11 +11,12 @@ from PIL import Image as PilImage
 
 from splatseed.camera import Intrinsics
 from splatseed.errors import OutputError
+from splatseed.io.picture import ORIENTATION, UPRIGHT
 from splatseed.pointcloud import first_of_equals
 from splatseed.sfm.colmap import Run
 from splatseed.sfm.readable import copy_misread
 
-_ORIENTATION, _SHORT, _UPRIGHT = 0x0112, 3, 1  # the tag, its type, its value for upright
+_SHORT = 3  # the type of the orientation's tag
 _HEAD_BYTES = 1 << 17  # EXIF (at most 64 KiB) is the first or second segment
 _NEGLIGIBLE = 2e-7  # a coefficient that counts as distortion but moves no pixel
 
@@ -105,25 +106,33 @@ def drop_repeats(model: Any) -> None:
 
 
 def clear_orientation(folder: Path) -> None:
-    """Set the EXIF orientation of all JPEGs in a folder to upright.
+    """Set the orientation of all JPEG and TIFF files in a folder to upright.
 
     COLMAP uses stored pixels but copies the tag; a trainer whose image reader applies it (OpenCV
-    does) would rotate the photograph relative to its camera. Only the tag's two bytes change.
+    does, and Pillow for TIFF) would rotate the photograph relative to its camera. Only the tag's
+    two bytes change.
     """
     for path in folder.rglob("*"):
-        if path.suffix.lower() not in {".jpg", ".jpeg"}:
+        if path.suffix.lower() not in {".jpg", ".jpeg", ".tif", ".tiff"}:
             continue
         with PilImage.open(path) as image:
-            orientation = image.getexif().get(_ORIENTATION, _UPRIGHT)
-        if orientation not in range(_UPRIGHT + 1, 9):  # upright or invalid
+            orientation = image.getexif().get(ORIENTATION, UPRIGHT)
+        if orientation not in range(UPRIGHT + 1, 9):  # upright or invalid
             continue
         content = path.read_bytes()
         # A TIFF 6.0 entry: tag, type, count and value, in either byte order.
         for order in ("<HHIH", ">HHIH"):
-            entry = struct.pack(order, _ORIENTATION, _SHORT, 1, orientation)
-            at = content.find(entry, 0, _HEAD_BYTES)
+            entry = struct.pack(order, ORIENTATION, _SHORT, 1, orientation)
+            start = _first_directory(content)
+            at = content.find(entry, start, start + _HEAD_BYTES)
             if at >= 0:
-                upright = struct.pack(order, _ORIENTATION, _SHORT, 1, _UPRIGHT)
+                upright = struct.pack(order, ORIENTATION, _SHORT, 1, UPRIGHT)
                 path.unlink()  # copies of read-only photographs are read-only
                 path.write_bytes(content[:at] + upright + content[at + len(upright) :])
                 break
+
+
+def _first_directory(content: bytes) -> int:
+    """Return where the tags of a TIFF file begin; 0 for other files."""
+    order = {b"II*\0": "<", b"MM\0*": ">"}.get(content[:4])
+    return 0 if order is None else int(struct.unpack_from(f"{order}I", content, 4)[0])
