@@ -70,6 +70,14 @@ def test_a_distorted_scene_becomes_one_of_pinholes(distorted, tmp_path, splatsee
     np.testing.assert_array_equal(after.points.xyz, before.points.xyz)
     assert len(load_views(after, after.images)) == len(before.images)
     assert not any("missing" in each for each in after.warnings)
+    for folder in (out, write_scene(after, tmp_path / "again").path):  # for depth maps
+        lenses = json.loads((folder / "distorted.json").read_text())
+        bent = before.images[0].intrinsics
+        assert lenses.keys() == {image.name for image in before.images}
+        assert (lenses["view_000.png"]["model"], lenses["view_000.png"]["width"]) == (
+            bent.model, bent.width,
+        )  # fmt: skip
+        assert lenses["view_000.png"]["params"] == pytest.approx(bent.params)
     assert [each.name for each in tmp_path.iterdir() if each.name.startswith(".")] == []
 
 

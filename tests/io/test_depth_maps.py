@@ -125,7 +125,7 @@ def test_confidence_is_undistorted_with_its_map(tmp_path):
     plain = maps.read("frame_00007.jpg")
     np.testing.assert_array_equal(plain.confidence, levels)
     wide = replace(LENS, params=(20.0, 20.0, 20.0, 15.0))  # its corners lie outside of the map
-    moved = replace(maps, lens=Undistortion(bent, {"frame_00007.jpg": wide}))
+    moved = replace(maps, lens=Undistortion({"frame_00007.jpg": bent}, {"frame_00007.jpg": wide}))
     depth = moved.read("frame_00007.jpg")
     known = np.isfinite(depth.values)
     assert 0.2 < known.mean() < 1

@@ -129,7 +129,7 @@ def test_undistorted_map_has_the_value_that_the_lens_saw_along_each_ray():
     row, column = np.mgrid[:480, :640].astype(np.float32)
     values = column + 1000 * row  # which pixel it is
     whole, half = (
-        Undistortion(lens, {"a.png": camera}).apply("a.png", values[::step, ::step])
+        Undistortion({"a.png": lens}, {"a.png": camera}).apply("a.png", values[::step, ::step])
         for step in (1, 2)
     )
     assert (whole.shape, whole.dtype) == ((440, 600), np.float32)

@@ -64,7 +64,7 @@ def test_reconstruct_finds_the_cameras(posed, photos, tmp_path):
     assert files_below(report.path) == {
         *(f"images/{image.name}" for image in posed.images),
         *(f"sparse/0/{n}.bin" for n in ("cameras", "images", "points3D", "rigs", "frames")),
-        "splatseed.json",
+        *("distorted.json", "splatseed.json"),
     }
     model = pycolmap.Reconstruction(report.path / "sparse" / "0")
     assert {camera.model.name for camera in model.cameras.values()} == {"PINHOLE"}

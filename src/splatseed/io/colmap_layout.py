@@ -19,12 +19,14 @@ from splatseed.io.image_folders import copy_files, image_folders
 from splatseed.io.ply import write_ply
 from splatseed.io.seeds import write_seeds
 from splatseed.io.split import MODEL_LISTS, ROOT_LISTS
+from splatseed.io.undistorted import LENSES
 from splatseed.scene import Scene
 
 Written = tuple[list[str], dict[str, Path], Float64[np.ndarray, " 3"]]
 """What a layout's writer returns: notes, image folders, and the offset of its space to the
 world."""
-_ROOT_EXTRAS = ("poses_bounds.npy", "ext_metadata.json")  # gsplat's examples read them if present
+_ROOT_EXTRAS = ("poses_bounds.npy", "ext_metadata.json", LENSES)
+"""Gsplat's examples read the first two if present."""
 _MODEL_EXTRAS = ("depth_params.json",)  # graphdeco's trainer reads it if present
 _SAME_POSE = 1e-9  # relative and absolute; a pose that went through other formats is that near
 

@@ -54,20 +54,20 @@ _CONFIDENCE_FOLDER = "confidence"
 class Undistortion:
     """Resamples maps of planar depth to the pixels of undistorted photographs."""
 
-    lens: Intrinsics
-    cameras: Mapping[str, Intrinsics]
+    lenses: Mapping[str, Intrinsics]  # by image name, of the photographs before undistortion
+    cameras: Mapping[str, Intrinsics]  # of the undistorted ones, at the size of the result
 
     def apply(self, name: str, values: np.ndarray, unknown: float = np.nan) -> np.ndarray:
         """Resample a map [H, W] of the distorted camera to the pixels of a photograph [h, w].
 
         Pixels outside of the map become ``unknown``.
         """
-        camera = self.cameras[name]
+        camera, lens = self.cameras[name], self.lenses[name]
         height, width = values.shape
         column, row = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
         fx, fy, cx, cy = camera.K[[0, 1, 0, 1], [0, 1, 2, 2]]
-        uv = project_rays(self.lens, np.stack([(column - cx) / fx, (row - cy) / fy], axis=-1))
-        uv *= [width / self.lens.width, height / self.lens.height]
+        uv = project_rays(lens, np.stack([(column - cx) / fx, (row - cy) / fy], axis=-1))
+        uv *= [width / lens.width, height / lens.height]
         inside = np.all((uv >= 0) & (uv < [width, height]), axis=-1)
         places = np.floor(np.where(inside[..., None], uv, 0)).astype(np.intp)
         moved = values[places[..., 1], places[..., 0]]
@@ -131,7 +131,7 @@ class DepthFiles:
             known &= stored != _SATURATED
         values[~known] = np.nan
         confidence = self._confidence(name, values.shape)
-        if self.lens is not None:
+        if self.lens is not None and name in self.lens.cameras:
             values = self.lens.apply(name, values)
             confidence = None if confidence is None else self.lens.apply(name, confidence, 0)
         return DepthMap(values, kind, confidence=confidence)
@@ -181,9 +181,19 @@ def find_confidences(paths: Mapping[str, Path]) -> dict[str, Path]:
     return found
 
 
-def confidence_warnings(maps: object) -> list[str]:
-    """Warn of maps without a confidence among others that have one; at most one sentence."""
-    if not isinstance(maps, DepthFiles) or not maps.confidences:
+def map_warnings(maps: object) -> list[str]:
+    """Warn of maps that are undistorted, and of those without a confidence among others."""
+    if not isinstance(maps, DepthFiles):
+        return []
+    notes = []
+    if maps.lens is not None:
+        what = "Depth maps have the shape of the photographs before undistortion"
+        notes.append(f"{what}, and are undistorted on reading.")
+    return notes + _confidence_warnings(maps)
+
+
+def _confidence_warnings(maps: DepthFiles) -> list[str]:
+    if not maps.confidences:
         return []
     lacking = [name for name in maps if name not in maps.confidences]
     if not lacking:

@@ -17,7 +17,7 @@ from splatseed.io.bit_depth import WHITE, find_white
 from splatseed.io.cleaning import clean_scene, cloud_warnings
 from splatseed.io.colmap_model import find_model, nested_model, read_model, scene_model, scene_root
 from splatseed.io.depth_files import KINDS, SUFFIXES
-from splatseed.io.depth_maps import DepthFiles, confidence_warnings, match_by_name
+from splatseed.io.depth_maps import DepthFiles, map_warnings, match_by_name
 from splatseed.io.files import StrPath, is_video, special_kind
 from splatseed.io.llff import is_llff, read_llff
 from splatseed.io.masks import with_own_masks
@@ -39,6 +39,7 @@ from splatseed.io.seeds import recall_seeds
 from splatseed.io.split import with_listed_split
 from splatseed.io.staging import ABSENT, BLACK, MANIFEST, TRANSPARENT, read_manifest
 from splatseed.io.stray import is_stray, read_stray
+from splatseed.io.undistorted import fitted_to_undistorted
 from splatseed.scene import Masks, Scene, SceneSource
 from splatseed.text import name_some, quoted
 
@@ -105,7 +106,7 @@ def load_scene(path: StrPath, *, require_points: bool = True) -> Scene:
     folder, white, notes = scene.source.image_dir if scene.source else None, WHITE, list[str]()
     if folder is not None:
         white, notes = find_white([folder / image.name for image in scene.images])
-    notes += confidence_warnings(scene.depths)
+    notes += map_warnings(scene.depths)
     warnings = (*scene.warnings, *notes, *cloud_warnings(scene.points))
     return scene.replace(warnings=warnings, white=white)
 
@@ -314,6 +315,7 @@ def find_depths(
             fix="Give maps the names of their images, subfolders included, with another suffix.",
         )
     maps = replace(maps, kind=kind or maps.kind, scale=scale or maps.scale)
+    maps = fitted_to_undistorted(scene, maps)
     own = scene.depths
     if isinstance(own, DepthFiles) and _same_maps(own, maps):
         return replace(maps, in_scene_units=own.in_scene_units)  # the capture's, named again
@@ -332,9 +334,9 @@ def with_depths_in(
 
 def _with_maps(scene: Scene, maps: DepthFiles | None) -> Scene:
     """Attach maps, with warnings about them in place of those about the scene's own."""
-    replaced = confidence_warnings(scene.depths)
+    replaced = map_warnings(scene.depths)
     warnings = [each for each in scene.warnings if each not in replaced]
-    return scene.replace(depths=maps, warnings=(*warnings, *confidence_warnings(maps)))
+    return scene.replace(depths=maps, warnings=(*warnings, *map_warnings(maps)))
 
 
 def _same_maps(maps: DepthFiles, others: DepthFiles) -> bool:

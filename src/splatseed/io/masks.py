@@ -259,5 +259,5 @@ def _undistorted(
     # Undistortion interpolates four pixels, all within one pixel of the nearest.
     windows = sliding_window_view(np.pad(counts, 1, constant_values=True), (3, 3))
     sure = np.asarray(windows.all(axis=(2, 3)))
-    moved = Undistortion(lens, {"": pinhole}).apply("", sure.astype(np.float32))
+    moved = Undistortion({"": lens}, {"": pinhole}).apply("", sure.astype(np.float32))
     return np.asarray(moved == 1)  # NaN outside of the image, where the copy is black

@@ -173,7 +173,7 @@ def find_tum_depths(scene: Scene, root: Path) -> depth_maps.DepthFiles | None:
         name, original = next(iter(originals.items()))
         both = (folder / name, original)
         undistorted = not all(p.is_file() for p in both) or len({p.read_bytes() for p in both}) > 1
-    moved = depth_maps.Undistortion(lens, posed) if undistorted else None
+    moved = depth_maps.Undistortion(dict.fromkeys(posed, lens), posed) if undistorted else None
     return depth_maps.DepthFiles(paths, "z", scale or _DEPTH_SCALE, moved)
 
 

@@ -33,6 +33,7 @@ from splatseed.io.photograph import photograph_folder
 from splatseed.io.photograph_checks import check_sizes, with_photographs
 from splatseed.io.seeds import carry_seeds
 from splatseed.io.staging import MANIFEST, output_folder, write_json
+from splatseed.io.undistorted import write_lenses
 from splatseed.photos.sizes import at_file_size
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent
@@ -223,12 +224,13 @@ def _export(
 ) -> None:
     """Write a model's undistorted photographs, masks and points."""
     export_scene(run, model_dir, staging, distinct=distinct)
-    if masks is None:
-        return
     before, after = (
         {image.name: image.intrinsics for image in read_model_cameras(folder)[1]}
         for folder in (model_dir, staging / "sparse" / "0")
     )
+    write_lenses(staging, {name: before[name] for name in after})
+    if masks is None:
+        return
     lenses = {name: (before[name], pinhole) for name, pinhole in after.items()}
     write_masks(masks, run.image_dir, lenses, staging / MASKS, lenses)
 

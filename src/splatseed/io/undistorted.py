@@ -1,0 +1,72 @@
+"""Depth maps of photographs as they were before ``splatseed undistort`` or ``sfm``.
+
+Output of these has ``distorted.json``, with the lenses of before: by image name, ``model``,
+``width``, ``height`` and ``params`` in COLMAP's terms. Maps with the shape of the photographs of
+before, and not of the undistorted ones, are undistorted on reading.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+from splatseed.camera import Intrinsics
+from splatseed.io.camera_records import make_intrinsics
+from splatseed.io.depth_files import read_stored
+from splatseed.io.depth_maps import DepthFiles, Undistortion
+from splatseed.io.files import read_json, translate_errors
+from splatseed.io.staging import write_json
+from splatseed.scene import Scene
+
+LENSES = "distorted.json"
+"""The file of the lenses, in the folder of an undistorted scene."""
+
+
+def write_lenses(folder: Path, lenses: Mapping[str, Intrinsics]) -> None:
+    """Write the lenses of photographs with distortion, by image name, if there are any."""
+    bent = {
+        name: {"model": lens.model, "width": lens.width, "height": lens.height,
+               "params": list(lens.params)}
+        for name, lens in sorted(lenses.items())
+        if lens.has_distortion
+    }  # fmt: skip
+    if bent:
+        write_json(folder / LENSES, bent)
+
+
+def fitted_to_undistorted(scene: Scene, maps: DepthFiles) -> DepthFiles:
+    """Return maps with the undistortion that the scene's photographs have had, if they need it."""
+    path = scene.source.root / LENSES if scene.source else None
+    if path is None or not path.is_file() or maps.lens is not None:
+        return maps
+    images = [image for image in scene.images if image.name in maps]
+    before = _read_lenses(path)
+    cameras = {im.name: im.intrinsics for im in images if im.name in before}
+    if not cameras:
+        return maps
+    name, camera = next(iter(cameras.items()))
+    height, width = read_stored(maps.paths[name]).values.shape
+    lens = before[name]
+    if width * lens.height != height * lens.width or width * camera.height == height * camera.width:
+        return maps  # made from the undistorted photographs, or nothing tells
+    share = width / lens.width  # of a photograph's pixels
+    reduced = {
+        name: camera.resized(round(camera.width * share), round(camera.height * share))
+        for name, camera in cameras.items()
+    }
+    return replace(maps, lens=Undistortion(before, reduced))
+
+
+def _read_lenses(path: Path) -> dict[str, Intrinsics]:
+    content = read_json(path)
+    fix = "Undistort the scene again."
+    with translate_errors(path, "lenses by image name, as splatseed undistort writes", fix=fix):
+        return {
+            name: make_intrinsics(
+                f"{path}, {name}",
+                1,
+                *(each["model"], each["width"], each["height"], each["params"]),
+            )
+            for name, each in content.items()
+        }
