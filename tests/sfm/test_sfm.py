@@ -26,7 +26,7 @@ from splatseed.pointcloud import PointCloud
 from splatseed.runtime import child
 from splatseed.scene import Scene, Split
 from splatseed.sfm import Settings, mapping, reconstruct
-from splatseed.sfm.export import clear_orientation, drop_repeats
+from splatseed.sfm.export import clear_orientation, drop_folded, drop_repeats
 from splatseed.similarity import fit_similarity
 
 pycolmap = pytest.importorskip("pycolmap")
@@ -307,3 +307,13 @@ def test_of_points_at_one_place_the_longest_track_stays(room_path):
     assert model.point3D_ids() == before - {short}
     seen = {p.point3D_id for image in model.images.values() for p in image.points2D}
     assert short not in seen
+
+
+def test_a_point_that_a_lens_model_folds_into_a_photograph_goes(room_path):
+    model = pycolmap.Reconstruction(room_path / "sparse" / "0")
+    before = model.point3D_ids()
+    near, folded = sorted(before)[:2]
+    model.point3D(near).xyz += [0.02, 0.0, 0.0]  # a pixel or two
+    model.point3D(folded).xyz += [30.0, 0.0, 0.0]
+    drop_folded(model)
+    assert model.point3D_ids() == before - {folded}

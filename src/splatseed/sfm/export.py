@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from splatseed.sfm.readable import copy_misread
 
 _SHORT = 3  # the type of the orientation's tag
 _HEAD_BYTES = 1 << 17  # EXIF (at most 64 KiB) is the first or second segment
+_FOLDED = 0.1  # share of a photograph's diagonal by which such a point misses its features, or more
 _NEGLIGIBLE = 2e-7  # a coefficient that counts as distortion but moves no pixel
 
 
@@ -27,7 +29,7 @@ def export_scene(run: Run, model_dir: Path, staging: Path, *, distinct: bool = T
     Photographs of PINHOLE cameras are copied, with the EXIF orientation cleared; of the others,
     transparent pixels are black. Reprojection
     errors are in pixels of the undistorted photographs. ``distinct`` drops points at the position
-    of another.
+    of another, and those that undistorted features contradict.
 
     Raises:
         OutputError: Not all photographs could be written.
@@ -73,6 +75,7 @@ def export_scene(run: Run, model_dir: Path, staging: Path, *, distinct: bool = T
     clear_orientation(staging / "images")
     model = pycolmap.Reconstruction(staging / "sparse" / "0")
     if distinct:
+        drop_folded(model)
         drop_repeats(model)
     model.update_point_3d_errors()
     model.write(staging / "sparse" / "0")
@@ -93,6 +96,19 @@ def mark_distortion(camera: Any) -> None:
     elif not lens.has_distortion and not lens.is_pinhole:
         camera.model = models.PINHOLE
         camera.params = list(lens.pinhole.params)
+
+
+def drop_folded(model: Any) -> None:
+    """Delete points that undistorted features contradict.
+
+    A lens model can fold directions far outside of a photograph back into it, so that points there
+    fit features whose rays they do not meet.
+    """
+    model.update_point_3d_errors()
+    sizes = [math.hypot(camera.width, camera.height) for camera in model.cameras.values()]
+    limit = _FOLDED * min(sizes, default=0.0)
+    for point in [i for i, each in model.points3D.items() if not each.error <= limit]:
+        model.delete_point3D(point)
 
 
 def drop_repeats(model: Any) -> None:
