@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from PIL import Image as PilImage
 
 from splatseed.camera import Intrinsics
 from splatseed.errors import SceneFormatError
@@ -39,6 +40,12 @@ def test_maps_of_the_photographs_of_before_are_undistorted(scene, tmp_path, fact
     row, column = np.mgrid[:height, :width] * 1.0 + 0.5
     for name in ("a.npy", "b.npy"):
         np.save(folder / name, column)  # depth is the column, so that it says where it comes from
+    if factor > 1:
+        assert find_depths(scene, folder).lens is None  # perhaps a network's
+        (tmp_path / "confidence").mkdir()
+        PilImage.fromarray(np.full((height, width), 2, np.uint8)).save(
+            tmp_path / "confidence/a.png"
+        )
     maps = find_depths(scene, folder)
     depth = maps.read("a.jpg")
     assert (depth.width, depth.height) == (86 // factor, 62 // factor)

@@ -187,7 +187,7 @@ def map_warnings(maps: object) -> list[str]:
         return []
     notes = []
     if maps.lens is not None:
-        what = "Depth maps have the shape of the photographs before undistortion"
+        what = "Depth maps are those of the photographs before undistortion"
         notes.append(f"{what}, and are undistorted on reading.")
     return notes + _confidence_warnings(maps)
 

@@ -1,8 +1,10 @@
 """Depth maps of photographs as they were before ``splatseed undistort`` or ``sfm``.
 
 Output of these has ``distorted.json``, with the lenses of before: by image name, ``model``,
-``width``, ``height`` and ``params`` in COLMAP's terms. Maps with the shape of the photographs of
-before, and not of the undistorted ones, are undistorted on reading.
+``width``, ``height`` and ``params`` in COLMAP's terms. Maps of the photographs of before are
+undistorted on reading: those that have their size, and those of a sensor, which have confidences,
+that have their shape, if the undistorted photographs have another. Other maps are taken as made
+from the undistorted ones, as a network's are of any size.
 """
 
 from __future__ import annotations
@@ -48,8 +50,13 @@ def fitted_to_undistorted(scene: Scene, maps: DepthFiles) -> DepthFiles:
     name, camera = next(iter(cameras.items()))
     height, width = read_stored(maps.paths[name]).values.shape
     lens = before[name]
-    if width * lens.height != height * lens.width or width * camera.height == height * camera.width:
-        return maps  # made from the undistorted photographs, or nothing tells
+    same_size = (width, height) == (lens.width, lens.height) != (camera.width, camera.height)
+    same_shape = (
+        width * lens.height == height * lens.width
+        and width * camera.height != height * camera.width
+    )
+    if not (same_size or (same_shape and maps.confidences)):
+        return maps
     share = width / lens.width  # of a photograph's pixels
     reduced = {
         name: camera.resized(round(camera.width * share), round(camera.height * share))
