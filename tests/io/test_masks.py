@@ -207,6 +207,15 @@ def test_masks_of_other_tools_are_found_and_written_as_colmaps(scene_path, tmp_p
     assert np.array_equal(masks_of(load_scene(out))[3], mask)
 
 
+def test_hidden_files_are_no_masks(scene_path):
+    for i in range(9):
+        paint(scene_path / f"masks/view_{i:03}.png")
+        for folder in ("masks", "images"):
+            (scene_path / folder / f"._view_{i:03}.png").write_bytes(b"Mac OS X")
+    assert load_scene(scene_path).warnings == ()
+    assert len(masks_near(scene_path / "images")[0].files) == 9
+
+
 def test_masks_of_a_format_that_is_not_read_are_noted(scene_path):
     paint(scene_path / "masks/view_003.png")
     for name in ("view_003.npy", "view_004.png.npy", "view_005.npy", "notes.txt"):

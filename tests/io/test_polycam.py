@@ -26,6 +26,12 @@ def rename(paths, suffix):
         path.rename(path.with_suffix(suffix))
 
 
+def test_hidden_files_of_macos_are_no_key_frames(export):
+    for path in [each for each in export.rglob("*") if each.is_file()]:
+        path.with_name(f"._{path.name}").write_bytes(b"Mac OS X")
+    assert (len(load(export).images), load(export).warnings) == (9, ())
+
+
 @pytest.mark.parametrize("prefix", ["corrected_", ""])
 @pytest.mark.parametrize("given", ["", "keyframes"])
 def test_cameras_depth_and_confidence_come_back(room_with_depth, tmp_path, prefix, given):

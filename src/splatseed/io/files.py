@@ -61,14 +61,23 @@ _PARSER = threading.Lock()
 
 
 def files_below(folder: Path) -> list[Path]:
-    """List the files in a folder and its subfolders, sorted; links are followed."""
+    """List the files in a folder and its subfolders, sorted; links are followed.
+
+    Hidden ones are left out, such as macOS's ``._a.png`` beside ``a.png`` on other file systems.
+    """
     found = list[Path]()
     for place, folders, names in os.walk(folder, followlinks=True):
         if os.path.realpath(place) in map(os.path.realpath, Path(place).parents):
             folders.clear()  # a link to a parent
         else:
-            found += [Path(place, name) for name in names]
+            folders[:] = [name for name in folders if not is_hidden(name)]
+            found += [Path(place, name) for name in names if not is_hidden(name)]
     return sorted(found)
+
+
+def is_hidden(name: str) -> bool:
+    """Whether a file or folder of this name is hidden."""
+    return name.startswith(".")
 
 
 def is_video(path: Path) -> bool:

@@ -17,7 +17,7 @@ import numpy as np
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io.depth_maps import match_by_name
-from splatseed.io.files import StrPath
+from splatseed.io.files import StrPath, is_hidden
 from splatseed.io.frame_files import SUFFIXES
 from splatseed.io.phone import EXPORT_AGAIN, PhoneFrame, read_numbers, read_phone_scene, read_record
 from splatseed.scene import Scene
@@ -92,8 +92,10 @@ def _choose(keyframes: Path) -> tuple[str, list[str], dict[str, Path]]:
     for prefix in (_CORRECTED, ""):
         images, cameras = keyframes / f"{prefix}images", keyframes / f"{prefix}cameras"
         listed = sorted(path.name for path in images.iterdir()) if images.is_dir() else []
-        names = [name for name in listed if Path(name).suffix.lower() in SUFFIXES]
-        records = {path.stem: path for path in sorted(cameras.glob("*.json"))}
+        shown = [name for name in listed if not is_hidden(name)]
+        names = [name for name in shown if Path(name).suffix.lower() in SUFFIXES]
+        found = (path for path in sorted(cameras.glob("*.json")) if not is_hidden(path.name))
+        records = {path.stem: path for path in found}
         if names and records:
             break
     return prefix, names, records

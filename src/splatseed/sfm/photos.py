@@ -82,8 +82,7 @@ def find_photos(image_dir: StrPath) -> tuple[dict[str, Photo], dict[str, list[st
             found=f"an output of splatseed {kind}",
             fix=f"Pass the folder of its photographs, such as {quoted(image_dir / 'images')}.",
         )
-    relative = [path.relative_to(image_dir) for path in files_below(image_dir) if path.is_file()]
-    files = [path for path in relative if not any(part.startswith(".") for part in path.parts)]
+    files = [path.relative_to(image_dir) for path in files_below(image_dir) if path.is_file()]
     names, foreign = (
         sorted(path.as_posix() for path in files if path.suffix.lower() in suffixes)
         for suffixes in (_SUFFIXES, _FOREIGN_SUFFIXES)
