@@ -63,6 +63,9 @@ def test_a_distorted_scene_becomes_one_of_pinholes(distorted, tmp_path, splatsee
     run = splatseed("undistort", path, "-o", out)
     assert run.code == 0, run
     assert f"splatseed upsample {out}" in run.out
+    assert f"Its 12 depth maps are not in the output: name them to upsample by --depth {path}" in (
+        run.out
+    )
     after = load_scene(out)
     assert {lens.model for lens in after.intrinsics} == {"PINHOLE"}
     assert {image.name for image in after.images} == {image.name for image in before.images}

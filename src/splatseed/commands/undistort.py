@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -11,12 +12,14 @@ import tyro
 from splatseed.commands.options import parse_options
 from splatseed.console import print_note, print_pairs, stage_display
 from splatseed.io import load_scene
+from splatseed.io.depth_maps import DepthFiles
+from splatseed.io.load import depths_beside
 from splatseed.io.photograph import warnings_without_lens
 from splatseed.io.seeds import was_upsampled
 from splatseed.io.staging import check_output
 from splatseed.seeding.trainability import is_distorted
 from splatseed.sfm import undistort
-from splatseed.text import quoted
+from splatseed.text import agreeing, counted, quoted
 
 
 @dataclass(frozen=True)
@@ -45,6 +48,14 @@ def run(arguments: list[str]) -> None:
     print_pairs("splatseed undistort", [*counts, ("output", str(output))])
     for warning in warnings_without_lens(scene):
         print_note(warning)
+    maps = scene.depths or depths_beside(scene)
+    if isinstance(maps, DepthFiles) and maps:
+        folder = quoted(os.path.commonpath([path.parent for path in maps.paths.values()]))
+        are = agreeing(len(maps), "is", "are")
+        print_note(
+            f"Its {counted(len(maps), 'depth map')} {are} not in the output: name them to upsample "
+            f"by --depth {folder}."
+        )
     if not is_distorted(scene):
         print_note("No camera had distortion: the photographs are copies.")
     verb, made = ("train", "RUN") if was_upsampled(scene) else ("upsample", "OUT")
