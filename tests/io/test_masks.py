@@ -207,6 +207,19 @@ def test_masks_of_other_tools_are_found_and_written_as_colmaps(scene_path, tmp_p
     assert np.array_equal(masks_of(load_scene(out))[3], mask)
 
 
+def test_files_beside_photographs_need_no_masks(scene_path):
+    folder = (scene_path / "images").rename(scene_path / "camera")
+    (scene_path / "images").mkdir()
+    folder.rename(scene_path / "images/camera")
+    for path in list((scene_path / "images/camera").iterdir()):
+        path.with_suffix(".xmp").touch()
+        paint(scene_path / "masks" / path.name)
+    (scene_path / "images/notes.txt").touch()
+    masks, notes = masks_near(scene_path / "images")
+    assert masks.files.keys() == {f"camera/view_{i:03}.png" for i in range(9)}
+    assert notes == [f"9 photographs with a mask in {scene_path / 'masks'}."]
+
+
 def test_hidden_files_are_no_masks(scene_path):
     for i in range(9):
         paint(scene_path / f"masks/view_{i:03}.png")

@@ -23,7 +23,7 @@ from splatseed.errors import SceneFormatError, SceneNotFoundError, SplatseedErro
 from splatseed.io.bit_depth import is_16_bit, opaque_value, read_16_bit
 from splatseed.io.depth_maps import Undistortion
 from splatseed.io.files import files_below, read_bytes, translate_errors
-from splatseed.io.mask_files import find_masks, find_own_masks, masks_among
+from splatseed.io.mask_files import SUFFIXES, find_masks, find_own_masks, masks_among
 from splatseed.io.photograph import has_alpha, open_photograph, photograph_bytes
 from splatseed.io.photograph_checks import photograph_size
 from splatseed.scene import Masks, Scene
@@ -95,8 +95,9 @@ def masks_near(photographs: Path) -> tuple[Masks, list[str]]:
     folder = photographs.absolute()
     if not photographs.is_dir():
         return Masks({}), []
-    below = (path.relative_to(photographs).as_posix() for path in files_below(photographs))
-    names = sorted(below)
+    # Not files of other kinds, such as a photograph's .xmp, for each of which a mask would lack.
+    pictures = (path for path in files_below(photographs) if path.suffix.lower() in SUFFIXES)
+    names = sorted(path.relative_to(photographs).as_posix() for path in pictures)
     names = sorted(set(names) - masks_among(names))
     files, notes = find_own_masks(names, folder, folder.parent)
     if files:
