@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections import Counter
 from dataclasses import replace
+from pathlib import PurePosixPath
 from types import SimpleNamespace
 
 import numpy as np
@@ -27,6 +29,7 @@ from splatseed.runtime import child
 from splatseed.scene import Scene, Split
 from splatseed.sfm import Settings, mapping, reconstruct
 from splatseed.sfm.export import clear_orientation, drop_folded, drop_repeats
+from splatseed.sfm.photos import find_photos
 from splatseed.similarity import fit_similarity
 
 pycolmap = pytest.importorskip("pycolmap")
@@ -196,6 +199,20 @@ def test_photographs_are_told_first_and_an_interrupt_leaves_nothing(photos, tmp_
         )
     assert told == [("below/view_000.png", ["depth.png"], ["conf_00000.png"], ["phone.heic"])]
     assert {path.name for path in tmp_path.iterdir()} == {"photos", "scene_sfm"}
+
+
+def test_reduced_copies_are_no_photographs(photos, tmp_path):
+    for folder in ("images", "images_2", "images_4_png", "images_8x", "b/images", "b/images_8"):
+        (tmp_path / folder).mkdir(parents=True)
+        for number in range(2):
+            shutil.copy(photos / f"view_00{number}.png", tmp_path / folder)
+    (tmp_path / "images_2/view_000.png").rename(tmp_path / "images_2/view_000.PNG")
+    (tmp_path / "images_2/view_001.png").rename(tmp_path / "images_2/other.png")  # not a copy
+    found, left_out = find_photos(tmp_path)
+    folders = Counter(str(PurePosixPath(name).parent) for name in found)
+    assert folders == {"images": 2, "images_2": 1, "images_8x": 2, "b/images": 2}
+    (copies,) = left_out.values()
+    assert len(copies) == 5
 
 
 def test_a_dying_process_is_one_clear_error(photos, tmp_path, monkeypatch):

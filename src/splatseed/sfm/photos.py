@@ -11,9 +11,10 @@ median shifts of blocks between frames, by phase correlation (Kuglin and Hines 1
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
 import numpy as np
@@ -44,11 +45,14 @@ _FOREIGN = "of an unsupported format"
 _MASK = "named as masks of others are"
 _MAP = "of grey, named as maps of depth or confidence are"
 _BESIDE = "that 3D Scanner App writes beside its photographs"
+_COPY = "that are reduced copies, as in images_2"
 _DEPTH_MODES = ("I", "F")  # Pillow's names for 16- and 32-bit grey
 _GREY_MODES = ("L", "1", "LA")
 _MAPS = re.compile(r"(^|[/_.-])(conf|confidence|depth|disparity|masks?)([/_.\d-]|$)", re.IGNORECASE)
 """Names of maps that scanning apps write beside photographs."""
 
+_REDUCED = re.compile(r"images_\d+(_png)?")
+"""Folders in which trainers keep reduced copies of the photographs in ``images``."""
 _BLOCK = 64
 """Side of the blocks of phase correlation, px."""
 _MIN_FRAMES = 3
@@ -58,9 +62,10 @@ _MIN_FRAMES = 3
 def find_photos(image_dir: StrPath) -> tuple[dict[str, Photo], dict[str, list[str]]]:
     """Find the photographs of a folder and its subfolders, at least two.
 
-    Skipped are hidden files, masks, depth maps (16-bit or float grey; next to colour photographs
-    also 8-bit grey with the name of a depth or confidence map), textures and thumbnails in an
-    export of 3D Scanner App, and unsupported formats such as HEIC or raw.
+    Skipped are hidden files, masks, reduced copies in ``images_2`` and so on, depth maps (16-bit or
+    float grey; next to colour photographs also 8-bit grey with the name of a depth or confidence
+    map), textures and thumbnails in an export of 3D Scanner App, and unsupported formats such as
+    HEIC or raw.
 
     Returns:
         The photographs by name (relative path), sorted; and the names of skipped images by reason.
@@ -89,6 +94,8 @@ def find_photos(image_dir: StrPath) -> tuple[dict[str, Photo], dict[str, list[st
     )
     masks = masks_among(names)
     names = [name for name in names if name not in masks]
+    copies = _reduced_copies(names)
+    names = [name for name in names if name not in copies]
     beside = []
     if is_scanner_app(image_dir):
         beside = [name for name in names if not (is_photograph(name) or _MAPS.search(name))]
@@ -104,6 +111,7 @@ def find_photos(image_dir: StrPath) -> tuple[dict[str, Photo], dict[str, list[st
         (_GREY, grey),
         (_MAP, [n for n in maps if n not in grey]),
         (_BESIDE, beside),
+        (_COPY, sorted(copies)),
         (_FOREIGN, foreign),
         (_MASK, sorted(masks)),
     )
@@ -122,6 +130,20 @@ def find_photos(image_dir: StrPath) -> tuple[dict[str, Photo], dict[str, list[st
             else "Pass the folder with the photographs of a scene.",
         )
     return photos, left_out
+
+
+def _reduced_copies(names: Iterable[str]) -> set[str]:
+    """Return the names of reduced copies: test views would be trained on by theirs."""
+    places = {name: PurePosixPath(name).with_suffix("").parts for name in names}
+    there = {*places.values()}
+    return {
+        name
+        for name, parts in places.items()
+        if any(
+            _REDUCED.fullmatch(part) and (*parts[:i], "images", *parts[i + 1 :]) in there
+            for i, part in enumerate(parts[:-1])
+        )
+    }
 
 
 def _read(path: Path) -> tuple[Photo | None, bool]:
