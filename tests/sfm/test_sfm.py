@@ -326,11 +326,15 @@ def test_of_points_at_one_place_the_longest_track_stays(room_path):
     assert short not in seen
 
 
-def test_a_point_that_a_lens_model_folds_into_a_photograph_goes(room_path):
+def test_points_that_a_lens_model_folds_into_a_photograph_go(room_path):
     model = pycolmap.Reconstruction(room_path / "sparse" / "0")
     before = model.point3D_ids()
-    near, folded = sorted(before)[:2]
+    near, folded, *_, long = sorted(before, key=lambda i: model.point3D(i).track.length())
     model.point3D(near).xyz += [0.02, 0.0, 0.0]  # a pixel or two
     model.point3D(folded).xyz += [30.0, 0.0, 0.0]
+    length = model.point3D(long).track.length()
+    wrong = model.point3D(long).track.elements[1]
+    model.image(wrong.image_id).point2D(wrong.point2D_idx).xy = [-500.0, 0.0]
     drop_folded(model)
     assert model.point3D_ids() == before - {folded}
+    assert model.point3D(long).track.length() == length - 1

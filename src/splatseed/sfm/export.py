@@ -99,16 +99,29 @@ def mark_distortion(camera: Any) -> None:
 
 
 def drop_folded(model: Any) -> None:
-    """Delete points that undistorted features contradict.
+    """Delete observations that points miss by far in undistorted photographs.
 
     A lens model can fold directions far outside of a photograph back into it, so that points there
-    fit features whose rays they do not meet.
+    fit features whose rays they do not meet. Points with fewer than two observations go.
     """
     model.update_point_3d_errors()
     sizes = [math.hypot(camera.width, camera.height) for camera in model.cameras.values()]
     limit = _FOLDED * min(sizes, default=0.0)
-    for point in [i for i, each in model.points3D.items() if not each.error <= limit]:
-        model.delete_point3D(point)
+    # The error is the observations' mean, infinite where a point is behind the camera.
+    odd = [i for i, p in model.points3D.items() if not p.error * p.track.length() <= limit]
+    for point_id in odd:
+        point = model.point3D(point_id)
+        seen = [(each.image_id, each.point2D_idx) for each in point.track.elements]
+        for image_id, index in [each for each in seen if _miss(model, point, *each) > limit]:
+            if model.exists_point3D(point_id):  # deleted with its last but one observation
+                model.delete_observation(image_id, index)
+
+
+def _miss(model: Any, point: Any, image_id: int, index: int) -> float:
+    """Return the distance of a feature from the projection of its point, px."""
+    image = model.image(image_id)
+    at = image.project_point(point.xyz)
+    return math.inf if at is None else math.dist(at, image.point2D(index).xy)
 
 
 def drop_repeats(model: Any) -> None:
