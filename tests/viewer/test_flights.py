@@ -13,7 +13,7 @@ import pytest
 torch = pytest.importorskip("torch", reason="rendering needs PyTorch")
 ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="videos need imageio-ffmpeg (extra view)")
 
-from splatseed.camera import Camera
+from splatseed.camera import Camera, quat_from_rotation
 from splatseed.errors import ParameterError, SceneFormatError
 from splatseed.io import load_scene, write_scene
 from splatseed.photos.view import NO_PIXELS, View, camera_views
@@ -85,9 +85,36 @@ def test_an_orbit_circles_the_focus_of_the_cameras(run_folder):
     assert np.isfinite(apart).all()
 
 
-def test_cameras_that_are_upside_down_to_each_other_have_an_up():
-    np.testing.assert_allclose(flights.upward(np.array([0.0, 0.0, -3.0])), [0, 0, -1])
-    np.testing.assert_allclose(flights.upward(np.zeros(3)), [0, -1, 0])
+def _sideways(scene):
+    """The scene as a phone stores it that was held upright: tall photographs, turned to be wide."""
+    quarter = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])  # the top of an image becomes its left
+    (lens,) = {image.intrinsics for image in scene.images}
+    fx, fy, cx, cy = lens.params
+    wide = dataclasses.replace(
+        lens, width=lens.height, height=lens.width, params=(fy, fx, cy, lens.width - cx)
+    )
+    images = tuple(
+        dataclasses.replace(
+            image,
+            intrinsics=wide,
+            quat=quat_from_rotation(quarter @ image.cam_from_world[:3, :3]),
+            translation=quarter @ image.translation,
+        )
+        for image in scene.images
+    )
+    return scene.replace(images=images, depths=None)
+
+
+def test_the_path_past_sideways_cameras_is_that_past_upright_ones(room):
+    scene = load_scene(room)
+    flights_of = []
+    for each in (scene, _sideways(scene)):
+        views = ViewerItem("", each).central_views
+        assert (views[0].width, views[0].height) == (96, 72)
+        flights_of.append(smooth_path(views, 12, (96, 72)))
+    for view, other in zip(*flights_of, strict=True):
+        np.testing.assert_allclose(view.cam_from_world, other.cam_from_world, atol=1e-6)
+        np.testing.assert_allclose(view.K, other.K, atol=1e-6)
 
 
 @pytest.mark.parametrize(

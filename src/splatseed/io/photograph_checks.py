@@ -120,7 +120,7 @@ def _misfit(lens: Intrinsics, size: Size, path: Path) -> tuple[str, str]:
             "Use the photographs of the reconstruction, or resized copies. A crop "
             "needs a camera record of its own: width, height and principal point."
         )
-    if orientation := _sideways(path):
+    if (orientation := exif_orientation(path)) in _SIDEWAYS:
         return f"stored rotated, with EXIF orientation {orientation}", (
             "The poses are for upright pixels: rotate copies as EXIF says (ImageMagick: mogrify "
             "-auto-orient), or estimate poses for the files as stored (splatseed sfm)."
@@ -130,14 +130,13 @@ def _misfit(lens: Intrinsics, size: Size, path: Path) -> tuple[str, str]:
     )
 
 
-def _sideways(path: Path) -> int:
-    """Return EXIF's orientation if it swaps width and height, else 0."""
+def exif_orientation(path: Path) -> int:
+    """Return EXIF's orientation of a photograph, 1 to 8; 0 if it has none, or cannot be read."""
     try:
         with open_file(path) as file, PilImage.open(file) as picture:
-            orientation = int(picture.getexif().get(ORIENTATION, 0))
+            return int(picture.getexif().get(ORIENTATION, 0))
     except Exception:  # noqa: BLE001  (damaged EXIF makes Pillow raise anything)
         return 0
-    return orientation if orientation in _SIDEWAYS else 0
 
 
 def image_warnings(images: Sequence[Image], image_dir: Path | None, root: Path) -> list[str]:

@@ -22,6 +22,7 @@ from splatseed.camera import Camera
 from splatseed.errors import OutputError, ParameterError, SceneFormatError
 from splatseed.io.files import read_bytes, translate_errors
 from splatseed.io.staging import atomic_file
+from splatseed.photos.upright import up_direction
 from splatseed.photos.view import View
 from splatseed.photos.viewpoint import look_at
 from splatseed.photos.visibility import points_in_image
@@ -50,7 +51,6 @@ class _Smoothing:
     sigma: float = 0.02  # of the Gaussian filter along the path, relative to its length
     samples_per_frame: int = 8
     max_detour: float = 2.0  # length in order of names over that by nearest neighbours
-    min_up: float = 1e-6  # length of the mean up direction below which the cameras' cancel
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,17 +99,16 @@ def orbit(
 ) -> list[View]:
     """Circle the cameras' focus at their distance and height; without cameras, the model."""
     if len(views) > 1:
-        centers, _, ups = np.split(_poses(views), 3, axis=1)
-        up, focus, lens = ups.mean(axis=0), focus_point(views), _lens(views, size)
+        centers = _poses(views)[:, :3]
+        focus, lens = focus_point(views), _lens(views, size)
     else:
         focus = np.median(gaussians.means.astype(np.float64), axis=0)
         reach = np.quantile(np.linalg.norm(gaussians.means - focus, axis=1), CORE)
         if not reach > 0:  # all are in one place
             reach = max(1.0, 3 * np.exp(gaussians.scales.astype(np.float64).max()))
-        up = np.zeros(3)
         centers = (focus + reach * np.array([2.0, -0.7, 0.0]))[None]
         lens = _lens([pinhole_view(DEFAULT_SIZE, 2 * np.arctan(0.5), np.eye(4))], size)
-    up = upward(up)
+    up = up_direction([view.camera for view in views if len(views) > 1])
     offsets = centers - focus
     # Distances from the focus along up, and around it.
     heights = offsets @ up
@@ -122,12 +121,6 @@ def orbit(
         for angle in 2 * np.pi * np.arange(frames) / frames
     ]
     return _posed(lens, [(eye, focus, up) for eye in eyes])
-
-
-def upward(up: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, " 3"]:
-    """Normalise a mean up direction; if the directions cancel, -y, up in most captures."""
-    length = np.linalg.norm(up)
-    return up / length if length > SMOOTHING.min_up else np.array([0.0, -1.0, 0.0])
 
 
 def focus_point(views: Sequence[View]) -> Float64[np.ndarray, " 3"]:

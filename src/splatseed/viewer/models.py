@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +21,7 @@ from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io import load_scene
 from splatseed.io.files import StrPath
 from splatseed.photos.camera_check import reference_points
+from splatseed.photos.upright import quarter_turns, turned
 from splatseed.photos.view import View, camera_views, view_of
 from splatseed.progress import Note, silent_note
 from splatseed.scene import Scene
@@ -71,9 +72,12 @@ class ViewerItem:
 
     @property
     def central_views(self) -> tuple[View, ...]:
-        """Training cameras without strays far from all others."""
+        """Training cameras without strays far from all others, upright."""
         views, strays = self.train_views, viewer_frame(self).strays
-        return tuple(view for view in views if view.name not in strays)
+        central = [view for view in views if view.name not in strays]
+        turns = quarter_turns([self.scene[view.name] for view in central] if self.scene else ())
+        pairs = zip(central, turns, strict=True)
+        return tuple(replace(view, camera=turned(view.camera, turn)) for view, turn in pairs)
 
 
 def open_item(path: StrPath, scene_path: Path | None = None) -> ViewerItem:

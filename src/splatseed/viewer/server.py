@@ -26,12 +26,13 @@ from jaxtyping import Float32, Float64
 
 from splatseed.camera import Camera
 from splatseed.errors import ParameterError
+from splatseed.photos.upright import quarter_turns, turned, up_direction
 from splatseed.photos.view import View
 from splatseed.photos.viewpoint import choose_camera, choose_image
 from splatseed.requirements import require
 from splatseed.scene import Image, Scene
 from splatseed.splat.training_frame import TrainingFrame
-from splatseed.viewer.flights import orbit, upward
+from splatseed.viewer.flights import orbit
 from splatseed.viewer.models import ViewerItem
 from splatseed.viewer.pictures import Drawn, Entry, fitted_fov, viewer_pose
 from splatseed.viewer.session import Session
@@ -133,14 +134,16 @@ class Viewer:
         scene, frame = entry.item.scene, entry.frame
         if scene is not None and (scene.images or len(scene.points)):
             image = choose_image(scene) if len(scene.points) else scene.images[0]
-            camera = choose_camera(scene) if image is None else image.camera
-            cameras = [image.camera for image in scene.images] or [camera]
-            up = -np.mean([c.cam_from_world[1, :3] for c in cameras], axis=0)
+            turns = quarter_turns(scene.images)
+            cameras = [turned(im.camera, n) for im, n in zip(scene.images, turns, strict=True)]
+            chosen = scene.images.index(image) if image is not None else 0
+            camera = cameras[chosen] if cameras else choose_camera(scene)
+            up = up_direction(cameras or [camera])
             # Behind the first camera of a scene, to see the cameras.
             place_camera(self.server, camera, up, frame, 0.0 if entry.has_model else STEP_BACK)
         else:
             outside = orbit([], entry.item.model, 1, (600, 400))[0].camera
-            place_camera(self.server, outside, np.zeros(3), frame)
+            place_camera(self.server, outside, up_direction([]), frame)
 
 
 def place_camera(
@@ -153,7 +156,7 @@ def place_camera(
     """Start browsers of a viser server at a camera, or some way behind it in the viewer frame."""
     ahead, (_, position) = camera.world_from_cam[:3, 2], viewer_pose(camera, frame)
     position = position - step_back * ahead
-    server.scene.set_up_direction(tuple(upward(up)))
+    server.scene.set_up_direction(tuple(up.tolist()))
     start = server.initial_camera
     start.position, start.look_at = tuple(position), tuple(position + ahead)
     start.fov, start.near = fitted_fov(camera, 1.5), min(start.near, frame.near)

@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from splatseed.errors import OutputError
 from splatseed.io.staging import atomic_file
+from splatseed.photos.upright import up_direction
 from splatseed.photos.view import View
 from splatseed.progress import Note, Progress, silent, silent_note
 from splatseed.rendering.harmonics import sh_basis
@@ -117,9 +118,8 @@ def write_page(
             scale=1 / unit,
         )
         views = item.central_views
-        up = -np.sum([view.camera.cam_from_world[1, :3] for view in views], axis=0)
         start = views[0] if views else orbit([], model, 1, (600, 400))[0]
-        place_camera(server, start.camera, up if views else np.zeros(3), frame)
+        place_camera(server, start.camera, up_direction([view.camera for view in views]), frame)
         farthest = np.linalg.norm(means, axis=1).max() + MAX_SIZE / unit
         server.initial_camera.far = float(max(server.initial_camera.far, 2 * farthest))
         text = server.get_scene_serializer().as_html()
