@@ -14,8 +14,9 @@ from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io import load_scene, write_scene
 from splatseed.io.load import with_own_depths
 from splatseed.io.mask_files import masks_among
-from splatseed.io.masks import masks_near, with_masks
+from splatseed.io.masks import mask_choice, masks_near, with_masks
 from splatseed.photos.loading import load_views
+from splatseed.pointcloud import PointCloud
 from splatseed.sfm.photos import find_photos
 from splatseed.synthetic import write_capture
 
@@ -306,3 +307,35 @@ def test_masks_are_no_photographs(scene_path):
     names = ["a.jpg", "b_mask.jpg", "a_mask.png", "x/masks/a.png"]
     assert masks_among(names) == {"a_mask.png", "x/masks/a.png"}
     assert masks_among(["mask/a.png", "mask/b.png"]) == set()
+
+
+@pytest.mark.parametrize("layout", ["auto", "colmap", "transforms"])
+@pytest.mark.parametrize("kind", ["blender", "named", "folder", "beside"])
+def test_no_masks_are_written_of_a_scene_without_them(kind, layout, tmp_path, rng):
+    """Neither a trainer nor splatseed would use them, whatever lies near the photographs."""
+    root, parts = tmp_path / "scene", ("train", "test") if kind == "blender" else ("images",)
+    for part in parts:
+        frames = []
+        for i in range(3):
+            photograph = root / part / f"{i}.png"
+            photograph.parent.mkdir(parents=True, exist_ok=True)
+            PilImage.new("RGBA", (96, 72)).save(photograph)
+            place = f"{part}/{i}_mask.png" if kind == "beside" else f"masks/{i}.png"
+            paint(root / (f"masks/{part}/{i}.png" if kind == "blender" else place))
+            pose = np.eye(4)
+            pose[:3, 3] = rng.normal(size=3)
+            frame = {"file_path": f"{part}/{i}.png", "transform_matrix": pose.tolist()}
+            frames.append(frame | ({"mask_path": place} if kind == "named" else {}))
+        name = f"transforms_{part}.json" if kind == "blender" else "transforms.json"
+        (root / name).write_text(json.dumps({"camera_angle_x": 0.7, "frames": frames}))
+    points = PointCloud(rng.normal(size=(9, 3)), np.zeros((9, 3), np.uint8))
+    scene = load_scene(root, require_points=False).with_points(points)
+    assert len(scene.masks.files) == 3 * len(parts)
+    out = write_scene(with_masks(scene, "none"), tmp_path / "out", format=layout).path
+    assert not (out / "masks").exists()
+    assert layout == "colmap" or "mask_path" not in (out / "transforms.json").read_text()
+    again = load_scene(out)
+    assert again.masks is None
+    assert mask_choice(again) == "none"
+    kept = load_scene(write_scene(scene, tmp_path / "kept", format=layout).path)
+    assert len(kept.masks.files) == 3 * len(parts)

@@ -14,12 +14,11 @@ from pathlib import Path, PurePath
 
 from splatseed.io.extraction import is_extracted
 from splatseed.io.files import open_file
+from splatseed.io.mask_files import FOLDER as MASKS
 from splatseed.scene import Scene
 
-_SIBLINGS = tuple(
-    f"{kind}{scale}" for kind in ("images", "masks", "depths") for scale in ("", "_2", "_4", "_8")
-)
-"""Folders in which trainers look for photographs, by the resolution they ask for."""
+_KINDS = ("images", MASKS, "depths")
+"""Folders in which trainers look, each also with the resolution that they ask for."""
 
 
 def image_folders(scene: Scene) -> dict[str, Path]:
@@ -27,7 +26,7 @@ def image_folders(scene: Scene) -> dict[str, Path]:
     source = scene.source
     if source is None or not scene.images:
         return {}
-    folders = sibling_folders(source.root)
+    folders = sibling_folders(scene)
     if source.image_dir is None:
         return folders
     if source.image_dir.resolve() != source.root.resolve():
@@ -45,9 +44,15 @@ def first_folders(paths: Iterable[str]) -> list[str]:
     return sorted(firsts - {".."})
 
 
-def sibling_folders(root: Path) -> dict[str, Path]:
-    """Return the folders of images, masks and depth maps, at any scale, in a scene's folder."""
-    return {name: root / name for name in _SIBLINGS if (root / name).is_dir()}
+def sibling_folders(scene: Scene) -> dict[str, Path]:
+    """Return the folders of images, masks and depth maps, at any scale, in a scene's folder.
+
+    Those of masks are left out if none of them count.
+    """
+    root = scene.source.root if scene.source else None
+    kinds = [kind for kind in _KINDS if kind != MASKS or scene.masks is not None]
+    names = (f"{kind}{scale}" for kind in kinds for scale in ("", "_2", "_4", "_8"))
+    return {name: root / name for name in names if root and (root / name).is_dir()}
 
 
 def photographs_hidden(folders: Mapping[str, Path], scene: Scene) -> str:

@@ -37,7 +37,15 @@ from splatseed.io.rgbd import find_tum_depths, is_replica, is_tum, load_rgbd, lo
 from splatseed.io.scanner_app import is_scanner_app, read_scanner_app
 from splatseed.io.seeds import recall_seeds
 from splatseed.io.split import with_listed_split
-from splatseed.io.staging import ABSENT, BLACK, MANIFEST, TRANSPARENT, read_manifest
+from splatseed.io.staging import (
+    ABSENT,
+    BLACK,
+    MANIFEST,
+    MASKED,
+    NOTHING,
+    TRANSPARENT,
+    read_manifest,
+)
 from splatseed.io.stray import is_stray, read_stray
 from splatseed.io.undistorted import fitted_to_undistorted
 from splatseed.scene import Masks, Scene, SceneSource
@@ -101,8 +109,8 @@ def load_scene(path: StrPath, *, require_points: bool = True) -> Scene:
         fix = _TRIANGULATE if scene.images else "Choose a scene or a PLY with points."
         raise SceneNotFoundError(f"points in {path}", found="none", fix=fix)
     # seeds.npz and the manifest refer to the points as stored: restore before cleaning.
-    scene = _restore_transparency(_restore_absent(recall_seeds(scene)))
-    scene = with_own_masks(clean_scene(with_listed_split(scene)))
+    scene = clean_scene(with_listed_split(_restore_absent(recall_seeds(scene))))
+    scene = _with_recorded_masks(scene)
     folder, white, notes = scene.source.image_dir if scene.source else None, WHITE, list[str]()
     if folder is not None:
         white, notes = find_white([folder / image.name for image in scene.images])
@@ -120,12 +128,14 @@ def _restore_absent(scene: Scene) -> Scene:
     return scene.replace(absent=(*scene.absent, *(name for name in noted if name not in known)))
 
 
-def _restore_transparency(scene: Scene) -> Scene:
-    """Do not mask transparent pixels if the manifest of a scene, of a Blender pair, says so."""
-    noted = read_manifest(scene.source.root).get(TRANSPARENT) if scene.source else None
-    if noted != BLACK:
-        return scene
-    return scene.replace(masks=replace(scene.masks or Masks({}), alpha=False))
+def _with_recorded_masks(scene: Scene) -> Scene:
+    """Attach the masks near the photographs, as far as the manifest of a scene lets them count."""
+    manifest = read_manifest(scene.source.root) if scene.source else {}
+    if manifest.get(MASKED) == NOTHING:
+        return scene.replace(masks=None)
+    if manifest.get(TRANSPARENT) == BLACK:  # of a Blender pair
+        scene = scene.replace(masks=replace(scene.masks or Masks({}), alpha=False))
+    return with_own_masks(scene)
 
 
 def load_originals(path: StrPath, *, require_points: bool = True) -> Scene:

@@ -21,7 +21,16 @@ from jaxtyping import Float32
 
 from splatseed.errors import PointCloudError
 from splatseed.io.files import ARCHIVE_FAILURES, read_npy
-from splatseed.io.staging import ABSENT, BLACK, MANIFEST, TRANSPARENT, read_manifest, write_json
+from splatseed.io.staging import (
+    ABSENT,
+    BLACK,
+    MANIFEST,
+    MASKED,
+    NOTHING,
+    TRANSPARENT,
+    read_manifest,
+    write_json,
+)
 from splatseed.pointcloud import ATTRIBUTES, ORIGINAL, PointCloud
 from splatseed.runtime.fingerprint import fingerprint
 from splatseed.scene import Scene
@@ -111,10 +120,19 @@ def carry_seeds(scene: Scene, written: Path, folder: Path) -> None:
     """
     if (written / SEEDS).is_file():
         shutil.copyfile(written / SEEDS, folder / SEEDS)
-    facts: dict[str, Any] = {ABSENT: list(scene.absent)} if scene.absent else {}
-    if scene.masks and not scene.masks.alpha:
+    write_json(folder / MANIFEST, {**facts_for_reading(scene), UPSAMPLED: _upsampling(scene)})
+
+
+def facts_for_reading(scene: Scene) -> dict[str, Any]:
+    """Return entries of an output's manifest by which ``load_scene`` reads it as this scene."""
+    facts: dict[str, Any] = {}
+    if scene.absent:  # so that the others train or test as before
+        facts[ABSENT] = list(scene.absent)
+    if scene.masks is None and scene.source and scene.source.image_dir:
+        facts[MASKED] = NOTHING  # else masks near the photographs would count again
+    if scene.masks and not scene.masks.alpha:  # else transparent pixels would be masked
         facts[TRANSPARENT] = BLACK
-    write_json(folder / MANIFEST, {**facts, UPSAMPLED: _upsampling(scene)})
+    return facts
 
 
 def _read_seeds(folder: Path, points: PointCloud) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:

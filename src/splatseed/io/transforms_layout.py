@@ -93,6 +93,8 @@ def _plan(scene: Scene) -> _Plan:
         return _Plan(_new_json(scene, A), image_folders(scene), A)
     names = {image.name for image in scene.images}
     content = _kept_json(nerfstudio.read_transforms(source.transforms_path), names)
+    if scene.masks is None:
+        _drop_mask_paths(content)
     if scene.origin.any():
         content = _moved_json(content, scene.origin)
     frames = (*content["frames"], *content.get("test_frames", ()))
@@ -102,7 +104,7 @@ def _plan(scene: Scene) -> _Plan:
         paths += names  # a frame's own path may lack the extension
     # The first folders of relative paths, so that these resolve.
     firsts = {first: source.root / first for first in first_folders(paths)}
-    return _Plan(content, {**sibling_folders(source.root), **firsts})
+    return _Plan(content, {**sibling_folders(scene), **firsts})
 
 
 def _write(scene: Scene, folder: Path, plan: _Plan, layout: Layout) -> Written:
@@ -278,9 +280,13 @@ def forget_masks(folder: Path) -> None:
     """Name no masks in an output's ``transforms.json``, as it has none."""
     path = folder / "transforms.json"
     content = json.loads(path.read_text("utf-8"))
+    _drop_mask_paths(content)
+    write_json(path, content)
+
+
+def _drop_mask_paths(content: Mapping[str, Any]) -> None:
     for frame in (*content["frames"], *content.get("test_frames", ())):
         frame.pop("mask_path", None)
-    write_json(path, content)
 
 
 def _names_masks(source: SceneSource) -> bool:

@@ -26,7 +26,8 @@ from splatseed.io.image_folders import link_folders, photographs_hidden
 from splatseed.io.mask_files import FOLDER as MASKS
 from splatseed.io.masks import write_masks
 from splatseed.io.origin import write_offset
-from splatseed.io.staging import ABSENT, BLACK, MANIFEST, TRANSPARENT, output_folder, write_json
+from splatseed.io.seeds import facts_for_reading
+from splatseed.io.staging import MANIFEST, output_folder, write_json
 from splatseed.io.transforms_layout import (
     Layout,
     forget_masks,
@@ -134,10 +135,7 @@ def write_scene(
             bare = source.points_path if is_file else source.root
             read = str(source.transforms_path or bare)
         num_new = counts["num_points"] - counts["num_original"]
-        if scene.absent:  # so that the others train or test as before
-            made[ABSENT] = list(scene.absent)
-        if masks and not masks.alpha:  # else they would be masked from then on
-            made[TRANSPARENT] = BLACK
+        made |= facts_for_reading(scene)
         facts = {"source": read, **made, "format": layout, **counts, "num_new": num_new}
         write_json(folder / MANIFEST, {**facts, "notes": notes, "versions": versions})
     return WriteReport(
