@@ -18,11 +18,13 @@ from PIL import Image as PilImage
 from splatseed.errors import OutputError, ParameterError, PointCloudError, SceneFormatError
 from splatseed.io import load_scene
 from splatseed.pointcloud import PointCloud
+from splatseed.scene import Split
 from splatseed.splat.evaluate import evaluate_views
 from splatseed.splat.formats import read_gaussians
 from splatseed.splat.pictures import BAND
 from splatseed.splat.rendering import opacity_from_logits
 from splatseed.training import device, prepare, run as run_module, trainer
+from splatseed.training.evaluation import Evaluation
 from splatseed.training.parameters import add_to_mean, gaussians_of, size_unit
 from splatseed.training.prepare import PrepareOptions, prepare_run
 from splatseed.training.settings import TrainSettings
@@ -257,6 +259,28 @@ def test_an_earlier_run_is_neither_replaced_nor_repeated_by_accident(begin, room
     refused("did not write", "mine", {"overwrite": True})
     with pytest.raises(OutputError, match="apart from the input"):
         prepare_run(room, room.source.root / "run", TrainSettings())
+
+
+def test_another_split_is_found_out(begin, room, tmp_path):
+    """A list of test images that is new since the run began: of views that it was trained on."""
+    names = sorted(image.name for image in room.images)
+    listed = room.replace(listed=Split(frozenset(names[2:]), frozenset(names[:2]), "test.txt"))
+    settings = TrainSettings(max_steps=2, data_factor=2, strategy="none")
+    run = begin(max_steps=2, strategy="none")
+    run.train(_stop_after(1))
+    with pytest.raises(ParameterError, match=r"other training or test images.*by its test\.txt"):
+        prepare_run(listed, tmp_path / "run", settings, PrepareOptions(**RESUME))
+    resumed = begin(ways=RESUME, max_steps=2, strategy="none")
+    resumed.train()
+    resumed.finish(evaluate_views)
+    found = "The run was trained on 1 of these 2 views: the scene's split was another."
+    for scene, doubts in ((room, []), (listed, [found])):
+        evaluation = Evaluation.of(tmp_path / "run", scene)
+        assert evaluation.doubts(evaluation.load()) == doubts
+    notes: list[str] = []
+    start = TrainSettings(max_steps=2, data_factor=2, start=str(resumed.folder.gaussians))
+    prepare_run(listed, tmp_path / "next", start, note=notes.append)
+    assert [note for note in notes if "1 of the 2 test views" in note]
 
 
 def test_a_run_goes_on_with_its_own_settings_and_seeds(begin, room, tmp_path):

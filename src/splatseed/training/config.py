@@ -46,6 +46,7 @@ def make_config(
         "device": device,
         "seeds": dict(initial),
         "photographs": photographs_digest(scene),
+        "split": _names_of_parts(scene, settings),
         "versions": {
             "python": platform.python_version(),
             **{name: _version(name) for name in ("torch", "gsplat", "numba", "numpy")},
@@ -55,6 +56,12 @@ def make_config(
         config["near_plane"] = frame.near / frame.scale
         config["frame"] = {"origin": frame.origin.tolist(), "scale": frame.scale}
     return config
+
+
+def _names_of_parts(scene: Scene, settings: TrainSettings) -> dict[str, list[str]]:
+    """Return the names of the training and test images."""
+    parts = zip(("train", "test"), scene.split(settings.test_every), strict=True)
+    return {part: [image.name for image in images] for part, images in parts}
 
 
 def _version(package: str) -> str | None:
@@ -113,6 +120,29 @@ def check_same_input(folder: RunFolder, config: Mapping[str, Any], now: Mapping[
         raise another_scene(folder, config, found)
     if config.get("photographs") != now["photographs"]:
         raise another_scene(folder, config, f"photographs or poses in {now['scene']}")
+
+
+def check_same_split(
+    folder: RunFolder, config: Mapping[str, Any], scene: Scene, settings: TrainSettings
+) -> None:
+    """Refuse to resume with other training or test images; older versions did not record them."""
+    then, now = config.get("split"), _names_of_parts(scene, settings)
+    if then is None or then == now:
+        return
+    where = scene.source.root if scene.source else "the scene"
+    listed = f", by its {scene.listed.origin}" if scene.listed else ""
+    raise another_scene(folder, config, f"training or test images in {where}{listed}")
+
+
+def trained_images(config: Mapping[str, Any], scene: Scene) -> Collection[str]:
+    """Return the names of the images that a run was trained on.
+
+    Older versions did not record them: then they follow from the scene as it is now.
+    """
+    if isinstance(split := config.get("split"), dict):
+        return frozenset(split.get("train", ()))
+    every = config.get("test_every")
+    return {im.name for im in scene.split(every)[0]} if isinstance(every, int) else ()
 
 
 def update_places(folder: RunFolder, config: Mapping[str, Any], now: Mapping[str, Any]) -> None:

@@ -21,6 +21,7 @@ from splatseed.splat.covisible import find_covisible, pixel_masks
 from splatseed.splat.evaluate import OnView, TrainedModel, evaluate_model, load_model
 from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.lpips import load_lpips
+from splatseed.training.config import trained_images
 from splatseed.training.device import pick_device
 from splatseed.training.models import config_of, model_file, near_plane_of, split_doubt
 from splatseed.training.settings import Backend, TrainSettings
@@ -99,14 +100,16 @@ class Evaluation:
     def doubts(self, loaded: TrainedModel) -> list[str]:
         """Describe what may make the scores wrong, one sentence each."""
         doubts = [*loaded.notes, loaded.frame_warning]
-        trained_every = self.config.get("test_every")
-        if isinstance(trained_every, int):
-            train = {image.name for image in loaded.scene.split(trained_every)[0]}
-            seen = len(train & {view.name for view in loaded.views})
-            if seen:
+        if self.config:
+            trained, every = (
+                trained_images(self.config, loaded.scene),
+                self.config.get("test_every"),
+            )
+            by_number = self.test_every != every and loaded.scene.listed is None
+            why = f"its test_every was {every}" if by_number else "the scene's split was another"
+            if seen := sum(view.name in trained for view in loaded.views):
                 doubts.append(
-                    f"The run was trained on {seen} of these {len(loaded.views)} views: its "
-                    f"test_every was {trained_every}."
+                    f"The run was trained on {seen} of these {len(loaded.views)} views: {why}."
                 )
         elif isinstance(self.model, Path):
             doubts.append(split_doubt(self.model, len(loaded.views)))

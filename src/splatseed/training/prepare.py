@@ -32,11 +32,14 @@ from splatseed.scene import Scene
 from splatseed.splat._kernels import WINDOW
 from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.training_frame import TrainingFrame, frame_of_model
+from splatseed.text import counted
 from splatseed.training.config import (
     another_scene,
     check_same_input,
+    check_same_split,
     make_config,
     resumed_settings,
+    trained_images,
     update_places,
     with_masks_of,
 )
@@ -111,6 +114,7 @@ def prepare_run(
             earlier, settings, options.explicit, refine_poses=refine_poses
         )
         scene = with_masks_of(scene, earlier)
+        check_same_split(folder, earlier, scene, settings)
     settings = settings.with_data_factor(scene.images, note)
     device = pick_device(settings.backend, progress)
     given = scene.points.xyz
@@ -183,7 +187,7 @@ def _open_folder(
 def _initial(scene: Scene, settings: TrainSettings, note: Note) -> _Seeds | _Start:
     """Return what the run starts from: trained Gaussians, or the usable points of the scene."""
     if settings.start is not None:
-        return _Start(_start_gaussians(Path(settings.start), scene, note))
+        return _Start(_start_gaussians(Path(settings.start), scene, settings, note))
     trained = scene.split(settings.test_every)[0]
     poses = camera_views(trained, settings.factor)
     return _Seeds(usable_seeds(scene.points, settings, note, poses))
@@ -288,9 +292,16 @@ def _at_refined_poses(
     return scene
 
 
-def _start_gaussians(path: Path, scene: Scene, note: Note) -> Gaussians:
+def _start_gaussians(path: Path, scene: Scene, settings: TrainSettings, note: Note) -> Gaussians:
     """Read the Gaussians that the run continues from."""
     folder, same_poses = RunFolder(path.parent), False
     if path == folder.gaussians and folder.is_run:
-        same_poses = folder.read_config().get("photographs") == photographs_digest(scene)
+        config = folder.read_config()
+        same_poses = config.get("photographs") == photographs_digest(scene)
+        tests, trained = scene.split(settings.test_every)[1], trained_images(config, scene)
+        if seen := sum(image.name in trained for image in tests):
+            note(
+                f"{path} was trained on {seen} of the {counted(len(tests), 'test view')}: scores "
+                "will be too high."
+            )
     return read_start(path, scene, note, same_poses=same_poses)
