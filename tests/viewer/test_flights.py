@@ -214,6 +214,39 @@ def test_without_cameras_the_video_circles_with_a_note(run_folder, tmp_path, spl
     assert (_frames(tmp_path / "a.mp4")[0] == _frames(tmp_path / "b.mp4")[0]).all()
 
 
+def _path_in(world, camera, path):
+    """Write a path as nerfstudio does: twice a camera of the scene, in another world."""
+    pose = np.linalg.inv(world.camera(camera.cam_from_world)) @ np.diag([1.0, -1, -1, 1])
+    fov = np.degrees(2 * np.arctan(camera.height / 2 / camera.K[1, 1]))
+    frames = 2 * [{"camera_to_world": pose.reshape(-1).tolist(), "fov": fov}]
+    path.write_text(json.dumps({"camera_path": frames, "fps": 8}))
+    return path
+
+
+def _render(run_folder, image):
+    gaussians = read_gaussians(run_folder / "point_cloud.ply")
+    renderer = ModelRenderer(gaussians, viewer_frame(ViewerItem("", None, gaussians)))
+    return renderer.color(camera_views([image])[0])
+
+
+def test_a_path_through_the_models_own_world_is_moved_with_the_model(
+    room, run_folder, tmp_path, splatseed
+):
+    """As drawn in the viewer of the model's trainer, which normalises the scene."""
+    scene = load_scene(room)
+    world, image = find_transform("gsplat", scene), scene.images[3]
+    path = _path_in(world, image.camera, tmp_path / "path.json")
+    moved = transform_gaussians(read_gaussians(run_folder / "point_cloud.ply"), world)
+    write_gaussians(tmp_path / "model.ply", moved)
+    video = tmp_path / "flight.mp4"
+    words = ("flight", tmp_path / "model.ply", "--scene", room, "--path", path, "-o", video)
+    said = splatseed(*words)
+    assert said.code == 0, said.err
+    assert "--transform none" in said.out
+    shown = _frames(video)[0][0] / 255
+    assert np.abs(shown - _render(run_folder, image)).mean() < 0.01
+
+
 def test_a_path_through_nerfstudios_world_needs_its_transform(
     room, run_folder, tmp_path, splatseed
 ):
@@ -224,20 +257,13 @@ def test_a_path_through_nerfstudios_world_needs_its_transform(
     rows = np.column_stack([turn, world.translation / 0.01]).tolist()
     content = {"transform": rows, "scale": 0.01}
     (tmp_path / "dataparser_transforms.json").write_text(json.dumps(content))
-    camera = load_scene(room).images[3].camera
-    pose = np.linalg.inv(world.camera(camera.cam_from_world)) @ np.diag([1.0, -1, -1, 1])
-    fov = np.degrees(2 * np.arctan(camera.height / 2 / camera.K[1, 1]))
-    frames = 2 * [{"camera_to_world": pose.reshape(-1).tolist(), "fov": fov}]
-    path = tmp_path / "path.json"
-    path.write_text(json.dumps({"camera_path": frames, "fps": 8}))
+    path = _path_in(world, load_scene(room).images[3].camera, tmp_path / "path.json")
     words = ("flight", run_folder, "-o", tmp_path / "flight.mp4", "--path", path)
     said = splatseed(*words)
     assert (said.code, "--transform" in said.err) == (2, True)
     said = splatseed(*words, "--transform", tmp_path / "dataparser_transforms.json")
     assert said.code == 0, said.err
-    gaussians = read_gaussians(run_folder / "point_cloud.ply")
-    renderer = ModelRenderer(gaussians, viewer_frame(ViewerItem("", None, gaussians)))
-    wanted = renderer.color(camera_views([load_scene(room).images[3]])[0])
+    wanted = _render(run_folder, load_scene(room).images[3])
     shown = _frames(tmp_path / "flight.mp4")[0][0] / 255
     assert np.abs(shown - wanted).mean() < 0.01  # mirrored, it would be 0.02
     said = splatseed(*words, "--transform", "none", "--depth", "--overwrite")

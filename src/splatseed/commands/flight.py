@@ -48,11 +48,12 @@ class Options:
     """The scene of a file of Gaussians, for its cameras; a run has its own. Without cameras, the
     video circles the Gaussians."""
     path: Annotated[Path | None, tyro.conf.arg(metavar="FILE|orbit")] = None
-    """A camera path to fly instead: nerfstudio's JSON, in the model's world or that of --transform;
-    or orbit, to circle the cameras' focus."""
+    """A camera path to fly instead: nerfstudio's JSON, in the world of the model's file or that of
+    --transform; or orbit, to circle the cameras' focus."""
     transform: Annotated[str | None, tyro.conf.arg(metavar="FILE|gsplat|flipped|none")] = None
-    """Transform from the model's world to the path's, by default none: the
-    dataparser_transforms.json of nerfstudio's run, or other values of evaluate --transform."""
+    """Transform from the scene's world to the path's, if that is not the model's: the
+    dataparser_transforms.json of nerfstudio's run, or other values of evaluate --transform; none
+    for a path in the scene's world."""
     compare: Path | None = None
     """Another run or file of the same scene, shown in the right half."""
     depth: bool = False
@@ -110,6 +111,11 @@ def run(arguments: list[str]) -> None:
     print_pairs("splatseed flight", rows)
     for note in (note for item in items for note in item.notes):
         print_note(note)
+    if items[0].moved and options.path not in (None, ORBIT) and options.transform is None:
+        print_note(
+            f"The path {options.path} is taken to be in the model's frame, too, and was "
+            "transformed with it; for one in the scene's frame, pass --transform none."
+        )
     if items[0].scene is None and options.path is None:
         print_note("The model has no cameras, so the video circles it; pass --scene for a path.")
 
@@ -164,7 +170,8 @@ def _path(options: Options, item: ViewerItem, size: tuple[int, int]) -> tuple[li
         return flights.orbit(cameras, item.model, frames, size), FPS
     if options.path is None:
         return flights.smooth_path(cameras, frames, size), FPS
-    world = None
+    # From the scene's world to the path's, which by default is the model's as in its file.
+    world = item.moved.inverse if item.moved and options.transform is None else None
     if options.transform is not None:
         world = find_transform(options.transform, item.scene or Scene(PointCloud.empty()))
     views, fps = flights.read_path(options.path, size, world)

@@ -153,29 +153,37 @@ def check_frame(
 
 
 def move_to_scene_frame(path: Path, scene: Scene, gaussians: Gaussians) -> tuple[Gaussians, str]:
-    """Transform Gaussians, read from ``path``, to the scene's frame; return a note for the user.
+    """Transform Gaussians, read from ``path``, by ``scene_from_model``; also return its note."""
+    move, note = scene_from_model(path, scene, gaussians)
+    return gaussians if move is None else transform_gaussians(gaussians, move), note
 
-    Gaussians that do not fit the scene's points are transformed by the inverse of the best of the
-    transforms that their trainer may have applied.
+
+def scene_from_model(
+    path: Path, scene: Scene, gaussians: Gaussians
+) -> tuple[Similarity | None, str]:
+    """Find the transform of Gaussians, read from ``path``, to the scene's frame.
+
+    It is None for Gaussians that fit the scene's points, else the inverse of the best of the
+    transforms that their trainer may have applied. Also returns a note for the user.
 
     Raises:
         SceneFormatError: No known transform fits.
     """
     misfit = _misfit_of(scene, gaussians)
     if misfit is None or misfit(None) <= SETTINGS.good_misfit:
-        return gaussians, ""
+        return None, ""
     misfits = {name: misfit(world) for name, world in _candidates(path, scene).items()}
     name = min(misfits, key=misfits.__getitem__)
     limit = min(SETTINGS.good_misfit, misfits[NO_TRANSFORM] / SETTINGS.ratio)
     if name == NO_TRANSFORM or misfits[name] > limit:
         try:
-            return gaussians, check_frame(path, scene, gaussians)
+            return None, check_frame(path, scene, gaussians)
         except SceneFormatError as error:
             fix = "Name the scene of the training, or transform the model to the scene's frame."
             raise SceneFormatError(error.expected, found=error.found, fix=fix) from None
     world = find_transform(name, scene)
     assert world is not None  # noqa: S101  (only `none` has no transform)
-    return transform_gaussians(gaussians, world.inverse), (
+    return world.inverse, (
         f"The Gaussians of {path} were in their trainer's frame ({name}) and were transformed to "
         "the scene's."
     )

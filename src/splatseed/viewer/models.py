@@ -25,9 +25,10 @@ from splatseed.photos.upright import quarter_turns, turned
 from splatseed.photos.view import View, camera_views, view_of
 from splatseed.progress import Note, silent_note
 from splatseed.scene import Scene
+from splatseed.similarity import Similarity
 from splatseed.splat.formats import holds_gaussians, read_gaussians
 from splatseed.splat.gaussians import Gaussians
-from splatseed.splat.model_frame import move_to_scene_frame, move_to_scene_origin
+from splatseed.splat.model_frame import move_to_scene_origin, scene_from_model, transform_gaussians
 from splatseed.splat.training_frame import TrainingFrame, frame_of_model
 from splatseed.text import quoted
 from splatseed.training.folder import RunFolder
@@ -49,6 +50,7 @@ class ViewerItem:
         data_factor: By which the model's run downsampled photographs.
         test_every: Every n-th image by name is a test view.
         notes: Changes to the model on reading, for the user.
+        moved: How the model was moved from its trainer's frame; None if it was in the scene's.
     """
 
     name: str
@@ -57,6 +59,7 @@ class ViewerItem:
     data_factor: int = 1
     test_every: int = 8
     notes: tuple[str, ...] = ()
+    moved: Similarity | None = None
 
     @property
     def model(self) -> Gaussians:
@@ -98,9 +101,10 @@ def open_item(path: StrPath, scene_path: Path | None = None) -> ViewerItem:
     if not path.is_dir() or not folder.is_run:
         if path.is_file() and holds_gaussians(path):
             gaussians, scene = read_gaussians(path, notes.append), scene_at(scene_path)
+            moved = None
             if scene is not None:
-                gaussians = _in_scene(path, scene, gaussians, notes.append)
-            return ViewerItem(path.name, scene, gaussians, notes=tuple(notes))
+                gaussians, moved = _in_scene(path, scene, gaussians, notes.append)
+            return ViewerItem(path.name, scene, gaussians, notes=tuple(notes), moved=moved)
         scene = load_scene(path, require_points=False)
         if not scene.images and not len(scene.points):
             raise SceneFormatError(
@@ -118,27 +122,33 @@ def open_item(path: StrPath, scene_path: Path | None = None) -> ViewerItem:
     scene, own = scene_at(scene_path), scene_path is None
     scene = scene or scene_of_run(folder)
     factor, every = _split_of_run(folder)
-    gaussians = read_gaussians(folder.gaussians, notes.append)
-    if scene is not None:
-        move = move_to_scene_origin if own else _in_scene
-        gaussians = move(folder.gaussians, scene, gaussians, notes.append)
-    return ViewerItem(folder.path.name, scene, gaussians, factor, every, tuple(notes))
+    gaussians, moved = read_gaussians(folder.gaussians, notes.append), None
+    if scene is not None and own:
+        gaussians = move_to_scene_origin(folder.gaussians, scene, gaussians, notes.append)
+    elif scene is not None:
+        gaussians, moved = _in_scene(folder.gaussians, scene, gaussians, notes.append)
+    return ViewerItem(folder.path.name, scene, gaussians, factor, every, tuple(notes), moved)
 
 
-def _in_scene(path: Path, scene: Scene, gaussians: Gaussians, note: Note) -> Gaussians:
-    """Move Gaussians to the frame of the scene that the user names; note it if none is known."""
+def _in_scene(
+    path: Path, scene: Scene, gaussians: Gaussians, note: Note
+) -> tuple[Gaussians, Similarity | None]:
+    """Move Gaussians to the frame of the scene that the user names; note it if none is known.
+
+    Also returns how they were moved there from their trainer's frame.
+    """
     gaussians = move_to_scene_origin(path, scene, gaussians, note)
     try:
-        gaussians, moved = move_to_scene_frame(path, scene, gaussians)
+        moved, message = scene_from_model(path, scene, gaussians)
     except SceneFormatError as error:
         note(
             f"The cameras probably do not show the Gaussians of {path} as photographed. "
             f"Expected {error.expected}; found {error.found}."
         )
-        return gaussians
-    if moved:
-        note(moved)
-    return gaussians
+        return gaussians, None
+    if message:
+        note(message)
+    return gaussians if moved is None else transform_gaussians(gaussians, moved), moved
 
 
 def scene_of_run(folder: RunFolder) -> Scene | None:
