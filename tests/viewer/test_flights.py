@@ -184,6 +184,18 @@ def test_a_model_in_its_trainers_frame_is_shown_by_the_cameras_of_its_scene(
     assert "another scene" in item.notes[0]
 
 
+def test_a_run_whose_scene_was_made_anew_since_is_noted(room, run_folder, tmp_path):
+    """The poses in its place are those of another world, in which the model is not."""
+    scene = load_scene(room)
+    points = scene.points.replace(xyz=scene.points.xyz + np.float32(100))
+    write_scene(scene.replace(points=points), tmp_path / "anew")
+    run = shutil.copytree(run_folder, tmp_path / "run")
+    config = json.loads((run / "config.json").read_text())
+    for place, noted in ((room, False), (tmp_path / "anew", True)):
+        (run / "config.json").write_text(json.dumps(config | {"scene": str(place)}))
+        assert any("another scene" in note for note in open_item(run).notes) == noted
+
+
 # The command --------------------------------------------------------------------------------------
 
 

@@ -110,6 +110,11 @@ def resumed_settings(
         ) from None
 
 
+def has_run_poses(config: Mapping[str, Any], scene: Scene) -> bool:
+    """Whether a scene has the photographs and poses that a run was trained with."""
+    return config.get("photographs") == photographs_digest(scene)
+
+
 def check_same_input(folder: RunFolder, config: Mapping[str, Any], now: Mapping[str, Any]) -> None:
     """Refuse to resume from other seeds, or another start, than those of the run.
 

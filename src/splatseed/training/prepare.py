@@ -18,7 +18,7 @@ from jaxtyping import Float32
 from splatseed.errors import ParameterError, SceneNotFoundError
 from splatseed.io import load_scene
 from splatseed.io.files import StrPath
-from splatseed.io.photograph import photograph_folder, photographs_digest
+from splatseed.io.photograph import photograph_folder
 from splatseed.io.photograph_checks import check_sizes, with_photographs
 from splatseed.io.seeds import was_upsampled
 from splatseed.photos.camera_check import format_stray_note, reference_points
@@ -37,6 +37,7 @@ from splatseed.training.config import (
     another_scene,
     check_same_input,
     check_same_split,
+    has_run_poses,
     make_config,
     resumed_settings,
     trained_images,
@@ -297,7 +298,7 @@ def _start_gaussians(path: Path, scene: Scene, settings: TrainSettings, note: No
     folder, same_poses = RunFolder(path.parent), False
     if path == folder.gaussians and folder.is_run:
         config = folder.read_config()
-        same_poses = config.get("photographs") == photographs_digest(scene)
+        same_poses = has_run_poses(config, scene)
         tests, trained = scene.split(settings.test_every)[1], trained_images(config, scene)
         if seen := sum(image.name in trained for image in tests):
             note(

@@ -31,6 +31,7 @@ from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.model_frame import move_to_scene_origin, scene_from_model, transform_gaussians
 from splatseed.splat.training_frame import TrainingFrame, frame_of_model
 from splatseed.text import quoted
+from splatseed.training.config import has_run_poses
 from splatseed.training.folder import RunFolder
 from splatseed.viewer.page import font, latin
 
@@ -119,25 +120,26 @@ def open_item(path: StrPath, scene_path: Path | None = None) -> ViewerItem:
             found="a run that has not finished",
             fix=f"Continue it: splatseed train SCENE -o {quoted(folder.path)} --resume.",
         )
-    scene, own = scene_at(scene_path), scene_path is None
-    scene = scene or scene_of_run(folder)
+    scene = scene_at(scene_path) or scene_of_run(folder)
     factor, every = _split_of_run(folder)
     gaussians, moved = read_gaussians(folder.gaussians, notes.append), None
-    if scene is not None and own:
-        gaussians = move_to_scene_origin(folder.gaussians, scene, gaussians, notes.append)
-    elif scene is not None:
-        gaussians, moved = _in_scene(folder.gaussians, scene, gaussians, notes.append)
+    if scene is not None:
+        own = has_run_poses(folder.read_config(), scene)
+        gaussians, moved = _in_scene(folder.gaussians, scene, gaussians, notes.append, own=own)
     return ViewerItem(folder.path.name, scene, gaussians, factor, every, tuple(notes), moved)
 
 
 def _in_scene(
-    path: Path, scene: Scene, gaussians: Gaussians, note: Note
+    path: Path, scene: Scene, gaussians: Gaussians, note: Note, *, own: bool = False
 ) -> tuple[Gaussians, Similarity | None]:
-    """Move Gaussians to the frame of the scene that the user names; note it if none is known.
+    """Move Gaussians to the frame of a scene; note it if they fit in none that is known.
 
-    Also returns how they were moved there from their trainer's frame.
+    ``own``: they were trained at its poses. Also returns how they were moved there from their
+    trainer's frame.
     """
     gaussians = move_to_scene_origin(path, scene, gaussians, note)
+    if own:
+        return gaussians, None
     try:
         moved, message = scene_from_model(path, scene, gaussians)
     except SceneFormatError as error:
@@ -172,7 +174,8 @@ def item_of_model(
         return ViewerItem(name, None, gaussians)
     scene = scene_of_run(folder)
     if scene is not None:
-        gaussians = move_to_scene_origin(model, scene, gaussians, note)
+        own = has_run_poses(folder.read_config(), scene)
+        gaussians, _ = _in_scene(model, scene, gaussians, note, own=own)
     return ViewerItem(name, scene, gaussians, *_split_of_run(folder))
 
 
