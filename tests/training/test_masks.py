@@ -18,6 +18,9 @@ from splatseed.splat.evaluate import evaluate_views
 from splatseed.splat.metrics import mirrored_ssim
 from splatseed.splat.photographs import fill_masked
 from splatseed.training import trainer
+from splatseed.training.evaluation import Evaluation
+from splatseed.training.prepare import PrepareOptions, prepare_run
+from splatseed.training.settings import TrainSettings
 from splatseed.training.strategies.grow import contributions
 from splatseed.training.trainer import photometric_loss
 
@@ -96,9 +99,6 @@ def test_masked_pixels_have_no_part_in_loss_growth_and_scores(occluded_path, beg
 
 
 def test_a_resumed_run_keeps_its_masks(occluded_path, tmp_path, begin):
-    from splatseed.training.prepare import PrepareOptions, prepare_run
-    from splatseed.training.settings import TrainSettings
-
     scene, settings = load_scene(occluded_path), TrainSettings(max_steps=30, strategy="none")
     prepare_run(with_masks(scene, "inverted"), tmp_path / "run", settings)
     resumed = prepare_run(scene, tmp_path / "run", settings, PrepareOptions(resume=True))
@@ -108,3 +108,24 @@ def test_a_resumed_run_keeps_its_masks(occluded_path, tmp_path, begin):
         prepare_run(
             with_masks(scene, "none"), tmp_path / "run", settings, PrepareOptions(resume=True)
         )
+
+
+def test_masks_that_changed_since_a_run_began_are_found_out(larger_room_path, tmp_path):
+    """A folder of masks that is new beside the photographs."""
+    own_path = shutil.copytree(larger_room_path, tmp_path / "own")
+    settings = TrainSettings(max_steps=2, data_factor=2, strategy="none", seeding="scene")
+    resume, without = PrepareOptions(resume=True), load_scene(own_path)
+    prepare_run(without, tmp_path / "run", settings)
+    mask, white = own_path / "masks/view_000.png", np.full((72, 96), 255, np.uint8)
+    white[:9] = 0
+    mask.parent.mkdir()
+    PilImage.fromarray(white).save(mask)
+    with pytest.raises(ParameterError, match="other masks in"):
+        prepare_run(load_scene(own_path), tmp_path / "run", settings, resume)
+    found = "The scene's masks have changed since the run was trained"
+    run = prepare_run(without, tmp_path / "run", settings, resume)
+    run.train()
+    run.finish(evaluate_views)
+    for scene, noted in ((own_path, True), (without, False)):
+        evaluation = Evaluation.of(tmp_path / "run", scene)
+        assert any(found in each for each in evaluation.doubts(evaluation.load())) == noted

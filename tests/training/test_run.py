@@ -268,7 +268,7 @@ def test_another_split_is_found_out(begin, room, tmp_path):
     settings = TrainSettings(max_steps=2, data_factor=2, strategy="none")
     run = begin(max_steps=2, strategy="none")
     run.train(_stop_after(1))
-    with pytest.raises(ParameterError, match=r"other training or test images.*by its test\.txt"):
+    with pytest.raises(ParameterError, match=r"other training or test images.*by its test\.txt\)"):
         prepare_run(listed, tmp_path / "run", settings, PrepareOptions(**RESUME))
     resumed = begin(ways=RESUME, max_steps=2, strategy="none")
     resumed.train()

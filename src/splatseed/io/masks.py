@@ -26,6 +26,7 @@ from splatseed.io.files import files_below, read_bytes, translate_errors
 from splatseed.io.mask_files import SUFFIXES, find_masks, find_own_masks, masks_among
 from splatseed.io.photograph import has_alpha, open_photograph, photograph_bytes
 from splatseed.io.photograph_checks import photograph_size
+from splatseed.runtime.fingerprint import fingerprint
 from splatseed.scene import Masks, Scene
 from splatseed.text import counted
 
@@ -74,6 +75,18 @@ def with_masks(scene: Scene, choice: str | None) -> Scene:
 def mask_choice(scene: Scene) -> str | None:
     """Return the ``choice`` that makes ``with_masks`` attach this scene's masks again."""
     return NONE if scene.masks is None else scene.masks.choice
+
+
+def masks_digest(scene: Scene) -> str | None:
+    """Fingerprint which masks the photographs have, and the sizes of their files; None without any.
+
+    A run keeps it, so that masks that were added or changed since are noticed.
+    """
+    masks = scene.masks
+    if masks is None or not masks.files:
+        return None
+    sizes = {name: file.stat().st_size for name, file in masks.files.items() if file.is_file()}
+    return fingerprint(repr(masks.inverted).encode(), repr(sorted(sizes.items())).encode())
 
 
 def with_own_masks(scene: Scene) -> Scene:

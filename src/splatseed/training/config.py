@@ -12,7 +12,7 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 from splatseed.errors import ParameterError, SceneFormatError
-from splatseed.io.masks import mask_choice, with_masks
+from splatseed.io.masks import mask_choice, masks_digest, with_masks
 from splatseed.io.photograph import photographs_digest
 from splatseed.io.staging import write_json
 from splatseed.scene import Scene
@@ -42,6 +42,7 @@ def make_config(
         "points": str(points.resolve()) if points else None,
         "refine_poses": refine_poses,
         "masks": mask_choice(scene),
+        "mask_files": masks_digest(scene),
         **dataclasses.asdict(settings),
         "device": device,
         "seeds": dict(initial),
@@ -127,18 +128,6 @@ def check_same_input(folder: RunFolder, config: Mapping[str, Any], now: Mapping[
         raise another_scene(folder, config, f"photographs or poses in {now['scene']}")
 
 
-def check_same_split(
-    folder: RunFolder, config: Mapping[str, Any], scene: Scene, settings: TrainSettings
-) -> None:
-    """Refuse to resume with other training or test images; older versions did not record them."""
-    then, now = config.get("split"), _names_of_parts(scene, settings)
-    if then is None or then == now:
-        return
-    where = scene.source.root if scene.source else "the scene"
-    listed = f", by its {scene.listed.origin}" if scene.listed else ""
-    raise another_scene(folder, config, f"training or test images in {where}{listed}")
-
-
 def trained_images(config: Mapping[str, Any], scene: Scene) -> Collection[str]:
     """Return the names of the images that a run was trained on.
 
@@ -169,6 +158,25 @@ def with_masks_of(scene: Scene, config: Mapping[str, Any]) -> Scene:
             fix="Leave it out to resume, or start again with `overwrite=True`.",
         )
     return scene
+
+
+def check_same_scene(
+    folder: RunFolder, config: Mapping[str, Any], scene: Scene, settings: TrainSettings
+) -> None:
+    """Refuse to resume with other masks, training or test images; older runs recorded none."""
+    found = "" if has_run_masks(config, scene) else "masks"
+    if config.get("split") not in (None, _names_of_parts(scene, settings)):
+        listed = f" (by its {scene.listed.origin})" if scene.listed else ""
+        found = f"training or test images{listed}"
+    if found:
+        where = scene.source.root if scene.source else "the scene"
+        raise another_scene(folder, config, f"{found} in {where}")
+
+
+def has_run_masks(config: Mapping[str, Any], scene: Scene) -> bool:
+    """Whether a scene's masks are those that a run was trained with, as far as it recorded them."""
+    now = masks_digest(scene)
+    return bool(config.get("mask_files", now) == now)
 
 
 def another_scene(folder: RunFolder, config: Mapping[str, Any], found: str) -> ParameterError:

@@ -21,7 +21,7 @@ from splatseed.splat.covisible import find_covisible, pixel_masks
 from splatseed.splat.evaluate import OnView, TrainedModel, evaluate_model, load_model
 from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.lpips import load_lpips
-from splatseed.training.config import trained_images
+from splatseed.training.config import has_run_masks, trained_images
 from splatseed.training.device import pick_device
 from splatseed.training.models import config_of, model_file, near_plane_of, split_doubt
 from splatseed.training.settings import Backend, TrainSettings
@@ -110,6 +110,13 @@ class Evaluation:
             if seen := sum(view.name in trained for view in loaded.views):
                 doubts.append(
                     f"The run was trained on {seen} of these {len(loaded.views)} views: {why}."
+                )
+            # A scene with refined poses was written with masks under other names.
+            kept = self.masks == self.config.get("masks") and not self.config.get("refine_poses")
+            if kept and not has_run_masks(self.config, loaded.scene):
+                doubts.append(
+                    "The scene's masks have changed since the run was trained: its own scores are "
+                    "over other pixels."
                 )
         elif isinstance(self.model, Path):
             doubts.append(split_doubt(self.model, len(loaded.views)))

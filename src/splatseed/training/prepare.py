@@ -36,7 +36,7 @@ from splatseed.text import counted
 from splatseed.training.config import (
     another_scene,
     check_same_input,
-    check_same_split,
+    check_same_scene,
     has_run_poses,
     make_config,
     resumed_settings,
@@ -115,7 +115,7 @@ def prepare_run(
             earlier, settings, options.explicit, refine_poses=refine_poses
         )
         scene = with_masks_of(scene, earlier)
-        check_same_split(folder, earlier, scene, settings)
+        check_same_scene(folder, earlier, scene, settings)
     settings = settings.with_data_factor(scene.images, note)
     device = pick_device(settings.backend, progress)
     given = scene.points.xyz
