@@ -122,6 +122,9 @@ def test_the_path_past_sideways_cameras_is_that_past_upright_ones(room):
     [
         "[]",
         '{"camera_path": []}',
+        json.dumps(
+            {"camera_type": "fisheye", "camera_path": [{"camera_to_world": np.eye(4).tolist()}]}
+        ),
         '{"camera_path": [{"camera_to_world": [1, 2]}]}',
         '{"camera_path": [{"camera_to_world": [1,0,0,0,0,1,0,0,0,0,5,0,0,0,0,1]}]}',
         '{"camera_path": [{"camera_to_world": [1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1], "fov": 200}]}',
@@ -233,6 +236,18 @@ def _path_in(world, camera, path):
     frames = 2 * [{"camera_to_world": pose.reshape(-1).tolist(), "fov": fov}]
     path.write_text(json.dumps({"camera_path": frames, "fps": 8}))
     return path
+
+
+def test_a_path_has_a_size_of_its_own(room, run_folder, tmp_path, splatseed):
+    camera = load_scene(room).images[3].camera
+    path = _path_in(Similarity(1.0, np.eye(3), np.zeros(3)), camera, tmp_path / "path.json")
+    content = json.loads(path.read_text()) | {"render_width": 64, "render_height": 36}
+    path.write_text(json.dumps(content))
+    for words, size in (((), (36, 64)), (("--size", "32x32"), (32, 32))):
+        video = tmp_path / f"{len(words)}.mp4"
+        said = splatseed("flight", run_folder, "--path", path, "-o", video, *words)
+        assert said.code == 0, said.err
+        assert _frames(video)[0].shape[1:3] == size
 
 
 def _render(run_folder, image):

@@ -61,8 +61,8 @@ class Options:
     seconds: float = 10.0
     """Length of the video in seconds; a path file has its own."""
     size: Annotated[str | None, tyro.conf.arg(metavar="WxH")] = None
-    """Size of the video in pixels, by default the photographs', at most 1280 a side; odd numbers
-    are rounded, as H.264 needs even numbers."""
+    """Size of the video in pixels, by default that of the path's file, else the photographs', at
+    most 1280 a side; odd numbers are rounded, as H.264 needs even numbers."""
     backend: Backend = "auto"
     """Where to render; auto takes a GPU if PyTorch sees one."""
     overwrite: bool = False
@@ -142,7 +142,7 @@ def _open_models(options: Options) -> list[ViewerItem]:
 
 def _size(options: Options, item: ViewerItem) -> tuple[int, int]:
     """Width and height of the video."""
-    from splatseed.viewer.flights import even_size
+    from splatseed.viewer.flights import even_size, size_of_path
 
     if options.size is not None:
         sides = options.size.lower().split("x")
@@ -155,6 +155,8 @@ def _size(options: Options, item: ViewerItem) -> tuple[int, int]:
                 fix="Try --size 960x540.",
             )
         return even_size(int(sides[0]), int(sides[1]))
+    if options.path not in (None, ORBIT) and (size := size_of_path(options.path)) is not None:
+        return even_size(*size, DEFAULT_SIDE)
     for view in item.central_views[:1]:
         return even_size(view.width, view.height, DEFAULT_SIDE)
     return WITHOUT_CAMERAS

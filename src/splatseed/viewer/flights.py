@@ -20,7 +20,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from splatseed.camera import Camera
 from splatseed.errors import OutputError, ParameterError, SceneFormatError
-from splatseed.io.files import read_bytes, translate_errors
+from splatseed.io.files import read_bytes, read_json, translate_errors
 from splatseed.io.staging import atomic_file
 from splatseed.photos.upright import up_direction
 from splatseed.photos.view import View
@@ -156,7 +156,10 @@ def read_path(
         fix="Export the path again.",
     ):
         content, views = json.loads(read_bytes(path)), []
-        for i, frame in enumerate(content["camera_path"]):
+        frames, kind = content["camera_path"], content.get("camera_type", "perspective")
+        if str(kind).lower() != "perspective":
+            raise ValueError(f"cameras of type {kind!r}, not 'perspective'")
+        for i, frame in enumerate(frames):
             world_from_gl = np.array(frame["camera_to_world"], np.float64).reshape(4, 4)
             fov, rotation = np.radians(float(frame.get("fov", 50))), world_from_gl[:3, :3]
             if not 0 < fov < np.pi:
@@ -169,6 +172,15 @@ def read_path(
         if not 0 < len(views) <= MAX_FRAMES:
             raise ValueError(counted(len(views), "camera"))
         return views, float(content["fps"]) if content.get("fps") else None
+
+
+def size_of_path(path: Path) -> tuple[int, int] | None:
+    """Return the width and height that a camera path is made for; None if it has none."""
+    with suppress(SceneFormatError, TypeError, KeyError, ValueError, OverflowError):
+        content = read_json(path, "a camera path")
+        width, height = int(content["render_width"]), int(content["render_height"])
+        return (width, height) if width > 0 and height > 0 else None
+    return None
 
 
 def check_path(
