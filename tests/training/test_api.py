@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import signal
 
@@ -39,6 +40,15 @@ def test_any_form_of_a_model_scores_the_same(trained, room_path):
     assert ss.evaluate(run.gaussians, scene, **same).psnr == pytest.approx(expected, abs=1e-4)
     with pytest.raises(ParameterError, match="scene"):
         ss.evaluate(run.gaussians)
+
+
+def test_poses_that_changed_since_a_run_are_noted(trained):
+    scene, run = trained
+    moved = [dataclasses.replace(im, translation=im.translation + 0.01) for im in scene.images]
+    for each, noted in ((scene, 0), (scene.replace(images=tuple(moved)), 1)):
+        notes: list[str] = []
+        ss.evaluate(run, each, note=notes.append)
+        assert sum("poses have changed since" in note for note in notes) == noted
 
 
 def test_a_render_shows_the_photograph(trained):

@@ -6,7 +6,7 @@ another trainer needs the scene. What is resolved here is loaded and scored by `
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
@@ -21,7 +21,7 @@ from splatseed.splat.covisible import find_covisible, pixel_masks
 from splatseed.splat.evaluate import OnView, TrainedModel, evaluate_model, load_model
 from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.lpips import load_lpips
-from splatseed.training.config import has_run_masks, trained_images
+from splatseed.training.config import has_run_masks, has_run_poses, trained_images
 from splatseed.training.device import pick_device
 from splatseed.training.models import config_of, model_file, near_plane_of, split_doubt
 from splatseed.training.settings import Backend, TrainSettings
@@ -101,26 +101,29 @@ class Evaluation:
         """Describe what may make the scores wrong, one sentence each."""
         doubts = [*loaded.notes, loaded.frame_warning]
         if self.config:
-            trained, every = (
-                trained_images(self.config, loaded.scene),
-                self.config.get("test_every"),
-            )
-            by_number = self.test_every != every and loaded.scene.listed is None
-            why = f"its test_every was {every}" if by_number else "the scene's split was another"
-            if seen := sum(view.name in trained for view in loaded.views):
-                doubts.append(
-                    f"The run was trained on {seen} of these {len(loaded.views)} views: {why}."
-                )
-            # A scene with refined poses was written with masks under other names.
-            kept = self.masks == self.config.get("masks") and not self.config.get("refine_poses")
-            if kept and not has_run_masks(self.config, loaded.scene):
-                doubts.append(
-                    "The scene's masks have changed since the run was trained: its own scores are "
-                    "over other pixels."
-                )
+            doubts += self._changes(loaded.scene, [view.name for view in loaded.views])
         elif isinstance(self.model, Path):
             doubts.append(split_doubt(self.model, len(loaded.views)))
         return [doubt for doubt in doubts if doubt]
+
+    def _changes(self, scene: Scene, tested: Sequence[str]) -> Iterator[str]:
+        """Describe what is not as in the run's training, one sentence each."""
+        config, trained = self.config, trained_images(self.config, scene)
+        if seen := sum(name in trained for name in tested):
+            every = config.get("test_every")
+            by_number = self.test_every != every and scene.listed is None
+            why = f"its test_every was {every}" if by_number else "the scene's split was another"
+            yield f"The run was trained on {seen} of these {len(tested)} views: {why}."
+        own = scene.source is not None and str(scene.source.again) == config.get("scene")
+        if not own or config.get("refine_poses"):
+            return  # another copy, or one that the run wrote: its files may differ
+        if not has_run_poses(config, scene):
+            yield "The scene's photographs or poses have changed since the run was trained."
+        if self.masks == config.get("masks") and not has_run_masks(config, scene):
+            yield (
+                "The scene's masks have changed since the run was trained: its own scores are over "
+                "other pixels."
+            )
 
     def score(
         self,
