@@ -62,6 +62,9 @@ def test_a_path_follows_the_cameras_evenly(rng):
         assert (-rotation[1] @ UP) > 0.9
     assert (path[0].width, path[0].height) == (160, 90)
     np.testing.assert_allclose(path[0].K[:2, 2], [80, 45])
+    # Numbers in names that are not padded: 10 comes after 9.
+    unpadded = [dataclasses.replace(v, name=f"{i}.jpg") for i, v in enumerate(cameras)]
+    np.testing.assert_allclose(_centers(smooth_path(unpadded, 90, (160, 90))), centers)
     # Names in no order: it goes from neighbour to neighbour.
     names = rng.permutation(24)
     shuffled = [dataclasses.replace(v, name=f"{i}") for i, v in zip(names, cameras, strict=True)]

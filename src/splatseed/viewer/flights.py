@@ -32,7 +32,7 @@ from splatseed.similarity import Similarity
 from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.pictures import to_uint8
 from splatseed.splat.rendering import ModelRenderer
-from splatseed.text import counted
+from splatseed.text import counted, numeric_order
 from splatseed.viewer.models import CORE, pinhole_view, split_picture
 from splatseed.viewer.page import depth_picture, nearness, value_range
 
@@ -211,7 +211,7 @@ def check_path(
 
 def _in_order(views: Sequence[View]) -> list[View]:
     """Sort views by name, as in a walk or video, or by nearest neighbour if names give no path."""
-    by_name = sorted(views, key=lambda view: view.name)
+    by_name = sorted(views, key=lambda view: numeric_order(view.name))
     if len(views) < 3:
         return by_name
     centers = _poses(by_name)[:, :3]
