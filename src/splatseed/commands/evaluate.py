@@ -145,8 +145,8 @@ def _score(
             "test_every": evaluation.test_every,
             **result.to_dict(),
         }
-        if model.notes:
-            content["notes"] = list(model.notes)
+        if doubts := evaluation.doubts(model):
+            content["notes"] = doubts
         write_json(options.output, content)
     return result
 
