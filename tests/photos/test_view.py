@@ -170,6 +170,7 @@ def test_each_photograph_is_checked_against_its_own_record(size, orientation, sa
     with pytest.raises(SceneFormatError, match=says) as caught:
         load_views(copied, images)
     assert images[3].name in caught.value.expected
+    assert caught.value.fix in told
     assert at_file_size(copied) is copied
 
 

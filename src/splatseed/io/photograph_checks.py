@@ -212,10 +212,11 @@ def _size_warnings(images: Sequence[Image], image_dir: Path) -> list[str]:
     stretched = [im for im in fitting if _off(im.intrinsics, sizes[im.name]) > ROUNDING]
     all_of = counted(len(images), "photograph")
     if wrong := [im for im in other if im not in fitting]:
-        reason = _misfit(wrong[0].intrinsics, sizes[wrong[0].name], image_dir / wrong[0].name)[0]
+        first = wrong[0].name
+        reason, fix = _misfit(wrong[0].intrinsics, sizes[first], image_dir / first)
         warnings.append(
             f"{len(wrong)} of {all_of} {agreeing(len(wrong), 'does', 'do')} not fit the camera: "
-            f"{_against(wrong[0], sizes)} ({reason}). They cannot be used for training."
+            f"{_against(wrong[0], sizes)} ({reason}). They cannot be used for training. {fix}"
         )
     if stretched:
         (width, height), lens = sizes[stretched[0].name], stretched[0].intrinsics
