@@ -1,10 +1,10 @@
-"""Depth maps of photographs as they were before ``splatseed undistort`` or ``sfm``.
+"""Depth maps of the distorted photographs that ``splatseed undistort`` or ``sfm`` started from.
 
-Output of these has ``distorted.json``, with the lenses of before: by image name, ``model``,
-``width``, ``height`` and ``params`` in COLMAP's terms. Maps of the photographs of before are
-undistorted on reading: those that have their size, and those of a sensor, which have confidences,
-that have their shape, if the undistorted photographs have another. Other maps are taken as made
-from the undistorted ones, as a network's are of any size.
+Output of these commands has ``distorted.json``, with the original lenses: by image name, ``model``,
+``width``, ``height`` and ``params`` in COLMAP's terms. If the undistorted photographs have another
+size, maps of the original size are undistorted on reading; if they have another aspect ratio, so
+are a sensor's maps, which have confidences, of the original aspect ratio. Other maps are taken to
+be made from the undistorted photographs, since a network's may have any size.
 """
 
 from __future__ import annotations
@@ -71,9 +71,7 @@ def _read_lenses(path: Path) -> dict[str, Intrinsics]:
     with translate_errors(path, "lenses by image name, as splatseed undistort writes", fix=fix):
         return {
             name: make_intrinsics(
-                f"{path}, {name}",
-                1,
-                *(each["model"], each["width"], each["height"], each["params"]),
+                f"{path}, {name}", 1, each["model"], each["width"], each["height"], each["params"]
             )
             for name, each in content.items()
         }

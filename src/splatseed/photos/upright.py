@@ -20,8 +20,6 @@ from splatseed.scene import Image
 
 _EXIF_TURNS = {6: 1, 3: 2, 8: 3}
 """Clockwise quarter turns by EXIF's orientation; cameras do not mirror photographs."""
-
-
 _QUARTER = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
 """The new x is the old -y, up; the new y is the old x."""
 
@@ -33,7 +31,7 @@ class UprightSettings:
     # In nine upright captures the spread of x is 2.8 to 24 times that of y.
     min_ratio: float = 2.0  # of the spread of y to that of x
     min_spread: float = 0.05  # of y; below, cameras look one way, and poses show no vertical
-    looks_down: float = 0.17  # mean sine of the pitch from which on it tells up from down
+    looks_down: float = 0.17  # mean sine of the pitch above which cameras would look up
     min_up: float = 1e-6  # length of the mean up direction below which the cameras' cancel
 
 

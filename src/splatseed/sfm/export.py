@@ -27,9 +27,9 @@ def export_scene(run: Run, model_dir: Path, staging: Path, *, distinct: bool = T
     """Write a model's undistorted photographs and points to ``staging``.
 
     Photographs of PINHOLE cameras are copied, with the EXIF orientation cleared; of the others,
-    transparent pixels are black. Reprojection
-    errors are in pixels of the undistorted photographs. ``distinct`` drops points at the position
-    of another, and those that undistorted features contradict.
+    transparent pixels are black. Reprojection errors are in pixels of the undistorted photographs.
+    ``distinct`` drops points at the position of another, and those that undistorted features
+    contradict.
 
     Raises:
         OutputError: Not all photographs could be written.
@@ -149,10 +149,10 @@ def clear_orientation(folder: Path) -> None:
         if orientation not in range(UPRIGHT + 1, 9):  # upright or invalid
             continue
         content = path.read_bytes()
+        start = _first_directory(content)
         # A TIFF 6.0 entry: tag, type, count and value, in either byte order.
         for order in ("<HHIH", ">HHIH"):
             entry = struct.pack(order, ORIENTATION, _SHORT, 1, orientation)
-            start = _first_directory(content)
             at = content.find(entry, start, start + _HEAD_BYTES)
             if at >= 0:
                 upright = struct.pack(order, ORIENTATION, _SHORT, 1, UPRIGHT)
