@@ -20,7 +20,6 @@ from splatseed.io.depth_files import KINDS, SUFFIXES
 from splatseed.io.depth_maps import DepthFiles, map_warnings, match_by_name
 from splatseed.io.files import StrPath, is_video, special_kind
 from splatseed.io.llff import is_llff, read_llff
-from splatseed.io.masks import with_own_masks
 from splatseed.io.nerfstudio import is_blender, read_blender, read_transforms_scene
 from splatseed.io.origin import recentered
 from splatseed.io.ply import read_ply_float64, refuse_gaussians
@@ -33,22 +32,15 @@ from splatseed.io.record3d import (
     read_r3d,
     read_record3d,
 )
+from splatseed.io.recorded import restore_absent, with_recorded_masks
 from splatseed.io.rgbd import find_tum_depths, is_replica, is_tum, load_rgbd, load_tum
 from splatseed.io.scanner_app import is_scanner_app, read_scanner_app
 from splatseed.io.seeds import recall_seeds
 from splatseed.io.split import with_listed_split
-from splatseed.io.staging import (
-    ABSENT,
-    BLACK,
-    MANIFEST,
-    MASKED,
-    NOTHING,
-    TRANSPARENT,
-    read_manifest,
-)
+from splatseed.io.staging import MANIFEST, read_manifest
 from splatseed.io.stray import is_stray, read_stray
 from splatseed.io.undistorted import fitted_to_undistorted
-from splatseed.scene import Masks, Scene, SceneSource
+from splatseed.scene import Scene, SceneSource
 from splatseed.text import name_some, quoted
 
 _TRANSFORMS = "transforms.json"
@@ -109,33 +101,14 @@ def load_scene(path: StrPath, *, require_points: bool = True) -> Scene:
         fix = _TRIANGULATE if scene.images else "Choose a scene or a PLY with points."
         raise SceneNotFoundError(f"points in {path}", found="none", fix=fix)
     # seeds.npz and the manifest refer to the points as stored: restore before cleaning.
-    scene = clean_scene(with_listed_split(_restore_absent(recall_seeds(scene))))
-    scene = _with_recorded_masks(scene)
+    scene = clean_scene(with_listed_split(restore_absent(recall_seeds(scene))))
+    scene = with_recorded_masks(scene)
     folder, white, notes = scene.source.image_dir if scene.source else None, WHITE, list[str]()
     if folder is not None:
         white, notes = find_white([folder / image.name for image in scene.images])
     notes += map_warnings(scene.depths)
     warnings = (*scene.warnings, *notes, *cloud_warnings(scene.points))
     return scene.replace(warnings=warnings, white=white)
-
-
-def _restore_absent(scene: Scene) -> Scene:
-    """Add the absent images that the manifest of a scene lists."""
-    noted = read_manifest(scene.source.root).get(ABSENT) if scene.source else None
-    if not isinstance(noted, list) or not all(isinstance(name, str) for name in noted):
-        return scene
-    known = {*scene.absent, *(image.name for image in scene.images)}
-    return scene.replace(absent=(*scene.absent, *(name for name in noted if name not in known)))
-
-
-def _with_recorded_masks(scene: Scene) -> Scene:
-    """Attach the masks near the photographs, as far as the manifest of a scene lets them count."""
-    manifest = read_manifest(scene.source.root) if scene.source else {}
-    if manifest.get(MASKED) == NOTHING:
-        return scene.replace(masks=None)
-    if manifest.get(TRANSPARENT) == BLACK:  # of a Blender pair
-        scene = scene.replace(masks=replace(scene.masks or Masks({}), alpha=False))
-    return with_own_masks(scene)
 
 
 def load_originals(path: StrPath, *, require_points: bool = True) -> Scene:

@@ -21,16 +21,8 @@ from jaxtyping import Float32
 
 from splatseed.errors import PointCloudError
 from splatseed.io.files import ARCHIVE_FAILURES, read_npy
-from splatseed.io.staging import (
-    ABSENT,
-    BLACK,
-    MANIFEST,
-    MASKED,
-    NOTHING,
-    TRANSPARENT,
-    read_manifest,
-    write_json,
-)
+from splatseed.io.recorded import facts_for_reading
+from splatseed.io.staging import MANIFEST, read_manifest, write_json
 from splatseed.pointcloud import ATTRIBUTES, ORIGINAL, PointCloud
 from splatseed.runtime.fingerprint import fingerprint
 from splatseed.scene import Scene
@@ -121,18 +113,6 @@ def carry_seeds(scene: Scene, written: Path, folder: Path) -> None:
     if (written / SEEDS).is_file():
         shutil.copyfile(written / SEEDS, folder / SEEDS)
     write_json(folder / MANIFEST, {**facts_for_reading(scene), UPSAMPLED: _upsampling(scene)})
-
-
-def facts_for_reading(scene: Scene) -> dict[str, Any]:
-    """Return entries of an output's manifest by which ``load_scene`` reads it as this scene."""
-    facts: dict[str, Any] = {}
-    if scene.absent:  # so that the others train or test as before
-        facts[ABSENT] = list(scene.absent)
-    if scene.masks is None and scene.source and scene.source.image_dir:
-        facts[MASKED] = NOTHING  # else masks near the photographs would count again
-    if scene.masks and not scene.masks.alpha:  # else transparent pixels would be masked
-        facts[TRANSPARENT] = BLACK
-    return facts
 
 
 def _read_seeds(folder: Path, points: PointCloud) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:

@@ -34,12 +34,6 @@ except ImportError:  # Windows has no file locks, so leftovers stay
 
 MANIFEST = "splatseed.json"
 """The file that marks a folder as written by splatseed."""
-ABSENT = "absent"
-"""The manifest's key for ``Scene.absent``."""
-TRANSPARENT, BLACK = "transparent", "black"
-"""The manifest's entry for masks without ``Masks.alpha``."""
-MASKED, NOTHING = "masks", "none"
-"""The manifest's entry for a scene without masks, whatever lies near its photographs."""
 
 _MIN_LEFTOVER_AGE = 5.0
 """Age in seconds from which an unlocked partial is a leftover; new ones are locked at once."""

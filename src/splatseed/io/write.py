@@ -26,7 +26,7 @@ from splatseed.io.image_folders import link_folders, photographs_hidden
 from splatseed.io.mask_files import FOLDER as MASKS
 from splatseed.io.masks import write_masks
 from splatseed.io.origin import write_offset
-from splatseed.io.seeds import facts_for_reading
+from splatseed.io.recorded import facts_for_reading
 from splatseed.io.staging import MANIFEST, output_folder, write_json
 from splatseed.io.transforms_layout import (
     Layout,
