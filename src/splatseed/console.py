@@ -20,6 +20,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from splatseed.findings import Finding
 from splatseed.progress import Progress, extraction_progress
 from splatseed.runtime.compilation import watched
 from splatseed.text import quoted, visible
@@ -107,9 +108,9 @@ class StageClock:
             self._bar.start_task(self._tasks[stage])
             self._bar.update(self._tasks[stage], completed=fraction)
 
-    def announce(self, sentence: str) -> None:
-        """Print a sentence above the bars, before long work."""
-        ERR.print(visible(with_options(sentence)), soft_wrap=True)
+    def announce(self, finding: Finding) -> None:
+        """Print a finding above the bars, before long work."""
+        ERR.print(visible(with_options(str(finding))), soft_wrap=True)
 
     def expect(self, *stages: str) -> None:
         """Show stages that are still to come."""
@@ -271,10 +272,10 @@ def print_pairs(title: str, rows: Sequence[tuple[str, str]]) -> None:
         OUT.print(f"  {label:<{width}}  {visible(with_options(value))}", soft_wrap=True)
 
 
-def print_note(note: str) -> None:
-    """Print a note, with options for the library's arguments."""
+def print_note(finding: Finding) -> None:
+    """Print a finding, with options for the library's arguments."""
     OUT.print("note:", style="yellow", end=" ")
-    OUT.print(visible(with_options(note)), soft_wrap=True)
+    OUT.print(visible(with_options(str(finding))), soft_wrap=True)
 
 
 def print_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:

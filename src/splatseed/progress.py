@@ -2,7 +2,7 @@
 
 A ``Progress`` is any callable that takes a stage's name and the fraction of it that is done, from
 0 to 1. Library functions default to ``silent``; the command line passes a progress bar. A ``Note``
-takes a sentence for the user.
+takes a ``Finding``.
 """
 
 from __future__ import annotations
@@ -13,8 +13,10 @@ from concurrent.futures import ThreadPoolExecutor
 from contextvars import ContextVar
 from typing import TypeAlias
 
+from splatseed.findings import Finding
+
 Progress: TypeAlias = Callable[[str, float], None]
-Note: TypeAlias = Callable[[str], None]
+Note: TypeAlias = Callable[[Finding], None]
 
 extraction_progress: ContextVar[Progress] = ContextVar("extraction_progress")
 """Called while a video or archive is extracted (``io.extraction``); unset: shown nowhere."""
@@ -26,8 +28,8 @@ def silent(stage: str, fraction: float) -> None:
     """Ignore the progress."""
 
 
-def silent_note(note: str) -> None:
-    """Ignore the note."""
+def silent_note(finding: Finding) -> None:
+    """Ignore the finding."""
 
 
 def blocks(total: int, size: int, stage: str, progress: Progress) -> Iterator[tuple[int, int]]:

@@ -21,6 +21,7 @@ from jaxtyping import Bool, Float64, Int64, UInt8, UInt32
 from splatseed.camera import Camera, Intrinsics, rotation_from_quat
 from splatseed.depthmap import DepthMaps, maps_by_name
 from splatseed.errors import ParameterError, SceneNotFoundError, UnknownNameError
+from splatseed.findings import Finding
 from splatseed.frozen import read_only
 from splatseed.pointcloud import PointCloud
 
@@ -249,7 +250,7 @@ class Scene:
     intrinsics: tuple[Intrinsics, ...] = ()  # all camera records of the file, including unused ones
     tracks: Tracks | None = None  # of the first ``len(tracks)`` points, which are the originals
     source: SceneSource | None = None  # where it was read from; None for a scene made in memory
-    warnings: tuple[str, ...] = ()  # what the reader repaired or found odd, one sentence each
+    findings: tuple[Finding, ...] = ()  # what the reader repaired or found odd
     depths: DepthMaps | None = None  # of some images, read on demand
     listed: Split | None = None  # the split given by lists beside the scene
     left_out: LeftOut = field(default_factory=LeftOut)  # how many points of its files were

@@ -48,7 +48,7 @@ def test_the_demo_leaves_a_scene_scores_pictures_and_runs(tmp_path, splatseed):
     assert pycolmap.Reconstruction(out / "scene/sparse/0").num_images() == 6
     before, after = load_scene(out / "scene"), load_scene(out / "scene_auto")
     assert len(after.points) > 2 * len(before.points)
-    assert not before.warnings
+    assert not before.findings
     assert after.points.num_original == len(before.points)
     metrics = {}
     for name in ("random", "poses", "sfm"):

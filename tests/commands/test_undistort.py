@@ -72,7 +72,7 @@ def test_a_distorted_scene_becomes_one_of_pinholes(distorted, tmp_path, splatsee
     assert (after.listed.train, after.listed.test) == (before.listed.train, before.listed.test)
     np.testing.assert_array_equal(after.points.xyz, before.points.xyz)
     assert len(load_views(after, after.images)) == len(before.images)
-    assert not any("missing" in each for each in after.warnings)
+    assert not any("missing" in each for each in after.findings)
     for folder in (out, write_scene(after, tmp_path / "again").path):  # for depth maps
         lenses = json.loads((folder / "distorted.json").read_text())
         bent = before.images[0].intrinsics

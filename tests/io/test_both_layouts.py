@@ -167,7 +167,7 @@ def test_each_trainer_finds_its_photographs_and_points(folder, copy, capture, se
     scene = load_scene(out)
     assert scene.source.transforms_path == out / "transforms.json"
     assert scene.points.num_original == 10
-    assert not scene.warnings
+    assert not scene.findings
     again = write_scene(scene, tmp_path / "again")
     assert again.layout == "both"
 

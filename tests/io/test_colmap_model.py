@@ -28,7 +28,7 @@ def model_of(scene_dir, model):
 
 
 def note_of(path):
-    (note,) = [each for each in load_scene(path).warnings if "models" in each]
+    (note,) = [each for each in load_scene(path).findings if "models" in each]
     return note
 
 
@@ -53,7 +53,7 @@ def test_one_model_needs_no_note_whatever_its_number(scene_dir, model_of):
     model_of(3, 2)
     scene = load_scene(scene_dir)
     assert len(scene.images) == 2
-    assert not any("models" in each for each in scene.warnings)
+    assert not any("models" in each for each in scene.findings)
 
 
 def test_a_damaged_model_is_left_aside_unless_it_was_the_largest(scene_dir, model_of):

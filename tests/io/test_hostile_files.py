@@ -51,7 +51,7 @@ def test_what_is_no_file_is_not_called_missing(odd, name, is_, scene_dir, model)
         load_scene(odd / name)
     _rename(scene_dir, model, str(odd / name))
     scene = load_scene(scene_dir)
-    assert f"{odd / name} is {is_}, not a file." in " ".join(scene.warnings)
+    assert f"{odd / name} is {is_}, not a file." in " ".join(scene.findings)
     shutil.rmtree(scene_dir / "images/left")
     assert f"{odd / name} is {is_}, not a file." in untrainable(scene)
 
@@ -82,7 +82,7 @@ def _rename(scene_dir, model, name):
 @pytest.mark.parametrize("name", ["../../x.jpg", "/dev/zero", "../images/left/image000.jpg"])
 def test_a_name_that_leads_out_of_the_scene_is_told(scene_dir, model, name):
     _rename(scene_dir, model, name)
-    told = [each for each in load_scene(scene_dir).warnings if "outside of" in each]
+    told = [each for each in load_scene(scene_dir).findings if "outside of" in each]
     assert [name in each for each in told] == ([] if "left" in name else [True])
 
 

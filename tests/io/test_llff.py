@@ -45,7 +45,7 @@ def test_cameras_are_those_of_the_model(root, room, tmp_path, folder, scale):
         root / folder,
         0,
     )
-    assert not scene.warnings
+    assert not scene.findings
     again = load(write_scene(scene, tmp_path / "out", require_points=False).path)
     assert again.source.format == "colmap"
     for read in (scene, again):

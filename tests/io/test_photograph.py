@@ -171,6 +171,6 @@ def test_a_scene_of_14_bits_has_its_note_once_and_bright_views(room, tmp_path):
         values = np.rint(pixels * (16383 / 255)).astype(np.uint16)
         (tmp_path / "scene/images" / image.name).write_bytes(png16(values))
     scene = load_scene(tmp_path / "scene")
-    assert sum("use 14 (values" in each for each in scene.warnings) == 1
+    assert sum("use 14 (values" in each for each in scene.findings) == 1
     wide, plain = (load_views(each, each.images[:1])[0] for each in (scene, room))
     assert np.array_equal(wide.photograph, plain.photograph)

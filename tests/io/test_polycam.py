@@ -29,7 +29,7 @@ def rename(paths, suffix):
 def test_hidden_files_of_macos_are_no_key_frames(export):
     for path in [each for each in export.rglob("*") if each.is_file()]:
         path.with_name(f"._{path.name}").write_bytes(b"Mac OS X")
-    assert (len(load(export).images), load(export).warnings) == (9, ())
+    assert (len(load(export).images), load(export).findings) == (9, ())
 
 
 @pytest.mark.parametrize("prefix", ["corrected_", ""])
@@ -37,7 +37,7 @@ def test_hidden_files_of_macos_are_no_key_frames(export):
 def test_cameras_depth_and_confidence_come_back(room_with_depth, tmp_path, prefix, given):
     export = write_polycam(room_with_depth, tmp_path / "export", prefix)
     scene = load(export / given)
-    assert scene.warnings == ()
+    assert scene.findings == ()
     assert (scene.source.format, scene.source.root) == ("phone", export / given)
     assert scene.source.image_dir == export / f"keyframes/{prefix}images"
     check_cameras(scene, room_with_depth)
@@ -59,7 +59,7 @@ def test_key_frames_without_a_photograph_or_a_camera_are_left_out(export):
     sorted((export / "keyframes/corrected_images").iterdir())[1].unlink()
     scene = load(export)
     assert [image.name for image in scene.images] == [f"{c.stem}.jpg" for c in cameras[2:]]
-    assert [w for w in scene.warnings if "left out" in w] == [
+    assert [w for w in scene.findings if "left out" in w] == [
         f"1 of 8 photographs has no camera and is left out, such as {cameras[0].stem}.jpg.",
         "1 of 8 cameras has no photograph and is left out.",
     ]

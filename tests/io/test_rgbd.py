@@ -63,7 +63,7 @@ def test_images_poses_and_depth_belong_together_by_time(capture):
     scene = load_scene(capture, require_points=False)
     names = [f"{t:.6f}.png" for t in TIMES]
     assert [image.name for image in scene.images] == list(scene.depths) == names
-    assert scene.warnings == ()
+    assert scene.findings == ()
     assert (scene.source.format, scene.source.image_dir) == ("rgbd", capture / "rgb")
     for i, image in enumerate(scene.images):
         assert np.unique(scene.depths.read(image.name).values) == [i + 1]
@@ -81,12 +81,12 @@ def test_camera_of_the_series_or_of_a_file(capture):
     scene = load_tum(capture)
     (lens,) = scene.intrinsics
     assert (lens.model, lens.params[0], len(lens.params)) == ("FULL_OPENCV", 520.9, 12)
-    assert any("distortion" in text for text in scene.warnings)
+    assert any("distortion" in text for text in scene.findings)
     assert scene.depths.lens is None  # the photographs have the same distortion
     capture = capture.rename(capture.with_name("kitchen"))
     scene = load_tum(capture)
     assert scene.intrinsics[0].params == (525, 525, 320, 240)
-    assert "focal length 525" in scene.warnings[0]
+    assert "focal length 525" in scene.findings[0]
     for folder in (capture.parent, capture):
         camera = CAMERA | {"w": 640, "h": 480}
         (folder / "cam_params.json").write_text(json.dumps({"camera": camera}))
@@ -115,7 +115,7 @@ def test_images_without_pose_or_file_are_left_out_and_told(capture):
     rows = [(f"{t + 0.005:.6f}", f"depth/{t + 0.005:.6f}.png") for t in TIMES]
     write_list(capture / "depth.txt", [rows[0], (TIMES[2] + 0.0205, rows[2][1])])
     assert list(load_tum(capture).depths) == [f"{TIMES[0]:.6f}.png"]  # the other is too late
-    without_pose, without_file = scene.warnings
+    without_pose, without_file = scene.findings
     assert f"rgb/{TIMES[3]:.6f}" in without_pose
     assert "1 image without a file" in without_file
 
@@ -196,7 +196,7 @@ def test_frames_are_paired_with_poses_and_depth_by_number(room):
     for image, world_from_cam in zip(scene.images, POSES, strict=True):
         np.testing.assert_allclose(image.camera.world_from_cam, world_from_cam, atol=1e-12)
     assert len({image.image_id for image in scene.images}) == 3
-    assert (len(scene.points), scene.warnings) == (0, ())
+    assert (len(scene.points), scene.findings) == (0, ())
     assert (scene.source.format, scene.source.image_dir) == ("rgbd", room / "results")
     depths = {name: np.unique(scene.depths.read(name).values).tolist() for name in scene.depths}
     assert depths == {names[0]: [0.5], names[1]: [1.0]}
@@ -210,7 +210,7 @@ def test_lost_frames_are_left_out_and_told(room):
     scene = load_rgbd(room)
     assert [image.name for image in scene.images] == ["frame000001.png", "frame10.jpg"]
     np.testing.assert_allclose(scene.images[1].camera.world_from_cam, POSES[2], atol=1e-12)
-    (told,) = scene.warnings
+    (told,) = scene.findings
     assert "frame2.jpg" in told
 
 
@@ -242,7 +242,7 @@ def test_missing_files_frames_of_another_size_and_bad_poses_are_named(room):
 
 def test_real_depth_agrees_best_at_the_principal_point(scenes):
     many = load_rgbd(scenes / "7scenes_redkitchen")
-    assert (len(many.images), many.warnings) == (143, ())
+    assert (len(many.images), many.findings) == (143, ())
     scene = load_rgbd(scenes / "replica/room0")
     first, last = (scene.images[i].camera for i in (0, 19))
     maps = [np.asarray(scene.depths.read(scene.images[i].name).values, float) for i in (0, 19)]

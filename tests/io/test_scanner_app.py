@@ -25,7 +25,7 @@ def export(room_with_depth, tmp_path):
 
 def test_cameras_depth_and_confidence_come_back(export, room_with_depth):
     scene = load(export)
-    assert scene.warnings == ()
+    assert scene.findings == ()
     assert (scene.source.format, scene.source.image_dir, len(scene.points)) == ("phone", export, 0)
     check_cameras(scene, room_with_depth)
     check_depths(scene, room_with_depth)
@@ -72,7 +72,7 @@ def test_frames_without_a_photograph_or_a_pose_are_left_out(export):
     scene = load(export)
     numbers = [0, 12, 15, 18, 21, 24]
     assert [image.name for image in scene.images] == [f"frame_{i:05d}.jpg" for i in numbers]
-    assert [w for w in scene.warnings if "left out" in w] == [
+    assert [w for w in scene.findings if "left out" in w] == [
         "2 of 8 frames have no photograph and are left out.",
         "1 photograph without a pose (a .json beside it) is left out, such as frame_00009.jpg.",
     ]
@@ -81,26 +81,26 @@ def test_frames_without_a_photograph_or_a_pose_are_left_out(export):
 
 
 def test_a_map_without_its_confidence_is_named(export, tmp_path):
-    assert with_depths_in(load(export), export).warnings == ()
+    assert with_depths_in(load(export), export).findings == ()
     (export / "conf_00006.png").unlink()
     (export / "conf_00012.png").unlink()
     scene = load(export)
     which = "frame_00006.jpg, frame_00012.jpg"
     note = f"2 of 9 depth maps have no confidence and are used whole: {which}."
-    assert scene.warnings == with_depths_in(scene, export).warnings == (note,)
+    assert scene.findings == with_depths_in(scene, export).findings == (note,)
     again = load(write_scene(scene, tmp_path / "out", require_points=False).path)
-    assert again.warnings == ()
-    assert with_depths_in(again, export).warnings == (note,)
+    assert again.findings == ()
+    assert with_depths_in(again, export).findings == (note,)
     for path in export.glob("conf_*.png"):
         path.unlink()  # then confidence is unknown to the whole capture
-    assert load(export).warnings == with_depths_in(scene, export).warnings == ()
+    assert load(export).findings == with_depths_in(scene, export).findings == ()
 
 
 def test_lost_tracking_leaves_an_image_out(export):
     change(export / "frame_00006.json", cameraPoseARFrame=[float("nan")] * 16)
     scene = load(export)
     assert scene.absent == ("frame_00006.jpg",)
-    assert "1 of 9 images is left out (frame_00006.jpg)" in scene.warnings[0]
+    assert "1 of 9 images is left out (frame_00006.jpg)" in scene.findings[0]
 
 
 def test_cameras_of_resized_photographs_belong_to_the_captured_size(export, room_with_depth):
@@ -108,7 +108,7 @@ def test_cameras_of_resized_photographs_belong_to_the_captured_size(export, room
         PilImage.open(path).resize((48, 36)).save(path)
     scene = load(export)
     check_cameras(scene, room_with_depth)
-    (warning,) = scene.warnings
+    (warning,) = scene.findings
     assert warning.startswith("frame_00000.jpg has 48 x 36 pixels, its camera 1 96 x 72;")
     change(export / "frame_00000.json", projectionMatrix=None)  # then only K's plausibility is left
     with pytest.raises(SceneFormatError, match=r"middle of 48 x 36 pixels in .*00000\.json"):
@@ -167,7 +167,7 @@ def test_a_real_export(scenes):
     if not root.is_dir():
         pytest.skip(f"no {root}")
     scene = load(root)
-    assert (len(scene.images), len(scene.depths), scene.warnings) == (146, 146, ())
+    assert (len(scene.images), len(scene.depths), scene.findings) == (146, 146, ())
     differences = []
     for first, second in zip(scene.images[::29], scene.images[2::29], strict=False):
         near, far = (scene.depths.read(image.name) for image in (first, second))

@@ -146,7 +146,7 @@ def test_a_scene_without_originals_keeps_what_its_points_are(scene, tmp_path):
         assert there == (tmp_path / "out" / name).read_bytes()
     bare = load_originals(tmp_path / "out", require_points=False)
     assert not len(bare.points)
-    assert f"{len(new):,} points" in bare.warnings[-1]
+    assert f"{len(new):,} points" in bare.findings[-1]
     with pytest.raises(SceneNotFoundError, match=f"found none: it made all {len(new):,}"):
         load_originals(tmp_path / "out")
 

@@ -54,14 +54,14 @@ def test_two_lists_can_leave_images_out(scene_dir):
     (scene_dir / "test_list.txt").write_text("left/image000.jpg")
     scene = load_scene(scene_dir)
     assert parts(scene) == (TEST, {"left/image000.jpg"})
-    assert not any("list.txt" in each for each in scene.warnings)
+    assert not any("list.txt" in each for each in scene.findings)
 
 
 def test_names_of_no_image_are_told(scene_dir):
     (scene_dir / "test_list.txt").write_text("\n".join([*TEST, "left/imgae002.jpg"]), "utf-8-sig")
     scene = load_scene(scene_dir)
     assert parts(scene)[1] == TEST
-    assert any("left/imgae002.jpg" in each for each in scene.warnings)
+    assert any("left/imgae002.jpg" in each for each in scene.findings)
 
 
 def test_the_lists_of_transforms_json_are_followed_and_carried_over(scene_dir, tmp_path):
@@ -90,4 +90,4 @@ def test_a_list_that_fits_no_image_is_left_aside(text, scene_dir):
     (scene_dir / "train.txt").write_text(text)
     scene = load_scene(scene_dir)
     assert (scene.listed, parts(scene)[1]) == (None, {"left/image000.jpg"})
-    assert bool(text) == any("train.txt was ignored" in each for each in scene.warnings)
+    assert bool(text) == any("train.txt was ignored" in each for each in scene.findings)

@@ -62,7 +62,7 @@ def shown(scene, truth):
 def test_cameras_depth_and_confidence_come_back(recording, room_with_depth, captures):
     before = {path: path.stat().st_mtime_ns for path in recording.rglob("*")}
     scene = load(recording)
-    assert scene.warnings == ()
+    assert scene.findings == ()
     assert (scene.source.format, scene.source.root) == ("phone", recording)
     assert scene.source.image_dir.parent == captures
     check_cameras(scene, room_with_depth)
@@ -91,7 +91,7 @@ def test_one_camera_in_older_versions(room_with_depth, tmp_path, captures):
 def test_the_frame_that_players_hide_is_the_first(recording, room_with_depth):
     hide_first_frame(recording / VIDEO)
     scene = load(recording)
-    assert scene.warnings == ()
+    assert scene.findings == ()
     assert shown(scene, room_with_depth) == [*range(9)]
 
 
@@ -105,7 +105,7 @@ def test_a_copy_without_the_hidden_frame_begins_at_the_second_pose(recording, ro
     assert [image.name for image in scene.images] == [f"{i:06}.jpg" for i in range(1, 10)]
     check_cameras(scene, room_with_depth)
     check_depths(scene, room_with_depth)
-    (note,) = scene.warnings
+    (note,) = scene.findings
     assert note == "rgb.mp4 has 9 frames and odometry.csv 10 poses: the first pose has none."
 
 
@@ -119,7 +119,7 @@ def test_frames_after_the_last_pose_are_left_out(recording, room_with_depth):
     change_lines(recording, lambda lines: lines[:7])
     scene = load(recording)
     check_cameras(scene, room_with_depth.replace(images=room_with_depth.images[:7]))
-    (note,) = scene.warnings
+    (note,) = scene.findings
     assert note == "rgb.mp4 has 9 frames and odometry.csv 7 poses: the last have no pose."
 
 
@@ -145,7 +145,7 @@ def test_few_frames_of_many_and_extracted_once(recording, captures, monkeypatch)
     monkeypatch.setattr("splatseed.io.stray.FILM", FilmSettings(max_frames=4))
     scene = load(recording)
     assert 3 <= len(scene.images) <= 4
-    (note,) = scene.warnings
+    (note,) = scene.findings
     assert note.startswith(f"{len(scene.images)} of the 9 frames of rgb.mp4 are used: the sharpest")
     (folder,) = captures.iterdir()
     before = {file: file.stat().st_mtime_ns for file in folder.rglob("*")}

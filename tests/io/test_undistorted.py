@@ -57,7 +57,7 @@ def test_maps_of_the_photographs_of_before_are_undistorted(scene, tmp_path, fact
     assert np.abs(depth.values - expected).max() <= 0.501
     assert np.abs(depth.values - column * width / depth.width).max() > 0.7  # as if not undistorted
     np.testing.assert_array_equal(maps.read("b.jpg").values[0], np.arange(width) + 0.5)
-    assert any("before undistortion" in each for each in with_depths_in(scene, folder).warnings)
+    assert any("before undistortion" in each for each in with_depths_in(scene, folder).findings)
 
 
 @pytest.mark.parametrize("shape", [(62, 86), (31, 43), (50, 50)])
@@ -65,7 +65,7 @@ def test_maps_of_the_undistorted_photographs_stay(scene, tmp_path, shape):
     (tmp_path / "depth").mkdir()
     np.save(tmp_path / "depth/a.npy", np.ones(shape))
     assert find_depths(scene, tmp_path / "depth").lens is None
-    assert with_depths_in(scene, tmp_path / "depth").warnings == ()
+    assert with_depths_in(scene, tmp_path / "depth").findings == ()
 
 
 def test_damaged_lenses_are_named(scene, tmp_path):

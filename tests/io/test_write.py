@@ -204,7 +204,7 @@ def test_image_folders_are_linked(scene_dir, tmp_path, monkeypatch):
     links = {path.name: str(path.readlink()) for path in out.iterdir() if path.is_symlink()}
     assert links == {name: f"../scene/{name}" for name in ("images", "images_4", "masks")}
     shutil.move(out, tmp_path / "elsewhere")
-    assert not any("missing" in w for w in load_scene(tmp_path / "elsewhere").warnings)
+    assert not any("missing" in w for w in load_scene(tmp_path / "elsewhere").findings)
 
 
 @pytest.mark.parametrize("how", ["asked", "no links"])
@@ -223,6 +223,6 @@ def test_images_are_copied_when_asked_or_when_links_fail(scene_dir, tmp_path, mo
         path.chmod(0o755 if path.is_dir() else 0o644)
     shutil.rmtree(scene_dir)
     scene = load_scene(tmp_path / "out")
-    assert not any("missing" in text for text in scene.warnings)
+    assert not any("missing" in text for text in scene.findings)
     assert [path.name for path in (tmp_path / "out/images").iterdir()] == ["left"]
     assert not (tmp_path / "out/images").is_symlink()

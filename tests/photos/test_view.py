@@ -161,7 +161,7 @@ def test_each_photograph_is_checked_against_its_own_record(size, orientation, sa
     images = sorted(copied.images, key=lambda image: image.name)[:9]
     for image in images[3:5]:
         PilImage.new("RGB", size).save(copied.source.image_dir / image.name, exif=exif)
-    told = " ".join(load_scene(copied.source.root).warnings)
+    told = " ".join(load_scene(copied.source.root).findings)
     if not says:
         assert "not fit" not in told
         assert [view.photograph.shape[1::-1] for view in load_views(copied, images)][3] == size

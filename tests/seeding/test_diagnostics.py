@@ -125,7 +125,7 @@ def _statistics(num_points, isolated, duplicates=0):
 
 
 def test_problems_list_those_of_the_reader_first(rng):
-    scene = _scene(rng.random((5, 3)), warnings=("The reader's.",))
+    scene = _scene(rng.random((5, 3)), findings=("The reader's.",))
     sound = module.find_problems(scene, _statistics(1000, 1), module.EmptyRegions(0.1, 0.9, "a"))
     assert sound == ("The reader's.",)
     first, *others = module.find_problems(

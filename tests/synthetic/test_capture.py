@@ -80,7 +80,7 @@ def test_visible_samples_are_on_surfaces_and_seen(capture, rng):
 def test_a_written_capture_loads_as_the_same_scene(capture, tmp_path):
     path = write_capture(capture, tmp_path / "room")
     scene = load_scene(path)
-    assert scene.warnings == ()
+    assert scene.findings == ()
     np.testing.assert_array_equal(scene.points.xyz, capture.scene.points.xyz)
     np.testing.assert_array_equal(scene.tracks.xyz, capture.scene.tracks.xyz)
     np.testing.assert_array_equal(scene.tracks.image_ids, capture.scene.tracks.image_ids)

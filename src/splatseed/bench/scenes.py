@@ -159,7 +159,7 @@ def survey(
     depth = Path(planned.depth) if planned.depth else scene.source.root
     if with_depth and (planned.depth or search_depths(scene, depth) is not None):
         maps, scene = str(depth.resolve()), with_depths_in(scene, depth)
-    notes = [*scene.warnings, *([scene.listed.sentence] if scene.listed else [])]
+    notes = [*scene.findings, *([scene.listed.sentence] if scene.listed else [])]
     notes += stray_camera_notes(scene)
     return SceneFacts(
         str(path.resolve()), planned.label, planned.images, maps, scan,

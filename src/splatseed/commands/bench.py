@@ -340,7 +340,7 @@ def _budget_notes(options: Options, plan: Plan) -> Iterator[str]:
 
 def _notes(plan: Plan, scenes: Sequence[SceneFacts], specs: Sequence[RunSpec]) -> Iterator[str]:
     for scene in scenes:
-        yield from (f"{scene.name}: {warning}" for warning in scene.warnings)
+        yield from (f"{scene.name}: {warning}" for warning in scene.findings)
     without_depth = ", ".join(scene.name for scene in scenes if not scene.depth_digest)
     if DEPTH in plan.methods and without_depth:
         yield f"no depth maps, so method depth is skipped: {without_depth} (--depth DIR)"

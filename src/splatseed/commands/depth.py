@@ -118,7 +118,7 @@ def _run_network(options: Options, model: str) -> None:
         ("output", str(options.output)),
     ]
     print_pairs("splatseed depth", rows)
-    for warning in scene.warnings:
+    for warning in scene.findings:
         print_note(warning)
     if report.flat:
         flat = name_some(report.flat, NAMES_SHOWN)

@@ -136,7 +136,7 @@ def _from_photographs(options: Options, images: Path, clock: StageClock) -> SfmR
     else:
         stages = [*(["refinement"] if options.refine_poses else []), "triangulation"]
         poses = load_scene(options.poses_from, require_points=False)
-        for note in (each for each in poses.warnings if RECENTER in each):
+        for note in (each for each in poses.findings if RECENTER in each):
             print_note(note)
         how = {"poses_from": poses, "refine_poses": options.refine_poses}
     if poses is not None and poses.masks is not None and poses.masks.files:

@@ -43,7 +43,7 @@ def clean_scene(scene: Scene) -> Scene:
         notes.append(f"{duplicates:,} {what} the position of another and {were} left out.")
     return replace(
         without_points(scene, keep),
-        warnings=(*scene.warnings, *notes),
+        findings=(*scene.findings, *notes),
         left_out=LeftOut(known.non_finite + non_finite, known.duplicates + duplicates),
     )
 

@@ -103,7 +103,7 @@ def read_model(model_dir: Path) -> Scene:
     other = next(each for each in ranked_models(model_dir.parent) if each.name != model_dir.name)
     listed = f"{model_dir.parent} has {len(models)} models, {', '.join(shown)}"
     note = f"{listed}: {model_dir.name} is read. To read another, pass its path, such as {other}."
-    return scene.replace(warnings=(*scene.warnings, note))
+    return scene.replace(findings=(*scene.findings, note))
 
 
 def find_model(*folders: Path) -> Path | None:

@@ -60,7 +60,7 @@ def read_llff(root: StrPath) -> Scene:
         tuple(images),
         tuple(cameras.values()),
         source=SceneSource("llff", root, path, image_dir=folder),
-        warnings=tuple(image_warnings(images, folder, root)),
+        findings=tuple(image_warnings(images, folder, root)),
     )
     return recentered(scene)
 

@@ -107,8 +107,8 @@ def load_scene(path: StrPath, *, require_points: bool = True) -> Scene:
     if folder is not None:
         white, notes = find_white([folder / image.name for image in scene.images])
     notes += map_warnings(scene.depths)
-    warnings = (*scene.warnings, *notes, *cloud_warnings(scene.points))
-    return scene.replace(warnings=warnings, white=white)
+    warnings = (*scene.findings, *notes, *cloud_warnings(scene.points))
+    return scene.replace(findings=warnings, white=white)
 
 
 def load_originals(path: StrPath, *, require_points: bool = True) -> Scene:
@@ -130,7 +130,7 @@ def load_originals(path: StrPath, *, require_points: bool = True) -> Scene:
         )
     used = f"Only the {len(points):,} original points are used" if len(points) else "No originals"
     note = f"{used}: the {added:,} points that splatseed added before are dropped."
-    return scene.replace(points=points, warnings=(*scene.warnings, note))
+    return scene.replace(points=points, findings=(*scene.findings, note))
 
 
 def check_exists(path: Path) -> None:
@@ -318,8 +318,8 @@ def with_depths_in(
 def _with_maps(scene: Scene, maps: DepthFiles | None) -> Scene:
     """Attach maps, with warnings about them in place of those about the scene's own."""
     replaced = map_warnings(scene.depths)
-    warnings = [each for each in scene.warnings if each not in replaced]
-    return scene.replace(depths=maps, warnings=(*warnings, *map_warnings(maps)))
+    warnings = [each for each in scene.findings if each not in replaced]
+    return scene.replace(depths=maps, findings=(*warnings, *map_warnings(maps)))
 
 
 def _same_maps(maps: DepthFiles, others: DepthFiles) -> bool:

@@ -51,9 +51,9 @@ def with_masks(scene: Scene, choice: str | None) -> Scene:
         return scene
     own, notes = scene.masks or Masks({}), list[str]()
     answered = _mostly_masked(own)
-    kept = [warning for warning in scene.warnings if warning not in answered]
+    kept = [warning for warning in scene.findings if warning not in answered]
     if choice == NONE:
-        return scene.replace(masks=None, warnings=tuple(kept))
+        return scene.replace(masks=None, findings=tuple(kept))
     inverted = choice == INVERTED or choice.startswith(f"{INVERTED}:")
     location = choice.removeprefix(INVERTED).removeprefix(":") if inverted else choice
     files: Mapping[str, Path] = own.files
@@ -69,7 +69,7 @@ def with_masks(scene: Scene, choice: str | None) -> Scene:
         fix = "Pass a folder of masks, or omit `masks`."
         raise SceneNotFoundError(f"{_LISTED} {where}", found=found, fix=fix)
     masks = replace(own, files=files, inverted=inverted, choice=choice)
-    return scene.replace(masks=masks, warnings=(*kept, *notes, *_mostly_masked(masks)))
+    return scene.replace(masks=masks, findings=(*kept, *notes, *_mostly_masked(masks)))
 
 
 def mask_choice(scene: Scene) -> str | None:
@@ -100,7 +100,7 @@ def with_own_masks(scene: Scene) -> Scene:
         files, notes = find_own_masks(names, folder, scene.source.root)
         notes += _resized(files, folder)
         masks = replace(masks, files=files)
-    return scene.replace(masks=masks, warnings=(*scene.warnings, *notes, *_mostly_masked(masks)))
+    return scene.replace(masks=masks, findings=(*scene.findings, *notes, *_mostly_masked(masks)))
 
 
 def masks_near(photographs: Path) -> tuple[Masks, list[str]]:

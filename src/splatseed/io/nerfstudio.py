@@ -126,7 +126,7 @@ def read_transforms_scene(path: StrPath) -> Scene:
     notes += image_warnings(images, folder, path.parent)
     scene = Scene(
         points, images, transforms.intrinsics, source=source,
-        warnings=(*notes, *lens_warnings(images)),
+        findings=(*notes, *lens_warnings(images)),
         depths=depths,
         listed=transforms.listed,
         masks=Masks(masks) if masks else None, absent=transforms.absent,
@@ -177,7 +177,7 @@ def read_blender(folder: StrPath) -> Scene:
         tuple(images),
         tuple(cameras.values()),
         source=SceneSource("transforms", folder, points_path, image_dir=folder),
-        warnings=(*notes, *image_warnings(images, folder, folder), *lens_warnings(images)),
+        findings=(*notes, *image_warnings(images, folder, folder), *lens_warnings(images)),
         listed=Split(train, test, f"pair of {_BLENDER[0]} and {_BLENDER[1]}") if split else None,
         masks=Masks(masks, alpha=False),  # transparent pixels are empty space, trained as black
     )

@@ -87,8 +87,8 @@ def recentered(scene: Scene, exact: Float64[np.ndarray, "N 3"] | None = None) ->
         known = _known(places)
         notes = [_note(scene, origin, known), *_precision_notes(scene, exact, origin)]
         scene = translated(scene, origin, exact)
-        scene = replace(scene, warnings=(*scene.warnings, *notes))
-    return replace(scene, warnings=(*scene.warnings, *_frame_notes(scene, centers - origin)))
+        scene = replace(scene, findings=(*scene.findings, *notes))
+    return replace(scene, findings=(*scene.findings, *_frame_notes(scene, centers - origin)))
 
 
 def translated(

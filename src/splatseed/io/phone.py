@@ -95,7 +95,7 @@ def read_phone_scene(
         tuple(images),
         tuple(cameras.values()),
         source=SceneSource("phone", root, track, image_dir=folder),
-        warnings=warnings,
+        findings=warnings,
         absent=tuple(unusable),
     )
     return recentered(scene)

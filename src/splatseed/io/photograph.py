@@ -168,7 +168,7 @@ def _grey_of(path: Path, photograph: PilImage.Image, white: int) -> PilImage.Ima
 def warnings_without_lens(scene: Scene) -> list[str]:
     """Return a scene's warnings except those of lens distortion."""
     lens = lens_warnings(scene.images)
-    return [warning for warning in scene.warnings if warning not in lens]
+    return [warning for warning in scene.findings if warning not in lens]
 
 
 def lens_warnings(images: Sequence[Image]) -> list[str]:

@@ -97,7 +97,7 @@ def _scene(
 ) -> Scene:
     source = SceneSource("rgbd", track.parent, track, image_dir=folder)
     points = PointCloud.empty()
-    return recentered(Scene(points, tuple(images), (lens,), source=source, warnings=warnings))
+    return recentered(Scene(points, tuple(images), (lens,), source=source, findings=warnings))
 
 
 def is_tum(root: Path) -> bool:

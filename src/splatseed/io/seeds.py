@@ -71,7 +71,7 @@ def recall_seeds(scene: Scene) -> Scene:
     tracks = scene.tracks
     if tracks is not None:
         tracks = tracks.select(np.arange(len(tracks)) < first_new)
-    return replace(scene, points=points, tracks=tracks, warnings=(*scene.warnings, *warnings))
+    return replace(scene, points=points, tracks=tracks, findings=(*scene.findings, *warnings))
 
 
 def _upsampling(scene: Scene) -> dict[str, Any] | None:

@@ -31,7 +31,7 @@ def with_listed_split(scene: Scene) -> Scene:
     """Set a scene's split from its lists, if it has any."""
     if scene.source is None or not scene.images or scene.listed is not None:
         return scene
-    warnings = list(scene.warnings)
+    warnings = list(scene.findings)
     for origin, parts in _lists(scene):
         split, unknown = _split(scene, origin, parts)
         if split is not None:
@@ -40,9 +40,9 @@ def with_listed_split(scene: Scene) -> Scene:
                 match = agreeing(len(unknown), "matches", "match")
                 names = counted(len(unknown), "name")
                 warnings.append(f"{origin}: {names} {match} no image ({shown}).")
-            return scene.replace(listed=split, warnings=tuple(warnings))
+            return scene.replace(listed=split, findings=tuple(warnings))
         warnings.append(f"{origin} was ignored: it leaves no images to train on, or none to test.")
-    return scene.replace(warnings=tuple(warnings))
+    return scene.replace(findings=tuple(warnings))
 
 
 def _lists(scene: Scene) -> Iterator[tuple[str, list[list[str]]]]:

@@ -179,7 +179,7 @@ def find_problems(
     scene: Scene, cloud: CloudStatistics, regions: EmptyRegions | None
 ) -> tuple[str, ...]:
     """List problems, one sentence each; the warnings of the scene's reader first."""
-    problems = list(scene.warnings)
+    problems = list(scene.findings)
     used = cloud.num_points - cloud.non_finite - cloud.duplicates
     added = scene.points.num_original < len(scene.points)  # nothing will be interpolated
     if not added and cloud.isolated > MAX_ISOLATED * max(used, 1):

@@ -201,7 +201,7 @@ def prepare_training(
         points_alone = settings.get("seeding") == "scene" and not refine_poses and not asked.start
         scene = load_scene(scene, require_points=points_alone)
     scene = at_file_size(with_masks(scene, masks))
-    for warning in scene.warnings:
+    for warning in scene.findings:
         note(warning)
     if scene.listed is not None:
         note(scene.listed.sentence)

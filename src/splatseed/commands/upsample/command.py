@@ -153,7 +153,7 @@ def _announce(
     memory_note: str,
 ) -> None:
     """Print the plan, the scene's warnings, and the options that have no effect."""
-    for warning in (*scene.warnings, *stray_camera_notes(scene)):
+    for warning in (*scene.findings, *stray_camera_notes(scene)):
         print_note(warning)
     name, method = options.method, methods[options.method]
     if unused := report.unused_maps_note(options, scene, method):
