@@ -44,8 +44,8 @@ class Options:
     """A run folder of splatseed train, or a file of Gaussians: .ply, .compressed.ply, .splat, .spz,
     .sog."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """The file to write; its suffix chooses the format: .ply, .compressed.ply, .splat, .spz, .sog,
-    or .html, a page with viewer and model that browsers open from disk."""
+    """The file to write; its suffix chooses the format: .ply, .splat, .spz, .sog, or .html, a page
+    with viewer and model that browsers open from disk."""
     crop: Annotated[str | None, tyro.conf.arg(metavar="x0,y0,z0,x1,y1,z1")] = None
     """Keep the Gaussians whose centres lie in this box, in world coordinates; write --crop=-1,...
     if the first number is negative."""

@@ -18,7 +18,7 @@ from splatseed.splat.gaussians import Gaussians
 from splatseed.text import agreeing, counted
 
 MAX_LOG_SCALE = 20.0
-"""Log-scale of the largest size; also the limit of compressed PLY and SOG."""
+"""Log-scale of the largest size; also the limit of SOG."""
 MAX_POSITION = 1e18
 MIN_LOG_SCALE = float(np.log(np.finfo(np.float32).tiny))
 """Replaces the log-scale of a size of 0, -infinity."""

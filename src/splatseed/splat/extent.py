@@ -3,8 +3,7 @@
 Packed positions are quantised between bounds: one Gaussian at 1e6 units would leave a few steps for
 all others. *Distance* is the maximum norm from the median position, and *reach* its median, which
 up to half of the Gaussians cannot move. *Shell* 0 ends at 8 reaches; each further shell is 64 times
-as large. Formats with chunks store each shell in its own chunks; formats with one step for all drop
-distant Gaussians if keeping them would cost more image quality.
+as large. Distant Gaussians are dropped if keeping them would cost more image quality.
 """
 
 from __future__ import annotations
@@ -55,8 +54,8 @@ def shells_of(means: Float32[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:
     return np.asarray(shells, np.int64)
 
 
-def morton_codes(means: Float32[np.ndarray, "N 3"]) -> np.ndarray:
-    """Return Z-curve codes of positions, in cells that grow with the distance.
+def morton_order(means: Float32[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:
+    """Return the order of positions along a Z curve, in cells that grow with the distance.
 
     Along each axis sign(x) log(1 + |x|), with x in reaches from the median, is divided evenly.
     """
@@ -71,12 +70,7 @@ def morton_codes(means: Float32[np.ndarray, "N 3"]) -> np.ndarray:
         for axis in range(3):
             digit = (cells[:, axis] >> np.uint64(bit)) & np.uint64(1)
             code |= digit << np.uint64(3 * bit + axis)
-    return code
-
-
-def morton_order(means: Float32[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:
-    """Return the order of positions along the Z curve."""
-    return np.argsort(morton_codes(means), kind="stable")
+    return np.argsort(code, kind="stable")
 
 
 class Fit(NamedTuple):
