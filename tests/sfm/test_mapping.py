@@ -10,7 +10,7 @@ pytest.importorskip("pycolmap", reason="needs pycolmap")
 from splatseed.progress import silent
 from splatseed.sfm import Settings, agreement, mapping
 from splatseed.sfm.agreement import compare_with_matches
-from splatseed.sfm.colmap import Run, posed_model, require_pycolmap
+from splatseed.sfm.colmap import ColmapRun, posed_model, require_pycolmap
 from splatseed.sfm.mapping import map_images
 from splatseed.sfm.matching import match_photographs
 from splatseed.similarity import fit_similarity
@@ -20,7 +20,7 @@ from splatseed.similarity import fit_similarity
 def matched(room, tmp_path_factory):
     """A run on eight photographs of the room whose pairs are matched, and their true model."""
     work = tmp_path_factory.mktemp("mapping")
-    run = Run(require_pycolmap(), Settings(threads=2), room.source.image_dir, work, silent)
+    run = ColmapRun(require_pycolmap(), Settings(threads=2), room.source.image_dir, work, silent)
     model = posed_model(run.pycolmap, room.images[:8])
     match_photographs(run, model)
     return run, model

@@ -15,7 +15,7 @@ from splatseed.progress import silent
 from splatseed.scene import Masks
 from splatseed.sfm import Settings, mapping, pipeline
 from splatseed.sfm.cameras import Photo
-from splatseed.sfm.colmap import Run, posed_model, require_pycolmap
+from splatseed.sfm.colmap import ColmapRun, posed_model, require_pycolmap
 from splatseed.sfm.database import run_database
 from splatseed.sfm.matching import match_photographs
 from splatseed.sfm.work_folder import WorkFolder, WorkKey, resumable_work, work_key
@@ -142,7 +142,7 @@ def test_features_and_matches_move_to_the_database_of_other_photographs(room, tm
     for each in (folder, work):
         each.mkdir()
     shutil.copytree(room.source.image_dir, photos)
-    run = Run(pycolmap, Settings("exhaustive", "cpu"), photos, work, silent)
+    run = ColmapRun(pycolmap, Settings("exhaustive", "cpu"), photos, work, silent)
 
     def of(numbers, earlier=()):
         images = [room.images[i] for i in numbers]
@@ -189,7 +189,7 @@ def test_mapping_goes_on_from_the_last_sure_snapshot(room, tmp_path, monkeypatch
     monkeypatch.setattr(mapping, "_SNAPSHOT_FRAMES", 2)
     settings = Settings("sequential", "cpu")
     kept = WorkFolder(folder, WorkKey({}, "", ""))
-    run = Run(require_pycolmap(), settings, room.source.image_dir, work, silent, kept)
+    run = ColmapRun(require_pycolmap(), settings, room.source.image_dir, work, silent, kept)
     images = room.images[:8]
     match_photographs(run, posed_model(run.pycolmap, images))
     names = [image.name for image in images]

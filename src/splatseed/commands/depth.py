@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import math
-import platform
 import time
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -23,7 +20,7 @@ from splatseed.io import dense, load_scene
 from splatseed.io.photograph import warnings_without_lens
 from splatseed.io.photograph_checks import with_photographs
 from splatseed.io.staging import check_output
-from splatseed.requirements import require
+from splatseed.requirements import require, versions_of
 from splatseed.scene import Scene
 from splatseed.seeding.trainability import is_distorted
 from splatseed.text import name_some, quoted, visible
@@ -84,12 +81,8 @@ def run(arguments: list[str]) -> None:
 
 def _provenance(options: Options) -> dict[str, object]:
     """Options and versions of packages, for ``splatseed.json``."""
-    versions = {"python": platform.python_version()}
-    for package in PACKAGES:
-        with suppress(PackageNotFoundError):
-            versions[package] = version(package)
     given = {name: value for name, value in asdict(options).items() if value is not None}
-    return {"command": "depth", "options": given, "versions": versions}
+    return {"command": "depth", "options": given, "versions": versions_of(PACKAGES)}
 
 
 def _run_network(options: Options, model: str) -> None:

@@ -11,7 +11,6 @@ import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, nullcontext
 from dataclasses import asdict, dataclass, replace
-from importlib.metadata import version
 from pathlib import Path, PurePosixPath
 from shutil import rmtree
 from tempfile import TemporaryDirectory
@@ -37,12 +36,12 @@ from splatseed.io.undistorted import write_lenses
 from splatseed.photos.sizes import at_file_size
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent
-from splatseed.requirements import require
+from splatseed.requirements import require, version_of
 from splatseed.runtime.child import Child
 from splatseed.scene import Image, LeftOut, Masks, Scene
 from splatseed.sfm import colmap
 from splatseed.sfm.cameras import Photos, SharedCamera, describe_cameras, share_cameras
-from splatseed.sfm.colmap import Run, Settings
+from splatseed.sfm.colmap import ColmapRun, Settings
 from splatseed.sfm.export import drop_repeats, export_scene
 from splatseed.sfm.mapping import map_images
 from splatseed.sfm.matching import match_further, match_photographs
@@ -170,7 +169,7 @@ def reconstruct(
             write_offset(staging, poses_from.offset)
         manifest = {
             "job": "reconstruct" if poses is None else "triangulate",
-            "version": version("splatseed"),
+            "version": version_of("splatseed"),
             "settings": asdict(settings),
             "report": {k: v for k, v in asdict(report).items() if k not in {"path", "poses"}},
         }
@@ -192,7 +191,7 @@ def _lenses(
 
 
 def _reconstruct(
-    run: Run,
+    run: ColmapRun,
     staging: Path,
     names: Sequence[str],
     cameras: Sequence[SharedCamera],
@@ -220,7 +219,7 @@ def _reconstruct(
 
 
 def _export(
-    run: Run, model_dir: Path, staging: Path, masks: Masks | None, *, distinct: bool = True
+    run: ColmapRun, model_dir: Path, staging: Path, masks: Masks | None, *, distinct: bool = True
 ) -> None:
     """Write a model's undistorted photographs, masks and points."""
     export_scene(run, model_dir, staging, distinct=distinct)
@@ -271,7 +270,7 @@ def undistort(
 
 
 def _undistort(
-    run: Run, staging: Path, model_dir: Path, names: Sequence[str], masks: Masks | None
+    run: ColmapRun, staging: Path, model_dir: Path, names: Sequence[str], masks: Masks | None
 ) -> SfmReport:
     _export(run, model_dir, staging, masks, distinct=False)
     return _report(run, staging, names)
@@ -348,7 +347,7 @@ class _Refined(NamedTuple):
 
 
 def _refine(
-    run: Run,
+    run: ColmapRun,
     _: Path,
     poses: Sequence[Image],
     test_names: Collection[str],
@@ -438,11 +437,11 @@ def _work(
     pycolmap = colmap.require_pycolmap(settings.device)
     pycolmap.logging.logtostderr = True  # not to files in the temporary folder
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.ERROR)
-    run = Run(pycolmap, settings, images, staging / _WORK, progress, kept)
+    run = ColmapRun(pycolmap, settings, images, staging / _WORK, progress, kept)
     return job(run, staging, *arguments)
 
 
-def _report(run: Run, staging: Path, names: Sequence[str]) -> SfmReport:
+def _report(run: ColmapRun, staging: Path, names: Sequence[str]) -> SfmReport:
     """Summarise the written model."""
     model = run.pycolmap.Reconstruction(staging / "sparse" / "0")
     registered = {image.name for image in model.images.values() if image.has_pose}

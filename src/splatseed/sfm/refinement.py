@@ -26,7 +26,7 @@ from scipy.spatial.transform import Rotation
 from splatseed.camera import quat_from_rotation
 from splatseed.errors import ReconstructionError
 from splatseed.scene import Image
-from splatseed.sfm.colmap import Run, posed_model, rigid
+from splatseed.sfm.colmap import ColmapRun, posed_model, rigid
 from splatseed.text import counted, name_some
 
 
@@ -157,7 +157,7 @@ def _turn_vectors(
     return np.asarray(Rotation.from_matrix(a @ b.transpose(0, 2, 1)).as_rotvec())
 
 
-def refine(run: Run, given: Sequence[Image]) -> tuple[list[Image], Refinement]:
+def refine(run: ColmapRun, given: Sequence[Image]) -> tuple[list[Image], Refinement]:
     """Refine given poses by the verified matches of ``posed_model(given)`` in the run.
 
     Cameras with fewer than 10 points are unchanged; so are all, if the mean reprojection error
@@ -244,7 +244,7 @@ def _enough(seeing: Bool[np.ndarray, " N"]) -> bool:
 class _Solver:
     """Rounds of triangulation and bundle adjustment; arguments as for ``refine``."""
 
-    def __init__(self, run: Run, images: Sequence[Image]) -> None:
+    def __init__(self, run: ColmapRun, images: Sequence[Image]) -> None:
         self.rounds = 0
         self._run, self._pycolmap = run, run.pycolmap
         self._images, self._given = images, poses_of(images)

@@ -13,12 +13,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from splatseed.camera import Intrinsics
 from splatseed.io.staging import MANIFEST, locked, read_manifest, remove, write_json
+from splatseed.requirements import version_of
 from splatseed.runtime.fingerprint import fingerprint
 from splatseed.scene import Masks
 from splatseed.sfm.cameras import Photos
@@ -80,7 +80,7 @@ def work_key(
     for names, lens in cameras:
         for name in names:
             facts = (photos[name].digest, *_mask_facts(masks, name))
-            by_name[name] = _digest([version("pycolmap"), *features, *facts])
+            by_name[name] = _digest([version_of("pycolmap"), *features, *facts])
         lenses += [*names, lens if isinstance(lens, str) else (lens.model, lens.params)]
     verified = _digest([*lenses, seed])
     return WorkKey(by_name, verified, _digest([*sorted(by_name.items()), verified, *pairs]))

@@ -32,7 +32,7 @@ class PackingSettings:
     morton_bits: int = 21  # per axis; 63 in all
 
 
-SETTINGS = PackingSettings()
+PACKING = PackingSettings()
 
 
 def distances_of(means: Float32[np.ndarray, "N 3"]) -> tuple[Float64[np.ndarray, " N"], float]:
@@ -49,8 +49,8 @@ def distances_of(means: Float32[np.ndarray, "N 3"]) -> tuple[Float64[np.ndarray,
 def shells_of(means: Float32[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:
     """Return the shell of each position."""
     distances, reach = distances_of(means)
-    beyond = np.maximum(distances / (SETTINGS.first_shell * reach), 1.0)
-    shells = np.ceil(np.log(beyond) / np.log(SETTINGS.shell_ratio))
+    beyond = np.maximum(distances / (PACKING.first_shell * reach), 1.0)
+    shells = np.ceil(np.log(beyond) / np.log(PACKING.shell_ratio))
     return np.asarray(shells, np.int64)
 
 
@@ -64,9 +64,9 @@ def morton_order(means: Float32[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:
     curved = np.sign(offsets) * np.log1p(np.abs(offsets))
     low, high = curved.min(axis=0), curved.max(axis=0)
     extent = np.where(high > low, high - low, 1)
-    cells = ((curved - low) / extent * (2**SETTINGS.morton_bits - 1)).astype(np.uint64)
+    cells = ((curved - low) / extent * (2**PACKING.morton_bits - 1)).astype(np.uint64)
     code = np.zeros(len(xyz), np.uint64)
-    for bit in range(SETTINGS.morton_bits):
+    for bit in range(PACKING.morton_bits):
         for axis in range(3):
             digit = (cells[:, axis] >> np.uint64(bit)) & np.uint64(1)
             code |= digit << np.uint64(3 * bit + axis)
@@ -95,14 +95,14 @@ def best_fit(gaussians: Gaussians, fits: Sequence[Fit]) -> tuple[int, float, flo
     visible = opacity * np.minimum(sizes / np.maximum(distances, reach), 1) ** 2
     even = np.full(len(visible), 1 / len(visible))
     visible = visible / visible.sum() if visible.any() else even
-    weights = (1 - SETTINGS.uniform_share) * visible + SETTINGS.uniform_share * even
+    weights = (1 - PACKING.uniform_share) * visible + PACKING.uniform_share * even
     costs = []
     for i, (kept, step) in enumerate(fits):
         error = step / np.sqrt(12) / sizes  # RMS error of rounding to steps
-        blurred = float((weights * np.minimum(error**2, SETTINGS.max_blur))[kept].sum())
+        blurred = float((weights * np.minimum(error**2, PACKING.max_blur))[kept].sum())
         lost = float(weights[~kept].sum())
         costs.append((lost + blurred, i, lost))
-        if lost + blurred <= SETTINGS.negligible_cost:
+        if lost + blurred <= PACKING.negligible_cost:
             break
     _, best, lost = min(costs)
     kept, step = fits[best]

@@ -53,7 +53,7 @@ class FrameSettings:
     min_in_box: int = 50  # points in the box, needed to measure the misfit of a part of the scene
 
 
-SETTINGS = FrameSettings()
+FRAME = FrameSettings()
 
 
 def view_in_model_frame(world: Similarity | None, view: View) -> View:
@@ -122,10 +122,10 @@ def check_frame(
     Returns a warning if the frame is uncertain, else "". Without points nothing is checked.
     """
     misfit = _misfit_of(scene, gaussians)
-    if misfit is None or (found := misfit(given)) <= SETTINGS.good_misfit:
+    if misfit is None or (found := misfit(given)) <= FRAME.good_misfit:
         return ""
     misfits = {name: misfit(world) for name, world in _candidates(path, scene).items()}
-    if found <= SETTINGS.max_misfit and found <= min(misfits.values()) * SETTINGS.ratio:
+    if found <= FRAME.max_misfit and found <= min(misfits.values()) * FRAME.ratio:
         return (
             f"Points of the scene are {found:.1f} times as far from the nearest Gaussian as "
             "Gaussians from each other: check the renders before you trust the scores."
@@ -138,7 +138,7 @@ def check_frame(
     fitting = [
         name
         for name, value in misfits.items()
-        if value < found / SETTINGS.ratio and value <= SETTINGS.good_misfit
+        if value < found / FRAME.ratio and value <= FRAME.good_misfit
     ]
     if fitting:
         fix = (
@@ -170,11 +170,11 @@ def scene_from_model(
         SceneFormatError: No known transform fits.
     """
     misfit = _misfit_of(scene, gaussians)
-    if misfit is None or misfit(None) <= SETTINGS.good_misfit:
+    if misfit is None or misfit(None) <= FRAME.good_misfit:
         return None, ""
     misfits = {name: misfit(world) for name, world in _candidates(path, scene).items()}
     name = min(misfits, key=misfits.__getitem__)
-    limit = min(SETTINGS.good_misfit, misfits[NO_TRANSFORM] / SETTINGS.ratio)
+    limit = min(FRAME.good_misfit, misfits[NO_TRANSFORM] / FRAME.ratio)
     if name == NO_TRANSFORM or misfits[name] > limit:
         try:
             return None, check_frame(path, scene, gaussians)
@@ -233,26 +233,26 @@ def _misfit_of(scene: Scene, gaussians: Gaussians) -> Callable[[Similarity | Non
     rng = np.random.default_rng(0)
     points = scene.points.references
     every = rng.permutation(points.xyz[points.finite].astype(np.float64))
-    xyz = every[: SETTINGS.max_points]
+    xyz = every[: FRAME.max_points]
     means = gaussians.means[gaussians.opacities > VISIBLE_LOGIT].astype(np.float64)
-    if len(xyz) < SETTINGS.min_points or len(means) < SETTINGS.min_points:
+    if len(xyz) < FRAME.min_points or len(means) < FRAME.min_points:
         return None
     tree = KDTree(means)
-    near = tree.query(rng.permutation(means)[: SETTINGS.max_points], k=2)[0][:, 1]
+    near = tree.query(rng.permutation(means)[: FRAME.max_points], k=2)[0][:, 1]
     gap = max(float(np.median(near)), float(np.finfo(np.float32).tiny))
 
-    low, high = np.quantile(means, SETTINGS.box, axis=0)
+    low, high = np.quantile(means, FRAME.box, axis=0)
 
     def misfit(world: Similarity | None) -> float:
         whole = float(np.median(tree.query(_moved(xyz, world))[0])) / gap
-        if whole <= SETTINGS.good_misfit:
+        if whole <= FRAME.good_misfit:
             return whole
         moved = _moved(every, world)
-        inside = moved[((moved >= low) & (moved <= high)).all(axis=1)][: SETTINGS.max_points]
-        if len(inside) < SETTINGS.min_in_box:
+        inside = moved[((moved >= low) & (moved <= high)).all(axis=1)][: FRAME.max_points]
+        if len(inside) < FRAME.min_in_box:
             return whole
         part = float(np.median(tree.query(inside)[0])) / gap
-        return part if part <= SETTINGS.good_misfit else whole
+        return part if part <= FRAME.good_misfit else whole
 
     return misfit
 

@@ -23,7 +23,7 @@ from splatseed.io.files import COPY_AGAIN, read_bytes, translate_errors
 from splatseed.progress import Note, silent_note
 from splatseed.requirements import require
 from splatseed.runtime.memory import check_memory
-from splatseed.splat.extent import SETTINGS, Fit, best_fit, left_out_note, morton_order
+from splatseed.splat.extent import PACKING, Fit, best_fit, left_out_note, morton_order
 from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.quantization import (
     SH_COUNTS,
@@ -137,7 +137,7 @@ def _fixed_point(gaussians: Gaussians, note: Note) -> tuple[Gaussians, int]:
         )
     if not kept.all():
         note(left_out_note(".spz", kept, f"more than {limit:,.4g} units from the origin"))
-    if error > SETTINGS.coarse_error:
+    if error > PACKING.coarse_error:
         steps = f"up to {limit:,.4g} units from the origin in steps of {2.0**-bits:.3g}"
         note(
             f"A .spz holds positions {steps}, too coarse for this model: export another format, or "
