@@ -19,6 +19,7 @@ from sqlite3 import connect
 from typing import Any
 
 from splatseed import errors
+from splatseed.findings import Finding
 from splatseed.io.staging import remove
 from splatseed.sfm.agreement import Agreement, compare_with_matches
 from splatseed.sfm.colmap import ColmapRun, mapping_options
@@ -48,10 +49,10 @@ def map_images(
     match_further: Callable[[Collection[str]], bool] | None,
     *,
     partial: bool,
-) -> tuple[Path, str]:
+) -> tuple[Path, Finding | None]:
     """Estimate poses, lenses and points.
 
-    Returns the folder of the model with the most images, and why its poses may be wrong (empty if
+    Returns the folder of the model with the most images, and why its poses may be wrong (None if
     the matches agree with them).
 
     ``match_further`` matches further pairs of photographs without a pose, by name, and returns
@@ -88,17 +89,20 @@ def map_images(
             fix=f"Pass `partial=True` to write the scene of these {len(found)}. For more, "
             f"{advice}.",
         )
-    return models_dir / str(best), _doubt(compare_with_matches(run, models[best]))
+    return models_dir / str(best), _contradiction(compare_with_matches(run, models[best]))
 
 
-def _doubt(found: Agreement) -> str:
+def _contradiction(found: Agreement) -> Finding | None:
     if found.link >= _LINK:
-        return ""
+        return None
     named = name_some(found.part)
-    return (
+    return Finding(
+        "contradicted-poses",
         f"The poses contradict {1 - found.link:.0%} of the matches between {len(found.part):,} of "
-        f"the photographs ({named}) and the others: one of these two parts is probably misplaced. "
-        "Check their cameras (splatseed view), and take photographs of what lies between the two."
+        f"the photographs ({named}) and the others: one of these two parts is probably misplaced.",
+        subjects=tuple(found.part),
+        fix="Check their cameras (splatseed view), and take photographs of what lies between the "
+        "two.",
     )
 
 

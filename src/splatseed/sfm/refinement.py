@@ -25,6 +25,7 @@ from scipy.spatial.transform import Rotation
 
 from splatseed.camera import quat_from_rotation
 from splatseed.errors import ReconstructionError
+from splatseed.findings import Finding
 from splatseed.scene import Image
 from splatseed.sfm.colmap import ColmapRun, posed_model, rigid
 from splatseed.text import counted, name_some
@@ -208,8 +209,10 @@ def refine(run: ColmapRun, given: Sequence[Image]) -> tuple[list[Image], Refinem
     return with_poses(given, poses), change
 
 
-def unrefined_note(total: int, excluded: Sequence[str], unread: Sequence[str] = ()) -> str:
-    """Name the images, of ``total``, whose poses stay as given beside refined ones; may be empty.
+def unrefined_finding(
+    total: int, excluded: Sequence[str], unread: Sequence[str] = ()
+) -> Finding | None:
+    """Return the finding on images, of ``total``, whose poses stay as given beside refined ones.
 
     ``unread`` have photographs that SfM does not read.
     """
@@ -217,7 +220,10 @@ def unrefined_note(total: int, excluded: Sequence[str], unread: Sequence[str] = 
     kinds = (("SfM does not read", unread), (too_few, excluded))
     reasons = "; ".join(f"{why} {name_some(names, 3)}" for why, names in kinds if names)
     unrefined = f"The poses of {len(unread) + len(excluded):,} of {counted(total, 'image')}"
-    return f"{unrefined} stay as given: {reasons}." if reasons else ""
+    if not reasons:
+        return None
+    text = f"{unrefined} stay as given: {reasons}."
+    return Finding("unrefined-poses", text, subjects=(*unread, *excluded))
 
 
 def _refused(expected: str, found: str) -> ReconstructionError:

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 
+from splatseed.findings import Finding
 from splatseed.splat.gaussians import Gaussians
 from splatseed.text import agreeing, counted
 
@@ -110,13 +111,14 @@ def best_fit(gaussians: Gaussians, fits: Sequence[Fit]) -> tuple[int, float, flo
     return best, lost, float(np.median(errors)) if len(errors) else np.inf
 
 
-def left_out_note(suffix: str, kept: Bool[np.ndarray, " N"], where: str) -> str:
-    """Return a note on the distant Gaussians left out of a file with this suffix."""
+def left_out_finding(suffix: str, kept: Bool[np.ndarray, " N"], where: str) -> Finding:
+    """Return the finding on distant Gaussians left out of a file with this suffix."""
     number = int(np.count_nonzero(~kept))
     distant = (
         f"{counted(number, 'Gaussian')} of {len(kept):,} {agreeing(number, 'is', 'are')} {where}"
     )
-    return (
+    return Finding(
+        "distant-gaussians",
         f"{distant} and {agreeing(number, 'was', 'were')} left out: in a {suffix} "
-        f"{agreeing(number, 'it', 'they')} would reduce the precision of all other positions."
+        f"{agreeing(number, 'it', 'they')} would reduce the precision of all other positions.",
     )

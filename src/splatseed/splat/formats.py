@@ -81,7 +81,7 @@ def read_gaussians(path: StrPath, note: Note = silent_note) -> Gaussians:
     Args:
         path: The folder of a run, or a .ply, compressed .ply, .splat, .spz, or .sog (or its
             meta.json), recognised by its content.
-        note: Called with notes for the user, such as on Gaussians with NaN, which are left out.
+        note: Called with findings, such as Gaussians with NaN, which are left out.
 
     Returns:
         The Gaussians, in the order and frame of the file.
@@ -95,10 +95,7 @@ def read_gaussians(path: StrPath, note: Note = silent_note) -> Gaussians:
     if path.is_dir():
         path /= RUN_FILE
     gaussians = FORMATS[detect_format(path, read_bytes(path))].decode(path, note)
-    gaussians, left_out = drop_unusable(path, gaussians)
-    if left_out:
-        note(left_out)
-    return gaussians
+    return drop_unusable(path, gaussians, note)
 
 
 def write_gaussians(
@@ -106,7 +103,7 @@ def write_gaussians(
 ) -> None:
     """Write one or more Gaussians, at finite positions, in the format of the file name's suffix.
 
-    ``note`` is called with notes for the user on what the format cannot represent.
+    ``note`` is called with findings on what the format cannot represent.
 
     Raises:
         ParameterError: The suffix is not of a supported format.
