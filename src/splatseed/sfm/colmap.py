@@ -22,7 +22,7 @@ from splatseed.requirements import install_command
 from splatseed.runtime.torch_device import DeviceName
 from splatseed.scene import Image
 from splatseed.sfm.cameras import SharedCamera
-from splatseed.sfm.readable import COPIES
+from splatseed.sfm.photos import COPIES
 from splatseed.sfm.work_folder import DATABASE, WorkFolder
 from splatseed.text import numeric_order
 

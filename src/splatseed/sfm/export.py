@@ -15,7 +15,7 @@ from splatseed.errors import OutputError
 from splatseed.io.picture import ORIENTATION, UPRIGHT
 from splatseed.pointcloud import first_of_equals
 from splatseed.sfm.colmap import ColmapRun
-from splatseed.sfm.readable import copy_misread
+from splatseed.sfm.photos import copy_misread
 
 _SHORT = 3  # the type of the orientation's tag
 _HEAD_BYTES = 1 << 17  # EXIF (at most 64 KiB) is the first or second segment

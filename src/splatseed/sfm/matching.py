@@ -29,7 +29,7 @@ from splatseed.sfm.first_look import (
     measure_agreement,
     poorly_connected,
 )
-from splatseed.sfm.readable import COPIES, copy_misread
+from splatseed.sfm.photos import COPIES, copy_misread
 from splatseed.text import name_some, numeric_order
 
 _STEPS = sorted({*range(1, 11), *(2**n for n in range(10))})

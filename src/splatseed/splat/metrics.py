@@ -15,8 +15,7 @@ from torch.nn.functional import pad
 
 from splatseed.requirements import require
 from splatseed.splat._kernels import WINDOW
-from splatseed.splat.ssim import l1_and_ssim
-from splatseed.splat.ssim_conv import l1_and_ssim_by_convolution, ssim_map
+from splatseed.splat.ssim import l1_and_ssim, l1_and_ssim_by_convolution, ssim_map
 
 _UNSATURATED = 0.5 / 255
 """Minimum distance from 0 and 1 of an unclipped value."""

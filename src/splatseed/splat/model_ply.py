@@ -22,17 +22,18 @@ from splatseed.findings import Finding
 from splatseed.io.files import ByteReader, translate_errors
 from splatseed.io.ply import EXPORT_PLY_AGAIN, Element, Header, parse_header
 from splatseed.progress import Note, silent_note
-from splatseed.splat.gaussians import SH_C0, Gaussians
-from splatseed.splat.ply_layout import (
+from splatseed.splat.gaussians import (
     DC,
     ROTATION,
     SCALES,
+    SH_C0,
+    SH_COUNTS,
     XYZ,
+    Gaussians,
     encode_layout,
     is_antialiased,
     rest_names,
 )
-from splatseed.splat.quantization import SH_COUNTS
 
 _COLORS = ("red", "green", "blue")
 _FILTER = "filter_3D"

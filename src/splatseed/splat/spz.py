@@ -24,11 +24,14 @@ from splatseed.io.files import COPY_AGAIN, read_bytes, translate_errors
 from splatseed.progress import Note, silent_note
 from splatseed.requirements import require
 from splatseed.runtime.memory import check_memory
-from splatseed.splat.extent import PACKING, Fit, best_fit, left_out_finding, morton_order
-from splatseed.splat.gaussians import Gaussians
-from splatseed.splat.quantization import (
-    SH_COUNTS,
+from splatseed.splat.gaussians import SH_COUNTS, Gaussians
+from splatseed.splat.packing import (
+    PACKING,
+    Fit,
+    best_fit,
     from_smallest_three,
+    left_out_finding,
+    morton_order,
     opacity_bytes,
     opacity_logits,
     rounded_bytes,

@@ -26,7 +26,7 @@ from splatseed.progress import Note, Progress, silent, silent_note
 from splatseed.rendering.harmonics import sh_basis
 from splatseed.requirements import require
 from splatseed.splat.gaussians import SH_C0, Gaussians, antialiasing_finding
-from splatseed.splat.quantization import opacity_bytes, unit_quats
+from splatseed.splat.packing import opacity_bytes, unit_quats
 from splatseed.text import counted
 from splatseed.viewer.flights import orbit
 from splatseed.viewer.models import ViewerItem, viewer_frame
