@@ -33,8 +33,6 @@ UNDEFINED = ir.Constant(VECTOR, ir.Undefined)
 
 
 class _F32x16(types.Type):
-    """Numba type of sixteen float32 lanes."""
-
     def __init__(self):
         super().__init__(name="f32x16")
 
@@ -44,8 +42,6 @@ f32x16 = _F32x16()
 
 @register_model(_F32x16)
 class _F32x16Model(models.PrimitiveModel):
-    """Represent values as LLVM vectors."""
-
     def __init__(self, manager, front_end_type):
         super().__init__(manager, front_end_type, VECTOR)
 

@@ -80,10 +80,6 @@ def find_photos(image_dir: StrPath) -> tuple[dict[str, Photo], dict[str, list[st
 
     Returns:
         The photographs by name (relative path), sorted; and the names of skipped images by reason.
-
-    Raises:
-        SceneNotFoundError: No such folder, or fewer than two photographs.
-        SceneFormatError: An image cannot be decoded.
     """
     image_dir = Path(image_dir)
     if not image_dir.is_dir():
@@ -169,12 +165,7 @@ def _read(path: Path) -> tuple[Photo | None, bool]:
 
 
 def match_poses(photos: Photos, scene: Scene, image_dir: Path) -> tuple[Image, ...]:
-    """Return the scene's images with photographs, in the photographs' order and sizes.
-
-    Raises:
-        SceneNotFoundError: Fewer than two common names.
-        SceneFormatError: A photograph is neither of its camera's size nor a resized copy.
-    """
+    """Return the scene's images with photographs, in the photographs' order and sizes."""
     posed = {image.name: image for image in scene.images}
     # Drop observations, which the child process does not need.
     images = [replace(posed[name], observations=None) for name in photos if name in posed]
@@ -199,14 +190,7 @@ class PickedFrames(NamedTuple):
 def pick_frames(
     video: Path, folder: Path, frames: int = 150, progress: Progress = silent
 ) -> PickedFrames:
-    """Write the best frames of a video, at most ``frames``, as JPEGs; deterministic.
-
-    Raises:
-        MissingDependencyError: imageio-ffmpeg is not installed.
-        SceneNotFoundError: No such file.
-        SceneFormatError: Unreadable, or with too little motion.
-        ParameterError: ``frames`` is too small.
-    """
+    """Write the best frames of a video, at most ``frames``, as JPEGs; deterministic."""
     if frames < _MIN_FRAMES:
         expected = f"`frames` to be {_MIN_FRAMES} or more"
         raise ParameterError(expected, found=f"{frames}", fix="Try 150.")

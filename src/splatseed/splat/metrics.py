@@ -121,9 +121,6 @@ def flip_map(
 
     LDR-FLIP at 67 pixels per degree of visual angle, computed on the CPU by its authors' package
     (Andersson et al. 2020). Images are sRGB, clamped to [0, 1].
-
-    Raises:
-        MissingDependencyError: flip-evaluator is absent.
     """
     require("flip_evaluator")
     from flip_evaluator import evaluate  # noqa: PLC0415  (optional: extra `train`)

@@ -144,14 +144,12 @@ def _check(path: Path, header: Header, names: set[str], data: bytes) -> None:
 
 
 def _up_to_vertices(header: Header) -> list[Element]:
-    """Return the elements of a file up to and including its vertices."""
     names = [element.name for element in header.elements]
     last = names.index("vertex") if "vertex" in names else len(names)
     return list(header.elements[: last + 1])
 
 
 def _rows(reader: ByteReader, header: Header) -> np.ndarray:
-    """Read the vertices as a structured array."""
     reader.offset = header.size
     *others, vertex = _up_to_vertices(header)
     if not header.byte_order:

@@ -213,7 +213,6 @@ def _grid(values: np.ndarray) -> UInt8[np.ndarray, "H W 4"]:
 
 
 def _part_reader(path: Path) -> Callable[[str], bytes]:
-    """Return a function that reads a named part."""
     if path.name.lower().endswith(".json"):
         return lambda name: read_bytes(path if name == _META else path.parent / Path(name).name)
     archive = zipfile.ZipFile(io.BytesIO(read_bytes(path)))

@@ -454,7 +454,6 @@ def parallel_plates(gap: float = 0.1) -> Union:
 
 
 def _box_corner() -> Union:
-    """Make three unit squares that meet at a corner with right angles."""
     x, y, z = yaw_frame(30.0)
     origin = np.zeros(3)
     return Union((Rectangle(origin, x, y), Rectangle(origin, y, z), Rectangle(origin, z, x)))

@@ -85,10 +85,6 @@ def write_page(
     """Write a model as a web page that starts at its first training camera.
 
     Without a scene it starts outside of the model.
-
-    Raises:
-        MissingDependencyError: viser is absent.
-        OutputError: There are too many Gaussians, or the file cannot be written.
     """
     require("viser")
     import viser  # noqa: PLC0415  (of the extra view)
