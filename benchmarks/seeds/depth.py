@@ -38,7 +38,7 @@ from splatseed.depth.alignment import map_camera
 from splatseed.errors import SceneNotFoundError
 from splatseed.io import find_depths
 from splatseed.io.photograph import decode_photograph, photograph_bytes
-from splatseed.photos.loading import user_cache_dir
+from splatseed.photos.cache import user_cache_dir
 from splatseed.photos.viewpoint import choose_camera
 from splatseed.progress import in_threads, silent
 from splatseed.scene import Scene, SceneSource, Tracks

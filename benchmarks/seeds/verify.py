@@ -30,7 +30,7 @@ from benchmarks.stereo.speed import prepare_views
 import splatseed as ss
 from splatseed.errors import SplatseedError
 from splatseed.methods.contract import NewPoints
-from splatseed.photos.loading import user_cache_dir
+from splatseed.photos.cache import user_cache_dir
 from splatseed.photos.visibility import find_visibility
 from splatseed.scene import Scene
 from splatseed.seeding import verify as module

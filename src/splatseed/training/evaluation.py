@@ -13,7 +13,7 @@ from typing import Any, Self
 
 from splatseed.errors import MissingDependencyError, ParameterError, SceneNotFoundError
 from splatseed.io.files import StrPath
-from splatseed.photos.loading import user_cache_dir
+from splatseed.photos.cache import user_cache_dir
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 from splatseed.scores import EvalResult
