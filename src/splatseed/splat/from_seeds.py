@@ -55,6 +55,9 @@ def initial_gaussians(
     disc perpendicular to it, ``flatness`` times as thick as wide; others become spheres. Sizes are
     multiplied by ``scale_factor`` and bounded by ``max_sizes``. ``harmonics`` of degree 1 replace
     the seeds' constant colours.
+
+    Raises:
+        PointCloudError: Fewer than two distinct finite points.
     """
     count, rest = len(seeds), (sh_degree + 1) ** 2 - 1
     sizes = neighbor_distances(seeds.xyz)
