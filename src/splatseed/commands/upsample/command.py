@@ -11,6 +11,7 @@ from splatseed.commands.upsample import previews, report
 from splatseed.commands.upsample.cloud import load_cloud
 from splatseed.commands.upsample.options import CLOUD, Options, check, parse
 from splatseed.console import OUT, StageClock, print_note, stage_display
+from splatseed.findings import Finding
 from splatseed.io import load_originals, write_scene
 from splatseed.io.clouds import open_cloud
 from splatseed.io.colmap_model import scene_root
@@ -107,7 +108,7 @@ def _upsample(options: Options, methods: dict[str, Any], arguments: list[str]) -
 
 def _refined(
     options: Options, scene: Scene, method: Upsampler, clock: StageClock
-) -> tuple[Scene, str]:
+) -> tuple[Scene, Finding]:
     """Return the scene at refined poses, and what changed; no points of the method's test views."""
     from splatseed.sfm import refined
     from splatseed.sfm.first_look import FIRST_LOOK, NEIGHBOURS, STAGE
