@@ -23,7 +23,7 @@ from splatseed.io.files import open_file, read_bytes
 from splatseed.io.load import search_depths, with_depths_in
 from splatseed.io.photograph import photograph_bytes
 from splatseed.io.photograph_checks import check_sizes, with_photographs
-from splatseed.photos.camera_check import stray_camera_notes
+from splatseed.photos.camera_check import stray_cameras
 from splatseed.photos.loading import refuse_distortion
 from splatseed.progress import Note, Progress, in_threads, silent, silent_note
 from splatseed.runtime.fingerprint import fingerprint, fingerprint_all
@@ -162,7 +162,7 @@ def survey(
     if with_depth and (planned.depth or search_depths(scene, depth) is not None):
         maps, scene = str(depth.resolve()), with_depths_in(scene, depth)
     split = [Finding("listed-split", scene.listed.sentence, "info")] if scene.listed else []
-    for finding in (*scene.findings, *split, *stray_camera_notes(scene)):
+    for finding in (*scene.findings, *split, *stray_cameras(scene)):
         note(finding)
     return SceneFacts(
         str(path.resolve()), planned.label, planned.images, maps, scan,
