@@ -23,7 +23,6 @@ from splatseed.bench.runs import (
     count_runs,
     estimate_seconds,
     locked_bench,
-    package_version,
     read_run,
     record_plan,
     run_folder,
@@ -35,11 +34,10 @@ from splatseed.errors import ParameterError, SceneNotFoundError
 from splatseed.findings import Finding
 from splatseed.io.staging import atomic_file
 from splatseed.methods import Profile
-from splatseed.requirements import require
+from splatseed.requirements import require, version_of
 from splatseed.runtime.interruption import exit_code
 from splatseed.runtime.memory import check_memory
-from splatseed.text import counted, did_you_mean, name_some, quoted, visible
-from splatseed.training.duration import format_duration
+from splatseed.text import counted, did_you_mean, format_duration, name_some, quoted, visible
 from splatseed.training.settings import BYTES_PER_GAUSSIAN, Backend, StrategyName
 
 if TYPE_CHECKING:
@@ -246,7 +244,7 @@ def _prepare(
         raise SceneNotFoundError(expected, found=found_none, fix="Name the folder that holds them.")
     plan = replace(plan, scenes=tuple(scene for scene, _ in present))
     scenes = [facts for _, facts in present]
-    specs = plan_runs(plan, scenes, machine.backend, package_version("splatseed"))
+    specs = plan_runs(plan, scenes, machine.backend, version_of("splatseed") or "")
     findings = [*missing, *_budget_findings(options, plan), *of_scenes]
     findings += [*_data_findings(plan, scenes), *_full_budgets(plan, specs)]
     fix = "Name other methods, or what these need."

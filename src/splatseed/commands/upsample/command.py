@@ -108,7 +108,7 @@ def _upsample(options: Options, methods: dict[str, Any], arguments: list[str]) -
 
 def _refined(
     options: Options, scene: Scene, method: Upsampler, clock: StageClock
-) -> tuple[Scene, str]:
+) -> tuple[Scene, Finding]:
     """Return the scene at refined poses, and what changed; no points of the method's test views."""
     from splatseed.sfm import refined
     from splatseed.sfm.first_look import FIRST_LOOK, NEIGHBOURS, STAGE
