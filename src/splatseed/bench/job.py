@@ -41,7 +41,7 @@ from splatseed.io.staging import MANIFEST, atomic_file, output_folder, write_jso
 from splatseed.methods import Upsampler, chooses_number, configure
 from splatseed.photos.cache import user_cache_dir
 from splatseed.pointcloud import PointCloud
-from splatseed.progress import Progress, silent
+from splatseed.progress import Progress, StageTimes, silent
 from splatseed.requirements import version_of
 from splatseed.runtime.compilation import watched
 from splatseed.runtime.environment import available_cpus, worker_env
@@ -331,21 +331,11 @@ def make_seeds(
 
 def _timed(make: Callable[..., PointCloud], *args: Any, **named: Any) -> tuple[PointCloud, float]:
     """Make points, and measure the time without the compilation of kernels, in seconds."""
-    compiling, starts = 0.0, list[float]()
-
-    def watch(begins: bool) -> None:
-        nonlocal compiling
-        if begins:
-            starts.append(time.perf_counter())
-            return
-        start = starts.pop()
-        if not starts:  # the outermost of nested compilations
-            compiling += time.perf_counter() - start
-
-    with watched(watch):
-        start = time.perf_counter()
+    times = StageTimes()
+    times("seeds", 0.0)
+    with watched(times.compilation):
         cloud = make(*args, **named)
-        return cloud, max(time.perf_counter() - start - compiling, 0.0)
+    return cloud, times.seconds()["seeds"]
 
 
 def _num_original(scene: Scene) -> int:

@@ -227,9 +227,9 @@ def _prepare(
     needs = {"with_depth": DEPTH in plan.methods, "with_cloud": any(map(needs_cloud, plan.methods))}
     with stage_display() as clock:
         for scene in plan.scenes:
-            found = list[Finding]()
+            noted = list[Finding]()
             try:
-                facts = survey(scene, demo=demo, **needs, progress=clock, note=found.append)
+                facts = survey(scene, demo=demo, **needs, progress=clock, note=noted.append)
             except SceneNotFoundError as error:
                 if options.data is None:
                     raise
@@ -237,11 +237,11 @@ def _prepare(
                 missing.append(Finding("missing-scene", text, subjects=(scene.label,)))
                 continue
             present.append((scene, facts))
-            of_scenes += [replace(each, text=f"{facts.name}: {each.text}") for each in found]
+            of_scenes += [replace(each, text=f"{facts.name}: {each.text}") for each in noted]
     if not present:
         expected = f"scenes of {options.plan} in {options.data}"
-        found_none = f"none of {', '.join(scene.label for scene in plan.scenes)}"
-        raise SceneNotFoundError(expected, found=found_none, fix="Name the folder that holds them.")
+        found = f"none of {', '.join(scene.label for scene in plan.scenes)}"
+        raise SceneNotFoundError(expected, found=found, fix="Name the folder that holds them.")
     plan = replace(plan, scenes=tuple(scene for scene, _ in present))
     scenes = [facts for _, facts in present]
     specs = plan_runs(plan, scenes, machine.backend, version_of("splatseed") or "")
@@ -249,9 +249,8 @@ def _prepare(
     findings += [*_data_findings(plan, scenes), *_full_budgets(plan, specs)]
     fix = "Name other methods, or what these need."
     refuse((not specs, "a plan with runs", "; ".join(map(str, findings)) or "none", fix))
-    if (
-        machine.backend == "cpu" and not machine.remote
-    ):  # the memory of a cluster's nodes is unknown
+    # The memory of a cluster's nodes is unknown.
+    if machine.backend == "cpu" and not machine.remote:
         num_seeds, jobs = int(max(spec.gaussians[0] for spec in specs)), machine.jobs
         fix = "Pass smaller --ratios or --budgets, or fewer --jobs."
         check_memory(
