@@ -83,16 +83,16 @@ def resumed_settings(
     """Return the settings of the run to resume, and whether it refined poses.
 
     Settings that are neither ``explicit`` nor differ from their defaults are the run's; others must
-    equal the run's. Only the backend may change. The config of an older version may lack a setting.
+    equal the run's. Only the backend may change.
 
     Raises:
         ParameterError: A setting differs from the run's.
-        SceneFormatError: The config is damaged.
+        SceneFormatError: The config is damaged, or another version of splatseed started the run.
     """
+    _check_version(config)
     default = {**dataclasses.asdict(TrainSettings()), "refine_poses": False}
     now = {**dataclasses.asdict(settings), "refine_poses": refine_poses}
-    then = {name: config.get(name, value) for name, value in default.items() if name != "backend"}
-    then["data_factor"] = config.get("data_factor", 1)  # older versions did not downsample
+    then = {name: config.get(name) for name in default if name != "backend"}
     for name, value in then.items():
         if now[name] != value and (name in explicit or now[name] != default[name]):
             raise ParameterError(
@@ -109,6 +109,16 @@ def resumed_settings(
             found=error.found,
             fix="Start again with `overwrite=True`.",
         ) from None
+
+
+def _check_version(config: Mapping[str, Any]) -> None:
+    then, now = config.get("splatseed"), _version("splatseed")
+    if then != now:
+        raise SceneFormatError(
+            f"a run that this version of splatseed ({now}) started, to resume it",
+            found=f"one of version {then}",
+            fix="Start again with `overwrite=True`, or resume it with that version.",
+        )
 
 
 def has_run_poses(config: Mapping[str, Any], scene: Scene) -> bool:
@@ -163,9 +173,9 @@ def with_masks_of(scene: Scene, config: Mapping[str, Any]) -> Scene:
 def check_same_scene(
     folder: RunFolder, config: Mapping[str, Any], scene: Scene, settings: TrainSettings
 ) -> None:
-    """Refuse to resume with other masks, training or test images; older runs recorded none."""
+    """Refuse to resume with other masks, training or test images."""
     found = "" if has_run_masks(config, scene) else "masks"
-    if config.get("split") not in (None, _names_of_parts(scene, settings)):
+    if config.get("split") != _names_of_parts(scene, settings):
         listed = f" (by its {scene.listed.origin})" if scene.listed else ""
         found = f"training or test images{listed}"
     if found:

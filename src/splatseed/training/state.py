@@ -40,9 +40,6 @@ from splatseed.training.strategies.default import Default
 from splatseed.training.strategies.grow import ErrorDensification
 from splatseed.training.strategies.mcmc import Mcmc
 
-FORMAT = 5
-"""Version of the checkpoint's content."""
-
 
 class Stopwatch:
     """Seconds spent training; paused during everything else."""
@@ -129,7 +126,6 @@ def first_state(
 def save_checkpoint(path: Path, state: TrainState) -> None:
     """Write the state of a run, replacing an older checkpoint."""
     content = {
-        "format": FORMAT,
         "step": state.step,
         "seconds": state.watch.seconds,
         "records": [tuple(record) for record in state.records],
@@ -156,31 +152,28 @@ def load_checkpoint(
     """Read the state that ``save_checkpoint`` wrote to a device, and the strategy's own.
 
     Raises:
-        SceneFormatError: The file is damaged, or of another version.
+        SceneFormatError: The file is damaged.
         torch.cuda.OutOfMemoryError: It does not fit on the GPU.
     """
-    found = "another kind or version of file"
     try:
         with warnings.catch_warnings(action="ignore"):  # about what a foreign file might be
             content = torch.load(path, map_location=device, weights_only=True)
-        if isinstance(content, dict) and content.get("format") == FORMAT:
-            params = as_parameters(content["params"])
-            optimizers = make_optimizers(params, schedule)
-            for name, optimizer in optimizers.items():
-                optimizer.load_state_dict(content["optimizers"][name])
-            strategy.state = content["strategy"]
-            strategy.capacity.held_at = content["held_at"]
-            records = [Record(*row) for row in content["records"]]
-            watch, losses = Stopwatch(float(content["seconds"])), list(content["losses"])
-            run, step = (params, optimizers, strategy), int(content["step"])
-            exposures = Exposures(content["exposures"]) if "exposures" in content else None
-            return TrainState(*run, step, records, watch, losses, content["mean"], exposures)
+        params = as_parameters(content["params"])
+        optimizers = make_optimizers(params, schedule)
+        for name, optimizer in optimizers.items():
+            optimizer.load_state_dict(content["optimizers"][name])
+        strategy.state = content["strategy"]
+        strategy.capacity.held_at = content["held_at"]
+        records = [Record(*row) for row in content["records"]]
+        watch, losses = Stopwatch(float(content["seconds"])), list(content["losses"])
+        run, step = (params, optimizers, strategy), int(content["step"])
+        exposures = Exposures(content["exposures"]) if "exposures" in content else None
+        return TrainState(*run, step, records, watch, losses, content["mean"], exposures)
     except torch.cuda.OutOfMemoryError:
         raise
     except Exception as error:  # noqa: BLE001  (PyTorch raises anything for a damaged file)
-        found = f"a damaged file ({type(error).__name__})"
-    raise SceneFormatError(
-        f"{path} to be a checkpoint of this version of splatseed",
-        found=found,
-        fix="Start again with `overwrite=True`.",
-    )
+        raise SceneFormatError(
+            f"{path} to be a checkpoint of splatseed",
+            found=f"a damaged file ({type(error).__name__})",
+            fix="Start again with `overwrite=True`.",
+        ) from None
