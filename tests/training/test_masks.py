@@ -19,7 +19,8 @@ from splatseed.splat.metrics import mirrored_ssim
 from splatseed.splat.photographs import fill_masked
 from splatseed.training import trainer
 from splatseed.training.evaluation import Evaluation
-from splatseed.training.prepare import PrepareOptions, prepare_run
+from splatseed.training.prepare import prepare_run
+from splatseed.training.request import PrepareOptions
 from splatseed.training.settings import TrainSettings
 from splatseed.training.strategies.grow import contributions
 from splatseed.training.trainer import photometric_loss

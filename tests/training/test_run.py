@@ -26,7 +26,8 @@ from splatseed.splat.rendering import opacity_from_logits
 from splatseed.training import device, prepare, run as run_module, trainer
 from splatseed.training.evaluation import Evaluation
 from splatseed.training.parameters import add_to_mean, gaussians_of, size_unit
-from splatseed.training.prepare import PrepareOptions, prepare_run
+from splatseed.training.prepare import prepare_run
+from splatseed.training.request import PrepareOptions
 from splatseed.training.settings import TrainSettings
 from splatseed.viewer.models import ViewerItem, viewer_frame
 

@@ -20,6 +20,7 @@ from splatseed.training.parameters import make_optimizers, make_parameters, opti
 from splatseed.training.schedule import make_schedule
 from splatseed.training.seeds import seeded, seeds_digest, usable_seeds
 from splatseed.training.settings import TrainSettings
+from splatseed.training.strategies.registry import STRATEGIES
 
 ORIGINALS, NEW = 40, 60
 
@@ -159,7 +160,7 @@ def _stepped(room, means, lengths, rate, steps):
     """How far Adam moves positions and scales of Gaussians whose gradients are all 1."""
     gaussians = dataclasses.replace(initial_gaussians(room.points), means=means)
     params = make_parameters(gaussians, torch.device("cpu"), lengths.astype(np.float32))
-    optimizers = make_optimizers(params, make_schedule("none", 100, as_3dgs=False))
+    optimizers = make_optimizers(params, make_schedule(STRATEGIES["none"], 100, as_3dgs=False))
     for _ in range(steps):
         for value in params.values():
             value.grad = torch.ones_like(value) if value.requires_grad else None

@@ -350,7 +350,8 @@ def _train_arm(
     from splatseed.splat.metrics import flip_map
     from splatseed.splat.photographs import photograph_tensor
     from splatseed.splat.pictures import FLIP_LABEL, flip_heatmap, to_uint8
-    from splatseed.training.prepare import PrepareOptions, prepare_run
+    from splatseed.training.prepare import prepare_run
+    from splatseed.training.request import PrepareOptions
     from splatseed.viewer.page import Tile
 
     stage = f"train {ARMS[name]}"

@@ -128,7 +128,9 @@ def run(arguments: list[str]) -> None:
         usable = scene.replace(depths=None)  # nothing follows from maps that cannot be used
     planned = Planned.of(usable, options.budget, options.max_steps, options.trainer)
     share = None if regions is None else regions.mean
-    advice = advice_for(usable, planned.max_seeds, strategy=planned.strategy, empty=share)
+    advice = advice_for(
+        usable, planned.max_seeds, why_no_seeds=planned.strategy.why_no_seeds, empty=share
+    )
     rows = [*_source_rows(scene), *_depth_map_rows(maps, beside)]
     rows += [*_cloud_rows(cloud), *_track_rows(tracks)]
     rows += _photograph_rows(regions, poses, masks)
@@ -408,7 +410,7 @@ def _advice_rows(advice: Advice, planned: Planned) -> list[tuple[str, str]]:
     """Return the advice, its reasons, and the training it is for."""
     size = f" ({planned.rho})" if planned.rho else ""
     plan = f"{planned.budget:,} Gaussians at most{size}, {planned.max_steps:,} steps, strategy"
-    rows = [("planned", f"{plan} {planned.strategy}"), ("advice", advice.sentence)]
+    rows = [("planned", f"{plan} {planned.strategy.name}"), ("advice", advice.sentence)]
     if advice.measured.layout:
         rows.insert(0, ("cameras stand", advice.measured.layout))
     return rows + [("" if i else "why", reason) for i, reason in enumerate(advice.reasons)]

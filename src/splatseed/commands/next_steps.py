@@ -23,8 +23,10 @@ from splatseed.seeding.photo_methods import Auto
 from splatseed.seeding.trainability import is_distorted, untrainable
 from splatseed.text import quoted
 from splatseed.training.duration import format_duration, planned_seconds
+from splatseed.training.request import DEFAULTS
 from splatseed.training.schedule import FULL_RUN
-from splatseed.training.settings import BUDGET, StrategyName, TrainSettings
+from splatseed.training.settings import BUDGET, TrainSettings
+from splatseed.training.strategies.registry import Traits
 
 TrainerName: TypeAlias = Literal[
     "splatseed", "gsplat", "graphdeco", "nerfstudio", "brush", "opensplat", "lichtfeld"
@@ -52,7 +54,7 @@ class Planned(NamedTuple):
     budget: int
     rho: str  # the budget per pixel, and the photograph's size; empty without photographs
     max_steps: int
-    strategy: str
+    strategy: Traits
     max_seeds: int
     flags: str
     trainer: TrainerName
@@ -85,7 +87,7 @@ class Planned(NamedTuple):
             flags = f"--budget {number} "
         if max_steps != FULL_RUN:
             flags = f"{flags}--max-steps {max_steps} "
-        strategy: StrategyName = "auto" if trainer == "splatseed" else "default"
+        strategy = DEFAULTS.strategy if trainer == "splatseed" else "default"
         settings = TrainSettings(strategy=strategy, max_steps=max_steps, cap_max=number)
         max_seeds = settings.max_seeds(number)
         rho = ""
@@ -96,9 +98,9 @@ class Planned(NamedTuple):
         threads = available_cpus()
         seconds = planned_seconds(settings, seeds, pixels, threads)
         seconds += COMPARE_SECONDS * len(images) / threads
-        growth = settings.densification
         most = len(scene.points) + _most_seeds(images)
-        return cls(number, rho, max_steps, growth, max_seeds, flags, trainer, seconds, most)
+        traits = settings.traits
+        return cls(number, rho, max_steps, traits, max_seeds, flags, trainer, seconds, most)
 
 
 def advice_commands(

@@ -76,13 +76,13 @@ def _version(package: str) -> str | None:
 def resumed_settings(
     config: Mapping[str, Any],
     settings: TrainSettings,
-    explicit: Collection[str] = (),
+    named: Collection[str] = (),
     *,
     refine_poses: bool,
 ) -> tuple[TrainSettings, bool]:
     """Return the settings of the run to resume, and whether it refined poses.
 
-    Settings that are neither ``explicit`` nor differ from their defaults are the run's; others must
+    Settings that are neither ``named`` nor differ from their defaults are the run's; others must
     equal the run's. Only the backend may change.
 
     Raises:
@@ -94,7 +94,7 @@ def resumed_settings(
     now = {**dataclasses.asdict(settings), "refine_poses": refine_poses}
     then = {name: config.get(name) for name in default if name != "backend"}
     for name, value in then.items():
-        if now[name] != value and (name in explicit or now[name] != default[name]):
+        if now[name] != value and (name in named or now[name] != default[name]):
             raise ParameterError(
                 f"`{name}={value!r}`, as when the run began",
                 found=f"`{name}={now[name]!r}`",

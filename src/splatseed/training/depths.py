@@ -63,6 +63,9 @@ class DepthCache:
     seconds_counted: bool = False  # whether the time of the seeds includes that of the maps
 
 
+NOT_CACHED = DepthCache()
+
+
 def stereo_size(
     images: Sequence[Image], settings: TrainSettings, device: str, fraction: float = 1.0
 ) -> int:
@@ -134,8 +137,7 @@ def known_depths(
         them took, in this run or in the run that wrote the file.
     """
     images = scene.split(settings.test_every)[0]
-    used = settings.densification == "grow" and settings.placing == "stereo"
-    if not used or len(images) < 2:
+    if not settings.uses_stereo or len(images) < 2:
         return {}, 0.0
     found = _read(cache)
     if found is None:
@@ -155,8 +157,8 @@ def known_depths(
     share = np.mean([np.isfinite(depth).mean() for depth in known.values()])
     duration = "" if stereo else f" ({seconds:.0f} s)"
     note(
-        f"Stereo found the depth of {share:.0%} of the pixels{duration}, where strategy grow "
-        'places most new Gaussians. placing = "none" only splits.'
+        f"Stereo found the depth of {share:.0%} of the pixels{duration}, where strategy "
+        f'{settings.traits.name} places most new Gaussians. placing = "none" only splits.'
     )
     # Stereo's depths are in units of the scene; unknown ones, NaN, become 0.
     return {

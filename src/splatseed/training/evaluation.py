@@ -7,7 +7,7 @@ another trainer needs the scene. What is resolved here is loaded and scored by `
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -24,7 +24,8 @@ from splatseed.splat.lpips import load_lpips
 from splatseed.training.config import has_run_masks, has_run_poses, trained_images
 from splatseed.training.device import pick_device
 from splatseed.training.models import config_of, model_file, near_plane_of, split_doubt
-from splatseed.training.settings import Backend, TrainSettings
+from splatseed.training.request import AS_TRAINED, EvaluateRequest
+from splatseed.training.settings import TrainSettings
 
 MINIMUM = {"data_factor": 1, "test_every": 2}
 """Lower bounds of the numbers that a run's config gives where the caller does not."""
@@ -32,14 +33,11 @@ MINIMUM = {"data_factor": 1, "test_every": 2}
 
 @dataclass(frozen=True)
 class Evaluation:
-    """A model, the scene to score it on, and how."""
+    """A model, the scene to score it on, and the request."""
 
     model: Path | Gaussians  # the file of a trained model, or Gaussians in the scene's frame
     scene: Path | Scene
-    data_factor: int | None  # None: as training chooses it
-    test_every: int
-    masks: str | None = None
-    transform: str | None = None
+    request: EvaluateRequest  # with the values of the run's config, where the caller left some out
     config: Mapping[str, Any] = field(default_factory=dict)  # of the run; empty for other models
 
     @classmethod
@@ -47,13 +45,9 @@ class Evaluation:
         cls,
         model: Gaussians | StrPath,
         scene: Scene | StrPath | None = None,
-        *,
-        data_factor: int | None = None,
-        test_every: int | None = None,
-        transform: str | None = None,
-        masks: str | None = None,
+        request: EvaluateRequest = AS_TRAINED,
     ) -> Self:
-        """Resolve the arguments of ``evaluate``: what is left out, a run's config gives.
+        """Resolve a request: what is left out, a run's config gives.
 
         Raises:
             SceneNotFoundError: The model is missing.
@@ -63,36 +57,35 @@ class Evaluation:
         config: Mapping[str, Any] = {}
         if not isinstance(model, Gaussians):
             config, model = config_of(Path(model)), model_file(Path(model))
-        numbers = {
-            name: config.get(name, getattr(TrainSettings, name)) if given is None else given
-            for name, given in (("data_factor", data_factor), ("test_every", test_every))
-        }
-        for name, value in numbers.items():
-            if (name, value) != ("data_factor", None) and not (
-                isinstance(value, int) and value >= MINIMUM[name]
-            ):
+        values: dict[str, Any] = {"masks": request.masks or config.get("masks")}
+        for name, minimum in MINIMUM.items():
+            value = getattr(request, name)
+            value = values[name] = config.get(name) if value is None else value
+            if value is not None and not (isinstance(value, int) and value >= minimum):
                 raise ParameterError(
-                    f"`{name}` of {MINIMUM[name]} or more",
+                    f"`{name}` of {minimum} or more",
                     found=str(value),
                     fix="Leave it out for the default.",
                 )
-        return cls(
-            model, _scene_of(model, scene, config), **numbers, transform=transform,
-            masks=masks or config.get("masks"), config=config,
-        )  # fmt: skip
+        return cls(model, _scene_of(model, scene, config), replace(request, **values), config)
 
-    def load(self, backend: Backend = "auto", progress: Progress = silent) -> TrainedModel:
+    @property
+    def test_every(self) -> int:
+        """Every n-th image is a test view."""
+        return self.request.test_every or TrainSettings.test_every
+
+    def load(self, progress: Progress = silent) -> TrainedModel:
         """Read the model and the photographs of its test views."""
         return load_model(
             self.model,
             self.scene,
-            data_factor=self.data_factor,
+            data_factor=self.request.data_factor,
             test_every=self.test_every,
-            transform=self.transform,
-            masks=self.masks,
+            transform=self.request.transform,
+            masks=self.request.masks,
             trained_on=self.config.get("photographs"),
             near_plane=near_plane_of(self.config),
-            device=pick_device(backend, progress),
+            device=pick_device(self.request.backend, progress),
             cache_dir=user_cache_dir(),
             progress=progress,
         )
@@ -120,7 +113,7 @@ class Evaluation:
             return  # another copy, or one that the run wrote: its files may differ
         if not has_run_poses(config, scene):
             yield "The scene's photographs or poses have changed since the run was trained."
-        if self.masks == config.get("masks") and not has_run_masks(config, scene):
+        if self.request.masks == config.get("masks") and not has_run_masks(config, scene):
             yield (
                 "The scene's masks have changed since the run was trained: its own scores are over "
                 "other pixels."
@@ -130,7 +123,6 @@ class Evaluation:
         self,
         loaded: TrainedModel,
         *,
-        lpips_weights: Path | None = None,
         on_view: OnView = lambda *_: None,
         progress: Progress = silent,
     ) -> EvalResult:
@@ -138,11 +130,11 @@ class Evaluation:
 
         Without weights for LPIPS, and none given, LPIPS is left out, with the reason in the result.
         """
-        lpips, reason = None, ""
+        lpips, reason, weights = None, "", self.request.lpips_weights
         try:
-            lpips = load_lpips(weights=lpips_weights)
+            lpips = load_lpips(weights=weights)
         except (MissingDependencyError, SceneNotFoundError) as error:
-            if lpips_weights is not None:
+            if weights is not None:
                 raise
             reason = str(error)
         covisible = find_covisible(loaded.scene, self.test_every, progress)

@@ -25,7 +25,7 @@ from splatseed.seeding.photo_methods import Auto
 from splatseed.seeding.thinning import thin
 from splatseed.seeding.upsampling import upsample
 from splatseed.training.depths import stereo_size
-from splatseed.training.settings import AS_3DGS, BUDGET, TrainSettings
+from splatseed.training.settings import BUDGET, TrainSettings
 
 
 def seeded(
@@ -39,11 +39,14 @@ def seeded(
 ) -> tuple[Scene, StereoResult | None]:
     """Add the points of method ``auto`` to a scene, if the settings or the advice say so.
 
-    The settings' budget limits the points. Also returns the depth maps that ``auto`` made, which
-    growth uses too; None without any. Where the points were ``triangulated`` while poses were
-    refined, ``auto`` adds to them: on held-out training views of two phones' walks it gained 0.34
-    and 0.96 dB under strategy ``grow`` (docs/known_poses.md), as bare walls have no features.
+    The settings' budget limits the points; a run that continues from Gaussians has none. Also
+    returns the depth maps that ``auto`` made, which growth uses too; None without any. Where the
+    points were ``triangulated`` while poses were refined, ``auto`` adds to them: on held-out
+    training views of two phones' walks it gained 0.34 and 0.96 dB under strategy ``grow``
+    (docs/known_poses.md), as bare walls have no features.
     """
+    if settings.start is not None:
+        return scene, None
     if saw_all_photographs(scene):
         note(
             "The seeds were made from all photographs, test views included, which may flatter the "
@@ -53,7 +56,7 @@ def seeded(
         return scene, None
     if settings.seeding == "advised" and not triangulated:
         limit = settings.max_seeds(settings.cap or BUDGET)
-        advice = advice_for(scene, limit, strategy=settings.densification)
+        advice = advice_for(scene, limit, why_no_seeds=settings.traits.why_no_seeds)
         if advice.method == AS_IT_IS:
             note(f"Seeds: {advice.sentence}. {advice.reasons[-1]}")
             return scene, None
@@ -80,7 +83,7 @@ def seeded(
 
 def no_seeding_reason(scene: Scene, settings: TrainSettings) -> str:
     """Explain why a run starts from the scene's points even with seeding ``auto``; else empty."""
-    if settings.strategy.endswith(AS_3DGS):
+    if settings.as_3dgs:
         return f"strategy {settings.strategy} starts from the scene's points as they are"
     if was_upsampled(scene):
         return "its points are upsampled already, and training starts from them as they are"
@@ -105,7 +108,7 @@ def usable_seeds(
         first, limit = crowd.num_original, settings.max_seeds(cap)
         seeds = crowd.select(thin(crowd.xyz, views, limit, first=first, priority=crowd.confidence))
         kept = f", {seeds.num_original:,} of them originals" if first else ""
-        room = "" if limit == cap else f"; strategy {settings.densification} adds the rest"
+        room = "" if limit == cap else f"; strategy {settings.traits.name} adds the rest"
         note(
             f"{len(crowd):,} seeds were thinned to {limit:,}{kept}: the limit is {cap:,} Gaussians"
             f"{room}."

@@ -11,6 +11,7 @@ import time
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -36,9 +37,6 @@ from splatseed.training.parameters import (
 from splatseed.training.schedule import Schedule
 from splatseed.training.settings import TrainSettings
 from splatseed.training.strategies.base import Strategy
-from splatseed.training.strategies.default import Default
-from splatseed.training.strategies.grow import ErrorDensification
-from splatseed.training.strategies.mcmc import Mcmc
 
 
 class Stopwatch:
@@ -86,21 +84,14 @@ def make_strategy(
 ) -> Strategy:
     """Make the strategy of the settings.
 
-    The memory of ``device``, by default the CPU, limits growth; see ``ErrorDensification`` for
-    ``depths`` and ``share``.
+    The memory of ``device``, by default the CPU, limits growth; see ``Strategy.of`` for ``depths``
+    and ``share``.
     """
     device = device or torch.device("cpu")
-    capacity = Capacity(settings.cap, device)
-    match settings.densification:
-        case "default":
-            return Default(settings, capacity)
-        case "mcmc":
-            return Mcmc(settings, capacity)
-        case "grow":
-            maps = {name: torch.as_tensor(each).to(device) for name, each in depths.items()}
-            return ErrorDensification(settings.schedule, capacity, maps, share)
-        case "none":
-            return Strategy(capacity)
+    maps = {name: torch.as_tensor(each).to(device) for name, each in depths.items()}
+    file, _, name = settings.traits.implementation.partition(":")
+    kind: type[Strategy] = getattr(import_module(f"splatseed.training.strategies.{file}"), name)
+    return kind.of(settings, Capacity(settings.cap, device), maps, share)
 
 
 def first_state(
