@@ -21,8 +21,8 @@ from splatseed.scene import Image, Scene
 from splatseed.seeding.advice import AS_IT_IS, SEEDED, Advice
 from splatseed.seeding.photo_methods import Auto
 from splatseed.seeding.trainability import is_distorted, untrainable
-from splatseed.text import quoted
-from splatseed.training.duration import format_duration, planned_seconds
+from splatseed.text import format_duration, quoted
+from splatseed.training.duration import planned_seconds
 from splatseed.training.request import DEFAULTS
 from splatseed.training.schedule import FULL_RUN
 from splatseed.training.settings import BUDGET, TrainSettings

@@ -14,6 +14,7 @@ from jaxtyping import Float64
 
 from splatseed.camera import CAMERA_MODELS, Intrinsics, quat_from_rotation, rotation_from_quat
 from splatseed.errors import SceneFormatError
+from splatseed.findings import Finding
 from splatseed.io.files import COPY_AGAIN
 from splatseed.text import agreeing, name_some
 
@@ -37,9 +38,9 @@ def make_intrinsics(
     where: str, camera_id: int, model: str, width: int, height: int, params: Sequence[float]
 ) -> Intrinsics:
     """Make a checked camera record; raise ``NotFiniteError`` for parameters that are not usable."""
-    require(0 <= camera_id <= MAX_ID, f"a camera id from 0 to {MAX_ID}", where, camera_id)
+    check_record(0 <= camera_id <= MAX_ID, f"a camera id from 0 to {MAX_ID}", where, camera_id)
     fits = 0 < width <= _MAX_SIZE and 0 < height <= _MAX_SIZE
-    require(fits, "a camera size in pixels", where, f"{width} x {height}")
+    check_record(fits, "a camera size in pixels", where, f"{width} x {height}")
     _require_finite(
         all(map(math.isfinite, params)), "finite camera parameters", where, tuple(params)
     )
@@ -94,17 +95,18 @@ def check_enough(unusable: Mapping[str, NotFiniteError], used: int) -> None:
         raise next(iter(unusable.values()))
 
 
-def unusable_warning(unusable: Mapping[str, NotFiniteError], used: int) -> list[str]:
-    """Warn of images that are left out, if any."""
+def unusable_findings(unusable: Mapping[str, NotFiniteError], used: int) -> list[Finding]:
+    """Report images that are left out, if any."""
     if not unusable:
         return []
     count, whose = len(unusable), agreeing(len(unusable), "its", "their")
     which = f"{count} of {count + used} images {agreeing(count, 'is', 'are')} left out"
     why = f"{whose} pose or camera is not finite, or zero"
-    return [f"{which} ({name_some([*unusable], 3)}): {why}."]
+    text = f"{which} ({name_some([*unusable], 3)}): {why}."
+    return [Finding("unusable-images", text, subjects=tuple(unusable))]
 
 
-def require(holds: bool, expected: str, where: str, found: object) -> None:
+def check_record(holds: bool, expected: str, where: str, found: object) -> None:
     """Raise a ``SceneFormatError`` for a record unless a condition holds."""
     if not holds:
         raise format_error(expected, where, str(found))

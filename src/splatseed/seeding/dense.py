@@ -15,9 +15,7 @@ points as thinning does.
 from __future__ import annotations
 
 import os
-import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -32,11 +30,12 @@ from splatseed.photos.loading import load_views
 from splatseed.photos.sizes import at_file_size, factor_for_size
 from splatseed.photos.view import View
 from splatseed.photos.visibility import find_visibility, points_in_image
-from splatseed.progress import Note, Progress, thread_limit
+from splatseed.progress import Note, Progress, StageTimes, thread_limit
 from splatseed.runtime.compilation import watched
 from splatseed.runtime.memory import PROCESS, format_bytes, free_memory, resident_bytes
 from splatseed.scene import Image, Scene
 from splatseed.seeding.photo_methods import Stereo, photographed, stereo_points
+from splatseed.text import format_duration
 
 if TYPE_CHECKING:
     from splatseed.depth.stereo.detail import Placed
@@ -107,9 +106,14 @@ class WithinBudget:
         self, scene: Scene, num_new: int, rng: np.random.Generator, progress: Progress
     ) -> NewPoints:
         """Make the points of a scene; ``num_new`` is ignored."""
-        watch = _Stopwatch(progress)
-        with watch.running():
-            new, stereo = self.method.run(scene, rng, watch)
+        times = StageTimes()
+
+        def timed(stage: str, fraction: float) -> None:
+            times(stage, fraction)
+            progress(stage, fraction)
+
+        with watched(times.compilation):
+            new, stereo = self.method.run(scene, rng, timed)
         room = self.limit - len(scene.points.originals)
         from_stereo = np.asarray(new.source) == source_code("stereo")
         # Cover's guesses stay as sparse as they are: more of them would confirm nothing.
@@ -127,7 +131,7 @@ class WithinBudget:
         plan = next((each for each in plans if each.within), plans[-1])
         dense = stereo
         if (plan.factor, plan.grid) != (first, self.method.grid):
-            self.announce(_announcement(self.limit, images, plan, stereo, watch.seconds))
+            self.announce(_announcement(self.limit, images, plan, stereo, times.seconds()))
             views = _read_again(scene, images, plan.factor, stereo.views, progress)
             dense = compare_closer(stereo, views, plan.grid, int(rng.integers(1 << 32)), progress)
         scale = first / plan.factor
@@ -230,12 +234,8 @@ def _announcement(
     return (
         f"Up to {limit:,} points: {len(images)} photographs are compared again at "
         f"{sides[0]} x {sides[1]} pixels, with a depth every {plan.grid}: about "
-        f"{_duration(expected)} and {format_bytes(plan.memory)} of memory."
+        f"{format_duration(expected)} and {format_bytes(plan.memory)} of memory."
     )
-
-
-def _duration(seconds: float) -> str:
-    return f"{max(round(seconds), 1)} s" if seconds < 90 else f"{round(seconds / 60)} minutes"
 
 
 def _read_again(
@@ -277,35 +277,3 @@ def _drop_guesses(points: NewPoints, room: int) -> NewPoints:
         for name in ("xyz", "rgb", "normals", "sizes", "confidence", "source")
     }
     return points._replace(**arrays)
-
-
-class _Stopwatch:
-    """A ``Progress`` that adds up the wall time of stages, without compilation."""
-
-    def __init__(self, progress: Progress) -> None:
-        self.seconds: dict[str, float] = {}
-        self._progress = progress
-        self._last = time.perf_counter()
-        self._nested, self._begun, self._compiled = 0, 0.0, 0.0
-
-    def __call__(self, stage: str, fraction: float) -> None:
-        """Add the time since the last call to this stage."""
-        now = time.perf_counter()
-        past = max(now - self._last - self._compiled, 0.0)
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + past
-        self._last, self._compiled = now, 0.0
-        self._progress(stage, fraction)
-
-    @contextmanager
-    def running(self) -> Iterator[None]:
-        """Leave out the time of compilation while the block runs."""
-        self._last = time.perf_counter()
-        with watched(self._compilation):
-            yield
-
-    def _compilation(self, begins: bool) -> None:
-        self._nested += 1 if begins else -1
-        if begins and self._nested == 1:
-            self._begun = time.perf_counter()
-        elif not begins and self._nested == 0:
-            self._compiled += time.perf_counter() - self._begun

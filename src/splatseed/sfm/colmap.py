@@ -100,7 +100,7 @@ def require_pycolmap(device: DeviceName = "auto") -> Any:
 
 
 @dataclass(frozen=True)
-class Run:
+class ColmapRun:
     """Shared state of the stages of a run."""
 
     pycolmap: Any
@@ -154,7 +154,7 @@ class Run:
             ) from error
 
 
-def guessed_model(run: Run, cameras: Sequence[SharedCamera], camera_model: str) -> Any:
+def guessed_model(run: ColmapRun, cameras: Sequence[SharedCamera], camera_model: str) -> Any:
     """Make a model without poses; focal lengths are from EXIF or defaults."""
     pycolmap, model = run.pycolmap, run.pycolmap.Reconstruction()
     options = pycolmap.ImageReaderOptions(camera_model=camera_model)
@@ -202,14 +202,16 @@ def rigid(pycolmap: Any, image: Image) -> Any:
     return pycolmap.Rigid3d(rotation, image.translation)
 
 
-def mapping_options(run: Run) -> Any:
+def mapping_options(run: ColmapRun) -> Any:
     """Return COLMAP's options of mapping and triangulation, for this run."""
     return run.pycolmap.IncrementalPipelineOptions(
         num_threads=run.settings.threads, random_seed=run.settings.seed
     )
 
 
-def triangulate_points(run: Run, poses: Sequence[Image], without: Collection[str] = ()) -> Path:
+def triangulate_points(
+    run: ColmapRun, poses: Sequence[Image], without: Collection[str] = ()
+) -> Path:
     """Triangulate points at fixed cameras and poses; return the folder of the model.
 
     ``without``: names of images to omit.

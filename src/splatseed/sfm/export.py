@@ -14,7 +14,7 @@ from splatseed.camera import Intrinsics
 from splatseed.errors import OutputError
 from splatseed.io.picture import ORIENTATION, UPRIGHT
 from splatseed.pointcloud import first_of_equals
-from splatseed.sfm.colmap import Run
+from splatseed.sfm.colmap import ColmapRun
 from splatseed.sfm.readable import copy_misread
 
 _SHORT = 3  # the type of the orientation's tag
@@ -23,7 +23,7 @@ _FOLDED = 0.1  # share of a photograph's diagonal by which such a point misses i
 _NEGLIGIBLE = 2e-7  # a coefficient that counts as distortion but moves no pixel
 
 
-def export_scene(run: Run, model_dir: Path, staging: Path, *, distinct: bool = True) -> None:
+def export_scene(run: ColmapRun, model_dir: Path, staging: Path, *, distinct: bool = True) -> None:
     """Write a model's undistorted photographs and points to ``staging``.
 
     Photographs of PINHOLE cameras are copied, with the EXIF orientation cleared; of the others,

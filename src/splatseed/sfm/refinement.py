@@ -25,8 +25,9 @@ from scipy.spatial.transform import Rotation
 
 from splatseed.camera import quat_from_rotation
 from splatseed.errors import ReconstructionError
+from splatseed.findings import Finding
 from splatseed.scene import Image
-from splatseed.sfm.colmap import Run, posed_model, rigid
+from splatseed.sfm.colmap import ColmapRun, posed_model, rigid
 from splatseed.text import counted, name_some
 
 
@@ -157,7 +158,7 @@ def _turn_vectors(
     return np.asarray(Rotation.from_matrix(a @ b.transpose(0, 2, 1)).as_rotvec())
 
 
-def refine(run: Run, given: Sequence[Image]) -> tuple[list[Image], Refinement]:
+def refine(run: ColmapRun, given: Sequence[Image]) -> tuple[list[Image], Refinement]:
     """Refine given poses by the verified matches of ``posed_model(given)`` in the run.
 
     Cameras with fewer than 10 points are unchanged; so are all, if the mean reprojection error
@@ -208,8 +209,10 @@ def refine(run: Run, given: Sequence[Image]) -> tuple[list[Image], Refinement]:
     return with_poses(given, poses), change
 
 
-def unrefined_note(total: int, excluded: Sequence[str], unread: Sequence[str] = ()) -> str:
-    """Name the images, of ``total``, whose poses stay as given beside refined ones; may be empty.
+def unrefined_finding(
+    total: int, excluded: Sequence[str], unread: Sequence[str] = ()
+) -> Finding | None:
+    """Return the finding on images, of ``total``, whose poses stay as given beside refined ones.
 
     ``unread`` have photographs that SfM does not read.
     """
@@ -217,7 +220,10 @@ def unrefined_note(total: int, excluded: Sequence[str], unread: Sequence[str] = 
     kinds = (("SfM does not read", unread), (too_few, excluded))
     reasons = "; ".join(f"{why} {name_some(names, 3)}" for why, names in kinds if names)
     unrefined = f"The poses of {len(unread) + len(excluded):,} of {counted(total, 'image')}"
-    return f"{unrefined} stay as given: {reasons}." if reasons else ""
+    if not reasons:
+        return None
+    text = f"{unrefined} stay as given: {reasons}."
+    return Finding("unrefined-poses", text, subjects=(*unread, *excluded))
 
 
 def _refused(expected: str, found: str) -> ReconstructionError:
@@ -244,7 +250,7 @@ def _enough(seeing: Bool[np.ndarray, " N"]) -> bool:
 class _Solver:
     """Rounds of triangulation and bundle adjustment; arguments as for ``refine``."""
 
-    def __init__(self, run: Run, images: Sequence[Image]) -> None:
+    def __init__(self, run: ColmapRun, images: Sequence[Image]) -> None:
         self.rounds = 0
         self._run, self._pycolmap = run, run.pycolmap
         self._images, self._given = images, poses_of(images)

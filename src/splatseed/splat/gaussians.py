@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float32, Int64
 
+from splatseed.findings import Finding
 from splatseed.frozen import read_only
 from splatseed.io.files import StrPath
 from splatseed.io.staging import atomic_file
@@ -83,9 +84,10 @@ class Gaussians:
             file.writelines(encode_layout(self.arrays(), self.antialiased))
 
 
-def antialiasing_note(file: str) -> str:
-    """Return a note for the user on an antialiased model in a file that cannot record it."""
-    return (
+def antialiasing_finding(file: str) -> Finding:
+    """Return the finding on an antialiased model in a file that cannot record it."""
+    return Finding(
+        "antialiasing-lost",
         f"The model needs antialiased rendering, which {file} cannot record: small Gaussians will "
-        "be too opaque."
+        "be too opaque.",
     )

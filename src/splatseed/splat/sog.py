@@ -18,10 +18,11 @@ from jaxtyping import Float32, Float64, Int64, UInt8
 from PIL import Image
 
 from splatseed.errors import SceneFormatError
+from splatseed.findings import Finding
 from splatseed.io.files import read_bytes, translate_errors
 from splatseed.progress import Note, Progress, silent, silent_note
 from splatseed.splat.cleaning import MAX_LOG_SCALE
-from splatseed.splat.extent import SETTINGS, Fit, best_fit, left_out_note, morton_order, shells_of
+from splatseed.splat.extent import PACKING, Fit, best_fit, left_out_finding, morton_order, shells_of
 from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.quantization import (
     SH_COUNTS,
@@ -136,11 +137,14 @@ def _within_steps(gaussians: Gaussians, note: Note) -> Gaussians:
     kept = fits[chosen].kept
     if not kept.all():
         nearest = np.abs(gaussians.means[~kept]).max(axis=1).min()
-        note(left_out_note(".sog", kept, f"{nearest:,.4g} units or more from the origin"))
-    if error > SETTINGS.coarse_error:
+        note(left_out_finding(".sog", kept, f"{nearest:,.4g} units or more from the origin"))
+    if error > PACKING.coarse_error:
         note(
-            "A .sog is too coarse for the positions of this model: export another format, or move "
-            "the model to the origin."
+            Finding(
+                "coarse-positions",
+                "A .sog is too coarse for the positions of this model: export another format, or "
+                "move the model to the origin.",
+            )
         )
     return gaussians if kept.all() else gaussians.select(kept)
 

@@ -19,11 +19,12 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from splatseed.errors import ParameterError, SceneFormatError
+from splatseed.findings import Finding
 from splatseed.io.files import COPY_AGAIN, read_bytes, translate_errors
 from splatseed.progress import Note, silent_note
 from splatseed.requirements import require
 from splatseed.runtime.memory import check_memory
-from splatseed.splat.extent import SETTINGS, Fit, best_fit, left_out_note, morton_order
+from splatseed.splat.extent import PACKING, Fit, best_fit, left_out_finding, morton_order
 from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.quantization import (
     SH_COUNTS,
@@ -136,12 +137,15 @@ def _fixed_point(gaussians: Gaussians, note: Note) -> tuple[Gaussians, int]:
             fix="Export another format, or crop the model.",
         )
     if not kept.all():
-        note(left_out_note(".spz", kept, f"more than {limit:,.4g} units from the origin"))
-    if error > SETTINGS.coarse_error:
+        note(left_out_finding(".spz", kept, f"more than {limit:,.4g} units from the origin"))
+    if error > PACKING.coarse_error:
         steps = f"up to {limit:,.4g} units from the origin in steps of {2.0**-bits:.3g}"
         note(
-            f"A .spz holds positions {steps}, too coarse for this model: export another format, or "
-            "move the model to the origin."
+            Finding(
+                "coarse-positions",
+                f"A .spz holds positions {steps}, too coarse for this model: export another "
+                "format, or move the model to the origin.",
+            )
         )
     scales = np.sort(
         gaussians.scales[kept], axis=1
@@ -150,8 +154,11 @@ def _fixed_point(gaussians: Gaussians, note: Note) -> tuple[Gaussians, int]:
     if number := int(np.count_nonzero(beyond)):
         smallest, largest = np.exp(_LOG_SCALES)
         note(
-            f"A .spz holds sizes from {smallest:.2g} to {largest:.0f} units: "
-            f"{counted(number, 'Gaussian')} {agreeing(number, 'was', 'were')} clipped."
+            Finding(
+                "clipped-sizes",
+                f"A .spz holds sizes from {smallest:.2g} to {largest:.0f} units: "
+                f"{counted(number, 'Gaussian')} {agreeing(number, 'was', 'were')} clipped.",
+            )
         )
     return gaussians if kept.all() else gaussians.select(kept), bits
 
@@ -186,7 +193,8 @@ def decode(path: Path, note: Note = silent_note) -> Gaussians:
         position, opacity, color, scale, rotation, sh = (part.reshape(count, -1) for part in parts)
         harmonics = (sh.reshape(count, rest, 3).astype(np.float32) - 128) / 128
         if rest > (limit := SH_COUNTS[-1]):
-            note(f"Of {rest} coefficients beyond the first, {limit} (degree 3) are used.")
+            text = f"Of {rest} coefficients beyond the first, {limit} (degree 3) are used."
+            note(Finding("unused-harmonics", text))
             rest, harmonics = limit, harmonics[:, :limit]
         if version == 1:  # half floats
             means = np.ascontiguousarray(position).view("<f2").astype(np.float32)

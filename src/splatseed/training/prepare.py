@@ -21,7 +21,7 @@ from splatseed.io.files import StrPath
 from splatseed.io.photograph import photograph_folder
 from splatseed.io.photograph_checks import check_sizes, with_photographs
 from splatseed.io.seeds import was_upsampled
-from splatseed.photos.camera_check import format_stray_note, reference_points
+from splatseed.photos.camera_check import reference_points, stray_findings
 from splatseed.photos.loading import load_split, refuse_distortion
 from splatseed.photos.sizes import at_file_size
 from splatseed.photos.view import View, camera_views
@@ -44,7 +44,7 @@ from splatseed.training.config import (
     update_places,
     with_masks_of,
 )
-from splatseed.training.depths import NOT_CACHED, DepthCache, DepthMaps, known_depths
+from splatseed.training.depths import NOT_CACHED, DepthCache, ImageDepths, known_depths
 from splatseed.training.device import check_fits, device_name, pick_device
 from splatseed.training.folder import RunFolder
 from splatseed.training.initialization import first_gaussians
@@ -234,7 +234,7 @@ def _checked_config(
     scene: Scene, initial: _Seeds | _Start, frame: TrainingFrame, setup: _Setup
 ) -> dict[str, Any]:
     """Return the content of config.json, once it fits the memory and the run to resume."""
-    for stray in format_stray_note(frame.strays):
+    for stray in stray_findings(frame.strays):
         setup.note(stray)
     facts, device = initial.facts, setup.device
     check_fits(facts["count"], device)
@@ -250,7 +250,7 @@ def _state(
     initial: _Seeds | _Start,
     views: Sequence[View],
     frame: TrainingFrame,
-    depths: DepthMaps,
+    depths: ImageDepths,
     setup: _Setup,
 ) -> TrainState:
     """Return the state of the checkpoint, or before the first step; ``views`` are for training."""
