@@ -123,11 +123,13 @@ def test_masks_that_changed_since_a_run_began_are_found_out(larger_room_path, tm
     PilImage.fromarray(white).save(mask)
     with pytest.raises(ParameterError, match="other masks in"):
         prepare_run(load_scene(own_path), tmp_path / "run", settings, resume)
-    found = "The scene's masks have changed since the run was trained"
     run = prepare_run(without, tmp_path / "run", settings, resume)
     run.train()
     run.finish(evaluate_views)
     for noted in (True, False):
         evaluation = Evaluation.of(tmp_path / "run")
-        assert any(found in each for each in evaluation.doubts(evaluation.load())) == noted
+        assert (
+            any(each.kind == "changed-masks" for each in evaluation.findings(evaluation.load()))
+            == noted
+        )
         mask.unlink(missing_ok=True)

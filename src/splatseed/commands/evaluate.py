@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,6 +12,7 @@ import tyro
 from splatseed.commands.options import parse_options
 from splatseed.commands.outputs import check_free
 from splatseed.console import StageClock, print_note, print_pairs, print_table, stage_display
+from splatseed.findings import Finding
 from splatseed.io.staging import check_output, output_folder, write_json
 from splatseed.photos.view import View
 from splatseed.requirements import require
@@ -97,9 +98,10 @@ def run(arguments: list[str]) -> None:
     facts += [(label, str(path)) for label, path in written if path is not None]
     print_pairs(str(options.model), facts)
     if result.lpips is None:
-        print_note(f"LPIPS was not computed: {result.lpips_reason}")
-    for doubt in evaluation.doubts(model):
-        print_note(doubt)
+        text = f"LPIPS was not computed: {result.lpips_reason}"
+        print_note(Finding("missing-lpips", text, "info"))
+    for finding in evaluation.findings(model):
+        print_note(finding)
 
 
 def _score(
@@ -127,8 +129,9 @@ def _score(
             "test_every": evaluation.test_every,
             **result.to_dict(),
         }
-        if doubts := evaluation.doubts(model):
-            content["notes"] = [str(each) for each in doubts]
+        if findings := evaluation.findings(model):
+            content["findings"] = [asdict(each) for each in findings]
+            content["notes"] = [str(each) for each in findings]
         write_json(options.output, content)
     return result
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from splatseed.console import print_note, print_pairs
 from splatseed.depth.settings import PER_POINT
+from splatseed.findings import Finding
 from splatseed.io.staging import read_manifest
 from splatseed.io.transforms_layout import Layout
 from splatseed.lens import undistort_command, undistorted_folder
@@ -251,15 +252,17 @@ def print_training(read_from: Path, scene: Scene, output: Path, layout: Layout) 
         trainers = training_commands(output, layout, distorted=bool(lenses))
         print_pairs("train it with", trainers)
         if "graphdeco" in dict(trainers) and (off := off_centre(scene)) > CENTRED:
-            print_note(
+            text = (
                 f"graphdeco's trainer ignores principal points, which are up to {off:.1f} px off "
+            )
+            text += (
                 "the photographs' centres: it trains as if they were there. The others read them."
             )
+            print_note(Finding("off-centre-principal-points", text))
     if lenses:
-        print_note(
-            f"{'The other trainers' if known else 'Trainers'} need photographs without lens "
-            f"distortion: begin with {undistort_command(read_from)}, and upsample that scene."
-        )
+        text = f"{'The other trainers' if known else 'Trainers'} need photographs without lens "
+        text += f"distortion: begin with {undistort_command(read_from)}, and upsample that scene."
+        print_note(Finding("lens-distortion", text, "info"))
 
 
 def off_centre(scene: Scene) -> float:

@@ -23,6 +23,7 @@ from rich.table import Column
 from splatseed.commands.options import parse_options, parse_some
 from splatseed.console import ERR, OUT, print_note, print_pairs, stage_display
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
+from splatseed.findings import Finding
 from splatseed.io import load_scene
 from splatseed.io.files import read_text
 from splatseed.requirements import require
@@ -158,17 +159,18 @@ def run(arguments: list[str]) -> None:
     from splatseed.splat.evaluate import evaluate_views
     from splatseed.training.api import prepare_training
 
-    notes: list[str] = []
+    findings: list[Finding] = []
     if options.request.resume and not RunFolder(options.output).is_run:
-        notes.append(f"There is no run to resume in {options.output}: a new one starts.")
+        text = f"There is no run to resume in {options.output}: a new one starts."
+        findings.append(Finding("no-run-to-resume", text, "info"))
     # ``api.train``, with displays.
     with stage_display() as clock:
         clock("read", 0.0)
         training = prepare_training(
-            options.scene, options.output, options.request, note=notes.append, progress=clock
+            options.scene, options.output, options.request, note=findings.append, progress=clock
         )
-    for note in notes:
-        print_note(note)
+    for finding in findings:
+        print_note(finding)
     _announce(options, training)
     left = _TimeLeft(training, per_pixel=_per_pixel(options))
     with _watched(options, training) as viewer, _training_bar(training, left) as show:
@@ -194,7 +196,8 @@ def _announce(options: Options, training: TrainingRun) -> None:
     """Print the scene, the settings and the output."""
     settings, views = training.settings, training.trainer.train_views
     for name in settings.unused:
-        print_note(f"{name} has no effect with strategy {settings.traits.name}.")
+        text = f"{name} has no effect with strategy {settings.traits.name}."
+        print_note(Finding("unused-setting", text))
     chosen = settings.strategy == DEFAULTS.strategy
     strategy = f"{settings.traits.name} ({settings.strategy})" if chosen else settings.strategy
     OUT.print(
@@ -260,8 +263,8 @@ class _TimeLeft:
         self.seconds = seconds_left(training.settings, now)
         if not self._is_printed and elapsed > REPORT_AFTER:
             self._is_printed = True
-            for note in self._notes(now, self.seconds):
-                print_note(note)
+            for finding in self._findings(now, self.seconds):
+                print_note(finding)
                 OUT.file.flush()
 
     @property
@@ -269,16 +272,18 @@ class _TimeLeft:
         """The remaining time for the progress bar; empty until it is known."""
         return "" if self.seconds is None else f"{timedelta(seconds=round(self.seconds))} left"
 
-    def _notes(self, now: RunSpeed, left: float) -> Iterator[str]:
+    def _findings(self, now: RunSpeed, left: float) -> Iterator[Finding]:
         settings, view = self._training.settings, self._training.trainer.train_views[0]
         steps = f"{settings.max_steps - now.step:,} steps that are left"
         slow = now.device == "cpu" and left > TOO_LONG
         if slow or (left > MIN_REPORTED and not ERR.is_terminal):
-            yield f"The {steps} take about {format_duration(left)}."
+            text = f"The {steps} take about {format_duration(left)}."
+            yield Finding("training-time", text, "info")
         if slow:
             side = max(view.width, view.height) * settings.factor
             flags = options_for_an_hour(settings, now, side, per_pixel=self._per_pixel)
-            yield f"On this CPU, training with {flags} takes about an hour; a GPU is much faster."
+            text = f"On this CPU, training with {flags} takes about an hour; a GPU is much faster."
+            yield Finding("training-time", text, "info")
 
 
 @contextmanager
@@ -342,10 +347,9 @@ def _summarise(options: Options, training: TrainingRun, result: TrainingResult) 
     ]
     print_pairs("splatseed train", rows)
     if held := result.held_by_memory_at:
-        print_note(
-            f"memory limited the run to {held:,} Gaussians; results may vary between machines. "
-            f"Pass --budget {held} for the same result everywhere."
-        )
+        text = f"memory limited the run to {held:,} Gaussians; results may vary between machines."
+        fix = f"Pass --budget {held} for the same result everywhere."
+        print_note(Finding("memory-limit", text, fix=fix))
     print_pairs("next", _next_commands(output))
 
 

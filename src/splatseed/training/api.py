@@ -39,6 +39,7 @@ from splatseed.training.settings import BUDGET, MIN_GAUSSIANS, TrainSettings
 require("torch", "gsplat", "flip_evaluator")  # before what imports them, for one clear error
 
 from splatseed.camera import Camera
+from splatseed.findings import Finding
 from splatseed.splat.evaluate import evaluate_views
 from splatseed.splat.formats import read_gaussians
 from splatseed.splat.gaussians import Gaussians
@@ -175,11 +176,11 @@ def prepare_training(
     for finding in scene.findings:
         note(finding)
     if scene.listed is not None:
-        note(scene.listed.sentence)
+        note(Finding("listed-split", scene.listed.sentence, "info"))
     settings = _sized(settings, scene, request.long_side, resumed, note)
     settings = _within_budget(settings, request.budget, scene, note)
     if settings.seeding == "auto" and (why := no_seeding_reason(scene, settings)):
-        note(f"`seeding='auto'` has no effect: {why}.")
+        note(Finding("unused-setting", f"`seeding='auto'` has no effect: {why}."))
     named = {*request.named}
     named |= {"cap_max"} if request.budget is not None else set()
     named |= {"data_factor"} if request.long_side is not None else set()
@@ -224,8 +225,8 @@ def evaluate(
     request = change_settings(EvaluateRequest(), "evaluate", options)
     evaluation = Evaluation.of(model.folder if isinstance(model, Run) else model, scene, request)
     loaded = evaluation.load(progress)
-    for doubt in evaluation.doubts(loaded):
-        note(doubt)
+    for finding in evaluation.findings(loaded):
+        note(finding)
     return evaluation.score(loaded, progress=progress)
 
 
@@ -280,12 +281,14 @@ def _within_budget(
             expected = f"`budget` of {MIN_GAUSSIANS} Gaussians or more"
             raise ParameterError(expected, found=str(budget), fix="Try 0.25rho.")
         if in_rho(budget):
-            note(f"At most {cap:,} Gaussians: {budget} of {size}.")
+            text = f"At most {cap:,} Gaussians: {budget} of {size}."
+            note(Finding("budget", text, "info"))
         return dataclasses.replace(settings, cap_max=cap)
     cap = max(2, min(BUDGET, round(pixels)))
     reason = f"{'1rho' if pixels <= BUDGET else 'fewer than 1rho'} of {size}"
     if settings.start:  # a merge of two may be larger, and must not be thinned unless asked for
         number = len(read_gaussians(Path(settings.start)))
         cap, reason = (number, "as many as it starts with") if number > cap else (cap, reason)
-    note(f"At most {cap:,} Gaussians: {reason}; `budget` sets another number.")
+    text = f"At most {cap:,} Gaussians: {reason}; `budget` sets another number."
+    note(Finding("budget", text, "info"))
     return dataclasses.replace(settings, cap_max=cap)

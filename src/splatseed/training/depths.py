@@ -19,6 +19,7 @@ from jaxtyping import Float32
 
 from splatseed.depth.stereo import stereo_depths
 from splatseed.depth.stereo.maps import StereoResult, StereoSettings
+from splatseed.findings import Finding
 from splatseed.io.files import ARCHIVE_FAILURES
 from splatseed.io.staging import atomic_file
 from splatseed.progress import Note, Progress, silent, silent_note
@@ -156,10 +157,9 @@ def known_depths(
     known, seconds = found
     share = np.mean([np.isfinite(depth).mean() for depth in known.values()])
     duration = "" if stereo else f" ({seconds:.0f} s)"
-    note(
-        f"Stereo found the depth of {share:.0%} of the pixels{duration}, where strategy "
-        f'{settings.traits.name} places most new Gaussians. placing = "none" only splits.'
-    )
+    text = f"Stereo found the depth of {share:.0%} of the pixels{duration}, where strategy "
+    text += f"{settings.traits.name} places most new Gaussians."
+    note(Finding("stereo-depths", text, "info", fix='placing = "none" only splits.'))
     # Stereo's depths are in units of the scene; unknown ones, NaN, become 0.
     return {
         name: np.nan_to_num(depth * scale)

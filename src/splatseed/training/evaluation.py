@@ -6,13 +6,21 @@ another trainer needs the scene. What is resolved here is loaded and scored by `
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
 
-from splatseed.errors import MissingDependencyError, ParameterError, SceneNotFoundError
-from splatseed.io.files import StrPath
+from splatseed.errors import (
+    MissingDependencyError,
+    ParameterError,
+    SceneNotFoundError,
+    SplatseedError,
+)
+from splatseed.findings import Finding
+from splatseed.io.files import StrPath, read_text
 from splatseed.photos.cache import user_cache_dir
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
@@ -21,9 +29,10 @@ from splatseed.splat.covisible import find_covisible, pixel_masks
 from splatseed.splat.evaluate import OnView, TrainedModel, evaluate_model, load_model
 from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.lpips import load_lpips
+from splatseed.text import counted
 from splatseed.training.config import has_run_masks, has_run_poses, trained_images
 from splatseed.training.device import pick_device
-from splatseed.training.models import config_of, model_file, near_plane_of, split_doubt
+from splatseed.training.models import config_of, model_file, near_plane_of
 from splatseed.training.request import AS_TRAINED, EvaluateRequest
 from splatseed.training.settings import TrainSettings
 
@@ -90,34 +99,35 @@ class Evaluation:
             progress=progress,
         )
 
-    def doubts(self, loaded: TrainedModel) -> list[str]:
-        """Describe what may make the scores wrong, or others than expected, one sentence each."""
-        listed = loaded.scene.listed
-        doubts = [*loaded.findings, listed.sentence if listed else ""]
+    def findings(self, loaded: TrainedModel) -> tuple[Finding, ...]:
+        """Return what may make the scores wrong, or others than expected."""
+        found, listed = [*loaded.findings], loaded.scene.listed
+        if listed is not None:
+            found.append(Finding("listed-split", listed.sentence, "info"))
         if self.config:
-            doubts += self._changes(loaded.scene, [view.name for view in loaded.views])
+            found += self._changes(loaded.scene, [view.name for view in loaded.views])
         elif isinstance(self.model, Path):
-            doubts.append(split_doubt(self.model, len(loaded.views)))
-        return [doubt for doubt in doubts if doubt]
+            found += split_findings(self.model, len(loaded.views))
+        return tuple(found)
 
-    def _changes(self, scene: Scene, tested: Sequence[str]) -> Iterator[str]:
-        """Describe what is not as in the run's training, one sentence each."""
+    def _changes(self, scene: Scene, tested: Sequence[str]) -> Iterator[Finding]:
+        """Yield what is not as in the run's training."""
         config, trained = self.config, trained_images(self.config, scene)
-        if seen := sum(name in trained for name in tested):
+        if seen := tuple(name for name in tested if name in trained):
             every = config.get("test_every")
             by_number = self.test_every != every and scene.listed is None
             why = f"its test_every was {every}" if by_number else "the scene's split was another"
-            yield f"The run was trained on {seen} of these {len(tested)} views: {why}."
+            text = f"The run was trained on {len(seen)} of these {len(tested)} views: {why}."
+            yield Finding("trained-test-views", text, "error", seen)
         own = scene.source is not None and str(scene.source.again) == config.get("scene")
         if not own or config.get("refine_poses"):
             return  # another copy, or one that the run wrote: its files may differ
         if not has_run_poses(config, scene):
-            yield "The scene's photographs or poses have changed since the run was trained."
+            text = "The scene's photographs or poses have changed since the run was trained."
+            yield Finding("changed-photographs", text)
         if self.request.masks == config.get("masks") and not has_run_masks(config, scene):
-            yield (
-                "The scene's masks have changed since the run was trained: its own scores are over "
-                "other pixels."
-            )
+            text = "The scene's masks have changed since the run was trained: its own scores are "
+            yield Finding("changed-masks", f"{text}over other pixels.")
 
     def score(
         self,
@@ -146,6 +156,27 @@ class Evaluation:
             on_view=on_view,
             progress=progress,
         )
+
+
+def split_findings(model: Path, views: int) -> tuple[Finding, ...]:
+    """Return whether another trainer held out these test views; empty if it did.
+
+    graphdeco's trainer and its relatives write ``cfg_args`` into the model's folder, with
+    ``eval=True`` if every 8th photograph was held out.
+    """
+    for folder in model.resolve().parents[:4]:
+        file = folder / "cfg_args"
+        with suppress(OSError, SplatseedError):
+            found = re.search(r"\beval=(True|False)\b", read_text(file))
+            if found and found[1] == "False":
+                text = f"The model was trained on all photographs, as {file} has eval=False: its "
+                text += "scores are too high, since it has seen the test views."
+                return (Finding("trained-test-views", text, "error"),)
+            if found:
+                return ()
+    text = f"{model} does not record on which photographs it was trained: if these "
+    text += f"{counted(views, 'view')} were among them, its scores are too high."
+    return (Finding("unknown-split", text),)
 
 
 def _scene_of(

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from splatseed.errors import SceneFormatError, SceneNotFoundError, SplatseedError
-from splatseed.io.files import read_text, special_kind
+from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.io.files import special_kind
 from splatseed.io.load import is_scene
 from splatseed.io.masks import NONE
-from splatseed.text import counted, quoted
+from splatseed.text import quoted
 from splatseed.training.folder import RunFolder
 
 
@@ -46,29 +44,6 @@ def near_plane_of(config: Mapping[str, Any]) -> float | None:
     """Return the near plane of a run's training, in scene units; None without one."""
     near = config.get("near_plane")
     return float(near) if isinstance(near, float) and 0 < near < math.inf else None
-
-
-def split_doubt(model: Path, views: int) -> str:
-    """Describe the doubt whether another trainer held out these test views; empty if it did.
-
-    graphdeco's trainer and its relatives write ``cfg_args`` into the model's folder, with
-    ``eval=True`` if every 8th photograph was held out.
-    """
-    for folder in model.resolve().parents[:4]:
-        file = folder / "cfg_args"
-        with suppress(OSError, SplatseedError):
-            found = re.search(r"\beval=(True|False)\b", read_text(file))
-            if found and found[1] == "False":
-                return (
-                    f"The model was trained on all photographs, as {file} has eval=False: its "
-                    "scores are too high, since it has seen the test views."
-                )
-            if found:
-                return ""
-    return (
-        f"{model} does not record on which photographs it was trained: if these "
-        f"{counted(views, 'view')} were among them, its scores are too high."
-    )
 
 
 def config_of(path: Path) -> Mapping[str, Any]:

@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Float32
 
 from splatseed.errors import ParameterError, SceneNotFoundError
+from splatseed.findings import Finding
 from splatseed.io import load_scene
 from splatseed.io.files import StrPath
 from splatseed.io.photograph import photograph_folder
@@ -263,7 +264,8 @@ def _state(
         first = initial.gaussians(views, frame, setup)
         state = first_state(first, len(views), settings, strategy, device)
     if state.step:
-        setup.note(f"Resuming after step {state.step:,} of {settings.max_steps:,}.")
+        text = f"Resuming after step {state.step:,} of {settings.max_steps:,}."
+        setup.note(Finding("resumed-run", text, "info"))
     return state
 
 
@@ -318,9 +320,7 @@ def _start_gaussians(path: Path, scene: Scene, settings: TrainSettings, note: No
         config = folder.read_config()
         same_poses = has_run_poses(config, scene)
         tests, trained = scene.split(settings.test_every)[1], trained_images(config, scene)
-        if seen := sum(image.name in trained for image in tests):
-            note(
-                f"{path} was trained on {seen} of the {counted(len(tests), 'test view')}: scores "
-                "will be too high."
-            )
+        if seen := tuple(image.name for image in tests if image.name in trained):
+            text = f"{path} was trained on {len(seen)} of the {counted(len(tests), 'test view')}: "
+            note(Finding("trained-test-views", f"{text}scores will be too high.", "error", seen))
     return read_start(path, scene, note, same_poses=same_poses)

@@ -7,13 +7,15 @@ Notation: a *step* renders one training view. A strategy whose name ends in ``-3
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from splatseed.findings import Finding
 from splatseed.photos.sizes import TRAINED_SIDE, default_factor
+from splatseed.progress import Note, silent_note
 from splatseed.scene import Image
 from splatseed.settings import Range, check_settings
 from splatseed.training.schedule import FULL_RUN, Schedule, continued, make_schedule
@@ -97,9 +99,7 @@ class TrainSettings:
     def __post_init__(self) -> None:
         check_settings(self)
 
-    def with_data_factor(
-        self, images: Sequence[Image], note: Callable[[str], None] = lambda _: None
-    ) -> TrainSettings:
+    def with_data_factor(self, images: Sequence[Image], note: Note = silent_note) -> TrainSettings:
         """Set the default data factor where the user set none; note it if it downsamples.
 
         The cameras of ``images`` are in pixels of the files.
@@ -113,10 +113,9 @@ class TrainSettings:
             )
             stored = f"{lens.width:,} x {lens.height:,}"
             size = f"{lens.width // factor:,} x {lens.height // factor:,}"
-            note(
-                f"Photographs of {stored} pixels are used at {size}, as the default is "
-                f"{TRAINED_SIDE:,} a side at most: `data_factor=1` keeps their size."
-            )
+            text = f"Photographs of {stored} pixels are used at {size}, as the default is "
+            text += f"{TRAINED_SIDE:,} a side at most: `data_factor=1` keeps their size."
+            note(Finding("downsampled-photographs", text, "info"))
         return replace(self, data_factor=factor)
 
     @property
