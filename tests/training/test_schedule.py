@@ -58,7 +58,7 @@ def test_enough_photographs_are_seen_between_densifications(strategy, steps, eve
 @pytest.mark.parametrize("steps", [1500, 30_000])
 def test_auto_is_grow_in_short_runs_and_in_long_ones(steps):
     auto, grow = (TrainSettings(strategy=name, max_steps=steps) for name in ("auto", "grow"))
-    assert (auto.densification, auto.schedule, auto.cap) == ("grow", grow.schedule, grow.cap)
+    assert (auto.traits, auto.schedule, auto.cap) == (grow.traits, grow.schedule, grow.cap)
 
 
 @pytest.mark.parametrize(

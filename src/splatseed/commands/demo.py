@@ -375,7 +375,6 @@ def _train_arm(
 def _summarise_training(
     picture: Path, seeding: float, results: Mapping[str, TrainingResult]
 ) -> None:
-    """Print the runs side by side, and the gain by seeds."""
     seconds = {name: each.train_seconds for name, each in results.items()}
     seconds[POSES] += seeding
     rows = [

@@ -54,7 +54,7 @@ RUN_FACTS = {"splatseed", "points", "photographs", "split", "mask_files", "devic
 """Keys of config.json that are not options."""
 EXCLUSIVE = (("start", "seeding"), ("start", "refine_poses"), ("long_side", "data_factor"))
 """Pairs of exclusive options: one on the command line replaces the other of a file."""
-BEST = TrainRequest()
+DEFAULT = TrainRequest()
 NESTED = {"request", "settings", "named"}
 """Fields that are no options."""
 
@@ -67,7 +67,7 @@ class Options:
     """A scene with photographs, as splatseed upsample writes it."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """The folder of the run."""
-    request: Annotated[TrainRequest, tyro.conf.arg(name="")] = BEST
+    request: Annotated[TrainRequest, tyro.conf.arg(name="")] = DEFAULT
     """How to train; its fields are options of their own."""
     view: bool = False
     """Watch training in the browser; pause it, or stop early and keep the result (extra view)."""
@@ -146,7 +146,7 @@ def _read_config(path: Path, words: Collection[str]) -> dict[str, Any]:
         content["seeding"] = None if content.get("start") else content.get("seeding")
     elif seeds is not None:
         content["seeding"] = seeds
-    if isinstance(content.get("budget"), int | float):
+    if isinstance(content.get("budget"), float):
         content["budget"] = str(content["budget"])
     excluded = {b for pair in EXCLUSIVE for a, b in (pair, pair[::-1]) if a in words} | RUN_FACTS
     return {k: v for k, v in content.items() if k not in excluded and v is not None}
@@ -193,7 +193,6 @@ def run(arguments: list[str]) -> None:
 
 
 def _announce(options: Options, training: TrainingRun) -> None:
-    """Print the scene, the settings and the output."""
     settings, views = training.settings, training.trainer.train_views
     for name in settings.unused:
         text = f"{name} has no effect with strategy {settings.traits.name}."
@@ -235,7 +234,6 @@ def _watched(options: Options, training: TrainingRun) -> Iterator[TrainingViewer
 
 
 def _per_pixel(options: Options) -> bool:
-    """Whether the budget depends on the size of the photographs."""
     return options.request.budget is None or in_rho(options.request.budget)
 
 
@@ -332,7 +330,6 @@ def _line(training: TrainingRun, steps_per_second: float | None) -> str:
 
 
 def _summarise(options: Options, training: TrainingRun, result: TrainingResult) -> None:
-    """Print the final table and the commands to run next."""
     scores, seconds, output = result.scores, result.train_seconds, options.output
     exposed = training.settings.exposure != "none"
     psnr = f"{scores.psnr:.2f} dB" if math.isfinite(scores.psnr) else "infinite"

@@ -31,10 +31,11 @@ from splatseed.scene import Image, Scene
 from splatseed.scores import EvalResult
 from splatseed.seeding.budget import in_rho, median_pixels, median_size, parse_budget
 from splatseed.settings import change_settings
-from splatseed.training.folder import RunFolder
-from splatseed.training.models import config_of, model_file, near_plane_of
+from splatseed.training.config import near_plane_of
+from splatseed.training.folder import RunFolder, config_of, model_file
 from splatseed.training.request import EvaluateRequest, TrainRequest
 from splatseed.training.settings import BUDGET, MIN_GAUSSIANS, TrainSettings
+from splatseed.training.strategies.registry import AUTO
 
 require("torch", "gsplat", "flip_evaluator")  # before what imports them, for one clear error
 
@@ -255,7 +256,9 @@ def _sized(
     if long_side is None:
         if settings.data_factor is None and resumed is not None:
             kept = resumed.read_config().get("data_factor")
-            return dataclasses.replace(settings, data_factor=kept)
+            return dataclasses.replace(
+                settings, data_factor=kept if isinstance(kept, int) else None
+            )
         return settings.with_data_factor(scene.images, note)
     if settings.data_factor is not None:
         raise ParameterError("`long_side` or `data_factor`", found="both", fix="Leave one out.")
@@ -269,7 +272,7 @@ def _within_budget(
     settings: TrainSettings, budget: int | str | None, scene: Scene, note: Note
 ) -> TrainSettings:
     """The settings with the number of Gaussians that the budget allows in this scene."""
-    chosen = settings.strategy == "auto" and settings.cap_max is None
+    chosen = settings.strategy == AUTO and settings.cap_max is None
     if budget is None and not (chosen and scene.images):
         return settings
     views = camera_views(scene.images, settings.factor)

@@ -6,6 +6,7 @@ Promise: an interrupted run resumes only with its own settings, seeds, photograp
 from __future__ import annotations
 
 import dataclasses
+import math
 import platform
 from collections.abc import Collection, Mapping
 from typing import Any
@@ -60,7 +61,6 @@ def make_config(
 
 
 def _names_of_parts(scene: Scene, settings: TrainSettings) -> dict[str, list[str]]:
-    """Return the names of the training and test images."""
     parts = zip(("train", "test"), scene.split(settings.test_every), strict=True)
     return {part: [image.name for image in images] for part, images in parts}
 
@@ -128,6 +128,12 @@ def check_same_input(folder: RunFolder, config: Mapping[str, Any], now: Mapping[
         raise another_scene(folder, config, found)
     if config.get("photographs") != now["photographs"]:
         raise another_scene(folder, config, f"photographs or poses in {now['scene']}")
+
+
+def near_plane_of(config: Mapping[str, Any]) -> float | None:
+    """Return the near plane of a run's training, in scene units; None without one."""
+    near = config.get("near_plane")
+    return float(near) if isinstance(near, float) and 0 < near < math.inf else None
 
 
 def trained_images(config: Mapping[str, Any], scene: Scene) -> Collection[str]:

@@ -30,9 +30,9 @@ from splatseed.splat.evaluate import OnView, TrainedModel, evaluate_model, load_
 from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.lpips import load_lpips
 from splatseed.text import counted
-from splatseed.training.config import has_run_masks, has_run_poses, trained_images
+from splatseed.training.config import has_run_masks, has_run_poses, near_plane_of, trained_images
 from splatseed.training.device import pick_device
-from splatseed.training.models import config_of, model_file, near_plane_of
+from splatseed.training.folder import config_of, model_file
 from splatseed.training.request import AS_TRAINED, EvaluateRequest
 from splatseed.training.settings import TrainSettings
 

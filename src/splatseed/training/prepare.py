@@ -193,8 +193,6 @@ def _initial(scene: Scene, setup: _Setup) -> _Seeds | _Start:
 
 @dataclass(frozen=True)
 class _Seeds:
-    """A run's start from points."""
-
     points: PointCloud
 
     @property
@@ -212,8 +210,6 @@ class _Seeds:
 
 @dataclass(frozen=True)
 class _Start:
-    """A run's start from trained Gaussians."""
-
     model: Gaussians
 
     @property
@@ -314,7 +310,6 @@ def _at_refined_poses(scene: Scene, setup: _Setup) -> Scene:
 
 
 def _start_gaussians(path: Path, scene: Scene, settings: TrainSettings, note: Note) -> Gaussians:
-    """Read the Gaussians that the run continues from."""
     folder, same_poses = RunFolder(path.parent), False
     if path == folder.gaussians and folder.is_run:
         config = folder.read_config()
