@@ -22,7 +22,7 @@ from benchmarks.training.baseline import read_ledger
 
 from splatseed.errors import SplatseedError
 from splatseed.seeding.advice import AS_IT_IS, MIN_ROOM, Measured, advise
-from splatseed.training.strategies.registry import STRATEGIES
+from splatseed.training.traits import STRATEGIES
 
 __all__: list[str] = []
 

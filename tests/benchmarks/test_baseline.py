@@ -11,7 +11,7 @@ pytest.importorskip("torch", reason="training needs PyTorch")
 from splatseed.io import load_scene
 from splatseed.training import TrainSettings
 from splatseed.training.schedule import make_schedule
-from splatseed.training.strategies.registry import STRATEGIES
+from splatseed.training.traits import STRATEGIES
 
 MODULES = ("training.baseline", "training.baseline_arms")
 

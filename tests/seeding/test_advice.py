@@ -11,7 +11,7 @@ from splatseed.camera import Intrinsics
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene
 from splatseed.seeding.advice import AS_IT_IS, Measured, advise, measure
-from splatseed.training.strategies.registry import STRATEGIES
+from splatseed.training.traits import STRATEGIES
 
 FERN = Measured(6_009, 120_000, empty=0.4)
 

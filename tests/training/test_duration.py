@@ -21,7 +21,7 @@ from splatseed.training.duration import (
     step_seconds,
 )
 from splatseed.training.settings import TrainSettings
-from splatseed.training.strategies.registry import FULL_AT
+from splatseed.training.traits import FULL_AT
 
 GROW = TrainSettings(strategy="auto", max_steps=10_000, cap_max=400_000, data_factor=3)
 EARLY = RunSpeed(100, 0.5, 20_000, 1344 * 1008)

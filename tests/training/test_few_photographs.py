@@ -8,7 +8,7 @@ import torch
 from splatseed.training import trainer
 from splatseed.training.parameters import DROPPED, as_parameters, with_dropout
 from splatseed.training.schedule import make_schedule
-from splatseed.training.strategies.registry import STRATEGIES
+from splatseed.training.traits import STRATEGIES
 
 
 def test_some_are_dropped_and_the_others_make_up_for_them():

@@ -14,7 +14,7 @@ from splatseed.training.parameters import as_parameters, make_optimizers
 from splatseed.training.schedule import LEARNING_RATES, make_schedule
 from splatseed.training.settings import TrainSettings
 from splatseed.training.state import make_strategy
-from splatseed.training.strategies.registry import STRATEGIES
+from splatseed.training.traits import STRATEGIES
 
 
 @pytest.mark.parametrize("as_3dgs", [True, False])

@@ -20,7 +20,7 @@ from splatseed.training.parameters import make_optimizers, make_parameters, opti
 from splatseed.training.schedule import make_schedule
 from splatseed.training.seeds import seeded, seeds_digest, usable_seeds
 from splatseed.training.settings import TrainSettings
-from splatseed.training.strategies.registry import STRATEGIES
+from splatseed.training.traits import STRATEGIES
 
 ORIGINALS, NEW = 40, 60
 

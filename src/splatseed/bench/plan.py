@@ -23,7 +23,7 @@ from splatseed.seeding.budget import RHO, parse_budget
 from splatseed.text import did_you_mean
 from splatseed.training.duration import GROWTH, step_seconds
 from splatseed.training.settings import Backend, StrategyName, TrainSettings
-from splatseed.training.strategies.registry import STRATEGIES
+from splatseed.training.traits import STRATEGIES
 
 SFM = "sfm"
 """The baseline: the unchanged points of Structure-from-Motion, at ratio 1."""

@@ -27,7 +27,7 @@ from splatseed.training.duration import planned_seconds
 from splatseed.training.request import DEFAULTS
 from splatseed.training.schedule import FULL_RUN
 from splatseed.training.settings import BUDGET, TrainSettings
-from splatseed.training.strategies.registry import Traits
+from splatseed.training.traits import Traits
 
 TrainerName: TypeAlias = Literal[
     "splatseed", "gsplat", "graphdeco", "nerfstudio", "brush", "opensplat", "lichtfeld"

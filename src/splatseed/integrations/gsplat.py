@@ -24,7 +24,7 @@ from splatseed.io.depth_maps import DESCRIPTION, DepthFiles, read_description
 from splatseed.photos.view import NO_PIXELS, View
 from splatseed.requirements import require
 from splatseed.training.schedule import FULL_RUN, make_schedule
-from splatseed.training.strategies.registry import GROW_EVERY, STRATEGIES
+from splatseed.training.traits import GROW_EVERY, STRATEGIES
 
 require("torch", "gsplat")  # before what imports them
 

@@ -35,7 +35,7 @@ from splatseed.training.config import near_plane_of
 from splatseed.training.folder import RunFolder, config_of, model_file
 from splatseed.training.request import EvaluateRequest, TrainRequest
 from splatseed.training.settings import BUDGET, MIN_GAUSSIANS, TrainSettings
-from splatseed.training.strategies.registry import AUTO
+from splatseed.training.traits import AUTO
 
 require("torch", "gsplat", "flip_evaluator")  # before what imports them, for one clear error
 

@@ -84,7 +84,7 @@ def resumed_settings(
     _check_version(config)
     default = {**dataclasses.asdict(TrainSettings()), "refine_poses": False}
     now = {**dataclasses.asdict(settings), "refine_poses": refine_poses}
-    then = {name: config.get(name) for name in default if name != "backend"}
+    then: dict[str, Any] = {name: config.get(name) for name in default if name != "backend"}
     for name, value in then.items():
         if now[name] != value and (name in named or now[name] != default[name]):
             raise ParameterError(

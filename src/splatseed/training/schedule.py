@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
-from splatseed.training.strategies.registry import Traits
+from splatseed.training.traits import Traits
 
 FULL_RUN = 30_000
 

@@ -19,7 +19,7 @@ from splatseed.progress import Note, silent_note
 from splatseed.scene import Image
 from splatseed.settings import Range, check_settings
 from splatseed.training.schedule import FULL_RUN, Schedule, continued, make_schedule
-from splatseed.training.strategies.registry import AS_3DGS, NAMES, STRATEGIES, Traits, traits_of
+from splatseed.training.traits import AS_3DGS, NAMES, STRATEGIES, Traits, traits_of
 
 if TYPE_CHECKING:
     StrategyName = str

@@ -40,7 +40,7 @@ from splatseed.training.strategies.candidates import (
     draw_candidates,
     join_candidates,
 )
-from splatseed.training.strategies.registry import FULL_AT
+from splatseed.training.traits import FULL_AT
 
 NO_DEPTHS: Mapping[str, Tensor] = MappingProxyType({})
 SUMS = ("errors", "pixels", "max_pixels", "views")

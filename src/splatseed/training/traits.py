@@ -1,7 +1,8 @@
 """The strategies and what each needs: all that is known of a strategy without PyTorch.
 
-To add one, write a subclass of ``base.Strategy`` in a file of this folder, and describe it in
-``STRATEGIES``; its name is then an option of the command line, of ``ss.train`` and of plans.
+To add one, write a subclass of ``strategies.base.Strategy`` in a file of ``strategies/``, and
+describe it in ``STRATEGIES``; its name is then one of the command line's, of ``ss.train``'s and of
+plans'.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ class Traits:
     """What a strategy needs, and its timing in a run of 30,000 steps."""
 
     name: str
-    implementation: str  # its class, as "file:class" in this folder
+    implementation: str  # its class, as "file:class" in ``strategies/``
     adds: bool = True  # changes the number of Gaussians
     has_budget: bool = False  # has a maximum number of Gaussians, by default ``settings.BUDGET``
     seed_share: float = 1.0  # maximum seeds as a fraction of the budget
