@@ -60,8 +60,7 @@ def with_masks(scene: Scene, choice: str | None) -> Scene:
     folder = Path(location).absolute() if location else None
     if folder is not None:
         names = [image.name for image in scene.images]
-        image_dir = scene.source.image_dir if scene.source else None
-        files, notes = find_masks(names, folder, image_dir, named=True)
+        files, notes = find_masks(names, folder, scene.source.image_dir, named=True)
         choice = f"{INVERTED}:{folder}" if inverted else str(folder)
     if not files:
         where = f"in {folder}" if folder else "beside its photographs"
@@ -91,13 +90,13 @@ def masks_digest(scene: Scene) -> str | None:
 
 def with_own_masks(scene: Scene) -> Scene:
     """Attach the masks found near the photographs of a scene that was just read, if it has none."""
-    folder = scene.source.image_dir if scene.source else None
+    folder, root = scene.source.image_dir, scene.source.root
     masks, notes = scene.masks or Masks({}), list[str]()
-    if scene.source is None or folder is None:
+    if folder is None or root is None:
         return scene
     if not masks.files:
         names = [image.name for image in scene.images]
-        files, notes = find_own_masks(names, folder, scene.source.root)
+        files, notes = find_own_masks(names, folder, root)
         notes += _resized(files, folder)
         masks = replace(masks, files=files)
     return scene.replace(masks=masks, findings=(*scene.findings, *notes, *_mostly_masked(masks)))

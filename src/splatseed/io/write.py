@@ -96,9 +96,8 @@ def write_scene(
             found=f"{len(scene.points)} points, none of them finite",
             fix="Check the cloud.",
         )
-    inputs = source.inputs if source else ()
     kind = str(made.get("command", _KIND))
-    with output_folder(path, kind=kind, overwrite=overwrite, protect=inputs) as folder:
+    with output_folder(path, kind=kind, overwrite=overwrite, protect=source.inputs) as folder:
         if layout == "both":
             (notes, image_sources, offset), layout = write_both_layouts(clean, folder)
         else:
@@ -107,11 +106,11 @@ def write_scene(
             if layout == "colmap" and (hidden := photographs_hidden(image_sources, clean)):
                 notes.append(f"{hidden}: remove the folder's link before you train with it.")
         write_offset(folder, offset)
-        masks, photographs = clean.masks, source.image_dir if source else None
+        masks, photographs = clean.masks, source.image_dir
         if masks and photographs and rewrites_masks(clean, layout):
             image_sources.pop(MASKS, None)
             alone = replace(masks, alpha=False)  # photographs keep their transparency
-            names = [im.name for im in clean.images if (photographs / im.name).is_file()]
+            names = [image.name for image in clean.images if image.has_photograph]
             write_masks(alone, photographs, names, folder / MASKS)
             if layout != "colmap" and not (folder / MASKS).is_dir():
                 forget_masks(folder)  # no photograph has a masked pixel
@@ -129,14 +128,17 @@ def write_scene(
         for package in _PACKAGES:
             with suppress(PackageNotFoundError):  # splatseed itself may not be installed
                 versions[package] = version(package)
-        read = None
-        if source is not None:
-            is_file = source.format == "ply" or is_extracted(source.root)
-            bare = source.points_path if is_file else source.root
-            read = str(source.transforms_path or bare)
+        is_file = source.format == "ply" or (source.root and is_extracted(source.root))
+        read = source.transforms_path or (source.points_path if is_file else source.root)
         num_new = counts["num_points"] - counts["num_original"]
         made |= facts_for_reading(scene)
-        facts = {"source": read, **made, "format": layout, **counts, "num_new": num_new}
+        facts = {
+            "source": read and str(read),
+            **made,
+            "format": layout,
+            **counts,
+            "num_new": num_new,
+        }
         write_json(folder / MANIFEST, {**facts, "notes": notes, "versions": versions})
     return WriteReport(
         path, layout, **counts, files=tuple(sorted([*files, *linked, MANIFEST])), notes=tuple(notes)
@@ -145,8 +147,7 @@ def write_scene(
 
 def _choose_layout(scene: Scene, wanted: str) -> Layout:
     if wanted == "auto":
-        read = scene.source is not None and scene.source.format == "transforms"
-        return "both" if read and scene.images else "colmap"
+        return "both" if scene.source.format == "transforms" and scene.images else "colmap"
     if wanted == "colmap":
         return "colmap"
     if wanted == "transforms" and scene.images:

@@ -23,7 +23,7 @@ from splatseed.io import load_scene
 from splatseed.io.files import StrPath, read_text
 from splatseed.io.masks import with_masks
 from splatseed.photos.cache import user_cache_dir
-from splatseed.photos.sizes import at_file_size, factor_for_size
+from splatseed.photos.sizes import factor_for_size
 from splatseed.photos.view import View, camera_views, view_of
 from splatseed.progress import Note, Progress, silent, silent_note
 from splatseed.requirements import require
@@ -200,7 +200,7 @@ def prepare_training(
     if not isinstance(scene, Scene):
         points_alone = settings.get("seeding") == "scene" and not refine_poses and not asked.start
         scene = load_scene(scene, require_points=points_alone)
-    scene = at_file_size(with_masks(scene, masks))
+    scene = with_masks(scene, masks)
     for warning in scene.findings:
         note(warning)
     if scene.listed is not None:

@@ -115,7 +115,7 @@ class Evaluation:
             by_number = self.test_every != every and scene.listed is None
             why = f"its test_every was {every}" if by_number else "the scene's split was another"
             yield f"The run was trained on {seen} of these {len(tested)} views: {why}."
-        own = scene.source is not None and str(scene.source.again) == config.get("scene")
+        own = str(scene.source.again) == config.get("scene")
         if not own or config.get("refine_poses"):
             return  # another copy, or one that the run wrote: its files may differ
         if not has_run_poses(config, scene):
