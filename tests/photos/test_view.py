@@ -11,7 +11,7 @@ from PIL import Image as PilImage
 
 from splatseed.camera import CAMERA_MODELS, Intrinsics
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
-from splatseed.io import load_scene
+from splatseed.io import load_scene, write_scene
 from splatseed.io.photograph_checks import ROUNDING, _off, fits
 from splatseed.lens import project_rays
 from splatseed.photos.cache import load_photograph
@@ -83,7 +83,7 @@ def test_files_resized_beforehand_scale_the_intrinsics(copied):
     (view,) = load_views(scene, scene.images[:1])
     for image in scene.images:
         assert image.intrinsics == image.lens.resized(96, 72) == whole.intrinsics
-        assert np.allclose(image.K[:2], whole.K[:2] / 2)
+        assert np.allclose(image.K[:2], whole.intrinsics.K[:2] / 2)
     assert np.array_equal(view.K, scene.images[0].K)
     assert points_within(scene, "1rho") == 48 * 36
     assert {(each.width, each.height) for each in frames_of(scene)} == {(48, 36)}
