@@ -119,8 +119,8 @@ def test_where_incremental_mapping_fails_all_photographs_are_mapped_at_once(
 
     monkeypatch.setattr(mapping, "_map", fail)
     names = [model.image(i).name for i in range(1, 9)]
-    folder, finding = map_images(run, names, "PINHOLE", None, partial=False)
-    assert finding is None
+    folder, doubt = map_images(run, names, "PINHOLE", None, partial=False)
+    assert doubt == ""
     found = run.pycolmap.Reconstruction(folder)
     assert found.num_reg_images() == 8
     assert found.compute_mean_reprojection_error() < 1
@@ -147,8 +147,8 @@ def test_a_worse_model_of_all_photographs_at_once_is_not_kept(run, monkeypatch):
 
     monkeypatch.setattr(mapping, "_map", extend)
     names = [model.image(i).name for i in range(1, 9)]
-    folder, finding = map_images(run, names, "PINHOLE", None, partial=False)
-    assert finding is None
+    folder, doubt = map_images(run, names, "PINHOLE", None, partial=False)
+    assert doubt == ""
     assert misplaced(model, run.pycolmap.Reconstruction(folder)) < 0.05
     assert {path.name for path in folder.parent.iterdir()} == {"0", "complete"}
 
@@ -174,8 +174,8 @@ def test_a_displaced_part_is_mapped_again_without_what_displaced_it(run, tmp_pat
     monkeypatch.setattr(mapping, "_map", map_wrongly)
     monkeypatch.setattr(mapping, "_map_globally", None)
     monkeypatch.setattr(mapping, "MODELS", str(tmp_path / "again"))
-    folder, finding = map_images(run, names, "PINHOLE", None, partial=False)
-    assert finding is None
+    folder, doubt = map_images(run, names, "PINHOLE", None, partial=False)
+    assert doubt == ""
     assert misplaced(model, run.pycolmap.Reconstruction(folder)) < 0.05
     assert {path.name for path in folder.parent.iterdir()} == {"0", "complete"}
     with run.pycolmap.Database.open(run.database) as database:  # the user's keep theirs
@@ -194,5 +194,5 @@ def test_a_part_that_stays_misplaced_is_named(run, monkeypatch):
     monkeypatch.setattr(mapping, "_map", map_wrongly)
     monkeypatch.setattr(mapping, "_map_globally", lambda *_: {})
     names = [model.image(i).name for i in range(1, 9)]
-    _, finding = map_images(run, names, "PINHOLE", None, partial=False)
-    assert "% of the matches between 3 of the photographs (view_001.png, " in str(finding)
+    _, doubt = map_images(run, names, "PINHOLE", None, partial=False)
+    assert "% of the matches between 3 of the photographs (view_001.png, " in doubt

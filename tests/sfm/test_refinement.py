@@ -176,7 +176,7 @@ def test_poses_that_stay_among_refined_ones_are_named(room, tmp_path, monkeypatc
 
     monkeypatch.setattr("splatseed.sfm.pipeline._call", call)
     _, note = refined_scene(scene, 0)
-    assert str(note).endswith(
+    assert note.endswith(
         "The poses of 2 of 12 images stay as given: SfM does not read view_001.webp; fewer than 10 "
         "points are seen in view_000.png."
     )

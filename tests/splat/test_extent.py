@@ -45,9 +45,9 @@ def near():
 
 
 def _written(path, model):
-    """What comes back from a file, and the findings of its writer, as printed."""
+    """What comes back from a file, and the notes of its writer."""
     notes = []
-    write_gaussians(path, model, note=lambda finding: notes.append(str(finding)))
+    write_gaussians(path, model, note=notes.append)
     return read_gaussians(path), notes
 
 

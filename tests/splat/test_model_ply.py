@@ -48,7 +48,7 @@ def _write(path, columns, form="binary_little_endian", before="", head=b"", afte
 
 def _read(path):
     notes = []
-    return read_gaussians(path, lambda finding: notes.append(str(finding))), notes
+    return read_gaussians(path, notes.append), notes
 
 
 def _same(model, other):
@@ -255,7 +255,7 @@ def test_antialiasing_round_trips_and_affects_the_render(tmp_path):
     np.testing.assert_allclose(faint.max() / plain.max(), 0.01 / 0.31, rtol=0.02)
     notes = []
     write_gaussians(tmp_path / "m.splat", model, note=notes.append)
-    assert [each.kind for each in notes] == ["antialiasing-lost"]
+    assert ".splat" in notes[0]
 
 
 def test_antialiasing_flags_of_other_programs_are_read(plain, tmp_path):

@@ -134,15 +134,9 @@ def write_scene(
         read = source.transforms_path or (source.points_path if is_file else source.root)
         num_new = counts["num_points"] - counts["num_original"]
         made |= facts_for_reading(scene)
-        facts = {
-            "source": read and str(read),
-            **made,
-            "format": layout,
-            **counts,
-            "num_new": num_new,
-        }
-        facts |= {"findings": [asdict(each) for each in findings], "versions": versions}
-        write_json(folder / MANIFEST, facts)
+        facts = {"source": read and str(read), **made, "format": layout, **counts}
+        facts |= {"num_new": num_new, "findings": [asdict(each) for each in findings]}
+        write_json(folder / MANIFEST, {**facts, "versions": versions})
     return WriteReport(
         path,
         layout,
