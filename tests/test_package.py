@@ -37,7 +37,11 @@ ORDER = (
 
 DELEGATING = {
     "pointcloud": {"splatseed.io.ply"},  # PointCloud.read_ply, write_ply
-    "scene": {"splatseed.io.photograph"},  # Image.read
+    "scene": {  # Image.read, size, lens, read_mask
+        "splatseed.io.photograph",
+        "splatseed.io.photograph_checks",
+        "splatseed.io.masks",
+    },
 }
 """What methods of data types hand over to when they are called: io, which imports these types."""
 

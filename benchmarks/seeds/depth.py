@@ -37,7 +37,6 @@ import splatseed as ss
 from splatseed.depth.alignment import map_camera
 from splatseed.errors import SceneNotFoundError
 from splatseed.io import find_depths
-from splatseed.io.photograph import decode_photograph, photograph_bytes
 from splatseed.photos.cache import user_cache_dir
 from splatseed.photos.viewpoint import choose_camera
 from splatseed.progress import in_threads, silent
@@ -296,8 +295,7 @@ def decode_all(scene: Scene, *, depths: bool) -> None:
 
     def work(start: int, stop: int) -> None:
         for image in scene.images[start:stop]:
-            path = scene.source.image_dir / image.name
-            np.asarray(decode_photograph(path, photograph_bytes(path)))
+            image.read()
             if depths:
                 scene.depths.read(image.name)
 

@@ -16,7 +16,7 @@ from splatseed.findings import Finding
 from splatseed.io.staging import read_manifest
 from splatseed.io.transforms_layout import Layout
 from splatseed.lens import undistort_command, undistorted_folder
-from splatseed.photos.sizes import TRAINED_SIDE, at_file_size, factor_for_size
+from splatseed.photos.sizes import TRAINED_SIDE, factor_for_size
 from splatseed.runtime.environment import available_cpus
 from splatseed.scene import Image, Scene
 from splatseed.seeding.advice import AS_IT_IS, SEEDED, Advice
@@ -75,9 +75,9 @@ class Planned(NamedTuple):
 
         The other trainers densify as 3DGS does by default.
         """
-        images = at_file_size(scene).images
+        images = scene.images
         factor = factor_for_size(images, long_side) if images else 1
-        lenses = [image.intrinsics for image in images]
+        lenses = [image.lens for image in images]
         sizes = [(lens.width // factor, lens.height // factor) for lens in lenses]
         pixels = round(float(np.median([w * h for w, h in sizes]))) if sizes else BUDGET
         number, flags = max(2, min(BUDGET, pixels)), ""
@@ -168,7 +168,7 @@ def _most_seeds(images: Sequence[Image]) -> int:
         return 0
     factor = factor_for_size(images, settings.max_size)
     step = factor * settings.spacing
-    sizes = [(image.intrinsics.width, image.intrinsics.height) for image in images]
+    sizes = [(image.camera.width, image.camera.height) for image in images]
     return sum(math.ceil(width / step) * math.ceil(height / step) for width, height in sizes)
 
 
@@ -176,9 +176,9 @@ def _for_trainer(
     path: Path, scene: Scene, advice: Advice, planned: Planned, *, refine: bool
 ) -> Commands:
     """Return the commands that lead to another trainer."""
-    source = scene.source.format if scene.source else "colmap"
+    source = scene.source.format
     layout: Layout = "transforms" if source == "transforms" else "colmap"
-    if scene.source and read_manifest(scene.source.root).get("format") == "both":
+    if read_manifest(scene.source.root).get("format") == "both":
         layout = "both"
     other = source not in {"colmap", "transforms"} or (
         layout == "transforms" and planned.trainer in map(str.lower, COLMAP_ONLY)
@@ -234,7 +234,7 @@ def lifting_command(path: Path, maps: Path, how: str) -> str:
 
 def triangulate_command(path: Path, scene: Scene, output: str) -> str:
     """Return the command that triangulates points for a scene's poses."""
-    photographs = scene.source.image_dir if scene.source else None
+    photographs = scene.source.image_dir
     images = "IMAGES" if photographs is None else quoted(photographs)
     return f"splatseed sfm {images} --poses-from {quoted(path)} -o {output}"
 

@@ -141,9 +141,9 @@ def advise(
 
 
 def measure(scene: Scene, empty: float | None = None) -> Measured:
-    """Measure a scene without opening a photograph; ``empty`` as in ``advice_for``."""
+    """Measure a scene without reading a photograph's pixels; ``empty`` as in ``advice_for``."""
     points = scene.points.originals
-    sizes = [image.intrinsics.width * image.intrinsics.height for image in scene.images]
+    sizes = [image.camera.width * image.camera.height for image in scene.images]
     return Measured(
         num_points=int(np.count_nonzero(points.distinct)),
         pixels=float(np.median(sizes)) if sizes else 0.0,

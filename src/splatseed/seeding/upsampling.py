@@ -22,7 +22,6 @@ from splatseed.methods import (
     configure,
     source_code,
 )
-from splatseed.photos.sizes import at_file_size
 from splatseed.photos.visibility import find_visibility
 from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.progress import Progress, silent
@@ -162,7 +161,7 @@ def upsample(
 
 
 def _as_scene(scene: Scene | PointCloud) -> Scene:
-    """Return a scene with cameras in pixels of the photographs' files; of a cloud without any."""
+    """Return the scene; of a cloud, one without images."""
     if isinstance(scene, PointCloud):
         return Scene(scene)
     if not isinstance(scene, Scene):
@@ -171,7 +170,7 @@ def _as_scene(scene: Scene | PointCloud) -> Scene:
             found=type(scene).__name__,
             fix="Load it first with load_scene.",
         )
-    return at_file_size(scene)
+    return scene
 
 
 def _thin_full_scene(

@@ -25,10 +25,11 @@ from splatseed.io.files import VIDEO_SUFFIXES, StrPath, files_below
 from splatseed.io.film import choose_frames
 from splatseed.io.mask_files import masks_among
 from splatseed.io.photograph import check_photograph, open_photograph, photograph_bytes
-from splatseed.io.photograph_checks import check_sizes, resized_to
+from splatseed.io.photograph_checks import check_sizes
 from splatseed.io.scanner_app import is_photograph, is_scanner_app
 from splatseed.io.staging import read_manifest
 from splatseed.io.video import ANALYSIS_WIDTH, sharpness, small_frames, write_frames
+from splatseed.photos.sizes import at_file_size
 from splatseed.progress import Progress, silent
 from splatseed.runtime.fingerprint import fingerprint
 from splatseed.scene import Image, Scene
@@ -165,8 +166,9 @@ def match_poses(photos: Photos, scene: Scene, image_dir: Path) -> tuple[Image, .
         SceneFormatError: A photograph is neither of its camera's size nor a resized copy.
     """
     posed = {image.name: image for image in scene.images}
-    # Drop observations, which the child process does not need.
-    images = [replace(posed[name], observations=None) for name in photos if name in posed]
+    # Without observations, which the child process does not need.
+    found = [posed[name] for name in photos if name in posed]
+    images = [replace(image, observations=None, folder=image_dir) for image in found]
     if len(images) < 2:
         raise SceneNotFoundError(
             f"two or more images of {image_dir} among the {len(posed)} posed images "
@@ -174,7 +176,8 @@ def match_poses(photos: Photos, scene: Scene, image_dir: Path) -> tuple[Image, .
             found=f"{len(images)} of {len(photos)} ({name_some(list(photos)[:3])}, ...)",
             fix="Names must match exactly, relative to the images folder, suffix included.",
         )
-    return resized_to(images, check_sizes(images, image_dir))
+    check_sizes(images)
+    return at_file_size(images)
 
 
 class PickedFrames(NamedTuple):

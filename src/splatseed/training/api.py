@@ -23,7 +23,7 @@ from splatseed.io import load_scene
 from splatseed.io.files import StrPath, read_text
 from splatseed.io.masks import with_masks
 from splatseed.photos.cache import user_cache_dir
-from splatseed.photos.sizes import at_file_size, factor_for_size
+from splatseed.photos.sizes import factor_for_size
 from splatseed.photos.view import View, camera_views, view_of
 from splatseed.progress import Note, Progress, silent, silent_note
 from splatseed.requirements import require
@@ -173,7 +173,7 @@ def prepare_training(
         points_alone = "seeding" in request.named and settings.seeding == "scene"
         points_alone &= not request.refine_poses and not settings.start
         scene = load_scene(scene, require_points=points_alone)
-    scene = at_file_size(with_masks(scene, request.masks))
+    scene = with_masks(scene, request.masks)
     for finding in scene.findings:
         note(finding)
     if scene.listed is not None:

@@ -36,10 +36,10 @@ def make_config(
 ) -> dict[str, Any]:
     """Return the content of config.json; ``initial`` are the facts of the seeds or of the start."""
     source = scene.source
-    points = source.points_path if source and not refine_poses else None
+    points = None if refine_poses else source.points_path
     config = {
         "splatseed": version_of("splatseed"),
-        "scene": str(source.again) if source else None,
+        "scene": str(source.again) if source.again else None,
         "points": str(points.resolve()) if points else None,
         "refine_poses": refine_poses,
         "masks": mask_choice(scene),
@@ -177,7 +177,7 @@ def check_same_scene(
         listed = f" (by its {scene.listed.origin})" if scene.listed else ""
         found = f"training or test images{listed}"
     if found:
-        where = scene.source.root if scene.source else "the scene"
+        where = scene.source.root or "the scene"
         raise another_scene(folder, config, f"{found} in {where}")
 
 

@@ -119,7 +119,7 @@ class Evaluation:
             why = f"its test_every was {every}" if by_number else "the scene's split was another"
             text = f"The run was trained on {len(seen)} of these {len(tested)} views: {why}."
             yield Finding("trained-test-views", text, "error", seen)
-        own = scene.source is not None and str(scene.source.again) == config.get("scene")
+        own = str(scene.source.again) == config.get("scene")
         if not own or config.get("refine_poses"):
             return  # another copy, or one that the run wrote: its files may differ
         if not has_run_poses(config, scene):

@@ -19,12 +19,10 @@ from splatseed.errors import ParameterError, SceneNotFoundError
 from splatseed.findings import Finding
 from splatseed.io import load_scene
 from splatseed.io.files import StrPath
-from splatseed.io.photograph import photograph_folder
 from splatseed.io.photograph_checks import check_sizes, with_photographs
 from splatseed.io.seeds import was_upsampled
 from splatseed.photos.camera_check import reference_points, stray_findings
 from splatseed.photos.loading import load_split, refuse_distortion
-from splatseed.photos.sizes import at_file_size
 from splatseed.photos.view import View, camera_views
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Note, Progress, silent, silent_note
@@ -176,8 +174,7 @@ def _open_folder(
     if options.tensorboard:
         require("tensorboard")
     folder = RunFolder(path)
-    inputs = scene.source.inputs if scene.source else ()
-    protect = [*inputs, *([Path(settings.start)] if settings.start else [])]
+    protect = [*scene.source.inputs, *([Path(settings.start)] if settings.start else [])]
     folder.check(overwrite=options.overwrite, resume=options.resume, protect=protect)
     return folder, folder.read_config() if options.resume and folder.is_run else None
 
@@ -270,20 +267,20 @@ def _train_poses(scene: Scene, settings: TrainSettings) -> Sequence[View]:
 
 
 def _photographed(scene: Scene) -> Scene:
-    """Drop images that cannot be trained on, and give cameras the sizes of the files."""
+    """Drop images without a photograph, and check that the others can be trained on."""
     source = scene.source
     if not scene.images:
         raise SceneNotFoundError(
             "a scene with photographs to train on",
-            found=f"points alone{f' ({source.points_path})' if source else ''}",
+            found=f"points alone{f' ({source.points_path})' if source.points_path else ''}",
             fix="Name a scene with cameras, images and photographs. To start from the points of a "
             "scan, add them to it: splatseed upsample SCENE --cloud FILE -o OUT.",
         )
     for image in scene.images:
-        refuse_distortion(image, source.root if source else None)
+        refuse_distortion(image, source.root)
     scene = with_photographs(scene)
-    check_sizes(scene.images, photograph_folder(scene))
-    return at_file_size(scene)
+    check_sizes(scene.images)
+    return scene
 
 
 def _at_refined_poses(scene: Scene, setup: _Setup) -> Scene:
@@ -293,7 +290,7 @@ def _at_refined_poses(scene: Scene, setup: _Setup) -> Scene:
     if setup.earlier is not None:
         kept = load_scene(setup.folder.scene)
         if {image.name for image in scene.images} != {image.name for image in kept.images}:
-            where = scene.source.root if scene.source else "the scene"
+            where = scene.source.root or "the scene"
             raise another_scene(setup.folder, setup.earlier, f"images in {where}")
         return with_refined(scene, kept)
     if was_upsampled(scene):

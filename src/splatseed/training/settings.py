@@ -100,17 +100,12 @@ class TrainSettings:
         check_settings(self)
 
     def with_data_factor(self, images: Sequence[Image], note: Note = silent_note) -> TrainSettings:
-        """Set the default data factor where the user set none; note it if it downsamples.
-
-        The cameras of ``images`` are in pixels of the files.
-        """
+        """Set the default data factor where the user set none; note it if it downsamples."""
         if self.data_factor is not None:
             return self
         factor = default_factor(images)
         if factor > 1:
-            lens = max(
-                (im.intrinsics for im in images), key=lambda lens: max(lens.width, lens.height)
-            )
+            lens = max((im.lens for im in images), key=lambda lens: max(lens.width, lens.height))
             stored = f"{lens.width:,} x {lens.height:,}"
             size = f"{lens.width // factor:,} x {lens.height // factor:,}"
             text = f"Photographs of {stored} pixels are used at {size}, as the default is "
