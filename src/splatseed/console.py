@@ -21,8 +21,7 @@ from rich.table import Table
 from rich.text import Text
 
 from splatseed.findings import Finding
-from splatseed.progress import COMPILATION, Progress, StageTimes, extraction_progress
-from splatseed.runtime.compilation import watched
+from splatseed.progress import COMPILATION, Progress, StageTimes, extraction_progress, watched
 from splatseed.text import quoted, visible
 
 ARGUMENT = re.compile(r"`(?P<name>[a-z]\w*(?:\.[a-z]\w*)*)(?:=(?P<value>[^`]+))?`")

@@ -1,8 +1,8 @@
-"""Report progress and notes to the caller.
+"""Report progress, findings and the compilation of kernels to the caller.
 
 A ``Progress`` is any callable that takes a stage's name and the fraction of it that is done, from
 0 to 1. Library functions default to ``silent``; the command line passes a progress bar. A ``Note``
-takes a ``Finding``.
+takes a ``Finding``. ``runtime.jit`` notifies watchers of compilation, which need not import Numba.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import TypeAlias
 
@@ -96,3 +97,22 @@ def in_threads(
             progress(stage, done / len(starts))
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
+
+
+_watchers: list[Callable[[bool], None]] = []
+
+
+@contextmanager
+def watched(watcher: Callable[[bool], None]) -> Iterator[None]:
+    """Call ``watcher`` with True when a compilation begins, False when it ends; they can nest."""
+    _watchers.append(watcher)
+    try:
+        yield
+    finally:
+        _watchers.remove(watcher)
+
+
+def notify(begins: bool) -> None:
+    """Notify all watchers that a compilation begins or ends."""
+    for watcher in tuple(_watchers):
+        watcher(begins)

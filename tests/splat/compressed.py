@@ -6,9 +6,8 @@ import numpy as np
 
 from splatseed.splat.compressed_ply import _BOUNDS, _PACKED
 from splatseed.splat.formats import write_gaussians
-from splatseed.splat.gaussians import SH_C0
-from splatseed.splat.ply_layout import antialiased_comment
-from splatseed.splat.quantization import opacity_bytes, smallest_three
+from splatseed.splat.gaussians import SH_C0, antialiased_comment
+from splatseed.splat.packing import opacity_bytes, smallest_three
 
 
 def write_any(path, gaussians):

@@ -39,9 +39,8 @@ from splatseed.io.staging import MANIFEST, atomic_file, output_folder, write_jso
 from splatseed.methods import Upsampler, chooses_number, configure
 from splatseed.photos.cache import user_cache_dir
 from splatseed.pointcloud import PointCloud
-from splatseed.progress import Progress, silent
+from splatseed.progress import Progress, silent, watched
 from splatseed.requirements import version_of
-from splatseed.runtime.compilation import watched
 from splatseed.runtime.memory import peak_bytes
 from splatseed.runtime.tasks import Report, Workers, run_tasks
 from splatseed.scene import Scene

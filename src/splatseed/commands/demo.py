@@ -37,9 +37,9 @@ from splatseed.io import find_depths, load_scene, write_scene
 from splatseed.io.staging import add_files, atomic_file, output_folder, read_manifest
 from splatseed.methods import METHODS, chooses_number, configure, methods_for
 from splatseed.pointcloud import PointCloud
+from splatseed.progress import watched
 from splatseed.requirements import require, version_of
 from splatseed.runtime.child import Child
-from splatseed.runtime.compilation import watched
 from splatseed.scene import Scene
 from splatseed.text import quoted
 

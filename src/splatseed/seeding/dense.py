@@ -30,8 +30,7 @@ from splatseed.photos.loading import load_views
 from splatseed.photos.sizes import factor_for_size
 from splatseed.photos.view import View
 from splatseed.photos.visibility import find_visibility, points_in_image
-from splatseed.progress import Note, Progress, StageTimes, thread_limit
-from splatseed.runtime.compilation import watched
+from splatseed.progress import Note, Progress, StageTimes, thread_limit, watched
 from splatseed.runtime.memory import PROCESS, format_bytes, free_memory, resident_bytes
 from splatseed.scene import Image, Scene
 from splatseed.seeding.photo_methods import Stereo, photographed, stereo_points

@@ -22,7 +22,7 @@ from splatseed.requirements import install_command
 from splatseed.runtime.torch_device import DeviceName
 from splatseed.scene import Image
 from splatseed.sfm.cameras import SharedCamera
-from splatseed.sfm.readable import COPIES
+from splatseed.sfm.photos import COPIES
 from splatseed.sfm.work_folder import DATABASE, WorkFolder
 from splatseed.text import numeric_order
 
@@ -71,11 +71,7 @@ def check_choice(name: str, value: str, choices: Sequence[str]) -> None:
 
 
 def require_pycolmap(device: DeviceName = "auto") -> Any:
-    """Import pycolmap.
-
-    Raises:
-        MissingDependencyError: Not installed, too old, or without support for ``device``.
-    """
+    """Import pycolmap; refuse an old one, or one without support for ``device``."""
     # pycolmap's wheel exports its own zlib. A system libz loaded after it binds to that and
     # corrupts the heap at the first compression (PNG, gzip); loaded before it, it does not.
     importlib.import_module("zlib")

@@ -15,7 +15,7 @@ from splatseed.errors import OutputError
 from splatseed.io.picture import ORIENTATION, UPRIGHT
 from splatseed.pointcloud import first_of_equals
 from splatseed.sfm.colmap import ColmapRun
-from splatseed.sfm.readable import copy_misread
+from splatseed.sfm.photos import copy_misread
 
 _SHORT = 3  # the type of the orientation's tag
 _HEAD_BYTES = 1 << 17  # EXIF (at most 64 KiB) is the first or second segment
@@ -30,9 +30,6 @@ def export_scene(run: ColmapRun, model_dir: Path, staging: Path, *, distinct: bo
     transparent pixels are black. Reprojection errors are in pixels of the undistorted photographs.
     ``distinct`` drops points at the position of another, and those that undistorted features
     contradict.
-
-    Raises:
-        OutputError: Not all photographs could be written.
     """
     pycolmap, dense, straight = run.pycolmap, run.work / "dense", run.work / "straight"
     given = pycolmap.Reconstruction(model_dir)
@@ -162,6 +159,5 @@ def clear_orientation(folder: Path) -> None:
 
 
 def _first_directory(content: bytes) -> int:
-    """Return where the tags of a TIFF file begin; 0 for other files."""
     order = {b"II*\0": "<", b"MM\0*": ">"}.get(content[:4])
     return 0 if order is None else int(struct.unpack_from(f"{order}I", content, 4)[0])

@@ -57,10 +57,6 @@ def map_images(
 
     ``match_further`` matches further pairs of photographs without a pose, by name, and returns
     whether some match; then mapping goes on. None if all pairs of the matcher are matched.
-
-    Raises:
-        ReconstructionError: No model, or one of fewer than half of the photographs while
-            ``partial`` is False.
     """
     models_dir = (run.kept.folder if run.kept else run.work) / MODELS
     models = _mapped(run, models_dir, names, match_further)

@@ -29,7 +29,7 @@ from splatseed.sfm.first_look import (
     measure_agreement,
     poorly_connected,
 )
-from splatseed.sfm.readable import COPIES, copy_misread
+from splatseed.sfm.photos import COPIES, copy_misread
 from splatseed.text import name_some, numeric_order
 
 _STEPS = sorted({*range(1, 11), *(2**n for n in range(10))})
@@ -120,7 +120,6 @@ def _match_further(
 
 
 def _verified(run: ColmapRun, database: Any, ids: Sequence[int]) -> dict[Pair, int]:
-    """Return the number of verified matches of the pairs that were matched, by index."""
     index = {image_id: i for i, image_id in enumerate(ids)}
     pairs, counts = database.read_two_view_geometry_num_inliers()
     of_id = run.pycolmap.pair_id_to_image_pair
@@ -131,7 +130,6 @@ def _verified(run: ColmapRun, database: Any, ids: Sequence[int]) -> dict[Pair, i
 
 
 def _pairs(run: ColmapRun, database: Any) -> list[Pair]:
-    """Return the pairs of the run's matcher."""
     if run.settings.matcher == "sequential":
         images = sorted(database.read_all_images(), key=lambda image: numeric_order(image.name))
         ids = [image.image_id for image in images]

@@ -229,7 +229,6 @@ def _reconstruct(
 def _export(
     run: ColmapRun, model_dir: Path, staging: Path, masks: Masks | None, *, distinct: bool = True
 ) -> None:
-    """Write a model's undistorted photographs, masks and points."""
     export_scene(run, model_dir, staging, distinct=distinct)
     before, after = (
         {image.name: image.intrinsics for image in read_model_cameras(folder)[1]}
@@ -348,8 +347,6 @@ def _for_poses(settings: Settings, photos: Photos) -> Settings:
 
 
 class _Refined(NamedTuple):
-    """Result of ``_refine``."""
-
     poses: tuple[Image, ...]
     points: PointCloud
     refinement: Refinement
@@ -451,7 +448,6 @@ def _work(
 
 
 def _report(run: ColmapRun, staging: Path, names: Sequence[str]) -> SfmReport:
-    """Summarise the written model."""
     model = run.pycolmap.Reconstruction(staging / "sparse" / "0")
     registered = {image.name for image in model.images.values() if image.has_pose}
     return SfmReport(
@@ -467,7 +463,6 @@ def _report(run: ColmapRun, staging: Path, names: Sequence[str]) -> SfmReport:
 
 
 def _check_names(scene: Scene) -> None:
-    """Raise ``SceneFormatError`` for photograph names that lead out of their folder."""
     for name in (image.name for image in scene.images):
         path = PurePosixPath(name.replace("\\", "/"))
         if path.is_absolute() or ".." in path.parts:  # pycolmap joins it with the output folder

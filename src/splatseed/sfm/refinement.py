@@ -163,11 +163,6 @@ def refine(run: ColmapRun, given: Sequence[Image]) -> tuple[list[Image], Refinem
 
     Cameras with fewer than 10 points are unchanged; so are all, if the mean reprojection error
     would fall by less than 0.1 px.
-
-    Raises:
-        ReconstructionError: Fewer than half of the photographs see points, or poses drifted: fewer
-            photographs or observations fit than before, or a camera rotated by more than 10 degrees
-            or moved by more than half of the cameras' spread.
     """
     solver = _Solver(run, given)
     poses, strict, after, before = run.stage(
@@ -235,8 +230,6 @@ def _refused(expected: str, found: str) -> ReconstructionError:
 
 
 class _Fit(NamedTuple):
-    """Fit of photographs and points."""
-
     seeing: Bool[np.ndarray, " N"]  # photographs with enough points
     observations: int
     error: float  # mean reprojection error over points, px; inf without points

@@ -30,11 +30,7 @@ _MAX_SPHERE_SPREAD = 1e-3  # largest difference of log-scales of a sphere
 
 
 def drop_unusable(path: Path, gaussians: Gaussians, note: Note = silent_note) -> Gaussians:
-    """Return the drawable Gaussians, in order; ``note`` is called if there are others.
-
-    Raises:
-        SceneFormatError: No Gaussian can be drawn.
-    """
+    """Return the drawable Gaussians, in order; ``note`` is called if there are others."""
     norms = np.linalg.norm(gaussians.quats.astype(np.float64), axis=1)
     kinds = _unusable(gaussians, norms)
     bad = np.logical_or.reduce(list(kinds.values()))

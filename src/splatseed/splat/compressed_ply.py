@@ -16,9 +16,8 @@ from numpy.lib.recfunctions import structured_to_unstructured
 from splatseed.io.files import ByteReader, translate_errors
 from splatseed.io.ply import parse_header
 from splatseed.progress import Note, silent_note
-from splatseed.splat.gaussians import SH_C0, Gaussians
-from splatseed.splat.ply_layout import is_antialiased
-from splatseed.splat.quantization import SH_COUNTS, from_smallest_three, opacity_logits
+from splatseed.splat.gaussians import SH_C0, SH_COUNTS, Gaussians, is_antialiased
+from splatseed.splat.packing import from_smallest_three, opacity_logits
 
 _CHUNK, _SH_RANGE = 256, 8.0
 _BOUNDS = [

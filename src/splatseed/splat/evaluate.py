@@ -88,9 +88,6 @@ def evaluate_views(
         on_view: Called with each view, its render and its FLIP.
         progress: Called with the name of a stage and its fraction done.
 
-    Raises:
-        ParameterError: There are no views, or a render has the wrong shape or is not finite.
-
     Example:
         >>> import numpy as np, torch
         >>> from splatseed.camera import Camera

@@ -127,9 +127,6 @@ def format_of_name(path: Path, more: Collection[str] = ()) -> str:
     """Return the name of the format to write, by a file name's suffix.
 
     ``more`` are suffixes that the caller handles, for the message.
-
-    Raises:
-        ParameterError: The suffix is not of a format that is written.
     """
     found, other = path.suffix or "none", _UNSUPPORTED.get(path.suffix.lower())
     known = (*WRITTEN_SUFFIXES, *more)
@@ -146,11 +143,7 @@ def format_of_name(path: Path, more: Collection[str] = ()) -> str:
 
 
 def detect_format(path: Path, data: bytes) -> str:
-    """Return the name of the format of a file's content (of a .splat, of its name).
-
-    Raises:
-        SceneFormatError: The format is not supported.
-    """
+    """Return the name of the format of a file's content (of a .splat, of its name)."""
     suffix = path.suffix.lower()
     if data.startswith(b"ply") and data[3:4] in (b"\n", b"\r", b" ", b"\t"):
         return "compressed-ply" if b"packed_position" in data[:_HEADER] else "ply"
@@ -192,9 +185,6 @@ def holds_gaussians(path: Path) -> bool:
 def parse_crop(text: str) -> Float64[np.ndarray, "2 3"]:
     """Parse a box of six comma-separated numbers: minimum x, y, z, then maximum x, y, z.
 
-    Raises:
-        ParameterError: The text is not six numbers, or a minimum is not below its maximum.
-
     Example:
         >>> parse_crop("-1,-1,-1,1,1,2").tolist()
         [[-1.0, -1.0, -1.0], [1.0, 1.0, 2.0]]
@@ -215,11 +205,7 @@ def parse_crop(text: str) -> Float64[np.ndarray, "2 3"]:
 def filter_gaussians(
     gaussians: Gaussians, crop: Float64[np.ndarray, "2 3"] | None = None, min_opacity: float = 0.0
 ) -> Gaussians:
-    """Keep the Gaussians with centres in the box ``crop`` and at least ``min_opacity``, in order.
-
-    Raises:
-        ParameterError: ``min_opacity`` is not in [0, 1), or no Gaussian is left.
-    """
+    """Keep Gaussians with centres in the box ``crop`` and at least ``min_opacity``, in order."""
     if not 0 <= min_opacity < 1:
         raise ParameterError(
             "`min_opacity` of 0 or more, less than 1", found=f"{min_opacity}", fix="Try 0.05."

@@ -181,9 +181,6 @@ def scene_from_model(
 
     It is None for Gaussians that fit the scene's points, else the inverse of the best of the
     transforms that their trainer may have applied, on which ``note`` is called.
-
-    Raises:
-        SceneFormatError: No known transform fits.
     """
     misfit = _misfit_of(scene, gaussians)
     if misfit is None or misfit(None) <= FRAME.good_misfit:

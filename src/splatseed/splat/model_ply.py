@@ -22,17 +22,18 @@ from splatseed.findings import Finding
 from splatseed.io.files import ByteReader, translate_errors
 from splatseed.io.ply import EXPORT_PLY_AGAIN, Element, Header, parse_header
 from splatseed.progress import Note, silent_note
-from splatseed.splat.gaussians import SH_C0, Gaussians
-from splatseed.splat.ply_layout import (
+from splatseed.splat.gaussians import (
     DC,
     ROTATION,
     SCALES,
+    SH_C0,
+    SH_COUNTS,
     XYZ,
+    Gaussians,
     encode_layout,
     is_antialiased,
     rest_names,
 )
-from splatseed.splat.quantization import SH_COUNTS
 
 _COLORS = ("red", "green", "blue")
 _FILTER = "filter_3D"
@@ -143,14 +144,12 @@ def _check(path: Path, header: Header, names: set[str], data: bytes) -> None:
 
 
 def _up_to_vertices(header: Header) -> list[Element]:
-    """Return the elements of a file up to and including its vertices."""
     names = [element.name for element in header.elements]
     last = names.index("vertex") if "vertex" in names else len(names)
     return list(header.elements[: last + 1])
 
 
 def _rows(reader: ByteReader, header: Header) -> np.ndarray:
-    """Read the vertices as a structured array."""
     reader.offset = header.size
     *others, vertex = _up_to_vertices(header)
     if not header.byte_order:

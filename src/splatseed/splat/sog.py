@@ -22,14 +22,18 @@ from splatseed.findings import Finding
 from splatseed.io.files import read_bytes, translate_errors
 from splatseed.progress import Note, Progress, silent, silent_note
 from splatseed.splat.cleaning import MAX_LOG_SCALE
-from splatseed.splat.extent import PACKING, Fit, best_fit, left_out_finding, morton_order, shells_of
-from splatseed.splat.gaussians import Gaussians
-from splatseed.splat.quantization import (
-    SH_COUNTS,
+from splatseed.splat.gaussians import SH_COUNTS, Gaussians
+from splatseed.splat.packing import (
+    PACKING,
+    Fit,
+    best_fit,
     from_smallest_three,
+    left_out_finding,
+    morton_order,
     opacity_bytes,
     opacity_logits,
     rounded_bytes,
+    shells_of,
     smallest_three,
 )
 
@@ -209,7 +213,6 @@ def _grid(values: np.ndarray) -> UInt8[np.ndarray, "H W 4"]:
 
 
 def _part_reader(path: Path) -> Callable[[str], bytes]:
-    """Return a function that reads a named part."""
     if path.name.lower().endswith(".json"):
         return lambda name: read_bytes(path if name == _META else path.parent / Path(name).name)
     archive = zipfile.ZipFile(io.BytesIO(read_bytes(path)))

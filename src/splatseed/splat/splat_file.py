@@ -12,7 +12,7 @@ import numpy as np
 from splatseed.io.files import ByteReader
 from splatseed.progress import Note, silent_note
 from splatseed.splat.gaussians import SH_C0, Gaussians, antialiasing_finding
-from splatseed.splat.quantization import opacity_bytes, opacity_logits, rounded_bytes, unit_quats
+from splatseed.splat.packing import opacity_bytes, opacity_logits, rounded_bytes, unit_quats
 
 RECORD = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 """One Gaussian: scales are standard deviations, the rotation is 128 q + 128."""

@@ -24,11 +24,14 @@ from splatseed.io.files import COPY_AGAIN, read_bytes, translate_errors
 from splatseed.progress import Note, silent_note
 from splatseed.requirements import require
 from splatseed.runtime.memory import check_memory
-from splatseed.splat.extent import PACKING, Fit, best_fit, left_out_finding, morton_order
-from splatseed.splat.gaussians import Gaussians
-from splatseed.splat.quantization import (
-    SH_COUNTS,
+from splatseed.splat.gaussians import SH_COUNTS, Gaussians
+from splatseed.splat.packing import (
+    PACKING,
+    Fit,
+    best_fit,
     from_smallest_three,
+    left_out_finding,
+    morton_order,
     opacity_bytes,
     opacity_logits,
     rounded_bytes,
@@ -68,7 +71,6 @@ class _Signs(NamedTuple):
 
 
 def _signs(axes: int) -> _Signs:
-    """Return the signs for axes 1 to 8."""
     right, up, front = (bool((axes - 1) >> bit & 1) for bit in range(3))
     x, y, z = 1 if right else -1, -1 if up else 1, 1 if front else -1
     sh = [y, z, x, x * y, y * z, 1, x * z, 1, y, x * y * z, y, z, x, z, x]
@@ -84,11 +86,7 @@ short run vanish, and PSNR falls by up to 2.8 dB."""
 
 
 def encode(gaussians: Gaussians, note: Note = silent_note) -> list[bytes]:
-    """Encode Gaussians in Z-curve order.
-
-    Raises:
-        ParameterError: Positions exceed the format's range.
-    """
+    """Encode Gaussians in Z-curve order."""
     gaussians, bits = _fixed_point(gaussians, note)
     order = morton_order(gaussians.means)
     rest = gaussians.shN.shape[1]
@@ -215,11 +213,7 @@ def decode(path: Path, note: Note = silent_note) -> Gaussians:
 
 
 def _axes_in(path: Path, extensions: bytes) -> int:
-    """Return the axes that extensions name; each is its type, the length of its content, and that.
-
-    Raises:
-        SceneFormatError: z is not the front or back.
-    """
+    """Return the axes that extensions name; each has its type, its length and its content."""
     at, axes = 0, _RIGHT_UP_BACK
     while at + 8 <= len(extensions):
         kind, length = struct.unpack_from("<II", extensions, at)

@@ -89,10 +89,6 @@ def open_item(path: StrPath, scene_path: Path | None = None) -> ViewerItem:
     """Read a scene, a run folder, or a file of Gaussians or points.
 
     A model's scene is at ``scene_path``, by default where its run's config has it, if it exists.
-
-    Raises:
-        SceneNotFoundError: ``path`` or ``scene_path`` does not exist.
-        SceneFormatError: It is damaged, or cannot be shown.
     """
     path = Path(path)
 
@@ -183,7 +179,6 @@ def item_of_model(
 
 
 def _split_of_run(folder: RunFolder) -> tuple[int, int]:
-    """Return the data factor and ``test_every`` of a run."""
     config = folder.read_config()
     factor, every = (int(config.get(n) or d) for n, d in (("data_factor", 1), ("test_every", 8)))
     return factor, every

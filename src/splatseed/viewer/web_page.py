@@ -26,7 +26,7 @@ from splatseed.progress import Note, Progress, silent, silent_note
 from splatseed.rendering.harmonics import sh_basis
 from splatseed.requirements import require
 from splatseed.splat.gaussians import SH_C0, Gaussians, antialiasing_finding
-from splatseed.splat.quantization import opacity_bytes, unit_quats
+from splatseed.splat.packing import opacity_bytes, unit_quats
 from splatseed.text import counted
 from splatseed.viewer.flights import orbit
 from splatseed.viewer.models import ViewerItem, viewer_frame
@@ -85,10 +85,6 @@ def write_page(
     """Write a model as a web page that starts at its first training camera.
 
     Without a scene it starts outside of the model.
-
-    Raises:
-        MissingDependencyError: viser is absent.
-        OutputError: There are too many Gaussians, or the file cannot be written.
     """
     require("viser")
     import viser  # noqa: PLC0415  (of the extra view)

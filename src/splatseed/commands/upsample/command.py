@@ -11,6 +11,7 @@ from splatseed.commands.upsample import previews, report
 from splatseed.commands.upsample.cloud import load_cloud
 from splatseed.commands.upsample.options import CLOUD, Options, check, parse
 from splatseed.console import OUT, StageClock, print_note, stage_display
+from splatseed.findings import Finding
 from splatseed.io import load_originals, write_scene
 from splatseed.io.clouds import open_cloud
 from splatseed.io.colmap_model import scene_root

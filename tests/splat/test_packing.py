@@ -9,9 +9,9 @@ import pytest
 from scipy.spatial import KDTree
 
 from splatseed.errors import ParameterError
-from splatseed.splat.extent import morton_order, shells_of
 from splatseed.splat.formats import WRITTEN_SUFFIXES, read_gaussians, write_gaussians
 from splatseed.splat.gaussians import Gaussians
+from splatseed.splat.packing import morton_order, shells_of
 
 COUNT = 600
 RNG = np.random.default_rng(5)
