@@ -130,7 +130,7 @@ def prepare(name: str, settings: Settings) -> Capture:
 
 
 def _image_folder(scene: Scene) -> Path:
-    folder = scene.source.image_dir if scene.source else None
+    folder = scene.source.image_dir
     if folder is None:
         raise SceneNotFoundError("photographs", found="none", fix="Choose another capture.")
     return folder

@@ -31,13 +31,17 @@ ORDER = (
     "errors", "text", "settings", "requirements", "progress", "frozen", "runtime", "camera",
     "similarity", "lens", "pointcloud", "depthmap", "scene", "scores", "io", "photos", "depth",
     "methods", "seeding", "synthetic", "sfm", "rendering", "splat", "training", "integrations",
-    "gsplat", "viewer", "bench", "console", "commands", "cli",
+    "viewer", "bench", "console", "commands", "cli",
 )  # fmt: skip
 """Parts of the package: each imports only parts before it, or itself."""
 
 DELEGATING = {
     "pointcloud": {"splatseed.io.ply"},  # PointCloud.read_ply, write_ply
-    "scene": {"splatseed.io.photograph"},  # Image.read
+    "scene": {  # Image.read, size, lens, read_mask
+        "splatseed.io.photograph",
+        "splatseed.io.photograph_checks",
+        "splatseed.io.masks",
+    },
 }
 """What methods of data types hand over to when they are called: io, which imports these types."""
 

@@ -2,13 +2,15 @@
 
 Notation: an ``_id`` comes from a file and may have gaps, an ``_idx`` is contiguous. ``tracks``
 belong to the first ``len(tracks)`` points, which are the originals in file order. Promise: a Scene
-is frozen; ``replace`` and ``with_...`` return copies; no file is opened but by ``Image.read``.
+is frozen; ``replace`` and ``with_...`` return copies; photographs and masks are the only files that
+its images open, when needed: cameras are in pixels of the photographs' files.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace as dataclass_replace
 from difflib import get_close_matches
 from functools import cached_property
@@ -20,7 +22,7 @@ from jaxtyping import Bool, Float64, Int64, UInt8, UInt32
 
 from splatseed.camera import Camera, Intrinsics, rotation_from_quat
 from splatseed.depthmap import DepthMaps, maps_by_name
-from splatseed.errors import ParameterError, SceneNotFoundError, UnknownNameError
+from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError, UnknownNameError
 from splatseed.findings import Finding
 from splatseed.frozen import read_only
 from splatseed.pointcloud import PointCloud
@@ -28,7 +30,7 @@ from splatseed.pointcloud import PointCloud
 NO_POINT = -1
 """Point id of a feature without a point."""
 
-SceneFormat = Literal["colmap", "transforms", "ply", "rgbd", "llff", "phone"]
+SceneFormat = Literal["colmap", "transforms", "ply", "rgbd", "llff", "phone", "memory"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,24 +60,27 @@ class Observations:
 class Image:
     """One posed photograph.
 
-    The pose is kept as the quaternion and translation of the file, so that it is written back
-    bit for bit.
+    The pose is kept as the quaternion and translation of the file, and camera and features in
+    pixels of the file's camera record, so that they are written back bit for bit. ``lens``,
+    ``camera`` and ``K`` are in pixels of the photograph, which may be a resized copy.
     """
 
     name: str  # path relative to the images folder, with forward slashes
     image_id: int  # that tracks refer to
-    intrinsics: Intrinsics
+    intrinsics: Intrinsics  # the camera record, as in the file
     quat: Float64[np.ndarray, " 4"]  # wxyz rotation of ``cam_from_world``, as in the file
     translation: Float64[np.ndarray, " 3"]  # of ``cam_from_world``
     observations: Observations | None = None  # None where the format has none
-    folder: Path | None = None  # the images folder; a scene sets it from its source
-    white: int = 65535  # the value of white in 16-bit photographs; a scene sets it
+    # A scene sets the following.
+    folder: Path | None = None  # the images folder; None for a scene without one
+    white: int = 65535  # the value of white in 16-bit photographs
+    masks: Masks | None = None  # which pixels of the scene's photographs do not count
 
     def __post_init__(self) -> None:
         _freeze(self, "quat", "translation")
 
     def __repr__(self) -> str:
-        lens = self.intrinsics
+        lens = self.lens
         seen = f", {self.observations}" if self.observations is not None else ""
         return f"Image({self.name!r}, {lens.width} x {lens.height} {lens.model}{seen})"
 
@@ -94,21 +99,45 @@ class Image:
             )
         return self.folder / self.name
 
-    def in_folder(self, folder: Path, white: int) -> Image:
-        """Return the image with the folder and the white value of its photograph."""
-        if (self.folder, self.white) == (folder, white):
-            return self
-        return dataclass_replace(self, folder=folder, white=white)
+    @property
+    def has_photograph(self) -> bool:
+        """Whether the photograph's file exists."""
+        return self.folder is not None and self.path.is_file()
+
+    @cached_property
+    def size(self) -> tuple[int, int] | None:
+        """Width and height of the photograph's file; None if it is missing or unreadable."""
+        from splatseed.io.photograph_checks import photograph_size
+
+        if self.has_photograph:
+            with suppress(SceneFormatError, SceneNotFoundError):
+                return photograph_size(self.path)
+        return None
+
+    @cached_property
+    def lens(self) -> Intrinsics:
+        """The camera record in pixels of the photograph's file.
+
+        That is ``intrinsics`` if the photograph is missing, unreadable or of another shape.
+        """
+        from splatseed.io.photograph_checks import fits
+
+        if self.size is None or not fits(self.intrinsics, self.size):
+            return self.intrinsics
+        return self.intrinsics.resized(*self.size)
 
     @property
     def K(self) -> Float64[np.ndarray, "3 3"]:  # noqa: N802  (the field's name)
-        """Pinhole matrix [3, 3] in pixels, for photographs of ``intrinsics``' width and height."""
+        """Pinhole matrix [3, 3] in pixels of the photograph."""
         return self.camera.K
 
-    @property
+    @cached_property
     def cam_from_world(self) -> Float64[np.ndarray, "4 4"]:
         """Pose [4, 4]: maps world points to OpenCV camera axes (x right, y down, z forward)."""
-        return self.camera.cam_from_world
+        cam_from_world = np.eye(4)
+        cam_from_world[:3, :3] = rotation_from_quat(self.quat)
+        cam_from_world[:3, 3] = self.translation
+        return read_only(cam_from_world)
 
     def read(self) -> UInt8[np.ndarray, "H W 3"]:
         """Read the photograph, sRGB, as stored: not rotated by EXIF, resized or undistorted.
@@ -121,15 +150,31 @@ class Image:
 
         return read_photograph(self.path, self.white)
 
+    def read_mask(self, factor: int = 1) -> Bool[np.ndarray, "h w"] | None:
+        """Read which pixels of the photograph count; None if all do.
+
+        Args:
+            factor: Integer reduction; a reduced pixel counts if its ``factor``^2 block does.
+
+        Raises:
+            SceneNotFoundError: The mask's file is missing.
+            SceneFormatError: It is no image, has another aspect ratio, or masks every pixel.
+        """
+        from splatseed.io.masks import read_mask
+
+        return read_mask(self.masks, self.name, self.path, factor)
+
     @cached_property
     def camera(self) -> Camera:
-        """The posed pinhole camera (distortion left out)."""
-        cam_from_world = np.eye(4)
-        cam_from_world[:3, :3] = rotation_from_quat(self.quat)
-        cam_from_world[:3, 3] = self.translation
-        return Camera(
-            self.intrinsics.K, self.intrinsics.width, self.intrinsics.height, cam_from_world
-        )
+        """The posed pinhole camera (distortion left out), in pixels of the photograph."""
+        lens = self.lens
+        return Camera(lens.K, lens.width, lens.height, self.cam_from_world)
+
+    def with_photograph(self, folder: Path, white: int, masks: Masks | None) -> Image:
+        """Return the image with the folder, the white value and the masks of its scene."""
+        if (self.folder, self.white, self.masks) == (folder, white, masks):
+            return self
+        return dataclass_replace(self, folder=folder, white=white, masks=masks)
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,11 +221,11 @@ class Tracks:
 
 @dataclass(frozen=True)
 class SceneSource:
-    """Where a scene was read from."""
+    """Where a scene was read from; without any path, it was made in memory."""
 
-    format: SceneFormat
-    root: Path  # the scene's folder; of a bare PLY, the one it lies in
-    points_path: Path  # of the points; of a capture without any, a file of the poses
+    format: SceneFormat = "memory"
+    root: Path | None = None  # the scene's folder; of a bare PLY, the one it lies in
+    points_path: Path | None = None  # of the points; of a capture without any, a file of the poses
     model_dir: Path | None = None  # COLMAP's, if there is one
     image_dir: Path | None = None  # that ``Image.name`` is relative to, if there is one
     transforms_path: Path | None = None  # if it was read
@@ -188,9 +233,10 @@ class SceneSource:
     named: Path | None = None  # what the user named, which may be one model or file of several
 
     @property
-    def again(self) -> Path:
-        """Absolute path from which ``load_scene`` reads the same scene."""
-        return (self.named or self.root).resolve()
+    def again(self) -> Path | None:
+        """Absolute path from which ``load_scene`` reads the same scene, if there is one."""
+        path = self.named or self.root
+        return path and path.resolve()
 
     @property
     def inputs(self) -> tuple[Path, ...]:
@@ -198,10 +244,9 @@ class SceneSource:
 
         An image folder above the root is excluded, so outputs may be written beside it.
         """
-        if self.format == "ply":
-            return (self.points_path,)
-        above = self.root.resolve().parents
-        places = (self.root, self.model_dir, self.image_dir)
+        is_file = self.format == "ply"
+        places = (self.points_path,) if is_file else (self.root, self.model_dir, self.image_dir)
+        above = self.root.resolve().parents if self.root else ()
         return tuple(path for path in places if path and path.resolve() not in above)
 
 
@@ -249,7 +294,7 @@ class Scene:
     images: tuple[Image, ...] = ()  # in file order; none for a bare cloud
     intrinsics: tuple[Intrinsics, ...] = ()  # all camera records of the file, including unused ones
     tracks: Tracks | None = None  # of the first ``len(tracks)`` points, which are the originals
-    source: SceneSource | None = None  # where it was read from; None for a scene made in memory
+    source: SceneSource = SceneSource()  # where it was read from
     findings: tuple[Finding, ...] = ()  # what the reader repaired or found odd
     depths: DepthMaps | None = None  # of some images, read on demand
     listed: Split | None = None  # the split given by lists beside the scene
@@ -266,13 +311,13 @@ class Scene:
             object.__setattr__(self, "depths", maps_by_name(self.depths, names, distorted))
         if self.points.original_idx is not None:  # from here on, rows count in this cloud
             object.__setattr__(self, "points", self.points.replace(original_idx=None))
-        folder = self.source.image_dir if self.source else None
-        if folder is not None:
-            images = tuple(image.in_folder(folder, self.white) for image in self.images)
-            object.__setattr__(self, "images", images)
+        if (folder := self.source.image_dir) is not None:
+            images = (im.with_photograph(folder, self.white, self.masks) for im in self.images)
+            object.__setattr__(self, "images", tuple(images))
 
     def __repr__(self) -> str:
-        where = f"{self.source.root}, {self.source.format}" if self.source else "made in memory"
+        root = self.source.root
+        where = f"{root}, {self.source.format}" if root else "made in memory"
         added = len(self.points) - self.points.num_original
         lines = [
             f"Scene({where})",
@@ -355,14 +400,12 @@ class Scene:
     @property
     def offset(self) -> Float64[np.ndarray, " 3"]:
         """Offset from positions to the world: the origin plus the offset recorded in the files."""
-        beside = self.source.offset if self.source else (0.0, 0.0, 0.0)
-        return np.asarray(self.origin + np.array(beside))
+        return np.asarray(self.origin + np.array(self.source.offset))
 
     @property
     def has_photographs(self) -> bool:
         """Whether at least one photograph exists."""
-        folder = self.source.image_dir if self.source else None
-        return folder is not None and any((folder / im.name).is_file() for im in self.images)
+        return any(image.has_photograph for image in self.images)
 
     def split(self, test_every: int = 8) -> tuple[tuple[Image, ...], tuple[Image, ...]]:
         """Return training and test images by name: as listed, else every ``test_every``-th tests.
@@ -390,7 +433,7 @@ class Scene:
 
 def _size_range(images: Sequence[Image]) -> str:
     """Format the pixels of the smallest and the largest image; empty without images."""
-    sizes = sorted({(im.intrinsics.width, im.intrinsics.height) for im in images}, key=math.prod)
+    sizes = sorted({(im.lens.width, im.lens.height) for im in images}, key=math.prod)
     ends = dict.fromkeys([*sizes[:1], *sizes[-1:]])
     return f", {' to '.join(f'{width} x {height}' for width, height in ends)} px" if ends else ""
 

@@ -183,7 +183,7 @@ def capture(tmp_path_factory):
     made = make_capture(num_views=4, width=64, height=48)
     path = write_capture(made, tmp_path_factory.mktemp("scenes") / "room")
     scene = load_scene(path)
-    return path, scene_digest(scene, scene.source.image_dir)
+    return path, scene_digest(scene)
 
 
 def with_capture(bench, path, digest, *gains, **changes):

@@ -175,7 +175,7 @@ def run_job(
     """Carry out a run, and write its folder."""
     from splatseed.splat.lpips import load_lpips  # noqa: PLC0415  (PyTorch)
     from splatseed.training.depths import DepthCache, placing_views  # noqa: PLC0415  (Numba)
-    from splatseed.training.prepare import PrepareOptions, prepare_run  # noqa: PLC0415  (PyTorch)
+    from splatseed.training.prepare import prepare_run  # noqa: PLC0415  (PyTorch)
 
     start = time.perf_counter()
     with output_folder(run_folder(bench, spec), kind="bench", overwrite=True) as folder:
@@ -192,14 +192,12 @@ def run_job(
             scene.replace(points=seeds),
             folder / "work",
             spec.settings,
-            PrepareOptions(
-                cache_dir=user_cache_dir(),
-                depth_cache=DepthCache(
-                    bench
-                    / "depths"
-                    / f"{spec.scene.digest}_{every}_{size}_{len(views)}_{spec.repeat}.npz",
-                    seeding_method(spec.arm.method) == DEFAULT_METHOD and not _is_full(scene, spec),
-                ),
+            cache_dir=user_cache_dir(),
+            depth_cache=DepthCache(
+                bench
+                / "depths"
+                / f"{spec.scene.digest}_{every}_{size}_{len(views)}_{spec.repeat}.npz",
+                seeding_method(spec.arm.method) == DEFAULT_METHOD and not _is_full(scene, spec),
             ),
             progress=progress,
         )

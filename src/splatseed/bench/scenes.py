@@ -102,12 +102,12 @@ def open_scene(scene: PlannedScene) -> Scene:
     """
     opened = load_originals(Path(scene.path))
     if scene.images:
-        if opened.source is None or not (opened.source.root / scene.images).is_dir():
+        folder = (opened.source.root or Path()) / scene.images
+        if not folder.is_dir():
             expected = f"the folder {scene.images} of photographs in {scene.path}"
             raise SceneNotFoundError(expected, found="none", fix="Name another, or none.")
-        source = replace(opened.source, image_dir=opened.source.root / scene.images)
-        opened = opened.replace(source=source)
-    if opened.images and opened.source is not None and opened.source.image_dir is not None:
+        opened = opened.replace(source=replace(opened.source, image_dir=folder))
+    if opened.images and opened.source.image_dir is not None:
         opened = with_photographs(opened)
     return with_depths_in(opened, Path(scene.depth)) if scene.depth else opened
 
@@ -147,18 +147,17 @@ def survey(
             write_capture(make_capture(), demo)
     path = Path(planned.path)
     scene = open_scene(replace(planned, depth=""))
-    folder = scene.source.image_dir if scene.source else None
-    if scene.source is None or folder is None or not scene.images:
+    if scene.source.image_dir is None or not scene.images:
         fix = "Name a scene with images: a point cloud alone cannot be trained."
         raise SceneNotFoundError(f"photographs in {path}", found="none", fix=fix)
     for image in scene.images:
         refuse_distortion(image, path)
-    size = check_sizes(scene.images, folder)[scene.images[0].name]
+    size = check_sizes(scene.images)[scene.images[0].name]
     maps = scan = ""
     if with_cloud and planned.cloud:
         scan = str(Path(planned.cloud).resolve())
         open_cloud(Path(planned.cloud))  # reports an invalid header now
-    depth = Path(planned.depth) if planned.depth else scene.source.root
+    depth = Path(planned.depth or scene.source.root or path)
     if with_depth and (planned.depth or search_depths(scene, depth) is not None):
         maps, scene = str(depth.resolve()), with_depths_in(scene, depth)
     split = [Finding("listed-split", scene.listed.sentence, "info")] if scene.listed else []
@@ -175,16 +174,15 @@ def fingerprints(
     scene: Scene, depth: str, cloud: str, progress: Progress = silent
 ) -> dict[str, str]:
     """Compute the digests of ``SceneFacts``; empty if the path of depth maps or scan is."""
-    folder = scene.source.image_dir if scene.source else None
     maps = scene.depths if depth else None
     return {
-        "digest": "" if folder is None else scene_digest(scene, folder, progress),
+        "digest": "" if scene.source.image_dir is None else scene_digest(scene, progress),
         "depth_digest": "" if maps is None else _depth_digest(maps, progress),
         "cloud_digest": _cloud_digest(Path(cloud), progress) if cloud else "",
     }
 
 
-def scene_digest(scene: Scene, folder: Path, progress: Progress = silent) -> str:
+def scene_digest(scene: Scene, progress: Progress = silent) -> str:
     """Fingerprint points, tracks, cameras, photographs and masks."""
     parts: list[object] = [scene.points.xyz, scene.points.rgb]
     if scene.tracks is not None:
@@ -204,7 +202,7 @@ def scene_digest(scene: Scene, folder: Path, progress: Progress = silent) -> str
 
     def of_file(i: int) -> str:
         name = images[i].name
-        content = photograph_bytes(folder / name)
+        content = photograph_bytes(images[i].path)
         if scene.masks is not None and name in scene.masks.files:
             content += read_bytes(scene.masks.files[name])
         return fingerprint(content)

@@ -32,6 +32,7 @@ import tyro
 from splatseed.commands.options import parse_options, refuse
 from splatseed.console import StageClock, print_note, print_pairs, print_table, stage_display
 from splatseed.errors import MissingDependencyError
+from splatseed.findings import Finding
 from splatseed.io import find_depths, load_scene, write_scene
 from splatseed.io.staging import add_files, atomic_file, output_folder, read_manifest
 from splatseed.methods import METHODS, chooses_number, configure, methods_for
@@ -226,7 +227,8 @@ def _make_points(options: Options) -> None:
         clock("pictures", 0.0)
         pictures.preview_pair(scene, clouds[SHOWN], folder / PICTURES[0], title=SHOWN)
     seconds = sum(clock.seconds().values())
-    print_note(f"the first picture is ready after {seconds:.0f} s: {out / PICTURES[0]}")
+    text = f"the first picture is ready after {seconds:.0f} s: {out / PICTURES[0]}"
+    print_note(Finding("first-picture", text, "info"))
 
     scene, methods = _load(out), methods_for(_load(out))
     add_files(out, [TABLE, *PICTURES[1:]])
@@ -291,7 +293,8 @@ def _train(options: Options) -> bool:
     try:
         require("torch", "gsplat", "flip_evaluator")
     except MissingDependencyError as error:
-        print_note(f"not trained: {error.found} installed. {error.fix}")
+        text = f"not trained: {error.found} installed."
+        print_note(Finding("missing-package", text, "info", fix=error.fix))
         return False
     from splatseed.training.settings import TrainSettings
     from splatseed.viewer.page import write_grid
@@ -345,7 +348,8 @@ def _train_arm(
     from splatseed.splat.metrics import flip_map
     from splatseed.splat.photographs import photograph_tensor
     from splatseed.splat.pictures import FLIP_LABEL, flip_heatmap, to_uint8
-    from splatseed.training.prepare import PrepareOptions, prepare_run
+    from splatseed.training.prepare import prepare_run
+    from splatseed.training.request import PrepareOptions
     from splatseed.viewer.page import Tile
 
     stage = f"train {ARMS[name]}"
@@ -371,7 +375,6 @@ def _train_arm(
 def _summarise_training(
     picture: Path, seeding: float, results: Mapping[str, TrainingResult]
 ) -> None:
-    """Print the runs side by side, and the gain by seeds."""
     seconds = {name: each.train_seconds for name, each in results.items()}
     seconds[POSES] += seeding
     rows = [

@@ -27,8 +27,7 @@ from splatseed.splat.formats import (
 from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.model_frame import translate_gaussians
 from splatseed.text import quoted, visible
-from splatseed.training.folder import RunFolder
-from splatseed.training.models import config_of, model_file
+from splatseed.training.folder import RunFolder, config_of, model_file
 from splatseed.training.settings import TrainSettings
 
 PAGE = ".html"

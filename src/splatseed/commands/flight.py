@@ -19,7 +19,7 @@ from splatseed.pointcloud import PointCloud
 from splatseed.requirements import require
 from splatseed.scene import Scene
 from splatseed.similarity import Similarity
-from splatseed.training.models import model_file
+from splatseed.training.folder import model_file
 from splatseed.training.settings import Backend
 
 if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it

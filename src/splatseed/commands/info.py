@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import tyro
 
+from splatseed.camera import Intrinsics
 from splatseed.commands import next_steps
 from splatseed.commands.next_steps import Commands, Planned, TrainerName
 from splatseed.commands.options import parse_options, refuse
@@ -128,7 +129,9 @@ def run(arguments: list[str]) -> None:
         usable = scene.replace(depths=None)  # nothing follows from maps that cannot be used
     planned = Planned.of(usable, options.budget, options.max_steps, options.trainer)
     share = None if regions is None else regions.mean
-    advice = advice_for(usable, planned.max_seeds, strategy=planned.strategy, empty=share)
+    advice = advice_for(
+        usable, planned.max_seeds, why_no_seeds=planned.strategy.why_no_seeds, empty=share
+    )
     rows = [*_source_rows(scene), *_depth_map_rows(maps, beside)]
     rows += [*_cloud_rows(cloud), *_track_rows(tracks)]
     rows += _photograph_rows(regions, poses, masks)
@@ -291,15 +294,15 @@ def _facts_of(scene: Scene) -> dict[str, Any]:
     """Return the source and the contents of a scene, for ``--json``."""
     train, test = scene.split()
     return {
-        "format": scene.source.format if scene.source else None,
-        "root": str(scene.source.root) if scene.source else None,
+        "format": scene.source.format,
+        "root": str(scene.source.root),
         "images": len(scene.images),
         "train_images": len(train),
         "test_images": len(test),
         "photographs": scene.has_photographs,
         "cameras": [
             {"id": c.camera_id, "model": c.model, "width": c.width, "height": c.height}
-            for c in scene.intrinsics
+            for c in _cameras(scene)
         ],
         "depth_maps": 0 if scene.depths is None else len(scene.depths),
         "depth_maps_beside": len(depths_beside(scene) or ()),
@@ -320,8 +323,16 @@ def _plain(value: Any) -> Any:
     return value
 
 
+def _cameras(scene: Scene) -> list[Intrinsics]:
+    """Return all cameras, in pixels of their photographs, in the order of their records."""
+    used: dict[int, dict[Intrinsics, None]] = {}
+    for image in scene.images:
+        used.setdefault(image.lens.camera_id, {})[image.lens] = None
+    return [c for record in scene.intrinsics for c in used.get(record.camera_id, (record,))]
+
+
 def _source_rows(scene: Scene) -> list[tuple[str, str]]:
-    sizes = Counter(f"{c.model} {c.width}x{c.height}" for c in scene.intrinsics)
+    sizes = Counter(f"{c.model} {c.width}x{c.height}" for c in _cameras(scene))
     cameras = [f"{count:,} {kind}" for kind, count in sizes.most_common(KINDS_SHOWN)]
     if len(sizes) > KINDS_SHOWN:
         cameras.append(f"{len(sizes) - KINDS_SHOWN:,} more kinds")
@@ -329,7 +340,7 @@ def _source_rows(scene: Scene) -> list[tuple[str, str]]:
     by = f", by its {scene.listed.origin}" if scene.listed else ""
     images = f"{len(scene.images):,} ({len(train):,} to train, {len(test):,} to test{by})"
     return [
-        ("format", scene.source.format if scene.source else "memory"),
+        ("format", scene.source.format),
         ("cameras", ", ".join(cameras) or "none"),
         ("images", images if scene.images else "none"),
     ]
@@ -408,7 +419,7 @@ def _advice_rows(advice: Advice, planned: Planned) -> list[tuple[str, str]]:
     """Return the advice, its reasons, and the training it is for."""
     size = f" ({planned.rho})" if planned.rho else ""
     plan = f"{planned.budget:,} Gaussians at most{size}, {planned.max_steps:,} steps, strategy"
-    rows = [("planned", f"{plan} {planned.strategy}"), ("advice", advice.sentence)]
+    rows = [("planned", f"{plan} {planned.strategy.name}"), ("advice", advice.sentence)]
     if advice.measured.layout:
         rows.insert(0, ("cameras stand", advice.measured.layout))
     return rows + [("" if i else "why", reason) for i, reason in enumerate(advice.reasons)]

@@ -21,8 +21,7 @@ from splatseed.io.origin import format_offset, offset_beside
 from splatseed.splat.formats import FORMATS, detect_format, holds_gaussians, read_gaussians
 from splatseed.splat.gaussians import VISIBLE_LOGIT, Gaussians
 from splatseed.text import quoted
-from splatseed.training.folder import RunFolder
-from splatseed.training.models import config_of, model_file
+from splatseed.training.folder import RunFolder, config_of, model_file
 
 PERCENTILES = (5, 25, 50, 75, 95)
 

@@ -12,10 +12,11 @@ import numpy as np
 
 from splatseed.console import print_note, print_pairs
 from splatseed.depth.settings import PER_POINT
+from splatseed.findings import Finding
 from splatseed.io.staging import read_manifest
 from splatseed.io.transforms_layout import Layout
 from splatseed.lens import undistort_command, undistorted_folder
-from splatseed.photos.sizes import TRAINED_SIDE, at_file_size, factor_for_size
+from splatseed.photos.sizes import TRAINED_SIDE, factor_for_size
 from splatseed.runtime.environment import available_cpus
 from splatseed.scene import Image, Scene
 from splatseed.seeding.advice import AS_IT_IS, SEEDED, Advice
@@ -23,8 +24,10 @@ from splatseed.seeding.photo_methods import Auto
 from splatseed.seeding.trainability import is_distorted, untrainable
 from splatseed.text import format_duration, quoted
 from splatseed.training.duration import planned_seconds
+from splatseed.training.request import DEFAULTS
 from splatseed.training.schedule import FULL_RUN
-from splatseed.training.settings import BUDGET, StrategyName, TrainSettings
+from splatseed.training.settings import BUDGET, TrainSettings
+from splatseed.training.traits import Traits
 
 TrainerName: TypeAlias = Literal[
     "splatseed", "gsplat", "graphdeco", "nerfstudio", "brush", "opensplat", "lichtfeld"
@@ -52,7 +55,7 @@ class Planned(NamedTuple):
     budget: int
     rho: str  # the budget per pixel, and the photograph's size; empty without photographs
     max_steps: int
-    strategy: str
+    strategy: Traits
     max_seeds: int
     flags: str
     trainer: TrainerName
@@ -72,9 +75,9 @@ class Planned(NamedTuple):
 
         The other trainers densify as 3DGS does by default.
         """
-        images = at_file_size(scene).images
+        images = scene.images
         factor = factor_for_size(images, long_side) if images else 1
-        lenses = [image.intrinsics for image in images]
+        lenses = [image.lens for image in images]
         sizes = [(lens.width // factor, lens.height // factor) for lens in lenses]
         pixels = round(float(np.median([w * h for w, h in sizes]))) if sizes else BUDGET
         number, flags = max(2, min(BUDGET, pixels)), ""
@@ -85,7 +88,7 @@ class Planned(NamedTuple):
             flags = f"--budget {number} "
         if max_steps != FULL_RUN:
             flags = f"{flags}--max-steps {max_steps} "
-        strategy: StrategyName = "auto" if trainer == "splatseed" else "default"
+        strategy = DEFAULTS.strategy if trainer == "splatseed" else "default"
         settings = TrainSettings(strategy=strategy, max_steps=max_steps, cap_max=number)
         max_seeds = settings.max_seeds(number)
         rho = ""
@@ -96,9 +99,9 @@ class Planned(NamedTuple):
         threads = available_cpus()
         seconds = planned_seconds(settings, seeds, pixels, threads)
         seconds += COMPARE_SECONDS * len(images) / threads
-        growth = settings.densification
         most = len(scene.points) + _most_seeds(images)
-        return cls(number, rho, max_steps, growth, max_seeds, flags, trainer, seconds, most)
+        traits = settings.traits
+        return cls(number, rho, max_steps, traits, max_seeds, flags, trainer, seconds, most)
 
 
 def advice_commands(
@@ -165,7 +168,7 @@ def _most_seeds(images: Sequence[Image]) -> int:
         return 0
     factor = factor_for_size(images, settings.max_size)
     step = factor * settings.spacing
-    sizes = [(image.intrinsics.width, image.intrinsics.height) for image in images]
+    sizes = [(image.camera.width, image.camera.height) for image in images]
     return sum(math.ceil(width / step) * math.ceil(height / step) for width, height in sizes)
 
 
@@ -173,9 +176,9 @@ def _for_trainer(
     path: Path, scene: Scene, advice: Advice, planned: Planned, *, refine: bool
 ) -> Commands:
     """Return the commands that lead to another trainer."""
-    source = scene.source.format if scene.source else "colmap"
+    source = scene.source.format
     layout: Layout = "transforms" if source == "transforms" else "colmap"
-    if scene.source and read_manifest(scene.source.root).get("format") == "both":
+    if read_manifest(scene.source.root).get("format") == "both":
         layout = "both"
     other = source not in {"colmap", "transforms"} or (
         layout == "transforms" and planned.trainer in map(str.lower, COLMAP_ONLY)
@@ -231,7 +234,7 @@ def lifting_command(path: Path, maps: Path, how: str) -> str:
 
 def triangulate_command(path: Path, scene: Scene, output: str) -> str:
     """Return the command that triangulates points for a scene's poses."""
-    photographs = scene.source.image_dir if scene.source else None
+    photographs = scene.source.image_dir
     images = "IMAGES" if photographs is None else quoted(photographs)
     return f"splatseed sfm {images} --poses-from {quoted(path)} -o {output}"
 
@@ -249,15 +252,17 @@ def print_training(read_from: Path, scene: Scene, output: Path, layout: Layout) 
         trainers = training_commands(output, layout, distorted=bool(lenses))
         print_pairs("train it with", trainers)
         if "graphdeco" in dict(trainers) and (off := off_centre(scene)) > CENTRED:
-            print_note(
+            text = (
                 f"graphdeco's trainer ignores principal points, which are up to {off:.1f} px off "
+            )
+            text += (
                 "the photographs' centres: it trains as if they were there. The others read them."
             )
+            print_note(Finding("off-centre-principal-points", text))
     if lenses:
-        print_note(
-            f"{'The other trainers' if known else 'Trainers'} need photographs without lens "
-            f"distortion: begin with {undistort_command(read_from)}, and upsample that scene."
-        )
+        text = f"{'The other trainers' if known else 'Trainers'} need photographs without lens "
+        text += f"distortion: begin with {undistort_command(read_from)}, and upsample that scene."
+        print_note(Finding("lens-distortion", text, "info"))
 
 
 def off_centre(scene: Scene) -> float:

@@ -122,7 +122,7 @@ def _from_photographs(options: Options, images: Path, clock: StageClock) -> SfmR
     masks: Masks | None = None
     poses: Scene | None = None
     capture = None if video else _posed(options.images)
-    if capture is not None and capture.source is not None and capture.source.format == "phone":
+    if capture is not None and capture.source.format == "phone":
         images = capture.source.image_dir or images  # an app's folder has other pictures, too
     if options.poses_from is None:
         stages = ["mapping"]

@@ -27,9 +27,8 @@ from splatseed.depth.views import DepthView, read_view
 from splatseed.depthmap import in_scene_units
 from splatseed.errors import PointCloudError, SceneFormatError, SceneNotFoundError
 from splatseed.findings import Finding
-from splatseed.io.photograph import photograph_folder
 from splatseed.io.photograph_checks import with_photographs
-from splatseed.photos.sizes import at_file_size, default_factor
+from splatseed.photos.sizes import default_factor
 from splatseed.photos.visibility import Visibility, find_visibility
 from splatseed.progress import Progress, in_threads, silent
 from splatseed.scene import Image, Scene
@@ -131,9 +130,7 @@ def suggested_number(scene: Scene, settings: DepthSettings) -> int:
     It is limited to what the maps can give. Raises as ``lift``.
     """
     settings = _settings_without_points(scene, settings)
-    images = at_file_size(
-        scene.replace(images=tuple(_images_with_maps(scene, settings, [])))
-    ).images
+    images = _images_with_maps(scene, settings, [])
     factor, depths = default_factor(images), scene.depths
     assert depths is not None  # noqa: S101  (these images have maps)
     sizes = [(im.camera.width // factor) * (im.camera.height // factor) for im in images]
@@ -187,9 +184,8 @@ def _images_with_maps(
         text = f"{lacking} of {len(used)} images {verbs} no points."
         names = tuple(image.name for image in used if image.name not in depths)
         findings.append(Finding("missing-depth-maps", text, subjects=names))
-    photograph_folder(scene)  # raises if there is none
-    readable = {image.name for image in with_photographs(scene).images}
-    return [image for image in images if image.name in readable]
+    with_photographs(scene)  # raises if too few are there
+    return [image for image in images if image.has_photograph]
 
 
 def _read_views(
@@ -202,7 +198,7 @@ def _read_views(
     progress: Progress,
 ) -> list[DepthView]:
     """Read all images, which share ``num`` candidates equally."""
-    depths, folder = scene.depths, photograph_folder(scene)
+    depths = scene.depths
     assert depths is not None  # noqa: S101  (these images have maps)
     views: dict[int, DepthView] = {}
     # A seed per image, drawn in order, so that threads do not matter.
@@ -211,8 +207,8 @@ def _read_views(
     def work(start: int, stop: int) -> None:
         for i in range(start, stop):
             views[i] = read_view(
-                images[i], folder, scene.masks, depths, visibility, settings, per_image,
-                np.random.default_rng(seeds[i]), scene.white,
+                images[i], depths, visibility, settings, per_image,
+                np.random.default_rng(seeds[i]),
             )  # fmt: skip
 
     in_threads(work, len(images), 1, "read images", progress)

@@ -23,9 +23,9 @@ from PIL import Image as PilImage
 
 from splatseed import errors
 from splatseed.depthmap import DepthKind
-from splatseed.io import photograph
 from splatseed.io.depth_maps import depth_folder
 from splatseed.io.files import StrPath
+from splatseed.io.photograph import check_photograph
 from splatseed.io.photograph_checks import check_sizes, with_photographs
 from splatseed.progress import Progress, silent
 from splatseed.runtime.torch_device import DeviceName, pick_torch_device
@@ -118,19 +118,15 @@ def estimate_depths(
         OutputError: The folder cannot be written.
     """
     scene, output, kind = with_photographs(scene), Path(output), network.meaning.kind
-    folder, flat = photograph.photograph_folder(scene), list[str]()
-    protect = (folder,) if scene.source is None else scene.source.inputs
+    inputs, flat = scene.source.inputs, list[str]()
     with depth_folder(
-        output, kind, overwrite=overwrite, protect=protect, provenance=provenance
+        output, kind, overwrite=overwrite, protect=inputs, provenance=provenance
     ) as writer:
-        sizes = _check_photographs(scene, folder, max_size, progress)
+        sizes = _check_photographs(scene, max_size, progress)
         start = time.perf_counter()
         progress("predict depth", 0.0)
         for done, (name, size) in enumerate(sizes.items(), 1):
-            path = folder / name
-            picture = photograph.decode_photograph(
-                path, photograph.photograph_bytes(path), scene.white
-            )
+            picture = PilImage.fromarray(scene[name].read())
             if picture.size != size:
                 picture = picture.resize(size, PilImage.Resampling.BICUBIC)
             values = network(np.array(picture))
@@ -143,13 +139,13 @@ def estimate_depths(
 
 
 def _check_photographs(
-    scene: Scene, folder: Path, max_size: int, progress: Progress
+    scene: Scene, max_size: int, progress: Progress
 ) -> dict[str, tuple[int, int]]:
     """Decode each photograph, and return the size at which the network sees it, by name."""
     names, sizes = sorted(image.name for image in scene.images), {}
-    check_sizes(scene.images, folder)
+    check_sizes(scene.images)
     for name in names:
-        width, height = photograph.check_photograph(folder / name)
+        width, height = check_photograph(scene[name].path)
         factor = min(max_size / max(width, height), 1.0)
         sizes[name] = max(round(width * factor), 1), max(round(height * factor), 1)
         progress("check images", len(sizes) / len(names))

@@ -13,11 +13,11 @@ Candidates depend on the image, the seed and the settings only, not on threads o
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
+from PIL import Image as PilImage
 
 from splatseed.camera import Camera
 from splatseed.depth._kernels import chamfer_distance, draw_pixels, find_edges
@@ -31,16 +31,10 @@ from splatseed.depth.alignment import (
 )
 from splatseed.depth.settings import DepthSettings
 from splatseed.depthmap import DepthMap, DepthMaps, in_scene_units
-from splatseed.io.bit_depth import WHITE
-from splatseed.io.masks import read_mask
-from splatseed.io.photograph import decode_photograph, photograph_bytes
 from splatseed.io.photograph_checks import check_sizes
 from splatseed.photos.loading import refuse_distortion
 from splatseed.photos.visibility import Visibility, points_in_image
-from splatseed.scene import Image, Masks
-
-if TYPE_CHECKING:
-    from PIL import Image as PilImage
+from splatseed.scene import Image
 
 
 @dataclass(frozen=True)
@@ -95,14 +89,11 @@ class DepthView:
 
 def read_view(
     image: Image,
-    folder: Path,
-    masks: Masks | None,
     depths: DepthMaps,
     visibility: Visibility,
     settings: DepthSettings,
     num: int,
     rng: np.random.Generator,
-    white: int = WHITE,
 ) -> DepthView:
     """Read an image and its map, and draw about ``num`` candidates.
 
@@ -112,7 +103,7 @@ def read_view(
     """
     refuse_distortion(image, reason="along whose rays pixels are lifted")
     depth = depths.read(image.name).reliable(settings.min_confidence)
-    if (mask := read_mask(masks, image.name, folder / image.name)) is not None:
+    if (mask := image.read_mask()) is not None:
         values = np.where(pixels_within(mask, depth), depth.values, np.float32(np.nan))
         depth = replace(depth, values=values)
     camera = map_camera(depth, image)
@@ -137,14 +128,15 @@ def read_view(
         step = -(-max(planar.values.shape) // SAMPLING.reduced_side)
         coarse = planar.strided(step // 2, step)
     del depth, planar  # before the photograph needs memory
-    path = folder / image.name
-    photograph = decode_photograph(path, photograph_bytes(path), white)
-    check_sizes([image], folder)
+    photograph = image.read()
+    check_sizes([image])
+    height, width = photograph.shape[:2]
     row, column = (index + 0.5 for index in np.divmod(pixel, camera.width))
-    row = (row * photograph.height / camera.height).astype(np.int64)
-    column = (column * photograph.width / camera.width).astype(np.int64)
-    rgb = np.asarray(photograph)[row, column]
-    reduced = None if coarse is None else _reduce(camera, coarse, unit, photograph)
+    row = (row * height / camera.height).astype(np.int64)
+    column = (column * width / camera.width).astype(np.int64)
+    rgb = photograph[row, column]
+    picture = PilImage.fromarray(photograph)
+    reduced = None if coarse is None else _reduce(camera, coarse, unit, picture)
     return DepthView(alignment, camera, pixel, z, rgb, edge, len(pixel) < num, reduced)
 
 

@@ -50,7 +50,7 @@ def write_colmap_layout(scene: Scene, folder: Path) -> Written:
     write_seeds(folder, scene.points)
     findings = list[Finding]()
     source = scene.source
-    if source is not None and source.model_dir is not None:
+    if source.model_dir is not None:
         rigs, findings = _rigs(scene, cameras, source.model_dir)
         copy_files(source.root, _ROOT_EXTRAS, folder)
         copy_files(source.model_dir, (*_MODEL_EXTRAS, *rigs), model_dir)
@@ -73,10 +73,8 @@ def write_colmap_layout(scene: Scene, folder: Path) -> Written:
 
 def write_split(scene: Scene, folder: Path) -> None:
     """Copy the lists of a scene's split beside a COLMAP model, or write them as nerfstudio does."""
-    if scene.source is not None:
-        copy_files(scene.source.root, ROOT_LISTS, folder)
-        if scene.source.model_dir is not None:
-            copy_files(scene.source.model_dir, MODEL_LISTS, folder / "sparse" / "0")
+    copy_files(scene.source.root, ROOT_LISTS, folder)
+    copy_files(scene.source.model_dir, MODEL_LISTS, folder / "sparse" / "0")
     if scene.listed is None or any((folder / name).exists() for name in ROOT_LISTS):
         return
     train, test = scene.split()

@@ -96,8 +96,8 @@ def write_dense_maps(
         OutputError: The folder exists or cannot be written.
     """
     path, images = Path(path), {image.name: image for image in scene.images}
-    protect = scene.source.inputs if scene.source else ()
-    folder = depth_folder(path, "z", overwrite=overwrite, protect=protect, provenance=provenance)
+    inputs = scene.source.inputs
+    folder = depth_folder(path, "z", overwrite=overwrite, protect=inputs, provenance=provenance)
     with folder as writer:
 
         def write(dense: DenseMap) -> None:
@@ -147,7 +147,7 @@ def write_dense_workspace(  # noqa: D417  (the rest is as for maps)
     path, sizes = Path(path), check_dense_scene(scene, undistorts=undistort is not None)
     cameras, images = _photograph_model(scene, sizes)
     idxs = {name: idx for idx, name in enumerate(images)}
-    inputs = scene.source.inputs if scene.source else ()
+    inputs = scene.source.inputs
     with output_folder(path, kind="depth", overwrite=overwrite, protect=inputs) as folder:
         _write_photographs(scene, folder, undistort, progress, copy=copy_images)
         stereo = folder / "stereo"
@@ -192,11 +192,11 @@ def check_dense_scene(scene: Scene, *, undistorts: bool = False) -> dict[str, Si
             another aspect ratio than its camera.
         OutputError: An image name leads out of the folder.
     """
-    folder = photograph.photograph_folder(scene)
-    return {image.name: _size_of(image, folder, undistorts=undistorts) for image in scene.images}
+    photograph.photograph_folder(scene)  # raises if there is none
+    return {image.name: _size_of(image, undistorts=undistorts) for image in scene.images}
 
 
-def _size_of(image: Image, folder: Path, *, undistorts: bool) -> Size:
+def _size_of(image: Image, *, undistorts: bool) -> Size:
     lens = image.intrinsics
     if lens.has_distortion and not undistorts:
         raise SceneFormatError(
@@ -214,7 +214,7 @@ def _size_of(image: Image, folder: Path, *, undistorts: bool) -> Size:
     if "/".join(safe_parts(image.name)) != image.name or "\n" in image.name:
         expected = "image names inside their folder"
         raise OutputError(expected, found=repr(image.name), fix="Rename the image.")
-    return check_sizes([image], folder)[image.name]
+    return check_sizes([image])[image.name]
 
 
 def _write_each(
@@ -358,22 +358,18 @@ def _write_photographs(
 ) -> None:
     """Link, copy or undistort a checked scene's photographs into ``images``."""
     distorted = [image for image in scene.images if image.intrinsics.has_distortion]
-    source = scene.source.image_dir if scene.source else None
-    if undistort is None or not distorted or source is None:
+    if undistort is None or not distorted:
         folders = image_folders(scene)
         wanted = {n: p for n, p in folders.items() if n == "images" or n.startswith("images/")}
         link_folders(wanted, folder, copy=copy)
         return
-    straight = [image.name for image in scene.images if not image.intrinsics.has_distortion]
-    link_folders({f"images/{name}": source / name for name in straight}, folder, copy=copy)
+    straight = [image for image in scene.images if not image.intrinsics.has_distortion]
+    link_folders({f"images/{image.name}": image.path for image in straight}, folder, copy=copy)
 
     def work(start: int, stop: int) -> None:
         for image in distorted[start:stop]:
-            path, target = source / image.name, folder / "images" / image.name
-            encoded = photograph.photograph_bytes(path)
-            pixels = np.asarray(photograph.decode_photograph(path, encoded, scene.white))
-            lens = image.intrinsics.resized(*pixels.shape[1::-1])
-            straight = PilImage.fromarray(undistort(pixels, lens, lens.K)[0])
+            target, lens = folder / "images" / image.name, image.lens
+            straight = PilImage.fromarray(undistort(image.read(), lens, lens.K)[0])
             target.parent.mkdir(parents=True, exist_ok=True)
             jpeg = PilImage.registered_extensions()[target.suffix.lower()] == "JPEG"
             # High quality, since JPEG pixels are compressed a second time.

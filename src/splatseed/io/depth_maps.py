@@ -214,8 +214,8 @@ def _match(scene: Scene, folder: Path) -> dict[str, Path]:
     """Match maps in one folder; leading folders of image names are dropped as needed."""
     parts = {image.name: safe_parts(image.name) for image in scene.images}
     taken, true_folder = set[Path](), cache(Path.resolve)
-    if scene.source and (image_dir := scene.source.image_dir):
-        photographs = (image_dir / image.name for image in scene.images)  # may be in this folder
+    if scene.source.image_dir:
+        photographs = (image.path for image in scene.images)  # may be in this folder
         taken = {true_folder(path.parent) / path.name for path in photographs}
     listing = cache(lambda parents: _listing(folder.joinpath(*parents), taken))
     for drop in range(max(map(len, parts.values()), default=0)):

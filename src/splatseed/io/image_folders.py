@@ -24,17 +24,17 @@ _KINDS = ("images", MASKS, "depths")
 def image_folders(scene: Scene) -> dict[str, Path]:
     """Map ``images`` and its siblings in an output to the scene's folders."""
     source = scene.source
-    if source is None or not scene.images:
+    if not scene.images:
         return {}
     folders = sibling_folders(scene)
     if source.image_dir is None:
         return folders
-    if source.image_dir.resolve() != source.root.resolve():
+    if source.root is None or source.image_dir.resolve() != source.root.resolve():
         return {**folders, "images": source.image_dir}
     folders.pop("images", None)
     names = [n for n in (image.name for image in scene.images) if first_folders([n])]
     # One by one: gsplat's examples do not enter a linked folder within images.
-    return {**folders, **{f"images/{name}": source.image_dir / name for name in names}}
+    return {**folders, **{f"images/{name}": scene[name].path for name in names}}
 
 
 def first_folders(paths: Iterable[str]) -> list[str]:
@@ -49,7 +49,7 @@ def sibling_folders(scene: Scene) -> dict[str, Path]:
 
     Those of masks are left out if none of them count.
     """
-    root = scene.source.root if scene.source else None
+    root = scene.source.root
     kinds = [kind for kind in _KINDS if kind != MASKS or scene.masks is not None]
     names = (f"{kind}{scale}" for kind in kinds for scale in ("", "_2", "_4", "_8"))
     return {name: root / name for name in names if root and (root / name).is_dir()}
@@ -61,7 +61,7 @@ def photographs_hidden(folders: Mapping[str, Path], scene: Scene) -> str:
     Of the files whose path ends in the name of an image of a COLMAP model, Brush takes the first
     by path, in whichever folder (its ``find_image_by_name``).
     """
-    image_dir = scene.source.image_dir if scene.source else None
+    image_dir = scene.source.image_dir
     wanted = {image.name.lower(): image.name for image in scene.images}
     for name, source in sorted(folders.items()):
         if image_dir is None or name >= "images" or not source.is_dir():
@@ -116,8 +116,8 @@ def _copy(source: Path, target: Path) -> None:
         _copy(each, target / each.name)
 
 
-def copy_files(source: Path, names: Sequence[str], target: Path) -> None:
-    """Copy the files of these names that exist."""
+def copy_files(source: Path | None, names: Sequence[str], target: Path) -> None:
+    """Copy the files of these names that exist, if there is a source."""
     for name in names:
-        if (source / name).is_file():
+        if source and (source / name).is_file():
             shutil.copyfile(source / name, target / name)

@@ -14,7 +14,7 @@ from pathlib import Path
 from splatseed.depthmap import DepthKind
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError, SplatseedError
 from splatseed.findings import Finding, without_kinds
-from splatseed.io.bit_depth import WHITE, find_white
+from splatseed.io.bit_depth import find_white
 from splatseed.io.cleaning import clean_scene, outlier_findings
 from splatseed.io.colmap_model import find_model, nested_model, read_model, scene_model, scene_root
 from splatseed.io.depth_files import KINDS, SUFFIXES
@@ -92,8 +92,7 @@ def load_scene(path: StrPath, *, require_points: bool = True) -> Scene:
         if reader is None:
             raise _no_scene_error(path)
         scene = reader()
-        if scene.source is not None:
-            scene = scene.replace(source=replace(scene.source, named=path.absolute()))
+        scene = scene.replace(source=replace(scene.source, named=path.absolute()))
         if isinstance(scene.depths, DepthFiles):  # their format states the unit
             scene = scene.replace(depths=replace(scene.depths, in_scene_units=True))
     except SplatseedError:
@@ -110,9 +109,7 @@ def load_scene(path: StrPath, *, require_points: bool = True) -> Scene:
     # seeds.npz and the manifest refer to the points as stored: restore before cleaning.
     scene = clean_scene(with_listed_split(restore_absent(recall_seeds(scene))))
     scene = with_recorded_masks(scene)
-    folder, white, found = scene.source.image_dir if scene.source else None, WHITE, list[Finding]()
-    if folder is not None:
-        white, found = find_white([folder / image.name for image in scene.images])
+    white, found = find_white([image.path for image in scene.images if image.folder])
     found += map_findings(scene.depths)
     findings = (*scene.findings, *found, *outlier_findings(scene.points))
     return scene.replace(findings=findings, white=white)
@@ -342,9 +339,10 @@ def _is_archive(path: Path) -> bool:
 
 def with_own_depths(scene: Scene) -> Scene:
     """Attach the depth maps found in the scene's own folder, unless it has maps already."""
-    if scene.depths is not None or scene.source is None:
+    root = scene.source.root
+    if scene.depths is not None or root is None:
         return scene
-    return _with_maps(scene, search_depths(scene, scene.source.root))
+    return _with_maps(scene, search_depths(scene, root))
 
 
 def depths_beside(scene: Scene) -> DepthFiles | None:
@@ -352,10 +350,11 @@ def depths_beside(scene: Scene) -> DepthFiles | None:
 
     In contrast to ``with_own_depths``, nobody asked for them: other files count less readily.
     """
-    if scene.depths is not None or scene.source is None:
+    root = scene.source.root
+    if scene.depths is not None or root is None:
         return None
     try:
-        maps = search_depths(scene, scene.source.root)
+        maps = search_depths(scene, root)
     except SplatseedError:
         return None  # method depth, which needs them, raises it
     shown = (

@@ -61,8 +61,7 @@ def with_masks(scene: Scene, choice: str | None) -> Scene:
     folder = Path(location).absolute() if location else None
     if folder is not None:
         names = [image.name for image in scene.images]
-        image_dir = scene.source.image_dir if scene.source else None
-        files, found = find_masks(names, folder, image_dir, named=True)
+        files, found = find_masks(names, folder, scene.source.image_dir, named=True)
         choice = f"{INVERTED}:{folder}" if inverted else str(folder)
     if not files:
         where = f"in {folder}" if folder else "beside its photographs"
@@ -92,13 +91,13 @@ def masks_digest(scene: Scene) -> str | None:
 
 def with_own_masks(scene: Scene) -> Scene:
     """Attach the masks found near the photographs of a scene that was just read, if it has none."""
-    folder = scene.source.image_dir if scene.source else None
+    folder, root = scene.source.image_dir, scene.source.root
     masks, found = scene.masks or Masks({}), list[Finding]()
-    if scene.source is None or folder is None:
+    if folder is None or root is None:
         return scene
     if not masks.files:
         names = [image.name for image in scene.images]
-        files, found = find_own_masks(names, folder, scene.source.root)
+        files, found = find_own_masks(names, folder, root)
         found += _resized(files, folder)
         masks = replace(masks, files=files)
     return scene.replace(masks=masks, findings=(*scene.findings, *found, *_mostly_masked(masks)))

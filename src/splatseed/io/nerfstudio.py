@@ -483,7 +483,7 @@ def similarity_in(path: Path, content: Any, scene: Scene, fix: str) -> Similarit
     try:
         matrix = np.atleast_1d(np.array(rows, np.float64))
         matrix = np.concatenate([matrix[:3] * float(scale), np.eye(4)[3:]])
-        transforms = scene.source.transforms_path if scene.source else None
+        transforms = scene.source.transforms_path
         if path.name == NERFSTUDIO and transforms is not None:
             applied = read_json(transforms, fix=fix).get("applied_transform")
             applied = np.eye(4) if applied is None else np.array(applied, np.float64)

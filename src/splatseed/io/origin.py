@@ -201,9 +201,8 @@ def format_offset(offset: Sequence[float] | np.ndarray) -> str:
 def _with_offset(scene: Scene) -> Scene:
     """Set a scene's offset from the record beside its files."""
     source = scene.source
-    if source is None:
-        return scene
-    offset = offset_beside(source.points_path if source.format == "ply" else source.root)
+    place = source.points_path if source.format == "ply" else source.root
+    offset = None if place is None else offset_beside(place)
     if offset is None:
         return scene
     x, y, z = offset.tolist()
@@ -249,9 +248,10 @@ def _lost_precision(
     xyz = scene.points.xyz if exact is None else exact
     # Ignore points of another frame, nearer to 0.
     xyz = xyz[np.abs(xyz - origin).max(axis=1, initial=0.0) < np.abs(origin).max() / 2]
-    if scene.source is None or len(xyz) < 2 or not np.array_equal(xyz, xyz.astype(np.float32)):
+    path = scene.source.points_path
+    if path is None or len(xyz) < 2 or not np.array_equal(xyz, xyz.astype(np.float32)):
         return []
-    text = f"The points in {scene.source.points_path.name} were stored in single precision, which "
+    text = f"The points in {path.name} were stored in single precision, which "
     text += "has rounded their positions: store them in double precision, or recentred."
     return [Finding("rounded-positions", text)]
 

@@ -35,7 +35,7 @@ _COMPLETE_IMAGE = "an image, neither truncated nor damaged"
 
 def photograph_folder(scene: Scene) -> Path:
     """Return the folder of a scene's photographs; raise ``SceneNotFoundError`` without any."""
-    folder = scene.source.image_dir if scene.source else None
+    folder = scene.source.image_dir
     if folder is None or not scene.images:
         raise SceneNotFoundError(
             "a scene with photographs",
@@ -52,10 +52,9 @@ def photographs_digest(scene: Scene) -> str:
     A run keeps it, so that a scene that has changed since is noticed.
     """
     parts = []
-    folder = scene.source.image_dir if scene.source else None
     for image in scene.images:
-        lens, path = image.intrinsics, folder and folder / image.name
-        size = path.stat().st_size if path and path.is_file() else None
+        lens = image.lens
+        size = image.path.stat().st_size if image.has_photograph else None
         facts = f"{image.name!r} {lens.params} {lens.width} {lens.height} {size}"
         parts.append(facts.encode())  # repr escapes what is no UTF-8 in a name
         parts.append(image.quat.tobytes() + image.translation.tobytes())

@@ -6,10 +6,10 @@ as in COLMAP: EXIF orientation is ignored. Only headers are read.
 
 from __future__ import annotations
 
-import itertools
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -49,7 +49,7 @@ def with_photographs(scene: Scene) -> Scene:
         SceneNotFoundError: Fewer than half of the photographs exist.
     """
     folder = photograph_folder(scene)
-    missing = tuple(image.name for image in scene.images if not (folder / image.name).is_file())
+    missing = tuple(image.name for image in scene.images if not image.has_photograph)
     if not missing:
         return scene
     if 2 * len(missing) > len(scene.images):
@@ -64,7 +64,7 @@ def with_photographs(scene: Scene) -> Scene:
 
 
 def photograph_size(path: Path) -> Size:
-    """Read width and height of an image file.
+    """Read width and height of an image file, once for each version of it.
 
     Raises:
         SceneNotFoundError: No such file.
@@ -72,7 +72,14 @@ def photograph_size(path: Path) -> Size:
     """
     if not path.is_file():
         photograph_bytes(path)  # raises with advice for a missing file
-    with translate_errors(path, "an image", fix=COPY_AGAIN), open_file(path) as file:
+    with translate_errors(path, "an image", fix=COPY_AGAIN):
+        state = path.stat()
+        return _size_in_header(path, state.st_mtime_ns, state.st_size)
+
+
+@lru_cache(maxsize=1 << 16)
+def _size_in_header(path: Path, *_version: int) -> Size:
+    with open_file(path) as file:
         return open_picture(file).size
 
 
@@ -91,22 +98,22 @@ def _off(lens: Intrinsics, size: Size) -> float:
     return min(abs(size[0] - width), abs(size[1] - height))
 
 
-def check_sizes(images: Sequence[Image], folder: Path) -> dict[str, Size]:
-    """Read the sizes of photographs, and check that all fit their cameras.
+def check_sizes(images: Sequence[Image]) -> dict[str, Size]:
+    """Return the sizes of photographs by name, once all are found to fit their cameras.
 
     Raises:
         SceneNotFoundError: One is missing.
         SceneFormatError: One does not fit, or is not an image.
     """
-    sizes = {image.name: photograph_size(folder / image.name) for image in images}
+    sizes = {image.name: image.size or photograph_size(image.path) for image in images}
     wrong = [image for image in images if not fits(image.intrinsics, sizes[image.name])]
     if wrong:
         lens, (width, height) = wrong[0].intrinsics, sizes[wrong[0].name]
-        reason, fix = _misfit(lens, (width, height), folder / wrong[0].name)
+        reason, fix = _misfit(wrong[0], (width, height))
         more = len(wrong) - 1
         others = f"; {more} more of {counted(len(images), 'photograph')} do not fit either"
         raise SceneFormatError(
-            f"{folder / wrong[0].name} to have the size of its camera {lens.camera_id}, "
+            f"{wrong[0].path} to have the size of its camera {lens.camera_id}, "
             f"{lens.width} x {lens.height}, or to be a resized copy",
             found=f"{width} x {height}: {reason}{others if more else ''}",
             fix=fix,
@@ -114,14 +121,14 @@ def check_sizes(images: Sequence[Image], folder: Path) -> dict[str, Size]:
     return sizes
 
 
-def _misfit(lens: Intrinsics, size: Size, path: Path) -> tuple[str, str]:
+def _misfit(image: Image, size: Size) -> tuple[str, str]:
     """Explain why a photograph does not fit its camera, and how to fix it."""
-    if not fits(lens, size[::-1]):
+    if not fits(image.intrinsics, size[::-1]):
         return "cropped, or stretched", (
             "Use the photographs of the reconstruction, or resized copies. A crop "
             "needs a camera record of its own: width, height and principal point."
         )
-    if (orientation := exif_orientation(path)) in _SIDEWAYS:
+    if (orientation := exif_orientation(image.path)) in _SIDEWAYS:
         return f"stored rotated, with EXIF orientation {orientation}", (
             "The poses are for upright pixels: rotate copies as EXIF says (ImageMagick: mogrify "
             "-auto-orient), or estimate poses for the files as stored (splatseed sfm)."
@@ -154,11 +161,12 @@ def photograph_findings(
         )
         text = f"The images folder {missing}; points can be made, but not trained."
         return [Finding("missing-photographs", text), *odd]
-    absent = {im.name: None for im in images if not (image_dir / im.name).is_file()}
+    images = [replace(image, folder=image_dir) for image in images]
+    absent = {im.name: None for im in images if not im.has_photograph}
     findings = [_missing([*absent], len(images), image_dir)] if absent else []
     # Links are not followed: users make them on purpose.
     around = os.path.abspath(root)  # noqa: PTH100
-    paths = {im.name: os.path.abspath(image_dir / im.name) for im in images}  # noqa: PTH100
+    paths = {im.name: os.path.abspath(im.path) for im in images}  # noqa: PTH100
     outside = [n for n, path in paths.items() if os.path.commonpath([path, around]) != around]
     if outside and not is_extracted(image_dir):
         lie = agreeing(len(outside), "lies", "lie")
@@ -166,7 +174,7 @@ def photograph_findings(
         text += f", such as {outside[0]}."
         findings.append(Finding("photographs-outside-scene", text, subjects=tuple(outside)))
     findings += odd
-    return [*findings, *_size_findings([im for im in images if im.name not in absent], image_dir)]
+    return [*findings, *_size_findings([im for im in images if im.name not in absent])]
 
 
 def _odd_cameras(images: Sequence[Image]) -> list[Finding]:
@@ -209,23 +217,22 @@ def _missing(missing: Sequence[str], count: int, image_dir: Path) -> Finding:
     return Finding("missing-photographs", text, subjects=tuple(missing))
 
 
-def _size_findings(images: Sequence[Image], image_dir: Path) -> list[Finding]:
+def _size_findings(images: Sequence[Image]) -> list[Finding]:
     """Describe each kind of mismatch between files and cameras, with the first example."""
-    sizes, findings = file_sizes(images, image_dir), list[Finding]()
+    sizes, findings = {im.name: im.size for im in images if im.size}, list[Finding]()
     if len(sizes) < len(images):
-        first = next(image.name for image in images if image.name not in sizes)
+        first = next(image for image in images if not image.size)
         try:
-            photograph_size(image_dir / first)
+            photograph_size(first.path)
         except SceneFormatError as error:
-            text = f"{first} cannot be read: {error.found}."
-            findings.append(Finding("unreadable-photograph", text, subjects=(first,)))
+            text = f"{first.name} cannot be read: {error.found}."
+            findings.append(Finding("unreadable-photograph", text, subjects=(first.name,)))
     other = [im for im in images if sizes.get(im.name, _own(im)) != _own(im)]
     fitting = [im for im in other if fits(im.intrinsics, sizes[im.name])]
     stretched = [im for im in fitting if _off(im.intrinsics, sizes[im.name]) > ROUNDING]
     all_of = counted(len(images), "photograph")
     if wrong := [im for im in other if im not in fitting]:
-        first = wrong[0].name
-        reason, fix = _misfit(wrong[0].intrinsics, sizes[first], image_dir / first)
+        reason, fix = _misfit(wrong[0], sizes[wrong[0].name])
         text = (
             f"{len(wrong)} of {all_of} {agreeing(len(wrong), 'does', 'do')} not fit the camera: "
             f"{_against(wrong[0], sizes)} ({reason}). They cannot be used for training."
@@ -258,39 +265,3 @@ def _against(image: Image, sizes: Mapping[str, Size]) -> str:
     lens, size = image.intrinsics, sizes[image.name]
     record = f"its camera {lens.camera_id} {lens.width} x {lens.height}"
     return f"{image.name} has {size[0]} x {size[1]} pixels, {record}"
-
-
-def file_sizes(images: Sequence[Image], folder: Path) -> Mapping[str, Size]:
-    """Read the sizes of readable photographs, by name."""
-    sizes = {}
-    for image in images:
-        try:
-            sizes[image.name] = photograph_size(folder / image.name)
-        except (SceneNotFoundError, SceneFormatError):
-            continue
-    return sizes
-
-
-def resized_to(images: Sequence[Image], sizes: Mapping[str, Size]) -> tuple[Image, ...]:
-    """Scale cameras and features to photographs of these sizes, by name.
-
-    If photographs of several sizes share a camera, each further size gets a new camera with an id
-    above all others. Images without a size, or whose photograph does not fit, are unchanged.
-    """
-    free = itertools.count(1 + max((image.intrinsics.camera_id for image in images), default=0))
-    records: dict[tuple[Intrinsics, Size], Intrinsics] = {}
-    used, changed = set[int](), list[Image]()
-    for image in images:
-        lens, found = image.intrinsics, image.observations
-        size = sizes.get(image.name, _own(image))
-        size = size if fits(lens, size) else _own(image)
-        if (lens, size) not in records:
-            camera_id = next(free) if lens.camera_id in used else lens.camera_id
-            used.add(camera_id)
-            records[lens, size] = replace(lens.resized(*size), camera_id=camera_id)
-        if found is not None and size != _own(image):
-            found = replace(found, xy=found.xy * (np.array(size) / _own(image)))
-        own = records[lens, size]
-        same = own == lens
-        changed.append(image if same else replace(image, intrinsics=own, observations=found))
-    return tuple(changed)

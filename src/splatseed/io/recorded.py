@@ -25,7 +25,7 @@ def facts_for_reading(scene: Scene) -> dict[str, Any]:
     facts: dict[str, Any] = {}
     if scene.absent:  # so that the others train or test as before
         facts[_ABSENT] = list(scene.absent)
-    if scene.masks is None and scene.source and scene.source.image_dir:
+    if scene.masks is None and scene.source.image_dir:
         facts[_MASKED] = _NOTHING  # else masks near the photographs would count again
     if scene.masks and not scene.masks.alpha:  # else transparent pixels would be masked
         facts[_TRANSPARENT] = _BLACK
@@ -34,7 +34,7 @@ def facts_for_reading(scene: Scene) -> dict[str, Any]:
 
 def restore_absent(scene: Scene) -> Scene:
     """Add the absent images that the manifest of a scene lists."""
-    noted = read_manifest(scene.source.root).get(_ABSENT) if scene.source else None
+    noted = read_manifest(scene.source.root).get(_ABSENT)
     if not isinstance(noted, list) or not all(isinstance(name, str) for name in noted):
         return scene
     known = {*scene.absent, *(image.name for image in scene.images)}
@@ -43,7 +43,7 @@ def restore_absent(scene: Scene) -> Scene:
 
 def with_recorded_masks(scene: Scene) -> Scene:
     """Attach the masks near the photographs, as far as the manifest of a scene lets them count."""
-    manifest = read_manifest(scene.source.root) if scene.source else {}
+    manifest = read_manifest(scene.source.root)
     if manifest.get(_MASKED) == _NOTHING:
         return scene.replace(masks=None)
     if manifest.get(_TRANSPARENT) == _BLACK:  # of a Blender pair

@@ -175,10 +175,9 @@ def find_tum_depths(scene: Scene, root: Path) -> depth_maps.DepthFiles | None:
     posed = {image.name: image.intrinsics for image in scene.images if image.name in paths}
     lens = _tum_camera(root)[0]
     undistorted = lens.has_distortion and not any(each.has_distortion for each in posed.values())
-    folder = scene.source.image_dir if scene.source else None
-    if undistorted and folder is not None:
+    if undistorted and scene.source.image_dir is not None:
         name, original = next(iter(originals.items()))
-        both = (folder / name, original)
+        both = (scene[name].path, original)
         undistorted = not all(p.is_file() for p in both) or len({p.read_bytes() for p in both}) > 1
     moved = depth_maps.Undistortion(dict.fromkeys(posed, lens), posed) if undistorted else None
     return depth_maps.DepthFiles(paths, "z", scale or _DEPTH_SCALE, moved)

@@ -64,9 +64,10 @@ def write_seeds(folder: Path, points: PointCloud) -> None:
 
 def recall_seeds(scene: Scene) -> Scene:
     """Give a scene's points the origin and the attributes in its ``seeds.npz``, if they match."""
-    if scene.source is None or not len(scene.points):
+    root = scene.source.root
+    if root is None or not len(scene.points):
         return scene
-    arrays, findings = _read_seeds(scene.source.root, scene.points)
+    arrays, findings = _read_seeds(root, scene.points)
     points = scene.points.replace(**arrays)
     # Tracks belong to the first points, and a new point has none.
     first_new = int(np.append(points.source != ORIGINAL, True).argmax())
@@ -78,7 +79,7 @@ def recall_seeds(scene: Scene) -> Scene:
 
 def _upsampling(scene: Scene) -> dict[str, Any] | None:
     """What ``splatseed upsample`` wrote about the points, if it made them."""
-    facts = read_manifest(scene.source.root) if scene.source else {}
+    facts = read_manifest(scene.source.root)
     carried = facts if facts.get("command") == "upsample" else facts.get(UPSAMPLED)
     return carried if isinstance(carried, dict) else None
 

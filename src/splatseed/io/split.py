@@ -30,7 +30,7 @@ _SHOWN = 3
 
 def with_listed_split(scene: Scene) -> Scene:
     """Set a scene's split from its lists, if it has any."""
-    if scene.source is None or not scene.images or scene.listed is not None:
+    if not scene.images or scene.listed is not None:
         return scene
     findings = list(scene.findings)
     for origin, parts in _lists(scene):
@@ -51,7 +51,6 @@ def with_listed_split(scene: Scene) -> Scene:
 def _lists(scene: Scene) -> Iterator[tuple[str, list[list[str]]]]:
     """Yield each list's description, and its names for training, test and maybe validation."""
     source = scene.source
-    assert source is not None  # noqa: S101  (checked by the caller)
     if source.transforms_path is not None:
         fields = json.loads(read_bytes(source.transforms_path))
         found = [fields.get(f"{part}_filenames") for part in ("train", "test", "val")]
@@ -79,7 +78,7 @@ def _read(path: Path) -> list[str]:
 def _split(scene: Scene, origin: str, parts: list[list[str]]) -> tuple[Split | None, list[str]]:
     """Make the split (None if a part is empty), and return names that match no image."""
     names = [image.name for image in scene.images]
-    folder = scene.source.image_dir if scene.source else None
+    folder = scene.source.image_dir
     prefixes = ("", "images/", f"{folder.name}/" if folder else "")
     if len(parts) > 2 and not _known(names, parts[1], prefixes):
         parts = [parts[0], next(filter(None, parts[2:]), parts[1])]  # validation

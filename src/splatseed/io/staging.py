@@ -149,8 +149,10 @@ def add_files(folder: Path, names: Iterable[str]) -> None:
     write_json(folder / MANIFEST, {**read_manifest(folder), "files": sorted(listed)})
 
 
-def read_manifest(folder: Path) -> dict[str, Any]:
-    """Read a folder's manifest; empty if there is none or it is damaged."""
+def read_manifest(folder: Path | None) -> dict[str, Any]:
+    """Read a folder's manifest; empty if there is none, it is damaged, or no folder is given."""
+    if folder is None:
+        return {}
     try:
         content = json.loads(read_text(folder / MANIFEST))
     except (OSError, ValueError, RecursionError):

@@ -86,10 +86,10 @@ def _obstacle(scene: Scene, named: Mapping[str, Path], folders: Mapping[str, Pat
 
 def _plan(scene: Scene) -> _Plan:
     source = scene.source
-    if source is None or source.transforms_path is None:
-        A = None if source and source.format == "transforms" else _NERFSTUDIO_FROM_COLMAP
+    if source.transforms_path is None:
+        A = None if source.format == "transforms" else _NERFSTUDIO_FROM_COLMAP
         return _Plan(_new_json(scene, A), image_folders(scene), A)
-    names = {image.name for image in scene.images}
+    names, root = {image.name for image in scene.images}, source.transforms_path.parent
     content = _kept_json(nerfstudio.read_transforms(source.transforms_path), names)
     if scene.masks is None:
         _drop_mask_paths(content)
@@ -98,16 +98,16 @@ def _plan(scene: Scene) -> _Plan:
     frames = (*content["frames"], *content.get("test_frames", ()))
     found = (frame.get(key) for frame in frames for key in _PATH_KEYS)
     paths = [each for each in found if isinstance(each, str) and not Path(each).is_absolute()]
-    if source.image_dir is not None and source.image_dir.resolve() == source.root.resolve():
+    if source.image_dir is not None and source.image_dir.resolve() == root.resolve():
         paths += names  # a frame's own path may lack the extension
     # The first folders of relative paths, so that these resolve.
-    firsts = {first: source.root / first for first in first_folders(paths)}
+    firsts = {first: root / first for first in first_folders(paths)}
     return _Plan(content, {**sibling_folders(scene), **firsts})
 
 
 def _write(scene: Scene, folder: Path, plan: _Plan, layout: Layout) -> Written:
     source, points, offset, (content, folders, A) = scene.source, scene.points, scene.offset, plan
-    if source is None or source.transforms_path is None:
+    if source.transforms_path is None:
         _name_masks(scene, content["frames"], [image.name for image in scene.images], layout)
     elif (scene.masks is not None and scene.masks.choice is not None) or rewrites_masks(
         scene, layout
@@ -262,7 +262,7 @@ def _moved_json(content: dict[str, Any], offset: Float64[np.ndarray, " 3"]) -> d
 def rewrites_masks(scene: Scene, layout: Layout) -> bool:
     """Whether masks must be written, as the scene's own folder cannot be linked."""
     masks, source = scene.masks, scene.source
-    if masks is None or source is None or not masks.files:
+    if masks is None or source.root is None or not masks.files:
         return False
     named = layout == "transforms" and masks.choice is None and _names_masks(source)
     folder = (source.root / MASKS).absolute()
@@ -299,9 +299,10 @@ def _name_masks(
     scene: Scene, frames: Sequence[dict[str, Any]], names: Sequence[str], layout: Layout
 ) -> None:
     """Set ``mask_path`` if all frames have a mask: nerfstudio takes masks of all or none."""
-    if scene.masks is None or scene.source is None:
+    root = scene.source.root
+    if scene.masks is None or root is None:
         return
-    files, root = scene.masks.files, scene.source.root
+    files = scene.masks.files
     rewrites = rewrites_masks(scene, layout)
     for frame, name in zip(frames, names, strict=True):
         frame.pop("mask_path", None)

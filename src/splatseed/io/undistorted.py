@@ -39,7 +39,7 @@ def write_lenses(folder: Path, lenses: Mapping[str, Intrinsics]) -> None:
 
 def fitted_to_undistorted(scene: Scene, maps: DepthFiles) -> DepthFiles:
     """Return maps with the undistortion that the scene's photographs have had, if they need it."""
-    path = scene.source.root / LENSES if scene.source else None
+    path = scene.source.root and scene.source.root / LENSES
     if path is None or not path.is_file() or maps.lens is not None:
         return maps
     images = [image for image in scene.images if image.name in maps]

@@ -95,9 +95,8 @@ def write_scene(
             found=f"{len(scene.points)} points, none of them finite",
             fix="Check the cloud.",
         )
-    inputs = source.inputs if source else ()
     kind = str(made.get("command", _KIND))
-    with output_folder(path, kind=kind, overwrite=overwrite, protect=inputs) as folder:
+    with output_folder(path, kind=kind, overwrite=overwrite, protect=source.inputs) as folder:
         if layout == "both":
             (findings, image_sources, offset), layout = write_both_layouts(clean, folder)
         else:
@@ -107,11 +106,11 @@ def write_scene(
                 text = f"{hidden}: remove the folder's link before you train with it."
                 findings.append(Finding("hidden-photographs", text))
         write_offset(folder, offset)
-        masks, photographs = clean.masks, source.image_dir if source else None
+        masks, photographs = clean.masks, source.image_dir
         if masks and photographs and rewrites_masks(clean, layout):
             image_sources.pop(MASKS, None)
             alone = replace(masks, alpha=False)  # photographs keep their transparency
-            names = [im.name for im in clean.images if (photographs / im.name).is_file()]
+            names = [image.name for image in clean.images if image.has_photograph]
             write_masks(alone, photographs, names, folder / MASKS)
             if layout != "colmap" and not (folder / MASKS).is_dir():
                 forget_masks(folder)  # no photograph has a masked pixel
@@ -125,19 +124,13 @@ def write_scene(
             "dropped_nonfinite": clean.left_out.non_finite,
             "dropped_duplicates": clean.left_out.duplicates,
         }
-        read = None
-        if source is not None:
-            is_file = source.format == "ply" or is_extracted(source.root)
-            bare = source.points_path if is_file else source.root
-            read = str(source.transforms_path or bare)
+        is_file = source.format == "ply" or (source.root and is_extracted(source.root))
+        read = source.transforms_path or (source.points_path if is_file else source.root)
         num_new = counts["num_points"] - counts["num_original"]
         made |= facts_for_reading(scene)
-        facts = {"source": read, **made, "format": layout, **counts, "num_new": num_new}
-        facts |= {
-            "findings": [asdict(each) for each in findings],
-            "versions": versions_of(_PACKAGES),
-        }
-        write_json(folder / MANIFEST, facts)
+        facts = {"source": read and str(read), **made, "format": layout, **counts}
+        facts |= {"num_new": num_new, "findings": [asdict(each) for each in findings]}
+        write_json(folder / MANIFEST, {**facts, "versions": versions_of(_PACKAGES)})
     return WriteReport(
         path,
         layout,
@@ -149,8 +142,7 @@ def write_scene(
 
 def _choose_layout(scene: Scene, wanted: str) -> Layout:
     if wanted == "auto":
-        read = scene.source is not None and scene.source.format == "transforms"
-        return "both" if read and scene.images else "colmap"
+        return "both" if scene.source.format == "transforms" and scene.images else "colmap"
     if wanted == "colmap":
         return "colmap"
     if wanted == "transforms" and scene.images:

@@ -27,8 +27,8 @@ FILTER = "box-3"  # part of the cache's key: change it whenever downsampling cha
 
 def load_photograph(
     path: StrPath, factor: int = 1, cache_dir: Path | None = None, white: int = WHITE
-) -> tuple[UInt8[np.ndarray, "H W 3"], tuple[int, int]]:
-    """Read a photograph, downsampled by ``factor``; also returns the file's width and height.
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Read a photograph, downsampled by ``factor``.
 
     Transparent pixels are laid over black, the background of renders. Smaller copies are cached in
     ``cache_dir``, if there is one.
@@ -43,7 +43,7 @@ def load_photograph(
     kept = (
         None if cache_dir is None or factor == 1 else cache_dir / f"{digest}_{factor}_{white}.npz"
     )
-    if kept is not None and (known := _read(kept)):
+    if kept is not None and (known := _read(kept)) is not None:
         return known
     original = decode_photograph(path, encoded, white)
     width, height = original.width // factor, original.height // factor
@@ -51,27 +51,29 @@ def load_photograph(
     photograph = original
     if factor > 1:
         photograph = original.reduce(factor, (0, 0, width * factor, height * factor))
-    pixels, size = np.array(photograph), original.size
+    pixels = np.array(photograph)
     if kept is not None:
         with suppress(OutputError, OSError):  # a cache that cannot be written is done without
             kept.parent.mkdir(parents=True, exist_ok=True)
             with atomic_file(kept) as partial, partial.open("wb") as file:
-                np.savez(file, photograph=pixels, size=np.array(size))
-    return pixels, size
+                np.savez(file, photograph=pixels)
+    return pixels
 
 
-def _read(path: Path) -> tuple[UInt8[np.ndarray, "H W 3"], tuple[int, int]] | None:
-    """Read a cached copy, and the size of the file that it was made from; None if unusable.
+def _read(path: Path) -> UInt8[np.ndarray, "H W 3"] | None:
+    """Read a cached copy; None if unusable.
 
     It is not compressed: reading a PNG takes longer than decoding a JPEG of twice its size.
     """
     if not path.is_file():
         return None
-    with suppress(*ARCHIVE_FAILURES), zipfile.ZipFile(path) as archive:  # damaged: made again
-        with archive.open("size.npy") as file:
-            width, height = read_npy(file).tolist()
-        with archive.open("photograph.npy") as file:  # not by np.load: views are read in threads
-            return read_npy(file), (width, height)
+    # A damaged one is made again. Not by np.load: views are read in threads.
+    with (
+        suppress(*ARCHIVE_FAILURES),
+        zipfile.ZipFile(path) as archive,
+        archive.open("photograph.npy") as file,
+    ):
+        return read_npy(file)
     return None
 
 

@@ -11,7 +11,6 @@ import numpy as np
 
 from splatseed.camera import Camera
 from splatseed.errors import SceneFormatError, SceneNotFoundError
-from splatseed.io.masks import read_mask
 from splatseed.io.photograph import photograph_folder
 from splatseed.io.photograph_checks import check_sizes
 from splatseed.lens import undistort_advice
@@ -83,11 +82,11 @@ def load_views(
         SceneFormatError: A camera has distortion that is not removed, or an image or a mask is
             unusable.
     """
-    folder = photograph_folder(scene)
+    photograph_folder(scene)  # raises if there is none
     for image in images if not undistort else ():
-        refuse_distortion(image, scene.source.root if scene.source else None)
+        refuse_distortion(image, scene.source.root)
     if images:
-        sizes, factor = check_sizes(images, folder), max(data_factor, 1)
+        sizes, factor = check_sizes(images), max(data_factor, 1)
         width, height = sizes[images[0].name]
         check_memory(
             sum(math.prod(size) for size in sizes.values()) // factor**2, 3,
@@ -98,7 +97,7 @@ def load_views(
     views = []
     with ThreadPoolExecutor(READERS) as pool:
         for view in pool.map(
-            lambda image: _load_view(scene, folder, image, data_factor, min_side, cache_dir), images
+            lambda image: _load_view(image, data_factor, min_side, cache_dir), images
         ):
             views.append(view)
             progress("read images", len(views) / len(images))
@@ -121,22 +120,14 @@ def refuse_distortion(
         )
 
 
-def _load_view(
-    scene: Scene,
-    folder: Path,
-    image: Image,
-    data_factor: int,
-    min_side: int,
-    cache_dir: Path | None,
-) -> View:
-    path = folder / image.name
-    photograph, file_size = load_photograph(path, data_factor, cache_dir, scene.white)
+def _load_view(image: Image, data_factor: int, min_side: int, cache_dir: Path | None) -> View:
+    photograph = load_photograph(image.path, data_factor, cache_dir, image.white)
     height, width = photograph.shape[:2]
-    check_side(path, min_side, data_factor, (width, height))
-    lens = image.intrinsics.resized(*file_size)
+    check_side(image.path, min_side, data_factor, (width, height))
+    lens = image.lens
     K = np.diag([1 / data_factor, 1 / data_factor, 1.0]) @ lens.K
     camera = Camera(K, width, height, image.camera.cam_from_world)
-    mask = read_mask(scene.masks, image.name, path, data_factor)
+    mask = image.read_mask(data_factor)
     if not lens.has_distortion:
         return View(image.name, photograph, camera, mask)
     from splatseed.photos.undistortion import undistort  # noqa: PLC0415  (loads Numba)

@@ -6,30 +6,41 @@ factor x factor are cut off, so intrinsics are divided by the factor and nothing
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
+from splatseed.camera import Intrinsics
 from splatseed.errors import SceneFormatError
-from splatseed.io.photograph_checks import file_sizes, resized_to
-from splatseed.scene import Image, Scene
+from splatseed.scene import Image
 
 TRAINED_SIDE = 1600
 """Longer side of photographs in training by default, in pixels, as in graphdeco's trainer."""
 
 
-def at_file_size(scene: Scene) -> Scene:
-    """The scene, with the camera of each image in pixels of its photograph's file.
+def at_file_size(images: Sequence[Image]) -> tuple[Image, ...]:
+    """Images with camera records and features in pixels of the files, as COLMAP needs them.
 
-    Photographs may be resized copies of those in the model. An image keeps its camera if its
-    photograph is missing, unreadable or of another shape.
+    If photographs of several sizes share a camera, each further size gets a new camera with an id
+    above all others.
     """
-    folder = scene.source.image_dir if scene.source else None
-    images = resized_to(scene.images, {} if folder is None else file_sizes(scene.images, folder))
-    if all(image is before for image, before in zip(images, scene.images, strict=True)):
-        return scene
-    cameras = {lens.camera_id: lens for lens in scene.intrinsics}
-    cameras |= {image.intrinsics.camera_id: image.intrinsics for image in images}
-    return scene.replace(images=images, intrinsics=tuple(cameras.values()))
+    free = itertools.count(1 + max((image.intrinsics.camera_id for image in images), default=0))
+    records: dict[tuple[Intrinsics, Intrinsics], Intrinsics] = {}
+    used, changed = set[int](), list[Image]()
+    for image in images:
+        record, lens, seen = image.intrinsics, image.lens, image.observations
+        if (record, lens) not in records:
+            camera_id = next(free) if lens.camera_id in used else lens.camera_id
+            used.add(camera_id)
+            records[record, lens] = replace(lens, camera_id=camera_id)
+        if seen is not None:
+            scale = np.array([lens.width, lens.height]) / [record.width, record.height]
+            seen = replace(seen, xy=seen.xy * scale)
+        changed.append(replace(image, intrinsics=records[record, lens], observations=seen))
+    return tuple(changed)
 
 
 def factor_for_size(images: Sequence[Image], max_size: int) -> int:

@@ -74,6 +74,6 @@ def up_direction(cameras: Sequence[Camera]) -> Float64[np.ndarray, " 3"]:
 
 
 def _exif_turn(image: Image) -> int:
-    if image.folder is None or image.intrinsics.width <= image.intrinsics.height:
+    if image.folder is None or image.lens.width <= image.lens.height:
         return 0  # sensors are wide: a tall photograph was turned, though its EXIF may still say so
     return _EXIF_TURNS.get(exif_orientation(image.path), 0)

@@ -72,16 +72,18 @@ def choose_image(scene: Scene) -> Image | None:
         return scene.images[len(scene.images) // 2]
     xyz = _finite_sample(scene)
     features = [image.observations for image in scene.images]
+    sizes = [(image.intrinsics.width, image.intrinsics.height) for image in scene.images]
     seen = [each.xy[each.point_ids >= 0] if each else np.empty((0, 2)) for each in features]
     if not any(len(uv) for uv in seen):
         seen = [image.camera.project(xyz)[0] for image in scene.images]
-    fill = [_fill(image.camera, uv) for image, uv in zip(scene.images, seen, strict=True)]
+        sizes = [(image.camera.width, image.camera.height) for image in scene.images]
+    fill = [_fill(uv / size) for size, uv in zip(sizes, seen, strict=True)]
     return scene.images[fill.index(max(fill))] if fill else None
 
 
-def _fill(camera: Camera, uv: Float64[np.ndarray, "M 2"]) -> tuple[int, int]:
-    """Return the fill of the frame and the number of points in it."""
-    cells = uv / [camera.width, camera.height] * VIEWPOINT.grid
+def _fill(places: Float64[np.ndarray, "M 2"]) -> tuple[int, int]:
+    """Return the fill of the frame and the number of points in it, by places in it from 0 to 1."""
+    cells = places * VIEWPOINT.grid
     inside = ((cells >= 0) & (cells < VIEWPOINT.grid)).all(axis=1)  # NaN compares false
     column, row = cells[inside].astype(np.int64).T
     return len(np.unique(row * VIEWPOINT.grid[0] + column)), int(inside.sum())

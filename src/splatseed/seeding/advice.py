@@ -67,14 +67,15 @@ class Advice:
 
 
 def advice_for(
-    scene: Scene, max_seeds: int, *, strategy: str = "default", empty: float | None = None
+    scene: Scene, max_seeds: int, *, why_no_seeds: str = "", empty: float | None = None
 ) -> Advice:
     """Advise on a scene's points before training, without opening a photograph.
 
     Args:
         scene: The scene.
         max_seeds: Seeds that training starts with under its budget.
-        strategy: Strategy of training.
+        why_no_seeds: Why the strategy of training gains nothing by more points than the scene has;
+            empty if it gains.
         empty: Share of the photographs' cells without points, if known.
     """
     measured = measure(scene, empty)
@@ -83,7 +84,7 @@ def advice_for(
         new = f"{len(scene.points) - kept:,} of its points and kept {kept:,}"
         made = f"splatseed upsample made {new}."
         return Advice(SEEDED if scene.has_photographs else AS_IT_IS, (made,), measured)
-    return advise(measured, max_seeds, strategy=strategy)
+    return advise(measured, max_seeds, why_no_seeds=why_no_seeds)
 
 
 def method_for(
@@ -99,7 +100,7 @@ def method_for(
 
 
 def advise(
-    measured: Measured, max_seeds: int, *, strategy: str = "default", room: float = MIN_ROOM
+    measured: Measured, max_seeds: int, *, why_no_seeds: str = "", room: float = MIN_ROOM
 ) -> Advice:
     """Apply the rules behind ``advice_for``; benchmarks vary ``room``."""
     if not measured.num_points:
@@ -126,14 +127,8 @@ def advise(
             "was measured, adding points cost up to 0.4 dB."
         )
         return Advice(AS_IT_IS, (f"It has {per_pixel}.", full), measured)
-    if strategy == "grow":
-        places_itself = (
-            "Strategy grow puts new Gaussians at the depth that stereo finds; adding points by "
-            "method auto first gained or lost 0.3 dB at most on all but one of the captures "
-            "measured. Under 3DGS's densification, which other trainers use, that gained 0.2 dB on "
-            "average: splatseed upsample adds them."
-        )
-        return Advice(AS_IT_IS, (f"It has {per_pixel}.", places_itself), measured)
+    if why_no_seeds:
+        return Advice(AS_IT_IS, (f"It has {per_pixel}.", why_no_seeds), measured)
     reasons = [f"It has {per_pixel}, and room for {has:.1f} times as many seeds."]
     if measured.metric_maps:
         reasons.append("Where photographs confirm no depth, it is that of the depth maps.")
@@ -146,9 +141,9 @@ def advise(
 
 
 def measure(scene: Scene, empty: float | None = None) -> Measured:
-    """Measure a scene without opening a photograph; ``empty`` as in ``advice_for``."""
+    """Measure a scene without reading a photograph's pixels; ``empty`` as in ``advice_for``."""
     points = scene.points.originals
-    sizes = [image.intrinsics.width * image.intrinsics.height for image in scene.images]
+    sizes = [image.camera.width * image.camera.height for image in scene.images]
     return Measured(
         num_points=int(np.count_nonzero(points.distinct)),
         pixels=float(np.median(sizes)) if sizes else 0.0,

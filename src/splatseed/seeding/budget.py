@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from splatseed.errors import ParameterError
-from splatseed.photos.sizes import TRAINED_SIDE, at_file_size, factor_for_size
+from splatseed.photos.sizes import TRAINED_SIDE, factor_for_size
 from splatseed.photos.view import View, camera_views
 from splatseed.scene import Scene
 
@@ -45,7 +45,7 @@ def in_rho(budget: int | str | None) -> bool:
 
 def _at_trained_size(scene: Scene) -> tuple[View, ...]:
     """The views of a scene, without pixels, at the default training size."""
-    images = at_file_size(scene).images
+    images = scene.images
     return camera_views(images, factor_for_size(images, TRAINED_SIDE)) if images else ()
 
 

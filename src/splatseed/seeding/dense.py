@@ -27,7 +27,7 @@ from splatseed.depth.stereo.maps import StereoSettings
 from splatseed.methods import source_code
 from splatseed.methods.contract import NewPoints, Traits
 from splatseed.photos.loading import load_views
-from splatseed.photos.sizes import at_file_size, factor_for_size
+from splatseed.photos.sizes import factor_for_size
 from splatseed.photos.view import View
 from splatseed.photos.visibility import find_visibility, points_in_image
 from splatseed.progress import Note, Progress, StageTimes, thread_limit, watched
@@ -122,9 +122,7 @@ class WithinBudget:
         spacing, finest = expected_spacing(stereo, num, self.method.spacing)
         if not finest:  # nothing is confirmed that could be sampled more closely
             return new._replace(notes=(*new.notes, *self._shortage(scene, new)))
-        images = at_file_size(
-            scene.replace(images=photographed(scene, self.method.test_every))
-        ).images
+        images = photographed(scene, self.method.test_every)
         first = factor_for_size(images, self.method.max_size)
         plans = plan_comparisons(images, first, self.method.grid, first * finest, self.limit)
         plan = next((each for each in plans if each.within), plans[-1])

@@ -15,7 +15,6 @@ from jaxtyping import Bool, Float64
 
 from splatseed.depthmap import in_scene_units
 from splatseed.errors import SplatseedError
-from splatseed.io.masks import read_mask
 from splatseed.methods.neighbors import prepare, sound_bases
 from splatseed.photos.visibility import points_in_image
 from splatseed.progress import Progress, silent
@@ -213,7 +212,7 @@ def find_problems(
 
 def _grid_shape(image: Image) -> tuple[int, int]:
     """Return rows and columns of an image's grid of cells."""
-    width, height = image.intrinsics.width, image.intrinsics.height
+    width, height = image.camera.width, image.camera.height
     cell = max(width, height) / EMPTY_CELLS
     return max(math.ceil(height / cell), 1), max(math.ceil(width / cell), 1)
 
@@ -251,18 +250,16 @@ class MaskSample:
 
 def read_mask_sample(scene: Scene, progress: Progress = silent) -> MaskSample:
     """Read the masks of some photographs of a scene."""
-    folder = scene.source.image_dir if scene.source else None
-    if folder is None or scene.masks is None:
+    if scene.masks is None:
         return MaskSample({}, (), "")
     files = scene.masks.files
-    images = [im for im in scene.images if (im.name in files or not files)]
-    images = [im for im in images if (folder / im.name).is_file()]
+    images = [im for im in scene.images if (im.name in files or not files) and im.has_photograph]
     images = images[:: -(-len(images) // MAX_MASKS_READ) or 1]
     cells: dict[str, Float64[np.ndarray, "R C"] | None] = {}
     shares, problem = [], ""
     for i, image in enumerate(images):
         try:
-            counts = read_mask(scene.masks, image.name, folder / image.name)
+            counts = image.read_mask()
         except SplatseedError as error:
             problem = problem or str(error)
             continue

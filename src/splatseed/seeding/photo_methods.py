@@ -21,7 +21,7 @@ from splatseed.errors import PointCloudError, SceneNotFoundError
 from splatseed.methods import as_cloud, source_code
 from splatseed.methods.contract import NewPoints, Traits
 from splatseed.photos.loading import load_views
-from splatseed.photos.sizes import at_file_size, factor_for_size
+from splatseed.photos.sizes import factor_for_size
 from splatseed.photos.view import View, camera_views
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress
@@ -264,7 +264,6 @@ def photographed(
     Raises:
         SceneNotFoundError: There are none.
     """
-    folder = scene.source.image_dir if scene.source else None
     ordered = sorted(scene.images, key=lambda image: image.name)
     used = list(scene.split(test_every)[0]) if test_every or scene.listed else ordered
     if ordered and not used:
@@ -273,12 +272,12 @@ def photographed(
             found=f"none: all {len(ordered)} are test views",
             fix="Add photographs to the scene.",
         )
-    if folder is not None:
-        used = [image for image in used if (folder / image.name).is_file()]
-    if folder is None or not used:
+    used = [image for image in used if image.has_photograph]
+    if not used:
+        missing = f"none of {len(ordered)} images"
         raise SceneNotFoundError(
             "photographs of the scene",
-            found=f"none of {len(ordered)} images" if folder else "no folder with images",
+            found=missing if scene.source.image_dir else "no folder with images",
             fix=f"Put them into a folder named images beside the model, or {without}.",
         )
     return tuple(used)
@@ -288,14 +287,13 @@ def read_views(
     scene: Scene, images: Sequence[Image], max_size: int, progress: Progress
 ) -> tuple[View, ...]:
     """Read the photographs of some images, undistorted, at most ``max_size`` pixels a side."""
-    sized = at_file_size(scene.replace(images=tuple(images))).images
-    factor = factor_for_size(sized, max_size)
+    factor = factor_for_size(images, max_size)
     return load_views(scene, images, data_factor=factor, undistort=True, progress=progress)
 
 
 def frames_of(scene: Scene) -> tuple[View, ...]:
     """Return the views of all images at ``MAX_SIZE``, without pixels."""
-    images = at_file_size(scene).images
+    images = scene.images
     return camera_views(images, factor_for_size(images, MAX_SIZE)) if images else ()
 
 

@@ -98,7 +98,6 @@ def check_poses(scene: Scene, images: Sequence[Image], progress: Progress = sile
     """
     poses = np.array([image.camera.cam_from_world for image in images])
     _check_centers(poses)
-    assert scene.source is not None  # noqa: S101  (it has photographs)
     expected = f"photographs that agree at the poses of {scene.source.root}"
     clear = _SETTINGS.clear_factor
     agreements: list[float] = []
@@ -136,7 +135,6 @@ def _disagreement(
     scene: Scene, images: Sequence[Image], expected: str, agreement: float
 ) -> SceneFormatError:
     """Return the error for photographs that agree by chance at most."""
-    assert scene.source is not None  # noqa: S101  (it has photographs)
     sfm = f"splatseed sfm {quoted(scene.source.image_dir or 'IMAGES')} -o SCENE"
     if not _any_overlap([image.camera for image in images]):
         return SceneFormatError(

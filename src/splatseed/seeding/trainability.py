@@ -16,10 +16,10 @@ def untrainable(scene: Scene) -> str:
         return "Points alone cannot be trained: training needs photographs and cameras."
     if not all(scene.split()):
         return "Training needs at least two photographs, one to train on and one to test."
-    folder = scene.source.image_dir if scene.source else None
+    folder = scene.source.image_dir
     if folder is None:
         return "Training needs the photographs: put them beside the model in a folder named images."
-    missing = [image.name for image in scene.images if not (folder / image.name).is_file()]
+    missing = [image.name for image in scene.images if not image.has_photograph]
     if 2 * len(missing) <= len(scene.images):
         return ""
     needs = f"Training needs at least half of the {len(scene.images):,} photographs"

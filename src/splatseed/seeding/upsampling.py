@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 from splatseed.errors import ParameterError
 from splatseed.methods import Profile, Upsampler, add_points, check_seed, configure
-from splatseed.photos.sizes import at_file_size
 from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
@@ -142,7 +141,7 @@ def upsample(
 
 
 def _as_scene(scene: Scene | PointCloud) -> Scene:
-    """Return a scene with cameras in pixels of the photographs' files; of a cloud without any."""
+    """Return the scene; of a cloud, one without images."""
     if isinstance(scene, PointCloud):
         return Scene(scene)
     if not isinstance(scene, Scene):
@@ -151,7 +150,7 @@ def _as_scene(scene: Scene | PointCloud) -> Scene:
             found=type(scene).__name__,
             fix="Load it first with load_scene.",
         )
-    return at_file_size(scene)
+    return scene
 
 
 def _thin_full_scene(

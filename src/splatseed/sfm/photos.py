@@ -33,10 +33,11 @@ from splatseed.io.photograph import (
     open_photograph,
     photograph_bytes,
 )
-from splatseed.io.photograph_checks import check_sizes, resized_to
+from splatseed.io.photograph_checks import check_sizes
 from splatseed.io.scanner_app import is_photograph, is_scanner_app
 from splatseed.io.staging import read_manifest
 from splatseed.io.video import ANALYSIS_WIDTH, sharpness, small_frames, write_frames
+from splatseed.photos.sizes import at_file_size
 from splatseed.progress import Progress, silent
 from splatseed.runtime.fingerprint import fingerprint
 from splatseed.scene import Image, Scene
@@ -167,8 +168,9 @@ def _read(path: Path) -> tuple[Photo | None, bool]:
 def match_poses(photos: Photos, scene: Scene, image_dir: Path) -> tuple[Image, ...]:
     """Return the scene's images with photographs, in the photographs' order and sizes."""
     posed = {image.name: image for image in scene.images}
-    # Drop observations, which the child process does not need.
-    images = [replace(posed[name], observations=None) for name in photos if name in posed]
+    # Without observations, which the child process does not need.
+    found = [posed[name] for name in photos if name in posed]
+    images = [replace(image, observations=None, folder=image_dir) for image in found]
     if len(images) < 2:
         raise SceneNotFoundError(
             f"two or more images of {image_dir} among the {len(posed)} posed images "
@@ -176,7 +178,8 @@ def match_poses(photos: Photos, scene: Scene, image_dir: Path) -> tuple[Image, .
             found=f"{len(images)} of {len(photos)} ({name_some(list(photos)[:3])}, ...)",
             fix="Names must match exactly, relative to the images folder, suffix included.",
         )
-    return resized_to(images, check_sizes(images, image_dir))
+    check_sizes(images)
+    return at_file_size(images)
 
 
 class PickedFrames(NamedTuple):

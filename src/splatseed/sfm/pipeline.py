@@ -260,8 +260,8 @@ def undistort(
     _check_names(scene)
     scene = with_photographs(scene)
     images = photograph_folder(scene).absolute()
-    check_sizes(scene.images, images)
-    scene = at_file_size(scene).replace(intrinsics=())  # pycolmap needs cameras of the files' size
+    check_sizes(scene.images)
+    scene = scene.replace(images=at_file_size(scene.images), intrinsics=())
     with _staged(images, Path(output), "undistort", overwrite=overwrite) as staging:
         work = staging / _WORK / "distorted"
         distorted = write_scene(scene, work, format="colmap", require_points=False).path

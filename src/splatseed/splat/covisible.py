@@ -63,8 +63,7 @@ def find_covisible(
     """
     points = scene.points.references
     xyz = np.ascontiguousarray(points.xyz[points.finite], np.float32)
-    sensed = scene.source is not None and scene.source.format in {"rgbd", "phone"}
-    maps = scene.depths if sensed else None
+    maps = scene.depths if scene.source.format in {"rgbd", "phone"} else None
     if not scene.images or (maps is None and not len(xyz)):
         return {}
     train, test = (_small_views(part, maps) for part in scene.split(test_every))

@@ -34,7 +34,7 @@ from splatseed.io.photograph import photographs_digest
 from splatseed.io.photograph_checks import with_photographs
 from splatseed.photos.camera_check import reference_points
 from splatseed.photos.loading import load_views
-from splatseed.photos.sizes import at_file_size, default_factor
+from splatseed.photos.sizes import default_factor
 from splatseed.photos.view import View, camera_views
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
@@ -219,7 +219,7 @@ def load_model(
         scene = load_scene(Path(scene), require_points=False)
     scene = with_masks(scene, masks)
     if scene.images:
-        scene = at_file_size(_with_test_photographs(scene, test_every))
+        scene = _with_test_photographs(scene, test_every)
     if gone := scene.absent:
         are = agreeing(len(gone), "image of the scene is", "images of the scene are")
         text = f"{len(gone)} {are} left out, without a photograph or a pose: {name_some(gone, 3)}."
@@ -227,8 +227,7 @@ def load_model(
     train, test = scene.split(test_every)
     if not train or not test:
         raise SceneNotFoundError(
-            f"{scene.source.root if scene.source else 'the scene'} to have images for training "
-            "and testing",
+            f"{scene.source.root or 'the scene'} to have images for training and testing",
             found=f"{len(scene.images)}",
             fix="Name the scene with its cameras and photographs.",
         )

@@ -6,6 +6,7 @@ Promise: an interrupted run resumes only with its own settings, seeds, photograp
 from __future__ import annotations
 
 import dataclasses
+import math
 import platform
 from collections.abc import Collection, Mapping
 from typing import Any
@@ -35,10 +36,10 @@ def make_config(
 ) -> dict[str, Any]:
     """Return the content of config.json; ``initial`` are the facts of the seeds or of the start."""
     source = scene.source
-    points = source.points_path if source and not refine_poses else None
+    points = None if refine_poses else source.points_path
     config = {
         "splatseed": version_of("splatseed"),
-        "scene": str(source.again) if source else None,
+        "scene": str(source.again) if source.again else None,
         "points": str(points.resolve()) if points else None,
         "refine_poses": refine_poses,
         "masks": mask_choice(scene),
@@ -60,7 +61,6 @@ def make_config(
 
 
 def _names_of_parts(scene: Scene, settings: TrainSettings) -> dict[str, list[str]]:
-    """Return the names of the training and test images."""
     parts = zip(("train", "test"), scene.split(settings.test_every), strict=True)
     return {part: [image.name for image in images] for part, images in parts}
 
@@ -68,25 +68,25 @@ def _names_of_parts(scene: Scene, settings: TrainSettings) -> dict[str, list[str
 def resumed_settings(
     config: Mapping[str, Any],
     settings: TrainSettings,
-    explicit: Collection[str] = (),
+    named: Collection[str] = (),
     *,
     refine_poses: bool,
 ) -> tuple[TrainSettings, bool]:
     """Return the settings of the run to resume, and whether it refined poses.
 
-    Settings that are neither ``explicit`` nor differ from their defaults are the run's; others must
-    equal the run's. Only the backend may change. The config of an older version may lack a setting.
+    Settings that are neither ``named`` nor differ from their defaults are the run's; others must
+    equal the run's. Only the backend may change.
 
     Raises:
         ParameterError: A setting differs from the run's.
-        SceneFormatError: The config is damaged.
+        SceneFormatError: The config is damaged, or another version of splatseed started the run.
     """
+    _check_version(config)
     default = {**dataclasses.asdict(TrainSettings()), "refine_poses": False}
     now = {**dataclasses.asdict(settings), "refine_poses": refine_poses}
-    then = {name: config.get(name, value) for name, value in default.items() if name != "backend"}
-    then["data_factor"] = config.get("data_factor", 1)  # older versions did not downsample
+    then: dict[str, Any] = {name: config.get(name) for name in default if name != "backend"}
     for name, value in then.items():
-        if now[name] != value and (name in explicit or now[name] != default[name]):
+        if now[name] != value and (name in named or now[name] != default[name]):
             raise ParameterError(
                 f"`{name}={value!r}`, as when the run began",
                 found=f"`{name}={now[name]!r}`",
@@ -101,6 +101,16 @@ def resumed_settings(
             found=error.found,
             fix="Start again with `overwrite=True`.",
         ) from None
+
+
+def _check_version(config: Mapping[str, Any]) -> None:
+    then, now = config.get("splatseed"), version_of("splatseed")
+    if then != now:
+        raise SceneFormatError(
+            f"a run that this version of splatseed ({now}) started, to resume it",
+            found=f"one of version {then}",
+            fix="Start again with `overwrite=True`, or resume it with that version.",
+        )
 
 
 def has_run_poses(config: Mapping[str, Any], scene: Scene) -> bool:
@@ -118,6 +128,12 @@ def check_same_input(folder: RunFolder, config: Mapping[str, Any], now: Mapping[
         raise another_scene(folder, config, found)
     if config.get("photographs") != now["photographs"]:
         raise another_scene(folder, config, f"photographs or poses in {now['scene']}")
+
+
+def near_plane_of(config: Mapping[str, Any]) -> float | None:
+    """Return the near plane of a run's training, in scene units; None without one."""
+    near = config.get("near_plane")
+    return float(near) if isinstance(near, float) and 0 < near < math.inf else None
 
 
 def trained_images(config: Mapping[str, Any], scene: Scene) -> Collection[str]:
@@ -155,13 +171,13 @@ def with_masks_of(scene: Scene, config: Mapping[str, Any]) -> Scene:
 def check_same_scene(
     folder: RunFolder, config: Mapping[str, Any], scene: Scene, settings: TrainSettings
 ) -> None:
-    """Refuse to resume with other masks, training or test images; older runs recorded none."""
+    """Refuse to resume with other masks, training or test images."""
     found = "" if has_run_masks(config, scene) else "masks"
-    if config.get("split") not in (None, _names_of_parts(scene, settings)):
+    if config.get("split") != _names_of_parts(scene, settings):
         listed = f" (by its {scene.listed.origin})" if scene.listed else ""
         found = f"training or test images{listed}"
     if found:
-        where = scene.source.root if scene.source else "the scene"
+        where = scene.source.root or "the scene"
         raise another_scene(folder, config, f"{found} in {where}")
 
 

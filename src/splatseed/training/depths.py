@@ -19,6 +19,7 @@ from jaxtyping import Float32
 
 from splatseed.depth.stereo import stereo_depths
 from splatseed.depth.stereo.maps import StereoResult, StereoSettings
+from splatseed.findings import Finding
 from splatseed.io.files import ARCHIVE_FAILURES
 from splatseed.io.staging import atomic_file
 from splatseed.progress import Note, Progress, silent, silent_note
@@ -61,6 +62,9 @@ class DepthCache:
 
     path: Path | None = None  # None: maps are not kept
     seconds_counted: bool = False  # whether the time of the seeds includes that of the maps
+
+
+NOT_CACHED = DepthCache()
 
 
 def stereo_size(
@@ -134,8 +138,7 @@ def known_depths(
         them took, in this run or in the run that wrote the file.
     """
     images = scene.split(settings.test_every)[0]
-    used = settings.densification == "grow" and settings.placing == "stereo"
-    if not used or len(images) < 2:
+    if not settings.uses_stereo or len(images) < 2:
         return {}, 0.0
     found = _read(cache)
     if found is None:
@@ -154,10 +157,9 @@ def known_depths(
     known, seconds = found
     share = np.mean([np.isfinite(depth).mean() for depth in known.values()])
     duration = "" if stereo else f" ({seconds:.0f} s)"
-    note(
-        f"Stereo found the depth of {share:.0%} of the pixels{duration}, where strategy grow "
-        'places most new Gaussians. placing = "none" only splits.'
-    )
+    text = f"Stereo found the depth of {share:.0%} of the pixels{duration}, where strategy "
+    text += f"{settings.traits.name} places most new Gaussians."
+    note(Finding("stereo-depths", text, "info", fix='placing = "none" only splits.'))
     # Stereo's depths are in units of the scene; unknown ones, NaN, become 0.
     return {
         name: np.nan_to_num(depth * scale)

@@ -10,7 +10,6 @@ import math
 from dataclasses import replace
 from typing import NamedTuple
 
-from splatseed.training.schedule import FULL_AT
 from splatseed.training.settings import TrainSettings
 
 COSTS = {"cpu": (5e-3, 0.35e-6, 0.15e-6), "cuda": (8e-3, 5e-9, 2e-9)}
@@ -50,12 +49,13 @@ def mean_gaussians(settings: TrainSettings, now: RunSpeed) -> float:
 
     The number rises linearly until growth ends, where it reaches the budget if there is one.
     """
-    growth, count, left = settings.densification, now.gaussians, settings.max_steps - now.step
-    stop = FULL_AT * settings.max_steps if growth == "grow" else settings.schedule.refine_stop
+    strategy, count, left = settings.traits, now.gaussians, settings.max_steps - now.step
+    full = strategy.full_at
+    stop = settings.schedule.refine_stop if full is None else full * settings.max_steps
     stop = min(stop, settings.max_steps)
-    if growth == "none" or now.step >= stop:
+    if not strategy.adds or now.step >= stop:
         return count
-    if growth in ("grow", "mcmc"):
+    if strategy.has_budget:
         last = float(settings.cap or count)
     else:
         last = min(count * GROWTH ** (1 - now.step / stop), settings.cap or math.inf)

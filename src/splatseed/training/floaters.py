@@ -28,7 +28,7 @@ from splatseed.io.photograph_checks import with_photographs
 from splatseed.photos.cache import user_cache_dir
 from splatseed.photos.camera_check import reference_points
 from splatseed.photos.loading import load_views
-from splatseed.photos.sizes import at_file_size, factor_for_size as factor_for
+from splatseed.photos.sizes import factor_for_size as factor_for
 from splatseed.photos.view import View
 from splatseed.progress import Progress, silent
 from splatseed.seeding.clouds.photo_consistency import find_evidence
@@ -83,9 +83,7 @@ def floaters_of_model(
         ParameterError: A number is out of range.
     """
     settings = TrainSettings(strategy="grow", data_factor=data_factor or 1, test_every=test_every)
-    scene = at_file_size(
-        with_photographs(with_masks(load_scene(scene_path, require_points=False), masks))
-    )
+    scene = with_photographs(with_masks(load_scene(scene_path, require_points=False), masks))
     images = photographed(scene, test_every, without="leave `clean` out")
     gaussians = read_start(path, scene, lambda _: None)
     if data_factor is None:

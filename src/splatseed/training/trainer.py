@@ -179,7 +179,6 @@ class Trainer:
 
 @lru_cache(maxsize=2)
 def _epoch_order(seed: int, epoch: int, count: int) -> Int[np.ndarray, " V"]:
-    """Draw the order of the photographs in an epoch."""
     return np.random.default_rng([seed, epoch]).permutation(count)
 
 

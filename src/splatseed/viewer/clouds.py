@@ -106,7 +106,7 @@ def preview_origins(scene: Scene, points: PointCloud, path: StrPath, other: str 
     camera = choose_camera(scene)
     scale = PAIR_SIDE / max(camera.width, camera.height)
     size = page.fitted(camera.width, camera.height, PAIR_SIDE)
-    photograph = page.photograph_at(scene, choose_image(scene), size)
+    photograph = page.photograph_at(choose_image(scene), size)
     colored = points.replace(rgb=origin_colors(points.source))
     tiles = [
         page.Tile(f"{len(points):,} seeds", render_points(points, camera, scale=scale)),
@@ -182,7 +182,7 @@ def cell_picture(
 def _photograph(scene: Scene, side: int, label: str) -> list[page.Tile]:
     camera = choose_camera(scene)
     size = page.fitted(camera.width, camera.height, side)
-    photograph = page.photograph_at(scene, choose_image(scene), size)
+    photograph = page.photograph_at(choose_image(scene), size)
     return [] if photograph is None else [page.Tile(label, photograph)]
 
 

@@ -41,7 +41,7 @@ def preview_maps(scene: Scene, maps: Sequence[StereoMap], path: StrPath, *, limi
     tiles: list[page.Tile] = []
     for i in np.unique(rows.round().astype(int)):
         size = page.fitted(maps[i].camera.width, maps[i].camera.height, SIDE)
-        photograph = page.photograph_or_blank(scene, by_name.get(maps[i].name), size)
+        photograph = page.photograph_or_blank(by_name.get(maps[i].name), size)
         tiles += map_tiles(maps[i], photograph)
     bar = page.color_bar("far; confidence 0", "near; confidence 1; grey: unknown", "viridis")
     return page.write_grid(tiles, path, columns=4, footer=bar)
@@ -103,8 +103,8 @@ def preview_depth(scene: Scene, alignments: Mapping[str, Alignment], path: StrPa
 def _checked(
     scene: Scene, image: Image, alignment: Alignment, xyz: Float64[np.ndarray, "M 3"], label: str
 ) -> list[page.Tile]:
-    size = page.fitted(image.intrinsics.width, image.intrinsics.height, CHECK_SIDE)
-    photograph = page.photograph_or_blank(scene, image, size)
+    size = page.fitted(image.camera.width, image.camera.height, CHECK_SIDE)
+    photograph = page.photograph_or_blank(image, size)
     assert scene.depths is not None  # noqa: S101  (there are alignments of them)
     depth = scene.depths.read(image.name).reliable(DepthSettings.min_confidence)
     camera = map_camera(depth, image)

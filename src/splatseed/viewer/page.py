@@ -17,9 +17,8 @@ from PIL import Image as PillowImage, ImageDraw, ImageFont
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io.files import StrPath
-from splatseed.io.photograph import decode_photograph, photograph_bytes
 from splatseed.io.staging import atomic_file
-from splatseed.scene import Image, Scene
+from splatseed.scene import Image
 
 GRID_SIDE = 600
 """Longer side of a picture in a grid, in pixels."""
@@ -176,24 +175,18 @@ def legend(entries: Mapping[str, tuple[int, ...]], width: int) -> UInt8[np.ndarr
 # Photographs --------------------------------------------------------------------------------------
 
 
-def photograph_at(
-    scene: Scene, image: Image | None, size: tuple[int, int]
-) -> UInt8[np.ndarray, "H W 3"] | None:
+def photograph_at(image: Image | None, size: tuple[int, int]) -> UInt8[np.ndarray, "H W 3"] | None:
     """Read an image's photograph at a width and height; None if it cannot be read."""
-    folder = scene.source.image_dir if scene.source else None
-    if folder is None or image is None:
+    if image is None:
         return None
     try:
-        path = folder / image.name
-        picture = decode_photograph(path, photograph_bytes(path), scene.white)
+        picture = PillowImage.fromarray(image.read())
     except (SceneNotFoundError, SceneFormatError):
         return None
     return np.array(picture.resize(size, PillowImage.Resampling.LANCZOS))
 
 
-def photograph_or_blank(
-    scene: Scene, image: Image | None, size: tuple[int, int]
-) -> UInt8[np.ndarray, "H W 3"]:
+def photograph_or_blank(image: Image | None, size: tuple[int, int]) -> UInt8[np.ndarray, "H W 3"]:
     """Read the photograph, or make a light grey picture if it cannot be read."""
-    photograph = photograph_at(scene, image, size)
+    photograph = photograph_at(image, size)
     return np.full((size[1], size[0], 3), BLANK, np.uint8) if photograph is None else photograph

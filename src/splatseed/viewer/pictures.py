@@ -183,14 +183,14 @@ class Entry:
                 self.draw("Gaussians", pinhole_view((32, 24), 0.7, np.eye(4)), None, fast=fast)
 
     def _photograph(self, canvas: View, at: Image) -> Picture | str:
-        photograph = _photograph_of(self._scene, at, PHOTOGRAPH_SIDE)
+        photograph = _photograph_of(at, PHOTOGRAPH_SIDE)
         if photograph is None:
             return f"The photograph {at.name} cannot be read."
         return warp_to_canvas(canvas, photograph, at.camera)
 
     def _error(self, canvas: View, at: Image) -> Picture | str:
         side = min(ERROR_SIDE, max(canvas.width, canvas.height))
-        view, photograph = _view_within(at, side), _photograph_of(self._scene, at, side)
+        view, photograph = _view_within(at, side), _photograph_of(at, side)
         if photograph is None:
             return f"The photograph {at.name} cannot be read."
         images = torch.from_numpy(self.renderer.color(view)), torch.from_numpy(photograph) / 255
@@ -204,7 +204,7 @@ class Entry:
         return warp_to_canvas(canvas, picture, at.camera, smooth=False)
 
     def _uncovered(self, canvas: View, at: Image) -> Picture | str:
-        view, photograph = _view_within(at, CELLS_SIDE), _photograph_of(self._scene, at, CELLS_SIDE)
+        view, photograph = _view_within(at, CELLS_SIDE), _photograph_of(at, CELLS_SIDE)
         if photograph is None:
             photograph = np.full((view.height, view.width, 3), BLANK, np.uint8)
         (covered,) = covered_cells([view], self._scene.points.xyz, CELL)
@@ -233,10 +233,10 @@ def _view_within(image: Image, side: int) -> View:
 
 
 @lru_cache(maxsize=8)
-def _photograph_of(scene: Scene, image: Image, side: int) -> UInt8[np.ndarray, "h w 3"] | None:
+def _photograph_of(image: Image, side: int) -> UInt8[np.ndarray, "h w 3"] | None:
     """Read a photograph without its lens distortion, as models are rendered."""
     view = _view_within(image, side)
-    photograph = photograph_at(scene, image, (view.width, view.height))
+    photograph = photograph_at(image, (view.width, view.height))
     if photograph is None or not image.intrinsics.has_distortion:
         return photograph
     return undistort(photograph, image.intrinsics, view.K)[0]

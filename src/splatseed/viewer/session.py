@@ -256,7 +256,7 @@ class Session:
             if self._closed or scene is None or cameras is not self._cameras:
                 return
             size = fitted(image.camera.width, image.camera.height, THUMBNAIL)
-            thumbnail = photograph_at(scene, image, size)
+            thumbnail = photograph_at(image, size)
             if thumbnail is not None:
                 handle.image = thumbnail
         if scene is None or len(scene.points) <= POINTS.first:

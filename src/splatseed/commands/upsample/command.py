@@ -175,11 +175,10 @@ def _announce(
         maps = scene.depths if method.depth_maps else None
         where = "" if maps is None else ", around its depth maps"
         how = f": {points} points, so depth is found by comparing photographs{where}"
-    kind = scene.source.format if scene.source else "memory"
     points = f"{counted(len(scene.points), 'point')}{report.in_place_of(replaced)}"
     size = f"{counted(len(scene.images), 'image')}, {points}"
     OUT.print(
-        f"{visible(options.scene)} ({kind}, {size})\n"
+        f"{visible(options.scene)} ({scene.source.format}, {size})\n"
         f"  -> {report.method_description(name, method, options.profile)}{how}\n  "
         f"-> {visible(options.output)} ({number}{describe_rho(scene, options.budget)}, "
         f"seed {options.seed}){memory_note}",

@@ -19,7 +19,7 @@ from splatseed.depthmap import DepthMap
 from splatseed.errors import SceneNotFoundError
 from splatseed.io.photograph_checks import with_photographs
 from splatseed.photos.loading import load_views
-from splatseed.photos.sizes import at_file_size, factor_for_size
+from splatseed.photos.sizes import factor_for_size
 from splatseed.photos.sources import choose_sources
 from splatseed.photos.view import View
 from splatseed.photos.visibility import Visibility, find_visibility
@@ -69,7 +69,7 @@ def stereo_depths(
             found=f"{len(scene.images)}",
             fix="Name a scene with photographs: stereo compares them.",
         )
-    scene = at_file_size(with_photographs(scene))
+    scene = with_photographs(scene)
     views = load_views(
         scene,
         scene.images,
