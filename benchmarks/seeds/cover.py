@@ -1,9 +1,4 @@
-"""Cover: how fast it is, and how near the guessed depths come to points that were taken away.
-
-Speed: 100 views of 800 x 600 in a made room, beside the same coverage in plain NumPy in the same
-run.
-Depths: real captures, test and validation views left out; see ``cover_rules.py`` and README.md.
-"""
+"""How fast cover is: 100 views of 800 x 600 in a made room, beside coverage in plain NumPy."""
 
 from __future__ import annotations
 
@@ -16,7 +11,6 @@ import tyro
 from benchmarks.common.clouds import room
 from benchmarks.common.machine import describe, warn_if_busy
 from benchmarks.common.markdown import table
-from benchmarks.seeds.cover_rules import rule_table
 
 from splatseed.camera import Camera
 from splatseed.errors import SplatseedError
@@ -47,10 +41,6 @@ class Settings:
     """Points of the room; five times as many for thinning."""
     repeats: int = 3
     """Runs; the best is shown."""
-    scenes: tuple[str, ...] = ("fern", "fox", "treehill", "bonsai")
-    """Real captures for the depths; none to leave these out."""
-    holes: int = 40
-    """Points that are looked for in each of up to 14 views."""
 
 
 def views_of_the_room(num: int) -> list[View]:
@@ -142,8 +132,6 @@ def main(settings: Settings) -> None:
     print(f"{describe()}\n")
     warn_if_busy()
     print_speed(settings)
-    if settings.scenes:
-        print(f"### Depths\n\n{rule_table(settings.scenes, settings.holes)}\n")
 
 
 if __name__ == "__main__":

@@ -19,8 +19,6 @@ import tyro
 from benchmarks.common.clouds import sample_unevenly
 from benchmarks.common.markdown import table
 from benchmarks.upsampling import naive
-from benchmarks.upsampling.outliers import outlier_table
-from benchmarks.upsampling.spline_smoothing import smoothing_table
 
 import splatseed as ss
 from splatseed.seeding.geometry_score import GeometryScore, far_share, measure, spacing
@@ -235,8 +233,6 @@ def main(settings: Settings) -> None:
     print(f"### Error + coverage by shape\n\n{shape_table(results)}\n")
     print(f"### Tilt\n\n{tilt_table(settings)}\n")
     print(f"### The paper profile and the paper's text\n\n{literal_table(settings)}\n")
-    print(f"### Planted outliers\n\n{outlier_table()}\n")
-    print(f"### FITPACK's smoothing\n\n{smoothing_table()}\n")
 
 
 if __name__ == "__main__":

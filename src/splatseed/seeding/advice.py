@@ -2,12 +2,12 @@
 
 *Room* is the number of seeds that training starts with under its budget, per point of the scene.
 ``advise`` depends on the measurements and the plan alone, so benchmark runs can test it. The rules
-rest on validation views of eight captures at 1,500 steps
-(benchmarks/README.md): where Structure-from-Motion left room, on six, ``auto`` gained -0.12 to 0.50
-dB under 3DGS's densification, 0.24 on average, and -0.30 to 0.28 under strategy ``grow``, -0.02 on
-average, with a quarter of a Gaussian per pixel; with one per pixel 0.27 and 0.28 on average, the
-latter from one capture (dorm, 1.27; the others at most 0.24). Where its points alone filled the
-budget (bonsai, treehill), adding points cost up to 0.4 dB.
+rest on validation views of eight captures at 1,500 steps (benchmarks/training/README.md): where
+Structure-from-Motion left room, on six, ``auto`` gained -0.12 to 0.50 dB under 3DGS's
+densification, 0.24 on average, and -0.30 to 0.28 under strategy ``grow``, -0.02 on average, with a
+quarter of a Gaussian per pixel; with one per pixel 0.27 and 0.28 on average, the latter from one
+capture (dorm, 1.27; the others at most 0.24). Where its points alone filled the budget (bonsai,
+treehill), adding points cost up to 0.4 dB.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ without covered cells it is the median depth of all views.
 Promise: confidence is low, at most ``MAX_CONFIDENCE``; the same seed gives the same bytes on any
 number of cores, as views are processed one after another.
 
-benchmarks/seeds/README.md says how the rule was chosen.
+benchmarks/tried.md says how the rule was chosen.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ Promise: points are visited in order, originals first, then by priority. Each is
 needed at the smallest spacing that keeps no more than ``num``; smaller spacings fill the rest. So
 the only point of a cell is kept before the second of another. But of originals alone every n-th is
 kept: Structure-from-Motion finds them in proportion to detail, where Gaussians are needed; kept
-evenly over the pictures they train to a lower SSIM (benchmarks/training/README.md). Nothing is
+evenly over the pictures they train to a lower SSIM (benchmarks/tried.md). Nothing is
 random, and bytes do not depend on the number of threads.
 """
 

@@ -1,7 +1,7 @@
-"""``upsample``: add points to a scene by a method, verify them, fill gaps, thin them to a budget.
+"""``upsample``: add points to a scene by a method, fill gaps, thin them to a budget.
 
-``verify`` checks interpolated points against the photographs, ``cover`` puts a seed into every cell
-of the photographs that holds no point, and a budget thins the result. Both are optional.
+``cover`` puts a seed into every cell of the photographs that holds no point, and a budget thins the
+result. Both are optional.
 """
 
 from __future__ import annotations
@@ -9,20 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from splatseed.errors import ParameterError
-from splatseed.methods import (
-    NewPoints,
-    Profile,
-    Upsampler,
-    add_points,
-    as_cloud,
-    check_seed,
-    configure,
-    source_code,
-)
-from splatseed.photos.visibility import find_visibility
+from splatseed.methods import Profile, Upsampler, add_points, check_seed, configure
 from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
@@ -40,14 +28,11 @@ from splatseed.seeding.photo_methods import (
     with_cover,
 )
 from splatseed.seeding.thinning import thin_to
-from splatseed.seeding.verify import verify as verify_points
 from splatseed.text import agreeing, counted
 
 if TYPE_CHECKING:
     from splatseed.depth.stereo.maps import StereoResult
 
-INTERPOLATING = ("linear", "triangle", "spline", "mls", "voronoi", "random")
-"""Methods whose points ``verify`` checks against the photographs."""
 FILLING = ("auto", "cover", "stereo")
 """Methods that add points where there are none yet."""
 
@@ -62,7 +47,6 @@ def upsample(
     num_points: int | None = None,
     budget: int | str | None = None,
     cover: int | None = None,
-    verify: bool = False,
     extra_method: Upsampler | None = None,
     seed: int = 0,
     profile: Profile = "default",
@@ -88,8 +72,6 @@ def upsample(
             pixel of one photograph. It may be below the number of originals. "auto" and "stereo"
             make up to that many where photographs confirm them (``dense=False``: only thin).
         cover: Side in pixels of the photographs' cells that get a seed if they hold no point.
-        verify: Slide interpolated points onto the surface that the photographs show, and drop those
-            that no photograph confirms.
         extra_method: A second method, such as ``Cloud().of("scan.laz")``. Its points come before
             those of ``method``, and "auto", "stereo" and "cover" only fill the gaps between them.
         seed: Seed of all random draws; the same seed gives the same bytes on any number of threads.
@@ -148,8 +130,6 @@ def upsample(
     )  # fmt: skip
     if first is not None:
         cloud = PointCloud.concatenate(first, cloud.select(cloud.source != ORIGINAL))
-    if verify:
-        cloud = _verified(scene, cloud, progress, note)
     if cover is not None:
         cloud = add_cover(
             scene, cloud, cell=cover, test_every=getattr(chosen, "test_every", 0), seed=seed,
@@ -222,23 +202,6 @@ def add_cover(
     images = photographed(scene, test_every, without="do without cover")
     views = read_views(scene, images, MAX_SIZE, progress)
     return with_cover(views, points, cell, seed, progress)
-
-
-def _verified(scene: Scene, cloud: PointCloud, progress: Progress, note: Note) -> PointCloud:
-    """Replace a cloud's interpolated points by those that the photographs confirm."""
-    interpolated = np.isin(cloud.source, [source_code(name) for name in INTERPOLATING])
-    if not interpolated.any():
-        note("There are no interpolated points to verify.")
-        return cloud
-    images = photographed(scene, without="do without verify")
-    views = read_views(scene, images, MAX_SIZE, progress)
-    points = cloud.select(interpolated)
-    new = NewPoints(points.xyz, points.rgb, (), source=points.source)
-    checked = verify_points(views, images, find_visibility(scene), new, progress)
-    for sentence in checked.notes:
-        note(sentence)
-    kept = as_cloud(checked, len(checked.xyz), 0)  # each point has its own source
-    return PointCloud.concatenate(cloud.select(~interpolated), kept)
 
 
 def share_covered(scene: Scene, cloud: PointCloud, cell: int = CELL) -> float:

@@ -49,7 +49,7 @@ MIN_VIEWS = 48
 """Minimum views to compare, if there are as many, however short the run: fewer may not overlap."""
 _PLACING = 0.5
 """Fraction of this cost that growth needs where it alone compares more than ``MIN_VIEWS``: it gains
-as much as from all of it (benchmarks/training/README.md), in up to a fifth less time."""
+as much as from all of it (benchmarks/tried.md), in up to a fifth less time."""
 SWEEPS = 2
 """PatchMatch iterations. Two more take 1.6 times as long, find the depth of 1% more of the pixels
 (bonsai, treehill, fox), and gain nothing beyond noise."""

@@ -75,13 +75,12 @@ def _upsample(options: Options, methods: dict[str, Any], arguments: list[str]) -
         new = number_of_new(method, options.method, scene, options.ratio, options.num_points)
         total = None if new is None else count + new
         limit = None if options.budget is None else points_within(scene, options.budget)
-    changes = {"--verify": options.verify, "--cover": options.cover_cell is not None}
-    number = report.number_summary(total, limit, [name for name in changes if changes[name]])
+    number = report.number_summary(total, limit, covered=options.cover_cell is not None)
     _announce(options, scene, replaced, methods, number, "" if cloud is None else cloud.memory_note)
     with stage_display(clock):
         seeds = upsample(
             scene, method, num_points=total, budget=options.budget, cover=options.cover_cell,
-            verify=options.verify, extra_method=extra_method, seed=options.seed, progress=clock,
+            extra_method=extra_method, seed=options.seed, progress=clock,
             note=notes.append, announce=clock.announce,
         )  # fmt: skip
         seeded = scene.with_points(seeds)

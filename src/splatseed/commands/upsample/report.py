@@ -41,6 +41,7 @@ MEASURED = {
 }
 """Origins of new points at a measured depth, and what they are."""
 GUESSED = "guessed from neighbours"
+INTERPOLATING = ("linear", "triangle", "spline", "mls", "voronoi", "random")
 
 
 def parameters_of(method: Upsampler) -> dict[str, object]:
@@ -76,7 +77,6 @@ def provenance(
         "num_points_asked": options.num_points,
         "budget": options.budget,
         "cover": options.cover_cell,
-        "verify": options.verify,
         "covered": None if coverage is None else {"cell": CELL, **coverage._asdict()},
         "seed": options.seed,
     }
@@ -105,8 +105,8 @@ def in_place_of(replaced: int) -> str:
     return f", triangulated in place of the scene's {replaced:,}" if replaced else ""
 
 
-def number_summary(total: int | None, limit: int | None, changed_by: Sequence[str] = ()) -> str:
-    """Say how many points to expect; the options ``changed_by`` may add or drop some.
+def number_summary(total: int | None, limit: int | None, *, covered: bool = False) -> str:
+    """Say how many points to expect; if ``covered``, ``--cover`` adds some.
 
     Example:
         >>> number_summary(None, 50_000), number_summary(800, 1000)
@@ -116,8 +116,7 @@ def number_summary(total: int | None, limit: int | None, changed_by: Sequence[st
         return f"at most {limit:,} points"
     if total is None:
         return "as many points as the photographs need"
-    before = f" before {' and '.join(changed_by)}" if changed_by else ""
-    return f"{total:,} points{before}"
+    return f"{total:,} points before --cover" if covered else f"{total:,} points"
 
 
 def unused_maps_note(options: Options, scene: Scene, method: Upsampler) -> str:
@@ -176,8 +175,6 @@ def _coverage_rows(coverage: Coverage, counts: Mapping[str, int]) -> list[tuple[
     rows = [("covered", f"{coverage.measured:.1%} {cells}{before}")]
     others = {n: counts[n] for n in counts if n not in {*MEASURED, source_name(ORIGINAL)}}
     if others:
-        from splatseed.seeding.upsampling import INTERPOLATING
-
         how = {**dict.fromkeys(INTERPOLATING, "interpolated between points"), "cover": GUESSED}
         made = " or ".join(f"{how.get(name, 'made')} by {name}" for name in others)
         of = f"{sum(others.values()):,} of {sum(counts.values()):,} points"

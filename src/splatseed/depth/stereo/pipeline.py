@@ -30,7 +30,7 @@ from splatseed.settings import change_settings
 MIN_SEEN = 300
 """A scene counts as having no points if half of its images see fewer. Coarse stereo takes two or
 three times as long as the rest of stereo, and gives as many known pixels as 800 points an image: of
-fern's .49, where 80 points an image give .44 and 8 give .41 (benchmarks/stereo)."""
+fern's .49, where 80 points an image give .44 and 8 give .41 (benchmarks/tried.md)."""
 MAP_SAMPLES = 18
 """Rows and columns at which points are sampled from a depth map."""
 
