@@ -17,7 +17,7 @@ from splatseed.depth.alignment import PlanarDepth, lift_pixels
 from splatseed.depth.settings import PER_POINT
 from splatseed.depthmap import HeldDepths
 from splatseed.errors import ParameterError, PointCloudError, SceneFormatError, SceneNotFoundError
-from splatseed.scene import Split
+from splatseed.scene import SceneSource, Split
 
 FLOAT32 = 3e-6  # metres, in a room of 5
 
@@ -262,7 +262,7 @@ def test_scenes_that_cannot_be_lifted_are_refused(own, make_maps):
         (own.points, None, SceneNotFoundError, "`depth`"),
         (own.replace(depths=None), None, SceneNotFoundError, "`depth`"),
         (own.replace(images=()), None, SceneNotFoundError, "`depth`"),
-        (own.replace(source=None), None, SceneNotFoundError, "photographs"),
+        (own.replace(source=SceneSource()), None, SceneNotFoundError, "photographs"),
         (with_bend(0.1), None, SceneFormatError, "SIMPLE_RADIAL for view_000"),
         (own, lambda: photograph.write_bytes(b"no image"), SceneFormatError, "view_004.png"),
         (own, lambda: resized(photograph, (120, 160)), SceneFormatError, "120 x 160"),
