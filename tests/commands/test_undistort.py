@@ -16,7 +16,7 @@ pytest.importorskip("pycolmap", reason="needs pycolmap")
 from splatseed.errors import SceneFormatError
 from splatseed.io import load_scene, write_scene
 from splatseed.io.colmap import write_images
-from splatseed.io.photograph import lens_warnings
+from splatseed.io.photograph import lens_findings
 from splatseed.io.seeds import saw_all_photographs, was_upsampled
 from splatseed.lens import project_rays, unproject_pixels
 from splatseed.photos.loading import load_views, refuse_distortion
@@ -24,6 +24,7 @@ from splatseed.sfm import undistort
 from splatseed.synthetic import write_capture
 
 from ..bent import bend
+from ..findings import texts
 from ..wide_png import png16
 
 pytestmark = pytest.mark.usefixtures("pycolmap_here")
@@ -72,7 +73,7 @@ def test_a_distorted_scene_becomes_one_of_pinholes(distorted, tmp_path, splatsee
     assert (after.listed.train, after.listed.test) == (before.listed.train, before.listed.test)
     np.testing.assert_array_equal(after.points.xyz, before.points.xyz)
     assert len(load_views(after, after.images)) == len(before.images)
-    assert not any("missing" in each for each in after.findings)
+    assert not any("missing" in each for each in texts(after))
     for folder in (out, write_scene(after, tmp_path / "again").path):  # for depth maps
         lenses = json.loads((folder / "distorted.json").read_text())
         bent = before.images[0].intrinsics
@@ -201,7 +202,7 @@ def test_a_model_without_distortion_is_written_as_pinhole(layout, distorted, tmp
     written = load_scene(write_scene(scene, tmp_path / "out", format=layout).path)
     assert written.images[0].intrinsics.model == "PINHOLE"
     assert written.images[0].intrinsics.params == old.pinhole.params
-    assert not lens_warnings(scene.images)
+    assert not lens_findings(scene.images)
 
 
 @pytest.mark.parametrize("kind", ["10 bits", "transparent"])

@@ -20,6 +20,8 @@ from splatseed.io import load_scene, write_scene
 from splatseed.io.ply import read_ply
 from splatseed.pointcloud import PointCloud
 
+from ..findings import texts
+
 LENSES = {
     "pinhole": Intrinsics(1, "PINHOLE", 640, 480, (500.0, 510.0, 318.0, 243.0)),
     "opencv": Intrinsics(
@@ -207,11 +209,11 @@ def test_a_layout_that_would_disturb_is_left_out(why, capture, seeded, tmp_path)
     report = write_scene(scene, tmp_path / "out")
     assert report.layout == "transforms"
     assert not (report.path / "sparse").exists()
-    (note,) = report.notes
+    (note,) = texts(report)
     assert "COLMAP's layout was left out" in note
     assert ("depths" in note) == (why == "depth")
     other = write_scene(scene, tmp_path / "colmap", format="colmap")
-    assert any("depths" in note for note in other.notes) == (why == "depth")
+    assert any("depths" in note for note in texts(other)) == (why == "depth")
 
 
 def test_fields_that_a_trainer_needs_are_added(capture, tmp_path):

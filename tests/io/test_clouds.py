@@ -83,7 +83,7 @@ def test_e57_scans_stand_where_their_poses_say(tmp_path, points):
 def test_one_cloud_of_every_format_in_chunks_of_any_size(name, cloud_files, size):
     path = cloud_files.folder / name
     check(path, cloud_files.xyz, cloud_files.rgb, 1e-6, size)
-    assert bool(open_cloud(path).warnings) == (name in {"a.xyz", "a.pts"})
+    assert bool(open_cloud(path).findings) == (name in {"a.xyz", "a.pts"})
 
 
 def test_glb_of_a_scene(tmp_path, points):
@@ -96,7 +96,7 @@ def test_glb_of_a_scene(tmp_path, points):
     scene.apply_transform(shift)
     scene.export(tmp_path / "scene.glb")
     check(tmp_path / "scene.glb", xyz + 5, rgb, 1e-5)
-    assert "meshes are left out" in open_cloud(tmp_path / "scene.glb").warnings[0]
+    assert open_cloud(tmp_path / "scene.glb").findings[0].kind == "meshes-left-out"
 
 
 @pytest.mark.parametrize(
@@ -134,7 +134,7 @@ def test_text_of_several_writers(tmp_path, points, name, header, delimiter, colo
     if name == "c.csv":
         path.write_text(path.read_text().replace(".", ","))
     check(path, xyz, rgb if colors else None)
-    assert bool(open_cloud(path).warnings) == (header is None)
+    assert bool(open_cloud(path).findings) == (header is None)
 
 
 def test_normals_are_not_taken_for_colours(tmp_path, points):

@@ -10,6 +10,7 @@ from splatseed.errors import SceneFormatError
 from splatseed.io import colmap, load_scene
 from splatseed.io.colmap_model import count_images
 
+from ..findings import texts
 from .conftest import written
 
 
@@ -28,7 +29,7 @@ def model_of(scene_dir, model):
 
 
 def note_of(path):
-    (note,) = [each for each in load_scene(path).findings if "models" in each]
+    (note,) = [each for each in texts(load_scene(path)) if "models" in each]
     return note
 
 
@@ -53,7 +54,7 @@ def test_one_model_needs_no_note_whatever_its_number(scene_dir, model_of):
     model_of(3, 2)
     scene = load_scene(scene_dir)
     assert len(scene.images) == 2
-    assert not any("models" in each for each in scene.findings)
+    assert not any("models" in each for each in texts(scene))
 
 
 def test_a_damaged_model_is_left_aside_unless_it_was_the_largest(scene_dir, model_of):

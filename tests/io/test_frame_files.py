@@ -11,6 +11,8 @@ from PIL import Image as PilImage
 from splatseed.errors import SceneFormatError
 from splatseed.io import load_scene, write_scene
 
+from ..findings import texts
+
 LENS = {"w": 8, "h": 6, "fl_x": 7.0}
 
 
@@ -72,8 +74,8 @@ def test_photographs_are_found_and_named_in_the_output(tmp_path, named, there, n
         shoot(root, "images/0.depth.png", mode="I;16")
     scene = load(write(root, [named.format(i) for i in range(3)]))
     assert files_of(scene) == [there.format(i) for i in range(3)]
-    notes = [text for text in scene.findings if "transforms.json" in text]
-    assert len(notes) == num_notes == len(scene.findings)
+    notes = [text for text in texts(scene) if "transforms.json" in text]
+    assert len(notes) == num_notes == len(texts(scene))
     out = write_scene(scene, tmp_path / "out", require_points=False).path
     frames = json.loads((out / "transforms.json").read_text())["frames"]
     again = load(out)
@@ -92,7 +94,7 @@ def test_what_is_missing_is_no_other_frames_photograph(tmp_path):
     write(no_size, ["images/0.png", "images/1.png"], w=None, h=None)
     scene = load(no_size)
     assert files_of(scene) == ["images/0.png"]
-    assert "1 of 2 frames" in " ".join(scene.findings)
+    assert "1 of 2 frames" in " ".join(texts(scene))
 
 
 def test_repeated_frames_are_left_out_unless_they_disagree(tmp_path):
@@ -102,7 +104,7 @@ def test_repeated_frames_are_left_out_unless_they_disagree(tmp_path):
     write(root, [*same, "images/1.png"])
     scene = load(root)
     assert files_of(scene) == ["images/0.png", "images/1.png"]
-    assert "1 frame of transforms.json" in " ".join(scene.findings)
+    assert "1 frame of transforms.json" in " ".join(texts(scene))
     write(root, ["images/0.png", "images\\0.png"])
     with pytest.raises(SceneFormatError, match=r"frame 2 .*image of its own"):
         load(root)
@@ -123,7 +125,7 @@ def test_test_frames_are_the_split_and_bad_ones_are_left_out(tmp_path):
         ["3.JPG", "4.JPG"],
     ]
     assert scene.masks.files == {"1.JPG": tmp_path / "dslr/resized_anon_masks/1.png"}
-    assert "1 frame marked is_bad" in " ".join(scene.findings)
+    assert "1 frame marked is_bad" in " ".join(texts(scene))
     again = load(write_scene(scene, tmp_path / "out", require_points=False).path)
     assert again.split() != again.replace(listed=None).split()
     assert [len(part) for part in again.split()] == [2, 2]
@@ -141,7 +143,7 @@ def test_test_frames_are_the_split_and_bad_ones_are_left_out(tmp_path):
         (tmp_path / f"dslr/resized_images/{i}.JPG").unlink()
     scene = load(root)
     assert (len(scene.images), scene.listed) == (2, None)
-    assert "2 test frames" in " ".join(scene.findings)
+    assert "2 test frames" in " ".join(texts(scene))
 
 
 @pytest.mark.parametrize("with_file", [True, False])
@@ -155,7 +157,7 @@ def test_blenders_files_without_test_pictures(tmp_path, with_file):
     scene = load(root)
     assert [len(part) for part in scene.split()] == [7, 2]
     assert scene.listed is None
-    assert sum("transforms_test.json" in text for text in scene.findings) == 1
+    assert sum("transforms_test.json" in text for text in texts(scene)) == 1
 
 
 @pytest.mark.parametrize(
@@ -212,7 +214,7 @@ def test_depth_maps_that_are_named_but_missing(tmp_path):
     write(root, frames, depth_integer_scale=1.0)
     scene = load(root)
     assert scene.depths is None
-    assert scene.findings == (
+    assert texts(scene) == (
         "2 depth maps named in transforms.json cannot be found, such as images/0.depth.png.",
     )
 
@@ -258,7 +260,7 @@ def test_relocated_masks_and_maps_are_of_one_frame(tmp_path):
     assert not scene.masks.files
     assert scene.depths is None
     for what in ("2 masks", "2 depth maps"):
-        assert f"{what} named in transforms.json cannot be found" in " ".join(scene.findings)
+        assert f"{what} named in transforms.json cannot be found" in " ".join(texts(scene))
     out = write_scene(scene, tmp_path / "out", format="transforms", require_points=False).path
     named = json.loads((out / "transforms.json").read_text())["frames"]
     assert [each["mask_path"] for each in named] == [each["mask_path"] for each in names]
@@ -275,4 +277,4 @@ def test_masks_that_are_named_are_found_or_told(tmp_path):
     ]
     scene = load(write(root, names))
     assert scene.masks.files == {"0.png": root / "masks/0.png"}
-    assert "1 mask named in transforms.json" in " ".join(scene.findings)
+    assert "1 mask named in transforms.json" in " ".join(texts(scene))

@@ -20,6 +20,7 @@ from splatseed.io.photograph import photograph_bytes
 from splatseed.io.staging import read_manifest
 from splatseed.seeding.trainability import untrainable
 
+from ..findings import texts
 from .checks import little_memory
 
 
@@ -51,7 +52,7 @@ def test_what_is_no_file_is_not_called_missing(odd, name, is_, scene_dir, model)
         load_scene(odd / name)
     _rename(scene_dir, model, str(odd / name))
     scene = load_scene(scene_dir)
-    assert f"{odd / name} is {is_}, not a file." in " ".join(scene.findings)
+    assert f"{odd / name} is {is_}, not a file." in " ".join(texts(scene))
     shutil.rmtree(scene_dir / "images/left")
     assert f"{odd / name} is {is_}, not a file." in untrainable(scene)
 
@@ -82,7 +83,7 @@ def _rename(scene_dir, model, name):
 @pytest.mark.parametrize("name", ["../../x.jpg", "/dev/zero", "../images/left/image000.jpg"])
 def test_a_name_that_leads_out_of_the_scene_is_told(scene_dir, model, name):
     _rename(scene_dir, model, name)
-    told = [each for each in load_scene(scene_dir).findings if "outside of" in each]
+    told = [each for each in texts(load_scene(scene_dir)) if "outside of" in each]
     assert [name in each for each in told] == ([] if "left" in name else [True])
 
 

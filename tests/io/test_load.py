@@ -17,6 +17,8 @@ from splatseed.io.ply import write_ply
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import LeftOut, Scene
 
+from ..findings import texts
+
 
 def rewrite_points(scene_dir, xyz):
     rgb = np.zeros((len(xyz), 3), np.uint8)
@@ -25,7 +27,7 @@ def rewrite_points(scene_dir, xyz):
 
 
 def warnings_of(path):
-    return " ".join(load_scene(path).findings)
+    return " ".join(texts(load_scene(path)))
 
 
 @pytest.mark.parametrize("place", ["sparse/0", "sparse", "colmap/sparse/0", "."])
@@ -92,7 +94,7 @@ def test_model_without_images_keeps_cameras_and_drops_tracks(scene_dir, model):
     scene = load_scene(scene_dir)
     assert (scene.images, scene.tracks, scene.intrinsics) == ((), None, model.intrinsics)
     np.testing.assert_array_equal(scene.points.xyz, model.points.xyz)
-    assert f"{folder} has no images.bin or images.txt" in " ".join(scene.findings)
+    assert f"{folder} has no images.bin or images.txt" in " ".join(texts(scene))
 
 
 def test_missing_photographs_are_counted_and_the_first_is_named(scene_dir, model):
@@ -117,7 +119,7 @@ def test_points_that_cannot_be_used_are_left_out_or_told(scene_dir, rng):
     rewrite_points(scene_dir, [[0, 0, 0], [-0.0, 0, 0], [1, 2, 3], [np.nan, 0, 0], [np.inf, 0, 0]])
     scene = load_scene(scene_dir)
     assert (len(scene.points), scene.left_out) == (2, LeftOut(2, 1))
-    text = " ".join(scene.findings)
+    text = " ".join(texts(scene))
     assert "2 points are not finite" in text
     assert "1 point repeats" in text
     room, notes = (
@@ -181,6 +183,6 @@ def test_a_point_beyond_all_distances_is_left_out(rng):
     xyz[0] = 1e30
     cloud = PointCloud(xyz, np.zeros((500, 3), np.uint8))
     clean = clean_scene(Scene(cloud))
-    assert clean.findings == ("1 point is beyond 1e15 and was left out.",)
+    assert texts(clean) == ("1 point is beyond 1e15 and was left out.",)
     assert len(clean.points) == 499
     assert np.abs(upsample(cloud, "linear", num_points=800).xyz[500:]).max() < 10

@@ -21,6 +21,7 @@ from splatseed.sfm.photos import find_photos
 from splatseed.synthetic import write_capture
 
 from ..bent import bend
+from ..findings import texts
 
 BOX = np.s_[20:40, 30:60]
 
@@ -52,7 +53,7 @@ def test_a_mask_belongs_to_the_photograph_of_its_name(scene_path, name):
     masks = masks_of(scene)
     assert np.array_equal(masks[3], counts)
     assert [mask is None for mask in masks] == [i != 3 for i in range(9)]
-    assert sum("other.png" in warning for warning in scene.findings) == 1
+    assert sum("other.png" in warning for warning in texts(scene)) == 1
 
 
 def test_a_smaller_pixel_counts_only_if_all_of_its_pixels_count(scene_path):
@@ -98,10 +99,10 @@ def test_masks_that_leave_out_most_pixels_may_be_inverted(scene_path, tmp_path):
         counted = paint(scene_path / f"masks/view_{i:03}.png", inside=255)
     assert 1 - counted.mean() == pytest.approx(0.91, abs=0.005)
     scene, of_sfm = load_scene(scene_path), masks_near(scene_path / "images")[1]
-    assert [each for each in scene.findings if note in each] == [f"{note}, use `masks='inverted'`."]
-    assert f"{note}, invert them." in of_sfm  # sfm has no such option
+    assert [each for each in texts(scene) if note in each] == [f"{note}, use `masks='inverted'`."]
+    assert f"{note}, invert them." in map(str, of_sfm)  # sfm has no such option
     for choice in ("inverted", "none", str(tmp_path / "own")):
-        assert not any(note in warning for warning in with_masks(scene, choice).findings)
+        assert not any(note in warning for warning in texts(with_masks(scene, choice)))
 
 
 def test_what_cannot_be_a_mask_is_named(scene_path):
@@ -216,9 +217,11 @@ def test_files_beside_photographs_need_no_masks(scene_path):
         path.with_suffix(".xmp").touch()
         paint(scene_path / "masks" / path.name)
     (scene_path / "images/notes.txt").touch()
-    masks, notes = masks_near(scene_path / "images")
+    masks, found = masks_near(scene_path / "images")
     assert masks.files.keys() == {f"camera/view_{i:03}.png" for i in range(9)}
-    assert notes == [f"9 photographs with a mask in {scene_path / 'masks'}."]
+    assert [str(each) for each in found] == [
+        f"9 photographs with a mask in {scene_path / 'masks'}."
+    ]
 
 
 def test_hidden_files_are_no_masks(scene_path):
@@ -237,10 +240,10 @@ def test_masks_of_a_format_that_is_not_read_are_noted(scene_path):
     reason = "are of a format that is not read: save masks as PNG."
     note = f"2 masks, such as view_004.png.npy, {reason}"
     scene = load_scene(scene_path)
-    assert [warning for warning in scene.findings if "not read" in warning] == [note]
-    assert note in with_masks(scene, str(scene_path / "masks")).findings
+    assert [warning for warning in texts(scene) if "not read" in warning] == [note]
+    assert note in texts(with_masks(scene, str(scene_path / "masks")))
     (scene_path / "masks/view_003.png").unlink()
-    assert f"3 masks, such as view_003.npy, {reason}" in load_scene(scene_path).findings
+    assert f"3 masks, such as view_003.npy, {reason}" in texts(load_scene(scene_path))
 
 
 @pytest.mark.parametrize(
@@ -257,25 +260,25 @@ def test_masks_of_unknown_meaning_are_mentioned_and_can_be_named(scene_path, nam
     scene = load_scene(scene_path)
     way = way.format(scene_path)
     assert not scene.masks.files
-    assert sum(f"`masks={way!r}`" in each for each in scene.findings) == 1
+    assert sum(f"`masks={way!r}`" in each for each in texts(scene)) == 1
     assert with_masks(scene, way).masks.files.keys() == {"view_003.png"}
 
 
 def test_masks_that_fit_no_photograph_are_counted_and_so_are_photographs_without(scene_path):
     paint(scene_path / "masks/IMG_1.png")
-    said, folder = " ".join(load_scene(scene_path).findings), scene_path / "masks"
+    said, folder = " ".join(texts(load_scene(scene_path))), scene_path / "masks"
     assert f"1 mask in {folder} belongs to no image of the scene, such as IMG_1" in said
     paint(scene_path / "mask/view_001.png")
     scene = load_scene(scene_path)  # the folder that fits
     assert scene.masks.files.keys() == {"view_001.png"}
-    assert "8 images of 9 with masks" in " ".join(scene.findings)
+    assert "8 images of 9 with masks" in " ".join(texts(scene))
 
 
 def test_masks_of_another_size_are_resized(scene_path):
     path = scene_path / "masks/view_000.png"
     paint(path, size=(48, 36), box=np.s_[10:20, 15:30])
     scene = load_scene(scene_path)
-    assert "resized" in " ".join(scene.findings)
+    assert "resized" in " ".join(texts(scene))
     counts = np.ones((72, 96), bool)
     counts[20:40, 30:60] = False
     assert np.array_equal(masks_of(scene)[0], counts)

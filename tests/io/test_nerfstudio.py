@@ -22,6 +22,7 @@ from splatseed.io.ply import read_ply, write_ply
 from splatseed.pointcloud import PointCloud
 from splatseed.similarity import Similarity
 
+from ..findings import texts
 from .checks import CHARACTERS
 
 FIELDS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
@@ -117,7 +118,7 @@ def test_a_named_ply_is_taken_as_it_is(content, scene_dir, model):
     write_json(path, content | {"ply_file_path": "given.ply"})
     assert_same_cloud(load_scene(path).points, model.points)
     write_json(path, content | {"ply_file_path": "gone.ply"})
-    assert any("gone.ply" in text for text in load_scene(path).findings)
+    assert any("gone.ply" in text for text in texts(load_scene(path)))
 
 
 @pytest.mark.parametrize("transform", [APPLIED, LEGACY, np.eye(4)[:3]])
@@ -144,7 +145,7 @@ def test_instant_ngps_recentred_poses_are_fitted(content, scene_dir, model, rng)
         frame["transform_matrix"] = pose.tolist()
     scene = load_scene(write_json(scene_dir / "transforms.json", content))
     np.testing.assert_allclose(scene.points.xyz, moved.points(model.tracks.xyz), atol=2e-3)
-    assert any("0.37" in text for text in scene.findings)
+    assert any("0.37" in text for text in texts(scene))
 
 
 def test_cameras_are_the_same_by_their_paths_or_by_names_that_are_unique(model):
@@ -313,4 +314,4 @@ def test_blenders_files_are_one_scene_and_so_is_its_output(layout, tmp_path, rng
         pixels.append(np.nan_to_num(np.stack(seen)))
     np.testing.assert_allclose(*pixels, rtol=1e-3, atol=1e-2)
     assert [each.masks.alpha for each in (scene, again)] == [False, False]  # black, not masked
-    assert not [each for each in scene.findings if "missing" in each or "outside" in each]
+    assert not [each for each in texts(scene) if "missing" in each or "outside" in each]

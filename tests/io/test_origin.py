@@ -19,6 +19,8 @@ from splatseed.io.origin import (
 )
 from splatseed.io.ply import read_ply_float64
 
+from ..findings import texts
+
 UTM, ECEF = (218248.62, 1925986.38, 179.47), (-1288000.5, -4720500.25, 4079400.75)
 GRIDS = {"utm": UTM, "ecef": ECEF, "high": (0.0, 0.0, 3e6)}
 
@@ -63,13 +65,13 @@ def test_a_scene_far_from_0_is_read_and_written_around_its_own_origin(room, tmp_
         write_far(room, GRIDS[grid], tmp_path / "far")
     scene = load_scene(tmp_path / "far")
     assert len(scene.points) == len(plain.points)  # none falls on another
-    assert sum(RECENTER in note for note in scene.findings) == 1
+    assert sum(RECENTER in note for note in texts(scene)) == 1
     assert np.abs(scene.points.xyz).max() < 30
     report = write_scene(scene, tmp_path / "out")
     assert RECENTER in report.files
     again = load_scene(tmp_path / "out")
     assert not again.origin.any()
-    assert not [note for note in again.findings if RECENTER in note]
+    assert not [note for note in texts(again) if RECENTER in note]
     for read in (scene, again):
         places = centers_of(read) + read.offset - GRIDS[grid]
         np.testing.assert_allclose(places, centers_of(plain), atol=1e-7)
@@ -128,8 +130,8 @@ def test_a_bare_cloud_is_moved_by_its_points(room, tmp_path):
     points = tmp_path / "out" / "sparse" / "0" / "points3D.ply"
     np.testing.assert_array_equal(read_ply_float64(points)[0].xyz, exact.points.xyz)
     rounded = load_scene(double_ply(tmp_path / "single.ply", xyz.astype(np.float32)))
-    assert any("single precision" in note for note in rounded.findings)
-    assert not any("single precision" in note for note in exact.findings)
+    assert any("single precision" in note for note in texts(rounded))
+    assert not any("single precision" in note for note in texts(exact))
 
 
 def test_points_in_another_frame_than_the_poses_are_noted(room, tmp_path):
@@ -137,7 +139,7 @@ def test_points_in_another_frame_than_the_poses_are_noted(room, tmp_path):
     model = tmp_path / "mixed" / "sparse" / "0"
     (model / "points3D.bin").unlink()
     double_ply(model / "points3D.ply", room.points.xyz + np.array(UTM))
-    notes = " ".join(load_scene(tmp_path / "mixed").findings)
+    notes = " ".join(texts(load_scene(tmp_path / "mixed")))
     assert "in different frames" in notes
     assert RECENTER not in notes
 

@@ -16,6 +16,7 @@ from splatseed.io.photograph import check_photograph, decode_photograph, photogr
 from splatseed.photos.loading import load_views
 from splatseed.scene import Masks
 
+from ..findings import texts
 from ..wide_png import png16
 
 
@@ -153,10 +154,10 @@ def test_photographs_of_fewer_bits_are_stretched_alike(count, bits, rng, tmp_pat
             tiff16(values, path)
         else:
             path.write_bytes(png16(values))
-    white, notes = find_white([*paths, tmp_path / "none.png"])
+    white, found = find_white([*paths, tmp_path / "none.png"])
     assert white == 2**bits - 1
     said = f"only use {bits} (values up to {white:,})"
-    assert [said in note for note in notes] == ([True] if bits < 16 else [])
+    assert [said in each.text for each in found] == ([True] if bits < 16 else [])
     for path, values in both:
         pixels = np.array(decode_photograph(path, photograph_bytes(path), white))
         colors = values[..., :1] if channels < 3 else values[..., :3]
@@ -171,6 +172,6 @@ def test_a_scene_of_14_bits_has_its_note_once_and_bright_views(room, tmp_path):
         values = np.rint(pixels * (16383 / 255)).astype(np.uint16)
         (tmp_path / "scene/images" / image.name).write_bytes(png16(values))
     scene = load_scene(tmp_path / "scene")
-    assert sum("use 14 (values" in each for each in scene.findings) == 1
+    assert sum("use 14 (values" in each for each in texts(scene)) == 1
     wide, plain = (load_views(each, each.images[:1])[0] for each in (scene, room))
     assert np.array_equal(wide.photograph, plain.photograph)

@@ -13,6 +13,8 @@ from splatseed.io import colmap, load_scene, write_scene
 from splatseed.io.photograph_checks import with_photographs
 from splatseed.photos.visibility import find_visibility
 
+from ..findings import texts
+
 
 def names(images):
     return [image.name for image in images]
@@ -34,7 +36,7 @@ def test_missing_photographs_leave_the_others_in_their_part(scene_dir):
         (scene_dir / "images" / name).unlink()
     scene = load_scene(scene_dir)
     assert len(scene.images) == len(whole.images)  # as the model is written again
-    noted = [text for text in scene.findings if "missing" in text]
+    noted = [text for text in texts(scene) if "missing" in text]
     assert len(noted) == 1
     assert (
         f"2 of 4 images are missing in {scene_dir / 'images'}, and left out ({', '.join(gone)})"
@@ -75,14 +77,14 @@ def test_images_of_nan_are_left_out_and_the_others_are_used(broken, form, scene_
     assert names(scene.images) == [n for n in names(whole.images) if n not in gone]
     assert scene.absent == tuple(gone)
     assert parts(scene) == without(parts(whole), gone)
-    (note,) = (text for text in scene.findings if "not finite" in text)
+    (note,) = (text for text in texts(scene) if "not finite" in text)
     assert f"{len(gone)} of 4 images" in note
     assert gone[0] in note
     assert len(find_visibility(scene).of(scene.images[0]))
     write_scene(scene, scene_dir.with_name("written"))
     again = load_scene(scene_dir.with_name("written"))
     assert parts(again) == parts(scene)
-    assert not any("not finite" in text for text in again.findings)
+    assert not any("not finite" in text for text in texts(again))
 
 
 def as_text(folder, cameras, images):
@@ -126,7 +128,7 @@ def test_frames_of_nan_are_left_out(change, scene_dir):
     path.write_text(json.dumps(content))
     scene = load_scene(path.parent)
     assert parts(scene) == without(parts(whole), [whole.images[1].name])
-    assert sum("1 of 4 images is left out" in text for text in scene.findings) == 1
+    assert sum("1 of 4 images is left out" in text for text in texts(scene)) == 1
     write_scene(scene, scene_dir.with_name("again"))
     assert parts(load_scene(scene_dir.with_name("again"))) == parts(scene)
 
@@ -138,6 +140,6 @@ def test_intrinsics_of_another_size_are_noted(scale, model, scene_dir):
     scaled = replace(lens, params=tuple(scale * each for each in lens.params))
     path = scene_dir / "sparse/0/cameras.bin"
     colmap.write_cameras(path, [scaled, model.images[1].intrinsics])
-    noted = [w for w in load_scene(scene_dir).findings if "not in pixels of this size" in w]
+    noted = [w for w in texts(load_scene(scene_dir)) if "not in pixels of this size" in w]
     assert len(noted) == (scale != 1)
     assert all("2 of 4 images" in note and model.images[0].name in note for note in noted)

@@ -12,9 +12,11 @@ from splatseed.io import colmap, load_scene, write_scene
 from splatseed.io.ply import write_ply
 from splatseed.pointcloud import PointCloud
 
+from ..findings import texts
+
 
 def notes_of(path):
-    return [each for each in load_scene(path).findings if " are used; " in each]
+    return [each for each in texts(load_scene(path)) if " are used; " in each]
 
 
 @pytest.mark.parametrize("age", [-100, 100])
@@ -63,7 +65,7 @@ def test_an_empty_file_gives_way_to_one_with_points(scene_dir, model):
     write_ply(folder / "points3D.ply", model.points)
     scene = load_scene(scene_dir)
     assert (len(scene.points), scene.source.points_path.name) == (10, "points3D.ply")
-    assert f"{folder / 'points3D.bin'} holds no points" in " ".join(scene.findings)
+    assert f"{folder / 'points3D.bin'} holds no points" in " ".join(texts(scene))
 
 
 def test_plys_beside_transforms_json_and_init_ply(scene_dir, model):

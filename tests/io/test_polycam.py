@@ -9,6 +9,7 @@ import pytest
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io import find_depths, load_scene, write_scene
 
+from ..findings import texts
 from .phone_exports import change, check_cameras, check_depths, write_polycam
 
 
@@ -59,7 +60,7 @@ def test_key_frames_without_a_photograph_or_a_camera_are_left_out(export):
     sorted((export / "keyframes/corrected_images").iterdir())[1].unlink()
     scene = load(export)
     assert [image.name for image in scene.images] == [f"{c.stem}.jpg" for c in cameras[2:]]
-    assert [w for w in scene.findings if "left out" in w] == [
+    assert [w for w in texts(scene) if "left out" in w] == [
         f"1 of 8 photographs has no camera and is left out, such as {cameras[0].stem}.jpg.",
         "1 of 8 cameras has no photograph and is left out.",
     ]

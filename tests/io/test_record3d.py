@@ -19,6 +19,7 @@ from splatseed.errors import OutputError, SceneFormatError, SceneNotFoundError
 from splatseed.io import find_depths, load_scene, write_scene
 from splatseed.io.film import FilmSettings
 
+from ..findings import texts
 from .phone_exports import change, check_cameras, check_depths, write_r3d, write_record3d
 
 
@@ -76,7 +77,7 @@ def test_without_openexr_poses_are_read_and_maps_left_out(export, monkeypatch):
     monkeypatch.setattr("splatseed.requirements.find_spec", lambda _: None)
     scene = load(export)
     assert (len(scene.images), scene.depths) == (9, None)
-    (note,) = scene.findings
+    (note,) = texts(scene)
     assert note.startswith("Depth maps are left out, as reading them needs OpenEXR. Install it")
 
 
@@ -89,7 +90,7 @@ def test_a_photograph_has_the_pose_of_its_number(room_with_depth, tmp_path):
     assert [image.name for image in scene.images] == [f"{2 * i}.jpg" for i in range(8)]
     truth = room_with_depth.replace(images=room_with_depth.images[:8])
     check_cameras(scene, truth)
-    (note,) = scene.findings
+    (note,) = texts(scene)
     assert note.startswith("There are 9 photographs and 18 poses in")
     assert note.endswith(f"in {export / 'EXR_RGBD'}: the 8 of the same number are used.")
 
@@ -115,7 +116,7 @@ def test_lost_tracking_leaves_an_image_out(export):
     change(path, poses=poses)
     scene = load(export)
     assert scene.absent == ("3.jpg",)
-    assert "1 of 9 images is left out (3.jpg)" in scene.findings[0]
+    assert "1 of 9 images is left out (3.jpg)" in texts(scene)[0]
     assert scene.depths is None or "3.jpg" not in scene.depths
 
 
@@ -129,7 +130,7 @@ def test_of_a_long_recording_the_sharpest_are_used(export, monkeypatch):
     numbers = {int(Path(image.name).stem) for image in scene.images}
     assert not numbers & {1, 4, 7}
     assert 5 <= len(numbers) <= 8
-    (note,) = scene.findings
+    (note,) = texts(scene)
     assert note.startswith(f"{len(numbers)} of 9 photographs are used: the sharpest")
 
 
@@ -140,7 +141,7 @@ def test_an_archive_is_extracted_once(room_with_depth, tmp_path, captures, lzfse
     check_depths(scene, room_with_depth)
     (folder,) = captures.iterdir()
     assert (scene.source.root, scene.source.again) == (folder, path)
-    assert scene.findings[0].endswith(f"18 poses in {path}: the 9 of the same number are used.")
+    assert texts(scene)[0].endswith(f"18 poses in {path}: the 9 of the same number are used.")
     before = {file: file.stat().st_mtime_ns for file in folder.rglob("*")}
     again = load(path.rename(tmp_path / "moved.r3d"))
     assert {file: file.stat().st_mtime_ns for file in folder.rglob("*")} == before
@@ -168,7 +169,7 @@ def test_depth_of_an_archive_needs_a_package(room_with_depth, tmp_path, captures
     scene = load(path)
     check_cameras(scene, room_with_depth)
     assert scene.depths is None
-    (note,) = scene.findings
+    (note,) = texts(scene)
     assert "needs lzfse. Install it (extra r3d):" in note
 
 

@@ -18,6 +18,8 @@ from splatseed.io.rgbd import load_rgbd, load_tum
 from splatseed.lens import project_rays
 from splatseed.scene import SceneSource
 
+from ..findings import texts
+
 START, PERIOD = 1305031102.175304, 1 / 30
 TIMES = START + PERIOD * np.arange(4)
 CAMERA = {"w": 40, "h": 30, "fx": 35.0, "fy": 36.0, "cx": 19.5, "cy": 14.5, "scale": 1000.0}
@@ -81,12 +83,12 @@ def test_camera_of_the_series_or_of_a_file(capture):
     scene = load_tum(capture)
     (lens,) = scene.intrinsics
     assert (lens.model, lens.params[0], len(lens.params)) == ("FULL_OPENCV", 520.9, 12)
-    assert any("distortion" in text for text in scene.findings)
+    assert any("distortion" in text for text in texts(scene))
     assert scene.depths.lens is None  # the photographs have the same distortion
     capture = capture.rename(capture.with_name("kitchen"))
     scene = load_tum(capture)
     assert scene.intrinsics[0].params == (525, 525, 320, 240)
-    assert "focal length 525" in scene.findings[0]
+    assert "focal length 525" in texts(scene)[0]
     for folder in (capture.parent, capture):
         camera = CAMERA | {"w": 640, "h": 480}
         (folder / "cam_params.json").write_text(json.dumps({"camera": camera}))
@@ -115,7 +117,7 @@ def test_images_without_pose_or_file_are_left_out_and_told(capture):
     rows = [(f"{t + 0.005:.6f}", f"depth/{t + 0.005:.6f}.png") for t in TIMES]
     write_list(capture / "depth.txt", [rows[0], (TIMES[2] + 0.0205, rows[2][1])])
     assert list(load_tum(capture).depths) == [f"{TIMES[0]:.6f}.png"]  # the other is too late
-    without_pose, without_file = scene.findings
+    without_pose, without_file = texts(scene)
     assert f"rgb/{TIMES[3]:.6f}" in without_pose
     assert "1 image without a file" in without_file
 
@@ -210,7 +212,7 @@ def test_lost_frames_are_left_out_and_told(room):
     scene = load_rgbd(room)
     assert [image.name for image in scene.images] == ["frame000001.png", "frame10.jpg"]
     np.testing.assert_allclose(scene.images[1].camera.world_from_cam, POSES[2], atol=1e-12)
-    (told,) = scene.findings
+    (told,) = texts(scene)
     assert "frame2.jpg" in told
 
 

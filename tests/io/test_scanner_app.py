@@ -11,6 +11,7 @@ from splatseed.io import find_depths, load_scene, write_scene
 from splatseed.io.load import with_depths_in, with_own_depths
 from splatseed.sfm.photos import find_photos
 
+from ..findings import texts
 from .phone_exports import change, check_cameras, check_depths, write_scanner_app
 
 
@@ -72,7 +73,7 @@ def test_frames_without_a_photograph_or_a_pose_are_left_out(export):
     scene = load(export)
     numbers = [0, 12, 15, 18, 21, 24]
     assert [image.name for image in scene.images] == [f"frame_{i:05d}.jpg" for i in numbers]
-    assert [w for w in scene.findings if "left out" in w] == [
+    assert [w for w in texts(scene) if "left out" in w] == [
         "2 of 8 frames have no photograph and are left out.",
         "1 photograph without a pose (a .json beside it) is left out, such as frame_00009.jpg.",
     ]
@@ -87,10 +88,10 @@ def test_a_map_without_its_confidence_is_named(export, tmp_path):
     scene = load(export)
     which = "frame_00006.jpg, frame_00012.jpg"
     note = f"2 of 9 depth maps have no confidence and are used whole: {which}."
-    assert scene.findings == with_depths_in(scene, export).findings == (note,)
+    assert texts(scene) == texts(with_depths_in(scene, export)) == (note,)
     again = load(write_scene(scene, tmp_path / "out", require_points=False).path)
     assert again.findings == ()
-    assert with_depths_in(again, export).findings == (note,)
+    assert texts(with_depths_in(again, export)) == (note,)
     for path in export.glob("conf_*.png"):
         path.unlink()  # then confidence is unknown to the whole capture
     assert load(export).findings == with_depths_in(scene, export).findings == ()
@@ -100,7 +101,7 @@ def test_lost_tracking_leaves_an_image_out(export):
     change(export / "frame_00006.json", cameraPoseARFrame=[float("nan")] * 16)
     scene = load(export)
     assert scene.absent == ("frame_00006.jpg",)
-    assert "1 of 9 images is left out (frame_00006.jpg)" in scene.findings[0]
+    assert "1 of 9 images is left out (frame_00006.jpg)" in texts(scene)[0]
 
 
 def test_cameras_of_resized_photographs_belong_to_the_captured_size(export, room_with_depth):
@@ -108,7 +109,7 @@ def test_cameras_of_resized_photographs_belong_to_the_captured_size(export, room
         PilImage.open(path).resize((48, 36)).save(path)
     scene = load(export)
     check_cameras(scene, room_with_depth)
-    (warning,) = scene.findings
+    (warning,) = texts(scene)
     assert warning.startswith("frame_00000.jpg has 48 x 36 pixels, its camera 1 96 x 72;")
     change(export / "frame_00000.json", projectionMatrix=None)  # then only K's plausibility is left
     with pytest.raises(SceneFormatError, match=r"middle of 48 x 36 pixels in .*00000\.json"):

@@ -19,6 +19,7 @@ from splatseed.synthetic import make_capture
 from splatseed.training.seeds import seeded
 from splatseed.training.settings import TrainSettings
 
+from ..findings import texts
 from .checks import EDITS, apply_edits
 
 NORMAL_STEP, CONFIDENCE_STEP = 1e-3, 5e-4
@@ -97,7 +98,7 @@ CLOUD = PointCloud(np.eye(3), np.zeros((3, 3), np.uint8), sizes=np.ones(3))
 )
 def test_damaged_files_are_left_aside_and_told_of(tmp_path, how):
     write_seeds(tmp_path, CLOUD)
-    assert "other points" in _read_seeds(tmp_path, PointCloud(2 * CLOUD.xyz, CLOUD.rgb))[1][0]
+    assert "other points" in _read_seeds(tmp_path, PointCloud(2 * CLOUD.xyz, CLOUD.rgb))[1][0].text
     assert _read_seeds(tmp_path, PointCloud(CLOUD.xyz, 255 - CLOUD.rgb))[0].keys() == {"sizes"}
     with np.load(tmp_path / SEEDS) as archive:
         arrays = dict(archive)
@@ -111,7 +112,7 @@ def test_damaged_files_are_left_aside_and_told_of(tmp_path, how):
             archive.writestr("sizes.npy", LYING + bytes(12))
     known, (told,) = _read_seeds(tmp_path, CLOUD.replace(sizes=None))
     assert known == {}
-    assert f"{SEEDS} was ignored" in told
+    assert f"{SEEDS} was ignored" in told.text
 
 
 @settings(deadline=None, max_examples=40)
@@ -146,7 +147,7 @@ def test_a_scene_without_originals_keeps_what_its_points_are(scene, tmp_path):
         assert there == (tmp_path / "out" / name).read_bytes()
     bare = load_originals(tmp_path / "out", require_points=False)
     assert not len(bare.points)
-    assert f"{len(new):,} points" in bare.findings[-1]
+    assert f"{len(new):,} points" in texts(bare)[-1]
     with pytest.raises(SceneNotFoundError, match=f"found none: it made all {len(new):,}"):
         load_originals(tmp_path / "out")
 

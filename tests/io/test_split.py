@@ -9,6 +9,8 @@ import pytest
 from splatseed.bench.scenes import scene_digest
 from splatseed.io import load_scene, write_scene
 
+from ..findings import texts
+
 TEST = {"left/image001.jpg", "left/image003.jpg"}
 TRAIN = {"left/image000.jpg", "left/image002.jpg"}
 
@@ -54,14 +56,14 @@ def test_two_lists_can_leave_images_out(scene_dir):
     (scene_dir / "test_list.txt").write_text("left/image000.jpg")
     scene = load_scene(scene_dir)
     assert parts(scene) == (TEST, {"left/image000.jpg"})
-    assert not any("list.txt" in each for each in scene.findings)
+    assert not any("list.txt" in each for each in texts(scene))
 
 
 def test_names_of_no_image_are_told(scene_dir):
     (scene_dir / "test_list.txt").write_text("\n".join([*TEST, "left/imgae002.jpg"]), "utf-8-sig")
     scene = load_scene(scene_dir)
     assert parts(scene)[1] == TEST
-    assert any("left/imgae002.jpg" in each for each in scene.findings)
+    assert any("left/imgae002.jpg" in each for each in texts(scene))
 
 
 def test_the_lists_of_transforms_json_are_followed_and_carried_over(scene_dir, tmp_path):
@@ -90,4 +92,4 @@ def test_a_list_that_fits_no_image_is_left_aside(text, scene_dir):
     (scene_dir / "train.txt").write_text(text)
     scene = load_scene(scene_dir)
     assert (scene.listed, parts(scene)[1]) == (None, {"left/image000.jpg"})
-    assert bool(text) == any("train.txt was ignored" in each for each in scene.findings)
+    assert bool(text) == any("train.txt was ignored" in each for each in texts(scene))

@@ -14,6 +14,7 @@ from splatseed.io import load_scene
 from splatseed.io.film import FilmSettings
 from splatseed.io.stray import CAMERA, ODOMETRY, VIDEO
 
+from ..findings import texts
 from .phone_exports import check_cameras, check_depths, write_stray
 
 pytest.importorskip("imageio_ffmpeg", reason="videos need imageio-ffmpeg (extra sfm)")
@@ -105,7 +106,7 @@ def test_a_copy_without_the_hidden_frame_begins_at_the_second_pose(recording, ro
     assert [image.name for image in scene.images] == [f"{i:06}.jpg" for i in range(1, 10)]
     check_cameras(scene, room_with_depth)
     check_depths(scene, room_with_depth)
-    (note,) = scene.findings
+    (note,) = texts(scene)
     assert note == "rgb.mp4 has 9 frames and odometry.csv 10 poses: the first pose has none."
 
 
@@ -119,7 +120,7 @@ def test_frames_after_the_last_pose_are_left_out(recording, room_with_depth):
     change_lines(recording, lambda lines: lines[:7])
     scene = load(recording)
     check_cameras(scene, room_with_depth.replace(images=room_with_depth.images[:7]))
-    (note,) = scene.findings
+    (note,) = texts(scene)
     assert note == "rgb.mp4 has 9 frames and odometry.csv 7 poses: the last have no pose."
 
 
@@ -145,7 +146,7 @@ def test_few_frames_of_many_and_extracted_once(recording, captures, monkeypatch)
     monkeypatch.setattr("splatseed.io.stray.FILM", FilmSettings(max_frames=4))
     scene = load(recording)
     assert 3 <= len(scene.images) <= 4
-    (note,) = scene.findings
+    (note,) = texts(scene)
     assert note.startswith(f"{len(scene.images)} of the 9 frames of rgb.mp4 are used: the sharpest")
     (folder,) = captures.iterdir()
     before = {file: file.stat().st_mtime_ns for file in folder.rglob("*")}

@@ -17,6 +17,8 @@ from splatseed.lens import project_rays
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene, SceneSource
 
+from ..findings import texts
+
 BENT = Intrinsics(1, "OPENCV", 80, 60, (70.0, 72.0, 40.0, 30.0, -0.2, 0.0, 0.0, 0.0))
 STRAIGHT = Intrinsics(1, "PINHOLE", 86, 62, (70.0, 72.0, 43.0, 31.0))
 
@@ -57,7 +59,7 @@ def test_maps_of_the_photographs_of_before_are_undistorted(scene, tmp_path, fact
     assert np.abs(depth.values - expected).max() <= 0.501
     assert np.abs(depth.values - column * width / depth.width).max() > 0.7  # as if not undistorted
     np.testing.assert_array_equal(maps.read("b.jpg").values[0], np.arange(width) + 0.5)
-    assert any("before undistortion" in each for each in with_depths_in(scene, folder).findings)
+    assert any("before undistortion" in each for each in texts(with_depths_in(scene, folder)))
 
 
 @pytest.mark.parametrize("shape", [(62, 86), (31, 43), (50, 50)])

@@ -18,6 +18,8 @@ from splatseed.io.ply import read_ply, write_ply
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Observations, Scene
 
+from ..findings import texts
+
 pycolmap = pytest.importorskip("pycolmap")
 
 
@@ -99,7 +101,7 @@ def test_unusable_points_are_dropped_with_their_observations(scene_dir, tmp_path
     report = write_scene(scene.replace(points=again), tmp_path / "out")
     assert (report.dropped_nonfinite, report.dropped_duplicates) == (2, 3)
     assert (report.num_points, report.num_original) == (10, 7)
-    assert report.notes == ()
+    assert report.findings == ()
     tracks = check_consistent(tmp_path / "out", scene, 10)
     np.testing.assert_array_equal(tracks.xyz[:7], xyz[[0, 1, 3, 4, 6, 8, 9]])
 
@@ -120,7 +122,7 @@ def test_references_that_nobody_confirms_are_taken_out(scene_dir, tmp_path, mode
     report = write_scene(scene, tmp_path / "out")
     written = check_consistent(tmp_path / "out", scene, 10)
     assert written.lengths.sum() == model.tracks.lengths.sum() - 2
-    assert "references" in " ".join(report.notes)
+    assert "references" in " ".join(texts(report))
 
 
 @pytest.mark.parametrize("lost", ["image", "camera", "unused camera"])
@@ -142,7 +144,7 @@ def test_rigs_and_frames_go_with_a_record_that_is_left_out(scene_dir, tmp_path, 
     if lost == "unused camera":
         scene = scene.replace(intrinsics=())
     report = write_scene(scene, tmp_path / "out")
-    assert "Rigs" in " ".join(report.notes)
+    assert "Rigs" in " ".join(texts(report))
     written = pycolmap.Reconstruction(str(tmp_path / "out/sparse/0"))
     assert len(written.images) == len(scene.images) == len(model.images) - (lost == "image")
     assert f"num_images = {len(scene.images)}" in written.summary()
@@ -165,14 +167,14 @@ def test_rigs_and_frames_are_copied_byte_for_byte(scene_dir, tmp_path, rng):
     for i, changed in enumerate(((), (other,), (moved,))):
         images = (*changed, *scene.images[1:])
         report = write_scene(scene.replace(images=images), tmp_path / f"{i}")
-        assert "Rigs" in " ".join(report.notes)
+        assert "Rigs" in " ".join(texts(report))
         assert not (tmp_path / f"{i}/sparse/0/frames.bin").exists()
         pycolmap.Reconstruction(str(tmp_path / f"{i}/sparse/0"))
     pycolmap.Reconstruction(str(folder)).write_text(str(folder))
     for path in folder.glob("*.bin"):
         path.unlink()
     report = write_scene(load_scene(scene_dir), tmp_path / "text")
-    assert "as text" in " ".join(report.notes)
+    assert "as text" in " ".join(texts(report))
     assert not list((tmp_path / "text/sparse/0").glob("*.txt"))
 
 
@@ -182,7 +184,7 @@ def test_scene_without_images_opens_and_says_what_to_do_with_it(scene_dir, tmp_p
     bare = load_scene(tmp_path / "cloud.ply")
     for name, scene in (("a", load_scene(scene_dir)), ("b", bare)):
         report = write_scene(scene, tmp_path / name)
-        assert "full scene" in " ".join(report.notes)
+        assert "full scene" in " ".join(texts(report))
         assert len(pycolmap.Reconstruction(str(report.path / "sparse/0")).points3D) == 10
     with pytest.raises(OutputError, match="needs images"):
         write_scene(bare, tmp_path / "json", format="transforms")
@@ -204,7 +206,7 @@ def test_image_folders_are_linked(scene_dir, tmp_path, monkeypatch):
     links = {path.name: str(path.readlink()) for path in out.iterdir() if path.is_symlink()}
     assert links == {name: f"../scene/{name}" for name in ("images", "images_4", "masks")}
     shutil.move(out, tmp_path / "elsewhere")
-    assert not any("missing" in w for w in load_scene(tmp_path / "elsewhere").findings)
+    assert not any("missing" in w for w in texts(load_scene(tmp_path / "elsewhere")))
 
 
 @pytest.mark.parametrize("how", ["asked", "no links"])
@@ -223,6 +225,6 @@ def test_images_are_copied_when_asked_or_when_links_fail(scene_dir, tmp_path, mo
         path.chmod(0o755 if path.is_dir() else 0o644)
     shutil.rmtree(scene_dir)
     scene = load_scene(tmp_path / "out")
-    assert not any("missing" in text for text in scene.findings)
+    assert not any("missing" in text for text in texts(scene))
     assert [path.name for path in (tmp_path / "out/images").iterdir()] == ["left"]
     assert not (tmp_path / "out/images").is_symlink()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from splatseed.camera import Camera
-from splatseed.photos.camera_check import check_cameras, format_stray_note, stray_views
+from splatseed.photos.camera_check import check_cameras, stray_findings, stray_views
 from splatseed.photos.view import NO_PIXELS, View
 from splatseed.photos.viewpoint import look_at
 from splatseed.splat.training_frame import NEAR_SHARE, training_frame
@@ -162,7 +162,7 @@ def test_without_points_one_camera_in_ten_can_be_a_stray(rng):
 
 
 def test_one_note_names_all_strays():
-    assert format_stray_note(()) == ()
-    assert "The camera of a is far" in format_stray_note("a")[0]
-    (note,) = format_stray_note("abcdefgh")
-    assert note.endswith("leave them out (a, b, c, d, e and 3 more).")
+    assert stray_findings(()) == ()
+    assert "The camera of a is far" in stray_findings("a")[0].text
+    (note,) = stray_findings("abcdefgh")
+    assert note.text.endswith("leave them out (a, b, c, d, e and 3 more).")

@@ -23,6 +23,8 @@ from splatseed.scene import NO_POINT, Observations
 from splatseed.seeding.budget import points_within
 from splatseed.seeding.photo_methods import frames_of
 
+from ..findings import texts
+
 
 @pytest.fixture
 def picture(tmp_path, rng):
@@ -161,7 +163,7 @@ def test_each_photograph_is_checked_against_its_own_record(size, orientation, sa
     images = sorted(copied.images, key=lambda image: image.name)[:9]
     for image in images[3:5]:
         PilImage.new("RGB", size).save(copied.source.image_dir / image.name, exif=exif)
-    told = " ".join(load_scene(copied.source.root).findings)
+    told = " ".join(texts(load_scene(copied.source.root)))
     if not says:
         assert "not fit" not in told
         assert [view.photograph.shape[1::-1] for view in load_views(copied, images)][3] == size

@@ -22,7 +22,7 @@ from splatseed.io.files import open_file, read_bytes
 from splatseed.io.load import search_depths, with_depths_in
 from splatseed.io.photograph import photograph_bytes
 from splatseed.io.photograph_checks import check_sizes, with_photographs
-from splatseed.photos.camera_check import stray_camera_notes
+from splatseed.photos.camera_check import stray_cameras
 from splatseed.photos.loading import refuse_distortion
 from splatseed.progress import Progress, in_threads, silent
 from splatseed.runtime.fingerprint import fingerprint, fingerprint_all
@@ -160,7 +160,7 @@ def survey(
     if with_depth and (planned.depth or search_depths(scene, depth) is not None):
         maps, scene = str(depth.resolve()), with_depths_in(scene, depth)
     notes = [*scene.findings, *([scene.listed.sentence] if scene.listed else [])]
-    notes += stray_camera_notes(scene)
+    notes += stray_cameras(scene)
     return SceneFacts(
         str(path.resolve()), planned.label, planned.images, maps, scan,
         num_points=len(scene.points), num_images=len(scene.images), pixels=size[0] * size[1],

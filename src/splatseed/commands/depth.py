@@ -19,8 +19,8 @@ from splatseed.commands.options import check_minimum, parse_options, refuse
 from splatseed.console import OUT, print_note, print_pairs, stage_display
 from splatseed.depth.stereo.maps import MIN_SIZE
 from splatseed.depthmap import DepthKind
+from splatseed.findings import without_kinds
 from splatseed.io import dense, load_scene
-from splatseed.io.photograph import warnings_without_lens
 from splatseed.io.photograph_checks import with_photographs
 from splatseed.io.staging import check_output
 from splatseed.requirements import require
@@ -167,7 +167,7 @@ def _summarise_stereo(
         f"pixels confirmed by other views, in {seconds:.1f} s, written to {visible(path)}",
         soft_wrap=True,
     )
-    for warning in warnings_without_lens(scene):
+    for warning in without_kinds(scene.findings, "lens-distortion"):
         print_note(warning)
     if report.empty:
         print_note(f"no other view confirms any pixel of: {name_some(report.empty, NAMES_SHOWN)}")

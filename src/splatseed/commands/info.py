@@ -37,7 +37,7 @@ from splatseed.errors import SplatseedError
 from splatseed.io import load_scene
 from splatseed.io.load import depths_beside, with_depths_in
 from splatseed.io.seeds import was_upsampled
-from splatseed.photos.camera_check import stray_camera_notes
+from splatseed.photos.camera_check import stray_cameras
 from splatseed.progress import Progress
 from splatseed.scene import Scene
 from splatseed.seeding import diagnostics
@@ -111,7 +111,7 @@ def run(arguments: list[str]) -> None:
     if maps is not None and mismatch:
         maps = dataclasses.replace(maps, in_scene_units=False)
     doubt = poses["problem"] if poses else ""
-    problems += [*stray_camera_notes(scene), *([masks.problem] if masks.problem else [])]
+    problems += [*stray_cameras(scene), *([masks.problem] if masks.problem else [])]
     problems += _unfit_maps(scene, alignments or {})
     problems += [each for each in (doubt, faint, mismatch) if each]
     if options.json:

@@ -11,10 +11,10 @@ import tyro
 
 from splatseed.commands.options import parse_options
 from splatseed.console import print_note, print_pairs, stage_display
+from splatseed.findings import without_kinds
 from splatseed.io import load_scene
 from splatseed.io.depth_maps import DepthFiles
 from splatseed.io.load import depths_beside
-from splatseed.io.photograph import warnings_without_lens
 from splatseed.io.seeds import was_upsampled
 from splatseed.io.staging import check_output
 from splatseed.seeding.trainability import is_distorted
@@ -46,7 +46,7 @@ def run(arguments: list[str]) -> None:
         report = undistort(scene, output, overwrite=overwrite, on_progress=clock)
     counts = [("images", f"{report.registered:,}"), ("points", f"{report.num_points:,}")]
     print_pairs("splatseed undistort", [*counts, ("output", str(output))])
-    for warning in warnings_without_lens(scene):
+    for warning in without_kinds(scene.findings, "lens-distortion"):
         print_note(warning)
     maps = scene.depths or depths_beside(scene)
     if isinstance(maps, DepthFiles) and maps:

@@ -3,7 +3,7 @@
 Notation: images give C *candidates* in all. A candidate is *sound* (``tier`` 0) if enough views
 confirm it, no view sees through it, and no depth discontinuity is near. Promise: ``lift`` returns
 exactly the requested number, or raises one error with the number that is possible. Sound candidates
-come first, then those that too few views confirm, then those near discontinuities; a note counts
+come first, then those that too few views confirm, then those near discontinuities; findings count
 the latter two. Points that a view sees through are used only if the settings allow it. Within a
 tier, points are spread evenly in space, or images give equal numbers as far as they can. Results do
 not depend on threads.
@@ -26,6 +26,7 @@ from splatseed.depth.thinning import spread_evenly
 from splatseed.depth.views import DepthView, read_view
 from splatseed.depthmap import in_scene_units
 from splatseed.errors import PointCloudError, SceneFormatError, SceneNotFoundError
+from splatseed.findings import Finding
 from splatseed.io.photograph import photograph_folder
 from splatseed.io.photograph_checks import with_photographs
 from splatseed.photos.sizes import at_file_size, default_factor
@@ -69,13 +70,13 @@ def lift(
     settings: DepthSettings,
     rng: np.random.Generator,
     progress: Progress = silent,
-) -> tuple[Float32[np.ndarray, "M 3"], UInt8[np.ndarray, "M 3"], tuple[str, ...]]:
+) -> tuple[Float32[np.ndarray, "M 3"], UInt8[np.ndarray, "M 3"], tuple[Finding, ...]]:
     """Lift ``num`` pixels of a scene's images into its world.
 
     Each image and its map are read once, and again only if too few candidates are sound.
 
     Returns:
-        World positions and colours, image after image, and notes for the user.
+        World positions and colours, image after image, and findings for the user.
 
     Raises:
         SceneNotFoundError: There are no maps or no photographs, or a file is gone.
@@ -85,13 +86,13 @@ def lift(
     """
     settings = _settings_without_points(scene, settings)
     scene, center = _centered(scene)
-    visibility, notes = find_visibility(scene), list[str]()
-    images = _images_with_maps(scene, settings, notes)
+    visibility, findings = find_visibility(scene), list[Finding]()
+    images = _images_with_maps(scene, settings, findings)
     factor = OVERSAMPLING.plain
     if settings.compares_views or settings.spread:
         factor = OVERSAMPLING.compared
     views = _read_views(scene, images, visibility, factor * num, settings, rng, progress)
-    images, views = _leave_out(images, views, settings, notes)
+    images, views = _leave_out(images, views, settings, findings)
     candidates = _gather(views, settings, progress)
     if not settings.align and settings.min_agreeing:  # nothing else checks unit and poses
         _check_agreement(candidates, len(views))
@@ -111,15 +112,17 @@ def lift(
     progress("choose points", 1.0)
     tier = candidates.tier[chosen]
     if unconfirmed := np.count_nonzero(tier == UNCONFIRMED):
-        notes.append(
+        text = (
             f"{unconfirmed:,} of {num:,} new points are confirmed by fewer than "
             f"{settings.min_agreeing} other views: no others were left."
         )
+        findings.append(Finding("unconfirmed-points", text))
     if edge := np.count_nonzero(tier == NEAR_EDGE):
-        notes.append(f"{edge:,} of {num:,} new points lie near depth discontinuities.")
+        text = f"{edge:,} of {num:,} new points lie near depth discontinuities."
+        findings.append(Finding("points-near-edges", text))
     xyz = candidates.xyz[chosen]
     np.add(xyz, center, out=xyz, casting="same_kind")  # in float64, then rounded
-    return xyz, candidates.rgb[chosen], tuple(notes)
+    return xyz, candidates.rgb[chosen], tuple(findings)
 
 
 def suggested_number(scene: Scene, settings: DepthSettings) -> int:
@@ -161,8 +164,10 @@ def _settings_without_points(scene: Scene, settings: DepthSettings) -> DepthSett
     return replace(settings, align=False)
 
 
-def _images_with_maps(scene: Scene, settings: DepthSettings, notes: list[str]) -> list[Image]:
-    """Images with a depth map and a photograph, without test images; adds a note on the others.
+def _images_with_maps(
+    scene: Scene, settings: DepthSettings, findings: list[Finding]
+) -> list[Image]:
+    """Images with a depth map and a photograph, without test images; reports the others.
 
     Raises:
         SceneNotFoundError: There are none.
@@ -179,7 +184,9 @@ def _images_with_maps(scene: Scene, settings: DepthSettings, notes: list[str]) -
         )
     if lacking := sum(image.name not in depths for image in used):
         verbs = agreeing(lacking, "has no depth map and gives", "have no depth map and give")
-        notes.append(f"{lacking} of {len(used)} images {verbs} no points.")
+        text = f"{lacking} of {len(used)} images {verbs} no points."
+        names = tuple(image.name for image in used if image.name not in depths)
+        findings.append(Finding("missing-depth-maps", text, subjects=names))
     photograph_folder(scene)  # raises if there is none
     readable = {image.name for image in with_photographs(scene).images}
     return [image for image in images if image.name in readable]
@@ -229,9 +236,9 @@ def _centered(scene: Scene) -> tuple[Scene, Float64[np.ndarray, " 3"]]:
 
 
 def _leave_out(
-    images: list[Image], views: list[DepthView], settings: DepthSettings, notes: list[str]
+    images: list[Image], views: list[DepthView], settings: DepthSettings, findings: list[Finding]
 ) -> tuple[list[Image], list[DepthView]]:
-    """Keep the images and views whose maps are aligned; adds a note on the others."""
+    """Keep the images and views whose maps are aligned; reports the others."""
     alignments = {image.name: view.alignment for image, view in zip(images, views, strict=True)}
     if settings.align:
         alignments = reject_other_units(alignments, settings.min_points)
@@ -248,7 +255,8 @@ def _leave_out(
     if reasons:
         named = "; ".join(f"{name}: {reason}" for name, reason in list(reasons.items())[:MAX_NAMED])
         more = ", ..." if len(reasons) > MAX_NAMED else ""
-        notes.append(f"{len(reasons)} of {len(images)} depth maps are left out ({named}{more}).")
+        text = f"{len(reasons)} of {len(images)} depth maps are left out ({named}{more})."
+        findings.append(Finding("unfit-depth-maps", text, subjects=tuple(reasons)))
     kept = [i for i, image in enumerate(images) if image.name not in reasons]
     return [images[i] for i in kept], [views[i] for i in kept]
 

@@ -19,6 +19,7 @@ from jaxtyping import UInt16
 from PIL import Image as PilImage
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.findings import Finding
 from splatseed.io.files import open_file, read_bytes, translate_errors
 from splatseed.io.picture import open_picture
 from splatseed.text import counted
@@ -89,8 +90,8 @@ def opaque_value(alpha: UInt16[np.ndarray, "H W"]) -> int:
     return white_of(int(alpha.max(initial=0)))
 
 
-def find_white(paths: Sequence[Path]) -> tuple[int, list[str]]:
-    """Find the white of a capture, and note if its photographs use fewer than 16 bits.
+def find_white(paths: Sequence[Path]) -> tuple[int, list[Finding]]:
+    """Find the white of a capture, and report if its photographs use fewer than 16 bits.
 
     8-bit and unreadable files are ignored.
     """
@@ -109,7 +110,8 @@ def find_white(paths: Sequence[Path]) -> tuple[int, list[str]]:
     bits = (white + 1).bit_length() - 1
     subject = f"{counted(len(wide), 'photograph')} of 16 bits per channel only use {bits}"
     values = f"(values up to {largest:,})"
-    return white, [f"{subject} {values}: all are scaled alike, with {white:,} as white."]
+    text = f"{subject} {values}: all are scaled alike, with {white:,} as white."
+    return white, [Finding("few-bits", text, "info")]
 
 
 def _is_16_bit_file(path: Path) -> bool:

@@ -14,6 +14,7 @@ from jaxtyping import Float64
 
 from splatseed.camera import CAMERA_MODELS, Intrinsics, quat_from_rotation, rotation_from_quat
 from splatseed.errors import SceneFormatError
+from splatseed.findings import Finding
 from splatseed.io.files import COPY_AGAIN
 from splatseed.text import agreeing, name_some
 
@@ -94,14 +95,15 @@ def check_enough(unusable: Mapping[str, NotFiniteError], used: int) -> None:
         raise next(iter(unusable.values()))
 
 
-def unusable_warning(unusable: Mapping[str, NotFiniteError], used: int) -> list[str]:
-    """Warn of images that are left out, if any."""
+def unusable_findings(unusable: Mapping[str, NotFiniteError], used: int) -> list[Finding]:
+    """Report images that are left out, if any."""
     if not unusable:
         return []
     count, whose = len(unusable), agreeing(len(unusable), "its", "their")
     which = f"{count} of {count + used} images {agreeing(count, 'is', 'are')} left out"
     why = f"{whose} pose or camera is not finite, or zero"
-    return [f"{which} ({name_some([*unusable], 3)}): {why}."]
+    text = f"{which} ({name_some([*unusable], 3)}): {why}."
+    return [Finding("unusable-images", text, subjects=tuple(unusable))]
 
 
 def require(holds: bool, expected: str, where: str, found: object) -> None:

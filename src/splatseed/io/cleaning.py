@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Int64
 
+from splatseed.findings import Finding
 from splatseed.io.colmap import check_tracks
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import NO_POINT, Image, LeftOut, Observations, Scene, Tracks
@@ -25,7 +26,7 @@ _FEW = 0.01  # largest share of outliers
 def clean_scene(scene: Scene) -> Scene:
     """Keep distinct finite points, with their tracks and observations.
 
-    ``left_out`` counts the other points, and ``warnings`` report them.
+    ``left_out`` counts the other points, and ``findings`` report them.
     """
     points, known = scene.points, scene.left_out
     keep = points.distinct
@@ -33,17 +34,19 @@ def clean_scene(scene: Scene) -> Scene:
         return scene
     num_finite = int(np.count_nonzero(points.finite))
     non_finite, duplicates = len(points) - num_finite, num_finite - int(np.count_nonzero(keep))
-    notes = []
+    findings = []
     if non_finite:
         what, were = ("point is", "was") if non_finite == 1 else ("points are", "were")
         which = "beyond 1e15" if np.isfinite(points.xyz).all() else "not finite"
-        notes.append(f"{non_finite:,} {what} {which} and {were} left out.")
+        text = f"{non_finite:,} {what} {which} and {were} left out."
+        findings.append(Finding("non-finite-points", text))
     if duplicates:
         what, were = ("point repeats", "was") if duplicates == 1 else ("points repeat", "were")
-        notes.append(f"{duplicates:,} {what} the position of another and {were} left out.")
+        text = f"{duplicates:,} {what} the position of another and {were} left out."
+        findings.append(Finding("duplicate-points", text))
     return replace(
         without_points(scene, keep),
-        findings=(*scene.findings, *notes),
+        findings=(*scene.findings, *findings),
         left_out=LeftOut(known.non_finite + non_finite, known.duplicates + duplicates),
     )
 
@@ -131,9 +134,8 @@ def _with_point_ids(
     )
 
 
-def cloud_warnings(points: PointCloud) -> tuple[str, ...]:
-    """Warn of points far outside of the cloud."""
-    warnings = []
+def outlier_findings(points: PointCloud) -> tuple[Finding, ...]:
+    """Report points far outside of the cloud."""
     xyz = points.xyz[points.finite]
     if len(xyz) < 2:
         return ()
@@ -142,9 +144,10 @@ def cloud_warnings(points: PointCloud) -> tuple[str, ...]:
     far = distance > _FAR_OUT * float((high - low).max())
     if far.any() and far.mean() <= _FEW and (high > low).any():
         what, them = ("point lies", "it") if far.sum() == 1 else ("points lie", "them")
-        warnings.append(
+        text = (
             f"{far.sum():,} {what} up to {distance.max():.3g} from the middle of the others, more"
             f" than {_FAR_OUT:,.0f} times their extent: probably a reconstruction error; remove"
             f" {them}."
         )
-    return tuple(warnings)
+        return (Finding("outlying-points", text),)
+    return ()

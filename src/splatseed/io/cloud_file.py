@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Shaped, UInt8
 
 from splatseed.errors import SceneFormatError
+from splatseed.findings import Finding
 from splatseed.io.files import COPY_AGAIN, open_file
 
 CHUNK = 1 << 20
@@ -84,11 +85,11 @@ class CloudFile(ABC):
         path: The file.
         count: Rows by the header; None if unknown. ``chunks`` may yield fewer points, since rows
             marked invalid are skipped.
-        warnings: Problems of the file, one sentence each.
+        findings: Problems of the file.
         used: Names of the columns that are read: positions and colours.
     """
 
-    warnings: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
     def __init__(self, path: Path, names: Iterable[str], count: int | None = None) -> None:
         self.path, self.count = path, count

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from splatseed.camera import Intrinsics
+from splatseed.findings import Finding
 from splatseed.io import colmap
 from splatseed.io.cleaning import renumber
 from splatseed.io.colmap_model import read_model_cameras
@@ -22,8 +23,8 @@ from splatseed.io.split import MODEL_LISTS, ROOT_LISTS
 from splatseed.io.undistorted import LENSES
 from splatseed.scene import Scene
 
-Written = tuple[list[str], dict[str, Path], Float64[np.ndarray, " 3"]]
-"""What a layout's writer returns: notes, image folders, and the offset of its space to the
+Written = tuple[list[Finding], dict[str, Path], Float64[np.ndarray, " 3"]]
+"""What a layout's writer returns: findings, image folders, and the offset of its space to the
 world."""
 _ROOT_EXTRAS = ("poses_bounds.npy", "ext_metadata.json", LENSES)
 """Gsplat's examples read the first two if present."""
@@ -47,25 +48,27 @@ def write_colmap_layout(scene: Scene, folder: Path) -> Written:
     colmap.write_points3d(model_dir / "points3D.bin", scene.points, tracks)
     write_ply(model_dir / "points3D.ply", scene.points)
     write_seeds(folder, scene.points)
-    notes: list[str] = []
+    findings = list[Finding]()
     source = scene.source
     if source is not None and source.model_dir is not None:
-        rigs, notes = _rigs(scene, cameras, source.model_dir)
+        rigs, findings = _rigs(scene, cameras, source.model_dir)
         copy_files(source.root, _ROOT_EXTRAS, folder)
         copy_files(source.model_dir, (*_MODEL_EXTRAS, *rigs), model_dir)
     if num_broken:
-        notes.append(
+        text = (
             f"{num_broken:,} references between features and points were removed: the other side"
             " does not have them."
         )
+        findings.append(Finding("broken-references", text))
     if not scene.images:
-        notes.append(
+        text = (
             "The scene has no images, so it cannot be trained as it is: copy points3D.bin and"
             " points3D.ply from sparse/0 into sparse/0 of a copy of the full scene, and seeds.npz,"
             " if there is one, into that copy."
         )
+        findings.append(Finding("points-alone", text))
     write_split(scene, folder)
-    return notes, image_folders(scene), scene.offset
+    return findings, image_folders(scene), scene.offset
 
 
 def write_split(scene: Scene, folder: Path) -> None:
@@ -82,8 +85,10 @@ def write_split(scene: Scene, folder: Path) -> None:
         (folder / part).write_text(text, "utf-8")
 
 
-def _rigs(scene: Scene, cameras: Container[int], model_dir: Path) -> tuple[list[str], list[str]]:
-    """Return the files of rigs and frames that fit the output, or a note why none does.
+def _rigs(
+    scene: Scene, cameras: Container[int], model_dir: Path
+) -> tuple[list[str], list[Finding]]:
+    """Return the files of rigs and frames that fit the output, or a finding why none does.
 
     ``cameras`` are the ids of the output's records.
     """
@@ -110,7 +115,7 @@ def _rigs(scene: Scene, cameras: Container[int], model_dir: Path) -> tuple[list[
         why = "the scene no longer has the same cameras, images and poses"
     elif not any((model_dir / name).is_file() for name in ("rigs.txt", "frames.txt")):
         return [], []
-    return [], [f"Rigs and frames were left out: {why}."]
+    return [], [Finding("rigs-left-out", f"Rigs and frames were left out: {why}.")]
 
 
 def without_zero_distortion(camera: Intrinsics) -> Intrinsics:

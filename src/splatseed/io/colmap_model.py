@@ -16,14 +16,15 @@ from jaxtyping import Float64
 
 from splatseed.camera import Intrinsics
 from splatseed.errors import SceneNotFoundError, SplatseedError
-from splatseed.io.camera_records import Unusable, check_enough, unusable_images, unusable_warning
+from splatseed.findings import Finding
+from splatseed.io.camera_records import Unusable, check_enough, unusable_findings, unusable_images
 from splatseed.io.colmap import MIN_IMAGE_BYTES, read_cameras, read_images, read_points3d
 from splatseed.io.files import StrPath, numbered_lines, open_file
 from splatseed.io.origin import recentered
-from splatseed.io.photograph import lens_warnings
-from splatseed.io.photograph_checks import image_warnings
+from splatseed.io.photograph import lens_findings
+from splatseed.io.photograph_checks import photograph_findings
 from splatseed.io.ply import read_ply_float64
-from splatseed.io.point_files import differing_points_notes, first_with_points
+from splatseed.io.point_files import differing_points, first_with_points
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene, SceneSource, Tracks
 from splatseed.text import counted
@@ -103,7 +104,7 @@ def read_model(model_dir: Path) -> Scene:
     other = next(each for each in ranked_models(model_dir.parent) if each.name != model_dir.name)
     listed = f"{model_dir.parent} has {len(models)} models, {', '.join(shown)}"
     note = f"{listed}: {model_dir.name} is read. To read another, pass its path, such as {other}."
-    return scene.replace(findings=(*scene.findings, note))
+    return scene.replace(findings=(*scene.findings, Finding("several-models", note, "info")))
 
 
 def find_model(*folders: Path) -> Path | None:
@@ -124,16 +125,17 @@ def _point_files(model_dir: Path) -> list[Path]:
     return [path for path in paths if path.is_file()]
 
 
-def _other_points(model_dir: Path, root: Path, read: Path, points: PointCloud) -> list[str]:
-    """Warn of other point files, from which other trainers may start."""
-    files, notes = _point_files(model_dir), list[str]()
+def _other_points(model_dir: Path, root: Path, read: Path, points: PointCloud) -> list[Finding]:
+    """Report other point files, from which other trainers may start."""
+    files, findings = _point_files(model_dir), list[Finding]()
     for i, path in enumerate(files):
         before = " and ".join(each.name for each in files[:i])
-        notes += differing_points_notes(read, points.xyz, path, f"move {before} out of {model_dir}")
+        use = f"move {before} out of {model_dir}"
+        findings += differing_points(read, points.xyz, path, use)
     place = f"copy it to {model_dir / 'points3D.ply'}"
     if first := [each.name for each in files if each.suffix != ".ply"]:
         place += f" and move {' and '.join(first)} out of that folder"
-    return notes + differing_points_notes(read, points.xyz, root / "init.ply", place)
+    return findings + differing_points(read, points.xyz, root / "init.ply", place)
 
 
 def scene_root(model_dir: Path) -> Path:
@@ -149,28 +151,30 @@ def scene_root(model_dir: Path) -> Path:
 
 
 def read_colmap_scene(model_dir: StrPath) -> Scene:
-    """Read a model as a scene, with warnings for the user."""
+    """Read a model as a scene, with findings for the user."""
     model_dir = Path(model_dir)
     root = scene_root(model_dir)
     intrinsics, images, left_out = read_model_cameras(model_dir)
     unusable = unusable_images(left_out)
     points, exact, tracks, points_path = read_model_points(model_dir)
     image_dir = _image_dir(root, images)
-    warnings = [*image_warnings(images, image_dir, root), *lens_warnings(images)]
-    warnings += unusable_warning(unusable, len(images))
-    warnings += _other_points(model_dir, root, points_path, points)
+    findings = [*photograph_findings(images, image_dir, root), *lens_findings(images)]
+    findings += unusable_findings(unusable, len(images))
+    findings += _other_points(model_dir, root, points_path, points)
     if (root / "transforms.json").is_file():
-        warnings.append(f"{root / 'transforms.json'} exists too; pass its path to read it instead.")
+        text = f"{root / 'transforms.json'} exists too; pass its path to read it instead."
+        findings.append(Finding("several-scenes", text, "info"))
     if not images and (tracks is not None or intrinsics or image_dir is not None):
         tracks, path = None, model_file(model_dir, "images")  # tracks name images
         why = f"{path} lists no images" if path else f"{model_dir} has no images.bin or images.txt"
-        warnings.append(
+        text = (
             f"{why}, so no photograph has a pose: copy the complete model, or make one with"
             " splatseed sfm IMAGES -o SCENE. Points can be interpolated, but not trained."
         )
+        findings.append(Finding("missing-poses", text))
     source = SceneSource("colmap", root, points_path, model_dir, image_dir)
     scene = Scene(
-        points, images, intrinsics, tracks, source, tuple(warnings), absent=tuple(unusable)
+        points, images, intrinsics, tracks, source, tuple(findings), absent=tuple(unusable)
     )
     return recentered(scene, exact)
 

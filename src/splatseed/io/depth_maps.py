@@ -25,6 +25,7 @@ from jaxtyping import Float32, UInt8
 from splatseed.camera import Intrinsics
 from splatseed.depthmap import DepthKind, DepthMap
 from splatseed.errors import OutputError, SceneFormatError, SceneNotFoundError
+from splatseed.findings import Finding
 from splatseed.io.depth_files import KINDS, SUFFIXES, check_stored, read_confidence, read_stored
 from splatseed.io.files import COPY_AGAIN, read_json, translate_errors
 from splatseed.io.staging import MANIFEST, output_folder, write_json
@@ -36,6 +37,9 @@ CAMERA_FILE = "cam_params.json"
 """Camera and depth scale of an RGB-D capture, in its folder or the parent."""
 DESCRIPTION = "depths.json"
 """The file that describes the maps of a folder."""
+
+DISTORTED_MAPS, WITHOUT_CONFIDENCE = "distorted-depth-maps", "depth-maps-without-confidence"
+"""Kinds of findings about maps."""
 
 _INTEGER_SCALE = 1000.0
 """Default scale of integer maps: millimetres in a scene in metres."""
@@ -181,18 +185,20 @@ def find_confidences(paths: Mapping[str, Path]) -> dict[str, Path]:
     return found
 
 
-def map_warnings(maps: object) -> list[str]:
-    """Warn of maps that are undistorted, and of those without a confidence among others."""
+def map_findings(maps: object) -> list[Finding]:
+    """Report maps that are undistorted, and of those without a confidence among others."""
     if not isinstance(maps, DepthFiles):
         return []
-    notes = []
+    findings = []
     if maps.lens is not None:
-        what = "Depth maps are those of the photographs before undistortion"
-        notes.append(f"{what}, and are undistorted on reading.")
-    return notes + _confidence_warnings(maps)
+        text = (
+            "Depth maps are those of the photographs before undistortion, and are undistorted on "
+        )
+        findings.append(Finding(DISTORTED_MAPS, f"{text}reading.", "info"))
+    return findings + _without_confidence(maps)
 
 
-def _confidence_warnings(maps: DepthFiles) -> list[str]:
+def _without_confidence(maps: DepthFiles) -> list[Finding]:
     if not maps.confidences:
         return []
     lacking = [name for name in maps if name not in maps.confidences]
@@ -200,7 +206,8 @@ def _confidence_warnings(maps: DepthFiles) -> list[str]:
         return []
     have = agreeing(len(lacking), "has no confidence and is", "have no confidence and are")
     which = name_some(lacking, 3)
-    return [f"{len(lacking):,} of {counted(len(maps), 'depth map')} {have} used whole: {which}."]
+    text = f"{len(lacking):,} of {counted(len(maps), 'depth map')} {have} used whole: {which}."
+    return [Finding(WITHOUT_CONFIDENCE, text, subjects=tuple(lacking))]
 
 
 def _match(scene: Scene, folder: Path) -> dict[str, Path]:

@@ -19,6 +19,7 @@ from urllib.parse import unquote
 
 from splatseed.depthmap import DepthKind
 from splatseed.errors import SceneFormatError
+from splatseed.findings import Finding
 from splatseed.io.depth_files import SUFFIXES as DEPTH_SUFFIXES
 from splatseed.io.depth_maps import DepthFiles, find_confidences
 from splatseed.io.files import read_json
@@ -151,26 +152,31 @@ def any_photograph(path: Path) -> bool:
     return any(each.found for each in _listed(path, read_json(path, fix=FIX)))
 
 
-def find_frames(path: Path, meta: Any) -> tuple[list[Frame], list[str]]:
-    """Return the usable frames with their files, and warnings about the others."""
+def find_frames(path: Path, meta: Any) -> tuple[list[Frame], list[Finding]]:
+    """Return the usable frames with their files, and findings about the others."""
     listed = _listed(path, meta)
     folders = [each.found.path.parent for each in listed if each.found]
     folder = Counter(folders).most_common(1)[0][0] if folders else None
-    notes = _moved(path, listed)
+    findings = _moved(path, listed)
     if bad := [each for each in listed if each.fields.get("is_bad") is True]:
-        notes.append(f"{counted(len(bad), 'frame')} marked is_bad in {path.name} are left out.")
+        text = f"{counted(len(bad), 'frame')} marked is_bad in {path.name} are left out."
+        names = tuple(each.name for each in bad)
+        findings.append(Finding("bad-frames", text, subjects=names))
         listed = [each for each in listed if each not in bad]
     tests = [each for each in listed if each.is_test]
     if tests and not any(each.found for each in tests):
         listed = [each for each in listed if not each.is_test]
         what = f"{path.name}: {counted(len(tests), 'test frame')} have no photographs and are"
-        notes.append(f"{what} left out, so some training images become test views.")
+        text = f"{what} left out, so some training images become test views."
+        findings.append(Finding("missing-test-views", text))
     sizes = [{**meta, **each.fields} for each in listed]
     sized = [size.get("w") is not None and size.get("h") is not None for size in sizes]
     used = [e for e, s in zip(listed, sized, strict=True) if e.found or s or folder is None]
     if lost := [each for each in listed if each not in used]:
         what = f"{len(lost)} of {counted(len(listed), 'frame')} in {path.name} have no photograph"
-        notes.append(f"{what} and no size, and are left out, such as {lost[0].name}.")
+        text = f"{what} and no size, and are left out, such as {lost[0].name}."
+        names = tuple(each.name for each in lost)
+        findings.append(Finding("missing-photographs", text, subjects=names))
     if not used:
         raise SceneFormatError(f"{path} to have usable frames", found="none", fix=FIX)
     files = FrameFiles(path)
@@ -178,7 +184,7 @@ def find_frames(path: Path, meta: Any) -> tuple[list[Frame], list[str]]:
     for each in used:
         file = each.found.path if each.found else files.expected(each.name, folder)
         frames.append(Frame(f"{path}, {each.where}", file, each.fields, each.is_test))
-    return frames, notes
+    return frames, findings
 
 
 def _listed(path: Path, meta: Any) -> list[_Listed]:
@@ -201,20 +207,21 @@ def _listed(path: Path, meta: Any) -> list[_Listed]:
     return [each._replace(found=photographs.get(each.name)) for each in listed]
 
 
-def _moved(path: Path, listed: Sequence[_Listed]) -> list[str]:
-    """Warn of photographs found in another place than named."""
+def _moved(path: Path, listed: Sequence[_Listed]) -> list[Finding]:
+    """Report photographs found in another place than named."""
     moved = {each.name: each.found.path for each in listed if each.found and each.found.relocated}
     if not moved:
         return []
     name, file = next(iter(moved.items()))
     what = f"{counted(len(moved), 'frame')} of {path.name} name missing photographs"
-    return [f"{what}; files of the same name are read instead, such as {file} for {name}."]
+    text = f"{what}; files of the same name are read instead, such as {file} for {name}."
+    return [Finding("moved-photographs", text, subjects=tuple(moved))]
 
 
 def named_masks(
     files: FrameFiles, frames: Mapping[str, Mapping[str, Any]]
-) -> tuple[dict[str, Path], list[str]]:
-    """Find the masks that frames name, by image, and warn of missing ones."""
+) -> tuple[dict[str, Path], list[Finding]]:
+    """Find the masks that frames name, by image, and report missing ones."""
     given = {name: frame.get("mask_path") for name, frame in frames.items()}
     named = {name: mask for name, mask in given.items() if isinstance(mask, str)}
     found = files.masks(named.values())
@@ -223,13 +230,14 @@ def named_masks(
     if not missing:
         return masks, []
     what = f"{counted(len(missing), 'mask')} named in {files.path.name} cannot be found"
-    return masks, [f"{what}, such as {missing[0]}."]
+    text = f"{what}, such as {missing[0]}."
+    return masks, [Finding("missing-masks", text, subjects=tuple(missing))]
 
 
 def named_depths(
     files: FrameFiles, frames: Mapping[str, Mapping[str, Any]], meta: Mapping[str, Any]
-) -> tuple[DepthFiles | None, list[str]]:
-    """Find the depth maps that frames name, with their unit, and warn of missing ones.
+) -> tuple[DepthFiles | None, list[Finding]]:
+    """Find the depth maps that frames name, with their unit, and report missing ones.
 
     Integers in ``depth_path`` (instant-ngp, NeRFCapture) are multiplied by
     ``integer_depth_scale``, of the file or of all its frames; those in ``depth_file_path``
@@ -244,16 +252,17 @@ def named_depths(
         for name, depth in named.items():
             if depth in found and found[depth].path.suffix.lower() in DEPTH_SUFFIXES:
                 paths[name], key_used = found[depth].path, key_used or key
-    notes = []
+    findings = []
     if lost := [depth for name, depth in missing.items() if name not in paths]:
         what = f"{counted(len(lost), 'depth map')} named in {files.path.name} cannot be found"
-        notes = [f"{what}, such as {lost[0]}."]
+        text = f"{what}, such as {lost[0]}."
+        findings = [Finding("missing-depth-maps", text, subjects=tuple(lost))]
     if not paths:
-        return None, notes
+        return None, findings
     unit = _depth_unit(files, key_used, paths, [{**meta, **frames[name]} for name in paths])
     scale = None if unit is None else 1 / unit
     kind: DepthKind | None = None if unit is None else "z"
-    return DepthFiles(paths, kind, scale, confidences=find_confidences(paths)), notes
+    return DepthFiles(paths, kind, scale, confidences=find_confidences(paths)), findings
 
 
 def _depth_unit(

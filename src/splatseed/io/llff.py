@@ -23,7 +23,7 @@ from splatseed.io.files import StrPath, is_hidden, open_file, read_npy, translat
 from splatseed.io.frame_files import SUFFIXES
 from splatseed.io.mask_files import masks_among
 from splatseed.io.origin import recentered
-from splatseed.io.photograph_checks import image_warnings, photograph_size
+from splatseed.io.photograph_checks import photograph_findings, photograph_size
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene, SceneSource
 from splatseed.text import counted
@@ -60,7 +60,7 @@ def read_llff(root: StrPath) -> Scene:
         tuple(images),
         tuple(cameras.values()),
         source=SceneSource("llff", root, path, image_dir=folder),
-        findings=tuple(image_warnings(images, folder, root)),
+        findings=tuple(photograph_findings(images, folder, root)),
     )
     return recentered(scene)
 

@@ -1,6 +1,6 @@
 """Load a scene of any format, and find depth maps for its images.
 
-Recoverable problems become ``Scene.warnings``; others raise one error.
+Recoverable problems become ``Scene.findings``; others raise one error.
 """
 
 from __future__ import annotations
@@ -13,11 +13,18 @@ from pathlib import Path
 
 from splatseed.depthmap import DepthKind
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError, SplatseedError
+from splatseed.findings import Finding, without_kinds
 from splatseed.io.bit_depth import WHITE, find_white
-from splatseed.io.cleaning import clean_scene, cloud_warnings
+from splatseed.io.cleaning import clean_scene, outlier_findings
 from splatseed.io.colmap_model import find_model, nested_model, read_model, scene_model, scene_root
 from splatseed.io.depth_files import KINDS, SUFFIXES
-from splatseed.io.depth_maps import DepthFiles, map_warnings, match_by_name
+from splatseed.io.depth_maps import (
+    DISTORTED_MAPS,
+    WITHOUT_CONFIDENCE,
+    DepthFiles,
+    map_findings,
+    match_by_name,
+)
 from splatseed.io.files import StrPath, is_video, special_kind
 from splatseed.io.llff import is_llff, read_llff
 from splatseed.io.nerfstudio import is_blender, read_blender, read_transforms_scene
@@ -103,12 +110,12 @@ def load_scene(path: StrPath, *, require_points: bool = True) -> Scene:
     # seeds.npz and the manifest refer to the points as stored: restore before cleaning.
     scene = clean_scene(with_listed_split(restore_absent(recall_seeds(scene))))
     scene = with_recorded_masks(scene)
-    folder, white, notes = scene.source.image_dir if scene.source else None, WHITE, list[str]()
+    folder, white, found = scene.source.image_dir if scene.source else None, WHITE, list[Finding]()
     if folder is not None:
-        white, notes = find_white([folder / image.name for image in scene.images])
-    notes += map_warnings(scene.depths)
-    warnings = (*scene.findings, *notes, *cloud_warnings(scene.points))
-    return scene.replace(findings=warnings, white=white)
+        white, found = find_white([folder / image.name for image in scene.images])
+    found += map_findings(scene.depths)
+    findings = (*scene.findings, *found, *outlier_findings(scene.points))
+    return scene.replace(findings=findings, white=white)
 
 
 def load_originals(path: StrPath, *, require_points: bool = True) -> Scene:
@@ -129,8 +136,9 @@ def load_originals(path: StrPath, *, require_points: bool = True) -> Scene:
             fix=_TRIANGULATE if scene.images else "Choose a scene or a PLY with other points.",
         )
     used = f"Only the {len(points):,} original points are used" if len(points) else "No originals"
-    note = f"{used}: the {added:,} points that splatseed added before are dropped."
-    return scene.replace(points=points, findings=(*scene.findings, note))
+    text = f"{used}: the {added:,} points that splatseed added before are dropped."
+    findings = (*scene.findings, Finding("added-points-dropped", text))
+    return scene.replace(points=points, findings=findings)
 
 
 def check_exists(path: Path) -> None:
@@ -316,10 +324,9 @@ def with_depths_in(
 
 
 def _with_maps(scene: Scene, maps: DepthFiles | None) -> Scene:
-    """Attach maps, with warnings about them in place of those about the scene's own."""
-    replaced = map_warnings(scene.depths)
-    warnings = [each for each in scene.findings if each not in replaced]
-    return scene.replace(depths=maps, findings=(*warnings, *map_warnings(maps)))
+    """Attach maps, with findings about them in place of those about the scene's own."""
+    kept = without_kinds(scene.findings, DISTORTED_MAPS, WITHOUT_CONFIDENCE)
+    return scene.replace(depths=maps, findings=(*kept, *map_findings(maps)))
 
 
 def _same_maps(maps: DepthFiles, others: DepthFiles) -> bool:

@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import Collection
 from pathlib import Path, PurePosixPath
 
+from splatseed.findings import Finding
 from splatseed.io.files import files_below
 from splatseed.text import agreeing, counted
 
@@ -27,41 +28,43 @@ _INVERTED = "dynamic_mask_"
 
 def find_own_masks(
     names: Collection[str], image_dir: Path, root: Path
-) -> tuple[dict[str, Path], list[str]]:
-    """Find the masks near a folder of photographs, by photograph, and notes for the user."""
+) -> tuple[dict[str, Path], list[Finding]]:
+    """Find the masks near a folder of photographs, by photograph, with findings for the user."""
     alone = image_dir.absolute() != root.absolute()
     parents = [image_dir.parent, root, image_dir] if alone else [image_dir]
     folders = list(dict.fromkeys(each for parent in parents for each in _folders(parent)))
     known = [each for name in _FOLDERS for each in folders if each.name.casefold() == name]
-    unused = list[str]()
+    unused = list[Finding]()
     for folder in known:
-        files, notes = find_masks(names, folder, image_dir)
+        files, findings = find_masks(names, folder, image_dir)
         if files:
-            return files, notes
-        unused = unused or notes
+            return files, findings
+        unused = unused or findings
     if files := _beside(names, image_dir):
         return files, unused
     for folder in folders:
         if folder not in known and (found := find_masks(names, folder, image_dir)[0]):
-            unused.append(
+            text = (
                 f"{folder} has pictures named like {counted(len(found), 'photograph')}, which are"
                 f" not used: pass `masks={str(folder)!r}` if 0 means masked, or"
                 f" `masks={f'inverted:{folder}'!r}` if 0 means valid."
             )
+            unused.append(Finding("unused-masks", text))
     marked = {PurePosixPath(_dynamic(name)).name.casefold() for name in names}
     if dynamic := [path for path in _listing(names, image_dir) if path.stem.casefold() in marked]:
-        unused.append(
+        text = (
             f"{counted(len(dynamic), 'mask')} of instant-ngp beside the photographs, such as"
             f" {dynamic[0].name}, are not used: pass `masks={f'inverted:{image_dir}'!r}` to use"
             " them."
         )
+        unused.append(Finding("unused-masks", text))
     return {}, unused
 
 
 def find_masks(
     names: Collection[str], folder: Path, image_dir: Path | None = None, *, named: bool = False
-) -> tuple[dict[str, Path], list[str]]:
-    """Find the masks in a folder by image name, and note masks and images that have no match.
+) -> tuple[dict[str, Path], list[Finding]]:
+    """Find the masks in a folder by image name, and report masks and images that have no match.
 
     ``named``: the user chose the folder, so masks of instant-ngp are included.
     """
@@ -85,14 +88,15 @@ def find_masks(
             files[name] = path
             used.add(path)
     left = [] if is_own else [path for path in there.values() if path not in used]
-    notes = _notes(names, files, left, folder)
+    findings = _unmatched(names, files, left, folder)
     if not is_own:
-        notes += _unread([name for name in names if name not in files], every.keys() - there.keys())
-    return files, notes
+        unmasked = [name for name in names if name not in files]
+        findings += _unread(unmasked, every.keys() - there.keys())
+    return files, findings
 
 
-def _unread(unmasked: Collection[str], others: Collection[str]) -> list[str]:
-    """Note files of other formats that are named as the masks of images without one."""
+def _unread(unmasked: Collection[str], others: Collection[str]) -> list[Finding]:
+    """Report files of other formats that are named as the masks of images without one."""
     stems = {stem.casefold() for name in unmasked for stem in _mask_stems(name)}
     found = sorted(other for other in others if _stem(other) in stems)
     if not found:
@@ -100,23 +104,24 @@ def _unread(unmasked: Collection[str], others: Collection[str]) -> list[str]:
     which = (
         f"{counted(len(found), 'mask')}, such as {found[0]}, {agreeing(len(found), 'is', 'are')}"
     )
-    return [f"{which} of a format that is not read: save masks as PNG."]
+    text = f"{which} of a format that is not read: save masks as PNG."
+    return [Finding("unread-masks", text, subjects=tuple(found))]
 
 
-def _notes(
+def _unmatched(
     names: Collection[str], files: Collection[str], left: list[Path], folder: Path
-) -> list[str]:
-    """Note masks without an image, and images without a mask if others have one."""
-    notes = []
+) -> list[Finding]:
+    """Report masks without an image, and images without a mask if others have one."""
+    parts = []
     if left:
         belong = f"{agreeing(len(left), 'belongs', 'belong')} to no image of the scene"
         such = left[0].relative_to(folder)
-        notes.append(f"{counted(len(left), 'mask')} in {folder} {belong}, such as {such}")
+        parts.append(f"{counted(len(left), 'mask')} in {folder} {belong}, such as {such}")
     if files and (unmasked := [name for name in names if name not in files]):
         count, lack = counted(len(unmasked), "image"), agreeing(len(unmasked), "has", "have")
         where = "" if left else f" of {len(names)} with masks in {folder}"
-        notes.append(f"{count}{where} {lack} no mask, such as {unmasked[0]}")
-    return [f"{'; '.join(notes)}."] if notes else []
+        parts.append(f"{count}{where} {lack} no mask, such as {unmasked[0]}")
+    return [Finding("unmatched-masks", f"{'; '.join(parts)}.")] if parts else []
 
 
 def masks_among(names: Collection[str]) -> set[str]:

@@ -20,6 +20,7 @@ from PIL import Image as PilImage
 
 from splatseed.camera import Intrinsics, same_shape
 from splatseed.errors import SceneFormatError, SceneNotFoundError, SplatseedError
+from splatseed.findings import Finding, without_kinds
 from splatseed.io.bit_depth import is_16_bit, opaque_value, read_16_bit
 from splatseed.io.depth_maps import Undistortion
 from splatseed.io.files import files_below, read_bytes, translate_errors
@@ -39,6 +40,7 @@ _SAMPLE = 5
 """Masks that are read with a scene."""
 _MOST = 0.5
 """Share of masked pixels from which on masks may be inverted ones."""
+_MOSTLY_MASKED = "mostly-masked"  # the kind of finding
 
 
 def with_masks(scene: Scene, choice: str | None) -> Scene:
@@ -49,11 +51,10 @@ def with_masks(scene: Scene, choice: str | None) -> Scene:
     """
     if choice is None:
         return scene
-    own, notes = scene.masks or Masks({}), list[str]()
-    answered = _mostly_masked(own)
-    kept = [warning for warning in scene.findings if warning not in answered]
+    own, found = scene.masks or Masks({}), list[Finding]()
+    kept = without_kinds(scene.findings, _MOSTLY_MASKED)
     if choice == NONE:
-        return scene.replace(masks=None, findings=tuple(kept))
+        return scene.replace(masks=None, findings=kept)
     inverted = choice == INVERTED or choice.startswith(f"{INVERTED}:")
     location = choice.removeprefix(INVERTED).removeprefix(":") if inverted else choice
     files: Mapping[str, Path] = own.files
@@ -61,15 +62,15 @@ def with_masks(scene: Scene, choice: str | None) -> Scene:
     if folder is not None:
         names = [image.name for image in scene.images]
         image_dir = scene.source.image_dir if scene.source else None
-        files, notes = find_masks(names, folder, image_dir, named=True)
+        files, found = find_masks(names, folder, image_dir, named=True)
         choice = f"{INVERTED}:{folder}" if inverted else str(folder)
     if not files:
         where = f"in {folder}" if folder else "beside its photographs"
-        found = "none" if folder is None or folder.is_dir() else "no such folder"
+        there = "none" if folder is None or folder.is_dir() else "no such folder"
         fix = "Pass a folder of masks, or omit `masks`."
-        raise SceneNotFoundError(f"{_LISTED} {where}", found=found, fix=fix)
+        raise SceneNotFoundError(f"{_LISTED} {where}", found=there, fix=fix)
     masks = replace(own, files=files, inverted=inverted, choice=choice)
-    return scene.replace(masks=masks, findings=(*kept, *notes, *_mostly_masked(masks)))
+    return scene.replace(masks=masks, findings=(*kept, *found, *_mostly_masked(masks)))
 
 
 def mask_choice(scene: Scene) -> str | None:
@@ -92,19 +93,19 @@ def masks_digest(scene: Scene) -> str | None:
 def with_own_masks(scene: Scene) -> Scene:
     """Attach the masks found near the photographs of a scene that was just read, if it has none."""
     folder = scene.source.image_dir if scene.source else None
-    masks, notes = scene.masks or Masks({}), list[str]()
+    masks, found = scene.masks or Masks({}), list[Finding]()
     if scene.source is None or folder is None:
         return scene
     if not masks.files:
         names = [image.name for image in scene.images]
-        files, notes = find_own_masks(names, folder, scene.source.root)
-        notes += _resized(files, folder)
+        files, found = find_own_masks(names, folder, scene.source.root)
+        found += _resized(files, folder)
         masks = replace(masks, files=files)
-    return scene.replace(masks=masks, findings=(*scene.findings, *notes, *_mostly_masked(masks)))
+    return scene.replace(masks=masks, findings=(*scene.findings, *found, *_mostly_masked(masks)))
 
 
-def masks_near(photographs: Path) -> tuple[Masks, list[str]]:
-    """Find the masks near a folder of photographs, and notes for the user."""
+def masks_near(photographs: Path) -> tuple[Masks, list[Finding]]:
+    """Find the masks near a folder of photographs, with findings for the user."""
     folder = photographs.absolute()
     if not photographs.is_dir():
         return Masks({}), []
@@ -112,15 +113,16 @@ def masks_near(photographs: Path) -> tuple[Masks, list[str]]:
     pictures = (path for path in files_below(photographs) if path.suffix.lower() in SUFFIXES)
     names = sorted(path.relative_to(photographs).as_posix() for path in pictures)
     names = sorted(set(names) - masks_among(names))
-    files, notes = find_own_masks(names, folder, folder.parent)
+    files, found = find_own_masks(names, folder, folder.parent)
     if files:
         where = next(iter(files.values())).parent
-        notes = [f"{counted(len(files), 'photograph')} with a mask in {where}.", *notes]
-    return Masks(files), [*notes, *_mostly_masked(Masks(files), "invert them")]
+        text = f"{counted(len(files), 'photograph')} with a mask in {where}."
+        found = [Finding("masks-used", text, "info"), *found]
+    return Masks(files), [*found, *_mostly_masked(Masks(files), "invert them")]
 
 
-def _mostly_masked(masks: Masks, fix: str = f"use `masks={INVERTED!r}`") -> list[str]:
-    """Note masks that leave out most pixels, by a sample: many tools mark by 255 what to leave out.
+def _mostly_masked(masks: Masks, fix: str = f"use `masks={INVERTED!r}`") -> list[Finding]:
+    """Report masks that leave out most pixels, by a sample: in many tools 255 means left out.
 
     Masks that the user has called inverted are taken as they are.
     """
@@ -131,18 +133,20 @@ def _mostly_masked(masks: Masks, fix: str = f"use `masks={INVERTED!r}`") -> list
     if not shares or (share := float(np.mean(shares))) < _MOST:
         return []
     what = f"Masks leave out {share:.0%} of the pixels of their photographs"
-    return [f"{what}: if 0 marks the pixels that count, {fix}."]
+    text = f"{what}: if 0 marks the pixels that count, {fix}."
+    return [Finding(_MOSTLY_MASKED, text)]
 
 
-def _resized(files: Mapping[str, Path], folder: Path) -> list[str]:
-    """Note masks of another size than their photographs, by the first readable pair."""
+def _resized(files: Mapping[str, Path], folder: Path) -> list[Finding]:
+    """Report masks of another size than their photographs, by the first readable pair."""
     for name, path in files.items():
         with suppress(SplatseedError, OSError, ValueError):
             sizes = [photograph_size(path), photograph_size(folder / name)]
             if sizes[0] == sizes[1]:
                 return []
             mask, photograph = (f"{width} x {height}" for width, height in sizes)
-            return [f"Masks are resized to their photographs: {path} has {mask}, not {photograph}."]
+            text = f"Masks are resized to their photographs: {path} has {mask}, not {photograph}."
+            return [Finding("masks-resized", text, "info")]
     return []
 
 

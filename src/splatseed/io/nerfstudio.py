@@ -22,13 +22,14 @@ from jaxtyping import Float64
 
 from splatseed.camera import Intrinsics
 from splatseed.errors import SceneFormatError
+from splatseed.findings import Finding
 from splatseed.io.camera_records import (
     MAX_ID,
     NotFiniteError,
     check_enough,
     make_intrinsics,
     rigid_pose,
-    unusable_warning,
+    unusable_findings,
 )
 from splatseed.io.colmap_model import (
     find_model,
@@ -53,11 +54,11 @@ from splatseed.io.frame_files import (
     named_masks,
 )
 from splatseed.io.origin import recentered
-from splatseed.io.photograph import lens_warnings
-from splatseed.io.photograph_checks import image_warnings
+from splatseed.io.photograph import lens_findings
+from splatseed.io.photograph_checks import photograph_findings
 from splatseed.io.picture import open_picture
 from splatseed.io.ply import read_ply_float64
-from splatseed.io.point_files import differing_points_notes
+from splatseed.io.point_files import differing_points
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Masks, Scene, SceneSource, Split
 from splatseed.similarity import Similarity, fit_similarity, similarity_of
@@ -98,7 +99,7 @@ class Transforms:
     intrinsics: tuple[Intrinsics, ...]
     image_dir: Path  # names are relative to it
     applied_transform: Float64[np.ndarray, "3 4"] | None
-    warnings: tuple[str, ...]
+    findings: tuple[Finding, ...]
     absent: tuple[str, ...] = ()  # images of omitted frames
 
     @property
@@ -114,7 +115,7 @@ def read_transforms_scene(path: StrPath) -> Scene:
     """Read a ``transforms.json`` with its points, masks and depth maps; the cloud may be empty."""
     path = Path(path)
     transforms = read_transforms(path)
-    points, exact, points_path, notes = _find_points(transforms)
+    points, exact, points_path, found = _find_points(transforms)
     images, folder = transforms.images, transforms.image_dir
     source = SceneSource(
         "transforms", path.parent, points_path, image_dir=folder, transforms_path=path
@@ -122,11 +123,11 @@ def read_transforms_scene(path: StrPath) -> Scene:
     frames = {i.name: f.fields for i, f in zip(images, transforms.frames, strict=True)}
     masks, gone = named_masks(FrameFiles(path), frames)
     depths, lost = named_depths(FrameFiles(path), frames, transforms.json)
-    notes = [*transforms.warnings, *notes, *gone, *lost]
-    notes += image_warnings(images, folder, path.parent)
+    found = [*transforms.findings, *found, *gone, *lost]
+    found += photograph_findings(images, folder, path.parent)
     scene = Scene(
         points, images, transforms.intrinsics, source=source,
-        findings=(*notes, *lens_warnings(images)),
+        findings=(*found, *lens_findings(images)),
         depths=depths,
         listed=transforms.listed,
         masks=Masks(masks) if masks else None, absent=transforms.absent,
@@ -146,12 +147,13 @@ def read_blender(folder: StrPath) -> Scene:
     so is a ``transforms_test.json`` without photographs, as BlenderNeRF writes it.
     """
     folder = Path(folder)
-    parts, notes, split = [read_transforms(folder / _BLENDER[0])], list[str](), True
+    parts, findings, split = [read_transforms(folder / _BLENDER[0])], list[Finding](), True
     if (path := folder / _BLENDER[1]).is_file() and any_photograph(path):
         parts.append(read_transforms(path))
     else:
         split, lacking = False, "there is none" if not path.is_file() else "it has no photographs"
-        notes = [f"{path}: {lacking}, so some training images become test views."]
+        text = f"{path}: {lacking}, so some training images become test views."
+        findings = [Finding("missing-test-views", text)]
     cameras: dict[tuple[object, ...], Intrinsics] = {}
     images: list[Image] = []
     masks: dict[str, Path] = {}
@@ -167,9 +169,9 @@ def read_blender(folder: StrPath) -> Scene:
             images.append(replace(image, name=name, image_id=len(images) + 1, intrinsics=shared))
         found_masks, gone = named_masks(FrameFiles(part.path), fields)
         masks |= found_masks
-        notes += gone
+        findings += gone
     points, exact, points_path, found = _find_points(parts[0])
-    notes = list(dict.fromkeys((*notes, *(each for p in parts for each in p.warnings), *found)))
+    findings += [each for part in parts for each in part.findings] + found
     names, num_train = [image.name for image in images], len(parts[0].images)
     train, test = frozenset(names[:num_train]), frozenset(names[num_train:])
     scene = Scene(
@@ -177,7 +179,11 @@ def read_blender(folder: StrPath) -> Scene:
         tuple(images),
         tuple(cameras.values()),
         source=SceneSource("transforms", folder, points_path, image_dir=folder),
-        findings=(*notes, *image_warnings(images, folder, folder), *lens_warnings(images)),
+        findings=(
+            *dict.fromkeys(findings),  # both files may have the same
+            *photograph_findings(images, folder, folder),
+            *lens_findings(images),
+        ),
         listed=Split(train, test, f"pair of {_BLENDER[0]} and {_BLENDER[1]}") if split else None,
         masks=Masks(masks, alpha=False),  # transparent pixels are empty space, trained as black
     )
@@ -187,7 +193,7 @@ def read_blender(folder: StrPath) -> Scene:
 def read_transforms(path: Path) -> Transforms:
     """Read the cameras and frames of a ``transforms.json``, without points."""
     meta = read_json(path, fix=_FIX)
-    frames, notes = find_frames(path, meta)
+    frames, findings = find_frames(path, meta)
     # The subfolder that contains all images, else the deepest common folder. Links are not
     # followed, so that names are as in COLMAP.
     image_dir = Path(os.path.commonpath([frame.file.parent for frame in frames]))
@@ -229,15 +235,15 @@ def read_transforms(path: Path) -> Transforms:
     if applied is not None:
         applied = _matrix(f"{path}, applied_transform", applied)
     if odd:
-        notes.append(
-            f"k4 of {odd} frames is ignored: COLMAP's perspective models have no such term."
-        )
+        text = f"k4 of {odd} frames is ignored: COLMAP's perspective models have no such term."
+        findings.append(Finding("ignored-distortion", text))
     if repeated:
-        notes.append(f"{counted(repeated, 'frame')} of {path.name} are duplicates and left out.")
-    notes += unusable_warning(unusable, len(images))
+        text = f"{counted(repeated, 'frame')} of {path.name} are duplicates and left out."
+        findings.append(Finding("duplicate-frames", text))
+    findings += unusable_findings(unusable, len(images))
     return Transforms(
         path, meta, tuple(images.values()), tuple(kept), tuple(cameras.values()), image_dir,
-        applied, tuple(notes), tuple(unusable),
+        applied, tuple(findings), tuple(unusable),
     )  # fmt: skip
 
 
@@ -339,34 +345,35 @@ def _matrix(where: str, value: Any) -> Float64[np.ndarray, "3 4"]:
 
 def _find_points(
     transforms: Transforms,
-) -> tuple[PointCloud, Float64[np.ndarray, "N 3"], Path, list[str]]:
+) -> tuple[PointCloud, Float64[np.ndarray, "N 3"], Path, list[Finding]]:
     """Find the points of a ``transforms.json``.
 
     They are those of the PLY that it names, else of a PLY known to be in the transforms' space,
     else of a COLMAP model, whose cameras determine the map into that space.
 
     Returns:
-        The cloud, its positions in float64, its file, and warnings.
+        The cloud, its positions in float64, its file, and findings.
     """
-    root, notes = transforms.path.parent, []
+    root, findings = transforms.path.parent, list[Finding]()
     named = transforms.json.get("ply_file_path")
     names = [name for name in (named, *_POINT_FILES) if isinstance(name, str)]
     if isinstance(named, str) and not (root / named).is_file():
-        notes.append(f"ply_file_path {named} is {special_kind(root / named) or 'missing'}.")
+        text = f"ply_file_path {named} is {special_kind(root / named) or 'missing'}."
+        findings.append(Finding("missing-points-file", text, subjects=(named,)))
     ply = next((root / name for name in names if (root / name).is_file()), None)
     if ply is not None:
         points, exact = read_ply_float64(ply)
         for name in (*names, "init.ply"):
             use = f"set it as ply_file_path in {transforms.path.name}"
-            notes += differing_points_notes(ply, points.xyz, root / name, use)
-        return points, exact, ply, notes
+            findings += differing_points(ply, points.xyz, root / name, use)
+        return points, exact, ply, findings
     models = _models(root)
     if not models:
-        return PointCloud.empty(), np.empty((0, 3)), root / _POINT_FILES[0], notes
+        return PointCloud.empty(), np.empty((0, 3)), root / _POINT_FILES[0], findings
     for model_dir in models[:-1]:  # the poses may come from a smaller model
         with suppress(SceneFormatError):
-            return _points_of_model(transforms, model_dir, notes)
-    return _points_of_model(transforms, models[-1], notes)
+            return _points_of_model(transforms, model_dir, findings)
+    return _points_of_model(transforms, models[-1], findings)
 
 
 def _models(root: Path) -> list[Path]:
@@ -378,20 +385,20 @@ def _models(root: Path) -> list[Path]:
 
 
 def _points_of_model(
-    transforms: Transforms, model_dir: Path, notes: list[str]
-) -> tuple[PointCloud, Float64[np.ndarray, "N 3"], Path, list[str]]:
+    transforms: Transforms, model_dir: Path, findings: list[Finding]
+) -> tuple[PointCloud, Float64[np.ndarray, "N 3"], Path, list[Finding]]:
     """Read the points of a COLMAP model and map them into the transforms' space."""
     points, exact, _, points_path = read_model_points(model_dir)
     model_images = read_model_cameras(model_dir)[1]
     transform, doubts = _transform_of_model(transforms, model_dir, model_images)
     xyz = apply_transform(transform, exact)
     with np.errstate(over="ignore"):  # beyond float32's range: infinite, dropped later
-        return points.replace(xyz=xyz.astype(np.float32)), xyz, points_path, notes + doubts
+        return points.replace(xyz=xyz.astype(np.float32)), xyz, points_path, findings + doubts
 
 
 def _transform_of_model(
     transforms: Transforms, model_dir: Path, model_images: Sequence[Image]
-) -> tuple[Float64[np.ndarray, "3 4"], list[str]]:
+) -> tuple[Float64[np.ndarray, "3 4"], list[Finding]]:
     """Find the map [3, 4] from the model's world that aligns its cameras with the frames'."""
     candidates = [_LEGACY_TRANSFORM, np.eye(4)[:3]]
     if transforms.applied_transform is not None:
@@ -406,19 +413,20 @@ def _transform_of_model(
     )
     if not pairs:
         doubt = f"no image of {model_dir} is in {transforms.path.name}: points may be misaligned."
-        return candidates[0], [doubt]
+        return candidates[0], [Finding("unrelated-models", doubt)]
     centers, model_centers = (np.array(each) for each in zip(*pairs, strict=True))
     extent = max(float(np.ptp(centers, axis=0).max()), 1e-6 * float(np.abs(centers).max()))
-    maps: list[tuple[np.ndarray, list[str]]] = [(each, []) for each in candidates]
+    maps: list[tuple[np.ndarray, list[Finding]]] = [(each, []) for each in candidates]
     fitted = fit_similarity(model_centers, centers)
     if fitted is not None and len(pairs) >= _MIN_FITTED:
         poses = f"The poses of {transforms.path.name} are a similarity transform of {model_dir}'s"
         by = f"(scale {fitted.scale:.3g}), as instant-ngp writes them"
-        maps.append((fitted.matrix, [f"{poses} {by}; the points were transformed likewise."]))
-    for matrix, notes in maps:
+        text = f"{poses} {by}; the points were transformed likewise."
+        maps.append((fitted.matrix, [Finding("transformed-points", text, "info")]))
+    for matrix, found in maps:
         off = np.abs(apply_transform(matrix, model_centers) - centers).max(axis=1)
         if np.median(off) <= _POSE_TOLERANCE * extent:
-            return matrix, notes
+            return matrix, found
     raise SceneFormatError(
         f"the cameras of {model_dir} to be those of {transforms.path} after applied_transform",
         found=f"cameras {np.median(off):.3g} apart in a scene of extent {extent:.3g}",

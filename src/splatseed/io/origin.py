@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 from splatseed.errors import SceneFormatError
+from splatseed.findings import Finding
 from splatseed.io.files import read_json
 from splatseed.io.staging import add_files, write_json
 from splatseed.scene import Image, Scene
@@ -85,10 +86,10 @@ def recentered(scene: Scene, exact: Float64[np.ndarray, "N 3"] | None = None) ->
     origin = choose_origin(places, in_order=len(centers) > 0)
     if origin.any():
         known = _known(places)
-        notes = [_note(scene, origin, known), *_precision_notes(scene, exact, origin)]
+        findings = [_far_away(scene, origin, known), *_lost_precision(scene, exact, origin)]
         scene = translated(scene, origin, exact)
-        scene = replace(scene, findings=(*scene.findings, *notes))
-    return replace(scene, findings=(*scene.findings, *_frame_notes(scene, centers - origin)))
+        scene = replace(scene, findings=(*scene.findings, *findings))
+    return replace(scene, findings=(*scene.findings, *_other_frame(scene, centers - origin)))
 
 
 def translated(
@@ -225,37 +226,38 @@ def _translated_image(image: Image, offset: Float64[np.ndarray, " 3"]) -> Image:
     return replace(image, translation=image.translation + rotation @ offset)
 
 
-def _note(
+def _far_away(
     scene: Scene, origin: Float64[np.ndarray, " 3"], places: Float64[np.ndarray, "N 3"]
-) -> str:
+) -> Finding:
     middle, extent = _middle(places)
     far, nouns = float(np.abs(middle).max()), "cameras" if scene.images else "points"
     step = np.spacing(np.float32(far))
-    note = (
+    text = (
         f"The {nouns} are so far from 0 that float32 has steps of {step:.2g} there: "
         f"{format_offset(origin)} is subtracted from all coordinates. Outputs stay recentred, with "
         f"the offset in {RECENTER}."
     )
     if (step := np.spacing(far)) > LIMITS.coarse * extent > 0:
-        note += f" Even double precision has steps of {step:.2g} there."
-    return note
+        text += f" Even double precision has steps of {step:.2g} there."
+    return Finding("far-from-origin", text)
 
 
-def _precision_notes(
+def _lost_precision(
     scene: Scene, exact: Float64[np.ndarray, "N 3"] | None, origin: Float64[np.ndarray, " 3"]
-) -> list[str]:
-    """Warn if points far from 0 were stored in float32, and so lost precision."""
+) -> list[Finding]:
+    """Report points far from 0 that were stored in float32, and so lost precision."""
     xyz = scene.points.xyz if exact is None else exact
     # Ignore points of another frame, nearer to 0.
     xyz = xyz[np.abs(xyz - origin).max(axis=1, initial=0.0) < np.abs(origin).max() / 2]
     if scene.source is None or len(xyz) < 2 or not np.array_equal(xyz, xyz.astype(np.float32)):
         return []
-    note = f"The points in {scene.source.points_path.name} were stored in single precision, which "
-    return [f"{note}has rounded their positions: store them in double precision, or recentred."]
+    text = f"The points in {scene.source.points_path.name} were stored in single precision, which "
+    text += "has rounded their positions: store them in double precision, or recentred."
+    return [Finding("rounded-positions", text)]
 
 
-def _frame_notes(scene: Scene, centers: Float64[np.ndarray, "I 3"]) -> list[str]:
-    """Warn if points are so far from the cameras that none can see them."""
+def _other_frame(scene: Scene, centers: Float64[np.ndarray, "I 3"]) -> list[Finding]:
+    """Report points so far from the cameras that none can see them."""
     xyz = scene.points.xyz[scene.points.finite].astype(np.float64)
     if not len(xyz) or not len(centers):
         return []
@@ -263,6 +265,6 @@ def _frame_notes(scene: Scene, centers: Float64[np.ndarray, "I 3"]) -> list[str]
     away = float(np.abs(here - there).max())
     if away <= LIMITS.other_frame * (around + extent) or not around + extent:
         return []
-    note = f"The points are {away:,.0f} from the cameras, {away / (around + extent):,.0f} times "
-    note += "their extent: points and poses are in different frames, such as a national grid and "
-    return [f"{note}a local one."]
+    text = f"The points are {away:,.0f} from the cameras, {away / (around + extent):,.0f} times "
+    text += "their extent: points and poses are in different frames, such as a national grid and "
+    return [Finding("points-in-another-frame", f"{text}a local one.", "error")]

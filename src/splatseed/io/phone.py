@@ -18,17 +18,18 @@ from jaxtyping import Float64
 
 from splatseed.camera import Intrinsics
 from splatseed.errors import SceneFormatError
+from splatseed.findings import Finding
 from splatseed.io.camera_records import (
     NotFiniteError,
     check_enough,
     make_intrinsics,
     rigid_pose,
-    unusable_warning,
+    unusable_findings,
 )
 from splatseed.io.files import read_json
 from splatseed.io.nerfstudio import OPENCV_FROM_OPENGL
 from splatseed.io.origin import recentered
-from splatseed.io.photograph_checks import image_warnings
+from splatseed.io.photograph_checks import photograph_findings
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene, SceneSource
 
@@ -55,7 +56,7 @@ def read_phone_scene(
     folder: Path,
     names: Iterable[str],
     read: Callable[[str], PhoneFrame],
-    notes: Iterable[str] = (),
+    findings: Iterable[Finding] = (),
 ) -> Scene:
     """Make a scene without points of a phone's photographs.
 
@@ -66,7 +67,7 @@ def read_phone_scene(
         names: The photographs, relative to it, in order.
         read: Returns the frame of a photograph; if it raises ``NotFiniteError``, the photograph is
             left out.
-        notes: Further warnings.
+        findings: What the format's reader found.
 
     Raises:
         SceneFormatError: A camera or pose is malformed, or more than half are not finite.
@@ -85,17 +86,17 @@ def read_phone_scene(
             continue
         images.append(Image(name, i + 1, cameras[key], *pose))
     check_enough(unusable, len(images))
-    warnings = (
-        *notes,
-        *unusable_warning(unusable, len(images)),
-        *image_warnings(images, folder, root),
+    findings = (
+        *findings,
+        *unusable_findings(unusable, len(images)),
+        *photograph_findings(images, folder, root),
     )
     scene = Scene(
         PointCloud.empty(),
         tuple(images),
         tuple(cameras.values()),
         source=SceneSource("phone", root, track, image_dir=folder),
-        findings=warnings,
+        findings=findings,
         absent=tuple(unusable),
     )
     return recentered(scene)

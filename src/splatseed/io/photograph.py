@@ -16,6 +16,7 @@ from jaxtyping import UInt8, UInt16
 from PIL import Image as PilImage
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.findings import Finding
 from splatseed.io.bit_depth import WHITE, is_16_bit, opaque_value, read_16_bit
 from splatseed.io.files import read_bytes, similar_name, translate_errors
 from splatseed.io.picture import open_picture
@@ -165,17 +166,12 @@ def _grey_of(path: Path, photograph: PilImage.Image, white: int) -> PilImage.Ima
     return PilImage.fromarray(grey)
 
 
-def warnings_without_lens(scene: Scene) -> list[str]:
-    """Return a scene's warnings except those of lens distortion."""
-    lens = lens_warnings(scene.images)
-    return [warning for warning in scene.findings if warning not in lens]
-
-
-def lens_warnings(images: Sequence[Image]) -> list[str]:
-    """Warn of lens distortion, which not every trainer supports."""
+def lens_findings(images: Sequence[Image]) -> list[Finding]:
+    """Report lens distortion, which not every trainer supports."""
     models = sorted({im.intrinsics.model for im in images if im.intrinsics.has_distortion})
     if not models:
         return []
     lenses = f"Cameras have lens distortion ({', '.join(models)})"
     trainers = "splatseed train, graphdeco's trainer and OpenSplat need PINHOLE cameras"
-    return [f"{lenses}; {trainers}: undistort the scene with splatseed undistort SCENE -o OUT."]
+    text = f"{lenses}; {trainers}: undistort the scene with splatseed undistort SCENE -o OUT."
+    return [Finding("lens-distortion", text)]

@@ -17,6 +17,7 @@ from PIL import Image as PilImage
 
 from splatseed.camera import Intrinsics
 from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.findings import Finding
 from splatseed.io.extraction import is_extracted
 from splatseed.io.files import open_file, similar_name, special_kind, translate_errors
 from splatseed.io.photograph import COPY_AGAIN, photograph_bytes, photograph_folder
@@ -139,34 +140,37 @@ def exif_orientation(path: Path) -> int:
         return 0
 
 
-def image_warnings(images: Sequence[Image], image_dir: Path | None, root: Path) -> list[str]:
-    """Warn of missing photographs, and of cameras that do not fit their sizes."""
+def photograph_findings(
+    images: Sequence[Image], image_dir: Path | None, root: Path
+) -> list[Finding]:
+    """Find missing photographs, and cameras that do not fit their sizes."""
     if not images:
         return []
-    odd = _odd_camera_warnings(images)
+    odd = _odd_cameras(images)
     if image_dir is None:
         dead = root / "images" if (root / "images").is_symlink() else None
         missing = (
             f"{dead} links to {dead.readlink()}, which does not exist" if dead else "is missing"
         )
-        return [f"The images folder {missing}; points can be made, but not trained.", *odd]
+        text = f"The images folder {missing}; points can be made, but not trained."
+        return [Finding("missing-photographs", text), *odd]
     absent = {im.name: None for im in images if not (image_dir / im.name).is_file()}
-    warnings = [_missing_warning([*absent], len(images), image_dir)] if absent else []
+    findings = [_missing([*absent], len(images), image_dir)] if absent else []
     # Links are not followed: users make them on purpose.
     around = os.path.abspath(root)  # noqa: PTH100
     paths = {im.name: os.path.abspath(image_dir / im.name) for im in images}  # noqa: PTH100
     outside = [n for n, path in paths.items() if os.path.commonpath([path, around]) != around]
     if outside and not is_extracted(image_dir):
         lie = agreeing(len(outside), "lies", "lie")
-        warnings.append(
-            f"{len(outside)} of {len(images)} images {lie} outside of {root}, such as {outside[0]}."
-        )
-    warnings += odd
-    return [*warnings, *_size_warnings([im for im in images if im.name not in absent], image_dir)]
+        text = f"{len(outside)} of {len(images)} images {lie} outside of {root}"
+        text += f", such as {outside[0]}."
+        findings.append(Finding("photographs-outside-scene", text, subjects=tuple(outside)))
+    findings += odd
+    return [*findings, *_size_findings([im for im in images if im.name not in absent], image_dir)]
 
 
-def _odd_camera_warnings(images: Sequence[Image]) -> list[str]:
-    """Warn of focal lengths and principal points that are probably of another image size."""
+def _odd_cameras(images: Sequence[Image]) -> list[Finding]:
+    """Find focal lengths and principal points that are probably of another image size."""
     odd = [image for image in images if _is_of_another_size(image.intrinsics)]
     if not odd:
         return []
@@ -175,8 +179,14 @@ def _odd_camera_warnings(images: Sequence[Image]) -> list[str]:
     of = f"{len(odd)} of {counted(len(images), 'image')}"
     what = f"The focal lengths and principal point of {of} are probably not in pixels of this size"
     such = f"({fx:.4g}, {fy:.4g}) and ({cx:.4g}, {cy:.4g}) in {lens.width} x {lens.height}"
-    advice = "State the width and height that they belong to."
-    return [f"{what}: {such} for {odd[0].name}. {advice}"]
+    return [
+        Finding(
+            "intrinsics-of-another-size",
+            f"{what}: {such} for {odd[0].name}.",
+            subjects=tuple(image.name for image in odd),
+            fix="State the width and height that they belong to.",
+        )
+    ]
 
 
 def _is_of_another_size(lens: Intrinsics) -> bool:
@@ -188,25 +198,27 @@ def _is_of_another_size(lens: Intrinsics) -> bool:
     return bool(off > MAX_OFF_CENTER or too_wide)
 
 
-def _missing_warning(missing: Sequence[str], count: int, image_dir: Path) -> str:
+def _missing(missing: Sequence[str], count: int, image_dir: Path) -> Finding:
     first, are = missing[0], agreeing(len(missing), "is", "are")
     near, kind = similar_name(image_dir / first), special_kind(image_dir / first)
     hint = f"; {near} exists, but names must match exactly" if near else ""
     hint = f"; {first} is {kind}" if kind else hint
     hint = "; separate folders by /, not by \\" if "\\" in first else hint
     subject = f"{len(missing)} of {count} images {are} missing in {image_dir}, and left out"
-    return f"{subject} ({name_some(missing, _NAMED)}){hint}."
+    text = f"{subject} ({name_some(missing, _NAMED)}){hint}."
+    return Finding("missing-photographs", text, subjects=tuple(missing))
 
 
-def _size_warnings(images: Sequence[Image], image_dir: Path) -> list[str]:
-    """Warn of each kind of mismatch between files and cameras, with the first example."""
-    sizes, warnings = file_sizes(images, image_dir), list[str]()
+def _size_findings(images: Sequence[Image], image_dir: Path) -> list[Finding]:
+    """Describe each kind of mismatch between files and cameras, with the first example."""
+    sizes, findings = file_sizes(images, image_dir), list[Finding]()
     if len(sizes) < len(images):
         first = next(image.name for image in images if image.name not in sizes)
         try:
             photograph_size(image_dir / first)
         except SceneFormatError as error:
-            warnings.append(f"{first} cannot be read: {error.found}.")
+            text = f"{first} cannot be read: {error.found}."
+            findings.append(Finding("unreadable-photograph", text, subjects=(first,)))
     other = [im for im in images if sizes.get(im.name, _own(im)) != _own(im)]
     fitting = [im for im in other if fits(im.intrinsics, sizes[im.name])]
     stretched = [im for im in fitting if _off(im.intrinsics, sizes[im.name]) > ROUNDING]
@@ -214,22 +226,28 @@ def _size_warnings(images: Sequence[Image], image_dir: Path) -> list[str]:
     if wrong := [im for im in other if im not in fitting]:
         first = wrong[0].name
         reason, fix = _misfit(wrong[0].intrinsics, sizes[first], image_dir / first)
-        warnings.append(
+        text = (
             f"{len(wrong)} of {all_of} {agreeing(len(wrong), 'does', 'do')} not fit the camera: "
-            f"{_against(wrong[0], sizes)} ({reason}). They cannot be used for training. {fix}"
+            f"{_against(wrong[0], sizes)} ({reason}). They cannot be used for training."
         )
+        names = tuple(image.name for image in wrong)
+        findings.append(Finding("photographs-do-not-fit", text, "error", names, fix))
     if stretched:
         (width, height), lens = sizes[stretched[0].name], stretched[0].intrinsics
         stretch = abs(width * lens.height / (height * lens.width) - 1)
         have = agreeing(len(stretched), "has", "have")
-        warnings.append(
+        text = (
             f"{len(stretched)} of {all_of} {have} another aspect ratio than the camera: "
             f"{_against(stretched[0], sizes)}. They count as resized and stretched by "
             f"{stretch:.1%}; if they were cropped, give them a camera of their own size."
         )
+        names = tuple(image.name for image in stretched)
+        findings.append(Finding("photographs-stretched", text, subjects=names))
     elif fitting:
-        warnings.append(f"{_against(fitting[0], sizes)}; some trainers rescale, others fail.")
-    return warnings
+        text = f"{_against(fitting[0], sizes)}; some trainers rescale, others fail."
+        names = tuple(image.name for image in fitting)
+        findings.append(Finding("photographs-resized", text, subjects=names))
+    return findings
 
 
 def _own(image: Image) -> Size:

@@ -14,10 +14,12 @@ import numpy as np
 from jaxtyping import Float
 
 from splatseed.errors import SplatseedError
+from splatseed.findings import Finding
 from splatseed.io.files import open_file, read_file
 from splatseed.io.ply import open_ply, read_ply
 from splatseed.text import counted
 
+_KIND = "differing-points"  # of findings
 _TOLERANCE = 1e-4
 """Tolerance as a share of the points' extent: text and PLY files round positions."""
 _USED_BY = {
@@ -50,10 +52,10 @@ def first_with_points(paths: Sequence[Path]) -> Path | None:
     return next(iter(paths), None)
 
 
-def differing_points_notes(
+def differing_points(
     read: Path, xyz: Float[np.ndarray, "N 3"], other: Path, use: str = ""
-) -> list[str]:
-    """Warn of another point file if its points differ from those read.
+) -> list[Finding]:
+    """Report another point file if its points differ from those read.
 
     Args:
         read: The file that was read.
@@ -65,14 +67,16 @@ def differing_points_notes(
         return []
     count = count_points(other)
     if count == 0:
-        return [f"{other} holds no points; {read.name} is read."] if len(xyz) else []
+        text = f"{other} holds no points; {read.name} is read."
+        return [Finding(_KIND, text)] if len(xyz) else []
     if count is None or (count == len(xyz) and _same(other, xyz)):
         return []
     differ = f"{count:,}" if count != len(xyz) else f"{count:,} at other positions"
     effect = _USED_BY.get(other.name, "is not used")
     advice = f" To use it here, {use}." if use else ""
     used = f"{counted(len(xyz), 'point')} of {read.name} are used"
-    return [f"{used}; {other.name}{_age(other, read)} has {differ}, and {effect}.{advice}"]
+    text = f"{used}; {other.name}{_age(other, read)} has {differ}, and {effect}.{advice}"
+    return [Finding(_KIND, text)]
 
 
 def _same(path: Path, xyz: Float[np.ndarray, "N 3"]) -> bool:

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.findings import Finding
 from splatseed.io.depth_maps import match_by_name
 from splatseed.io.files import StrPath, is_hidden
 from splatseed.io.frame_files import SUFFIXES
@@ -68,19 +69,21 @@ def read_polycam(root: StrPath) -> Scene:
             fix="In Polycam, switch Developer mode on, process the scan again and export raw data"
             + (f"; or run: splatseed sfm {quoted(folder)} -o SCENE." if names else "."),
         )
-    notes = []
+    findings = []
     if lost := [name for name in names if name not in used]:
         have = agreeing(len(lost), "has no camera and is", "have no camera and are")
-        notes.append(f"{len(lost)} of {len(names)} photographs {have} left out, such as {lost[0]}.")
+        text = f"{len(lost)} of {len(names)} photographs {have} left out, such as {lost[0]}."
+        findings.append(Finding("missing-poses", text, subjects=tuple(lost)))
     if lacking := len(cameras) - len(used):
         have = agreeing(lacking, "has no photograph and is", "have no photograph and are")
-        notes.append(f"{lacking} of {counted(len(cameras), 'camera')} {have} left out.")
+        text = f"{lacking} of {counted(len(cameras), 'camera')} {have} left out."
+        findings.append(Finding("missing-photographs", text))
 
     def read(name: str) -> PhoneFrame:
         return _read_camera(cameras[Path(name).stem])
 
     track = cameras[Path(used[0]).stem]
-    scene = read_phone_scene(root, track, folder, used, read, notes)
+    scene = read_phone_scene(root, track, folder, used, read, findings)
     return scene.replace(depths=match_by_name(scene, keyframes))
 
 

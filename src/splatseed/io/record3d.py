@@ -31,6 +31,7 @@ from PIL import Image as PilImage
 
 from splatseed.camera import rotation_from_quat
 from splatseed.errors import MissingDependencyError, SceneFormatError, SceneNotFoundError
+from splatseed.findings import Finding
 from splatseed.io.camera_records import check_pose
 from splatseed.io.depth_maps import DepthFiles, find_confidences
 from splatseed.io.extraction import extracted
@@ -115,15 +116,18 @@ def read_record3d(folder: StrPath) -> Scene:
     data = read_bytes(path)
     metadata = _read_metadata(path, data)
     sizes = {file.name: file.stat().st_size for file in photographs.iterdir() if file.is_file()}
-    names, notes = _choose(metadata, sizes, root)
+    names, findings = _choose(metadata, sizes, root)
     depths = root / layout.depths, layout.depth_suffix
     if layout is _R3D:
         maps = [f"{_number(name)}{suffix}" for name in names for suffix in (".depth", ".conf")]
         facts = fingerprint(data, [(name, sizes.get(name)) for name in maps])
         read = partial(_read_member, root)
-        unpacked, note = _unpack(root, facts, metadata, names, read, photographs=False)
-        depths, notes = (unpacked / _EXTRACTED.depths, _EXTRACTED.depth_suffix), [*notes, *note]
-    return _scene(root, metadata, photographs, names, depths, notes)
+        unpacked, lacking = _unpack(root, facts, metadata, names, read, photographs=False)
+        depths, findings = (
+            (unpacked / _EXTRACTED.depths, _EXTRACTED.depth_suffix),
+            findings + lacking,
+        )
+    return _scene(root, metadata, photographs, names, depths, findings)
 
 
 def read_r3d(path: StrPath) -> Scene:
@@ -141,13 +145,14 @@ def read_r3d(path: StrPath) -> Scene:
     metadata = _read_metadata(path, data)
     inside = f"{_R3D.photographs}/"
     sizes = {n.removeprefix(inside): s for n, (s, _) in members.items() if n.startswith(inside)}
-    names, notes = _choose(metadata, sizes, path)
+    names, findings = _choose(metadata, sizes, path)
     facts = fingerprint(data, sorted(members.items()))
     with _opened(path) as archive:
         read = partial(_read_packed, path, archive)
-        root, note = _unpack(path, facts, metadata, names, read, photographs=True)
+        root, lacking = _unpack(path, facts, metadata, names, read, photographs=True)
     depths = root / _EXTRACTED.depths, _EXTRACTED.depth_suffix
-    return _scene(root, metadata, root / _EXTRACTED.photographs, names, depths, [*notes, *note])
+    photographs = root / _EXTRACTED.photographs
+    return _scene(root, metadata, photographs, names, depths, findings + lacking)
 
 
 def find_recorded_depths(scene: Scene, path: Path) -> DepthFiles | None:
@@ -172,28 +177,29 @@ def _scene(
     photographs: Path,
     names: Sequence[str],
     depths: tuple[Path, str],
-    notes: Sequence[str],
+    findings: Sequence[Finding],
 ) -> Scene:
     """Make the scene of some photographs; ``depths`` are a folder of maps and their suffix."""
     folder, suffix = depths
     paths = {name: folder / f"{_number(name)}{suffix}" for name in names}
     paths = {name: path for name, path in paths.items() if path.is_file()}
-    if paths and suffix == _EXR.depth_suffix and (note := _lacking("OpenEXR")):
-        paths, notes = {}, [*notes, note]
-    scene = read_phone_scene(root, metadata.path, photographs, names, metadata.frame, notes)
+    if paths and suffix == _EXR.depth_suffix and (lacking := _lacking("OpenEXR")):
+        paths, findings = {}, [*findings, *lacking]
+    scene = read_phone_scene(root, metadata.path, photographs, names, metadata.frame, findings)
     posed = {image.name for image in scene.images}
     paths = {name: path for name, path in paths.items() if name in posed}
     maps = DepthFiles(paths, "z", confidences=find_confidences(paths)) if paths else None
     return scene.replace(depths=maps)
 
 
-def _lacking(package: str) -> str | None:
-    """Return a note if a package that depth maps need is not installed."""
+def _lacking(package: str) -> list[Finding]:
+    """Report that a package is not installed which depth maps need."""
     try:
         require(package)
     except MissingDependencyError as error:
-        return f"Depth maps are left out, as reading them needs {package}. {error.fix}"
-    return None
+        text = f"Depth maps are left out, as reading them needs {package}."
+        return [Finding("missing-package", text, fix=error.fix)]
+    return []
 
 
 def _number(name: str) -> int:
@@ -270,8 +276,8 @@ def _numbers(content: Any, columns: int) -> Float64[np.ndarray, "N C"]:
 
 def _choose(
     metadata: _Metadata, sizes: Mapping[str, int], where: Path
-) -> tuple[list[str], list[str]]:
-    """Return the photographs to use in order of their numbers, and notes about the others.
+) -> tuple[list[str], list[Finding]]:
+    """Return the photographs to use in order of their numbers, and findings about the others.
 
     Args:
         metadata: The recording's.
@@ -286,11 +292,11 @@ def _choose(
             found=f"none with one of the {len(metadata.poses):,} poses" if found else "none",
             fix=_FIX,
         )
-    notes = []
+    findings = []
     if len(posed) < max(len(found), len(metadata.poses)):
         numbers = f"{counted(len(found), 'photograph')} and {counted(len(metadata.poses), 'pose')}"
         used = f"the {len(posed):,} of the same number {agreeing(len(posed), 'is', 'are')} used"
-        notes.append(f"There are {numbers} in {where}: {used}.")
+        findings.append(Finding("missing-poses", f"There are {numbers} in {where}: {used}."))
     quats, centers = metadata.poses[posed, :4], metadata.poses[posed, 4:]
     usable = np.isfinite(metadata.poses[posed]).all(axis=1) & quats.any(axis=1)
     known = [number for number, ok in zip(posed, usable.tolist(), strict=True) if ok]
@@ -302,9 +308,10 @@ def _choose(
     chosen = choose_photographs(details, rotations.reshape(-1, 3, 3), centers[usable], focal)
     if len(chosen) < len(known):
         which = "the sharpest at equal distances of the camera's motion"
-        notes.append(f"{len(chosen):,} of {len(known):,} photographs are used: {which}.")
+        text = f"{len(chosen):,} of {len(known):,} photographs are used: {which}."
+        findings.append(Finding("chosen-photographs", text, "info"))
         posed = [known[index] for index in chosen.tolist()]
-    return [found[number] for number in posed], notes
+    return [found[number] for number in posed], findings
 
 
 # Archives -----------------------------------------------------------------------------------------
@@ -351,8 +358,8 @@ def _unpack(
     read: _Read,
     *,
     photographs: bool,
-) -> tuple[Path, list[str]]:
-    """Extract some photographs and their maps; return the folder, and a note if maps lack.
+) -> tuple[Path, list[Finding]]:
+    """Extract some photographs and their maps; return the folder, and a finding if maps lack.
 
     Args:
         source: The archive.
@@ -362,7 +369,7 @@ def _unpack(
         read: Reads a member.
         photographs: Extract photographs as well, not their maps alone.
     """
-    note = _lacking("lzfse")
+    lacking = _lacking("lzfse")
 
     def fill(folder: Path, progress: Progress) -> None:
         places = [folder / each for each in ("rgb", "depth", "confidence")]
@@ -372,7 +379,7 @@ def _unpack(
             if photographs and (data := read(name)) is not None:
                 (places[0] / name).write_bytes(data)
             number = _number(name)
-            if note is None and (data := read(f"{number}.depth")):
+            if not lacking and (data := read(f"{number}.depth")):
                 where = f"{number}.depth in {source}"
                 np.save(places[1] / f"{number}.npy", _decode(data, "<f4", metadata, where))
                 if data := read(f"{number}.conf"):
@@ -380,8 +387,8 @@ def _unpack(
                     PilImage.fromarray(levels).save(places[2] / f"{number}.png")
             progress(f"extract {source.name}", (i + 1) / len(names))
 
-    folder = extracted(source, (facts, list(names), note is None, photographs), fill)
-    return folder, [] if note is None else [note]
+    folder = extracted(source, (facts, list(names), not lacking, photographs), fill)
+    return folder, lacking
 
 
 def _decode(data: bytes, dtype: str, metadata: _Metadata, where: str) -> np.ndarray:

@@ -19,11 +19,12 @@ from jaxtyping import Bool, Float64, Int64
 
 from splatseed.camera import Intrinsics, rotation_from_quat
 from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.findings import Finding
 from splatseed.io import depth_maps
 from splatseed.io.camera_records import make_intrinsics, rigid_pose
 from splatseed.io.files import StrPath, numbered_lines, read_json, translate_errors
 from splatseed.io.origin import recentered
-from splatseed.io.photograph import lens_warnings
+from splatseed.io.photograph import lens_findings
 from splatseed.io.photograph_checks import photograph_size
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene, SceneSource
@@ -88,16 +89,22 @@ def load_rgbd(root: StrPath) -> Scene:
         _check_image(frames[i], intrinsics)
         images.append(Image(frames[i].name, i + 1, intrinsics, quat, translation))
     lost = [frames[i].name for i in np.flatnonzero(~tracked)]
-    scene = _scene(track, folder, images, intrinsics, *_left_out("frame", "a finite pose", lost))
+    scene = _scene(
+        track,
+        folder,
+        images,
+        intrinsics,
+        *_left_out("missing-poses", "frame", "a finite pose", lost),
+    )
     return scene.replace(depths=depth_maps.match_by_name(scene, folder))
 
 
 def _scene(
-    track: Path, folder: Path, images: Sequence[Image], lens: Intrinsics, *warnings: str
+    track: Path, folder: Path, images: Sequence[Image], lens: Intrinsics, *findings: Finding
 ) -> Scene:
     source = SceneSource("rgbd", track.parent, track, image_dir=folder)
     points = PointCloud.empty()
-    return recentered(Scene(points, tuple(images), (lens,), source=source, findings=warnings))
+    return recentered(Scene(points, tuple(images), (lens,), source=source, findings=findings))
 
 
 def is_tum(root: Path) -> bool:
@@ -109,7 +116,7 @@ def load_tum(root: StrPath) -> Scene:
     """Read TUM's layout.
 
     Poses are interpolated between the records before and after an image if both are close in time,
-    else taken from the nearest. Images without a pose or a file are left out, with a warning.
+    else taken from the nearest. Images without a pose or a file are left out, with a finding.
     """
     root = Path(root)
     track = root / "groundtruth.txt"
@@ -136,10 +143,10 @@ def load_tum(root: StrPath) -> Scene:
         images.append(Image(name, i + 1, intrinsics, quat, translation))
     lost = [names[i] for i in np.flatnonzero(~near)]
     missing = [names[i] for i in np.flatnonzero(near & ~present)]
-    left_out = _left_out("image", "a pose close in time", lost)
-    left_out += _left_out("image", "a file", missing)
-    warnings = (*guessed, *left_out, *lens_warnings(images))
-    scene = _scene(track, root / folder, images, intrinsics, *warnings)
+    left_out = _left_out("missing-poses", "image", "a pose close in time", lost)
+    left_out += _left_out("missing-photographs", "image", "a file", missing)
+    findings = (*guessed, *left_out, *lens_findings(images))
+    scene = _scene(track, root / folder, images, intrinsics, *findings)
     return scene.replace(depths=find_tum_depths(scene, root))
 
 
@@ -177,8 +184,8 @@ def find_tum_depths(scene: Scene, root: Path) -> depth_maps.DepthFiles | None:
     return depth_maps.DepthFiles(paths, "z", scale or _DEPTH_SCALE, moved)
 
 
-def _tum_camera(root: Path) -> tuple[Intrinsics, tuple[str, ...]]:
-    """Return the capture's camera, and a warning if it is a guess.
+def _tum_camera(root: Path) -> tuple[Intrinsics, tuple[Finding, ...]]:
+    """Return the capture's camera, and a finding if it is a guess.
 
     From ``cam_params.json``, else published values for the series in the folder's name, else the
     ROS default.
@@ -195,7 +202,8 @@ def _tum_camera(root: Path) -> tuple[Intrinsics, tuple[str, ...]]:
         f"{root} has no cam_params.json and no freiburg1, 2 or 3 in its name: focal length 525"
         " and a central principal point are assumed."
     )
-    return Intrinsics(1, "PINHOLE", *_SIZE, pinhole), () if series else (guess,)
+    found = () if series else (Finding("assumed-intrinsics", guess),)
+    return Intrinsics(1, "PINHOLE", *_SIZE, pinhole), found
 
 
 def _read_intrinsics(path: Path) -> Intrinsics:
@@ -221,10 +229,13 @@ def _check_image(path: Path, intrinsics: Intrinsics) -> None:
         )
 
 
-def _left_out(noun: str, lacking: str, names: Sequence[str]) -> tuple[str, ...]:
+def _left_out(kind: str, noun: str, lacking: str, names: Sequence[str]) -> tuple[Finding, ...]:
     are = agreeing(len(names), "is", "are")
     subject = f"{counted(len(names), noun)} without {lacking}"
-    return (f"{subject} {are} left out, such as {names[0]}.",) if names else ()
+    if not names:
+        return ()
+    text = f"{subject} {are} left out, such as {names[0]}."
+    return (Finding(kind, text, subjects=tuple(names)),)
 
 
 def _read_list(path: Path) -> tuple[Float64[np.ndarray, " N"], tuple[str, ...]]:

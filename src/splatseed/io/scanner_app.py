@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.findings import Finding
 from splatseed.io.depth_maps import match_by_name
 from splatseed.io.files import StrPath
 from splatseed.io.phone import (
@@ -73,19 +74,21 @@ def read_scanner_app(root: StrPath) -> Scene:
             found=f"none for {counted(len(records), 'frame')}",
             fix='In the app, share the scan as "All Data" and pass the folder in the archive.',
         )
-    notes = []
+    findings = []
     if lacking := len(records) - len(used):
         have = agreeing(lacking, "has no photograph and is", "have no photograph and are")
-        notes.append(f"{lacking} of {counted(len(records), 'frame')} {have} left out.")
+        text = f"{lacking} of {counted(len(records), 'frame')} {have} left out."
+        findings.append(Finding("missing-photographs", text))
     if lost := [name for stem, name in photographs.items() if stem not in records]:
         are = agreeing(len(lost), "is", "are")
         subject = f"{counted(len(lost), 'photograph')} without a pose (a .json beside it)"
-        notes.append(f"{subject} {are} left out, such as {lost[0]}.")
+        text = f"{subject} {are} left out, such as {lost[0]}."
+        findings.append(Finding("missing-poses", text, subjects=tuple(lost)))
 
     def read(name: str) -> PhoneFrame:
         return _read_frame(records[Path(name).stem], photograph_size(root / name))
 
-    scene = read_phone_scene(root, first, root, used, read, notes)
+    scene = read_phone_scene(root, first, root, used, read, findings)
     return scene.replace(depths=match_by_name(scene, root))
 
 

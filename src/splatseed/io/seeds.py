@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from splatseed.errors import PointCloudError
+from splatseed.findings import Finding
 from splatseed.io.files import ARCHIVE_FAILURES, read_npy
 from splatseed.io.recorded import facts_for_reading
 from splatseed.io.staging import MANIFEST, read_manifest, write_json
@@ -41,6 +42,7 @@ _STORED: dict[str, tuple[tuple[int, ...], np.dtype[Any]]] = {
 }
 """Shape of one point's value, and type in the file."""
 _DIGEST_BYTES = 16
+_IGNORED = "seeds-file-ignored"  # the kind of finding
 
 
 def _position_digest(xyz: Float32[np.ndarray, "n 3"]) -> bytes:
@@ -64,14 +66,14 @@ def recall_seeds(scene: Scene) -> Scene:
     """Give a scene's points the origin and the attributes in its ``seeds.npz``, if they match."""
     if scene.source is None or not len(scene.points):
         return scene
-    arrays, warnings = _read_seeds(scene.source.root, scene.points)
+    arrays, findings = _read_seeds(scene.source.root, scene.points)
     points = scene.points.replace(**arrays)
     # Tracks belong to the first points, and a new point has none.
     first_new = int(np.append(points.source != ORIGINAL, True).argmax())
     tracks = scene.tracks
     if tracks is not None:
         tracks = tracks.select(np.arange(len(tracks)) < first_new)
-    return replace(scene, points=points, tracks=tracks, findings=(*scene.findings, *warnings))
+    return replace(scene, points=points, tracks=tracks, findings=(*scene.findings, *findings))
 
 
 def _upsampling(scene: Scene) -> dict[str, Any] | None:
@@ -115,7 +117,9 @@ def carry_seeds(scene: Scene, written: Path, folder: Path) -> None:
     write_json(folder / MANIFEST, {**facts_for_reading(scene), UPSAMPLED: _upsampling(scene)})
 
 
-def _read_seeds(folder: Path, points: PointCloud) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
+def _read_seeds(
+    folder: Path, points: PointCloud
+) -> tuple[dict[str, np.ndarray], tuple[Finding, ...]]:
     """What ``seeds.npz`` says about the points read from a folder, or why it was ignored."""
     path = folder / SEEDS
     try:
@@ -125,7 +129,7 @@ def _read_seeds(folder: Path, points: PointCloud) -> tuple[dict[str, np.ndarray]
             digest = _member(archive, "digest", (_DIGEST_BYTES,), np.dtype("u1"))
             if digest.tobytes() != _position_digest(points.xyz):
                 found = "it belongs to other points than the scene's, which all count as originals"
-                return {}, (f"{SEEDS} was ignored: {found}.",)
+                return {}, (Finding(_IGNORED, f"{SEEDS} was ignored: {found}."),)
             there = {name.removesuffix(".npy") for name in archive.namelist()}
             arrays = {
                 name: _member(archive, name, (len(points), *shape), dtype)
@@ -135,8 +139,8 @@ def _read_seeds(folder: Path, points: PointCloud) -> tuple[dict[str, np.ndarray]
         known = {n: a if n == "source" else a.astype(np.float32) for n, a in arrays.items()}
         points.replace(**known)  # checks the values
     except (*ARCHIVE_FAILURES, PointCloudError) as error:
-        warning = f"{SEEDS} was ignored: it is damaged, or not splatseed's"
-        return {}, (f"{warning} ({type(error).__name__}).",)
+        text = f"{SEEDS} was ignored: it is damaged, or not splatseed's ({type(error).__name__})."
+        return {}, (Finding(_IGNORED, text),)
     return known, ()
 
 

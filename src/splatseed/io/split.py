@@ -11,6 +11,7 @@ import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
 
+from splatseed.findings import Finding
 from splatseed.io.files import read_bytes
 from splatseed.scene import Scene, Split
 from splatseed.text import agreeing, counted
@@ -31,7 +32,7 @@ def with_listed_split(scene: Scene) -> Scene:
     """Set a scene's split from its lists, if it has any."""
     if scene.source is None or not scene.images or scene.listed is not None:
         return scene
-    warnings = list(scene.findings)
+    findings = list(scene.findings)
     for origin, parts in _lists(scene):
         split, unknown = _split(scene, origin, parts)
         if split is not None:
@@ -39,10 +40,12 @@ def with_listed_split(scene: Scene) -> Scene:
                 shown = ", ".join(unknown[:_SHOWN]) + (", ..." if len(unknown) > _SHOWN else "")
                 match = agreeing(len(unknown), "matches", "match")
                 names = counted(len(unknown), "name")
-                warnings.append(f"{origin}: {names} {match} no image ({shown}).")
-            return scene.replace(listed=split, findings=tuple(warnings))
-        warnings.append(f"{origin} was ignored: it leaves no images to train on, or none to test.")
-    return scene.replace(findings=tuple(warnings))
+                text = f"{origin}: {names} {match} no image ({shown})."
+                findings.append(Finding("unknown-names-in-split", text, subjects=tuple(unknown)))
+            return scene.replace(listed=split, findings=tuple(findings))
+        text = f"{origin} was ignored: it leaves no images to train on, or none to test."
+        findings.append(Finding("unusable-split", text))
+    return scene.replace(findings=tuple(findings))
 
 
 def _lists(scene: Scene) -> Iterator[tuple[str, list[list[str]]]]:

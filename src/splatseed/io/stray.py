@@ -24,6 +24,7 @@ from jaxtyping import Bool, Float64
 
 from splatseed.camera import rotation_from_quat
 from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.findings import Finding
 from splatseed.io.camera_records import check_pose
 from splatseed.io.depth_maps import DepthFiles, find_confidences
 from splatseed.io.extraction import extracted, identity
@@ -72,12 +73,12 @@ def read_stray(root: StrPath) -> Scene:
     total = int(read_json(folder / _COUNT)["total"])
     names = sorted(path.name for path in folder.glob("*.jpg"))
     size = photograph_size(folder / names[0])
-    notes = _notes(track, len(names), total)
+    findings = _findings(track, len(names), total)
 
     def frame(name: str) -> PhoneFrame:
         return track.frame(int(Path(name).stem), size)
 
-    scene = read_phone_scene(root, root / ODOMETRY, folder, names, frame, notes)
+    scene = read_phone_scene(root, root / ODOMETRY, folder, names, frame, findings)
     maps = {im.name: track.depth(root, int(Path(im.name).stem)) for im in scene.images}
     paths = {name: path for name, path in maps.items() if path is not None}
     confidences = find_confidences(paths)
@@ -207,13 +208,15 @@ def _first_line(video: Path, track: _Track, total: int) -> int:
     )
 
 
-def _notes(track: _Track, used: int, total: int) -> list[str]:
-    notes = []
+def _findings(track: _Track, used: int, total: int) -> list[Finding]:
+    findings = []
     if used < min(total, len(track.poses)):
         which = "the sharpest at equal distances of the camera's motion"
-        notes.append(f"{used:,} of the {total:,} frames of {VIDEO} are used: {which}.")
+        text = f"{used:,} of the {total:,} frames of {VIDEO} are used: {which}."
+        findings.append(Finding("chosen-photographs", text, "info"))
     if total != len(track.poses):
         frames, lines = counted(total, "frame"), counted(len(track.poses), "pose")
         first = "the first pose has none" if total < len(track.poses) else "the last have no pose"
-        notes.append(f"{VIDEO} has {frames} and {ODOMETRY} {lines}: {first}.")
-    return notes
+        text = f"{VIDEO} has {frames} and {ODOMETRY} {lines}: {first}."
+        findings.append(Finding("missing-poses", text))
+    return findings

@@ -14,6 +14,7 @@ from jaxtyping import Float64
 
 from splatseed.camera import CAMERA_MODELS, Intrinsics
 from splatseed.errors import OutputError
+from splatseed.findings import Finding
 from splatseed.io import nerfstudio
 from splatseed.io.colmap_layout import Written, without_zero_distortion, write_colmap_layout
 from splatseed.io.frame_files import Found, FrameFiles
@@ -61,19 +62,16 @@ def write_both_layouts(scene: Scene, folder: Path) -> tuple[Written, Layout]:
     """Write a scene from a ``transforms.json`` in both layouts, in one world.
 
     Readers of COLMAP models find ``sparse/0`` and ``images``, the others ``transforms.json``. If
-    both cannot be in one folder, ``transforms.json`` is written alone, with a note.
+    both cannot be in one folder, ``transforms.json`` is written alone, with a finding.
     """
     plan, folders = _plan(scene), image_folders(scene)
     if obstacle := _obstacle(scene, plan.folders, folders):
-        notes, linked, offset = _write(scene, folder, plan, "transforms")
-        return (
-            [*notes, f"COLMAP's layout was left out: {obstacle}."],
-            linked,
-            offset,
-        ), "transforms"
-    notes, linked, offset = _write(scene, folder, plan, "both")
-    more, folders, _ = write_colmap_layout(scene, folder)
-    return ([*notes, *more], {**linked, **folders}, offset), "both"
+        _, linked, offset = _write(scene, folder, plan, "transforms")
+        text = f"COLMAP's layout was left out: {obstacle}."
+        return ([Finding("layout-left-out", text)], linked, offset), "transforms"
+    _, linked, offset = _write(scene, folder, plan, "both")
+    findings, folders, _ = write_colmap_layout(scene, folder)
+    return (findings, {**linked, **folders}, offset), "both"
 
 
 def _obstacle(scene: Scene, named: Mapping[str, Path], folders: Mapping[str, Path]) -> str:

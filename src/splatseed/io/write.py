@@ -12,12 +12,13 @@ from __future__ import annotations
 import platform
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path, PurePath
 from typing import Literal
 
 from splatseed.errors import OutputError, PointCloudError
+from splatseed.findings import Finding
 from splatseed.io.cleaning import clean_scene
 from splatseed.io.colmap_layout import write_colmap_layout
 from splatseed.io.extraction import is_extracted
@@ -44,7 +45,7 @@ _PACKAGES = ("splatseed", "numpy", "scipy", "numba")
 
 @dataclass(frozen=True)
 class WriteReport:
-    """Files, counts and notes of a written scene.
+    """Files, counts and findings of a written scene.
 
     Dropped points, counted since reading, had a coordinate that is not finite or the position of an
     earlier point. ``files`` are paths inside the folder; image folders are named, not listed.
@@ -57,7 +58,7 @@ class WriteReport:
     dropped_nonfinite: int
     dropped_duplicates: int
     files: tuple[str, ...]
-    notes: tuple[str, ...]
+    findings: tuple[Finding, ...]
 
 
 def write_scene(
@@ -100,12 +101,13 @@ def write_scene(
     kind = str(made.get("command", _KIND))
     with output_folder(path, kind=kind, overwrite=overwrite, protect=inputs) as folder:
         if layout == "both":
-            (notes, image_sources, offset), layout = write_both_layouts(clean, folder)
+            (findings, image_sources, offset), layout = write_both_layouts(clean, folder)
         else:
             write = write_colmap_layout if layout == "colmap" else write_transforms_layout
-            notes, image_sources, offset = write(clean, folder)
+            findings, image_sources, offset = write(clean, folder)
             if layout == "colmap" and (hidden := photographs_hidden(image_sources, clean)):
-                notes.append(f"{hidden}: remove the folder's link before you train with it.")
+                text = f"{hidden}: remove the folder's link before you train with it."
+                findings.append(Finding("hidden-photographs", text))
         write_offset(folder, offset)
         masks, photographs = clean.masks, source.image_dir if source else None
         if masks and photographs and rewrites_masks(clean, layout):
@@ -137,9 +139,14 @@ def write_scene(
         num_new = counts["num_points"] - counts["num_original"]
         made |= facts_for_reading(scene)
         facts = {"source": read, **made, "format": layout, **counts, "num_new": num_new}
-        write_json(folder / MANIFEST, {**facts, "notes": notes, "versions": versions})
+        facts |= {"findings": [asdict(each) for each in findings], "versions": versions}
+        write_json(folder / MANIFEST, facts)
     return WriteReport(
-        path, layout, **counts, files=tuple(sorted([*files, *linked, MANIFEST])), notes=tuple(notes)
+        path,
+        layout,
+        **counts,
+        files=tuple(sorted([*files, *linked, MANIFEST])),
+        findings=tuple(findings),
     )
 
 

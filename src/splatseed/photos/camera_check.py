@@ -22,6 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64
 
+from splatseed.findings import Finding
 from splatseed.photos.view import View, camera_views
 from splatseed.photos.visibility import points_in_image
 from splatseed.scene import Scene
@@ -43,7 +44,7 @@ class CameraCheckSettings:
     stray_distance: float = 10.0  # without points: distance of a stray, in extents of the others
     max_projections: int = 10_000_000  # points times views; beyond it points are subsampled
     min_sample: int = 10_000  # points that subsampling keeps
-    max_names: int = 5  # strays named in a note
+    max_names: int = 5  # strays named in a message
 
 
 SETTINGS = CameraCheckSettings()
@@ -96,16 +97,16 @@ def stray_views(views: Sequence[View], xyz: Float[np.ndarray, "P 3"]) -> tuple[s
     return tuple(view.name for view, stray in zip(views, strays, strict=True) if stray)
 
 
-def stray_camera_notes(scene: Scene) -> tuple[str, ...]:
-    """Return a note for the user that names a scene's stray cameras, if it has any."""
-    return format_stray_note(stray_views(camera_views(scene.images), reference_points(scene)))
+def stray_cameras(scene: Scene) -> tuple[Finding, ...]:
+    """Name a scene's stray cameras, if it has any."""
+    return stray_findings(stray_views(camera_views(scene.images), reference_points(scene)))
 
 
-def format_stray_note(names: Sequence[str]) -> tuple[str, ...]:
-    """Return a note for the user on stray cameras of these names, if there are any."""
+def stray_findings(names: Sequence[str]) -> tuple[Finding, ...]:
+    """Make the finding on stray cameras of these names, if there are any."""
     if not names:
         return ()
-    note = f"The camera of {names[0]} is far from all others: check its pose, or leave it out."
+    text = f"The camera of {names[0]} is far from all others: check its pose, or leave it out."
     if len(names) > 1:
         listed = ", ".join(names[: SETTINGS.max_names])
         listed += (
@@ -113,9 +114,9 @@ def format_stray_note(names: Sequence[str]) -> tuple[str, ...]:
             if len(names) > SETTINGS.max_names
             else ""
         )
-        note = f"{len(names):,} cameras are far from all others: check their poses, or leave them"
-        note = f"{note} out ({listed})."
-    return (note,)
+        text = f"{len(names):,} cameras are far from all others: check their poses, or leave them"
+        text = f"{text} out ({listed})."
+    return (Finding("stray-cameras", text, subjects=tuple(names)),)
 
 
 def camera_centers(views: Sequence[View]) -> Float64[np.ndarray, "V 3"]:

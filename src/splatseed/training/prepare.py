@@ -21,7 +21,7 @@ from splatseed.io.files import StrPath
 from splatseed.io.photograph import photograph_folder
 from splatseed.io.photograph_checks import check_sizes, with_photographs
 from splatseed.io.seeds import was_upsampled
-from splatseed.photos.camera_check import format_stray_note, reference_points
+from splatseed.photos.camera_check import reference_points, stray_findings
 from splatseed.photos.loading import load_split, refuse_distortion
 from splatseed.photos.sizes import at_file_size
 from splatseed.photos.view import View, camera_views
@@ -129,7 +129,7 @@ def prepare_run(
         )
     initial = _initial(scene, settings, note)
     frame = initial.frame(scene, settings)
-    for stray in format_stray_note(frame.strays):
+    for stray in stray_findings(frame.strays):
         note(stray)
     check_fits(initial.facts["count"], device)
     name = device_name(device)

@@ -19,7 +19,7 @@ from splatseed.io.masks import with_masks
 from splatseed.io.origin import RECENTER, format_offset, middle_of_cameras, translated
 from splatseed.io.staging import check_output
 from splatseed.methods import Upsampler, configure, number_of_new, planned_size, traits_of
-from splatseed.photos.camera_check import stray_camera_notes
+from splatseed.photos.camera_check import stray_cameras
 from splatseed.scene import Scene
 from splatseed.seeding import photo_methods
 from splatseed.seeding.advice import DEFAULT_METHOD, method_for
@@ -152,7 +152,7 @@ def _announce(
     memory_note: str,
 ) -> None:
     """Print the plan, the scene's warnings, and the options that have no effect."""
-    for warning in (*scene.findings, *stray_camera_notes(scene)):
+    for warning in (*scene.findings, *stray_cameras(scene)):
         print_note(warning)
     name, method = options.method, methods[options.method]
     if unused := report.unused_maps_note(options, scene, method):

@@ -250,7 +250,7 @@ def summarise(
         paths = [output / name for name in names if (output / name).is_file()]
         rows += [("" if i else label, str(path)) for i, path in enumerate(paths)]
     print_pairs("splatseed upsample", rows)
-    for note in written.notes:
+    for note in written.findings:
         print_note(note)
     if written.layout == "transforms":
         print_note(

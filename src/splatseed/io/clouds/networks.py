@@ -23,6 +23,7 @@ from jaxtyping import Float64
 
 from splatseed.camera import rotation_from_quat
 from splatseed.errors import SceneFormatError
+from splatseed.findings import Finding
 from splatseed.io.cloud_file import RGB, XYZ, Block, CloudFile, RowCloud, to_uint8
 from splatseed.io.files import open_file, read_npy, read_npy_header, translate_errors
 from splatseed.runtime.memory import check_memory
@@ -136,7 +137,8 @@ class GlbCloud(CloudFile):
         count = sum(part.position.num_rows for part in self._parts)
         super().__init__(path, (*XYZ, *RGB) if colored else XYZ, count)
         if points and len(points) < len(parts):
-            self.warnings = ("It holds points and meshes: the meshes are left out.",)
+            text = "It holds points and meshes: the meshes are left out."
+            self.findings = (Finding("meshes-left-out", text),)
 
     def _sample(self) -> Block:
         return dict.fromkeys(RGB, np.empty(0, np.uint8))  # blocks have bytes

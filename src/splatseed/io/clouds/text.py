@@ -3,7 +3,7 @@
 Delimiter, decimal comma and header line are detected from the first lines. Without a header,
 columns 1 to 3 are the position. The colour is the first run of three columns with integers from 0
 to 65535, or with numbers from 0 to 1 that are not unit normals; if the first of them exceeds 255
-and three bytes follow it, it is intensity. A fourth and last column is intensity. ``warnings``
+and three bytes follow it, it is intensity. A fourth and last column is intensity. ``findings``
 report the guess. PTS files start with the point count and have intensity before colours.
 """
 
@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from splatseed.errors import SceneFormatError
+from splatseed.findings import Finding
 from splatseed.io.cloud_file import RGB, SAMPLE_BYTES, XYZ, CloudFile, Dialect, LineCloud
 from splatseed.io.files import open_file
 
@@ -60,7 +61,8 @@ def open_text(path: Path) -> CloudFile:
         elif cloud.colors == "intensity":
             colors = "4 as intensity"
         guess = f"columns 1 to 3 of {path.name} are taken as x, y, z, {colors}"
-        cloud.warnings = (f"It has no header line: {guess}.",)
+        text = f"It has no header line: {guess}."
+        cloud.findings = (Finding("guessed-columns", text),)
     return cloud
 
 

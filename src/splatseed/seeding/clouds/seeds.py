@@ -194,7 +194,7 @@ def _reading_notes(merged: MergedCloud) -> list[str]:
     voxels = merged.voxels
     outside = f"{voxels.num_outside:,} of them outside of every photograph"
     notes = [f"{voxels.total + merged.non_finite:,} points were read, {outside}."]
-    notes += [warning for file in merged.files for warning in file.warnings]
+    notes += [warning for file in merged.files for warning in file.findings]
     if merged.non_finite:
         notes.append(f"{merged.non_finite:,} points of the cloud are not finite and were left out.")
     if voxels.coarsening:
