@@ -9,21 +9,24 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from types import ModuleType
+from typing import Any, TypeAlias
 
 import numpy as np
 from benchmarks.stereo.truth import first, load, nearest_error
 
 import splatseed as ss
-from splatseed.depth.stereo import detail
-from splatseed.depth.stereo.fusion import StereoSeeds, fuse
+from splatseed.depth.stereo import detail, fusion
+from splatseed.depth.stereo.fusion import fuse
 from splatseed.depth.stereo.maps import StereoResult, StereoSettings
 from splatseed.depth.stereo.pipeline import find_stereo, known_visibility
 from splatseed.photos.loading import load_views
 from splatseed.photos.sizes import factor_for_size
+from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
-from splatseed.seeding import dense
 
 __all__ = ["MULTIPLES", "score_dense"]
 
@@ -31,6 +34,8 @@ MULTIPLES = (4, 16)
 """Budgets, as multiples of the sparse seeds."""
 ARMS = {"in proportion to contrast": 1.0, "evenly": 0.0}
 SPACING = 8.0
+Part: TypeAlias = tuple[StereoResult, int, PointCloud]
+"""Seeds of one view: the result of stereo, the index of the view, and the seeds."""
 
 
 def score_dense(name: str, cache: str, limit: int) -> list[dict[str, Any]]:
@@ -38,10 +43,11 @@ def score_dense(name: str, cache: str, limit: int) -> list[dict[str, Any]]:
     scene = first(load(name, Path(cache)), limit)
     images = scene.images
     views = load_views(scene, images, data_factor=factor_for_size(images, 800), undistort=True)
-    started = time.process_time()
-    stereo = find_stereo(views, images, known_visibility(scene), StereoSettings())
-    seeds = fuse(stereo, SPACING)
-    rows = [_row("sparse", stereo, seeds, scene, time.process_time() - started)]
+    with _watched(fusion) as parts:
+        started = time.process_time()
+        stereo = find_stereo(views, images, known_visibility(scene), StereoSettings())
+        seeds = fuse(stereo, SPACING)
+        rows = [_row("sparse", parts, scene, time.process_time() - started)]
     for multiple in MULTIPLES:
         for label, exponent in ARMS.items():
             budget = len(scene.points) + multiple * len(seeds)
@@ -51,34 +57,43 @@ def score_dense(name: str, cache: str, limit: int) -> list[dict[str, Any]]:
 
 def _dense_row(label: str, scene: Scene, budget: int, exponent: float) -> dict[str, Any]:
     """Make seeds within a budget, and keep what they are made of."""
-    made: list[tuple[StereoResult, StereoSeeds]] = []
-    choose, before = dense.fuse_at_most, detail.DETAIL
+    before, started = detail.DETAIL, time.process_time()
+    with _watched(detail) as parts:
+        try:
+            detail.DETAIL = dataclasses.replace(before, exponent=exponent)
+            ss.upsample(scene, "stereo", budget=budget)
+        finally:
+            detail.DETAIL = before
+    return _row(label, parts, scene, time.process_time() - started)
 
-    def watched(stereo: StereoResult, *arguments: Any) -> StereoSeeds:
-        made.append((stereo, choose(stereo, *arguments)))
-        return made[0][1]
 
-    started = time.process_time()
+@contextmanager
+def _watched(module: ModuleType) -> Iterator[list[Part]]:
+    """Keep the seeds of each view that ``module`` makes while the block runs."""
+    make_seeds, parts = module.make_seeds, list[Part]()
+
+    def watched(stereo: StereoResult, i: int, places: Any) -> PointCloud:
+        parts.append((stereo, i, make_seeds(stereo, i, places)))
+        return parts[-1][2]
+
+    module.make_seeds = watched
     try:
-        dense.fuse_at_most = watched
-        detail.DETAIL = dataclasses.replace(before, exponent=exponent)
-        ss.upsample(scene, "stereo", budget=budget)
+        yield parts
     finally:
-        dense.fuse_at_most, detail.DETAIL = choose, before
-    return _row(label, *made[0], scene, time.process_time() - started)
+        module.make_seeds = make_seeds
 
 
-def _row(
-    label: str, stereo: StereoResult, seeds: StereoSeeds, scene: Scene, seconds: float
-) -> dict[str, Any]:
-    errors = []
-    for i, view in enumerate(stereo.views):
-        uv, z = view.camera.project(seeds.xyz[seeds.view_idx == i].astype(float))
+def _row(label: str, parts: list[Part], scene: Scene, seconds: float) -> dict[str, Any]:
+    errors, stereo = [], parts[0][0]
+    for _, i, seeds in parts:
+        view = stereo.views[i]
+        uv, z = view.camera.project(seeds.xyz.astype(float))
         errors.append(
             nearest_error(uv / [view.width, view.height], z, scene.depths.read(view.name).values)
         )
     error = np.concatenate(errors)
     error = error[np.isfinite(error)]
     size = f"{stereo.views[0].width}, every {stereo.settings.grid}"
+    num = sum(len(seeds) for _, _, seeds in parts)
     shares = [float((error < limit).mean()) for limit in (0.01, 0.05)]
-    return {"label": label, "size": size, "seeds": len(seeds), "shares": shares, "seconds": seconds}
+    return {"label": label, "size": size, "seeds": num, "shares": shares, "seconds": seconds}

@@ -6,12 +6,13 @@ xyz uniform in the axis-aligned bounding box of the originals, rgb drawn from th
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from splatseed.methods.contract import NewPoints
 from splatseed.methods.neighbors import prepare_scene
+from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress
 from splatseed.scene import Scene
 
@@ -22,9 +23,11 @@ BLOCK = 1 << 18
 class BoundingBox:
     """Points uniform in the bounding box, coloured as random originals: the baseline."""
 
+    name: ClassVar[str] = "random"
+
     def __call__(
         self, scene: Scene, num_new: int, rng: np.random.Generator, progress: Progress
-    ) -> NewPoints:
+    ) -> PointCloud:
         """Make ``num_new`` points."""
         cloud = prepare_scene(scene, progress)
         low, high = cloud.xyz.min(axis=0), cloud.xyz.max(axis=0)
@@ -37,7 +40,7 @@ class BoundingBox:
         by_rank[cloud.rank] = cloud.rgb
         rgb = by_rank[rng.integers(0, len(cloud), num_new, dtype=np.int32)]
         progress("random", 1.0)
-        return NewPoints(xyz, rgb)
+        return PointCloud(xyz, rgb)
 
 
 def in_box(

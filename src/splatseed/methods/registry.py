@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping
 from functools import cached_property
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
+from types import MappingProxyType
 from typing import Any, Literal, cast
 
 from splatseed.errors import MissingDependencyError, ParameterError, UnknownNameError
@@ -137,6 +138,27 @@ def configure(method: str, profile: Profile = "default", **parameters: Any) -> U
     chosen: Any = getattr(kind, "paper", kind)() if profile == "paper" else kind()
     configured: Upsampler = change_settings(chosen, method, parameters)
     return configured
+
+
+def resolve(
+    method: str | Upsampler,
+    profile: Profile = "default",
+    parameters: Mapping[str, Any] = MappingProxyType({}),
+) -> tuple[str, Upsampler]:
+    """Return the name of a method, and the method with its parameters.
+
+    Raises:
+        ParameterError: As for ``configure``, or a configured method has a profile or parameters.
+    """
+    if isinstance(method, str):
+        return method, configure(method, profile, **parameters)
+    if extra := [*parameters, *(["profile"] if profile != "default" else [])]:
+        raise ParameterError(
+            f"no parameters next to {method!r}, which has its own",
+            found=", ".join(extra),
+            fix="Give the method by name, or set its fields with dataclasses.replace.",
+        )
+    return getattr(method, "name", type(method).__name__), method
 
 
 def chooses_number(method: str | Upsampler) -> bool:

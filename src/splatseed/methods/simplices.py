@@ -15,9 +15,9 @@ from typing import ClassVar
 import numpy as np
 
 from splatseed.methods._kernels import simplices as kernels
-from splatseed.methods.contract import NewPoints
 from splatseed.methods.nearest import Aux, NearestMethod
 from splatseed.methods.neighbors import Bases, Neighbors, PreparedCloud
+from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress
 
 
@@ -34,18 +34,18 @@ class _Simplex(NearestMethod):
         bases: Bases,
         rng: np.random.Generator,
         progress: Progress,
-    ) -> NewPoints:
+    ) -> PointCloud:
         """Make the points of all bases."""
         num = bases.total
         draws = rng.random((num, 2) if self.num_neighbors == 2 else num, dtype=np.float32)
         progress(self.name, 0.0)
-        new = NewPoints(np.empty((num, 3), np.float32), np.empty((num, 3), np.uint8))
+        xyz, rgb = np.empty((num, 3), np.float32), np.empty((num, 3), np.uint8)
         self._fill(
             cloud.xyz, cloud.rgb, cloud.center, neighbors.idx, bases.start, bases.count,
-            draws, new.xyz, new.rgb,
+            draws, xyz, rgb,
         )  # fmt: skip
         progress(self.name, 1.0)
-        return new
+        return PointCloud(xyz, rgb)
 
     @staticmethod
     @abstractmethod

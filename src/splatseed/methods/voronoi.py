@@ -23,10 +23,10 @@ from jaxtyping import Float64
 from splatseed.methods._kernels import cells as kernels
 from splatseed.methods._kernels.cells import MAX_NEIGHBORS
 from splatseed.methods.cells import Cells, box_cells
-from splatseed.methods.contract import NewPoints
 from splatseed.methods.nearest import Aux, NearestMethod, colors_of_nearest, interpolate_colors
 from splatseed.methods.neighbors import Bases, Neighbors, PreparedCloud
 from splatseed.methods.patches import local_frames
+from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, blocks
 from splatseed.settings import Range
 
@@ -85,7 +85,7 @@ class Voronoi(NearestMethod):
         bases: Bases,
         rng: np.random.Generator,
         progress: Progress,
-    ) -> NewPoints:
+    ) -> PointCloud:
         """Draw the points of all bases in the balls of their cells."""
         frames, _ = local_frames(cloud.xyz, neighbors.idx)
         xyz = rng.random((bases.total, 3), dtype=np.float32)
@@ -97,7 +97,7 @@ class Voronoi(NearestMethod):
             rgb = colors_of_nearest(cloud, neighbors, local, self.color_k, progress)
         else:
             rgb = interpolate_colors(cloud, neighbors.nearest(self.color_k), bases, xyz)
-        return NewPoints(xyz, rgb)
+        return PointCloud(xyz, rgb)
 
 
 def _clamped_cells(cloud: PreparedCloud, neighbors: Neighbors, progress: Progress) -> Cells:

@@ -12,16 +12,17 @@ budget (bonsai, treehill), adding points cost up to 0.4 dB.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
 from splatseed.depthmap import in_scene_units
+from splatseed.findings import Finding
 from splatseed.io.seeds import was_upsampled
 from splatseed.methods import Upsampler
 from splatseed.pointcloud import PointCloud
+from splatseed.progress import Note, silent_note
 from splatseed.scene import Scene
 
 DEFAULT_METHOD, FALLBACK = "auto", "mls"
@@ -87,14 +88,13 @@ def advice_for(
 
 
 def method_for(
-    scene: Scene | PointCloud,
-    method: str | Upsampler = DEFAULT_METHOD,
-    note: Callable[[str], None] = lambda _: None,
+    scene: Scene | PointCloud, method: str | Upsampler = DEFAULT_METHOD, note: Note = silent_note
 ) -> str | Upsampler:
     """Return ``method`` if there are photographs, else ``FALLBACK``, with a note."""
     if isinstance(scene, Scene) and scene.has_photographs:
         return method
-    note(f"Without photographs, method {FALLBACK} is used instead of {DEFAULT_METHOD}.")
+    text = f"Without photographs, method {FALLBACK} is used instead of {DEFAULT_METHOD}."
+    note(Finding("fallback-method", text, "info"))
     return FALLBACK
 
 

@@ -17,16 +17,18 @@ benchmarks/seeds/README.md says how the rule was chosen.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int32, Int64, UInt8
+from jaxtyping import Bool, Float32, Float64, Int64
 
 from splatseed.errors import ParameterError, PointCloudError
+from splatseed.methods import source_code
 from splatseed.photos.projection import cells_from_world, grid_shape
 from splatseed.photos.view import View
 from splatseed.photos.visibility import SURFACE
 from splatseed.photos.zbuffer import cell_depths
+from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.seeding._kernels.cover import guess_cell_depths, lift_cells, mean_colors
 from splatseed.seeding.coverage import cell_depths_of_views, check_points
@@ -98,30 +100,6 @@ def guess_depths(
 Mask = Bool[np.ndarray, "H W"]
 
 
-@dataclass(frozen=True, eq=False)
-class CoverSeeds:
-    """Seeds, in the order in which the views were taken."""
-
-    xyz: Float32[np.ndarray, "M 3"]  # world
-    rgb: UInt8[np.ndarray, "M 3"]  # mean of the cell
-    view: Int32[np.ndarray, " M"]  # the index of its view
-    size: Float32[np.ndarray, " M"]  # side of the cell at the seed's depth, scene units
-    confidence: Float32[np.ndarray, " M"]  # 0.3 beside a covered cell, falling to 0.1
-
-    def __len__(self) -> int:
-        return len(self.xyz)
-
-    def select(self, which: Bool[np.ndarray, " M"]) -> CoverSeeds:
-        """Return some of the seeds."""
-        return CoverSeeds(*(getattr(self, field.name)[which] for field in fields(CoverSeeds)))
-
-    @staticmethod
-    def concatenate(parts: Sequence[CoverSeeds]) -> CoverSeeds:
-        """Join parts, one after another."""
-        names = [field.name for field in fields(CoverSeeds)]
-        return CoverSeeds(*(np.concatenate([getattr(part, n) for part in parts]) for n in names))
-
-
 def cover(
     views: Sequence[View],
     xyz: Float32[np.ndarray, "N 3"],
@@ -130,7 +108,7 @@ def cover(
     rng: np.random.Generator,
     masks: Sequence[Mask | None] | None = None,
     progress: Progress = silent,
-) -> CoverSeeds:
+) -> PointCloud:
     """Seed every empty cell of every view.
 
     Args:
@@ -140,6 +118,11 @@ def cover(
         rng: Draws the order of the views, and those that may contradict.
         masks: For each view the pixels that count, None for all; a cell needs half of its pixels.
         progress: Called with the stage and the fraction done.
+
+    Returns:
+        Seeds in the order in which the views were taken, with the mean colour of the cell, as sizes
+        the side of the cell at that depth, and confidence: 0.3 beside a covered cell, falling to
+        0.1.
 
     Raises:
         ParameterError: There is no view, one has no pixels, ``cell`` is below 1, or a mask has
@@ -162,11 +145,11 @@ def cover(
             guess = guess_depths(depths, empty, lift, reference, checked)
         else:
             guess = np.full(len(empty), typical), np.full(len(empty), np.inf, np.float32)
-        seeds = make_seeds(views[v], int(v), cell, empty, guess, masks[v])
+        seeds = make_seeds(views[v], cell, empty, guess, masks[v])
         cloud.append(seeds.xyz)
         parts.append(seeds)
         progress("cover", len(parts) / len(views))
-    return CoverSeeds.concatenate(parts)
+    return PointCloud.concatenate(*parts).with_source(source_code("cover"))
 
 
 def _draw_others(v: int, num: int, rng: np.random.Generator) -> Int64[np.ndarray, " K"]:
@@ -238,12 +221,11 @@ class GrowableArray:
 
 def make_seeds(
     view: View,
-    idx: int,
     cell: float,
     empty: Int64[np.ndarray, " M"],
     guess: tuple[Float32[np.ndarray, " M"], Float32[np.ndarray, " M"]],
     mask: Mask | None,
-) -> CoverSeeds:
+) -> PointCloud:
     """Place seeds in empty cells at given depths, except where too few pixels count.
 
     ``guess`` are the depths and the distances to the nearest covered cells, in cells.
@@ -259,8 +241,7 @@ def make_seeds(
     sides = depths * np.float32(_side_at_one(view, shape))
     # The distance is 1 beside a covered cell.
     confidence = np.maximum(np.float32(MAX_CONFIDENCE) / distances, np.float32(MIN_CONFIDENCE))
-    of = np.full(len(empty), idx, np.int32)
-    return CoverSeeds(*(values[usable] for values in (xyz, rgb, of, sides, confidence)))
+    return PointCloud(xyz[usable], rgb[usable], sizes=sides[usable], confidence=confidence[usable])
 
 
 def _side_at_one(view: View, shape: tuple[int, ...]) -> float:
