@@ -18,7 +18,7 @@ from splatseed.io.depth_files import read_stored
 from splatseed.io.files import open_file, read_file
 from splatseed.io.photograph import photograph_bytes
 from splatseed.io.staging import read_manifest
-from splatseed.seeding.trainability import untrainable
+from splatseed.seeding.advice import untrainable
 
 from ..findings import texts
 from .checks import little_memory

@@ -12,8 +12,13 @@ from splatseed.errors import ParameterError, PointCloudError
 from splatseed.photos.zbuffer import cell_depths
 from splatseed.progress import silent
 from splatseed.seeding import cover as module
-from splatseed.seeding.cover import cover, guess_depths, reference_depths, world_from_cells
-from splatseed.seeding.coverage import covered_share
+from splatseed.seeding.cover import (
+    cover,
+    covered_share,
+    guess_depths,
+    reference_depths,
+    world_from_cells,
+)
 
 from ..seeds_of_views import seeds_of_views
 from . import references as slow

@@ -42,9 +42,8 @@ from splatseed.photos.camera_check import stray_cameras
 from splatseed.progress import Progress
 from splatseed.scene import Scene
 from splatseed.seeding import diagnostics
-from splatseed.seeding.advice import Advice, advice_for
+from splatseed.seeding.advice import Advice, advice_for, is_distorted, untrainable
 from splatseed.seeding.photo_methods import has_points, photographed
-from splatseed.seeding.trainability import is_distorted, untrainable
 from splatseed.text import counted, quoted, visible
 from splatseed.training.folder import RunFolder
 from splatseed.training.schedule import FULL_RUN

@@ -18,9 +18,8 @@ from splatseed.lens import undistort_command, undistorted_folder
 from splatseed.photos.sizes import TRAINED_SIDE, at_file_size, factor_for_size
 from splatseed.runtime.environment import available_cpus
 from splatseed.scene import Image, Scene
-from splatseed.seeding.advice import AS_IT_IS, SEEDED, Advice
+from splatseed.seeding.advice import AS_IT_IS, SEEDED, Advice, is_distorted, untrainable
 from splatseed.seeding.photo_methods import Auto
-from splatseed.seeding.trainability import is_distorted, untrainable
 from splatseed.text import quoted
 from splatseed.training.duration import format_duration, planned_seconds
 from splatseed.training.schedule import FULL_RUN

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
 from splatseed.errors import PointCloudError
-from splatseed.methods._kernels import colors as kernels
+from splatseed.methods._kernels import nearest as kernels
 from splatseed.methods.neighbors import (
     QUERY_BLOCK,
     Bases,

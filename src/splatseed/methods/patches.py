@@ -20,7 +20,6 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32
 
 from splatseed.methods._kernels import patches as kernels
-from splatseed.methods._kernels.frames import fill_frames
 from splatseed.methods.nearest import Aux, NearestMethod, interpolate_colors
 from splatseed.methods.neighbors import Bases, Neighbors, PreparedCloud
 from splatseed.pointcloud import PointCloud
@@ -36,7 +35,7 @@ def local_frames(
 ) -> tuple[Float64[np.ndarray, "m 3 3"], Bool[np.ndarray, " m"]]:
     """Compute the axes e_u, e_v, e_n of m neighbourhoods, and mark the collinear ones."""
     frames, collinear = np.empty((len(idx), 3, 3)), np.empty(len(idx), bool)
-    fill_frames(xyz, idx, frames, collinear, COLLINEAR)
+    kernels.fill_frames(xyz, idx, frames, collinear, COLLINEAR)
     return frames, collinear
 
 

@@ -25,13 +25,13 @@ from splatseed.text import did_you_mean
 GROUP = "splatseed.methods"
 
 BUILT_IN = {
-    "linear": "splatseed.methods.simplices:Linear",
-    "triangle": "splatseed.methods.simplices:Triangle",
-    "spline": "splatseed.methods.spline:Spline",
-    "mls": "splatseed.methods.mls:Mls",
+    "linear": "splatseed.methods.elementary:Linear",
+    "triangle": "splatseed.methods.elementary:Triangle",
+    "spline": "splatseed.methods.surfaces:Spline",
+    "mls": "splatseed.methods.surfaces:Mls",
     "voronoi": "splatseed.methods.voronoi:Voronoi",
     "depth": "splatseed.methods.depth:Depth",
-    "random": "splatseed.methods.bounding_box:BoundingBox",
+    "random": "splatseed.methods.elementary:BoundingBox",
     "stereo": "splatseed.seeding.photo_methods:Stereo",
     "cover": "splatseed.seeding.photo_methods:Cover",
     "auto": "splatseed.seeding.photo_methods:Auto",

@@ -1,13 +1,14 @@
 """Cover: a seed in every part of every photograph that no point covers.
 
-Notation: cells are those of ``photos.zbuffer``; an *empty* cell is one that is not covered
-(``coverage``). Views are taken in random order, each with the seeds of the views before. An empty
-cell gets one seed on the ray through its centre. Its depth is a guess from covered cells of the
-same view: in each of eight sectors of 45 degrees the nearest one, up to ``2 r + 1`` cells away,
-where r is the distance of the nearest of all. Another view *contradicts* a seed that lies in front
-of the view's covered cell, nearer by more than ``SURFACE``: it sees through the seed. The guess is
-the median of the sectors' depths, weighted by ``1 / ((1 + contradictions) distance^2)``. In a view
-without covered cells it is the median depth of all views.
+Notation: views are divided into the cells of ``photos.zbuffer``; a cell is *covered* if it holds a
+point and its neighbours do not hide it, so that its depth is finite; else it is *empty*. Views are
+taken in random order, each with the seeds of the views before. An empty cell gets one seed on the
+ray through its centre. Its depth is a guess from covered cells of the same view: in each of eight
+sectors of 45 degrees the nearest one, up to ``2 r + 1`` cells away, where r is the distance of the
+nearest of all. Another view *contradicts* a seed that lies in front of the view's covered cell,
+nearer by more than ``SURFACE``: it sees through the seed. The guess is the median of the sectors'
+depths, weighted by ``1 / ((1 + contradictions) distance^2)``. In a view without covered cells it is
+the median depth of all views.
 Promise: confidence is low, at most ``MAX_CONFIDENCE``; the same seed gives the same bytes on any
 number of cores, as views are processed one after another.
 
@@ -29,14 +30,84 @@ from splatseed.photos.view import View
 from splatseed.photos.visibility import SURFACE
 from splatseed.photos.zbuffer import cell_depths
 from splatseed.pointcloud import PointCloud
-from splatseed.progress import Progress, silent
+from splatseed.progress import Progress, in_threads, silent
 from splatseed.seeding._kernels.cover import guess_cell_depths, lift_cells, mean_colors
-from splatseed.seeding.coverage import cell_depths_of_views, check_points
 
 CHECKED_VIEWS = 12  # other views that may contradict a seed
 MIN_CHECK_CELL = 8  # minimum side of these views' cells, in pixels
 MAX_CONFIDENCE, MIN_CONFIDENCE = 0.3, 0.1
 """Confidence of a seed beside a covered cell, and of one far from all."""
+
+
+def covered_share(
+    views: Sequence[View],
+    xyz: Float32[np.ndarray, "N 3"],
+    cell: float = 8,
+    progress: Progress = silent,
+) -> float:
+    """Return the mean over views of the fraction of cells, ``cell`` pixels wide, that are covered.
+
+    Views need no pixels.
+
+    Raises:
+        ParameterError: There is no view, or ``cell`` is below 1.
+        PointCloudError: ``xyz`` is not of shape [N, 3].
+    """
+    return float(np.mean([cells.mean() for cells in covered_cells(views, xyz, cell, progress)]))
+
+
+def covered_cells(
+    views: Sequence[View],
+    xyz: Float32[np.ndarray, "N 3"],
+    cell: float = 8,
+    progress: Progress = silent,
+) -> tuple[Bool[np.ndarray, "rows cols"], ...]:
+    """Tell which cells of each view are covered; arguments and errors as in ``covered_share``."""
+    xyz = check_points(views, xyz, cell)
+    depths = cell_depths_of_views(views, xyz, cell, progress, "find uncovered cells")
+    return tuple(np.isfinite(cells) for cells in depths)
+
+
+def cell_depths_of_views(
+    views: Sequence[View],
+    xyz: Float32[np.ndarray, "N 3"],
+    cell: float,
+    progress: Progress,
+    stage: str,
+) -> list[Float32[np.ndarray, "rows cols"]]:
+    """Compute ``cell_depths`` of each view, on all threads."""
+    maps = [np.empty((0, 0), np.float32)] * len(views)
+
+    def work(start: int, _stop: int) -> None:
+        maps[start] = cell_depths(views[start].camera, xyz, cell)
+
+    in_threads(work, len(views), 1, stage, progress)
+    return maps
+
+
+def check_points(
+    views: Sequence[View], xyz: Float32[np.ndarray, "N 3"], cell: float
+) -> Float32[np.ndarray, "N 3"]:
+    """Return ``kernel_points``; errors are those of ``covered_share``."""
+    if not views:
+        raise ParameterError("at least one view", found="none", fix="Pass a scene with images.")
+    if not (np.isfinite(cell) and cell >= 1):
+        raise ParameterError("a cell of at least 1 pixel", found=f"{cell}", fix="Choose 4 to 16.")
+    return kernel_points(xyz)
+
+
+def kernel_points(xyz: Float32[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N 3"]:
+    """Return points as kernels need them: float32, contiguous.
+
+    Raises:
+        PointCloudError: ``xyz`` is not of shape [N, 3].
+    """
+    xyz = np.asarray(xyz)
+    if xyz.ndim != 2 or xyz.shape[1] != 3:
+        raise PointCloudError(
+            "xyz of shape [N, 3]", found=f"{list(xyz.shape)}", fix="Pass one row x, y, z per point."
+        )
+    return np.ascontiguousarray(xyz, np.float32)
 
 
 @dataclass(frozen=True, eq=False)

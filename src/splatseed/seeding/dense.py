@@ -23,9 +23,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from splatseed.depth.stereo.closer import compare_closer
 from splatseed.depth.stereo.detail import expected_spacing, fuse_at_most
 from splatseed.depth.stereo.maps import StereoSettings
+from splatseed.depth.stereo.pipeline import compare_closer
 from splatseed.findings import Finding
 from splatseed.methods import source_code
 from splatseed.photos.loading import load_views

@@ -30,7 +30,7 @@ from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.progress import Progress
 from splatseed.scene import Scene
 from splatseed.seeding._kernels import thinning as kernels
-from splatseed.seeding.coverage import kernel_points
+from splatseed.seeding.cover import kernel_points
 from splatseed.seeding.photo_methods import (
     CELL,
     MAX_SIZE,

@@ -18,7 +18,7 @@ from splatseed.progress import Note, Progress, silent, silent_note
 from splatseed.scene import Scene
 from splatseed.seeding.advice import DEFAULT_METHOD, method_for
 from splatseed.seeding.budget import points_within
-from splatseed.seeding.coverage import covered_share
+from splatseed.seeding.cover import covered_share
 from splatseed.seeding.photo_methods import (
     CELL,
     MAX_SIZE,

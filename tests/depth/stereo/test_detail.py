@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from splatseed.depth.stereo import detail
-from splatseed.depth.stereo.closer import compare_closer
 from splatseed.depth.stereo.detail import expected_spacing, fuse_at_most
 from splatseed.depth.stereo.maps import StereoSettings
-from splatseed.depth.stereo.pipeline import find_stereo
+from splatseed.depth.stereo.pipeline import compare_closer, find_stereo
 from splatseed.photos.loading import load_views
 from splatseed.photos.visibility import find_visibility
 from splatseed.progress import silent

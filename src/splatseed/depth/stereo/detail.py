@@ -24,7 +24,7 @@ from scipy.ndimage import uniform_filter
 
 from splatseed.depth.stereo.fusion import CellGrids, Places, by_confidence, make_seeds
 from splatseed.depth.stereo.maps import StereoResult
-from splatseed.depth.stereo.quads import grey_image
+from splatseed.depth.stereo.matching import grey_image
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent
 

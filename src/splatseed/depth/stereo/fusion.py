@@ -19,7 +19,7 @@ from jaxtyping import Float32, Float64, Int32, Int64, UInt8
 
 from splatseed.depth.stereo._kernels.agreement import occupy_cells
 from splatseed.depth.stereo.maps import StereoResult, block_means
-from splatseed.depth.stereo.quads import other_from_view
+from splatseed.depth.stereo.matching import other_from_view
 from splatseed.photos.view import View
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent

@@ -29,7 +29,7 @@ from splatseed.seeding.clouds.photo_consistency import (
 )
 from splatseed.seeding.clouds.reading import MergedCloud, read_clouds
 from splatseed.seeding.clouds.settings import CloudInputs, CloudSettings
-from splatseed.seeding.coverage import covered_share
+from splatseed.seeding.cover import covered_share
 from splatseed.seeding.photo_methods import (
     CELL,
     MAX_SIZE,

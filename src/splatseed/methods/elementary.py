@@ -1,9 +1,12 @@
-"""Linear and triangular upsampling (paper, eqs. 1 and 2): points between nearest neighbours.
+"""Points between nearest neighbours (paper, eqs. 1 and 2), and anywhere in the bounding box.
 
 Linear: P = a P1 + (1 - a) P2 with a ~ U[0, 1], P1 a random original and P2 its nearest neighbour.
 Triangular: P = b0 P1 + b1 P2 + b2 P3 with the two nearest, (b0, b1, b2) uniform in the triangle:
 the barycentric weights come from the square-root map. Colours likewise. Promise: each new point
 lies between two originals, or in the triangle of three.
+
+Random, the paper's ablation: xyz uniform in the axis-aligned bounding box of the originals, rgb
+drawn from the originals.
 """
 
 from __future__ import annotations
@@ -13,12 +16,16 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
+from jaxtyping import Float32, Float64
 
-from splatseed.methods._kernels import simplices as kernels
+from splatseed.methods._kernels import nearest as kernels
 from splatseed.methods.nearest import Aux, NearestMethod
-from splatseed.methods.neighbors import Bases, Neighbors, PreparedCloud
+from splatseed.methods.neighbors import Bases, Neighbors, PreparedCloud, prepare_scene
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress
+from splatseed.scene import Scene
+
+BLOCK = 1 << 18
 
 
 class _Simplex(NearestMethod):
@@ -76,3 +83,37 @@ class Triangle(_Simplex):
     @staticmethod
     def _fill(*arrays: np.ndarray) -> None:
         kernels.sample_triangles(*arrays)
+
+
+@dataclass(frozen=True)
+class BoundingBox:
+    """Points uniform in the bounding box, coloured as random originals: the baseline."""
+
+    name: ClassVar[str] = "random"
+
+    def __call__(
+        self, scene: Scene, num_new: int, rng: np.random.Generator, progress: Progress
+    ) -> PointCloud:
+        """Make ``num_new`` points."""
+        cloud = prepare_scene(scene, progress)
+        low, high = cloud.xyz.min(axis=0), cloud.xyz.max(axis=0)
+        progress("random", 0.0)
+        xyz = rng.random((num_new, 3), dtype=np.float32)
+        for start in range(0, num_new, BLOCK):  # sums in float64 without a whole float64 cloud
+            part = xyz[start : start + BLOCK]
+            part[...] = in_box(part, low, high, cloud.center)
+        by_rank = np.empty_like(cloud.rgb)
+        by_rank[cloud.rank] = cloud.rgb
+        rgb = by_rank[rng.integers(0, len(cloud), num_new, dtype=np.int32)]
+        progress("random", 1.0)
+        return PointCloud(xyz, rgb)
+
+
+def in_box(
+    draws: Float32[np.ndarray, "m 3"],
+    low: Float64[np.ndarray, " 3"],
+    high: Float64[np.ndarray, " 3"],
+    center: Float64[np.ndarray, " 3"],
+) -> Float64[np.ndarray, "m 3"]:
+    """Map numbers from 0 to 1 to a box relative to ``center``; world positions."""
+    return np.asarray(low + center + draws * (high - low))
