@@ -29,8 +29,6 @@ BLOCK = 1 << 18
 
 
 class _Simplex(NearestMethod):
-    """Base of ``Linear`` and ``Triangle``."""
-
     name: ClassVar[str]
 
     def sample(

@@ -149,7 +149,6 @@ class PatchMethod(NearestMethod, ABC):
     def _patches(
         self, cloud: PreparedCloud, neighbors: Neighbors, bases: Bases, rng: np.random.Generator
     ) -> Patches:
-        """Compute the axes of all patches and draw the positions of their points."""
         if self.frame == "local":
             frames, collinear = local_frames(cloud.xyz, neighbors.idx)
         else:

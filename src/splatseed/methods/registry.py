@@ -62,7 +62,6 @@ class MethodRegistry(Mapping[str, type[Upsampler]]):
         )
 
     def _load(self, name: str) -> type[Upsampler]:
-        """Import the class that an installed package registers."""
         entry = self._plugins[name]
         try:
             return cast("type[Upsampler]", entry.load())
@@ -145,11 +144,7 @@ def resolve(
     profile: Profile = "default",
     parameters: Mapping[str, Any] = MappingProxyType({}),
 ) -> tuple[str, Upsampler]:
-    """Return the name of a method, and the method with its parameters.
-
-    Raises:
-        ParameterError: As for ``configure``, or a configured method has a profile or parameters.
-    """
+    """Return the name of a method, and the method with its parameters."""
     if isinstance(method, str):
         return method, configure(method, profile, **parameters)
     if extra := [*parameters, *(["profile"] if profile != "default" else [])]:

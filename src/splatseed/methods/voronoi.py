@@ -105,7 +105,6 @@ class Voronoi(NearestMethod):
 
 
 def _clamped_cells(cloud: PreparedCloud, neighbors: Neighbors, progress: Progress) -> Cells:
-    """Build the cells of all rows, block by block."""
     frames, _ = local_frames(cloud.xyz, neighbors.idx)
     n = len(neighbors.idx)
     cells = Cells(np.empty((n, 3)), np.empty(n), np.empty(n), np.empty(n, bool))

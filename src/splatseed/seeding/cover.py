@@ -48,10 +48,6 @@ def covered_share(
     """Return the mean over views of the fraction of cells, ``cell`` pixels wide, that are covered.
 
     Views need no pixels.
-
-    Raises:
-        ParameterError: There is no view, or ``cell`` is below 1.
-        PointCloudError: ``xyz`` is not of shape [N, 3].
     """
     return float(np.mean([cells.mean() for cells in covered_cells(views, xyz, cell, progress)]))
 
@@ -62,7 +58,7 @@ def covered_cells(
     cell: float = 8,
     progress: Progress = silent,
 ) -> tuple[Bool[np.ndarray, "rows cols"], ...]:
-    """Tell which cells of each view are covered; arguments and errors as in ``covered_share``."""
+    """Return which cells of each view are covered; arguments as of ``covered_share``."""
     xyz = check_points(views, xyz, cell)
     depths = cell_depths_of_views(views, xyz, cell, progress, "find uncovered cells")
     return tuple(np.isfinite(cells) for cells in depths)
@@ -88,7 +84,7 @@ def cell_depths_of_views(
 def check_points(
     views: Sequence[View], xyz: Float32[np.ndarray, "N 3"], cell: float
 ) -> Float32[np.ndarray, "N 3"]:
-    """Return ``kernel_points``; errors are those of ``covered_share``."""
+    """Check views, cell and points; return the points as kernels need them."""
     if not views:
         raise ParameterError("at least one view", found="none", fix="Pass a scene with images.")
     if not (np.isfinite(cell) and cell >= 1):
@@ -97,11 +93,7 @@ def check_points(
 
 
 def kernel_points(xyz: Float32[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N 3"]:
-    """Return points as kernels need them: float32, contiguous.
-
-    Raises:
-        PointCloudError: ``xyz`` is not of shape [N, 3].
-    """
+    """Return points as kernels need them: float32, contiguous."""
     xyz = np.asarray(xyz)
     if xyz.ndim != 2 or xyz.shape[1] != 3:
         raise PointCloudError(
@@ -224,7 +216,6 @@ def cover(
 
 
 def _draw_others(v: int, num: int, rng: np.random.Generator) -> Int64[np.ndarray, " K"]:
-    """Draw some of the other views."""
     others = rng.choice(num - 1, min(CHECKED_VIEWS, num - 1), replace=False)
     # Numbers from v on move up by one: v itself is left out.
     return others + (others >= v)

@@ -249,7 +249,6 @@ def _duration(seconds: float) -> str:
 def _read_again(
     scene: Scene, images: Sequence[Image], factor: int, before: Sequence[View], progress: Progress
 ) -> tuple[View, ...]:
-    """Read the photographs at another size."""
     names = {view.name for view in before}
     used = [image for image in images if image.name in names]
 

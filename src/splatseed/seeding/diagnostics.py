@@ -118,12 +118,7 @@ def track_statistics(scene: Scene) -> TrackStatistics | None:
 
 
 def depth_map_statistics(scene: Scene, progress: Progress = silent) -> DepthMapStatistics | None:
-    """Read some of a scene's depth maps; None without any.
-
-    Raises:
-        SceneNotFoundError: A map's file is gone.
-        SceneFormatError: A map cannot be read.
-    """
+    """Read some of a scene's depth maps; None without any."""
     depths = scene.depths
     if depths is None or not len(depths):
         return None
@@ -217,7 +212,6 @@ def find_problems(
 
 
 def _grid_shape(image: Image) -> tuple[int, int]:
-    """Return rows and columns of an image's grid of cells."""
     width, height = image.intrinsics.width, image.intrinsics.height
     cell = max(width, height) / EMPTY_CELLS
     return max(math.ceil(height / cell), 1), max(math.ceil(width / cell), 1)

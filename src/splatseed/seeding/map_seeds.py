@@ -40,8 +40,6 @@ CellMap = Float32[np.ndarray, "rows cols"]
 
 @dataclass(frozen=True)
 class _MapSettings:
-    """Settings of seeds from maps."""
-
     confidence: float = 0.5  # of a seed: above cover's guesses, below what photographs confirm
     tolerance: float = 0.05  # relative depth by which a view must see past a seed
 
@@ -201,10 +199,6 @@ def cell_maps(
         cell: Side of a cell, in pixels of the views.
         min_confidence: Depth of a lower confidence is unknown.
         progress: Called with the stage and the fraction done.
-
-    Raises:
-        SceneNotFoundError: A map's file is gone.
-        SceneFormatError: A map cannot be read, or differs from its image in aspect ratio.
     """
     found = [np.full(grid_shape(view.camera, cell), np.nan, np.float32) for view in views]
 

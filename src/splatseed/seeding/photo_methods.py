@@ -260,9 +260,6 @@ def photographed(
         scene: Images whose files are missing are left out.
         test_every: As in ``PhotographMethod``.
         without: What to do without photographs, for the message.
-
-    Raises:
-        SceneNotFoundError: There are none.
     """
     folder = scene.source.image_dir if scene.source else None
     ordered = sorted(scene.images, key=lambda image: image.name)
@@ -330,7 +327,6 @@ def _cover(
     rng: np.random.Generator,
     progress: Progress,
 ) -> PointCloud:
-    """Make cover's seeds for the gaps between a cloud's finite points."""
     from splatseed.seeding.cover import cover
 
     xyz, masks = cloud.xyz[cloud.finite], [view.mask for view in views]
@@ -353,12 +349,7 @@ def _confirmed_share(scene: Scene, stereo: StereoResult, seconds: float) -> tupl
 def check_given_poses(
     scene: Scene, images: Sequence[Image], progress: Progress
 ) -> tuple[Finding, ...]:
-    """Check the poses of a scene without points.
-
-    Raises:
-        SceneNotFoundError: There are fewer than two photographs.
-        SceneFormatError: The photographs agree nowhere, as ``poses.check_poses`` says.
-    """
+    """Check the poses of a scene without points."""
     from splatseed.seeding.pose_accuracy import given_pose_error
     from splatseed.seeding.poses import agreement_findings, check_poses
 

@@ -105,9 +105,6 @@ def estimate_pose_error(
 
     Returns None if too few corners are found again, as on plain walls or with poses that are far
     off.
-
-    Raises:
-        SceneFormatError: A photograph cannot be used.
     """
     poses = np.array([image.camera.cam_from_world for image in images])
     partners = choose_by_pose(poses, _SETTINGS.partners)
@@ -144,9 +141,6 @@ def given_pose_error(
     Drift shows between neighbours that are further apart: of a phone's walk (``corridor``), whose
     refined poses gain 2.3 dB, all views have 0.50 px, which is exact, and those to train 0.74.
     Without an estimate, as poses that are far off leave too few corners there, all are measured.
-
-    Raises:
-        SceneFormatError: A photograph cannot be used.
     """
     names = {image.name for image in scene.split()[0]}
     train = [image for image in images if image.name in names]

@@ -130,10 +130,6 @@ def thin(
         num: Number of points to keep, at least 1.
         first: Number of originals, which come before the other points.
         priority: Among originals, and among other points, higher ones are visited earlier.
-
-    Raises:
-        ParameterError: ``num`` is below 1.
-        PointCloudError: ``xyz`` is not of shape [N, 3], or ``priority`` not of shape [N].
     """
     xyz = kernel_points(xyz)
     if num < 1:

@@ -117,7 +117,6 @@ def _keep_or_announce(notes: list[Finding], clock: StageClock) -> Note:
 
 
 def _recentered(scene: Scene, note: Note) -> Scene:
-    """Move a scene to the middle of its cameras."""
     scene = translated(scene, middle_of_cameras(scene))
     where = f"written around {format_offset(scene.offset)}, as {RECENTER} has it."
     unchanged = "around 0 already: --recenter changes nothing."

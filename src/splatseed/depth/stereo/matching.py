@@ -152,9 +152,6 @@ def check_stereo_memory(views: Sequence[View], settings: StereoSettings) -> None
 
     Memory holds all grey photographs, the planes at each grid point, and for each thread the quad
     images (4 bytes per pixel) of a view and its sources.
-
-    Raises:
-        ParameterError: It does not fit.
     """
     grid, sizes = settings.grid, [view.width * view.height for view in views]
     depths = sum((view.width // grid) * (view.height // grid) for view in views)
@@ -186,9 +183,6 @@ def match_views(
         settings: Settings of stereo.
         seed: The same seed gives the same bytes.
         progress: Called with the stage and the fraction done.
-
-    Raises:
-        ParameterError: The photographs do not fit into memory.
     """
     check_stereo_memory(views, settings)
     greys = [grey_image(view.photograph) for view in views]

@@ -204,11 +204,7 @@ def _unreliable(found: str) -> PointCloudError:
 def _candidates(
     surface: Surface, tie_xyz: Points, settings: AlignSettings, progress: Progress
 ) -> list[Alignment]:
-    """Return distinct alignments, best first.
-
-    Raises:
-        PointCloudError: No start converged.
-    """
+    """Return distinct alignments, best first."""
     stages = settings.stages
     starts = find_starts(surface.xyz, tie_xyz, stages[0].candidates, progress, settings.search)
     for s, stage in enumerate(stages):

@@ -250,9 +250,6 @@ def consistent_voxels(
         progress: Called with the stage and the fraction done.
         clean: Without it, only hidden voxels are dropped.
         free: As of ``free_space``.
-
-    Raises:
-        PointCloudError: No photograph sees any voxel.
     """
     dropped: Counter[str] = Counter()
     active = np.arange(len(voxels))

@@ -57,13 +57,7 @@ def cloud_seeds(
     progress: Progress,
     note: Note,
 ) -> PointCloud:
-    """Make seeds from files, for a scene with cameras.
-
-    Raises:
-        PointCloudError: A file has no finite point, or the cloud lies elsewhere.
-        SceneNotFoundError: A file is missing.
-        SceneFormatError: A file or photograph is damaged.
-    """
+    """Make seeds from files, for a scene with cameras."""
     frames = frames_of(scene)
     merged = read_clouds(
         inputs.paths, inputs.scene_from_cloud, frames, settings.pixels, inputs.capacity, progress
@@ -112,7 +106,6 @@ def _colors(
 
 
 def _found_colors(merged: MergedCloud) -> str:
-    """Describe the colours of files that do not all have some."""
     if all(file.colors != "none" for file in merged.files):
         return "intensity only"
     if any(file.colors != "none" for file in merged.files):

@@ -67,9 +67,6 @@ def plan_memory(limit: int | None, views: Sequence[View]) -> MemoryPlan:
     """Compute how many voxels fit into ``limit`` bytes beside the photographs.
 
     The limit is 4 GB by default, and never more than the free memory.
-
-    Raises:
-        ParameterError: Too few fit.
     """
     free = free_memory()
     wanted = _MEMORY.default if limit is None else limit
