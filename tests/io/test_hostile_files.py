@@ -54,7 +54,7 @@ def test_what_is_no_file_is_not_called_missing(odd, name, is_, scene_dir, model)
     scene = load_scene(scene_dir)
     assert f"{odd / name} is {is_}, not a file." in " ".join(texts(scene))
     shutil.rmtree(scene_dir / "images/left")
-    assert f"{odd / name} is {is_}, not a file." in untrainable(scene)
+    assert f"{odd / name} is {is_}, not a file." in untrainable(scene).text
 
 
 @pytest.mark.parametrize("kind", ["pipe", "link"])

@@ -183,11 +183,16 @@ def camera_layout(
     return "around something" if inward.mean() > MIN_INWARD else "through a place"
 
 
-def untrainable(scene: Scene) -> str:
-    """Explain in a sentence why no trainer can use the scene; empty if one can.
+def untrainable(scene: Scene) -> Finding | None:
+    """Return why no trainer can use the scene; None if one can.
 
     Lens distortion is not a reason, as it can be removed (``is_distorted``).
     """
+    why = _why_untrainable(scene)
+    return Finding("untrainable", why, "error") if why else None
+
+
+def _why_untrainable(scene: Scene) -> str:
     if not scene.images:
         return "Points alone cannot be trained: training needs photographs and cameras."
     if not all(scene.split()):

@@ -106,7 +106,7 @@ class Stereo(PhotographMethod):
 
         images, watch = photographed(scene, self.test_every), Stopwatch(progress)
         with watch.running():
-            findings = () if has_points(scene) else check_given_poses(scene, images, watch)
+            findings = () if has_points(scene) else _check_given_poses(scene, images, watch)
             guided, mismatch = self._guided(scene, images)
             views = read_views(scene, images, self.max_size, watch)
             start = time.perf_counter()
@@ -346,7 +346,7 @@ def _confirmed_share(scene: Scene, stereo: StereoResult, seconds: float) -> tupl
     return (Finding("confirmed-depth", text, "info"),)
 
 
-def check_given_poses(
+def _check_given_poses(
     scene: Scene, images: Sequence[Image], progress: Progress
 ) -> tuple[Finding, ...]:
     """Check the poses of a scene without points."""
