@@ -22,11 +22,12 @@ from splatseed.bench.job import (
     run_remotely,
 )
 from splatseed.bench.plan import plan_runs
-from splatseed.bench.runs import package_version, read_run, run_folder
+from splatseed.bench.runs import read_run, run_folder
 from splatseed.cli import main
 from splatseed.errors import ParameterError, SceneNotFoundError
 from splatseed.io import load_scene
 from splatseed.io.ply import write_ply
+from splatseed.requirements import version_of
 from splatseed.splat.covisible import read_covisible
 from splatseed.splat.pictures import BAND
 from splatseed.training.seeds import seeds_digest
@@ -44,7 +45,7 @@ def specs(small_plan, room_path):
         training=dataclasses.replace(small_plan.training, max_steps=4),
     )
     facts = surveyed(room_path, with_depth=True)
-    runs = plan_runs(plan, [facts], "cpu", package_version("splatseed"))
+    runs = plan_runs(plan, [facts], "cpu", version_of("splatseed") or "")
     return {run.arm.method: run for run in runs}
 
 

@@ -14,7 +14,6 @@ from splatseed.seeding.budget import points_within
 from splatseed.training.duration import (
     HOUR,
     RunSpeed,
-    format_duration,
     mean_gaussians,
     options_for_an_hour,
     planned_seconds,
@@ -79,12 +78,6 @@ def test_what_is_advised_takes_about_an_hour(seconds, steps, per_pixel):
     each = slower * step_seconds("cpu", count, pixels)
     expected = seconds_left(chosen, RunSpeed(0, each, count, round(pixels)))
     assert HOUR / 3 < expected < 1.05 * HOUR  # and no less than need be
-
-
-def test_durations_in_words():
-    assert [format_duration(s) for s in (20, 3600, 5300, 86_400)] == [
-        "1 minute", "60 minutes", "88 minutes", "24 hours"
-    ]  # fmt: skip
 
 
 @pytest.mark.parametrize(("side", "factor"), [(1600, 1), (1601, 2), (1920, 2), (4032, 3)])

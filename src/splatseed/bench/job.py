@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from splatseed.bench.plan import CLOUD, SFM, WITH_CLOUD, RunResult, RunSpec, seeding_method
-from splatseed.bench.runs import ERROR, RESULT, Run, package_version, run_folder
+from splatseed.bench.runs import ERROR, RESULT, Run, run_folder
 from splatseed.bench.scenes import SceneFacts, fingerprints, open_scene
 from splatseed.errors import (
     OutputError,
@@ -39,8 +39,8 @@ from splatseed.io.staging import MANIFEST, atomic_file, output_folder, write_jso
 from splatseed.methods import Upsampler, chooses_number, configure
 from splatseed.photos.cache import user_cache_dir
 from splatseed.pointcloud import PointCloud
-from splatseed.progress import Progress, silent
-from splatseed.runtime.compilation import watched
+from splatseed.progress import Progress, silent, watched
+from splatseed.requirements import version_of
 from splatseed.runtime.memory import peak_bytes
 from splatseed.runtime.tasks import Report, Workers, run_tasks
 from splatseed.scene import Scene
@@ -171,7 +171,7 @@ def run_job(
 
 def run_remotely(spec: RunSpec, options: RunOptions) -> tuple[RunResult, dict[str, bytes]]:
     """Carry out a run on a node of a cluster; returns the files of its folder by name."""
-    host, here = socket.gethostname(), package_version("splatseed")
+    host, here = socket.gethostname(), version_of("splatseed") or ""
     if here != spec.version:
         expected = f"splatseed {spec.version} on the node {host}"
         fix = "Install it on every node."

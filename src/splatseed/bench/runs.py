@@ -16,7 +16,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -32,6 +31,7 @@ from splatseed.io.staging import (
     read_manifest,
     write_json,
 )
+from splatseed.requirements import version_of
 from splatseed.text import counted
 
 RESULT, ERROR = "result.json", "error.json"
@@ -194,16 +194,8 @@ def _describe_call(verb: str, arguments: Sequence[str]) -> dict[str, Any]:
         "cpu": cpu,
         "cores": os.cpu_count(),
         "python": platform.python_version(),
-        "versions": {name: known for name in _PACKAGES if (known := package_version(name))},
+        "versions": {name: known for name in _PACKAGES if (known := version_of(name))},
     }
-
-
-def package_version(package: str) -> str:
-    """Return the version of an installed package; empty if it is not installed."""
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return ""
 
 
 def estimate_seconds(specs: Sequence[RunSpec], runs: Iterable[Run], threads: int) -> float:

@@ -24,7 +24,6 @@ from splatseed.bench.runs import (
     count_runs,
     estimate_seconds,
     locked_bench,
-    package_version,
     read_run,
     read_runs,
     record_plan,
@@ -35,12 +34,12 @@ from splatseed.console import ERR, OUT, print_note, print_pairs, print_table, st
 from splatseed.errors import ParameterError, SceneNotFoundError
 from splatseed.io.staging import atomic_file, check_output, output_folder
 from splatseed.methods import Profile
-from splatseed.requirements import require
+from splatseed.requirements import require, version_of
 from splatseed.runtime.environment import available_cpus, worker_env
 from splatseed.runtime.interruption import exit_code
 from splatseed.runtime.memory import check_memory
 from splatseed.runtime.tasks import ProcessWorkers, Workers
-from splatseed.text import counted, did_you_mean, name_some, quoted, visible
+from splatseed.text import counted, did_you_mean, format_duration, name_some, quoted, visible
 from splatseed.training.settings import BYTES_PER_GAUSSIAN, Backend, StrategyName
 
 if TYPE_CHECKING:
@@ -312,7 +311,7 @@ def _prepare(
         raise SceneNotFoundError(expected, found=found, fix="Name the folder that holds them.")
     plan = replace(plan, scenes=tuple(scene for scene, _ in present))
     scenes = [facts for _, facts in present]
-    specs = plan_runs(plan, scenes, machine.backend, package_version("splatseed"))
+    specs = plan_runs(plan, scenes, machine.backend, version_of("splatseed") or "")
     notes += [*_budget_notes(options, plan), *_notes(plan, scenes, specs)]
     fix = "Name other methods, or what these need."
     refuse((not specs, "a plan with runs", "; ".join(notes) or "none", fix))
@@ -467,13 +466,6 @@ def _describe(spec: RunSpec) -> str:
     budget = f", {spec.arm.budget}" if spec.arm.budget else ""
     arm = f"{spec.arm.label}, {spec.arm.strategy}{budget}"
     return f"{visible(spec.scene.name)}, {arm}, repeat {spec.repeat + 1}"
-
-
-def format_duration(seconds: float) -> str:
-    """Format an estimated duration."""
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
 def _print_summary(bench: Path, runs: Sequence[Run]) -> None:

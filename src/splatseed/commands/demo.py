@@ -23,7 +23,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import astuple, dataclass, replace
 from importlib import invalidate_caches
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -37,9 +36,9 @@ from splatseed.io import find_depths, load_scene, write_scene
 from splatseed.io.staging import add_files, atomic_file, output_folder, read_manifest
 from splatseed.methods import METHODS, chooses_number, configure, methods_for
 from splatseed.pointcloud import PointCloud
-from splatseed.requirements import require
+from splatseed.progress import watched
+from splatseed.requirements import require, version_of
 from splatseed.runtime.child import Child
-from splatseed.runtime.compilation import watched
 from splatseed.scene import Scene
 from splatseed.text import quoted
 
@@ -191,12 +190,8 @@ def _compile(part: str, scene: Scene, folder: Path) -> None:
 def _has_pytorch() -> bool:
     """Return whether training's packages are completely installed."""
     invalidate_caches()
-    try:
-        for package in ("torch", "gsplat", "torchmetrics", "flip-evaluator"):
-            version(package)  # from what pip writes last
-    except PackageNotFoundError:
-        return False
-    return True
+    # Versions come from what pip writes last.
+    return all(map(version_of, ("torch", "gsplat", "torchmetrics", "flip-evaluator")))
 
 
 # Points -------------------------------------------------------------------------------------------

@@ -146,7 +146,7 @@ def _score(
             **result.to_dict(),
         }
         if doubts := evaluation.doubts(model):
-            content["notes"] = doubts
+            content["notes"] = [str(each) for each in doubts]
         write_json(options.output, content)
     return result
 

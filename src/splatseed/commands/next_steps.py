@@ -20,8 +20,8 @@ from splatseed.runtime.environment import available_cpus
 from splatseed.scene import Image, Scene
 from splatseed.seeding.advice import AS_IT_IS, SEEDED, Advice, is_distorted, untrainable
 from splatseed.seeding.photo_methods import Auto
-from splatseed.text import quoted
-from splatseed.training.duration import format_duration, planned_seconds
+from splatseed.text import format_duration, quoted
+from splatseed.training.duration import planned_seconds
 from splatseed.training.schedule import FULL_RUN
 from splatseed.training.settings import BUDGET, StrategyName, TrainSettings
 

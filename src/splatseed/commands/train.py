@@ -30,14 +30,8 @@ from splatseed.runtime.interruption import exit_code
 from splatseed.scores import TrainingResult
 from splatseed.seeding.budget import in_rho
 from splatseed.settings import fits
-from splatseed.text import did_you_mean, quoted, visible
-from splatseed.training.duration import (
-    TOO_LONG,
-    RunSpeed,
-    format_duration,
-    options_for_an_hour,
-    seconds_left,
-)
+from splatseed.text import did_you_mean, format_duration, quoted, visible
+from splatseed.training.duration import TOO_LONG, RunSpeed, options_for_an_hour, seconds_left
 from splatseed.training.folder import RunFolder
 from splatseed.training.settings import Seeding, StrategyName, TrainSettings
 

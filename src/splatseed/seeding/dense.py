@@ -15,9 +15,7 @@ points as thinning does.
 from __future__ import annotations
 
 import os
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -34,9 +32,9 @@ from splatseed.photos.view import View
 from splatseed.photos.visibility import find_visibility, points_in_image
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Note, Progress, thread_limit
-from splatseed.runtime.compilation import watched
 from splatseed.runtime.memory import PROCESS, format_bytes, free_memory, resident_bytes
 from splatseed.scene import Image, Scene
+from splatseed.text import format_duration
 
 if TYPE_CHECKING:
     from splatseed.depth.stereo.detail import Placed
@@ -237,13 +235,9 @@ def _announcement(
     text = (
         f"Up to {limit:,} points: {len(images)} photographs are compared again at "
         f"{sides[0]} x {sides[1]} pixels, with a depth every {plan.grid}: about "
-        f"{_duration(expected)} and {format_bytes(plan.memory)} of memory."
+        f"{format_duration(expected)} and {format_bytes(plan.memory)} of memory."
     )
     return Finding(SECOND_COMPARISON, text, "info")
-
-
-def _duration(seconds: float) -> str:
-    return f"{max(round(seconds), 1)} s" if seconds < 90 else f"{round(seconds / 60)} minutes"
 
 
 def _read_again(
@@ -280,35 +274,3 @@ def _drop_guesses(points: PointCloud, room: int) -> PointCloud:
     confidence = np.asarray(points.confidence)[guesses]
     kept[guesses[np.argsort(confidence, kind="stable")[:surplus]]] = False
     return points.select(kept)
-
-
-class Stopwatch:
-    """A ``Progress`` that adds up the wall time of stages, without compilation."""
-
-    def __init__(self, progress: Progress) -> None:
-        self.seconds: dict[str, float] = {}
-        self._progress = progress
-        self._last = time.perf_counter()
-        self._nested, self._begun, self._compiled = 0, 0.0, 0.0
-
-    def __call__(self, stage: str, fraction: float) -> None:
-        """Add the time since the last call to this stage."""
-        now = time.perf_counter()
-        past = max(now - self._last - self._compiled, 0.0)
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + past
-        self._last, self._compiled = now, 0.0
-        self._progress(stage, fraction)
-
-    @contextmanager
-    def running(self) -> Iterator[None]:
-        """Leave out the time of compilation while the block runs."""
-        self._last = time.perf_counter()
-        with watched(self._compilation):
-            yield
-
-    def _compilation(self, begins: bool) -> None:
-        self._nested += 1 if begins else -1
-        if begins and self._nested == 1:
-            self._begun = time.perf_counter()
-        elif not begins and self._nested == 0:
-            self._compiled += time.perf_counter() - self._begun

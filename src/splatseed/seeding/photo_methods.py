@@ -24,7 +24,7 @@ from splatseed.photos.loading import load_views
 from splatseed.photos.sizes import at_file_size, factor_for_size
 from splatseed.photos.view import View, camera_views
 from splatseed.pointcloud import PointCloud
-from splatseed.progress import Note, Progress, silent_note
+from splatseed.progress import Note, Progress, StageTimes, silent_note, watched
 from splatseed.scene import Image, Scene
 from splatseed.settings import Range, check_settings
 from splatseed.text import counted
@@ -102,25 +102,30 @@ class Stereo(PhotographMethod):
         compared again where that fills the ``budget``.
         """
         from splatseed.depth.stereo.fusion import fuse
-        from splatseed.seeding.dense import Comparison, Stopwatch, fill_budget
+        from splatseed.seeding.dense import Comparison, fill_budget
 
-        images, watch = photographed(scene, self.test_every), Stopwatch(progress)
-        with watch.running():
-            findings = () if has_points(scene) else _check_given_poses(scene, images, watch)
+        images, times = photographed(scene, self.test_every), StageTimes()
+
+        def timed(stage: str, fraction: float) -> None:
+            times(stage, fraction)
+            progress(stage, fraction)
+
+        with watched(times.compilation):
+            findings = () if has_points(scene) else _check_given_poses(scene, images, timed)
             guided, mismatch = self._guided(scene, images)
-            views = read_views(scene, images, self.max_size, watch)
+            views = read_views(scene, images, self.max_size, timed)
             start = time.perf_counter()
-            stereo = compare(guided, images, views, self.grid, rng, watch)
-            seeds = fuse(stereo, self.spacing, watch).with_source(source_code("stereo"))
+            stereo = compare(guided, images, views, self.grid, rng, timed)
+            seeds = fuse(stereo, self.spacing, timed).with_source(source_code("stereo"))
             found = _confirmed_share(scene, stereo, time.perf_counter() - start)
             for finding in (*found, *findings, *mismatch):
                 note(finding)
-            points = self.fill(scene, seeds, stereo, rng, watch, note)
+            points = self.fill(scene, seeds, stereo, rng, timed, note)
         if on_stereo is not None:
             on_stereo(stereo)
         if budget is None or not self.dense:
             return points
-        first = Comparison(images, stereo, self.max_size, self.spacing, watch.seconds)
+        first = Comparison(images, stereo, self.max_size, self.spacing, times.seconds())
 
         def refill(denser: PointCloud) -> PointCloud:
             return self.fill(scene, denser, stereo, rng, progress, silent_note)

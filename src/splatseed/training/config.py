@@ -8,13 +8,13 @@ from __future__ import annotations
 import dataclasses
 import platform
 from collections.abc import Collection, Mapping
-from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 from splatseed.errors import ParameterError, SceneFormatError
 from splatseed.io.masks import mask_choice, masks_digest, with_masks
 from splatseed.io.photograph import photographs_digest
 from splatseed.io.staging import write_json
+from splatseed.requirements import version_of
 from splatseed.scene import Scene
 from splatseed.splat.training_frame import TrainingFrame
 from splatseed.training.folder import RunFolder
@@ -37,7 +37,7 @@ def make_config(
     source = scene.source
     points = source.points_path if source and not refine_poses else None
     config = {
-        "splatseed": _version("splatseed"),
+        "splatseed": version_of("splatseed"),
         "scene": str(source.again) if source else None,
         "points": str(points.resolve()) if points else None,
         "refine_poses": refine_poses,
@@ -50,7 +50,7 @@ def make_config(
         "split": _names_of_parts(scene, settings),
         "versions": {
             "python": platform.python_version(),
-            **{name: _version(name) for name in ("torch", "gsplat", "numba", "numpy")},
+            **{name: version_of(name) for name in ("torch", "gsplat", "numba", "numpy")},
         },
     }
     if frame is not None:  # in which the run is rendered; lengths are the scene's
@@ -63,14 +63,6 @@ def _names_of_parts(scene: Scene, settings: TrainSettings) -> dict[str, list[str
     """Return the names of the training and test images."""
     parts = zip(("train", "test"), scene.split(settings.test_every), strict=True)
     return {part: [image.name for image in images] for part, images in parts}
-
-
-def _version(package: str) -> str | None:
-    """Return a package's version; None if it is run from its source tree."""
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None
 
 
 def resumed_settings(

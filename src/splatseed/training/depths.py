@@ -25,7 +25,7 @@ from splatseed.progress import Note, Progress, silent, silent_note
 from splatseed.scene import Image, Scene
 from splatseed.training.settings import TrainSettings
 
-DepthMaps = dict[str, Float32[np.ndarray, "h w"]]
+ImageDepths = dict[str, Float32[np.ndarray, "h w"]]
 """Planar depths by the names of their views."""
 
 
@@ -116,7 +116,7 @@ def known_depths(
     cache: Path | None = None,
     note: Note = silent_note,
     progress: Progress = silent,
-) -> tuple[DepthMaps, float]:
+) -> tuple[ImageDepths, float]:
     """Find the depth maps on which ``grow`` places Gaussians; none if the settings use none.
 
     Args:
@@ -166,14 +166,14 @@ def known_depths(
     }, seconds
 
 
-def _write(path: Path, maps: DepthMaps, seconds: float) -> None:
+def _write(path: Path, maps: ImageDepths, seconds: float) -> None:
     arrays: dict[str, Any] = {f"depth_{i}": depth for i, depth in enumerate(maps.values())}
     names = np.array(list(maps), dtype=np.str_)
     with atomic_file(path) as partial, partial.open("wb") as file:
         np.savez(file, names=names, seconds=np.float64(seconds), **arrays)
 
 
-def _read(path: Path | None) -> tuple[DepthMaps, float] | None:
+def _read(path: Path | None) -> tuple[ImageDepths, float] | None:
     """Read the maps of ``_write``; None without a readable file."""
     if path is None:
         return None

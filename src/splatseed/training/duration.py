@@ -115,16 +115,3 @@ def options_for_an_hour(
         steps = max(STEP_UNIT, int(steps * HOUR / needed) // STEP_UNIT * STEP_UNIT)
     flags = f"`long_side={math.ceil(long_side / factor)}`"
     return flags if steps == settings.max_steps else f"{flags} `max_steps={steps}`"
-
-
-def format_duration(seconds: float) -> str:
-    """Return a duration in minutes or hours.
-
-    Example:
-        >>> format_duration(100), format_duration(3000), format_duration(200_000)
-        ('2 minutes', '50 minutes', '56 hours')
-    """
-    if seconds < HOUR * 1.5:
-        minutes = max(1, round(seconds / 60))
-        return f"{minutes} minute{'s' if minutes > 1 else ''}"
-    return f"{math.floor(seconds / HOUR + 0.5)} hours"

@@ -100,7 +100,7 @@ class Evaluation:
     def doubts(self, loaded: TrainedModel) -> list[str]:
         """Describe what may make the scores wrong, or others than expected, one sentence each."""
         listed = loaded.scene.listed
-        doubts = [*loaded.notes, loaded.frame_warning, listed.sentence if listed else ""]
+        doubts = [*loaded.findings, listed.sentence if listed else ""]
         if self.config:
             doubts += self._changes(loaded.scene, [view.name for view in loaded.views])
         elif isinstance(self.model, Path):

@@ -41,11 +41,9 @@ def read_start(path: Path, scene: Scene, note: Note, *, same_poses: bool = False
         SceneNotFoundError: There is no such file.
         SceneFormatError: It holds no Gaussians, or they belong to another scene.
     """
-    gaussians, message = move_to_scene_origin(path, scene, read_gaussians(path, note), note), ""
+    gaussians = move_to_scene_origin(path, scene, read_gaussians(path, note), note)
     if not same_poses:  # else mcmc's clones could look like another frame
-        gaussians, message = move_to_scene_frame(path, scene, gaussians)
-    if message:
-        note(message)
+        gaussians = move_to_scene_frame(path, scene, gaussians, note)
     if gaussians.antialiased:
         note(
             f"{path} was trained with antialiasing; this run continues without it, so small "

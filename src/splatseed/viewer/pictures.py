@@ -54,8 +54,6 @@ TEST_COLOR, TRAIN_COLOR = (213, 94, 0), (0, 114, 178)
 
 @dataclass(frozen=True)
 class _Sizes:
-    """Sizes of points and cameras in the viewer frame."""
-
     frustum: float = 0.5  # relative to the distance to the nearest other camera
     min_frustum: float = 0.008
     max_frustum: float = 0.05
