@@ -109,21 +109,20 @@ def upsample(
     if extra_method is None and DEFAULT_METHOD in {method, getattr(method, "name", None)}:
         method = method_for(scene, method, note)
     name, chosen = resolve(method, profile, parameters)
-    measured: PointCloud | None = None
+    only_default = name == DEFAULT_METHOD and ratio is None and num_points is None and cover is None
+    base, measured = scene, None
     if extra_method is not None:
         # Measured points come first, so that the method fills the gaps between them.
         extra_name, extra = resolve(extra_method)
         measured = add_points(scene, extra_name, extra, seed=seed, progress=progress, note=note)
-    elif name == DEFAULT_METHOD and ratio is None and num_points is None and cover is None:
-        originals = scene.points.originals
-        originals = originals.select(originals.distinct)
-        if limit is not None and len(originals) >= limit:
-            note(_no_room(limit, len(originals)))
-            return thin_to(scene, originals, limit, None, seed, progress)
-    base = scene
-    if measured is not None:
         known = measured.replace(source=None) if name in FILLING else measured
         base = scene.with_points(known)
+    elif only_default and limit is not None:
+        originals = scene.points.originals
+        originals = originals.select(originals.distinct)
+        if len(originals) >= limit:
+            note(_no_room(limit, len(originals)))
+            return thin_to(scene, originals, limit, None, seed, progress)
     cloud = add_points(
         base, name, chosen, ratio=ratio, num_points=num_points, budget=limit, seed=seed,
         progress=progress, note=note, on_stereo=on_stereo,
