@@ -25,8 +25,6 @@ from splatseed.progress import Progress
 
 @dataclass(frozen=True)
 class _CoarseSettings:
-    """Settings of coarse stereo."""
-
     side: int = 200  # longer side of the downsampled photographs, pixels
     cell: float = 4.0  # pixels between points
     num_sampled: int = 24  # views matched first, to find the range of depths
