@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from splatseed.camera import CAMERA_MODELS, Intrinsics
+from splatseed.projection import normalized
 from splatseed.text import quoted
 
 
@@ -89,8 +90,7 @@ def unproject_pixels(
 
     NaN where no ray within the lens's fold projects to the pixel.
     """
-    K = lens.K
-    goal = (np.asarray(uv, np.float64) - K[:2, 2]) / K[[0, 1], [0, 1]]
+    goal = normalized(lens.K, uv)
     xy, moves = goal.copy(), SETTINGS.difference * np.eye(2)
     with np.errstate(all="ignore"):  # distant coordinates need not stay finite
         for _ in range(SETTINGS.newton_steps):

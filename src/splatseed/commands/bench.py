@@ -35,8 +35,9 @@ from splatseed.console import ERR, OUT, print_note, print_pairs, print_table, st
 from splatseed.errors import ParameterError, SceneNotFoundError
 from splatseed.io.staging import atomic_file, check_output, output_folder
 from splatseed.methods import Profile
+from splatseed.progress import available_cpus
 from splatseed.requirements import require
-from splatseed.runtime.environment import available_cpus, worker_env
+from splatseed.runtime.environment import worker_env
 from splatseed.runtime.interruption import exit_code
 from splatseed.runtime.memory import check_memory
 from splatseed.runtime.tasks import ProcessWorkers, Workers

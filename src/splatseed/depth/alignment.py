@@ -207,14 +207,9 @@ def lift_pixels(
     Equation 9: P = c + z v, where v is the ray through the pixel's centre, with unit z in camera
     axes; the text's P = c + s d v / |v| is the same with z = s d / |v|.
     """
-    m = camera.cam_from_world[:3, :3].T @ np.linalg.inv(camera.K)
     row, column = np.divmod(pixel, camera.width)
-    z = factor * z.astype(np.float64)
-    xyz = np.empty((len(pixel), 3), np.float32)
-    for axis in range(3):
-        ray = m[axis, 0] * (column + 0.5) + m[axis, 1] * (row + 0.5) + m[axis, 2]
-        xyz[:, axis] = camera.center[axis] + z * ray
-    return xyz
+    uv = np.stack([column, row], axis=1) + 0.5
+    return camera.unproject(uv, factor * z.astype(np.float64)).astype(np.float32)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,6 @@ points as thinning does.
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -32,7 +31,7 @@ from splatseed.photos.loading import load_views
 from splatseed.photos.sizes import at_file_size, factor_for_size
 from splatseed.photos.view import View
 from splatseed.photos.visibility import find_visibility, points_in_image
-from splatseed.progress import Note, Progress, thread_limit
+from splatseed.progress import Note, Progress, num_threads
 from splatseed.runtime.compilation import watched
 from splatseed.runtime.memory import PROCESS, format_bytes, free_memory, resident_bytes
 from splatseed.scene import Image, Scene
@@ -195,7 +194,7 @@ def _plan(images: Sequence[Image], factor: int, grid: int, split: int, num: int)
     sizes = [(im.camera.width // factor, im.camera.height // factor) for im in images]
     pixels = [width * height for width, height in sizes]
     depths = [(width // grid) * (height // grid) for width, height in sizes]
-    threads = min(thread_limit.get() or os.cpu_count() or 1, len(images))
+    threads = min(num_threads(), len(images))
     sources = 1 + min(StereoSettings().num_sources, len(images) - 1)
     # Colours and grey; each thread's photographs with 4 bytes per pixel and candidate planes.
     matching = 4 * sum(pixels) + DENSE.depth_bytes * sum(depths)

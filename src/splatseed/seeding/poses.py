@@ -26,6 +26,8 @@ from splatseed.photos.sizes import factor_for_size
 from splatseed.photos.sources import choose_by_pose
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent
+from splatseed.projection import pixel_centers
+from splatseed.sampling import strided
 from splatseed.scene import Image, Scene
 from splatseed.seeding.pose_accuracy import estimate_pose_error
 from splatseed.text import quoted
@@ -242,8 +244,8 @@ def compare_sample(
 
 def _any_overlap(cameras: Sequence[Camera]) -> bool:
     """Whether a point at some depth in front of one camera falls into another's image."""
-    uv = (np.indices((4, 5)).reshape(2, -1).T[:, ::-1] + 0.5) / [5, 4]
-    for first in cameras[:: -(-len(cameras) // _SETTINGS.overlap_samples)]:
+    uv = pixel_centers(4, 5).reshape(-1, 2) / [5, 4]
+    for first in strided(cameras, _SETTINGS.overlap_samples):
         for other in cameras:
             if gap := float(np.linalg.norm(first.center - other.center)):
                 z = gap * np.repeat(np.geomspace(0.1, 1000.0, 12), len(uv))

@@ -27,11 +27,11 @@ from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
 from splatseed.depth.stereo.quads import grey_image, make_quad_images
 from splatseed.methods.contract import NewPoints
-from splatseed.photos.projection import pixels_from_world
 from splatseed.photos.sources import choose_sources, views_of_points
 from splatseed.photos.view import View
 from splatseed.photos.visibility import Visibility
 from splatseed.progress import Progress, in_threads, silent
+from splatseed.projection import camera_centers
 from splatseed.scene import Image
 from splatseed.seeding._kernels.verify import REFERENCE_VIEWS, rank_reference_views, slide
 from splatseed.seeding.local_geometry import LocalGeometry, local_geometry
@@ -106,7 +106,7 @@ def verify(
     if len(visibility.xyz) < 2 or not len(new.xyz) or not views:
         return _unchecked(new)
     visible = [visibility.rows_of(image) for image in images]
-    centers = _centers(views)
+    centers = camera_centers([view.cam_from_world for view in views])
     sources = choose_sources(visible, visibility.xyz, centers, SETTINGS.num_sources)
     geometry = local_geometry(visibility.xyz, new.xyz, progress)
     reference_views = choose_reference_views(
@@ -114,11 +114,6 @@ def verify(
     )
     checks = _check_photos(new.xyz, geometry, views, reference_views, sources, progress)
     return _apply_checks(new, geometry, checks, centers[reference_views])
-
-
-def _centers(views: Sequence[View]) -> Float64[np.ndarray, "V 3"]:
-    poses = np.stack([view.cam_from_world for view in views])
-    return np.asarray(-np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3]))
 
 
 def choose_reference_views(
@@ -134,13 +129,13 @@ def choose_reference_views(
     ``visible`` are the originals that each view sees, ``sources`` the views it is compared with.
     """
     order, offsets = views_of_points(visible, num_originals)
-    matrices = np.stack([pixels_from_world(view.camera) for view in views])
+    matrices = np.stack([view.camera.pixels_from_world for view in views])
     sizes = np.array([(view.width, view.height) for view in views], np.float64)
     focals = np.array([view.K[0, 0] for view in views])
     reference_views = np.full((len(xyz), REFERENCE_VIEWS), -1)
     rank_reference_views(
         xyz, geometry.base, np.nan_to_num(geometry.normals), order, offsets, matrices, sizes,
-        _centers(views), focals, sources, reference_views,
+        camera_centers([view.cam_from_world for view in views]), focals, sources, reference_views,
     )  # fmt: skip
     return reference_views
 
@@ -195,8 +190,7 @@ def _check_in_view(
     if view.mask is not None:
         column, row = uv.astype(np.int64).T
         costs[~view.mask[row, column]] = np.inf
-    rotation, translation = view.cam_from_world[:3, :3], view.cam_from_world[:3, 3]
-    center = -rotation.T @ translation
+    center = view.camera.center
     # The plane at w / (1 + t h / (n X)) meets the ray 1 + t h / (n X) times as far from the camera.
     checks.xyz[point, slot] = center + (1.0 + moves * reach)[:, None] * (world - center)
     checks.moves[point, slot], checks.costs[point, slot] = moves, costs

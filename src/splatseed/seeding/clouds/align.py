@@ -23,6 +23,7 @@ from jaxtyping import Float64, UInt8
 
 from splatseed.errors import PointCloudError
 from splatseed.progress import Progress, silent
+from splatseed.sampling import strided
 from splatseed.scene import Scene
 from splatseed.seeding.clouds.global_search import SEARCH, SearchSettings, find_starts, to_unit_size
 from splatseed.seeding.clouds.icp import Alignment, RefinedAlignment, Stage, Surface, fit, refine
@@ -209,7 +210,7 @@ def _candidates(
     stages = settings.stages
     starts = find_starts(surface.xyz, tie_xyz, stages[0].candidates, progress, settings.search)
     for s, stage in enumerate(stages):
-        sample = tie_xyz[:: -(-len(tie_xyz) // stage.tie_points)]
+        sample = strided(tie_xyz, stage.tie_points)
         starts = starts[: stage.candidates]
         fitted: list[Alignment] = []
         for i, start in enumerate(starts):

@@ -28,11 +28,11 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64, UInt8, UInt16
 
 from splatseed.errors import PointCloudError
-from splatseed.photos.projection import pixels_from_world
 from splatseed.photos.view import View
 from splatseed.photos.visibility import points_in_image
 from splatseed.photos.zbuffer import cell_counts
 from splatseed.progress import Progress
+from splatseed.sampling import strided
 from splatseed.seeding.clouds._kernels import count_by_cell, observe, sum_around, summarise
 from splatseed.seeding.clouds.voxels import Voxels
 from splatseed.seeding.coverage import cell_depths_of_views
@@ -142,7 +142,7 @@ def find_surfaces(
 
 def _choose_cell(views: Sequence[View], xyz: Float32[np.ndarray, "N 3"]) -> int:
     """Return the smallest side at which the median non-empty cell holds enough points."""
-    sample = views[:: -(-len(views) // 8)]
+    sample = strided(views, 8)
     for cell in SETTINGS.cells[:-1]:
         counts = np.concatenate([cell_counts(view.camera, xyz, cell) for view in sample])
         counts = counts[counts > 0]
@@ -187,7 +187,7 @@ def find_evidence(
         samples = np.zeros((len(block), closest, 3), np.uint8)
         for v, view in enumerate(views):
             observe(
-                block, pixels_from_world(view.camera),
+                block, view.camera.pixels_from_world,
                 np.sqrt(abs(view.K[0, 0] * view.K[1, 1])), view.width, view.height, surfaces[v],
                 behind, no_rays if free is None else free[v], view.photograph,
                 no_mask if view.mask is None else view.mask, closeness, samples,

@@ -16,6 +16,7 @@ from jaxtyping import Float64, Int64
 
 from splatseed.errors import PointCloudError
 from splatseed.pointcloud import ORIGINAL
+from splatseed.sampling import strided
 from splatseed.scene import Image, Scene, Tracks
 from splatseed.similarity import Similarity
 
@@ -67,7 +68,7 @@ def select_tie_points(scene: Scene) -> TiePoints:
             found=f"{len(rows):,}",
             fix="Make some: splatseed sfm IMAGES --poses-from SCENE; or pass `transform`.",
         )
-    rows = rows[:: -(-len(rows) // MAX_TIE_POINTS)]
+    rows = strided(rows, MAX_TIE_POINTS)
     xyz = points.xyz[rows].astype(np.float64)
     covariance, sensitivity = np.full((len(rows), 3, 3), np.nan), np.zeros((len(rows), 3, 2))
     if tracks is not None:
