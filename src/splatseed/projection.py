@@ -60,6 +60,36 @@ def normalized(
     return np.stack([x, y], axis=-1)
 
 
+def denormalized(
+    K: Float64[np.ndarray, "3 3"], xy: Float64[np.ndarray, "*B 2"]
+) -> Float64[np.ndarray, "*B 2"]:
+    """Pixels of normalised coordinates: (u, v, 1) = K (x, y, 1)."""
+    x, y = np.moveaxis(xy, -1, 0)
+    return np.stack([x * K[0, 0] + y * K[0, 1] + K[0, 2], y * K[1, 1] + K[1, 2]], axis=-1)
+
+
+def in_camera(
+    cam_from_world: Float64[np.ndarray, "N 4 4"], xyz: Float64[np.ndarray, "N 3"]
+) -> Float64[np.ndarray, "N 3"]:
+    """World points in camera axes, each in those of its own camera."""
+    rotated = np.einsum("nij,nj->ni", cam_from_world[:, :3, :3], xyz)
+    return np.asarray(rotated + cam_from_world[:, :3, 3])
+
+
+def pixel_jacobians(
+    focals: Float64[np.ndarray, "N 2"],
+    cam_from_world: Float64[np.ndarray, "N 4 4"],
+    xyz: Float64[np.ndarray, "N 3"],
+) -> Float64[np.ndarray, "N 2 3"]:
+    """Derivatives d (u, v) / d X of points in the axes of their own cameras (``in_camera``).
+
+    u = f x / z + c gives du/dX = (f / z) (r_x - (x / z) r_z), r_x and r_z rows of the rotation.
+    """
+    slope = xyz[:, :2] / xyz[:, 2:]
+    across = cam_from_world[:, :2, :3] - slope[:, :, None] * cam_from_world[:, None, 2, :3]
+    return np.asarray((focals / xyz[:, 2:])[:, :, None] * across)
+
+
 def camera_centers(
     cam_from_world: Sequence[Float[np.ndarray, "4 4"]] | Float[np.ndarray, "V 4 4"],
 ) -> Float64[np.ndarray, "V 3"]:

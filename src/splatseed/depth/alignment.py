@@ -26,6 +26,7 @@ from splatseed.depthmap import DepthMap, in_scene_units
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.photos.visibility import PointsInImage, find_visibility, points_in_image
 from splatseed.progress import Progress, in_threads, silent
+from splatseed.projection import normalized
 from splatseed.scene import Image, Scene
 
 
@@ -344,7 +345,7 @@ def _values_at(
 
 def _rays(camera: Camera, uv: Float64[np.ndarray, "M 2"]) -> Float64[np.ndarray, "M 3"]:
     """Rays of unit z through image positions, in camera axes."""
-    return np.column_stack([uv, np.ones(len(uv))]) @ np.linalg.inv(camera.K).T
+    return np.column_stack([normalized(camera.K, uv), np.ones(len(uv))])
 
 
 def _residual(depth: DepthMap, value: Values, z: Values, scale: float, shift: float) -> float:

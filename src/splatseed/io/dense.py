@@ -32,7 +32,7 @@ from splatseed.io.staging import MANIFEST, output_folder, write_json
 from splatseed.lens import unproject_pixels
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, in_threads, silent
-from splatseed.projection import normalized, pixel_centers
+from splatseed.projection import denormalized, normalized, pixel_centers
 from splatseed.scene import Image, Observations, Scene, Tracks
 
 DenseMap: TypeAlias = Any
@@ -402,7 +402,7 @@ def _photograph_model(
         if seen is not None:
             uv = seen.xy
             if lens.has_distortion:  # features outside of the lens model stay
-                straight = unproject_pixels(lens, uv) * lens.K[[0, 1], [0, 1]] + lens.K[:2, 2]
+                straight = denormalized(lens.K, unproject_pixels(lens, uv))
                 uv = np.where(np.isnan(straight), uv, straight)
             scale = np.array([record.width / lens.width, record.height / lens.height])
             seen = Observations(uv * scale, seen.point_ids)

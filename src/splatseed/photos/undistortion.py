@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float64, UInt8
 from splatseed.camera import Intrinsics
 from splatseed.lens import distort, fold_radius
 from splatseed.photos._kernels import resample
-from splatseed.projection import normalized, pixel_centers
+from splatseed.projection import denormalized, normalized, pixel_centers
 
 BAND = 64  # rows of a photograph computed at a time, which bounds the memory of their rays
 
@@ -32,7 +32,7 @@ def undistort(
         rows = slice(first, min(first + BAND, height))
         rays = normalized(K, pixel_centers(rows.stop - first, width) + np.array([0, first]))
         with np.errstate(all="ignore"):  # beyond the fold nothing needs to be finite
-            uv = distort(lens, rays) * K[[0, 1], [0, 1]] + K[:2, 2]
+            uv = denormalized(K, distort(lens, rays))
         # Beyond the fold the lens maps two rays to one pixel.
         uv[np.linalg.norm(rays, axis=-1) > limit] = np.nan
         resample(photograph, uv, out[rows], known[rows])

@@ -26,7 +26,7 @@ from splatseed.lens import project_rays
 from splatseed.photos.view import View
 from splatseed.photos.zbuffer import cell_depths
 from splatseed.progress import Progress, in_threads, silent
-from splatseed.projection import normalized, pixel_centers, project
+from splatseed.projection import denormalized, normalized, pixel_centers, project
 from splatseed.scene import Image, Scene
 from splatseed.seeding.cover import CoverSeeds, GrowableArray, make_seeds
 from splatseed.seeding.poses import compare_samples
@@ -255,8 +255,8 @@ def _pixels_of_rays(
     image: Image, depth: DepthMap, rays: Float64[np.ndarray, "R C 2"]
 ) -> Float64[np.ndarray, "R C 2"]:
     """Project rays (x, y, 1) to the pixels of an image's map, with the image's lens."""
-    K = map_camera(depth, image).K
+    camera = map_camera(depth, image)
     if depth.K is not None:
-        return np.asarray(rays * K[[0, 1], [0, 1]] + K[:2, 2])
+        return denormalized(camera.K, rays)
     lens = image.intrinsics
     return project_rays(lens, rays) * [depth.width / lens.width, depth.height / lens.height]

@@ -26,7 +26,7 @@ from splatseed.photos.sizes import factor_for_size
 from splatseed.photos.sources import choose_by_pose
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent
-from splatseed.projection import pixel_centers
+from splatseed.projection import camera_centers, pixel_centers
 from splatseed.sampling import strided
 from splatseed.scene import Image, Scene
 from splatseed.seeding.pose_accuracy import estimate_pose_error
@@ -194,7 +194,7 @@ def _check_centers(poses: Poses) -> None:
             found=f"{len(poses)}",
             fix="Add photographs: depth comes from comparing them. Test views do not count.",
         )
-    centers = np.linalg.inv(poses)[:, :3, 3]
+    centers = camera_centers(poses)
     apart = np.abs(centers - centers[0]).max()
     if apart <= np.finfo(np.float32).eps * np.abs(centers).max():
         raise SceneFormatError(

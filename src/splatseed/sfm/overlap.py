@@ -21,7 +21,7 @@ from jaxtyping import Float64
 from splatseed.camera import Camera
 from splatseed.photos.sources import choose_by_pose
 from splatseed.photos.visibility import points_in_image
-from splatseed.projection import pixel_centers
+from splatseed.projection import denormalized, pixel_centers
 from splatseed.sampling import strided
 from splatseed.sfm.first_look import Agreement, Pair
 
@@ -97,8 +97,7 @@ def points_of_matches(
 def _world(
     camera: Camera, rays: Float64[np.ndarray, "M 2"], depth: Float64[np.ndarray, " M"]
 ) -> Points:
-    uv = rays * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2]
-    return camera.unproject(uv, depth)
+    return camera.unproject(denormalized(camera.K, rays), depth)
 
 
 def overlaps(cameras: Sequence[Camera], seen: Sequence[Points]) -> Float64[np.ndarray, "V V"]:
