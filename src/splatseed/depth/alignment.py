@@ -224,7 +224,7 @@ class Alignment:
     rejected: str | None = None  # reason why the map is not used; None = it is used
 
 
-def align(
+def align_maps(
     scene: Scene, *, max_residual_ratio: float | None = 3.0, progress: Progress = silent
 ) -> dict[str, Alignment]:
     """Align each depth map of a scene to its SfM points, by image name; rejected maps included.

@@ -26,7 +26,14 @@ from splatseed.progress import Progress, silent
 from splatseed.sampling import strided
 from splatseed.scene import Scene
 from splatseed.seeding.clouds.global_search import SEARCH, SearchSettings, find_starts, to_unit_size
-from splatseed.seeding.clouds.icp import Alignment, RefinedAlignment, Stage, Surface, fit, refine
+from splatseed.seeding.clouds.icp import (
+    Alignment,
+    CloudSurface,
+    RefinedAlignment,
+    Stage,
+    fit,
+    refine,
+)
 from splatseed.seeding.clouds.reading import sample_cloud
 from splatseed.seeding.clouds.tie_points import (
     MAX_TIE_POINTS,
@@ -130,7 +137,7 @@ class CloudAlignment:
         return text
 
 
-def align(
+def align_cloud(
     scene: Scene,
     paths: Sequence[Path],
     progress: Progress = silent,
@@ -148,7 +155,7 @@ def align(
     progress("align", 0.0)
     unit_from_scene, unit_from_cloud = to_unit_size(tie_points.xyz), to_unit_size(xyz)
     unit_points = tie_points.transformed(unit_from_scene)
-    surface = Surface.of(unit_from_cloud.points(xyz))
+    surface = CloudSurface.of(unit_from_cloud.points(xyz))
     first, *others = _candidates(surface, unit_points.xyz, settings, progress)
     close = settings.inlier_distance
     refined = refine(surface, unit_points, first.cloud_from_scene, close)
@@ -200,7 +207,7 @@ def _unreliable(found: str) -> PointCloudError:
 
 
 def _candidates(
-    surface: Surface, tie_xyz: Points, settings: AlignSettings, progress: Progress
+    surface: CloudSurface, tie_xyz: Points, settings: AlignSettings, progress: Progress
 ) -> list[Alignment]:
     """Return distinct alignments, best first.
 
@@ -246,7 +253,7 @@ def _is_distinct(first: Alignment, second: Alignment, settings: AlignSettings) -
 
 def _brightness_correlation(
     alignment: Alignment,
-    surface: Surface,
+    surface: CloudSurface,
     tie_points: TiePoints,
     rgb: UInt8[np.ndarray, "N 3"] | None,
     inlier_distance: float,
