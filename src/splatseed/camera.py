@@ -196,7 +196,7 @@ class Camera:
     @property
     def center(self) -> Float64[np.ndarray, " 3"]:
         """The camera's position in the world."""
-        return camera_centers([self.cam_from_world])[0]
+        return np.asarray(camera_centers([self.cam_from_world])[0])
 
     @property
     def pixels_from_world(self) -> Float64[np.ndarray, "3 4"]:
