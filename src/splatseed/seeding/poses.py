@@ -24,6 +24,7 @@ from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.photos.loading import load_views
 from splatseed.photos.sizes import factor_for_size
 from splatseed.photos.sources import choose_by_pose
+from splatseed.photos.visibility import points_in_image
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.projection import camera_centers, pixel_centers
@@ -250,8 +251,7 @@ def _any_overlap(cameras: Sequence[Camera]) -> bool:
             if gap := float(np.linalg.norm(first.center - other.center)):
                 z = gap * np.repeat(np.geomspace(0.1, 1000.0, 12), len(uv))
                 xyz = first.unproject(np.tile(uv * [first.width, first.height], (12, 1)), z)
-                pixels = other.project(xyz)[0]  # NaN behind the camera
-                if ((pixels >= 0) & (pixels < [other.width, other.height])).all(axis=1).any():
+                if len(points_in_image(other, xyz).point_idx):
                     return True
     return False
 

@@ -15,10 +15,11 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int64, UInt8
+from jaxtyping import Bool, Float32, UInt8
 
 from splatseed.camera import Camera
 from splatseed.photos.viewpoint import look_at
+from splatseed.photos.visibility import points_in_image
 from splatseed.progress import num_threads
 from splatseed.projection import pixel_centers
 from splatseed.synthetic.surfaces import (
@@ -231,9 +232,7 @@ def _shade(room: Room, camera: Camera, directions: Points) -> Points:
 
 def visible(surfaces: Surface, camera: Camera, xyz: Points) -> Bool[np.ndarray, " N"]:
     """Whether each surface point is in the image and not occluded, [N]."""
-    uv, depth = camera.project(xyz)
-    inside = (depth > 0) & (uv >= 0).all(axis=1) & (uv < [camera.width, camera.height]).all(axis=1)
-    seen: Int64[np.ndarray, " M"] = np.flatnonzero(inside)
+    seen = points_in_image(camera, xyz).point_idx
     first = surfaces.intersect(camera.center, xyz[seen] - camera.center)
     result = np.zeros(len(xyz), bool)
     result[seen] = first > 1.0 - 1e-6  # t = 1 is the point itself

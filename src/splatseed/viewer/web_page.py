@@ -21,6 +21,7 @@ from splatseed.errors import OutputError
 from splatseed.io.staging import atomic_file
 from splatseed.photos.upright import up_direction
 from splatseed.photos.view import View
+from splatseed.photos.visibility import points_in_image
 from splatseed.progress import Note, Progress, silent, silent_note
 from splatseed.rendering.harmonics import sh_basis
 from splatseed.requirements import require
@@ -163,10 +164,7 @@ def mean_colors(model: Gaussians, views: tuple[View, ...]) -> UInt8[np.ndarray, 
     total, weights = np.zeros((len(model), 3)), np.zeros(len(model))
     chosen = evenly_spaced(len(views), COLOR_VIEWS) if model.shN.size else ()
     for camera in (views[i].camera for i in chosen):
-        uv, depth = camera.project(model.means)
-        seen = np.flatnonzero(
-            (depth > 0) & ((uv >= 0) & (uv < [camera.width, camera.height])).all(axis=1)
-        )
+        seen = points_in_image(camera, model.means).point_idx
         rays: Float64[np.ndarray, "M 3"] = model.means[seen] - camera.center
         distance = np.linalg.norm(rays, axis=1)
         basis = sh_basis(rays / distance[:, None], 1 + model.shN.shape[1])[:, 1:]
