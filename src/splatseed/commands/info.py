@@ -189,9 +189,9 @@ def _read(options: Options) -> Scene:
 
 def _alignments(options: Options, scene: Scene, clock: StageClock) -> dict[str, Alignment]:
     """Align each map with the SfM points; draw the picture, if requested."""
-    from splatseed.depth.alignment import align
+    from splatseed.depth.alignment import align_maps
 
-    alignments = align(scene, progress=clock)
+    alignments = align_maps(scene, progress=clock)
     if options.picture is not None:
         from splatseed.viewer.maps import preview_depth
 

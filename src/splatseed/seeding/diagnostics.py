@@ -19,6 +19,7 @@ from splatseed.findings import Finding
 from splatseed.methods.neighbors import prepare, sound_bases
 from splatseed.photos.visibility import points_in_image
 from splatseed.progress import Progress, silent
+from splatseed.sampling import strided
 from splatseed.scene import NO_POINT, Image, Scene
 
 EMPTY_CELLS = 32  # cells of the grid of empty regions along an image's longer side
@@ -253,7 +254,7 @@ def read_mask_sample(scene: Scene, progress: Progress = silent) -> MaskSample:
         return MaskSample({}, (), "")
     files = scene.masks.files
     images = [im for im in scene.images if (im.name in files or not files) and im.has_photograph]
-    images = images[:: -(-len(images) // MAX_MASKS_READ) or 1]
+    images = strided(images, MAX_MASKS_READ)
     cells: dict[str, Float64[np.ndarray, "R C"] | None] = {}
     shares, problem = [], ""
     for i, image in enumerate(images):
