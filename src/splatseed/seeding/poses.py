@@ -92,6 +92,10 @@ CONVENTIONS = {
 """The convention of each format's poses."""
 
 
+class InexactPosesError(SceneFormatError):
+    """Photographs agree nowhere, and their poses miss by an error that refinement can correct."""
+
+
 def check_poses(scene: Scene, images: Sequence[Image], progress: Progress = silent) -> float:
     """Return the mean agreement of a few photographs, or refuse their poses, within seconds.
 
@@ -148,17 +152,14 @@ def _disagreement(
         )
     error = estimate_pose_error(scene, images)
     inexact = error is not None and not error.exact
-    fix = (
-        "Correct the poses with `refine_poses=True`"
-        if inexact
-        else "Check that poses and names of the images belong together"
-    )
-    return SceneFormatError(
-        expected,
-        found=f"a depth that others confirm at {agreement:.1%} of their pixels"
-        + (f"; they miss each other by about {error}" if inexact else ""),
-        fix=f"{fix}, or estimate new poses: {sfm}.",
-    )
+    found = f"a depth that others confirm at {agreement:.1%} of their pixels"
+    new_poses = f"or estimate new poses: {sfm}."
+    if inexact:
+        found += f"; they miss each other by about {error}"
+        fix = f"Correct the poses with `refine_poses=True`, {new_poses}"
+        return InexactPosesError(expected, found=found, fix=fix)
+    fix = f"Check that poses and names of the images belong together, {new_poses}"
+    return SceneFormatError(expected, found=found, fix=fix)
 
 
 def agreement_findings(
