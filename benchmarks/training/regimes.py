@@ -22,7 +22,7 @@ from benchmarks.training.baseline import read_ledger
 
 from splatseed.errors import SplatseedError
 from splatseed.seeding.advice import AS_IT_IS, MIN_ROOM, Measured, advise
-from splatseed.training.traits import STRATEGIES
+from splatseed.training.settings import SEED_SHARE
 
 __all__: list[str] = []
 
@@ -120,12 +120,7 @@ def advice(ledger: Ledger, strategy: str) -> Iterable[list[str]]:
     def followed(plan: Plan, capture: str, room: float) -> float:
         """What following the advice gains."""
         has = rooms[plan, capture]
-        said = advise(
-            Measured(1000, 0.0),
-            round(1000 * has),
-            why_no_seeds=STRATEGIES[strategy].why_no_seeds,
-            room=room,
-        )
+        said = advise(Measured(1000, 0.0), round(1000 * has), strategy=strategy, room=room)
         return 0.0 if said.method == AS_IT_IS else by_plan[plan][capture][0]
 
     def chosen(capture: str) -> float:
@@ -151,7 +146,7 @@ def advice(ledger: Ledger, strategy: str) -> Iterable[list[str]]:
 def _room(ledger: Ledger, capture: str, strategy: str, plan: Plan) -> float:
     """The number of seeds with which training can begin, per point of the capture."""
     run = next(iter(ledger.runs[capture, SFM, strategy, plan].values()))
-    return float(run["cap"] * STRATEGIES[strategy].seed_share / run["points"])
+    return float(run["cap"] * SEED_SHARE.get(strategy, 1.0) / run["points"])
 
 
 @dataclass(frozen=True)

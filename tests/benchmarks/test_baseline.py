@@ -11,7 +11,6 @@ pytest.importorskip("torch", reason="training needs PyTorch")
 from splatseed.io import load_scene
 from splatseed.training import TrainSettings
 from splatseed.training.schedule import make_schedule
-from splatseed.training.traits import STRATEGIES
 
 MODULES = ("training.baseline", "training.baseline_arms")
 
@@ -25,7 +24,7 @@ def captures(room_of, tmp_path_factory):
 
 
 def test_an_arm_is_a_strategy_with_one_choice_changed(bench):
-    own = make_schedule(STRATEGIES["default"], 1500, as_3dgs=False)
+    own = make_schedule("default", 1500, as_3dgs=False)
     for name, arm in bench.baseline_arms.ARMS.items():
         settings = TrainSettings(strategy=arm.strategy, max_steps=1500)
         changed = arm.change(settings.schedule)
