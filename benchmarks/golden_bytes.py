@@ -92,10 +92,8 @@ def cases(scenes: Path) -> Iterator[tuple[str, Callable[[], str]]]:
             lambda s=scene: of_cloud(ss.upsample(s, budget=8_000, seed=0)),
         )
         yield (
-            f"points/{name}/mls-verify-cover",
-            lambda s=scene: of_cloud(
-                ss.upsample(s, method="mls", ratio=4, seed=0, verify=True, cover=8)
-            ),
+            f"points/{name}/mls-cover",
+            lambda s=scene: of_cloud(ss.upsample(s, method="mls", ratio=4, seed=0, cover=8)),
         )
     room = load_scene(scenes / "replica" / "room0", require_points=False)
     yield ("points/room0/auto", lambda: of_cloud(ss.upsample(room, budget=8_000, seed=0)))

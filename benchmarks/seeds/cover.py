@@ -1,9 +1,4 @@
-"""Cover: how fast it is, and how near the guessed depths come to points that were taken away.
-
-Speed: 100 views of 800 x 600 in a made room, beside the same coverage in plain NumPy in the same
-run.
-Depths: real captures, test and validation views left out; see ``cover_rules.py`` and README.md.
-"""
+"""How fast cover is: 100 views of 800 x 600 in a made room, beside coverage in plain NumPy."""
 
 from __future__ import annotations
 
@@ -16,17 +11,14 @@ import tyro
 from benchmarks.common.clouds import room
 from benchmarks.common.machine import describe, warn_if_busy
 from benchmarks.common.markdown import table
-from benchmarks.seeds.cover_rules import rule_table
 
 from splatseed.camera import Camera
 from splatseed.errors import SplatseedError
-from splatseed.photos.projection import cells_from_world, grid_shape
 from splatseed.photos.view import View
 from splatseed.photos.viewpoint import look_at
 from splatseed.photos.visibility import SURFACE
 from splatseed.photos.zbuffer import MIN_NEARER
-from splatseed.seeding.cover import cover
-from splatseed.seeding.coverage import covered_share
+from splatseed.seeding.cover import cover, covered_share
 from splatseed.seeding.thinning import thin
 
 __all__: list[str] = []
@@ -47,10 +39,6 @@ class Settings:
     """Points of the room; five times as many for thinning."""
     repeats: int = 3
     """Runs; the best is shown."""
-    scenes: tuple[str, ...] = ("fern", "fox", "treehill", "bonsai")
-    """Real captures for the depths; none to leave these out."""
-    holes: int = 40
-    """Points that are looked for in each of up to 14 views."""
 
 
 def views_of_the_room(num: int) -> list[View]:
@@ -73,7 +61,7 @@ def numpy_share(views: Sequence[View], xyz: np.ndarray) -> float:
 
 
 def _numpy_cells(view: View, xyz: np.ndarray) -> np.ndarray:
-    (rows, cols), m = grid_shape(view.camera, CELL), cells_from_world(view.camera, CELL)
+    (rows, cols), m = view.camera.grid_shape(CELL), view.camera.cells_from_world(CELL)
     x, y, depth = m[:, :3] @ xyz.T.astype(np.float64) + m[:, 3:]
     with np.errstate(divide="ignore", invalid="ignore"):
         j, i = np.floor(x / depth), np.floor(y / depth)
@@ -142,8 +130,6 @@ def main(settings: Settings) -> None:
     print(f"{describe()}\n")
     warn_if_busy()
     print_speed(settings)
-    if settings.scenes:
-        print(f"### Depths\n\n{rule_table(settings.scenes, settings.holes)}\n")
 
 
 if __name__ == "__main__":

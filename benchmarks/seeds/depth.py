@@ -1,4 +1,4 @@
-"""Depth-guided lifting on two real captures: how exact it is, and how long it takes.
+"""Accuracy of points lifted from depth maps, on two real captures.
 
 Notation: *held out* is every eighth frame by name: its photograph and depth are never lifted from,
 and its depth is the surface that new points are held against. A point is *judged* if in some
@@ -9,28 +9,23 @@ to the nearest point of the cloud, *bare* their share with no point within 5 cm.
 captures are only read; without them the script says so and ends.
 
 Run it as ``python -m benchmarks.seeds.depth`` (some minutes, and one more for each capture the
-first time: SfM points are triangulated and kept under ``--cache``); ``--speed`` measures time
-alone.
+first time: SfM points are triangulated and kept under ``--cache``).
 """
 
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import os
 import subprocess
 import sys
-import tempfile
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from benchmarks.common.clouds import find_scenes
-from benchmarks.common.machine import describe, warn_if_busy
+from benchmarks.common.machine import describe
 from benchmarks.common.markdown import table
-from PIL import Image as PilImage
 from scipy.spatial import cKDTree
 
 import splatseed as ss
@@ -38,10 +33,8 @@ from splatseed.depth.alignment import map_camera
 from splatseed.errors import SceneNotFoundError
 from splatseed.io import find_depths
 from splatseed.photos.cache import user_cache_dir
-from splatseed.photos.viewpoint import choose_camera
 from splatseed.progress import in_threads, silent
-from splatseed.scene import Scene, SceneSource, Tracks
-from splatseed.viewer.points import render_points
+from splatseed.scene import Scene
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # as the command line does
 
@@ -52,10 +45,6 @@ HELD_OUT = 8
 FAR = 0.05
 RATIO = 16
 GAP_SAMPLES = 50_000
-
-FRAMES, REPEATS, POINTS, SPEED_RATIO, TRACK = 20, 10, 23_000, 32, 12
-REPLICA_SCALE = 6553.5
-RUNS = 5
 
 ARMS: dict[str, tuple[str, str, dict[str, object]]] = {
     "mls": ("mls", "default", {}),
@@ -183,17 +172,11 @@ def main() -> None:
     parser.add_argument("--cache", type=Path, default=user_cache_dir().parent / "benchmarks")
     parser.add_argument("--arms", nargs="*", default=list(ARMS), help="quality of these alone")
     parser.add_argument("--scenes", nargs="*", default=list(CAPTURES), choices=list(CAPTURES))
-    parser.add_argument("--pictures", type=Path, help="a folder to draw into")
-    parser.add_argument("--speed", action="store_true", help="measure time alone")
     options = parser.parse_args()
     if not (SCENES / "replica/room0").is_dir():
         print(f"skipped: no captures in {SCENES}; set SPLATSEED_SCENES to their folder")
         return
     print(describe(), "\n")
-    if options.speed:
-        warn_if_busy()
-        print(speed_table(options.cache))
-        return
     for name in options.scenes:
         print(quality_table(name, options), "\n", flush=True)
 
@@ -208,8 +191,6 @@ def quality_table(name: str, options: argparse.Namespace) -> str:
         if method == "depth":
             changes = {"test_every": HELD_OUT, **changes}
         clouds[arm] = ss.upsample(scene, method, ratio=RATIO, profile=profile, **changes)
-    if options.pictures:
-        draw(scene, clouds, options.pictures / f"{name.replace('/', '_')}.png")
     header = [
         f"{name}, {len(scene.points):,} points, {RATIO}x",
         "judged",
@@ -219,14 +200,6 @@ def quality_table(name: str, options: argparse.Namespace) -> str:
         "bare",
     ]
     return table(header, [[arm, *Score.of(c, truth).cells()] for arm, c in clouds.items()])
-
-
-def draw(scene: Scene, clouds: dict[str, ss.PointCloud], path: Path) -> None:
-    """The paper's figure 2: the SfM points, and lifting by both profiles, from one camera."""
-    shown = [clouds[arm] for arm in ("SfM points", "depth, paper", "depth, default")]
-    pictures = [render_points(cloud, choose_camera(scene), point_size=2.0) for cloud in shown]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    PilImage.fromarray(np.concatenate(pictures, axis=1)).save(path)
 
 
 def at_hand(names: Sequence[str]) -> list[str]:
@@ -252,101 +225,6 @@ def triangulated(name: str, cache: Path) -> Scene:
         subprocess.run([program, *map(str, words)], check=True)
     scene = ss.load_scene(folder)
     return scene.replace(depths=find_depths(scene, SCENES / name))
-
-
-def speed_table(cache: Path) -> str:
-    """Lifting beside reading and decoding, with as many threads; the best of five runs."""
-    with tempfile.TemporaryDirectory() as folder:
-        scene = long_capture(triangulated("replica/room0", cache), Path(folder))
-        warm = scene.replace(images=scene.images[:FRAMES])
-        ss.upsample(warm, "depth", num_points=2 * POINTS)
-        arms: dict[str, Callable[[], object]] = {
-            "photographs read and decoded": lambda: decode_all(scene, depths=False),
-            "photographs and maps read and decoded": lambda: decode_all(scene, depths=True),
-            "depth, default": lambda: ss.upsample(scene, "depth", ratio=SPEED_RATIO),
-            "depth, paper": lambda: ss.upsample(scene, "depth", ratio=SPEED_RATIO, profile="paper"),
-        }
-        # In turns, so that a busy minute falls on all of them.
-        runs = [[seconds(function) for function in arms.values()] for _ in range(RUNS)]
-    best = np.min(runs, axis=0)
-    rows = [
-        [arm, f"{wall:.2f}", f"{wall / best[1, 0]:.2f}", f"{cpu:.2f}", f"{cpu / best[1, 1]:.2f}"]
-        for arm, (wall, cpu) in zip(arms, best, strict=True)
-    ]
-    header = [
-        f"{FRAMES * REPEATS} frames of 1200 x 680, {POINTS:,} points to {SPEED_RATIO}x",
-        "best s",
-        "of reading",
-        "CPU s",
-        "of reading",
-    ]
-    return table(header, rows)
-
-
-def seconds(function: Callable[[], object]) -> tuple[float, float]:
-    """How long a call takes, and of how much processor."""
-    wall, cpu = time.perf_counter(), time.process_time()
-    function()
-    return time.perf_counter() - wall, time.process_time() - cpu
-
-
-def decode_all(scene: Scene, *, depths: bool) -> None:
-    """Read and decode every photograph, and every map, once, and keep nothing."""
-
-    def work(start: int, stop: int) -> None:
-        for image in scene.images[start:stop]:
-            image.read()
-            if depths:
-                scene.depths.read(image.name)
-
-    in_threads(work, len(scene.images), 1, "decode", silent)
-
-
-def long_capture(scene: Scene, folder: Path) -> Scene:
-    """A capture of ten times the frames, by links, and of as many points as Replica's scenes have.
-
-    The points are made from the few of the short capture, and each is taken to be seen by up to
-    ``TRACK`` of the frames in which it is not hidden.
-    """
-    results = SCENES / "replica/room0/results"
-    frames = sorted(results.glob("frame*.jpg"))
-    images = []
-    for i in range(REPEATS * FRAMES):
-        name = f"frame{i:06d}.jpg"
-        (folder / name).symlink_to(frames[i % FRAMES])
-        depth = frames[i % FRAMES].with_suffix(".png").name.replace("frame", "depth")
-        (folder / f"depth{i:06d}.png").symlink_to(results / depth)
-        image = next(each for each in scene.images if each.name == frames[i % FRAMES].name)
-        images.append(dataclasses.replace(image, name=name, image_id=i + 1, observations=None))
-    points = ss.upsample(scene.points, "mls", num_points=POINTS)
-    points = ss.PointCloud(points.xyz, points.rgb)
-    source = SceneSource("colmap", folder, folder, image_dir=folder)
-    long = Scene(points, tuple(images), scene.intrinsics, source=source)
-    long = long.replace(depths=find_depths(long, folder, scale=REPLICA_SCALE))
-    return long.replace(tracks=made_tracks(long))
-
-
-def made_tracks(scene: Scene) -> Tracks:
-    """Up to ``TRACK`` random frames for each point, of those that see it."""
-    rng = np.random.default_rng(0)
-    seen = np.zeros((len(scene.points), len(scene.images)), bool)
-    for i, image in enumerate(scene.images):
-        depth = scene.depths.read(image.name).values
-        uv, z = image.camera.project(scene.points.xyz)
-        inside = (z > 0) & ((uv >= 0) & (uv < depth.shape[::-1])).all(axis=1)
-        column, row = uv[inside].astype(int).T
-        seen[inside, i] = np.abs(depth[row, column] / z[inside] - 1.0) < FAR
-    order = np.argsort(rng.random(seen.shape) - seen, axis=1)[:, :TRACK]
-    kept = np.take_along_axis(seen, order, axis=1)
-    num = len(seen)
-    return Tracks(
-        point_ids=np.arange(1, num + 1),
-        xyz=scene.points.xyz.astype(np.float64),
-        errors=np.ones(num),
-        offsets=np.concatenate([[0], np.cumsum(kept.sum(axis=1))]),
-        image_ids=(order[kept] + 1).astype(np.uint32),
-        point2d_idx=np.zeros(kept.sum(), np.uint32),
-    )
 
 
 if __name__ == "__main__":

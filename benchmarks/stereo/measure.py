@@ -1,15 +1,13 @@
-"""Depth from photographs alone: how fast, how near the truth, and what each choice gives.
+"""Depth from photographs alone: speed, and accuracy against exact depth.
 
-Notation: see ``speed``, ``truth``, ``points`` and ``semi_global``, where the measuring is done.
-Promise: every measurement has a process of its own; each table is Markdown. What needs captures is
-left out, with the reason, where there are none. See README.md for what is and is not measured.
+Notation: see ``speed`` and ``truth``. Promise: every measurement has its own process; tables are
+Markdown. Without captures, the parts that need them are skipped with the reason.
 """
 
 from __future__ import annotations
 
-import importlib.util
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,12 +15,9 @@ from typing import Any
 import tyro
 from benchmarks.common.children import avx2_environment, call
 from benchmarks.common.clocks import Clock
-from benchmarks.common.clouds import find_scenes
 from benchmarks.common.machine import describe, warn_if_busy
 from benchmarks.common.markdown import table
 from benchmarks.seeds.depth import at_hand
-from benchmarks.stereo.arms import ARMS, FOLIAGE, Arm, scores_of
-from benchmarks.stereo.points import FEW, PointScore
 from benchmarks.stereo.speed import NUM_VIEWS, prepare_views
 from benchmarks.stereo.truth import TRUE_SCENES, Score, prepare
 
@@ -36,8 +31,9 @@ HYPOTHESIS_TARGET, PEER_TARGET, AVX2_TARGET = 0.4, 3.3, 1.5
 WHOLE_TARGET = "30 s, 2 GB"
 THREADS = 2
 PEER_ROWS = 40
-POINTS_OF = ("treehill", "fern", "fox", "bonsai")
-PARTS = ("speed", "whole", "truth", "pairs", "points", "few", "bare", "foliage", "dense")
+PARTS = ("speed", "whole", "truth")
+STARTS = {"SfM's points": "", "no points": "depths", "depth maps": "points"}
+"""Starts of stereo, and what is removed from the scene."""
 
 
 @dataclass(frozen=True)
@@ -45,24 +41,18 @@ class Settings:
     """What to measure."""
 
     parts: tuple[str, ...] = PARTS
-    """speed: a hypothesis; whole: 100 views; truth: against true depth; pairs: OpenCV's semi-global
-    matching, likewise; points: against SfM's points; few: begun from a few of these; bare: without
-    points; foliage: treehill; dense: seeds within budgets."""
+    """speed: a hypothesis; whole: 100 views; truth: accuracy against exact depth."""
     scenes: tuple[str, ...] = TRUE_SCENES
     """Where depth is known."""
-    arms: tuple[str, ...] = tuple(ARMS)
-    """Which choices."""
-    captures: tuple[str, ...] = POINTS_OF
-    """Where SfM's points are known."""
     limit: int = 48
-    """Photographs of a scene at most where depth is known; elsewhere half of it."""
+    """Maximum number of photographs of a scene."""
     clock: Clock = "wall"
     """On a machine that is not idle, cpu: processor time over threads."""
     cache: Path = user_cache_dir().parent / "benchmarks"
     """Where made and triangulated scenes are kept."""
 
     def __post_init__(self) -> None:
-        known = {"parts": PARTS, "scenes": TRUE_SCENES, "arms": tuple(ARMS)}
+        known = {"parts": PARTS, "scenes": TRUE_SCENES}
         for name, all_of_them in known.items():
             for each in getattr(self, name):
                 if each not in all_of_them:
@@ -121,134 +111,26 @@ def print_whole(settings: Settings) -> None:
 
 
 def print_truth(settings: Settings) -> None:
-    """Every arm against true depth."""
+    """Accuracy with SfM's points, without, and with depth maps instead."""
     names = at_hand(settings.scenes)
-    prepare(names, settings.cache)
-    arguments = {"cache": str(settings.cache), "limit": settings.limit}
-    header = ["kept", "within 1%", "within 5%", "reached", "CPU s"]
-    _print_arms("benchmarks.stereo.truth:score_all", Score, names, settings.arms, header, arguments)
-
-
-def print_pairs(settings: Settings) -> None:
-    """Ours beside OpenCV's semi-global matching of rectified pairs, against true depth."""
-    if importlib.util.find_spec("cv2") is None:
-        print("No peer: OpenCV is not installed (pip install opencv-python-headless).\n")
-        return
-    names = at_hand(settings.scenes)
-    prepare(names, settings.cache)
-    arguments: dict[str, Any] = {
-        "names": names, "cache": str(settings.cache), "limit": settings.limit,
-    }  # fmt: skip
-    pairs = "benchmarks.stereo.semi_global:score_pairs"
-    scores = {
-        "stereo": scores_of(ARMS["stereo"], "benchmarks.stereo.truth:score_all", **arguments),
-        "one rectified pair": scores_of(Arm(), pairs, pairs=1, **arguments),
-        "two that agree": scores_of(Arm(), pairs, pairs=2, **arguments),
-    }
-    header = ["kept", "within 1%", "within 5%", "reached", "CPU s"]
-    for name in names:
-        rows = [[label, *Score(**each[name]).cells()] for label, each in scores.items()]
-        print(f"{table([name, *header], rows)}\n", flush=True)
-
-
-def print_points(settings: Settings) -> None:
-    """Every arm against SfM's points."""
-    _print_against_points(settings, settings.captures, settings.arms)
-
-
-def print_few(settings: Settings) -> None:
-    """From which number on SfM's points show better where to search than small photographs do."""
-    find_scenes()
-    header = ["begun from", "seen by an image", "kept", "CPU s"]
-    for name in settings.captures:
-        found = call(
-            "benchmarks.stereo.points:score_few", threads=1, name=name, limit=settings.limit
-        )
-        rows = [
-            [f"{count:,} points" if count else "none", f"{seen:.0f}", f"{kept:.1%}", f"{s:.1f}"]
-            for count, (seen, kept, s) in zip(FEW, found, strict=True)
-        ]
-        print(f"{table([f'{name}: {header[0]}', *header[1:]], rows)}\n", flush=True)
-
-
-def print_foliage(settings: Settings) -> None:
-    """What finer windows, more views and smaller steps do on leaves."""
-    _print_against_points(settings, ("treehill",), tuple(FOLIAGE))
-
-
-def _print_against_points(settings: Settings, names: Sequence[str], arms: Sequence[str]) -> None:
-    find_scenes()
-    header = ["kept", "points known", "within 1%", "within 5%", "CPU s"]
-    arguments = {"limit": settings.limit // 2}
-    _print_arms("benchmarks.stereo.points:score_points", PointScore, names, arms, header, arguments)
-
-
-def print_bare(settings: Settings) -> None:
-    """The scenes with their points, without, and with depth maps instead."""
-    names = [name for name in at_hand(settings.scenes) if name != "made, no texture"]
     prepare(names, settings.cache)
     arguments = {"names": names, "cache": str(settings.cache), "limit": settings.limit}
-    for_each = {"SfM's points": "", "no points": "depths", "depth maps": "points"}
-    scores_of_start = {
-        label: scores_of(
-            ARMS["stereo"], "benchmarks.stereo.truth:score_all", without=without, **arguments
+    scores_of = {
+        start: call(
+            "benchmarks.stereo.truth:score_all", threads=THREADS, without=without, **arguments
         )
-        for label, without in for_each.items()
+        for start, without in STARTS.items()
     }
-    header = ["begun from", "kept", "within 1%", "within 5%", "reached", "CPU s"]
+    header = ["started from", "kept", "within 1%", "within 5%", "reached", "CPU s"]
     for name in names:
-        rows = [
-            [label, *Score(**scores[name]).cells()] for label, scores in scores_of_start.items()
-        ]
+        rows = [[start, *Score(**scores[name]).cells()] for start, scores in scores_of.items()]
         print(f"{table([f'{name}: {header[0]}', *header[1:]], rows)}\n", flush=True)
-
-
-def print_dense(settings: Settings) -> None:
-    """Seeds of a budget against true depth, beside sparse ones."""
-    names = [name for name in at_hand(settings.scenes) if name != "made, no texture"]
-    prepare(names, settings.cache)
-    header = ["photographs, depths", "seeds", "within 1%", "within 5%", "CPU s"]
-    for name in names:
-        rows = call(
-            "benchmarks.stereo.dense:score_dense", threads=THREADS, name=name,
-            cache=str(settings.cache), limit=settings.limit,
-        )  # fmt: skip
-        cells = [
-            [row["label"], row["size"], f"{row['seeds']:,}",
-             *(f"{share:.1%}" for share in row["shares"]), f"{row['seconds']:.1f}"]
-            for row in rows
-        ]  # fmt: skip
-        print(f"{table([name, *header], cells)}\n", flush=True)
-
-
-def _print_arms(
-    function: str,
-    score: Callable[..., Any],
-    names: Sequence[str],
-    arms: Sequence[str],
-    header: Sequence[str],
-    arguments: dict[str, Any],
-) -> None:
-    """A table a scene, a row an arm."""
-    scores_of_arm = {
-        arm: scores_of({**ARMS, **FOLIAGE}[arm], function, names=list(names), **arguments)
-        for arm in arms
-    }
-    for name in names:
-        rows = [[arm, *score(**scores[name]).cells()] for arm, scores in scores_of_arm.items()]
-        print(f"{table([name, *header], rows)}\n", flush=True)
 
 
 PRINTERS: dict[str, Callable[[Settings], None]] = {
     "speed": print_speed,
     "whole": print_whole,
     "truth": print_truth,
-    "pairs": print_pairs,
-    "points": print_points,
-    "few": print_few,
-    "bare": print_bare,
-    "foliage": print_foliage,
-    "dense": print_dense,
 }
 
 

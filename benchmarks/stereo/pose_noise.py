@@ -21,10 +21,10 @@ from pathlib import Path
 import numpy as np
 import tyro
 from benchmarks.common.clouds import find_scenes
+from benchmarks.common.ledger import report
 from benchmarks.common.machine import describe
 from benchmarks.common.markdown import table
 from benchmarks.stereo.truth import first, load, prepare, relative_error
-from benchmarks.training.baseline import say
 from scipy.spatial.transform import Rotation
 
 import splatseed as ss
@@ -74,7 +74,7 @@ def _rows(name: str, options: Options) -> Iterator[list[str]]:
     )  # fmt: skip
     scene = first(scene, options.limit)
     for degrees in options.degrees:
-        say(f"{name}, {degrees:g} degrees ...")
+        report(f"{name}, {degrees:g} degrees ...")
         noisy = _with_noise(scene, degrees, np.random.default_rng(0))
         start = time.perf_counter()
         try:

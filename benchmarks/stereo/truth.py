@@ -31,18 +31,7 @@ from splatseed.synthetic import make_capture, write_capture
 from splatseed.synthetic.room import Room, render_views
 from splatseed.synthetic.texture import Plain
 
-__all__ = [
-    "MADE_STEP",
-    "TRUE_SCENES",
-    "Score",
-    "first",
-    "load",
-    "nearest_error",
-    "prepare",
-    "reached",
-    "relative_error",
-    "score_all",
-]
+__all__ = ["TRUE_SCENES", "Score", "first", "load", "prepare", "relative_error", "score_all"]
 
 TRUE_SCENES = ("replica/room0", "7scenes_redkitchen", "made room", "made, no texture")
 CELL = 4.0
@@ -92,23 +81,22 @@ def prepare(names: list[str], cache: Path) -> None:
 
 
 def score_all(
-    names: list[str], cache: str, settings: dict[str, Any], limit: int, without: str = ""
+    names: list[str], cache: str, limit: int, without: str
 ) -> dict[str, dict[str, float]]:
     """The score on each scene, as JSON can hold it.
 
     Args:
         names: Of the scenes, which are in the cache.
         cache: Where.
-        settings: Fields of ``StereoSettings``.
         limit: Photographs of a capture at most, the first by name.
         without: "points": forget what Structure-from-Motion found; "depths": the depth maps as
             well.
     """
-    chosen = StereoSettings(**settings)
-    return {name: asdict(_score(name, Path(cache), chosen, limit, without)) for name in names}
+    return {name: asdict(_score(name, Path(cache), limit, without)) for name in names}
 
 
-def _score(name: str, cache: Path, settings: StereoSettings, limit: int, without: str) -> Score:
+def _score(name: str, cache: Path, limit: int, without: str) -> Score:
+    settings = StereoSettings()
     scene = first(load(name, cache), limit)
     truth = Truth.of(scene, CAPTURES.get(name, MADE_STEP))
     images = scene.split(HELD_OUT)[0]
@@ -127,7 +115,7 @@ def _score(name: str, cache: Path, settings: StereoSettings, limit: int, without
     seeds = fuse(stereo, CELL)
     seconds = time.process_time() - started
     kept, one, five = _map_shares(stereo, scene)
-    return Score(kept, one, five, reached(seeds.xyz, truth), len(seeds), seconds)
+    return Score(kept, one, five, _reached(seeds.xyz, truth), len(seeds), seconds)
 
 
 def load(name: str, cache: Path) -> Scene:
@@ -171,18 +159,15 @@ def _map_shares(stereo: StereoResult, scene: Scene) -> tuple[float, float, float
 
 
 def relative_error(depth: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Of a map against depth pixels of any size, [h, w]; NaN where either is unknown."""
-    row, column = ((np.arange(n) + 0.5) / n for n in depth.shape)
-    places = np.stack(np.broadcast_arrays(column, row[:, None]), axis=-1)
-    return nearest_error(places, depth, truth)
+    """Of a map against the four depth pixels around each of its own, [h, w]; NaN where unknown.
 
-
-def nearest_error(places: np.ndarray, depth: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Of depths at places [..., 2], in widths and heights, against the four pixels around each."""
-    column, row = (
-        np.clip(np.rint(places[..., axis] * m).astype(int), 1, m - 1)
-        for axis, m in enumerate(reversed(truth.shape))
+    The maps may differ in size.
+    """
+    row, column = (
+        np.clip(np.rint((np.arange(n) + 0.5) / n * m).astype(int), 1, m - 1)
+        for n, m in zip(depth.shape, truth.shape, strict=True)
     )
+    row = row[:, None]
     around = np.stack([truth[row - a, column - b] for a in (0, 1) for b in (0, 1)])
     around = np.where(around > 0, around, np.nan)
     one = around.max(axis=0) < ONE_SURFACE * around.min(axis=0)
@@ -190,7 +175,7 @@ def nearest_error(places: np.ndarray, depth: np.ndarray, truth: np.ndarray) -> n
     return np.abs(depth / around - 1.0).min(axis=0)
 
 
-def reached(xyz: np.ndarray, truth: Truth) -> float:
+def _reached(xyz: np.ndarray, truth: Truth) -> float:
     """The share of the held-out surface with a point within ``FAR``."""
     if not len(xyz):
         return 0.0

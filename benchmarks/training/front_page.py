@@ -34,9 +34,9 @@ import numpy as np
 import tyro
 from benchmarks.common.children import call
 from benchmarks.common.clouds import find_scenes
+from benchmarks.common.ledger import report
 from benchmarks.common.machine import describe
 from benchmarks.common.markdown import table
-from benchmarks.training.baseline import say
 from benchmarks.training.seeding_arms import at_refined_poses
 from jaxtyping import UInt8
 from matplotlib.figure import Figure
@@ -154,14 +154,14 @@ def _kept(name: str, options: Options) -> Path:
 def _result(name: str, options: Options) -> dict[str, Any]:
     path = _kept(name, options)
     if not path.is_file():
-        say(f"{name} ...")
+        report(f"{name} ...")
         told = call(
             "benchmarks.training.front_page:train_all", threads=1,
             scene=str(find_scenes() / name), pictures=str(path.with_suffix(".npz")),
             rho=options.rho, max_steps=options.max_steps, long_side=options.long_side,
         )  # fmt: skip
         path.write_text(json.dumps(told))
-        say(f"  {name}: {_gain(told):+.2f} dB")
+        report(f"  {name}: {_gain(told):+.2f} dB")
     return cast("dict[str, Any]", json.loads(path.read_text()))
 
 

@@ -1,8 +1,9 @@
-"""What seeds are worth: trained from, on held-out training views, at equal numbers of Gaussians.
+"""What seeds and strategies gain on held-out training views, at equal numbers of Gaussians.
 
 The test views (names sorted, every 8th) are taken out of a capture first; of the rest every 8th is
-held out and scored, another eighth with each seed. Runs have a process of their own each; those
-that are in the ledger are not run again. Prints Markdown; see README.md.
+held out and scored, another eighth with each seed. Each run has its own process; runs in the ledger
+are not repeated. Gains are over the first arm under the first strategy. Prints Markdown; see
+README.md.
 """
 
 from __future__ import annotations
@@ -17,16 +18,17 @@ from typing import Any, Literal
 
 import tyro
 from benchmarks.common.children import call
+from benchmarks.common.clouds import find_scenes
+from benchmarks.common.ledger import read_ledger, report, run_missing, write_line
 from benchmarks.common.machine import describe
 from benchmarks.common.markdown import table
-from benchmarks.training.baseline import read_ledger, run_missing, say, write_line
-from benchmarks.training.baseline_arms import CAPS
 from benchmarks.training.seeding_arms import ARMS
 
 from splatseed.errors import SplatseedError
 
 __all__: list[str] = []
 
+CAPTURES = ("dorm", "desk", "stone_horse", "face", "fern", "fox", "treehill", "bonsai")
 Key = tuple[str, str, str, float, int, int, int, int]
 """Capture, arm, strategy, rho, steps, data factor, seed, and ``every``."""
 
@@ -35,7 +37,7 @@ Key = tuple[str, str, str, float, int, int, int, int]
 class Settings:
     """What to run."""
 
-    scenes: tuple[str, ...] = tuple(CAPS)
+    scenes: tuple[str, ...] = CAPTURES
     """Captures, by their names in the folder of captures."""
     arms: tuple[str, ...] = tuple(ARMS)
     """Which seeds."""
@@ -59,17 +61,17 @@ class Settings:
     """Where results are kept, a line a run; seeds in a folder of the same name beside it."""
 
 
-def run(key: Key, scenes: Path, ledger: Path, backend: str = "cpu") -> None:
+def run(key: Key, scenes: Path, ledger: Path, backend: str) -> None:
     """One run, and its line in the ledger."""
     scene, arm, strategy, rho, max_steps, data_factor, seed, every = key
-    say(f"{scene}, {arm}, {strategy}, rho {rho:g}, seed {seed} ...")
+    report(f"{scene}, {arm}, {strategy}, rho {rho:g}, seed {seed} ...")
     result = call(
         "benchmarks.training.seeding_arms:train", threads=1, scene=str(scenes / scene), arm=arm,
         strategy=strategy, rho=rho, max_steps=max_steps, data_factor=data_factor, seed=seed,
         every=every, kept=str(ledger.resolve().with_suffix(".seeds")), backend=backend,
     )  # fmt: skip
     write_line(ledger, key, result)
-    say(f"  {scene}, {arm}, {strategy}: {result['psnr']:.2f} dB")
+    report(f"  {scene}, {arm}, {strategy}: {result['psnr']:.2f} dB")
 
 
 def wanted(settings: Settings) -> Iterable[Key]:
@@ -84,18 +86,31 @@ def wanted(settings: Settings) -> Iterable[Key]:
 
 
 def rows(results: Mapping[Any, Mapping[str, Any]], settings: Settings) -> Iterable[list[str]]:
-    """By strategy, rho and arm: PSNR / SSIM (Gaussians, seeds) per capture, and the mean."""
+    """By strategy, rho and arm: PSNR / SSIM (Gaussians, seeds) per capture, the mean, the gain."""
+    baseline = settings.arms[0], settings.strategies[0]
     for strategy in settings.strategies:
         for rho in settings.rho:
+            base = [_means(results, (s, *baseline, rho), settings) for s in settings.scenes]
             for arm in settings.arms:
                 means = [
                     _means(results, (s, arm, strategy, rho), settings) for s in settings.scenes
                 ]
                 if any(means):
-                    every = [each for each in means if each]
-                    mean = [statistics.mean(v) for v in zip(*every, strict=True)]
-                    whole = _scores(mean) if len(every) == len(means) else ""
-                    yield [strategy, f"{rho:g}", arm, *(map(_cell, means)), whole]
+                    known = [each for each in means if each]
+                    mean = [statistics.mean(v) for v in zip(*known, strict=True)]
+                    score = _scores(mean) if len(known) == len(means) else ""
+                    gain = "" if (arm, strategy) == baseline else _gain(means, base)
+                    yield [strategy, f"{rho:g}", arm, *(map(_cell, means)), score, gain]
+
+
+def _gain(means: list[list[float]], base: list[list[float]]) -> str:
+    """Mean gain in PSNR with its standard error over captures, and in SSIM."""
+    pairs = [(ours, theirs) for ours, theirs in zip(means, base, strict=True) if ours and theirs]
+    if not pairs:
+        return ""
+    psnr, ssim = ([ours[i] - theirs[i] for ours, theirs in pairs] for i in (0, 1))
+    error = f" ± {statistics.stdev(psnr) / len(psnr) ** 0.5:.2f}" if len(psnr) > 1 else ""
+    return f"{statistics.mean(psnr):+.2f}{error} / {statistics.mean(ssim):+.3f}"
 
 
 def _means(
@@ -125,9 +140,9 @@ def _scores(means: list[float]) -> str:
 
 def main(settings: Settings) -> None:
     """Run what is not there yet, and print the table."""
-    train = partial(run, backend=settings.backend)
+    train = partial(run, scenes=find_scenes(), ledger=settings.ledger, backend=settings.backend)
     run_missing(wanted(settings), train, settings.ledger, settings.jobs)
-    header = ["strategy", "rho", "seeds", *settings.scenes, "mean"]
+    header = ["strategy", "rho", "seeds", *settings.scenes, "mean", "gain, dB / SSIM"]
     print(f"{describe()}\n\n### {settings.max_steps:,} steps, {settings.seeds} run(s) of each\n")
     print(table(header, rows(read_ledger(settings.ledger), settings)))
 

@@ -12,12 +12,10 @@ import os
 import tempfile
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import torch
 
 import splatseed as ss
 from splatseed.io.staging import atomic_file
@@ -31,48 +29,10 @@ from splatseed.splat.evaluate import evaluate_views
 from splatseed.training import TrainSettings, prepare_run
 from splatseed.training.depths import stereo_size
 from splatseed.training.folder import Record
-from splatseed.training.schedule import Schedule
 from splatseed.training.trainer import Trainer
 
 __all__ = ["ARMS", "TEST_EVERY", "at_refined_poses", "train", "validation_split"]
 
-
-@dataclass(frozen=True)
-class Start:
-    """How Gaussians begin, where it differs from ``train``."""
-
-    discs: bool = False
-    """Flat across stereo's normals, a tenth as thick as wide."""
-    opacities: tuple[float, float] | None = None
-    """From confidence 0 to 1; None: all 0.1."""
-    position_rate: float = 1.0
-    """Learning rate of the positions, as a multiple."""
-
-    def settings(self, **given: Any) -> TrainSettings:
-        """Settings whose schedule has this rate."""
-        rate = self.position_rate
-
-        class Slowed(TrainSettings):
-            @property
-            def schedule(self) -> Schedule:
-                own = super().schedule
-                rates = {**own.learning_rates, "means": rate * own.learning_rates["means"]}
-                return dataclasses.replace(own, learning_rates=rates)
-
-        kind = TrainSettings if rate == 1.0 else Slowed
-        return kind(seed_normals=self.discs, **given)
-
-    def set_opacities(self, logits: torch.Tensor, confidence: np.ndarray | None) -> None:
-        """Set first opacities by the seeds' confidence; SfM's points have none, and keep theirs."""
-        if self.opacities is None or confidence is None:
-            return
-        low, high = self.opacities
-        known = np.isfinite(confidence)
-        opacity = torch.from_numpy(low + (high - low) * confidence[known])
-        logits.data[torch.from_numpy(known)] = torch.logit(opacity).to(logits.dtype)
-
-
-DENSE = {"method": "auto"}
 ARMS: Mapping[str, Mapping[str, Any]] = {
     "sfm": {"method": "linear", "ratio": 1},
     "mls": {"method": "mls", "ratio": 4},
@@ -80,26 +40,13 @@ ARMS: Mapping[str, Mapping[str, Any]] = {
     "stereo": {"method": "stereo", "dense": False},
     "auto": {"method": "auto", "dense": False},
     "auto, photographs alone": {"method": "auto", "dense": False, "depth_maps": False},
-    "auto, depth maps too": {"method": "auto", "dense": False},
     "depth": {"method": "depth"},
     "auto, no points": {"method": "auto", "dense": False, "points": False},
     "auto, refined": {"method": "auto", "dense": False, "refined": True},
-    "auto, refined, no points": {
-        "method": "auto",
-        "dense": False,
-        "points": False,
-        "refined": True,
-    },
-    "depth, refined": {"method": "depth", "points": False, "refined": True},
     "triangulated": {"method": "linear", "ratio": 1, "refined": True},
-    "dense": DENSE,
-    "dense, no points": {**DENSE, "points": False},
-    "dense, discs": {**DENSE, "start": Start(discs=True)},
-    "dense, opacities": {**DENSE, "start": Start(opacities=(0.1, 0.8))},
-    "dense, slow": {**DENSE, "start": Start(position_rate=1 / 3)},
-    "dense, all three": {**DENSE, "start": Start(True, (0.1, 0.8), 1 / 3)},
+    "dense": {"method": "auto"},
+    "dense, no points": {"method": "auto", "points": False},
     "random as gsplat": {"random": "gsplat"},
-    "random as nerfstudio": {"random": "nerfstudio"},
     "random, refined": {"random": "gsplat", "refined": True},
 }
 """How seeds are made, by what the table calls them; *photographs alone* leaves out the depth maps
@@ -128,13 +75,12 @@ def train(
     validation = validation_split(whole, every, HELD_STEP * seed % TEST_EVERY)
     camera = validation.images[0].camera
     cap = round(rho * (camera.width // data_factor) * (camera.height // data_factor))
-    begin = ARMS[arm].get("start", Start())
-    settings = begin.settings(
+    settings = TrainSettings(
         strategy=strategy, max_steps=max_steps, data_factor=data_factor, seed=seed,
         cap_max=cap, test_every=TEST_EVERY, backend=backend, seeding="scene",
     )  # fmt: skip
     plan = settings.max_seeds(cap), max_steps, data_factor, seed, every
-    key = fingerprint(Path(scene).name, _how(arm), *plan)
+    key = fingerprint(Path(scene).name, ARMS[arm], *plan)
     file = Path(kept) / f"{key}.npz" if kept else None
     seeding = seeding_processor = 0.0
     if ARMS[arm].get("refined", False):
@@ -146,7 +92,6 @@ def train(
     begun = time.process_time() - seeding_processor
     with tempfile.TemporaryDirectory() as folder:
         run = prepare_run(validation.replace(points=points), Path(folder) / "run", settings)
-        begin.set_opacities(run.state.params["opacities"], points.confidence)
         before = time.process_time()
         curve = Curve(run.trainer, begun)
         run.train(curve.on_step)
@@ -205,11 +150,6 @@ def validation_split(whole: Scene, every: int, first: int) -> Scene:
     return validation.replace(images=(*shown, *held), listed=split)
 
 
-def _how(arm: str) -> dict[str, Any]:
-    """How an arm's seeds are made, without how training starts from them."""
-    return {name: value for name, value in ARMS[arm].items() if name != "start"}
-
-
 def _known_seeds(
     scene: Scene, arm: str, settings: TrainSettings, file: Path | None
 ) -> tuple[PointCloud, float, float]:
@@ -238,7 +178,7 @@ def _seeds(scene: Scene, arm: str, settings: TrainSettings) -> PointCloud:
 
     Photographs are compared at the size at which ``splatseed train`` compares them.
     """
-    chosen = _how(arm)
+    chosen = dict(ARMS[arm])
     if "random" in chosen:
         return random_start(scene, np.random.default_rng(settings.seed), chosen["random"])
     if not chosen.pop("points", True):

@@ -3,9 +3,6 @@
 A ``Finding`` has a stable ``kind`` to filter by, in kebab case; its text may be reworded at any
 time, so that no code compares it. ``docs/findings.md`` lists the kinds. Texts follow the rules of
 messages in ``errors``: an argument stands in backticks.
-
-Example:
-    >>> [each.subjects for each in scene.findings if each.kind == "missing-photographs"]
 """
 
 from __future__ import annotations

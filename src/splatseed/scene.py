@@ -170,7 +170,7 @@ class Image:
         lens = self.lens
         return Camera(lens.K, lens.width, lens.height, self.cam_from_world)
 
-    def with_photograph(self, folder: Path, white: int, masks: Masks | None) -> Image:
+    def with_photograph(self, folder: Path | None, white: int, masks: Masks | None) -> Image:
         """Return the image with the folder, the white value and the masks of its scene."""
         if (self.folder, self.white, self.masks) == (folder, white, masks):
             return self
@@ -311,9 +311,9 @@ class Scene:
             object.__setattr__(self, "depths", maps_by_name(self.depths, names, distorted))
         if self.points.original_idx is not None:  # from here on, rows count in this cloud
             object.__setattr__(self, "points", self.points.replace(original_idx=None))
-        if (folder := self.source.image_dir) is not None:
-            images = (im.with_photograph(folder, self.white, self.masks) for im in self.images)
-            object.__setattr__(self, "images", tuple(images))
+        of_scene = self.source.image_dir, self.white, self.masks
+        images = tuple(image.with_photograph(*of_scene) for image in self.images)
+        object.__setattr__(self, "images", images)
 
     def __repr__(self) -> str:
         root = self.source.root
@@ -389,8 +389,8 @@ class Scene:
         """Mark the tracked points that another cloud has first and in order, else none."""
         kept = np.zeros(len(self.tracks or ()), bool)
         rows = points.rows_of_originals
-        rising = np.append(np.diff(rows, prepend=-1) <= 0, True)
-        num = min(int(rising.argmax()), int(np.append(rows >= len(kept), True).argmax()))
+        in_order = (np.diff(rows, prepend=-1) > 0) & (rows < len(kept))
+        num = len(rows) if in_order.all() else int(in_order.argmin())  # up to the first that is not
         kept[rows[:num]] = True
         others = rows[num:][(rows[num:] >= 0) & (rows[num:] < len(kept))]
         # A row of another scene's cloud may have the same number, but seldom the same position.

@@ -22,6 +22,7 @@ from splatseed.io.dense import (
 )
 from splatseed.io.ply import read_ply
 from splatseed.photos.undistortion import undistort
+from splatseed.scene import SceneSource
 from splatseed.synthetic import make_capture, write_capture
 
 from ..bent import bend
@@ -210,7 +211,7 @@ def test_scenes_that_cannot_be_fused_are_refused(maps, room, tmp_path):
         with pytest.raises(error, match=said):
             write_dense_workspace(scene, maps[4][:1], tmp_path / "w")
     with pytest.raises(SceneNotFoundError, match="photographs"):
-        write_dense_workspace(room.replace(source=None), maps[4][:1], tmp_path / "w")
+        write_dense_workspace(room.replace(source=SceneSource()), maps[4][:1], tmp_path / "w")
     assert list(tmp_path.iterdir()) == []
 
 

@@ -184,7 +184,8 @@ class RunSpec:
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
         """The inverse of ``to_dict``."""
-        scene = SceneFacts(**{**values["scene"], "warnings": ()})
+        known = {key: value for key, value in values["scene"].items() if key != "warnings"}
+        scene = SceneFacts(**known)  # older benchmarks have empty warnings
         parts = {"arm": Arm(**values["arm"]), "training": TrainSettings(**values["training"])}
         return cls(**{**values, "scene": scene, **parts})
 
@@ -371,12 +372,12 @@ def plan_runs(
 
 
 def _needed(scene: SceneFacts, method: str) -> SceneFacts:
-    """Drop the files that a method does not read, and the warnings, which are shown before."""
+    """Drop the files that a method does not read."""
     if method != DEPTH:
         scene = replace(scene, depth="", depth_digest="")
     if not needs_cloud(method):
         scene = replace(scene, cloud="", cloud_digest="")
-    return replace(scene, warnings=())
+    return scene
 
 
 def _training(plan: Plan, scene: SceneFacts, arm: Arm, backend: Backend) -> TrainSettings:

@@ -22,7 +22,7 @@ from splatseed.io.photograph_checks import with_photographs
 from splatseed.io.staging import check_output
 from splatseed.requirements import require, versions_of
 from splatseed.scene import Scene
-from splatseed.seeding.trainability import is_distorted
+from splatseed.seeding.advice import is_distorted
 from splatseed.text import name_some, quoted, visible
 
 if TYPE_CHECKING:  # stereo is loaded after the options are parsed

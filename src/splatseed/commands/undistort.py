@@ -17,7 +17,7 @@ from splatseed.io.depth_maps import DepthFiles
 from splatseed.io.load import depths_beside
 from splatseed.io.seeds import was_upsampled
 from splatseed.io.staging import check_output
-from splatseed.seeding.trainability import is_distorted
+from splatseed.seeding.advice import is_distorted
 from splatseed.sfm import undistort
 from splatseed.text import agreeing, counted, quoted
 

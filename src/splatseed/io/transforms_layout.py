@@ -126,8 +126,7 @@ def _write(scene: Scene, folder: Path, plan: _Plan, layout: Layout) -> Written:
     write_ply(folder / "sparse_pc.ply", points)
     shutil.copyfile(folder / "sparse_pc.ply", folder / "pointcloud.ply")  # LichtFeld's name for it
     write_seeds(folder, points)
-    if source is not None:
-        copy_files(source.root, ROOT_LISTS, folder)
+    copy_files(source.root, ROOT_LISTS, folder)
     return [], folders, offset
 
 

@@ -1,28 +1,31 @@
-"""Advice: whether to add points to a scene before training, by which method, and why.
+"""Advice: whether a scene can be trained, whether to add points before, by which method, and why.
 
 *Room* is the number of seeds that training starts with under its budget, per point of the scene.
 ``advise`` depends on the measurements and the plan alone, so benchmark runs can test it. The rules
-rest on validation views of eight captures at 1,500 steps
-(benchmarks/README.md): where Structure-from-Motion left room, on six, ``auto`` gained -0.12 to 0.50
-dB under 3DGS's densification, 0.24 on average, and -0.30 to 0.28 under strategy ``grow``, -0.02 on
-average, with a quarter of a Gaussian per pixel; with one per pixel 0.27 and 0.28 on average, the
-latter from one capture (dorm, 1.27; the others at most 0.24). Where its points alone filled the
-budget (bonsai, treehill), adding points cost up to 0.4 dB.
+rest on validation views of eight captures at 1,500 steps (benchmarks/training/README.md): where
+Structure-from-Motion left room, on six, ``auto`` gained -0.12 to 0.50 dB under 3DGS's
+densification, 0.24 on average, and -0.30 to 0.28 under strategy ``grow``, -0.02 on average, with a
+quarter of a Gaussian per pixel; with one per pixel 0.27 and 0.28 on average, the latter from one
+capture (dorm, 1.27; the others at most 0.24). Where its points alone filled the budget (bonsai,
+treehill), adding points cost up to 0.4 dB.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
 from splatseed.depthmap import in_scene_units
+from splatseed.findings import Finding
+from splatseed.io.files import special_kind
 from splatseed.io.seeds import was_upsampled
 from splatseed.methods import Upsampler
 from splatseed.pointcloud import PointCloud
+from splatseed.progress import Note, silent_note
 from splatseed.scene import Scene
+from splatseed.text import agreeing, visible
 
 DEFAULT_METHOD, FALLBACK = "auto", "mls"
 """The default method, and the method for scenes without photographs."""
@@ -88,14 +91,13 @@ def advice_for(
 
 
 def method_for(
-    scene: Scene | PointCloud,
-    method: str | Upsampler = DEFAULT_METHOD,
-    note: Callable[[str], None] = lambda _: None,
+    scene: Scene | PointCloud, method: str | Upsampler = DEFAULT_METHOD, note: Note = silent_note
 ) -> str | Upsampler:
     """Return ``method`` if there are photographs, else ``FALLBACK``, with a note."""
     if isinstance(scene, Scene) and scene.has_photographs:
         return method
-    note(f"Without photographs, method {FALLBACK} is used instead of {DEFAULT_METHOD}.")
+    text = f"Without photographs, method {FALLBACK} is used instead of {DEFAULT_METHOD}."
+    note(Finding("fallback-method", text, "info"))
     return FALLBACK
 
 
@@ -161,7 +163,7 @@ def camera_layout(
     """Classify the layout of a scene's cameras; None for fewer than three."""
     if len(scene.images) < 3:
         return None
-    world_from_cam = [np.linalg.inv(image.camera.cam_from_world) for image in scene.images]
+    world_from_cam = [image.camera.world_from_cam for image in scene.images]
     axes = np.array([pose[:3, 2] for pose in world_from_cam])
     centers = np.array([pose[:3, 3] for pose in world_from_cam])
     if np.linalg.norm(axes.mean(axis=0)) >= MIN_MEAN_DIRECTION:
@@ -174,3 +176,35 @@ def camera_layout(
     towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
     inward = (towards * axes).sum(axis=1) > MIN_INWARD
     return "around something" if inward.mean() > MIN_INWARD else "through a place"
+
+
+def untrainable(scene: Scene) -> Finding | None:
+    """Return why no trainer can use the scene; None if one can.
+
+    Lens distortion is not a reason, as it can be removed (``is_distorted``).
+    """
+    why = _why_untrainable(scene)
+    return Finding("untrainable", why, "error") if why else None
+
+
+def _why_untrainable(scene: Scene) -> str:
+    if not scene.images:
+        return "Points alone cannot be trained: training needs photographs and cameras."
+    if not all(scene.split()):
+        return "Training needs at least two photographs, one to train on and one to test."
+    folder = scene.source.image_dir
+    if folder is None:
+        return "Training needs the photographs: put them beside the model in a folder named images."
+    missing = [image.name for image in scene.images if not image.has_photograph]
+    if 2 * len(missing) <= len(scene.images):
+        return ""
+    needs = f"Training needs at least half of the {len(scene.images):,} photographs"
+    if kind := special_kind(folder / missing[0]):
+        return f"{needs}: {visible(missing[0])} is {kind}."
+    which = agreeing(len(missing), "", f"and {len(missing) - 1:,} more ")
+    return f"{needs}: put {visible(missing[0])} {which}into {visible(folder)}."
+
+
+def is_distorted(scene: Scene) -> bool:
+    """Whether any camera has lens distortion."""
+    return any(image.intrinsics.has_distortion for image in scene.images)

@@ -17,17 +17,22 @@ from jaxtyping import Bool, Float64
 from scipy.ndimage import gaussian_filter, maximum_filter, sobel
 
 from splatseed.depth.stereo.maps import StereoSettings
+from splatseed.findings import Finding
 from splatseed.photos.loading import load_views
 from splatseed.photos.sizes import factor_for_size
 from splatseed.photos.sources import choose_by_pose
 from splatseed.photos.view import View
 from splatseed.progress import Progress, silent
+from splatseed.projection import pixel_centers
+from splatseed.sampling import evenly_spaced
 from splatseed.scene import Image, Scene
 from splatseed.seeding._kernels.correlation import correlate_patch, interpolate
 
 Gray = Float64[np.ndarray, "H W"]
 Pixel = Float64[np.ndarray, " 2"]
 
+INEXACT_POSES = "inexact-poses"
+"""Kind of the finding that poses may be refined."""
 MAX_EXACT = 0.5
 """Maximum error of exact poses, in pixels at the size of stereo. COLMAP's are 0.1 to 0.5 on eight
 captures; at 0.55, a tenth of a degree of noise, fern keeps 0.6 of its depths
@@ -84,14 +89,15 @@ class PoseErrorEstimate:
         return f"{self}: {'exact, at most' if self.exact else 'above'} {MAX_EXACT:g} px"
 
     @property
-    def warning(self) -> str:
-        """A sentence with advice; empty if the poses are exact."""
+    def findings(self) -> tuple[Finding, ...]:
+        """A warning with advice; nothing if the poses are exact."""
         if self.exact:
-            return ""
-        return (
+            return ()
+        text = (
             f"The photographs are misaligned by about {self}, the size at which stereo compares "
             f"them; above {MAX_EXACT:g} px, `refine_poses=True` may help."
         )
+        return (Finding(INEXACT_POSES, text),)
 
 
 def estimate_pose_error(
@@ -101,15 +107,11 @@ def estimate_pose_error(
 
     Returns None if too few corners are found again, as on plain walls or with poses that are far
     off.
-
-    Raises:
-        SceneFormatError: A photograph cannot be used.
     """
     poses = np.array([image.camera.cam_from_world for image in images])
     partners = choose_by_pose(poses, _SETTINGS.partners)
     factor = factor_for_size(images, _SETTINGS.side)
-    spread = np.linspace(0, len(images) - 1, _SETTINGS.photographs).round().astype(int)
-    chosen = np.unique(spread).tolist()
+    chosen = evenly_spaced(len(images), _SETTINGS.photographs).tolist()
     errors, pairs = [], 0
     for number, i in enumerate(chosen):
         compared = [images[i], *(images[j] for j in partners[i].tolist() if j >= 0)]
@@ -140,9 +142,6 @@ def given_pose_error(
     Drift shows between neighbours that are further apart: of a phone's walk (``corridor``), whose
     refined poses gain 2.3 dB, all views have 0.50 px, which is exact, and those to train 0.74.
     Without an estimate, as poses that are far off leave too few corners there, all are measured.
-
-    Raises:
-        SceneFormatError: A photograph cannot be used.
     """
     names = {image.name for image in scene.split()[0]}
     train = [image for image in images if image.name in names]
@@ -178,8 +177,8 @@ def _gray(view: View) -> Gray:
 def _rotated(image: Gray, homography: Float64[np.ndarray, "3 3"], view: View, margin: int) -> Gray:
     """Resample a photograph in the view's orientation, with a margin; NaN outside of it."""
     rows, columns = view.height + 2 * margin, view.width + 2 * margin
-    v, u = np.indices((rows, columns)) - margin + 0.5
-    rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ homography.T
+    uv = pixel_centers(rows, columns) - margin
+    rays = np.concatenate([uv, np.ones((rows, columns, 1))], axis=-1) @ homography.T
     with np.errstate(divide="ignore", invalid="ignore"):
         x, y = rays[..., 0] / rays[..., 2], rays[..., 1] / rays[..., 2]
     turned: Gray = interpolate(image, *np.where(rays[..., 2] <= 0, -1.0, [x - 0.5, y - 0.5]))

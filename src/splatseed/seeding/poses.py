@@ -21,11 +21,15 @@ from splatseed.depth.stereo.coarse import prior_from_baseline
 from splatseed.depth.stereo.maps import StereoResult, StereoSettings
 from splatseed.depth.stereo.matching import match_views, valid_blocks
 from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.findings import Finding
 from splatseed.photos.loading import load_views
 from splatseed.photos.sizes import factor_for_size
 from splatseed.photos.sources import choose_by_pose
+from splatseed.photos.visibility import points_in_image
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent
+from splatseed.projection import camera_centers, pixel_centers
+from splatseed.sampling import strided
 from splatseed.scene import Image, Scene
 from splatseed.seeding.pose_accuracy import estimate_pose_error
 from splatseed.text import quoted
@@ -157,8 +161,10 @@ def _disagreement(
     )
 
 
-def agreement_warning(agreement: float, masked: float = 0.0, *, stated: bool = False) -> str:
-    """Explain a low result of ``check_poses`` in a sentence; empty if it is not low.
+def agreement_findings(
+    agreement: float, masked: float = 0.0, *, stated: bool = False
+) -> tuple[Finding, ...]:
+    """Explain a low result of ``check_poses``; nothing if it is not low.
 
     Args:
         agreement: The result.
@@ -167,7 +173,7 @@ def agreement_warning(agreement: float, masked: float = 0.0, *, stated: bool = F
             photographs instead of a few: two different numbers for it would confuse.
     """
     if agreement >= _SETTINGS.low:
-        return ""
+        return ()
     few = f" masks that leave {1 - masked:.0%} of the pixels," if masked >= 0.5 else ""
     what = "Likely reasons for so little are"
     if not stated:
@@ -175,11 +181,15 @@ def agreement_warning(agreement: float, masked: float = 0.0, *, stated: bool = F
             f"The photographs agree on the depth of only {agreement:.0%} of the pixels that count, "
             "so method auto will find few points. Likely reasons are"
         )
-    return (
+    text = (
         f"{what}{few} light that changes between photographs, bare or shiny surfaces, or "
-        "photographs far apart. Take more from closer together in constant light, or triangulate "
-        "points (splatseed sfm --poses-from)."
+        "photographs far apart."
     )
+    fix = (
+        "Take more from closer together in constant light, or triangulate points (splatseed sfm "
+        "--poses-from)."
+    )
+    return (Finding("low-agreement", text, fix=fix),)
 
 
 def _check_centers(poses: Poses) -> None:
@@ -190,7 +200,7 @@ def _check_centers(poses: Poses) -> None:
             found=f"{len(poses)}",
             fix="Add photographs: depth comes from comparing them. Test views do not count.",
         )
-    centers = np.linalg.inv(poses)[:, :3, 3]
+    centers = camera_centers(poses)
     apart = np.abs(centers - centers[0]).max()
     if apart <= np.finfo(np.float32).eps * np.abs(centers).max():
         raise SceneFormatError(
@@ -240,14 +250,13 @@ def compare_sample(
 
 def _any_overlap(cameras: Sequence[Camera]) -> bool:
     """Whether a point at some depth in front of one camera falls into another's image."""
-    uv = (np.indices((4, 5)).reshape(2, -1).T[:, ::-1] + 0.5) / [5, 4]
-    for first in cameras[:: -(-len(cameras) // _SETTINGS.overlap_samples)]:
+    uv = pixel_centers(4, 5).reshape(-1, 2) / [5, 4]
+    for first in strided(cameras, _SETTINGS.overlap_samples):
         for other in cameras:
             if gap := float(np.linalg.norm(first.center - other.center)):
                 z = gap * np.repeat(np.geomspace(0.1, 1000.0, 12), len(uv))
                 xyz = first.unproject(np.tile(uv * [first.width, first.height], (12, 1)), z)
-                pixels = other.project(xyz)[0]  # NaN behind the camera
-                if ((pixels >= 0) & (pixels < [other.width, other.height])).all(axis=1).any():
+                if len(points_in_image(other, xyz).point_idx):
                     return True
     return False
 

@@ -9,7 +9,7 @@ Promise: points are visited in order, originals first, then by priority. Each is
 needed at the smallest spacing that keeps no more than ``num``; smaller spacings fill the rest. So
 the only point of a cell is kept before the second of another. But of originals alone every n-th is
 kept: Structure-from-Motion finds them in proportion to detail, where Gaussians are needed; kept
-evenly over the pictures they train to a lower SSIM (benchmarks/training/README.md). Nothing is
+evenly over the pictures they train to a lower SSIM (benchmarks/tried.md). Nothing is
 random, and bytes do not depend on the number of threads.
 """
 
@@ -24,13 +24,12 @@ from jaxtyping import Bool, Float, Float32, Int32, Int64
 
 from splatseed.errors import ParameterError, PointCloudError
 from splatseed.methods import Upsampler, source_code
-from splatseed.photos.projection import cells_from_world
 from splatseed.photos.view import View
 from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.progress import Progress
 from splatseed.scene import Scene
 from splatseed.seeding._kernels import thinning as kernels
-from splatseed.seeding.coverage import kernel_points
+from splatseed.seeding.cover import kernel_points
 from splatseed.seeding.photo_methods import (
     CELL,
     MAX_SIZE,
@@ -130,10 +129,6 @@ def thin(
         num: Number of points to keep, at least 1.
         first: Number of originals, which come before the other points.
         priority: Among originals, and among other points, higher ones are visited earlier.
-
-    Raises:
-        ParameterError: ``num`` is below 1.
-        PointCloudError: ``xyz`` is not of shape [N, 3], or ``priority`` not of shape [N].
     """
     xyz = kernel_points(xyz)
     if num < 1:
@@ -234,7 +229,7 @@ def _places_in_space(xyz: Float32[np.ndarray, "N 3"]) -> _Places:
 
 def _places_in_views(xyz: Float32[np.ndarray, "N 3"], views: Sequence[View]) -> _Places:
     """Find the views that see each point most closely, and its position in them."""
-    matrices = np.stack([cells_from_world(view.camera, 1) for view in views])
+    matrices = np.stack([view.camera.cells_from_world(1) for view in views])
     focals = np.array([np.sqrt(abs(view.K[0, 0] * view.K[1, 1])) for view in views])
     sizes = np.array([[view.width, view.height] for view in views], np.float64)
     shape = len(xyz), min(CLOSEST, len(views))

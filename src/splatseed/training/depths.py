@@ -23,6 +23,7 @@ from splatseed.findings import Finding
 from splatseed.io.files import ARCHIVE_FAILURES
 from splatseed.io.staging import atomic_file
 from splatseed.progress import Note, Progress, silent, silent_note
+from splatseed.sampling import evenly_spaced
 from splatseed.scene import Image, Scene
 from splatseed.training.settings import TrainSettings
 
@@ -50,7 +51,7 @@ MIN_VIEWS = 48
 """Minimum views to compare, if there are as many, however short the run: fewer may not overlap."""
 _PLACING = 0.5
 """Fraction of this cost that growth needs where it alone compares more than ``MIN_VIEWS``: it gains
-as much as from all of it (benchmarks/training/README.md), in up to a fifth less time."""
+as much as from all of it (benchmarks/tried.md), in up to a fifth less time."""
 SWEEPS = 2
 """PatchMatch iterations. Two more take 1.6 times as long, find the depth of 1% more of the pixels
 (bonsai, treehill, fox), and gain nothing beyond noise."""
@@ -106,8 +107,7 @@ def placing_views(
     pixels = fraction * COSTS[device].pixels
     affordable = pixels * settings.max_steps / (scale * settings.factor) ** 2
     count = min(len(images), max(MIN_VIEWS, int(affordable)))
-    places = np.linspace(0, len(images) - 1, count).round().astype(int)
-    return [images[i] for i in places], size
+    return [images[i] for i in evenly_spaced(len(images), count)], size
 
 
 def known_depths(

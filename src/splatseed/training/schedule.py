@@ -5,7 +5,7 @@ of steps of the run. Lengths, and so the rates of positions, are in *size units*
 view depth (``initialization``) in splatseed's conventions, the cameras' extent in 3DGS's. Promise:
 a full run of splatseed's differs from 3DGS's in the size unit, in bounds on sizes (initial sizes
 have one, later sizes have none), and in MCMC's start; these and each departure in short runs were
-chosen on held-out training views: see benchmarks/training/README.md.
+chosen on held-out training views: see benchmarks/tried.md.
 """
 
 from __future__ import annotations
@@ -137,7 +137,7 @@ def make_schedule(strategy: Traits, max_steps: int, *, as_3dgs: bool) -> Schedul
 def continued(schedule: Schedule) -> Schedule:
     """Return the schedule of a run that continues from Gaussians: all harmonics at once.
 
-    Rates are those of a new run: lower rates lose (benchmarks/training/README.md).
+    Rates are those of a new run: lower rates lose (benchmarks/tried.md).
     """
     return replace(schedule, sh_every=0, recycles=False)
 

@@ -27,7 +27,7 @@ from splatseed.photos.undistortion import undistort
 from splatseed.photos.view import View, camera_views
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene
-from splatseed.seeding.coverage import covered_cells
+from splatseed.seeding.cover import covered_cells
 from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.metrics import flip_map
 from splatseed.splat.pictures import flip_heatmap, to_uint8

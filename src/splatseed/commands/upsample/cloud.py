@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from splatseed.commands.upsample.options import Options
+from splatseed.findings import Finding
 from splatseed.io.clouds import open_cloud
 from splatseed.io.nerfstudio import read_cloud_transform
 from splatseed.io.origin import find_shift
@@ -40,9 +41,9 @@ class LoadedCloud(NamedTuple):
     alignment: CloudAlignment | None = None
 
     @property
-    def notes(self) -> list[str]:
-        """Notes for the user."""
-        return [] if self.alignment is None else [self.alignment.summary]
+    def findings(self) -> tuple[Finding, ...]:
+        """How well the cloud is aligned, if that was computed."""
+        return () if self.alignment is None else (self.alignment.finding,)
 
     def write(self, folder: Path) -> None:
         """Write the alignment's report and picture into the scene folder, if there is one."""
@@ -69,9 +70,9 @@ def load_cloud(options: Options, scene: Scene, method: Cloud, progress: Progress
     elif not options.align and (shift := find_shift(scene, _sample(files))).any():
         transform = Similarity(1.0, np.eye(3), shift)
     if options.align:
-        from splatseed.seeding.clouds.align import align
+        from splatseed.seeding.clouds.align import align_cloud
 
-        alignment = align(scene, files, progress)
+        alignment = align_cloud(scene, files, progress)
         transform = alignment.scene_from_cloud
     given = method.of(*files, transform=transform, memory=memory)
     return LoadedCloud(scene, given, memory_note, alignment)

@@ -50,8 +50,6 @@ class Options:
     cover_cell: Annotated[int | None, tyro.conf.arg(name="cover")] = None
     """Add a seed to every photograph cell without a point; the value is the cell's side in pixels.
     Methods auto and cover have --auto.cell and --cover.cell instead."""
-    verify: bool = False
-    """Move interpolated points to where the photographs agree; drop points without such a place."""
     seed: int = 0
     """Random seed: same seed, same bytes."""
     profile: Profile = "default"

@@ -16,6 +16,7 @@ from splatseed.commands.upsample.options import Options
 from splatseed.commands.upsample.previews import PICTURES
 from splatseed.console import print_note, print_pairs
 from splatseed.depthmap import in_scene_units
+from splatseed.findings import Finding
 from splatseed.io import WriteReport
 from splatseed.io.load import depths_beside
 from splatseed.methods import (
@@ -41,6 +42,7 @@ MEASURED = {
 }
 """Origins of new points at a measured depth, and what they are."""
 GUESSED = "guessed from neighbours"
+INTERPOLATING = ("linear", "triangle", "spline", "mls", "voronoi", "random")
 
 
 def parameters_of(method: Upsampler) -> dict[str, object]:
@@ -76,7 +78,6 @@ def provenance(
         "num_points_asked": options.num_points,
         "budget": options.budget,
         "cover": options.cover_cell,
-        "verify": options.verify,
         "covered": None if coverage is None else {"cell": CELL, **coverage._asdict()},
         "seed": options.seed,
     }
@@ -105,8 +106,8 @@ def in_place_of(replaced: int) -> str:
     return f", triangulated in place of the scene's {replaced:,}" if replaced else ""
 
 
-def number_summary(total: int | None, limit: int | None, changed_by: Sequence[str] = ()) -> str:
-    """Say how many points to expect; the options ``changed_by`` may add or drop some.
+def number_summary(total: int | None, limit: int | None, *, covered: bool = False) -> str:
+    """Say how many points to expect; if ``covered``, ``--cover`` adds some.
 
     Example:
         >>> number_summary(None, 50_000), number_summary(800, 1000)
@@ -116,22 +117,22 @@ def number_summary(total: int | None, limit: int | None, changed_by: Sequence[st
         return f"at most {limit:,} points"
     if total is None:
         return "as many points as the photographs need"
-    before = f" before {' and '.join(changed_by)}" if changed_by else ""
-    return f"{total:,} points{before}"
+    return f"{total:,} points before --cover" if covered else f"{total:,} points"
 
 
-def unused_maps_note(options: Options, scene: Scene, method: Upsampler) -> str:
-    """Point out the scene's depth maps if the method does not use them; else empty."""
+def unused_maps(options: Options, scene: Scene, method: Upsampler) -> tuple[Finding, ...]:
+    """Point out the scene's depth maps if the method does not use them."""
     attached, beside = scene.depths, depths_beside(scene)
     maps = attached or beside
     used = in_scene_units(attached) and getattr(method, "depth_maps", False)
     if not maps or used or options.method == "depth" or options.depth_maps is not None:
-        return ""
+        return ()
     others = "method depth aligns them with the points"
     if in_scene_units(attached):
         others = "methods auto and depth use them"
     are = agreeing(len(maps), "is", "are")
-    return f"Its {counted(len(maps), 'depth map')} {are} not used by {options.method}: {others}."
+    text = f"Its {counted(len(maps), 'depth map')} {are} not used by {options.method}: {others}."
+    return (Finding("unused-depth-maps", text),)
 
 
 class Coverage(NamedTuple):
@@ -152,7 +153,7 @@ def measure_coverage(scene: Scene, seeds: PointCloud) -> Coverage | None:
     return Coverage(*(share_covered(scene, each) for each in (scene.points, measured, seeds)))
 
 
-def findings(
+def quality_rows(
     options: Options, scene: Scene, seeds: PointCloud, method: Upsampler, coverage: Coverage | None
 ) -> list[tuple[str, str]]:
     """Return rows on new points far from the originals, and on photograph cells covered."""
@@ -176,8 +177,6 @@ def _coverage_rows(coverage: Coverage, counts: Mapping[str, int]) -> list[tuple[
     rows = [("covered", f"{coverage.measured:.1%} {cells}{before}")]
     others = {n: counts[n] for n in counts if n not in {*MEASURED, source_name(ORIGINAL)}}
     if others:
-        from splatseed.seeding.upsampling import INTERPOLATING
-
         how = {**dict.fromkeys(INTERPOLATING, "interpolated between points"), "cover": GUESSED}
         made = " or ".join(f"{how.get(name, 'made')} by {name}" for name in others)
         of = f"{sum(others.values()):,} of {sum(counts.values()):,} points"
@@ -256,8 +255,9 @@ def summarise(
     for note in written.findings:
         print_note(note)
     if written.layout == "transforms":
-        print_note(
+        text = (
             "gsplat's examples, graphdeco's code and LichtFeld need COLMAP's layout, written by: "
             f"{colmap_command(arguments, output)}"
         )
+        print_note(Finding("colmap-layout", text, "info"))
     print_training(options.scene, scene, output, written.layout)

@@ -6,12 +6,14 @@ map holds only depths that independently computed maps of other views confirm.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
 
+from splatseed.depth.alignment import ray_length
 from splatseed.depth.stereo.coarse import coarse_stereo, without_tracks
 from splatseed.depth.stereo.maps import MIN_POINTS, StereoMap, StereoResult, StereoSettings
 from splatseed.depth.stereo.matching import DepthPrior, match_views
@@ -30,7 +32,10 @@ from splatseed.settings import change_settings
 MIN_SEEN = 300
 """A scene counts as having no points if half of its images see fewer. Coarse stereo takes two or
 three times as long as the rest of stereo, and gives as many known pixels as 800 points an image: of
-fern's .49, where 80 points an image give .44 and 8 give .41 (benchmarks/stereo)."""
+fern's .49, where 80 points an image give .44 and 8 give .41 (benchmarks/tried.md)."""
+CLOSER_SWEEPS = 1
+"""PatchMatch iterations on larger photographs: with a second one the same pixels are confirmed, no
+more accurately."""
 MAP_SAMPLES = 18
 """Rows and columns at which points are sampled from a depth map."""
 
@@ -117,6 +122,39 @@ def find_stereo(
     return match_views(views, priors, sources, settings, seed, progress)
 
 
+def compare_closer(
+    coarse: StereoResult, views: Sequence[View], grid: int, seed: int, progress: Progress
+) -> StereoResult:
+    """Match photographs that were matched at a smaller size before, starting from those planes.
+
+    Args:
+        coarse: The result at the smaller size.
+        views: The same photographs in the same order, as large or larger.
+        grid: Pixels of these between depths.
+        seed: The same seed gives the same bytes.
+        progress: Called with the stage, as in ``match_views`` with "again", and the fraction done.
+    """
+    priors = [_prior_from_planes(coarse, i, view) for i, view in enumerate(views)]
+    settings = dataclasses.replace(coarse.settings, grid=grid, sweeps=CLOSER_SWEEPS)
+
+    def again(stage: str, fraction: float) -> None:
+        progress(f"{stage} again", fraction)
+
+    return match_views(views, priors, coarse.sources, settings, seed, again)
+
+
+def _prior_from_planes(coarse: StereoResult, i: int, view: View) -> DepthPrior | None:
+    """The planes of view i in pixels of the larger photograph; None without any."""
+    if not np.isfinite(coarse.costs[i]).any():
+        return None
+    # Both are whole divisions of the same photograph, so focal lengths have the ratio of sizes.
+    ratio = view.K[0, 0] / coarse.views[i].K[0, 0]
+    planes = coarse.planes[i].copy()
+    planes[1:] /= np.float32(ratio)  # slopes are per pixel
+    step = coarse.settings.grid * ratio
+    return DepthPrior(np.empty((0, 2)), np.empty(0), coarse.bounds[i], planes, step)
+
+
 def known_visibility(scene: Scene) -> Visibility:
     """Points that each image sees: from SfM, else sampled from the depth maps, else none.
 
@@ -146,16 +184,12 @@ def _map_points(image: Image, depth: DepthMap) -> Float64[np.ndarray, "N 3"]:
         ((np.arange(MAP_SAMPLES) + 0.5) * side / MAP_SAMPLES).astype(np.int64)
         for side in depth.values.shape
     )
-    row, column = (axis.ravel() for axis in np.meshgrid(row, column, indexing="ij"))
+    row, column = np.repeat(row, MAP_SAMPLES), np.tile(column, MAP_SAMPLES)
     z = depth.values[row, column].astype(np.float64)
     known = np.isfinite(z) & (z > 0) & (depth.kind != "inverse")
-    uv = np.stack([column, row], axis=1)[known] + 0.5
-    z = z[known]
     if depth.kind == "ray":
-        rays = np.concatenate([uv, np.ones((len(uv), 1))], axis=1) @ np.linalg.inv(camera.K).T
-        # distance along the ray / |ray|, for rays of unit z, is planar depth
-        z /= np.linalg.norm(rays, axis=1)
-    return camera.unproject(uv, z)
+        z /= ray_length(camera, column, row)
+    return camera.unproject(np.stack([column, row], axis=1)[known] + 0.5, z[known])
 
 
 def _prior_from_points(view: View, xyz: Float64[np.ndarray, "M 3"]) -> DepthPrior | None:

@@ -11,7 +11,7 @@ Gaussians, does not reach: a leaf, a rod, a piece of wall without a seed. Promis
 Gaussians never exceeds the budget; growth depends only on the views and PyTorch's generator.
 Source: S. Rota Bulo et al., "Revising Densification in Gaussian Splatting" (2024) grows by the
 error that a Gaussian contributes to; pruning, its timing, and the normalisation of the error were
-chosen on held-out training views (benchmarks/training/README.md).
+chosen on held-out training views (benchmarks/tried.md).
 """
 
 from __future__ import annotations
