@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 
 import splatseed as ss
-from splatseed.methods import NewPoints
 from splatseed.methods.neighbors import prepare_scene
 from splatseed.progress import Progress
 
@@ -25,7 +24,7 @@ class Jitter:
 
     def __call__(
         self, scene: ss.Scene, num_new: int, rng: np.random.Generator, progress: Progress
-    ) -> NewPoints:
+    ) -> ss.PointCloud:
         """Make ``num_new`` points."""
         cloud = prepare_scene(scene, progress)  # the originals: clean, centred, with neighbours
         progress("jitter", 0.0)
@@ -34,7 +33,7 @@ class Jitter:
         steps = rng.standard_normal((num_new, 3)) * self.radius
         xyz = cloud.xyz[rows] + steps * cloud.neighbors(6).spacing[rows, None] + cloud.center
         progress("jitter", 1.0)
-        return NewPoints(xyz.astype(np.float32), cloud.rgb[rows])
+        return ss.PointCloud(xyz, cloud.rgb[rows])
 
 
 def main() -> None:

@@ -31,7 +31,7 @@ ORDER = (
     "errors", "text", "settings", "requirements", "progress", "frozen", "runtime", "camera",
     "similarity", "lens", "pointcloud", "depthmap", "scene", "scores", "io", "photos", "depth",
     "methods", "seeding", "synthetic", "sfm", "rendering", "splat", "training", "integrations",
-    "gsplat", "viewer", "bench", "console", "commands", "cli",
+    "viewer", "bench", "console", "commands", "cli",
 )  # fmt: skip
 """Parts of the package: each imports only parts before it, or itself."""
 

@@ -22,7 +22,7 @@ from splatseed import load_scene
 from splatseed.photos.loading import load_split
 from splatseed.photos.view import View
 from splatseed.splat.evaluate import evaluate_views
-from splatseed.splat.ssim_conv import l1_and_ssim_by_convolution
+from splatseed.splat.ssim import l1_and_ssim_by_convolution
 from splatseed.training import TrainSettings
 from splatseed.training.device import pick_device
 from splatseed.training.seeds import usable_seeds

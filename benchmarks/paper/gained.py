@@ -18,7 +18,7 @@ import pandas as pd
 
 from splatseed.bench.comparisons import gains
 from splatseed.bench.plan import ANY_RATIO, DEPTH, SFM, Arm
-from splatseed.bench.runs import Run, read_runs
+from splatseed.bench.runs import BenchRun, read_runs
 from splatseed.bench.statistics import Difference
 from splatseed.bench.study import Study, studies
 from splatseed.methods import Profile, configure
@@ -47,7 +47,7 @@ class Way(NamedTuple):
 class Results:
     """The runs of some benchmarks, planned or finished, and the studies of the finished ones."""
 
-    runs: Sequence[Run]
+    runs: Sequence[BenchRun]
     found: Sequence[Study]
 
     def study(self, strategy: StrategyName) -> Study | None:

@@ -27,11 +27,11 @@ from benchmarks.paper.printed import printed_costs, printed_gains, printed_psnr
 from splatseed.bench.plan import SFM
 from splatseed.bench.statistics import Difference, adjusted, over_scenes
 from splatseed.bench.study_tables import verdict_mark
-from splatseed.bench.tables import Cell, Number, Row, Table, to_markdown
+from splatseed.bench.tables import Cell, Number, Row, Table
 from splatseed.errors import SceneFormatError, SplatseedError
 from splatseed.io.staging import atomic_file
 
-__all__ = ["fill", "page_tables", "run_frame"]
+__all__ = ["fill", "page_tables", "run_frame", "to_markdown"]
 
 RESULTS = Path(__file__).parents[2] / "docs" / "results"
 MEASURES = {
@@ -88,6 +88,20 @@ def fill(text: str, name: str, content: str) -> str:
     if [text.count(mark) for mark in marks] != [1, 1] or not between.search(text):
         raise SceneFormatError(f"a page with {' and '.join(marks)}", found="none", fix="Add them.")
     return between.sub(lambda _: f"\n{content}\n" if content else "", text)
+
+
+def to_markdown(table: Table) -> str:
+    """A table as Markdown, with the title above and the notes below."""
+    shown = table.shown(_escape, "**{}**")
+    right = ["---", *(["---:"] * (len(table.header) - 1))]
+    lines = [list(shown.columns), right, *shown.itertuples(index=False, name=None)]
+    notes = "".join(f"\n{_escape(note)}\n" for note in table.notes)
+    rows = "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    return f"**{_escape(table.title)}**\n\n{rows}\n{notes}"
+
+
+def _escape(text: str) -> str:
+    return re.sub(r"([\\|*_`<>])", r"\\\1", text)
 
 
 def page_tables(results: Results) -> dict[str, list[Table]]:

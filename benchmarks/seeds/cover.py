@@ -19,8 +19,7 @@ from splatseed.photos.view import View
 from splatseed.photos.viewpoint import look_at
 from splatseed.photos.visibility import SURFACE
 from splatseed.photos.zbuffer import MIN_NEARER
-from splatseed.seeding.cover import cover
-from splatseed.seeding.coverage import covered_share
+from splatseed.seeding.cover import cover, covered_share
 from splatseed.seeding.thinning import thin
 
 __all__: list[str] = []

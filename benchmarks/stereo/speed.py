@@ -21,8 +21,8 @@ import splatseed as ss
 from splatseed.depth.stereo._kernels.patchmatch import QuadImages, initialise, red_black_sweep
 from splatseed.depth.stereo.fusion import fuse
 from splatseed.depth.stereo.maps import StereoSettings
+from splatseed.depth.stereo.matching import make_quads
 from splatseed.depth.stereo.pipeline import find_stereo
-from splatseed.depth.stereo.quads import make_quads
 from splatseed.photos.loading import load_views
 from splatseed.photos.visibility import find_visibility
 from splatseed.pointcloud import PointCloud

@@ -23,8 +23,7 @@ from benchmarks.upsampling import naive
 import splatseed as ss
 from splatseed.seeding.geometry_score import GeometryScore, far_share, measure, spacing
 from splatseed.synthetic import SHAPES, Surface
-from splatseed.synthetic.shapes import plane, sine_sheet
-from splatseed.synthetic.surfaces import SineSheet
+from splatseed.synthetic.surfaces import SineSheet, plane, sine_sheet
 
 __all__: list[str] = []
 

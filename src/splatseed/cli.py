@@ -9,13 +9,13 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
-from importlib.metadata import version
 from typing import NoReturn
 
 from rich.table import Table
 
 from splatseed.console import ERR, OUT, show_extraction, with_options
 from splatseed.errors import SplatseedError
+from splatseed.requirements import version_of
 from splatseed.runtime.environment import set_thread_defaults
 from splatseed.runtime.interruption import Termination, exit_code
 from splatseed.text import did_you_mean, visible
@@ -85,7 +85,7 @@ def _run_verb(words: list[str]) -> None:
     elif verb in {"-h", "--help"}:
         _print_help()
     elif verb in {"-V", "--version"}:
-        OUT.print(f"splatseed {version('splatseed')}")
+        OUT.print(f"splatseed {version_of('splatseed')}")
     elif verb.partition("=")[0] == COMPLETION:
         import tyro  # noqa: PLC0415  (takes a while to load)
 

@@ -21,8 +21,7 @@ from rich.table import Table
 from rich.text import Text
 
 from splatseed.findings import Finding
-from splatseed.progress import Progress, extraction_progress
-from splatseed.runtime.compilation import watched
+from splatseed.progress import COMPILATION, Progress, StageTimes, extraction_progress, watched
 from splatseed.text import quoted, visible
 
 ARGUMENT = re.compile(r"`(?P<name>[a-z]\w*(?:\.[a-z]\w*)*)(?:=(?P<value>[^`]+))?`")
@@ -46,8 +45,6 @@ OUT = LiteralConsole()
 ERR = LiteralConsole(stderr=True)
 FILE_WIDTH = 1000
 """Width of tables in a file, in characters."""
-COMPILATION = "compiling kernels"
-"""The stage of compilation."""
 LINE_INTERVAL = 30.0
 """Seconds between lines on a running stage, if stderr is not a terminal."""
 MIN_LOGGED_COMPILATION = 3.0
@@ -84,23 +81,20 @@ class _Lines:
         ERR.print(f"{stage}:{done}, {now - start:.{0 if now - start >= 10 else 1}f} s")
 
 
-class StageClock:
+class StageClock(StageTimes):
     """A ``Progress`` that times stages and, within ``stage_display``, shows them."""
 
     def __init__(self) -> None:
+        super().__init__()
         self._lines: _Lines | None = None
         self._items: dict[str, tuple[int, str]] = {}
         self._bar: rich_progress.Progress | None = None
         self._tasks: dict[str, rich_progress.TaskID] = {}
-        self._started: list[tuple[str, float]] = []
-        self._compiling = 0
-        self._before = COMPILATION
         self._logged = 0.0
 
     def __call__(self, stage: str, fraction: float) -> None:
         """Record that ``fraction`` of ``stage`` is done."""
-        if not self._started or self._started[-1][0] != stage:
-            self._started.append((stage, time.perf_counter()))
+        super().__call__(stage, fraction)
         if self._lines is not None:
             self._lines(stage, fraction)
         if self._bar is not None:
@@ -122,28 +116,15 @@ class StageClock:
         """Set the number of items of some stages, which lines off a terminal show."""
         self._items |= dict.fromkeys(stages, (number, noun))
 
-    def seconds(self) -> dict[str, float]:
-        """Return the wall time of each stage so far, in order of first appearance."""
-        if not self._started:
-            return {}
-        ends = [start for _, start in self._started[1:]] + [time.perf_counter()]
-        total: dict[str, float] = {}
-        for (stage, start), end in zip(self._started, ends, strict=True):
-            total[stage] = total.get(stage, 0.0) + end - start
-        return total
-
     def compilation(self, begins: bool) -> None:
         """Count and show the time from the first compilation that begins to the last that ends."""
-        self._compiling += 1 if begins else -1
-        if self._compiling != int(begins):  # nested in another
+        super().compilation(begins)
+        if self._compiling != int(begins) or self._bar is None:  # nested in another
             return
         if begins:
-            self._before = self._started[-1][0] if self._started else COMPILATION
-        self._started.append((COMPILATION if begins else self._before, time.perf_counter()))
-        if self._bar is not None and begins:
             note = f"{COMPILATION} (first use only, then cached)"
             self._tasks[COMPILATION] = self._bar.add_task(note, total=None)
-        elif self._bar is not None and COMPILATION in self._tasks:
+        elif COMPILATION in self._tasks:
             self._bar.remove_task(self._tasks.pop(COMPILATION))
 
     @contextmanager

@@ -29,7 +29,7 @@ class DistortionSettings:
     tolerance: float = 1e-9  # normalised coordinates
 
 
-SETTINGS = DistortionSettings()
+DISTORTION = DistortionSettings()
 
 
 def undistort_advice(scene: Path | None) -> str:
@@ -91,17 +91,17 @@ def unproject_pixels(
     """
     K = lens.K
     goal = (np.asarray(uv, np.float64) - K[:2, 2]) / K[[0, 1], [0, 1]]
-    xy, moves = goal.copy(), SETTINGS.difference * np.eye(2)
+    xy, moves = goal.copy(), DISTORTION.difference * np.eye(2)
     with np.errstate(all="ignore"):  # distant coordinates need not stay finite
-        for _ in range(SETTINGS.newton_steps):
+        for _ in range(DISTORTION.newton_steps):
             columns = [distort(lens, xy + move) - distort(lens, xy - move) for move in moves]
             (a, c), (b, d) = (
-                np.moveaxis(each / (2 * SETTINGS.difference), -1, 0) for each in columns
+                np.moveaxis(each / (2 * DISTORTION.difference), -1, 0) for each in columns
             )
             residual = goal - distort(lens, xy)
             u, v = residual[..., 0], residual[..., 1]
             xy = xy + np.stack([d * u - b * v, a * v - c * u], axis=-1) / (a * d - b * c)[..., None]
-        converged = np.linalg.norm(goal - distort(lens, xy), axis=-1) < SETTINGS.tolerance
+        converged = np.linalg.norm(goal - distort(lens, xy), axis=-1) < DISTORTION.tolerance
     radius = np.where(converged, np.linalg.norm(xy, axis=-1), 0.0)
     converged &= radius <= fold_radius(lens, float(radius.max(initial=0.0)))
     return np.where(converged[..., None], xy, np.nan)
@@ -113,8 +113,8 @@ def fold_radius(lens: Intrinsics, limit: float) -> float:
     Distortion polynomials are fitted within the image. Beyond it they may decrease, so that distant
     rays would project into the image a second time.
     """
-    radius = np.linspace(0.0, limit, SETTINGS.fold_samples + 1)
-    angle = np.arange(SETTINGS.fold_directions) * (2 * np.pi / SETTINGS.fold_directions)
+    radius = np.linspace(0.0, limit, DISTORTION.fold_samples + 1)
+    angle = np.arange(DISTORTION.fold_directions) * (2 * np.pi / DISTORTION.fold_directions)
     rays = np.stack([np.cos(angle), np.sin(angle)], axis=-1)[:, None] * radius[:, None]
     with np.errstate(all="ignore"):  # rational models may have poles
         distance = np.linalg.norm(distort(lens, rays) - distort(lens, np.zeros(2)), axis=-1)

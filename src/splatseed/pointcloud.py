@@ -178,6 +178,10 @@ class PointCloud:
         """Return a copy with some arrays replaced; None removes an attribute."""
         return dataclass_replace(self, **changes)  # type: ignore[arg-type]  # None for attributes
 
+    def with_source(self, code: int) -> PointCloud:
+        """Return a copy whose points are all from the method with this ``source`` code."""
+        return self.replace(source=np.full(len(self), code, np.uint8), original_idx=None)
+
     def with_added(
         self,
         xyz: Float[np.ndarray, "M 3"],
@@ -195,7 +199,7 @@ class PointCloud:
             PointCloudError: As for a new ``PointCloud``.
         """
         own = PointCloud(xyz, rgb, **attributes)
-        return PointCloud.concatenate(self, own.replace(source=np.full(len(own), GENERATED)))
+        return PointCloud.concatenate(self, own.with_source(GENERATED))
 
     @staticmethod
     def read_ply(path: str | Path) -> PointCloud:

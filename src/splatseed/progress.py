@@ -1,15 +1,17 @@
-"""Report progress and notes to the caller.
+"""Report progress, findings and the compilation of kernels to the caller.
 
 A ``Progress`` is any callable that takes a stage's name and the fraction of it that is done, from
 0 to 1. Library functions default to ``silent``; the command line passes a progress bar. A ``Note``
-takes a ``Finding``.
+takes a ``Finding``. ``runtime.jit`` notifies watchers of compilation, which need not import Numba.
 """
 
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import TypeAlias
 
@@ -24,12 +26,49 @@ thread_limit: ContextVar[int | None] = ContextVar("thread_limit", default=None)
 """Maximum threads of ``in_threads``; None for one per CPU."""
 
 
+COMPILATION = "compiling kernels"
+"""The stage of compilation."""
+
+
 def silent(stage: str, fraction: float) -> None:
     """Ignore the progress."""
 
 
 def silent_note(finding: Finding) -> None:
     """Ignore the finding."""
+
+
+class StageTimes:
+    """A ``Progress`` that times stages; a stage's time runs until the next one starts."""
+
+    def __init__(self) -> None:
+        self._started: list[tuple[str, float]] = []
+        self._compiling = 0
+        self._before = COMPILATION
+
+    def __call__(self, stage: str, fraction: float) -> None:  # noqa: ARG002  (a Progress)
+        """Record that ``fraction`` of ``stage`` is done."""
+        if not self._started or self._started[-1][0] != stage:
+            self._started.append((stage, time.perf_counter()))
+
+    def seconds(self) -> dict[str, float]:
+        """Return the wall time of each stage so far, in order of first appearance."""
+        if not self._started:
+            return {}
+        ends = [start for _, start in self._started[1:]] + [time.perf_counter()]
+        total: dict[str, float] = {}
+        for (stage, start), end in zip(self._started, ends, strict=True):
+            total[stage] = total.get(stage, 0.0) + end - start
+        return total
+
+    def compilation(self, begins: bool) -> None:
+        """Count the time from the first compilation that begins to the last that ends, apart."""
+        self._compiling += 1 if begins else -1
+        if self._compiling != int(begins):  # nested in another
+            return
+        if begins:
+            self._before = self._started[-1][0] if self._started else COMPILATION
+        self._started.append((COMPILATION if begins else self._before, time.perf_counter()))
 
 
 def blocks(total: int, size: int, stage: str, progress: Progress) -> Iterator[tuple[int, int]]:
@@ -58,3 +97,22 @@ def in_threads(
             progress(stage, done / len(starts))
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
+
+
+_watchers: list[Callable[[bool], None]] = []
+
+
+@contextmanager
+def watched(watcher: Callable[[bool], None]) -> Iterator[None]:
+    """Call ``watcher`` with True when a compilation begins, False when it ends; they can nest."""
+    _watchers.append(watcher)
+    try:
+        yield
+    finally:
+        _watchers.remove(watcher)
+
+
+def notify(begins: bool) -> None:
+    """Notify all watchers that a compilation begins or ends."""
+    for watcher in tuple(_watchers):
+        watcher(begins)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import platform
 import re
 import sys
+from collections.abc import Iterable
+from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
 from shlex import quote
@@ -53,6 +56,20 @@ def require(*packages: str) -> None:
             found=f"no {', no '.join(missing)}",
             fix=advice,
         )
+
+
+def version_of(package: str) -> str | None:
+    """Return the version of a package; None if it is not installed."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def versions_of(packages: Iterable[str]) -> dict[str, str]:
+    """Return the versions of Python and of those packages that are installed."""
+    known = {package: found for package in packages if (found := version_of(package))}
+    return {"python": platform.python_version(), **known}
 
 
 def install_command(*packages: str, upgrade: bool = False) -> str:

@@ -80,9 +80,9 @@ def check_settings(settings: Any, group: str = "") -> None:
     for name, (hint, limits) in _limits_of(kind).items():
         value = getattr(settings, name)
         label = f"{group}.{name}" if group else f"`{name}`"
-        require(fits(value, hint), f"{label} as {describe_type(hint)}", value)
+        _require(fits(value, hint), f"{label} as {describe_type(hint)}", value)
         if limits is not None and value is not None:
-            require(limits.contains(value, settings), f"{label} {limits}", value)
+            _require(limits.contains(value, settings), f"{label} {limits}", value)
 
 
 Settings = TypeVar("Settings")
@@ -106,7 +106,7 @@ def change_settings(settings: Settings, name: str, values: Mapping[str, Any]) ->
     return changed
 
 
-def require(condition: bool, expected: str, found: object) -> None:
+def _require(condition: bool, expected: str, found: object) -> None:
     """Raise a ``ParameterError`` unless ``condition`` holds."""
     if not condition:
         raise ParameterError(expected, found=repr(found), fix="Choose such a value.")

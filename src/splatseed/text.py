@@ -120,6 +120,20 @@ def agreeing(number: int, singular: str, plural: str) -> str:
     return singular if number == 1 else plural
 
 
+def format_duration(seconds: float) -> str:
+    """Format an estimated duration.
+
+    Example:
+        >>> format_duration(40), format_duration(3000), format_duration(200_000)
+        ('40 s', '50 minutes', '56 hours')
+    """
+    if seconds < 90:
+        return f"{max(1, round(seconds))} s"
+    if seconds < 5400:
+        return f"{round(seconds / 60)} minutes"
+    return f"{int(seconds / 3600 + 0.5)} hours"
+
+
 def _is_visible(character: str) -> bool:
     return character.isprintable() or unicodedata.category(character) == "Zs"
 

@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from splatseed.bench.plan import SFM, SHARED, Arm, RunResult, RunSpec
-from splatseed.bench.runs import ERROR, RESULT, Run, record_plan, run_folder
+from splatseed.bench.runs import ERROR, RESULT, BenchRun, record_plan, run_folder
 from splatseed.bench.scenes import PlannedScene, SceneFacts, survey
 from splatseed.scores import CurvePoint, EvalResult, ViewScore
 from splatseed.training.settings import TrainSettings
@@ -68,7 +68,7 @@ def runs(
                     count, early = int(5000 * math.sqrt(ratio)), 0.1 if gain > 0 else 0.0
                     made = result(float(psnr), num_gaussians=count, early=early)
                     told = {"strategy": strategy, "repeat": repeat, **changes}
-                    finished.append(Run(spec(scene, method, ratio, **told), made))
+                    finished.append(BenchRun(spec(scene, method, ratio, **told), made))
     return finished
 
 

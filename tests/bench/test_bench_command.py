@@ -19,14 +19,14 @@ pytest.importorskip("torch", reason="training needs PyTorch")
 pytest.importorskip("gsplat", reason="training needs gsplat's strategies")
 
 from splatseed import synthetic
+from splatseed.bench import job
 from splatseed.bench.plan_file import plan_text, read_plan
 from splatseed.bench.runs import read_calls, read_runs, record_plan
 from splatseed.bench.scenes import DEMO, PlannedScene, survey
-from splatseed.commands import bench as command
 from splatseed.io import load_scene
 from splatseed.synthetic import make_capture
 
-PAPER_PLAN = Path(__file__).parents[2] / "benchmarks" / "paper" / "small.toml"
+PLANS = Path(__file__).parents[2] / "benchmarks" / "paper"
 COMMAND = (sys.executable, "-c", "from splatseed.cli import main; main()", "bench")
 
 
@@ -52,7 +52,7 @@ def bench(splatseed):
 @pytest.fixture
 def here(monkeypatch, in_process):
     """Runs take place in this process, which spares the import of PyTorch."""
-    monkeypatch.setattr(command, "ProcessWorkers", lambda _: in_process)
+    monkeypatch.setattr(job, "ProcessWorkers", lambda _: in_process)
 
 
 def test_runs_everything_once_and_a_failed_run_ends_nothing_else(here, bench, plan_path, tmp_path):
@@ -117,12 +117,13 @@ def test_a_dry_run_prints_a_plan_and_writes_nothing(bench, plan_path, tmp_path, 
     assert not (tmp_path / "B").exists()
 
 
-def test_missing_scenes_of_a_preset_are_skipped(bench, own_room, tmp_path):
+def test_missing_scenes_of_a_plan_are_skipped(bench, own_room, tmp_path):
     data = tmp_path / "360"
     for name, images in (("garden", "images_4"), ("bonsai", "images_2"), ("room", "images_8")):
         shutil.copytree(own_room, data / name)
         (data / name / "images").rename(data / name / images)
-    code, out, _ = bench("--preset", "mipnerf360", "--data", data, "--dry-run", "--repeats", 1)
+    words = ("--plan", PLANS / "mipnerf360.toml", "--data", data)
+    code, out, _ = bench(*words, "--dry-run", "--repeats", 1)
     assert code == 0
     left_out = re.findall(r"^# (\w+) is skipped: .*(bicycle|images_2)", out, re.MULTILINE)
     assert left_out == [("bicycle", "bicycle"), ("room", "images_2")]
@@ -137,7 +138,15 @@ def test_missing_scenes_of_a_preset_are_skipped(bench, own_room, tmp_path):
 def test_options_make_a_plan_smaller(bench, own_room, tmp_path):
     for name in ("fern", "desk"):
         shutil.copytree(own_room, tmp_path / "data" / name)
-    words = ("--plan", PAPER_PLAN, "--data", tmp_path / "data", "--scenes", "desk", "fern")
+    words = (
+        "--plan",
+        PLANS / "small.toml",
+        "--data",
+        tmp_path / "data",
+        "--scenes",
+        "desk",
+        "fern",
+    )
     code, out, err = bench(*words, "--budgets", "9rho", "--repeats", 1, "--dry-run")
     assert (code, err) == (0, "")
     (tmp_path / "plan.toml").write_text(out)
@@ -147,21 +156,21 @@ def test_options_make_a_plan_smaller(bench, own_room, tmp_path):
     assert "# 136 runs" in out
 
 
-def test_the_quick_preset_makes_its_own_scene_once(bench, tmp_path, monkeypatch):
+def test_the_synthetic_room_is_made_once(bench, tmp_path, monkeypatch):
     monkeypatch.setattr(synthetic, "make_capture", partial(make_capture, 0, 9, 64, 48))
     facts = survey(PlannedScene(DEMO), demo=tmp_path / "B" / "scenes" / "demo")
     assert (facts.num_images, len(load_scene(facts.path).images)) == (9, 9)
     monkeypatch.setattr(synthetic, "make_capture", lambda: pytest.fail("made again"))
-    assert bench("--preset", "quick", "--dry-run", "-o", tmp_path / "B").code == 0
+    assert bench("--scenes", DEMO, "--dry-run", "-o", tmp_path / "B").code == 0
 
 
-def test_a_dry_run_of_the_quick_preset_loads_nothing_heavy():
+def test_a_dry_run_loads_nothing_heavy():
     """It takes a second; to make the room and to import PyTorch took over a minute."""
     code = f"{COMMAND[2]}; print(*sys.modules)"
-    words = [sys.executable, "-c", f"import sys; {code}", "bench", "--preset", "quick", "--dry-run"]
+    words = [sys.executable, "-c", f"import sys; {code}", "bench", "--scenes", DEMO, "--dry-run"]
     run = subprocess.run(words, capture_output=True, text=True, check=True)
     loaded = set(run.stdout.splitlines()[-1].split())
-    assert "# 12 runs" in run.stdout
+    assert "# 9 runs" in run.stdout
     assert not {"torch", "matplotlib", "splatseed.synthetic"} & loaded
 
 
@@ -174,13 +183,9 @@ def test_a_dry_run_of_the_quick_preset_loads_nothing_heavy():
         (("-o", "B", "--scenes", "ROOM", "--address", "auto"), "--executor ray"),
         (("-o", "B", "--scenes", "ROOM", "--methods", "depth", "--depth", "a", "b"), "--depth"),
         (("-o", "ROOM/B", "--scenes", "ROOM"), "apart from the input"),
-        (("-o", "B", "--preset", "mipnerf360"), "--data"),
-        (("-o", "B", "--preset", "replica", "--data", "OTHER"), "none of office0"),
-        (
-            ("-o", "B", "--preset", "replica", "--data", "OTHER", "--scenes", "ROOM"),
-            "--scenes among",
-        ),
-        (("-o", "B", "--preset", "quick", "--plan", "x.toml"), "both"),
+        (("-o", "B", "--data", "OTHER"), "--plan with --data"),
+        (("-o", "B", "--plan", "REPLICA", "--data", "OTHER"), "none of office0"),
+        (("-o", "B", "--plan", "REPLICA", "--data", "OTHER", "--scenes", "x"), "--scenes among"),
         (("--dry-run", "--plan", "lpips.toml"), "LPIPS"),
         (("-o", "OTHER", "--scenes", "ROOM"), "splatseed upsample wrote"),
     ],
@@ -193,7 +198,9 @@ def test_bad_words_are_refused_and_nothing_is_written(
     (tmp_path / "lpips.toml").write_text(f"lpips = true\n[[scenes]]\npath = '{room_path}'\n")
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     before = sorted(tmp_path.rglob("*"))
-    words = [word.replace("ROOM", str(room_path)) for word in words]
+    names = {"ROOM": str(room_path), "REPLICA": str(PLANS / "replica.toml")}
+    for name, path in names.items():
+        words = [word.replace(name, path) for word in words]
     code, out, err = bench(*words)
     assert (code, out) == (2, "")
     assert said.replace("ROOM", str(room_path)) in " ".join(err.split())

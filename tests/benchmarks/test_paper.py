@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from importlib import import_module
 
 import numpy as np
@@ -10,8 +11,8 @@ import pytest
 
 pytest.importorskip("pandas", reason="tables need pandas")
 
-from splatseed.bench.runs import Run
-from splatseed.bench.tables import to_markdown
+from splatseed.bench.runs import BenchRun
+from splatseed.bench.tables import Number, Table
 from splatseed.errors import SceneFormatError
 
 from ..bench.planted import runs, spec, write_bench
@@ -36,7 +37,7 @@ def planned(scenes=SCENES, **changes):
     """All runs of the paper's profile, finished; the baseline's profile is the default one."""
     finished = runs(scenes, GAINS, ("default-3dgs",), noise=0.01, **changes)
     return [
-        Run(spec(r.spec.scene.name, r.spec.arm.method, r.spec.arm.ratio, repeat=r.spec.repeat,
+        BenchRun(spec(r.spec.scene.name, r.spec.arm.method, r.spec.arm.ratio, repeat=r.spec.repeat,
                  strategy="default-3dgs", profile="default" if r.spec.arm.method == "sfm" else
                  "paper"), r.result)
         for r in finished
@@ -51,7 +52,8 @@ def row(text, *cells):
 def test_a_benchmark_that_was_killed_fills_the_page_and_blanks_the_rest(paper, tmp_path):
     all_runs, missing = planned(), ("face", "voronoi", 16.0)
     kept = [
-        Run(run.spec) if (run.spec.scene.name, run.spec.arm.method, run.spec.arm.ratio) == missing
+        BenchRun(run.spec)
+        if (run.spec.scene.name, run.spec.arm.method, run.spec.arm.ratio) == missing
         else run
         for run in all_runs
     ]  # fmt: skip
@@ -81,11 +83,12 @@ def test_a_benchmark_that_was_killed_fills_the_page_and_blanks_the_rest(paper, t
 def test_further_ways_have_means_alone(paper, tmp_path):
     own = runs(SCENES[:3], GAINS, ("default", "mcmc"), noise=0.01)
     results = paper("gained").read_results([write_bench(tmp_path / "B", own)])
-    full, means = map(to_markdown, paper("tables").page_tables(results)["table1"])
+    tables = paper("tables")
+    full, means = map(tables.to_markdown, tables.page_tables(results)["table1"])
     assert "/ .800 (+0.6" in row(full, "fern", "16x")[-2]
     assert row(full, "mean", "4x")[-2].startswith("+0.6")
     assert "| fern | 4x |" not in full
-    (costs,) = map(to_markdown, paper("tables").page_tables(results)["table3"])
+    (costs,) = map(tables.to_markdown, tables.page_tables(results)["table3"])
     assert row(costs, "mls", "16x")
     assert "| mls | 4x |" not in costs
     assert row(means, "mcmc, profile default", "4x")[-2].startswith("+0.6")
@@ -102,7 +105,15 @@ def test_guidelines_are_decided_by_what_was_planted(paper, tmp_path):
     assert by_text["Voronoi suits planar scenes"].startswith("fails: -0.1")
     assert by_text["Simple methods at low ratios suffice"].startswith("fails: -0.1")
     assert by_text["Benefits rise to 32x indoors"] == "not decided here: not run"
-    assert "mls 8" in to_markdown(guidelines.verdict_table(results))
+    assert "mls 8" in paper("tables").to_markdown(guidelines.verdict_table(results))
+
+
+def test_markdown_escapes_what_would_end_a_cell(paper):
+    odd = Number(-0.0001, 2, 0.5, signed=True, mark="~", bold=True)
+    table = Table("odd", "a | b", ("scene", "a_b & c"), (("<s|c>_#1", odd),), ("~ means ±",))
+    lines = paper("tables").to_markdown(table).splitlines()
+    assert len({len(re.findall(r"(?<!\\)\|", line)) for line in lines[2:5]}) == 1
+    assert "**0.00 ± 0.50** ~" in lines[4]
 
 
 def test_noise_and_a_single_scene_decide_nothing(paper):

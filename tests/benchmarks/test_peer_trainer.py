@@ -11,7 +11,7 @@ import torch
 
 from splatseed.errors import MissingDependencyError, ParameterError, SceneNotFoundError
 from splatseed.photos.loading import load_split
-from splatseed.splat.ssim_conv import l1_and_ssim_by_convolution
+from splatseed.splat.ssim import l1_and_ssim_by_convolution
 
 MODULES = (
     "common.children",

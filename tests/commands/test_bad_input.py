@@ -67,7 +67,7 @@ MLS = (*UP, "--method", "mls")
 TRAIN = ("train", "ROOM", *OUT)
 DEPTH = ("depth", "ROOM", *OUT)
 SFM = ("sfm", "ROOM/images", *OUT)
-QUICK = ("bench", "--preset", "quick", *OUT)
+BENCH = ("bench", "--scenes", "demo:", *OUT)
 EVALUATE = ("evaluate", "model.ply", "--scene", "ROOM")
 FLIGHT = ("flight", "model.ply", "-o", "a.mp4")
 
@@ -139,8 +139,8 @@ COMMANDS = [
     ((*SFM, "--refine-poses"), "--poses-from"),
     ((*SFM, "--poses-from", "ROOM", "--camera-model", "PINHOLE"), "--camera-model"),
     (("bench", "reprot", "B"), "report?"),
-    ((*QUICK, "--repeats", "0"), "--repeats"),
-    ((*QUICK, "--long-side", "0"), "--long-side"),
+    ((*BENCH, "--repeats", "0"), "--repeats"),
+    ((*BENCH, "--long-side", "0"), "--long-side"),
     (("demo", "--views", "2"), "views"),
     (("demo", "--train-steps", "-1"), "--train-steps"),
     ((*MLS, "--cloud", "SCAN"), "--cloud"),
@@ -263,7 +263,7 @@ def test_an_error_names_the_file_option_or_value(words, named, refused):
     assert named in refused(*words)
 
 
-THINGS = {"sfm": ["ROOM/images"], "bench": QUICK[1:], "evaluate": EVALUATE[1:]}
+THINGS = {"sfm": ["ROOM/images"], "bench": BENCH[1:], "evaluate": EVALUATE[1:]}
 MODELS = {"flight": "out.mp4", "export": "out.splat"}
 ALSO = {"upsample": ["--method", "mls"]}
 ANY = {("sfm", "--threads")}

@@ -19,7 +19,7 @@ from splatseed.commands import demo
 from splatseed.errors import MissingDependencyError
 from splatseed.io import load_scene
 from splatseed.methods import METHODS
-from splatseed.runtime.compilation import notify
+from splatseed.progress import notify
 from splatseed.synthetic import write_capture
 
 

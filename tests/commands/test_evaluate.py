@@ -13,7 +13,7 @@ from splatseed.io import load_scene
 from splatseed.splat.evaluate import evaluate_views
 from splatseed.splat.formats import write_gaussians
 from splatseed.splat.from_seeds import initial_gaussians
-from splatseed.training.models import split_doubt
+from splatseed.training.evaluation import split_findings
 from splatseed.training.prepare import prepare_run
 from splatseed.training.settings import TrainSettings
 
@@ -71,8 +71,8 @@ def test_graphdecos_trainer_records_whether_it_held_out_photographs(evaluated, t
     model = tmp_path / "point_cloud/iteration_7/point_cloud.ply"
     model.parent.mkdir(parents=True)
     (tmp_path / "cfg_args").write_text(f"Namespace(data_device='cuda', eval={evaluated})")
-    assert ("eval=False" in split_doubt(model, 3)) != evaluated
-    assert bool(split_doubt(model, 3)) != evaluated
+    kinds = [each.kind for each in split_findings(model, 3)]
+    assert kinds == ([] if evaluated else ["trained-test-views"])
 
 
 def _refused(run, *texts):

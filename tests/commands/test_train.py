@@ -45,15 +45,17 @@ def test_a_file_gives_options_and_the_command_line_wins(tmp_path):
     )
     options = parse(["-o", "out", "--config", str(toml)])
     assert (options.scene, options.output) == (Path("room"), Path("out"))
-    assert (options.training.max_steps, options.training.opacity_reset) == (7, True)
-    assert (options.seeds, options.budget) == ("scene", "900")
+    settings = options.request.settings
+    assert (settings.max_steps, settings.opacity_reset, settings.seeding) == (7, True, "scene")
+    assert options.request.budget == 900
+    assert options.request.named == {"max_steps", "opacity_reset", "seeding"}
     options = parse(["mine", f"--config={toml}", "--max-steps=9", "-o", "out"])
-    assert (options.scene, options.training.max_steps) == (Path("mine"), 9)
+    assert (options.scene, options.request.settings.max_steps) == (Path("mine"), 9)
     for one, other in (("long_side", "data_factor"), ("data_factor", "long_side")):
         toml.write_text(f"{one} = 8\n")
         words = ["mine", "-o", "out", "--config", str(toml), f"--{other.replace('_', '-')}", "4"]
-        options = parse(words)
-        sizes = {"long_side": options.long_side, "data_factor": options.training.data_factor}
+        request = parse(words).request
+        sizes = {"long_side": request.long_side, "data_factor": request.settings.data_factor}
         assert sizes == {one: None, other: 4}
     with pytest.raises(SceneNotFoundError):
         parse(["--config", str(tmp_path / "none.toml")])
@@ -197,7 +199,8 @@ def refinement_of_room(room, monkeypatch):
 def test_points_stay_where_refinement_gains_nothing(room, refinement_of_room, splatseed, tmp_path):
     refinement_of_room(kept=True)
     own, scene = load_scene(room), load_scene(room)
-    same, note = pipeline.refined(own, 0)
+    same, finding = pipeline.refined(own, 0)
+    note = str(finding)
     assert same is own
     words = ("--method", "linear", "--ratio", "2", "-o")
     out = splatseed("upsample", room, "--refine-poses", *words, tmp_path / "seeds").out

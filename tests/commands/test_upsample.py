@@ -30,7 +30,7 @@ from splatseed.io.staging import unlisted_files
 from splatseed.methods import METHODS, SOURCE_CODES, chooses_number, configure, source_code
 from splatseed.methods.registry import GROUP
 from splatseed.pointcloud import PointCloud
-from splatseed.seeding.coverage import covered_share
+from splatseed.seeding.cover import covered_share
 from splatseed.seeding.photo_methods import frames_of
 from splatseed.sfm.refinement import poses_of, turns
 from splatseed.similarity import Similarity

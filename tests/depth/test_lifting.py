@@ -124,7 +124,7 @@ def test_images_are_read_again_if_too_few_candidates_are_sound(exact, make_maps,
     lifted(scene, 3000, align=False, note=notes.append)
     assert len(set(reads)) > 1
     assert max(reads) <= lifting.OVERSAMPLING.limit * 3000 / 12 + 1
-    assert any(re.match(r"[\d,]+ of 3,000 ", note) for note in notes)
+    assert any(re.match(r"[\d,]+ of 3,000 ", note.text) for note in notes)
 
 
 def test_all_pixels_can_be_lifted_but_no_more(exact):
@@ -204,8 +204,9 @@ def test_images_with_few_points_keep_metric_depth(exact, capture, metric):
     other = metric("z", lambda z, _: 3 * z)
     lifted(few.replace(depths=other), 1000, note=notes.append, min_points=30)
     lifted(few, 1000, note=notes.append, min_points=30)
-    left_out = [note for note in notes if "10 of 12 depth maps are left out" in note]
+    left_out = [note.text for note in notes if note.kind == "unfit-depth-maps"]
     assert len(left_out) == 2
+    assert all(text.startswith("10 of 12 depth maps are left out") for text in left_out)
     assert "SfM points on known depth; 30 are needed" in left_out[1]
 
 

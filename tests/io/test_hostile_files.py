@@ -18,7 +18,7 @@ from splatseed.io.depth_files import read_stored
 from splatseed.io.files import open_file, read_file
 from splatseed.io.photograph import photograph_bytes
 from splatseed.io.staging import read_manifest
-from splatseed.seeding.trainability import untrainable
+from splatseed.seeding.advice import untrainable
 
 from ..findings import texts
 from .checks import little_memory
@@ -54,7 +54,7 @@ def test_what_is_no_file_is_not_called_missing(odd, name, is_, scene_dir, model)
     scene = load_scene(scene_dir)
     assert f"{odd / name} is {is_}, not a file." in " ".join(texts(scene))
     shutil.rmtree(scene_dir / "images/left")
-    assert f"{odd / name} is {is_}, not a file." in untrainable(scene)
+    assert f"{odd / name} is {is_}, not a file." in untrainable(scene).text
 
 
 @pytest.mark.parametrize("kind", ["pipe", "link"])

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 import splatseed as ss
-from splatseed.methods.contract import NewPoints
 from splatseed.methods.neighbors import prepare_scene
 
 from .surroundings import scene_around
@@ -22,7 +21,7 @@ class Copies:
         cloud = prepare_scene(scene)
         row_of_rank = np.argsort(cloud.rank)
         rows = row_of_rank[rng.integers(0, len(cloud), num_new)]
-        return NewPoints((cloud.xyz[rows] + cloud.center).astype(np.float32), cloud.rgb[rows])
+        return (cloud.xyz[rows] + cloud.center).astype(np.float32), cloud.rgb[rows]
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,9 @@ import pytest
 
 from splatseed import PointCloud
 from splatseed.methods._kernels.cells import MAX_NEIGHBORS, build_cells
-from splatseed.methods.cells import Cells, box_cells
 from splatseed.methods.neighbors import prepare
 from splatseed.methods.patches import local_frames
+from splatseed.methods.voronoi import Cells, box_cells
 from splatseed.progress import silent
 
 from . import paper_equations as paper, references_voronoi as slow

@@ -17,7 +17,7 @@ import splatseed as ss
 from splatseed.methods.patches import local_frames
 from splatseed.seeding.geometry_score import far_share, spacing
 from splatseed.synthetic import SHAPES
-from splatseed.synthetic.shapes import parallel_plates, plane
+from splatseed.synthetic.surfaces import parallel_plates, plane
 
 from . import references as slow
 

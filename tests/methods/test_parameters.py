@@ -16,6 +16,7 @@ from splatseed.errors import (
     UnknownNameError,
 )
 from splatseed.methods import configure
+from splatseed.pointcloud import PointCloud
 
 from .contract import METHOD_NAMES, PHOTOGRAPH_METHODS, Copies
 
@@ -125,12 +126,12 @@ class Changing(Copies):
         object.__setattr__(self, "change", change)
 
     def __call__(self, scene, num_new, rng, progress):
-        return self.change(super().__call__(scene, num_new, rng, progress))
+        return self.change(PointCloud(*super().__call__(scene, num_new, rng, progress)))
 
 
 def test_what_a_method_knows_of_its_points_is_handed_on(wavy):
     source, sizes = np.array([9, 8, 9, 8], np.uint8), np.full(4, 0.5)
-    knowing = Changing(lambda new: new._replace(sizes=sizes, source=source))
+    knowing = Changing(lambda new: new.replace(sizes=sizes, source=source))
     seeds = ss.upsample(wavy, knowing, num_points=len(wavy) + 4)
     assert seeds.source[len(wavy) :].tolist() == [9, 8, 9, 8]
     assert seeds.sizes[len(wavy) :].tolist() == [0.5] * 4
@@ -142,10 +143,10 @@ def test_what_a_method_knows_of_its_points_is_handed_on(wavy):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        ({"xyz": np.full((4, 3), np.nan, np.float32)}, "at new point 0"),
-        *(({"source": np.full(4, wrong)}, "codes from 1 to 255") for wrong in (0, 256)),
+        (lambda new: new.replace(xyz=np.full((4, 3), np.nan)), "at new point 0"),
+        (lambda new: new.select(slice(3)), "expected 4 new points; found 3"),
     ],
 )
 def test_a_third_partys_bad_points_are_refused(change, says, wavy):
     with pytest.raises(PointCloudError, match=says):
-        ss.upsample(wavy, Changing(lambda new: new._replace(**change)), num_points=len(wavy) + 4)
+        ss.upsample(wavy, Changing(change), num_points=len(wavy) + 4)

@@ -74,7 +74,7 @@ def test_numbas_workqueue_still_takes_one_loop_at_a_time(tmp_path):
 SLOW = """
 import sys, time
 from pathlib import Path
-from splatseed.runtime.compilation import watched
+from splatseed.progress import watched
 from splatseed.runtime.jit import inline
 
 @inline

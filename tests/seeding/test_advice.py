@@ -11,6 +11,7 @@ from splatseed.camera import Intrinsics
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene
 from splatseed.seeding.advice import AS_IT_IS, Measured, advise, measure
+from splatseed.training.traits import STRATEGIES
 
 FERN = Measured(6_009, 120_000, empty=0.4)
 
@@ -30,7 +31,7 @@ FERN = Measured(6_009, 120_000, empty=0.4)
     ],
 )
 def test_what_is_there_decides_the_method(measured, most, strategy, method, says):
-    said = advise(measured, most, strategy=strategy)
+    said = advise(measured, most, why_no_seeds=STRATEGIES[strategy].why_no_seeds)
     assert said.method == method
     assert all(word in reason for word, reason in zip(says, said.reasons, strict=False))
     per_pixel = "per pixel of a photograph's" in said.reasons[0]

@@ -8,7 +8,7 @@ from hypothesis import given, settings, strategies as st
 
 from splatseed.errors import ParameterError, PointCloudError
 from splatseed.photos.zbuffer import cell_depths
-from splatseed.seeding.coverage import covered_share
+from splatseed.seeding.cover import covered_share
 from splatseed.seeding.thinning import _places_in_views, thin
 
 from . import references as slow

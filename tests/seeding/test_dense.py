@@ -15,7 +15,7 @@ from splatseed.methods import SOURCE_CODES
 from splatseed.photos import loading
 from splatseed.runtime import memory
 from splatseed.seeding import dense
-from splatseed.seeding.dense import plan_comparisons
+from splatseed.seeding.dense import SECOND_COMPARISON, plan_comparisons
 
 STEREO, COVER = SOURCE_CODES["stereo"], SOURCE_CODES["cover"]
 BUDGET = 6000
@@ -34,14 +34,13 @@ def sparse(few):
 
 @pytest.fixture(scope="module")
 def made(few):
-    """Dense seeds, and what was said before and after."""
-    before, notes = [], []
-    seeds = ss.upsample(few, budget=BUDGET, announce=before.append, note=notes.append)
-    return seeds, before, notes
+    """Dense seeds, and what was found."""
+    notes = []
+    return ss.upsample(few, budget=BUDGET, note=notes.append), notes
 
 
 def test_a_budget_is_filled_where_photographs_confirm_points(made, sparse, few, room_capture):
-    seeds, before, notes = made
+    seeds, notes = made
     assert len(sparse) < 0.6 * BUDGET < 0.9 * BUDGET < len(seeds) <= BUDGET
     count = len(few.points)
     np.testing.assert_array_equal(seeds.xyz[:count], few.points.xyz)
@@ -59,16 +58,17 @@ def test_a_budget_is_filled_where_photographs_confirm_points(made, sparse, few, 
     assert np.median(cosine) > 0.97
     assert 0 < np.median(new.sizes) < 0.7 * np.median(old.sizes)
     assert ((new.confidence > 0) & (new.confidence <= 1)).all()
-    assert len(before) == 1
-    assert re.search(r"6,000 points: 6 photographs .* 160 x 120 .* about .* of memory", before[0])
-    assert not [note for note in notes if "budget" in note]
+    (announced,) = notes
+    assert announced.kind == SECOND_COMPARISON
+    expected = r"6,000 points: 6 photographs .* 160 x 120 .* about .* of memory"
+    assert re.search(expected, announced.text)
 
 
 def test_what_photographs_do_not_confirm_is_not_made_up(few, sparse):
     notes = []
     seeds = ss.upsample(few, "stereo", budget="10M", note=notes.append)
     assert len(sparse) < len(seeds) < 60_000
-    assert notes[-1] == (
+    assert notes[-1].text == (
         f"Photographs confirm {len(seeds):,} of the 10,000,000 points of the budget."
     )
 
@@ -81,7 +81,7 @@ def test_where_no_third_view_confirms_a_depth_sparse_seeds_remain(few, sparse, m
     seeds = ss.upsample(few, budget=BUDGET, note=notes.append)
     assert seeds.xyz.tobytes() == sparse.xyz.tobytes()
     confirmed = len(few.points) + (sparse.source == STEREO).sum()
-    assert notes[-1].startswith(f"Photographs confirm {confirmed:,} of the 6,000 points")
+    assert notes[-1].text.startswith(f"Photographs confirm {confirmed:,} of the 6,000 points")
 
 
 def test_a_budget_that_sparse_seeds_fill_only_thins_them(few, sparse, monkeypatch):
@@ -115,22 +115,22 @@ def test_held_out_photographs_are_not_compared_again(few, monkeypatch):
 
 def test_memory_is_predicted_and_kept_within_what_is_free(few, monkeypatch):
     monkeypatch.setattr(dense, "resident_bytes", lambda: 1)
-    before, notes = [], []
+    notes = []
     tracemalloc.start()
-    ss.upsample(few, budget=BUDGET, announce=before.append)
+    ss.upsample(few, budget=BUDGET, note=notes.append)
     peak = tracemalloc.get_traced_memory()[1] / 2**20
     tracemalloc.stop()
-    predicted = float(re.search(r"and (\d+) MB of memory", before.pop())[1])
+    predicted = float(re.search(r"and (\d+) MB of memory", notes.pop().text)[1])
     assert 0.5 * peak < predicted < 2 * peak
     plans = plan_comparisons(few.images, 1, 4, 1.0, 10**7)
     assert [(plan.grid, plan.split) for plan in plans] == [(2, 2), (4, 2)]
     assert plans[0].memory > plans[1].memory
     free = int(plans[1].memory / dense.DENSE.usable) + 2
     monkeypatch.setattr(dense, "free_memory", lambda: free)
-    ss.upsample(few, budget="10M", note=notes.append, announce=before.append)
-    assert not before  # as coarse as the first comparison
-    assert f"takes {memory.format_bytes(plans[0].memory)} of memory, which is not" in notes[-1]
-    assert " more fill gaps. " in notes[-1]
+    ss.upsample(few, budget="10M", note=notes.append)
+    assert [note.kind for note in notes] == ["budget-not-filled"]  # as coarse as the first
+    assert f"takes {memory.format_bytes(plans[0].memory)} of memory, which is not" in notes[-1].text
+    assert " more fill gaps. " in notes[-1].text
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ import pytest
 
 from splatseed.camera import Intrinsics
 from splatseed.depthmap import DepthMap
+from splatseed.findings import Finding
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Masks, Scene, Tracks
 from splatseed.seeding import diagnostics as module
@@ -125,17 +126,19 @@ def _statistics(num_points, isolated, duplicates=0):
 
 
 def test_problems_list_those_of_the_reader_first(rng):
-    scene = _scene(rng.random((5, 3)), findings=("The reader's.",))
+    own = Finding("of-the-reader", "The reader's.")
+    scene = _scene(rng.random((5, 3)), findings=(own,))
     sound = module.find_problems(scene, _statistics(1000, 1), module.EmptyRegions(0.1, 0.9, "a"))
-    assert sound == ("The reader's.",)
+    assert sound == (own,)
     first, *others = module.find_problems(
         scene, _statistics(1000, 100), module.EmptyRegions(0.8, 0.9, "a")
     )
-    assert first == "The reader's."
-    assert [text.split()[0] for text in others] == ["100", "80%"]
+    assert first == own
+    assert [each.kind for each in others] == ["isolated-points", "empty-regions"]
+    assert [each.text.split()[0] for each in others] == ["100", "80%"]
     (repeats,) = module.find_problems(_scene(rng.random((5, 3))), _statistics(1000, 100, 200), None)
-    assert repeats.startswith("100 points (12.5%)")  # of those that are left
-    assert "no points" in module.find_problems(_scene([]), _statistics(0, 0), None)[0]
+    assert repeats.text.startswith("100 points (12.5%)")  # of those that are left
+    assert module.find_problems(_scene([]), _statistics(0, 0), None)[0].kind == "no-points"
 
 
 def test_depth_maps_are_described_by_a_sample(room):

@@ -13,7 +13,7 @@ from splatseed.depthmap import DepthMap, HeldDepths
 from splatseed.methods import SOURCE_CODES
 from splatseed.photos.view import view_of
 from splatseed.pointcloud import PointCloud
-from splatseed.seeding.map_seeds import depth_at_cells, unit_mismatch
+from splatseed.seeding.map_seeds import UNIT_MISMATCH, depth_at_cells, unit_ratio
 
 pytestmark = pytest.mark.usefixtures("compare_once")
 DEPTH, COVER = SOURCE_CODES["depth"], SOURCE_CODES["cover"]
@@ -52,7 +52,8 @@ def test_measured_depth_replaces_guesses(room, room_capture, make_maps):
     assert len(off) > 300
     assert off.max() < 2e-3  # metres; the room measures 5
     assert np.count_nonzero(seeds.source == COVER) < 0.7 * np.count_nonzero(guessed.source == COVER)
-    assert any("it is that of the scene's 16 depth maps" in note for note in notes)
+    (used,) = [note.text for note in notes if note.kind == "depth-maps-used"]
+    assert "it is that of the scene's 16 depth maps" in used
     confidence = seeds.confidence[seeds.source == DEPTH]
     assert seeds.confidence[seeds.source == COVER].max() < confidence.min()
     without = ss.upsample(scene, depth_maps=False)
@@ -66,7 +67,7 @@ def test_maps_of_another_unit_or_origin_are_not_used(room, make_maps):
     notes = []
     twice = room.replace(depths=make_maps(lambda z, _: 1.5 * z))
     assert DEPTH not in ss.upsample(twice, note=notes.append).source
-    assert "times that of the photographs" in notes[-1]
+    assert notes[-1].kind == UNIT_MISMATCH
 
 
 def test_single_maps_of_another_unit_are_left_out(room, room_capture, make_maps):
@@ -77,9 +78,10 @@ def test_single_maps_of_another_unit_are_left_out(room, room_capture, make_maps)
     off = off_surface(seeds, room_capture, DEPTH)
     assert len(off) > 200
     assert off.max() < 2e-3
-    left_out = next(note for note in notes if "left out" in note)
-    assert left_out.startswith("3 of 16 depth maps are left out (view_003.png, view_009.png, ")
-    assert any("it is that of the scene's 13 depth maps" in note for note in notes)
+    left_out, used = notes
+    assert left_out.text.startswith("3 of 16 depth maps are left out (view_003.png, view_009.png, ")
+    assert left_out.subjects == ("view_003.png", "view_009.png", "view_012.png")
+    assert "it is that of the scene's 13 depth maps" in used.text
 
 
 def test_maps_of_another_unit_do_not_guide_stereo(room, make_maps):
@@ -88,10 +90,11 @@ def test_maps_of_another_unit_do_not_guide_stereo(room, make_maps):
     bare, notes = few.with_points(PointCloud.empty()), []
     scene = bare.replace(depths=make_maps(lambda z, _: 1000 * z))
     seeds = ss.upsample(scene, note=notes.append)
-    assert any("do not guide stereo" in note for note in notes)
-    assert any("have another unit" in note for note in notes)
+    mismatches = [note.text for note in notes if note.kind == UNIT_MISMATCH]
+    assert "do not guide stereo" in mismatches[0]
+    assert "have another unit" in mismatches[1]
     assert DEPTH not in seeds.source
-    assert not unit_mismatch(bare.replace(depths=make_maps()), bare.images)
+    assert unit_ratio(bare.replace(depths=make_maps()), bare.images) is None
 
 
 def test_uncertain_and_contradicted_depth_gives_no_seed(room, room_capture, make_maps):

@@ -35,7 +35,7 @@ def test_sound_poses_are_exact_in_any_unit(unit, room, poses):
     error = estimate_pose_error(scene, scene.images)
     assert error.exact
     assert error.px < 0.5
-    assert not error.warning
+    assert not error.findings
 
 
 def test_noise_is_measured(room, poses):
@@ -54,7 +54,7 @@ def test_noise_is_measured(room, poses):
     for error, degrees in zip(found, (1.0, 4.0), strict=True):
         assert 0.3 * degrees < error.degrees < 1.3 * degrees
         assert error.px == pytest.approx(focal * np.tan(np.radians(error.degrees)), rel=0.1)
-    assert "`refine_poses=True`" in found[-1].warning
+    assert [each.kind for each in found[-1].findings] == [module.INEXACT_POSES]
 
 
 def test_the_error_is_in_pixels_of_the_size_of_stereo(room, poses, monkeypatch):
@@ -70,6 +70,6 @@ def test_the_error_is_in_pixels_of_the_size_of_stereo(room, poses, monkeypatch):
     assert half.px == pytest.approx(full.px / 2)
     assert half.degrees == full.degrees
     for error in (full, half):
-        assert error.exact == (round(error.px, 2) <= 0.5) == (error.warning == "")
+        assert error.exact == (round(error.px, 2) <= 0.5) == (not error.findings)
         assert f"{error.px:.2g} px" in str(error)
         assert f"at {error.side} px a side" in str(error)

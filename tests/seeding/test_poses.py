@@ -16,7 +16,7 @@ from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io import load_scene
 from splatseed.pointcloud import PointCloud
 from splatseed.seeding import poses as module
-from splatseed.seeding.poses import CORRECTIONS, agreement_warning, check_poses, random_start
+from splatseed.seeding.poses import CORRECTIONS, agreement_findings, check_poses, random_start
 from splatseed.seeding.upsampling import upsample
 
 YZ, XY = np.diag([1.0, -1.0, -1.0, 1.0]), np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -130,19 +130,21 @@ def test_masked_pixels_need_not_agree(room, tmp_path):
     scene = _changed(room, tmp_path / "statue", lambda pixels, _: pixels, mask)
     share = check_poses(scene, scene.images)
     assert share > 0.3
-    assert agreement_warning(share, 0.75) == ""
+    assert not agreement_findings(share, 0.75)
 
 
 def test_changing_light_gives_a_warning_and_exposure_none(sixteen_views, tmp_path):
     _, room = sixteen_views
     exposed = _changed(room, tmp_path / "exposed", lambda p, rng: p * rng.uniform(0.4, 1.2))
-    assert agreement_warning(check_poses(exposed, exposed.images)) == ""
+    assert not agreement_findings(check_poses(exposed, exposed.images))
 
     def light(pixels, rng):
         return pixels * np.exp(2.0 * zoom(rng.normal(size=(9, 12)), 120 / 9, order=1))[..., None]
 
     lit = _changed(room, tmp_path / "lit", light)
     agreement = check_poses(lit, lit.images)
-    assert f"{agreement:.0%} of the pixels" in agreement_warning(agreement)
-    assert "20%" in agreement_warning(0.08, 0.8)
-    assert f"{agreement:.0%}" not in agreement_warning(agreement, stated=True)
+    (low,), (masked,) = agreement_findings(agreement), agreement_findings(0.08, 0.8)
+    (stated,) = agreement_findings(agreement, stated=True)
+    assert f"{agreement:.0%} of the pixels" in low.text
+    assert "20%" in masked.text
+    assert f"{agreement:.0%}" not in stated.text

@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 
 from splatseed.progress import silent, thread_limit
 from splatseed.sfm import Settings, first_look, matching
-from splatseed.sfm.colmap import Run, posed_model, require_pycolmap
+from splatseed.sfm.colmap import ColmapRun, posed_model, require_pycolmap
 from splatseed.sfm.database import run_database
 from splatseed.sfm.first_look import (
     FIRST_LOOK,
@@ -124,7 +124,7 @@ def run(room, tmp_path):
     shutil.copytree(room.source.image_dir, tmp_path / "photos")
     work = tmp_path / "work"
     work.mkdir()
-    run = Run(require_pycolmap(), Settings(threads=2), tmp_path / "photos", work, silent)
+    run = ColmapRun(require_pycolmap(), Settings(threads=2), tmp_path / "photos", work, silent)
     return run, posed_model(run.pycolmap, room.images[:8])
 
 

@@ -10,7 +10,7 @@ pytest.importorskip("pycolmap", reason="needs pycolmap")
 from splatseed.progress import silent
 from splatseed.sfm import Settings, agreement, mapping
 from splatseed.sfm.agreement import compare_with_matches
-from splatseed.sfm.colmap import Run, posed_model, require_pycolmap
+from splatseed.sfm.colmap import ColmapRun, posed_model, require_pycolmap
 from splatseed.sfm.mapping import map_images
 from splatseed.sfm.matching import match_photographs
 from splatseed.similarity import fit_similarity
@@ -20,7 +20,7 @@ from splatseed.similarity import fit_similarity
 def matched(room, tmp_path_factory):
     """A run on eight photographs of the room whose pairs are matched, and their true model."""
     work = tmp_path_factory.mktemp("mapping")
-    run = Run(require_pycolmap(), Settings(threads=2), room.source.image_dir, work, silent)
+    run = ColmapRun(require_pycolmap(), Settings(threads=2), room.source.image_dir, work, silent)
     model = posed_model(run.pycolmap, room.images[:8])
     match_photographs(run, model)
     return run, model
@@ -119,8 +119,8 @@ def test_where_incremental_mapping_fails_all_photographs_are_mapped_at_once(
 
     monkeypatch.setattr(mapping, "_map", fail)
     names = [model.image(i).name for i in range(1, 9)]
-    folder, doubt = map_images(run, names, "PINHOLE", None, partial=False)
-    assert doubt == ""
+    folder, finding = map_images(run, names, "PINHOLE", None, partial=False)
+    assert finding is None
     found = run.pycolmap.Reconstruction(folder)
     assert found.num_reg_images() == 8
     assert found.compute_mean_reprojection_error() < 1
@@ -147,8 +147,8 @@ def test_a_worse_model_of_all_photographs_at_once_is_not_kept(run, monkeypatch):
 
     monkeypatch.setattr(mapping, "_map", extend)
     names = [model.image(i).name for i in range(1, 9)]
-    folder, doubt = map_images(run, names, "PINHOLE", None, partial=False)
-    assert doubt == ""
+    folder, finding = map_images(run, names, "PINHOLE", None, partial=False)
+    assert finding is None
     assert misplaced(model, run.pycolmap.Reconstruction(folder)) < 0.05
     assert {path.name for path in folder.parent.iterdir()} == {"0", "complete"}
 
@@ -174,8 +174,8 @@ def test_a_displaced_part_is_mapped_again_without_what_displaced_it(run, tmp_pat
     monkeypatch.setattr(mapping, "_map", map_wrongly)
     monkeypatch.setattr(mapping, "_map_globally", None)
     monkeypatch.setattr(mapping, "MODELS", str(tmp_path / "again"))
-    folder, doubt = map_images(run, names, "PINHOLE", None, partial=False)
-    assert doubt == ""
+    folder, finding = map_images(run, names, "PINHOLE", None, partial=False)
+    assert finding is None
     assert misplaced(model, run.pycolmap.Reconstruction(folder)) < 0.05
     assert {path.name for path in folder.parent.iterdir()} == {"0", "complete"}
     with run.pycolmap.Database.open(run.database) as database:  # the user's keep theirs
@@ -194,5 +194,5 @@ def test_a_part_that_stays_misplaced_is_named(run, monkeypatch):
     monkeypatch.setattr(mapping, "_map", map_wrongly)
     monkeypatch.setattr(mapping, "_map_globally", lambda *_: {})
     names = [model.image(i).name for i in range(1, 9)]
-    _, doubt = map_images(run, names, "PINHOLE", None, partial=False)
-    assert "% of the matches between 3 of the photographs (view_001.png, " in doubt
+    _, finding = map_images(run, names, "PINHOLE", None, partial=False)
+    assert "% of the matches between 3 of the photographs (view_001.png, " in str(finding)

@@ -12,7 +12,7 @@ from PIL import Image as PilImage
 from splatseed.progress import silent
 from splatseed.sfm import Settings, pipeline
 from splatseed.sfm.cameras import Photo, SharedCamera
-from splatseed.sfm.colmap import Run, guessed_model, posed_model, require_pycolmap
+from splatseed.sfm.colmap import ColmapRun, guessed_model, posed_model, require_pycolmap
 from splatseed.sfm.database import run_database
 from splatseed.sfm.matching import _pairs, detect_features, match_pairs, match_photographs
 
@@ -30,7 +30,7 @@ def run(room, tmp_path):
     work = tmp_path / "work"
     work.mkdir()
     settings = Settings("exhaustive", "cpu", threads=1)
-    run = Run(require_pycolmap(), settings, folder, work, silent)
+    run = ColmapRun(require_pycolmap(), settings, folder, work, silent)
     return run, posed_model(pycolmap, images)
 
 

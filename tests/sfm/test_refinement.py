@@ -17,7 +17,7 @@ from splatseed.io import load_scene
 from splatseed.progress import silent
 from splatseed.scene import LeftOut
 from splatseed.sfm import Settings, first_look, matching, reconstruct
-from splatseed.sfm.colmap import Run, posed_model, require_pycolmap
+from splatseed.sfm.colmap import ColmapRun, posed_model, require_pycolmap
 from splatseed.sfm.matching import match_photographs
 from splatseed.sfm.pipeline import _Refined, refined as refined_scene, with_refined
 from splatseed.sfm.refinement import (
@@ -42,7 +42,7 @@ EXTENT = 3.2
 def refined(room, tmp_path_factory):
     """Refines poses of the room's photographs, whose matches are verified once."""
     work, settings = tmp_path_factory.mktemp("matches"), Settings(device="cpu", threads=1)
-    run = Run(require_pycolmap(), settings, room.source.image_dir, work, silent)
+    run = ColmapRun(require_pycolmap(), settings, room.source.image_dir, work, silent)
     match_photographs(run, posed_model(pycolmap, room.images))
     return partial(refine, run)
 
@@ -84,7 +84,9 @@ def test_pairs_by_poses_that_are_off_suffice(room, tmp_path, monkeypatch):
     for module in (first_look, matching):
         monkeypatch.setattr(module, "FIRST_LOOK", few)
     given = with_noise(room.images, 2.0, 3.0)
-    run = Run(require_pycolmap(), Settings(device="cpu"), room.source.image_dir, tmp_path, silent)
+    run = ColmapRun(
+        require_pycolmap(), Settings(device="cpu"), room.source.image_dir, tmp_path, silent
+    )
     model = posed_model(pycolmap, given)
     agreement = match_photographs(run, model, None, given)
     assert run.num_pairs() < 50  # of 66
@@ -176,7 +178,7 @@ def test_poses_that_stay_among_refined_ones_are_named(room, tmp_path, monkeypatc
 
     monkeypatch.setattr("splatseed.sfm.pipeline._call", call)
     _, note = refined_scene(scene, 0)
-    assert note.endswith(
+    assert str(note).endswith(
         "The poses of 2 of 12 images stay as given: SfM does not read view_001.webp; fewer than 10 "
         "points are seen in view_000.png."
     )

@@ -159,10 +159,10 @@ def test_too_few_registered_is_an_error_that_names_them(num, photos, tmp_path, m
         assert "view_000.png" not in caught.value.found
         assert "`partial=True`" in caught.value.fix
         notes = []
-        report = reconstruct(mixed, tmp_path / "scene", **how, partial=True, on_note=notes.append)
+        report = reconstruct(mixed, tmp_path / "scene", **how, partial=True, note=notes.append)
         assert (report.registered, len(report.unregistered)) == (6, 8)
         assert "mapping" not in report.seconds  # its models were kept
-        assert len(notes) == 1
+        assert [each.kind for each in notes] == ["resumed-work"]
         assert len(load_scene(report.path).images) == 6
         assert {path.name for path in tmp_path.iterdir()} == {"mixed", "temporary", "scene"}
     assert not list((tmp_path / "temporary").iterdir())

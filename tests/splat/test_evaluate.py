@@ -115,7 +115,8 @@ def test_a_ply_in_world_coordinates_is_scored_on_the_test_views(
     path = tmp_path / "broken.ply"
     write_gaussians(path, broken)
     whole = load_model(path, larger_room_path)
-    assert (model.notes, len(whole.notes), len(whole.gaussians)) == ((), 1, len(broken) - 1)
+    assert (model.findings, len(whole.gaussians)) == ((), len(broken) - 1)
+    assert [each.kind for each in whole.findings] == ["unusable-gaussians"]
     cut = load_model(model_path, larger_room_path, near_plane=1e3)  # all is nearer
     assert not cut.render(cut.views[0]).any()
     # It looks the same in whatever frame it is rendered; nothing lies at the nearer near plane.
@@ -137,10 +138,10 @@ def test_missing_photographs_leave_the_other_test_views(larger_room_path, model_
     model = load_model(model_path, root)
     assert [view.name for view in model.views] == [test[0].name]
     assert [image.name for image in model.scene.split()[0]] == [i.name for i in train[1:]]
-    assert len(model.notes) == 1
+    assert [each.kind for each in model.findings] == ["missing-photographs"]
     assert (
         f"2 images of the scene are left out, without a photograph or a pose: {train[0].name}"
-        in model.notes[0]
+        in str(model.findings[0])
     )
     trained_on = photographs_digest(with_photographs(load_scene(root)))
     assert photographs_digest(model.scene) == trained_on

@@ -25,6 +25,8 @@ from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.model_frame import transform_gaussians
 from splatseed.splat.sog import _MAX_META
 
+from .compressed import encode, write_any
+
 SUFFIXES = [each.suffix for each in FORMATS.values()]
 # Of positions, log-scales, degrees of rotation, opacities, first and further coefficients.
 LIMITS = {
@@ -79,9 +81,9 @@ def _assert_close(model, truth, limits):
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_formats_round_trip_within_their_precision(suffix, rest, tmp_path):
     truth = _gaussians(rest=rest)
-    write_gaussians(tmp_path / f"m{suffix}", truth)
+    write_any(tmp_path / f"m{suffix}", truth)
     content = (tmp_path / f"m{suffix}").read_bytes()
-    write_gaussians(tmp_path / f"m{suffix}", truth)
+    write_any(tmp_path / f"m{suffix}", truth)
     assert (tmp_path / f"m{suffix}").read_bytes() == content
     (tmp_path / f"m{suffix}").rename(tmp_path / "m.splat")  # the content says what a file is
     model = read_gaussians(tmp_path / "m.splat")
@@ -110,14 +112,30 @@ def test_a_ply_has_the_layout_of_3dgs(tmp_path):
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_single_equal_and_distant_gaussians_round_trip(suffix, tmp_path):
     path, one, near = tmp_path / f"m{suffix}", _gaussians(1), _gaussians()
-    write_gaussians(path, one)
+    write_any(path, one)
     assert len(read_gaussians(path)) == 1
-    write_gaussians(path, one.select(np.zeros(300, int)))
+    write_any(path, one.select(np.zeros(300, int)))
     np.testing.assert_allclose(read_gaussians(path).means, one.means.repeat(300, 0), atol=1e-3)
     far = replace(near, means=near.means + np.float32(1e4))
-    write_gaussians(path, far)
+    write_any(path, far)
     found = np.sort(read_gaussians(path).means, axis=0)
     np.testing.assert_allclose(found, np.sort(far.means, axis=0), atol=0.02)
+
+
+def test_a_compressed_ply_is_not_written(tmp_path):
+    with pytest.raises(ParameterError, match=r"\.sog") as caught:
+        write_gaussians(tmp_path / "m.compressed.ply", _gaussians())
+    assert caught.value.found == ".compressed.ply, which is only read"
+    assert not list(tmp_path.iterdir())
+
+
+def test_fillers_of_a_compressed_ply_are_dropped(tmp_path):
+    """Older versions padded chunks: the minimum of each bound, no rotation, opacity 0."""
+    content = bytearray(encode(_gaussians(300, rest=0)))
+    words = np.frombuffer(content, "<u4", offset=len(content) - 300 * 16).reshape(300, 4)
+    words[200:256] = [0, 0x20080200, 0, 0]
+    (tmp_path / "m.compressed.ply").write_bytes(content)
+    assert len(read_gaussians(tmp_path / "m.compressed.ply")) == 300 - 56
 
 
 def test_values_out_of_range_are_refused_or_leave_the_others_intact(tmp_path):
@@ -133,7 +151,7 @@ def test_values_out_of_range_are_refused_or_leave_the_others_intact(tmp_path):
 def test_opacities_of_0_and_1_stay_finite(tmp_path):
     sure = replace(_gaussians(), opacities=np.full(700, np.inf, np.float32))
     for suffix in SUFFIXES[:1] + SUFFIXES[2:]:
-        write_gaussians(tmp_path / f"m{suffix}", sure)
+        write_any(tmp_path / f"m{suffix}", sure)
         opacities = read_gaussians(tmp_path / f"m{suffix}").opacities
         assert (np.isfinite(opacities) & (opacities > 5)).all()
 
@@ -146,7 +164,7 @@ def files(tmp_path_factory):
     """A small model in each format, as bytes."""
     folder = tmp_path_factory.mktemp("models")
     for suffix in SUFFIXES:
-        write_gaussians(folder / f"m{suffix}", _gaussians(300))
+        write_any(folder / f"m{suffix}", _gaussians(300))
     return {suffix: (folder / f"m{suffix}").read_bytes() for suffix in SUFFIXES}
 
 
@@ -305,7 +323,7 @@ def _upright(model, suffix, truth):
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_splat_transform_reads_our_files(suffix, converter, tmp_path):
     truth = _gaussians()
-    write_gaussians(tmp_path / f"ours{suffix}", truth)
+    write_any(tmp_path / f"ours{suffix}", truth)
     converter(tmp_path / f"ours{suffix}", tmp_path / "theirs.ply")
     limits = [None if limit is None else limit + 1e-6 for limit in LIMITS[suffix]]
     limits[2] = 2 * limits[2] + 0.01  # it takes 127.5 for the middle of a byte, not 128

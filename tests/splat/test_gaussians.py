@@ -14,7 +14,7 @@ from splatseed.photos.view import View
 from splatseed.pointcloud import PointCloud
 from splatseed.splat.formats import write_gaussians
 from splatseed.splat.from_seeds import (
-    SETTINGS,
+    INITIALIZATION,
     fit_harmonics,
     initial_gaussians,
     neighbor_distances,
@@ -120,10 +120,10 @@ def test_fitted_harmonics_minimise_the_sum_of_squares():
         rows.append([SH_C0, -SH_C1 * d[1], SH_C1 * d[2], -SH_C1 * d[0]])
         right.append(value / 255 - 0.5)
     rows += [
-        np.sqrt(SETTINGS.color_weight) * np.array([SH_C0, 0, 0, 0]),
-        *(np.sqrt(SETTINGS.smoothness_weight) * SH_C1 * np.eye(4)[1:]),
+        np.sqrt(INITIALIZATION.color_weight) * np.array([SH_C0, 0, 0, 0]),
+        *(np.sqrt(INITIALIZATION.smoothness_weight) * SH_C1 * np.eye(4)[1:]),
     ]
-    right += [np.sqrt(SETTINGS.color_weight) * (100 / 255 - 0.5), 0, 0, 0]
+    right += [np.sqrt(INITIALIZATION.color_weight) * (100 / 255 - 0.5), 0, 0, 0]
     expected = np.linalg.lstsq(np.array(rows), np.array(right), rcond=None)[0]
     for channel in fit_harmonics(seeds, views)[0].T:
         np.testing.assert_allclose(channel, expected, rtol=1e-4, atol=1e-5)

@@ -18,8 +18,7 @@ from splatseed.photos.view import View
 from splatseed.splat.evaluate import evaluate_views
 from splatseed.splat.lpips import LPIPS_FILE, load_lpips
 from splatseed.splat.metrics import color_corrected, flip_map, psnr
-from splatseed.splat.ssim import l1_and_ssim
-from splatseed.splat.ssim_conv import l1_and_ssim_by_convolution
+from splatseed.splat.ssim import l1_and_ssim, l1_and_ssim_by_convolution
 from splatseed.training.trainer import photometric_loss
 
 # L1, SSIM, PSNR -----------------------------------------------------------------------------------

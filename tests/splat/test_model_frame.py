@@ -190,9 +190,12 @@ def test_a_flipped_model_is_named_and_a_cropped_one_is_accepted(room, gaussians,
     assert scored.psnr == pytest.approx(psnr, abs=0.05)
     distance = np.linalg.norm(gaussians.means - gaussians.means[0], axis=1)
     part = gaussians.select(np.argsort(distance)[: len(gaussians) // 4])
-    assert not check_frame(path, scene, part)
+    notes = []
+    check_frame(path, scene, part, note=notes.append)
+    assert not notes
     turned = transform_gaussians(part, find_transform("flipped", scene))
-    assert "flipped" in move_to_scene_frame(path, scene, turned)[1]
+    move_to_scene_frame(path, scene, turned, notes.append)
+    assert "flipped" in str(notes[0])
     moved = replace(part, means=part.means + np.float32([0, 0, 30]))
     with pytest.raises(SceneFormatError, match="No known transform fits"):
         check_frame(path, scene, moved)
@@ -201,12 +204,14 @@ def test_a_flipped_model_is_named_and_a_cropped_one_is_accepted(room, gaussians,
 def test_a_slightly_misplaced_model_is_scored_with_a_warning(room, gaussians, tmp_path):
     """As another scene's does in a transform that happens to bring it near."""
     scene = load_scene(room)
-    assert not check_frame(tmp_path / "model.ply", scene, gaussians)
+    notes = []
+    check_frame(tmp_path / "model.ply", scene, gaussians, note=notes.append)
     gap = np.median(np.linalg.norm(np.diff(gaussians.means, axis=0), axis=1))
     beside = replace(gaussians, means=gaussians.means + np.float32([0, 0, 0.4 * gap]))
     write_gaussians(tmp_path / "model.ply", beside)
     model = load_model(tmp_path / "model.ply", room)
-    assert "times as far from the nearest Gaussian" in model.frame_warning
-    assert not load_model(tmp_path / "model.ply", room, transform="none").frame_warning
+    assert [each.kind for each in model.findings] == ["uncertain-frame"]
+    assert not load_model(tmp_path / "model.ply", room, transform="none").findings
     few = gaussians.select(np.arange(0, len(gaussians), 8))  # large, they are a model still
-    assert not check_frame(tmp_path / "few.ply", scene, few)
+    check_frame(tmp_path / "few.ply", scene, few, note=notes.append)
+    assert not notes

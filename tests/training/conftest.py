@@ -7,7 +7,8 @@ import pytest
 pytest.importorskip("torch", reason="training needs PyTorch")
 pytest.importorskip("gsplat", reason="training needs gsplat's strategies")
 
-from splatseed.training.prepare import PrepareOptions, prepare_run
+from splatseed.training.prepare import prepare_run
+from splatseed.training.request import PrepareOptions
 from splatseed.training.settings import TrainSettings
 
 

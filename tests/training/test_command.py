@@ -96,19 +96,17 @@ def test_a_cloud_alone_cannot_be_trained(tmp_path, capsys):
 
 @pytest.fixture(scope="module")
 def begun(room_path, tmp_path_factory):
-    """A run that was killed before its first checkpoint, by a version without some settings."""
-    run = tmp_path_factory.mktemp("old") / "run"
+    """A run that was killed before its first checkpoint."""
+    run = tmp_path_factory.mktemp("begun") / "run"
     settings = TrainSettings(strategy="none", max_steps=3, data_factor=2)
     scene = load_scene(room_path)
     seeds = seeds_facts(usable_seeds(scene.points, settings, print))
     config = make_config(scene, seeds, settings, "cpu")
-    for name in ("placing", "seed_sizes", "seed_normals", "seed_colors", "seeding"):
-        del config[name]
     RunFolder(run).create(config)
     return run
 
 
-def test_a_run_of_an_older_version_resumes_with_its_own_settings(room_path, begun, tmp_path):
+def test_a_killed_run_resumes_with_its_own_settings(room_path, begun, tmp_path):
     run = shutil.copytree(begun, tmp_path / "run")
     assert _run(room_path, "-o", run, "--resume") == 0
     metrics = _json(run / "metrics.json")
@@ -119,6 +117,7 @@ def test_a_run_of_an_older_version_resumes_with_its_own_settings(room_path, begu
 @pytest.mark.parametrize(
     ("change", "told"),
     [
+        ({"splatseed": "0.1"}, "one of version 0.1"),
         ({"strategy": "absgrad"}, "--strategy"),
         ({"max_steps": "3"}, "config.json"),
         ({"seeds": {"count": 1, "digest": "0"}}, "the scene of the run"),

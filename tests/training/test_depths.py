@@ -23,8 +23,8 @@ def test_depths_are_those_of_the_surfaces_and_kept_with_the_time_they_took(
     sixteen_views, tmp_path, monkeypatch
 ):
     capture, scene = sixteen_views
-    kept, notes = tmp_path / "bench" / "depths.npz", []
-    depths, seconds = known_depths(scene, SCALE, GROW, "cpu", cache=kept, note=notes.append)
+    kept, findings = tmp_path / "bench" / "depths.npz", []
+    depths, seconds = known_depths(scene, SCALE, GROW, "cpu", cache=kept, note=findings.append)
     truths = {image.name: truth for image, truth in zip(scene.images, capture.depths, strict=True)}
     errors = []
     for name, depth in depths.items():
@@ -38,7 +38,7 @@ def test_depths_are_those_of_the_surfaces_and_kept_with_the_time_they_took(
     assert depths.keys() <= {image.name for image in scene.split(8)[0]}  # no test view's
     assert len(errors) > 2000
     assert np.median(errors) < 0.02
-    assert "only splits" in notes[0]
+    assert [each.kind for each in findings[:1]] == ["stereo-depths"]
     with monkeypatch.context() as patch:
         patch.setattr("splatseed.training.depths.stereo_depths", None)
         again, same = known_depths(scene, SCALE, GROW, "cpu", cache=kept)

@@ -14,15 +14,14 @@ from splatseed.seeding.budget import points_within
 from splatseed.training.duration import (
     HOUR,
     RunSpeed,
-    format_duration,
     mean_gaussians,
     options_for_an_hour,
     planned_seconds,
     seconds_left,
     step_seconds,
 )
-from splatseed.training.schedule import FULL_AT
 from splatseed.training.settings import TrainSettings
+from splatseed.training.traits import FULL_AT
 
 GROW = TrainSettings(strategy="auto", max_steps=10_000, cap_max=400_000, data_factor=3)
 EARLY = RunSpeed(100, 0.5, 20_000, 1344 * 1008)
@@ -81,22 +80,16 @@ def test_what_is_advised_takes_about_an_hour(seconds, steps, per_pixel):
     assert HOUR / 3 < expected < 1.05 * HOUR  # and no less than need be
 
 
-def test_durations_in_words():
-    assert [format_duration(s) for s in (20, 3600, 5300, 86_400)] == [
-        "1 minute", "60 minutes", "88 minutes", "24 hours"
-    ]  # fmt: skip
-
-
 @pytest.mark.parametrize(("side", "factor"), [(1600, 1), (1601, 2), (1920, 2), (4032, 3)])
 def test_photographs_are_1600_pixels_a_side_at_most_unless_asked(side, factor, rng):
     lens = Intrinsics(1, "PINHOLE", side, side // 2, (900.0, 900.0, side / 2, side / 4))
     image = Image("a.jpg", 1, lens, rng.normal(size=4), rng.normal(size=3))
-    notes: list[str] = []
-    settings = TrainSettings().with_data_factor((image,), notes.append)
-    assert (settings.data_factor, len(notes)) == (factor, factor > 1)
-    assert TrainSettings(data_factor=1).with_data_factor((image,), notes.append).data_factor == 1
+    findings = []
+    settings = TrainSettings().with_data_factor((image,), findings.append)
+    assert (settings.data_factor, len(findings)) == (factor, factor > 1)
+    assert TrainSettings(data_factor=1).with_data_factor((image,), findings.append).data_factor == 1
     if factor > 1:
-        assert f"{side // factor:,} x" in notes[0]
+        assert f"{side // factor:,} x" in findings[0].text
     # Budgets in rho count pixels at that size, in whatever verb.
     scene = Scene(PointCloud.empty(), (image,))
     assert points_within(scene, "1rho") == (side // factor) * (side // 2 // factor)

@@ -8,6 +8,7 @@ import torch
 from splatseed.training import trainer
 from splatseed.training.parameters import DROPPED, as_parameters, with_dropout
 from splatseed.training.schedule import make_schedule
+from splatseed.training.traits import STRATEGIES
 
 
 def test_some_are_dropped_and_the_others_make_up_for_them():
@@ -33,9 +34,9 @@ def test_raised_opacities_stay_below_one():
 
 
 def test_dropout_rises_and_3dgs_has_none():
-    schedule = make_schedule("grow", 1500, as_3dgs=False)
+    schedule = make_schedule(STRATEGIES["grow"], 1500, as_3dgs=False)
     assert [schedule.dropout_at(step) for step in (0, 750, 1500)] == [0, 0.1, 0.2]
-    assert make_schedule("default", 1500, as_3dgs=True).dropout_at(1500) == 0
+    assert make_schedule(STRATEGIES["default"], 1500, as_3dgs=True).dropout_at(1500) == 0
 
 
 @pytest.mark.parametrize(("few", "differs"), [(7, True), (6, False)])

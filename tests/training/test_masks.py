@@ -19,7 +19,8 @@ from splatseed.splat.metrics import mirrored_ssim
 from splatseed.splat.photographs import fill_masked
 from splatseed.training import trainer
 from splatseed.training.evaluation import Evaluation
-from splatseed.training.prepare import PrepareOptions, prepare_run
+from splatseed.training.prepare import prepare_run
+from splatseed.training.request import PrepareOptions
 from splatseed.training.settings import TrainSettings
 from splatseed.training.strategies.grow import contributions
 from splatseed.training.trainer import photometric_loss
@@ -122,11 +123,13 @@ def test_masks_that_changed_since_a_run_began_are_found_out(larger_room_path, tm
     PilImage.fromarray(white).save(mask)
     with pytest.raises(ParameterError, match="other masks in"):
         prepare_run(load_scene(own_path), tmp_path / "run", settings, resume)
-    found = "The scene's masks have changed since the run was trained"
     run = prepare_run(without, tmp_path / "run", settings, resume)
     run.train()
     run.finish(evaluate_views)
     for noted in (True, False):
         evaluation = Evaluation.of(tmp_path / "run")
-        assert any(found in each for each in evaluation.doubts(evaluation.load())) == noted
+        assert (
+            any(each.kind == "changed-masks" for each in evaluation.findings(evaluation.load()))
+            == noted
+        )
         mask.unlink(missing_ok=True)

@@ -26,7 +26,8 @@ from splatseed.splat.rendering import opacity_from_logits
 from splatseed.training import device, prepare, run as run_module, trainer
 from splatseed.training.evaluation import Evaluation
 from splatseed.training.parameters import add_to_mean, gaussians_of, size_unit
-from splatseed.training.prepare import PrepareOptions, prepare_run
+from splatseed.training.prepare import prepare_run
+from splatseed.training.request import PrepareOptions
 from splatseed.training.settings import TrainSettings
 from splatseed.viewer.models import ViewerItem, viewer_frame
 
@@ -128,13 +129,13 @@ def test_a_stray_pose_is_named_and_has_no_part_in_the_frame(room, tmp_path):
     """One camera 10,000 units away once made the others' views black: the frame followed it."""
     images = sorted(room.images, key=lambda image: image.name)
     far = dataclasses.replace(images[2], translation=images[2].translation + np.array([0, 0, 1e4]))
-    runs, notes = [], []
+    runs, findings = [], []
     for name, each in (("left out", []), ("stray", [far])):
         scene = room.replace(images=(*images[:2], *each, *images[3:]))
         asked = TrainSettings(data_factor=2, test_every=9)
-        runs.append(prepare_run(scene, tmp_path / name, asked, note=notes.append))
+        runs.append(prepare_run(scene, tmp_path / name, asked, note=findings.append))
     assert _bytes(runs[0]) == _bytes(runs[1])
-    assert [far.name in note for note in notes] == [True]
+    assert [(each.kind, far.name in each.text) for each in findings] == [("stray-cameras", True)]
 
 
 def test_missing_photographs_change_no_other_views_part(room_path, tmp_path):
@@ -274,13 +275,13 @@ def test_another_split_is_found_out(begin, room, tmp_path):
     resumed.train()
     resumed.finish(evaluate_views)
     found = "The run was trained on 1 of these 2 views: the scene's split was another."
-    for scene, doubts in ((room, []), (listed, [listed.listed.sentence, found])):
+    for scene, texts in ((room, []), (listed, [listed.listed.sentence, found])):
         evaluation = Evaluation.of(tmp_path / "run", scene)
-        assert evaluation.doubts(evaluation.load()) == doubts
-    notes: list[str] = []
+        assert [each.text for each in evaluation.findings(evaluation.load())] == texts
+    findings = []
     start = TrainSettings(max_steps=2, data_factor=2, start=str(resumed.folder.gaussians))
-    prepare_run(listed, tmp_path / "next", start, note=notes.append)
-    assert [note for note in notes if "1 of the 2 test views" in note]
+    prepare_run(listed, tmp_path / "next", start, note=findings.append)
+    assert [len(f.subjects) for f in findings if f.kind == "trained-test-views"] == [1]
 
 
 def test_a_run_goes_on_with_its_own_settings_and_seeds(begin, room, tmp_path):

@@ -14,11 +14,14 @@ from splatseed.training.parameters import as_parameters, make_optimizers
 from splatseed.training.schedule import LEARNING_RATES, make_schedule
 from splatseed.training.settings import TrainSettings
 from splatseed.training.state import make_strategy
+from splatseed.training.traits import STRATEGIES
 
 
 @pytest.mark.parametrize("as_3dgs", [True, False])
 def test_a_full_run_has_3dgs_schedule(as_3dgs):
-    full, mcmc = (make_schedule(name, 30_000, as_3dgs=as_3dgs) for name in ("default", "mcmc"))
+    full, mcmc = (
+        make_schedule(STRATEGIES[name], 30_000, as_3dgs=as_3dgs) for name in ("default", "mcmc")
+    )
     assert (full.refine_start, full.reset_every) == (500, 3000)
     assert full.prune_size == (0.1 if as_3dgs else math.inf)
     assert full.refine_every == mcmc.refine_every == 100
@@ -31,7 +34,7 @@ def test_a_full_run_has_3dgs_schedule(as_3dgs):
 
 @pytest.mark.parametrize("steps", [1, 7, 300, 1500, 7000])
 def test_3dgs_schedule_shrinks_as_by_the_steps_scaler_of_gsplats_trainer(steps):
-    short = make_schedule("default", steps, as_3dgs=True)
+    short = make_schedule(STRATEGIES["default"], steps, as_3dgs=True)
     assert (short.depth_units, short.learning_rates) == (False, LEARNING_RATES)
     assert abs(short.refine_stop - steps / 2) <= 0.5
     assert short.decay("means", steps) == pytest.approx(0.01)
@@ -47,7 +50,7 @@ def test_3dgs_schedule_shrinks_as_by_the_steps_scaler_of_gsplats_trainer(steps):
 )
 def test_enough_photographs_are_seen_between_densifications(strategy, steps, every):
     """Rounds of two steps lost ``grow`` ten decibels in a run of forty."""
-    schedule = make_schedule(strategy, steps, as_3dgs=False)
+    schedule = make_schedule(STRATEGIES[strategy], steps, as_3dgs=False)
     assert schedule.refine_every == every
     assert strategy != "grow" or schedule.refine_start == every
 
@@ -55,7 +58,7 @@ def test_enough_photographs_are_seen_between_densifications(strategy, steps, eve
 @pytest.mark.parametrize("steps", [1500, 30_000])
 def test_auto_is_grow_in_short_runs_and_in_long_ones(steps):
     auto, grow = (TrainSettings(strategy=name, max_steps=steps) for name in ("auto", "grow"))
-    assert (auto.densification, auto.schedule, auto.cap) == ("grow", grow.schedule, grow.cap)
+    assert (auto.traits, auto.schedule, auto.cap) == (grow.traits, grow.schedule, grow.cap)
 
 
 @pytest.mark.parametrize(
@@ -63,7 +66,7 @@ def test_auto_is_grow_in_short_runs_and_in_long_ones(steps):
     [(90_000, (1, 1), 0.999), (15_000, (2, 2), 0.998), (1500, (20, 4), 0.99), (10, (20, 4), 0.99)],
 )
 def test_short_runs_learn_and_forget_faster_up_to_a_bound(steps, faster, beta2):
-    schedule = make_schedule("none", steps, as_3dgs=False)
+    schedule = make_schedule(STRATEGIES["none"], steps, as_3dgs=False)
     for name, factor in zip(("means", "sh0", "opacities"), (*faster, 1), strict=True):
         assert schedule.learning_rates[name] == pytest.approx(factor * LEARNING_RATES[name])
     optimizers = make_optimizers(as_parameters({"means": torch.zeros((1, 3))}), schedule)
@@ -74,7 +77,9 @@ def test_no_optimiser_imports_torch_compile(monkeypatch):
     """A second and a half of the four that it takes to start."""
     monkeypatch.setitem(sys.modules, "torch._dynamo", None)  # an import of it fails
     params = as_parameters({"means": torch.zeros((1, 3))})
-    optimizer = make_optimizers(params, make_schedule("none", 100, as_3dgs=False))["means"]
+    optimizer = make_optimizers(params, make_schedule(STRATEGIES["none"], 100, as_3dgs=False))[
+        "means"
+    ]
     params["means"].sum().backward()
     optimizer.step()
     optimizer.zero_grad()

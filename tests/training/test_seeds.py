@@ -20,6 +20,7 @@ from splatseed.training.parameters import make_optimizers, make_parameters, opti
 from splatseed.training.schedule import make_schedule
 from splatseed.training.seeds import seeded, seeds_digest, usable_seeds
 from splatseed.training.settings import TrainSettings
+from splatseed.training.traits import STRATEGIES
 
 ORIGINALS, NEW = 40, 60
 
@@ -32,17 +33,17 @@ def points(rng) -> PointCloud:
 
 
 def thinned(points: PointCloud, cap: int, **settings) -> tuple[PointCloud, list[str]]:
-    notes: list[str] = []
-    return usable_seeds(points, TrainSettings(cap_max=cap, **settings), notes.append), notes
+    findings = []
+    return usable_seeds(points, TrainSettings(cap_max=cap, **settings), findings.append), findings
 
 
 def test_more_than_the_cap_are_thinned_and_told_of(points):
     mixed = points.select(np.random.default_rng(0).permutation(len(points)))
     for strategy, most in (("default", 49), ("none", 70)):  # default adds the rest
-        seeds, notes = thinned(points, 70, strategy=strategy)
+        seeds, findings = thinned(points, 70, strategy=strategy)
         assert len(seeds) == most
         assert np.isin(seeds.xyz, points.xyz).all()
-        assert f"100 seeds were thinned to {most}, {seeds.num_original} of them" in notes[0]
+        assert f"100 seeds were thinned to {most}, {seeds.num_original} of them" in findings[0].text
         assert np.array_equal(thinned(points, 70, seed=1, strategy=strategy)[0].xyz, seeds.xyz)
         # Originals are asked first wherever they stand.
         assert thinned(mixed, 70, strategy=strategy)[0].num_original == seeds.num_original
@@ -52,9 +53,9 @@ def test_points_that_are_not_finite_and_wishes_without_effect_are_told_of(points
     xyz = points.xyz.copy()
     xyz[3] = np.nan
     broken = points.replace(xyz=xyz, sizes=np.full(len(points), np.nan))
-    seeds, notes = thinned(broken, 1000, seed_sizes=True, seed_normals=True)
+    seeds, findings = thinned(broken, 1000, seed_sizes=True, seed_normals=True)
     assert len(seeds) == ORIGINALS + NEW - 1
-    assert [note.split()[0] for note in notes] == ["1", "seed_sizes", "seed_normals"]
+    assert [each.kind for each in findings] == ["non-finite-points", *["unused-setting"] * 2]
 
 
 def test_of_what_is_known_only_what_is_asked_for_has_a_part(points):
@@ -75,17 +76,17 @@ def test_of_what_is_known_only_what_is_asked_for_has_a_part(points):
 
 
 def test_a_plain_scene_is_seeded_on_request_and_the_user_told(room):
-    notes: list[str] = []
+    findings = []
     asked = TrainSettings(seeding="auto")
-    scene, stereo = seeded(room, asked, "cpu", notes.append, silent)
+    scene, stereo = seeded(room, asked, "cpu", findings.append, silent)
     assert len(scene.points) > len(room.points)
     assert np.array_equal(scene.points.originals.xyz, room.points.xyz)
     assert [view.name for view in stereo.views] == [image.name for image in room.split(8)[0]]
-    assert "`seeding=" in notes[-1]
+    assert findings[-1].fix
     bounded = TrainSettings(seeding="auto", strategy="none", cap_max=100)
     empty = room.replace(points=room.points.select(slice(0)), tracks=None)
-    assert len(seeded(empty, bounded, "cpu", notes.append, silent)[0].points) == 100
-    assert "--seeds scene" not in notes[-1]  # there are none to begin with
+    assert len(seeded(empty, bounded, "cpu", findings.append, silent)[0].points) == 100
+    assert not findings[-1].fix  # there are none to begin with
 
 
 @pytest.mark.parametrize(("strategy", "points", "added"), [
@@ -96,10 +97,10 @@ def test_a_plain_scene_is_seeded_on_request_and_the_user_told(room):
 def test_seeds_are_added_where_that_is_advised(strategy, points, added, room):
     scene = room.replace(points=room.points.select(points), tracks=None)
     asked = TrainSettings(seeding="advised", strategy=strategy, cap_max=2000)
-    notes: list[str] = []
-    made, _ = seeded(scene, asked, "cpu", notes.append, silent)
+    findings = []
+    made, _ = seeded(scene, asked, "cpu", findings.append, silent)
     assert (len(made.points) > len(scene.points)) == added
-    assert notes[-1].startswith("Seeds by method auto:" if added else "Seeds: leave the points")
+    assert findings[-1].text.startswith("Seeds by method auto:" if added else "Seeds: leave the")
 
 
 @pytest.mark.parametrize("why", ["as it is", "3dgs", "added to", "thinned"])
@@ -117,9 +118,9 @@ def test_other_points_are_left_alone(why, room, tmp_path):
         write_scene(room.replace(points=room.points.select(slice(100))), tmp_path / "thin")
         scene = load_scene(tmp_path / "thin")
         (tmp_path / "thin" / MANIFEST).write_text('{"command": "upsample"}')
-    notes: list[str] = []
-    assert seeded(scene, asked, "cpu", notes.append, silent) == (scene, None)
-    assert not notes
+    findings = []
+    assert seeded(scene, asked, "cpu", findings.append, silent) == (scene, None)
+    assert not findings
 
 
 def _literal(xyz, views):
@@ -159,7 +160,7 @@ def _stepped(room, means, lengths, rate, steps):
     """How far Adam moves positions and scales of Gaussians whose gradients are all 1."""
     gaussians = dataclasses.replace(initial_gaussians(room.points), means=means)
     params = make_parameters(gaussians, torch.device("cpu"), lengths.astype(np.float32))
-    optimizers = make_optimizers(params, make_schedule("none", 100, as_3dgs=False))
+    optimizers = make_optimizers(params, make_schedule(STRATEGIES["none"], 100, as_3dgs=False))
     for _ in range(steps):
         for value in params.values():
             value.grad = torch.ones_like(value) if value.requires_grad else None

@@ -65,21 +65,23 @@ def test_a_model_in_its_trainers_world_is_brought_into_the_scenes(room, first, t
     path, scores = first
     world = find_transform("gsplat", room)
     write_gaussians(tmp_path / "theirs.ply", transform_gaussians(read_gaussians(path), world))
-    notes = []
-    run = prepare_run(room, tmp_path / "run", going_on(tmp_path / "theirs.ply"), note=notes.append)
-    assert any("(gsplat)" in note for note in notes)
+    findings = []
+    run = prepare_run(
+        room, tmp_path / "run", going_on(tmp_path / "theirs.ply"), note=findings.append
+    )
+    assert any("(gsplat)" in each.text for each in findings)
     shown = evaluate_views(run.trainer.render, run.trainer.test_views)
     assert shown.psnr == pytest.approx(scores.psnr, abs=0.02)
 
 
 def test_a_smaller_budget_keeps_those_that_contribute_most(room, first, tmp_path):
     path, _ = first
-    whole, notes = read_gaussians(path), []
+    whole, findings = read_gaussians(path), []
     half = len(whole) // 2
     settings = going_on(path, cap_max=half)
-    run = prepare_run(room, tmp_path / "run", settings, note=notes.append)
+    run = prepare_run(room, tmp_path / "run", settings, note=findings.append)
     assert run.count() == half
-    assert any(f"{half} of {len(whole):,} Gaussians" in note for note in notes)
+    assert any(f"{half} of {len(whole):,} Gaussians" in each.text for each in findings)
     rng = np.random.default_rng(0)
     write_gaussians(
         tmp_path / "some.ply", whole.select(np.sort(rng.permutation(len(whole))[:half]))

@@ -182,12 +182,12 @@ def test_a_model_in_its_trainers_frame_is_shown_by_the_cameras_of_its_scene(
     write_gaussians(tmp_path / "model.ply", transform_gaussians(gaussians, transform))
     item = open_item(tmp_path / "model.ply", room)
     assert np.abs(item.model.means - gaussians.means).max() < 1e-4
-    assert "trainer's frame (gsplat)" in item.notes[0]
+    assert "trainer's frame (gsplat)" in str(item.findings[0])
     elsewhere = dataclasses.replace(gaussians, means=gaussians.means + np.float32(100))
     write_gaussians(tmp_path / "model.ply", elsewhere)
     item = open_item(tmp_path / "model.ply", room)
     assert np.array_equal(item.model.means, elsewhere.means)
-    assert "another scene" in item.notes[0]
+    assert [each.kind for each in item.findings] == ["another-scene"]
 
 
 def test_a_run_whose_scene_was_made_anew_since_is_noted(room, run_folder, tmp_path):
@@ -199,7 +199,8 @@ def test_a_run_whose_scene_was_made_anew_since_is_noted(room, run_folder, tmp_pa
     config = json.loads((run / "config.json").read_text())
     for place, noted in ((room, False), (tmp_path / "anew", True)):
         (run / "config.json").write_text(json.dumps(config | {"scene": str(place)}))
-        assert any("another scene" in note for note in open_item(run).notes) == noted
+        kinds = [each.kind for each in open_item(run).findings]
+        assert ("another-scene" in kinds) == noted
 
 
 # The command --------------------------------------------------------------------------------------

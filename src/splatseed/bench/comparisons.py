@@ -1,4 +1,4 @@
-"""Compare runs: gains of variants, arms at equal cost, and two benchmarks.
+"""Compare runs: gains of variants, and arms at equal cost.
 
 A *gain* is the PSNR of a run minus that of its baseline in dB, paired by scene and repeat. An *arm*
 is a variant with a strategy. A run *reaches* a target when its test PSNR, interpolated linearly
@@ -8,10 +8,9 @@ between tests, first equals it. Seconds include seeding.
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from itertools import product
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -19,10 +18,8 @@ import pandas as pd
 
 from splatseed.bench import statistics
 from splatseed.bench.plan import SFM, RunResult, RunSpec
-from splatseed.bench.runs import Run
 from splatseed.bench.statistics import Difference, difference
-from splatseed.bench.study import Study, studies, variant_order
-from splatseed.text import counted
+from splatseed.bench.study import Study
 from splatseed.training.settings import StrategyName
 
 Key = TypeVar("Key", bound=Hashable)
@@ -36,7 +33,6 @@ class Gains:
     label, the mean over scenes, with the error for these scenes and for scenes like these.
     """
 
-    strategy: StrategyName
     on_scene: Mapping[tuple[str, str], Difference]
     on_these: Mapping[str, Difference]
     on_like: Mapping[str, Difference]
@@ -51,13 +47,9 @@ class Gains:
         """The labels of the variants with a gain."""
         return tuple(self.on_these)
 
-    def means(self, scene: str) -> dict[str, float]:
-        """The mean gain of each variant on a scene."""
-        return {label: gain.mean for (of, label), gain in self.on_scene.items() if of == scene}
-
     def top(self, scene: str) -> str:
         """The variant with the highest mean gain on a scene; SFM if there are no gains."""
-        means = self.means(scene)
+        means = {label: gain.mean for (of, label), gain in self.on_scene.items() if of == scene}
         return max(means, key=lambda label: means[label], default=SFM)
 
 
@@ -76,7 +68,7 @@ def gains(study: Study, strategy: StrategyName) -> Gains:
         if known := [gain for (_, of), gain in on_scene.items() if of == label]:
             on_these[label] = statistics.these_scenes(known)
             on_like[label] = statistics.over_scenes([gain.mean for gain in known])
-    return Gains(strategy, _adjusted(on_scene), _adjusted(on_these), _adjusted(on_like))
+    return Gains(_adjusted(on_scene), _adjusted(on_these), _adjusted(on_like))
 
 
 def _adjusted(family: Mapping[Key, Difference | None]) -> dict[Key, Difference]:
@@ -268,114 +260,3 @@ class _MeanGains:
         others = [ArmKey(*each) for each in scores.index if each != self._base]
         differences = statistics.paired_differences(scores.loc[[self._base, *others]].to_numpy())
         return dict(zip(others, differences, strict=True))
-
-
-Place = tuple[StrategyName, str, str]
-"""Strategy, label of the variant, and scene."""
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """The changes of PSNR from benchmark A to B in dB, by place, and by arm over common scenes.
-
-    Runs are not paired, as a random seed may differ in effect between versions. The noise of each
-    benchmark is pooled over all arms of a scene, and tested by Welch's test, adjusted after Holm.
-    ``settings`` lists different settings with both values, ``only`` the places of "A" or "B" alone.
-    """
-
-    settings: tuple[tuple[str, str, str], ...]
-    changes: Mapping[Place, Difference]
-    means: Mapping[ArmKey, Difference]
-    only: tuple[tuple[str, str, str, str], ...]
-    notes: tuple[str, ...]
-
-
-def compare(a: Sequence[Run], b: Sequence[Run]) -> Comparison | None:
-    """Compare the two studies of two benchmarks whose settings differ least.
-
-    Returns None if a benchmark has no finished run.
-    """
-    sets = studies(a), studies(b)
-    pairs = list(product(*sets))
-    if not pairs:
-        return None
-    # In a tie, the pair with the most places in common.
-    first, second = both = min(
-        pairs, key=lambda pair: (len(_differing(*pair)), -len(_places(pair[0]) & _places(pair[1])))
-    )
-    unused = [len(found) - 1 for found in sets]
-    variants = {**first.variants, **second.variants}
-
-    def ordered(places: set[Place]) -> list[Place]:
-        return sorted(places, key=lambda p: (p[0], variant_order((p[1], variants[p[1]])), p[2]))
-
-    here, there = map(_places, both)
-    changes = {place: _change(first, second, place) for place in ordered(here & there)}
-    by_arm: dict[ArmKey, list[Difference]] = {}
-    for (strategy, label, _), each in changes.items():
-        by_arm.setdefault(ArmKey(strategy, label), []).append(each)
-    settings = _differing(*both)
-    scores = [{(r.spec.key, r.result.psnr) for r in runs if r.result} for runs in (a, b)]
-    same = len(scores[0] & scores[1])
-    digests, extra = [dict[str, str](), dict[str, str]()], [dict[str, str](), dict[str, str]()]
-    for i, study in enumerate(both):
-        for scene, label, spec in study.runs[["scene", "seeds", "spec"]].to_numpy():
-            digests[i][scene] = spec.scene.digest
-            extra[i][f"{scene}, {label}"] = spec.scene.depth_digest + spec.scene.cloud_digest
-    notes = [
-        "" if settings else "All settings are the same.",
-        "" if changes else "They have no arm on the same scene in common.",
-        f"{counted(same, 'run')} with equal key and score in both." if same else "",
-        *(f"{scene} differs: its points, cameras or photographs are not the same."
-          for scene in _unequal(*digests)),
-        *(f"{place} differs: its depth maps or its scan are not the same."
-          for place in _unequal(*extra)),
-        f"Other sets of runs are not compared: {unused[0]} of A, {unused[1]} of B." if any(unused)
-        else "",
-    ]  # fmt: skip
-    return Comparison(
-        settings,
-        _adjusted(changes),
-        _adjusted({arm: statistics.these_scenes(each) for arm, each in by_arm.items()}),
-        tuple((name, s, scene, v) for name, of in (("A", here - there), ("B", there - here))
-              for s, v, scene in ordered(of)),
-        tuple(filter(None, notes)),
-    )  # fmt: skip
-
-
-def _unequal(a: Mapping[str, str], b: Mapping[str, str]) -> list[str]:
-    return sorted(name for name in a.keys() & b.keys() if a[name] != b[name])
-
-
-def _places(study: Study) -> set[Place]:
-    return set(study.runs[["strategy", "seeds", "scene"]].itertuples(index=False, name=None))
-
-
-def _differing(a: Study, b: Study) -> tuple[tuple[str, str, str], ...]:
-    one, other = (_settings(each, {*a.scenes} & {*b.scenes}) for each in (a, b))
-    values = ((name, one.get(name), other.get(name)) for name in one | other)
-    return tuple((name, str(x), str(y)) for name, x, y in values if x != y)
-
-
-def _settings(study: Study, scenes: Iterable[str]) -> dict[str, object]:
-    """The settings of a study, with the data factors of some scenes."""
-    settings, factors = dict(study.settings), study.settings["data_factor"]
-    if isinstance(factors, Mapping):
-        sizes = {scene: factors[scene] for scene in sorted(scenes)}
-        settings["data_factor"] = sizes if len(set(sizes.values())) != 1 else min(sizes.values())
-    return settings
-
-
-def _change(a: Study, b: Study, place: Place) -> Difference:
-    """Test the difference B - A of a place by Welch's test."""
-    strategy, label, scene = place
-    parts = []
-    for study, sign in ((a, -1), (b, 1)):
-        scores = study.scores(strategy, scene)
-        rest = scores.sub(scores.mean(axis=1), axis=0).to_numpy()
-        df = int(np.isfinite(rest).sum() - scores.notna().any(axis=1).sum())
-        psnr = scores.loc[label].dropna()
-        se = math.sqrt(float(np.nansum(rest**2)) / df / len(psnr)) if df else math.nan
-        parts.append(Difference(sign * float(psnr.mean()), se, df, len(psnr), math.nan))
-    half = statistics.these_scenes(parts)  # a mean of two, with Welch's degrees of freedom
-    return difference(2 * half.mean, 2 * half.se, half.df, half.n)

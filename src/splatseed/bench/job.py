@@ -1,4 +1,4 @@
-"""Carry out a run: make seeds, train, score, and write the run's folder.
+"""Carry out runs: make seeds, train, score, and write the run's folder, on this machine or on Ray.
 
 A run's folder is written in one step. Seeds equal the output of ``splatseed upsample``, with
 ``--auto.no-dense`` under a budget, as arms of several budgets share them; their time excludes the
@@ -9,22 +9,24 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import shutil
 import socket
 import tempfile
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from shutil import which
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from splatseed.bench.plan import CLOUD, SFM, WITH_CLOUD, RunResult, RunSpec, seeding_method
-from splatseed.bench.runs import ERROR, RESULT, Run, package_version, run_folder
+from splatseed.bench.runs import ERROR, RESULT, BenchRun, run_folder
 from splatseed.bench.scenes import SceneFacts, fingerprints, open_scene
 from splatseed.errors import (
     OutputError,
@@ -39,22 +41,75 @@ from splatseed.io.staging import MANIFEST, atomic_file, output_folder, write_jso
 from splatseed.methods import Upsampler, chooses_number, configure
 from splatseed.photos.cache import user_cache_dir
 from splatseed.pointcloud import PointCloud
-from splatseed.progress import Progress, silent
-from splatseed.runtime.compilation import watched
+from splatseed.progress import Progress, StageTimes, silent, watched
+from splatseed.requirements import version_of
+from splatseed.runtime.environment import available_cpus, worker_env
 from splatseed.runtime.memory import peak_bytes
-from splatseed.runtime.tasks import Report, Workers, run_tasks
+from splatseed.runtime.tasks import ProcessWorkers, Report, Workers, run_tasks
 from splatseed.scene import Scene
 from splatseed.scores import EvalResult
 from splatseed.seeding.advice import DEFAULT_METHOD
 from splatseed.seeding.clouds.method import Cloud
 from splatseed.seeding.photo_methods import Stereo
-from splatseed.training.settings import TrainSettings
+from splatseed.text import counted
+from splatseed.training.settings import Backend, TrainSettings
 
 if TYPE_CHECKING:  # PyTorch, which takes a while
     from splatseed.training.run import TrainingRun
 
-_PICTURES = 3
-"""Number of test views whose renders are kept."""
+
+@dataclass(frozen=True)
+class Machine:
+    """The workers of a benchmark: how many ``jobs`` at a time, with ``threads`` CPU threads each.
+
+    ``backend`` is not "auto"; ``remote`` workers are other machines, which return files as bytes.
+    """
+
+    backend: Backend
+    jobs: int
+    threads: int
+    workers: Workers
+    remote: bool = False
+
+    @property
+    def description(self) -> str:
+        """The machine, for the user."""
+        where = "Ray" if self.remote else "this machine"
+        on = "on a GPU" if self.backend == "cuda" else "on the CPU"
+        return f"{where}, {self.jobs} at a time, {on}, {counted(self.threads, 'thread')} each"
+
+
+def local_machine(jobs: int | None, backend: Backend, progress: Progress = silent) -> Machine:
+    """Choose processes on this machine; by default one per GPU, or one."""
+    chosen: Backend = "cpu"
+    driver = which("nvidia-smi") or which("rocminfo") or Path("/proc/driver/nvidia").exists()
+    if backend == "cuda" or (backend == "auto" and driver):  # else PyTorch sees no GPU
+        from splatseed.training.device import pick_device  # noqa: PLC0415  (PyTorch)
+
+        # gsplat's kernels are built here, not by each run.
+        chosen = "cuda" if pick_device(backend, progress).type == "cuda" else "cpu"
+    gpus = [""]
+    if chosen == "cuda":
+        import torch  # noqa: PLC0415
+
+        named = [each for each in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if each]
+        gpus = named or [f"{i}" for i in range(torch.cuda.device_count())]
+    jobs = jobs or len(gpus)
+    threads = max(1, available_cpus() // jobs)
+    slots = [worker_env(threads, gpus[slot % len(gpus)]) for slot in range(jobs)]
+    return Machine(chosen, jobs, threads, ProcessWorkers(slots))
+
+
+@contextmanager
+def ray_machine(address: str | None, jobs: int | None, backend: Backend) -> Iterator[Machine]:
+    """Connect to a Ray cluster; without an address, Ray starts on this machine."""
+    from splatseed.runtime.ray_tasks import RayWorkers, ray_cluster  # noqa: PLC0415  (Ray)
+
+    with ray_cluster(address):
+        gpu = None if backend == "auto" else backend == "cuda"
+        workers = RayWorkers(gpu=gpu, limit=jobs)
+        chosen: Backend = "cuda" if workers.gpu else "cpu"
+        yield Machine(chosen, workers.jobs, workers.threads, workers, remote=True)
 
 
 @dataclass(frozen=True)
@@ -68,37 +123,30 @@ class RunOptions:
 def execute_runs(
     bench: Path,
     specs: Sequence[RunSpec],
-    workers: Workers,
+    machine: Machine,
     options: RunOptions,
-    remote: bool = False,
     report: Report | None = None,
-) -> Iterator[Run]:
+) -> Iterator[BenchRun]:
     """Carry out runs, and yield each as it ends; failed runs are recorded.
 
-    Args:
-        bench: The benchmark's folder.
-        specs: The runs.
-        workers: Where to run them.
-        options: Options of the runs.
-        remote: Whether ``workers`` are other machines, which return the run's files as bytes.
-        report: Takes the index of a run in ``specs``, its stage, and the fraction that is done.
+    ``report`` takes the index of a run in ``specs``, its stage, and the fraction that is done.
 
     Raises:
-        OutputError: The benchmark's folder cannot be written.
         KeyboardInterrupt: The user stopped the runs.
     """
+    remote = machine.remote
     function = run_remotely if remote else run_job
     calls = [(spec, options) if remote else (spec, options, bench) for spec in specs]
     try:
-        for ended in run_tasks(workers, function, calls, report):
+        for ended in run_tasks(machine.workers, function, calls, report):
             spec, value = specs[ended.index], ended.value
             if ended.error is not None:
-                yield Run(spec, error=_record_error(bench, spec, ended.error))
+                yield BenchRun(spec, error=_record_error(bench, spec, ended.error))
                 continue
             if remote:
                 value, files = value
                 _write_files(bench, spec, files)
-            yield Run(spec, value)
+            yield BenchRun(spec, value)
     except KeyboardInterrupt:
         for partial in (bench / "runs").glob(".*.partial-*"):  # of processes that were killed
             shutil.rmtree(partial, ignore_errors=True)
@@ -127,7 +175,7 @@ def run_job(
     """Carry out a run, and write its folder."""
     from splatseed.splat.lpips import load_lpips  # noqa: PLC0415  (PyTorch)
     from splatseed.training.depths import DepthCache, placing_views  # noqa: PLC0415  (Numba)
-    from splatseed.training.prepare import PrepareOptions, prepare_run  # noqa: PLC0415  (PyTorch)
+    from splatseed.training.prepare import prepare_run  # noqa: PLC0415  (PyTorch)
 
     start = time.perf_counter()
     with output_folder(run_folder(bench, spec), kind="bench", overwrite=True) as folder:
@@ -144,14 +192,12 @@ def run_job(
             scene.replace(points=seeds),
             folder / "work",
             spec.settings,
-            PrepareOptions(
-                cache_dir=user_cache_dir(),
-                depth_cache=DepthCache(
-                    bench
-                    / "depths"
-                    / f"{spec.scene.digest}_{every}_{size}_{len(views)}_{spec.repeat}.npz",
-                    seeding_method(spec.arm.method) == DEFAULT_METHOD and not _is_full(scene, spec),
-                ),
+            cache_dir=user_cache_dir(),
+            depth_cache=DepthCache(
+                bench
+                / "depths"
+                / f"{spec.scene.digest}_{every}_{size}_{len(views)}_{spec.repeat}.npz",
+                seeding_method(spec.arm.method) == DEFAULT_METHOD and not _is_full(scene, spec),
             ),
             progress=progress,
         )
@@ -171,7 +217,7 @@ def run_job(
 
 def run_remotely(spec: RunSpec, options: RunOptions) -> tuple[RunResult, dict[str, bytes]]:
     """Carry out a run on a node of a cluster; returns the files of its folder by name."""
-    host, here = socket.gethostname(), package_version("splatseed")
+    host, here = socket.gethostname(), version_of("splatseed") or ""
     if here != spec.version:
         expected = f"splatseed {spec.version} on the node {host}"
         fix = "Install it on every node."
@@ -190,13 +236,12 @@ def run_remotely(spec: RunSpec, options: RunOptions) -> tuple[RunResult, dict[st
 def _collect_files(run: TrainingRun, folder: Path, *, models: bool) -> None:
     """Move the files to keep out of the training folder, and remove it.
 
-    Renders are kept of evenly spaced test views, the same for every arm.
+    The render is kept of the middle test view, the same for every arm.
     """
     files = [run.folder.metrics, run.folder.config, run.folder.curve_csv]
     files += [run.folder.gaussians] if models else []
     pictures = sorted(run.folder.renders.iterdir())
-    count = min(_PICTURES, len(pictures))
-    files += [pictures[(2 * i + 1) * len(pictures) // (2 * count)] for i in range(count)]
+    files += [pictures[len(pictures) // 2]]
     (folder / run.folder.renders.name).mkdir()
     for path in files:
         shutil.move(path, folder / path.relative_to(run.folder.path))
@@ -283,21 +328,11 @@ def make_seeds(
 
 def _timed(make: Callable[..., PointCloud], *args: Any, **named: Any) -> tuple[PointCloud, float]:
     """Make points, and measure the time without the compilation of kernels, in seconds."""
-    compiling, starts = 0.0, list[float]()
-
-    def watch(begins: bool) -> None:
-        nonlocal compiling
-        if begins:
-            starts.append(time.perf_counter())
-            return
-        start = starts.pop()
-        if not starts:  # the outermost of nested compilations
-            compiling += time.perf_counter() - start
-
-    with watched(watch):
-        start = time.perf_counter()
+    times = StageTimes()
+    times("seeds", 0.0)
+    with watched(times.compilation):
         cloud = make(*args, **named)
-        return cloud, max(time.perf_counter() - start - compiling, 0.0)
+    return cloud, times.seconds()["seeds"]
 
 
 def _num_original(scene: Scene) -> int:

@@ -27,6 +27,7 @@ from splatseed.bench.plan import RunSpec
 from splatseed.bench.runs import run_folder
 from splatseed.bench.study import Study
 from splatseed.errors import SplatseedError
+from splatseed.findings import Finding
 from splatseed.io.files import read_file
 from splatseed.io.photograph import decode_photograph, photograph_bytes
 from splatseed.progress import Progress, silent
@@ -42,10 +43,10 @@ _SIDE, _CLOUD_SIDE = 960, 1800
 
 @dataclass
 class ScenePictures:
-    """Pictures of a study's scenes: file name without suffix and PNG; notes on missing ones."""
+    """Pictures of a study's scenes: file name without suffix and PNG; findings on missing ones."""
 
     clouds: dict[str, tuple[str, bytes]] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
+    findings: list[Finding] = field(default_factory=list)
 
 
 def scene_pictures(bench: Path, study: Study, progress: Progress = silent) -> ScenePictures:
@@ -71,7 +72,8 @@ def scene_pictures(bench: Path, study: Study, progress: Progress = silent) -> Sc
             opened = open_unchanged(next((scene for scene in facts if scene.depth), facts[0]))
             pictures.clouds[scene] = name, _draw_seeds(opened, specs, progress, bench)
         except SplatseedError as error:
-            pictures.notes.append(f"{scene}: no picture of its points: {error}")
+            text = f"{scene}: no picture of its points: {error}"
+            pictures.findings.append(Finding("missing-picture", text, subjects=(scene,)))
     return pictures
 
 

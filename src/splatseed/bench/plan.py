@@ -22,7 +22,8 @@ from splatseed.scores import CurvePoint, EvalResult
 from splatseed.seeding.budget import RHO, parse_budget
 from splatseed.text import did_you_mean
 from splatseed.training.duration import GROWTH, step_seconds
-from splatseed.training.settings import SEED_SHARE, Backend, StrategyName, TrainSettings
+from splatseed.training.settings import Backend, StrategyName, TrainSettings
+from splatseed.training.traits import STRATEGIES
 
 SFM = "sfm"
 """The baseline: the unchanged points of Structure-from-Motion, at ratio 1."""
@@ -154,7 +155,7 @@ class RunSpec:
         cap = self.settings.cap or math.inf
         num_seeds = self.scene.num_points * (self.arm.ratio or _COST.ratio)
         seeds = min(num_seeds, self.max_seeds or cap)
-        grown = seeds if self.settings.densification == "none" else seeds * GROWTH
+        grown = seeds * GROWTH if self.settings.traits.adds else seeds
         if self.arm.strategy == "default-3dgs":
             pixels = self.scene.pixels_at(self.training.factor)
             grown = seeds + _COST.added + _COST.added_per_pixel * pixels
@@ -168,7 +169,7 @@ class RunSpec:
         renders = _COST.tests * self.scene.num_images / self.training.test_every
         method = seeding_method(self.arm.method)
         uses_stereo = method != SFM and chooses_number(method)
-        uses_stereo |= self.settings.densification == "grow"
+        uses_stereo |= self.settings.traits.uses_stereo
         stereo = _COST.stereo_seconds * self.scene.num_images * uses_stereo
         training = step * (self.training.max_steps + _COST.render_share * renders)
         slowdown = 1.0 if on_gpu else 2 / threads
@@ -183,7 +184,8 @@ class RunSpec:
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
         """The inverse of ``to_dict``."""
-        scene = SceneFacts(**{**values["scene"], "warnings": ()})
+        known = {key: value for key, value in values["scene"].items() if key != "warnings"}
+        scene = SceneFacts(**known)  # older benchmarks have empty warnings
         parts = {"arm": Arm(**values["arm"]), "training": TrainSettings(**values["training"])}
         return cls(**{**values, "scene": scene, **parts})
 
@@ -370,12 +372,12 @@ def plan_runs(
 
 
 def _needed(scene: SceneFacts, method: str) -> SceneFacts:
-    """Drop the files that a method does not read, and the warnings, which are shown before."""
+    """Drop the files that a method does not read."""
     if method != DEPTH:
         scene = replace(scene, depth="", depth_digest="")
     if not needs_cloud(method):
         scene = replace(scene, cloud="", cloud_digest="")
-    return replace(scene, warnings=())
+    return scene
 
 
 def _training(plan: Plan, scene: SceneFacts, arm: Arm, backend: Backend) -> TrainSettings:
@@ -417,7 +419,7 @@ def fair_budget(ratios: Sequence[float]) -> str:
 
     It also allows ``_FAIR_RHO``, as few points would else make a coarse model.
     """
-    seeds = max(ratios, default=1.0) / min(SEED_SHARE.values())
+    seeds = max(ratios, default=1.0) / min(each.seed_share for each in STRATEGIES.values())
     return f"{_FAIR_RHO:g}{RHO}{_OR}{math.ceil(seeds)}{PER_POINT}"
 
 

@@ -1,4 +1,4 @@
-"""Read and write plans as TOML, and read the presets.
+"""Read and write plans as TOML.
 
 ``read_plan`` inverts ``plan_text``. An unknown key or a value of the wrong type is an error. Paths
 are relative to the file.
@@ -10,9 +10,8 @@ import json
 import tomllib
 from collections.abc import Mapping
 from dataclasses import asdict, fields
-from importlib.resources import files
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any, get_args, get_origin, get_type_hints
 
 from splatseed.bench.plan import SHARED, Plan
 from splatseed.bench.scenes import DEMO, PlannedScene
@@ -21,7 +20,6 @@ from splatseed.io.files import StrPath, read_text
 from splatseed.settings import describe_type, fits
 from splatseed.training.settings import TrainSettings
 
-PresetName = Literal["mipnerf360", "replica", "laptop", "quick"]
 PLAN = "plan.toml"
 """The name of the plan in a benchmark's folder."""
 _FILES = ("path", "depth", "cloud")
@@ -138,8 +136,3 @@ def _value(value: object) -> str:
 
 def _key(name: str) -> str:
     return name if name.replace("_", "").isalnum() and name.isascii() else _value(name)
-
-
-def preset_plan(name: PresetName, data: Path | None) -> Plan:
-    """Read a preset, for the scenes in a folder."""
-    return read_plan(Path(str(files("splatseed.bench") / "data" / f"{name}.toml")), data)

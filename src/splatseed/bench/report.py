@@ -28,9 +28,10 @@ from splatseed.bench.comparisons import (
 )
 from splatseed.bench.plan import SFM
 from splatseed.bench.plan_file import PLAN
-from splatseed.bench.runs import Run, count_runs, read_calls, read_runs
+from splatseed.bench.runs import BenchRun, count_runs, read_calls, read_runs
 from splatseed.bench.study import Study, studies
 from splatseed.bench.tables import Number, Table, to_html, write_table
+from splatseed.findings import Finding
 from splatseed.io.files import StrPath, read_text
 from splatseed.io.staging import atomic_file, output_folder
 from splatseed.progress import Progress, silent
@@ -49,13 +50,13 @@ Part: TypeAlias = Mapping[str, Any] | Table | figures.Plot | str | None
 
 @dataclass(frozen=True)
 class Report:
-    """The page, numbers of tables and figures, conclusions, and notes on what is missing."""
+    """The page, numbers of tables and figures, conclusions, and findings on what is missing."""
 
     path: Path
     tables: int
     figures: int
     summary: tuple[str, ...]
-    notes: tuple[str, ...]
+    findings: tuple[Finding, ...]
 
 
 def write_report(bench: StrPath, progress: Progress = silent) -> Report:
@@ -63,11 +64,10 @@ def write_report(bench: StrPath, progress: Progress = silent) -> Report:
 
     Raises:
         SceneNotFoundError: There is no benchmark.
-        OutputError: A file cannot be written.
     """
     bench = Path(bench)
     runs = read_runs(bench)
-    found, page, notes = studies(runs), _Page(), dict[str, None]()
+    found, page, findings = studies(runs), _Page(), dict[Finding, None]()
     conclusions, summary, several = list[str](), list[Part](), len(found) > 1
     for number, study in enumerate(found, start=1):
         answers, name = conclude(study), f"Set {number}" if several else "All runs"
@@ -85,7 +85,7 @@ def write_report(bench: StrPath, progress: Progress = silent) -> Report:
         for key, title, parts in _study_sections(study, drawn, bench):
             page.add(key, title, *parts)
         page.images |= dict(drawn.clouds.values())
-        notes |= dict.fromkeys(drawn.notes)
+        findings |= dict.fromkeys(drawn.findings)
     progress("page", 0.0)
     page.prefix = page.title = ""
     written = len(page.tables)
@@ -99,11 +99,10 @@ def write_report(bench: StrPath, progress: Progress = silent) -> Report:
             (partial / f"{name}.png").write_bytes(png)
     with atomic_file(bench / REPORT) as partial:
         partial.write_text(page.html(runs), "utf-8", errors="backslashreplace")
-    pending = f"Not all runs are finished; the conclusions may change: {count_runs(runs)}."
-    incomplete = [pending] if any(run.result is None for run in runs) else []
-    return Report(
-        bench / REPORT, written, len(page.images), tuple(conclusions), (*incomplete, *notes)
-    )
+    if any(run.result is None for run in runs):
+        text = f"Not all runs are finished; the conclusions may change: {count_runs(runs)}."
+        findings = {Finding("unfinished-runs", text): None, **findings}
+    return Report(bench / REPORT, written, len(page.images), tuple(conclusions), tuple(findings))
 
 
 @dataclass
@@ -137,7 +136,7 @@ class _Page:
             return _figure(part.png, part.caption)
         return part
 
-    def html(self, runs: Sequence[Run]) -> str:
+    def html(self, runs: Sequence[BenchRun]) -> str:
         scenes = ", ".join(dict.fromkeys(run.spec.scene.name for run in runs))
         question = "Which seeds help on these scenes, and at what cost?"
         loader = jinja2.PackageLoader("splatseed.bench", "data")
@@ -170,6 +169,7 @@ def conclude(study: Study) -> tuple[str, ...]:
     best, compared = others[0], {arm.arm: arm for arm in compared_arms(study)}
     at = " under one budget of Gaussians" if study.settings["budget"] else ""
     at = at if unequal_numbers(study) else " with equal numbers of Gaussians"
+    equal: ComparedArm | None = None
     place = "is best" if best.gain.verdict == "better" else "has the highest mean"
     first = f"{best.arm.label} {place}: "
     if best.gain.mean < _MIN_GAIN:
@@ -181,14 +181,13 @@ def conclude(study: Study) -> tuple[str, ...]:
         conclusions[0] += (
             f" A run takes {own:.0f} s, seeding included, against {other:.0f} s of {base.label}."
         )
-        conclusions += _at_equal_numbers(others, compared[base])
+        equal = _best_at_equal_numbers(others, compared[base])
+        conclusions += _at_equal_numbers(best, equal, compared[base])
     from_sfm = best.arm.seeds == SFM
     rest = [arm for arm in others if (arm.arm.seeds == SFM) != from_sfm]
-    if rest:
+    if rest and rest[0] is not equal:
         kind = "Of arms with other seeds" if from_sfm else "Of arms without new points"
-        answer = f"{rest[0].arm.label} is best: {_against(rest[0], base)}."
-        if not conclusions[-1].endswith(answer):  # as the best at equal numbers
-            conclusions.append(f"{kind}, {answer}")
+        conclusions.append(f"{kind}, {rest[0].arm.label} is best: {_against(rest[0], base)}.")
     lead, time_ratio = best.gains["in_time"], best.gains["seconds"]
     if lead is not None:
         position = f"{abs(lead.mean):.2f} dB {'ahead' if lead.mean > 0 else 'behind'}"
@@ -226,17 +225,23 @@ def _beyond_noise(study: Study) -> Iterator[str]:
             )
 
 
-def _at_equal_numbers(others: Sequence[ComparedArm], base: ComparedArm) -> Iterator[str]:
+def _best_at_equal_numbers(others: Sequence[ComparedArm], base: ComparedArm) -> ComparedArm | None:
+    """Return the best arm with no more Gaussians than the baseline, if there is one."""
+    limit = base.means["gaussians"] * (1 + _EQUAL)
+    return next((arm for arm in others if arm.means["gaussians"] <= limit), None)
+
+
+def _at_equal_numbers(
+    best: ComparedArm, equal: ComparedArm | None, base: ComparedArm
+) -> Iterator[str]:
     """State the numbers of Gaussians where the best arm has more, and the best without more."""
-    label, limit = base.arm.label, base.means["gaussians"] * (1 + _EQUAL)
-    best, number = others[0], others[0].means["gaussians"]
-    if number <= limit:
+    if best is equal:
         return
+    label, number = base.arm.label, best.means["gaussians"]
     yield (
         f"{best.arm.label} ends with {number:,.0f} Gaussians, {label} with "
         f"{base.means['gaussians']:,.0f}: the larger number alone can raise PSNR."
     )
-    equal = next((arm for arm in others if arm.means["gaussians"] <= limit), None)
     if equal is None:
         budget = f"{base.means['gaussians']:.0f}"
         how = f"; splatseed bench --budgets {budget}, its other options as here, does"
@@ -285,7 +290,7 @@ def _study_sections(
         )
         for scene, (_, png) in drawn.clouds.items()
     ]
-    yield "pictures", "Pictures", [*shown, _text(*drawn.notes, mark="note")]
+    yield "pictures", "Pictures", [*shown, _text(*map(str, drawn.findings), mark="note")]
     if base is not None:
         title = "At equal cost" if study.settings["budget"] else "All arms"
         yield "cost", title, [
@@ -303,7 +308,7 @@ def _study_sections(
     yield "resources", "Time and memory", [tables.cost_table(study, s) for s in strategies]
 
 
-def _run_parts(runs: Sequence[Run], found: Sequence[Study]) -> Iterator[Part]:
+def _run_parts(runs: Sequence[BenchRun], found: Sequence[Study]) -> Iterator[Part]:
     yield f"{count_runs(runs)}."
     failed = [run for run in runs if run.error]
     missing = [run for run in runs if run.result is None and not run.error]
@@ -325,7 +330,7 @@ def _run_parts(runs: Sequence[Run], found: Sequence[Study]) -> Iterator[Part]:
         yield f"These runs are in no mean, as their PSNR is not finite: {'; '.join(invalid)}."
 
 
-def _setup_parts(bench: Path, runs: Sequence[Run]) -> Iterator[Part]:
+def _setup_parts(bench: Path, runs: Sequence[BenchRun]) -> Iterator[Part]:
     calls = read_calls(bench)
     commands = dict.fromkeys(str(call.get("command", "")) for call in calls)
     if commands:
@@ -360,7 +365,6 @@ def _url(content: bytes, kind: str) -> str:
 
 
 def _views(view: pictures.ComparedView) -> Part:
-    """Make a comparison of pictures with a slider, and their error maps."""
     base, best, _ = view.pictures
     caption = (
         f"{view.scene}, test view {view.name}: {base} on the left, {best} on the right "

@@ -16,7 +16,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -32,6 +31,7 @@ from splatseed.io.staging import (
     read_manifest,
     write_json,
 )
+from splatseed.requirements import version_of
 from splatseed.text import counted
 
 RESULT, ERROR = "result.json", "error.json"
@@ -42,7 +42,7 @@ _PACKAGES = ("splatseed", "torch", "gsplat", "torchmetrics", "numpy", "scipy", "
 
 
 @dataclass(frozen=True)
-class Run:
+class BenchRun:
     """A run: finished if it has a result, failed if it has an error, else pending."""
 
     spec: RunSpec
@@ -55,12 +55,12 @@ def run_folder(bench: Path, spec: RunSpec) -> Path:
     return bench / "runs" / spec.key
 
 
-def read_run(bench: Path, spec: RunSpec) -> Run:
+def read_run(bench: Path, spec: RunSpec) -> BenchRun:
     """Read a run from its folder; it is pending if there is none."""
     return _read(run_folder(bench, spec), spec)
 
 
-def _read(folder: Path, spec: RunSpec | None = None) -> Run:
+def _read(folder: Path, spec: RunSpec | None = None) -> BenchRun:
     """Read a run from a folder, which may be missing only if ``spec`` is given."""
     for name in (RESULT, ERROR):
         with suppress(FileNotFoundError, NotADirectoryError):
@@ -69,13 +69,13 @@ def _read(folder: Path, spec: RunSpec | None = None) -> Run:
                 content = json.loads(text)
                 known = spec or RunSpec.from_dict(content["spec"])
                 if name == ERROR:
-                    return Run(known, error=str(content["error"]))
-                return Run(known, RunResult.from_dict(content["result"]))
+                    return BenchRun(known, error=str(content["error"]))
+                return BenchRun(known, RunResult.from_dict(content["result"]))
             except _OTHER_LAYOUT as error:
                 fix = "Remove that folder to repeat its run, or start a new benchmark."
                 raise _layout_error(folder / name, error, fix) from None
     assert spec is not None  # noqa: S101  (folders are listed by these files)
-    return Run(spec)
+    return BenchRun(spec)
 
 
 def _layout_error(path: Path, error: Exception, fix: str) -> SceneFormatError:
@@ -93,7 +93,7 @@ def _planned_runs(bench: Path) -> list[RunSpec]:
         raise _layout_error(bench / _PLANNED, error, fix) from None
 
 
-def read_runs(bench: StrPath) -> list[Run]:
+def read_runs(bench: StrPath) -> list[BenchRun]:
     """Read the runs of the last plan, in its order, and the finished runs of earlier plans.
 
     Raises:
@@ -112,7 +112,7 @@ def read_runs(bench: StrPath) -> list[Run]:
     return [*runs, *(_read(folder) for folder in finished if folder.name not in known)]
 
 
-def count_runs(runs: Sequence[Run]) -> str:
+def count_runs(runs: Sequence[BenchRun]) -> str:
     """Describe the numbers of finished, failed and pending runs."""
     done = sum(run.result is not None for run in runs)
     failed = sum(bool(run.error) for run in runs)
@@ -157,11 +157,7 @@ def locked_bench(bench: Path) -> Iterator[None]:
 
 
 def record_plan(bench: Path, verb: str, specs: Iterable[RunSpec], arguments: Sequence[str]) -> None:
-    """Record a call of the command and the runs that it plans; creates the folder.
-
-    Raises:
-        OutputError: The folder cannot be written.
-    """
+    """Record a call of the command and the runs that it plans; creates the folder."""
     if not (bench / MANIFEST).is_file():
         write_json(bench / MANIFEST, {"command": verb})
     calls = [*read_calls(bench), _describe_call(verb, arguments)]
@@ -194,19 +190,11 @@ def _describe_call(verb: str, arguments: Sequence[str]) -> dict[str, Any]:
         "cpu": cpu,
         "cores": os.cpu_count(),
         "python": platform.python_version(),
-        "versions": {name: known for name in _PACKAGES if (known := package_version(name))},
+        "versions": {name: known for name in _PACKAGES if (known := version_of(name))},
     }
 
 
-def package_version(package: str) -> str:
-    """Return the version of an installed package; empty if it is not installed."""
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return ""
-
-
-def estimate_seconds(specs: Sequence[RunSpec], runs: Iterable[Run], threads: int) -> float:
+def estimate_seconds(specs: Sequence[RunSpec], runs: Iterable[BenchRun], threads: int) -> float:
     """Estimate the time of runs in sequence, corrected by the times of finished runs."""
     paces = [run.result.wall_seconds / run.spec.seconds(threads) for run in runs if run.result]
     return median(paces or [1.0]) * sum(spec.seconds(threads) for spec in specs)

@@ -15,6 +15,7 @@ import numpy as np
 
 from splatseed.depthmap import DepthMaps
 from splatseed.errors import SceneNotFoundError
+from splatseed.findings import Finding
 from splatseed.io import load_originals
 from splatseed.io.clouds import open_cloud
 from splatseed.io.colmap_model import scene_root
@@ -24,7 +25,7 @@ from splatseed.io.photograph import photograph_bytes
 from splatseed.io.photograph_checks import check_sizes, with_photographs
 from splatseed.photos.camera_check import stray_cameras
 from splatseed.photos.loading import refuse_distortion
-from splatseed.progress import Progress, in_threads, silent
+from splatseed.progress import Note, Progress, in_threads, silent, silent_note
 from splatseed.runtime.fingerprint import fingerprint, fingerprint_all
 from splatseed.scene import Scene
 
@@ -78,7 +79,6 @@ class SceneFacts(PlannedScene):
     long_side: int = 1
     depth_digest: str = ""
     cloud_digest: str = ""
-    warnings: tuple[str, ...] = ()
 
     def pixels_at(self, factor: int) -> int:
         """The pixels of the first photograph, downsampled by a whole factor."""
@@ -119,6 +119,7 @@ def survey(
     with_depth: bool = False,
     with_cloud: bool = False,
     progress: Progress = silent,
+    note: Note = silent_note,
 ) -> SceneFacts:
     """Check a scene and all files that runs on it read.
 
@@ -129,6 +130,7 @@ def survey(
         with_depth: Whether a method needs depth maps.
         with_cloud: Whether a method needs the scan.
         progress: Reports progress.
+        note: Takes what was found out about the scene.
 
     Raises:
         SceneNotFoundError: There is no scene, or a file is missing.
@@ -158,12 +160,13 @@ def survey(
     depth = Path(planned.depth or scene.source.root or path)
     if with_depth and (planned.depth or search_depths(scene, depth) is not None):
         maps, scene = str(depth.resolve()), with_depths_in(scene, depth)
-    notes = [*scene.findings, *([scene.listed.sentence] if scene.listed else [])]
-    notes += stray_cameras(scene)
+    split = [Finding("listed-split", scene.listed.sentence, "info")] if scene.listed else []
+    for finding in (*scene.findings, *split, *stray_cameras(scene)):
+        note(finding)
     return SceneFacts(
         str(path.resolve()), planned.label, planned.images, maps, scan,
         num_points=len(scene.points), num_images=len(scene.images), pixels=size[0] * size[1],
-        long_side=max(size), **fingerprints(scene, maps, scan, progress), warnings=tuple(notes),
+        long_side=max(size), **fingerprints(scene, maps, scan, progress),
     )  # fmt: skip
 
 
@@ -209,7 +212,6 @@ def scene_digest(scene: Scene, progress: Progress = silent) -> str:
 
 
 def _depth_digest(maps: DepthMaps, progress: Progress) -> str:
-    """Fingerprint depth maps as they are read."""
     names = sorted(maps)
 
     def of_map(i: int) -> str:
@@ -220,7 +222,6 @@ def _depth_digest(maps: DepthMaps, progress: Progress) -> str:
 
 
 def _cloud_digest(path: Path, progress: Progress) -> str:
-    """Fingerprint the bytes of a scan's file."""
     progress("fingerprint the scan", 0.0)
     with open_file(path) as file:
         return fingerprint_all(iter(lambda: file.read(1 << 22), b""))

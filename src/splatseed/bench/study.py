@@ -17,7 +17,7 @@ from typing import get_args
 import pandas as pd
 
 from splatseed.bench.plan import SFM, SHARED, Arm, RunResult, RunSpec, describe_budget
-from splatseed.bench.runs import Run
+from splatseed.bench.runs import BenchRun
 from splatseed.methods import METHODS
 from splatseed.training.settings import StrategyName, TrainSettings
 
@@ -133,28 +133,28 @@ class Study:
         return ", ".join(filter(None, parts))
 
 
-def variant_order(variant: tuple[str, Arm]) -> tuple[object, ...]:
+def _variant_order(variant: tuple[str, Arm]) -> tuple[object, ...]:
     """Sort key of variants: the baseline first, then methods in the order of the registry."""
     (label, arm), names = variant, [SFM, *METHODS]
     place = names.index(arm.method) if arm.method in names else len(names)
     return place, arm.method, arm.profile, arm.ratio, label
 
 
-def studies(runs: Iterable[Run]) -> tuple[Study, ...]:
+def studies(runs: Iterable[BenchRun]) -> tuple[Study, ...]:
     """Group finished runs into studies, the one with the most runs first.
 
     Different scenes may have different ``data_factor``; several for one scene make several studies.
     Scenes with the same name but different content get different labels; the same content under
     several names is one scene. Duplicate runs count once.
     """
-    groups: dict[tuple[tuple[str, object], ...], list[Run]] = defaultdict(list)
+    groups: dict[tuple[tuple[str, object], ...], list[BenchRun]] = defaultdict(list)
     for run in runs:
         if run.result is not None:
-            groups[tuple(_common(run.spec).items())].append(run)
+            groups[tuple(_shared_settings(run.spec).items())].append(run)
     grouped = []
     for key, group in groups.items():
         sizes = {(run.spec.scene.digest, run.spec.training.data_factor) for run in group}
-        parts: dict[int, list[Run]] = defaultdict(list)
+        parts: dict[int, list[BenchRun]] = defaultdict(list)
         for run in group:  # by size if a scene has several
             by_size = len(sizes) > len({digest for digest, _ in sizes})
             parts[run.spec.training.factor if by_size else 0].append(run)
@@ -162,15 +162,14 @@ def studies(runs: Iterable[Run]) -> tuple[Study, ...]:
     return tuple(sorted(grouped, key=lambda study: -len(study.runs)))
 
 
-def _common(spec: RunSpec) -> dict[str, object]:
-    """The settings that all runs of a study share."""
+def _shared_settings(spec: RunSpec) -> dict[str, object]:
     settings = {name: getattr(spec.training, name) for name in SHARED if name != "data_factor"}
     if spec.arm.budget:  # its number of Gaussians may differ between scenes
         settings["cap_max"] = None
     return {**settings, "budget": spec.arm.budget, "version": spec.version}
 
 
-def _study(settings: Mapping[str, object], runs: Sequence[Run]) -> Study:
+def _study(settings: Mapping[str, object], runs: Sequence[BenchRun]) -> Study:
     names: dict[str, str] = {}
     digests = defaultdict[str, set[str]](set)
     beside = {kind: defaultdict[str, set[str]](set) for kind in _EXTRA_DIGESTS}
@@ -200,7 +199,7 @@ def _study(settings: Mapping[str, object], runs: Sequence[Run]) -> Study:
     factor = sizes.pop() if len(sizes) == 1 else dict(sorted(factors.items()))
     frame = pd.DataFrame(rows, columns=None if rows else _COLUMNS)
     frame = frame.drop_duplicates(list(_COLUMNS[:4]), ignore_index=True)
-    ordered = dict(sorted(variants.items(), key=variant_order))
+    ordered = dict(sorted(variants.items(), key=_variant_order))
     return Study({**settings, "data_factor": factor}, frame, ordered, tuple(odd))
 
 

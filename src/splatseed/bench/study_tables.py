@@ -1,4 +1,4 @@
-"""Tables of a study (scores, gains, costs, arms at equal cost) and of a comparison.
+"""Tables of a study: scores, gains, costs, arms at equal cost.
 
 Means are over the runs of a scene first, then over scenes. Only a significant gain is marked best.
 """
@@ -43,7 +43,6 @@ def verdict_mark(gain: Difference) -> str:
 
 
 def _gain_cell(gain: Difference | None, digits: int = 3) -> Cell:
-    """Format a gain with its standard error."""
     if gain is None:
         return ""
     return Number(gain.mean, digits, gain.se, signed=True, mark=verdict_mark(gain))
@@ -193,24 +192,3 @@ def seconds_table(study: Study, base: ArmKey) -> Table:
         "relative steps",
     )
     return make_table("seconds", header, rows, base=base.label)
-
-
-def comparison_tables(comparison: comparisons.Comparison) -> tuple[Table, Table, Table]:
-    """Tabulate different settings, changes, and arms of only one benchmark."""
-    scenes = sorted({scene for _, _, scene in comparison.changes})
-    changes = [
-        (*arm, *(_change_cell(comparison.changes.get((*arm, scene))) for scene in scenes),
-         _change_cell(mean))
-        for arm, mean in comparison.means.items()
-    ]  # fmt: skip
-    settings = make_table("settings", ("setting", "A", "B"), comparison.settings)
-    changed = make_table("changes", ("strategy", "method", *scenes, "mean"), changes)
-    only = make_table("only_one", ("in", "strategy", "scene", "method"), comparison.only)
-    return settings, changed, only
-
-
-def _change_cell(change: Difference | None) -> Cell:
-    if change is None:
-        return ""
-    mark = verdict_mark(change) or "*"
-    return Number(change.mean, 3, change.se, signed=True, mark=mark, bold=mark == "*")

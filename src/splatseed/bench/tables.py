@@ -1,4 +1,4 @@
-"""Tables as CSV, Markdown, LaTeX and HTML; ``data/tables.toml`` has their titles and notes.
+"""Tables as CSV and HTML; ``data/tables.toml`` has their titles and notes.
 
 CSV has unrounded numbers, and columns for standard errors and marks.
 """
@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import html
 import math
-import re
 import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -19,12 +18,6 @@ from typing import Any, TypeAlias
 import pandas as pd
 
 from splatseed.io.staging import atomic_file
-
-_TEX = str.maketrans({
-    "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_",
-    "{": r"\{", "}": r"\}", "~": r"$\sim$", "^": r"\^{}", "±": r"$\pm$", "†": r"$\dagger$",
-    "∞": r"$\infty$", "≤": r"$\le$", "<": r"$<$", ">": r"$>$",
-})  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -129,37 +122,6 @@ def _full(value: float | None) -> str:
     return "" if value is None or math.isnan(value) else f"{value:.8g}"
 
 
-def to_markdown(table: Table) -> str:
-    """Convert to Markdown, with the title above and the notes below."""
-    shown = table.shown(_escape_markdown, "**{}**")
-    right = ["---", *(["---:"] * (len(table.header) - 1))]
-    lines = [list(shown.columns), right, *shown.itertuples(index=False, name=None)]
-    notes = "".join(f"\n{_escape_markdown(note)}\n" for note in table.notes)
-    rows = "\n".join(f"| {' | '.join(line)} |" for line in lines)
-    return f"**{_escape_markdown(table.title)}**\n\n{rows}\n{notes}"
-
-
-def _escape_markdown(text: str) -> str:
-    return re.sub(r"([\\|*_`<>])", r"\\\1", text)
-
-
-def to_tex(table: Table) -> str:
-    """Convert to a LaTeX ``table`` that needs the package booktabs."""
-    text = table.shown(_escape_tex, r"\textbf{{{}}}").to_latex(
-        index=False,
-        escape=False,
-        caption=_escape_tex(table.title),
-        label=f"tab:{table.name}",
-        column_format="l" + "r" * (len(table.header) - 1),
-    )
-    notes = "".join(rf"\par\footnotesize {_escape_tex(note)}" + "\n" for note in table.notes)
-    return str(text).replace(r"\end{table}", rf"{notes}\end{{table}}")
-
-
-def _escape_tex(text: str) -> str:
-    return text.translate(_TEX)
-
-
 def to_html(table: Table) -> str:
     """Convert to an HTML table without title and notes."""
     mark = ' <span class="mark">{}</span>'
@@ -170,8 +132,7 @@ def to_html(table: Table) -> str:
 
 
 def write_table(table: Table, folder: Path) -> None:
-    """Write ``NAME.csv``, ``NAME.md``, ``NAME.tex`` and ``NAME.html``."""
-    kinds = {"csv": to_csv, "md": to_markdown, "tex": to_tex, "html": to_html}
-    for suffix, text in kinds.items():
+    """Write ``NAME.csv`` and ``NAME.html``."""
+    for suffix, text in (("csv", to_csv), ("html", to_html)):
         with atomic_file(folder / f"{table.name}.{suffix}") as partial:
             partial.write_text(text(table), "utf-8", errors="backslashreplace")

@@ -2,45 +2,42 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from shutil import which
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 from rich.progress import BarColumn, Progress as Bar, TaskID, TextColumn, TimeRemainingColumn
 
-from splatseed.bench.job import RunOptions, execute_runs
+from splatseed.bench.job import Machine, RunOptions, execute_runs, local_machine, ray_machine
 from splatseed.bench.plan import DEPTH, SFM, Plan, RunSpec, fair_budget, needs_cloud, plan_runs
-from splatseed.bench.plan_file import PLAN, PresetName, plan_text, preset_plan, read_plan
+from splatseed.bench.plan_file import PLAN, plan_text, read_plan
 from splatseed.bench.runs import (
-    Run,
+    ERROR,
+    BenchRun,
     check_bench_folder,
     count_runs,
     estimate_seconds,
     locked_bench,
-    package_version,
     read_run,
-    read_runs,
     record_plan,
+    run_folder,
 )
 from splatseed.bench.scenes import PlannedScene, SceneFacts, survey
 from splatseed.commands.options import check_minimum, parse_options, refuse
 from splatseed.console import ERR, OUT, print_note, print_pairs, print_table, stage_display
 from splatseed.errors import ParameterError, SceneNotFoundError
-from splatseed.io.staging import atomic_file, check_output, output_folder
+from splatseed.findings import Finding
+from splatseed.io.staging import atomic_file
 from splatseed.methods import Profile
-from splatseed.requirements import require
-from splatseed.runtime.environment import available_cpus, worker_env
+from splatseed.requirements import require, version_of
 from splatseed.runtime.interruption import exit_code
 from splatseed.runtime.memory import check_memory
-from splatseed.runtime.tasks import ProcessWorkers, Workers
-from splatseed.text import counted, did_you_mean, name_some, quoted, visible
+from splatseed.text import counted, did_you_mean, format_duration, name_some, quoted, visible
 from splatseed.training.settings import BYTES_PER_GAUSSIAN, Backend, StrategyName
 
 if TYPE_CHECKING:
@@ -65,8 +62,8 @@ class Options:
     """Train from the seeds of several methods, with repeats, and compare the results.
 
     Stop it at any time; the same command or ``splatseed bench -o BENCH`` resumes. ``splatseed bench
-    report BENCH`` writes a report, ``splatseed bench compare A B`` compares two benchmarks. A plan
-    file (--dry-run prints one) has further settings: training, scene names, method parameters.
+    report BENCH`` writes a report. A plan file (--dry-run prints one) has further settings:
+    training, scene names, method parameters.
     """
 
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="DIR")] = None
@@ -99,13 +96,10 @@ class Options:
     default those of the scene."""
     clouds: tuple[Path, ...] = ()
     """Scans for cloud and cloud+auto: a file per scene, in its frame (docs/scans.md)."""
-    preset: PresetName | None = None
-    """A ready-made plan: the scenes of Mip-NeRF360 or Replica, or four for one core (laptop), each
-    with --data; or quick, on a synthetic room."""
-    data: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """The folder of the scenes of a preset or a plan; missing scenes are skipped."""
     plan: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """A plan file, as --dry-run prints; options override it."""
+    data: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    """The folder of the scenes of a plan; missing scenes are skipped."""
     dry_run: bool = False
     """Print the plan, the number of runs, and estimates of time and disk; run nothing."""
     executor: Literal["local", "ray"] = "local"
@@ -124,27 +118,14 @@ class ReportOptions:
     """The benchmark's folder."""
 
 
-@dataclass(frozen=True)
-class CompareOptions:
-    """Show the changes from benchmark A to B, and whether they exceed the noise."""
-
-    a: Annotated[Path, tyro.conf.Positional]
-    """The folder of benchmark A."""
-    b: Annotated[Path, tyro.conf.Positional]
-    """The folder of benchmark B."""
-    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="DIR")] = None
-    """A new folder for the tables, as CSV, Markdown, LaTeX and HTML."""
-
-
 def run(arguments: list[str]) -> None:
     """Run the verb with these arguments."""
-    reporting = {"report": _report, "compare": _compare}
-    if arguments and arguments[0] in reporting:
-        reporting[arguments[0]](arguments[1:])
+    if arguments and arguments[0] == "report":
+        _report(arguments[1:])
         return
     if arguments and not arguments[0].startswith("-"):
-        fix = f"{did_you_mean(arguments[0], reporting)}Name scenes with --scenes."
-        expected = "report or compare after splatseed bench, or options"
+        fix = f"{did_you_mean(arguments[0], ['report'])}Name scenes with --scenes."
+        expected = "report after splatseed bench, or options"
         raise ParameterError(expected, found=repr(arguments[0]), fix=fix)
     options, plan = parse_plan(arguments)
     with open_machine(options, plan.training.backend) as machine:
@@ -154,41 +135,30 @@ def run(arguments: list[str]) -> None:
 def parse_plan(arguments: Sequence[str]) -> tuple[Options, Plan]:
     """Parse options, and apply them to a plan.
 
-    The plan is that of the preset, of the file, of the folder to resume, or the default one.
+    The plan is that of the file, of the folder to resume, or the default one.
     """
     options = parse_options(Options, "bench", arguments)
     check_minimum(options, 1, "jobs", "repeats", "long_side", "max_steps", "data_factor")
-    output, preset, data = options.output, options.preset, options.data
-    needs_data = preset not in {None, "quick"}
+    output = options.output
     refuse(
         (not (output or options.dry_run), "-o BENCH, the folder of the benchmark", "none",
          "Name a folder, or pass --dry-run."),
-        (options.plan and preset, "--plan or --preset", "both", "Drop one."),
-        (data and not (preset or options.plan), "--preset or --plan with --data", "neither",
-         "Name the preset."),
-        (data and preset == "quick", "--scenes for the preset quick", "--data",
-         "Drop --data."),
-        (needs_data and not data, f"--data DIR, the folder of the scenes of {preset}", "none",
-         "Name it."),
+        (options.data and not options.plan, "--plan with --data", "none", "Name the plan."),
         (options.address and options.executor != "ray", "--executor ray with --address", "local",
          "Add --executor ray."),
     )  # fmt: skip
     plan = _DEFAULT
-    if preset is not None:
-        plan = preset_plan(preset, data)
-    elif options.plan is not None:
-        plan = read_plan(options.plan, data)
+    if options.plan is not None:
+        plan = read_plan(options.plan, options.data)
     elif output and not options.scenes and (output / PLAN).is_file():
         plan = read_plan(output / PLAN)
     plan = _changed(plan, options)
-    fix = "splatseed bench --preset quick -o BENCH tries it on a synthetic room."
-    refuse((not plan.scenes, "--scenes DIR..., --preset or --plan", "none of them", fix))
+    fix = "splatseed bench --scenes demo: --max-steps 500 -o BENCH tries it on a synthetic room."
+    refuse((not plan.scenes, "--scenes DIR... or --plan", "neither", fix))
     return options, plan
 
 
 def _changed(plan: Plan, options: Options) -> Plan:
-    """Apply the options to a plan."""
-
     def given(*names: str) -> dict[str, Any]:
         return {n: value for n in names if (value := getattr(options, n)) not in (None, ())}
 
@@ -231,139 +201,114 @@ def _scenes(plan: Plan, options: Options) -> list[PlannedScene]:
     return [own[name] for name in options.scenes]
 
 
-@dataclass(frozen=True)
-class Machine:
-    """The workers of a benchmark: how many ``jobs`` at a time, with ``threads`` CPU threads each.
-
-    ``backend`` is not "auto"; ``remote`` workers are other machines.
-    """
-
-    backend: Backend
-    jobs: int
-    threads: int
-    workers: Workers
-    remote: bool = False
-
-    @property
-    def description(self) -> str:
-        """The machine, for the user."""
-        where = "Ray" if self.remote else "this machine"
-        on = "on a GPU" if self.backend == "cuda" else "on the CPU"
-        return f"{where}, {self.jobs} at a time, {on}, {counted(self.threads, 'thread')} each"
-
-
 @contextmanager
 def open_machine(options: Options, backend: Backend) -> Iterator[Machine]:
     """Open the workers for a backend."""
     require("torch", "gsplat", "flip_evaluator", "pandas")
-    if options.executor == "local":
-        yield _local_machine(options.jobs, backend)
+    if options.executor == "ray":
+        with ray_machine(options.address, options.jobs, backend) as machine:
+            yield machine
         return
-    from splatseed.runtime.ray_tasks import RayWorkers, ray_cluster
-
-    with ray_cluster(options.address):
-        gpu = None if backend == "auto" else backend == "cuda"
-        workers = RayWorkers(gpu=gpu, limit=options.jobs)
-        chosen: Backend = "cuda" if workers.gpu else "cpu"
-        yield Machine(chosen, workers.jobs, workers.threads, workers, remote=True)
-
-
-def _local_machine(jobs: int | None, backend: Backend) -> Machine:
-    chosen: Backend = "cpu"
-    driver = which("nvidia-smi") or which("rocminfo") or Path("/proc/driver/nvidia").exists()
-    if backend == "cuda" or (backend == "auto" and driver):  # else PyTorch sees no GPU
-        from splatseed.training.device import pick_device
-
-        with stage_display() as clock:  # gsplat's kernels are built here, not by each run
-            chosen = "cuda" if pick_device(backend, clock).type == "cuda" else "cpu"
-    gpus = [""]
-    if chosen == "cuda":
-        import torch
-
-        named = [each for each in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if each]
-        gpus = named or [f"{i}" for i in range(torch.cuda.device_count())]
-    jobs = jobs or len(gpus)
-    threads = max(1, available_cpus() // jobs)
-    slots = [worker_env(threads, gpus[slot % len(gpus)]) for slot in range(jobs)]
-    return Machine(chosen, jobs, threads, ProcessWorkers(slots))
+    with stage_display() as clock:
+        machine = local_machine(options.jobs, backend, clock)
+    yield machine
 
 
 def _prepare(
     options: Options, plan: Plan, machine: Machine, demo: Path | None
-) -> tuple[Plan, list[SceneFacts], list[RunSpec], list[str]]:
-    """Survey the scenes of a plan; returns the plan of those present, these, its runs, and notes.
+) -> tuple[Plan, list[SceneFacts], list[RunSpec], list[Finding]]:
+    """Survey the scenes of a plan; returns the plan of those present, these, its runs, findings.
 
     With ``--data``, scenes may be missing. ``demo`` is the folder of the synthetic scene; None to
     use its known facts.
     """
-    notes, present = list[str](), list[tuple[PlannedScene, SceneFacts]]()
+    missing, of_scenes = list[Finding](), list[Finding]()
+    present = list[tuple[PlannedScene, SceneFacts]]()
     needs = {"with_depth": DEPTH in plan.methods, "with_cloud": any(map(needs_cloud, plan.methods))}
     with stage_display() as clock:
         for scene in plan.scenes:
+            noted = list[Finding]()
             try:
-                present.append((scene, survey(scene, demo=demo, **needs, progress=clock)))
+                facts = survey(scene, demo=demo, **needs, progress=clock, note=noted.append)
             except SceneNotFoundError as error:
                 if options.data is None:
                     raise
-                notes.append(f"{scene.label} is skipped: {error}")
+                text = f"{scene.label} is skipped: {error}"
+                missing.append(Finding("missing-scene", text, subjects=(scene.label,)))
+                continue
+            present.append((scene, facts))
+            of_scenes += [replace(each, text=f"{facts.name}: {each.text}") for each in noted]
     if not present:
-        expected = f"scenes of {options.preset or options.plan} in {options.data}"
+        expected = f"scenes of {options.plan} in {options.data}"
         found = f"none of {', '.join(scene.label for scene in plan.scenes)}"
         raise SceneNotFoundError(expected, found=found, fix="Name the folder that holds them.")
     plan = replace(plan, scenes=tuple(scene for scene, _ in present))
     scenes = [facts for _, facts in present]
-    specs = plan_runs(plan, scenes, machine.backend, package_version("splatseed"))
-    notes += [*_budget_notes(options, plan), *_notes(plan, scenes, specs)]
+    specs = plan_runs(plan, scenes, machine.backend, version_of("splatseed") or "")
+    findings = [*missing, *_budget_findings(options, plan), *of_scenes]
+    findings += [*_data_findings(plan, scenes), *_full_budgets(plan, specs)]
     fix = "Name other methods, or what these need."
-    refuse((not specs, "a plan with runs", "; ".join(notes) or "none", fix))
-    if (
-        machine.backend == "cpu" and not machine.remote
-    ):  # the memory of a cluster's nodes is unknown
+    refuse((not specs, "a plan with runs", "; ".join(map(str, findings)) or "none", fix))
+    # The memory of a cluster's nodes is unknown.
+    if machine.backend == "cpu" and not machine.remote:
         num_seeds, jobs = int(max(spec.gaussians[0] for spec in specs)), machine.jobs
         fix = "Pass smaller --ratios or --budgets, or fewer --jobs."
         check_memory(
             num_seeds, BYTES_PER_GAUSSIAN * jobs, f"seeds per run with {jobs} at a time", fix=fix
         )
-    return plan, scenes, specs, notes
+    return plan, scenes, specs, findings
 
 
-def _budget_notes(options: Options, plan: Plan) -> Iterator[str]:
-    """Say what the options for budgets and ratios mean where one of both is left out."""
+def _budget_findings(options: Options, plan: Plan) -> Iterator[Finding]:
+    """Explain the budgets and ratios where one of both options is left out."""
     if options.budgets and plan.budgets and not plan.ratios:
-        yield "Methods fill the budget: --ratios 8 makes 8 times the points instead."
+        text = "Methods fill the budget: --ratios 8 makes 8 times the points instead."
+        yield Finding("budget", text, "info")
     if plan.budgets == (fair_budget(plan.ratios),) and not options.budgets:
-        yield (
+        text = (
             "All arms have the same limit of Gaussians, since more of them alone raise PSNR: "
             "--budgets none lifts it, and --profiles paper has none."
         )
+        yield Finding("budget", text, "info")
 
 
-def _notes(plan: Plan, scenes: Sequence[SceneFacts], specs: Sequence[RunSpec]) -> Iterator[str]:
-    for scene in scenes:
-        yield from (f"{scene.name}: {warning}" for warning in scene.findings)
-    without_depth = ", ".join(scene.name for scene in scenes if not scene.depth_digest)
+def _data_findings(plan: Plan, scenes: Sequence[SceneFacts]) -> Iterator[Finding]:
+    """Find methods without their data, data without a method, and a plan without a baseline."""
+    without_depth = tuple(scene.name for scene in scenes if not scene.depth_digest)
     if DEPTH in plan.methods and without_depth:
-        yield f"no depth maps, so method depth is skipped: {without_depth} (--depth DIR)"
-    without_scan = ", ".join(scene.name for scene in scenes if not scene.cloud_digest)
+        names = ", ".join(without_depth)
+        text = f"no depth maps, so method depth is skipped: {names} (--depth DIR)"
+        yield Finding("missing-depth-maps", text, subjects=without_depth)
+    without_scan = tuple(scene.name for scene in scenes if not scene.cloud_digest)
     scans = any(map(needs_cloud, plan.methods))
     if scans and without_scan:
-        yield f"no scan, so methods that need one are skipped: {without_scan} (--clouds)"
+        names = ", ".join(without_scan)
+        text = f"no scan, so methods that need one are skipped: {names} (--clouds)"
+        yield Finding("missing-scan", text, subjects=without_scan)
     if not scans and any(scene.cloud for scene in plan.scenes):
-        yield "No method uses the scans: add cloud or cloud+auto to --methods."
+        text = "No method uses the scans: add cloud or cloud+auto to --methods."
+        yield Finding("unused-scan", text)
     if SFM not in plan.methods:
-        yield "Without sfm among the methods there is no baseline."
+        text = "Without sfm among the methods there is no baseline."
+        yield Finding("missing-baseline", text)
+
+
+def _full_budgets(plan: Plan, specs: Sequence[RunSpec]) -> Iterator[Finding]:
+    """Find scenes whose points fill a budget before any method adds one."""
     full = defaultdict[tuple[str, str, int, int], dict[str, None]](dict)
     for spec in specs:
         if spec.max_seeds is not None and spec.max_seeds <= spec.scene.num_points:
             key = spec.scene.name, spec.arm.budget, spec.max_seeds, spec.scene.num_points
             full[key][spec.arm.strategy] = None
+    if set(plan.methods) == {SFM}:
+        return
     for (name, budget, limit, num_points), strategies in full.items():
-        if set(plan.methods) != {SFM}:
-            yield (
-                f"{name}: under {budget}, runs with {', '.join(strategies)} start from at most "
-                f"{limit:,} seeds, and it has {num_points:,} points: auto and the methods that "
-                "interpolate add none."
-            )
+        text = (
+            f"{name}: under {budget}, runs with {', '.join(strategies)} start from at most "
+            f"{limit:,} seeds, and it has {num_points:,} points: auto and the methods that "
+            "interpolate add none."
+        )
+        yield Finding("full-budget", text, subjects=(name,))
 
 
 def _bench(options: Options, plan: Plan, machine: Machine, arguments: Sequence[str]) -> None:
@@ -378,21 +323,21 @@ def _bench(options: Options, plan: Plan, machine: Machine, arguments: Sequence[s
         load_lpips()  # fails now rather than in every run
     if bench is None or options.dry_run:
         demo = demo if demo and demo.is_dir() else None
-        plan, _, specs, notes = _prepare(options, plan, machine, demo)
-        runs = [read_run(bench, spec) if bench else Run(spec) for spec in specs]
-        lines = [*notes, *_announcement(plan, runs, machine)]
+        plan, _, specs, findings = _prepare(options, plan, machine, demo)
+        runs = [read_run(bench, spec) if bench else BenchRun(spec) for spec in specs]
+        lines = [*map(str, findings), *_announcement(plan, runs, machine)]
         comments = "".join(f"# {' '.join(line.split())}\n" for line in lines)
         OUT.print(f"{plan_text(plan)}\n{comments}", end="", soft_wrap=True)
         return
     from splatseed.splat.lpips import has_lpips_weights
 
-    plan, scenes, specs, notes = _prepare(options, plan, machine, demo)
+    plan, scenes, specs, findings = _prepare(options, plan, machine, demo)
     record_plan(bench, "bench", specs, arguments)
     with atomic_file(bench / PLAN) as partial:  # escapes file names that are no text
         partial.write_text(plan_text(plan), "utf-8", "backslashreplace")
     runs = [read_run(bench, spec) for spec in specs]
-    for note in notes:
-        print_note(note)
+    for finding in findings:
+        print_note(finding)
     names = ", ".join(f"{visible(s.name)} ({s.num_points:,} points)" for s in scenes)
     lines = [names, *_announcement(plan, runs, machine), visible(bench)]
     OUT.print("\n  -> ".join(lines), soft_wrap=True)
@@ -406,7 +351,7 @@ def _bench(options: Options, plan: Plan, machine: Machine, arguments: Sequence[s
         sys.exit(_SOME_FAILED)
 
 
-def _announcement(plan: Plan, runs: Sequence[Run], machine: Machine) -> Iterator[str]:
+def _announcement(plan: Plan, runs: Sequence[BenchRun], machine: Machine) -> Iterator[str]:
     """Describe the runs, and estimate time and disk of the pending ones."""
     yield f"{count_runs(runs)}; {machine.description}"
     specs = (run.spec for run in runs if run.spec.arm.budget)
@@ -421,12 +366,12 @@ def _announcement(plan: Plan, runs: Sequence[Run], machine: Machine) -> Iterator
         remaining = total / min(machine.jobs, len(pending))
         disk = 0.0
         for spec in pending:
-            disk += 60e3 + 18 * spec.scene.pixels_at(spec.training.factor)  # three pictures
+            disk += 60e3 + 6 * spec.scene.pixels_at(spec.training.factor)  # a picture
             disk += 236 * spec.gaussians[1] * plan.keep_models
         yield f"about {format_duration(remaining)} ({by}), {disk / 1e6:,.1f} MB of results"
 
 
-def execute(bench: Path, runs: Sequence[Run], machine: Machine, options: RunOptions) -> bool:
+def execute(bench: Path, runs: Sequence[BenchRun], machine: Machine, options: RunOptions) -> bool:
     """Carry out the pending runs; returns False if the user stopped them.
 
     Prints a line per run, and shows bars if stderr is a terminal.
@@ -445,7 +390,7 @@ def execute(bench: Path, runs: Sequence[Run], machine: Machine, options: RunOpti
             tasks[key] = bar.add_task(label, total=1.0)
         bar.update(tasks[key], completed=fraction, description=label)
 
-    ended = execute_runs(bench, pending, machine.workers, options, machine.remote, report)
+    ended = execute_runs(bench, pending, machine, options, report)
     try:
         with bar:
             for number, run in enumerate(ended, start=before + 1):
@@ -469,14 +414,7 @@ def _describe(spec: RunSpec) -> str:
     return f"{visible(spec.scene.name)}, {arm}, repeat {spec.repeat + 1}"
 
 
-def format_duration(seconds: float) -> str:
-    """Format an estimated duration."""
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
-
-
-def _print_summary(bench: Path, runs: Sequence[Run]) -> None:
+def _print_summary(bench: Path, runs: Sequence[BenchRun]) -> None:
     from splatseed.bench.study import studies
     from splatseed.bench.study_tables import arm_table
 
@@ -489,13 +427,14 @@ def _print_summary(bench: Path, runs: Sequence[Run]) -> None:
     print_pairs("next", [*(resume if pending else []), report])
 
 
-def print_failures(bench: Path, runs: Sequence[Run]) -> None:
+def print_failures(bench: Path, runs: Sequence[BenchRun]) -> None:
     """Print the errors of failed runs."""
     failed = [run for run in runs if run.error]
     if failed:
         shown = [(_describe(run.spec), run.error) for run in failed[:_FAILURES_SHOWN]]
         print_pairs(f"failed: {len(failed)}", shown)
-        print_note(f"Full errors: {bench / 'runs' / failed[0].spec.key / 'error.json'}")
+        path = run_folder(bench, failed[0].spec) / ERROR
+        print_note(Finding("failed-runs", f"Full errors: {path}", "error", subjects=(str(path),)))
 
 
 def _report(arguments: list[str]) -> None:
@@ -508,41 +447,13 @@ def _report(arguments: list[str]) -> None:
         report = write_report(options.bench, clock)
     for sentence in report.summary:
         OUT.print(sentence)
-    for note in report.notes:
-        print_note(note)
-    kinds = f"{report.tables}, each as .csv, .md, .tex and .html, in {options.bench / 'tables'}"
+    for finding in report.findings:
+        print_note(finding)
+    kinds = f"{report.tables}, each as .csv and .html, in {options.bench / 'tables'}"
     figures = f"{report.figures} in {options.bench / 'figures'}"
     rows = [("report", str(report.path)), ("tables", kinds), ("figures", figures)]
     print_pairs(str(options.bench), rows)
     print_pairs("next", [("", f"open {quoted(report.path)} in a browser")])
-
-
-def _compare(arguments: list[str]) -> None:
-    options = parse_options(CompareOptions, "bench compare", arguments)
-    require("pandas")
-    from splatseed.bench.comparisons import compare
-    from splatseed.bench.study_tables import comparison_tables
-    from splatseed.bench.tables import write_table
-
-    written: Any = {"kind": "bench compare", "protect": (options.a, options.b)}
-    if options.output is not None:
-        check_output(options.output, **written)
-    comparison = compare(read_runs(options.a), read_runs(options.b))
-    if comparison is None:
-        expected = f"finished runs in both {options.a} and {options.b}"
-        fix = "Finish runs of both with splatseed bench."
-        raise SceneNotFoundError(expected, found="none in one of them", fix=fix)
-    tables = comparison_tables(comparison)
-    for table in tables:
-        if table.rows:
-            _print_table(table)
-    for note in comparison.notes:
-        print_note(note)
-    if options.output is not None:
-        with output_folder(options.output, **written) as partial:
-            for table in tables:
-                write_table(table, partial)
-        print_pairs("written", [("tables", str(options.output))])
 
 
 def _print_table(table: Table) -> None:

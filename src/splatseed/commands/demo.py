@@ -23,7 +23,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import astuple, dataclass, replace
 from importlib import invalidate_caches
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -33,13 +32,14 @@ import tyro
 from splatseed.commands.options import parse_options, refuse
 from splatseed.console import StageClock, print_note, print_pairs, print_table, stage_display
 from splatseed.errors import MissingDependencyError
+from splatseed.findings import Finding
 from splatseed.io import find_depths, load_scene, write_scene
 from splatseed.io.staging import add_files, atomic_file, output_folder, read_manifest
 from splatseed.methods import METHODS, chooses_number, configure, methods_for
 from splatseed.pointcloud import PointCloud
-from splatseed.requirements import require
+from splatseed.progress import watched
+from splatseed.requirements import require, version_of
 from splatseed.runtime.child import Child
-from splatseed.runtime.compilation import watched
 from splatseed.scene import Scene
 from splatseed.text import quoted
 
@@ -191,12 +191,8 @@ def _compile(part: str, scene: Scene, folder: Path) -> None:
 def _has_pytorch() -> bool:
     """Return whether training's packages are completely installed."""
     invalidate_caches()
-    try:
-        for package in ("torch", "gsplat", "torchmetrics", "flip-evaluator"):
-            version(package)  # from what pip writes last
-    except PackageNotFoundError:
-        return False
-    return True
+    # Versions come from what pip writes last.
+    return all(map(version_of, ("torch", "gsplat", "torchmetrics", "flip-evaluator")))
 
 
 # Points -------------------------------------------------------------------------------------------
@@ -231,7 +227,8 @@ def _make_points(options: Options) -> None:
         clock("pictures", 0.0)
         pictures.preview_pair(scene, clouds[SHOWN], folder / PICTURES[0], title=SHOWN)
     seconds = sum(clock.seconds().values())
-    print_note(f"the first picture is ready after {seconds:.0f} s: {out / PICTURES[0]}")
+    text = f"the first picture is ready after {seconds:.0f} s: {out / PICTURES[0]}"
+    print_note(Finding("first-picture", text, "info"))
 
     scene, methods = _load(out), methods_for(_load(out))
     add_files(out, [TABLE, *PICTURES[1:]])
@@ -296,7 +293,8 @@ def _train(options: Options) -> bool:
     try:
         require("torch", "gsplat", "flip_evaluator")
     except MissingDependencyError as error:
-        print_note(f"not trained: {error.found} installed. {error.fix}")
+        text = f"not trained: {error.found} installed."
+        print_note(Finding("missing-package", text, "info", fix=error.fix))
         return False
     from splatseed.training.settings import TrainSettings
     from splatseed.viewer.page import write_grid
@@ -350,7 +348,8 @@ def _train_arm(
     from splatseed.splat.metrics import flip_map
     from splatseed.splat.photographs import photograph_tensor
     from splatseed.splat.pictures import FLIP_LABEL, flip_heatmap, to_uint8
-    from splatseed.training.prepare import PrepareOptions, prepare_run
+    from splatseed.training.prepare import prepare_run
+    from splatseed.training.request import PrepareOptions
     from splatseed.viewer.page import Tile
 
     stage = f"train {ARMS[name]}"
@@ -376,7 +375,6 @@ def _train_arm(
 def _summarise_training(
     picture: Path, seeding: float, results: Mapping[str, TrainingResult]
 ) -> None:
-    """Print the runs side by side, and the gain by seeds."""
     seconds = {name: each.train_seconds for name, each in results.items()}
     seconds[POSES] += seeding
     rows = [

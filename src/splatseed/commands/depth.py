@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import math
-import platform
 import time
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,13 +16,13 @@ from splatseed.commands.options import check_minimum, parse_options, refuse
 from splatseed.console import OUT, print_note, print_pairs, stage_display
 from splatseed.depth.stereo.maps import MIN_SIZE
 from splatseed.depthmap import DepthKind
-from splatseed.findings import without_kinds
+from splatseed.findings import Finding, without_kinds
 from splatseed.io import dense, load_scene
 from splatseed.io.photograph_checks import with_photographs
 from splatseed.io.staging import check_output
-from splatseed.requirements import require
+from splatseed.requirements import require, versions_of
 from splatseed.scene import Scene
-from splatseed.seeding.trainability import is_distorted
+from splatseed.seeding.advice import is_distorted
 from splatseed.text import name_some, quoted, visible
 
 if TYPE_CHECKING:  # stereo is loaded after the options are parsed
@@ -84,12 +81,8 @@ def run(arguments: list[str]) -> None:
 
 def _provenance(options: Options) -> dict[str, object]:
     """Options and versions of packages, for ``splatseed.json``."""
-    versions = {"python": platform.python_version()}
-    for package in PACKAGES:
-        with suppress(PackageNotFoundError):
-            versions[package] = version(package)
     given = {name: value for name, value in asdict(options).items() if value is not None}
-    return {"command": "depth", "options": given, "versions": versions}
+    return {"command": "depth", "options": given, "versions": versions_of(PACKAGES)}
 
 
 def _run_network(options: Options, model: str) -> None:
@@ -118,11 +111,12 @@ def _run_network(options: Options, model: str) -> None:
         ("output", str(options.output)),
     ]
     print_pairs("splatseed depth", rows)
-    for warning in scene.findings:
-        print_note(warning)
+    for finding in scene.findings:
+        print_note(finding)
     if report.flat:
         flat = name_some(report.flat, NAMES_SHOWN)
-        print_note(f"the network predicted no depth (a constant map, or none) for: {flat}")
+        text = f"the network predicted no depth (a constant map, or none) for: {flat}"
+        print_note(Finding("no-depth", text, subjects=tuple(report.flat)))
     known = num * min(math.prod(size) for size in sizes)
     print_pairs("next", after_depth(options.scene, scene, options.output, known, aligned=False))
 
@@ -167,10 +161,11 @@ def _summarise_stereo(
         f"pixels confirmed by other views, in {seconds:.1f} s, written to {visible(path)}",
         soft_wrap=True,
     )
-    for warning in without_kinds(scene.findings, "lens-distortion"):
-        print_note(warning)
+    for finding in without_kinds(scene.findings, "lens-distortion"):
+        print_note(finding)
     if report.empty:
-        print_note(f"no other view confirms any pixel of: {name_some(report.empty, NAMES_SHOWN)}")
+        text = f"no other view confirms any pixel of: {name_some(report.empty, NAMES_SHOWN)}"
+        print_note(Finding("no-depth", text, subjects=tuple(report.empty)))
     if options.colmap:
         fuse = f"--workspace_path {quoted(path)} --output_path {quoted(path / 'fused.ply')}"
         fuse = f"colmap stereo_fusion {fuse} --StereoFusion.min_num_pixels {MIN_PIXELS}"
@@ -178,10 +173,9 @@ def _summarise_stereo(
         print_pairs("next", [show_maps(path, path), ("fuse", fuse)])
         return
     if is_distorted(scene):
-        print_note(
-            "the cameras have lens distortion, and these maps belong to the undistorted "
-            "photographs: --colmap writes both, as a scene to continue with"
-        )
+        text = "the cameras have lens distortion, and these maps belong to the undistorted "
+        text += "photographs: --colmap writes both, as a scene to continue with"
+        print_note(Finding("lens-distortion", text, "info"))
     known = report.num_known
     print_pairs("next", after_depth(options.scene, scene, path, known, aligned=True))
 

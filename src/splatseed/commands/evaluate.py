@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from splatseed.commands.options import MaskChoice, parse_options
+from splatseed.commands.options import parse_options
 from splatseed.commands.outputs import check_free
 from splatseed.console import StageClock, print_note, print_pairs, print_table, stage_display
+from splatseed.findings import Finding
 from splatseed.io.staging import check_output, output_folder, write_json
 from splatseed.photos.view import View
 from splatseed.requirements import require
 from splatseed.text import counted
 from splatseed.training.folder import RunFolder
-from splatseed.training.settings import Backend
+from splatseed.training.request import AS_TRAINED, EvaluateRequest
 
 if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
     from splatseed.scores import EvalResult, ViewScore
@@ -39,23 +40,8 @@ class Options:
     .splat."""
     scene: Path | None = None
     """The scene the model belongs to, in the same world; a run knows its own."""
-    data_factor: int | None = None
-    """Factor by which photographs are downsampled; by default a run's own, else the smallest that
-    leaves at most 1600 pixels on the longer side."""
-    test_every: int | None = None
-    """Score every n-th image, sorted by name; by default as the run was trained, else 8."""
-    transform: Annotated[str | None, tyro.conf.arg(metavar="FILE|gsplat|flipped|none")] = None
-    """From the scene's world to the model's, if its trainer normalised the scene: a JSON file with
-    a matrix, nerfstudio's dataparser_transforms.json, graphdeco's cameras.json, gsplat for its
-    examples' normalisation, or flipped for y and z negated; none: score the model where it is,
-    unchanged."""
-    masks: MaskChoice = None
-    """A folder of masks, where pixels of 0 do not count, or none; inverted: only they count. By
-    default the run's, else the folder masks beside the photographs, and transparency."""
-    lpips_weights: Path | None = None
-    """The file of VGG's weights for LPIPS, or its folder; by default PyTorch's cache."""
-    backend: Backend = "auto"
-    """Where to render; auto takes a GPU if PyTorch sees one."""
+    request: Annotated[EvaluateRequest, tyro.conf.arg(name="")] = AS_TRAINED
+    """How to score; its fields are options of their own."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """A JSON file to write the scores to."""
     renders: Path | None = None
@@ -70,10 +56,7 @@ def run(arguments: list[str]) -> None:
     require("torch", "flip_evaluator")
     from splatseed.training.evaluation import Evaluation
 
-    evaluation = Evaluation.of(
-        options.model, options.scene, data_factor=options.data_factor,
-        test_every=options.test_every, transform=options.transform, masks=options.masks,
-    )  # fmt: skip
+    evaluation = Evaluation.of(options.model, options.scene, options.request)
     scene, gaussians = Path(str(evaluation.scene)), Path(str(evaluation.model))
     if options.renders is not None:
         check_output(
@@ -86,7 +69,7 @@ def run(arguments: list[str]) -> None:
         check_free(options.output, overwrite=options.overwrite, protect=inputs)
     with stage_display() as clock:
         clock("read", 0.0)
-        model = evaluation.load(options.backend, clock)
+        model = evaluation.load(clock)
         result = _score(options, evaluation, model, clock)
     rows = [
         (score.name, *_numbers(score), f"{1e3 * score.seconds:.1f}") for score in result.per_image
@@ -115,9 +98,10 @@ def run(arguments: list[str]) -> None:
     facts += [(label, str(path)) for label, path in written if path is not None]
     print_pairs(str(options.model), facts)
     if result.lpips is None:
-        print_note(f"LPIPS was not computed: {result.lpips_reason}")
-    for doubt in evaluation.doubts(model):
-        print_note(doubt)
+        text = f"LPIPS was not computed: {result.lpips_reason}"
+        print_note(Finding("missing-lpips", text, "info"))
+    for finding in evaluation.findings(model):
+        print_note(finding)
 
 
 def _score(
@@ -126,7 +110,7 @@ def _score(
     """Score the test views and write the requested files."""
     from splatseed.splat.pictures import picture_names, write_comparison
 
-    score = partial(evaluation.score, model, lpips_weights=options.lpips_weights, progress=clock)
+    score = partial(evaluation.score, model, progress=clock)
     if options.renders is None:
         result = score()
     else:
@@ -145,8 +129,9 @@ def _score(
             "test_every": evaluation.test_every,
             **result.to_dict(),
         }
-        if doubts := evaluation.doubts(model):
-            content["notes"] = doubts
+        if findings := evaluation.findings(model):
+            content["findings"] = [asdict(each) for each in findings]
+            content["notes"] = [str(each) for each in findings]
         write_json(options.output, content)
     return result
 

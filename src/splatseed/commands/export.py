@@ -12,6 +12,7 @@ import tyro
 from splatseed.commands.options import parse_options, refuse
 from splatseed.commands.outputs import check_free
 from splatseed.console import print_note, print_pairs, stage_display
+from splatseed.findings import Finding
 from splatseed.io.origin import RECENTER, choose_origin, format_offset, offset_beside, write_offset
 from splatseed.progress import Note, Progress
 from splatseed.requirements import require
@@ -26,8 +27,7 @@ from splatseed.splat.formats import (
 from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.model_frame import translate_gaussians
 from splatseed.text import quoted, visible
-from splatseed.training.folder import RunFolder
-from splatseed.training.models import config_of, model_file
+from splatseed.training.folder import RunFolder, config_of, model_file
 from splatseed.training.settings import TrainSettings
 
 PAGE = ".html"
@@ -44,8 +44,8 @@ class Options:
     """A run folder of splatseed train, or a file of Gaussians: .ply, .compressed.ply, .splat, .spz,
     .sog."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """The file to write; its suffix chooses the format: .ply, .compressed.ply, .splat, .spz, .sog,
-    or .html, a page with viewer and model that browsers open from disk."""
+    """The file to write; its suffix chooses the format: .ply, .splat, .spz, .sog, or .html, a page
+    with viewer and model that browsers open from disk."""
     crop: Annotated[str | None, tyro.conf.arg(metavar="x0,y0,z0,x1,y1,z1")] = None
     """Keep the Gaussians whose centres lie in this box, in world coordinates; write --crop=-1,...
     if the first number is negative."""
@@ -83,10 +83,10 @@ def run(arguments: list[str]) -> None:
     )  # fmt: skip
     if cleans or page:
         require("torch", *["viser"] * page)
-    notes: list[str] = []
+    findings: list[Finding] = []
     with stage_display() as clock:
         clock("read", 0.0)
-        gaussians = read_gaussians(path, notes.append)
+        gaussians = read_gaussians(path, findings.append)
         # What leaves nothing is refused before photographs are compared.
         kept = filter_gaussians(gaussians, crop, options.min_opacity)
         floaters = np.zeros(len(gaussians), bool)
@@ -101,9 +101,9 @@ def run(arguments: list[str]) -> None:
             )
             kept = filter_gaussians(gaussians.select(~floaters), crop, options.min_opacity)
         if page:
-            _write_page(options.model, path, kept, target, clock, notes.append)
+            _write_page(options.model, path, kept, target, clock, findings.append)
         else:
-            _write_file(path, kept, target, clock, notes.append)
+            _write_file(path, kept, target, clock, findings.append)
     before, after = path.stat().st_size, target.stat().st_size
     rows = [
         ("Gaussians", f"{len(kept):,} of {len(gaussians):,}"),
@@ -113,15 +113,15 @@ def run(arguments: list[str]) -> None:
         ("output", str(target)),
     ]
     print_pairs("splatseed export", rows)
-    for note in notes:
-        print_note(note)
     if path.suffix.lower() == ".spz" != target.suffix.lower():
-        print_note(
-            "The axes of the .spz were read as right, up, back, as specified. If the result is "
-            "upside down, they had not been converted (docs/models.md)."
-        )
+        text = "The axes of the .spz were read as right, up, back, as specified."
+        fix = "If the result is upside down, they had not been converted (docs/models.md)."
+        findings.append(Finding("spz-axes", text, "info", fix=fix))
     if name == "splat" and gaussians.shN.size:
-        print_note("A .splat has no view-dependent colour: the model's is left out.")
+        text = "A .splat has no view-dependent colour: the model's is left out."
+        findings.append(Finding("unused-harmonics", text))
+    for finding in findings:
+        print_note(finding)
     if page:
         link = visible(target.resolve().as_uri())
         print_pairs("next", [("open it in a browser, here or wherever you send it", link)])
@@ -139,8 +139,12 @@ def _write_file(path: Path, kept: Gaussians, target: Path, progress: Progress, n
     write_offset(target, offset)
     if offset.any():
         note(
-            f"The file is around {format_offset(offset)}, as {target.name}.{RECENTER} beside it "
-            "records: coordinates before = after + offset."
+            Finding(
+                "far-from-origin",
+                f"The file is around {format_offset(offset)}, as {target.name}.{RECENTER} beside "
+                "it records: coordinates before = after + offset.",
+                "info",
+            )
         )
 
 
@@ -165,7 +169,8 @@ def _scoring_command(options: Options) -> str:
     words = ["splatseed evaluate", quoted(options.output)]
     words += ["--scene", quoted(scene) if isinstance(scene, str) else "SCENE"]
     if not isinstance(factor, int):
-        print_note("Score it at the size of training: N is the --data-factor of the run.")
+        text = "Score it at the size of training: N is the --data-factor of the run."
+        print_note(Finding("unknown-data-factor", text, "info"))
         words += ["--data-factor", "N"]
     elif factor != 1:
         words += ["--data-factor", str(factor)]

@@ -13,12 +13,13 @@ from splatseed.commands.options import parse_options, refuse
 from splatseed.commands.outputs import check_free
 from splatseed.console import print_note, print_pairs, stage_display
 from splatseed.errors import ParameterError
+from splatseed.findings import Finding
 from splatseed.io.origin import find_shift
 from splatseed.pointcloud import PointCloud
 from splatseed.requirements import require
 from splatseed.scene import Scene
 from splatseed.similarity import Similarity
-from splatseed.training.models import model_file
+from splatseed.training.folder import model_file
 from splatseed.training.settings import Backend
 
 if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
@@ -109,15 +110,15 @@ def run(arguments: list[str]) -> None:
         ("video", f"{options.output}, {options.output.stat().st_size / 1e6:.1f} MB"),
     ]
     print_pairs("splatseed flight", rows)
-    for note in (note for item in items for note in item.notes):
-        print_note(note)
+    for finding in (finding for item in items for finding in item.findings):
+        print_note(finding)
     if items[0].moved and options.path not in (None, ORBIT) and options.transform is None:
-        print_note(
-            f"The path {options.path} is taken to be in the model's frame, too, and was "
-            "transformed with it; for one in the scene's frame, pass --transform none."
-        )
+        text = f"The path {options.path} is taken to be in the model's frame, too, and was "
+        text += "transformed with it; for one in the scene's frame, pass --transform none."
+        print_note(Finding("path-frame", text, "info"))
     if items[0].scene is None and options.path is None:
-        print_note("The model has no cameras, so the video circles it; pass --scene for a path.")
+        text = "The model has no cameras, so the video circles it; pass --scene for a path."
+        print_note(Finding("no-cameras", text, "info"))
 
 
 def _open_models(options: Options) -> list[ViewerItem]:

@@ -35,6 +35,7 @@ from splatseed.console import (
 from splatseed.depth.settings import DepthSettings
 from splatseed.depthmap import DepthKind, DepthMaps, in_scene_units
 from splatseed.errors import SplatseedError
+from splatseed.findings import Finding
 from splatseed.io import load_scene
 from splatseed.io.load import depths_beside, with_depths_in
 from splatseed.io.seeds import was_upsampled
@@ -42,9 +43,8 @@ from splatseed.photos.camera_check import stray_cameras
 from splatseed.progress import Progress
 from splatseed.scene import Scene
 from splatseed.seeding import diagnostics
-from splatseed.seeding.advice import Advice, advice_for
+from splatseed.seeding.advice import Advice, advice_for, is_distorted, untrainable
 from splatseed.seeding.photo_methods import has_points, photographed
-from splatseed.seeding.trainability import is_distorted, untrainable
 from splatseed.text import counted, quoted, visible
 from splatseed.training.folder import RunFolder
 from splatseed.training.schedule import FULL_RUN
@@ -129,7 +129,9 @@ def run(arguments: list[str]) -> None:
         usable = scene.replace(depths=None)  # nothing follows from maps that cannot be used
     planned = Planned.of(usable, options.budget, options.max_steps, options.trainer)
     share = None if regions is None else regions.mean
-    advice = advice_for(usable, planned.max_seeds, strategy=planned.strategy, empty=share)
+    advice = advice_for(
+        usable, planned.max_seeds, why_no_seeds=planned.strategy.why_no_seeds, empty=share
+    )
     rows = [*_source_rows(scene), *_depth_map_rows(maps, beside)]
     rows += [*_cloud_rows(cloud), *_track_rows(tracks)]
     rows += _photograph_rows(regions, poses, masks)
@@ -231,7 +233,7 @@ def _check_poses(
     if not scene.has_photographs:
         return None, ""
     from splatseed.seeding.pose_accuracy import estimate_pose_error, given_pose_error
-    from splatseed.seeding.poses import agreement_warning, check_poses
+    from splatseed.seeding.poses import agreement_findings, check_poses
 
     try:
         images = photographed(scene)
@@ -245,19 +247,22 @@ def _check_poses(
         error = estimate_pose_error(scene, images, progress)
         return {"agreement": agreement, "error": error, "problem": ""}, ""
     error = given_pose_error(scene, images, progress)
-    problem = with_options(error.warning) if error else ""
+    problem = with_options("".join(map(str, error.findings))) if error else ""
     facts = {"agreement": agreement, "error": error, "problem": problem}
-    return facts, agreement_warning(agreement, masked)
+    return facts, "".join(map(str, agreement_findings(agreement, masked)))
 
 
 def _unit_mismatch(scene: Scene, poses: Mapping[str, Any] | None) -> str:
     """Describe depth maps of another unit than the poses, unless the poses cannot be checked."""
     if not in_scene_units(scene.depths) or poses is None or not poses["agreement"]:
         return ""
-    from splatseed.seeding.map_seeds import unit_mismatch
+    from splatseed.seeding.map_seeds import unit_ratio
 
-    mismatch = unit_mismatch(scene, photographed(scene))
-    return f"the depth maps are in another unit than the poses: {mismatch}" if mismatch else ""
+    ratio = unit_ratio(scene, photographed(scene))
+    if ratio is None:
+        return ""
+    times = f"their depth is {ratio:.4g} times that of the photographs"
+    return f"the depth maps are in another unit than the poses: {times}"
 
 
 def _next(
@@ -309,6 +314,8 @@ def _facts_of(scene: Scene) -> dict[str, Any]:
 
 def _plain(value: Any) -> Any:
     """Convert a value for JSON: a dataclass to an object, a number that is not finite to null."""
+    if isinstance(value, Finding):
+        return str(value)
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         value = dataclasses.asdict(value)
     if isinstance(value, Mapping):
@@ -403,9 +410,9 @@ def _photograph_rows(
         grid = f"(of cells, {diagnostics.EMPTY_CELLS} along the longer side)"
         rows.append(("image area without points", f"{regions.mean:.0%} on average, {worst} {grid}"))
     if poses and (poses["error"] is not None or not poses["problem"]):
-        from splatseed.seeding.poses import agreement_warning
+        from splatseed.seeding.poses import agreement_findings
 
-        few = agreement_warning(poses["agreement"]) != ""
+        few = bool(agreement_findings(poses["agreement"]))
         agreed = f"at {poses['agreement']:.0%} of the pixels compared: {'few' if few else 'enough'}"
         error = poses["error"]
         miss = "unknown: too few corners are found again" if error is None else error.verdict
@@ -417,7 +424,7 @@ def _advice_rows(advice: Advice, planned: Planned) -> list[tuple[str, str]]:
     """Return the advice, its reasons, and the training it is for."""
     size = f" ({planned.rho})" if planned.rho else ""
     plan = f"{planned.budget:,} Gaussians at most{size}, {planned.max_steps:,} steps, strategy"
-    rows = [("planned", f"{plan} {planned.strategy}"), ("advice", advice.sentence)]
+    rows = [("planned", f"{plan} {planned.strategy.name}"), ("advice", advice.sentence)]
     if advice.measured.layout:
         rows.insert(0, ("cameras stand", advice.measured.layout))
     return rows + [("" if i else "why", reason) for i, reason in enumerate(advice.reasons)]
@@ -473,7 +480,7 @@ def _print_depth(title: str, scene: Scene, alignments: Mapping[str, Alignment]) 
 def _print_list(title: str, sentences: Sequence[str]) -> None:
     OUT.print(f"\n{title}", style="bold" if sentences else "")
     for sentence in sentences:
-        OUT.print(f"  - {with_options(sentence)}", soft_wrap=True)
+        OUT.print(f"  - {with_options(str(sentence))}", soft_wrap=True)
 
 
 def _spread(values: Iterable[float], style: str) -> str:

@@ -7,6 +7,7 @@ and 95, and keys are only ever added.
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +15,13 @@ import numpy as np
 from jaxtyping import Float
 
 from splatseed.console import OUT, print_note, print_pairs
+from splatseed.findings import Finding
 from splatseed.io.files import read_bytes
 from splatseed.io.origin import format_offset, offset_beside
 from splatseed.splat.formats import FORMATS, detect_format, holds_gaussians, read_gaussians
 from splatseed.splat.gaussians import VISIBLE_LOGIT, Gaussians
 from splatseed.text import quoted
-from splatseed.training.folder import RunFolder
-from splatseed.training.models import config_of, model_file
+from splatseed.training.folder import RunFolder, config_of, model_file
 
 PERCENTILES = (5, 25, 50, 75, 95)
 
@@ -32,8 +33,8 @@ def is_model(path: Path) -> bool:
 
 def show_model(path: Path, *, as_json: bool = False) -> None:
     """Print the count, the extent, and the sizes and opacities of a model's Gaussians."""
-    file, notes = model_file(path), list[str]()
-    gaussians = read_gaussians(file, notes.append)
+    file, findings = model_file(path), list[Finding]()
+    gaussians = read_gaussians(file, findings.append)
     facts = {
         "format": detect_format(file, read_bytes(file)),
         "bytes": file.stat().st_size,
@@ -42,7 +43,9 @@ def show_model(path: Path, *, as_json: bool = False) -> None:
     offset = offset_beside(file)
     facts["offset"] = None if offset is None else offset.tolist()
     if as_json:
-        print(json.dumps({**facts, "notes": notes}, indent=2), file=OUT.file)
+        facts["findings"] = [asdict(each) for each in findings]
+        facts["notes"] = [str(each) for each in findings]
+        print(json.dumps(facts, indent=2), file=OUT.file)
         return
     middle, whole = (
         "  to  ".join(" ".join(f"{x:.4g}" for x in corner) for corner in facts[name])
@@ -66,8 +69,8 @@ def show_model(path: Path, *, as_json: bool = False) -> None:
     if offset is not None:
         rows.append(("offset", f"{format_offset(offset)}: before = after + offset"))
     print_pairs(str(path), rows)
-    for note in notes:
-        print_note(note)
+    for finding in findings:
+        print_note(finding)
     known = isinstance(config_of(path).get("scene"), str)
     scored = f"splatseed evaluate {quoted(path)}{'' if known else ' --scene SCENE'}"
     print_pairs("next", [("look at it", f"splatseed view {quoted(path)}"), ("score it", scored)])

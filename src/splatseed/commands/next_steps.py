@@ -12,19 +12,21 @@ import numpy as np
 
 from splatseed.console import print_note, print_pairs
 from splatseed.depth.settings import PER_POINT
+from splatseed.findings import Finding
 from splatseed.io.staging import read_manifest
 from splatseed.io.transforms_layout import Layout
 from splatseed.lens import undistort_command, undistorted_folder
 from splatseed.photos.sizes import TRAINED_SIDE, factor_for_size
 from splatseed.runtime.environment import available_cpus
 from splatseed.scene import Image, Scene
-from splatseed.seeding.advice import AS_IT_IS, SEEDED, Advice
+from splatseed.seeding.advice import AS_IT_IS, SEEDED, Advice, is_distorted, untrainable
 from splatseed.seeding.photo_methods import Auto
-from splatseed.seeding.trainability import is_distorted, untrainable
-from splatseed.text import quoted
-from splatseed.training.duration import format_duration, planned_seconds
+from splatseed.text import format_duration, quoted
+from splatseed.training.duration import planned_seconds
+from splatseed.training.request import DEFAULTS
 from splatseed.training.schedule import FULL_RUN
-from splatseed.training.settings import BUDGET, StrategyName, TrainSettings
+from splatseed.training.settings import BUDGET, TrainSettings
+from splatseed.training.traits import Traits
 
 TrainerName: TypeAlias = Literal[
     "splatseed", "gsplat", "graphdeco", "nerfstudio", "brush", "opensplat", "lichtfeld"
@@ -52,7 +54,7 @@ class Planned(NamedTuple):
     budget: int
     rho: str  # the budget per pixel, and the photograph's size; empty without photographs
     max_steps: int
-    strategy: str
+    strategy: Traits
     max_seeds: int
     flags: str
     trainer: TrainerName
@@ -85,7 +87,7 @@ class Planned(NamedTuple):
             flags = f"--budget {number} "
         if max_steps != FULL_RUN:
             flags = f"{flags}--max-steps {max_steps} "
-        strategy: StrategyName = "auto" if trainer == "splatseed" else "default"
+        strategy = DEFAULTS.strategy if trainer == "splatseed" else "default"
         settings = TrainSettings(strategy=strategy, max_steps=max_steps, cap_max=number)
         max_seeds = settings.max_seeds(number)
         rho = ""
@@ -96,9 +98,9 @@ class Planned(NamedTuple):
         threads = available_cpus()
         seconds = planned_seconds(settings, seeds, pixels, threads)
         seconds += COMPARE_SECONDS * len(images) / threads
-        growth = settings.densification
         most = len(scene.points) + _most_seeds(images)
-        return cls(number, rho, max_steps, growth, max_seeds, flags, trainer, seconds, most)
+        traits = settings.traits
+        return cls(number, rho, max_steps, traits, max_seeds, flags, trainer, seconds, most)
 
 
 def advice_commands(
@@ -249,15 +251,17 @@ def print_training(read_from: Path, scene: Scene, output: Path, layout: Layout) 
         trainers = training_commands(output, layout, distorted=bool(lenses))
         print_pairs("train it with", trainers)
         if "graphdeco" in dict(trainers) and (off := off_centre(scene)) > CENTRED:
-            print_note(
+            text = (
                 f"graphdeco's trainer ignores principal points, which are up to {off:.1f} px off "
+            )
+            text += (
                 "the photographs' centres: it trains as if they were there. The others read them."
             )
+            print_note(Finding("off-centre-principal-points", text))
     if lenses:
-        print_note(
-            f"{'The other trainers' if known else 'Trainers'} need photographs without lens "
-            f"distortion: begin with {undistort_command(read_from)}, and upsample that scene."
-        )
+        text = f"{'The other trainers' if known else 'Trainers'} need photographs without lens "
+        text += f"distortion: begin with {undistort_command(read_from)}, and upsample that scene."
+        print_note(Finding("lens-distortion", text, "info"))
 
 
 def off_centre(scene: Scene) -> float:

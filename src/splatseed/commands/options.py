@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from typing import Annotated, Any, TypeVar
+from typing import Any, TypeVar
 
 import tyro
 
@@ -14,10 +14,6 @@ Options = TypeVar("Options")
 
 CONFIG = (tyro.conf.DisallowNone, tyro.conf.FlagCreatePairsOff)
 """Optional options take no None; a switch has no negated twin."""
-
-
-MaskChoice = Annotated[str | None, tyro.conf.arg(metavar="DIR|none|inverted[:DIR]")]
-"""The masks to use: see ``io.masks.with_masks``."""
 
 
 def parse_options(

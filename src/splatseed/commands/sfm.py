@@ -16,17 +16,16 @@ import tyro
 from splatseed.commands.options import parse_options, refuse
 from splatseed.console import ERR, StageClock, print_note, print_pairs, stage_display
 from splatseed.errors import SplatseedError
+from splatseed.findings import Finding
 from splatseed.io import load_scene
 from splatseed.io.files import is_video
 from splatseed.io.masks import masks_near
-from splatseed.io.origin import RECENTER
 from splatseed.io.staging import check_output
 from splatseed.runtime.torch_device import DeviceName
 from splatseed.scene import Masks, Scene
 from splatseed.sfm import MatcherName, Settings, SfmReport, reconstruct
 from splatseed.sfm.first_look import FIRST_LOOK, NEIGHBOURS, STAGE
 from splatseed.sfm.photos import pick_frames
-from splatseed.sfm.refinement import unrefined_note
 from splatseed.text import counted, name_some, quoted, visible
 
 if TYPE_CHECKING:  # Numba, for which --help would wait, comes with it
@@ -111,10 +110,9 @@ def _from_video(options: Options, video: Path, clock: StageClock) -> SfmReport:
     with TemporaryDirectory(prefix="splatseed-frames-") as name:
         picked = pick_frames(video, Path(name), options.frames, clock)
         report = _from_photographs(options, Path(name), clock)
-    print_note(
-        f"{len(picked.numbers)} of the video's {picked.total:,} frames were picked; the "
-        f"picture moves by {picked.motion:.1f} times its width."
-    )
+    text = f"{len(picked.numbers)} of the video's {picked.total:,} frames were picked; the "
+    text += f"picture moves by {picked.motion:.1f} times its width."
+    print_note(Finding("picked-frames", text, "info"))
     return report
 
 
@@ -136,15 +134,15 @@ def _from_photographs(options: Options, images: Path, clock: StageClock) -> SfmR
     else:
         stages = [*(["refinement"] if options.refine_poses else []), "triangulation"]
         poses = load_scene(options.poses_from, require_points=False)
-        for note in (each for each in poses.findings if RECENTER in each):
-            print_note(note)
+        for finding in (each for each in poses.findings if each.kind == "far-from-origin"):
+            print_note(finding)
         how = {"poses_from": poses, "refine_poses": options.refine_poses}
     if poses is not None and poses.masks is not None and poses.masks.files:
         masks = poses.masks
     elif not video:
-        masks, notes = masks_near(images)
-        for note in notes:
-            print_note(note)
+        masks, findings = masks_near(images)
+        for finding in findings:
+            print_note(finding)
     return reconstruct(
         images,
         options.output,
@@ -153,7 +151,7 @@ def _from_photographs(options: Options, images: Path, clock: StageClock) -> SfmR
         resume=options.resume,
         overwrite=options.overwrite,
         on_progress=clock,
-        on_note=print_note,
+        note=print_note,
         on_photos=partial(_report_photographs, options, images, capture, clock, stages, poses),
         **how,
     )
@@ -209,14 +207,15 @@ def _report_photographs(
             f"{counted(len(lost), 'pose')} without a photograph ({name_some(lost, SHOWN)})"
         )
     if skipped:
-        print_note(f"Left out: {'; '.join(skipped)}.")
+        print_note(Finding("images-left-out", f"Left out: {'; '.join(skipped)}."))
     if capture is not None and options.poses_from is None:
         scene = quoted(options.images)
-        print_note(
+        text = (
             f"{visible(options.images)} has poses of {counted(len(capture.images), 'photograph')}"
             f"{', and depth maps' if capture.depths else ''}: splatseed upsample {scene} -o OUT "
             f"uses them without SfM, splatseed info {scene} measures the error of the poses."
         )
+        print_note(Finding("known-poses", text, "info"))
 
 
 def _pose_error(report: SfmReport, clock: StageClock) -> PoseErrorEstimate | None:
@@ -253,16 +252,18 @@ def _summarise(options: Options, report: SfmReport, error: PoseErrorEstimate | N
     ]
     print_pairs("splatseed sfm", rows)
     if 2 * report.registered < report.total:
-        print_note("This is a part of the scene: fewer than half of the photographs have a pose.")
-    if report.doubt:
-        print_note(report.doubt)
-    elif error is not None and not error.exact:
-        print_note(
+        text = "This is a part of the scene: fewer than half of the photographs have a pose."
+        print_note(Finding("partial-scene", text))
+    contradicted = any(each.kind == "contradicted-poses" for each in report.findings)
+    if not contradicted and error is not None and not error.exact:
+        text = (
             "The photographs do not fit these poses well: look at them (splatseed view), and take "
             "more photographs, closer together, of where they are wrong."
         )
-    if change is not None and (note := unrefined_note(len(report.poses), change.excluded)):
-        print_note(note)
+        print_note(Finding("inexact-poses", text))
+    for finding in report.findings:
+        print_note(finding)
     if report.unregistered:
-        print_note(f"without a pose: {name_some(report.unregistered)}")
+        text = f"without a pose: {name_some(report.unregistered)}"
+        print_note(Finding("unregistered-images", text, subjects=tuple(report.unregistered)))
     print_pairs("next", [("what suits it", f"splatseed info {quoted(options.output)}")])

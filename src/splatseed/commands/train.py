@@ -8,7 +8,7 @@ import sys
 import time
 import tomllib
 from collections import deque
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from datetime import timedelta
@@ -20,9 +20,10 @@ import tyro
 from rich import progress as rich_progress
 from rich.table import Column
 
-from splatseed.commands.options import MaskChoice, parse_options, parse_some
+from splatseed.commands.options import parse_options, parse_some
 from splatseed.console import ERR, OUT, print_note, print_pairs, stage_display
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
+from splatseed.findings import Finding
 from splatseed.io import load_scene
 from splatseed.io.files import read_text
 from splatseed.requirements import require
@@ -30,25 +31,17 @@ from splatseed.runtime.interruption import exit_code
 from splatseed.scores import TrainingResult
 from splatseed.seeding.budget import in_rho
 from splatseed.settings import fits
-from splatseed.text import did_you_mean, quoted, visible
-from splatseed.training.duration import (
-    TOO_LONG,
-    RunSpeed,
-    format_duration,
-    options_for_an_hour,
-    seconds_left,
-)
+from splatseed.text import did_you_mean, format_duration, quoted, visible
+from splatseed.training.duration import TOO_LONG, RunSpeed, options_for_an_hour, seconds_left
 from splatseed.training.folder import RunFolder
-from splatseed.training.settings import Seeding, StrategyName, TrainSettings
+from splatseed.training.request import DEFAULTS, TrainRequest
+from splatseed.training.settings import TrainSettings
 
 if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
     from splatseed.training.run import TrainingRun
     from splatseed.viewer.server import TrainingViewer
 
 BAR_WIDTH = 12
-DEFAULT = TrainSettings()
-BEST: StrategyName = "auto"
-"""The default strategy."""
 HOST, PORT = "127.0.0.1", 8080
 """The address of the viewer, if the port is free."""
 MIN_STEPS, WINDOW, REPORT_AFTER, ESTIMATE_EVERY = 5, 100, 10.0, 5
@@ -59,9 +52,11 @@ MIN_REPORTED = 120.0
 RUN_FACTS = {"splatseed", "points", "photographs", "split", "mask_files", "device", "versions",
     "near_plane", "frame"}  # fmt: skip
 """Keys of config.json that are not options."""
-EXCLUSIVE = (("start", "seeds"), ("start", "refine_poses"), ("long_side", "data_factor"))
+EXCLUSIVE = (("start", "seeding"), ("start", "refine_poses"), ("long_side", "data_factor"))
 """Pairs of exclusive options: one on the command line replaces the other of a file."""
-BEST_SETTINGS = replace(DEFAULT, strategy=BEST)
+DEFAULT = TrainRequest()
+NESTED = {"request", "settings", "named"}
+"""Fields that are no options."""
 
 
 @dataclass(frozen=True)
@@ -72,35 +67,12 @@ class Options:
     """A scene with photographs, as splatseed upsample writes it."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """The folder of the run."""
-    training: Annotated[TrainSettings, tyro.conf.arg(name="")] = BEST_SETTINGS
-    """The settings; its fields are options of their own."""
-    budget: Annotated[str | None, tyro.conf.arg(metavar="N|Xrho")] = None
-    """Maximum Gaussians: a number, or 0.25rho for a quarter of a photograph's pixels at training
-    size; by default 1rho for strategy auto and 1000000 for grow and mcmc. If there are more seeds,
-    they are thinned."""
-    long_side: int | None = None
-    """Instead of --data-factor: downsample by the least whole factor that leaves at most this many
-    pixels on a photograph's longer side."""
-    seeds: Seeding | None = None
-    """Start from the scene's points as they are (scene), with those that method auto adds from the
-    training photographs (auto), or as splatseed info advises for this strategy and budget (advised;
-    default)."""
-    masks: MaskChoice = None
-    """A folder of masks, where pixels of 0 do not count, or none; inverted: only they count. By
-    default the folder masks beside the photographs, and transparency."""
-    refine_poses: bool = False
-    """First refine a phone's or SLAM's poses; points triangulated there replace the scene's, unless
-    refinement gains nothing."""
-    resume: bool = False
-    """Resume the run in the output folder, with its own settings; start one if there is none."""
-    tensorboard: bool = False
-    """Also write a log for TensorBoard."""
+    request: Annotated[TrainRequest, tyro.conf.arg(name="")] = DEFAULT
+    """How to train; its fields are options of their own."""
     view: bool = False
     """Watch training in the browser; pause it, or stop early and keep the result (extra view)."""
     config: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """A .toml with these options, or a run's config.json; the command line takes precedence."""
-    overwrite: bool = False
-    """Replace an earlier run in the output folder."""
 
 
 @dataclass(frozen=True)
@@ -111,52 +83,51 @@ class _ConfigFile:
 def parse(arguments: list[str]) -> Options:
     """Parse the options; the command line takes precedence over the file of --config."""
     path = parse_some(_ConfigFile, arguments).config
-    default = None if path is None else _in_file(path, _words(arguments))
-    return parse_options(Options, "train", arguments, default)
+    words = _words(arguments)
+    given = {} if path is None else _read_config(path, words)
+    default = None if path is None else _with_options(path, given)
+    options = parse_options(Options, "train", arguments, default)
+    named = (words | given.keys()) & {each.name for each in fields(TrainSettings)}
+    return replace(options, request=replace(options.request, named=frozenset(named)))
 
 
 def _words(arguments: Sequence[str]) -> set[str]:
     """Return the fields of the options on the command line."""
     options = {each.partition("=")[0] for each in arguments if each.startswith("--")}
-    return {option.removeprefix("--").replace("-", "_") for option in options}
+    names = {option.removeprefix("--").replace("-", "_") for option in options}
+    return {"seeding" if name == "seeds" else name for name in names}
 
 
-def _in_file(path: Path, words: Collection[str]) -> Options:
-    """Read options from a .toml or a run's config.json, without those that ``words`` exclude."""
-    excluded = {b for pair in EXCLUSIVE for a, b in (pair, pair[::-1]) if a in words}
-    kinds = {"training": TrainSettings, "": Options}
-    known = {
-        name: (group, hint)
-        for group, kind in kinds.items()
-        for name, hint in get_type_hints(kind).items()
-        if name not in kinds
-    }
-    given: dict[str, dict[str, Any]] = {group: {} for group in kinds}
-    for name, value in _read_config(path).items():
-        if name in excluded:
-            continue
+def _with_options(path: Path, content: Mapping[str, Any]) -> Options:
+    """Return the options of a file, checked."""
+    kinds = (TrainSettings, TrainRequest, Options)
+    hints = {kind: get_type_hints(kind) for kind in kinds}
+    known = {name: kind for kind in kinds for name in hints[kind] if name not in NESTED}
+    given: dict[type, dict[str, Any]] = {kind: {} for kind in kinds}
+    for name, value in content.items():
         if name not in known:
             raise SceneFormatError(
                 f"options of splatseed train in {path}",
                 found=repr(name),
                 fix=f"{did_you_mean(name, known)}Run splatseed train --help.",
             )
-        group, hint = known[name]
-        named = Path in (hint, *get_args(hint)) and isinstance(value, str)
-        given[group][name] = Path(value) if named else value
-        if not fits(given[group][name], hint):
+        hint = hints[known[name]][name]
+        is_path = Path in (hint, *get_args(hint)) and isinstance(value, str)
+        given[known[name]][name] = Path(value) if is_path else value
+        if not fits(given[known[name]][name], hint):
             raise SceneFormatError(
                 f"a value for {name} in {path} that the option takes",
                 found=repr(value)[:80],
                 fix="Run splatseed train --help.",
             )
+    settings = replace(DEFAULTS, **given[TrainSettings])
+    request = TrainRequest(**given[TrainRequest], settings=settings)
     paths: dict[str, Any] = {"scene": tyro.MISSING, "output": tyro.MISSING}
-    training = replace(BEST_SETTINGS, **given["training"])
-    return Options(**{**paths, **given[""]}, training=training)
+    return Options(**{**paths, **given[Options]}, request=request)
 
 
-def _read_config(path: Path) -> dict[str, Any]:
-    """Read the options of a file."""
+def _read_config(path: Path, words: Collection[str]) -> dict[str, Any]:
+    """Read options from a .toml or a run's config.json, without those that ``words`` exclude."""
     try:
         text = read_text(path)
         content = json.loads(text) if path.suffix.lower() == ".json" else tomllib.loads(text)
@@ -170,20 +141,15 @@ def _read_config(path: Path) -> dict[str, Any]:
             found=" ".join(str(error).split())[:160],
             fix="Write lines such as max_steps = 7000.",
         ) from None
-    if isinstance(content.get("seeds"), dict):  # a run's: what its seeds were
-        seeding = content.pop("seeding", None)
-        content["seeds"] = None if content.get("start") else seeding
-    if isinstance(content.get("budget"), int | float):
+    seeds = content.pop("seeds", None)
+    if isinstance(seeds, dict):  # a run's: what its seeds were
+        content["seeding"] = None if content.get("start") else content.get("seeding")
+    elif seeds is not None:
+        content["seeding"] = seeds
+    if isinstance(content.get("budget"), float):
         content["budget"] = str(content["budget"])
-    return {k: v for k, v in content.items() if k not in RUN_FACTS and v is not None}
-
-
-def _given(options: Options, arguments: Sequence[str]) -> dict[str, Any]:
-    """Return the settings that the command line or the file of --config gives."""
-    words = _words(arguments) | set(() if options.config is None else _read_config(options.config))
-    names = {each.name for each in fields(TrainSettings)} & words
-    given = {name: getattr(options.training, name) for name in names}
-    return given if options.seeds is None else {**given, "seeding": options.seeds}
+    excluded = {b for pair in EXCLUSIVE for a, b in (pair, pair[::-1]) if a in words} | RUN_FACTS
+    return {k: v for k, v in content.items() if k not in excluded and v is not None}
 
 
 def run(arguments: list[str]) -> None:
@@ -193,28 +159,18 @@ def run(arguments: list[str]) -> None:
     from splatseed.splat.evaluate import evaluate_views
     from splatseed.training.api import prepare_training
 
-    notes: list[str] = []
-    if options.resume and not RunFolder(options.output).is_run:
-        notes.append(f"There is no run to resume in {options.output}: a new one starts.")
+    findings: list[Finding] = []
+    if options.request.resume and not RunFolder(options.output).is_run:
+        text = f"There is no run to resume in {options.output}: a new one starts."
+        findings.append(Finding("no-run-to-resume", text, "info"))
     # ``api.train``, with displays.
     with stage_display() as clock:
         clock("read", 0.0)
         training = prepare_training(
-            options.scene,
-            options.output,
-            budget=options.budget,
-            long_side=options.long_side,
-            masks=options.masks,
-            refine_poses=options.refine_poses,
-            resume=options.resume,
-            overwrite=options.overwrite,
-            tensorboard=options.tensorboard,
-            note=notes.append,
-            progress=clock,
-            **_given(options, arguments),
+            options.scene, options.output, options.request, note=findings.append, progress=clock
         )
-    for note in notes:
-        print_note(note)
+    for finding in findings:
+        print_note(finding)
     _announce(options, training)
     left = _TimeLeft(training, per_pixel=_per_pixel(options))
     with _watched(options, training) as viewer, _training_bar(training, left) as show:
@@ -237,12 +193,12 @@ def run(arguments: list[str]) -> None:
 
 
 def _announce(options: Options, training: TrainingRun) -> None:
-    """Print the scene, the settings and the output."""
     settings, views = training.settings, training.trainer.train_views
     for name in settings.unused:
-        print_note(f"{name} has no effect with strategy {settings.densification}.")
-    chosen = settings.strategy == BEST
-    strategy = f"{settings.densification} ({BEST})" if chosen else settings.strategy
+        text = f"{name} has no effect with strategy {settings.traits.name}."
+        print_note(Finding("unused-setting", text))
+    chosen = settings.strategy == DEFAULTS.strategy
+    strategy = f"{settings.traits.name} ({settings.strategy})" if chosen else settings.strategy
     OUT.print(
         f"{visible(options.scene)} ({len(views)} training and {len(training.trainer.test_views)} "
         f"test views of {views[0].width} x {views[0].height}, "
@@ -278,8 +234,7 @@ def _watched(options: Options, training: TrainingRun) -> Iterator[TrainingViewer
 
 
 def _per_pixel(options: Options) -> bool:
-    """Whether the budget depends on the size of the photographs."""
-    return options.budget is None or in_rho(options.budget)
+    return options.request.budget is None or in_rho(options.request.budget)
 
 
 class _TimeLeft:
@@ -306,8 +261,8 @@ class _TimeLeft:
         self.seconds = seconds_left(training.settings, now)
         if not self._is_printed and elapsed > REPORT_AFTER:
             self._is_printed = True
-            for note in self._notes(now, self.seconds):
-                print_note(note)
+            for finding in self._findings(now, self.seconds):
+                print_note(finding)
                 OUT.file.flush()
 
     @property
@@ -315,16 +270,18 @@ class _TimeLeft:
         """The remaining time for the progress bar; empty until it is known."""
         return "" if self.seconds is None else f"{timedelta(seconds=round(self.seconds))} left"
 
-    def _notes(self, now: RunSpeed, left: float) -> Iterator[str]:
+    def _findings(self, now: RunSpeed, left: float) -> Iterator[Finding]:
         settings, view = self._training.settings, self._training.trainer.train_views[0]
         steps = f"{settings.max_steps - now.step:,} steps that are left"
         slow = now.device == "cpu" and left > TOO_LONG
         if slow or (left > MIN_REPORTED and not ERR.is_terminal):
-            yield f"The {steps} take about {format_duration(left)}."
+            text = f"The {steps} take about {format_duration(left)}."
+            yield Finding("training-time", text, "info")
         if slow:
             side = max(view.width, view.height) * settings.factor
             flags = options_for_an_hour(settings, now, side, per_pixel=self._per_pixel)
-            yield f"On this CPU, training with {flags} takes about an hour; a GPU is much faster."
+            text = f"On this CPU, training with {flags} takes about an hour; a GPU is much faster."
+            yield Finding("training-time", text, "info")
 
 
 @contextmanager
@@ -373,7 +330,6 @@ def _line(training: TrainingRun, steps_per_second: float | None) -> str:
 
 
 def _summarise(options: Options, training: TrainingRun, result: TrainingResult) -> None:
-    """Print the final table and the commands to run next."""
     scores, seconds, output = result.scores, result.train_seconds, options.output
     exposed = training.settings.exposure != "none"
     psnr = f"{scores.psnr:.2f} dB" if math.isfinite(scores.psnr) else "infinite"
@@ -388,10 +344,9 @@ def _summarise(options: Options, training: TrainingRun, result: TrainingResult) 
     ]
     print_pairs("splatseed train", rows)
     if held := result.held_by_memory_at:
-        print_note(
-            f"memory limited the run to {held:,} Gaussians; results may vary between machines. "
-            f"Pass --budget {held} for the same result everywhere."
-        )
+        text = f"memory limited the run to {held:,} Gaussians; results may vary between machines."
+        fix = f"Pass --budget {held} for the same result everywhere."
+        print_note(Finding("memory-limit", text, fix=fix))
     print_pairs("next", _next_commands(output))
 
 

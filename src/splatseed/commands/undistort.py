@@ -11,13 +11,13 @@ import tyro
 
 from splatseed.commands.options import parse_options
 from splatseed.console import print_note, print_pairs, stage_display
-from splatseed.findings import without_kinds
+from splatseed.findings import Finding, without_kinds
 from splatseed.io import load_scene
 from splatseed.io.depth_maps import DepthFiles
 from splatseed.io.load import depths_beside
 from splatseed.io.seeds import was_upsampled
 from splatseed.io.staging import check_output
-from splatseed.seeding.trainability import is_distorted
+from splatseed.seeding.advice import is_distorted
 from splatseed.sfm import undistort
 from splatseed.text import agreeing, counted, quoted
 
@@ -46,17 +46,16 @@ def run(arguments: list[str]) -> None:
         report = undistort(scene, output, overwrite=overwrite, on_progress=clock)
     counts = [("images", f"{report.registered:,}"), ("points", f"{report.num_points:,}")]
     print_pairs("splatseed undistort", [*counts, ("output", str(output))])
-    for warning in without_kinds(scene.findings, "lens-distortion"):
-        print_note(warning)
+    for finding in without_kinds(scene.findings, "lens-distortion"):
+        print_note(finding)
     maps = scene.depths or depths_beside(scene)
     if isinstance(maps, DepthFiles) and maps:
         folder = quoted(os.path.commonpath([path.parent for path in maps.paths.values()]))
         are = agreeing(len(maps), "is", "are")
-        print_note(
-            f"Its {counted(len(maps), 'depth map')} {are} not in the output: name them to upsample "
-            f"by --depth {folder}."
-        )
+        text = f"Its {counted(len(maps), 'depth map')} {are} not in the output: name them to "
+        print_note(Finding("depth-maps-left-out", f"{text}upsample by --depth {folder}."))
     if not is_distorted(scene):
-        print_note("No camera had distortion: the photographs are copies.")
+        text = "No camera had distortion: the photographs are copies."
+        print_note(Finding("no-distortion", text, "info"))
     verb, made = ("train", "RUN") if was_upsampled(scene) else ("upsample", "OUT")
     print_pairs("next", [("", f"splatseed {verb} {quoted(output)} -o {made}")])

@@ -13,6 +13,7 @@ import tyro
 
 from splatseed.commands.options import parse_options
 from splatseed.console import OUT, print_note, print_pairs, stage_display
+from splatseed.findings import Finding
 from splatseed.io.load import check_exists, is_scene
 from splatseed.requirements import require
 from splatseed.runtime.interruption import Termination, exit_code
@@ -98,10 +99,9 @@ def _items_in(path: Path) -> list[Path]:
         return [path]
     items = [child for child in sorted(path.iterdir()) if _is_item(child)]
     if len(items) > MAX_ITEMS:
-        print_note(
-            f"{visible(path)} has {len(items)} items; the first {MAX_ITEMS} by name are shown. "
-            "To view others, pass their paths."
-        )
+        text = f"{visible(path)} has {len(items)} items; the first {MAX_ITEMS} by name are shown."
+        fix = "To view others, pass their paths."
+        print_note(Finding("items-left-out", text, "info", fix=fix))
     return items[:MAX_ITEMS] or [path]
 
 
@@ -126,8 +126,8 @@ def _announce(options: Options, port: int, items: list[ViewerItem], second: int 
     if second is not None:
         rows.append(("side by side", f"{items[0].name} left, {items[second].name} right"))
     print_pairs("splatseed view", rows)
-    for note in (note for item in items for note in item.notes):
-        print_note(note)
+    for finding in (finding for item in items for finding in item.findings):
+        print_note(finding)
     commands = [("open in a browser", f"http://{host}:{port}")]
     if options.host in LOCAL:
         tunnel = f"ssh -L {port}:localhost:{port} {socket.gethostname()}"

@@ -23,7 +23,8 @@ from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundErro
 from splatseed.io.depth_maps import DESCRIPTION, DepthFiles, read_description
 from splatseed.photos.view import NO_PIXELS, View
 from splatseed.requirements import require
-from splatseed.training.schedule import FULL_RUN, GROW_EVERY, make_schedule
+from splatseed.training.schedule import FULL_RUN, make_schedule
+from splatseed.training.traits import GROW_EVERY, STRATEGIES
 
 require("torch", "gsplat")  # before what imports them
 
@@ -179,7 +180,7 @@ class GrowStrategy(MCMCStrategy):  # type: ignore[misc]  # gsplat has no types
     def _growing(self, params: torch.nn.ParameterDict, state: dict[str, Any]) -> ErrorDensification:
         """Return the strategy of ``splatseed train`` at this state."""
         schedule = dataclasses.replace(
-            make_schedule("grow", 2 * self.refine_stop_iter, as_3dgs=False),
+            make_schedule(STRATEGIES["grow"], 2 * self.refine_stop_iter, as_3dgs=False),
             refine_start=self.refine_start_iter,
             refine_stop=self.refine_stop_iter,
             refine_every=self.refine_every,

@@ -38,9 +38,9 @@ def make_intrinsics(
     where: str, camera_id: int, model: str, width: int, height: int, params: Sequence[float]
 ) -> Intrinsics:
     """Make a checked camera record; raise ``NotFiniteError`` for parameters that are not usable."""
-    require(0 <= camera_id <= MAX_ID, f"a camera id from 0 to {MAX_ID}", where, camera_id)
+    check_record(0 <= camera_id <= MAX_ID, f"a camera id from 0 to {MAX_ID}", where, camera_id)
     fits = 0 < width <= _MAX_SIZE and 0 < height <= _MAX_SIZE
-    require(fits, "a camera size in pixels", where, f"{width} x {height}")
+    check_record(fits, "a camera size in pixels", where, f"{width} x {height}")
     _require_finite(
         all(map(math.isfinite, params)), "finite camera parameters", where, tuple(params)
     )
@@ -106,7 +106,7 @@ def unusable_findings(unusable: Mapping[str, NotFiniteError], used: int) -> list
     return [Finding("unusable-images", text, subjects=tuple(unusable))]
 
 
-def require(holds: bool, expected: str, where: str, found: object) -> None:
+def check_record(holds: bool, expected: str, where: str, found: object) -> None:
     """Raise a ``SceneFormatError`` for a record unless a condition holds."""
     if not holds:
         raise format_error(expected, where, str(found))

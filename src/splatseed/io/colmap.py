@@ -24,9 +24,9 @@ from splatseed.io.camera_records import (
     NotFiniteError,
     Unusable,
     check_pose,
+    check_record,
     format_error,
     make_intrinsics,
-    require,
 )
 from splatseed.io.files import ByteReader, StrPath, numbered_lines
 from splatseed.pointcloud import PointCloud
@@ -65,7 +65,7 @@ def read_cameras(path: StrPath, unusable: Unusable | None = None) -> tuple[Intri
     for where, camera_id, *record in (_text_cameras if path.suffix == ".txt" else _binary_cameras)(
         path
     ):
-        require(camera_id not in cameras, "each camera id once", where, f"{camera_id} again")
+        check_record(camera_id not in cameras, "each camera id once", where, f"{camera_id} again")
         try:
             cameras[camera_id] = make_intrinsics(where, camera_id, *record)
         except NotFiniteError as error:
@@ -89,10 +89,10 @@ def read_images(
     names: set[str] = set()
     for record in (_text_images if path.suffix == ".txt" else _binary_images)(path):
         where, image_id, pose, camera_id, name, observations = record
-        require(0 <= image_id <= MAX_ID, f"an image id from 0 to {MAX_ID}", where, image_id)
-        require(image_id not in images, "each image id once", where, f"{image_id} again")
-        require(bool(name), "an image name", where, "an empty one")
-        require(name not in names, "each image name once", where, f"{name} again")
+        check_record(0 <= image_id <= MAX_ID, f"an image id from 0 to {MAX_ID}", where, image_id)
+        check_record(image_id not in images, "each image id once", where, f"{image_id} again")
+        check_record(bool(name), "an image name", where, "an empty one")
+        check_record(name not in names, "each image name once", where, f"{name} again")
         of = f"of image {name!r}"
         names.add(name)
         if unusable is not None and camera_id in unusable:
@@ -106,10 +106,10 @@ def read_images(
             unusable[name] = error
             continue
         known = f"one of the {len(cameras)} camera records as that {of}"
-        require(camera_id in cameras, known, where, f"camera id {camera_id}")
+        check_record(camera_id in cameras, known, where, f"camera id {camera_id}")
         ids = observations.point_ids
         in_range = bool((ids >= NO_POINT).all())
-        require(in_range, f"point ids from -1 (none) to 2^63 - 1 {of}", where, "another")
+        check_record(in_range, f"point ids from -1 (none) to 2^63 - 1 {of}", where, "another")
         quat, translation = np.split(np.array(pose, np.float64), [4])
         lens = cameras[camera_id]
         images[image_id] = Image(name, image_id, lens, quat, translation, observations)

@@ -9,11 +9,8 @@ what each trainer needs.
 
 from __future__ import annotations
 
-import platform
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path, PurePath
 from typing import Literal
 
@@ -36,6 +33,7 @@ from splatseed.io.transforms_layout import (
     write_both_layouts,
     write_transforms_layout,
 )
+from splatseed.requirements import versions_of
 from splatseed.scene import Scene
 
 _KIND = "write_scene"
@@ -126,17 +124,13 @@ def write_scene(
             "dropped_nonfinite": clean.left_out.non_finite,
             "dropped_duplicates": clean.left_out.duplicates,
         }
-        versions = {"python": platform.python_version()}
-        for package in _PACKAGES:
-            with suppress(PackageNotFoundError):  # splatseed itself may not be installed
-                versions[package] = version(package)
         is_file = source.format == "ply" or (source.root and is_extracted(source.root))
         read = source.transforms_path or (source.points_path if is_file else source.root)
         num_new = counts["num_points"] - counts["num_original"]
         made |= facts_for_reading(scene)
         facts = {"source": read and str(read), **made, "format": layout, **counts}
         facts |= {"num_new": num_new, "findings": [asdict(each) for each in findings]}
-        write_json(folder / MANIFEST, {**facts, "versions": versions})
+        write_json(folder / MANIFEST, {**facts, "versions": versions_of(_PACKAGES)})
     return WriteReport(
         path,
         layout,

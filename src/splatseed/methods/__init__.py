@@ -6,12 +6,11 @@
 from splatseed.methods.add_points import (
     DEFAULT_RATIO,
     add_points,
-    as_cloud,
     check_seed,
     number_of_new,
     planned_size,
 )
-from splatseed.methods.contract import NewPoints, Traits, Upsampler, traits_of
+from splatseed.methods.contract import Made, Traits, Upsampler, traits_of
 from splatseed.methods.registry import (
     METHODS,
     SOURCE_CODES,
@@ -19,6 +18,7 @@ from splatseed.methods.registry import (
     chooses_number,
     configure,
     methods_for,
+    resolve,
     source_code,
     source_name,
 )
@@ -27,18 +27,18 @@ __all__ = [
     "DEFAULT_RATIO",
     "METHODS",
     "SOURCE_CODES",
-    "NewPoints",
+    "Made",
     "Profile",
     "Traits",
     "Upsampler",
     "add_points",
-    "as_cloud",
     "check_seed",
     "chooses_number",
     "configure",
     "methods_for",
     "number_of_new",
     "planned_size",
+    "resolve",
     "source_code",
     "source_name",
     "traits_of",

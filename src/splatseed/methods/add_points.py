@@ -7,16 +7,17 @@ number of threads; new points are finite.
 from __future__ import annotations
 
 from collections.abc import Callable
+from inspect import signature
 from numbers import Real
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from splatseed.errors import ParameterError, PointCloudError
-from splatseed.methods.contract import NewPoints, Upsampler, nothing_finite, traits_of
-from splatseed.methods.registry import METHODS, Profile, chooses_number, configure, source_code
-from splatseed.pointcloud import ATTRIBUTES, ORIGINAL, PointCloud
-from splatseed.progress import Progress, silent
+from splatseed.methods.contract import Made, Upsampler, nothing_finite, traits_of
+from splatseed.methods.registry import chooses_number, source_code
+from splatseed.pointcloud import ORIGINAL, PointCloud
+from splatseed.progress import Note, Progress, silent, silent_note
 from splatseed.runtime.memory import check_memory
 from splatseed.scene import Scene
 
@@ -29,50 +30,33 @@ MAX_POINTS = 1 << 32  # a request for more points than this is a typo
 
 
 def add_points(
-    scene: Scene | PointCloud,
-    method: str | Upsampler,
+    scene: Scene,
+    name: str,
+    method: Upsampler,
     *,
     ratio: float | None = None,
     num_points: int | None = None,
+    budget: int | None = None,
     seed: int = 0,
-    profile: Profile = "default",
     progress: Progress = silent,
-    note: Callable[[str], None] = lambda _: None,
+    note: Note = silent_note,
     on_stereo: Callable[[StereoResult], None] | None = None,
-    **parameters: Any,
 ) -> PointCloud:
-    """Append the points of one method to a scene's originals.
+    """Append the points of the method ``name`` to a scene's originals.
 
-    Arguments and errors are those of ``splatseed.upsample``.
+    Other arguments and errors are those of ``splatseed.upsample``.
     """
-    whole = scene if isinstance(scene, Scene) else Scene(scene)
-    originals = whole.points.originals
-    if isinstance(method, str):
-        chosen, name = configure(method, profile, **parameters), method
-    elif extra := [*parameters, *(["profile"] if profile != "default" else [])]:
-        raise ParameterError(
-            f"no parameters next to {method!r}, which has its own",
-            found=", ".join(extra),
-            fix="Give the method by name, or set its fields with dataclasses.replace.",
-        )
-    else:
-        chosen, kind = method, type(method)
-        known = (each for each in METHODS if METHODS[each] is kind)
-        name = next(known, getattr(chosen, "name", kind.__name__))
-    check_seed(seed)
-    num_new = number_of_new(chosen, name, whole, ratio, num_points)
-    rng = np.random.default_rng(seed)
+    originals = scene.points.originals
+    num_new = number_of_new(method, name, scene, ratio, num_points)
     if num_new == 0 and len(originals) > 0:
         return originals
-    if "points" in traits_of(chosen).needs and not originals.finite.any():
+    if "points" in traits_of(method).needs and not originals.finite.any():
         raise nothing_finite(len(originals))
-    new = NewPoints(*chosen(whole, num_new or 0, rng, progress))  # methods may return a plain tuple
-    for sentence in new.notes:
-        note(sentence)
-    if on_stereo is not None and new.stereo is not None:
-        on_stereo(new.stereo)
-    made = len(new.xyz) if num_new is None else num_new
-    return PointCloud.concatenate(originals, as_cloud(new, made, source_code(name)))
+    call: Any = method  # with parameters beyond the contract's
+    offered = {"note": note, "budget": budget, "on_stereo": on_stereo}
+    taken = {key: offered[key] for key in offered if key in signature(call).parameters}
+    made = call(scene, num_new or 0, np.random.default_rng(seed), progress, **taken)
+    return PointCloud.concatenate(originals, _as_cloud(made, num_new, source_code(name)))
 
 
 def number_of_new(
@@ -149,24 +133,19 @@ def planned_size(num_original: int, ratio: float | None, num_points: int | None)
     return num_points
 
 
-def as_cloud(new: NewPoints, num_new: int, code: int) -> PointCloud:
-    """Check ``num_new`` points that a method returned, and make a cloud of them.
-
-    ``code`` is their ``source`` unless the method gives one. Raises ``PointCloudError``.
-    """
-    if not np.isfinite(new.xyz).all():
-        bad = int(np.flatnonzero(~np.isfinite(new.xyz).all(axis=1))[0])
+def _as_cloud(made: Made, num_new: int | None, code: int) -> PointCloud:
+    """Check the points that a method returned; ``num_new`` is None if it chose their number."""
+    points = made if isinstance(made, PointCloud) else PointCloud(*made)
+    if num_new is not None and len(points) != num_new:
+        raise PointCloudError(
+            f"{num_new:,} new points", found=f"{len(points):,}", fix="Report this to its author."
+        )
+    if not np.isfinite(points.xyz).all():
+        bad = int(np.flatnonzero(~np.isfinite(points.xyz).all(axis=1))[0])
         raise PointCloudError(
             "finite new points",
-            found=f"{new.xyz[bad].tolist()} at new point {bad}",
+            found=f"{points.xyz[bad].tolist()} at new point {bad}",
             fix="Report this with the scene; float32 may be too small for its coordinates.",
         )
-    source = np.full(num_new, code, np.uint8) if new.source is None else np.asarray(new.source)
-    if source.dtype != np.uint8 or (source == ORIGINAL).any():
-        raise PointCloudError(
-            "a uint8 source of new points, of codes from 1 to 255",
-            found=f"{source.dtype}, {np.count_nonzero(source == ORIGINAL):,} with the originals' 0",
-            fix="Leave the method's source out, or take codes of SOURCE_CODES.",
-        )
-    known = {name: getattr(new, name) for name in ATTRIBUTES}
-    return PointCloud(new.xyz, new.rgb, source, **known)
+    source = np.where(points.source == ORIGINAL, np.uint8(code), points.source)
+    return points.replace(source=source, original_idx=None)

@@ -1,39 +1,27 @@
 """The contract of upsampling methods: a frozen dataclass of parameters that can be called.
 
-A method gets the scene, the number of points to make and a random generator, and returns positions
-in the world and colours. Methods that start from the originals get them clean, centred and with
-their neighbours from ``neighbors.prepare_scene``. Putting originals first, counting and the origin
-of points are handled once, around the method.
+A method gets the scene, the number of points to make and a random generator, and returns the new
+points. Methods that start from the originals get them clean, centred and with their neighbours from
+``neighbors.prepare_scene``. Putting originals first, counting and the origin of points are handled
+once, around the method.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol, runtime_checkable
+from typing import Literal, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32, UInt8
 
 from splatseed.errors import PointCloudError
+from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress
 from splatseed.scene import Scene
 
-if TYPE_CHECKING:
-    from splatseed.depth.stereo.maps import StereoResult
-
-
-class NewPoints(NamedTuple):
-    """New points with their attributes, NaN where unknown."""
-
-    xyz: Float32[np.ndarray, "M 3"]  # world
-    rgb: UInt8[np.ndarray, "M 3"]
-    notes: tuple[str, ...] = ()  # for the user, one sentence each
-    normals: Float32[np.ndarray, "M 3"] | None = None  # unit, world axes
-    sizes: Float32[np.ndarray, " M"] | None = None  # initial radius of a Gaussian, scene units
-    confidence: Float32[np.ndarray, " M"] | None = None  # that a surface is there, 0 to 1
-    source: UInt8[np.ndarray, " M"] | None = None  # codes of their methods, never 0; None: its own
-    stereo: StereoResult | None = None  # of methods that compare the photographs
-
+Made: TypeAlias = PointCloud | tuple[Float32[np.ndarray, "M 3"], UInt8[np.ndarray, "M 3"]]
+"""New points, or their positions in the world and colours. Points with ``source`` 0 get the code of
+the method; a method that calls others sets theirs."""
 
 Need = Literal["points", "depth", "photographs", "cloud"]
 
@@ -62,10 +50,14 @@ class Upsampler(Protocol):
 
     def __call__(
         self, scene: Scene, num_new: int, rng: np.random.Generator, progress: Progress
-    ) -> NewPoints:
+    ) -> Made:
         """Make exactly ``num_new`` finite points for a scene.
 
         All random numbers come from ``rng``; ``progress`` is called with stage and fraction.
+        A call that has these optional parameters gets them by name: ``note``, to be called with a
+        ``Finding`` for each thing that the user should know; ``budget``, the maximum number of
+        points in all, or None, for a method that chooses the number; ``on_stereo``, to be called
+        with the ``StereoResult`` of a method that compares the photographs.
         """
         ...
 

@@ -14,8 +14,9 @@ from typing import ClassVar, Self
 import numpy as np
 
 from splatseed.depth.settings import DepthSettings
-from splatseed.methods.contract import NewPoints, Traits
-from splatseed.progress import Progress
+from splatseed.methods.contract import Traits
+from splatseed.pointcloud import PointCloud
+from splatseed.progress import Note, Progress, silent_note
 from splatseed.scene import Scene
 from splatseed.settings import check_settings
 
@@ -47,9 +48,18 @@ class Depth(DepthSettings):
         )  # fmt: skip
 
     def __call__(
-        self, scene: Scene, num_new: int, rng: np.random.Generator, progress: Progress
-    ) -> NewPoints:
+        self,
+        scene: Scene,
+        num_new: int,
+        rng: np.random.Generator,
+        progress: Progress,
+        *,
+        note: Note = silent_note,
+    ) -> PointCloud:
         """Lift ``num_new`` pixels."""
         from splatseed.depth.lifting import lift
 
-        return NewPoints(*lift(scene, num_new, self, rng, progress))
+        xyz, rgb, findings = lift(scene, num_new, self, rng, progress)
+        for finding in findings:
+            note(finding)
+        return PointCloud(xyz, rgb)

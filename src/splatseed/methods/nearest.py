@@ -20,8 +20,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
 from splatseed.errors import PointCloudError
-from splatseed.methods._kernels import colors as kernels
-from splatseed.methods.contract import NewPoints
+from splatseed.methods._kernels import nearest as kernels
 from splatseed.methods.neighbors import (
     QUERY_BLOCK,
     Bases,
@@ -31,6 +30,7 @@ from splatseed.methods.neighbors import (
     prepare_scene,
     sound_bases,
 )
+from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, in_threads
 from splatseed.scene import Scene
 from splatseed.settings import check_settings
@@ -72,7 +72,7 @@ class NearestMethod(ABC):
 
     def __call__(
         self, scene: Scene, num_new: int, rng: np.random.Generator, progress: Progress
-    ) -> NewPoints:
+    ) -> PointCloud:
         """Make ``num_new`` points."""
         cloud = prepare_scene(scene, progress)
         self.check_enough(len(cloud))
@@ -111,7 +111,7 @@ class NearestMethod(ABC):
         bases: Bases,
         rng: np.random.Generator,
         progress: Progress,
-    ) -> NewPoints:
+    ) -> PointCloud:
         """Make the points of all bases; ``neighbors`` has ``num_neighbors`` per row."""
 
 

@@ -20,10 +20,9 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32
 
 from splatseed.methods._kernels import patches as kernels
-from splatseed.methods._kernels.frames import fill_frames
-from splatseed.methods.contract import NewPoints
 from splatseed.methods.nearest import Aux, NearestMethod, interpolate_colors
 from splatseed.methods.neighbors import Bases, Neighbors, PreparedCloud
+from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, blocks
 from splatseed.settings import Range
 
@@ -36,7 +35,7 @@ def local_frames(
 ) -> tuple[Float64[np.ndarray, "m 3 3"], Bool[np.ndarray, " m"]]:
     """Compute the axes e_u, e_v, e_n of m neighbourhoods, and mark the collinear ones."""
     frames, collinear = np.empty((len(idx), 3, 3)), np.empty(len(idx), bool)
-    fill_frames(xyz, idx, frames, collinear, COLLINEAR)
+    kernels.fill_frames(xyz, idx, frames, collinear, COLLINEAR)
     return frames, collinear
 
 
@@ -138,19 +137,18 @@ class PatchMethod(NearestMethod, ABC):
         bases: Bases,
         rng: np.random.Generator,
         progress: Progress,
-    ) -> NewPoints:
+    ) -> PointCloud:
         """Fit a patch to each base and put its points on it."""
         patches = self._patches(cloud, neighbors, bases, rng)
         height = np.empty(bases.total, np.float32)
         for first, last in blocks(len(cloud), BLOCK, self.name, progress):
             self.heights(patches, first, last, height)
         xyz = lift(patches, height, self.clamp)
-        return NewPoints(xyz, interpolate_colors(cloud, neighbors, bases, xyz))
+        return PointCloud(xyz, interpolate_colors(cloud, neighbors, bases, xyz))
 
     def _patches(
         self, cloud: PreparedCloud, neighbors: Neighbors, bases: Bases, rng: np.random.Generator
     ) -> Patches:
-        """Compute the axes of all patches and draw the positions of their points."""
         if self.frame == "local":
             frames, collinear = local_frames(cloud.xyz, neighbors.idx)
         else:

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping
 from functools import cached_property
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
+from types import MappingProxyType
 from typing import Any, Literal, cast
 
 from splatseed.errors import MissingDependencyError, ParameterError, UnknownNameError
@@ -24,13 +25,13 @@ from splatseed.text import did_you_mean
 GROUP = "splatseed.methods"
 
 BUILT_IN = {
-    "linear": "splatseed.methods.simplices:Linear",
-    "triangle": "splatseed.methods.simplices:Triangle",
-    "spline": "splatseed.methods.spline:Spline",
-    "mls": "splatseed.methods.mls:Mls",
+    "linear": "splatseed.methods.elementary:Linear",
+    "triangle": "splatseed.methods.elementary:Triangle",
+    "spline": "splatseed.methods.surfaces:Spline",
+    "mls": "splatseed.methods.surfaces:Mls",
     "voronoi": "splatseed.methods.voronoi:Voronoi",
     "depth": "splatseed.methods.depth:Depth",
-    "random": "splatseed.methods.bounding_box:BoundingBox",
+    "random": "splatseed.methods.elementary:BoundingBox",
     "stereo": "splatseed.seeding.photo_methods:Stereo",
     "cover": "splatseed.seeding.photo_methods:Cover",
     "auto": "splatseed.seeding.photo_methods:Auto",
@@ -61,7 +62,6 @@ class MethodRegistry(Mapping[str, type[Upsampler]]):
         )
 
     def _load(self, name: str) -> type[Upsampler]:
-        """Import the class that an installed package registers."""
         entry = self._plugins[name]
         try:
             return cast("type[Upsampler]", entry.load())
@@ -137,6 +137,23 @@ def configure(method: str, profile: Profile = "default", **parameters: Any) -> U
     chosen: Any = getattr(kind, "paper", kind)() if profile == "paper" else kind()
     configured: Upsampler = change_settings(chosen, method, parameters)
     return configured
+
+
+def resolve(
+    method: str | Upsampler,
+    profile: Profile = "default",
+    parameters: Mapping[str, Any] = MappingProxyType({}),
+) -> tuple[str, Upsampler]:
+    """Return the name of a method, and the method with its parameters."""
+    if isinstance(method, str):
+        return method, configure(method, profile, **parameters)
+    if extra := [*parameters, *(["profile"] if profile != "default" else [])]:
+        raise ParameterError(
+            f"no parameters next to {method!r}, which has its own",
+            found=", ".join(extra),
+            fix="Give the method by name, or set its fields with dataclasses.replace.",
+        )
+    return getattr(method, "name", type(method).__name__), method
 
 
 def chooses_number(method: str | Upsampler) -> bool:

@@ -47,7 +47,7 @@ class CameraCheckSettings:
     max_names: int = 5  # strays named in a message
 
 
-SETTINGS = CameraCheckSettings()
+CAMERA_CHECK = CameraCheckSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,24 +63,24 @@ def check_cameras(views: Sequence[View], xyz: Float[np.ndarray, "P 3"]) -> Camer
     centers = camera_centers(views)
     if not views or not len(xyz):
         return CameraCheck(_distant_cameras(centers), None)
-    limit = max(SETTINGS.min_sample, SETTINGS.max_projections // len(views))
+    limit = max(CAMERA_CHECK.min_sample, CAMERA_CHECK.max_projections // len(views))
     sample = np.asfortranarray(xyz[:: -(-len(xyz) // limit)], np.float64)
     count, area, near, middle = np.array([_point_statistics(view, sample) for view in views]).T
     median_count = np.median(count)
     min_count = max(
         1.0,
-        SETTINGS.min_share * median_count,
-        min(SETTINGS.min_points, SETTINGS.low_share * median_count),
+        CAMERA_CHECK.min_share * median_count,
+        min(CAMERA_CHECK.min_points, CAMERA_CHECK.low_share * median_count),
     )
-    seeing = (count >= min_count) & (area >= SETTINGS.min_area)
+    seeing = (count >= min_count) & (area >= CAMERA_CHECK.min_area)
     if 2 * seeing.sum() >= len(views):
         middle_camera = np.median(centers[seeing], axis=0)
         distance = np.linalg.norm(centers - middle_camera, axis=1)
         reach = max(distance[seeing].max(), np.median(middle[seeing]))
-        strays = ~seeing & (distance > SETTINGS.stray_reach * reach)
+        strays = ~seeing & (distance > CAMERA_CHECK.stray_reach * reach)
     else:
         strays = _distant_cameras(centers)
-    known = ~strays & (count >= min(SETTINGS.min_points, count[~strays].max()))
+    known = ~strays & (count >= min(CAMERA_CHECK.min_points, count[~strays].max()))
     depth = float(near[known].min())
     return CameraCheck(strays, depth if np.isfinite(depth) else None)
 
@@ -108,10 +108,10 @@ def stray_findings(names: Sequence[str]) -> tuple[Finding, ...]:
         return ()
     text = f"The camera of {names[0]} is far from all others: check its pose, or leave it out."
     if len(names) > 1:
-        listed = ", ".join(names[: SETTINGS.max_names])
+        listed = ", ".join(names[: CAMERA_CHECK.max_names])
         listed += (
-            f" and {len(names) - SETTINGS.max_names:,} more"
-            if len(names) > SETTINGS.max_names
+            f" and {len(names) - CAMERA_CHECK.max_names:,} more"
+            if len(names) > CAMERA_CHECK.max_names
             else ""
         )
         text = f"{len(names):,} cameras are far from all others: check their poses, or leave them"
@@ -134,19 +134,19 @@ def _point_statistics(
     points = points_in_image(view.camera, xyz)
     if not len(points.point_idx):
         return 0.0, 0.0, np.inf, np.inf
-    low, high = np.quantile(points.uv, SETTINGS.spread, axis=0)
+    low, high = np.quantile(points.uv, CAMERA_CHECK.spread, axis=0)
     width, height = (high - low) / [view.width, view.height]
-    near, middle = np.quantile(points.depth, [SETTINGS.near_quantile, 0.5])
+    near, middle = np.quantile(points.depth, [CAMERA_CHECK.near_quantile, 0.5])
     return float(len(points.point_idx)), float(width * height), float(near), float(middle)
 
 
 def _distant_cameras(centers: Float64[np.ndarray, "V 3"]) -> Bool[np.ndarray, " V"]:
     """Return a mask of the cameras that are far from nine tenths of all cameras."""
-    if len(centers) < SETTINGS.min_cameras:
+    if len(centers) < CAMERA_CHECK.min_cameras:
         return np.zeros(len(centers), bool)
     distances = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
     # The nearest nine tenths cannot be strays; `reach` is the distance of their farthest.
-    usual = max(1, len(centers) - max(1, round(SETTINGS.stray_share * len(centers))))
+    usual = max(1, len(centers) - max(1, round(CAMERA_CHECK.stray_share * len(centers))))
     reach = np.partition(distances, usual - 1)[usual - 1]
     rounding = 1e-9 * float(np.abs(np.median(centers, axis=0)).max())
-    return np.asarray((distances > SETTINGS.stray_distance * reach) & (reach > rounding))
+    return np.asarray((distances > CAMERA_CHECK.stray_distance * reach) & (reach > rounding))

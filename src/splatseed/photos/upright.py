@@ -35,7 +35,7 @@ class UprightSettings:
     min_up: float = 1e-6  # length of the mean up direction below which the cameras' cancel
 
 
-SETTINGS = UprightSettings()
+UPRIGHT = UprightSettings()
 
 
 def quarter_turns(images: Sequence[Image]) -> list[int]:
@@ -50,10 +50,10 @@ def quarter_turns(images: Sequence[Image]) -> list[int]:
     rotations = [image.camera.cam_from_world[:3, :3] for image in images]
     x, y, forward = np.mean(rotations, axis=0)
     spread_x, spread_y = 1 - np.linalg.norm(x), 1 - np.linalg.norm(y)
-    if spread_y < SETTINGS.min_spread or spread_y < SETTINGS.min_ratio * spread_x:
+    if spread_y < UPRIGHT.min_spread or spread_y < UPRIGHT.min_ratio * spread_x:
         return turns
     pitch = forward @ -x / np.linalg.norm(x)  # as if the left were up
-    return [1 if pitch < SETTINGS.looks_down else 3] * len(images)
+    return [1 if pitch < UPRIGHT.looks_down else 3] * len(images)
 
 
 def turned(camera: Camera, quarters: int) -> Camera:
@@ -70,7 +70,7 @@ def up_direction(cameras: Sequence[Camera]) -> Float64[np.ndarray, " 3"]:
     ups = [-camera.cam_from_world[1, :3] for camera in cameras] or [np.zeros(3)]
     up = np.mean(ups, axis=0)
     length = np.linalg.norm(up)
-    return np.asarray(up / length) if length > SETTINGS.min_up else np.array([0.0, -1.0, 0.0])
+    return np.asarray(up / length) if length > UPRIGHT.min_up else np.array([0.0, -1.0, 0.0])
 
 
 def _exif_turn(image: Image) -> int:

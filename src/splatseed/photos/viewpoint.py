@@ -27,7 +27,7 @@ class ViewpointSettings:
     focal: float = 900.0  # px, of a synthetic camera
 
 
-SETTINGS = ViewpointSettings()
+VIEWPOINT = ViewpointSettings()
 
 
 def look_at(
@@ -83,10 +83,10 @@ def choose_image(scene: Scene) -> Image | None:
 
 def _fill(places: Float64[np.ndarray, "M 2"]) -> tuple[int, int]:
     """Return the fill of the frame and the number of points in it, by places in it from 0 to 1."""
-    cells = places * SETTINGS.grid
-    inside = ((cells >= 0) & (cells < SETTINGS.grid)).all(axis=1)  # NaN compares false
+    cells = places * VIEWPOINT.grid
+    inside = ((cells >= 0) & (cells < VIEWPOINT.grid)).all(axis=1)  # NaN compares false
     column, row = cells[inside].astype(np.int64).T
-    return len(np.unique(row * SETTINGS.grid[0] + column)), int(inside.sum())
+    return len(np.unique(row * VIEWPOINT.grid[0] + column)), int(inside.sum())
 
 
 def _finite_sample(scene: Scene) -> Float64[np.ndarray, "N 3"]:
@@ -98,20 +98,20 @@ def _finite_sample(scene: Scene) -> Float64[np.ndarray, "N 3"]:
             found=f"none among {len(scene.points)}",
             fix="Check that the cloud was read correctly.",
         )
-    return np.asarray(xyz[:: -(-len(xyz) // SETTINGS.max_points)])
+    return np.asarray(xyz[:: -(-len(xyz) // VIEWPOINT.max_points)])
 
 
 def _synthetic_camera(xyz: Float64[np.ndarray, "N 3"]) -> Camera:
     center = np.median(xyz, axis=0)
     radius = np.linalg.norm(xyz - center, axis=1)
-    core = xyz[radius <= np.quantile(radius, SETTINGS.core_share)]
+    core = xyz[radius <= np.quantile(radius, VIEWPOINT.core_share)]
     _, axes = np.linalg.eigh(np.cov((core - center).T) if len(core) > 1 else np.eye(3))
     up = _thin_side(core - center, axes[:, 0])
     backward = _thin_side(core - center, axes[:, 1])
-    tilt = np.radians(SETTINGS.elevation)
+    tilt = np.radians(VIEWPOINT.elevation)
     toward_eye = np.cos(tilt) * backward + np.sin(tilt) * up
-    (width, height), extent = SETTINGS.size, np.linalg.norm(core - center, axis=1).max() or 1.0
-    focal = SETTINGS.focal
+    (width, height), extent = VIEWPOINT.size, np.linalg.norm(core - center, axis=1).max() or 1.0
+    focal = VIEWPOINT.focal
     eye = center + toward_eye * extent * 2.0 * focal / width
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
     return Camera(K, width, height, look_at(eye, center, up))

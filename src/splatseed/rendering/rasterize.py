@@ -223,7 +223,6 @@ def _colors(
 
 
 def _channels(colors: Tensor, depth: Tensor, render_mode: RenderMode) -> Tensor:
-    """Return the channels of a render mode, depth last."""
     if render_mode == "RGB":
         return colors
     return depth if render_mode in {"D", "ED"} else torch.cat([colors, depth], dim=-1)

@@ -16,7 +16,7 @@ from typing import Any, TypeVar, cast
 import numba
 from numba.core import config, event
 
-from splatseed.runtime.compilation import notify
+from splatseed.progress import notify
 from splatseed.runtime.kernel_cache import cache_folder
 from splatseed.runtime.workarounds import compile_in_one_process, serialise_calls
 

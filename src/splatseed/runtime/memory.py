@@ -42,11 +42,7 @@ def check_memory(count: int, bytes_each: int, what: str, *, found: str = "", fix
 
 
 def parse_bytes(text: str) -> int:
-    """Parse an amount of memory: 4G, 500M, or a number of bytes.
-
-    Raises:
-        ParameterError: It is none.
-    """
+    """Parse an amount of memory: 4G, 500M, or a number of bytes."""
     plain = text.strip().upper().removesuffix("B").removesuffix("I")
     number, unit = (plain[:-1], UNITS[plain[-1]]) if plain[-1:] in UNITS else (plain, 1)
     with suppress(ValueError):

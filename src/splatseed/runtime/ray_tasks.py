@@ -158,7 +158,6 @@ class RayWorkers:
 
 
 def _nodes() -> list[tuple[float, float]]:
-    """CPUs and GPUs of each node."""
     import ray  # noqa: PLC0415  (an extra)
 
     resources = [node["Resources"] for node in ray.nodes() if node["Alive"]]
@@ -180,7 +179,6 @@ def _limited(threads: int, function: Function, call: tuple[Any, ...]) -> Any:
 
 
 def _value(reference: Any) -> Any:
-    """Wait for a task's value, or raise its error."""
     import ray  # noqa: PLC0415  (an extra)
 
     try:

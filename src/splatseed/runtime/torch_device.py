@@ -35,12 +35,7 @@ BUILDING = "building gsplat's kernels, some minutes, once"
 
 
 def pick_torch_device(choice: DeviceName, argument: str) -> torch.device:
-    """Return the device for a choice; ``auto`` takes a GPU if PyTorch sees one.
-
-    Raises:
-        ParameterError: The choice is none of ``DeviceName``, or CUDA is requested and PyTorch sees
-            no GPU; the message names ``argument``.
-    """
+    """Return the device for a choice; ``auto`` takes a GPU if PyTorch sees one."""
     import torch  # noqa: PLC0415  (see the file's docstring)
 
     if choice not in get_args(DeviceName):

@@ -20,7 +20,7 @@ from filelock import FileLock, Timeout
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.registry import CPUDispatcher
 
-from splatseed.runtime.compilation import notify
+from splatseed.progress import notify
 
 # Numba: parallel loops of several Python threads ----------------------------------------------
 

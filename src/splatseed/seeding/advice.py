@@ -1,4 +1,4 @@
-"""Advice: whether to add points to a scene before training, by which method, and why.
+"""Advice: whether a scene can be trained, whether to add points before, by which method, and why.
 
 *Room* is the number of seeds that training starts with under its budget, per point of the scene.
 ``advise`` depends on the measurements and the plan alone, so benchmark runs can test it. The rules
@@ -12,17 +12,20 @@ treehill), adding points cost up to 0.4 dB.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
 from splatseed.depthmap import in_scene_units
+from splatseed.findings import Finding
+from splatseed.io.files import special_kind
 from splatseed.io.seeds import was_upsampled
 from splatseed.methods import Upsampler
 from splatseed.pointcloud import PointCloud
+from splatseed.progress import Note, silent_note
 from splatseed.scene import Scene
+from splatseed.text import agreeing, visible
 
 DEFAULT_METHOD, FALLBACK = "auto", "mls"
 """The default method, and the method for scenes without photographs."""
@@ -67,14 +70,15 @@ class Advice:
 
 
 def advice_for(
-    scene: Scene, max_seeds: int, *, strategy: str = "default", empty: float | None = None
+    scene: Scene, max_seeds: int, *, why_no_seeds: str = "", empty: float | None = None
 ) -> Advice:
     """Advise on a scene's points before training, without opening a photograph.
 
     Args:
         scene: The scene.
         max_seeds: Seeds that training starts with under its budget.
-        strategy: Strategy of training.
+        why_no_seeds: Why the strategy of training gains nothing by more points than the scene has;
+            empty if it gains.
         empty: Share of the photographs' cells without points, if known.
     """
     measured = measure(scene, empty)
@@ -83,23 +87,22 @@ def advice_for(
         new = f"{len(scene.points) - kept:,} of its points and kept {kept:,}"
         made = f"splatseed upsample made {new}."
         return Advice(SEEDED if scene.has_photographs else AS_IT_IS, (made,), measured)
-    return advise(measured, max_seeds, strategy=strategy)
+    return advise(measured, max_seeds, why_no_seeds=why_no_seeds)
 
 
 def method_for(
-    scene: Scene | PointCloud,
-    method: str | Upsampler = DEFAULT_METHOD,
-    note: Callable[[str], None] = lambda _: None,
+    scene: Scene | PointCloud, method: str | Upsampler = DEFAULT_METHOD, note: Note = silent_note
 ) -> str | Upsampler:
     """Return ``method`` if there are photographs, else ``FALLBACK``, with a note."""
     if isinstance(scene, Scene) and scene.has_photographs:
         return method
-    note(f"Without photographs, method {FALLBACK} is used instead of {DEFAULT_METHOD}.")
+    text = f"Without photographs, method {FALLBACK} is used instead of {DEFAULT_METHOD}."
+    note(Finding("fallback-method", text, "info"))
     return FALLBACK
 
 
 def advise(
-    measured: Measured, max_seeds: int, *, strategy: str = "default", room: float = MIN_ROOM
+    measured: Measured, max_seeds: int, *, why_no_seeds: str = "", room: float = MIN_ROOM
 ) -> Advice:
     """Apply the rules behind ``advice_for``; benchmarks vary ``room``."""
     if not measured.num_points:
@@ -126,14 +129,8 @@ def advise(
             "was measured, adding points cost up to 0.4 dB."
         )
         return Advice(AS_IT_IS, (f"It has {per_pixel}.", full), measured)
-    if strategy == "grow":
-        places_itself = (
-            "Strategy grow puts new Gaussians at the depth that stereo finds; adding points by "
-            "method auto first gained or lost 0.3 dB at most on all but one of the captures "
-            "measured. Under 3DGS's densification, which other trainers use, that gained 0.2 dB on "
-            "average: splatseed upsample adds them."
-        )
-        return Advice(AS_IT_IS, (f"It has {per_pixel}.", places_itself), measured)
+    if why_no_seeds:
+        return Advice(AS_IT_IS, (f"It has {per_pixel}.", why_no_seeds), measured)
     reasons = [f"It has {per_pixel}, and room for {has:.1f} times as many seeds."]
     if measured.metric_maps:
         reasons.append("Where photographs confirm no depth, it is that of the depth maps.")
@@ -179,3 +176,35 @@ def camera_layout(
     towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
     inward = (towards * axes).sum(axis=1) > MIN_INWARD
     return "around something" if inward.mean() > MIN_INWARD else "through a place"
+
+
+def untrainable(scene: Scene) -> Finding | None:
+    """Return why no trainer can use the scene; None if one can.
+
+    Lens distortion is not a reason, as it can be removed (``is_distorted``).
+    """
+    why = _why_untrainable(scene)
+    return Finding("untrainable", why, "error") if why else None
+
+
+def _why_untrainable(scene: Scene) -> str:
+    if not scene.images:
+        return "Points alone cannot be trained: training needs photographs and cameras."
+    if not all(scene.split()):
+        return "Training needs at least two photographs, one to train on and one to test."
+    folder = scene.source.image_dir
+    if folder is None:
+        return "Training needs the photographs: put them beside the model in a folder named images."
+    missing = [image.name for image in scene.images if not image.has_photograph]
+    if 2 * len(missing) <= len(scene.images):
+        return ""
+    needs = f"Training needs at least half of the {len(scene.images):,} photographs"
+    if kind := special_kind(folder / missing[0]):
+        return f"{needs}: {visible(missing[0])} is {kind}."
+    which = agreeing(len(missing), "", f"and {len(missing) - 1:,} more ")
+    return f"{needs}: put {visible(missing[0])} {which}into {visible(folder)}."
+
+
+def is_distorted(scene: Scene) -> bool:
+    """Whether any camera has lens distortion."""
+    return any(image.intrinsics.has_distortion for image in scene.images)

@@ -1,13 +1,14 @@
 """Cover: a seed in every part of every photograph that no point covers.
 
-Notation: cells are those of ``photos.zbuffer``; an *empty* cell is one that is not covered
-(``coverage``). Views are taken in random order, each with the seeds of the views before. An empty
-cell gets one seed on the ray through its centre. Its depth is a guess from covered cells of the
-same view: in each of eight sectors of 45 degrees the nearest one, up to ``2 r + 1`` cells away,
-where r is the distance of the nearest of all. Another view *contradicts* a seed that lies in front
-of the view's covered cell, nearer by more than ``SURFACE``: it sees through the seed. The guess is
-the median of the sectors' depths, weighted by ``1 / ((1 + contradictions) distance^2)``. In a view
-without covered cells it is the median depth of all views.
+Notation: views are divided into the cells of ``photos.zbuffer``; a cell is *covered* if it holds a
+point and its neighbours do not hide it, so that its depth is finite; else it is *empty*. Views are
+taken in random order, each with the seeds of the views before. An empty cell gets one seed on the
+ray through its centre. Its depth is a guess from covered cells of the same view: in each of eight
+sectors of 45 degrees the nearest one, up to ``2 r + 1`` cells away, where r is the distance of the
+nearest of all. Another view *contradicts* a seed that lies in front of the view's covered cell,
+nearer by more than ``SURFACE``: it sees through the seed. The guess is the median of the sectors'
+depths, weighted by ``1 / ((1 + contradictions) distance^2)``. In a view without covered cells it is
+the median depth of all views.
 Promise: confidence is low, at most ``MAX_CONFIDENCE``; the same seed gives the same bytes on any
 number of cores, as views are processed one after another.
 
@@ -17,24 +18,88 @@ benchmarks/tried.md says how the rule was chosen.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int32, Int64, UInt8
+from jaxtyping import Bool, Float32, Float64, Int64
 
 from splatseed.errors import ParameterError, PointCloudError
+from splatseed.methods import source_code
 from splatseed.photos.projection import cells_from_world, grid_shape
 from splatseed.photos.view import View
 from splatseed.photos.visibility import SURFACE
 from splatseed.photos.zbuffer import cell_depths
-from splatseed.progress import Progress, silent
+from splatseed.pointcloud import PointCloud
+from splatseed.progress import Progress, in_threads, silent
 from splatseed.seeding._kernels.cover import guess_cell_depths, lift_cells, mean_colors
-from splatseed.seeding.coverage import cell_depths_of_views, check_points
 
 CHECKED_VIEWS = 12  # other views that may contradict a seed
 MIN_CHECK_CELL = 8  # minimum side of these views' cells, in pixels
 MAX_CONFIDENCE, MIN_CONFIDENCE = 0.3, 0.1
 """Confidence of a seed beside a covered cell, and of one far from all."""
+
+
+def covered_share(
+    views: Sequence[View],
+    xyz: Float32[np.ndarray, "N 3"],
+    cell: float = 8,
+    progress: Progress = silent,
+) -> float:
+    """Return the mean over views of the fraction of cells, ``cell`` pixels wide, that are covered.
+
+    Views need no pixels.
+    """
+    return float(np.mean([cells.mean() for cells in covered_cells(views, xyz, cell, progress)]))
+
+
+def covered_cells(
+    views: Sequence[View],
+    xyz: Float32[np.ndarray, "N 3"],
+    cell: float = 8,
+    progress: Progress = silent,
+) -> tuple[Bool[np.ndarray, "rows cols"], ...]:
+    """Return which cells of each view are covered; arguments as of ``covered_share``."""
+    xyz = check_points(views, xyz, cell)
+    depths = cell_depths_of_views(views, xyz, cell, progress, "find uncovered cells")
+    return tuple(np.isfinite(cells) for cells in depths)
+
+
+def cell_depths_of_views(
+    views: Sequence[View],
+    xyz: Float32[np.ndarray, "N 3"],
+    cell: float,
+    progress: Progress,
+    stage: str,
+) -> list[Float32[np.ndarray, "rows cols"]]:
+    """Compute ``cell_depths`` of each view, on all threads."""
+    maps = [np.empty((0, 0), np.float32)] * len(views)
+
+    def work(start: int, _stop: int) -> None:
+        maps[start] = cell_depths(views[start].camera, xyz, cell)
+
+    in_threads(work, len(views), 1, stage, progress)
+    return maps
+
+
+def check_points(
+    views: Sequence[View], xyz: Float32[np.ndarray, "N 3"], cell: float
+) -> Float32[np.ndarray, "N 3"]:
+    """Check views, cell and points; return the points as kernels need them."""
+    if not views:
+        raise ParameterError("at least one view", found="none", fix="Pass a scene with images.")
+    if not (np.isfinite(cell) and cell >= 1):
+        raise ParameterError("a cell of at least 1 pixel", found=f"{cell}", fix="Choose 4 to 16.")
+    return kernel_points(xyz)
+
+
+def kernel_points(xyz: Float32[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N 3"]:
+    """Return points as kernels need them: float32, contiguous."""
+    xyz = np.asarray(xyz)
+    if xyz.ndim != 2 or xyz.shape[1] != 3:
+        raise PointCloudError(
+            "xyz of shape [N, 3]", found=f"{list(xyz.shape)}", fix="Pass one row x, y, z per point."
+        )
+    return np.ascontiguousarray(xyz, np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,30 +163,6 @@ def guess_depths(
 Mask = Bool[np.ndarray, "H W"]
 
 
-@dataclass(frozen=True, eq=False)
-class CoverSeeds:
-    """Seeds, in the order in which the views were taken."""
-
-    xyz: Float32[np.ndarray, "M 3"]  # world
-    rgb: UInt8[np.ndarray, "M 3"]  # mean of the cell
-    view: Int32[np.ndarray, " M"]  # the index of its view
-    size: Float32[np.ndarray, " M"]  # side of the cell at the seed's depth, scene units
-    confidence: Float32[np.ndarray, " M"]  # 0.3 beside a covered cell, falling to 0.1
-
-    def __len__(self) -> int:
-        return len(self.xyz)
-
-    def select(self, which: Bool[np.ndarray, " M"]) -> CoverSeeds:
-        """Return some of the seeds."""
-        return CoverSeeds(*(getattr(self, field.name)[which] for field in fields(CoverSeeds)))
-
-    @staticmethod
-    def concatenate(parts: Sequence[CoverSeeds]) -> CoverSeeds:
-        """Join parts, one after another."""
-        names = [field.name for field in fields(CoverSeeds)]
-        return CoverSeeds(*(np.concatenate([getattr(part, n) for part in parts]) for n in names))
-
-
 def cover(
     views: Sequence[View],
     xyz: Float32[np.ndarray, "N 3"],
@@ -130,7 +171,7 @@ def cover(
     rng: np.random.Generator,
     masks: Sequence[Mask | None] | None = None,
     progress: Progress = silent,
-) -> CoverSeeds:
+) -> PointCloud:
     """Seed every empty cell of every view.
 
     Args:
@@ -140,6 +181,11 @@ def cover(
         rng: Draws the order of the views, and those that may contradict.
         masks: For each view the pixels that count, None for all; a cell needs half of its pixels.
         progress: Called with the stage and the fraction done.
+
+    Returns:
+        Seeds in the order in which the views were taken, with the mean colour of the cell, as sizes
+        the side of the cell at that depth, and confidence: 0.3 beside a covered cell, falling to
+        0.1.
 
     Raises:
         ParameterError: There is no view, one has no pixels, ``cell`` is below 1, or a mask has
@@ -162,15 +208,14 @@ def cover(
             guess = guess_depths(depths, empty, lift, reference, checked)
         else:
             guess = np.full(len(empty), typical), np.full(len(empty), np.inf, np.float32)
-        seeds = make_seeds(views[v], int(v), cell, empty, guess, masks[v])
+        seeds = make_seeds(views[v], cell, empty, guess, masks[v])
         cloud.append(seeds.xyz)
         parts.append(seeds)
         progress("cover", len(parts) / len(views))
-    return CoverSeeds.concatenate(parts)
+    return PointCloud.concatenate(*parts).with_source(source_code("cover"))
 
 
 def _draw_others(v: int, num: int, rng: np.random.Generator) -> Int64[np.ndarray, " K"]:
-    """Draw some of the other views."""
     others = rng.choice(num - 1, min(CHECKED_VIEWS, num - 1), replace=False)
     # Numbers from v on move up by one: v itself is left out.
     return others + (others >= v)
@@ -238,12 +283,11 @@ class GrowableArray:
 
 def make_seeds(
     view: View,
-    idx: int,
     cell: float,
     empty: Int64[np.ndarray, " M"],
     guess: tuple[Float32[np.ndarray, " M"], Float32[np.ndarray, " M"]],
     mask: Mask | None,
-) -> CoverSeeds:
+) -> PointCloud:
     """Place seeds in empty cells at given depths, except where too few pixels count.
 
     ``guess`` are the depths and the distances to the nearest covered cells, in cells.
@@ -259,8 +303,7 @@ def make_seeds(
     sides = depths * np.float32(_side_at_one(view, shape))
     # The distance is 1 beside a covered cell.
     confidence = np.maximum(np.float32(MAX_CONFIDENCE) / distances, np.float32(MIN_CONFIDENCE))
-    of = np.full(len(empty), idx, np.int32)
-    return CoverSeeds(*(values[usable] for values in (xyz, rgb, of, sides, confidence)))
+    return PointCloud(xyz[usable], rgb[usable], sizes=sides[usable], confidence=confidence[usable])
 
 
 def _side_at_one(view: View, shape: tuple[int, ...]) -> float:

@@ -15,33 +15,34 @@ points as thinning does.
 from __future__ import annotations
 
 import os
-import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from splatseed.depth.stereo.closer import compare_closer
 from splatseed.depth.stereo.detail import expected_spacing, fuse_at_most
 from splatseed.depth.stereo.maps import StereoSettings
+from splatseed.depth.stereo.pipeline import compare_closer
+from splatseed.findings import Finding
 from splatseed.methods import source_code
-from splatseed.methods.contract import NewPoints, Traits
 from splatseed.photos.loading import load_views
 from splatseed.photos.sizes import factor_for_size
 from splatseed.photos.view import View
 from splatseed.photos.visibility import find_visibility, points_in_image
+from splatseed.pointcloud import PointCloud
 from splatseed.progress import Note, Progress, thread_limit
-from splatseed.runtime.compilation import watched
 from splatseed.runtime.memory import PROCESS, format_bytes, free_memory, resident_bytes
 from splatseed.scene import Image, Scene
-from splatseed.seeding.photo_methods import Stereo, photographed, stereo_points
+from splatseed.text import format_duration
 
 if TYPE_CHECKING:
     from splatseed.depth.stereo.detail import Placed
     from splatseed.depth.stereo.maps import StereoResult
 
+STEREO = source_code("stereo")
+SECOND_COMPARISON = "second-comparison"
+"""Kind of the finding that announces another comparison, before it starts."""
 STAGES = ("read images", "compare photographs", "compare depths", "fuse depths", "cover")
 """Stages of the first comparison from which the time of the second is estimated."""
 
@@ -79,85 +80,91 @@ class Plan:
     within: bool  # whether free memory holds that
 
 
-@dataclass(frozen=True)
-class WithinBudget:
-    """A method that compares photographs, within a budget.
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """The first comparison of photographs."""
+
+    images: tuple[Image, ...]
+    stereo: StereoResult
+    max_size: int  # maximum side of the photographs, in pixels
+    spacing: float  # pixels between its seeds
+    seconds: Mapping[str, float]  # time of its stages
+
+
+def fill_budget(
+    scene: Scene,
+    first: Comparison,
+    points: PointCloud,
+    budget: int,
+    refill: Callable[[PointCloud], PointCloud],
+    rng: np.random.Generator,
+    progress: Progress,
+    note: Note,
+) -> PointCloud:
+    """Replace the new points of a first comparison by as many as a budget allows.
 
     Args:
-        method: ``auto`` or ``stereo``.
-        limit: Points in all.
-        announce: Called with a sentence on time and memory before the second comparison.
+        scene: The scene.
+        first: The first comparison.
+        points: Its new points, of stereo and others.
+        budget: Points in all.
+        refill: Adds the points of others to denser seeds of stereo.
+        rng: Draws the seed of the second comparison.
+        progress: Called with the stage and the fraction done.
+        note: Called with the time and memory before the second comparison, and with a shortage.
+
+    Returns:
+        The new points: ``points`` themselves if they fill the budget, or nothing is confirmed that
+        could be sampled more closely.
     """
-
-    method: Stereo
-    limit: int
-    announce: Note
-
-    @property
-    def name(self) -> str:
-        """The name of the method."""
-        return self.method.name
-
-    @property
-    def traits(self) -> Traits:
-        """The traits of the method."""
-        return self.method.traits
-
-    def __call__(
-        self, scene: Scene, num_new: int, rng: np.random.Generator, progress: Progress
-    ) -> NewPoints:
-        """Make the points of a scene; ``num_new`` is ignored."""
-        watch = _Stopwatch(progress)
-        with watch.running():
-            new, stereo = self.method.run(scene, rng, watch)
-        room = self.limit - len(scene.points.originals)
-        from_stereo = np.asarray(new.source) == source_code("stereo")
-        # Cover's guesses stay as sparse as they are: more of them would confirm nothing.
-        num = room - int(np.count_nonzero(~from_stereo))
-        if len(new.xyz) >= room:
-            return new
-        spacing, finest = expected_spacing(stereo, num, self.method.spacing)
-        if not finest:  # nothing is confirmed that could be sampled more closely
-            return new._replace(notes=(*new.notes, *self._shortage(scene, new)))
-        images = photographed(scene, self.method.test_every)
-        first = factor_for_size(images, self.method.max_size)
-        plans = plan_comparisons(images, first, self.method.grid, first * finest, self.limit)
+    stereo, grid = first.stereo, first.stereo.settings.grid
+    num_known = len(scene.points.originals)
+    room = budget - num_known
+    # Cover's guesses stay as sparse as they are: more of them would confirm nothing.
+    num = room - (len(points) - _count_stereo(points))
+    if len(points) >= room:
+        return points
+    spacing, finest = expected_spacing(stereo, num, first.spacing)
+    need = 0
+    if finest:
+        images = first.images
+        factor = factor_for_size(images, first.max_size)
+        plans = plan_comparisons(images, factor, grid, factor * finest, budget)
         plan = next((each for each in plans if each.within), plans[-1])
         dense = stereo
-        if (plan.factor, plan.grid) != (first, self.method.grid):
-            self.announce(_announcement(self.limit, images, plan, stereo, watch.seconds))
+        if (plan.factor, plan.grid) != (factor, grid):
+            note(_announcement(budget, images, plan, stereo, first.seconds))
             views = _read_again(scene, images, plan.factor, stereo.views, progress)
             dense = compare_closer(stereo, views, plan.grid, int(rng.integers(1 << 32)), progress)
-        scale = first / plan.factor
+        scale = factor / plan.factor
         known = _originals_in_views(scene, images, dense.views)
-        largest = self.method.spacing * scale
         seeds = fuse_at_most(
-            dense, num, largest, known, spacing * scale, progress, plan.split
-        )  # fmt: skip
-        points = self.method.fill(
-            scene, stereo_points(seeds, new.notes, stereo), stereo.views, rng, progress
+            dense, num, first.spacing * scale, known, spacing * scale, progress, plan.split
         )
-        points = _drop_guesses(points, room)
+        points = _drop_guesses(refill(seeds.with_source(STEREO)), room)
         need = 0 if plan is plans[0] else plans[0].memory
-        return points._replace(notes=(*new.notes, *self._shortage(scene, points, need)))
+    if num_known + len(points) < DENSE.nearly * budget:
+        note(_shortage(scene, points, budget, need))
+    return points
 
-    def _shortage(self, scene: Scene, points: NewPoints, need: int = 0) -> tuple[str, ...]:
-        """Say why there are fewer points than the budget allows, if so.
 
-        ``need`` is the memory that comparing more pixels would take; 0 if that is not the reason.
-        """
-        num_known = len(scene.points.originals)
-        if num_known + len(points.xyz) >= DENSE.nearly * self.limit:
-            return ()
-        from_stereo = np.asarray(points.source) == source_code("stereo")
-        confirmed = num_known + int(np.count_nonzero(from_stereo))
-        others = len(points.xyz) - int(np.count_nonzero(from_stereo))
-        note = f"Photographs confirm {confirmed:,} of the {self.limit:,} points of the budget"
-        note += f"; {others:,} more fill gaps." if others else "."
-        if need:
-            amount = format_bytes(need)
-            note += f" Comparing more of their pixels takes {amount} of memory, which is not free."
-        return (note,)
+def _count_stereo(points: PointCloud) -> int:
+    return int(np.count_nonzero(points.source == STEREO))
+
+
+def _shortage(scene: Scene, points: PointCloud, budget: int, need: int) -> Finding:
+    """Explain why there are fewer points than a budget allows.
+
+    ``need`` is the memory that comparing more pixels would take; 0 if that is not the reason.
+    """
+    confirmed = len(scene.points.originals) + _count_stereo(points)
+    others = len(points) - _count_stereo(points)
+    text = f"Photographs confirm {confirmed:,} of the {budget:,} points of the budget"
+    text += f"; {others:,} more fill gaps." if others else "."
+    if need:
+        amount = format_bytes(need)
+        text += f" Comparing more of their pixels takes {amount} of memory, which is not free."
+    return Finding("budget-not-filled", text)
 
 
 def plan_comparisons(
@@ -214,8 +221,8 @@ def _announcement(
     plan: Plan,
     stereo: StereoResult,
     seconds: Mapping[str, float],
-) -> str:
-    """Say what is compared, and the time and memory that takes by the first comparison."""
+) -> Finding:
+    """Announce what is compared, and the time and memory that takes by the first comparison."""
     ratio = plan.num_depths / max(sum(cost.size for cost in stereo.costs), 1)
     spent = {stage: seconds.get(stage, 0.0) for stage in STAGES}
     expected = ratio * (
@@ -225,21 +232,17 @@ def _announcement(
     )
     expected += spent["read images"] + spent["cover"]
     sides = max((im.camera.width // plan.factor, im.camera.height // plan.factor) for im in images)
-    return (
+    text = (
         f"Up to {limit:,} points: {len(images)} photographs are compared again at "
         f"{sides[0]} x {sides[1]} pixels, with a depth every {plan.grid}: about "
-        f"{_duration(expected)} and {format_bytes(plan.memory)} of memory."
+        f"{format_duration(expected)} and {format_bytes(plan.memory)} of memory."
     )
-
-
-def _duration(seconds: float) -> str:
-    return f"{max(round(seconds), 1)} s" if seconds < 90 else f"{round(seconds / 60)} minutes"
+    return Finding(SECOND_COMPARISON, text, "info")
 
 
 def _read_again(
     scene: Scene, images: Sequence[Image], factor: int, before: Sequence[View], progress: Progress
 ) -> tuple[View, ...]:
-    """Read the photographs at another size."""
     names = {view.name for view in before}
     used = [image for image in images if image.name in names]
 
@@ -261,49 +264,13 @@ def _originals_in_views(
     return placed
 
 
-def _drop_guesses(points: NewPoints, room: int) -> NewPoints:
+def _drop_guesses(points: PointCloud, room: int) -> PointCloud:
     """Drop cover's least confident seeds beyond the number of points that there is room for."""
-    surplus = len(points.xyz) - room
-    guesses = np.flatnonzero(np.asarray(points.source) == source_code("cover"))
+    surplus = len(points) - room
+    guesses = np.flatnonzero(points.source == source_code("cover"))
     if surplus <= 0 or not len(guesses):
         return points
-    kept = np.ones(len(points.xyz), np.bool_)
+    kept = np.ones(len(points), np.bool_)
     confidence = np.asarray(points.confidence)[guesses]
     kept[guesses[np.argsort(confidence, kind="stable")[:surplus]]] = False
-    arrays = {
-        name: getattr(points, name)[kept]
-        for name in ("xyz", "rgb", "normals", "sizes", "confidence", "source")
-    }
-    return points._replace(**arrays)
-
-
-class _Stopwatch:
-    """A ``Progress`` that adds up the wall time of stages, without compilation."""
-
-    def __init__(self, progress: Progress) -> None:
-        self.seconds: dict[str, float] = {}
-        self._progress = progress
-        self._last = time.perf_counter()
-        self._nested, self._begun, self._compiled = 0, 0.0, 0.0
-
-    def __call__(self, stage: str, fraction: float) -> None:
-        """Add the time since the last call to this stage."""
-        now = time.perf_counter()
-        past = max(now - self._last - self._compiled, 0.0)
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + past
-        self._last, self._compiled = now, 0.0
-        self._progress(stage, fraction)
-
-    @contextmanager
-    def running(self) -> Iterator[None]:
-        """Leave out the time of compilation while the block runs."""
-        self._last = time.perf_counter()
-        with watched(self._compilation):
-            yield
-
-    def _compilation(self, begins: bool) -> None:
-        self._nested += 1 if begins else -1
-        if begins and self._nested == 1:
-            self._begun = time.perf_counter()
-        elif not begins and self._nested == 0:
-            self._compiled += time.perf_counter() - self._begun
+    return points.select(kept)

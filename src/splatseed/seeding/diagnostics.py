@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float64
 
 from splatseed.depthmap import in_scene_units
 from splatseed.errors import SplatseedError
+from splatseed.findings import Finding
 from splatseed.methods.neighbors import prepare, sound_bases
 from splatseed.photos.visibility import points_in_image
 from splatseed.progress import Progress, silent
@@ -116,12 +117,7 @@ def track_statistics(scene: Scene) -> TrackStatistics | None:
 
 
 def depth_map_statistics(scene: Scene, progress: Progress = silent) -> DepthMapStatistics | None:
-    """Read some of a scene's depth maps; None without any.
-
-    Raises:
-        SceneNotFoundError: A map's file is gone.
-        SceneFormatError: A map cannot be read.
-    """
+    """Read some of a scene's depth maps; None without any."""
     depths = scene.depths
     if depths is None or not len(depths):
         return None
@@ -176,42 +172,45 @@ def empty_regions(
 
 def find_problems(
     scene: Scene, cloud: CloudStatistics, regions: EmptyRegions | None
-) -> tuple[str, ...]:
-    """List problems, one sentence each; the warnings of the scene's reader first."""
+) -> tuple[Finding, ...]:
+    """Return what is wrong with a scene; the findings of its reader first."""
     problems = list(scene.findings)
     used = cloud.num_points - cloud.non_finite - cloud.duplicates
     added = scene.points.num_original < len(scene.points)  # nothing will be interpolated
     if not added and cloud.isolated > MAX_ISOLATED * max(used, 1):
-        problems.append(
+        text = (
             f"{cloud.isolated:,} points ({cloud.isolated / used:.1%}) are isolated: "
             "outliers or a sparse background; methods that interpolate never start from them"
         )
+        problems.append(Finding("isolated-points", text))
     if cloud.num_points == 0:
-        problems.append(
+        text = (
             "there are no points yet: splatseed upsample makes some from the photographs, by "
             "comparing them (method auto), splatseed sfm --poses-from triangulates some"
             if scene.has_photographs
             else "there are no points to upsample"
         )
+        problems.append(Finding("no-points", text))
     elif regions is not None and regions.mean > MAX_EMPTY:
-        problems.append(
+        text = (
             f"{regions.mean:.0%} of the images' area has no point: upsampling fills between "
             "points, but only photographs or depth maps can fill a bare wall"
         )
+        problems.append(Finding("empty-regions", text))
     if cloud.num_points and track_statistics(scene) is None:
         features = (image.observations for image in scene.images)
         stray = sum(int(np.count_nonzero(f.point_ids != NO_POINT)) for f in features if f)
         if stray:
-            problems.append(
+            text = (
                 f"{stray:,} features of the photographs name points, but no point has a track: "
                 "the points were added later, and a trainer that reads features gets wrong ones; "
                 "what splatseed upsample writes of this scene is free of that"
             )
+            problems.append(Finding("features-without-tracks", text))
     return tuple(problems)
 
 
 def _grid_shape(image: Image) -> tuple[int, int]:
-    """Return rows and columns of an image's grid of cells."""
     width, height = image.camera.width, image.camera.height
     cell = max(width, height) / EMPTY_CELLS
     return max(math.ceil(height / cell), 1), max(math.ceil(width / cell), 1)

@@ -51,9 +51,6 @@ def measure(
         surfaces: An object with ``distance(xyz)``.
         surface_samples: Points spread evenly over the surfaces.
         h: The unit, usually ``spacing(originals)``.
-
-    Raises:
-        PointCloudError: There are no points, or ``h`` is not positive.
     """
     if len(all_xyz) == 0 or not h > 0:
         raise PointCloudError(
@@ -70,11 +67,7 @@ def measure(
 
 
 def spacing(xyz: Float[np.ndarray, "N 3"]) -> float:
-    """Return h, the mean spacing of the points, in scene units.
-
-    Raises:
-        PointCloudError: Fewer than two distinct finite points.
-    """
+    """Return h, the mean spacing of the points, in scene units."""
     finite = _distinct(xyz)
     h = float(_spacing(cKDTree(finite), finite).mean()) if len(finite) else 0.0
     if not h > 0:
@@ -87,7 +80,6 @@ def spacing(xyz: Float[np.ndarray, "N 3"]) -> float:
 
 
 def _distinct(xyz: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "M 3"]:
-    """Return the distinct finite points, in their order."""
     finite = xyz[np.isfinite(xyz).all(axis=1)]
     distinct: Float[np.ndarray, "M 3"] = finite[first_of_equals(finite)]
     return distinct
@@ -106,9 +98,6 @@ def far_share(originals_xyz: Float[np.ndarray, "N 3"], new_xyz: Float[np.ndarray
     """Return the fraction of new points farther than 3 h from the nearest original.
 
     h is the spacing of that original. Of many points a sample is tested; a non-finite one is far.
-
-    Raises:
-        PointCloudError: There are new points but no finite original.
     """
     if len(new_xyz) == 0:
         return 0.0

@@ -12,7 +12,7 @@ on the number of threads.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
@@ -22,13 +22,16 @@ from splatseed.depth.alignment import LIMITS, map_camera
 from splatseed.depth.settings import DepthSettings
 from splatseed.depth.stereo.maps import StereoResult
 from splatseed.depthmap import MIN_CONFIDENCE, DepthMap, DepthMaps
+from splatseed.findings import Finding
 from splatseed.lens import project_rays
+from splatseed.methods import source_code
 from splatseed.photos.projection import cells_from_world, grid_shape, project
 from splatseed.photos.view import View
 from splatseed.photos.zbuffer import cell_depths
+from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, in_threads, silent
 from splatseed.scene import Image, Scene
-from splatseed.seeding.cover import CoverSeeds, GrowableArray, make_seeds
+from splatseed.seeding.cover import GrowableArray, make_seeds
 from splatseed.seeding.poses import compare_samples
 from splatseed.text import agreeing, counted, name_some
 
@@ -37,13 +40,13 @@ CellMap = Float32[np.ndarray, "rows cols"]
 
 @dataclass(frozen=True)
 class _MapSettings:
-    """Settings of seeds from maps."""
-
     confidence: float = 0.5  # of a seed: above cover's guesses, below what photographs confirm
     tolerance: float = 0.05  # relative depth by which a view must see past a seed
 
 
 MAPS = _MapSettings()
+UNIT_MISMATCH = "depth-unit-mismatch"
+"""Kind of the finding that depth maps have another unit than the poses."""
 
 
 def seeds_from_maps(
@@ -53,7 +56,7 @@ def seeds_from_maps(
     sources: Int64[np.ndarray, "V K"],
     cell: float,
     progress: Progress = silent,
-) -> CoverSeeds:
+) -> PointCloud:
     """Put a seed into every empty cell whose depth is known.
 
     Args:
@@ -70,21 +73,21 @@ def seeds_from_maps(
         covered = np.isfinite(cell_depths(view.camera, cloud.values, cell))
         empty = np.flatnonzero(~covered & np.isfinite(maps[i]))
         found = maps[i].ravel()[empty], np.ones(len(empty), np.float32)
-        seeds = make_seeds(view, i, cell, empty, found, view.mask)
+        seeds = make_seeds(view, cell, empty, found, view.mask)
         others = [j for j in sources[i].tolist() if j >= 0]
         seeds = seeds.select(~_seen_through(seeds.xyz, views, maps, others, cell))
         cloud.append(seeds.xyz)
-        parts.append(replace(seeds, confidence=np.full(len(seeds), MAPS.confidence, np.float32)))
+        parts.append(seeds.replace(confidence=np.full(len(seeds), MAPS.confidence)))
         progress("depth maps", (i + 1) / len(views))
-    return CoverSeeds.concatenate(parts)
+    return PointCloud.concatenate(*parts).with_source(source_code("depth"))
 
 
 def in_scene_unit(
     stereo: StereoResult, names: Sequence[str], maps: Sequence[CellMap]
-) -> tuple[list[CellMap], str]:
-    """Return the maps without those whose depth contradicts the photographs', and a note on these.
+) -> tuple[list[CellMap], tuple[Finding, ...]]:
+    """Return the maps without those whose depth contradicts the photographs', and a finding on it.
 
-    A map with too few cells that photographs confirm is judged by those of all maps.
+    A map with too few cells that photographs confirm is compared by those of all maps.
 
     Args:
         stereo: Stereo of the photographs.
@@ -97,22 +100,29 @@ def in_scene_unit(
     enough = {i: len(ratios[i]) >= LIMITS.unit_points for i in known}
     wrong = [i for i in known if not _same_unit(ratios[i] if enough[i] else pooled)]
     if not wrong:
-        return list(maps), ""
+        return list(maps), ()
     kept = [np.full_like(each, np.nan) if i in wrong else each for i, each in enumerate(maps)]
     factor = f"{np.median(np.concatenate([ratios[i] for i in wrong])):.4g}"
+    left_out = tuple(names[i] for i in wrong)
     if wrong == known:
-        what = "The scene's depth maps are left out: their depth is"
-        return kept, f"{what} {factor} times that of the photographs, so they have another unit."
-    are, which = agreeing(len(wrong), "is", "are"), name_some([names[i] for i in wrong], 3)
-    what = f"{len(wrong)} of {counted(len(known), 'depth map')} {are} left out ({which}): depth is"
-    return kept, f"{what} {factor} times that of the photographs."
+        text = (
+            f"The scene's depth maps are left out: their depth is {factor} times that of the "
+            "photographs, so they have another unit."
+        )
+    else:
+        are, which = agreeing(len(wrong), "is", "are"), name_some(left_out, 3)
+        text = (
+            f"{len(wrong)} of {counted(len(known), 'depth map')} {are} left out ({which}): depth "
+            f"is {factor} times that of the photographs."
+        )
+    return kept, (Finding(UNIT_MISMATCH, text, subjects=left_out),)
 
 
-def unit_mismatch(scene: Scene, images: Sequence[Image]) -> str:
-    """Say how the depth of a scene's maps differs from that of its photographs; empty if it agrees.
+def unit_ratio(scene: Scene, images: Sequence[Image]) -> float | None:
+    """Return the depth of a scene's maps relative to that of its photographs; None if it agrees.
 
-    A few photographs are compared without them: begun at wrong depths, stereo finds too little to
-    contradict them.
+    A few photographs are compared without the maps: started at wrong depths, stereo finds too
+    little to contradict them.
     """
     ratios = np.empty(0)
     for stereo, chosen in compare_samples(scene, images):
@@ -122,9 +132,7 @@ def unit_mismatch(scene: Scene, images: Sequence[Image]) -> str:
         ratios = np.concatenate([ratios, *found])
         if len(ratios) >= LIMITS.unit_points:
             break
-    if _same_unit(ratios):
-        return ""
-    return f"their depth is {np.median(ratios):.4g} times that of the photographs"
+    return None if _same_unit(ratios) else float(np.median(ratios))
 
 
 def _same_unit(ratios: Float64[np.ndarray, " M"]) -> bool:
@@ -191,10 +199,6 @@ def cell_maps(
         cell: Side of a cell, in pixels of the views.
         min_confidence: Depth of a lower confidence is unknown.
         progress: Called with the stage and the fraction done.
-
-    Raises:
-        SceneNotFoundError: A map's file is gone.
-        SceneFormatError: A map cannot be read, or differs from its image in aspect ratio.
     """
     found = [np.full(grid_shape(view.camera, cell), np.nan, np.float32) for view in views]
 

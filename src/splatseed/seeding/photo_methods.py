@@ -9,30 +9,28 @@ runs.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import numpy as np
 
 from splatseed.depth.stereo.maps import MAX_GRID, MIN_POINTS, StereoSettings
 from splatseed.depthmap import MIN_CONFIDENCE, in_scene_units
 from splatseed.errors import PointCloudError, SceneNotFoundError
-from splatseed.methods import as_cloud, source_code
-from splatseed.methods.contract import NewPoints, Traits
+from splatseed.findings import Finding
+from splatseed.methods import Traits, source_code
 from splatseed.photos.loading import load_views
 from splatseed.photos.sizes import factor_for_size
 from splatseed.photos.view import View, camera_views
 from splatseed.pointcloud import PointCloud
-from splatseed.progress import Progress
+from splatseed.progress import Note, Progress, StageTimes, silent_note, watched
 from splatseed.scene import Image, Scene
 from splatseed.settings import Range, check_settings
 from splatseed.text import counted
 
 if TYPE_CHECKING:
-    from splatseed.depth.stereo.fusion import StereoSeeds
     from splatseed.depth.stereo.maps import StereoMap, StereoResult
-    from splatseed.seeding.cover import CoverSeeds
 
 MAX_SIZE = 800
 """Longer side, in pixels, of the photographs that methods compare."""
@@ -87,61 +85,79 @@ class Stereo(PhotographMethod):
         stereo = compare(guided, images, views, self.grid, rng, progress, only)
         return tuple(stereo.map(i) for i in only)
 
-    def _guided(self, scene: Scene, images: Sequence[Image]) -> tuple[Scene, tuple[str, ...]]:
-        """Return the scene, without maps that stereo must not begin at, and a note on them."""
-        if scene.depths is None or has_depth_hints(scene):
-            return scene, ()
-        problem = ""
-        if self.depth_maps:
-            from splatseed.seeding.map_seeds import unit_mismatch
-
-            if mismatch := unit_mismatch(scene, images):
-                problem = f"The scene's depth maps do not guide stereo: {mismatch}."
-        used = self.depth_maps and not problem
-        return scene if used else scene.replace(depths=None), (problem,) if problem else ()
-
     def __call__(
-        self, scene: Scene, num_new: int, rng: np.random.Generator, progress: Progress
-    ) -> NewPoints:
-        """Make the points of a scene; ``num_new`` is ignored."""
-        return self.run(scene, rng, progress)[0]
+        self,
+        scene: Scene,
+        num_new: int,
+        rng: np.random.Generator,
+        progress: Progress,
+        *,
+        budget: int | None = None,
+        note: Note = silent_note,
+        on_stereo: Callable[[StereoResult], None] | None = None,
+    ) -> PointCloud:
+        """Make the points of a scene; ``num_new`` is ignored.
 
-    def run(
-        self, scene: Scene, rng: np.random.Generator, progress: Progress
-    ) -> tuple[NewPoints, StereoResult]:
-        """Make the new points and return stereo's result besides.
-
-        Without points, the scene's poses are checked first.
+        Without points, the scene's poses are checked first. With ``dense``, the photographs are
+        compared again where that fills the ``budget``.
         """
         from splatseed.depth.stereo.fusion import fuse
+        from splatseed.seeding.dense import Comparison, fill_budget
 
-        images = photographed(scene, self.test_every)
-        warnings: tuple[str, ...] = ()
-        if not has_points(scene):
-            from splatseed.seeding.pose_accuracy import given_pose_error
-            from splatseed.seeding.poses import agreement_warning, check_poses
+        images, times = photographed(scene, self.test_every), StageTimes()
 
-            faint = agreement_warning(check_poses(scene, images, progress), stated=True)
-            error = given_pose_error(scene, images, progress)
-            warnings = tuple(each for each in (faint, error.warning if error else "") if each)
-        guided, notes = self._guided(scene, images)
-        warnings = (*warnings, *notes)
-        views = read_views(scene, images, self.max_size, progress)
-        start = time.perf_counter()
-        stereo = compare(guided, images, views, self.grid, rng, progress)
-        seeds = fuse(stereo, self.spacing, progress)
-        found = _stereo_note(scene, stereo, time.perf_counter() - start)
-        new = stereo_points(seeds, (*found, *warnings), stereo)
-        return self.fill(scene, new, stereo.views, rng, progress), stereo
+        def timed(stage: str, fraction: float) -> None:
+            times(stage, fraction)
+            progress(stage, fraction)
+
+        with watched(times.compilation):
+            findings = () if has_points(scene) else _check_given_poses(scene, images, timed)
+            guided, mismatch = self._guided(scene, images)
+            views = read_views(scene, images, self.max_size, timed)
+            start = time.perf_counter()
+            stereo = compare(guided, images, views, self.grid, rng, timed)
+            seeds = fuse(stereo, self.spacing, timed).with_source(source_code("stereo"))
+            found = _confirmed_share(scene, stereo, time.perf_counter() - start)
+            for finding in (*found, *findings, *mismatch):
+                note(finding)
+            points = self.fill(scene, seeds, stereo, rng, timed, note)
+        if on_stereo is not None:
+            on_stereo(stereo)
+        if budget is None or not self.dense:
+            return points
+        first = Comparison(images, stereo, self.max_size, self.spacing, times.seconds())
+
+        def refill(denser: PointCloud) -> PointCloud:
+            return self.fill(scene, denser, stereo, rng, progress, silent_note)
+
+        return fill_budget(scene, first, points, budget, refill, rng, progress, note)
+
+    def _guided(self, scene: Scene, images: Sequence[Image]) -> tuple[Scene, tuple[Finding, ...]]:
+        """Return the scene without depth maps that stereo must not start at, and why."""
+        if scene.depths is None or has_depth_hints(scene):
+            return scene, ()
+        if not self.depth_maps:
+            return scene.replace(depths=None), ()
+        from splatseed.seeding.map_seeds import UNIT_MISMATCH, unit_ratio
+
+        ratio = unit_ratio(scene, images)
+        if ratio is None:
+            return scene, ()
+        text = (
+            "The scene's depth maps do not guide stereo: "
+            f"their depth is {ratio:.4g} times that of the photographs."
+        )
+        return scene.replace(depths=None), (Finding(UNIT_MISMATCH, text),)
 
     def fill(
         self,
         scene: Scene,
-        seeds: NewPoints,
-        views: Sequence[View],
+        seeds: PointCloud,
+        stereo: StereoResult,
         rng: np.random.Generator,
         progress: Progress,
-    ) -> NewPoints:
+        note: Note,
+    ) -> PointCloud:
         """Add seeds where stereo found none; this method adds none."""
         return seeds
 
@@ -157,7 +173,7 @@ class Cover(PhotographMethod):
 
     def __call__(
         self, scene: Scene, num_new: int, rng: np.random.Generator, progress: Progress
-    ) -> NewPoints:
+    ) -> PointCloud:
         """Make the points of a scene from the depths of its originals; ``num_new`` is ignored."""
         originals = scene.points.originals
         if not originals.finite.any():
@@ -188,33 +204,28 @@ class Auto(Stereo):
     def fill(
         self,
         scene: Scene,
-        seeds: NewPoints,
-        views: Sequence[View],
+        seeds: PointCloud,
+        stereo: StereoResult,
         rng: np.random.Generator,
         progress: Progress,
-    ) -> NewPoints:
+        note: Note,
+    ) -> PointCloud:
         """Add a seed in each cell that stereo leaves empty, at a measured depth if there is one."""
-        known = PointCloud.concatenate(scene.points.originals, PointCloud(seeds.xyz, seeds.rgb))
-        parts = [seeds]
+        known = PointCloud.concatenate(scene.points.originals, seeds)
         if self.depth_maps and in_scene_units(scene.depths):
-            parts.append(self._from_maps(scene, seeds.stereo, known, progress))
-            known = PointCloud.concatenate(known, PointCloud(parts[1].xyz, parts[1].rgb))
-        parts.append(_cover(views, known, self.cell, rng, progress))
-        arrays: dict[str, Any] = {
-            name: np.concatenate([getattr(part, name) for part in parts])
-            for name in ("xyz", "rgb", "normals", "sizes", "confidence", "source")
-        }
-        notes = tuple(note for part in parts for note in part.notes)
-        return seeds._replace(notes=notes, **arrays)
+            measured = self._from_maps(scene, stereo, known, progress, note)
+            seeds = PointCloud.concatenate(seeds, measured)
+            known = PointCloud.concatenate(known, measured)
+        guessed = _cover(stereo.views, known, self.cell, rng, progress)
+        return PointCloud.concatenate(seeds, guessed)
 
     def _from_maps(
-        self, scene: Scene, stereo: StereoResult | None, known: PointCloud, progress: Progress
-    ) -> NewPoints:
+        self, scene: Scene, stereo: StereoResult, known: PointCloud, progress: Progress, note: Note
+    ) -> PointCloud:
         """Make the seeds that the scene's depth maps give where stereo found none."""
         from splatseed.seeding.map_seeds import cell_maps, in_scene_unit, seeds_from_maps
 
         assert scene.depths is not None  # noqa: S101  (they are in scene units)
-        assert stereo is not None  # noqa: S101  (its seeds are to be completed)
         images = photographed(scene, self.test_every)
         maps = cell_maps(
             stereo.views, images, scene.depths, self.cell, self.min_confidence, progress
@@ -222,19 +233,13 @@ class Auto(Stereo):
         maps, left_out = in_scene_unit(stereo, [image.name for image in images], maps)
         xyz = known.xyz[known.finite]
         seeds = seeds_from_maps(stereo.views, xyz, maps, stereo.sources, self.cell, progress)
-        notes = [left_out] if left_out else []
+        for finding in left_out:
+            note(finding)
         if num := sum(bool(np.isfinite(each).any()) for each in maps):
             of = counted(num, "depth map")
-            notes.append(f"Where photographs confirm no depth, it is that of the scene's {of}.")
-        return _unoriented(seeds, "depth", tuple(notes))
-
-
-def stereo_points(seeds: StereoSeeds, notes: tuple[str, ...], stereo: StereoResult) -> NewPoints:
-    """Return stereo's seeds as new points."""
-    source = np.full(len(seeds), source_code("stereo"), np.uint8)
-    return NewPoints(
-        seeds.xyz, seeds.rgb, notes, seeds.normals, seeds.sizes, seeds.confidence, source, stereo
-    )
+            text = f"Where photographs confirm no depth, it is that of the scene's {of}."
+            note(Finding("depth-maps-used", text, "info"))
+        return seeds
 
 
 def has_points(scene: Scene) -> bool:
@@ -260,9 +265,6 @@ def photographed(
         scene: Images whose files are missing are left out.
         test_every: As in ``PhotographMethod``.
         without: What to do without photographs, for the message.
-
-    Raises:
-        SceneNotFoundError: There are none.
     """
     ordered = sorted(scene.images, key=lambda image: image.name)
     used = list(scene.split(test_every)[0]) if test_every or scene.listed else ordered
@@ -317,9 +319,8 @@ def with_cover(
     views: Sequence[View], points: PointCloud, cell: int, seed: int, progress: Progress
 ) -> PointCloud:
     """Add a seed for every cell of the views, ``cell`` pixels wide, that holds no point."""
-    code = source_code("cover")
-    new = _cover(views, points, cell, np.random.default_rng([seed, code]), progress)
-    return PointCloud.concatenate(points, as_cloud(new, len(new.xyz), code))
+    rng = np.random.default_rng([seed, source_code("cover")])
+    return PointCloud.concatenate(points, _cover(views, points, cell, rng, progress))
 
 
 def _cover(
@@ -328,30 +329,33 @@ def _cover(
     cell: int,
     rng: np.random.Generator,
     progress: Progress,
-) -> NewPoints:
-    """Make cover's seeds for the gaps between a cloud's finite points."""
+) -> PointCloud:
     from splatseed.seeding.cover import cover
 
     xyz, masks = cloud.xyz[cloud.finite], [view.mask for view in views]
-    seeds = cover(views, xyz, cell=cell, rng=rng, masks=masks, progress=progress)
-    return _unoriented(seeds, "cover")
+    return cover(views, xyz, cell=cell, rng=rng, masks=masks, progress=progress)
 
 
-def _unoriented(seeds: CoverSeeds, method: str, notes: tuple[str, ...] = ()) -> NewPoints:
-    """Make new points of seeds without normals."""
-    normals = np.full((len(seeds), 3), np.nan, np.float32)
-    source = np.full(len(seeds), source_code(method), np.uint8)
-    return NewPoints(seeds.xyz, seeds.rgb, notes, normals, seeds.size, seeds.confidence, source)
-
-
-def _stereo_note(scene: Scene, stereo: StereoResult, seconds: float) -> tuple[str, ...]:
+def _confirmed_share(scene: Scene, stereo: StereoResult, seconds: float) -> tuple[Finding, ...]:
     """Report the share of pixels with depth, and the time, if points could not guide stereo."""
     if has_depth_hints(scene):
         return ()
     points = "too few" if has_points(scene) else "no"
     share = np.mean([stereo.confirmed(i).mean() for i in range(len(stereo.views))])
-    note = (
+    text = (
         f"With {points} points to start from, stereo gave {share:.0%} of the photographs' pixels a "
         f"confirmed depth, in {seconds:.0f} s."
     )
-    return (note,)
+    return (Finding("confirmed-depth", text, "info"),)
+
+
+def _check_given_poses(
+    scene: Scene, images: Sequence[Image], progress: Progress
+) -> tuple[Finding, ...]:
+    """Check the poses of a scene without points."""
+    from splatseed.seeding.pose_accuracy import given_pose_error
+    from splatseed.seeding.poses import agreement_findings, check_poses
+
+    faint = agreement_findings(check_poses(scene, images, progress), stated=True)
+    error = given_pose_error(scene, images, progress)
+    return (*faint, *(error.findings if error else ()))

@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float64
 from scipy.ndimage import gaussian_filter, maximum_filter, sobel
 
 from splatseed.depth.stereo.maps import StereoSettings
+from splatseed.findings import Finding
 from splatseed.photos.loading import load_views
 from splatseed.photos.sizes import factor_for_size
 from splatseed.photos.sources import choose_by_pose
@@ -28,6 +29,8 @@ from splatseed.seeding._kernels.correlation import correlate_patch, interpolate
 Gray = Float64[np.ndarray, "H W"]
 Pixel = Float64[np.ndarray, " 2"]
 
+INEXACT_POSES = "inexact-poses"
+"""Kind of the finding that poses may be refined."""
 MAX_EXACT = 0.5
 """Maximum error of exact poses, in pixels at the size of stereo. COLMAP's are 0.1 to 0.5 on eight
 captures; at 0.55, a tenth of a degree of noise, fern keeps 0.6 of its depths
@@ -84,14 +87,15 @@ class PoseErrorEstimate:
         return f"{self}: {'exact, at most' if self.exact else 'above'} {MAX_EXACT:g} px"
 
     @property
-    def warning(self) -> str:
-        """A sentence with advice; empty if the poses are exact."""
+    def findings(self) -> tuple[Finding, ...]:
+        """A warning with advice; nothing if the poses are exact."""
         if self.exact:
-            return ""
-        return (
+            return ()
+        text = (
             f"The photographs are misaligned by about {self}, the size at which stereo compares "
             f"them; above {MAX_EXACT:g} px, `refine_poses=True` may help."
         )
+        return (Finding(INEXACT_POSES, text),)
 
 
 def estimate_pose_error(
@@ -101,9 +105,6 @@ def estimate_pose_error(
 
     Returns None if too few corners are found again, as on plain walls or with poses that are far
     off.
-
-    Raises:
-        SceneFormatError: A photograph cannot be used.
     """
     poses = np.array([image.camera.cam_from_world for image in images])
     partners = choose_by_pose(poses, _SETTINGS.partners)
@@ -140,9 +141,6 @@ def given_pose_error(
     Drift shows between neighbours that are further apart: of a phone's walk (``corridor``), whose
     refined poses gain 2.3 dB, all views have 0.50 px, which is exact, and those to train 0.74.
     Without an estimate, as poses that are far off leave too few corners there, all are measured.
-
-    Raises:
-        SceneFormatError: A photograph cannot be used.
     """
     names = {image.name for image in scene.split()[0]}
     train = [image for image in images if image.name in names]

@@ -21,6 +21,7 @@ from splatseed.depth.stereo.coarse import prior_from_baseline
 from splatseed.depth.stereo.maps import StereoResult, StereoSettings
 from splatseed.depth.stereo.matching import match_views, valid_blocks
 from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.findings import Finding
 from splatseed.photos.loading import load_views
 from splatseed.photos.sizes import factor_for_size
 from splatseed.photos.sources import choose_by_pose
@@ -157,8 +158,10 @@ def _disagreement(
     )
 
 
-def agreement_warning(agreement: float, masked: float = 0.0, *, stated: bool = False) -> str:
-    """Explain a low result of ``check_poses`` in a sentence; empty if it is not low.
+def agreement_findings(
+    agreement: float, masked: float = 0.0, *, stated: bool = False
+) -> tuple[Finding, ...]:
+    """Explain a low result of ``check_poses``; nothing if it is not low.
 
     Args:
         agreement: The result.
@@ -167,7 +170,7 @@ def agreement_warning(agreement: float, masked: float = 0.0, *, stated: bool = F
             photographs instead of a few: two different numbers for it would confuse.
     """
     if agreement >= _SETTINGS.low:
-        return ""
+        return ()
     few = f" masks that leave {1 - masked:.0%} of the pixels," if masked >= 0.5 else ""
     what = "Likely reasons for so little are"
     if not stated:
@@ -175,11 +178,15 @@ def agreement_warning(agreement: float, masked: float = 0.0, *, stated: bool = F
             f"The photographs agree on the depth of only {agreement:.0%} of the pixels that count, "
             "so method auto will find few points. Likely reasons are"
         )
-    return (
+    text = (
         f"{what}{few} light that changes between photographs, bare or shiny surfaces, or "
-        "photographs far apart. Take more from closer together in constant light, or triangulate "
-        "points (splatseed sfm --poses-from)."
+        "photographs far apart."
     )
+    fix = (
+        "Take more from closer together in constant light, or triangulate points (splatseed sfm "
+        "--poses-from)."
+    )
+    return (Finding("low-agreement", text, fix=fix),)
 
 
 def _check_centers(poses: Poses) -> None:

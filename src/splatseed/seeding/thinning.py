@@ -30,7 +30,7 @@ from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.progress import Progress
 from splatseed.scene import Scene
 from splatseed.seeding._kernels import thinning as kernels
-from splatseed.seeding.coverage import kernel_points
+from splatseed.seeding.cover import kernel_points
 from splatseed.seeding.photo_methods import (
     CELL,
     MAX_SIZE,
@@ -130,10 +130,6 @@ def thin(
         num: Number of points to keep, at least 1.
         first: Number of originals, which come before the other points.
         priority: Among originals, and among other points, higher ones are visited earlier.
-
-    Raises:
-        ParameterError: ``num`` is below 1.
-        PointCloudError: ``xyz`` is not of shape [N, 3], or ``priority`` not of shape [N].
     """
     xyz = kernel_points(xyz)
     if num < 1:

@@ -10,18 +10,17 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from splatseed.errors import ParameterError
-from splatseed.methods import Profile, Upsampler, add_points, check_seed, configure
+from splatseed.findings import Finding
+from splatseed.methods import Profile, Upsampler, add_points, check_seed, resolve
 from splatseed.pointcloud import ORIGINAL, PointCloud
-from splatseed.progress import Progress, silent
+from splatseed.progress import Note, Progress, silent, silent_note
 from splatseed.scene import Scene
 from splatseed.seeding.advice import DEFAULT_METHOD, method_for
 from splatseed.seeding.budget import points_within
-from splatseed.seeding.coverage import covered_share
-from splatseed.seeding.dense import WithinBudget
+from splatseed.seeding.cover import covered_share
 from splatseed.seeding.photo_methods import (
     CELL,
     MAX_SIZE,
-    Stereo,
     frames_of,
     photographed,
     read_views,
@@ -36,8 +35,6 @@ if TYPE_CHECKING:
 FILLING = ("auto", "cover", "stereo")
 """Methods that add points where there are none yet."""
 
-Note = Callable[[str], None]
-
 
 def upsample(
     scene: Scene | PointCloud,
@@ -51,8 +48,7 @@ def upsample(
     seed: int = 0,
     profile: Profile = "default",
     progress: Progress = silent,
-    note: Note = lambda _: None,
-    announce: Note | None = None,
+    note: Note = silent_note,
     on_stereo: Callable[[StereoResult], None] | None = None,
     **parameters: Any,
 ) -> PointCloud:
@@ -77,9 +73,8 @@ def upsample(
         seed: Seed of all random draws; the same seed gives the same bytes on any number of threads.
         profile: "default", or "paper" for the parameters and equations of the paper's text.
         progress: Called with the stage and the fraction done.
-        note: Called with a sentence for each thing that was replaced or left out.
-        announce: Called with a sentence before work whose time and memory depend on the budget;
-            ``note`` if left out.
+        note: Called with a ``Finding`` for each thing that was chosen, replaced or left out. Before
+            photographs are compared again, ``second-comparison`` gives its time and memory.
         on_stereo: Called with stereo's depth maps and views if the method compares photographs and
             the budget leaves room for new points.
         parameters: Fields of the method, such as ``k=12``.
@@ -107,29 +102,32 @@ def upsample(
     check_seed(seed)
     if added := len(scene.points) - scene.points.num_original:
         verb = agreeing(added, "is", "are")
-        note(f"{counted(added, 'point')} added before upsampling {verb} left out.")
+        text = f"{counted(added, 'point')} added before upsampling {verb} left out."
+        note(Finding("earlier-seeds-replaced", text, "info"))
     limit = None if budget is None else points_within(scene, budget)
     if extra_method is None and DEFAULT_METHOD in {method, getattr(method, "name", None)}:
         method = method_for(scene, method, note)
-    chosen = configure(method, profile, **parameters) if isinstance(method, str) else method
-    is_auto = extra_method is None and getattr(chosen, "name", None) == DEFAULT_METHOD
-    if is_auto and ratio is None and num_points is None and cover is None and limit is not None:
-        thinned = _thin_full_scene(scene, limit, seed, progress, note)
-        if thinned is not None:
-            return thinned
-    options: dict[str, Any] = {"seed": seed, "progress": progress, "note": note}
-    # Measured points come first, so that the method fills the gaps between them.
-    first = None if extra_method is None else add_points(scene, extra_method, **options)
-    base = scene if first is None else _with_measured(scene, first, method)
-    if limit is not None and isinstance(chosen, Stereo) and chosen.dense:
-        parameters = {} if isinstance(method, str) else parameters  # an object takes none
-        method, profile = WithinBudget(chosen, limit, announce or note), "default"
+    name, chosen = resolve(method, profile, parameters)
+    only_default = name == DEFAULT_METHOD and ratio is None and num_points is None and cover is None
+    base, measured = scene, None
+    if extra_method is not None:
+        # Measured points come first, so that the method fills the gaps between them.
+        extra_name, extra = resolve(extra_method)
+        measured = add_points(scene, extra_name, extra, seed=seed, progress=progress, note=note)
+        known = measured.replace(source=None) if name in FILLING else measured
+        base = scene.with_points(known)
+    elif only_default and limit is not None:
+        originals = scene.points.originals
+        originals = originals.select(originals.distinct)
+        if len(originals) >= limit:
+            note(_no_room(limit, len(originals)))
+            return thin_to(scene, originals, limit, None, seed, progress)
     cloud = add_points(
-        base, method, ratio=ratio, num_points=num_points, profile=profile, on_stereo=on_stereo,
-        **options, **parameters,
+        base, name, chosen, ratio=ratio, num_points=num_points, budget=limit, seed=seed,
+        progress=progress, note=note, on_stereo=on_stereo,
     )  # fmt: skip
-    if first is not None:
-        cloud = PointCloud.concatenate(first, cloud.select(cloud.source != ORIGINAL))
+    if measured is not None:
+        cloud = PointCloud.concatenate(measured, cloud.select(cloud.source != ORIGINAL))
     if cover is not None:
         cloud = add_cover(
             scene, cloud, cell=cover, test_every=getattr(chosen, "test_every", 0), seed=seed,
@@ -153,25 +151,12 @@ def _as_scene(scene: Scene | PointCloud) -> Scene:
     return scene
 
 
-def _thin_full_scene(
-    scene: Scene, limit: int, seed: int, progress: Progress, note: Note
-) -> PointCloud | None:
-    """Thin the originals if they fill the budget already; None if there is room for new points."""
-    originals = scene.points.originals
-    originals = originals.select(originals.distinct)
-    if len(originals) < limit:
-        return None
-    note(
-        f"The budget allows {limit:,} points, and the scene has {len(originals):,}: they are "
+def _no_room(limit: int, num_original: int) -> Finding:
+    text = (
+        f"The budget allows {limit:,} points, and the scene has {num_original:,}: they are "
         "thinned, and none are added."
     )
-    return thin_to(scene, originals, limit, None, seed, progress)
-
-
-def _with_measured(scene: Scene, points: PointCloud, method: str | Upsampler) -> Scene:
-    """Return the scene with measured points, as originals for methods that fill gaps."""
-    name = method if isinstance(method, str) else getattr(method, "name", None)
-    return scene.with_points(points.replace(source=None) if name in FILLING else points)
+    return Finding("no-room-for-seeds", text, "info")
 
 
 def add_cover(

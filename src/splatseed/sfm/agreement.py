@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from scipy.linalg import eigh
 
-from splatseed.sfm.colmap import Run
+from splatseed.sfm.colmap import ColmapRun
 
 _MAX_ERROR = 4.0  # px between a match and its epipolar line, as in COLMAP's verification of pairs
 _PART = 0.05  # of the photographs in each of two parts at least; a few may look like others
@@ -40,7 +40,7 @@ class _Pairs(NamedTuple):
     explained: Float64[np.ndarray, " P"]  # a
 
 
-def compare_with_matches(run: Run, model: Any) -> Agreement:
+def compare_with_matches(run: ColmapRun, model: Any) -> Agreement:
     """Return how far a model's poses agree with the verified matches.
 
     A match is explained if its points are within ``_MAX_ERROR`` of their epipolar lines (Sampson's
@@ -52,7 +52,7 @@ def compare_with_matches(run: Run, model: Any) -> Agreement:
     return Agreement(share, *_weakest_link(pairs))
 
 
-def _read_pairs(run: Run, model: Any) -> tuple[_Pairs, int]:
+def _read_pairs(run: ColmapRun, model: Any) -> tuple[_Pairs, int]:
     """Count the matches of pairs with poses, and those of pairs without."""
     pycolmap = run.pycolmap
     names: list[str] = []

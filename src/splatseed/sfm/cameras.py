@@ -168,7 +168,6 @@ def _settings(names: Sequence[str], lengths: Mapping[str, float | None]) -> list
 
 
 def _by_folder(names: Sequence[str]) -> list[list[str]]:
-    """Group photographs of one setting by folder; small folders are merged."""
     folders = _grouped(names, lambda name: PurePosixPath(name).parent)
     rest = [name for each in folders if len(each) < _MIN_GROUP for name in each]
     return [*(each for each in folders if len(each) >= _MIN_GROUP), *([rest] if rest else [])]

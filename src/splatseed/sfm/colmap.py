@@ -22,7 +22,7 @@ from splatseed.requirements import install_command
 from splatseed.runtime.torch_device import DeviceName
 from splatseed.scene import Image
 from splatseed.sfm.cameras import SharedCamera
-from splatseed.sfm.readable import COPIES
+from splatseed.sfm.photos import COPIES
 from splatseed.sfm.work_folder import DATABASE, WorkFolder
 from splatseed.text import numeric_order
 
@@ -71,11 +71,7 @@ def check_choice(name: str, value: str, choices: Sequence[str]) -> None:
 
 
 def require_pycolmap(device: DeviceName = "auto") -> Any:
-    """Import pycolmap.
-
-    Raises:
-        MissingDependencyError: Not installed, too old, or without support for ``device``.
-    """
+    """Import pycolmap; refuse an old one, or one without support for ``device``."""
     # pycolmap's wheel exports its own zlib. A system libz loaded after it binds to that and
     # corrupts the heap at the first compression (PNG, gzip); loaded before it, it does not.
     importlib.import_module("zlib")
@@ -100,7 +96,7 @@ def require_pycolmap(device: DeviceName = "auto") -> Any:
 
 
 @dataclass(frozen=True)
-class Run:
+class ColmapRun:
     """Shared state of the stages of a run."""
 
     pycolmap: Any
@@ -154,7 +150,7 @@ class Run:
             ) from error
 
 
-def guessed_model(run: Run, cameras: Sequence[SharedCamera], camera_model: str) -> Any:
+def guessed_model(run: ColmapRun, cameras: Sequence[SharedCamera], camera_model: str) -> Any:
     """Make a model without poses; focal lengths are from EXIF or defaults."""
     pycolmap, model = run.pycolmap, run.pycolmap.Reconstruction()
     options = pycolmap.ImageReaderOptions(camera_model=camera_model)
@@ -202,14 +198,16 @@ def rigid(pycolmap: Any, image: Image) -> Any:
     return pycolmap.Rigid3d(rotation, image.translation)
 
 
-def mapping_options(run: Run) -> Any:
+def mapping_options(run: ColmapRun) -> Any:
     """Return COLMAP's options of mapping and triangulation, for this run."""
     return run.pycolmap.IncrementalPipelineOptions(
         num_threads=run.settings.threads, random_seed=run.settings.seed
     )
 
 
-def triangulate_points(run: Run, poses: Sequence[Image], without: Collection[str] = ()) -> Path:
+def triangulate_points(
+    run: ColmapRun, poses: Sequence[Image], without: Collection[str] = ()
+) -> Path:
     """Triangulate points at fixed cameras and poses; return the folder of the model.
 
     ``without``: names of images to omit.

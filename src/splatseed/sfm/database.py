@@ -17,11 +17,11 @@ from pathlib import Path
 from typing import Any
 
 from splatseed.io.staging import remove
-from splatseed.sfm.colmap import Run
+from splatseed.sfm.colmap import ColmapRun
 
 
 @contextmanager
-def run_database(run: Run, model: Any) -> Iterator[Any]:
+def run_database(run: ColmapRun, model: Any) -> Iterator[Any]:
     """Open the database of a run on the images and cameras of ``model``."""
     pycolmap, path, kept = run.pycolmap, run.database, run.kept
     found = kept is not None and path.is_file()

@@ -14,8 +14,8 @@ from splatseed.camera import Intrinsics
 from splatseed.errors import OutputError
 from splatseed.io.picture import ORIENTATION, UPRIGHT
 from splatseed.pointcloud import first_of_equals
-from splatseed.sfm.colmap import Run
-from splatseed.sfm.readable import copy_misread
+from splatseed.sfm.colmap import ColmapRun
+from splatseed.sfm.photos import copy_misread
 
 _SHORT = 3  # the type of the orientation's tag
 _HEAD_BYTES = 1 << 17  # EXIF (at most 64 KiB) is the first or second segment
@@ -23,16 +23,13 @@ _FOLDED = 0.1  # share of a photograph's diagonal by which such a point misses i
 _NEGLIGIBLE = 2e-7  # a coefficient that counts as distortion but moves no pixel
 
 
-def export_scene(run: Run, model_dir: Path, staging: Path, *, distinct: bool = True) -> None:
+def export_scene(run: ColmapRun, model_dir: Path, staging: Path, *, distinct: bool = True) -> None:
     """Write a model's undistorted photographs and points to ``staging``.
 
     Photographs of PINHOLE cameras are copied, with the EXIF orientation cleared; of the others,
     transparent pixels are black. Reprojection errors are in pixels of the undistorted photographs.
     ``distinct`` drops points at the position of another, and those that undistorted features
     contradict.
-
-    Raises:
-        OutputError: Not all photographs could be written.
     """
     pycolmap, dense, straight = run.pycolmap, run.work / "dense", run.work / "straight"
     given = pycolmap.Reconstruction(model_dir)
@@ -162,6 +159,5 @@ def clear_orientation(folder: Path) -> None:
 
 
 def _first_directory(content: bytes) -> int:
-    """Return where the tags of a TIFF file begin; 0 for other files."""
     order = {b"II*\0": "<", b"MM\0*": ">"}.get(content[:4])
     return 0 if order is None else int(struct.unpack_from(f"{order}I", content, 4)[0])

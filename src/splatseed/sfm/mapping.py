@@ -19,9 +19,10 @@ from sqlite3 import connect
 from typing import Any
 
 from splatseed import errors
+from splatseed.findings import Finding
 from splatseed.io.staging import remove
 from splatseed.sfm.agreement import Agreement, compare_with_matches
-from splatseed.sfm.colmap import Run, mapping_options
+from splatseed.sfm.colmap import ColmapRun, mapping_options
 from splatseed.sfm.work_folder import COMPLETE, MODELS
 from splatseed.text import counted, name_some
 
@@ -42,24 +43,20 @@ _SIMPLE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL")
 
 
 def map_images(
-    run: Run,
+    run: ColmapRun,
     names: Sequence[str],
     camera_model: str,
     match_further: Callable[[Collection[str]], bool] | None,
     *,
     partial: bool,
-) -> tuple[Path, str]:
+) -> tuple[Path, Finding | None]:
     """Estimate poses, lenses and points.
 
-    Returns the folder of the model with the most images, and why its poses may be wrong (empty if
+    Returns the folder of the model with the most images, and why its poses may be wrong (None if
     the matches agree with them).
 
     ``match_further`` matches further pairs of photographs without a pose, by name, and returns
     whether some match; then mapping goes on. None if all pairs of the matcher are matched.
-
-    Raises:
-        ReconstructionError: No model, or one of fewer than half of the photographs while
-            ``partial`` is False.
     """
     models_dir = (run.kept.folder if run.kept else run.work) / MODELS
     models = _mapped(run, models_dir, names, match_further)
@@ -88,22 +85,25 @@ def map_images(
             fix=f"Pass `partial=True` to write the scene of these {len(found)}. For more, "
             f"{advice}.",
         )
-    return models_dir / str(best), _doubt(compare_with_matches(run, models[best]))
+    return models_dir / str(best), _contradiction(compare_with_matches(run, models[best]))
 
 
-def _doubt(found: Agreement) -> str:
+def _contradiction(found: Agreement) -> Finding | None:
     if found.link >= _LINK:
-        return ""
+        return None
     named = name_some(found.part)
-    return (
+    return Finding(
+        "contradicted-poses",
         f"The poses contradict {1 - found.link:.0%} of the matches between {len(found.part):,} of "
-        f"the photographs ({named}) and the others: one of these two parts is probably misplaced. "
-        "Check their cameras (splatseed view), and take photographs of what lies between the two."
+        f"the photographs ({named}) and the others: one of these two parts is probably misplaced.",
+        subjects=tuple(found.part),
+        fix="Check their cameras (splatseed view), and take photographs of what lies between the "
+        "two.",
     )
 
 
 def _mapped(
-    run: Run,
+    run: ColmapRun,
     models_dir: Path,
     names: Sequence[str],
     match_further: Callable[[Collection[str]], bool] | None,
@@ -144,7 +144,7 @@ def _mapped(
 
 
 def _map(
-    run: Run, stage: str, folder: Path, total: int, given: Path | None = None
+    run: ColmapRun, stage: str, folder: Path, total: int, given: Path | None = None
 ) -> dict[int, Any]:
     """Map images to models in numbered folders, or extend a given model in ``folder`` itself."""
     registered: list[None] = []  # except initial pairs
@@ -168,7 +168,7 @@ def _map(
     return models
 
 
-def _extend(run: Run, stage: str, given: Path, folder: Path, total: int) -> Any:
+def _extend(run: ColmapRun, stage: str, given: Path, folder: Path, total: int) -> Any:
     """Go on mapping from a given model, and write the result to ``folder``."""
     extended = folder.with_name("extended")
     extended.mkdir()
@@ -179,7 +179,7 @@ def _extend(run: Run, stage: str, given: Path, folder: Path, total: int) -> Any:
 
 
 def _relinked(
-    run: Run, models_dir: Path, number: int, found: Agreement
+    run: ColmapRun, models_dir: Path, number: int, found: Agreement
 ) -> tuple[Any, Agreement] | None:
     """Map the part again that is linked to the others by few matches that agree with its place.
 
@@ -216,7 +216,7 @@ def _relinked(
 
 
 def _map_globally(
-    run: Run, models_dir: Path, number: int, share: float, names: Sequence[str]
+    run: ColmapRun, models_dir: Path, number: int, share: float, names: Sequence[str]
 ) -> dict[int, Any]:
     """Map all images at once; return the model by its number if it explains more than ``share``.
 
@@ -237,7 +237,7 @@ def _map_globally(
         remove(folder)
 
 
-def _map_at_once(run: Run, folder: Path, total: int) -> tuple[Path, Any] | None:
+def _map_at_once(run: ColmapRun, folder: Path, total: int) -> tuple[Path, Any] | None:
     """Return the largest model of COLMAP's global mapper, and its folder; None without one."""
     pycolmap, settings = run.pycolmap, run.settings
     options = pycolmap.GlobalPipelineOptions(

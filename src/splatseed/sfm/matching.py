@@ -15,7 +15,7 @@ import numpy as np
 from splatseed.errors import SceneFormatError
 from splatseed.io.masks import write_masks
 from splatseed.scene import Image, Masks
-from splatseed.sfm.colmap import Run
+from splatseed.sfm.colmap import ColmapRun
 from splatseed.sfm.database import numbered, run_database
 from splatseed.sfm.first_look import (
     FIRST_LOOK,
@@ -29,7 +29,7 @@ from splatseed.sfm.first_look import (
     measure_agreement,
     poorly_connected,
 )
-from splatseed.sfm.readable import COPIES, copy_misread
+from splatseed.sfm.photos import COPIES, copy_misread
 from splatseed.text import name_some, numeric_order
 
 _STEPS = sorted({*range(1, 11), *(2**n for n in range(10))})
@@ -39,7 +39,7 @@ _BLOCK_PAIRS = 128
 
 
 def match_photographs(
-    run: Run, model: Any, masks: Masks | None = None, poses: Sequence[Image] = ()
+    run: ColmapRun, model: Any, masks: Masks | None = None, poses: Sequence[Image] = ()
 ) -> Agreement | None:
     """Fill the database with a model's images, features and verified matches.
 
@@ -68,7 +68,9 @@ def match_photographs(
     return agreement
 
 
-def _expected_agreement(run: Run, database: Any, model: Any, poses: Sequence[Image]) -> Agreement:
+def _expected_agreement(
+    run: ColmapRun, database: Any, model: Any, poses: Sequence[Image]
+) -> Agreement:
     """Infer the agreement from poses, and from depths by the matches of neighbours.
 
     It suffers from errors of the poses, but not from bare surfaces.
@@ -98,7 +100,7 @@ def _expected_agreement(run: Run, database: Any, model: Any, poses: Sequence[Ima
     return overlap.expected_agreement(shares)
 
 
-def match_further(run: Run, agreement: Agreement, names: Collection[str]) -> bool:
+def match_further(run: ColmapRun, agreement: Agreement, names: Collection[str]) -> bool:
     """Match further pairs of photographs that got no pose; return whether any was verified."""
     with run.pycolmap.Database.open(run.database) as database:
         images = sorted(database.read_all_images(), key=lambda image: image.image_id)
@@ -107,7 +109,7 @@ def match_further(run: Run, agreement: Agreement, names: Collection[str]) -> boo
 
 
 def _match_further(
-    run: Run, database: Any, agreement: Agreement, photographs: Iterable[int]
+    run: ColmapRun, database: Any, agreement: Agreement, photographs: Iterable[int]
 ) -> bool:
     ids = sorted(image.image_id for image in database.read_all_images())
     before = _verified(run, database, ids)
@@ -117,8 +119,7 @@ def _match_further(
     return any(after[pair] > 0 for pair in after.keys() - before)
 
 
-def _verified(run: Run, database: Any, ids: Sequence[int]) -> dict[Pair, int]:
-    """Return the number of verified matches of the pairs that were matched, by index."""
+def _verified(run: ColmapRun, database: Any, ids: Sequence[int]) -> dict[Pair, int]:
     index = {image_id: i for i, image_id in enumerate(ids)}
     pairs, counts = database.read_two_view_geometry_num_inliers()
     of_id = run.pycolmap.pair_id_to_image_pair
@@ -128,8 +129,7 @@ def _verified(run: Run, database: Any, ids: Sequence[int]) -> dict[Pair, int]:
     }
 
 
-def _pairs(run: Run, database: Any) -> list[Pair]:
-    """Return the pairs of the run's matcher."""
+def _pairs(run: ColmapRun, database: Any) -> list[Pair]:
     if run.settings.matcher == "sequential":
         images = sorted(database.read_all_images(), key=lambda image: numeric_order(image.name))
         ids = [image.image_id for image in images]
@@ -138,7 +138,7 @@ def _pairs(run: Run, database: Any) -> list[Pair]:
     return list(dict.fromkeys(run.pycolmap.ExhaustivePairGenerator(options, database).all_pairs()))
 
 
-def detect_features(run: Run, database: Any, model: Any, masks: Masks | None = None) -> None:
+def detect_features(run: ColmapRun, database: Any, model: Any, masks: Masks | None = None) -> None:
     """Write the features of a model's images to the database, as far as they are missing."""
     pycolmap, settings = run.pycolmap, run.settings
     names = {image_id: image.name for image_id, image in sorted(model.images.items())}
@@ -171,7 +171,9 @@ def detect_features(run: Run, database: Any, model: Any, masks: Masks | None = N
         )
 
 
-def match_pairs(run: Run, database: Any, pairs: Sequence[Pair], stage: str = "matching") -> None:
+def match_pairs(
+    run: ColmapRun, database: Any, pairs: Sequence[Pair], stage: str = "matching"
+) -> None:
     """Match and verify distinct pairs of images whose features are in the database.
 
     Pairs with matches from before are skipped. May be called again for further pairs, if each call

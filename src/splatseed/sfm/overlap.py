@@ -27,7 +27,7 @@ Points: TypeAlias = Float64[np.ndarray, "M 3"]
 
 
 @dataclass(frozen=True)
-class _Settings:
+class _OverlapSettings:
     """Pairs of the first look, and when features of the same surface match."""
 
     successors: int = 2
@@ -48,15 +48,15 @@ class _Settings:
     """Common features, of the ``FIRST_LOOK.features`` largest, of two views of overlap 1."""
 
 
-_SETTINGS = _Settings()
+OVERLAP = _OverlapSettings()
 
 
 def first_pairs(cameras: Sequence[Camera]) -> list[Pair]:
     """Choose the pairs of the first look, sorted: successors by name, and nearby views."""
     count, pairs = len(cameras), set[Pair]()
-    near = choose_by_pose(np.stack([c.cam_from_world for c in cameras]), _SETTINGS.near)
+    near = choose_by_pose(np.stack([c.cam_from_world for c in cameras]), OVERLAP.near)
     for i in range(count):
-        others = [*range(i + 1, min(i + 1 + _SETTINGS.successors, count)), *near[i].tolist()]
+        others = [*range(i + 1, min(i + 1 + OVERLAP.successors, count)), *near[i].tolist()]
         pairs |= {(min(i, j), max(i, j)) for j in others if j >= 0}
     return sorted(pairs)
 
@@ -79,7 +79,7 @@ def points_of_matches(
     # The depths z of the midpoint solve z_a a + t = z_b b in least squares (a, b: rays in view 2).
     aa, bb, ab = (a * a).sum(axis=1), (b * b).sum(axis=1), (a * b).sum(axis=1)
     at, bt, det = a @ translation, b @ translation, aa * bb - ab**2
-    wide = det > np.sin(np.radians(_SETTINGS.min_angle)) ** 2 * aa * bb
+    wide = det > np.sin(np.radians(OVERLAP.min_angle)) ** 2 * aa * bb
     det = np.where(wide, det, 1.0)
     z_a, z_b = (ab * bt - bb * at) / det, (aa * bt - ab * at) / det
     baseline = float(np.linalg.norm(cameras[0].center - cameras[1].center))
@@ -102,7 +102,7 @@ def _world(
 def overlaps(cameras: Sequence[Camera], seen: Sequence[Points]) -> Float64[np.ndarray, "V V"]:
     """Return the overlap of each two views; 0 on the diagonal."""
     seen = _completed(cameras, seen)
-    thinned = [points[:: -(-len(points) // _SETTINGS.points) or 1] for points in seen]
+    thinned = [points[:: -(-len(points) // OVERLAP.points) or 1] for points in seen]
     count = np.array([len(points) for points in thinned])
     owner = np.repeat(np.arange(len(cameras)), count)
     xyz = np.concatenate(thinned)
@@ -119,7 +119,7 @@ def overlaps(cameras: Sequence[Camera], seen: Sequence[Points]) -> Float64[np.nd
         cosine = (to_camera * to_owner[rows]).sum(axis=1) * size[rows] / focal[owner[rows]]
         angle = np.degrees(np.arccos(np.clip(cosine / distance, -1, 1)))
         ratio = np.abs(np.log(focal[j] / distance / size[rows]))
-        weight = _ramp(angle, *_SETTINGS.angles) * _ramp(ratio, *np.log(_SETTINGS.sizes))
+        weight = _ramp(angle, *OVERLAP.angles) * _ramp(ratio, *np.log(OVERLAP.sizes))
         shown[:, j] = np.bincount(owner[rows], weight, len(cameras)) / count
     overlap = np.sqrt(shown * shown.T)
     np.fill_diagonal(overlap, 0.0)
@@ -128,7 +128,7 @@ def overlaps(cameras: Sequence[Camera], seen: Sequence[Points]) -> Float64[np.nd
 
 def expected_agreement(overlap: Float64[np.ndarray, "V V"]) -> Agreement:
     """Return how many of their largest features views of these overlaps have in common."""
-    return np.rint(_SETTINGS.common * overlap).astype(np.int32)
+    return np.rint(OVERLAP.common * overlap).astype(np.int32)
 
 
 def _completed(cameras: Sequence[Camera], seen: Sequence[Points]) -> list[Points]:
@@ -137,7 +137,7 @@ def _completed(cameras: Sequence[Camera], seen: Sequence[Points]) -> list[Points
     Without any, depths are the median distance of the cameras.
     """
     centers = np.stack([camera.center for camera in cameras])
-    known = np.array([len(points) >= _SETTINGS.min_points for points in seen])
+    known = np.array([len(points) >= OVERLAP.min_points for points in seen])
     apart = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
     spread = float(np.median(apart)) or 1.0
     depths = np.array(

@@ -11,7 +11,7 @@ median shifts of blocks between frames, by phase correlation (Kuglin and Hines 1
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Container, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
@@ -21,10 +21,18 @@ import numpy as np
 from jaxtyping import Float32
 
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
+from splatseed.io.bit_depth import WHITE, find_white, is_16_bit
 from splatseed.io.files import VIDEO_SUFFIXES, StrPath, files_below
 from splatseed.io.film import choose_frames
+from splatseed.io.image_folders import link_folders
 from splatseed.io.mask_files import masks_among
-from splatseed.io.photograph import check_photograph, open_photograph, photograph_bytes
+from splatseed.io.photograph import (
+    check_photograph,
+    decode_photograph,
+    has_alpha,
+    open_photograph,
+    photograph_bytes,
+)
 from splatseed.io.photograph_checks import check_sizes
 from splatseed.io.scanner_app import is_photograph, is_scanner_app
 from splatseed.io.staging import read_manifest
@@ -36,6 +44,9 @@ from splatseed.scene import Image, Scene
 from splatseed.sfm.cameras import Photo, Photos, read_exif
 from splatseed.text import name_some, quoted
 
+COPIES = "readable"
+"""Folder of a run's scratch folder with such copies."""
+_MISREAD_SUFFIXES = frozenset({".png", ".tif", ".tiff", ".webp"})  # with 16 bits or transparency
 _SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
 _FOREIGN_SUFFIXES = frozenset(
     {".heic", ".heif", ".avif", ".webp", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf",
@@ -70,10 +81,6 @@ def find_photos(image_dir: StrPath) -> tuple[dict[str, Photo], dict[str, list[st
 
     Returns:
         The photographs by name (relative path), sorted; and the names of skipped images by reason.
-
-    Raises:
-        SceneNotFoundError: No such folder, or fewer than two photographs.
-        SceneFormatError: An image cannot be decoded.
     """
     image_dir = Path(image_dir)
     if not image_dir.is_dir():
@@ -159,12 +166,7 @@ def _read(path: Path) -> tuple[Photo | None, bool]:
 
 
 def match_poses(photos: Photos, scene: Scene, image_dir: Path) -> tuple[Image, ...]:
-    """Return the scene's images with photographs, in the photographs' order and sizes.
-
-    Raises:
-        SceneNotFoundError: Fewer than two common names.
-        SceneFormatError: A photograph is neither of its camera's size nor a resized copy.
-    """
+    """Return the scene's images with photographs, in the photographs' order and sizes."""
     posed = {image.name: image for image in scene.images}
     # Without observations, which the child process does not need.
     found = [posed[name] for name in photos if name in posed]
@@ -191,14 +193,7 @@ class PickedFrames(NamedTuple):
 def pick_frames(
     video: Path, folder: Path, frames: int = 150, progress: Progress = silent
 ) -> PickedFrames:
-    """Write the best frames of a video, at most ``frames``, as JPEGs; deterministic.
-
-    Raises:
-        MissingDependencyError: imageio-ffmpeg is not installed.
-        SceneNotFoundError: No such file.
-        SceneFormatError: Unreadable, or with too little motion.
-        ParameterError: ``frames`` is too small.
-    """
+    """Write the best frames of a video, at most ``frames``, as JPEGs; deterministic."""
     if frames < _MIN_FRAMES:
         expected = f"`frames` to be {_MIN_FRAMES} or more"
         raise ParameterError(expected, found=f"{frames}", fix="Try 150.")
@@ -241,3 +236,51 @@ def shift(before: Float32[np.ndarray, "H W"], now: Float32[np.ndarray, "H W"]) -
     # Shifts of more than half a block are negative.
     dy, dx = ((each + _BLOCK // 2) % _BLOCK - _BLOCK // 2 for each in np.divmod(at, _BLOCK))
     return float(np.median(np.hypot(dx, dy)))
+
+
+def copy_misread(
+    image_dir: Path,
+    names: Iterable[str],
+    folder: Path,
+    *,
+    over_black: bool = False,
+    linked: Container[str] = (),
+) -> Path:
+    """Copy photographs that pycolmap misreads to ``folder``, with links to the others.
+
+    Args:
+        image_dir: The photographs.
+        names: Their names.
+        folder: A folder to create if there is any to copy. Copies have 8 bits per channel.
+        over_black: Copy photographs with transparent pixels, too.
+        linked: Names of photographs that pycolmap only copies.
+
+    Returns:
+        The folder for pycolmap: ``folder``, or ``image_dir`` if there is nothing to copy.
+    """
+    paths = {name: image_dir / name for name in names}
+    white, _ = find_white(list(paths.values()))
+    read = [
+        n
+        for n, path in paths.items()
+        if n not in linked and path.suffix.lower() in _MISREAD_SUFFIXES
+    ]
+    odd = [name for name in read if _is_misread(paths[name], white, over_black=over_black)]
+    if not odd:
+        return image_dir
+    link_folders({n: path for n, path in paths.items() if n not in odd}, folder, copy=False)
+    for name in odd:
+        copy = folder / name
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        picture = decode_photograph(paths[name], photograph_bytes(paths[name]), white)
+        picture.save(copy, lossless=True)  # of WebP; PNG and TIFF are
+    return folder
+
+
+def _is_misread(path: Path, white: int, *, over_black: bool) -> bool:
+    picture = open_photograph(path, photograph_bytes(path))
+    if is_16_bit(picture) and white != WHITE:
+        return True
+    if not (over_black and has_alpha(picture)):
+        return False
+    return bool(np.asarray(picture.convert("RGBA").getchannel("A")).min() < WHITE // 257)

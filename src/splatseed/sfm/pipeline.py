@@ -11,7 +11,6 @@ import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, nullcontext
 from dataclasses import asdict, dataclass, replace
-from importlib.metadata import version
 from pathlib import Path, PurePosixPath
 from shutil import rmtree
 from tempfile import TemporaryDirectory
@@ -21,6 +20,7 @@ import numpy as np
 
 from splatseed import errors
 from splatseed.camera import CAMERA_MODELS, Intrinsics
+from splatseed.findings import Finding
 from splatseed.io import write_scene
 from splatseed.io.bit_depth import find_white
 from splatseed.io.colmap_layout import write_split
@@ -36,18 +36,18 @@ from splatseed.io.staging import MANIFEST, output_folder, write_json
 from splatseed.io.undistorted import write_lenses
 from splatseed.photos.sizes import at_file_size
 from splatseed.pointcloud import PointCloud
-from splatseed.progress import Progress, silent
-from splatseed.requirements import require
+from splatseed.progress import Note, Progress, silent, silent_note
+from splatseed.requirements import require, version_of
 from splatseed.runtime.child import Child
 from splatseed.scene import Image, LeftOut, Masks, Scene
 from splatseed.sfm import colmap
 from splatseed.sfm.cameras import Photos, SharedCamera, describe_cameras, share_cameras
-from splatseed.sfm.colmap import Run, Settings
+from splatseed.sfm.colmap import ColmapRun, Settings
 from splatseed.sfm.export import drop_repeats, export_scene
 from splatseed.sfm.mapping import map_images
 from splatseed.sfm.matching import match_further, match_photographs
 from splatseed.sfm.photos import find_photos, match_poses
-from splatseed.sfm.refinement import Refinement, refine, unrefined_note
+from splatseed.sfm.refinement import Refinement, refine, unrefined_finding
 from splatseed.sfm.work_folder import WorkFolder, resumable_work, work_key
 
 OnPhotos: TypeAlias = Callable[[Sequence[str], Mapping[str, Sequence[str]], str], None]
@@ -72,7 +72,7 @@ class SfmReport:
     refinement: Refinement | None = None  # None without ``refine_poses``
     poses: tuple[Image, ...] = ()  # the known poses, refined with ``refine_poses``
     num_pairs: int = 0  # matched pairs of photographs
-    doubt: str = ""  # why the poses may be wrong; empty if the matches agree with them
+    findings: tuple[Finding, ...] = ()  # poses that may be wrong, or were not refined
 
 
 Job: TypeAlias = Callable[..., Any]
@@ -96,7 +96,7 @@ def reconstruct(
     overwrite: bool = False,
     on_progress: Progress = silent,
     on_photos: OnPhotos | None = None,
-    on_note: Callable[[str], None] = lambda _: None,
+    note: Note = silent_note,
 ) -> SfmReport:
     """Reconstruct a scene: features, matching, mapping or triangulation, undistortion.
 
@@ -128,7 +128,7 @@ def reconstruct(
         on_progress: Called with the stage and the fraction done.
         on_photos: Called before work starts with the photographs' names, the names of skipped
             images by reason, and a description of the cameras (empty if poses are known).
-        on_note: Called with a sentence on resumed work.
+        note: Called with findings on resumed work.
 
     Raises:
         InputError: Photographs missing, unreadable or of another size than their known camera;
@@ -161,7 +161,7 @@ def reconstruct(
             pairs=[settings.matcher, refine_poses],
         )
         options = camera_model, poses, refine_poses, test_names, masks, partial
-        work = resumable_work(Path(output), key, on_note, resume=resume)
+        work = resumable_work(Path(output), key, note, resume=resume)
         with work if keep or resume else nullcontext() as kept:
             how = (images, staging, settings, on_progress, kept, _reconstruct)
             report: SfmReport = _call(*how, list(photos), cameras, *options)
@@ -170,7 +170,7 @@ def reconstruct(
             write_offset(staging, poses_from.offset)
         manifest = {
             "job": "reconstruct" if poses is None else "triangulate",
-            "version": version("splatseed"),
+            "version": version_of("splatseed"),
             "settings": asdict(settings),
             "report": {k: v for k, v in asdict(report).items() if k not in {"path", "poses"}},
         }
@@ -192,7 +192,7 @@ def _lenses(
 
 
 def _reconstruct(
-    run: Run,
+    run: ColmapRun,
     staging: Path,
     names: Sequence[str],
     cameras: Sequence[SharedCamera],
@@ -203,26 +203,32 @@ def _reconstruct(
     masks: Masks | None,
     partial: bool,
 ) -> SfmReport:
-    refinement, doubt = None, ""
+    refinement: Refinement | None = None
+    finding: Finding | None = None
     if poses is None:
         model = colmap.guessed_model(run, cameras, camera_model)
         agreement = match_photographs(run, model, masks)
         further = None if agreement is None else lambda lost: match_further(run, agreement, lost)
-        model_dir, doubt = map_images(run, names, camera_model, further, partial=partial)
+        model_dir, finding = map_images(run, names, camera_model, further, partial=partial)
     else:
         match_photographs(run, colmap.posed_model(run.pycolmap, poses), masks, poses)
         if refine_poses:
             poses, refinement = refine(run, poses)
+            finding = unrefined_finding(len(poses), refinement.excluded)
         model_dir = colmap.triangulate_points(run, poses, test_names)
     _export(run, model_dir, staging, masks)
-    report = replace(_report(run, staging, names), num_pairs=run.num_pairs(), doubt=doubt)
-    return replace(report, refinement=refinement, poses=tuple(poses or ()))
+    return replace(
+        _report(run, staging, names),
+        num_pairs=run.num_pairs(),
+        findings=() if finding is None else (finding,),
+        refinement=refinement,
+        poses=tuple(poses or ()),
+    )
 
 
 def _export(
-    run: Run, model_dir: Path, staging: Path, masks: Masks | None, *, distinct: bool = True
+    run: ColmapRun, model_dir: Path, staging: Path, masks: Masks | None, *, distinct: bool = True
 ) -> None:
-    """Write a model's undistorted photographs, masks and points."""
     export_scene(run, model_dir, staging, distinct=distinct)
     before, after = (
         {image.name: image.intrinsics for image in read_model_cameras(folder)[1]}
@@ -271,7 +277,7 @@ def undistort(
 
 
 def _undistort(
-    run: Run, staging: Path, model_dir: Path, names: Sequence[str], masks: Masks | None
+    run: ColmapRun, staging: Path, model_dir: Path, names: Sequence[str], masks: Masks | None
 ) -> SfmReport:
     _export(run, model_dir, staging, masks, distinct=False)
     return _report(run, staging, names)
@@ -279,8 +285,8 @@ def _undistort(
 
 def refined(
     scene: Scene, seed: int, progress: Progress = silent, *, test_every: int = 0
-) -> tuple[Scene, str]:
-    """Return the scene at refined poses, and what was done, in sentences.
+) -> tuple[Scene, Finding]:
+    """Return the scene at refined poses, and what was done.
 
     Where refinement gains nothing, the scene keeps its poses, and its points if it has any. Else
     points are triangulated from its photographs' features, in place of its own. Photographs, lenses
@@ -317,9 +323,10 @@ def refined(
         )
         others = {image.name for image in scene.images} - {image.name for image in poses}
         unread = [name for name in sorted(others) if (folder / name).is_file()]
-        if note := unrefined_note(len(scene.images), change.excluded, unread):
-            how = f"{how} {note}"
-    return with_refined(scene, scene.replace(images=found.poses, points=found.points)), how
+        if unrefined := unrefined_finding(len(scene.images), change.excluded, unread):
+            how = f"{how} {unrefined}"
+    scene = with_refined(scene, scene.replace(images=found.poses, points=found.points))
+    return scene, Finding("refined-poses", how, "info")
 
 
 _LARGE = 1600  # px; longer sides of photographs whose features suffice without doubling
@@ -340,15 +347,13 @@ def _for_poses(settings: Settings, photos: Photos) -> Settings:
 
 
 class _Refined(NamedTuple):
-    """Result of ``_refine``."""
-
     poses: tuple[Image, ...]
     points: PointCloud
     refinement: Refinement
 
 
 def _refine(
-    run: Run,
+    run: ColmapRun,
     _: Path,
     poses: Sequence[Image],
     test_names: Collection[str],
@@ -438,12 +443,11 @@ def _work(
     pycolmap = colmap.require_pycolmap(settings.device)
     pycolmap.logging.logtostderr = True  # not to files in the temporary folder
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.ERROR)
-    run = Run(pycolmap, settings, images, staging / _WORK, progress, kept)
+    run = ColmapRun(pycolmap, settings, images, staging / _WORK, progress, kept)
     return job(run, staging, *arguments)
 
 
-def _report(run: Run, staging: Path, names: Sequence[str]) -> SfmReport:
-    """Summarise the written model."""
+def _report(run: ColmapRun, staging: Path, names: Sequence[str]) -> SfmReport:
     model = run.pycolmap.Reconstruction(staging / "sparse" / "0")
     registered = {image.name for image in model.images.values() if image.has_pose}
     return SfmReport(
@@ -459,7 +463,6 @@ def _report(run: Run, staging: Path, names: Sequence[str]) -> SfmReport:
 
 
 def _check_names(scene: Scene) -> None:
-    """Raise ``SceneFormatError`` for photograph names that lead out of their folder."""
     for name in (image.name for image in scene.images):
         path = PurePosixPath(name.replace("\\", "/"))
         if path.is_absolute() or ".." in path.parts:  # pycolmap joins it with the output folder

@@ -25,8 +25,9 @@ from scipy.spatial.transform import Rotation
 
 from splatseed.camera import quat_from_rotation
 from splatseed.errors import ReconstructionError
+from splatseed.findings import Finding
 from splatseed.scene import Image
-from splatseed.sfm.colmap import Run, posed_model, rigid
+from splatseed.sfm.colmap import ColmapRun, posed_model, rigid
 from splatseed.text import counted, name_some
 
 
@@ -157,16 +158,11 @@ def _turn_vectors(
     return np.asarray(Rotation.from_matrix(a @ b.transpose(0, 2, 1)).as_rotvec())
 
 
-def refine(run: Run, given: Sequence[Image]) -> tuple[list[Image], Refinement]:
+def refine(run: ColmapRun, given: Sequence[Image]) -> tuple[list[Image], Refinement]:
     """Refine given poses by the verified matches of ``posed_model(given)`` in the run.
 
     Cameras with fewer than 10 points are unchanged; so are all, if the mean reprojection error
     would fall by less than 0.1 px.
-
-    Raises:
-        ReconstructionError: Fewer than half of the photographs see points, or poses drifted: fewer
-            photographs or observations fit than before, or a camera rotated by more than 10 degrees
-            or moved by more than half of the cameras' spread.
     """
     solver = _Solver(run, given)
     poses, strict, after, before = run.stage(
@@ -208,8 +204,10 @@ def refine(run: Run, given: Sequence[Image]) -> tuple[list[Image], Refinement]:
     return with_poses(given, poses), change
 
 
-def unrefined_note(total: int, excluded: Sequence[str], unread: Sequence[str] = ()) -> str:
-    """Name the images, of ``total``, whose poses stay as given beside refined ones; may be empty.
+def unrefined_finding(
+    total: int, excluded: Sequence[str], unread: Sequence[str] = ()
+) -> Finding | None:
+    """Return the finding on images, of ``total``, whose poses stay as given beside refined ones.
 
     ``unread`` have photographs that SfM does not read.
     """
@@ -217,7 +215,10 @@ def unrefined_note(total: int, excluded: Sequence[str], unread: Sequence[str] = 
     kinds = (("SfM does not read", unread), (too_few, excluded))
     reasons = "; ".join(f"{why} {name_some(names, 3)}" for why, names in kinds if names)
     unrefined = f"The poses of {len(unread) + len(excluded):,} of {counted(total, 'image')}"
-    return f"{unrefined} stay as given: {reasons}." if reasons else ""
+    if not reasons:
+        return None
+    text = f"{unrefined} stay as given: {reasons}."
+    return Finding("unrefined-poses", text, subjects=(*unread, *excluded))
 
 
 def _refused(expected: str, found: str) -> ReconstructionError:
@@ -229,8 +230,6 @@ def _refused(expected: str, found: str) -> ReconstructionError:
 
 
 class _Fit(NamedTuple):
-    """Fit of photographs and points."""
-
     seeing: Bool[np.ndarray, " N"]  # photographs with enough points
     observations: int
     error: float  # mean reprojection error over points, px; inf without points
@@ -244,7 +243,7 @@ def _enough(seeing: Bool[np.ndarray, " N"]) -> bool:
 class _Solver:
     """Rounds of triangulation and bundle adjustment; arguments as for ``refine``."""
 
-    def __init__(self, run: Run, images: Sequence[Image]) -> None:
+    def __init__(self, run: ColmapRun, images: Sequence[Image]) -> None:
         self.rounds = 0
         self._run, self._pycolmap = run, run.pycolmap
         self._images, self._given = images, poses_of(images)

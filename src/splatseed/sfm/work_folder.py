@@ -11,14 +11,16 @@ contains, and names its images in the order of their ids.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from splatseed.camera import Intrinsics
+from splatseed.findings import Finding
 from splatseed.io.staging import MANIFEST, locked, read_manifest, remove, write_json
+from splatseed.progress import Note
+from splatseed.requirements import version_of
 from splatseed.runtime.fingerprint import fingerprint
 from splatseed.scene import Masks
 from splatseed.sfm.cameras import Photos
@@ -80,7 +82,7 @@ def work_key(
     for names, lens in cameras:
         for name in names:
             facts = (photos[name].digest, *_mask_facts(masks, name))
-            by_name[name] = _digest([version("pycolmap"), *features, *facts])
+            by_name[name] = _digest([version_of("pycolmap"), *features, *facts])
         lenses += [*names, lens if isinstance(lens, str) else (lens.model, lens.params)]
     verified = _digest([*lenses, seed])
     return WorkKey(by_name, verified, _digest([*sorted(by_name.items()), verified, *pairs]))
@@ -100,7 +102,7 @@ def _digest(facts: Sequence[object]) -> str:
 
 @contextmanager
 def resumable_work(
-    output: Path, key: WorkKey, on_note: Callable[[str], None], *, resume: bool = False
+    output: Path, key: WorkKey, note: Note, *, resume: bool = False
 ) -> Iterator[WorkFolder | None]:
     """Yield the work folder of an output; it is kept if the block fails after work started.
 
@@ -116,32 +118,33 @@ def resumable_work(
             folder.mkdir(exist_ok=True)
             stack.enter_context(locked(folder))
         except OSError:
-            on_note(f"{quoted(folder)} is not free, so that nothing of this run can be kept.")
+            text = f"{quoted(folder)} is not free, so that nothing of this run can be kept."
+            note(Finding("work-not-kept", text))
             yield None
             return
         resume = resume or bool(read_manifest(folder).get(_KEEP))
-        kept = _prepare(folder, key, on_note, keep=resume)
+        kept = _prepare(folder, key, note, keep=resume)
         try:
             yield kept
         except BaseException as error:
             if not (folder / DATABASE).exists():
                 remove(folder)
             elif isinstance(error, KeyboardInterrupt):
-                on_note(f"The same command resumes from {quoted(folder)}.")
+                text = f"The same command resumes from {quoted(folder)}."
+                note(Finding("work-kept", text, "info"))
             raise
         if resume:
             size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
-            on_note(
+            text = (
                 f"Features and matches are kept in {quoted(folder)}, {size / 2**20:,.0f} MB, for "
-                "runs with further photographs or other options; it may be deleted."
             )
+            text += "runs with further photographs or other options; it may be deleted."
+            note(Finding("work-kept", text, "info"))
         else:
             remove(folder)
 
 
-def _prepare(
-    folder: Path, key: WorkKey, on_note: Callable[[str], None], *, keep: bool
-) -> WorkFolder:
+def _prepare(folder: Path, key: WorkKey, note: Note, *, keep: bool) -> WorkFolder:
     """Find out what an earlier run left that applies, and remove models that do not."""
     before: Mapping[str, Any] = read_manifest(folder)
     old = before.get("features") if (folder / DATABASE).is_file() else {}
@@ -153,14 +156,18 @@ def _prepare(
     if not unchanged or before.get("models") != key.models:
         remove(folder / MODELS)
     if unchanged and (folder / MODELS / COMPLETE).is_file():
-        on_note(f"Resumes from the features, matches and models in {where}.")
+        text = f"Resumes from the features, matches and models in {where}."
     elif unchanged:
-        on_note(f"Resumes from the features and matches in {where}.")
+        text = f"Resumes from the features and matches in {where}."
     elif reusable:
         those = "The" if same else f"{number:,} of {total:,} photographs are as before: their"
-        on_note(f"{those} features and matches in {where} are used.")
+        text = f"{those} features and matches in {where} are used."
     elif old:
-        on_note(f"The work in {where} is of other photographs or masks: started again.")
+        text = f"The work in {where} is of other photographs or masks: started again."
+    else:
+        text = ""
+    if text:
+        note(Finding("resumed-work", text, "info"))
     # Until the database is of this run, the manifest vouches only for what both have in common.
     now = key if unchanged else WorkKey(reusable, "", "")
     images = {_IMAGES: before[_IMAGES]} if _IMAGES in before and (old or unchanged) else {}

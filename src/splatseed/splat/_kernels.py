@@ -57,7 +57,6 @@ lines, so that a column spreads over the cache's sets."""
 
 @always_inline
 def _all_lanes(weights):
-    """Broadcast the first six weights of the symmetric window."""
     return (
         broadcast(weights[0]), broadcast(weights[1]), broadcast(weights[2]),
         broadcast(weights[3]), broadcast(weights[4]), broadcast(weights[5]),
@@ -86,7 +85,6 @@ def _blur_columns(source, start, step, rows, columns, weights, out):
 
 @inline
 def _copy_block(x, y, start, width, rows, columns, planes):
-    """Copy a block of both images, and compute x y and x^2 + y^2."""
     plane_x, plane_y, plane_xy, plane_2 = planes[0], planes[1], planes[2], planes[3]
     for row in range(rows):
         for at in range(0, columns, LANES):

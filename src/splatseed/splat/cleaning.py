@@ -14,11 +14,13 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from splatseed.errors import SceneFormatError
+from splatseed.findings import Finding
+from splatseed.progress import Note, silent_note
 from splatseed.splat.gaussians import Gaussians
 from splatseed.text import agreeing, counted
 
 MAX_LOG_SCALE = 20.0
-"""Log-scale of the largest size; also the limit of compressed PLY and SOG."""
+"""Log-scale of the largest size; also the limit of SOG."""
 MAX_POSITION = 1e18
 MIN_LOG_SCALE = float(np.log(np.finfo(np.float32).tiny))
 """Replaces the log-scale of a size of 0, -infinity."""
@@ -27,12 +29,8 @@ _NORMS = (1e-6, 1e6)
 _MAX_SPHERE_SPREAD = 1e-3  # largest difference of log-scales of a sphere
 
 
-def drop_unusable(path: Path, gaussians: Gaussians) -> tuple[Gaussians, str]:
-    """Return the drawable Gaussians, in order, and a note on the others (empty without any).
-
-    Raises:
-        SceneFormatError: No Gaussian can be drawn.
-    """
+def drop_unusable(path: Path, gaussians: Gaussians, note: Note = silent_note) -> Gaussians:
+    """Return the drawable Gaussians, in order; ``note`` is called if there are others."""
     norms = np.linalg.norm(gaussians.quats.astype(np.float64), axis=1)
     kinds = _unusable(gaussians, norms)
     bad = np.logical_or.reduce(list(kinds.values()))
@@ -43,16 +41,16 @@ def drop_unusable(path: Path, gaussians: Gaussians) -> tuple[Gaussians, str]:
             found=f"{counted(len(bad), 'Gaussian')} without a usable {_listed(counts)}",
             fix="Train or export it again.",
         )
-    note = ""
     if bad.any():
         number = int(np.count_nonzero(bad))
-        note = (
+        text = (
             f"{counted(number, 'Gaussian')} of {len(bad):,} in {path} "
             f"{agreeing(number, 'has', 'have')} no usable {_listed(counts)} and "
             f"{agreeing(number, 'was', 'were')} left out (NaN, infinity or zero length)."
         )
+        note(Finding("unusable-gaussians", text, subjects=(str(path),)))
         gaussians, norms = gaussians.select(~bad), norms[~bad]
-    return _representable(gaussians, norms), note
+    return _representable(gaussians, norms)
 
 
 def _unusable(

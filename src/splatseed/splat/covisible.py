@@ -46,7 +46,7 @@ class CovisibilitySettings:
     num_nearest: int = 4  # covered cells whose median inverse depth fills an empty cell
 
 
-SETTINGS = CovisibilitySettings()
+COVISIBILITY = CovisibilitySettings()
 
 Grids = Mapping[str, Bool[np.ndarray, "rows cols"]]
 
@@ -97,13 +97,13 @@ def _resized(values: np.ndarray[Any, Any], rows: int, cols: int) -> np.ndarray[A
 
 
 def _cell(view: View) -> float:
-    return max(max(view.width, view.height) / SETTINGS.num_cells, SETTINGS.min_cell)
+    return max(max(view.width, view.height) / COVISIBILITY.num_cells, COVISIBILITY.min_cell)
 
 
 def _small_views(images: Sequence[Image], maps: DepthMaps | None) -> Sequence[View]:
     """Return the images' views at most ``max_side`` large; with depth maps, of images with one."""
     known = [image for image in images if maps is None or image.name in maps]
-    return camera_views(known, factor_for_size(known, SETTINGS.max_side)) if known else ()
+    return camera_views(known, factor_for_size(known, COVISIBILITY.max_side)) if known else ()
 
 
 def _depths(
@@ -117,7 +117,7 @@ def _depths(
         depths = np.nan_to_num(values, nan=np.inf)
     known = np.isfinite(depths)
     if known.any() and not known.all():
-        k = min(SETTINGS.num_nearest, np.count_nonzero(known))
+        k = min(COVISIBILITY.num_nearest, np.count_nonzero(known))
         _, near = cKDTree(np.argwhere(known)).query(np.argwhere(~known), k=k)
         inverse = 1.0 / depths[known][near.reshape(-1, k)]
         depths = depths.copy()
@@ -141,7 +141,7 @@ def _covisible(
         points = points_in_image(other.camera, xyz)
         there = farthest[points.cells(other.camera, farthest.shape)]
         count[points.point_idx] += there >= (1.0 - SURFACE) * points.depth
-    return np.asarray((count.reshape(depths.shape) >= SETTINGS.min_views) & known)
+    return np.asarray((count.reshape(depths.shape) >= COVISIBILITY.min_views) & known)
 
 
 def write_covisible(path: Path, grids: Grids) -> None:

@@ -27,6 +27,7 @@ import torch
 from torch import Tensor
 
 from splatseed.errors import ParameterError, SceneNotFoundError
+from splatseed.findings import Finding
 from splatseed.io import load_scene
 from splatseed.io.masks import with_masks
 from splatseed.io.photograph import photographs_digest
@@ -86,9 +87,6 @@ def evaluate_views(
         covisible: Pixels over which PSNR is also computed, for some or all views.
         on_view: Called with each view, its render and its FLIP.
         progress: Called with the name of a stage and its fraction done.
-
-    Raises:
-        ParameterError: There are no views, or a render has the wrong shape or is not finite.
 
     Example:
         >>> import numpy as np, torch
@@ -165,8 +163,7 @@ def _now() -> float:
 class TrainedModel:
     """Gaussians, the test views of their scene, and a function that renders a view.
 
-    ``frame_warning`` says why the Gaussians may be in another frame; empty if they fit. ``notes``
-    list what was dropped or changed on reading.
+    ``findings`` list what was dropped or changed on reading, and whether the frame is uncertain.
     """
 
     gaussians: Gaussians
@@ -174,8 +171,7 @@ class TrainedModel:
     render: Render
     scene: Scene
     data_factor: int = 1
-    frame_warning: str = ""
-    notes: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
 
 def load_model(
@@ -214,9 +210,11 @@ def load_model(
         SceneFormatError: A file is damaged, or the Gaussians are in another frame.
         ParameterError: The transform cannot be computed.
     """
-    notes: list[str] = []
+    findings: list[Finding] = []
     path = None if isinstance(model, Gaussians) else Path(model)
-    gaussians = model if isinstance(model, Gaussians) else read_gaussians(Path(model), notes.append)
+    gaussians = (
+        model if isinstance(model, Gaussians) else read_gaussians(Path(model), findings.append)
+    )
     if not isinstance(scene, Scene):
         scene = load_scene(Path(scene), require_points=False)
     scene = with_masks(scene, masks)
@@ -224,9 +222,8 @@ def load_model(
         scene = _with_test_photographs(scene, test_every)
     if gone := scene.absent:
         are = agreeing(len(gone), "image of the scene is", "images of the scene are")
-        notes.append(
-            f"{len(gone)} {are} left out, without a photograph or a pose: {name_some(gone, 3)}."
-        )
+        text = f"{len(gone)} {are} left out, without a photograph or a pose: {name_some(gone, 3)}."
+        findings.append(Finding("missing-photographs", text, subjects=tuple(gone)))
     train, test = scene.split(test_every)
     if not train or not test:
         raise SceneNotFoundError(
@@ -244,11 +241,12 @@ def load_model(
         progress=progress,
     )
     if transform is None and path is not None:
-        gaussians = move_to_scene_origin(path, scene, gaussians, notes.append)
+        gaussians = move_to_scene_origin(path, scene, gaussians, findings.append)
     world = None if transform is None else find_transform(transform, scene)
     same_scene = transform is None and trained_on == photographs_digest(scene)
     skip_check = same_scene or transform == NO_TRANSFORM
-    frame_warning = "" if skip_check else check_frame(path, scene, gaussians, world)
+    if not skip_check:
+        check_frame(path, scene, gaussians, world, findings.append)
     points = reference_points(scene)
     frame = frame_of_model(
         [view_in_model_frame(world, view) for view in camera_views(train)],
@@ -260,7 +258,7 @@ def load_model(
     image = ModelRenderer(gaussians, frame, device).image
     return TrainedModel(
         gaussians, views, lambda view: image(view_in_model_frame(world, view)), scene, factor,
-        frame_warning, tuple(notes),
+        tuple(findings),
     )  # fmt: skip
 
 

@@ -37,35 +37,38 @@ _UNSUPPORTED = {
 
 
 class Format(NamedTuple):
-    """A file format; ``description`` lists what it preserves and its readers."""
+    """A file format; ``description`` lists what it preserves and its readers.
+
+    One without ``encode`` is only read.
+    """
 
     suffix: str
     description: str
-    encode: Callable[[Gaussians, Note], Iterable[bytes | memoryview]]
     decode: Callable[[Path, Note], Gaussians]
+    encode: Callable[[Gaussians, Note], Iterable[bytes | memoryview]] | None = None
 
 
 FORMATS = {
     "compressed-ply": Format(
-        ".compressed.ply", "all but fine detail; PlayCanvas, SuperSplat",
-        compressed_ply.encode, compressed_ply.decode,
+        ".compressed.ply", "all but fine detail; PlayCanvas, SuperSplat", compressed_ply.decode
     ),
     "ply": Format(
         ".ply", "everything, as 3DGS writes it; every tool reads it",
-        model_ply.encode, model_ply.decode,
+        model_ply.decode, model_ply.encode,
     ),
     "splat": Format(
-        ".splat", "no view-dependent colour; web viewers", splat_file.encode, splat_file.decode
+        ".splat", "no view-dependent colour; web viewers", splat_file.decode, splat_file.encode
     ),
     "spz": Format(
         ".spz", "all but fine detail; Niantic, three.js viewers, glTF tools",
-        spz.encode, spz.decode,
+        spz.decode, spz.encode,
     ),
-    "sog": Format(".sog", "all but fine detail; PlayCanvas, SuperSplat", sog.encode, sog.decode),
+    "sog": Format(".sog", "all but fine detail; PlayCanvas, SuperSplat", sog.decode, sog.encode),
 }  # fmt: skip
 """Formats by name; a suffix stands before those that it ends with."""
 SUFFIXES = {each.suffix: name for name, each in FORMATS.items()}
 """Names of formats by suffix."""
+WRITTEN_SUFFIXES = tuple(each.suffix for each in FORMATS.values() if each.encode)
 
 
 RUN_FILE = "point_cloud.ply"
@@ -78,7 +81,7 @@ def read_gaussians(path: StrPath, note: Note = silent_note) -> Gaussians:
     Args:
         path: The folder of a run, or a .ply, compressed .ply, .splat, .spz, or .sog (or its
             meta.json), recognised by its content.
-        note: Called with notes for the user, such as on Gaussians with NaN, which are left out.
+        note: Called with findings, such as Gaussians with NaN, which are left out.
 
     Returns:
         The Gaussians, in the order and frame of the file.
@@ -92,10 +95,7 @@ def read_gaussians(path: StrPath, note: Note = silent_note) -> Gaussians:
     if path.is_dir():
         path /= RUN_FILE
     gaussians = FORMATS[detect_format(path, read_bytes(path))].decode(path, note)
-    gaussians, left_out = drop_unusable(path, gaussians)
-    if left_out:
-        note(left_out)
-    return gaussians
+    return drop_unusable(path, gaussians, note)
 
 
 def write_gaussians(
@@ -103,7 +103,7 @@ def write_gaussians(
 ) -> None:
     """Write one or more Gaussians, at finite positions, in the format of the file name's suffix.
 
-    ``note`` is called with notes for the user on what the format cannot represent.
+    ``note`` is called with findings on what the format cannot represent.
 
     Raises:
         ParameterError: The suffix is not of a supported format.
@@ -115,38 +115,35 @@ def write_gaussians(
     if name == "sog":
         parts: Iterable[bytes | memoryview] = sog.encode(gaussians, note, progress)
     else:
-        parts = FORMATS[name].encode(gaussians, note)
+        encode = FORMATS[name].encode
+        assert encode is not None  # noqa: S101  (format_of_name refuses formats that are only read)
+        parts = encode(gaussians, note)
     progress("encode", 1.0)
     with atomic_file(path) as partial, partial.open("wb") as file:
         file.writelines(parts)
 
 
 def format_of_name(path: Path, more: Collection[str] = ()) -> str:
-    """Return the name of the format of a file name's suffix.
+    """Return the name of the format to write, by a file name's suffix.
 
     ``more`` are suffixes that the caller handles, for the message.
-
-    Raises:
-        ParameterError: The suffix is not of a supported format.
     """
+    found, other = path.suffix or "none", _UNSUPPORTED.get(path.suffix.lower())
+    known = (*WRITTEN_SUFFIXES, *more)
+    fix = f"Export a .ply: {other}." if other else f"{did_you_mean(found, known)}Choose one."
     for suffix, name in SUFFIXES.items():
         if path.name.lower().endswith(suffix):
-            return name
-    suffix, other = path.suffix or "none", _UNSUPPORTED.get(path.suffix.lower())
-    known = (*SUFFIXES, *more)
+            if suffix in known:
+                return name
+            found, fix = f"{suffix}, which is only read", "Write a .sog, its successor."
+            break
     raise ParameterError(
-        f"a file name that ends in one of {', '.join(known)}",
-        found=suffix,
-        fix=f"Export a .ply: {other}." if other else f"{did_you_mean(suffix, known)}Choose one.",
+        f"a file name that ends in one of {', '.join(known)}", found=found, fix=fix
     )
 
 
 def detect_format(path: Path, data: bytes) -> str:
-    """Return the name of the format of a file's content (of a .splat, of its name).
-
-    Raises:
-        SceneFormatError: The format is not supported.
-    """
+    """Return the name of the format of a file's content (of a .splat, of its name)."""
     suffix = path.suffix.lower()
     if data.startswith(b"ply") and data[3:4] in (b"\n", b"\r", b" ", b"\t"):
         return "compressed-ply" if b"packed_position" in data[:_HEADER] else "ply"
@@ -188,9 +185,6 @@ def holds_gaussians(path: Path) -> bool:
 def parse_crop(text: str) -> Float64[np.ndarray, "2 3"]:
     """Parse a box of six comma-separated numbers: minimum x, y, z, then maximum x, y, z.
 
-    Raises:
-        ParameterError: The text is not six numbers, or a minimum is not below its maximum.
-
     Example:
         >>> parse_crop("-1,-1,-1,1,1,2").tolist()
         [[-1.0, -1.0, -1.0], [1.0, 1.0, 2.0]]
@@ -211,11 +205,7 @@ def parse_crop(text: str) -> Float64[np.ndarray, "2 3"]:
 def filter_gaussians(
     gaussians: Gaussians, crop: Float64[np.ndarray, "2 3"] | None = None, min_opacity: float = 0.0
 ) -> Gaussians:
-    """Keep the Gaussians with centres in the box ``crop`` and at least ``min_opacity``, in order.
-
-    Raises:
-        ParameterError: ``min_opacity`` is not in [0, 1), or no Gaussian is left.
-    """
+    """Keep Gaussians with centres in the box ``crop`` and at least ``min_opacity``, in order."""
     if not 0 <= min_opacity < 1:
         raise ParameterError(
             "`min_opacity` of 0 or more, less than 1", found=f"{min_opacity}", fix="Try 0.05."

@@ -36,7 +36,7 @@ class InitializationSettings:
     )
 
 
-SETTINGS = InitializationSettings()
+INITIALIZATION = InitializationSettings()
 
 
 def initial_gaussians(
@@ -106,7 +106,7 @@ def neighbor_distances(xyz: Float[np.ndarray, "N 3"]) -> Float64[np.ndarray, " N
         # An unbalanced tree is built several times faster and queried as fast.
         tree = cKDTree(xyz, balanced_tree=False, compact_nodes=False)
         order = tree.indices  # of its leaves: a query near the last one finds them in the cache
-        k = min(SETTINGS.num_neighbors, len(xyz) - 1) + 1
+        k = min(INITIALIZATION.num_neighbors, len(xyz) - 1) + 1
         distances, _ = tree.query(xyz[order], k=k, workers=-1)
         squares[order] = (distances[:, 1:] ** 2).mean(axis=1)
     if not (squares > 0).any():
@@ -117,7 +117,9 @@ def neighbor_distances(xyz: Float[np.ndarray, "N 3"]) -> Float64[np.ndarray, " N
         )
     median = np.sqrt(np.median(squares[squares > 0]))
     return np.asarray(
-        np.clip(np.sqrt(squares), SETTINGS.min_size * median, SETTINGS.max_size * median)
+        np.clip(
+            np.sqrt(squares), INITIALIZATION.min_size * median, INITIALIZATION.max_size * median
+        )
     )
 
 
@@ -136,14 +138,17 @@ def fit_harmonics(seeds: PointCloud, views: Sequence[View]) -> Float32[np.ndarra
 
     xyz = np.ascontiguousarray(seeds.xyz, np.float32)
     # Normal equations; the priors make them regular even for a seed that no view sees.
-    priors = [SETTINGS.color_weight * SH_C0**2, *[SETTINGS.smoothness_weight * SH_C1**2] * 3]
+    priors = [
+        INITIALIZATION.color_weight * SH_C0**2,
+        *[INITIALIZATION.smoothness_weight * SH_C1**2] * 3,
+    ]
     normal = np.tile(np.diag(priors), (len(xyz), 1, 1))
     right = np.zeros((len(xyz), 4, 3))
-    right[:, 0] = SETTINGS.color_weight * SH_C0 * (seeds.rgb / 255.0 - 0.5)
-    limit = max(SETTINGS.min_views, SETTINGS.max_projections // max(1, len(xyz)))
+    right[:, 0] = INITIALIZATION.color_weight * SH_C0 * (seeds.rgb / 255.0 - 0.5)
+    limit = max(INITIALIZATION.min_views, INITIALIZATION.max_projections // max(1, len(xyz)))
     view_idx = np.linspace(0, len(views) - 1, min(limit, len(views))).round().astype(int)
     for view in [views[i] for i in np.unique(view_idx)]:
-        index, uv, _ = visible_points(view.camera, xyz, SETTINGS.occlusion_cell, view.mask)
+        index, uv, _ = visible_points(view.camera, xyz, INITIALIZATION.occlusion_cell, view.mask)
         column, row = uv.astype(np.int64).T
         offsets = xyz[index].astype(np.float64) - camera_centers([view])[0]
         d = offsets / np.maximum(np.linalg.norm(offsets, axis=1, keepdims=True), 1e-12)

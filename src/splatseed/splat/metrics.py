@@ -15,8 +15,7 @@ from torch.nn.functional import pad
 
 from splatseed.requirements import require
 from splatseed.splat._kernels import WINDOW
-from splatseed.splat.ssim import l1_and_ssim
-from splatseed.splat.ssim_conv import l1_and_ssim_by_convolution, ssim_map
+from splatseed.splat.ssim import l1_and_ssim, l1_and_ssim_by_convolution, ssim_map
 
 _UNSATURATED = 0.5 / 255
 """Minimum distance from 0 and 1 of an unclipped value."""
@@ -122,9 +121,6 @@ def flip_map(
 
     LDR-FLIP at 67 pixels per degree of visual angle, computed on the CPU by its authors' package
     (Andersson et al. 2020). Images are sRGB, clamped to [0, 1].
-
-    Raises:
-        MissingDependencyError: flip-evaluator is absent.
     """
     require("flip_evaluator")
     from flip_evaluator import evaluate  # noqa: PLC0415  (optional: extra `train`)

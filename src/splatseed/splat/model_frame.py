@@ -23,10 +23,12 @@ from scipy.spatial import KDTree
 
 from splatseed.camera import quat_from_rotation
 from splatseed.errors import ParameterError, SceneFormatError
+from splatseed.findings import Finding
 from splatseed.io.files import read_json
 from splatseed.io.nerfstudio import NERFSTUDIO, pair_centers, similarity_in
 from splatseed.io.origin import find_shift, format_offset, offset_beside
 from splatseed.photos.view import View
+from splatseed.progress import Note, silent_note
 from splatseed.scene import Scene
 from splatseed.similarity import Similarity, fit_similarity, similarity_of
 from splatseed.splat.gaussians import VISIBLE_LOGIT, Gaussians
@@ -53,7 +55,7 @@ class FrameSettings:
     min_in_box: int = 50  # points in the box, needed to measure the misfit of a part of the scene
 
 
-SETTINGS = FrameSettings()
+FRAME = FrameSettings()
 
 
 def view_in_model_frame(world: Similarity | None, view: View) -> View:
@@ -89,7 +91,7 @@ def find_transform(name: str, scene: Scene) -> Similarity | None:
 
 
 def move_to_scene_origin(
-    path: Path, scene: Scene, gaussians: Gaussians, note: Callable[[str], None] = lambda _: None
+    path: Path, scene: Scene, gaussians: Gaussians, note: Note = silent_note
 ) -> Gaussians:
     """Translate Gaussians, read from ``path``, to the origin of the loaded scene.
 
@@ -102,8 +104,12 @@ def move_to_scene_origin(
         return gaussians
     if recorded is None:
         note(
-            f"The Gaussians of {path} were far from the scene's origin: they were moved by "
-            f"{format_offset(shift)}."
+            Finding(
+                "far-from-origin",
+                f"The Gaussians of {path} were far from the scene's origin: they were moved by "
+                f"{format_offset(shift)}.",
+                subjects=(str(path),),
+            )
         )
     return translate_gaussians(gaussians, shift)
 
@@ -115,21 +121,29 @@ def translate_gaussians(gaussians: Gaussians, shift: Float64[np.ndarray, " 3"]) 
 
 
 def check_frame(
-    path: Path | None, scene: Scene, gaussians: Gaussians, given: Similarity | None = None
-) -> str:
+    path: Path | None,
+    scene: Scene,
+    gaussians: Gaussians,
+    given: Similarity | None = None,
+    note: Note = silent_note,
+) -> None:
     """Raise unless a model, read from ``path``, is in the scene's frame, or that of ``given``.
 
-    Returns a warning if the frame is uncertain, else "". Without points nothing is checked.
+    ``note`` is called if the frame is uncertain. Without points nothing is checked.
     """
     misfit = _misfit_of(scene, gaussians)
-    if misfit is None or (found := misfit(given)) <= SETTINGS.good_misfit:
-        return ""
+    if misfit is None or (found := misfit(given)) <= FRAME.good_misfit:
+        return
     misfits = {name: misfit(world) for name, world in _candidates(path, scene).items()}
-    if found <= SETTINGS.max_misfit and found <= min(misfits.values()) * SETTINGS.ratio:
-        return (
-            f"Points of the scene are {found:.1f} times as far from the nearest Gaussian as "
-            "Gaussians from each other: check the renders before you trust the scores."
+    if found <= FRAME.max_misfit and found <= min(misfits.values()) * FRAME.ratio:
+        note(
+            Finding(
+                "uncertain-frame",
+                f"Points of the scene are {found:.1f} times as far from the nearest Gaussian as "
+                "Gaussians from each other: check the renders before you trust the scores.",
+            )
         )
+        return
     fix = (
         "No known transform fits: this is probably a model of another scene. Otherwise pass its "
         "trainer's transform as `transform=FILE`, or "
@@ -138,7 +152,7 @@ def check_frame(
     fitting = [
         name
         for name, value in misfits.items()
-        if value < found / SETTINGS.ratio and value <= SETTINGS.good_misfit
+        if value < found / FRAME.ratio and value <= FRAME.good_misfit
     ]
     if fitting:
         fix = (
@@ -152,41 +166,44 @@ def check_frame(
     )
 
 
-def move_to_scene_frame(path: Path, scene: Scene, gaussians: Gaussians) -> tuple[Gaussians, str]:
-    """Transform Gaussians, read from ``path``, by ``scene_from_model``; also return its note."""
-    move, note = scene_from_model(path, scene, gaussians)
-    return gaussians if move is None else transform_gaussians(gaussians, move), note
+def move_to_scene_frame(
+    path: Path, scene: Scene, gaussians: Gaussians, note: Note = silent_note
+) -> Gaussians:
+    """Transform Gaussians, read from ``path``, by ``scene_from_model``."""
+    move = scene_from_model(path, scene, gaussians, note)
+    return gaussians if move is None else transform_gaussians(gaussians, move)
 
 
 def scene_from_model(
-    path: Path, scene: Scene, gaussians: Gaussians
-) -> tuple[Similarity | None, str]:
+    path: Path, scene: Scene, gaussians: Gaussians, note: Note = silent_note
+) -> Similarity | None:
     """Find the transform of Gaussians, read from ``path``, to the scene's frame.
 
     It is None for Gaussians that fit the scene's points, else the inverse of the best of the
-    transforms that their trainer may have applied. Also returns a note for the user.
-
-    Raises:
-        SceneFormatError: No known transform fits.
+    transforms that their trainer may have applied, on which ``note`` is called.
     """
     misfit = _misfit_of(scene, gaussians)
-    if misfit is None or misfit(None) <= SETTINGS.good_misfit:
-        return None, ""
+    if misfit is None or misfit(None) <= FRAME.good_misfit:
+        return None
     misfits = {name: misfit(world) for name, world in _candidates(path, scene).items()}
     name = min(misfits, key=misfits.__getitem__)
-    limit = min(SETTINGS.good_misfit, misfits[NO_TRANSFORM] / SETTINGS.ratio)
+    limit = min(FRAME.good_misfit, misfits[NO_TRANSFORM] / FRAME.ratio)
     if name == NO_TRANSFORM or misfits[name] > limit:
         try:
-            return None, check_frame(path, scene, gaussians)
+            check_frame(path, scene, gaussians, note=note)
         except SceneFormatError as error:
             fix = "Name the scene of the training, or transform the model to the scene's frame."
             raise SceneFormatError(error.expected, found=error.found, fix=fix) from None
+        return None
     world = find_transform(name, scene)
     assert world is not None  # noqa: S101  (only `none` has no transform)
-    return world.inverse, (
-        f"The Gaussians of {path} were in their trainer's frame ({name}) and were transformed to "
-        "the scene's."
+    text = f"The Gaussians of {path} were in their trainer's frame ({name})"
+    note(
+        Finding(
+            "model-frame", f"{text} and were transformed to the scene's.", subjects=(str(path),)
+        )
     )
+    return world.inverse
 
 
 def transform_gaussians(gaussians: Gaussians, similarity: Similarity) -> Gaussians:
@@ -233,26 +250,26 @@ def _misfit_of(scene: Scene, gaussians: Gaussians) -> Callable[[Similarity | Non
     rng = np.random.default_rng(0)
     points = scene.points.references
     every = rng.permutation(points.xyz[points.finite].astype(np.float64))
-    xyz = every[: SETTINGS.max_points]
+    xyz = every[: FRAME.max_points]
     means = gaussians.means[gaussians.opacities > VISIBLE_LOGIT].astype(np.float64)
-    if len(xyz) < SETTINGS.min_points or len(means) < SETTINGS.min_points:
+    if len(xyz) < FRAME.min_points or len(means) < FRAME.min_points:
         return None
     tree = KDTree(means)
-    near = tree.query(rng.permutation(means)[: SETTINGS.max_points], k=2)[0][:, 1]
+    near = tree.query(rng.permutation(means)[: FRAME.max_points], k=2)[0][:, 1]
     gap = max(float(np.median(near)), float(np.finfo(np.float32).tiny))
 
-    low, high = np.quantile(means, SETTINGS.box, axis=0)
+    low, high = np.quantile(means, FRAME.box, axis=0)
 
     def misfit(world: Similarity | None) -> float:
         whole = float(np.median(tree.query(_moved(xyz, world))[0])) / gap
-        if whole <= SETTINGS.good_misfit:
+        if whole <= FRAME.good_misfit:
             return whole
         moved = _moved(every, world)
-        inside = moved[((moved >= low) & (moved <= high)).all(axis=1)][: SETTINGS.max_points]
-        if len(inside) < SETTINGS.min_in_box:
+        inside = moved[((moved >= low) & (moved <= high)).all(axis=1)][: FRAME.max_points]
+        if len(inside) < FRAME.min_in_box:
             return whole
         part = float(np.median(tree.query(inside)[0])) / gap
-        return part if part <= SETTINGS.good_misfit else whole
+        return part if part <= FRAME.good_misfit else whole
 
     return misfit
 

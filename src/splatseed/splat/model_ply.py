@@ -18,20 +18,22 @@ from jaxtyping import Float32
 from numpy.lib.recfunctions import structured_to_unstructured
 
 from splatseed.errors import SceneFormatError
+from splatseed.findings import Finding
 from splatseed.io.files import ByteReader, translate_errors
 from splatseed.io.ply import EXPORT_PLY_AGAIN, Element, Header, parse_header
 from splatseed.progress import Note, silent_note
-from splatseed.splat.gaussians import SH_C0, Gaussians
-from splatseed.splat.ply_layout import (
+from splatseed.splat.gaussians import (
     DC,
     ROTATION,
     SCALES,
+    SH_C0,
+    SH_COUNTS,
     XYZ,
+    Gaussians,
     encode_layout,
     is_antialiased,
     rest_names,
 )
-from splatseed.splat.quantization import SH_COUNTS
 
 _COLORS = ("red", "green", "blue")
 _FILTER = "filter_3D"
@@ -78,9 +80,13 @@ def decode(path: Path, note: Note = silent_note) -> Gaussians:
             arrays["scales"], arrays["opacities"], sizes
         )
         note(
-            f"{path} has filter_3D (Mip-Splatting and related methods), which was applied to sizes "
-            "and opacities. Their renderers also blur less than 3DGS's and splatseed's, so scores "
-            "may differ."
+            Finding(
+                "other-renderer",
+                f"{path} has filter_3D (Mip-Splatting and related methods), which was applied to "
+                "sizes and opacities. Their renderers also blur less than 3DGS's and splatseed's, "
+                "so scores may differ.",
+                subjects=(str(path),),
+            )
         )
     return Gaussians(**arrays, antialiased=is_antialiased(reader.data[: header.size]))
 
@@ -138,14 +144,12 @@ def _check(path: Path, header: Header, names: set[str], data: bytes) -> None:
 
 
 def _up_to_vertices(header: Header) -> list[Element]:
-    """Return the elements of a file up to and including its vertices."""
     names = [element.name for element in header.elements]
     last = names.index("vertex") if "vertex" in names else len(names)
     return list(header.elements[: last + 1])
 
 
 def _rows(reader: ByteReader, header: Header) -> np.ndarray:
-    """Read the vertices as a structured array."""
     reader.offset = header.size
     *others, vertex = _up_to_vertices(header)
     if not header.byte_order:
@@ -205,7 +209,10 @@ def _harmonics(rows: np.ndarray, names: set[str], note: Note) -> Float32[np.ndar
         return np.zeros((len(rows), 0, 3), np.float32)
     count, limit = rest // 3, SH_COUNTS[-1]
     if count > limit:
-        note(f"Of {count} coefficients beyond the first, only the {limit} up to degree 3 are used.")
+        text = (
+            f"Of {count} coefficients beyond the first, only the {limit} up to degree 3 are used."
+        )
+        note(Finding("unused-harmonics", text))
     every = rest_names(rest)
     used = [name for color in range(3) for name in every[color * count :][: min(count, limit)]]
     planes = _columns(rows, used).reshape(len(rows), 3, -1)
@@ -218,13 +225,17 @@ def _shape(
     """Return log-scales and rotations: spheres for one size, discs for two (as of 2DGS)."""
     scales = _columns(rows, [name for name in SCALES if name in names])
     if scales.shape[1] == 1:
-        note("Gaussians have one size, scale_0: they are read as spheres.")
+        text = "Gaussians have one size, scale_0: they are read as spheres."
+        note(Finding("spheres-or-discs", text, "info"))
         quats = np.tile(np.array([1, 0, 0, 0], np.float32), (len(rows), 1))
         return np.repeat(scales, 3, axis=1), quats
     if scales.shape[1] == 2:
         note(
-            "Gaussians have two sizes, as of 2D Gaussian Splatting: they are read as discs. Its "
-            "renderer intersects rays with discs, so scores may differ."
+            Finding(
+                "spheres-or-discs",
+                "Gaussians have two sizes, as of 2D Gaussian Splatting: they are read as discs. "
+                "Its renderer intersects rays with discs, so scores may differ.",
+            )
         )
         thin = scales.min(axis=1, keepdims=True) + np.float32(np.log(FLATNESS))
         scales = np.concatenate([scales, thin], axis=1)

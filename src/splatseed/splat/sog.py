@@ -18,17 +18,22 @@ from jaxtyping import Float32, Float64, Int64, UInt8
 from PIL import Image
 
 from splatseed.errors import SceneFormatError
+from splatseed.findings import Finding
 from splatseed.io.files import read_bytes, translate_errors
 from splatseed.progress import Note, Progress, silent, silent_note
 from splatseed.splat.cleaning import MAX_LOG_SCALE
-from splatseed.splat.extent import SETTINGS, Fit, best_fit, left_out_note, morton_order, shells_of
-from splatseed.splat.gaussians import Gaussians
-from splatseed.splat.quantization import (
-    SH_COUNTS,
+from splatseed.splat.gaussians import SH_COUNTS, Gaussians
+from splatseed.splat.packing import (
+    PACKING,
+    Fit,
+    best_fit,
     from_smallest_three,
+    left_out_finding,
+    morton_order,
     opacity_bytes,
     opacity_logits,
     rounded_bytes,
+    shells_of,
     smallest_three,
 )
 
@@ -136,11 +141,14 @@ def _within_steps(gaussians: Gaussians, note: Note) -> Gaussians:
     kept = fits[chosen].kept
     if not kept.all():
         nearest = np.abs(gaussians.means[~kept]).max(axis=1).min()
-        note(left_out_note(".sog", kept, f"{nearest:,.4g} units or more from the origin"))
-    if error > SETTINGS.coarse_error:
+        note(left_out_finding(".sog", kept, f"{nearest:,.4g} units or more from the origin"))
+    if error > PACKING.coarse_error:
         note(
-            "A .sog is too coarse for the positions of this model: export another format, or move "
-            "the model to the origin."
+            Finding(
+                "coarse-positions",
+                "A .sog is too coarse for the positions of this model: export another format, or "
+                "move the model to the origin.",
+            )
         )
     return gaussians if kept.all() else gaussians.select(kept)
 
@@ -205,7 +213,6 @@ def _grid(values: np.ndarray) -> UInt8[np.ndarray, "H W 4"]:
 
 
 def _part_reader(path: Path) -> Callable[[str], bytes]:
-    """Return a function that reads a named part."""
     if path.name.lower().endswith(".json"):
         return lambda name: read_bytes(path if name == _META else path.parent / Path(name).name)
     archive = zipfile.ZipFile(io.BytesIO(read_bytes(path)))

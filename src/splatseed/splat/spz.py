@@ -19,15 +19,19 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from splatseed.errors import ParameterError, SceneFormatError
+from splatseed.findings import Finding
 from splatseed.io.files import COPY_AGAIN, read_bytes, translate_errors
 from splatseed.progress import Note, silent_note
 from splatseed.requirements import require
 from splatseed.runtime.memory import check_memory
-from splatseed.splat.extent import SETTINGS, Fit, best_fit, left_out_note, morton_order
-from splatseed.splat.gaussians import Gaussians
-from splatseed.splat.quantization import (
-    SH_COUNTS,
+from splatseed.splat.gaussians import SH_COUNTS, Gaussians
+from splatseed.splat.packing import (
+    PACKING,
+    Fit,
+    best_fit,
     from_smallest_three,
+    left_out_finding,
+    morton_order,
     opacity_bytes,
     opacity_logits,
     rounded_bytes,
@@ -67,7 +71,6 @@ class _Signs(NamedTuple):
 
 
 def _signs(axes: int) -> _Signs:
-    """Return the signs for axes 1 to 8."""
     right, up, front = (bool((axes - 1) >> bit & 1) for bit in range(3))
     x, y, z = 1 if right else -1, -1 if up else 1, 1 if front else -1
     sh = [y, z, x, x * y, y * z, 1, x * z, 1, y, x * y * z, y, z, x, z, x]
@@ -83,11 +86,7 @@ short run vanish, and PSNR falls by up to 2.8 dB."""
 
 
 def encode(gaussians: Gaussians, note: Note = silent_note) -> list[bytes]:
-    """Encode Gaussians in Z-curve order.
-
-    Raises:
-        ParameterError: Positions exceed the format's range.
-    """
+    """Encode Gaussians in Z-curve order."""
     gaussians, bits = _fixed_point(gaussians, note)
     order = morton_order(gaussians.means)
     rest = gaussians.shN.shape[1]
@@ -136,12 +135,15 @@ def _fixed_point(gaussians: Gaussians, note: Note) -> tuple[Gaussians, int]:
             fix="Export another format, or crop the model.",
         )
     if not kept.all():
-        note(left_out_note(".spz", kept, f"more than {limit:,.4g} units from the origin"))
-    if error > SETTINGS.coarse_error:
+        note(left_out_finding(".spz", kept, f"more than {limit:,.4g} units from the origin"))
+    if error > PACKING.coarse_error:
         steps = f"up to {limit:,.4g} units from the origin in steps of {2.0**-bits:.3g}"
         note(
-            f"A .spz holds positions {steps}, too coarse for this model: export another format, or "
-            "move the model to the origin."
+            Finding(
+                "coarse-positions",
+                f"A .spz holds positions {steps}, too coarse for this model: export another "
+                "format, or move the model to the origin.",
+            )
         )
     scales = np.sort(
         gaussians.scales[kept], axis=1
@@ -150,8 +152,11 @@ def _fixed_point(gaussians: Gaussians, note: Note) -> tuple[Gaussians, int]:
     if number := int(np.count_nonzero(beyond)):
         smallest, largest = np.exp(_LOG_SCALES)
         note(
-            f"A .spz holds sizes from {smallest:.2g} to {largest:.0f} units: "
-            f"{counted(number, 'Gaussian')} {agreeing(number, 'was', 'were')} clipped."
+            Finding(
+                "clipped-sizes",
+                f"A .spz holds sizes from {smallest:.2g} to {largest:.0f} units: "
+                f"{counted(number, 'Gaussian')} {agreeing(number, 'was', 'were')} clipped.",
+            )
         )
     return gaussians if kept.all() else gaussians.select(kept), bits
 
@@ -186,7 +191,8 @@ def decode(path: Path, note: Note = silent_note) -> Gaussians:
         position, opacity, color, scale, rotation, sh = (part.reshape(count, -1) for part in parts)
         harmonics = (sh.reshape(count, rest, 3).astype(np.float32) - 128) / 128
         if rest > (limit := SH_COUNTS[-1]):
-            note(f"Of {rest} coefficients beyond the first, {limit} (degree 3) are used.")
+            text = f"Of {rest} coefficients beyond the first, {limit} (degree 3) are used."
+            note(Finding("unused-harmonics", text))
             rest, harmonics = limit, harmonics[:, :limit]
         if version == 1:  # half floats
             means = np.ascontiguousarray(position).view("<f2").astype(np.float32)
@@ -207,11 +213,7 @@ def decode(path: Path, note: Note = silent_note) -> Gaussians:
 
 
 def _axes_in(path: Path, extensions: bytes) -> int:
-    """Return the axes that extensions name; each is its type, the length of its content, and that.
-
-    Raises:
-        SceneFormatError: z is not the front or back.
-    """
+    """Return the axes that extensions name; each has its type, its length and its content."""
     at, axes = 0, _RIGHT_UP_BACK
     while at + 8 <= len(extensions):
         kind, length = struct.unpack_from("<II", extensions, at)

@@ -5,7 +5,6 @@ Motion points; ``SHAPES`` are single surfaces on which methods are measured.
 """
 
 from splatseed.synthetic.capture import DEPTH_SCALE, Capture, make_capture, write_capture
-from splatseed.synthetic.shapes import SHAPES
-from splatseed.synthetic.surfaces import Surface
+from splatseed.synthetic.surfaces import SHAPES, Surface
 
 __all__ = ["DEPTH_SCALE", "SHAPES", "Capture", "Surface", "make_capture", "write_capture"]

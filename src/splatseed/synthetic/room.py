@@ -86,7 +86,6 @@ def build_room(rng: np.random.Generator) -> Room:
 
 
 def _grain(frequency: float, seed: int, stretch: tuple[float, float, float] = (1, 1, 1)) -> Mottled:
-    """Make a grey texture that modulates the brightness within tiles."""
     x, y, z = (frequency * s for s in stretch)
     return Mottled(((0.55,) * 3, (1.35,) * 3), (x, y, z), octaves=3, seed=seed)
 
@@ -210,7 +209,6 @@ def render_view(
 
 
 def _in_bundles(function: Callable[[np.ndarray], np.ndarray], directions: Points) -> np.ndarray:
-    """Apply a function to rays, ``BUNDLE`` at a time."""
     bundles = range(0, len(directions), BUNDLE)
     return np.concatenate([function(directions[start : start + BUNDLE]) for start in bundles])
 

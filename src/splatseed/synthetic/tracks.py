@@ -208,7 +208,6 @@ def _displace(
 def _project(
     cameras: Sequence[Camera], xyz: Points, point_idx: Indices, view_idx: Indices
 ) -> Pixels:
-    """Project each observation's point into its view."""
     uv = np.empty((len(point_idx), 2))
     for v, camera in enumerate(cameras):
         mine = view_idx == v

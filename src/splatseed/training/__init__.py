@@ -1,7 +1,7 @@
 """Training: from a scene and its seeds to Gaussians that look like the photographs.
 
 ``prepare_run`` reads what a run needs and opens its folder; the ``TrainingRun`` it returns trains
-and writes the results. ``TrainSettings`` can be used without PyTorch: the rest is imported when
+and writes the results. Settings and requests can be used without PyTorch: the rest is imported when
 first accessed (``pip install ".[train]"``).
 """
 
@@ -11,13 +11,14 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from splatseed.requirements import require
+from splatseed.training.request import PrepareOptions, TrainRequest
 from splatseed.training.settings import TrainSettings
 
 if TYPE_CHECKING:
-    from splatseed.training.prepare import PrepareOptions, prepare_run
+    from splatseed.training.prepare import prepare_run
     from splatseed.training.run import TrainingRun
 
-__all__ = ["PrepareOptions", "TrainSettings", "TrainingRun", "prepare_run"]
+__all__ = ["PrepareOptions", "TrainRequest", "TrainSettings", "TrainingRun", "prepare_run"]
 
 
 def __getattr__(name: str) -> Any:

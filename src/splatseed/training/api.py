@@ -30,14 +30,17 @@ from splatseed.requirements import require
 from splatseed.scene import Image, Scene
 from splatseed.scores import EvalResult
 from splatseed.seeding.budget import in_rho, median_pixels, median_size, parse_budget
-from splatseed.text import did_you_mean
-from splatseed.training.folder import RunFolder
-from splatseed.training.models import config_of, model_file, near_plane_of
-from splatseed.training.settings import BUDGET, MIN_GAUSSIANS, Backend, TrainSettings
+from splatseed.settings import change_settings
+from splatseed.training.config import near_plane_of
+from splatseed.training.folder import RunFolder, config_of, model_file
+from splatseed.training.request import EvaluateRequest, TrainRequest
+from splatseed.training.settings import BUDGET, MIN_GAUSSIANS, TrainSettings
+from splatseed.training.traits import AUTO
 
 require("torch", "gsplat", "flip_evaluator")  # before what imports them, for one clear error
 
 from splatseed.camera import Camera
+from splatseed.findings import Finding
 from splatseed.splat.evaluate import evaluate_views
 from splatseed.splat.formats import read_gaussians
 from splatseed.splat.gaussians import Gaussians
@@ -45,12 +48,9 @@ from splatseed.splat.rendering import ModelRenderer
 from splatseed.splat.training_frame import TrainingFrame
 from splatseed.training.device import pick_device
 from splatseed.training.evaluation import Evaluation
-from splatseed.training.prepare import PrepareOptions, prepare_run
+from splatseed.training.prepare import prepare_run
 from splatseed.training.run import TrainingRun
 from splatseed.training.seeds import no_seeding_reason
-
-DEFAULTS = TrainSettings(strategy="auto", seeding="advised")
-"""The settings of a new run; a resumed run has its own."""
 
 
 @dataclass(frozen=True)
@@ -115,17 +115,10 @@ def train(
     scene: Scene | StrPath,
     output: StrPath,
     *,
-    budget: int | str | None = None,
-    long_side: int | None = None,
-    masks: str | None = None,
-    refine_poses: bool = False,
-    resume: bool = False,
-    overwrite: bool = False,
-    tensorboard: bool = False,
     on_step: Callable[[int], None] = lambda _: None,
     note: Note = silent_note,
     progress: Progress = silent,
-    **settings: Any,
+    **options: Any,
 ) -> Run:
     """Train Gaussians on a scene and score them on its test views.
 
@@ -134,25 +127,17 @@ def train(
             upsampled yet, method ``auto`` adds points if ``splatseed info`` would advise it
             (``seeding="scene"`` keeps them as they are).
         output: The folder of the run.
-        budget: Maximum number of Gaussians: a number, or "0.25rho" for a quarter of a photograph's
-            pixels at training size. By default "1rho" for strategy auto, 1,000,000 for grow and
-            mcmc, and unlimited for the others.
-        long_side: Instead of ``data_factor``: downsample photographs by the smallest whole factor
-            that leaves at most this many pixels on their longer side.
-        masks: A folder of masks, "none", or "inverted"; by default the scene's own masks.
-        refine_poses: First refine the poses of a phone or SLAM; points triangulated there replace
-            the scene's, unless refinement gains nothing.
-        resume: Resume the run in ``output``, with its own settings; start one if there is none.
-        overwrite: Replace an earlier run in ``output``.
-        tensorboard: Also write a log for TensorBoard.
         on_step: Called after each step with the number of steps done.
-        note: Called with notes for the user, one sentence each, such as ``print``.
+        note: Called with each finding for the user, such as ``print``.
         progress: Called with the name of a stage and its fraction done.
-        **settings: Fields of ``TrainSettings``: ``strategy``, ``max_steps``, ``data_factor``,
-            ``seed``, ``test_every``, ``backend``, ``start``, ``exposure``, ``seeding``, ...
+        **options: Fields of ``TrainSettings``: ``strategy``, ``max_steps``, ``data_factor``,
+            ``seed``, ``test_every``, ``backend``, ``start``, ``exposure``, ``seeding``, ...; and of
+            ``TrainRequest``: ``budget`` (a number, or "0.25rho" for a quarter of a photograph's
+            pixels), ``long_side`` instead of ``data_factor``, ``masks`` (a folder, "none",
+            "inverted"), ``refine_poses``, ``resume``, ``overwrite``, ``tensorboard``.
 
     Raises:
-        ParameterError: A setting is unknown or out of range, or differs from the resumed run's.
+        ParameterError: An option is unknown or out of range, or differs from the resumed run's.
         OutputError: ``output`` is taken, protected or cannot be written.
         SceneNotFoundError: Fewer than half of the photographs are there.
         SceneFormatError: A camera, a photograph or the run to resume cannot be used.
@@ -163,11 +148,8 @@ def train(
         run = ss.train(scene, "run", strategy="grow", max_steps=7000, budget="1rho")
         run.metrics["psnr"]
     """
-    training = prepare_training(
-        scene, output, budget=budget, long_side=long_side, masks=masks, refine_poses=refine_poses,
-        resume=resume, overwrite=overwrite, tensorboard=tensorboard, note=note, progress=progress,
-        **settings,
-    )  # fmt: skip
+    request = TrainRequest.of(options)
+    training = prepare_training(scene, output, request, note=note, progress=progress)
     if not training.train(on_step):
         done = f"stopped after step {training.state.step}, which is kept: pass `resume=True`"
         raise KeyboardInterrupt(done)
@@ -178,69 +160,44 @@ def train(
 def prepare_training(
     scene: Scene | StrPath,
     output: StrPath,
+    request: TrainRequest,
     *,
-    budget: int | str | None = None,
-    long_side: int | None = None,
-    masks: str | None = None,
-    refine_poses: bool = False,
-    resume: bool = False,
-    overwrite: bool = False,
-    tensorboard: bool = False,
     note: Note = silent_note,
     progress: Progress = silent,
-    **settings: Any,
 ) -> TrainingRun:
     """Prepare a run: the first step of ``train``, which see for arguments and errors."""
     folder = RunFolder(Path(output))
-    resumes = resume and folder.is_run
-    asked = _settings_from(settings, resumes=resumes)
-    if asked.start and (refine_poses or "seeding" in settings):
-        other = "refine_poses" if refine_poses else "seeding"
-        raise ParameterError(f"`start` or `{other}`", found="both", fix="Leave one out.")
+    resumed = folder if request.resume and folder.is_run else None
+    settings = _named_settings(request, resumes=resumed is not None)
     if not isinstance(scene, Scene):
-        points_alone = settings.get("seeding") == "scene" and not refine_poses and not asked.start
+        points_alone = "seeding" in request.named and settings.seeding == "scene"
+        points_alone &= not request.refine_poses and not settings.start
         scene = load_scene(scene, require_points=points_alone)
-    scene = with_masks(scene, masks)
-    for warning in scene.findings:
-        note(warning)
+    scene = with_masks(scene, request.masks)
+    for finding in scene.findings:
+        note(finding)
     if scene.listed is not None:
-        note(scene.listed.sentence)
-    asked = _sized(asked, scene, long_side, folder if resumes else None, note)
-    asked = _within_budget(asked, budget, scene, note)
-    if settings.get("seeding") == "auto" and (why := no_seeding_reason(scene, asked)):
-        note(f"`seeding='auto'` has no effect: {why}.")
-    explicit = {*settings}
-    explicit |= {"cap_max"} if budget is not None else set()
-    explicit |= {"data_factor"} if long_side is not None else set()
+        note(Finding("listed-split", scene.listed.sentence, "info"))
+    settings = _sized(settings, scene, request.long_side, resumed, note)
+    settings = _within_budget(settings, request.budget, scene, note)
+    if settings.seeding == "auto" and (why := no_seeding_reason(scene, settings)):
+        note(Finding("unused-setting", f"`seeding='auto'` has no effect: {why}."))
+    named = {*request.named}
+    named |= {"cap_max"} if request.budget is not None else set()
+    named |= {"data_factor"} if request.long_side is not None else set()
     return prepare_run(
-        scene,
-        output,
-        asked,
-        PrepareOptions(
-            resume=resume,
-            overwrite=overwrite,
-            refine_poses=refine_poses,
-            tensorboard=tensorboard,
-            explicit=explicit,
-            cache_dir=user_cache_dir(),
-        ),
-        note=note,
-        progress=progress,
-    )
+        scene, output, settings, request,
+        named=named, cache_dir=user_cache_dir(), note=note, progress=progress,
+    )  # fmt: skip
 
 
 def evaluate(
     model: Run | Gaussians | StrPath,
     scene: Scene | StrPath | None = None,
     *,
-    data_factor: int | None = None,
-    test_every: int | None = None,
-    transform: str | None = None,
-    masks: str | None = None,
-    lpips_weights: Path | None = None,
-    backend: Backend = "auto",
     note: Note = silent_note,
     progress: Progress = silent,
+    **options: Any,
 ) -> EvalResult:
     """Score Gaussians on the test views of a scene.
 
@@ -248,19 +205,13 @@ def evaluate(
         model: A run, Gaussians in the scene's frame, or the path of a run or of a file of any
             trainer (.ply, .spz, .sog, .splat).
         scene: The scene, or its path; a run knows its own.
-        data_factor: Divide the width and height of the photographs by this; by default as the run
-            was trained, else to at most 1600 pixels a side.
-        test_every: Every n-th image, sorted by name, is a test view; by default as the run was
-            trained, else 8.
-        transform: From the scene's frame to the model's, if its trainer normalised the scene: a
-            file, "gsplat", "flipped" (y and z negated), or "none" to skip the check that they
-            agree.
-        masks: A folder of masks, "none", or "inverted"; by default the run's, else the scene's.
-        lpips_weights: VGG's weights for LPIPS; by default from PyTorch's cache. Without weights
-            LPIPS is None.
-        backend: Where to render.
-        note: Called with notes for the user, one sentence each.
+        note: Called with each finding for the user.
         progress: Called with the name of a stage and its fraction done.
+        **options: Fields of ``EvaluateRequest``: ``data_factor`` and ``test_every``, by default as
+            the run was trained; ``transform`` from the scene's frame to the model's (a file,
+            "gsplat", "flipped", or "none" to skip the check that they agree); ``masks`` (a folder,
+            "none", "inverted"); ``lpips_weights``, a file, without which, here or in PyTorch's
+            cache, LPIPS is None; ``backend``.
 
     Returns:
         Means over the test views, as attributes (``psnr`` in dB, ``cc_psnr``, ``covisible_psnr``,
@@ -270,32 +221,28 @@ def evaluate(
         SceneNotFoundError: The model, the scene or its photographs are missing.
         SceneFormatError: One of them is damaged, or the Gaussians are not where the scene's points
             are.
-        ParameterError: An argument is out of range.
+        ParameterError: An option is unknown or out of range.
     """
-    evaluation = Evaluation.of(
-        model.folder if isinstance(model, Run) else model, scene, data_factor=data_factor,
-        test_every=test_every, transform=transform, masks=masks,
-    )  # fmt: skip
-    loaded = evaluation.load(backend, progress)
-    for doubt in evaluation.doubts(loaded):
-        note(doubt)
-    return evaluation.score(loaded, lpips_weights=lpips_weights, progress=progress)
+    request = change_settings(EvaluateRequest(), "evaluate", options)
+    evaluation = Evaluation.of(model.folder if isinstance(model, Run) else model, scene, request)
+    loaded = evaluation.load(progress)
+    for finding in evaluation.findings(loaded):
+        note(finding)
+    return evaluation.score(loaded, progress=progress)
 
 
-def _settings_from(given: Mapping[str, Any], *, resumes: bool) -> TrainSettings:
-    """The settings of keyword arguments; others are the defaults, of a resumed run its own."""
-    known = [each.name for each in dataclasses.fields(TrainSettings)]
-    for name in given:
-        if name not in known:
-            raise ParameterError(
-                "arguments of train, or fields of TrainSettings",
-                found=name,
-                fix=f"{did_you_mean(name, known)}The fields are {', '.join(known)}.",
-            )
-    start = given.get("start")
-    if start is not None:
-        given = {**given, "start": str(model_file(Path(start)).resolve())}
-    return dataclasses.replace(TrainSettings() if resumes else DEFAULTS, **given)
+def _named_settings(request: TrainRequest, *, resumes: bool) -> TrainSettings:
+    """Return the request's settings; for a run that resumes, those alone that the caller named."""
+    settings = request.settings
+    if resumes:
+        given = {name: getattr(settings, name) for name in request.named}
+        settings = dataclasses.replace(TrainSettings(), **given)
+    if settings.start is None:
+        return settings
+    if request.refine_poses or "seeding" in request.named:
+        other = "refine_poses" if request.refine_poses else "seeding"
+        raise ParameterError(f"`start` or `{other}`", found="both", fix="Leave one out.")
+    return dataclasses.replace(settings, start=str(model_file(Path(settings.start)).resolve()))
 
 
 def _sized(
@@ -309,7 +256,9 @@ def _sized(
     if long_side is None:
         if settings.data_factor is None and resumed is not None:
             kept = resumed.read_config().get("data_factor")
-            return dataclasses.replace(settings, data_factor=kept if isinstance(kept, int) else 1)
+            return dataclasses.replace(
+                settings, data_factor=kept if isinstance(kept, int) else None
+            )
         return settings.with_data_factor(scene.images, note)
     if settings.data_factor is not None:
         raise ParameterError("`long_side` or `data_factor`", found="both", fix="Leave one out.")
@@ -323,7 +272,7 @@ def _within_budget(
     settings: TrainSettings, budget: int | str | None, scene: Scene, note: Note
 ) -> TrainSettings:
     """The settings with the number of Gaussians that the budget allows in this scene."""
-    chosen = settings.strategy == "auto" and settings.cap_max is None
+    chosen = settings.strategy == AUTO and settings.cap_max is None
     if budget is None and not (chosen and scene.images):
         return settings
     views = camera_views(scene.images, settings.factor)
@@ -335,12 +284,14 @@ def _within_budget(
             expected = f"`budget` of {MIN_GAUSSIANS} Gaussians or more"
             raise ParameterError(expected, found=str(budget), fix="Try 0.25rho.")
         if in_rho(budget):
-            note(f"At most {cap:,} Gaussians: {budget} of {size}.")
+            text = f"At most {cap:,} Gaussians: {budget} of {size}."
+            note(Finding("budget", text, "info"))
         return dataclasses.replace(settings, cap_max=cap)
     cap = max(2, min(BUDGET, round(pixels)))
     reason = f"{'1rho' if pixels <= BUDGET else 'fewer than 1rho'} of {size}"
     if settings.start:  # a merge of two may be larger, and must not be thinned unless asked for
         number = len(read_gaussians(Path(settings.start)))
         cap, reason = (number, "as many as it starts with") if number > cap else (cap, reason)
-    note(f"At most {cap:,} Gaussians: {reason}; `budget` sets another number.")
+    text = f"At most {cap:,} Gaussians: {reason}; `budget` sets another number."
+    note(Finding("budget", text, "info"))
     return dataclasses.replace(settings, cap_max=cap)

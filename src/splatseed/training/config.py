@@ -6,15 +6,16 @@ Promise: an interrupted run resumes only with its own settings, seeds, photograp
 from __future__ import annotations
 
 import dataclasses
+import math
 import platform
 from collections.abc import Collection, Mapping
-from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 from splatseed.errors import ParameterError, SceneFormatError
 from splatseed.io.masks import mask_choice, masks_digest, with_masks
 from splatseed.io.photograph import photographs_digest
 from splatseed.io.staging import write_json
+from splatseed.requirements import version_of
 from splatseed.scene import Scene
 from splatseed.splat.training_frame import TrainingFrame
 from splatseed.training.folder import RunFolder
@@ -37,7 +38,7 @@ def make_config(
     source = scene.source
     points = None if refine_poses else source.points_path
     config = {
-        "splatseed": _version("splatseed"),
+        "splatseed": version_of("splatseed"),
         "scene": str(source.again) if source.again else None,
         "points": str(points.resolve()) if points else None,
         "refine_poses": refine_poses,
@@ -50,7 +51,7 @@ def make_config(
         "split": _names_of_parts(scene, settings),
         "versions": {
             "python": platform.python_version(),
-            **{name: _version(name) for name in ("torch", "gsplat", "numba", "numpy")},
+            **{name: version_of(name) for name in ("torch", "gsplat", "numba", "numpy")},
         },
     }
     if frame is not None:  # in which the run is rendered; lengths are the scene's
@@ -60,41 +61,32 @@ def make_config(
 
 
 def _names_of_parts(scene: Scene, settings: TrainSettings) -> dict[str, list[str]]:
-    """Return the names of the training and test images."""
     parts = zip(("train", "test"), scene.split(settings.test_every), strict=True)
     return {part: [image.name for image in images] for part, images in parts}
-
-
-def _version(package: str) -> str | None:
-    """Return a package's version; None if it is run from its source tree."""
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None
 
 
 def resumed_settings(
     config: Mapping[str, Any],
     settings: TrainSettings,
-    explicit: Collection[str] = (),
+    named: Collection[str] = (),
     *,
     refine_poses: bool,
 ) -> tuple[TrainSettings, bool]:
     """Return the settings of the run to resume, and whether it refined poses.
 
-    Settings that are neither ``explicit`` nor differ from their defaults are the run's; others must
-    equal the run's. Only the backend may change. The config of an older version may lack a setting.
+    Settings that are neither ``named`` nor differ from their defaults are the run's; others must
+    equal the run's. Only the backend may change.
 
     Raises:
         ParameterError: A setting differs from the run's.
-        SceneFormatError: The config is damaged.
+        SceneFormatError: The config is damaged, or another version of splatseed started the run.
     """
+    _check_version(config)
     default = {**dataclasses.asdict(TrainSettings()), "refine_poses": False}
     now = {**dataclasses.asdict(settings), "refine_poses": refine_poses}
-    then = {name: config.get(name, value) for name, value in default.items() if name != "backend"}
-    then["data_factor"] = config.get("data_factor", 1)  # older versions did not downsample
+    then: dict[str, Any] = {name: config.get(name) for name in default if name != "backend"}
     for name, value in then.items():
-        if now[name] != value and (name in explicit or now[name] != default[name]):
+        if now[name] != value and (name in named or now[name] != default[name]):
             raise ParameterError(
                 f"`{name}={value!r}`, as when the run began",
                 found=f"`{name}={now[name]!r}`",
@@ -109,6 +101,16 @@ def resumed_settings(
             found=error.found,
             fix="Start again with `overwrite=True`.",
         ) from None
+
+
+def _check_version(config: Mapping[str, Any]) -> None:
+    then, now = config.get("splatseed"), version_of("splatseed")
+    if then != now:
+        raise SceneFormatError(
+            f"a run that this version of splatseed ({now}) started, to resume it",
+            found=f"one of version {then}",
+            fix="Start again with `overwrite=True`, or resume it with that version.",
+        )
 
 
 def has_run_poses(config: Mapping[str, Any], scene: Scene) -> bool:
@@ -126,6 +128,12 @@ def check_same_input(folder: RunFolder, config: Mapping[str, Any], now: Mapping[
         raise another_scene(folder, config, found)
     if config.get("photographs") != now["photographs"]:
         raise another_scene(folder, config, f"photographs or poses in {now['scene']}")
+
+
+def near_plane_of(config: Mapping[str, Any]) -> float | None:
+    """Return the near plane of a run's training, in scene units; None without one."""
+    near = config.get("near_plane")
+    return float(near) if isinstance(near, float) and 0 < near < math.inf else None
 
 
 def trained_images(config: Mapping[str, Any], scene: Scene) -> Collection[str]:
@@ -163,9 +171,9 @@ def with_masks_of(scene: Scene, config: Mapping[str, Any]) -> Scene:
 def check_same_scene(
     folder: RunFolder, config: Mapping[str, Any], scene: Scene, settings: TrainSettings
 ) -> None:
-    """Refuse to resume with other masks, training or test images; older runs recorded none."""
+    """Refuse to resume with other masks, training or test images."""
     found = "" if has_run_masks(config, scene) else "masks"
-    if config.get("split") not in (None, _names_of_parts(scene, settings)):
+    if config.get("split") != _names_of_parts(scene, settings):
         listed = f" (by its {scene.listed.origin})" if scene.listed else ""
         found = f"training or test images{listed}"
     if found:

@@ -19,13 +19,14 @@ from jaxtyping import Float32
 
 from splatseed.depth.stereo import stereo_depths
 from splatseed.depth.stereo.maps import StereoResult, StereoSettings
+from splatseed.findings import Finding
 from splatseed.io.files import ARCHIVE_FAILURES
 from splatseed.io.staging import atomic_file
 from splatseed.progress import Note, Progress, silent, silent_note
 from splatseed.scene import Image, Scene
 from splatseed.training.settings import TrainSettings
 
-DepthMaps = dict[str, Float32[np.ndarray, "h w"]]
+ImageDepths = dict[str, Float32[np.ndarray, "h w"]]
 """Planar depths by the names of their views."""
 
 
@@ -61,6 +62,9 @@ class DepthCache:
 
     path: Path | None = None  # None: maps are not kept
     seconds_counted: bool = False  # whether the time of the seeds includes that of the maps
+
+
+NOT_CACHED = DepthCache()
 
 
 def stereo_size(
@@ -116,7 +120,7 @@ def known_depths(
     cache: Path | None = None,
     note: Note = silent_note,
     progress: Progress = silent,
-) -> tuple[DepthMaps, float]:
+) -> tuple[ImageDepths, float]:
     """Find the depth maps on which ``grow`` places Gaussians; none if the settings use none.
 
     Args:
@@ -134,8 +138,7 @@ def known_depths(
         them took, in this run or in the run that wrote the file.
     """
     images = scene.split(settings.test_every)[0]
-    used = settings.densification == "grow" and settings.placing == "stereo"
-    if not used or len(images) < 2:
+    if not settings.uses_stereo or len(images) < 2:
         return {}, 0.0
     found = _read(cache)
     if found is None:
@@ -154,10 +157,9 @@ def known_depths(
     known, seconds = found
     share = np.mean([np.isfinite(depth).mean() for depth in known.values()])
     duration = "" if stereo else f" ({seconds:.0f} s)"
-    note(
-        f"Stereo found the depth of {share:.0%} of the pixels{duration}, where strategy grow "
-        'places most new Gaussians. placing = "none" only splits.'
-    )
+    text = f"Stereo found the depth of {share:.0%} of the pixels{duration}, where strategy "
+    text += f"{settings.traits.name} places most new Gaussians."
+    note(Finding("stereo-depths", text, "info", fix='placing = "none" only splits.'))
     # Stereo's depths are in units of the scene; unknown ones, NaN, become 0.
     return {
         name: np.nan_to_num(depth * scale)
@@ -166,14 +168,14 @@ def known_depths(
     }, seconds
 
 
-def _write(path: Path, maps: DepthMaps, seconds: float) -> None:
+def _write(path: Path, maps: ImageDepths, seconds: float) -> None:
     arrays: dict[str, Any] = {f"depth_{i}": depth for i, depth in enumerate(maps.values())}
     names = np.array(list(maps), dtype=np.str_)
     with atomic_file(path) as partial, partial.open("wb") as file:
         np.savez(file, names=names, seconds=np.float64(seconds), **arrays)
 
 
-def _read(path: Path | None) -> tuple[DepthMaps, float] | None:
+def _read(path: Path | None) -> tuple[ImageDepths, float] | None:
     """Read the maps of ``_write``; None without a readable file."""
     if path is None:
         return None

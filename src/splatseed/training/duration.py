@@ -10,7 +10,6 @@ import math
 from dataclasses import replace
 from typing import NamedTuple
 
-from splatseed.training.schedule import FULL_AT
 from splatseed.training.settings import TrainSettings
 
 COSTS = {"cpu": (5e-3, 0.35e-6, 0.15e-6), "cuda": (8e-3, 5e-9, 2e-9)}
@@ -50,12 +49,13 @@ def mean_gaussians(settings: TrainSettings, now: RunSpeed) -> float:
 
     The number rises linearly until growth ends, where it reaches the budget if there is one.
     """
-    growth, count, left = settings.densification, now.gaussians, settings.max_steps - now.step
-    stop = FULL_AT * settings.max_steps if growth == "grow" else settings.schedule.refine_stop
+    strategy, count, left = settings.traits, now.gaussians, settings.max_steps - now.step
+    full = strategy.full_at
+    stop = settings.schedule.refine_stop if full is None else full * settings.max_steps
     stop = min(stop, settings.max_steps)
-    if growth == "none" or now.step >= stop:
+    if not strategy.adds or now.step >= stop:
         return count
-    if growth in ("grow", "mcmc"):
+    if strategy.has_budget:
         last = float(settings.cap or count)
     else:
         last = min(count * GROWTH ** (1 - now.step / stop), settings.cap or math.inf)
@@ -115,16 +115,3 @@ def options_for_an_hour(
         steps = max(STEP_UNIT, int(steps * HOUR / needed) // STEP_UNIT * STEP_UNIT)
     flags = f"`long_side={math.ceil(long_side / factor)}`"
     return flags if steps == settings.max_steps else f"{flags} `max_steps={steps}`"
-
-
-def format_duration(seconds: float) -> str:
-    """Return a duration in minutes or hours.
-
-    Example:
-        >>> format_duration(100), format_duration(3000), format_duration(200_000)
-        ('2 minutes', '50 minutes', '56 hours')
-    """
-    if seconds < HOUR * 1.5:
-        minutes = max(1, round(seconds / 60))
-        return f"{minutes} minute{'s' if minutes > 1 else ''}"
-    return f"{math.floor(seconds / HOUR + 0.5)} hours"

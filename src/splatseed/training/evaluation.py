@@ -6,13 +6,21 @@ another trainer needs the scene. What is resolved here is loaded and scored by `
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
 
-from splatseed.errors import MissingDependencyError, ParameterError, SceneNotFoundError
-from splatseed.io.files import StrPath
+from splatseed.errors import (
+    MissingDependencyError,
+    ParameterError,
+    SceneNotFoundError,
+    SplatseedError,
+)
+from splatseed.findings import Finding
+from splatseed.io.files import StrPath, read_text
 from splatseed.photos.cache import user_cache_dir
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
@@ -21,10 +29,12 @@ from splatseed.splat.covisible import find_covisible, pixel_masks
 from splatseed.splat.evaluate import OnView, TrainedModel, evaluate_model, load_model
 from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.lpips import load_lpips
-from splatseed.training.config import has_run_masks, has_run_poses, trained_images
+from splatseed.text import counted
+from splatseed.training.config import has_run_masks, has_run_poses, near_plane_of, trained_images
 from splatseed.training.device import pick_device
-from splatseed.training.models import config_of, model_file, near_plane_of, split_doubt
-from splatseed.training.settings import Backend, TrainSettings
+from splatseed.training.folder import config_of, model_file
+from splatseed.training.request import AS_TRAINED, EvaluateRequest
+from splatseed.training.settings import TrainSettings
 
 MINIMUM = {"data_factor": 1, "test_every": 2}
 """Lower bounds of the numbers that a run's config gives where the caller does not."""
@@ -32,14 +42,11 @@ MINIMUM = {"data_factor": 1, "test_every": 2}
 
 @dataclass(frozen=True)
 class Evaluation:
-    """A model, the scene to score it on, and how."""
+    """A model, the scene to score it on, and the request."""
 
     model: Path | Gaussians  # the file of a trained model, or Gaussians in the scene's frame
     scene: Path | Scene
-    data_factor: int | None  # None: as training chooses it
-    test_every: int
-    masks: str | None = None
-    transform: str | None = None
+    request: EvaluateRequest  # with the values of the run's config, where the caller left some out
     config: Mapping[str, Any] = field(default_factory=dict)  # of the run; empty for other models
 
     @classmethod
@@ -47,13 +54,9 @@ class Evaluation:
         cls,
         model: Gaussians | StrPath,
         scene: Scene | StrPath | None = None,
-        *,
-        data_factor: int | None = None,
-        test_every: int | None = None,
-        transform: str | None = None,
-        masks: str | None = None,
+        request: EvaluateRequest = AS_TRAINED,
     ) -> Self:
-        """Resolve the arguments of ``evaluate``: what is left out, a run's config gives.
+        """Resolve a request: what is left out, a run's config gives.
 
         Raises:
             SceneNotFoundError: The model is missing.
@@ -63,74 +66,73 @@ class Evaluation:
         config: Mapping[str, Any] = {}
         if not isinstance(model, Gaussians):
             config, model = config_of(Path(model)), model_file(Path(model))
-        numbers = {
-            name: config.get(name, getattr(TrainSettings, name)) if given is None else given
-            for name, given in (("data_factor", data_factor), ("test_every", test_every))
-        }
-        for name, value in numbers.items():
-            if (name, value) != ("data_factor", None) and not (
-                isinstance(value, int) and value >= MINIMUM[name]
-            ):
+        values: dict[str, Any] = {"masks": request.masks or config.get("masks")}
+        for name, minimum in MINIMUM.items():
+            value = getattr(request, name)
+            value = values[name] = config.get(name) if value is None else value
+            if value is not None and not (isinstance(value, int) and value >= minimum):
                 raise ParameterError(
-                    f"`{name}` of {MINIMUM[name]} or more",
+                    f"`{name}` of {minimum} or more",
                     found=str(value),
                     fix="Leave it out for the default.",
                 )
-        return cls(
-            model, _scene_of(model, scene, config), **numbers, transform=transform,
-            masks=masks or config.get("masks"), config=config,
-        )  # fmt: skip
+        return cls(model, _scene_of(model, scene, config), replace(request, **values), config)
 
-    def load(self, backend: Backend = "auto", progress: Progress = silent) -> TrainedModel:
+    @property
+    def test_every(self) -> int:
+        """Every n-th image is a test view."""
+        return self.request.test_every or TrainSettings.test_every
+
+    def load(self, progress: Progress = silent) -> TrainedModel:
         """Read the model and the photographs of its test views."""
         return load_model(
             self.model,
             self.scene,
-            data_factor=self.data_factor,
+            data_factor=self.request.data_factor,
             test_every=self.test_every,
-            transform=self.transform,
-            masks=self.masks,
+            transform=self.request.transform,
+            masks=self.request.masks,
             trained_on=self.config.get("photographs"),
             near_plane=near_plane_of(self.config),
-            device=pick_device(backend, progress),
+            device=pick_device(self.request.backend, progress),
             cache_dir=user_cache_dir(),
             progress=progress,
         )
 
-    def doubts(self, loaded: TrainedModel) -> list[str]:
-        """Describe what may make the scores wrong, or others than expected, one sentence each."""
-        listed = loaded.scene.listed
-        doubts = [*loaded.notes, loaded.frame_warning, listed.sentence if listed else ""]
+    def findings(self, loaded: TrainedModel) -> tuple[Finding, ...]:
+        """Return what may make the scores wrong, or others than expected."""
+        found, listed = [*loaded.findings], loaded.scene.listed
+        if listed is not None:
+            found.append(Finding("listed-split", listed.sentence, "info"))
         if self.config:
-            doubts += self._changes(loaded.scene, [view.name for view in loaded.views])
+            found += self._changes(loaded.scene, [view.name for view in loaded.views])
         elif isinstance(self.model, Path):
-            doubts.append(split_doubt(self.model, len(loaded.views)))
-        return [doubt for doubt in doubts if doubt]
+            found += split_findings(self.model, len(loaded.views))
+        return tuple(found)
 
-    def _changes(self, scene: Scene, tested: Sequence[str]) -> Iterator[str]:
-        """Describe what is not as in the run's training, one sentence each."""
+    def _changes(self, scene: Scene, tested: Sequence[str]) -> Iterator[Finding]:
+        """Yield what is not as in the run's training."""
         config, trained = self.config, trained_images(self.config, scene)
-        if seen := sum(name in trained for name in tested):
+        if seen := tuple(name for name in tested if name in trained):
             every = config.get("test_every")
             by_number = self.test_every != every and scene.listed is None
             why = f"its test_every was {every}" if by_number else "the scene's split was another"
-            yield f"The run was trained on {seen} of these {len(tested)} views: {why}."
+            text = f"The run was trained on {len(seen)} of these {len(tested)} views: {why}."
+            yield Finding("trained-test-views", text, "error", seen)
         own = str(scene.source.again) == config.get("scene")
         if not own or config.get("refine_poses"):
             return  # another copy, or one that the run wrote: its files may differ
         if not has_run_poses(config, scene):
-            yield "The scene's photographs or poses have changed since the run was trained."
-        if self.masks == config.get("masks") and not has_run_masks(config, scene):
-            yield (
-                "The scene's masks have changed since the run was trained: its own scores are over "
-                "other pixels."
-            )
+            text = "The scene's photographs or poses have changed since the run was trained."
+            yield Finding("changed-photographs", text)
+        if self.request.masks == config.get("masks") and not has_run_masks(config, scene):
+            text = "The scene's masks have changed since the run was trained: its own scores are "
+            yield Finding("changed-masks", f"{text}over other pixels.")
 
     def score(
         self,
         loaded: TrainedModel,
         *,
-        lpips_weights: Path | None = None,
         on_view: OnView = lambda *_: None,
         progress: Progress = silent,
     ) -> EvalResult:
@@ -138,11 +140,11 @@ class Evaluation:
 
         Without weights for LPIPS, and none given, LPIPS is left out, with the reason in the result.
         """
-        lpips, reason = None, ""
+        lpips, reason, weights = None, "", self.request.lpips_weights
         try:
-            lpips = load_lpips(weights=lpips_weights)
+            lpips = load_lpips(weights=weights)
         except (MissingDependencyError, SceneNotFoundError) as error:
-            if lpips_weights is not None:
+            if weights is not None:
                 raise
             reason = str(error)
         covisible = find_covisible(loaded.scene, self.test_every, progress)
@@ -154,6 +156,27 @@ class Evaluation:
             on_view=on_view,
             progress=progress,
         )
+
+
+def split_findings(model: Path, views: int) -> tuple[Finding, ...]:
+    """Return whether another trainer held out these test views; empty if it did.
+
+    graphdeco's trainer and its relatives write ``cfg_args`` into the model's folder, with
+    ``eval=True`` if every 8th photograph was held out.
+    """
+    for folder in model.resolve().parents[:4]:
+        file = folder / "cfg_args"
+        with suppress(OSError, SplatseedError):
+            found = re.search(r"\beval=(True|False)\b", read_text(file))
+            if found and found[1] == "False":
+                text = f"The model was trained on all photographs, as {file} has eval=False: its "
+                text += "scores are too high, since it has seen the test views."
+                return (Finding("trained-test-views", text, "error"),)
+            if found:
+                return ()
+    text = f"{model} does not record on which photographs it was trained: if these "
+    text += f"{counted(views, 'view')} were among them, its scores are too high."
+    return (Finding("unknown-split", text),)
 
 
 def _scene_of(

@@ -37,7 +37,7 @@ from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.photographs import fill_masked, mask_tensor, photograph_tensor
 from splatseed.splat.rendering import render_view
 from splatseed.splat.training_frame import frame_of_model
-from splatseed.training.depths import DepthMaps, known_depths
+from splatseed.training.depths import ImageDepths, known_depths
 from splatseed.training.device import pick_device
 from splatseed.training.parameters import make_parameters
 from splatseed.training.settings import TrainSettings
@@ -107,7 +107,7 @@ def _device(progress: Progress) -> torch.device:
 def find_floaters(
     gaussians: Gaussians,
     views: Sequence[View],
-    depths: DepthMaps,
+    depths: ImageDepths,
     device: torch.device,
     progress: Progress = silent,
 ) -> Bool[np.ndarray, " N"]:

@@ -1,4 +1,4 @@
-"""The folder of a run: its files, checks before they are written, and the curve.
+"""Trained models on disk: the folder of a run, its curve, and files of Gaussians of any trainer.
 
 Promise: a folder that splatseed did not write is never changed; an earlier run is replaced only on
 request, and only when the new run is ready to start; the curve is written atomically, so that it
@@ -16,13 +16,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
-from splatseed.errors import OutputError, SceneFormatError
+from splatseed.errors import OutputError, SceneFormatError, SceneNotFoundError
 from splatseed.io import staging, write_scene
-from splatseed.io.files import read_text
+from splatseed.io.files import read_text, special_kind
+from splatseed.io.load import is_scene
+from splatseed.io.masks import NONE
 from splatseed.io.origin import add_offset
 from splatseed.io.staging import MANIFEST, atomic_file, write_json
 from splatseed.scene import Scene
 from splatseed.splat.formats import RUN_FILE
+from splatseed.text import quoted
 
 KIND = "train"  # in a run folder's manifest
 
@@ -125,6 +128,53 @@ class RunFolder:
         """Return the path of the trained scene: in this folder if poses were refined."""
         refined = config.get("refine_poses") is True
         return str(self.scene.resolve()) if refined else config.get("scene")
+
+
+def model_file(path: Path) -> Path:
+    """Return the file of a model's Gaussians; for a run, the file in its folder.
+
+    Raises:
+        SceneNotFoundError: There is none, or the run has not finished.
+    """
+    folder = RunFolder(path)
+    for file in (path, folder.gaussians):
+        if file.is_file():
+            return file
+    found, fix = special_kind(path) or "nothing there", "Check the path."
+    if folder.is_run:
+        found = "a run that has not finished"
+        fix = "Finish it: train with the same output and `resume=True`."
+    elif path.is_dir() and is_scene(path):
+        found, fix = "a scene", f"Train it first: splatseed train {quoted(path)} -o RUN."
+    elif path.is_dir():
+        found, fix = "a folder that is no run", "Name a run, or the file itself."
+    raise SceneNotFoundError(
+        f"{path} to be a finished run of splatseed train, or a file of Gaussians (.ply, .spz, ...)",
+        found=found,
+        fix=fix,
+    )
+
+
+def config_of(path: Path) -> Mapping[str, Any]:
+    """Read the config of a run, given its folder or its file of Gaussians; empty for other files.
+
+    ``scene`` is the trained scene (with refined poses, if the run refined them), ``masks`` are the
+    masks of that scene.
+
+    Raises:
+        SceneFormatError: The config is damaged.
+    """
+    folder = RunFolder(path if path.is_dir() else path.parent)
+    if path not in (folder.path, folder.gaussians) or not folder.is_run:
+        return {}
+    config = folder.read_config()
+    masks = config.get("masks")
+    if not isinstance(masks, str | None):
+        expected = f"masks of {folder.config} to name a folder"
+        raise SceneFormatError(expected, found=str(masks), fix="Train again with `overwrite=True`.")
+    if config.get("refine_poses") is True and masks != NONE:
+        masks = None  # the scene with refined poses was written with its masks
+    return {**config, "scene": folder.scene_of(config), "masks": masks}
 
 
 class Record(NamedTuple):

@@ -7,7 +7,7 @@ settings, seeds and poses that it started with.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Float32
 
 from splatseed.errors import ParameterError, SceneNotFoundError
+from splatseed.findings import Finding
 from splatseed.io import load_scene
 from splatseed.io.files import StrPath
 from splatseed.io.photograph_checks import check_sizes, with_photographs
@@ -42,45 +43,40 @@ from splatseed.training.config import (
     update_places,
     with_masks_of,
 )
-from splatseed.training.depths import DepthCache, known_depths
+from splatseed.training.depths import NOT_CACHED, DepthCache, ImageDepths, known_depths
 from splatseed.training.device import check_fits, device_name, pick_device
 from splatseed.training.folder import RunFolder
 from splatseed.training.initialization import first_gaussians
+from splatseed.training.request import NEW_RUN, PrepareOptions
 from splatseed.training.run import TrainingRun
 from splatseed.training.seeds import seeded, seeds_facts, usable_seeds
 from splatseed.training.settings import TrainSettings
 from splatseed.training.start import continued_gaussians, read_start, start_facts
-from splatseed.training.state import first_state, load_checkpoint, make_strategy
+from splatseed.training.state import TrainState, first_state, load_checkpoint, make_strategy
 
 
 @dataclass(frozen=True)
-class PrepareOptions:
-    """What to do with a run's folder and its scene, besides training."""
+class _Setup:
+    """What all later stages need."""
 
-    resume: bool = False
-    """Resume the run in the folder, if there is one, with its own settings."""
-    overwrite: bool = False
-    """Replace an earlier run in the folder."""
-    refine_poses: bool = False
-    """First refine the poses of a phone or SLAM; points triangulated there replace the scene's,
-    unless refinement gains nothing."""
-    tensorboard: bool = False
-    """Also write TensorBoard's log."""
-    explicit: Collection[str] = ()
-    """The settings that the user gave, which the run to resume must have even where they are the
-    defaults."""
-    cache_dir: Path | None = None
-    """The folder for downsampled photographs; None: they are not kept."""
-    depth_cache: DepthCache = field(default_factory=DepthCache)
-    """The file in which the depths for strategy grow are kept."""
+    folder: RunFolder
+    earlier: Mapping[str, Any] | None  # the config of the run to resume
+    settings: TrainSettings
+    refine_poses: bool
+    device: torch.device
+    note: Note
+    progress: Progress
 
 
 def prepare_run(
     scene: Scene,
     output: StrPath,
     settings: TrainSettings,
-    options: PrepareOptions = PrepareOptions(),
+    options: PrepareOptions = NEW_RUN,
     *,
+    named: Collection[str] = (),
+    cache_dir: Path | None = None,
+    depth_cache: DepthCache = NOT_CACHED,
     note: Note = silent_note,
     progress: Progress = silent,
 ) -> TrainingRun:
@@ -91,7 +87,10 @@ def prepare_run(
         output: The folder of the run.
         settings: How to train.
         options: What to do with the folder and the scene.
-        note: Called with notes for the user, one sentence each.
+        named: Settings that the run to resume must have even where they are the defaults.
+        cache_dir: The folder for downsampled photographs; None: they are not kept.
+        depth_cache: The file in which the depths for strategy grow are kept.
+        note: Called with each finding for the user.
         progress: Called with the name of a stage and its fraction done.
 
     Raises:
@@ -106,68 +105,66 @@ def prepare_run(
         MissingDependencyError: TensorBoard or pycolmap is needed and absent.
     """
     scene = _photographed(scene)  # before the folder is checked, which may be a bare cloud's
-    folder, earlier = _open_folder(Path(output), options, scene, settings)
-    refine_poses = options.refine_poses
-    if earlier:
-        settings, refine_poses = resumed_settings(
-            earlier, settings, options.explicit, refine_poses=refine_poses
-        )
-        scene = with_masks_of(scene, earlier)
-        check_same_scene(folder, earlier, scene, settings)
-    settings = settings.with_data_factor(scene.images, note)
-    device = pick_device(settings.backend, progress)
-    given = scene.points.xyz
-    if refine_poses:
-        scene = _at_refined_poses(scene, folder, earlier, settings, note, progress)
-    posed, stereo = scene, None
-    if settings.start is None:
-        triangulated = not np.array_equal(scene.points.xyz, given)
-        scene, stereo = seeded(
-            scene, settings, device.type, note, progress, triangulated=triangulated
-        )
-    initial = _initial(scene, settings, note)
+    scene, setup = _set_up(scene, Path(output), settings, options, named, note, progress)
+    settings, folder = setup.settings, setup.folder
+    posed = _at_refined_poses(scene, setup) if setup.refine_poses else scene
+    triangulated = posed.points is not scene.points  # else refinement keeps them
+    scene, stereo = seeded(
+        posed, settings, setup.device.type, note, progress, triangulated=triangulated
+    )
+    initial = _initial(scene, setup)
     frame = initial.frame(scene, settings)
-    for stray in stray_findings(frame.strays):
-        note(stray)
-    check_fits(initial.facts["count"], device)
-    name = device_name(device)
-    config = make_config(scene, initial.facts, settings, name, frame, refine_poses=refine_poses)
-    if earlier:
-        check_same_input(folder, earlier, config)
+    config = _checked_config(scene, initial, frame, setup)
     views = load_split(
         scene,
         data_factor=settings.factor,
         test_every=settings.test_every,
         min_side=WINDOW,  # smaller views have no SSIM
-        cache_dir=options.cache_dir,
+        cache_dir=cache_dir,
         progress=progress,
     )
     depths, seconds = known_depths(
-        scene, frame.scale, settings, device.type,
-        stereo=stereo, cache=options.depth_cache.path, note=note, progress=progress,
+        scene, frame.scale, settings, setup.device.type,
+        stereo=stereo, cache=depth_cache.path, note=note, progress=progress,
     )  # fmt: skip
-    strategy = make_strategy(settings, device, depths, len(depths) / max(1, len(views[0])))
-    if earlier and folder.checkpoint.is_file():
-        state = load_checkpoint(folder.checkpoint, strategy, settings.schedule, device)
-    else:
-        first = initial.gaussians(views[0], frame, settings, device, note)
-        state = first_state(first, len(views[0]), settings, strategy, device)
-    if state.step:
-        note(f"Resuming after step {state.step:,} of {settings.max_steps:,}.")
+    state = _state(initial, views[0], frame, depths, setup)
     run = TrainingRun(folder, settings, frame, state, views)
     progress("compile", 0.0)
     with run.translate_errors():
         run.trainer.warm_up()
     # What cannot be rendered has failed by now, and leaves no folder.
-    if earlier:
-        update_places(folder, earlier, config)
+    if setup.earlier:
+        update_places(folder, setup.earlier, config)
     else:
         # The cost of growth includes stereo.
-        state.watch.seconds += 0.0 if options.depth_cache.seconds_counted else seconds
-        folder.create(config, posed if refine_poses else None, scene.offset)
+        state.watch.seconds += 0.0 if depth_cache.seconds_counted else seconds
+        folder.create(config, posed if setup.refine_poses else None, scene.offset)
     if options.tensorboard:
         run.log_to_tensorboard()
     return run
+
+
+def _set_up(
+    scene: Scene,
+    output: Path,
+    settings: TrainSettings,
+    options: PrepareOptions,
+    named: Collection[str],
+    note: Note,
+    progress: Progress,
+) -> tuple[Scene, _Setup]:
+    """Check the folder; a run to resume gives the settings and masks that were not named."""
+    folder, earlier = _open_folder(output, options, scene, settings)
+    refine_poses = options.refine_poses
+    if earlier:
+        settings, refine_poses = resumed_settings(
+            earlier, settings, named, refine_poses=refine_poses
+        )
+        scene = with_masks_of(scene, earlier)
+        check_same_scene(folder, earlier, scene, settings)
+    settings = settings.with_data_factor(scene.images, note)
+    device = pick_device(settings.backend, progress)
+    return scene, _Setup(folder, earlier, settings, refine_poses, device, note, progress)
 
 
 def _open_folder(
@@ -182,19 +179,17 @@ def _open_folder(
     return folder, folder.read_config() if options.resume and folder.is_run else None
 
 
-def _initial(scene: Scene, settings: TrainSettings, note: Note) -> _Seeds | _Start:
+def _initial(scene: Scene, setup: _Setup) -> _Seeds | _Start:
     """Return what the run starts from: trained Gaussians, or the usable points of the scene."""
+    settings, note = setup.settings, setup.note
     if settings.start is not None:
         return _Start(_start_gaussians(Path(settings.start), scene, settings, note))
-    trained = scene.split(settings.test_every)[0]
-    poses = camera_views(trained, settings.factor)
+    poses = camera_views(scene.split(settings.test_every)[0], settings.factor)
     return _Seeds(usable_seeds(scene.points, settings, note, poses))
 
 
 @dataclass(frozen=True)
 class _Seeds:
-    """A run's start from points."""
-
     points: PointCloud
 
     @property
@@ -205,20 +200,13 @@ class _Seeds:
         return frame_of_model(_train_poses(scene, settings), reference_points(scene), None)
 
     def gaussians(
-        self,
-        views: Sequence[View],
-        frame: TrainingFrame,
-        settings: TrainSettings,
-        device: torch.device,  # noqa: ARG002  (the other start needs it)
-        note: Note,  # noqa: ARG002
+        self, views: Sequence[View], frame: TrainingFrame, setup: _Setup
     ) -> tuple[Gaussians, Float32[np.ndarray, " N"]]:
-        return first_gaussians(self.points, views, frame, settings)
+        return first_gaussians(self.points, views, frame, setup.settings)
 
 
 @dataclass(frozen=True)
 class _Start:
-    """A run's start from trained Gaussians."""
-
     model: Gaussians
 
     @property
@@ -230,14 +218,48 @@ class _Start:
         return frame_of_model(_train_poses(scene, settings), reference_points(scene), self.model)
 
     def gaussians(
-        self,
-        views: Sequence[View],
-        frame: TrainingFrame,
-        settings: TrainSettings,
-        device: torch.device,
-        note: Note,
+        self, views: Sequence[View], frame: TrainingFrame, setup: _Setup
     ) -> tuple[Gaussians, Float32[np.ndarray, " N"]]:
+        settings, device, note = setup.settings, setup.device, setup.note
         return continued_gaussians(self.model, views, frame, settings, device, note)
+
+
+def _checked_config(
+    scene: Scene, initial: _Seeds | _Start, frame: TrainingFrame, setup: _Setup
+) -> dict[str, Any]:
+    """Return the content of config.json, once it fits the memory and the run to resume."""
+    for stray in stray_findings(frame.strays):
+        setup.note(stray)
+    facts, device = initial.facts, setup.device
+    check_fits(facts["count"], device)
+    config = make_config(
+        scene, facts, setup.settings, device_name(device), frame, refine_poses=setup.refine_poses
+    )
+    if setup.earlier:
+        check_same_input(setup.folder, setup.earlier, config)
+    return config
+
+
+def _state(
+    initial: _Seeds | _Start,
+    views: Sequence[View],
+    frame: TrainingFrame,
+    depths: ImageDepths,
+    setup: _Setup,
+) -> TrainState:
+    """Return the state of the checkpoint, or before the first step; ``views`` are for training."""
+    settings, device = setup.settings, setup.device
+    strategy = make_strategy(settings, device, depths, len(depths) / max(1, len(views)))
+    checkpoint = setup.folder.checkpoint
+    if setup.earlier and checkpoint.is_file():
+        state = load_checkpoint(checkpoint, strategy, settings.schedule, device)
+    else:
+        first = initial.gaussians(views, frame, setup)
+        state = first_state(first, len(views), settings, strategy, device)
+    if state.step:
+        text = f"Resuming after step {state.step:,} of {settings.max_steps:,}."
+        setup.note(Finding("resumed-run", text, "info"))
+    return state
 
 
 def _train_poses(scene: Scene, settings: TrainSettings) -> Sequence[View]:
@@ -261,22 +283,15 @@ def _photographed(scene: Scene) -> Scene:
     return scene
 
 
-def _at_refined_poses(
-    scene: Scene,
-    folder: RunFolder,
-    earlier: Mapping[str, Any] | None,
-    settings: TrainSettings,
-    note: Note,
-    progress: Progress,
-) -> Scene:
+def _at_refined_poses(scene: Scene, setup: _Setup) -> Scene:
     """Return the scene at refined poses; those of the run to resume, if there is one."""
     from splatseed.sfm import refined, with_refined  # noqa: PLC0415  (pycolmap is optional)
 
-    if earlier is not None:
-        kept = load_scene(folder.scene)
+    if setup.earlier is not None:
+        kept = load_scene(setup.folder.scene)
         if {image.name for image in scene.images} != {image.name for image in kept.images}:
             where = scene.source.root or "the scene"
-            raise another_scene(folder, earlier, f"images in {where}")
+            raise another_scene(setup.folder, setup.earlier, f"images in {where}")
         return with_refined(scene, kept)
     if was_upsampled(scene):
         raise ParameterError(
@@ -285,21 +300,19 @@ def _at_refined_poses(
             fix="Name the scene that they were made from, or refine before seeds are made: "
             "splatseed upsample SCENE --refine-poses -o OUT.",
         )
-    scene, message = refined(scene, settings.seed, progress, test_every=settings.test_every)
-    note(message)
+    settings = setup.settings
+    scene, message = refined(scene, settings.seed, setup.progress, test_every=settings.test_every)
+    setup.note(message)
     return scene
 
 
 def _start_gaussians(path: Path, scene: Scene, settings: TrainSettings, note: Note) -> Gaussians:
-    """Read the Gaussians that the run continues from."""
     folder, same_poses = RunFolder(path.parent), False
     if path == folder.gaussians and folder.is_run:
         config = folder.read_config()
         same_poses = has_run_poses(config, scene)
         tests, trained = scene.split(settings.test_every)[1], trained_images(config, scene)
-        if seen := sum(image.name in trained for image in tests):
-            note(
-                f"{path} was trained on {seen} of the {counted(len(tests), 'test view')}: scores "
-                "will be too high."
-            )
+        if seen := tuple(image.name for image in tests if image.name in trained):
+            text = f"{path} was trained on {len(seen)} of the {counted(len(tests), 'test view')}: "
+            note(Finding("trained-test-views", f"{text}scores will be too high.", "error", seen))
     return read_start(path, scene, note, same_poses=same_poses)

@@ -14,11 +14,11 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Literal
 
-Densification = Literal["default", "grow", "mcmc", "none"]
+from splatseed.training.traits import Traits
 
 FULL_RUN = 30_000
+
 LEARNING_RATES: Mapping[str, float] = MappingProxyType(
     {
         "means": 1.6e-4,  # times the size unit
@@ -34,11 +34,6 @@ DECAYS: Mapping[str, float] = MappingProxyType({"means": 0.01})
 """Final learning rates as a fraction of the initial ones; exponential in between."""
 GROWTH = 1.05
 """Factor by which MCMC grows the number of Gaussians at a time, up to the cap."""
-MIN_ROUNDS: Mapping[Densification, int] = MappingProxyType(
-    {"default": 6, "grow": 1, "mcmc": 24, "none": 1}
-)
-"""Minimum number of densifications. A short run densifies more often than every 100 steps, but not
-much more: gradients averaged over few photographs are noise."""
 MAX_SPEEDUP: Mapping[str, float] = MappingProxyType(
     {"means": 20.0, "scales": 4.0, "quats": 4.0, "opacities": 1.0, "sh0": 4.0, "shN": 16.0}
 )
@@ -50,13 +45,9 @@ FORGETTING = 1e-3
 MAX_FORGETTING = 1e-2
 """A run n times shorter forgets n times faster, but at most this fraction per step: gradients
 shrink within some hundred steps, and Adam divides steps by the remembered gradients."""
-FULL_AT = 0.35
-"""Fraction of the run by which ``grow`` has spent its budget."""
-GROW_EVERY = FULL_RUN // 15
-"""Steps of a full run between rounds of ``grow``, and before the first: a long round measures
-contributions to many photographs."""
 MIN_ROUND_STEPS = 20
-"""Minimum steps per round of ``grow``: splitting halves again before they have settled is noise."""
+"""Minimum steps per round of a strategy with long rounds: splitting halves again before they have
+settled is noise."""
 MEAN_FROM = 0.8
 """Fraction of a run after which the mean of the Gaussians is taken."""
 DROPOUT = 0.2
@@ -120,13 +111,12 @@ class Schedule:
         return float(self.decays.get(name, 1.0) ** (step / self.max_steps))
 
 
-def make_schedule(densification: Densification, max_steps: int, *, as_3dgs: bool) -> Schedule:
-    """Return the schedule of a run of T steps.
+def make_schedule(strategy: Traits, max_steps: int, *, as_3dgs: bool) -> Schedule:
+    """Return the schedule of a run of T steps with a strategy.
 
     3DGS's conventions are those of gsplat's trainer with its ``steps_scaler``: step numbers are
     proportional to T, other numbers are not.
     """
-    mcmc = densification == "mcmc"
     schedule = Schedule(
         max_steps=max_steps,
         depth_units=False,
@@ -135,13 +125,13 @@ def make_schedule(densification: Densification, max_steps: int, *, as_3dgs: bool
         beta2=1 - FORGETTING,
         sh_every=_scaled(1000, max_steps),
         refine_start=_scaled(500, max_steps),
-        refine_stop=_scaled(25_000 if mcmc else 15_000, max_steps),
+        refine_stop=_scaled(strategy.refine_stop, max_steps),
         refine_every=_scaled(100, max_steps),
         reset_every=_scaled(3000, max_steps),
-        opacity=0.5 if mcmc else 0.1,
-        scale_factor=0.1 if mcmc else 1.0,
+        opacity=strategy.first_opacity,
+        scale_factor=strategy.first_size,
     )
-    return schedule if as_3dgs else _own(schedule, densification)
+    return schedule if as_3dgs else _own(schedule, strategy)
 
 
 def continued(schedule: Schedule) -> Schedule:
@@ -152,14 +142,14 @@ def continued(schedule: Schedule) -> Schedule:
     return replace(schedule, sh_every=0, recycles=False)
 
 
-def _own(theirs: Schedule, densification: Densification) -> Schedule:
+def _own(theirs: Schedule, strategy: Traits) -> Schedule:
     """Return splatseed's schedule: its departures from 3DGS's."""
     speedup, stop = max(FULL_RUN / theirs.max_steps, 1.0), theirs.refine_stop
     # 3DGS densifies every 100 steps of 30,000.
     shrunk, start = 100 * theirs.max_steps / FULL_RUN, theirs.refine_start
-    every = max(1, round(shrunk), min(100, stop // MIN_ROUNDS[densification]))
-    if densification == "grow":
-        every = start = max(MIN_ROUND_STEPS, _scaled(GROW_EVERY, theirs.max_steps))
+    every = max(1, round(shrunk), min(100, stop // strategy.min_rounds))
+    if strategy.round_steps is not None:
+        every = start = max(MIN_ROUND_STEPS, _scaled(strategy.round_steps, theirs.max_steps))
     rates = {n: rate * min(speedup, MAX_SPEEDUP[n]) for n, rate in LEARNING_RATES.items()}
     return replace(
         theirs,

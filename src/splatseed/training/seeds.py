@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from splatseed.depth.stereo.maps import StereoResult
+from splatseed.findings import Finding
 from splatseed.io.seeds import saw_all_photographs, was_upsampled
 from splatseed.methods import source_code
 from splatseed.photos.view import View
@@ -25,7 +26,7 @@ from splatseed.seeding.photo_methods import Auto
 from splatseed.seeding.thinning import thin
 from splatseed.seeding.upsampling import upsample
 from splatseed.training.depths import stereo_size
-from splatseed.training.settings import AS_3DGS, BUDGET, TrainSettings
+from splatseed.training.settings import BUDGET, TrainSettings
 
 
 def seeded(
@@ -39,23 +40,26 @@ def seeded(
 ) -> tuple[Scene, StereoResult | None]:
     """Add the points of method ``auto`` to a scene, if the settings or the advice say so.
 
-    The settings' budget limits the points. Also returns the depth maps that ``auto`` made, which
-    growth uses too; None without any. Where the points were ``triangulated`` while poses were
-    refined, ``auto`` adds to them: on held-out training views of two phones' walks it gained 0.34
-    and 0.96 dB under strategy ``grow`` (docs/known_poses.md), as bare walls have no features.
+    The settings' budget limits the points; a run that continues from Gaussians has none. Also
+    returns the depth maps that ``auto`` made, which growth uses too; None without any. Where the
+    points were ``triangulated`` while poses were refined, ``auto`` adds to them: on held-out
+    training views of two phones' walks it gained 0.34 and 0.96 dB under strategy ``grow``
+    (docs/known_poses.md), as bare walls have no features.
     """
+    if settings.start is not None:
+        return scene, None
     if saw_all_photographs(scene):
-        note(
-            "The seeds were made from all photographs, test views included, which may flatter the "
-            "score: train the scene itself, or seed without test views: `auto.test_every=8`."
-        )
+        text = "The seeds were made from all photographs, test views included, which may flatter "
+        text += "the score: train the scene itself, or seed without test views: "
+        note(Finding("seeds-of-test-views", f"{text}`auto.test_every=8`."))
     if settings.seeding == "scene" or no_seeding_reason(scene, settings):
         return scene, None
     if settings.seeding == "advised" and not triangulated:
         limit = settings.max_seeds(settings.cap or BUDGET)
-        advice = advice_for(scene, limit, strategy=settings.densification)
+        advice = advice_for(scene, limit, why_no_seeds=settings.traits.why_no_seeds)
         if advice.method == AS_IT_IS:
-            note(f"Seeds: {advice.sentence}. {advice.reasons[-1]}")
+            text = f"Seeds: {advice.sentence}. {advice.reasons[-1]}"
+            note(Finding("seeds", text, "info"))
             return scene, None
     start = time.perf_counter()
     size = stereo_size(scene.split(settings.test_every)[0], settings, device)
@@ -71,16 +75,17 @@ def seeded(
     made, alternative, kept = f"{len(cloud):,} points", "", cloud.num_original
     if len(scene.points):
         made = f"{kept:,} points of the scene and {len(cloud) - kept:,} new ones"
-        alternative = " `seeding='scene'` starts from the scene's points alone."
+        alternative = "`seeding='scene'` starts from the scene's points alone."
     guessed = np.count_nonzero(cloud.source == source_code("cover"))
     made = f"{made}, {guessed:,} of them guessed from neighbours"
-    note(f"Seeds by method auto: {made}, in {time.perf_counter() - start:.0f} s.{alternative}")
+    text = f"Seeds by method auto: {made}, in {time.perf_counter() - start:.0f} s."
+    note(Finding("seeds", text, "info", fix=alternative))
     return scene.replace(points=cloud), stereo[0] if stereo else None
 
 
 def no_seeding_reason(scene: Scene, settings: TrainSettings) -> str:
     """Explain why a run starts from the scene's points even with seeding ``auto``; else empty."""
-    if settings.strategy.endswith(AS_3DGS):
+    if settings.as_3dgs:
         return f"strategy {settings.strategy} starts from the scene's points as they are"
     if was_upsampled(scene):
         return "its points are upsampled already, and training starts from them as they are"
@@ -98,22 +103,22 @@ def usable_seeds(
     """
     seeds, cap = points.select(points.finite), settings.cap
     if len(seeds) < len(points):
-        note(f"{len(points) - len(seeds):,} points without finite coordinates were left out.")
+        text = f"{len(points) - len(seeds):,} points without finite coordinates were left out."
+        note(Finding("non-finite-points", text))
     if cap is not None and len(seeds) > cap:
         # Thinning takes the earlier of equals: originals first.
         crowd = seeds.select(np.argsort(seeds.source != ORIGINAL, kind="stable"))
         first, limit = crowd.num_original, settings.max_seeds(cap)
         seeds = crowd.select(thin(crowd.xyz, views, limit, first=first, priority=crowd.confidence))
         kept = f", {seeds.num_original:,} of them originals" if first else ""
-        room = "" if limit == cap else f"; strategy {settings.densification} adds the rest"
-        note(
-            f"{len(crowd):,} seeds were thinned to {limit:,}{kept}: the limit is {cap:,} Gaussians"
-            f"{room}."
-        )
+        room = "" if limit == cap else f"; strategy {settings.traits.name} adds the rest"
+        text = f"{len(crowd):,} seeds were thinned to {limit:,}{kept}: the limit is {cap:,} "
+        note(Finding("thinned-seeds", f"{text}Gaussians{room}.", "info"))
     used = {"sizes": settings.seed_sizes, "normals": settings.seed_normals}
     for name, is_used in used.items():
         if is_used and np.isnan(seeds.attributes.get(name, np.nan)).all():
-            note(f"seed_{name} has no effect: no seed has known {name}.")
+            text = f"seed_{name} has no effect: no seed has known {name}."
+            note(Finding("unused-setting", text))
     return seeds.replace(**dict.fromkeys(n for n in seeds.attributes if not used.get(n)))
 
 

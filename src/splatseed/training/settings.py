@@ -7,20 +7,25 @@ Notation: a *step* renders one training view. A strategy whose name ends in ``-3
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Literal, cast
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from splatseed.findings import Finding
 from splatseed.photos.sizes import TRAINED_SIDE, default_factor
+from splatseed.progress import Note, silent_note
 from splatseed.scene import Image
 from splatseed.settings import Range, check_settings
-from splatseed.training.schedule import FULL_RUN, Densification, Schedule, continued, make_schedule
+from splatseed.training.schedule import FULL_RUN, Schedule, continued, make_schedule
+from splatseed.training.traits import AS_3DGS, NAMES, STRATEGIES, Traits, traits_of
 
-StrategyName = Literal[
-    "auto", "default", "grow", "mcmc", "none", "default-3dgs", "mcmc-3dgs", "none-3dgs"
-]
+if TYPE_CHECKING:
+    StrategyName = str
+else:
+    StrategyName = Literal[NAMES]
+
 Backend = Literal["auto", "cpu", "cuda"]
 Placing = Literal["stereo", "none"]
 Seeding = Literal["advised", "auto", "scene"]
@@ -29,10 +34,6 @@ Exposure = Literal["none", "affine"]
 MIN_GAUSSIANS = 2
 BUDGET = 1_000_000
 """Default cap of the strategies that have a budget."""
-AS_3DGS = "-3dgs"
-SEED_SHARE = {"default": 0.7, "mcmc": 0.7}
-"""Maximum seeds as a fraction of the budget, for strategies that add Gaussians; else 1."""
-
 BYTES_PER_GAUSSIAN = 2000
 """Memory per Gaussian in training: its 59 numbers, their gradients and two moments (944 bytes),
 and as much again for the rasteriser's lists and for copies while Gaussians are added."""
@@ -90,17 +91,15 @@ class TrainSettings:
     start: Annotated[str | None, tyro.conf.arg(metavar="MODEL|RUN")] = None
     """Continue from trained Gaussians instead of points: a run, or any trainer's file of this
     scene, edited or not. Holes are filled where the strategy adds Gaussians."""
-    seeding: tyro.conf.Suppress[Seeding] = "scene"  # the option is --seeds, "advised" by default
-    """Start from the scene's points as they are, let method ``auto`` add the points that the
-    training photographs need, or do what ``splatseed info`` advises. Points that splatseed has
-    added already, and 3DGS's conventions, are left alone."""
+    seeding: Annotated[Seeding, tyro.conf.arg(name="seeds")] = "scene"  # of train: "advised"
+    """Start from the scene's points as they are (scene), with those that method auto adds from the
+    training photographs (auto), or as splatseed info advises for this strategy and budget
+    (advised). Points that splatseed has added already, and 3DGS's conventions, are left alone."""
 
     def __post_init__(self) -> None:
         check_settings(self)
 
-    def with_data_factor(
-        self, images: Sequence[Image], note: Callable[[str], None] = lambda _: None
-    ) -> TrainSettings:
+    def with_data_factor(self, images: Sequence[Image], note: Note = silent_note) -> TrainSettings:
         """Set the default data factor where the user set none; note it if it downsamples."""
         if self.data_factor is not None:
             return self
@@ -109,10 +108,9 @@ class TrainSettings:
             lens = max((im.lens for im in images), key=lambda lens: max(lens.width, lens.height))
             stored = f"{lens.width:,} x {lens.height:,}"
             size = f"{lens.width // factor:,} x {lens.height // factor:,}"
-            note(
-                f"Photographs of {stored} pixels are used at {size}, as the default is "
-                f"{TRAINED_SIDE:,} a side at most: `data_factor=1` keeps their size."
-            )
+            text = f"Photographs of {stored} pixels are used at {size}, as the default is "
+            text += f"{TRAINED_SIDE:,} a side at most: `data_factor=1` keeps their size."
+            note(Finding("downsampled-photographs", text, "info"))
         return replace(self, data_factor=factor)
 
     @property
@@ -121,35 +119,40 @@ class TrainSettings:
         return self.data_factor or 1
 
     @property
-    def densification(self) -> Densification:
-        """The strategy without its conventions; for ``auto`` the one that measured best."""
-        if self.strategy == "auto":
-            return "grow"
-        return cast("Densification", self.strategy.removesuffix(AS_3DGS))
+    def traits(self) -> Traits:
+        """The strategy's description; for ``auto`` that of the one that measured best."""
+        return traits_of(self.strategy)
+
+    @property
+    def as_3dgs(self) -> bool:
+        """Whether rates, sizes and schedules are 3DGS's."""
+        return self.strategy.endswith(AS_3DGS)
+
+    @property
+    def uses_stereo(self) -> bool:
+        """Whether the strategy places Gaussians at depths that stereo finds."""
+        return self.traits.uses_stereo and self.placing == "stereo"
 
     @property
     def unused(self) -> tuple[str, ...]:
         """Settings that differ from their defaults but have no effect on this strategy."""
-        given = (
-            ("opacity_reset", self.opacity_reset, "default"),
-            ("placing", self.placing != "stereo", "grow"),
-        )
-        return tuple(name for name, set_, of in given if set_ and self.densification != of)
+        others = [each for each in STRATEGIES.values() if each is not self.traits]
+        names = [name for each in others for name in each.own_settings]
+        return tuple(name for name in names if getattr(self, name) != getattr(type(self), name))
 
     @property
     def schedule(self) -> Schedule:
         """The run's hyperparameters and their timing."""
-        as_3dgs = self.strategy.endswith(AS_3DGS)
-        schedule = make_schedule(self.densification, self.max_steps, as_3dgs=as_3dgs)
+        schedule = make_schedule(self.traits, self.max_steps, as_3dgs=self.as_3dgs)
         return continued(schedule) if self.start else schedule
 
     def max_seeds(self, cap: int) -> int:
         """Return the maximum number of seeds of a run of up to ``cap`` Gaussians."""
-        return max(2, round(SEED_SHARE.get(self.densification, 1.0) * cap))
+        return max(2, round(self.traits.seed_share * cap))
 
     @property
     def cap(self) -> int | None:
         """The maximum number of Gaussians; None for no limit."""
-        if self.cap_max is None and self.densification in ("grow", "mcmc"):
+        if self.cap_max is None and self.traits.has_budget:
             return BUDGET
         return self.cap_max

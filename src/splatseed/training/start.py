@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 
+from splatseed.findings import Finding
 from splatseed.photos.view import View
 from splatseed.progress import Note
 from splatseed.runtime.fingerprint import fingerprint
@@ -41,16 +42,12 @@ def read_start(path: Path, scene: Scene, note: Note, *, same_poses: bool = False
         SceneNotFoundError: There is no such file.
         SceneFormatError: It holds no Gaussians, or they belong to another scene.
     """
-    gaussians, message = move_to_scene_origin(path, scene, read_gaussians(path, note), note), ""
+    gaussians = move_to_scene_origin(path, scene, read_gaussians(path, note), note)
     if not same_poses:  # else mcmc's clones could look like another frame
-        gaussians, message = move_to_scene_frame(path, scene, gaussians)
-    if message:
-        note(message)
+        gaussians = move_to_scene_frame(path, scene, gaussians, note)
     if gaussians.antialiased:
-        note(
-            f"{path} was trained with antialiasing; this run continues without it, so small "
-            "Gaussians are too opaque at first."
-        )
+        text = f"{path} was trained with antialiasing; this run continues without it, so small "
+        note(Finding("antialiased-model", f"{text}Gaussians are too opaque at first."))
     # Some trainers write opacities of 0 and 1, whose logits are infinite.
     opacities = gaussians.opacities.clip(ABSENT, MAX_LOGIT)
     return dataclasses.replace(gaussians, opacities=opacities, antialiased=False)
@@ -79,10 +76,8 @@ def continued_gaussians(
     cap, count = settings.cap, len(gaussians)
     if cap is not None and count > cap:
         gaussians = gaussians.select(_largest_contributors(gaussians, views, cap, device))
-        note(
-            f"The {cap:,} of {count:,} Gaussians that contribute most are kept: the budget allows "
-            "no more."
-        )
+        text = f"The {cap:,} of {count:,} Gaussians that contribute most are kept: the budget "
+        note(Finding("thinned-start", f"{text}allows no more.", "info"))
     return gaussians, min_view_depths(gaussians.means, views)
 
 

@@ -11,6 +11,7 @@ import time
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -36,12 +37,6 @@ from splatseed.training.parameters import (
 from splatseed.training.schedule import Schedule
 from splatseed.training.settings import TrainSettings
 from splatseed.training.strategies.base import Strategy
-from splatseed.training.strategies.default import Default
-from splatseed.training.strategies.grow import ErrorDensification
-from splatseed.training.strategies.mcmc import Mcmc
-
-FORMAT = 5
-"""Version of the checkpoint's content."""
 
 
 class Stopwatch:
@@ -89,21 +84,14 @@ def make_strategy(
 ) -> Strategy:
     """Make the strategy of the settings.
 
-    The memory of ``device``, by default the CPU, limits growth; see ``ErrorDensification`` for
-    ``depths`` and ``share``.
+    The memory of ``device``, by default the CPU, limits growth; see ``Strategy.of`` for ``depths``
+    and ``share``.
     """
     device = device or torch.device("cpu")
-    capacity = Capacity(settings.cap, device)
-    match settings.densification:
-        case "default":
-            return Default(settings, capacity)
-        case "mcmc":
-            return Mcmc(settings, capacity)
-        case "grow":
-            maps = {name: torch.as_tensor(each).to(device) for name, each in depths.items()}
-            return ErrorDensification(settings.schedule, capacity, maps, share)
-        case "none":
-            return Strategy(capacity)
+    maps = {name: torch.as_tensor(each).to(device) for name, each in depths.items()}
+    file, _, name = settings.traits.implementation.partition(":")
+    kind: type[Strategy] = getattr(import_module(f"splatseed.training.strategies.{file}"), name)
+    return kind.of(settings, Capacity(settings.cap, device), maps, share)
 
 
 def first_state(
@@ -129,7 +117,6 @@ def first_state(
 def save_checkpoint(path: Path, state: TrainState) -> None:
     """Write the state of a run, replacing an older checkpoint."""
     content = {
-        "format": FORMAT,
         "step": state.step,
         "seconds": state.watch.seconds,
         "records": [tuple(record) for record in state.records],
@@ -156,31 +143,28 @@ def load_checkpoint(
     """Read the state that ``save_checkpoint`` wrote to a device, and the strategy's own.
 
     Raises:
-        SceneFormatError: The file is damaged, or of another version.
+        SceneFormatError: The file is damaged.
         torch.cuda.OutOfMemoryError: It does not fit on the GPU.
     """
-    found = "another kind or version of file"
     try:
         with warnings.catch_warnings(action="ignore"):  # about what a foreign file might be
             content = torch.load(path, map_location=device, weights_only=True)
-        if isinstance(content, dict) and content.get("format") == FORMAT:
-            params = as_parameters(content["params"])
-            optimizers = make_optimizers(params, schedule)
-            for name, optimizer in optimizers.items():
-                optimizer.load_state_dict(content["optimizers"][name])
-            strategy.state = content["strategy"]
-            strategy.capacity.held_at = content["held_at"]
-            records = [Record(*row) for row in content["records"]]
-            watch, losses = Stopwatch(float(content["seconds"])), list(content["losses"])
-            run, step = (params, optimizers, strategy), int(content["step"])
-            exposures = Exposures(content["exposures"]) if "exposures" in content else None
-            return TrainState(*run, step, records, watch, losses, content["mean"], exposures)
+        params = as_parameters(content["params"])
+        optimizers = make_optimizers(params, schedule)
+        for name, optimizer in optimizers.items():
+            optimizer.load_state_dict(content["optimizers"][name])
+        strategy.state = content["strategy"]
+        strategy.capacity.held_at = content["held_at"]
+        records = [Record(*row) for row in content["records"]]
+        watch, losses = Stopwatch(float(content["seconds"])), list(content["losses"])
+        run, step = (params, optimizers, strategy), int(content["step"])
+        exposures = Exposures(content["exposures"]) if "exposures" in content else None
+        return TrainState(*run, step, records, watch, losses, content["mean"], exposures)
     except torch.cuda.OutOfMemoryError:
         raise
     except Exception as error:  # noqa: BLE001  (PyTorch raises anything for a damaged file)
-        found = f"a damaged file ({type(error).__name__})"
-    raise SceneFormatError(
-        f"{path} to be a checkpoint of this version of splatseed",
-        found=found,
-        fix="Start again with `overwrite=True`.",
-    )
+        raise SceneFormatError(
+            f"{path} to be a checkpoint of splatseed",
+            found=f"a damaged file ({type(error).__name__})",
+            fix="Start again with `overwrite=True`.",
+        ) from None

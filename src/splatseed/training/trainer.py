@@ -24,8 +24,7 @@ from splatseed.runtime.workarounds import keep_freed_memory
 from splatseed.splat.metrics import mirrored_ssim, psnr
 from splatseed.splat.photographs import PhotographCache, fill_masked, mask_tensor, photograph_tensor
 from splatseed.splat.rendering import render_view
-from splatseed.splat.ssim import l1_and_ssim
-from splatseed.splat.ssim_conv import l1_and_ssim_by_convolution
+from splatseed.splat.ssim import l1_and_ssim, l1_and_ssim_by_convolution
 from splatseed.training.folder import Record
 from splatseed.training.parameters import add_to_mean, optimize, take_mean, with_dropout
 from splatseed.training.schedule import MAX_DROPOUT_VIEWS
@@ -180,7 +179,6 @@ class Trainer:
 
 @lru_cache(maxsize=2)
 def _epoch_order(seed: int, epoch: int, count: int) -> Int[np.ndarray, " V"]:
-    """Draw the order of the photographs in an epoch."""
     return np.random.default_rng([seed, epoch]).permutation(count)
 
 

@@ -180,7 +180,6 @@ def cell_picture(
 
 
 def _photograph(scene: Scene, side: int, label: str) -> list[page.Tile]:
-    """Photograph of the camera that ``choose_camera`` returns, if it can be read."""
     camera = choose_camera(scene)
     size = page.fitted(camera.width, camera.height, side)
     photograph = page.photograph_at(choose_image(scene), size)

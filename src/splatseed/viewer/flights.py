@@ -46,8 +46,6 @@ QUALITY = 8  # imageio-ffmpeg's, 0 to 10
 
 @dataclasses.dataclass(frozen=True)
 class _Smoothing:
-    """How a path past cameras is smoothed."""
-
     sigma: float = 0.02  # of the Gaussian filter along the path, relative to its length
     samples_per_frame: int = 8
     max_detour: float = 2.0  # length in order of names over that by nearest neighbours
@@ -55,8 +53,6 @@ class _Smoothing:
 
 @dataclasses.dataclass(frozen=True)
 class _PathCheck:
-    """When a path misses the model."""
-
     num_views: int = 60  # sampled from the path
     num_gaussians: int = 5000  # sampled from the model
     min_seen: float = 0.002  # fraction of these that half of the views must see
@@ -69,11 +65,7 @@ SMOOTHING, CHECK = _Smoothing(), _PathCheck()
 
 
 def smooth_path(views: Sequence[View], frames: int, size: tuple[int, int]) -> list[View]:
-    """Make a path of ``frames`` views past all cameras, at constant speed.
-
-    Raises:
-        ParameterError: There are fewer than two cameras, or all are in one place.
-    """
+    """Make a path of ``frames`` views past all cameras, at constant speed."""
     ordered = _in_order(views)
     poses = _poses(ordered)
     reach = np.linalg.norm(poses[:, :3] - poses[:, :3].mean(axis=0), axis=1).max() if ordered else 0
@@ -186,11 +178,7 @@ def size_of_path(path: Path) -> tuple[int, int] | None:
 def check_path(
     path: Path, views: Sequence[View], gaussians: Gaussians, cameras: Sequence[View]
 ) -> None:
-    """Refuse the path of a file that misses the model or is far from all training cameras.
-
-    Raises:
-        SceneFormatError: Most of the views see hardly any Gaussians, or are far away.
-    """
+    """Refuse the path of a file that misses the model or is far from all training cameras."""
     num = min(len(views), CHECK.num_views)
     sample = [views[i] for i in np.linspace(0, len(views) - 1, num).astype(int)]
     xyz = gaussians.means[:: max(1, len(gaussians) // CHECK.num_gaussians)].astype(np.float64)
@@ -234,7 +222,6 @@ def _poses(views: Sequence[View]) -> Float64[np.ndarray, "V 9"]:
 
 
 def _posed(lens: View, looks: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> list[View]:
-    """Make views from (centre, target, up)."""
     poses = [look_at(*look) for look in looks]
     return [dataclasses.replace(lens.posed(p), name=f"{i}") for i, p in enumerate(poses)]
 
@@ -295,10 +282,6 @@ def write_video(
     """Write frames as H.264 to a .mp4, .mkv or .mov; replaces an existing file.
 
     Width and height of all frames are even.
-
-    Raises:
-        MissingDependencyError: imageio-ffmpeg is absent.
-        OutputError: The video cannot be written.
     """
     require("imageio_ffmpeg")
     import imageio_ffmpeg  # noqa: PLC0415  (of the extra view)

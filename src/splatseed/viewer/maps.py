@@ -103,7 +103,6 @@ def preview_depth(scene: Scene, alignments: Mapping[str, Alignment], path: StrPa
 def _checked(
     scene: Scene, image: Image, alignment: Alignment, xyz: Float64[np.ndarray, "M 3"], label: str
 ) -> list[page.Tile]:
-    """Row of an image."""
     size = page.fitted(image.camera.width, image.camera.height, CHECK_SIDE)
     photograph = page.photograph_or_blank(image, size)
     assert scene.depths is not None  # noqa: S101  (there are alignments of them)

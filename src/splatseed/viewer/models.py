@@ -18,6 +18,7 @@ from PIL import Image as PillowImage, ImageDraw
 
 from splatseed.camera import Camera
 from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.findings import Finding
 from splatseed.io import load_scene
 from splatseed.io.files import StrPath
 from splatseed.photos.camera_check import reference_points
@@ -50,7 +51,7 @@ class ViewerItem:
         gaussians: The model.
         data_factor: By which the model's run downsampled photographs.
         test_every: Every n-th image by name is a test view.
-        notes: Changes to the model on reading, for the user.
+        findings: What was changed in the model on reading.
         moved: How the model was moved from its trainer's frame; None if it was in the scene's.
     """
 
@@ -59,7 +60,7 @@ class ViewerItem:
     gaussians: Gaussians | None = None
     data_factor: int = 1
     test_every: int = 8
-    notes: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
     moved: Similarity | None = None
 
     @property
@@ -88,24 +89,20 @@ def open_item(path: StrPath, scene_path: Path | None = None) -> ViewerItem:
     """Read a scene, a run folder, or a file of Gaussians or points.
 
     A model's scene is at ``scene_path``, by default where its run's config has it, if it exists.
-
-    Raises:
-        SceneNotFoundError: ``path`` or ``scene_path`` does not exist.
-        SceneFormatError: It is damaged, or cannot be shown.
     """
     path = Path(path)
 
     def scene_at(folder: Path | None) -> Scene | None:
         return None if folder is None else load_scene(folder, require_points=False)
 
-    folder, notes = RunFolder(path), list[str]()
+    folder, findings = RunFolder(path), list[Finding]()
     if not path.is_dir() or not folder.is_run:
         if path.is_file() and holds_gaussians(path):
-            gaussians, scene = read_gaussians(path, notes.append), scene_at(scene_path)
+            gaussians, scene = read_gaussians(path, findings.append), scene_at(scene_path)
             moved = None
             if scene is not None:
-                gaussians, moved = _in_scene(path, scene, gaussians, notes.append)
-            return ViewerItem(path.name, scene, gaussians, notes=tuple(notes), moved=moved)
+                gaussians, moved = _in_scene(path, scene, gaussians, findings.append)
+            return ViewerItem(path.name, scene, gaussians, findings=tuple(findings), moved=moved)
         scene = load_scene(path, require_points=False)
         if not scene.images and not len(scene.points):
             raise SceneFormatError(
@@ -122,11 +119,11 @@ def open_item(path: StrPath, scene_path: Path | None = None) -> ViewerItem:
         )
     scene = scene_at(scene_path) or scene_of_run(folder)
     factor, every = _split_of_run(folder)
-    gaussians, moved = read_gaussians(folder.gaussians, notes.append), None
+    gaussians, moved = read_gaussians(folder.gaussians, findings.append), None
     if scene is not None:
         own = has_run_poses(folder.read_config(), scene)
-        gaussians, moved = _in_scene(folder.gaussians, scene, gaussians, notes.append, own=own)
-    return ViewerItem(folder.path.name, scene, gaussians, factor, every, tuple(notes), moved)
+        gaussians, moved = _in_scene(folder.gaussians, scene, gaussians, findings.append, own=own)
+    return ViewerItem(folder.path.name, scene, gaussians, factor, every, tuple(findings), moved)
 
 
 def _in_scene(
@@ -141,15 +138,17 @@ def _in_scene(
     if own:
         return gaussians, None
     try:
-        moved, message = scene_from_model(path, scene, gaussians)
+        moved = scene_from_model(path, scene, gaussians, note)
     except SceneFormatError as error:
         note(
-            f"The cameras probably do not show the Gaussians of {path} as photographed. "
-            f"Expected {error.expected}; found {error.found}."
+            Finding(
+                "another-scene",
+                f"The cameras probably do not show the Gaussians of {path} as photographed. "
+                f"Expected {error.expected}; found {error.found}.",
+                subjects=(str(path),),
+            )
         )
         return gaussians, None
-    if message:
-        note(message)
     return gaussians if moved is None else transform_gaussians(gaussians, moved), moved
 
 
@@ -180,7 +179,6 @@ def item_of_model(
 
 
 def _split_of_run(folder: RunFolder) -> tuple[int, int]:
-    """Return the data factor and ``test_every`` of a run."""
     config = folder.read_config()
     factor, every = (int(config.get(n) or d) for n, d in (("data_factor", 1), ("test_every", 8)))
     return factor, every

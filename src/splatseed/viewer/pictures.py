@@ -27,7 +27,7 @@ from splatseed.photos.undistortion import undistort
 from splatseed.photos.view import View, camera_views
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene
-from splatseed.seeding.coverage import covered_cells
+from splatseed.seeding.cover import covered_cells
 from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.metrics import flip_map
 from splatseed.splat.pictures import flip_heatmap, to_uint8
@@ -54,8 +54,6 @@ TEST_COLOR, TRAIN_COLOR = (213, 94, 0), (0, 114, 178)
 
 @dataclass(frozen=True)
 class _Sizes:
-    """Sizes of points and cameras in the viewer frame."""
-
     frustum: float = 0.5  # relative to the distance to the nearest other camera
     min_frustum: float = 0.008
     max_frustum: float = 0.05

@@ -48,11 +48,7 @@ ENDED = "The training has ended: open the run with splatseed view."
 
 
 def free_port(host: str, port: int) -> int:
-    """Check that a port can be listened on; 0 finds a free port.
-
-    Raises:
-        ParameterError: The port is taken or out of range, or the host is not this machine's.
-    """
+    """Check that a port can be listened on; 0 finds a free port."""
     try:
         with socket.socket() as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

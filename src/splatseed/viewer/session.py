@@ -37,8 +37,6 @@ BORDER = 0.38
 
 @dataclass(frozen=True)
 class _Frames:
-    """Size and quality of the pictures sent."""
-
     moving_seconds: float = 0.12  # that a frame may take while the camera moves
     still_after: float = 0.2  # seconds without movement until the full picture
     min_scale: float = 0.12
@@ -51,8 +49,6 @@ class _Frames:
 
 @dataclass(frozen=True)
 class _Points:
-    """Number of points sent; larger clouds are thinned evenly."""
-
     first: int = 300_000  # sent at once
     limit: int = 5_000_000  # for a fast browser
     min_factor: float = 1.5  # of more points that are worth sending again
@@ -62,8 +58,6 @@ class _Points:
 
 @dataclass(frozen=True)
 class _Flight:
-    """Flight of the browser's camera to an image's."""
-
     seconds: float = 0.5
     steps: int = 15
     tolerance: float = 1e-3  # in the viewer frame, at which a camera counts as being there
@@ -292,7 +286,6 @@ class Session:
         return round(POINTS.first * POINTS.seconds / max(seconds[True] - seconds[False], 1e-3))
 
     def _restyle(self) -> None:
-        """Apply the switches to points and cameras."""
         for name, node in self._nodes.items():
             node.visible = self._points_on.value and self._origins[name].value
             node.point_size = self._base_size * self._size.value
@@ -325,7 +318,6 @@ class Session:
                 self._fly(image)
 
     def _fly(self, image: Image) -> None:
-        """Move the browser's camera to an image's, in half a second."""
         camera = self._client.camera
         wxyz, position = pictures.viewer_pose(image.camera, self._entry.frame)
         start, origin = np.array(camera.wxyz), np.array(camera.position)

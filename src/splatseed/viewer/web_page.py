@@ -18,14 +18,15 @@ from jaxtyping import Float32, Float64, UInt8
 from scipy.spatial.transform import Rotation
 
 from splatseed.errors import OutputError
+from splatseed.findings import Finding
 from splatseed.io.staging import atomic_file
 from splatseed.photos.upright import up_direction
 from splatseed.photos.view import View
 from splatseed.progress import Note, Progress, silent, silent_note
 from splatseed.rendering.harmonics import sh_basis
 from splatseed.requirements import require
-from splatseed.splat.gaussians import SH_C0, Gaussians, antialiasing_note
-from splatseed.splat.quantization import opacity_bytes, unit_quats
+from splatseed.splat.gaussians import SH_C0, Gaussians, antialiasing_finding
+from splatseed.splat.packing import opacity_bytes, unit_quats
 from splatseed.text import counted
 from splatseed.viewer.flights import orbit
 from splatseed.viewer.models import ViewerItem, viewer_frame
@@ -84,10 +85,6 @@ def write_page(
     """Write a model as a web page that starts at its first training camera.
 
     Without a scene it starts outside of the model.
-
-    Raises:
-        MissingDependencyError: viser is absent.
-        OutputError: There are too many Gaussians, or the file cannot be written.
     """
     require("viser")
     import viser  # noqa: PLC0415  (of the extra view)
@@ -96,11 +93,12 @@ def write_page(
     check_page_size(len(model))
     progress("encode", 0.0)
     if model.antialiased:
-        note(antialiasing_note("a web page"))
+        note(antialiasing_finding("a web page"))
     frame = viewer_frame(item)
     covariances, unit, clipped = page_covariances(model, frame.scale)
     if clipped:
-        note(f"The page draws {counted(clipped, 'huge Gaussian')} smaller: it cannot hold them.")
+        text = f"The page draws {counted(clipped, 'huge Gaussian')} smaller: it cannot hold them."
+        note(Finding("clipped-sizes", text))
     colors = mean_colors(model, item.central_views)
     means = (model.means.astype(np.float64) - frame.origin) * frame.scale
     progress("encode", 0.5)

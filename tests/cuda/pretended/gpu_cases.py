@@ -62,8 +62,9 @@ def few_records(monkeypatch):
 
 def _begin(room, output, strategy, backend, max_steps=STEPS, **ways):
     settings = TrainSettings(strategy=strategy, backend=backend, max_steps=max_steps, cap_max=400)
-    options = PrepareOptions(depth_cache=DepthCache(output.parent / "depths.npz"), **ways)
-    return prepare_run(room, output, settings, options)
+    options = PrepareOptions(**ways)
+    cache = DepthCache(output.parent / "depths.npz")
+    return prepare_run(room, output, settings, options, depth_cache=cache)
 
 
 def _waits():

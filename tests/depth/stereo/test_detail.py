@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from splatseed.depth.stereo import detail
-from splatseed.depth.stereo.closer import compare_closer
 from splatseed.depth.stereo.detail import expected_spacing, fuse_at_most
 from splatseed.depth.stereo.maps import StereoSettings
-from splatseed.depth.stereo.pipeline import find_stereo
+from splatseed.depth.stereo.pipeline import compare_closer, find_stereo
 from splatseed.photos.loading import load_views
 from splatseed.photos.visibility import find_visibility
 from splatseed.progress import silent
 from splatseed.synthetic.texture import Mottled
 
+from ...seeds_of_views import seeds_of_views
 from .made import arc, photograph, relative_error, tilted_plane
 
 FAINT = Mottled(((0.45,) * 3, (0.55,) * 3), (7.0, 7.0, 7.0), octaves=3, contrast=3.0)
@@ -116,8 +116,13 @@ def test_larger_photographs_refine_the_planes_of_smaller_ones(tmp_path):
 
 
 def test_places_within_a_pixel_lie_on_its_plane(plane):
-    whole, half = (
-        fuse_at_most(plane.stereo, 10**9, LARGEST, NONE, 0.2, split=split) for split in (1, 2)
+    (whole, _), (half, view_idx) = (
+        seeds_of_views(
+            detail,
+            lambda _stereo, i, _places: i,
+            lambda split=split: fuse_at_most(plane.stereo, 10**9, LARGEST, NONE, 0.2, split=split),
+        )
+        for split in (1, 2)
     )
     assert len(half) > 2 * len(whole)
     off = [plane.surfaces.distance(seeds.xyz.astype(float)) for seeds in (whole, half)]
@@ -125,9 +130,9 @@ def test_places_within_a_pixel_lie_on_its_plane(plane):
     assert np.median(half.sizes) == pytest.approx(0.5 * np.median(whole.sizes), rel=0.05)
     # Colours are those of the places.
     view = plane.stereo.views[0]
-    uv = view.camera.project(half.xyz[half.view_idx == 0].astype(float))[0]
+    uv = view.camera.project(half.xyz[view_idx == 0].astype(float))[0]
     column, row = np.floor(uv + 1e-3).astype(int).T
-    same = (view.photograph[row, column] == half.rgb[half.view_idx == 0]).all(axis=1)
+    same = (view.photograph[row, column] == half.rgb[view_idx == 0]).all(axis=1)
     assert same.mean() > 0.99
 
 

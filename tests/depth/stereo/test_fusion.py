@@ -5,32 +5,43 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from splatseed.depth.stereo import fusion
 from splatseed.depth.stereo.fusion import SAME_DEPTH, fuse
+
+from ...seeds_of_views import seeds_of_views
 
 CELL = 6.0
 
 
 @pytest.fixture(scope="module")
-def seeds(ball):
-    return fuse(ball.stereo, CELL)
+def made(ball):
+    """Seeds, and the index of the view that each comes from."""
+    return seeds_of_views(fusion, lambda _stereo, i, _places: i, lambda: fuse(ball.stereo, CELL))
 
 
-def test_seeds_lie_on_the_surface_with_its_normals_most_confident_first(seeds, ball):
+@pytest.fixture(scope="module")
+def seeds(made):
+    return made[0]
+
+
+def test_seeds_lie_on_the_surface_with_its_normals_most_confident_first(made, ball):
+    seeds, view_idx = made
     xyz = seeds.xyz.astype(np.float64)
     assert np.quantile(ball.surfaces.distance(xyz), 0.9) < 0.04
     cosine = np.abs((ball.surfaces.normals(xyz) * seeds.normals).sum(axis=1))
     assert np.degrees(np.arccos(np.median(cosine))) < 12
     np.testing.assert_allclose(np.linalg.norm(seeds.normals, axis=1), 1.0, atol=1e-5)
-    assert (np.diff(seeds.view_idx) >= 0).all()
-    for i in np.unique(seeds.view_idx):
-        assert (np.diff(seeds.confidence[seeds.view_idx == i]) <= 0).all()
+    assert (np.diff(view_idx) >= 0).all()
+    for i in np.unique(view_idx):
+        assert (np.diff(seeds.confidence[view_idx == i]) <= 0).all()
     assert ((seeds.confidence > 0) & (seeds.confidence <= 1)).all()
 
 
-def test_a_cell_of_a_view_has_one_seed_at_a_depth(seeds, ball):
+def test_a_cell_of_a_view_has_one_seed_at_a_depth(made, ball):
     """Asked of the view that each comes from, where it certainly counts."""
+    seeds, view_idx = made
     for i, view in enumerate(ball.stereo.views):
-        uv, z = view.camera.project(seeds.xyz[seeds.view_idx == i].astype(float))
+        uv, z = view.camera.project(seeds.xyz[view_idx == i].astype(float))
         cells = np.floor(uv / CELL).astype(int)
         for cell in np.unique(cells, axis=0):
             here = np.sort(1.0 / z[(cells == cell).all(axis=1)])

@@ -21,7 +21,7 @@ from splatseed.depth.stereo._kernels.patchmatch import (
     initialise,
     red_black_sweep,
 )
-from splatseed.depth.stereo.quads import grey_image, make_quads
+from splatseed.depth.stereo.matching import grey_image, make_quads
 from splatseed.runtime.simd import LANES, load, store
 
 from .references import OFFSETS, agrees, best_of, bilinear, cost_in, window_weights

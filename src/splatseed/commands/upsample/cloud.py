@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from splatseed.commands.upsample.options import Options
+from splatseed.findings import Finding
 from splatseed.io.clouds import open_cloud
 from splatseed.io.nerfstudio import read_cloud_transform
 from splatseed.io.origin import find_shift
@@ -40,9 +41,9 @@ class LoadedCloud(NamedTuple):
     alignment: CloudAlignment | None = None
 
     @property
-    def notes(self) -> list[str]:
-        """Notes for the user."""
-        return [] if self.alignment is None else [self.alignment.summary]
+    def findings(self) -> tuple[Finding, ...]:
+        """How well the cloud is aligned, if that was computed."""
+        return () if self.alignment is None else (self.alignment.finding,)
 
     def write(self, folder: Path) -> None:
         """Write the alignment's report and picture into the scene folder, if there is one."""

@@ -11,6 +11,7 @@ from splatseed.commands.upsample import previews, report
 from splatseed.commands.upsample.cloud import load_cloud
 from splatseed.commands.upsample.options import CLOUD, Options, check, parse
 from splatseed.console import OUT, StageClock, print_note, stage_display
+from splatseed.findings import Finding
 from splatseed.io import load_originals, write_scene
 from splatseed.io.clouds import open_cloud
 from splatseed.io.colmap_model import scene_root
@@ -20,6 +21,7 @@ from splatseed.io.origin import RECENTER, format_offset, middle_of_cameras, tran
 from splatseed.io.staging import check_output
 from splatseed.methods import Upsampler, configure, number_of_new, planned_size, traits_of
 from splatseed.photos.camera_check import stray_cameras
+from splatseed.progress import Note
 from splatseed.scene import Scene
 from splatseed.seeding import photo_methods
 from splatseed.seeding.advice import DEFAULT_METHOD, method_for
@@ -46,29 +48,27 @@ def run(arguments: list[str]) -> None:
 def _upsample(options: Options, methods: dict[str, Any], arguments: list[str]) -> None:
     from splatseed.seeding.upsampling import upsample
 
-    notes: list[str] = []
+    notes: list[Finding] = []
     with stage_display() as clock:
+        note = _keep_or_announce(notes, clock)
         clock("read", 0.0)
         scene = _read(options, methods[options.method])
         own, replaced = scene.points, 0
         if options.gaussians is not None:  # photographs bound their sizes
             photo_methods.photographed(scene, without="leave out --gaussians")
         if options.refine_poses:
-            scene, note = _refined(options, scene, methods[options.method], clock)
+            scene, refinement = _refined(options, scene, methods[options.method], clock)
             replaced = 0 if scene.points is own else len(own)
-            notes.append(note)
+            notes.append(refinement)
         if options.recenter:
-            scene = translated(scene, middle_of_cameras(scene))
-            where = f"written around {format_offset(scene.offset)}, as {RECENTER} has it."
-            unchanged = "around 0 already: --recenter changes nothing."
-            notes.append(f"The scene is {where if scene.offset.any() else unchanged}")
+            scene = _recentered(scene, note)
         if options.method == DEFAULT_METHOD:  # it needs photographs
-            options = replace(options, method=str(method_for(scene, note=notes.append)))
+            options = replace(options, method=str(method_for(scene, note=note)))
         cloud, extra_method = None, None
         if options.cloud_files:
             cloud = load_cloud(options, scene, methods[CLOUD], clock)
             scene, methods = cloud.scene, {**methods, CLOUD: cloud.method}
-            notes += cloud.notes
+            notes += cloud.findings
             if options.method != CLOUD:
                 extra_method = replace(cloud.method, alone=False)
         method, count = methods[options.method], len(scene.points)
@@ -81,12 +81,12 @@ def _upsample(options: Options, methods: dict[str, Any], arguments: list[str]) -
         seeds = upsample(
             scene, method, num_points=total, budget=options.budget, cover=options.cover_cell,
             extra_method=extra_method, seed=options.seed, progress=clock,
-            note=notes.append, announce=clock.announce,
+            note=note,
         )  # fmt: skip
         seeded = scene.with_points(seeds)
         clock("check", 0.0)
         coverage = report.measure_coverage(scene, seeds)
-        findings = report.findings(options, scene, seeds, method, coverage)
+        quality = report.quality_rows(options, scene, seeds, method, coverage)
         clock("write", 0.0)
         written = write_scene(
             seeded, options.output, format=options.format, overwrite=options.overwrite,
@@ -98,16 +98,36 @@ def _upsample(options: Options, methods: dict[str, Any], arguments: list[str]) -
         _write_extras(options, scene, seeded, method, clock)
         seconds = clock.seconds()
     if options.gaussians is not None:
-        notes.append(f"The initial Gaussians are in {visible(options.gaussians)}.")
+        text = f"The initial Gaussians are in {visible(options.gaussians)}."
+        notes.append(Finding("gaussians-written", text, "info"))
     origins = report.origin_counts(seeds, options.method, written.num_points)
-    report.summarise(options, scene, replaced, origins, written, seconds, findings, arguments)
-    for note in notes:
-        print_note(note)
+    report.summarise(options, scene, replaced, origins, written, seconds, quality, arguments)
+    for finding in notes:
+        print_note(finding)
+
+
+def _keep_or_announce(notes: list[Finding], clock: StageClock) -> Note:
+    """Return a ``Note`` that keeps findings for the end, but shows what long work takes at once."""
+    from splatseed.seeding.dense import SECOND_COMPARISON
+
+    def note(finding: Finding) -> None:
+        (clock.announce if finding.kind == SECOND_COMPARISON else notes.append)(finding)
+
+    return note
+
+
+def _recentered(scene: Scene, note: Note) -> Scene:
+    scene = translated(scene, middle_of_cameras(scene))
+    where = f"written around {format_offset(scene.offset)}, as {RECENTER} has it."
+    unchanged = "around 0 already: --recenter changes nothing."
+    text = f"The scene is {where if scene.offset.any() else unchanged}"
+    note(Finding("recentered", text, "info"))
+    return scene
 
 
 def _refined(
     options: Options, scene: Scene, method: Upsampler, clock: StageClock
-) -> tuple[Scene, str]:
+) -> tuple[Scene, Finding]:
     """Return the scene at refined poses, and what changed; no points of the method's test views."""
     from splatseed.sfm import refined
     from splatseed.sfm.first_look import FIRST_LOOK, NEIGHBOURS, STAGE
@@ -152,22 +172,24 @@ def _announce(
     memory_note: str,
 ) -> None:
     """Print the plan, the scene's warnings, and the options that have no effect."""
-    for warning in (*scene.findings, *stray_cameras(scene)):
-        print_note(warning)
     name, method = options.method, methods[options.method]
-    if unused := report.unused_maps_note(options, scene, method):
-        print_note(unused)
+    unused = report.unused_maps(options, scene, method)
+    for finding in (*scene.findings, *stray_cameras(scene), *unused):
+        print_note(finding)
     if (listed := scene.listed) is not None and hasattr(method, "test_every"):
         tests = counted(len(listed.test), "test image")
-        print_note(f"{tests} of the scene's {listed.origin} take no part in the seeds.")
+        text = f"{tests} of the scene's {listed.origin} take no part in the seeds."
+        print_note(Finding("test-views-left-out", text, "info"))
     for other, given in methods.items():
         changed = given != configure(other, options.profile) and not (
             other == CLOUD and options.cloud_files
         )
         if other != name and (changed or (other == "depth" and options.depth_maps is not None)):
-            print_note(f"The options of {other} have no effect with --method {name}.")
+            text = f"The options of {other} have no effect with --method {name}."
+            print_note(Finding("unused-options", text))
     if options.profile == "paper" and configure(name, "paper") == configure(name):
-        print_note(f"Profile paper changes nothing for method {name}.")
+        text = f"Profile paper changes nothing for method {name}."
+        print_note(Finding("unused-options", text))
     how = ""
     if isinstance(method, photo_methods.Stereo) and not photo_methods.has_depth_hints(scene):
         points = "too few" if photo_methods.has_points(scene) else "no"

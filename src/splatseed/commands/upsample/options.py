@@ -11,12 +11,13 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from splatseed.commands.options import MaskChoice, check_minimum, parse_options, parse_some, refuse
+from splatseed.commands.options import check_minimum, parse_options, parse_some, refuse
 from splatseed.depthmap import DepthKind
 from splatseed.methods import METHODS, Profile, Upsampler, configure
 from splatseed.runtime.memory import parse_bytes
 from splatseed.seeding.advice import DEFAULT_METHOD
 from splatseed.text import quoted
+from splatseed.training.request import MaskChoice
 
 POINT_FILES = (".ply", ".las", ".laz", ".e57", ".pcd", ".xyz", ".pts", ".npz", ".bin", ".txt")
 """Suffixes that suggest the user wants a point file, not a scene folder."""

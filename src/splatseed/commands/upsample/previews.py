@@ -45,7 +45,7 @@ def write_previews(
     options: Options, scene: Scene, seeds: PointCloud, method: Upsampler, clock: StageClock
 ) -> None:
     """Draw the points before and after; with photographs, also origins, cells and stereo's maps."""
-    from splatseed.seeding.coverage import covered_cells
+    from splatseed.seeding.cover import covered_cells
     from splatseed.viewer import clouds, maps
 
     folder = options.output

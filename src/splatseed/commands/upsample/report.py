@@ -16,6 +16,7 @@ from splatseed.commands.upsample.options import Options
 from splatseed.commands.upsample.previews import PICTURES
 from splatseed.console import print_note, print_pairs
 from splatseed.depthmap import in_scene_units
+from splatseed.findings import Finding
 from splatseed.io import WriteReport
 from splatseed.io.load import depths_beside
 from splatseed.methods import (
@@ -119,18 +120,19 @@ def number_summary(total: int | None, limit: int | None, *, covered: bool = Fals
     return f"{total:,} points before --cover" if covered else f"{total:,} points"
 
 
-def unused_maps_note(options: Options, scene: Scene, method: Upsampler) -> str:
-    """Point out the scene's depth maps if the method does not use them; else empty."""
+def unused_maps(options: Options, scene: Scene, method: Upsampler) -> tuple[Finding, ...]:
+    """Point out the scene's depth maps if the method does not use them."""
     attached, beside = scene.depths, depths_beside(scene)
     maps = attached or beside
     used = in_scene_units(attached) and getattr(method, "depth_maps", False)
     if not maps or used or options.method == "depth" or options.depth_maps is not None:
-        return ""
+        return ()
     others = "method depth aligns them with the points"
     if in_scene_units(attached):
         others = "methods auto and depth use them"
     are = agreeing(len(maps), "is", "are")
-    return f"Its {counted(len(maps), 'depth map')} {are} not used by {options.method}: {others}."
+    text = f"Its {counted(len(maps), 'depth map')} {are} not used by {options.method}: {others}."
+    return (Finding("unused-depth-maps", text),)
 
 
 class Coverage(NamedTuple):
@@ -151,7 +153,7 @@ def measure_coverage(scene: Scene, seeds: PointCloud) -> Coverage | None:
     return Coverage(*(share_covered(scene, each) for each in (scene.points, measured, seeds)))
 
 
-def findings(
+def quality_rows(
     options: Options, scene: Scene, seeds: PointCloud, method: Upsampler, coverage: Coverage | None
 ) -> list[tuple[str, str]]:
     """Return rows on new points far from the originals, and on photograph cells covered."""
@@ -253,8 +255,9 @@ def summarise(
     for note in written.findings:
         print_note(note)
     if written.layout == "transforms":
-        print_note(
+        text = (
             "gsplat's examples, graphdeco's code and LichtFeld need COLMAP's layout, written by: "
             f"{colmap_command(arguments, output)}"
         )
+        print_note(Finding("colmap-layout", text, "info"))
     print_training(options.scene, scene, output, written.layout)

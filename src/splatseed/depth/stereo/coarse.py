@@ -25,8 +25,6 @@ from splatseed.progress import Progress
 
 @dataclass(frozen=True)
 class _CoarseSettings:
-    """Settings of coarse stereo."""
-
     side: int = 200  # longer side of the downsampled photographs, pixels
     cell: float = 4.0  # pixels between points
     num_sampled: int = 24  # views matched first, to find the range of depths
@@ -37,7 +35,7 @@ class _CoarseSettings:
 
 
 COARSE = _CoarseSettings()
-SETTINGS = StereoSettings(grid=2, sweeps=6, tolerance=0.03, max_cost=0.4)
+MATCHING = StereoSettings(grid=2, sweeps=6, tolerance=0.03, max_cost=0.4)
 
 
 def coarse_stereo(views: Sequence[View], seed: int, progress: Progress) -> Visibility:
@@ -47,10 +45,10 @@ def coarse_stereo(views: Sequence[View], seed: int, progress: Progress) -> Visib
     # Sources share the hypothetical points that a view may see, at good angles.
     xyz, seen = _hypothetical_points(small, quantiles)
     centers = np.stack([view.camera.center for view in small])
-    sources = choose_sources(seen, xyz, centers, SETTINGS.num_check_views)
+    sources = choose_sources(seen, xyz, centers, MATCHING.num_check_views)
     factor = COARSE.range_factor
     priors = [DepthPrior.from_range(low / factor, high * factor) for low, _, high in quantiles]
-    stereo = match_views(small, priors, sources, SETTINGS, seed, progress)
+    stereo = match_views(small, priors, sources, MATCHING, seed, progress)
     return without_tracks(fuse(stereo, COARSE.cell).xyz.astype(np.float64))
 
 
@@ -99,13 +97,13 @@ def _inverse_depth_quantiles(
 ) -> Float64[np.ndarray, "V 3"]:
     """The 10%, 50% and 90% quantiles of each view's inverse depth, of the nearest sampled view."""
     poses = np.stack([view.cam_from_world for view in views])
-    sources = choose_by_pose(poses, SETTINGS.num_sources)
+    sources = choose_by_pose(poses, MATCHING.num_sources)
     last = len(views) - 1
     sampled = np.unique(np.linspace(0, last, COARSE.num_sampled).round().astype(np.int64))
     priors: list[DepthPrior | None] = [None] * len(views)
     for i in sampled:
         priors[i] = prior_from_baseline(views, int(i), sources[i])
-    stereo = match_views(views, priors, sources, SETTINGS, seed, progress)
+    stereo = match_views(views, priors, sources, MATCHING, seed, progress)
     good = [stereo.planes[i][0][stereo.costs[i] < COARSE.max_sample_cost] for i in sampled]
     found = np.array([np.quantile(w, [0.1, 0.5, 0.9]) if len(w) else [np.nan] * 3 for w in good])
     if np.isnan(found).all():

@@ -22,16 +22,10 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int8, UInt8
 from scipy.ndimage import uniform_filter
 
-from splatseed.depth.stereo.fusion import (
-    CellGrids,
-    Places,
-    StereoSeeds,
-    by_confidence,
-    concatenate,
-    make_seeds,
-)
+from splatseed.depth.stereo.fusion import CellGrids, Places, by_confidence, make_seeds
 from splatseed.depth.stereo.maps import StereoResult
-from splatseed.depth.stereo.quads import grey_image
+from splatseed.depth.stereo.matching import grey_image
+from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent
 
 Steps = Int8[np.ndarray, "h w"]
@@ -163,7 +157,7 @@ def fuse_at_most(
     spacing: float,
     progress: Progress = silent,
     split: int = 1,
-) -> StereoSeeds:
+) -> PointCloud:
     """Choose at most ``num`` seeds from confirmed pixels, in proportion to detail.
 
     Args:
@@ -177,7 +171,9 @@ def fuse_at_most(
         split: Places for seeds along a row and a column of a pixel of the maps.
     """
     chosen = _Search(stereo, largest, split, known, progress).run(num, spacing)
-    return concatenate([make_seeds(stereo, i, each) for i, each in enumerate(chosen.places)])
+    return PointCloud.concatenate(
+        *(make_seeds(stereo, i, each) for i, each in enumerate(chosen.places))
+    )
 
 
 @dataclass(frozen=True, eq=False)

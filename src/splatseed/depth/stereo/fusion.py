@@ -12,43 +12,20 @@ Promise: seeds lie on confirmed depths only; the same maps give the same bytes.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64, UInt8
 
 from splatseed.depth.stereo._kernels.agreement import occupy_cells
 from splatseed.depth.stereo.maps import StereoResult, block_means
-from splatseed.depth.stereo.quads import other_from_view
+from splatseed.depth.stereo.matching import other_from_view
 from splatseed.photos.view import View
+from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent
 
 SAME_DEPTH = 0.03
 """Relative difference of depth up to which two seeds in a cell count as one."""
-
-
-@dataclass(frozen=True, eq=False)
-class StereoSeeds:
-    """Points on surfaces.
-
-    Args:
-        xyz: World positions, float32 [N, 3].
-        rgb: Mean colour of the map pixel in the photograph, uint8 [N, 3].
-        normals: World axes, towards the view it comes from, float32 [N, 3].
-        sizes: The side of a cell at that depth, scene units, float32 [N].
-        confidence: From 0 to 1, float32 [N].
-        view_idx: The view it comes from, int32 [N].
-    """
-
-    xyz: Float32[np.ndarray, "N 3"]
-    rgb: UInt8[np.ndarray, "N 3"]
-    normals: Float32[np.ndarray, "N 3"]
-    sizes: Float32[np.ndarray, " N"]
-    confidence: Float32[np.ndarray, " N"]
-    view_idx: Int32[np.ndarray, " N"]
-
-    def __len__(self) -> int:
-        return len(self.xyz)
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,13 +103,17 @@ class CellGrids:
         return Places(pixels, place.astype(np.uint8), self.cells[levels.ravel()[pixels]], split)
 
 
-def fuse(stereo: StereoResult, cell: float, progress: Progress = silent) -> StereoSeeds:
+def fuse(stereo: StereoResult, cell: float, progress: Progress = silent) -> PointCloud:
     """Choose seeds from confirmed pixels, about ``cell`` pixels apart in the photographs.
 
     Args:
         stereo: The result of stereo.
         cell: Side of a cell in pixels of the views; not below the grid of the maps.
         progress: Called with the stage and the fraction done.
+
+    Returns:
+        World positions view by view, the mean colour of the map's pixel, normals towards the view,
+        as sizes the side of a cell at that depth, and confidence.
     """
     grids = CellGrids.of(stereo.views, [max(float(cell), float(stereo.settings.grid))])
     parts = []
@@ -141,14 +122,7 @@ def fuse(stereo: StereoResult, cell: float, progress: Progress = silent) -> Ster
         chosen = grids.choose(stereo, i, by_confidence(stereo, i), levels)
         parts.append(make_seeds(stereo, i, chosen))
         progress("fuse depths", (i + 1) / len(stereo.views))
-    return concatenate(parts)
-
-
-def concatenate(parts: Sequence[StereoSeeds]) -> StereoSeeds:
-    """Join the seeds of all views."""
-    return StereoSeeds(
-        **{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(StereoSeeds)}
-    )
+    return PointCloud.concatenate(*parts)
 
 
 def by_confidence(stereo: StereoResult, i: int) -> Int32[np.ndarray, " P"]:
@@ -159,7 +133,7 @@ def by_confidence(stereo: StereoResult, i: int) -> Int32[np.ndarray, " P"]:
     return order.astype(np.int32)
 
 
-def make_seeds(stereo: StereoResult, i: int, places: Places) -> StereoSeeds:
+def make_seeds(stereo: StereoResult, i: int, places: Places) -> PointCloud:
     """Seeds at places of view i."""
     view, grid, split = stereo.views[i], stereo.settings.grid, places.split
     width = stereo.costs[i].shape[1]
@@ -173,11 +147,10 @@ def make_seeds(stereo: StereoResult, i: int, places: Places) -> StereoSeeds:
     # n' R = (R' n)': from camera axes to the world's.
     normals = stereo.normals(i)[row, column] @ view.cam_from_world[:3, :3]
     column, row = (np.stack([column, row], axis=1) * split + part).T
-    return StereoSeeds(
+    return PointCloud(
         view.camera.unproject(uv, z).astype(np.float32),
         block_means(view.photograph, grid // split)[row, column],
-        normals.astype(np.float32),
-        (places.sides * z / view.K[0, 0]).astype(np.float32),
-        stereo.confidence(i)[places.pixels // width, places.pixels % width],
-        np.full(len(places), i, np.int32),
+        normals=normals.astype(np.float32),
+        sizes=(places.sides * z / view.K[0, 0]).astype(np.float32),
+        confidence=stereo.confidence(i)[places.pixels // width, places.pixels % width],
     )

@@ -21,13 +21,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int64, UInt8
+from jaxtyping import Bool, Float32, Float64, Int32, Int64, UInt8
 from scipy.spatial import cKDTree
 
 from splatseed.depth.stereo._kernels.agreement import confirm
-from splatseed.depth.stereo._kernels.patchmatch import initialise, red_black_sweep
+from splatseed.depth.stereo._kernels.cost import pack_quads, to_grey
+from splatseed.depth.stereo._kernels.patchmatch import QuadImages, initialise, red_black_sweep
 from splatseed.depth.stereo.maps import StereoResult, StereoSettings
-from splatseed.depth.stereo.quads import Grey, grey_image, make_quad_images, other_from_view
 from splatseed.photos.view import View
 from splatseed.progress import Progress, in_threads
 from splatseed.runtime.memory import check_memory
@@ -35,6 +35,10 @@ from splatseed.runtime.memory import check_memory
 BYTES_PER_DEPTH = 3 * 4 + 4 + 1
 """A plane, a cost and agreement bits."""
 
+LUMA = np.array([0.299, 0.587, 0.114], np.float32)
+"""Weights of red, green and blue, ITU-R BT.601."""
+
+Grey = UInt8[np.ndarray, "H W"]
 Matched = tuple[Float32[np.ndarray, "3 h w"], Float32[np.ndarray, "h w"]]
 """Planes and costs of a view."""
 
@@ -148,9 +152,6 @@ def check_stereo_memory(views: Sequence[View], settings: StereoSettings) -> None
 
     Memory holds all grey photographs, the planes at each grid point, and for each thread the quad
     images (4 bytes per pixel) of a view and its sources.
-
-    Raises:
-        ParameterError: It does not fit.
     """
     grid, sizes = settings.grid, [view.width * view.height for view in views]
     depths = sum((view.width // grid) * (view.height // grid) for view in views)
@@ -182,9 +183,6 @@ def match_views(
         settings: Settings of stereo.
         seed: The same seed gives the same bytes.
         progress: Called with the stage and the fraction done.
-
-    Raises:
-        ParameterError: The photographs do not fit into memory.
     """
     check_stereo_memory(views, settings)
     greys = [grey_image(view.photograph) for view in views]
@@ -265,3 +263,57 @@ def _confirm_all(
 
     in_threads(work, len(views), 4, "compare depths", progress)
     return agreeing
+
+
+def grey_image(image: UInt8[np.ndarray, "H W 3"]) -> Grey:
+    """Luma of sRGB pixels, rounded to 8 bits."""
+    out = np.empty(image.shape[:2], np.uint8)
+    to_grey(image, LUMA, out)
+    return out
+
+
+def make_quads(grey: Grey) -> Int32[np.ndarray, "H W"]:
+    """Quad image of a grey image (see ``_kernels.cost``)."""
+    out = np.empty(grey.shape, np.int32)
+    pack_quads(grey, out)
+    return out
+
+
+def make_quad_images(
+    view: View,
+    grey: Grey,
+    others: Sequence[View],
+    greys: Sequence[Grey],
+    grid: int,
+    bounds: Float32[np.ndarray, " 2"],
+) -> QuadImages:
+    """Pack a view and its sources for the kernels.
+
+    Args:
+        view: The reference view.
+        grey: Its grey image.
+        others: Its sources.
+        greys: Their grey images.
+        grid: Pixels between grid points.
+        bounds: Smallest and largest inverse depth.
+    """
+    offsets = np.cumsum([0, *(image.size for image in greys)])
+    sources: Int32[np.ndarray, " Q"] = np.empty(offsets[-1], np.int32)
+    for start, stop, image in zip(offsets, offsets[1:], greys, strict=False):
+        sources[start:stop] = make_quads(image).ravel()
+    warps = [other_from_view(view, other) for other in others]
+    packed = [np.concatenate([warp[:, :3].ravel(), warp[:, 3]]) for warp in warps]
+    sizes = np.array([(other.width, other.height) for other in others], np.int64)
+    return QuadImages(
+        make_quads(grey).ravel(), np.array([view.width, view.height], np.int64),
+        sources, sizes, offsets, np.array(packed, np.float32), grid, float(view.K[0, 0]), bounds,
+    )  # fmt: skip
+
+
+def other_from_view(view: View, other: View) -> Float64[np.ndarray, "3 4"]:
+    """Matrix K_s [R K_r^-1, t] from pixels (u, v, 1) of a view times depth, and 1, to another's."""
+    # source from reference: x_s = R x_r + t with x_r = z K_r^-1 (u, v, 1)
+    relative = other.cam_from_world @ np.linalg.inv(view.cam_from_world)
+    return np.asarray(
+        other.K @ np.hstack([relative[:3, :3] @ np.linalg.inv(view.K), relative[:3, 3:]])
+    )

@@ -6,6 +6,7 @@ map holds only depths that independently computed maps of other views confirm.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
@@ -31,6 +32,9 @@ MIN_SEEN = 300
 """A scene counts as having no points if half of its images see fewer. Coarse stereo takes two or
 three times as long as the rest of stereo, and gives as many known pixels as 800 points an image: of
 fern's .49, where 80 points an image give .44 and 8 give .41 (benchmarks/tried.md)."""
+CLOSER_SWEEPS = 1
+"""PatchMatch iterations on larger photographs: with a second one the same pixels are confirmed, no
+more accurately."""
 MAP_SAMPLES = 18
 """Rows and columns at which points are sampled from a depth map."""
 
@@ -115,6 +119,39 @@ def find_stereo(
         for i, (view, rows) in enumerate(zip(views, seen, strict=True))
     ]
     return match_views(views, priors, sources, settings, seed, progress)
+
+
+def compare_closer(
+    coarse: StereoResult, views: Sequence[View], grid: int, seed: int, progress: Progress
+) -> StereoResult:
+    """Match photographs that were matched at a smaller size before, starting from those planes.
+
+    Args:
+        coarse: The result at the smaller size.
+        views: The same photographs in the same order, as large or larger.
+        grid: Pixels of these between depths.
+        seed: The same seed gives the same bytes.
+        progress: Called with the stage, as in ``match_views`` with "again", and the fraction done.
+    """
+    priors = [_prior_from_planes(coarse, i, view) for i, view in enumerate(views)]
+    settings = dataclasses.replace(coarse.settings, grid=grid, sweeps=CLOSER_SWEEPS)
+
+    def again(stage: str, fraction: float) -> None:
+        progress(f"{stage} again", fraction)
+
+    return match_views(views, priors, coarse.sources, settings, seed, again)
+
+
+def _prior_from_planes(coarse: StereoResult, i: int, view: View) -> DepthPrior | None:
+    """The planes of view i in pixels of the larger photograph; None without any."""
+    if not np.isfinite(coarse.costs[i]).any():
+        return None
+    # Both are whole divisions of the same photograph, so focal lengths have the ratio of sizes.
+    ratio = view.K[0, 0] / coarse.views[i].K[0, 0]
+    planes = coarse.planes[i].copy()
+    planes[1:] /= np.float32(ratio)  # slopes are per pixel
+    step = coarse.settings.grid * ratio
+    return DepthPrior(np.empty((0, 2)), np.empty(0), coarse.bounds[i], planes, step)
 
 
 def known_visibility(scene: Scene) -> Visibility:

@@ -14,17 +14,20 @@ import numpy as np
 
 from splatseed.rendering.harmonics import CHANNELS, FIRST, FORM, ROW, USED, Y0, coefficient_index
 from splatseed.runtime.jit import always_inline, kernel, parallel_range
-from splatseed.runtime.shuffles import lane, permutation, three_sums, triple
 from splatseed.runtime.simd import (
     LANES,
     add,
     broadcast,
     fma,
+    lane,
     load,
     multiply,
+    permutation,
     prefetch,
     select_greater,
     store,
+    three_sums,
+    triple,
 )
 
 CHUNKS = 64

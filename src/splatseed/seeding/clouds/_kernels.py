@@ -1,6 +1,9 @@
 """Kernels of clouds: merging points in voxels, their support, and what a view sees of points."""
 
+from typing import NamedTuple
+
 import numpy as np
+from jaxtyping import Float32, Int16, Int32, UInt64
 
 from splatseed.photos._kernels import project_point
 from splatseed.runtime.hashing import FREE, scramble, slot_of
@@ -13,6 +16,17 @@ OUTSIDE = -(1 << 15)  # level of a point in no frame
 VOXEL_ORIGIN = 0.381966
 """Where voxels start along each axis: walls at round coordinates would otherwise lie on voxel
 faces, and rounding would put their points into either voxel."""
+
+
+class VoxelTable(NamedTuple):
+    """Voxels in the order in which they were first filled, and a hash table to find them."""
+
+    keys: UInt64[np.ndarray, " C"]
+    mean: Float32[np.ndarray, "C 3"]
+    color: Float32[np.ndarray, "C 3"]
+    counts: Int32[np.ndarray, " C"]
+    level: Int16[np.ndarray, " C"]
+    slots: Int32[np.ndarray, " S"]
 
 
 @kernel
@@ -53,29 +67,30 @@ def _lower_footprints(block, m, side, size, footprints):
 
 
 @inline
-def merge_points(start, xyz, rgb, levels, coarsening, keys, mean, color, count, level, table, num):
-    """Merge points into voxels, one after another, from ``start`` on.
+def merge_points(start, xyz, rgb, levels, coarsening, voxels, num):
+    """Merge points into ``num`` voxels, one after another, from ``start`` on.
 
     Returns the first point that found no free voxel, or the number of points, and the number of
     voxels.
     """
     has_color = len(rgb) == len(xyz)
+    keys, mean, color, counts, level, slots = voxels
     for i in range(start, len(xyz)):
         if levels[i] == OUTSIDE:
             continue
         key = _voxel_key(xyz[i], levels[i], coarsening)
-        slot = _voxel_slot(key, keys, table)
-        e = table[slot] - 1
+        slot = _voxel_slot(key, keys, slots)
+        e = slots[slot] - 1
         if e < 0:
             if num == len(keys):
                 return i, num
             e = num
             num += 1
-            table[slot], keys[e], level[e], count[e] = num, key, levels[i], 0
+            slots[slot], keys[e], level[e], counts[e] = num, key, levels[i], 0
             for axis in range(3):
                 mean[e, axis] = color[e, axis] = np.float32(0.0)
-        count[e] += 1
-        share = 1.0 / count[e]
+        counts[e] += 1
+        share = 1.0 / counts[e]
         for axis in range(3):  # m <- m + (x - m) / n
             mean[e, axis] += (xyz[i, axis] - mean[e, axis]) * share
             if has_color:
@@ -84,27 +99,25 @@ def merge_points(start, xyz, rgb, levels, coarsening, keys, mean, color, count, 
 
 
 @inline
-def merge_voxels(
-    mean, color, count, level, num, coarsening, new_keys, new_mean, new_color, new_count,
-    new_level, table,
-):  # fmt: skip
-    """Merge voxels into coarser ones, weighted by their points; return how many these are."""
+def merge_voxels(old, num, coarsening, new):
+    """Merge ``num`` voxels into coarser ones, weighted by their points; return their number."""
     filled = 0
     for i in range(num):
-        key = _voxel_key(mean[i], level[i], coarsening)
-        slot = _voxel_slot(key, new_keys, table)
-        e = table[slot] - 1
+        key = _voxel_key(old.mean[i], old.level[i], coarsening)
+        slot = _voxel_slot(key, new.keys, new.slots)
+        e = new.slots[slot] - 1
         if e < 0:
             e = filled
             filled += 1
-            table[slot], new_keys[e], new_level[e], new_count[e] = filled, key, level[i], 0
+            new.slots[slot], new.keys[e] = filled, key
+            new.level[e], new.counts[e] = old.level[i], 0
             for axis in range(3):
-                new_mean[e, axis] = new_color[e, axis] = np.float32(0.0)
-        new_count[e] += count[i]
-        share = np.float64(count[i]) / new_count[e]
+                new.mean[e, axis] = new.color[e, axis] = np.float32(0.0)
+        new.counts[e] += old.counts[i]
+        share = np.float64(old.counts[i]) / new.counts[e]
         for axis in range(3):
-            new_mean[e, axis] += (mean[i, axis] - new_mean[e, axis]) * share
-            new_color[e, axis] += (color[i, axis] - new_color[e, axis]) * share
+            new.mean[e, axis] += (old.mean[i, axis] - new.mean[e, axis]) * share
+            new.color[e, axis] += (old.color[i, axis] - new.color[e, axis]) * share
     return filled
 
 
@@ -119,11 +132,11 @@ def _voxel_key(point, level, coarsening):
 
 
 @inline
-def _voxel_slot(key, keys, table):
+def _voxel_slot(key, keys, slots):
     """The slot of a key, or the free one where it belongs."""
-    last = np.uint64(len(table) - 1)
+    last = np.uint64(len(slots) - 1)
     slot = key & last
-    while table[slot] != 0 and keys[table[slot] - 1] != key:
+    while slots[slot] != 0 and keys[slots[slot] - 1] != key:
         slot = (slot + np.uint64(1)) & last
     return slot
 

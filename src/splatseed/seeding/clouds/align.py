@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 
 from splatseed.errors import PointCloudError
+from splatseed.findings import Finding
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 from splatseed.seeding.clouds.global_search import SEARCH, SearchSettings, find_starts, to_unit_size
@@ -110,23 +111,25 @@ class CloudAlignment:
         }
 
     @property
-    def summary(self) -> str:
-        """The result in a sentence, with a warning if the rotation is uncertain."""
+    def finding(self) -> Finding:
+        """The result, as a warning if the rotation is uncertain."""
+        uncertain = 2 * self.rotation_error > MAX_ROTATION_ERROR
+        sensitive = self.principal_point_sensitivity > MAX_ROTATION_ERROR / 2
         text = (
             f"Aligned at scale {self.scene_from_cloud.scale:.6g}: {self.inlier_ratio:.0%} of the "
             f"scene's points lie on the cloud (median distance {self.median_residual:.3g}), "
             f"standard error {self.error:.2g} (scene units) and {self.rotation_error:.2g} degrees."
         )
-        if 2 * self.rotation_error > MAX_ROTATION_ERROR:
+        if uncertain:
             text += (
                 f" Warning: the rotation may be off by more than {MAX_ROTATION_ERROR:g} degrees."
             )
-        if self.principal_point_sensitivity > MAX_ROTATION_ERROR / 2:
+        if sensitive:
             text += (
                 " The photographs stand so close together that a principal point half a pixel off "
                 f"would rotate the cloud by {self.principal_point_sensitivity:.2g} degrees."
             )
-        return text
+        return Finding("cloud-alignment", text, "warning" if uncertain or sensitive else "info")
 
 
 def align(
@@ -201,11 +204,7 @@ def _unreliable(found: str) -> PointCloudError:
 def _candidates(
     surface: Surface, tie_xyz: Points, settings: AlignSettings, progress: Progress
 ) -> list[Alignment]:
-    """Return distinct alignments, best first.
-
-    Raises:
-        PointCloudError: No start converged.
-    """
+    """Return distinct alignments, best first."""
     stages = settings.stages
     starts = find_starts(surface.xyz, tie_xyz, stages[0].candidates, progress, settings.search)
     for s, stage in enumerate(stages):

@@ -9,11 +9,11 @@ from typing import ClassVar
 import numpy as np
 
 from splatseed.errors import ParameterError
-from splatseed.methods.contract import NewPoints, Traits
-from splatseed.progress import Progress
+from splatseed.methods.contract import Traits
+from splatseed.pointcloud import PointCloud
+from splatseed.progress import Note, Progress, silent_note
 from splatseed.scene import Scene
-from splatseed.seeding.clouds.memory_plan import MemoryPlan, plan_memory
-from splatseed.seeding.clouds.settings import CloudInputs, CloudSettings
+from splatseed.seeding.clouds.settings import CloudInputs, CloudSettings, MemoryPlan, plan_memory
 from splatseed.seeding.photo_methods import frames_of
 from splatseed.settings import check_settings
 from splatseed.similarity import Similarity
@@ -44,7 +44,7 @@ class Cloud(CloudSettings):
 
     def __call__(
         self, scene: Scene, num_new: int, rng: np.random.Generator, progress: Progress
-    ) -> NewPoints:
+    ) -> PointCloud:
         """Raise, as there are no files: ``of`` adds them."""
         raise ParameterError(
             "`cloud=FILE` for the method cloud", found="none", fix="Name the scan."
@@ -75,11 +75,16 @@ class GivenClouds(Cloud):
         return plan_memory(self.memory, frames_of(scene))
 
     def __call__(
-        self, scene: Scene, num_new: int, rng: np.random.Generator, progress: Progress
-    ) -> NewPoints:
+        self,
+        scene: Scene,
+        num_new: int,
+        rng: np.random.Generator,
+        progress: Progress,
+        note: Note = silent_note,
+    ) -> PointCloud:
         """Make the seeds."""
         from splatseed.seeding.clouds.seeds import cloud_seeds
 
         paths, capacity = tuple(map(Path, self.files)), self.plan(scene).capacity
         inputs = CloudInputs(paths, self.transform, capacity, self.alone)
-        return cloud_seeds(scene, self, inputs, rng, progress)
+        return cloud_seeds(scene, self, inputs, rng, progress, note)

@@ -35,7 +35,7 @@ from splatseed.photos.zbuffer import cell_counts
 from splatseed.progress import Progress
 from splatseed.seeding.clouds._kernels import count_by_cell, observe, sum_around, summarise
 from splatseed.seeding.clouds.voxels import Voxels
-from splatseed.seeding.coverage import cell_depths_of_views
+from splatseed.seeding.cover import cell_depths_of_views
 
 Surface = Float32[np.ndarray, "rows cols"]
 
@@ -250,9 +250,6 @@ def consistent_voxels(
         progress: Called with the stage and the fraction done.
         clean: Without it, only hidden voxels are dropped.
         free: As of ``free_space``.
-
-    Raises:
-        PointCloudError: No photograph sees any voxel.
     """
     dropped: Counter[str] = Counter()
     active = np.arange(len(voxels))

@@ -44,13 +44,7 @@ def read_clouds(
     capacity: int,
     progress: Progress,
 ) -> MergedCloud:
-    """Merge clouds, all in one frame, in voxels of so many pixels of the views.
-
-    Raises:
-        PointCloudError: A file has no finite point.
-        SceneNotFoundError: A file is missing.
-        SceneFormatError: A file is damaged.
-    """
+    """Merge clouds, all in one frame, in voxels of so many pixels of the views."""
     files = tuple(open_cloud(path) for path in paths)
     has_color = all(file.colors != "none" for file in files)
     voxels = Voxels(capacity, views, pixels)
@@ -95,9 +89,6 @@ def sample_cloud(
     """Sample clouds of one frame evenly.
 
     Returns an offset, the positions minus this offset, and the colours if all files have some.
-
-    Raises:
-        PointCloudError: There are fewer than ``MIN_SAMPLE`` points.
     """
     files = [open_cloud(path) for path in paths]
     has_color = all(file.colors == "rgb" for file in files)

@@ -14,12 +14,12 @@ from jaxtyping import Float64, UInt8
 
 from splatseed.depth.stereo.maps import StereoSettings
 from splatseed.errors import PointCloudError
+from splatseed.findings import Finding
 from splatseed.io.origin import LIMITS
-from splatseed.methods import source_code
-from splatseed.methods.contract import NewPoints
 from splatseed.photos.view import View
 from splatseed.photos.visibility import find_visibility
-from splatseed.progress import Progress, silent
+from splatseed.pointcloud import PointCloud
+from splatseed.progress import Note, Progress, silent
 from splatseed.scene import Image, Scene
 from splatseed.seeding.clouds.photo_consistency import (
     ConsistentVoxels,
@@ -29,7 +29,7 @@ from splatseed.seeding.clouds.photo_consistency import (
 )
 from splatseed.seeding.clouds.reading import MergedCloud, read_clouds
 from splatseed.seeding.clouds.settings import CloudInputs, CloudSettings
-from splatseed.seeding.coverage import covered_share
+from splatseed.seeding.cover import covered_share
 from splatseed.seeding.photo_methods import (
     CELL,
     MAX_SIZE,
@@ -55,14 +55,9 @@ def cloud_seeds(
     inputs: CloudInputs,
     rng: np.random.Generator,
     progress: Progress,
-) -> NewPoints:
-    """Make seeds from files, for a scene with cameras.
-
-    Raises:
-        PointCloudError: A file has no finite point, or the cloud lies elsewhere.
-        SceneNotFoundError: A file is missing.
-        SceneFormatError: A file or photograph is damaged.
-    """
+    note: Note,
+) -> PointCloud:
+    """Make seeds from files, for a scene with cameras."""
     frames = frames_of(scene)
     merged = read_clouds(
         inputs.paths, inputs.scene_from_cloud, frames, settings.pixels, inputs.capacity, progress
@@ -84,17 +79,19 @@ def cloud_seeds(
     )  # fmt: skip
     xyz = voxels.xyz[selected.kept]
     share = covered_share(frames, xyz, CELL, silent)
-    notes = [*_reading_notes(merged), *_check_fit(selected), _kept_note(selected, len(voxels))]
+    findings = [*_reading_findings(merged), *_check_fit(selected)]
+    findings.append(_kept_points(selected, len(voxels)))
     if scene.has_photographs and not has_rgb:
-        notes.append(f"The cloud has {_found_colors(merged)}: colours are from the photographs.")
+        text = f"The cloud has {_found_colors(merged)}: colours are from the photographs."
+        findings.append(Finding("colors-of-photographs", text, "info"))
     if share < LOW_COVERAGE:
         hint = ": `method='auto'` with `cloud` seeds the rest" if inputs.alone else ""
-        notes.append(f"The cloud covers {share:.0%} of the photographs{hint}.")
-    return NewPoints(
-        xyz, _colors(settings, scene, merged, selected), tuple(notes),
-        confidence=np.nan_to_num(selected.evidence.agreement, nan=UNKNOWN_CONFIDENCE),
-        source=np.full(len(xyz), source_code("cloud"), np.uint8),
-    )  # fmt: skip
+        text = f"The cloud covers {share:.0%} of the photographs{hint}."
+        findings.append(Finding("low-coverage", text))
+    for finding in findings:
+        note(finding)
+    agreement = np.nan_to_num(selected.evidence.agreement, nan=UNKNOWN_CONFIDENCE)
+    return PointCloud(xyz, _colors(settings, scene, merged, selected), confidence=agreement)
 
 
 def _colors(
@@ -109,7 +106,6 @@ def _colors(
 
 
 def _found_colors(merged: MergedCloud) -> str:
-    """Describe the colours of files that do not all have some."""
     if all(file.colors != "none" for file in merged.files):
         return "intensity only"
     if any(file.colors != "none" for file in merged.files):
@@ -117,10 +113,11 @@ def _found_colors(merged: MergedCloud) -> str:
     return "no colours"
 
 
-def _kept_note(selected: ConsistentVoxels, total: int) -> str:
+def _kept_points(selected: ConsistentVoxels, total: int) -> Finding:
     dropped = [f"{selected.num_hidden:,} are hidden in every photograph"]
     dropped += [f"{count:,} {reason}" for reason, count in selected.dropped.items() if count]
-    return f"Kept {len(selected.kept):,} of {total:,} merged points: {', '.join(dropped)}."
+    text = f"Kept {len(selected.kept):,} of {total:,} merged points: {', '.join(dropped)}."
+    return Finding("contradicted-points", text, "info")
 
 
 def _free_space(
@@ -170,8 +167,8 @@ def _span(*corners: Float64[np.ndarray, " 3"]) -> str:
     return f"from ({first}) to ({last})"
 
 
-def _check_fit(selected: ConsistentVoxels) -> tuple[str, ...]:
-    """Return a note on how well the cloud fits the scene's own points.
+def _check_fit(selected: ConsistentVoxels) -> tuple[Finding, ...]:
+    """Report how well the cloud fits the scene's own points.
 
     Raises:
         PointCloudError: It does not.
@@ -186,20 +183,25 @@ def _check_fit(selected: ConsistentVoxels) -> tuple[str, ...]:
             fix="It shows another place, or is in another frame: try `align=True`, or pass "
             "`transform`.",
         )
-    doubt = ": check its frame and its unit" if selected.fit < DOUBTFUL_FIT else ""
-    return (f"The cloud fits: {share} lie at its depth, within 3%{doubt}.",)
+    doubtful = selected.fit < DOUBTFUL_FIT
+    doubt = ": check its frame and its unit" if doubtful else ""
+    text = f"The cloud fits: {share} lie at its depth, within 3%{doubt}."
+    return (Finding("cloud-fit", text, "warning" if doubtful else "info"),)
 
 
-def _reading_notes(merged: MergedCloud) -> list[str]:
+def _reading_findings(merged: MergedCloud) -> list[Finding]:
     voxels = merged.voxels
     outside = f"{voxels.num_outside:,} of them outside of every photograph"
-    notes = [f"{voxels.total + merged.non_finite:,} points were read, {outside}."]
-    notes += [warning for file in merged.files for warning in file.findings]
+    text = f"{voxels.total + merged.non_finite:,} points were read, {outside}."
+    findings = [Finding("cloud-read", text, "info")]
+    findings += [finding for file in merged.files for finding in file.findings]
     if merged.non_finite:
-        notes.append(f"{merged.non_finite:,} points of the cloud are not finite and were left out.")
+        text = f"{merged.non_finite:,} points of the cloud are not finite and were left out."
+        findings.append(Finding("non-finite-points", text))
     if voxels.coarsening:
-        notes.append(
+        text = (
             f"The cloud was merged at {2**voxels.coarsening} times the spacing asked for, to stay "
             "within the memory: pass more `memory`."
         )
-    return notes
+        findings.append(Finding("coarser-voxels", text))
+    return findings

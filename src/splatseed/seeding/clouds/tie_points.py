@@ -50,9 +50,6 @@ def select_tie_points(scene: Scene) -> TiePoints:
     """Select up to ``MAX_TIE_POINTS`` of the scene's own points, evenly spaced in file order.
 
     Points without a track get the median variance of the others.
-
-    Raises:
-        PointCloudError: There are fewer than ``MIN_TIE_POINTS``.
     """
     points, tracks = scene.points, scene.tracks
     usable = (points.source == ORIGINAL) & points.distinct

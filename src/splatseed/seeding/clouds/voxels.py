@@ -13,37 +13,31 @@ are filled, all are merged with their neighbours into voxels of twice the side.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int16, Int32, UInt8, UInt64
+from jaxtyping import Float32, Float64, Int32, UInt8
 
 from splatseed.photos.projection import pixels_from_world
 from splatseed.photos.view import View
-from splatseed.seeding.clouds._kernels import OUTSIDE, find_levels, merge_points, merge_voxels
+from splatseed.seeding.clouds._kernels import (
+    OUTSIDE,
+    VoxelTable,
+    find_levels,
+    merge_points,
+    merge_voxels,
+)
 
 MAX_HALVINGS = 20  # of the first points' extent, down to the first side of voxels without views
 MIN_EXTENT = 1e-6
 """Minimum extent assumed of the first points: there may be a single one, such as a marker."""
 
 
-class _Table(NamedTuple):
-    """Voxels in the order in which they were first filled, and a hash table to find them."""
-
-    keys: UInt64[np.ndarray, " C"]
-    mean: Float32[np.ndarray, "C 3"]
-    color: Float32[np.ndarray, "C 3"]
-    counts: Int32[np.ndarray, " C"]
-    level: Int16[np.ndarray, " C"]
-    slots: Int32[np.ndarray, " S"]
-
-    @classmethod
-    def of(cls, capacity: int) -> _Table:
-        """Return an empty table; pages that are not written take no memory."""
-        mean, color = np.empty((capacity, 3), np.float32), np.empty((capacity, 3), np.float32)
-        count, level = np.empty(capacity, np.int32), np.empty(capacity, np.int16)
-        slots = np.zeros(1 << (2 * capacity - 1).bit_length(), np.int32)
-        return cls(np.empty(capacity, np.uint64), mean, color, count, level, slots)
+def _empty_table(capacity: int) -> VoxelTable:
+    """Return an empty table; pages that are not written take no memory."""
+    mean, color = np.empty((capacity, 3), np.float32), np.empty((capacity, 3), np.float32)
+    counts, level = np.empty(capacity, np.int32), np.empty(capacity, np.int16)
+    slots = np.zeros(1 << (2 * capacity - 1).bit_length(), np.int32)
+    return VoxelTable(np.empty(capacity, np.uint64), mean, color, counts, level, slots)
 
 
 class Voxels:
@@ -62,7 +56,7 @@ class Voxels:
     """
 
     def __init__(self, capacity: int, views: Sequence[View] = (), pixels: float = 2.0) -> None:
-        self._capacity, self._num, self._table = capacity, 0, _Table.of(capacity)
+        self._capacity, self._num, self._table = capacity, 0, _empty_table(capacity)
         self._has_views, self._level = bool(views), 0
         self.coarsening = self.total = self.num_outside = 0
         if views:
@@ -113,11 +107,11 @@ class Voxels:
         start = 0
         while start < len(xyz):
             start, num = merge_points(
-                start, xyz, colors, levels, self.coarsening, *self._table, self._num
+                start, xyz, colors, levels, self.coarsening, self._table, self._num
             )
             self._num = int(num)
             while start < len(xyz) and self._num == self._capacity:
                 self.coarsening += 1
-                old, self._table = self._table, _Table.of(self._capacity)
-                num = merge_voxels(*old[1:5], self._num, self.coarsening, *self._table)
+                old, self._table = self._table, _empty_table(self._capacity)
+                num = merge_voxels(old, self._num, self.coarsening, self._table)
                 self._num = int(num)

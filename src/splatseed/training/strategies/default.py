@@ -7,11 +7,13 @@ resetting is an option here.
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, Self
 
 import torch
 from gsplat.strategy import DefaultStrategy
 from gsplat.strategy.ops import reset_opa
+from torch import Tensor
 
 from splatseed.splat.training_frame import SCENE_SCALE
 from splatseed.training.device import Capacity, on_one_thread
@@ -82,6 +84,17 @@ class Default(Strategy):
         self.inner.capacity = capacity
         self.resets = settings.opacity_reset
         self.state = self.inner.initialize_state()
+
+    @classmethod
+    def of(
+        cls,
+        settings: TrainSettings,
+        capacity: Capacity,
+        depths: Mapping[str, Tensor],  # noqa: ARG003  (the interface's name)
+        share: float,  # noqa: ARG003
+    ) -> Self:
+        """Make the strategy of a run; depths are not used."""
+        return cls(settings, capacity)
 
     def before_backward(
         self, params: Parameters, optimizers: Optimizers, step: int, info: Any

@@ -20,7 +20,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Self
 
 import torch
 from gsplat.strategy.ops import remove, split
@@ -32,13 +32,15 @@ from splatseed.splat.photographs import fill_masked, mask_tensor
 from splatseed.splat.rendering import opacity_from_logits, render_features
 from splatseed.training.device import Capacity, on_one_thread
 from splatseed.training.parameters import MAX_LOGIT, Optimizers, Parameters
-from splatseed.training.schedule import FULL_AT, Schedule
+from splatseed.training.schedule import Schedule
+from splatseed.training.settings import TrainSettings
 from splatseed.training.strategies.base import Strategy
 from splatseed.training.strategies.candidates import (
     add_candidates,
     draw_candidates,
     join_candidates,
 )
+from splatseed.training.traits import FULL_AT
 
 NO_DEPTHS: Mapping[str, Tensor] = MappingProxyType({})
 SUMS = ("errors", "pixels", "max_pixels", "views")
@@ -88,6 +90,17 @@ class ErrorDensification(Strategy):
         super().__init__(capacity)
         self.schedule = schedule
         self.depths, self.share = depths, share
+
+    @classmethod
+    def of(
+        cls,
+        settings: TrainSettings,
+        capacity: Capacity,
+        depths: Mapping[str, Float[Tensor, "h w"]],
+        share: float,
+    ) -> Self:
+        """Make the strategy of a run; without depths it only splits."""
+        return cls(settings.schedule, capacity, depths, share)
 
     def should_accumulate(self, step: int) -> bool:
         """Whether contributions are measured at this step."""

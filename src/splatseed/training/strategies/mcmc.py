@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, Self
 
 import torch
 from gsplat.strategy.ops import sample_add
@@ -60,6 +61,17 @@ class Mcmc(Strategy):
         )
         self.inner.capacity, self.inner.schedule = capacity, schedule
         self.state = self.inner.initialize_state()
+
+    @classmethod
+    def of(
+        cls,
+        settings: TrainSettings,
+        capacity: Capacity,
+        depths: Mapping[str, Tensor],  # noqa: ARG003  (the interface's name)
+        share: float,  # noqa: ARG003
+    ) -> Self:
+        """Make the strategy of a run; depths are not used."""
+        return cls(settings, capacity)
 
     def regularization(self, params: Parameters) -> Float[Tensor, ""]:
         """Return the weighted sum of mean opacity and mean size."""

@@ -1,10 +1,12 @@
-"""Preserve the precision of positions in packed formats despite distant Gaussians.
+"""Quantise Gaussians for packed formats, and keep positions precise despite distant Gaussians.
+
+Notation: quaternions are wxyz. *Smallest three* stores a unit quaternion as the index of its
+largest component, made positive, and the other three, each within 1/sqrt(2) of 0.
 
 Packed positions are quantised between bounds: one Gaussian at 1e6 units would leave a few steps for
 all others. *Distance* is the maximum norm from the median position, and *reach* its median, which
 up to half of the Gaussians cannot move. *Shell* 0 ends at 8 reaches; each further shell is 64 times
-as large. Formats with chunks store each shell in its own chunks; formats with one step for all drop
-distant Gaussians if keeping them would cost more image quality.
+as large. Distant Gaussians are dropped if keeping them would cost more image quality.
 """
 
 from __future__ import annotations
@@ -14,10 +16,63 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int64
+from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
+from splatseed.findings import Finding
 from splatseed.splat.gaussians import Gaussians
 from splatseed.text import agreeing, counted
+
+_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+"""The remaining components, by the index of the largest."""
+
+
+def smallest_three(
+    quats: Float32[np.ndarray, "N 4"],
+) -> tuple[Int64[np.ndarray, " N"], Float32[np.ndarray, "N 3"]]:
+    """Return the index of each quaternion's largest component, and the other three in order."""
+    unit = unit_quats(quats)
+    largest = np.argmax(np.abs(unit), axis=1)
+    rows = np.arange(len(unit))
+    unit *= np.where(unit[rows, largest] < 0, -1, 1).astype(np.float32)[:, None]
+    return largest, unit[rows[:, None], _OTHERS[largest]]
+
+
+def from_smallest_three(
+    largest: Int64[np.ndarray, " N"], three: Float32[np.ndarray, "N 3"]
+) -> Float32[np.ndarray, "N 4"]:
+    """Decode the unit quaternions of ``smallest_three``."""
+    rows = np.arange(len(three))
+    quats = np.empty((len(three), 4), np.float32)
+    quats[rows[:, None], _OTHERS[largest]] = three
+    # A unit quaternion: the fourth square is 1 minus the other three.
+    quats[rows, largest] = np.sqrt(np.maximum(1 - (three**2).sum(axis=1), 0))
+    return quats
+
+
+def opacity_bytes(logits: Float32[np.ndarray, " N"]) -> UInt8[np.ndarray, " N"]:
+    """Convert logits to opacities in steps of 1/255."""
+    with np.errstate(over="ignore"):
+        return np.rint(255 / (1 + np.exp(-logits.astype(np.float64)))).astype(np.uint8)
+
+
+def opacity_logits(values: UInt8[np.ndarray, " N"]) -> Float32[np.ndarray, " N"]:
+    """Convert opacities in steps of 1/255 to logits; 0 and 1 move inwards by a quarter step."""
+    opacity = np.clip(values / 255, 0.25 / 255, 1 - 0.25 / 255)
+    return np.log(opacity / (1 - opacity)).astype(np.float32)
+
+
+def rounded_bytes(values: np.ndarray) -> UInt8[np.ndarray, "..."]:
+    """Round values to bytes, clipped to 0 to 255."""
+    return np.asarray(np.clip(np.rint(values), 0, 255), np.uint8)
+
+
+def unit_quats(quats: Float32[np.ndarray, "N 4"]) -> Float32[np.ndarray, "N 4"]:
+    """Normalise quaternions; those of length 0 become the identity."""
+    norms = np.linalg.norm(quats, axis=1, keepdims=True)
+    known = np.isfinite(norms) & (norms > 0)
+    unit = np.divide(quats, norms, out=np.zeros_like(quats), where=known)
+    unit[~known[:, 0]] = (1, 0, 0, 0)
+    return np.asarray(unit)
 
 
 @dataclass(frozen=True)
@@ -33,7 +88,7 @@ class PackingSettings:
     morton_bits: int = 21  # per axis; 63 in all
 
 
-SETTINGS = PackingSettings()
+PACKING = PackingSettings()
 
 
 def distances_of(means: Float32[np.ndarray, "N 3"]) -> tuple[Float64[np.ndarray, " N"], float]:
@@ -50,13 +105,13 @@ def distances_of(means: Float32[np.ndarray, "N 3"]) -> tuple[Float64[np.ndarray,
 def shells_of(means: Float32[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:
     """Return the shell of each position."""
     distances, reach = distances_of(means)
-    beyond = np.maximum(distances / (SETTINGS.first_shell * reach), 1.0)
-    shells = np.ceil(np.log(beyond) / np.log(SETTINGS.shell_ratio))
+    beyond = np.maximum(distances / (PACKING.first_shell * reach), 1.0)
+    shells = np.ceil(np.log(beyond) / np.log(PACKING.shell_ratio))
     return np.asarray(shells, np.int64)
 
 
-def morton_codes(means: Float32[np.ndarray, "N 3"]) -> np.ndarray:
-    """Return Z-curve codes of positions, in cells that grow with the distance.
+def morton_order(means: Float32[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:
+    """Return the order of positions along a Z curve, in cells that grow with the distance.
 
     Along each axis sign(x) log(1 + |x|), with x in reaches from the median, is divided evenly.
     """
@@ -65,18 +120,13 @@ def morton_codes(means: Float32[np.ndarray, "N 3"]) -> np.ndarray:
     curved = np.sign(offsets) * np.log1p(np.abs(offsets))
     low, high = curved.min(axis=0), curved.max(axis=0)
     extent = np.where(high > low, high - low, 1)
-    cells = ((curved - low) / extent * (2**SETTINGS.morton_bits - 1)).astype(np.uint64)
+    cells = ((curved - low) / extent * (2**PACKING.morton_bits - 1)).astype(np.uint64)
     code = np.zeros(len(xyz), np.uint64)
-    for bit in range(SETTINGS.morton_bits):
+    for bit in range(PACKING.morton_bits):
         for axis in range(3):
             digit = (cells[:, axis] >> np.uint64(bit)) & np.uint64(1)
             code |= digit << np.uint64(3 * bit + axis)
-    return code
-
-
-def morton_order(means: Float32[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:
-    """Return the order of positions along the Z curve."""
-    return np.argsort(morton_codes(means), kind="stable")
+    return np.argsort(code, kind="stable")
 
 
 class Fit(NamedTuple):
@@ -101,14 +151,14 @@ def best_fit(gaussians: Gaussians, fits: Sequence[Fit]) -> tuple[int, float, flo
     visible = opacity * np.minimum(sizes / np.maximum(distances, reach), 1) ** 2
     even = np.full(len(visible), 1 / len(visible))
     visible = visible / visible.sum() if visible.any() else even
-    weights = (1 - SETTINGS.uniform_share) * visible + SETTINGS.uniform_share * even
+    weights = (1 - PACKING.uniform_share) * visible + PACKING.uniform_share * even
     costs = []
     for i, (kept, step) in enumerate(fits):
         error = step / np.sqrt(12) / sizes  # RMS error of rounding to steps
-        blurred = float((weights * np.minimum(error**2, SETTINGS.max_blur))[kept].sum())
+        blurred = float((weights * np.minimum(error**2, PACKING.max_blur))[kept].sum())
         lost = float(weights[~kept].sum())
         costs.append((lost + blurred, i, lost))
-        if lost + blurred <= SETTINGS.negligible_cost:
+        if lost + blurred <= PACKING.negligible_cost:
             break
     _, best, lost = min(costs)
     kept, step = fits[best]
@@ -116,13 +166,14 @@ def best_fit(gaussians: Gaussians, fits: Sequence[Fit]) -> tuple[int, float, flo
     return best, lost, float(np.median(errors)) if len(errors) else np.inf
 
 
-def left_out_note(suffix: str, kept: Bool[np.ndarray, " N"], where: str) -> str:
-    """Return a note on the distant Gaussians left out of a file with this suffix."""
+def left_out_finding(suffix: str, kept: Bool[np.ndarray, " N"], where: str) -> Finding:
+    """Return the finding on distant Gaussians left out of a file with this suffix."""
     number = int(np.count_nonzero(~kept))
     distant = (
         f"{counted(number, 'Gaussian')} of {len(kept):,} {agreeing(number, 'is', 'are')} {where}"
     )
-    return (
+    return Finding(
+        "distant-gaussians",
         f"{distant} and {agreeing(number, 'was', 'were')} left out: in a {suffix} "
-        f"{agreeing(number, 'it', 'they')} would reduce the precision of all other positions."
+        f"{agreeing(number, 'it', 'they')} would reduce the precision of all other positions.",
     )
