@@ -114,7 +114,7 @@ def test_images_are_read_again_if_too_few_candidates_are_sound(exact, make_maps,
     reads, plain = [], lifting.read_view
 
     def counted(*args):
-        reads.append(args[6])
+        reads.append(args[4])
         return plain(*args)
 
     monkeypatch.setattr(lifting, "read_view", counted)
