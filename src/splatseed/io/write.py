@@ -129,7 +129,8 @@ def write_scene(
         num_new = counts["num_points"] - counts["num_original"]
         made |= facts_for_reading(scene)
         facts = {"source": read and str(read), **made, "format": layout, **counts}
-        facts |= {"num_new": num_new, "findings": [asdict(each) for each in findings]}
+        found = [asdict(each) for each in (*scene.findings, *findings)]
+        facts |= {"num_new": num_new, "findings": found}
         write_json(folder / MANIFEST, {**facts, "versions": versions_of(_PACKAGES)})
     return WriteReport(
         path,

@@ -83,7 +83,7 @@ def _upsample(options: Options, methods: dict[str, Any], arguments: list[str]) -
             extra_method=extra_method, seed=options.seed, progress=clock,
             note=note,
         )  # fmt: skip
-        seeded = scene.with_points(seeds)
+        seeded = scene.replace(points=seeds, findings=(*scene.findings, *notes))
         clock("check", 0.0)
         coverage = report.measure_coverage(scene, seeds)
         quality = report.quality_rows(options, scene, seeds, method, coverage)
