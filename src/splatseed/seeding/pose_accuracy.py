@@ -67,8 +67,8 @@ class _Settings:
     """A larger median error may be chance: wrong matches are spread over ``max_miss``."""
 
 
-_SETTINGS = _Settings()
-_HALF, _REACH = _SETTINGS.half_patch, _SETTINGS.max_miss
+POSE_ACCURACY = _Settings()
+_HALF, _REACH = POSE_ACCURACY.half_patch, POSE_ACCURACY.max_miss
 
 
 @dataclass(frozen=True)
@@ -109,9 +109,9 @@ def estimate_pose_error(
     off.
     """
     poses = np.array([image.camera.cam_from_world for image in images])
-    partners = choose_by_pose(poses, _SETTINGS.partners)
-    factor = factor_for_size(images, _SETTINGS.side)
-    chosen = evenly_spaced(len(images), _SETTINGS.photographs).tolist()
+    partners = choose_by_pose(poses, POSE_ACCURACY.partners)
+    factor = factor_for_size(images, POSE_ACCURACY.side)
+    chosen = evenly_spaced(len(images), POSE_ACCURACY.photographs).tolist()
     errors, pairs = [], 0
     for number, i in enumerate(chosen):
         compared = [images[i], *(images[j] for j in partners[i].tolist() if j >= 0)]
@@ -119,14 +119,14 @@ def estimate_pose_error(
         pairs += len(others)
         for other in others:
             misses = np.abs(_misses(view, other))
-            if len(misses) >= _SETTINGS.min_found:
+            if len(misses) >= POSE_ACCURACY.min_found:
                 px = float(np.median(misses))
                 errors.append((px, np.degrees(np.arctan(px / view.K[0, 0]))))
         progress("measure poses", (number + 1) / len(chosen))
-    if len(errors) < max(1.0, _SETTINGS.min_pairs * pairs):
+    if len(errors) < max(1.0, POSE_ACCURACY.min_pairs * pairs):
         return None
     px, degrees = np.median(errors, axis=0).tolist()
-    if px > _SETTINGS.max_median:
+    if px > POSE_ACCURACY.max_median:
         return None
     stereo_factor = factor_for_size(images, StereoSettings.max_size)
     px *= factor / stereo_factor
@@ -152,7 +152,7 @@ def given_pose_error(
 def _misses(view: View, other: View) -> Float64[np.ndarray, " M"]:
     """Return the signed distances from their epipolar lines at which corners are found."""
     j_from_i = other.cam_from_world @ np.linalg.inv(view.cam_from_world)
-    max_motion = _SETTINGS.max_motion * view.width
+    max_motion = POSE_ACCURACY.max_motion * view.width
     margin = int(max_motion) + _REACH + 2 * _HALF
     image = _gray(view)
     homography = other.K @ j_from_i[:3, :3] @ np.linalg.inv(view.K)
@@ -194,11 +194,11 @@ def _corners(image: Gray, mask: Bool[np.ndarray, "H W"] | None) -> Float64[np.nd
     xx, xy, yy = (gaussian_filter(product, 2.0) for product in (x * x, x * y, y * y))
     # The smaller eigenvalue of the structure tensor.
     strength = 0.5 * (xx + yy - np.hypot(xx - yy, 2 * xy))
-    peaks = (strength == maximum_filter(strength, _SETTINGS.corner_spacing)) & (strength > 0)
+    peaks = (strength == maximum_filter(strength, POSE_ACCURACY.corner_spacing)) & (strength > 0)
     if mask is not None:
         peaks &= mask
     row, column = np.nonzero(peaks)
-    best = np.argsort(-strength[peaks], kind="stable")[: _SETTINGS.corners]
+    best = np.argsort(-strength[peaks], kind="stable")[: POSE_ACCURACY.corners]
     return np.stack([column[best], row[best]], axis=1) + 0.5
 
 
@@ -218,7 +218,7 @@ def _miss(
     columns = slice(max(column - _HALF, 0), column + _HALF + 1)
     rest[columns, max(row - _HALF, 0) : row + _HALF + 1] = -1.0
     inside = 0 < row < scores.shape[1] - 1
-    unclear = best < _SETTINGS.min_correlation or best - rest.max() < _SETTINGS.min_lead
+    unclear = best < POSE_ACCURACY.min_correlation or best - rest.max() < POSE_ACCURACY.min_lead
     if unclear or not inside:
         return None
     before, after = scores[column, row - 1], scores[column, row + 1]

@@ -67,7 +67,7 @@ class _Settings:
     """Photographs that are tested for overlap with all others."""
 
 
-_SETTINGS = _Settings()
+POSE_CHECK = _Settings()
 _YZ, _XY = np.diag([1.0, -1.0, -1.0, 1.0]), np.diag([-1.0, -1.0, 1.0, 1.0])
 CORRECTIONS: Mapping[str, Callable[[Poses], Poses]] = MappingProxyType(
     {
@@ -107,33 +107,33 @@ def check_poses(scene: Scene, images: Sequence[Image], progress: Progress = sile
     poses = np.array([image.camera.cam_from_world for image in images])
     _check_centers(poses)
     expected = f"photographs that agree at the poses of {scene.source.root}"
-    clear = _SETTINGS.clear_factor
+    clear = POSE_CHECK.clear_factor
     agreements: list[float] = []
-    for sample in range(_SETTINGS.samples):
-        progress("check poses", sample / _SETTINGS.samples)
+    for sample in range(POSE_CHECK.samples):
+        progress("check poses", sample / POSE_CHECK.samples)
         agreement = _agreement(scene, images, poses, sample)
         agreements.append(agreement)
-        if agreement >= _SETTINGS.sound:
+        if agreement >= POSE_CHECK.sound:
             break
         corrected = {
             name: _agreement(scene, images, correct(poses), sample)
             for name, correct in CORRECTIONS.items()
         }
         best = max(corrected, key=lambda name: corrected[name])
-        if corrected[best] >= max(clear * agreement, _SETTINGS.min_corrected):
+        if corrected[best] >= max(clear * agreement, POSE_CHECK.min_corrected):
             found = f"a depth that others confirm at {agreement:.1%} of their pixels"
             raise SceneFormatError(
                 expected,
                 found=f"{found}, and at {corrected[best]:.0%} once {best}",
                 fix=f"Write the poses so: {CONVENTIONS[scene.source.format]}.",
             )
-        if agreement > max(clear * corrected[best], _SETTINGS.chance):
+        if agreement > max(clear * corrected[best], POSE_CHECK.chance):
             # The poses are sound; the mean agreement needs more than one photograph.
-            rest = range(sample + 1, _SETTINGS.samples)
+            rest = range(sample + 1, POSE_CHECK.samples)
             agreements += [_agreement(scene, images, poses, other) for other in rest]
             break
     else:
-        if (mean := float(np.mean(agreements))) <= _SETTINGS.chance:
+        if (mean := float(np.mean(agreements))) <= POSE_CHECK.chance:
             raise _disagreement(scene, images, expected, mean)
     progress("check poses", 1.0)
     return float(np.mean(agreements))
@@ -173,7 +173,7 @@ def agreement_findings(
         stated: Whether the share of pixels with a confirmed depth has been stated, by all
             photographs instead of a few: two different numbers for it would confuse.
     """
-    if agreement >= _SETTINGS.low:
+    if agreement >= POSE_CHECK.low:
         return ()
     few = f" masks that leave {1 - masked:.0%} of the pixels," if masked >= 0.5 else ""
     what = "Likely reasons for so little are"
@@ -218,7 +218,7 @@ def _agreement(scene: Scene, images: Sequence[Image], poses: Poses, sample: int)
     for i, view in enumerate(stereo.views):
         confirmed = stereo.confirmed(i)
         if view.mask is not None:
-            confirmed = confirmed[valid_blocks(view.mask, _SETTINGS.stereo.grid)]
+            confirmed = confirmed[valid_blocks(view.mask, POSE_CHECK.stereo.grid)]
         if confirmed.size:
             shares.append(confirmed.mean())
     return float(np.mean(shares)) if shares else 0.0
@@ -229,7 +229,7 @@ def compare_samples(
 ) -> Iterator[tuple[StereoResult, list[Image]]]:
     """Compare a few photographs with their partners over all depths, one after the other."""
     poses = np.stack([image.camera.cam_from_world for image in images])
-    for sample in range(_SETTINGS.samples):
+    for sample in range(POSE_CHECK.samples):
         yield compare_sample(scene, images, poses, sample)
 
 
@@ -237,22 +237,22 @@ def compare_sample(
     scene: Scene, images: Sequence[Image], poses: Poses, sample: int
 ) -> tuple[StereoResult, list[Image]]:
     """Compare a sampled photograph and its partners at these poses; also return their images."""
-    first = (2 * sample + 1) * len(images) // (2 * _SETTINGS.samples)
-    partners = choose_by_pose(poses, _SETTINGS.partners)[first]
+    first = (2 * sample + 1) * len(images) // (2 * POSE_CHECK.samples)
+    partners = choose_by_pose(poses, POSE_CHECK.partners)[first]
     idx = [first, *partners[partners >= 0].tolist()]
     chosen = [images[i] for i in idx]
-    factor = factor_for_size(chosen, _SETTINGS.side)
+    factor = factor_for_size(chosen, POSE_CHECK.side)
     loaded = load_views(scene, chosen, data_factor=factor, undistort=True)
     views = [view.posed(poses[i]) for view, i in zip(loaded, idx, strict=True)]
-    sources = choose_by_pose(poses[idx], _SETTINGS.partners)
+    sources = choose_by_pose(poses[idx], POSE_CHECK.partners)
     priors = [prior_from_baseline(views, i, others) for i, others in enumerate(sources)]
-    return match_views(views, priors, sources, _SETTINGS.stereo, 0, silent), chosen
+    return match_views(views, priors, sources, POSE_CHECK.stereo, 0, silent), chosen
 
 
 def _any_overlap(cameras: Sequence[Camera]) -> bool:
     """Whether a point at some depth in front of one camera falls into another's image."""
     uv = pixel_centers(4, 5).reshape(-1, 2) / [5, 4]
-    for first in strided(cameras, _SETTINGS.overlap_samples):
+    for first in strided(cameras, POSE_CHECK.overlap_samples):
         for other in cameras:
             if gap := float(np.linalg.norm(first.center - other.center)):
                 z = gap * np.repeat(np.geomspace(0.1, 1000.0, 12), len(uv))

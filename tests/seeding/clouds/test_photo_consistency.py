@@ -9,7 +9,7 @@ from splatseed.camera import Camera
 from splatseed.photos.view import View
 from splatseed.progress import silent
 from splatseed.seeding.clouds.photo_consistency import (
-    SETTINGS,
+    CONSISTENCY,
     find_evidence,
     find_support,
     find_surfaces,
@@ -58,7 +58,7 @@ def test_points_behind_the_wall_are_hidden_and_those_on_it_are_not(wall, rng):
         u, v = F * cam[:, 0] / cam[:, 2] + W / 2, F * cam[:, 1] / cam[:, 2] + H / 2
         inside = (u >= 0) & (u < W) & (v >= 0) & (v < H)
         cells = v[inside] * surface.shape[0] / H, u[inside] * surface.shape[1] / W
-        limit = surface[tuple(np.array(cells).astype(int))] * (1 + SETTINGS.behind * cell / 4)
+        limit = surface[tuple(np.array(cells).astype(int))] * (1 + CONSISTENCY.behind * cell / 4)
         seen[np.flatnonzero(inside)[cam[inside, 2] <= limit]] += 1
     np.testing.assert_array_equal(found.num_views, seen)
     middle = (np.abs(wall[:, :2]) < 0.8).all(axis=1)

@@ -73,7 +73,7 @@ class ConsistencySettings:
     """Fraction of dropped voxels above which the others are checked again."""
 
 
-SETTINGS = ConsistencySettings()
+CONSISTENCY = ConsistencySettings()
 BLOCK = 1 << 20  # points compared at a time
 
 
@@ -99,7 +99,7 @@ def free_space(
     It is the smallest depth of the points that a view certainly sees, ``visible``, and of the maps
     of stereo, whose cells it has.
     """
-    side = SETTINGS.ray_cell
+    side = CONSISTENCY.ray_cell
     free = []
     for v, (view, xyz) in enumerate(zip(views, visible, strict=True)):
         shape = -(-view.height // side), -(-view.width // side)
@@ -124,7 +124,7 @@ class Evidence(NamedTuple):
     @property
     def free_space_violation(self) -> Bool[np.ndarray, " N"]:
         """Whether enough views see through a point, and more than confirm it."""
-        enough = self.violations >= SETTINGS.min_violations
+        enough = self.violations >= CONSISTENCY.min_violations
         return np.asarray(enough & (self.violations > self.confirmations))
 
     def select(self, which: Bool[np.ndarray, " N"]) -> Evidence:
@@ -143,12 +143,12 @@ def find_surfaces(
 def _choose_cell(views: Sequence[View], xyz: Float32[np.ndarray, "N 3"]) -> int:
     """Return the smallest side at which the median non-empty cell holds enough points."""
     sample = strided(views, 8)
-    for cell in SETTINGS.cells[:-1]:
+    for cell in CONSISTENCY.cells[:-1]:
         counts = np.concatenate([cell_counts(view.camera, xyz, cell) for view in sample])
         counts = counts[counts > 0]
-        if len(counts) and np.median(counts) >= SETTINGS.min_points_per_cell:
+        if len(counts) and np.median(counts) >= CONSISTENCY.min_points_per_cell:
             return cell
-    return SETTINGS.cells[-1]
+    return CONSISTENCY.cells[-1]
 
 
 def find_evidence(
@@ -169,7 +169,7 @@ def find_evidence(
         free: As of ``free_space``; None if no ray is known to be free.
         progress: Called with the stage and the fraction done.
     """
-    num, closest = len(xyz), SETTINGS.closest
+    num, closest = len(xyz), CONSISTENCY.closest
     evidence = Evidence(
         np.zeros(num, np.uint16),
         np.full((num, 3), 128, np.uint8),
@@ -177,7 +177,7 @@ def find_evidence(
         np.zeros(num, np.uint16),
         np.zeros(num, np.uint16),
     )
-    behind = SETTINGS.behind * cell / SETTINGS.cells[0]
+    behind = CONSISTENCY.behind * cell / CONSISTENCY.cells[0]
     no_mask, no_rays = np.ones((1, 1), np.bool_), np.empty((0, 0), np.float32)
     steps = max(len(range(0, num, BLOCK)) * len(views), 1)
     for b, start in enumerate(range(0, num, BLOCK)):
@@ -215,7 +215,7 @@ def surface_agreement(
         known = np.isfinite(depth)
         total += int(np.count_nonzero(known))
         deviation = np.abs(points.depth[known] / depth[known] - 1.0)
-        close += int(np.count_nonzero(deviation <= SETTINGS.fit_tolerance))
+        close += int(np.count_nonzero(deviation <= CONSISTENCY.fit_tolerance))
     return (close / total if total else 0.0), total
 
 
@@ -255,7 +255,7 @@ def consistent_voxels(
     active = np.arange(len(voxels))
     if clean:
         support = find_support(voxels.xyz, voxels.side, voxels.count)
-        isolated = support < SETTINGS.min_support * np.median(support)
+        isolated = support < CONSISTENCY.min_support * np.median(support)
         dropped["are isolated"] = int(np.count_nonzero(isolated))
         active = active[~isolated]
     for last in (False, True):
@@ -267,7 +267,7 @@ def consistent_voxels(
             own = None if colors is None else colors[active]
             contradicted, counts = _contradicted(evidence, own)
             dropped.update(counts)
-        if last or np.count_nonzero(contradicted) <= SETTINGS.repeat_above * len(active):
+        if last or np.count_nonzero(contradicted) <= CONSISTENCY.repeat_above * len(active):
             break
         active = active[~contradicted]
     seen = evidence.num_views > 0
@@ -287,7 +287,7 @@ def _contradicted(
     evidence: Evidence, colors: UInt8[np.ndarray, "N 3"] | None
 ) -> tuple[Bool[np.ndarray, " N"], dict[str, int]]:
     """Tell which voxels are contradicted, and count them by their first reason."""
-    s = SETTINGS
+    s = CONSISTENCY
     violation = evidence.free_space_violation
     # NaN compares false.
     inconsistent = (evidence.num_views >= s.min_views) & (evidence.agreement < s.min_agreement)
